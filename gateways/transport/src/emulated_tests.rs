@@ -5,7 +5,7 @@ use core::time::Duration;
 
 use hil_core::link_model::Fate;
 use hil_core::random::RandomStream;
-use hil_link::bernoulli::BernoulliLink;
+use hil_link::spec::{LinkPlace, LinkSpec};
 
 use super::*;
 use crate::DatagramSender;
@@ -51,9 +51,9 @@ fn take(receiver: &mut impl DatagramReceiver, now: Instant) -> Option<(u8, Recei
 #[test]
 fn a_caller_that_was_held_up_does_not_make_a_datagram_early() {
     let (mut sender, inner) = queue_pair(&QueueSettings::default());
-    let stream = RandomStream::new(1, "late caller");
-    let delay = Duration::from_millis(50);
-    let link = BernoulliLink::new(delay, 0.0, stream).unwrap();
+    let link = LinkSpec::fixed(Duration::from_millis(50), 0.0)
+        .build(&LinkPlace::alone(1, "late caller"))
+        .unwrap();
     let settings = EmulatedSettings {
         clock: Some(|| Instant::from_ns(8_000_000)),
         ..EmulatedSettings::default()
@@ -229,8 +229,9 @@ fn exempt_datagrams_pass_at_once_and_change_no_fate() {
 #[test]
 fn equal_seeds_lose_the_same_datagrams() {
     let survivors = |seed| {
-        let stream = RandomStream::new(seed, "link");
-        let link = BernoulliLink::new(Duration::from_millis(3), 0.3, stream).unwrap();
+        let link = LinkSpec::fixed(Duration::from_millis(3), 0.3)
+            .build(&LinkPlace::alone(seed, "link"))
+            .unwrap();
         let (mut sender, mut receiver) = emulated(link, 8);
         let mut seen = Vec::new();
         for byte in 0..200 {

@@ -4,7 +4,7 @@
 use core::time::Duration;
 
 use super::delay::DelaySampler;
-use super::loss::LossProcess;
+use super::loss::Losses;
 use super::outages::OutageLink;
 use super::rate::Bottleneck;
 use super::reordering::Strikes;
@@ -16,11 +16,11 @@ use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
 /// The link.
-#[derive(Debug, Clone)]
-pub struct LinkChain {
+#[derive(Debug)]
+pub(crate) struct LinkChain {
     outages: OutageLink,
     wifi: Option<Box<WifiLink>>,
-    loss: LossProcess,
+    loss: Box<dyn Losses>,
     bottleneck: Option<Bottleneck>,
     delay: (DelaySampler, RandomStream),
     reorders: bool,
@@ -52,7 +52,7 @@ impl LinkChain {
         Ok(Self {
             outages,
             wifi: wifi.transpose()?,
-            loss: LossProcess::new(spec.loss, own(""), shared(".bursts"))?,
+            loss: spec.loss.start(own(""), shared(".bursts"))?,
             bottleneck: spec.rate.map(Bottleneck::new).transpose()?,
             delay: (DelaySampler::new(&spec.delay)?, own(".delay")),
             reorders: spec.reorders,

@@ -52,8 +52,7 @@ impl LinkCondition {
         ParameterError::check("loss", loss_ratio, 0.0..=1.0, "0 to 1")
     }
 
-    /// The link that does this in place of the topology's; `None` for the topology's own. A cut loses
-    /// everything by itself, see [`super::switched`].
+    /// The link that does this in place of the topology's; `None` for the topology's own.
     pub fn spec(self) -> Option<LinkSpec> {
         match self {
             Self::Topology => None,
@@ -80,7 +79,7 @@ impl LinkCondition {
         }
     }
 
-    fn of((kind, delay_ns, loss_ratio): (u32, u64, f64)) -> Option<Self> {
+    fn of(kind: u32, delay_ns: u64, loss_ratio: f64) -> Option<Self> {
         match kind {
             TOPOLOGY => Some(Self::Topology),
             FIXED => Some(Self::Fixed {
@@ -138,7 +137,7 @@ impl LinkOrder {
     /// What it asks for; `None` when it is of another version or kind, or a number is outside its
     /// range.
     pub fn condition(&self) -> Option<LinkCondition> {
-        let condition = LinkCondition::of((self.kind, self.delay_ns, self.loss_ratio))?;
+        let condition = LinkCondition::of(self.kind, self.delay_ns, self.loss_ratio)?;
         (self.version == ORDER_VERSION && condition.check().is_ok()).then_some(condition)
     }
 }
@@ -207,7 +206,7 @@ pub struct LinkConditionRecord {
 impl LinkConditionRecord {
     /// What was asked for; `None` for a kind that this version does not know.
     pub fn condition(&self) -> Option<LinkCondition> {
-        LinkCondition::of((self.kind, self.delay_ns, self.loss_ratio))
+        LinkCondition::of(self.kind, self.delay_ns, self.loss_ratio)
     }
 
     /// What became of it; `None` for an outcome that this version does not know.

@@ -5,101 +5,55 @@
 
 use core::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
+use crate::options::{options, words};
+use crate::outages::OutageLink;
 use hil_core::case_study::ParameterError;
-use hil_core::message::Envelope;
 use hil_core::random::RandomStream;
-use hil_core::simulation::Carrier;
 use hil_core::time::Instant;
 
-/// How a link's delay is drawn.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum DelayLaw {
-    /// Every message takes `delay_ms`.
-    #[default]
-    Constant,
-    /// Each takes a time of its own, uniform from 0 to `delay_ms`.
-    Uniform,
+words! {
+    /// How a link's delay is drawn.
+    pub enum DelayLaw {
+        /// Every message takes `delay_ms`.
+        #[default]
+        Constant = "constant",
+        /// Each takes a time of its own, uniform from 0 to `delay_ms`.
+        Uniform = "uniform",
+    }
 }
 
-/// What a link does to messages. The default does nothing.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Impairments {
-    /// Delay, or its upper end, 0..=60000 ms.
-    pub delay_ms: f64,
-    /// How the delay is drawn.
-    pub delay_law: DelayLaw,
-    /// Probability that a copy is lost, 0..=1.
-    pub loss_ratio: f64,
-    /// Copies sent of each message, 1..=16; a message is lost when all of them are.
-    pub copies: u32,
-    /// Probability that a message arrives twice, 0..=1.
-    pub duplicate_ratio: f64,
-    /// The second arrival comes up to this much later, uniform, 0..=60000 ms.
-    pub duplicate_lag_ms: f64,
-    /// Probability that a message is held back and so overtaken, 0..=1.
-    pub hold_ratio: f64,
-    /// It is held up to this long, uniform, 0..=60000 ms.
-    pub hold_ms: f64,
-    /// Mean length of a stall, exponential, 0..=60 s; 0 for none. What is offered during a stall
-    /// sets out at its end.
-    pub stall_mean_s: f64,
-    /// Mean time from the end of a stall to the next, exponential, 0.1..=86400 s.
-    pub stall_gap_mean_s: f64,
+options! {
+    /// What a link does to messages. The default does nothing.
+    #[derive(Copy)]
+    #[serde(default)]
+    pub struct Impairments {
+        /// Delay, or its upper end, ms.
+        delay_ms: f64 = 0.0, in 0.0..=60_000.0;
+        /// How the delay is drawn.
+        delay_law: DelayLaw = DelayLaw::Constant;
+        /// Probability that a copy is lost.
+        loss_ratio: f64 = 0.0, in 0.0..=1.0;
+        /// Copies sent of each message; a message is lost when all of them are.
+        copies: u32 = 1, in 1..=16;
+        /// Probability that a message arrives twice.
+        duplicate_ratio: f64 = 0.0, in 0.0..=1.0;
+        /// The second arrival comes up to this much later, uniform, ms.
+        duplicate_lag_ms: f64 = 0.0, in 0.0..=60_000.0;
+        /// Probability that a message is held back and so overtaken.
+        hold_ratio: f64 = 0.0, in 0.0..=1.0;
+        /// It is held up to this long, uniform, ms.
+        hold_ms: f64 = 0.0, in 0.0..=60_000.0;
+        /// Mean length of a stall, exponential, s; 0 for none. What is offered during a stall sets
+        /// out at its end.
+        stall_mean_s: f64 = 0.0, in 0.0..=60.0;
+        /// Mean time from the end of a stall to the next, exponential, s.
+        stall_gap_mean_s: f64 = 30.0, in 0.1..=86_400.0;
+    }
 }
 
 impl Default for Impairments {
     fn default() -> Self {
-        Self {
-            delay_ms: 0.0,
-            delay_law: DelayLaw::Constant,
-            loss_ratio: 0.0,
-            copies: 1,
-            duplicate_ratio: 0.0,
-            duplicate_lag_ms: 0.0,
-            hold_ratio: 0.0,
-            hold_ms: 0.0,
-            stall_mean_s: 0.0,
-            stall_gap_mean_s: 30.0,
-        }
-    }
-}
-
-impl Impairments {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// The first key outside its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        const LONG_MS: core::ops::RangeInclusive<f64> = 0.0..=60_000.0;
-        const LONG_MS_TEXT: &str = "0 to 60000";
-        let ratios = [
-            ("loss_ratio", self.loss_ratio),
-            ("duplicate_ratio", self.duplicate_ratio),
-            ("hold_ratio", self.hold_ratio),
-        ];
-        for (key, ratio) in ratios {
-            ParameterError::check(key, ratio, 0.0..=1.0, "0 to 1")?;
-        }
-        let times = [
-            ("delay_ms", self.delay_ms),
-            ("duplicate_lag_ms", self.duplicate_lag_ms),
-            ("hold_ms", self.hold_ms),
-        ];
-        for (key, time_ms) in times {
-            ParameterError::check(key, time_ms, LONG_MS, LONG_MS_TEXT)?;
-        }
-        ParameterError::check("copies", f64::from(self.copies), 1.0..=16.0, "1 to 16")?;
-        ParameterError::check("stall_mean_s", self.stall_mean_s, 0.0..=60.0, "0 to 60")?;
-        ParameterError::check(
-            "stall_gap_mean_s",
-            self.stall_gap_mean_s,
-            0.1..=86_400.0,
-            "0.1 to 86400",
-        )
+        Self::TEMPLATE
     }
 }
 
@@ -123,7 +77,7 @@ pub struct LinkCounts {
 pub struct ImpairedLink {
     impairments: Impairments,
     random: RandomStream,
-    stalls: Option<Stalls>,
+    stalls: Option<OutageLink>,
     counts: LinkCounts,
 }
 
@@ -139,7 +93,8 @@ impl ImpairedLink {
         stalls: RandomStream,
     ) -> Result<Self, ParameterError> {
         impairments.check()?;
-        let stalls = (impairments.stall_mean_s > 0.0).then(|| Stalls::new(&impairments, stalls));
+        let (gap_mean_s, mean_s) = (impairments.stall_gap_mean_s, impairments.stall_mean_s);
+        let stalls = (mean_s > 0.0).then(|| OutageLink::holding(gap_mean_s, mean_s, stalls));
         Ok(Self {
             impairments,
             random,
@@ -152,10 +107,8 @@ impl ImpairedLink {
     /// non-decreasing `now`.
     pub fn offer(&mut self, now: Instant, deliver: &mut dyn FnMut(Instant)) {
         self.counts.offered_count += 1;
-        let sets_out = self
-            .stalls
-            .as_mut()
-            .map_or(now, |stalls| stalls.end_of(now));
+        let stall = self.stalls.as_mut().and_then(|link| link.outage_at(now));
+        let sets_out = stall.map_or(now, |stall| stall.end);
         self.counts.stalled_count += u64::from(sets_out > now);
         let told = self.impairments;
         // A draw is skipped only where the impairment is off for the whole run, so the fate of the
@@ -195,62 +148,6 @@ impl ImpairedLink {
         let (is_met, share) = (self.random.chance(ratio), self.random.uniform());
         is_met.then_some(share * up_to_ms)
     }
-}
-
-impl Carrier for ImpairedLink {
-    fn offer(
-        &mut self,
-        now: Instant,
-        envelope: &Envelope,
-        payload: &[u8],
-        deliver: &mut dyn FnMut(Instant, Envelope, &[u8]),
-    ) {
-        Self::offer(self, now, &mut |at| deliver(at, *envelope, payload));
-    }
-}
-
-/// Times at which nothing gets through.
-#[derive(Debug, Clone)]
-struct Stalls {
-    random: RandomStream,
-    gap_mean_s: f64,
-    length_mean_s: f64,
-    begin: Instant,
-    end: Instant,
-}
-
-impl Stalls {
-    fn new(impairments: &Impairments, random: RandomStream) -> Self {
-        let mut stalls = Self {
-            random,
-            gap_mean_s: impairments.stall_gap_mean_s,
-            length_mean_s: impairments.stall_mean_s,
-            begin: Instant::ZERO,
-            end: Instant::ZERO,
-        };
-        stalls.draw();
-        stalls
-    }
-
-    fn draw(&mut self) {
-        let gap_s = exponential(&mut self.random, self.gap_mean_s);
-        let length_s = exponential(&mut self.random, self.length_mean_s);
-        self.begin = self.end + Duration::from_secs_f64(gap_s);
-        self.end = self.begin + Duration::from_secs_f64(length_s);
-    }
-
-    /// The end of the stall that `now` falls into, or `now`.
-    fn end_of(&mut self, now: Instant) -> Instant {
-        while now >= self.end {
-            self.draw();
-        }
-        if now >= self.begin { self.end } else { now }
-    }
-}
-
-/// Exponential with the mean `mean`.
-fn exponential(random: &mut RandomStream, mean: f64) -> f64 {
-    -mean * (1.0 - random.uniform()).ln()
 }
 
 #[allow(

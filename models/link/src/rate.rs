@@ -10,65 +10,28 @@
 
 use core::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
+use crate::options::options;
 use hil_core::case_study::ParameterError;
 use hil_core::time::{Instant, duration_ns};
 
-/// A rate and a queue in front of it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RateLimit {
-    /// Rate, 1 kbit/s..=100 Gbit/s.
-    pub bits_per_second: u64,
-    /// Bytes that may wait, the message being sent included, 64..=67108864.
-    #[serde(default = "default_queue_bytes")]
-    pub queue_bytes: u64,
-    /// What each message takes on the wire on top of what is offered to the model, which is our
-    /// datagram with its own header; 0..=1000. 28 are the headers of IPv4 and UDP.
-    #[serde(default = "default_overhead_bytes")]
-    pub overhead_bytes: u64,
-}
-
-/// What Linux gives a socket by default, twice over: a hundred full frames.
-pub const QUEUE_BYTES_DEFAULT: u64 = 150_000;
-/// Headers of IPv4 and UDP.
-pub const OVERHEAD_BYTES_DEFAULT: u64 = 28;
-
-const fn default_queue_bytes() -> u64 {
-    QUEUE_BYTES_DEFAULT
-}
-
-const fn default_overhead_bytes() -> u64 {
-    OVERHEAD_BYTES_DEFAULT
+options! {
+    /// A rate and a queue in front of it.
+    #[derive(Copy, Eq)]
+    pub struct RateLimit {
+        /// Rate.
+        bits_per_second: u64, in 1_000..=100_000_000_000;
+        /// Bytes that may wait, the message being sent included. By default what Linux gives a socket,
+        /// twice over: a hundred full frames.
+        queue_bytes: u64 = 150_000, in 64..=67_108_864;
+        /// What each message takes on the wire on top of what is offered to the model, which is our
+        /// datagram with its own header. 28 are the headers of IPv4 and UDP.
+        overhead_bytes: u64 = 28, in 0..=1_000;
+    }
 }
 
 const NS_PER_S: u128 = 1_000_000_000;
 
 impl RateLimit {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// The first key outside its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        let ranges = [
-            (
-                "bits_per_second",
-                self.bits_per_second,
-                1_000..=100_000_000_000,
-            ),
-            ("queue_bytes", self.queue_bytes, 64..=67_108_864),
-            ("overhead_bytes", self.overhead_bytes, 0..=1_000),
-        ];
-        for (key, value, range) in ranges {
-            if !range.contains(&value) {
-                let problem = format!("{value} is outside {} to {}", range.start(), range.end());
-                return Err(ParameterError::new(key, problem));
-            }
-        }
-        Ok(())
-    }
-
     /// How long a full queue takes to empty: the longest a message waits here, its own sending
     /// included.
     pub fn longest(&self) -> Duration {

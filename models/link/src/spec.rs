@@ -28,6 +28,7 @@ use serde::{Deserialize, Serialize};
 use super::chain::LinkChain;
 use super::delay::DelayLaw;
 use super::loss::LossLaw;
+use super::options::Options;
 use super::outages::Outages;
 use super::rate::RateLimit;
 use super::reordering::{Duplication, Reordering};
@@ -83,6 +84,18 @@ pub struct LinkPlace<'a> {
     pub way: Way,
 }
 
+impl<'a> LinkPlace<'a> {
+    /// Of a channel alone on its link.
+    pub const fn alone(seed: u64, channel: &'a str) -> Self {
+        Self {
+            seed,
+            link: channel,
+            channel,
+            way: Way::Forward,
+        }
+    }
+}
+
 impl LinkSpec {
     /// The paper's static model: a fixed delay and independent losses.
     pub fn fixed(delay: Duration, loss_ratio: f64) -> Self {
@@ -98,22 +111,30 @@ impl LinkSpec {
     /// # Errors
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
-        self.outages.check()?;
+        let mut spec = self.clone();
+        spec.outages.check()?;
         if let Some(wifi) = &self.wifi {
             wifi.check()?;
         }
-        self.loss.check()?;
-        if let Some(rate) = &self.rate {
-            rate.check()?;
+        spec.loss.check()?;
+        spec.delay.check()?;
+        let mut tables = spec.tables().into_iter();
+        tables.try_for_each(|(_, part)| part.check_all())
+    }
+
+    /// The parts that are tables of their own in files, by key, where they are there.
+    pub fn tables(&mut self) -> Vec<(&'static str, &mut dyn Options)> {
+        let mut tables: Vec<(&'static str, &mut dyn Options)> = Vec::new();
+        if let Some(rate) = &mut self.rate {
+            tables.push(("rate", rate));
         }
-        self.delay.check()?;
-        if let Some(reordering) = &self.reordering {
-            reordering.check()?;
+        if let Some(reordering) = &mut self.reordering {
+            tables.push(("reordering", reordering));
         }
-        if let Some(duplication) = &self.duplication {
-            duplication.check()?;
+        if let Some(duplication) = &mut self.duplication {
+            tables.push(("duplication", duplication));
         }
-        Ok(())
+        tables
     }
 
     /// The model of the channel at `place`, on a clock that reads zero when the run starts: the
@@ -143,7 +164,7 @@ impl LinkSpec {
         if let Some(wifi) = &self.wifi {
             parts.insert(0, wifi.describe());
             if wifi.outages.is_active() {
-                parts.insert(1, describe_outages(&wifi.outages));
+                parts.insert(1, wifi.outages.describe());
             }
         }
         if !self.delay.is_fixed() {
@@ -168,26 +189,8 @@ impl LinkSpec {
             parts.push(format!("a ratio of {ratio} twice, {} ms apart", ms(lag)));
         }
         if self.outages.is_active() {
-            parts.push(describe_outages(&self.outages));
+            parts.push(self.outages.describe());
         }
         parts.join(", ")
     }
-}
-
-fn describe_outages(outages: &Outages) -> String {
-    let Outages {
-        mean_s,
-        per_hour,
-        buffered,
-    } = outages;
-    let what = if *buffered {
-        "which hold everything until they end"
-    } else {
-        "which lose everything"
-    };
-    let mean_ms = mean_s * 1e3;
-    format!(
-        "{per_hour} outages per hour of {mean_ms} ms on average, {what}, on all channels of the \
-         link both ways, counted from the start of the run"
-    )
 }

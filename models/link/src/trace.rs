@@ -194,7 +194,7 @@ impl TraceLink {
         let met = match self.replay.matching {
             TraceMatch::Index => self.counted(self.by_index(number)),
             TraceMatch::Time => self.counted(self.by_time(now)),
-            TraceMatch::Tick => self.by_tick((now, message.published), number, is_restarted),
+            TraceMatch::Tick => self.by_tick(now, message.published, number, is_restarted),
         };
         self.offered.keep(number, met);
         if let Met::Record(record) = met
@@ -255,7 +255,8 @@ impl TraceLink {
     /// As the others, with its count: a message may have no record of its own.
     fn by_tick(
         &mut self,
-        (now, published): (Instant, Option<RemoteInstant>),
+        now: Instant,
+        published: Option<RemoteInstant>,
         number: u64,
         is_restarted: bool,
     ) -> Met {

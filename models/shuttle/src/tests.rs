@@ -5,14 +5,14 @@ use std::collections::BTreeMap;
 
 use super::*;
 use hil_core::link_model::PerfectLink;
-use hil_core::random::RandomStream;
 use hil_core::simulation::{Carrier, Simulation, SimulationResult};
-use hil_link::bernoulli::BernoulliLink;
+use hil_link::spec::{LinkPlace, LinkSpec};
 
 fn run(seed: u64, loss_ratio: f64, delay_ms: u64) -> SimulationResult {
     let case = Shuttle::new(ShuttleParameters::default(), seed).unwrap();
-    let stream = RandomStream::new(seed, "shuttle/command");
-    let link = BernoulliLink::new(Duration::from_millis(delay_ms), loss_ratio, stream).unwrap();
+    let link = LinkSpec::fixed(Duration::from_millis(delay_ms), loss_ratio)
+        .build(&LinkPlace::alone(seed, "shuttle/command"))
+        .unwrap();
     let carriers = BTreeMap::from([(
         "shuttle/command".to_owned(),
         Box::new(link) as Box<dyn Carrier>,

@@ -1,7 +1,7 @@
 //! Quantiles and distributions behind the intervals of [`super::statistics`]. Cold path: clarity and
 //! accuracy before speed; nothing here is a general numerics library.
 
-use statrs::function::erf::{erfc, erfc_inv};
+use statrs::function::erf::erfc_inv;
 use statrs::function::gamma::ln_gamma;
 
 /// Terms after which a continued fraction is taken as converged. It needs about the square root of its
@@ -80,9 +80,30 @@ pub fn normal_quantile(probability: f64) -> f64 {
     -core::f64::consts::SQRT_2 * erfc_inv(2.0 * probability)
 }
 
-/// Probability of a standard normal value up to `z`.
+/// Probability of a standard normal value up to `z`, to 1e-14, by the series about zero of Marsaglia
+/// (2004, "Evaluating the normal distribution", J. Stat. Softw. 11(4), equation 3); the `erfc` of
+/// `statrs` is off by more than 1e-13.
 pub fn normal_distribution(z: f64) -> f64 {
-    0.5 * erfc(-z / core::f64::consts::SQRT_2)
+    if z.is_nan() {
+        return z;
+    }
+    // Beyond, the rest is below 1e-15, the error of the series.
+    if z.abs() > 8.0 {
+        return if z > 0.0 { 1.0 } else { 0.0 };
+    }
+    let (mut sum, mut term, mut odd) = (z, z, 1.0);
+    loop {
+        odd += 2.0;
+        term *= z * z / odd;
+        let next = sum + term;
+        // Until the terms no longer change the sum: the series converges, and a sum has finitely
+        // many digits.
+        if (next - sum).abs() <= f64::EPSILON * 0.1 * next.abs() {
+            let density = (-0.5 * z * z).exp() / (2.0 * core::f64::consts::PI).sqrt();
+            return (0.5 + sum * density).clamp(0.0, 1.0);
+        }
+        sum = next;
+    }
 }
 
 /// The quantile of Student's distribution above the median. That of `statrs` rests on its incomplete
@@ -133,6 +154,27 @@ mod tests {
     fn close(actual: f64, expected: f64) {
         let error = (actual - expected).abs() / expected.abs().max(1e-12);
         assert!(error < 1e-11, "{actual} is not {expected}");
+    }
+
+    #[test]
+    fn the_normal_distribution_has_the_values_of_the_tables() {
+        // Abramowitz and Stegun, table 26.1.
+        for (z, expected) in [
+            (0.0, 0.5),
+            (0.5, 0.691_462_461_274_013),
+            (1.0, 0.841_344_746_068_543),
+            (1.96, 0.975_002_104_851_780),
+            (3.0, 0.998_650_101_968_370),
+        ] {
+            assert!((normal_distribution(z) - expected).abs() < 1e-13, "{z}");
+            assert!(
+                (normal_distribution(-z) - (1.0 - expected)).abs() < 1e-13,
+                "{z}"
+            );
+        }
+        assert!(normal_distribution(7.9) > 1.0 - 1e-13);
+        assert!(normal_distribution(f64::INFINITY) > 0.999);
+        assert!(normal_distribution(f64::NEG_INFINITY) < 1e-15);
     }
 
     #[test]

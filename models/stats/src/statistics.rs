@@ -171,28 +171,6 @@ fn partition(count: u64, holds: impl Fn(u64) -> bool) -> u64 {
     yes
 }
 
-/// The order-statistics interval of a quantile of independent samples in ascending order; see
-/// [`quantile_ranks`].
-///
-/// # Panics
-/// When `quantile` or `confidence` is not inside 0..1.
-pub fn quantile_interval(
-    ascending_ns: &[i64],
-    quantile: f64,
-    confidence: f64,
-) -> Option<IntervalNs> {
-    let (low, high) = quantile_ranks(ascending_ns.len() as u64, quantile, confidence)?;
-    let at = |rank: u64| {
-        usize::try_from(rank - 1)
-            .ok()
-            .map(|index| ascending_ns[index])
-    };
-    Some(IntervalNs {
-        low_ns: at(low)?,
-        high_ns: at(high)?,
-    })
-}
-
 /// The percentile interval of a quantile by resampling non-overlapping blocks (Carlstein 1986)
 /// of consecutive samples, each about the square root of the sample count long. `None` below 100
 /// samples. Equal samples and streams give equal intervals.
@@ -295,7 +273,12 @@ mod tests {
             let block = block_bootstrap_quantile(&samples, 0.5, 0.95, &mut stream).unwrap();
             let mut ascending = samples;
             ascending.sort_unstable();
-            let naive = quantile_interval(&ascending, 0.5, 0.95).unwrap();
+            let (low, high) = quantile_ranks(1_600, 0.5, 0.95).unwrap();
+            let at = |rank: u64| ascending[usize::try_from(rank).unwrap() - 1];
+            let naive = IntervalNs {
+                low_ns: at(low),
+                high_ns: at(high),
+            };
             let holds = |i: IntervalNs| i.low_ns <= 1_000_000 && 1_000_000 <= i.high_ns;
             naive_hits += u32::from(holds(naive));
             block_hits += u32::from(holds(block));

@@ -22,10 +22,9 @@ use hil_core::case_study::CaseStudy;
 use hil_core::component::Role;
 use hil_core::link_model::{Fate, LinkModel};
 use hil_core::message::Message;
-use hil_core::random::RandomStream;
 use hil_core::simulation::{Carrier, Simulation, SimulationResult};
 use hil_core::time::Instant;
-use hil_link::bernoulli::BernoulliLink;
+use hil_link::spec::{LinkPlace, LinkSpec};
 
 fn case(change: impl FnOnce(&mut TeleoperationParameters)) -> Teleoperation {
     let mut parameters = TeleoperationParameters::default();
@@ -166,9 +165,8 @@ fn a_lost_request_is_repeated_ever_more_slowly() {
 fn a_bad_network_for_requests_still_gets_both_arms_going() {
     for seed in 0..5 {
         let lossy = |name| {
-            let stream = RandomStream::new(seed, name);
-            let delay = Duration::from_millis(120);
-            Box::new(BernoulliLink::new(delay, 0.5, stream).unwrap()) as Box<dyn Carrier>
+            let spec = LinkSpec::fixed(Duration::from_millis(120), 0.5);
+            Box::new(spec.build(&LinkPlace::alone(seed, name)).unwrap()) as Box<dyn Carrier>
         };
         let links = [
             MOTION_REQUEST,

@@ -13,7 +13,7 @@ use hil_arm::yumi::inverse::Reach;
 use hil_core::link_model::{Fate, LinkModel};
 use hil_core::simulation::{Carrier, Simulation, SimulationResult};
 use hil_core::time::Instant;
-use hil_link::bernoulli::BernoulliLink;
+use hil_link::spec::{LinkPlace, LinkSpec};
 
 /// A case with the maker's default gain and filter, without the lag between plan and measurement:
 /// what the published control law alone does.
@@ -149,7 +149,9 @@ fn the_highest_gain_and_feed_forward_follow_as_the_control_law_says() {
 #[test]
 fn bernoulli_loss_of_half_the_commands_loses_no_loop() {
     let case = case(|_| {});
-    let link = BernoulliLink::new(Duration::ZERO, 0.5, RandomStream::new(1, "link")).unwrap();
+    let link = LinkSpec::fixed(Duration::ZERO, 0.5)
+        .build(&LinkPlace::alone(1, "link"))
+        .unwrap();
     let figure = figures(&case, &run(&case, Some(Box::new(link)), 2.0 + 8.0 * 4.033));
     assert!((figure("motion_loops_sent_count") - 8.0).abs() < 0.5);
     assert!(figure("motion_loss_ratio").abs() < 1e-12);
@@ -216,7 +218,7 @@ fn equal_seeds_give_equal_runs_and_unequal_seeds_do_not() {
             ..TeleoperationParameters::default()
         };
         let case = Teleoperation::new(parameters, seed).unwrap();
-        let link = BernoulliLink::new(Duration::ZERO, 0.1, RandomStream::new(seed, "link"));
+        let link = LinkSpec::fixed(Duration::ZERO, 0.1).build(&LinkPlace::alone(seed, "link"));
         run(&case, Some(Box::new(link.unwrap())), 5.0)
     };
     assert_eq!(with_seed(1), with_seed(1));

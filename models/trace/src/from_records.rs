@@ -140,7 +140,7 @@ impl Tracer<'_> {
         let key = (ingress.epoch, ingress.sequence);
         let second = self.copies.get(&key).copied();
         let second = second.filter(|_| ingress.flags & IngressRecord::DUPLICATE == 0);
-        self.put_delays(&mut record, departure_ns, (ingress.received_ns, second));
+        self.put_delays(&mut record, departure_ns, ingress.received_ns, second);
         record
     }
 
@@ -149,7 +149,8 @@ impl Tracer<'_> {
         &self,
         record: &mut TraceRecord,
         departure_ns: i64,
-        (arrival_ns, second_ns): (i64, Option<i64>),
+        arrival_ns: i64,
+        second_ns: Option<i64>,
     ) {
         let remote = RemoteInstant::from_ns(departure_ns);
         let localised = self.context.path.localise(remote);

@@ -378,15 +378,6 @@ impl Trace {
         delivered.filter_map(TraceRecord::delay).collect()
     }
 
-    /// The first record published before its predecessor, if there is one.
-    pub fn first_out_of_order(&self) -> Option<usize> {
-        let pairs = self.records.windows(2);
-        let mut pairs = pairs.map(|pair| pair[1].published_ns < pair[0].published_ns);
-        pairs
-            .position(|is_earlier| is_earlier)
-            .map(|index| index + 1)
-    }
-
     /// Middle of the times from one publication to the next; `None` below two messages.
     pub fn period_ns(&self) -> Option<i64> {
         let pairs = self.records.windows(2);

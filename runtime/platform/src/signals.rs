@@ -62,15 +62,31 @@ impl Signals {
     /// From now until the watch is dropped a signal ends the program with
     /// [`EXIT_INTERRUPTED`] and a line with the reason: for work that does not look at signals.
     pub fn end_program_unless_over(&self, why: &'static str) -> EndWatch {
+        self.end_program_after(Duration::ZERO, move |signal| {
+            format!("ended by {signal}: {why}")
+        })
+    }
+
+    /// As [`Self::end_program_unless_over`], `grace` after the signal and with the line that `last` makes of
+    /// it: for work that looks at signals only now and then.
+    pub fn end_program_after(
+        &self,
+        grace: Duration,
+        last: impl FnOnce(&str) -> String + Send + 'static,
+    ) -> EndWatch {
         let is_over = Arc::new(AtomicBool::new(false));
         let (signals, over) = (self.clone(), Arc::clone(&is_over));
         thread::spawn(move || {
             while !over.load(Ordering::Acquire) {
-                if let Some(signal) = signals.received() {
-                    Console::new(true).error(&format!("ended by {signal}: {why}"));
+                let Some(signal) = signals.received() else {
+                    thread::sleep(LOOK_PERIOD);
+                    continue;
+                };
+                thread::sleep(grace);
+                if !over.load(Ordering::Acquire) {
+                    Console::new(true).error(&last(signal));
                     process::exit(EXIT_INTERRUPTED);
                 }
-                thread::sleep(LOOK_PERIOD);
             }
         });
         EndWatch { is_over }

@@ -130,37 +130,7 @@ pub(crate) enum Command {
     },
     /// Record a run while it goes.
     #[command(after_help = RECORD_EXAMPLES)]
-    Record {
-        /// Name of the run, the beginning of it, or its folder; the only one if left out.
-        #[arg(value_name = "RUN")]
-        run: Option<String>,
-        /// The file to write, or a folder for a file with the run's name; one that is not there is
-        /// made if the name ends in `/`.
-        #[arg(long, short, value_name = "FILE")]
-        output: PathBuf,
-        /// Wait for a run to begin.
-        #[arg(long)]
-        wait: bool,
-        /// Of the runs that go on, know only those whose folders lie below this one, as those of one
-        /// unit of systemd do.
-        #[arg(long, value_name = "DIR")]
-        below: Option<PathBuf>,
-        /// Leave out what the run recorded before; otherwise a recorder that comes late catches up.
-        #[arg(long)]
-        from_now: bool,
-        /// Begin another file when one is larger, e.g. 1GiB; looked at with every flush.
-        #[arg(long, value_name = "SIZE", value_parser = size)]
-        split_size: Option<u64>,
-        /// What a kill of the recorder may lose at most, 100ms to 60s.
-        #[arg(long, value_name = "TIME", value_parser = flush, default_value = "1s")]
-        flush: Duration,
-        /// Replace files that exist.
-        #[arg(long)]
-        force: bool,
-        /// Leave out /scene and /tf, and the work that drawing them takes.
-        #[arg(long)]
-        no_scene: bool,
-    },
+    Record(RecordOptions),
     /// Make a whole MCAP file of what is left of a broken one.
     #[command(after_help = RECOVER_EXAMPLES)]
     Recover {
@@ -186,6 +156,44 @@ pub(crate) enum Command {
     /// Feed recorded channels into a run that goes on, at their recorded spacing.
     #[command(after_help = PLAY_EXAMPLES)]
     Play(PlayOptions),
+}
+
+/// What to record, and how.
+#[derive(Debug, Clone, Args)]
+#[allow(clippy::struct_excessive_bools, reason = "options of a command line")]
+pub(crate) struct RecordOptions {
+    /// Name of the run, the beginning of it, or its folder; the only one if left out.
+    #[arg(value_name = "RUN")]
+    pub(crate) run: Option<String>,
+    /// The file to write, or a folder for a file with the run's name; one that is not there is
+    /// made if the name ends in `/`.
+    #[arg(long, short, value_name = "FILE")]
+    pub(crate) output: PathBuf,
+    /// Wait for a run to begin.
+    #[arg(long)]
+    pub(crate) wait: bool,
+    /// Of the runs that go on, know only those whose folders lie below this one, as those of one
+    /// unit of systemd do.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) below: Option<PathBuf>,
+    /// Leave out what the run recorded before; otherwise a recorder that comes late catches up.
+    #[arg(long)]
+    pub(crate) from_now: bool,
+    /// Begin another file when one is larger, e.g. 1GiB; looked at with every flush.
+    #[arg(long, value_name = "SIZE", value_parser = size)]
+    pub(crate) split_size: Option<u64>,
+    /// What a kill of the recorder may lose at most, 100ms to 60s.
+    #[arg(long, value_name = "TIME", value_parser = flush, default_value = "1s")]
+    pub(crate) flush: Duration,
+    /// Replace files that exist.
+    #[arg(long)]
+    pub(crate) force: bool,
+    /// Leave out /scene and /tf, and the work that drawing them takes.
+    #[arg(long)]
+    pub(crate) no_scene: bool,
+    /// The run that lies in this folder, instead.
+    #[arg(skip)]
+    pub(crate) folder: Option<PathBuf>,
 }
 
 /// What to play, and how.

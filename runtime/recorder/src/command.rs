@@ -3,47 +3,45 @@
 use std::fs;
 use std::path::Path;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::{CommandFactory as _, Parser};
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
-use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
+use hil_platform::signals::Signals;
 use hil_platform::words::counted_plainly;
 use hil_topology::documents;
 
-use crate::cli::{Cli, Command, PlayOptions, ServeOptions};
-use crate::convert::{ConvertError, convert};
-use crate::ending::Ending;
-use crate::play::{PlayEnd, PlayError, SourceError, TargetError, play};
-use crate::record::{Progress as RecordProgress, RecordError, Request, Which, record};
-use crate::recover::{RecoverError, loss_words, recover};
-use crate::scan::ScanError;
-use crate::serve::{ServeError, serve};
-use crate::writer::{WriteError, check_target, partial};
+use crate::cli::{Cli, Command, PlayOptions, RecordOptions};
+use crate::convert::convert;
+use crate::failure::{Exit, Failure};
+use crate::play::{PlayEnd, play};
+use crate::record::{Progress as RecordProgress, Recorded, record};
+use crate::recover::{loss_words, recover};
+use crate::serve::serve;
+use crate::writer::{check_target, partial};
 
-/// Exit codes, as `--help` lists them; those of `hil-runtime`.
-mod exit {
-    pub(super) const DONE: u8 = 0;
-    pub(super) const FAILED: u8 = 1;
-    pub(super) const USAGE: u8 = 2;
-    pub(super) const INTERNAL: u8 = 70;
-}
+/// How long a conversion may take to end by itself after a signal.
+const END_WITHIN: Duration = Duration::from_millis(400);
 
 /// Does what the command line of this process says, and tells the exit code.
 pub fn run() -> ExitCode {
     let cli = Cli::parse();
     let mut console = Console::new(cli.quiet);
-    let signals = match Signals::install() {
-        Ok(signals) => signals,
+    let exit = match Signals::install() {
+        Ok(signals) => work(cli.command, &signals, &mut console).unwrap_or_else(|failure| {
+            console.error(&failure.words);
+            failure.exit
+        }),
         Err(error) => {
             console.error(&format!("cannot handle signals: {error}"));
-            return ExitCode::from(exit::INTERNAL);
+            Exit::Internal
         }
     };
-    ExitCode::from(work(cli.command, &signals, &mut console))
+    ExitCode::from(exit as u8)
 }
 
-fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
+fn work(command: Command, signals: &Signals, console: &mut Console) -> Result<Exit, Failure> {
     match command {
         Command::Convert {
             run,
@@ -51,83 +49,25 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             force,
             no_scene,
         } => {
-            if let Err(error) = check_target(&output, &run, force) {
-                console.error(&error.to_string());
-                return exit::USAGE;
-            }
+            check_target(&output, &run, force).map_err(Failure::usage)?;
             convert_run(&run, &output, !no_scene, signals, console)
         }
-        Command::Record {
-            run,
-            output,
-            wait,
-            below,
-            from_now,
-            split_size,
-            flush,
-            force,
-            no_scene,
-        } => {
-            let request = Request {
-                run: Which::Named(run),
-                output,
-                waits: wait,
-                below,
-                from_now,
-                split_bytes: split_size,
-                flush,
-                force,
-                has_scene: !no_scene,
-            };
-            record_run(&request, signals, console)
-        }
+        Command::Record(options) => record_run(&options, signals, console),
         Command::Recover {
             broken,
             output,
             force,
         } => {
-            if let Err(error) = check_target(&output, &broken, force) {
-                console.error(&error.to_string());
-                return exit::USAGE;
-            }
+            check_target(&output, &broken, force).map_err(Failure::usage)?;
             recover_file(&broken, &output, signals, console)
         }
-        Command::Documents { folder } => write_documents(&folder, console),
-        Command::Serve(options) => serve_run(&options, signals, console),
+        Command::Documents { folder } => match documents::write(Cli::command(), &folder) {
+            Ok(_) => Ok(Exit::Done),
+            Err(error) => Err(Failure::failed(format!("{}: {error}", folder.display()))),
+        },
+        Command::Serve(options) => serve(&options, signals, console),
         Command::Play(options) => play_file(&options, signals, console),
     }
-}
-
-fn write_documents(folder: &Path, console: &mut Console) -> u8 {
-    match documents::write(Cli::command(), folder) {
-        Ok(_) => exit::DONE,
-        Err(error) => {
-            console.error(&format!("{}: {error}", folder.display()));
-            exit::FAILED
-        }
-    }
-}
-
-fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -> u8 {
-    match serve(options, signals, console) {
-        Ok(code) => u8::try_from(code).unwrap_or(exit::FAILED),
-        Err(error) => {
-            console.error(&error.to_string());
-            match error {
-                ServeError::Run(_)
-                | ServeError::Select(_)
-                | ServeError::Over { .. }
-                | ServeError::Record(WriteError::Exists { .. } | WriteError::Unfinished { .. }) => {
-                    exit::USAGE
-                }
-                _ => exit::FAILED,
-            }
-        }
-    }
-}
-
-fn interrupted() -> u8 {
-    u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::FAILED)
 }
 
 fn convert_run(
@@ -136,66 +76,36 @@ fn convert_run(
     has_scene: bool,
     signals: &Signals,
     console: &mut Console,
-) -> u8 {
+) -> Result<Exit, Failure> {
     let progress = Progress::begin();
     // Much of the work is done in one piece, of a large run for seconds.
-    let ending = Ending::watch(signals, partial(output));
+    let unfinished = partial(output);
+    let ending = signals.end_program_after(END_WITHIN, move |signal| {
+        let removed = fs::remove_file(&unfinished);
+        match removed.err().filter(|_| unfinished.exists()) {
+            Some(error) => {
+                let path = unfinished.display();
+                format!("ended by {signal}; what was written so far is in {path}: {error}")
+            }
+            None => format!("ended by {signal}; no file was written"),
+        }
+    });
     let converted = convert(run, output, has_scene, &mut |share, words| {
         progress.show(console, share, words);
         signals.received()
     });
     drop(ending);
-    match converted {
-        Ok(converted) => {
-            for words in &converted.words {
-                console.warn(words);
-            }
-            console.result(&format!(
-                "{}: {} of the run, {} in all on {}\n",
-                output.display(),
-                counted_plainly(converted.message_count, "message"),
-                converted.written_count,
-                counted_plainly(converted.topic_count as u64, "topic")
-            ));
-            if converted.has_gaps {
-                console.error("the run's folder has gaps, see above; the file says so too");
-                return exit::FAILED;
-            }
-            exit::DONE
-        }
-        Err(error) => {
-            console.error(&error.to_string());
-            match error {
-                ConvertError::Run(_) => exit::USAGE,
-                ConvertError::Write(_) => exit::FAILED,
-                ConvertError::Interrupted(_) => interrupted(),
-            }
-        }
-    }
+    let gaps = "the run's folder has gaps, see above; the file says so too";
+    tell(&converted?, "", gaps, console)
 }
 
-fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8 {
-    let recorded = record(request, &mut |progress| {
-        console.progress(&progress_words(progress));
-        signals.received()
-    });
-    let recorded = match recorded {
-        Ok(recorded) => recorded,
-        Err(error) => {
-            console.error(&error.to_string());
-            return match error {
-                RecordError::Select(_)
-                | RecordError::NotYet(_)
-                | RecordError::Write(WriteError::Exists { .. } | WriteError::Unfinished { .. }) => {
-                    exit::USAGE
-                }
-                RecordError::Interrupted(_) => interrupted(),
-                RecordError::Feed(_) | RecordError::Gone { .. } | RecordError::Write(_) => {
-                    exit::FAILED
-                }
-            };
-        }
-    };
+/// Says what was written, with `missed` behind it, and what of the run is not in it.
+fn tell(
+    recorded: &Recorded,
+    missed: &str,
+    gaps: &str,
+    console: &mut Console,
+) -> Result<Exit, Failure> {
     for words in &recorded.words {
         console.warn(words);
     }
@@ -203,27 +113,31 @@ fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8
         let count = counted_plainly(*count, "message");
         console.warn(&format!("{channel}: missed {count}"));
     }
-    let files: Vec<String> = recorded
-        .paths
-        .iter()
-        .map(|path| path.display().to_string())
-        .collect();
     console.result(&format!(
-        "{}: {} of the run, {} in all on {}; missed {}\n",
-        files.join(", "),
-        counted_plainly(recorded.message_count, "message"),
+        "{}, {} in all on {}{missed}\n",
+        recorded.files(),
         recorded.written_count,
-        counted_plainly(recorded.topic_count as u64, "topic"),
-        recorded.missed.values().sum::<u64>()
+        counted_plainly(recorded.topic_count as u64, "topic")
     ));
-    if recorded.signal.is_some() {
-        return interrupted();
+    match recorded.signal {
+        Some(_) => Ok(Exit::Interrupted),
+        None if recorded.has_gaps => Err(Failure::failed(gaps)),
+        None => Ok(Exit::Done),
     }
-    if recorded.has_gaps {
-        console.error("something of the run is not in the file, see above; the file says so too");
-        return exit::FAILED;
-    }
-    exit::DONE
+}
+
+fn record_run(
+    options: &RecordOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<Exit, Failure> {
+    let recorded = record(options, &mut |progress| {
+        console.progress(&progress_words(progress));
+        signals.received()
+    })?;
+    let missed = format!("; missed {}", recorded.missed.values().sum::<u64>());
+    let gaps = "something of the run is not in the file, see above; the file says so too";
+    tell(&recorded, &missed, gaps, console)
 }
 
 fn progress_words(progress: &RecordProgress<'_>) -> String {
@@ -243,25 +157,19 @@ fn progress_words(progress: &RecordProgress<'_>) -> String {
     )
 }
 
-fn recover_file(broken: &Path, output: &Path, signals: &Signals, console: &mut Console) -> u8 {
+fn recover_file(
+    broken: &Path,
+    output: &Path,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<Exit, Failure> {
     let progress = Progress::begin();
     let size_bytes = fs::metadata(broken).map_or(0, |file| file.len());
     let recovered = recover(broken, output, &mut |offset| {
         let share = (size_bytes > 0).then(|| offset as f64 / size_bytes as f64);
         progress.show(console, share, &format!("{} MiB read", offset >> 20));
         signals.received()
-    });
-    let recovered = match recovered {
-        Ok(recovered) => recovered,
-        Err(error) => {
-            console.error(&error.to_string());
-            return match error {
-                RecoverError::Scan(ScanError::Foreign { .. }) => exit::USAGE,
-                RecoverError::Interrupted(_) => interrupted(),
-                _ => exit::FAILED,
-            };
-        }
-    };
+    })?;
     for loss in &recovered.end.losses {
         console.warn(&format!("lost: {}", loss_words(loss)));
     }
@@ -280,27 +188,19 @@ fn recover_file(broken: &Path, output: &Path, signals: &Signals, console: &mut C
         counted_plainly(recovered.message_count, "message"),
         recovered.span_s()
     ));
-    exit::DONE
+    Ok(Exit::Done)
 }
 
-fn play_file(options: &PlayOptions, signals: &Signals, console: &mut Console) -> u8 {
-    match play(options, signals, console) {
-        Ok(PlayEnd::Done) => exit::DONE,
-        Ok(PlayEnd::Interrupted(signal)) => {
+fn play_file(
+    options: &PlayOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<Exit, Failure> {
+    Ok(match play(options, signals, console)? {
+        PlayEnd::Done => Exit::Done,
+        PlayEnd::Interrupted(signal) => {
             console.say(&format!("ended by {signal}"));
-            interrupted()
+            Exit::Interrupted
         }
-        Err(error) => {
-            console.error(&error.to_string());
-            match error {
-                PlayError::Source(SourceError::Message { .. })
-                | PlayError::Target(TargetError::Domain(_) | TargetError::Channel(_)) => {
-                    exit::FAILED
-                }
-                PlayError::NoneChosen { .. } | PlayError::Source(_) | PlayError::Target(_) => {
-                    exit::USAGE
-                }
-            }
-        }
-    }
+    })
 }

@@ -5,8 +5,7 @@ use hil_rundir::layout::LayoutFault;
 use hil_rundir::manifest::FieldDescription;
 use mcap::records::Record;
 
-use crate::decode::Decoder;
-use crate::encode::Encoder;
+use crate::codec::Codec;
 use crate::scan::{Limits, scan_from};
 use crate::serve::judge_head;
 
@@ -79,10 +78,7 @@ pub fn recording(bytes: &[u8], record_bytes_max: usize) -> Option<Recording> {
 
 /// How messages of one layout are written into a file, and read from it to be played.
 #[derive(Debug)]
-pub struct RecordedMessages {
-    encoder: Encoder,
-    decoder: Decoder,
-}
+pub struct RecordedMessages(Codec);
 
 impl RecordedMessages {
     /// For messages with these fields in memory.
@@ -90,11 +86,9 @@ impl RecordedMessages {
     /// # Errors
     /// When they do not describe exactly `size_bytes`, or have no form in a file.
     pub fn new(fields: &[FieldDescription], size_bytes: usize) -> Result<Self, LayoutFault> {
-        const NAME: &str = "input.Message.v1";
-        Ok(Self {
-            encoder: Encoder::typed(NAME, fields, size_bytes)?.0,
-            decoder: Decoder::new(NAME, fields, size_bytes)?.0,
-        })
+        Ok(Self(
+            Codec::typed("input.Message.v1", fields, size_bytes)?.0,
+        ))
     }
 
     /// The message as it lies in memory that a file has as `data`.
@@ -102,12 +96,12 @@ impl RecordedMessages {
     /// # Errors
     /// Why there is none, in words.
     pub fn read(&self, data: &[u8]) -> Result<Vec<u8>, String> {
-        self.decoder.decode(data).map_err(|fault| fault.to_string())
+        self.0.decode(data)
     }
 
     /// What a file has for `message`; `None` when it has another size than the layout.
     pub fn write(&self, message: &[u8]) -> Option<Vec<u8>> {
         let mut data = Vec::new();
-        self.encoder.encode(message, &mut data).then_some(data)
+        self.0.encode(message, &mut data).then_some(data)
     }
 }

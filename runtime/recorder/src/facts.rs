@@ -1,19 +1,17 @@
 //! What a recording says of its run beside the messages: what ran, on what, by which clocks, and what
 //! is missing. Names and keys are in `docs/recordings.md`; all values are text.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs;
 
 use hil_arm::yumi::description::Urdf;
 use hil_rundir::manifest::Manifest;
 use hil_rundir::run_folder::RunFolder;
-use mcap::Attachment;
 use serde_json::Value;
 
-use crate::channel::ChannelTopics;
 use crate::clocks::{self, Clocks};
 use crate::run::Run;
+use crate::run_topics::RunTopics;
 use crate::scene::is_of_arms;
 use crate::topics::Names;
 use crate::writer::{Recording, WriteError};
@@ -24,18 +22,17 @@ pub(crate) type Words = BTreeMap<String, String>;
 /// `time_ns` gives the time of an instant on the clock of a host.
 pub(crate) fn event_times(
     run: &Run,
-    has_one_clock: Option<bool>,
     time_ns: &mut dyn FnMut(&str, i64) -> Option<u64>,
 ) -> Vec<Option<u64>> {
     let Some(summary) = &run.summary else {
         return Vec::new();
     };
     let starts = &summary.run.starts_ns;
+    let is_one = clocks::has_one_clock(run) == Some(true);
     // On one clock an event's time counts from the earliest start, else from that of its own host.
     let earliest = starts.iter().min_by_key(|(_, start_ns)| **start_ns);
     let mut at = |at_s: f64, clock: &str| {
         let own = starts.get_key_value(clock);
-        let is_one = has_one_clock == Some(true);
         let (host, start_ns) = own.filter(|_| !is_one).or(earliest)?;
         let since_start_ns = (at_s * 1e9).round();
         // Beyond this a number of seconds is none that a run could have.
@@ -58,19 +55,17 @@ pub(crate) fn write(
     recording: &mut Recording,
     run: &Run,
     clocks: &Clocks,
-    channels: &[ChannelTopics],
-    names: &Names,
+    topics: &RunTopics,
 ) -> Result<(), WriteError> {
     recording.describe("hil.run", run_words(run))?;
     if let Some(manifest) = &run.manifest {
         describe_manifest(recording, manifest)?;
     }
     recording.describe("hil.clocks", clock_words(run, clocks))?;
-    recording.describe("hil.channels", ChannelTopics::words(channels.iter()))?;
-    recording.describe("hil.recording", gap_words(run, names))?;
+    recording.describe("hil.channels", topics.channel_words())?;
+    recording.describe("hil.recording", gap_words(run, &topics.names))?;
     attach(recording, &run.folder)?;
-    let messages = channels.iter().filter_map(|one| one.message.as_deref());
-    attach_robot(recording, messages)
+    attach_robot(recording, topics.messages())
 }
 
 /// What ran.
@@ -103,14 +98,7 @@ pub(crate) fn run_words(run: &Run) -> Words {
 }
 
 fn clock_words(run: &Run, clocks: &Clocks) -> Words {
-    let mut words = clocks::words(clocks.has_one_clock);
-    for (host, clock) in clocks.hosts() {
-        clocks::host_words(host, clock.basis, Some(clock.offset_ns), &mut words);
-        if let Some((lowest, highest)) = clock.noted_ns {
-            words.insert(format!("{host}/offset_lowest_ns"), lowest.to_string());
-            words.insert(format!("{host}/offset_highest_ns"), highest.to_string());
-        }
-    }
+    let mut words = clocks.words();
     let section = run.summary.as_ref().and_then(|one| one.clocks.as_ref());
     if let Some(text) = section.and_then(|section| serde_json::to_string(section).ok()) {
         words.insert("alignment_json".to_owned(), text);
@@ -178,13 +166,8 @@ pub(crate) fn attach_robot<'a>(
     if !messages.into_iter().any(is_of_arms) {
         return Ok(());
     }
-    recording.attach(&Attachment {
-        log_time: 0,
-        create_time: 0,
-        name: "yumi.urdf".to_owned(),
-        media_type: "application/xml".to_owned(),
-        data: Cow::Owned(Urdf.to_string().into_bytes()),
-    })
+    let urdf = Urdf.to_string().into_bytes();
+    recording.attach_file("yumi.urdf", "application/xml", urdf)
 }
 
 /// Report and figures as they are: whoever has only this file has them too.
@@ -201,13 +184,7 @@ pub(crate) fn attach(recording: &mut Recording, folder: &RunFolder) -> Result<()
         // A killed run lacks some of them, which the metadata say.
         let Ok(data) = fs::read(&path) else { continue };
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        recording.attach(&Attachment {
-            log_time: 0,
-            create_time: 0,
-            name: name.into_owned(),
-            media_type: media_type.to_owned(),
-            data: Cow::Owned(data),
-        })?;
+        recording.attach_file(&name, media_type, data)?;
     }
     Ok(())
 }

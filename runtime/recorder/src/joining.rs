@@ -98,23 +98,13 @@ impl Joining {
         net::join(&mut self.waiting, key, record);
     }
 
-    fn is_whole(&self, key: &MessageId) -> bool {
-        let message = self.waiting.get(key);
-        let is_whole = |one: &MessageLatency| self.told.iter().all(|told| has(one, told.stage));
-        !self.told.is_empty() && message.is_some_and(is_whole)
-    }
-
-    /// The publication up to which every stage here has told of all that it will tell, but for what
-    /// comes out of order.
-    fn reached_ns(&self) -> Option<i64> {
-        let newest = self.told.iter().map(|told| told.newest.get());
-        newest.min().flatten()
-    }
-
     /// The earliest message, if stamps of messages published well after it are there from every stage.
     pub(crate) fn next(&mut self) -> Option<MessageLatency> {
         let (&(published_ns, _), _) = self.order.first_key_value()?;
-        let reached_ns = self.reached_ns();
+        // The publication up to which every stage here has told of all that it will tell, but for what
+        // comes out of order.
+        let newest = self.told.iter().map(|told| told.newest.get());
+        let reached_ns = newest.min().flatten();
         let is_reached = reached_ns.is_some_and(|ns| ns.saturating_sub(published_ns) >= HOLD_NS);
         let is_due = is_reached || self.waiting.len() > WAITING_MAX;
         if is_due { self.earliest() } else { None }
@@ -127,7 +117,9 @@ impl Joining {
             return Some(one);
         }
         let (&(_, key), first) = self.order.first_key_value()?;
-        let wait = if self.is_whole(&key) { HOLD } else { WAIT };
+        let message = self.waiting.get(&key).filter(|_| !self.told.is_empty());
+        let is_whole = message.is_some_and(|one| self.told.iter().all(|told| has(one, told.stage)));
+        let wait = if is_whole { HOLD } else { WAIT };
         if now.saturating_duration_since(first.came) < wait {
             return None;
         }

@@ -2,31 +2,28 @@
 //! program of its own so that the real-time binary carries none of what this needs.
 //!
 //! Read in this order: `run` and `clocks`, what there is and when it was; `schema` and
-//! `encode`, what a message looks like; `topics`, `net` and `channel`, what is made of it; `writer`,
-//! the file; `convert`, all of them together. While a run goes, `live` makes the same topics of
+//! `codec`, what a message looks like; `topics`, `net` and `run_topics`, what is made of it;
+//! `writer`, the file; `convert`, all of them together. While a run goes, `live` makes the same topics of
 //! its events for any `sink`, and `record` puts them into files; `pace` keeps it out of the run's
-//! way. `scan` reads files as far as their `lengths` hold, for `recover`; `play` feeds what `decode`
+//! way. `scan` reads files as far as their `lengths` hold, for `recover`; `play` feeds what `codec`
 //! makes of them into a run. `view` is the state of a run that goes on, `serve` shows it.
 //!
 //! The program is [`run()`]; nothing else is for other crates but [`decoders`], for tests.
 #![forbid(unsafe_code)]
 
-mod channel;
 mod cli;
 mod clocks;
+mod codec;
 mod command;
 mod conditions;
 mod convert;
-mod decode;
 pub mod decoders;
 mod disk;
-mod encode;
-mod ending;
 mod facts;
+mod failure;
 mod joining;
 mod lengths;
 mod live;
-mod live_clocks;
 mod net;
 mod newest;
 mod pace;
@@ -34,6 +31,7 @@ mod play;
 mod record;
 mod recover;
 mod run;
+mod run_topics;
 mod scan;
 mod scene;
 mod schema;

@@ -6,29 +6,18 @@ use std::time::Instant;
 
 use hil_core::message::Envelope;
 use hil_core::record::UNAVAILABLE;
-use hil_link::condition::LinkConditionRecord;
-use hil_rundir::live_run::Source;
 use hil_watch::{Event, Feed, Origin, Record, Seen, WatchedChannel};
 
-use crate::channel::{ChannelTopics, Wanted, typed};
-use crate::conditions::Conditions;
-use crate::facts::Words;
+use crate::clocks::LiveClocks;
 use crate::joining::Joining;
-use crate::live_clocks::LiveClocks;
-use crate::net::{self, MessageLatency};
+use crate::net::MessageLatency;
 use crate::run::Run;
-use crate::scene::waiting::LiveScene;
-use crate::scene::{Heard, Scene};
-use crate::sink::{Sink, Topic};
-use crate::topics::{self, Names};
-use crate::writer::Stamp;
+use crate::run_topics::{Drawn, Plan, RunTopics, Wanted};
+use crate::sink::Sink;
 
-/// One channel and what is made of it.
+/// What is known of one channel while its run goes.
 #[derive(Debug)]
 struct LiveChannel {
-    topics: ChannelTopics,
-    /// Host of its producer; empty when the manifest does not tell.
-    host: String,
     receiving_host: String,
     joining: Joining,
     written: Seen,
@@ -42,64 +31,34 @@ struct LiveChannel {
 /// The topics of a run that goes.
 #[derive(Debug)]
 pub(crate) struct LiveTopics {
-    channels: BTreeMap<String, LiveChannel>,
-    /// Those that were not free among them.
-    pub(crate) names: Names,
-    events: Topic,
-    conditions: Conditions,
-    scene: Option<LiveScene>,
+    /// What is written.
+    pub(crate) topics: RunTopics,
+    /// In the same order.
+    channels: Vec<LiveChannel>,
+    /// Their places, by name.
+    places: BTreeMap<String, usize>,
     /// The clocks of the recording.
     pub(crate) clocks: LiveClocks,
-    /// What was made so far.
-    pub(crate) counts: Counts,
-}
-
-/// What was made, and what could not be.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-#[allow(clippy::struct_field_names, reason = "the ending of every count")]
-pub(crate) struct Counts {
-    /// Messages of the run's own channels.
-    pub(crate) message_count: u64,
-    /// Messages whose size is not that of their channel, left out.
-    pub(crate) misfit_count: u64,
-    /// Messages and records without a time on the recording's clock, left out.
-    pub(crate) timeless_count: u64,
 }
 
 impl LiveTopics {
     /// Names the topics of a run; they appear with their first message. Without a scene, what it takes
     /// to draw one is not worked out.
     pub(crate) fn of(feed: &Feed, has_scene: bool) -> Self {
-        let mut names = Names::default();
-        let wanted = feed.channels().map(|channel| {
-            let described = Some(&channel.description);
-            Wanted {
-                name: &channel.description.name,
-                described,
-                typed: typed(described),
-            }
+        let wanted = feed.channels().map(|channel| Wanted {
+            name: &channel.description.name,
+            described: Some(&channel.description),
+            recorded_bytes: Vec::new(),
         });
-        let topics = ChannelTopics::of_all(wanted.collect(), &mut names);
-        let channels = feed.channels().zip(topics);
-        let channels = channels
-            .map(|(channel, topics)| (topics.name.clone(), LiveChannel::of(feed, channel, topics)))
-            .collect();
-        let events = topics::event_topic(&mut names);
-        let topology = &feed.manifest().topology;
-        let conditions = Conditions::of(topology, &mut names);
-        let case = &topology["case"];
-        let scene = has_scene.then(|| {
-            let scene = Scene::new(case["name"].as_str(), &case["parameters"], &mut names);
-            LiveScene::new(scene)
-        });
+        let names = feed.channels().map(|one| one.description.name.clone());
         Self {
-            channels,
-            names,
-            events,
-            conditions,
-            scene,
+            topics: RunTopics::new(wanted.collect(), &feed.manifest().topology, has_scene),
+            channels: feed
+                .channels()
+                .map(|one| LiveChannel::of(feed, one))
+                .collect(),
+            places: names.zip(0..).collect(),
             clocks: LiveClocks::of(feed),
-            counts: Counts::default(),
         }
     }
 
@@ -113,7 +72,33 @@ impl LiveTopics {
         sink: &mut S,
     ) -> Result<(), S::Error> {
         match event {
-            Event::Message { .. } => self.message(event, sink),
+            Event::Message {
+                channel,
+                origin,
+                envelope,
+                payload,
+            } => {
+                let Some(place) = self.places.get(&channel.description.name).copied() else {
+                    return Ok(());
+                };
+                let host = &self.topics.channels[place].host;
+                let Some(at_ns) = self.clocks.message_ns(host, envelope) else {
+                    self.topics.counts.timeless_count += 1;
+                    return Ok(());
+                };
+                let drawn = if *origin == Origin::OtherHost {
+                    Drawn::Never
+                } else {
+                    Drawn::Later
+                };
+                if self
+                    .topics
+                    .message(place, at_ns, envelope, payload, drawn, sink)?
+                {
+                    self.channels[place].note_written(envelope);
+                }
+                Ok(())
+            }
             Event::Record {
                 channel,
                 is_of_this_host,
@@ -125,48 +110,6 @@ impl LiveTopics {
         }
     }
 
-    fn message<S: Sink>(&mut self, event: &Event<'_>, sink: &mut S) -> Result<(), S::Error> {
-        let Event::Message {
-            channel,
-            origin,
-            envelope,
-            payload,
-        } = event
-        else {
-            return Ok(());
-        };
-        let name = channel.description.name.as_str();
-        let Some(channel) = self.channels.get_mut(name) else {
-            return Ok(());
-        };
-        let Some(at_ns) = self.clocks.message_ns(&channel.host, envelope) else {
-            self.counts.timeless_count += 1;
-            return Ok(());
-        };
-        let at = Stamp::new(at_ns, envelope.sequence);
-        if !channel.topics.write_message(at, payload, sink)? {
-            self.counts.misfit_count += 1;
-            return Ok(());
-        }
-        channel.note_written(envelope);
-        self.counts.message_count += 1;
-        // What another host sends at the end was long ago: the pictures of that time are drawn.
-        if *origin == Origin::OtherHost {
-            return Ok(());
-        }
-        if let Some((scene, message)) = self.scene.as_mut().zip(channel.topics.message.as_deref()) {
-            let heard = Heard {
-                channel: name,
-                message,
-                payload,
-                at_ns,
-                published_ns: envelope.published_ns,
-            };
-            scene.take(&heard, sink)?;
-        }
-        Ok(())
-    }
-
     fn record<S: Sink>(
         &mut self,
         name: &str,
@@ -175,33 +118,48 @@ impl LiveTopics {
         sink: &mut S,
     ) -> Result<(), S::Error> {
         if let Record::LinkCondition(one) = record {
-            return self.condition(name, one, sink);
+            let conditions = &mut self.topics.conditions;
+            let host = conditions.host_of(name);
+            let at_ns = host.and_then(|host| self.clocks.time_ns(host, one.from_ns));
+            if let Some(at_ns) = at_ns {
+                return conditions.write(name, at_ns, one, sink);
+            }
+            self.topics.counts.timeless_count += 1;
+            return Ok(());
         }
-        let Some(channel) = self.channels.get_mut(name) else {
+        let Some(place) = self.places.get(name).copied() else {
             return Ok(());
         };
+        let channel = &mut self.channels[place];
         match record {
-            Record::Egress(one) => self.clocks.note(&channel.host, one.realtime_offset_ns),
+            Record::Egress(one) => {
+                let host = &self.topics.channels[place].host;
+                self.clocks.note(host, one.realtime_offset_ns);
+            }
             Record::Ingress(one) => {
-                self.clocks
-                    .note(&channel.receiving_host, one.realtime_offset_ns);
+                let host = &channel.receiving_host;
+                self.clocks.note(host, one.realtime_offset_ns);
             }
             _ => {}
         }
         channel.note_due(record, is_of_this_host);
-        channel
-            .joining
-            .take(record, is_of_this_host, Instant::now());
-        channel.give_out(&mut Joining::next, &mut self.clocks, &mut self.counts, sink)
+        let now = Instant::now();
+        channel.joining.take(record, is_of_this_host, now);
+        self.give_out(place, &mut Joining::next, sink)
     }
 
     /// Nothing more is to be read by `now`: gives out the stamps of messages that were held for long
-    /// enough.
+    /// enough, and draws the scene as far as it is known.
     ///
     /// # Errors
     /// When the sink cannot take them.
     pub(crate) fn settle<S: Sink>(&mut self, now: Instant, sink: &mut S) -> Result<(), S::Error> {
-        self.give_out(&mut |joining| joining.next_held(now), sink)
+        if let Some(scene) = &mut self.topics.scene {
+            scene.settle(sink)?;
+        }
+        let mut places = 0..self.channels.len();
+        places
+            .try_for_each(|place| self.give_out(place, &mut |joining| joining.next_held(now), sink))
     }
 
     /// Gives out the stamps of all messages that are still waited for.
@@ -209,205 +167,109 @@ impl LiveTopics {
     /// # Errors
     /// When the sink cannot take them.
     pub(crate) fn flush_joins<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
-        self.give_out(&mut Joining::earliest, sink)
-    }
-
-    fn give_out<S: Sink>(
-        &mut self,
-        next: &mut dyn FnMut(&mut Joining) -> Option<MessageLatency>,
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
-        let (clocks, counts) = (&mut self.clocks, &mut self.counts);
-        let mut channels = self.channels.values_mut();
-        channels.try_for_each(|channel| channel.give_out(next, clocks, counts, sink))
-    }
-
-    /// Writes what only the end of the run tells: the verdicts of its links, and the events of its
-    /// score with their times.
-    ///
-    /// # Errors
-    /// When the sink cannot take it.
-    pub(crate) fn conclude<S: Sink>(
-        &mut self,
-        run: &Run,
-        events: &[Option<u64>],
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
-        for trace in &run.traces {
-            let Some(channel) = self.channels.get_mut(&trace.header.channel) else {
-                continue;
-            };
-            for (index, record) in trace.records.iter().enumerate() {
-                let published_ns = net::published_ns(trace, index).unwrap_or(UNAVAILABLE);
-                let Some(at_ns) = self.clocks.time_ns(&channel.host, published_ns) else {
-                    self.counts.timeless_count += 1;
-                    continue;
-                };
-                channel.topics.write_decision(at_ns, record, sink)?;
-            }
-        }
-        let Some(summary) = &run.summary else {
-            return Ok(());
-        };
-        for (index, event) in summary.score_events.events.iter().enumerate() {
-            let Some(at_ns) = events.get(index).copied().flatten() else {
-                self.counts.timeless_count += 1;
-                continue;
-            };
-            if let Some(line) = topics::event_line(event, at_ns) {
-                self.events
-                    .write(sink, Stamp::new(at_ns, index as u64), &line)?;
-            }
-        }
-        Ok(())
-    }
-
-    /// Messages that should be there and are not, by channel. `is_silent` says that all records of
-    /// the run have come, so that what is not there will not come.
-    pub(crate) fn missed(&self, feed: &Feed, is_silent: bool) -> BTreeMap<String, u64> {
-        let of = |name: &String, channel: &LiveChannel| {
-            let unseen_count = feed.missed_count(name);
-            if is_silent && channel.due.count() > 0 {
-                channel.outstanding_count
-            } else {
-                unseen_count
-            }
-        };
-        let all = self
-            .channels
-            .iter()
-            .map(|(name, one)| (name.clone(), of(name, one)));
-        all.filter(|(_, count)| *count > 0).collect()
-    }
-
-    /// Messages that were published before anybody looked, by channel: of own programs, whose
-    /// messages nobody records.
-    pub(crate) fn earlier(&self, feed: &Feed) -> BTreeMap<String, u64> {
-        let of = |name: &String, channel: &LiveChannel| {
-            let counters = feed.counters(name).filter(|_| channel.is_from_memory)?;
-            (counters.earlier_count > 0).then(|| (name.clone(), counters.earlier_count))
-        };
-        self.channels
-            .iter()
-            .filter_map(|(name, one)| of(name, one))
-            .collect()
-    }
-
-    /// Stamps that came for messages that had been waited for long enough.
-    pub(crate) fn late_count(&self) -> u64 {
-        self.channels
-            .values()
-            .map(|one| one.joining.late_count)
-            .sum()
-    }
-
-    /// Messages whose stamps were given out after those of a message published later.
-    pub(crate) fn unordered_count(&self) -> u64 {
-        let channels = self.channels.values();
-        channels.map(|one| one.joining.unordered_count).sum()
-    }
-
-    /// The names of the messages, a channel each.
-    pub(crate) fn messages(&self) -> impl Iterator<Item = &str> {
-        self.channels
-            .values()
-            .filter_map(|one| one.topics.message.as_deref())
-    }
-
-    /// By channel: its message, and whether it is typed.
-    pub(crate) fn channel_words(&self) -> Words {
-        ChannelTopics::words(self.channels.values().map(|one| &one.topics))
-    }
-
-    /// Nothing more has come for now: draws the scene as far as it is known.
-    ///
-    /// # Errors
-    /// When the sink cannot take it.
-    pub(crate) fn draw<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
-        self.scene
-            .as_mut()
-            .map_or(Ok(()), |scene| scene.settle(sink))
-    }
-
-    /// False while something is being made that the scene waits for.
-    pub(crate) fn is_scene_ready(&mut self) -> bool {
-        self.scene.as_mut().is_none_or(LiveScene::is_ready)
-    }
-
-    /// Nothing more will come: draws the rest of the scene; what it lacks.
-    ///
-    /// # Errors
-    /// When the sink cannot take it.
-    pub(crate) fn finish_scene<S: Sink>(&mut self, sink: &mut S) -> Result<Vec<String>, S::Error> {
-        let Some(scene) = &mut self.scene else {
-            return Ok(Vec::new());
-        };
-        scene.finish(sink)?;
-        Ok(scene.problems())
-    }
-
-    /// An order to an emulated link.
-    ///
-    /// # Errors
-    /// When the sink cannot take it.
-    fn condition<S: Sink>(
-        &mut self,
-        name: &str,
-        record: &LinkConditionRecord,
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
-        let host = self.conditions.host_of(name);
-        let at_ns = host.and_then(|host| self.clocks.time_ns(host, record.from_ns));
-        let Some(at_ns) = at_ns else {
-            self.counts.timeless_count += 1;
-            return Ok(());
-        };
-        self.conditions.write(name, at_ns, record, sink)
-    }
-}
-
-impl LiveChannel {
-    fn of(feed: &Feed, channel: &WatchedChannel, topics: ChannelTopics) -> Self {
-        let one = &channel.description;
-        let mut announced = feed.run().channels.iter();
-        let announced = announced.find(|announced| announced.name == one.name);
-        Self {
-            topics,
-            host: one.from_host.clone().unwrap_or_default(),
-            receiving_host: one.to_host.clone().unwrap_or_default(),
-            joining: Joining::new(announced.map_or(&[], |one| &one.noted)),
-            written: Seen::default(),
-            due: Seen::default(),
-            outstanding_count: 0,
-            is_from_memory: matches!(
-                channel.source,
-                Some(Source::SharedMemory {
-                    is_forwarded: false,
-                    ..
-                })
-            ),
-        }
+        let mut places = 0..self.channels.len();
+        places.try_for_each(|place| self.give_out(place, &mut Joining::earliest, sink))
     }
 
     /// Writes the stamps of the messages that `next` gives out.
     fn give_out<S: Sink>(
         &mut self,
+        place: usize,
         next: &mut dyn FnMut(&mut Joining) -> Option<MessageLatency>,
-        clocks: &mut LiveClocks,
-        counts: &mut Counts,
         sink: &mut S,
     ) -> Result<(), S::Error> {
-        while let Some(mut one) = next(&mut self.joining) {
-            let Some(at_ns) = clocks.latency_ns(&self.host, &one) else {
-                counts.timeless_count += 1;
+        let (channel, topics) = (&mut self.channels[place], &mut self.topics.channels[place]);
+        while let Some(mut one) = next(&mut channel.joining) {
+            let Some(at_ns) = self.clocks.latency_ns(&topics.host, &one) else {
+                self.topics.counts.timeless_count += 1;
                 continue;
             };
-            if clocks.compares() || self.host == self.receiving_host {
+            if self.clocks.compares() || topics.host == channel.receiving_host {
                 one.compare_ends();
             }
-            self.topics.write_latency(at_ns, &one, sink)?;
+            topics.write_latency(at_ns, &one, sink)?;
         }
         Ok(())
+    }
+
+    /// Writes what only the end of the run tells: the verdicts of its links, and the events of its
+    /// score.
+    ///
+    /// # Errors
+    /// When the sink cannot take it.
+    pub(crate) fn conclude<S: Sink>(&mut self, run: &Run, sink: &mut S) -> Result<(), S::Error> {
+        let mut plan = Plan::default();
+        let clocks = &mut self.clocks;
+        plan.put_end(run, &self.topics.channels, &mut |host, ns| {
+            clocks.time_ns(host, ns)
+        });
+        self.topics.counts.timeless_count += plan.timeless_count;
+        let mut items = plan.items.into_iter();
+        items.try_for_each(|item| self.topics.write(run, &[], item, sink))
+    }
+
+    /// Messages that should be there and are not, by channel. `is_silent` says that all records of
+    /// the run have come, so that what is not there will not come.
+    pub(crate) fn missed(&self, feed: &Feed, is_silent: bool) -> BTreeMap<String, u64> {
+        let counts = self.places.iter().map(|(name, place)| {
+            let channel = &self.channels[*place];
+            let is_known = is_silent && channel.due.count() > 0;
+            let unseen_count = feed.missed_count(name);
+            let outstanding_count = channel.outstanding_count;
+            (
+                name.clone(),
+                if is_known {
+                    outstanding_count
+                } else {
+                    unseen_count
+                },
+            )
+        });
+        counts.filter(|(_, count)| *count > 0).collect()
+    }
+
+    /// Messages that were published before anybody looked, by channel: of own programs, whose
+    /// messages nobody records.
+    pub(crate) fn earlier(&self, feed: &Feed) -> BTreeMap<String, u64> {
+        let from_memory = self.places.iter();
+        let from_memory = from_memory.filter(|(_, place)| self.channels[**place].is_from_memory);
+        let counts = from_memory
+            .filter_map(|(name, _)| Some((name.clone(), feed.counters(name)?.earlier_count)));
+        counts.filter(|(_, count)| *count > 0).collect()
+    }
+
+    /// Stamps that came for messages that had been waited for long enough.
+    pub(crate) fn late_count(&self) -> u64 {
+        let channels = self.channels.iter();
+        channels.map(|one| one.joining.late_count).sum()
+    }
+
+    /// Messages whose stamps were given out after those of a message published later.
+    pub(crate) fn unordered_count(&self) -> u64 {
+        let channels = self.channels.iter();
+        channels.map(|one| one.joining.unordered_count).sum()
+    }
+
+    /// False while something is being made that the scene waits for.
+    pub(crate) fn is_scene_ready(&mut self) -> bool {
+        let scene = self.topics.scene.as_mut();
+        scene.is_none_or(|scene| !scene.awaits_ground())
+    }
+}
+
+impl LiveChannel {
+    fn of(feed: &Feed, channel: &WatchedChannel) -> Self {
+        let one = &channel.description;
+        let mut announced = feed.run().channels.iter();
+        let announced = announced.find(|announced| announced.name == one.name);
+        Self {
+            receiving_host: one.to_host.clone().unwrap_or_default(),
+            joining: Joining::new(announced.map_or(&[], |one| &one.noted)),
+            written: Seen::default(),
+            due: Seen::default(),
+            outstanding_count: 0,
+            is_from_memory: channel.is_unrecorded(),
+        }
     }
 
     fn note_written(&mut self, envelope: &Envelope) {

@@ -3,17 +3,18 @@
 //! [`crate::split`].
 
 use std::collections::BTreeMap;
-use std::io;
 use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use hil_platform::words::counted_plainly;
 use hil_rundir::live_run::LiveRun;
-use hil_rundir::select::select;
-use hil_rundir::select::{SelectError, select_below};
-use hil_watch::{Event, Feed, FeedError, Poll};
+use hil_rundir::select::{SelectError, select, select_below};
+use hil_watch::{Event, Feed, Poll};
 
+use crate::cli::RecordOptions;
 use crate::facts::{self, Words};
+use crate::failure::Failure;
 use crate::live::LiveTopics;
 use crate::pace::Pace;
 use crate::run::Run;
@@ -38,68 +39,7 @@ const GROUND_PAUSE: Duration = Duration::from_millis(20);
 /// Problems that the file tells in words; further ones are counted.
 const PROBLEMS_MAX: usize = 1000;
 
-/// How a recording went wrong.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum RecordError {
-    /// No run, or several.
-    #[error(transparent)]
-    Select(#[from] SelectError),
-    /// None that fits, and nobody asked to wait for one.
-    #[error("{0}; --wait waits for one to begin")]
-    NotYet(SelectError),
-    /// The run cannot be watched.
-    #[error(transparent)]
-    Feed(#[from] FeedError),
-    /// The run that was chosen is not there any more.
-    #[error("the run in {folder} does not go any more: {why}", folder = .folder.display())]
-    Gone {
-        /// Its folder.
-        folder: PathBuf,
-        /// What the system said.
-        why: io::Error,
-    },
-    /// Nowhere to put it.
-    #[error(transparent)]
-    Write(#[from] WriteError),
-    /// A signal came before a run did.
-    #[error("ended by {0}; no run had begun and no file was written")]
-    Interrupted(&'static str),
-}
-
-/// The run that is meant.
-#[derive(Debug, Clone)]
-pub(crate) enum Which {
-    /// By a word of the user's; the only one if left out.
-    Named(Option<String>),
-    /// The one in this folder.
-    In(PathBuf),
-}
-
-/// What is asked for.
-#[derive(Debug, Clone)]
-#[allow(clippy::struct_excessive_bools, reason = "options of a command line")]
-pub(crate) struct Request {
-    /// Which run.
-    pub(crate) run: Which,
-    /// File to write, or folder to write it into.
-    pub(crate) output: PathBuf,
-    /// Wait for a run to begin.
-    pub(crate) waits: bool,
-    /// Know only runs whose folders lie below this one.
-    pub(crate) below: Option<PathBuf>,
-    /// Leave out what is recorded already.
-    pub(crate) from_now: bool,
-    /// Begin another file when one is larger than this, bytes.
-    pub(crate) split_bytes: Option<u64>,
-    /// What a kill may lose at most.
-    pub(crate) flush: Duration,
-    /// Replace files that exist.
-    pub(crate) force: bool,
-    /// Draw the scene.
-    pub(crate) has_scene: bool,
-}
-
-/// What a recording came to.
+/// What a recording, of a run that goes or of a folder, came to.
 #[derive(Debug)]
 pub(crate) struct Recorded {
     /// The files, in order.
@@ -118,6 +58,16 @@ pub(crate) struct Recorded {
     pub(crate) has_gaps: bool,
     /// The signal that ended the recording before its run.
     pub(crate) signal: Option<&'static str>,
+}
+
+impl Recorded {
+    /// The files, and what is in them.
+    pub(crate) fn files(&self) -> String {
+        let paths = self.paths.iter().map(|path| path.display().to_string());
+        let paths = paths.collect::<Vec<_>>().join(", ");
+        let messages = counted_plainly(self.message_count, "message");
+        format!("{paths}: {messages} of the run")
+    }
 }
 
 /// How far a recording is.
@@ -143,46 +93,47 @@ pub(crate) type Look<'a> = &'a mut dyn FnMut(&Progress<'_>) -> Option<&'static s
 /// # Errors
 /// When there is no run to record or no file can be written; what was written is beside its place
 /// then.
-pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, RecordError> {
-    prepare(&request.output, request.split_bytes, request.force)?;
-    let run = find(request, look)?;
-    let target = target(&request.output, &run.name);
-    let mut feed = Feed::open(run)?;
-    if request.from_now {
+pub(crate) fn record(options: &RecordOptions, look: Look<'_>) -> Result<Recorded, Failure> {
+    let (split_bytes, force) = (options.split_size, options.force);
+    prepare(&options.output, split_bytes, force)?;
+    let run = find(options, look)?;
+    let target = target(&options.output, &run.name);
+    let mut feed = Feed::open(run).map_err(Failure::failed)?;
+    if options.from_now {
         feed.skip_to_now();
     }
-    let files = Files::begin(&target, request.split_bytes, request.force)?;
-    let topics = LiveTopics::of(&feed, request.has_scene);
-    let mut recording = LiveRecording::begin(feed, topics, files)?;
-    let signal = recording.run(request.flush, look)?;
+    let files = Files::begin(&target, split_bytes, force)?;
+    let live = LiveTopics::of(&feed, !options.no_scene);
+    let mut recording = LiveRecording::begin(feed, live, files)?;
+    let signal = recording.run(options.flush, look)?;
     recording.finish(signal)
 }
 
-fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
-    let wanted = match &request.run {
-        Which::Named(wanted) => wanted.as_deref(),
-        Which::In(folder) => {
-            return LiveRun::read(folder).map_err(|why| RecordError::Gone {
-                folder: folder.clone(),
-                why,
-            });
-        }
-    };
+fn find(options: &RecordOptions, look: Look<'_>) -> Result<LiveRun, Failure> {
+    if let Some(folder) = &options.folder {
+        return LiveRun::read(folder).map_err(|why| {
+            let folder = folder.display();
+            Failure::failed(format!("the run in {folder} does not go any more: {why}"))
+        });
+    }
+    let wanted = options.run.as_deref();
     loop {
-        let selected = match &request.below {
+        let selected = match &options.below {
             Some(below) => select_below(below, wanted),
             None => select(wanted),
         };
         match selected {
             Ok(run) => return Ok(run),
-            Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if request.waits => {}
+            Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if options.wait => {}
             Err(error @ (SelectError::NoneRuns | SelectError::NoSuch { .. })) => {
-                return Err(RecordError::NotYet(error));
+                let cure = "--wait waits for one to begin";
+                return Err(Failure::usage(format!("{error}; {cure}")));
             }
-            Err(error) => return Err(error.into()),
+            Err(error) => return Err(Failure::usage(error)),
         }
         if let Some(signal) = look(&Progress::default()) {
-            return Err(RecordError::Interrupted(signal));
+            let words = format!("ended by {signal}; no run had begun and no file was written");
+            return Err(Failure::interrupted(words));
         }
         thread::sleep(WAIT_PAUSE);
     }
@@ -206,7 +157,7 @@ impl Problems {
 
 struct LiveRecording {
     feed: Feed,
-    topics: LiveTopics,
+    live: LiveTopics,
     files: Files,
     /// All records of the run have come.
     is_silent: bool,
@@ -217,9 +168,9 @@ struct LiveRecording {
 }
 
 impl LiveRecording {
-    fn begin(feed: Feed, topics: LiveTopics, files: Files) -> Result<Self, WriteError> {
+    fn begin(feed: Feed, live: LiveTopics, files: Files) -> Result<Self, WriteError> {
         let mut recording = Self {
-            topics,
+            live,
             feed,
             files,
             is_silent: false,
@@ -243,8 +194,7 @@ impl LiveRecording {
             let polled = self.poll()?;
             let now = Instant::now();
             if polled != Poll::Busy {
-                self.topics.draw(&mut self.files)?;
-                self.topics.settle(now, &mut self.files)?;
+                self.live.settle(now, &mut self.files)?;
             }
             // What was there before the recorder is not to wait for its first period.
             let is_abreast = polled == Poll::Idle && !has_caught_up;
@@ -261,7 +211,7 @@ impl LiveRecording {
             }
             let since_told = now.duration_since(told);
             if since_told >= PROGRESS_PERIOD {
-                let count = self.topics.counts.message_count;
+                let count = self.live.topics.counts.message_count;
                 let rate_hz = (count - told_count) as f64 / since_told.as_secs_f64();
                 (told, told_count) = (now, count);
                 if let Some(signal) = look(&self.progress(rate_hz)) {
@@ -276,7 +226,7 @@ impl LiveRecording {
     }
 
     fn progress(&self, rate_hz: f64) -> Progress<'_> {
-        let missed = self.topics.missed(&self.feed, false);
+        let missed = self.live.missed(&self.feed, false);
         Progress {
             run: &self.feed.run().name,
             rate_hz,
@@ -287,7 +237,7 @@ impl LiveRecording {
     }
 
     fn poll(&mut self) -> Result<Poll, WriteError> {
-        self.topics.clocks.learn(self.feed.has_one_clock());
+        self.live.clocks.learn(self.feed.has_one_clock());
         let mut failed = None;
         let polled = self.feed.poll(&mut |event| {
             match &event {
@@ -297,18 +247,10 @@ impl LiveRecording {
                 Event::Message { .. } | Event::Record { .. } => {}
             }
             if failed.is_none() {
-                failed = self.topics.take(&event, &mut self.files).err();
+                failed = self.live.take(&event, &mut self.files).err();
             }
         });
         failed.map_or(Ok(polled), Err)
-    }
-
-    /// A run may be over before the ground of its fleet was made.
-    fn await_scene(&mut self) {
-        let since = Instant::now();
-        while !self.topics.is_scene_ready() && since.elapsed() < GROUND_WITHIN {
-            thread::sleep(GROUND_PAUSE);
-        }
     }
 
     /// What was published before the signal is to be in the file; what the last poll came to.
@@ -318,7 +260,7 @@ impl LiveRecording {
         while polled == Poll::Busy {
             polled = self.poll()?;
         }
-        self.topics.flush_joins(&mut self.files)?;
+        self.live.flush_joins(&mut self.files)?;
         Ok(polled)
     }
 
@@ -330,10 +272,17 @@ impl LiveRecording {
         Ok(())
     }
 
-    fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, RecordError> {
-        self.await_scene();
-        for problem in self.topics.finish_scene(&mut self.files)? {
-            self.problems.note(&problem);
+    fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, Failure> {
+        // A run may be over before the ground of its fleet was made.
+        let since = Instant::now();
+        while !self.live.is_scene_ready() && since.elapsed() < GROUND_WITHIN {
+            thread::sleep(GROUND_PAUSE);
+        }
+        if let Some(scene) = &mut self.live.topics.scene {
+            scene.finish(&mut self.files)?;
+            for problem in scene.problems() {
+                self.problems.note(&problem);
+            }
         }
         let mut run = Run::without_records(self.feed.run().run_folder());
         if self.has_summary {
@@ -341,12 +290,7 @@ impl LiveRecording {
             if let Err(error) = run.read_traces() {
                 run.gaps.leave_out(error.to_string());
             }
-            let section = run.summary.as_ref().and_then(|one| one.clocks.as_ref());
-            let has_one_clock = section.map(|section| section.has_one_clock);
-            let clocks = &mut self.topics.clocks;
-            let mut time_ns = |host: &str, at_ns| clocks.time_ns(host, at_ns);
-            let events = facts::event_times(&run, has_one_clock, &mut time_ns);
-            self.topics.conclude(&run, &events, &mut self.files)?;
+            self.live.conclude(&run, &mut self.files)?;
         }
         let how = match signal {
             Some(signal) => format!("the recorder was ended by {signal}, the run went on"),
@@ -360,8 +304,8 @@ impl LiveRecording {
         }
         self.files.open().describe("hil.end", end)?;
         facts::attach(self.files.open(), &run.folder)?;
-        let counts = self.topics.counts;
-        let missed = self.topics.missed(&self.feed, self.is_silent);
+        let counts = self.live.topics.counts;
+        let missed = self.live.missed(&self.feed, self.is_silent);
         let mut words = self.problems.words.clone();
         if self.has_summary {
             words.extend(run.gaps.words.iter().cloned());
@@ -391,38 +335,38 @@ impl LiveRecording {
             "exit_reason".to_owned(),
             "recorded while it went".to_owned(),
         );
-        self.told_clocks = self.topics.clocks.words();
+        self.told_clocks = self.live.clocks.words();
         let file = self.files.open();
         file.describe("hil.clocks", self.told_clocks.clone())?;
         file.describe("hil.run", words)?;
         facts::describe_manifest(file, self.feed.manifest())?;
-        facts::attach_robot(file, self.topics.messages())
+        facts::attach_robot(file, self.live.topics.messages())
     }
 
     /// What was recorded so far, at the end of each file.
     fn describe_recording(&mut self, how: &str) -> Result<(), WriteError> {
-        let counts = self.topics.counts;
+        let counts = self.live.topics.counts;
         let numbers = [
             ("file_number", self.files.number() as u64),
             ("message_count", counts.message_count),
             ("misfit_message_count", counts.misfit_count),
             ("timeless_record_count", counts.timeless_count),
-            ("late_record_count", self.topics.late_count()),
-            ("unordered_latency_count", self.topics.unordered_count()),
+            ("late_record_count", self.live.late_count()),
+            ("unordered_latency_count", self.live.unordered_count()),
             ("problem_count", self.problems.count),
         ];
-        let names = &self.topics.names;
+        let names = &self.live.topics.names;
         let mut words = facts::recording_words(&numbers, &self.problems.words, names);
         words.insert("mode".to_owned(), "live".to_owned());
         words.insert("ended".to_owned(), how.to_owned());
-        for (channel, count) in self.topics.missed(&self.feed, self.is_silent) {
+        for (channel, count) in self.live.missed(&self.feed, self.is_silent) {
             words.insert(format!("missed {channel}"), count.to_string());
         }
-        for (channel, count) in self.topics.earlier(&self.feed) {
+        for (channel, count) in self.live.earlier(&self.feed) {
             words.insert(format!("before {channel}"), count.to_string());
         }
-        let clocks = self.topics.clocks.words();
-        let channels = self.topics.channel_words();
+        let clocks = self.live.clocks.words();
+        let channels = self.live.topics.channel_words();
         let file = self.files.open();
         // Offsets of other clocks come with the last records.
         if clocks != self.told_clocks {

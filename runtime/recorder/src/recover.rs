@@ -8,24 +8,11 @@ use std::sync::Arc;
 use mcap::records::Record;
 use mcap::{Attachment, Channel, Schema};
 
-use crate::scan::{Loss, ScanEnd, ScanError, scan};
+use crate::failure::Failure;
+use crate::scan::{Loss, ScanEnd, scan};
 use crate::sink::Sink as _;
 use crate::writer::{Recording, Stamp, WriteError};
 use hil_platform::words::counted_plainly;
-
-/// How a recovery went wrong.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum RecoverError {
-    /// The broken file cannot be read.
-    #[error(transparent)]
-    Scan(#[from] ScanError),
-    /// The whole file cannot be written.
-    #[error(transparent)]
-    Write(#[from] WriteError),
-    /// A signal came.
-    #[error("ended by {0}; no file was written")]
-    Interrupted(&'static str),
-}
 
 /// What was recovered, and what was not.
 #[derive(Debug, Default)]
@@ -68,7 +55,7 @@ pub(crate) fn recover(
     from: &Path,
     to: &Path,
     look: &mut dyn FnMut(u64) -> Option<&'static str>,
-) -> Result<Recovered, RecoverError> {
+) -> Result<Recovered, Failure> {
     let (recording, mut recovered) = attempt(from, Copy::new(to)?, look)?;
     if recovered.homeless_count == 0 {
         recovered.message_count = recording.finish()?;
@@ -86,8 +73,8 @@ pub(crate) fn recover(
     })?;
     for record in described {
         match copy.take(record) {
-            Ok(()) | Err(CopyError::Conflict(_)) => {}
-            Err(CopyError::Write(error)) => return Err(error.into()),
+            Ok(_) | Err(WriteError::Container { .. }) => {}
+            Err(error) => return Err(error.into()),
         }
     }
     let (recording, mut recovered) = attempt(from, copy, look)?;
@@ -100,17 +87,21 @@ fn attempt(
     from: &Path,
     mut copy: Copy,
     look: &mut dyn FnMut(u64) -> Option<&'static str>,
-) -> Result<(Recording, Recovered), RecoverError> {
+) -> Result<(Recording, Recovered), Failure> {
     let mut conflicts = Vec::new();
     let end = scan(from, &mut |offset, record| {
         match copy.take(record) {
-            Ok(()) => {}
-            Err(CopyError::Conflict(why)) => conflicts.push(Loss::new(offset, 0, why)),
-            Err(CopyError::Write(error)) => copy.stopped = Some(error.into()),
+            Ok(lost) => conflicts.extend(lost.map(|why| Loss::new(offset, 0, why))),
+            Err(WriteError::Container { source, .. }) => {
+                conflicts.push(Loss::new(offset, 0, source.to_string()));
+            }
+            Err(error) => copy.stopped = Some(error.into()),
         }
         copy.record_count += 1;
         if copy.record_count % 4096 == 1 && copy.stopped.is_none() {
-            copy.stopped = look(offset).map(RecoverError::Interrupted);
+            copy.stopped = look(offset).map(|signal| {
+                Failure::interrupted(format!("ended by {signal}; no file was written"))
+            });
         }
         copy.stopped.is_none()
     })?;
@@ -159,27 +150,13 @@ pub(crate) fn loss_words(loss: &Loss) -> String {
     format!("byte {offset}, {size} bytes: {why}{count}")
 }
 
-enum CopyError {
-    Write(WriteError),
-    Conflict(String),
-}
-
-impl From<WriteError> for CopyError {
-    fn from(error: WriteError) -> Self {
-        match error {
-            WriteError::Container { source, .. } => Self::Conflict(source.to_string()),
-            error => Self::Write(error),
-        }
-    }
-}
-
 struct Copy {
     recording: Recording,
     schemas: BTreeMap<u16, Arc<Schema<'static>>>,
     /// Channels that are in the new file.
     channels: BTreeSet<u16>,
     recovered: Recovered,
-    stopped: Option<RecoverError>,
+    stopped: Option<Failure>,
     record_count: u64,
 }
 
@@ -195,7 +172,8 @@ impl Copy {
         })
     }
 
-    fn take(&mut self, record: Record<'_>) -> Result<(), CopyError> {
+    /// Copies a record; what of it was lost.
+    fn take(&mut self, record: Record<'_>) -> Result<Option<String>, WriteError> {
         match record {
             Record::Schema { header, data } => {
                 let schema = Schema {
@@ -206,7 +184,7 @@ impl Copy {
                 };
                 self.schemas.insert(schema.id, Arc::new(schema));
             }
-            Record::Channel(channel) => self.channel(channel)?,
+            Record::Channel(channel) => return self.channel(channel),
             Record::Message { header, data } => self.message(header, &data)?,
             Record::Metadata(metadata) => {
                 self.recording.describe(&metadata.name, metadata.metadata)?;
@@ -220,10 +198,10 @@ impl Copy {
             })?,
             _ => {}
         }
-        Ok(())
+        Ok(None)
     }
 
-    fn channel(&mut self, channel: mcap::records::Channel) -> Result<(), CopyError> {
+    fn channel(&mut self, channel: mcap::records::Channel) -> Result<Option<String>, WriteError> {
         let (id, schema_id) = (channel.id, channel.schema_id);
         let schema = self.schemas.get(&schema_id).cloned();
         let is_lost = schema.is_none() && schema_id != 0;
@@ -241,14 +219,14 @@ impl Copy {
             })?;
             self.channels.insert(id);
         }
-        why.map_or(Ok(()), |why| Err(CopyError::Conflict(why)))
+        Ok(why)
     }
 
     fn message(
         &mut self,
         header: mcap::records::MessageHeader,
         data: &[u8],
-    ) -> Result<(), CopyError> {
+    ) -> Result<(), WriteError> {
         if !self.channels.contains(&header.channel_id) {
             self.recovered.homeless_count += 1;
             return Ok(());

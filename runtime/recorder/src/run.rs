@@ -3,7 +3,6 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_platform::words::counted_plainly;
@@ -13,6 +12,8 @@ use hil_rundir::record::{RecordFile, RecordKind};
 use hil_rundir::run_folder::RunFolder;
 use hil_trace::{Trace, wire};
 use serde_json::Value;
+
+use crate::failure::Failure;
 
 /// The kinds of records that end in a recording.
 const KINDS: [RecordKind; 7] = [
@@ -24,25 +25,6 @@ const KINDS: [RecordKind; 7] = [
     RecordKind::Message,
     RecordKind::LinkCondition,
 ];
-
-/// Why a folder cannot be turned into a recording at all.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum RunError {
-    /// No folder, or one without records.
-    #[error("{path}: not a run's folder: {source}")]
-    Foreign {
-        /// What was looked for.
-        path: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
-    /// Of a run in virtual time.
-    #[error("{path}: a folder of `simulate` has no records; only a run's folder can be converted")]
-    Virtual {
-        /// The folder.
-        path: PathBuf,
-    },
-}
 
 /// What could be read of a run.
 #[derive(Debug)]
@@ -106,11 +88,13 @@ impl Run {
     pub(crate) fn read(
         path: &Path,
         goes_on: &mut dyn FnMut(f64, &str) -> bool,
-    ) -> Result<Self, RunError> {
+    ) -> Result<Self, Failure> {
         let folder = RunFolder::existing(path);
         if !folder.records().is_dir() && folder.summary().is_file() {
-            let path = path.to_owned();
-            return Err(RunError::Virtual { path });
+            return Err(Failure::usage(format!(
+                "{}: a folder of `simulate` has no records; only a run's folder can be converted",
+                path.display()
+            )));
         }
         let paths = listed(&folder.records())?;
         let mut run = Self::without_records(folder);
@@ -146,7 +130,7 @@ impl Run {
     ///
     /// # Errors
     /// When the folder of traces cannot be listed.
-    pub(crate) fn read_traces(&mut self) -> Result<(), RunError> {
+    pub(crate) fn read_traces(&mut self) -> Result<(), Failure> {
         if self.folder.traces().is_dir() {
             for path in listed(&self.folder.traces())? {
                 self.read_trace(&path);
@@ -260,12 +244,12 @@ impl Run {
     }
 }
 
-fn listed(folder: &Path) -> Result<Vec<PathBuf>, RunError> {
+fn listed(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     let mut paths: Vec<PathBuf> = fs::read_dir(folder)
         .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
-        .map_err(|source| RunError::Foreign {
-            path: folder.to_owned(),
-            source,
+        .map_err(|source| {
+            let folder = folder.display();
+            Failure::usage(format!("{folder}: not a run's folder: {source}"))
         })?;
     // By name, so that the starts of a restarted process come in order.
     paths.sort();

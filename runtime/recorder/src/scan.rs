@@ -4,12 +4,13 @@
 
 use std::fs::File;
 use std::io::{self, BufReader, Read};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use mcap::MAGIC;
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
+use crate::failure::Failure;
 use crate::lengths;
 
 /// Largest record, compressed or not: a bound on what a damaged length may ask for.
@@ -20,25 +21,6 @@ const RECORD_HEAD_BYTES: u64 = 9;
 const CHUNK_HEAD_BYTES: usize = 40;
 /// Where in it the length of that name stands, and the name itself.
 const COMPRESSION_AT: usize = 28;
-
-/// Why a file cannot be scanned at all.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum ScanError {
-    /// Not readable.
-    #[error("cannot read {path}: {source}")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
-    /// Something else.
-    #[error("{path}: not an MCAP file, whose first bytes are 89 4D 43 41 50 30 0D 0A")]
-    Foreign {
-        /// The file.
-        path: PathBuf,
-    },
-}
 
 /// Bytes that nothing could be made of.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -87,11 +69,9 @@ pub(crate) struct ScanEnd {
 ///
 /// # Errors
 /// When the file cannot be read, or is no MCAP file.
-pub(crate) fn scan(path: &Path, visit: &mut Visit<'_>) -> Result<ScanEnd, ScanError> {
-    let failed = |source| ScanError::Io {
-        path: path.to_owned(),
-        source,
-    };
+pub(crate) fn scan(path: &Path, visit: &mut Visit<'_>) -> Result<ScanEnd, Failure> {
+    let name = path.display();
+    let failed = |source: io::Error| Failure::failed(format!("cannot read {name}: {source}"));
     let file = File::open(path).map_err(failed)?;
     let size_bytes = file.metadata().map_err(failed)?.len();
     let limits = Limits {
@@ -99,8 +79,10 @@ pub(crate) fn scan(path: &Path, visit: &mut Visit<'_>) -> Result<ScanEnd, ScanEr
         record_bytes_max: RECORD_BYTES_MAX,
     };
     let end = scan_from(BufReader::new(file), limits, visit).map_err(failed)?;
-    end.ok_or_else(|| ScanError::Foreign {
-        path: path.to_owned(),
+    end.ok_or_else(|| {
+        Failure::usage(format!(
+            "{name}: not an MCAP file, whose first bytes are 89 4D 43 41 50 30 0D 0A"
+        ))
     })
 }
 

@@ -53,17 +53,6 @@ pub(crate) fn opaque() -> Schema {
     file("google.protobuf", "google.protobuf.BytesValue", proto)
 }
 
-/// A field of the recorder's own messages: its name and type, and whether it may be absent.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct OwnField {
-    /// Its name.
-    pub(crate) name: &'static str,
-    /// Its type.
-    pub(crate) kind: Type,
-    /// True when it is `optional`.
-    pub(crate) may_be_absent: bool,
-}
-
 /// One of the recorder's own messages, `hil.<name>`: its fields with their kinds and numbers, from which
 /// protobuf's form and the schema are made.
 macro_rules! own_message {
@@ -74,26 +63,6 @@ macro_rules! own_message {
     (@type double) => { f64 };
     (@type bool) => { bool };
     (@type string) => { String };
-    (@kind uint32) => { prost_types::field_descriptor_proto::Type::Uint32 };
-    (@kind uint64) => { prost_types::field_descriptor_proto::Type::Uint64 };
-    (@kind int64) => { prost_types::field_descriptor_proto::Type::Int64 };
-    (@kind double) => { prost_types::field_descriptor_proto::Type::Double };
-    (@kind bool) => { prost_types::field_descriptor_proto::Type::Bool };
-    (@kind string) => { prost_types::field_descriptor_proto::Type::String };
-    (@field $name:ident optional $kind:ident) => {
-        $crate::schema::OwnField {
-            name: stringify!($name),
-            kind: $crate::schema::own_message!(@kind $kind),
-            may_be_absent: true,
-        }
-    };
-    (@field $name:ident $kind:ident) => {
-        $crate::schema::OwnField {
-            name: stringify!($name),
-            kind: $crate::schema::own_message!(@kind $kind),
-            may_be_absent: false,
-        }
-    };
     (
         $(#[$meta:meta])*
         pub(crate) struct $name:ident as $message:literal {
@@ -113,24 +82,32 @@ macro_rules! own_message {
         impl $name {
             /// Its schema.
             pub(crate) fn schema() -> $crate::schema::Schema {
-                let fields = [$($crate::schema::own_message!(@field $field $($kind)+)),+];
-                $crate::schema::own($message, &fields)
+                $crate::schema::own($message, &[
+                    $([stringify!($field), stringify!($($kind)+)]),+
+                ])
             }
         }
     };
 }
 pub(crate) use own_message;
 
-/// The schema of one of the recorder's own messages, `hil.<name>`; numbers are positions from 1.
-pub(crate) fn own(name: &str, fields: &[OwnField]) -> Schema {
+/// The schema of one of the recorder's own messages, `hil.<name>`, whose fields are `[name, kind]`; numbers
+/// are positions from 1.
+pub(crate) fn own(name: &str, fields: &[[&str; 2]]) -> Schema {
     let mut proto = DescriptorProto {
         name: Some("v1".to_owned()),
         ..DescriptorProto::default()
     };
-    for (one, number) in fields.iter().zip(1..) {
-        let name = one.name;
-        let mut field = own_field(name, number, one.kind);
-        if one.may_be_absent {
+    for ([name, kind], number) in fields.iter().zip(1..) {
+        let optional = kind.strip_prefix("optional ");
+        let kind = optional.unwrap_or(kind).to_uppercase();
+        let kind = Type::from_str_name(&format!("TYPE_{kind}"));
+        let mut field = own_field(
+            name,
+            number,
+            kind.expect("the macro takes protobuf's kinds"),
+        );
+        if optional.is_some() {
             // What `optional` of proto3 compiles to: a choice of one.
             field.proto3_optional = Some(true);
             field.oneof_index = i32::try_from(proto.oneof_decl.len()).ok();

@@ -14,10 +14,11 @@ use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
 use serde_json::json;
 
-use crate::convert::{ConvertError, Converted, convert};
-use crate::recover::{RecoverError, Recovered, recover};
-use crate::run::RunError;
-use crate::scan::{ScanError, scan};
+use crate::convert::convert;
+use crate::failure::{Exit, Failure};
+use crate::record::Recorded;
+use crate::recover::{Recovered, recover};
+use crate::scan::scan;
 
 /// Messages of each made-up channel: enough for several chunks.
 const MESSAGE_COUNT: u64 = 60_000;
@@ -76,7 +77,7 @@ impl Folder {
         fs::write(self.at("run/manifest.json"), manifest.to_string()).unwrap();
     }
 
-    fn convert(&self) -> Result<Converted, ConvertError> {
+    fn convert(&self) -> Result<Recorded, Failure> {
         convert(&self.at("run"), &self.at("run.mcap"), true, &mut |_, _| {
             None
         })
@@ -245,7 +246,8 @@ fn a_signal_leaves_no_file() {
     for wanted in ["reading", "writing"] {
         let mut stop = |_: Option<f64>, words: &str| words.starts_with(wanted).then_some("Ctrl-C");
         let stopped = convert(&folder.at("run"), &folder.at("run.mcap"), true, &mut stop);
-        assert!(matches!(stopped, Err(ConvertError::Interrupted("Ctrl-C"))));
+        let interrupted = Failure::interrupted("ended by Ctrl-C; no file was written");
+        assert_eq!(stopped.unwrap_err(), interrupted);
         assert_eq!(fs::read_dir(&folder.0).unwrap().count(), 1);
     }
     assert!(folder.convert().is_ok());
@@ -258,11 +260,14 @@ fn a_signal_leaves_no_file() {
 fn other_folders_and_files_are_named_as_such() {
     let folder = Folder::new();
     fs::remove_dir(folder.at("run/records")).unwrap();
-    let error = folder.convert().unwrap_err();
-    assert!(matches!(error, ConvertError::Run(RunError::Foreign { .. })));
+    let refused = |words: &str| {
+        let failure = folder.convert().unwrap_err();
+        assert_eq!(failure.exit, Exit::Usage);
+        assert!(failure.words.contains(words), "{failure}");
+    };
+    refused("run/records: not a run's folder: No such file");
     fs::write(folder.at("run/summary.json"), "{}").unwrap();
-    let error = folder.convert().unwrap_err();
-    assert!(matches!(error, ConvertError::Run(RunError::Virtual { .. })));
+    refused("a folder of `simulate` has no records");
     assert!(!folder.at("run.mcap").exists());
     for bytes in [&b""[..], b"\x89MCAP0\r", b"HILREC01 and more"] {
         assert!(
@@ -273,10 +278,9 @@ fn other_folders_and_files_are_named_as_such() {
         );
     }
     let missing = recover(&folder.at("none"), &folder.at("whole.mcap"), &mut |_| None);
-    assert!(matches!(
-        missing,
-        Err(RecoverError::Scan(ScanError::Io { .. }))
-    ));
+    let missing = missing.unwrap_err();
+    assert_eq!(missing.exit, Exit::Failed);
+    assert!(missing.words.contains("cannot read"), "{missing}");
 }
 
 /// A whole file of [`MESSAGE_COUNT`] messages, and where its chunks begin and end.

@@ -200,11 +200,26 @@ pub(crate) fn pose([x, y, z]: [f64; 3], [i, j, k, w]: [f64; 4]) -> Pose {
     }
 }
 
+/// A box of this size, metres, around a place.
+pub(crate) fn cube(
+    place: [f64; 3],
+    turned: [f64; 4],
+    size: [f64; 3],
+    color: Color,
+) -> CubePrimitive {
+    let [x, y, z] = size;
+    CubePrimitive {
+        pose: Some(pose(place, turned)),
+        size: Some(Vector3 { x, y, z }),
+        color: Some(color),
+    }
+}
+
 fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
     let (fleet, robot) = (state.header.fleet_id, state.header.robot_id);
     let (sine, cosine) = (state.heading_rad / 2.0).sin_cos();
     let turned = [0.0, 0.0, sine, cosine];
-    let [length, width, height] = VEHICLE_SIZE_M;
+    let height = VEHICLE_SIZE_M[2];
     // Neighbours in number get colours far apart: steps of the golden section around the circle.
     let hue = f64::from(robot) * 0.618_033_988_75 % 1.0;
     let part = |shift: f64| 0.55 + 0.4 * (core::f64::consts::TAU * (hue + shift)).cos();
@@ -214,15 +229,8 @@ fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
         b: part(2.0 / 3.0),
         a: 1.0,
     };
-    let body = CubePrimitive {
-        pose: Some(pose([state.x_m, state.y_m, height / 2.0], turned)),
-        size: Some(Vector3 {
-            x: length,
-            y: width,
-            z: height,
-        }),
-        color: Some(color),
-    };
+    let place = [state.x_m, state.y_m, height / 2.0];
+    let body = cube(place, turned, VEHICLE_SIZE_M, color);
     let name = TextPrimitive {
         pose: Some(pose([state.x_m, state.y_m, 2.0 * height], turned)),
         billboard: true,

@@ -1,6 +1,7 @@
 //! One recording on its way into a file: topics, messages, metadata. The file appears under its name
 //! only when it is whole; until then it lies beside it, and goes when the work is given up.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io;
@@ -15,6 +16,7 @@ use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 use nix::unistd::{AccessFlags, access};
 
 use crate::disk::QueuedFile;
+use crate::failure::Failure;
 use crate::schema::Schema;
 use crate::sink::Sink;
 
@@ -72,6 +74,15 @@ pub(crate) enum WriteError {
         /// Why.
         source: McapError,
     },
+}
+
+impl From<WriteError> for Failure {
+    fn from(error: WriteError) -> Self {
+        match error {
+            WriteError::Exists { .. } | WriteError::Unfinished { .. } => Self::usage(error),
+            _ => Self::failed(error),
+        }
+    }
 }
 
 /// When a message was, nanoseconds, and its number.
@@ -327,7 +338,26 @@ impl Recording {
         self.with(|writer| writer.write_metadata(&Metadata { name, metadata }))
     }
 
-    /// A whole file beside the messages.
+    /// A whole file beside the messages, of no time.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub(crate) fn attach_file(
+        &mut self,
+        name: &str,
+        media_type: &str,
+        data: Vec<u8>,
+    ) -> Result<(), WriteError> {
+        self.attach(&Attachment {
+            log_time: 0,
+            create_time: 0,
+            name: name.to_owned(),
+            media_type: media_type.to_owned(),
+            data: Cow::Owned(data),
+        })
+    }
+
+    /// The same as it was elsewhere.
     ///
     /// # Errors
     /// When the file cannot be written.

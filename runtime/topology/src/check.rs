@@ -49,8 +49,7 @@ pub(super) fn check(file: File<'_>, known: &KnownCases, needs: Needs, faults: &F
     }
     let processes = check_processes(&file.processes, &hosts, &roles, faults);
     let written = case_entry.and_then(|entry| entry.parameters);
-    let case_parts = (case.as_ref(), written);
-    check_faces(&file.processes, &processes, case_parts, faults);
+    check_faces(&file.processes, &processes, case.as_ref(), written, faults);
     if let (Some(entry), Some(known), false) = (case_entry, known_case, runs_nothing) {
         check_every_role_is_played(known, &processes, entry.place, faults);
     }

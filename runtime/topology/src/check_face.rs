@@ -152,7 +152,8 @@ pub(super) fn is_played_by_face(process: &Process) -> bool {
 pub(super) fn check_faces(
     entries: &[ProcessEntry],
     processes: &[Process],
-    case: (Option<&Case>, Option<&Table>),
+    case: Option<&Case>,
+    written: Option<&Table>,
     faults: &Faults,
 ) {
     let mut taken = Vec::new();
@@ -171,15 +172,20 @@ pub(super) fn check_faces(
             }
         }
         if face.kind == FaceKind::Robot {
-            check_sessions(table, case, faults);
+            check_sessions(table, case, written, faults);
         }
     }
 }
 
 /// The maker's protocol has no word for starting a session, so nobody could ask for the first one,
 /// nor for another after a session ended.
-fn check_sessions(entry: &FaceEntry, case: (Option<&Case>, Option<&Table>), faults: &Faults) {
-    let (Some(case), written) = case else { return };
+fn check_sessions(
+    entry: &FaceEntry,
+    case: Option<&Case>,
+    written: Option<&Table>,
+    faults: &Faults,
+) {
+    let Some(case) = case else { return };
     let value = |key| case.parameters.get("egm")?.get(key)?.as_str();
     let why = "but a foreign program cannot request a session (EGM has no word for it)";
     let refuse = |key: &str, value: &str, allowed: &str| {

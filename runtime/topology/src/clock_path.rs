@@ -121,7 +121,7 @@ impl Topology {
     }
 
     /// Two other hosts whose clock path has a name or a process in common with that of these.
-    fn namesake(&self, (from, to): (&Host, &Host)) -> Option<(&str, &str)> {
+    fn namesake(&self, from: &Host, to: &Host) -> Option<(&str, &str)> {
         let own = (name_of(&from.name, &to.name), ends_of(&from.name, &to.name));
         let pairs = self.clock_pairs().into_iter();
         let mut others = pairs
@@ -224,7 +224,7 @@ pub(super) fn check(topology: &Topology, entries: &[Option<ClockEntry>], faults:
         let (Some(end), Some(entry)) = (&host.clock, entry) else {
             continue;
         };
-        check_owner(topology, (index, host), (end, entry), faults);
+        check_owner(topology, index, end.address, entry, faults);
     }
     // Without a host or a channel that is meant, these would be noise.
     if !faults.is_empty() || topology.processes().is_empty() {
@@ -232,23 +232,23 @@ pub(super) fn check(topology: &Topology, entries: &[Option<ClockEntry>], faults:
     }
     for (host, entry) in topology.hosts().iter().zip(entries) {
         if let (Some(end), Some(entry)) = (&host.clock, entry) {
-            check_use(topology, host, (end, entry), faults);
-            check_ports(topology, host, (end, entry), faults);
+            check_use(topology, host, end, entry, faults);
+            check_ports(topology, host, end, entry, faults);
         }
     }
 }
 
-/// An address belongs to one host.
+/// An address belongs to one host, the one at `index`.
 fn check_owner(
     topology: &Topology,
-    (index, host): (usize, &Host),
-    (end, entry): (&ClockEnd, &ClockEntry),
+    index: usize,
+    address: IpAddr,
+    entry: &ClockEntry,
     faults: &Faults,
 ) {
     let key = join(&entry.path, "clock_address");
-    let address = end.address;
     for (place, other) in topology.hosts().iter().enumerate() {
-        if other.name == host.name {
+        if place == index {
             continue;
         }
         let is_clock = other
@@ -269,7 +269,8 @@ fn check_owner(
 fn check_use(
     topology: &Topology,
     host: &Host,
-    (end, entry): (&ClockEnd, &ClockEntry),
+    end: &ClockEnd,
+    entry: &ClockEntry,
     faults: &Faults,
 ) {
     let add = |fault: String| {
@@ -308,17 +309,12 @@ fn check_use(
                 end.address, other.name, its.address
             ));
         }
-        check_name(topology, (host, other), entry, faults);
+        check_name(topology, host, other, entry, faults);
     }
 }
 
 /// The path's name stands in the headers of its record files, among the names of channels.
-fn check_name(
-    topology: &Topology,
-    (host, other): (&Host, &Host),
-    entry: &ClockEntry,
-    faults: &Faults,
-) {
+fn check_name(topology: &Topology, host: &Host, other: &Host, entry: &ClockEntry, faults: &Faults) {
     if host.name > other.name {
         return;
     }
@@ -331,7 +327,7 @@ fn check_name(
         )
     } else if topology.channel(&name).is_some() {
         format!("makes a clock path called `{name}`, and a channel has that name")
-    } else if let Some((one, two)) = topology.namesake((host, other)) {
+    } else if let Some((one, two)) = topology.namesake(host, other) {
         // `a-b` with `c`, and `a` with `b-c`: their exchanges could not be told apart.
         format!("makes a clock path called `{name}`, as hosts `{one}` and `{two}` do: rename one")
     } else if let Some(process) = ends_of(&host.name, &other.name)
@@ -350,7 +346,8 @@ fn check_name(
 fn check_ports(
     topology: &Topology,
     host: &Host,
-    (end, entry): (&ClockEnd, &ClockEntry),
+    end: &ClockEnd,
+    entry: &ClockEntry,
     faults: &Faults,
 ) {
     let add = |fault: String| {

@@ -1,24 +1,25 @@
-//! What an emulated link's tables say about what it does to messages, in each direction; see
-//! `file_links`. It builds no model.
+//! What an emulated link's tables say about what it does to messages, in each direction, and the same
+//! written back; see `file_links`. It builds no model. The keys of a part are those that the part
+//! itself declares.
 
 use core::time::Duration;
 
-use hil_core::case_study::ParameterError;
-use hil_link::delay::{
-    DelayLaw, Exponential, Fixed, Histogram, LogNormal, Normal, Pareto, Uniform,
-};
-use hil_link::loss::{Bernoulli, Bursts, GilbertElliott, LossLaw};
+use hil_link::delay::DelayLaw;
+use hil_link::loss::LossLaw;
+use hil_link::options::{Options, Slot};
 use hil_link::outages::Outages;
 use hil_link::rate::RateLimit;
 use hil_link::reordering::{Duplication, Reordering};
 use hil_link::spec::LinkSpec;
+use hil_link::wifi::{WifiPreset, WifiSpec};
+use toml::{Table, Value};
 
 use super::errors::Fault;
 use super::file_trace::read_trace;
-use super::file_wifi::read_wifi;
 use super::limits::{self, Limit};
 use super::model_links::Emulation;
 use super::reader::Reader;
+use super::resolved::{duration, integer, put};
 
 /// Keys that only an emulated link has.
 pub(super) const EMULATION_KEYS: &[&str] = &[
@@ -35,56 +36,17 @@ pub(super) const EMULATION_KEYS: &[&str] = &[
     "wifi",
 ];
 
-#[derive(Debug, Clone, Copy)]
-enum DelayWord {
-    Fixed,
-    Uniform,
-    Normal,
-    LogNormal,
-    Exponential,
-    Pareto,
-    Histogram,
-}
-
-const DELAY_WORDS: &[(&str, DelayWord)] = &[
-    ("fixed", DelayWord::Fixed),
-    ("uniform", DelayWord::Uniform),
-    ("normal", DelayWord::Normal),
-    ("log-normal", DelayWord::LogNormal),
-    ("exponential", DelayWord::Exponential),
-    ("pareto", DelayWord::Pareto),
-    ("histogram", DelayWord::Histogram),
+const PRESETS: &[(&str, WifiPreset)] = &[
+    (WifiPreset::ShortRange.name(), WifiPreset::ShortRange),
+    (WifiPreset::LongRange.name(), WifiPreset::LongRange),
 ];
-
-#[derive(Debug, Clone, Copy)]
-enum LossWord {
-    Bernoulli,
-    GilbertElliott,
-    Bursts,
-}
-
-/// The names of the delay laws.
-pub(super) fn delay_laws() -> impl Iterator<Item = &'static str> {
-    DELAY_WORDS.iter().map(|(word, _)| *word)
-}
-
-const LOSS_WORDS: &[(&str, LossWord)] = &[
-    ("bernoulli", LossWord::Bernoulli),
-    ("gilbert-elliott", LossWord::GilbertElliott),
-    ("bursts", LossWord::Bursts),
-];
-
-/// The names of the loss laws.
-pub(super) fn loss_laws() -> impl Iterator<Item = &'static str> {
-    LOSS_WORDS.iter().map(|(word, _)| *word)
-}
 
 /// Reads what the link does: each direction does what is said for both, but for the parts it has a
 /// key or table of its own for.
 pub(super) fn read_emulation(reader: &mut Reader<'_>) -> Emulation {
     let none = LinkSpec {
         wifi: read_wifi(reader),
-        outages: read_outages(reader.table("outages"), NO_OUTAGES),
+        outages: read_part(reader.table("outages"), Outages::default()).unwrap_or_default(),
         ..LinkSpec::default()
     };
     let both = read_spec(reader, &none);
@@ -123,256 +85,168 @@ fn read_spec(reader: &mut Reader<'_>, default: &LinkSpec) -> LinkSpec {
         }
         spec.loss = read_loss(table).unwrap_or(spec.loss);
     }
-    if let Some(table) = reader.table("rate") {
-        spec.rate = read_rate(table).or(spec.rate);
-    }
-    if let Some(mut table) = reader.table("reordering") {
-        let ratio = required_number(&mut table, "ratio", &limits::LINK_LOSS_RATIO);
-        let hold = required_duration(&mut table, "hold", &limits::LINK_DELAY);
-        table.finish();
-        let read = ratio.zip(hold);
-        spec.reordering = read
-            .map(|(ratio, hold)| Reordering { ratio, hold })
-            .or(spec.reordering);
-    }
-    if let Some(mut table) = reader.table("duplication") {
-        let ratio = required_number(&mut table, "ratio", &limits::LINK_LOSS_RATIO);
-        let lag = table
-            .duration("lag", &limits::LINK_DELAY)
-            .unwrap_or_default();
-        table.finish();
-        let read = ratio.map(|ratio| Duplication { ratio, lag });
-        spec.duplication = read.or(spec.duplication);
-    }
+    spec.rate = read_part(reader.table("rate"), RateLimit::TEMPLATE).or(spec.rate);
+    let reordering = read_part(reader.table("reordering"), Reordering::TEMPLATE);
+    spec.reordering = reordering.or(spec.reordering);
+    let duplication = read_part(reader.table("duplication"), Duplication::TEMPLATE);
+    spec.duplication = duplication.or(spec.duplication);
     spec
 }
 
-/// Notes that `key` is missing, and what it would be.
-fn missing(reader: &Reader<'_>, key: &str, hint: &str) {
-    if !reader.has(key) {
-        reader.refuse(key, Fault::Missing(hint.to_owned()));
-    }
-}
-
-fn required_duration(
-    reader: &mut Reader<'_>,
-    key: &'static str,
-    limit: &Limit<Duration>,
-) -> Option<Duration> {
-    missing(reader, key, "a duration, e.g. \"20 ms\"");
-    reader.duration(key, limit)
-}
-
-fn required_number(reader: &mut Reader<'_>, key: &'static str, limit: &Limit<f64>) -> Option<f64> {
-    missing(reader, key, "a number");
-    reader.number(key, limit)
-}
-
-/// What each number says by itself is within limits by now; what is left is what they say together.
-fn refuse_inconsistent(reader: &Reader<'_>, checked: Result<(), ParameterError>) -> Option<()> {
-    let error = checked.err();
-    if let Some(ParameterError { key, problem }) = &error {
-        reader.refuse(key, Fault::Inconsistent(problem.clone()));
-    }
-    error.is_none().then_some(())
-}
-
 fn read_delay(mut reader: Reader<'_>) -> Option<(DelayLaw, bool)> {
-    missing(
-        &reader,
-        "law",
-        "one of \"fixed\", \"uniform\", \"normal\", \"log-normal\", \"exponential\", \"pareto\", \
-         \"histogram\"",
-    );
-    let word = reader.word("law", DELAY_WORDS);
-    let law = word.and_then(|word| read_delay_law(word, &mut reader));
-    let reorders = match word {
-        None | Some(DelayWord::Fixed) => None,
-        Some(_) => reader.boolean("reorders"),
-    };
-    let is_consistent = law
-        .as_ref()
-        .and_then(|law| refuse_inconsistent(&reader, law.check()));
     // The keys that belong here depend on the law: without it none is unknown.
-    if word.is_some() {
-        reader.finish();
-    }
-    is_consistent?;
-    Some((law?, reorders.unwrap_or(false)))
-}
-
-fn read_delay_law(word: DelayWord, reader: &mut Reader<'_>) -> Option<DelayLaw> {
-    use limits::{LINK_DELAY, LINK_DELAY_SCALE};
-    let min = |reader: &mut Reader<'_>| reader.duration("min", &LINK_DELAY).unwrap_or_default();
-    let max = |reader: &mut Reader<'_>| {
-        let read = reader.duration("max", &LINK_DELAY);
-        read.unwrap_or(LINK_DELAY.max)
-    };
-    Some(match word {
-        DelayWord::Fixed => DelayLaw::Fixed(Fixed {
-            delay: required_duration(reader, "delay", &LINK_DELAY)?,
-        }),
-        DelayWord::Uniform => {
-            let (min, max) = (
-                required_duration(reader, "min", &LINK_DELAY),
-                required_duration(reader, "max", &LINK_DELAY),
-            );
-            DelayLaw::Uniform(Uniform {
-                min: min?,
-                max: max?,
-            })
-        }
-        DelayWord::Normal => {
-            let mean = required_duration(reader, "mean", &LINK_DELAY);
-            let deviation = required_duration(reader, "deviation", &LINK_DELAY_SCALE);
-            let max = max(reader);
-            DelayLaw::Normal(Normal {
-                mean: mean?,
-                deviation: deviation?,
-                max,
-            })
-        }
-        DelayWord::LogNormal => {
-            let (min, max) = (min(reader), max(reader));
-            let median = required_duration(reader, "median", &LINK_DELAY_SCALE);
-            let sigma = required_number(reader, "sigma", &limits::LINK_DELAY_SIGMA);
-            DelayLaw::LogNormal(LogNormal {
-                min,
-                median: median?,
-                sigma: sigma?,
-                max,
-            })
-        }
-        DelayWord::Exponential => {
-            let (min, max) = (min(reader), max(reader));
-            let mean_excess = required_duration(reader, "mean_excess", &LINK_DELAY_SCALE);
-            DelayLaw::Exponential(Exponential {
-                min,
-                mean_excess: mean_excess?,
-                max,
-            })
-        }
-        DelayWord::Pareto => {
-            let (min, max) = (min(reader), max(reader));
-            let scale = required_duration(reader, "scale", &LINK_DELAY_SCALE);
-            let shape = required_number(reader, "shape", &limits::LINK_DELAY_SHAPE);
-            DelayLaw::Pareto(Pareto {
-                min,
-                scale: scale?,
-                shape: shape?,
-                max,
-            })
-        }
-        DelayWord::Histogram => DelayLaw::Histogram(read_histogram(reader)?),
-    })
-}
-
-fn read_histogram(reader: &mut Reader<'_>) -> Option<Histogram> {
-    missing(
-        reader,
-        "edges",
-        "an array of durations, one more than weights",
-    );
-    missing(reader, "weights", "an array of numbers, one per bin");
-    let edges = reader.durations("edges", &limits::LINK_DELAY);
-    let weights = reader.numbers("weights", &limits::LINK_DELAY_WEIGHT);
-    Some(Histogram {
-        edges: edges?,
-        weights: weights?,
-    })
+    let mut law = DelayLaw::named(read_law(&mut reader, DelayLaw::NAMES)?)?;
+    let is_usable = read_options(&mut reader, law.options());
+    let reorders = !law.is_fixed() && reader.boolean("reorders").unwrap_or(false);
+    reader.finish();
+    is_usable.then_some((law, reorders))
 }
 
 fn read_loss(mut reader: Reader<'_>) -> Option<LossLaw> {
-    missing(
-        &reader,
-        "law",
-        "one of \"bernoulli\", \"gilbert-elliott\", \"bursts\"",
-    );
-    let word = reader.word("law", LOSS_WORDS)?;
-    let law = read_loss_law(word, &mut reader);
+    let mut law = LossLaw::named(read_law(&mut reader, LossLaw::NAMES)?)?;
+    let is_usable = read_options(&mut reader, law.options());
     reader.finish();
-    law
+    is_usable.then_some(law)
 }
 
-fn read_loss_law(word: LossWord, reader: &mut Reader<'_>) -> Option<LossLaw> {
-    use limits::{LINK_LOSS_RATIO, LINK_STATE_MEAN, LINK_STEP};
-    let ratios = |reader: &mut Reader<'_>| {
-        let bad = reader.number("bad_loss_ratio", &limits::LINK_BAD_LOSS_RATIO);
-        let good = reader.number("good_loss_ratio", &LINK_LOSS_RATIO);
-        (
-            bad.unwrap_or(limits::LINK_BAD_LOSS_RATIO.default),
-            good.unwrap_or(LINK_LOSS_RATIO.default),
-        )
-    };
-    Some(match word {
-        LossWord::Bernoulli => LossLaw::Bernoulli(Bernoulli {
-            ratio: required_number(reader, "ratio", &LINK_LOSS_RATIO)?,
-        }),
-        LossWord::GilbertElliott => {
-            let to_bad = required_number(reader, "to_bad", &LINK_STEP);
-            let to_good = required_number(reader, "to_good", &LINK_STEP);
-            let (bad_loss_ratio, good_loss_ratio) = ratios(reader);
-            LossLaw::GilbertElliott(GilbertElliott {
-                to_bad: to_bad?,
-                to_good: to_good?,
-                bad_loss_ratio,
-                good_loss_ratio,
-            })
-        }
-        LossWord::Bursts => {
-            let good_mean = required_duration(reader, "good_mean", &LINK_STATE_MEAN);
-            let bad_mean = required_duration(reader, "bad_mean", &LINK_STATE_MEAN);
-            let (bad_loss_ratio, good_loss_ratio) = ratios(reader);
-            LossLaw::Bursts(Bursts {
-                good_mean: good_mean?,
-                bad_mean: bad_mean?,
-                bad_loss_ratio,
-                good_loss_ratio,
-            })
-        }
-    })
-}
-
-fn read_rate(mut reader: Reader<'_>) -> Option<RateLimit> {
-    missing(&reader, "bits_per_second", "an integer, e.g. 10_000_000");
-    let bits_per_second = reader.integer("bits_per_second", &limits::LINK_RATE_BITS_PER_SECOND);
-    let mut bytes = |key, limit: &Limit<i64>| {
-        let read: Option<u64> = reader.integer(key, limit);
-        read.unwrap_or_else(|| limit.default.unsigned_abs())
-    };
-    let queue_bytes = bytes("queue_bytes", &limits::LINK_QUEUE_BYTES);
-    let overhead_bytes = bytes("overhead_bytes", &limits::LINK_OVERHEAD_BYTES);
-    reader.finish();
-    Some(RateLimit {
-        bits_per_second: bits_per_second?,
-        queue_bytes,
-        overhead_bytes,
-    })
-}
-
-/// What a link without outages says of them.
-const NO_OUTAGES: Outages = Outages {
-    mean_s: limits::LINK_OUTAGE_MEAN.default.as_millis() as f64 * 1e-3,
-    per_hour: limits::LINK_OUTAGES_PER_HOUR.default,
-    buffered: false,
-};
-
-/// Outages as the table has them; what it leaves out is that of `none`.
-pub(super) fn read_outages(reader: Option<Reader<'_>>, none: Outages) -> Outages {
-    let (mean, per_hour) = (&limits::LINK_OUTAGE_MEAN, &limits::LINK_OUTAGES_PER_HOUR);
-    let Some(mut reader) = reader else {
-        return none;
-    };
-    let read_mean = reader.duration("mean", mean);
-    let outages = Outages {
-        mean_s: read_mean.map_or(none.mean_s, |mean| mean.as_secs_f64()),
-        per_hour: reader.number("per_hour", per_hour).unwrap_or(none.per_hour),
-        buffered: reader.boolean("buffered").unwrap_or(none.buffered),
-    };
-    // Each number is within its own limits by now; what is left is what they say together.
-    if let Err(error) = outages.check() {
-        reader.refuse("per_hour", Fault::Inconsistent(error.problem));
+/// The name of a law, one of `names`.
+fn read_law(reader: &mut Reader<'_>, names: &[&'static str]) -> Option<&'static str> {
+    if !reader.has("law") {
+        let quoted: Vec<_> = names.iter().map(|name| format!("\"{name}\"")).collect();
+        let hint = format!("one of {}", quoted.join(", "));
+        reader.refuse("law", Fault::Missing(hint));
     }
-    reader.finish();
-    outages
+    let words: Vec<_> = names.iter().map(|name| (*name, *name)).collect();
+    reader.word("law", &words)
+}
+
+/// The radio of a link, if it has one: a preset by name, or a table that starts from one and says
+/// what differs.
+fn read_wifi(reader: &mut Reader<'_>) -> Option<WifiSpec> {
+    if !reader.has("wifi") {
+        return None;
+    }
+    reader.refuse_present(
+        &["outages"],
+        "beside `wifi` says outages twice; the radio has its own, in [links.<name>.wifi.outages]",
+    );
+    reader.refuse_present(
+        &["trace"],
+        "beside `wifi` stands in its place, so no message would meet the radio; say one of them",
+    );
+    if !reader.is_table("wifi") {
+        return Some(reader.word("wifi", PRESETS)?.spec());
+    }
+    let mut table = reader.table("wifi")?;
+    let preset = table.word("preset", PRESETS);
+    let preset = preset.unwrap_or(WifiPreset::ShortRange);
+    read_part(Some(table), preset.spec())
+}
+
+/// The part that a table describes; what it leaves out is that of `default`. `None` without a table,
+/// and when something is missing or refused, which is noted.
+fn read_part<P: Options>(table: Option<Reader<'_>>, default: P) -> Option<P> {
+    let (mut table, mut part) = (table?, default);
+    let is_usable = read_options(&mut table, &mut part);
+    table.finish();
+    is_usable.then_some(part)
+}
+
+/// Reads every option of a part. True when all that are required are there and all fit together; what
+/// is wrong is noted.
+fn read_options(reader: &mut Reader<'_>, options: &mut dyn Options) -> bool {
+    fn set<T>(place: &mut T, read: Option<T>) -> bool {
+        let is_read = read.is_some();
+        if let Some(value) = read {
+            *place = value;
+        }
+        is_read
+    }
+    let mut is_usable = true;
+    for field in options.fields() {
+        let key = field.key;
+        if field.is_required && !reader.has(key) {
+            reader.refuse(key, Fault::Missing(field.hint.to_owned()));
+        }
+        let is_read = match field.slot {
+            Slot::Duration(time, range) => set(time, reader.duration(key, &Limit::of(&range))),
+            Slot::Seconds(time_s, range) => {
+                let time = reader.duration(key, &Limit::of(&range));
+                set(time_s, time.as_ref().map(Duration::as_secs_f64))
+            }
+            Slot::Number(number, range) => set(number, reader.number(key, &Limit::of(&range))),
+            Slot::Integer(count, range) => set(count, reader.integer(key, &Limit::whole(&range))),
+            Slot::Count(count, range) => set(count, reader.integer(key, &Limit::whole(&range))),
+            Slot::Boolean(value) => set(value, reader.boolean(key)),
+            Slot::Word(word) => {
+                let words: Vec<_> = word.words().iter().copied().zip(0..).collect();
+                let index = reader.word(key, &words);
+                index.map(|index| word.set(index)).is_some()
+            }
+            Slot::Durations(times, range) => set(times, reader.durations(key, &Limit::of(&range))),
+            Slot::Numbers(numbers, range) => set(numbers, reader.numbers(key, &Limit::of(&range))),
+            Slot::Table(part) => reader.table(key).is_some_and(|mut table| {
+                let is_usable = read_options(&mut table, part);
+                table.finish();
+                is_usable
+            }),
+        };
+        is_usable &= is_read || !field.is_required;
+    }
+    // Each option is within its range by now; what is left is what they say together.
+    if is_usable && let Err(error) = options.check_all() {
+        reader.refuse(&error.key, Fault::Inconsistent(error.problem));
+        return false;
+    }
+    is_usable
+}
+
+/// The table of one direction, without what both share. It leaves nothing out and repeats no default of
+/// the file's own.
+pub(super) fn resolved_spec(mut spec: LinkSpec) -> Table {
+    let mut table = Table::new();
+    match &mut spec.delay {
+        DelayLaw::Fixed(law) => put(&mut table, "delay", duration(law.delay)),
+        law => {
+            let mut delay = resolved_part(law.options());
+            put(&mut delay, "law", law.name());
+            put(&mut delay, "reorders", spec.reorders);
+            put(&mut table, "delay", delay);
+        }
+    }
+    match &mut spec.loss {
+        LossLaw::Bernoulli(law) => put(&mut table, "loss_ratio", law.ratio),
+        law => {
+            let mut loss = resolved_part(law.options());
+            put(&mut loss, "law", law.name());
+            put(&mut table, "loss", loss);
+        }
+    }
+    for (key, part) in spec.tables() {
+        put(&mut table, key, resolved_part(part));
+    }
+    table
+}
+
+/// Every option of a part.
+pub(super) fn resolved_part(part: &mut dyn Options) -> Table {
+    let mut table = Table::new();
+    for field in part.fields() {
+        let value = match field.slot {
+            Slot::Duration(time, _) => duration(*time),
+            Slot::Seconds(time_s, _) => duration(Duration::from_secs_f64(*time_s)),
+            Slot::Number(number, _) => Value::from(*number),
+            Slot::Integer(count, _) => integer(*count),
+            Slot::Count(count, _) => integer(*count),
+            Slot::Boolean(value) => Value::from(*value),
+            Slot::Word(word) => Value::from(word.word()),
+            Slot::Durations(times, _) => {
+                Value::Array(times.iter().copied().map(duration).collect())
+            }
+            Slot::Numbers(numbers, _) => Value::from(numbers.clone()),
+            Slot::Table(part) => Value::Table(resolved_part(part)),
+        };
+        put(&mut table, field.key, value);
+    }
+    table
 }

@@ -25,7 +25,6 @@ mod file;
 mod file_impairments;
 mod file_links;
 mod file_trace;
-mod file_wifi;
 mod host;
 mod known;
 mod layers;
@@ -37,7 +36,6 @@ mod parameter_reader;
 mod reader;
 pub mod registry;
 mod resolved;
-mod resolved_impairments;
 mod schema;
 mod security;
 mod suggest;
@@ -87,7 +85,7 @@ pub fn load(
     overrides: &[String],
     known: &KnownCases,
 ) -> Result<Topology, TopologyErrors> {
-    read_and_check(path, None, overrides, (known, Needs::Processes))
+    read_and_check(path, None, overrides, known, Needs::Processes)
 }
 
 /// Like [`load`], for whoever wants the case alone: the file need not say where its roles run.
@@ -99,7 +97,7 @@ pub fn load_case(
     overrides: &[String],
     known: &KnownCases,
 ) -> Result<Topology, TopologyErrors> {
-    read_and_check(path, None, overrides, (known, Needs::Case))
+    read_and_check(path, None, overrides, known, Needs::Case)
 }
 
 /// Like [`load_case`], without any file: the case called `name` as it is by default, with the
@@ -113,7 +111,7 @@ pub fn case_by_name(
     known: &KnownCases,
 ) -> Result<Topology, TopologyErrors> {
     let text = format!("version = 1\nname = \"{name}\"\ncase.name = \"{name}\"\n");
-    read_and_check(Path::new(name), Some(text), overrides, (known, Needs::Case))
+    read_and_check(Path::new(name), Some(text), overrides, known, Needs::Case)
 }
 
 /// Like [`load`], but from a text; `name` stands in error messages, and what the text extends is
@@ -147,14 +145,15 @@ pub fn parse(
     known: &KnownCases,
 ) -> Result<Topology, TopologyErrors> {
     let text = Some(text.to_owned());
-    read_and_check(Path::new(name), text, overrides, (known, Needs::Processes))
+    read_and_check(Path::new(name), text, overrides, known, Needs::Processes)
 }
 
 fn read_and_check(
     path: &Path,
     text: Option<String>,
     overrides: &[String],
-    (known, needs): (&KnownCases, Needs),
+    known: &KnownCases,
+    needs: Needs,
 ) -> Result<Topology, TopologyErrors> {
     let mut layers = Layers::default();
     let Some(mut table) = layers.read(path, text) else {

@@ -2,6 +2,7 @@
 //! other place.
 
 use core::fmt;
+use core::ops::RangeInclusive;
 use core::time::Duration;
 
 use super::units::format_duration;
@@ -66,34 +67,9 @@ pub(super) const LINK_SOCKET_PRIORITY: Limit<i64> = limit(0, 0, 263);
 pub(super) const LINK_BUFFER_BYTES: Limit<i64> = limit(212_992, 4_096, 67_108_864);
 /// Smallest: what every IPv4 host must accept (RFC 791).
 pub(super) const LINK_PATH_MTU_BYTES: Limit<i64> = limit(1_500, 576, 65_535);
+/// Of the shorthands of a link, as the laws they stand for have it.
 pub(super) const LINK_DELAY: Limit<Duration> = limit(ms(0), ms(0), ms(10_000));
-/// Mean, median or deviation of a random delay. Without default.
-pub(super) const LINK_DELAY_SCALE: Limit<Duration> =
-    limit(ms(1), Duration::from_nanos(1), ms(10_000));
-/// Deviation of the logarithm of a log-normal delay. Without default.
-pub(super) const LINK_DELAY_SIGMA: Limit<f64> = limit(1.0, 0.001, 3.0);
-/// Exponent of the tail of a Pareto delay. Without default.
-pub(super) const LINK_DELAY_SHAPE: Limit<f64> = limit(2.0, 1.05, 100.0);
-/// Of a bin of an empirical delay. Without default.
-pub(super) const LINK_DELAY_WEIGHT: Limit<f64> = limit(1.0, 0.0, 1e12);
 pub(super) const LINK_LOSS_RATIO: Limit<f64> = limit(0.0, 0.0, 1.0);
-/// Of the bad state of a link with bursts of loss.
-pub(super) const LINK_BAD_LOSS_RATIO: Limit<f64> = limit(1.0, 0.0, 1.0);
-/// Probability that such a link changes its state with a message. Without default.
-pub(super) const LINK_STEP: Limit<f64> = limit(0.5, 1e-9, 1.0);
-/// Mean time that such a link stays in a state. Without default.
-pub(super) const LINK_STATE_MEAN: Limit<Duration> =
-    limit(ms(100), Duration::from_micros(1), ms(3_600_000));
-/// Without default: a bottleneck says how narrow it is.
-pub(super) const LINK_RATE_BITS_PER_SECOND: Limit<i64> = limit(10_000_000, 1_000, 100_000_000_000);
-/// A hundred full Ethernet frames.
-pub(super) const LINK_QUEUE_BYTES: Limit<i64> = limit(150_000, 64, 67_108_864);
-/// IPv4 and UDP headers by default.
-pub(super) const LINK_OVERHEAD_BYTES: Limit<i64> = limit(28, 0, 1_000);
-/// Mean length of an outage.
-pub(super) const LINK_OUTAGE_MEAN: Limit<Duration> = limit(ms(500), ms(1), ms(3_600_000));
-/// None by default. Together with the mean length they may take up 95 % of the time.
-pub(super) const LINK_OUTAGES_PER_HOUR: Limit<f64> = limit(0.0, 0.0, 100_000.0);
 
 /// Joints of an arm on the wire of an EGM face.
 pub(super) const EGM_AXES: Limit<i64> = limit(7, 6, 7);
@@ -110,9 +86,23 @@ pub(super) const EXTENDS_DEPTH_MAX: usize = 16;
 pub(super) const FILE_BYTES_MAX: u64 = 1_048_576;
 
 impl<T: PartialOrd + Copy> Limit<T> {
+    /// Of an option that is required, or whose default its part knows.
+    pub(super) fn of(range: &RangeInclusive<T>) -> Self {
+        limit(*range.start(), *range.start(), *range.end())
+    }
+
     /// True when `value` is allowed; NaN never is.
     pub(super) fn allows(&self, value: &T) -> bool {
         (self.min..=self.max).contains(value)
+    }
+}
+
+impl Limit<i64> {
+    /// As [`Limit::of`], of integers of another type: a file's have 64 bits.
+    pub(super) fn whole<T: TryInto<i64> + Copy>(range: &RangeInclusive<T>) -> Self {
+        let [min, max] = [*range.start(), *range.end()].map(|end| end.try_into().ok());
+        let (min, max) = min.zip(max).expect("ranges are within 64 bits");
+        limit(min, min, max)
     }
 }
 
@@ -170,9 +160,6 @@ mod tests {
             LINK_SOCKET_PRIORITY,
             LINK_BUFFER_BYTES,
             LINK_PATH_MTU_BYTES,
-            LINK_RATE_BITS_PER_SECOND,
-            LINK_QUEUE_BYTES,
-            LINK_OVERHEAD_BYTES,
             EGM_AXES,
             EGM_ROBOTWARE,
         ] {
@@ -184,24 +171,11 @@ mod tests {
             RUN_PEER_TIMEOUT,
             TIMER_SLACK,
             LINK_DELAY,
-            LINK_DELAY_SCALE,
-            LINK_STATE_MEAN,
-            LINK_OUTAGE_MEAN,
         ] {
             assert!(limit.allows(&limit.default), "{limit:?}");
         }
-        for limit in [
-            LINK_LOSS_RATIO,
-            LINK_BAD_LOSS_RATIO,
-            LINK_STEP,
-            LINK_DELAY_SIGMA,
-            LINK_DELAY_SHAPE,
-            LINK_DELAY_WEIGHT,
-        ] {
-            assert!(limit.allows(&limit.default), "{limit:?}");
-        }
+        assert!(LINK_LOSS_RATIO.allows(&LINK_LOSS_RATIO.default));
         assert!(EGM_SEND_HZ.allows(&EGM_SEND_HZ.default));
-        assert!(LINK_OUTAGES_PER_HOUR.allows(&LINK_OUTAGES_PER_HOUR.default));
         assert!(!LINK_LOSS_RATIO.allows(&f64::NAN));
     }
 }

@@ -7,11 +7,10 @@ use hil_core::message::{FNV_OFFSET, fnv1a};
 use serde::Serialize;
 use toml::{Table, Value};
 
+use super::file_impairments::{resolved_part, resolved_spec};
 use super::file_trace::resolved_trace;
-use super::file_wifi::resolved_wifi;
 use super::model::{Channel, Execution, Host, OnExit, Process, Program, Scheduling, Topology};
 use super::model_links::{Gateway, Hop, Link, Via};
-use super::resolved_impairments::{resolved_outages, resolved_spec};
 use super::units::format_duration;
 
 impl Topology {
@@ -226,15 +225,18 @@ fn resolved_link(link: &Link) -> Table {
         Via::Udp(hop) | Via::Tcp(hop) => put_hop(&mut table, hop),
         Via::Emulated(hop, emulation) => {
             put_hop(&mut table, hop);
-            put(&mut table, "forward", resolved_spec(&emulation.forward));
-            put(&mut table, "backward", resolved_spec(&emulation.backward));
+            let (forward, backward) = (emulation.forward.clone(), emulation.backward.clone());
             // A radio has outages of its own, and the link then has none beside them.
-            if let Some(wifi) = &emulation.forward.wifi {
-                put(&mut table, "wifi", resolved_wifi(wifi));
-            } else {
-                let outages = resolved_outages(emulation.forward.outages);
-                put(&mut table, "outages", outages);
+            match forward.wifi {
+                Some(mut wifi) => put(&mut table, "wifi", resolved_part(&mut wifi)),
+                None => put(
+                    &mut table,
+                    "outages",
+                    resolved_part(&mut { forward.outages }),
+                ),
             }
+            put(&mut table, "forward", resolved_spec(forward));
+            put(&mut table, "backward", resolved_spec(backward));
             if let Some(trace) = &emulation.trace {
                 put(&mut table, "trace", resolved_trace(trace));
             }

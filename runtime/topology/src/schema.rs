@@ -9,11 +9,12 @@ use core::fmt::{Display, Write as _};
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 
+use hil_link::delay::DelayLaw;
+use hil_link::loss::LossLaw;
 use serde_json::{Map, Value, json};
 
 use super::errors::{Faults, Place, Source};
 use super::file;
-use super::file_impairments::{delay_laws, loss_laws};
 use super::limits::{Limit, NAME_LENGTH_MAX};
 use super::tree::{self, join};
 use super::units::{format_duration, unit_words};
@@ -237,8 +238,16 @@ fn asked() -> Asked {
 /// as a fault, and nobody looks at it.
 fn texts() -> Vec<String> {
     let mut impairments: Vec<String> = IMPAIRMENTS.map(str::to_owned).to_vec();
-    impairments.extend(delay_laws().map(|law| format!("delay = {{ law = \"{law}\" }}")));
-    impairments.extend(loss_laws().map(|law| format!("loss = {{ law = \"{law}\" }}")));
+    impairments.extend(
+        DelayLaw::NAMES
+            .iter()
+            .map(|law| format!("delay = {{ law = \"{law}\" }}")),
+    );
+    impairments.extend(
+        LossLaw::NAMES
+            .iter()
+            .map(|law| format!("loss = {{ law = \"{law}\" }}")),
+    );
     let directions = ["forward", "backward"];
     let mut texts = vec![TABLES.to_owned()];
     texts.extend(OF_WHOLE_LINK.map(of_link));

@@ -6,8 +6,7 @@ use std::path::{Path, PathBuf};
 use toml::Table;
 
 use super::errors::Fault;
-use super::model::Topology;
-use super::model::words;
+use super::model::{Topology, words};
 use super::reader::Reader;
 use super::resolved::put;
 

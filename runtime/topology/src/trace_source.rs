@@ -11,9 +11,8 @@ use std::time::Duration;
 use hil_core::link_model::TraceMatch;
 use hil_link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};
 use hil_trace::fault::TraceFault;
-use hil_trace::wire;
 use hil_trace::wire::Decoded;
-use hil_trace::{Trace, csv};
+use hil_trace::{Trace, csv, wire};
 use serde::{Deserialize, Serialize};
 
 use crate::Topology;

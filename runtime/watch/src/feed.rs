@@ -69,6 +69,14 @@ pub struct WatchedChannel {
     pub source: Option<Source>,
 }
 
+impl WatchedChannel {
+    /// True where a program of the user's writes it: it keeps no records of what it publishes.
+    pub const fn is_unrecorded(&self) -> bool {
+        let source = &self.source;
+        matches!(source, Some(Source::SharedMemory { is_forwarded, .. }) if !*is_forwarded)
+    }
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
     Running,

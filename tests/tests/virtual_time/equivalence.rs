@@ -10,10 +10,9 @@ use std::time::Duration;
 use hil_core::case_study::{CaseStudy, ChannelSpec};
 use hil_core::link_model::{Fate, LinkModel, PerfectLink};
 use hil_core::message::Envelope;
-use hil_core::random::RandomStream;
 use hil_core::simulation::{Carrier, Simulation, SimulationResult};
 use hil_core::time::{Instant, duration_ns};
-use hil_link::bernoulli::BernoulliLink;
+use hil_link::spec::{LinkPlace, LinkSpec};
 use hil_protocol::wire::Kind;
 use hil_protocol::{
     ArrivalStamps, ChannelIdentity, Delivery, EgressBridge, EgressSettings, IngressBridge,
@@ -166,8 +165,9 @@ fn perfect(_seed: u64, _channel: &str) -> Box<dyn LinkModel> {
 
 /// Every tenth message is lost, the others take 20 ms: the seed paper's static network.
 fn lossy(seed: u64, channel: &str) -> Box<dyn LinkModel> {
-    let stream = RandomStream::new(seed, channel);
-    Box::new(BernoulliLink::new(Duration::from_millis(20), 0.1, stream).unwrap())
+    LinkSpec::fixed(Duration::from_millis(20), 0.1)
+        .build(&LinkPlace::alone(seed, channel))
+        .unwrap()
 }
 
 /// As [`Carrier`] of a [`LinkModel`], for one whose type is no longer known.

@@ -9,18 +9,12 @@ const WORDS: usize = 32;
 const _: () = assert!(WORDS * 64 == WINDOW_LENGTH as usize);
 
 /// The window of one key.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct ReplayWindow {
     /// One past the newest number taken.
     end: u32,
     /// Bit `number % 2048`: taken.
     taken: [u64; WORDS],
-}
-
-impl Default for ReplayWindow {
-    fn default() -> Self {
-        Self::new()
-    }
 }
 
 impl ReplayWindow {

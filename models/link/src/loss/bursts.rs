@@ -7,89 +7,84 @@
 //! `exp(-t (1 / good_mean + 1 / bad_mean))`. What is lost of a message that comes alone is as in the
 //! per-message law: the long-run ratio. It models no retransmission and no delay.
 
+use core::ops::RangeInclusive;
 use core::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
-use super::check_loss_ratios;
-use hil_core::case_study::ParameterError;
+use super::{Law, Losses};
+use crate::options::options;
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
-/// A link that is good and bad in turn.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Bursts {
-    /// Mean time in the good state, exponential, 1 us..=1 h.
-    pub good_mean: Duration,
-    /// Mean time in the bad state, exponential, 1 us..=1 h.
-    pub bad_mean: Duration,
-    /// Probability of a loss in the bad state, 0..=1.
-    #[serde(default = "one")]
-    pub bad_loss_ratio: f64,
-    /// Probability of a loss in the good state, 0..=1.
-    #[serde(default)]
-    pub good_loss_ratio: f64,
+options! {
+    /// A link that is good and bad in turn.
+    #[derive(Copy)]
+    pub struct Bursts {
+        /// Mean time in the good state, exponential.
+        good_mean: Duration, in STAYS;
+        /// Mean time in the bad state, exponential.
+        bad_mean: Duration, in STAYS;
+        /// Probability of a loss in the bad state.
+        bad_loss_ratio: f64 = 1.0, in 0.0..=1.0;
+        /// Probability of a loss in the good state.
+        good_loss_ratio: f64 = 0.0, in 0.0..=1.0;
+    }
 }
 
-const fn one() -> f64 {
-    1.0
-}
-
-const SHORTEST: Duration = Duration::from_micros(1);
-const LONGEST: Duration = Duration::from_hours(1);
+/// Range of the mean time in a state.
+const STAYS: RangeInclusive<Duration> = Duration::from_micros(1)..=Duration::from_hours(1);
 
 impl Bursts {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// The first key outside its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        for (key, mean) in [("good_mean", self.good_mean), ("bad_mean", self.bad_mean)] {
-            if !(SHORTEST..=LONGEST).contains(&mean) {
-                let problem = format!("{mean:?} is outside {SHORTEST:?} to {LONGEST:?}");
-                return Err(ParameterError::new(key, problem));
-            }
-        }
-        check_loss_ratios(self.bad_loss_ratio, self.good_loss_ratio)
-    }
-
     /// Share of the time in the bad state in the long run.
     pub fn bad_ratio(&self) -> f64 {
         let (good_s, bad_s) = (self.good_mean.as_secs_f64(), self.bad_mean.as_secs_f64());
         bad_s / (good_s + bad_s)
     }
+}
 
-    /// Share of the messages lost in the long run.
-    pub fn loss_ratio(&self) -> f64 {
+impl Law for Bursts {
+    fn loss_ratio(&self) -> f64 {
         let bad = self.bad_ratio();
         bad * self.bad_loss_ratio + (1.0 - bad) * self.good_loss_ratio
     }
+
+    fn text(&self) -> String {
+        format!(
+            "loss in bursts, {} ms good and {} ms bad on average, lost {} in bad and {} in good \
+             (loss ratio {:.6}), on all channels of the link at the same times",
+            self.good_mean.as_secs_f64() * 1e3,
+            self.bad_mean.as_secs_f64() * 1e3,
+            self.bad_loss_ratio,
+            self.good_loss_ratio,
+            self.loss_ratio()
+        )
+    }
+
+    /// The states from time zero on, as `shared` has them.
+    fn start(&self, own: RandomStream, mut shared: RandomStream) -> Box<dyn Losses> {
+        let is_bad = shared.chance(self.bad_ratio());
+        let mut states = States {
+            law: *self,
+            shared,
+            own,
+            is_bad,
+            until: Instant::ZERO,
+        };
+        states.until = Instant::ZERO + states.stay();
+        Box::new(states)
+    }
 }
 
-/// The states of a link, from time zero on.
-#[derive(Debug, Clone)]
-pub(super) struct States {
+/// The states of a link; equal laws and streams have equal states.
+#[derive(Debug)]
+struct States {
     law: Bursts,
-    random: RandomStream,
+    shared: RandomStream,
+    own: RandomStream,
     is_bad: bool,
     until: Instant,
 }
 
 impl States {
-    /// The states as `random` has them; equal laws and streams have equal states.
-    pub(super) fn new(law: Bursts, mut random: RandomStream) -> Self {
-        let is_bad = random.chance(law.bad_ratio());
-        let mut states = Self {
-            law,
-            random,
-            is_bad,
-            until: Instant::ZERO,
-        };
-        states.until = Instant::ZERO + states.stay();
-        states
-    }
-
     /// Exponential, of the state's mean; what is left of a state at time zero has the same law.
     fn stay(&mut self) -> Duration {
         let mean = if self.is_bad {
@@ -97,20 +92,21 @@ impl States {
         } else {
             self.law.good_mean
         };
-        Duration::from_secs_f64(-mean.as_secs_f64() * (1.0 - self.random.uniform()).ln())
+        Duration::from_secs_f64(-mean.as_secs_f64() * (1.0 - self.shared.uniform()).ln())
     }
+}
 
-    /// Probability of a loss at `now`. Calls come in non-decreasing `now`.
-    pub(super) fn loss_ratio_at(&mut self, now: Instant) -> f64 {
+impl Losses for States {
+    fn is_lost(&mut self, now: Instant) -> bool {
         while now >= self.until && self.until < END_OF_TIME {
             self.is_bad = !self.is_bad;
             self.until = self.until + self.stay();
         }
-        if self.is_bad {
+        self.own.chance(if self.is_bad {
             self.law.bad_loss_ratio
         } else {
             self.law.good_loss_ratio
-        }
+        })
     }
 }
 

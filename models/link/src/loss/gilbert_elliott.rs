@@ -8,82 +8,80 @@
 //! [`bursts`](super::bursts) is the other way round. Unlike netem, the first state is drawn from
 //! the long-run shares, so that the promised ratio holds from the first message on.
 
-use serde::{Deserialize, Serialize};
-
-use super::check_loss_ratios;
-use hil_core::case_study::ParameterError;
+use super::{Law, Losses};
+use crate::options::options;
 use hil_core::random::RandomStream;
+use hil_core::time::Instant;
 
-/// A chain that takes one step per message.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GilbertElliott {
-    /// Probability of a step from good to bad, 1e-9..=1.
-    pub to_bad: f64,
-    /// Probability of a step from bad to good, 1e-9..=1; the bad state lasts 1 / `to_good`
-    /// messages on average.
-    pub to_good: f64,
-    /// Probability of a loss in the bad state, 0..=1.
-    #[serde(default = "one")]
-    pub bad_loss_ratio: f64,
-    /// Probability of a loss in the good state, 0..=1.
-    #[serde(default)]
-    pub good_loss_ratio: f64,
-}
-
-const fn one() -> f64 {
-    1.0
+options! {
+    /// A chain that takes one step per message.
+    #[derive(Copy)]
+    pub struct GilbertElliott {
+        /// Probability of a step from good to bad.
+        to_bad: f64, in 1e-9..=1.0;
+        /// Probability of a step from bad to good; the bad state lasts 1 / `to_good` messages on
+        /// average.
+        to_good: f64, in 1e-9..=1.0;
+        /// Probability of a loss in the bad state.
+        bad_loss_ratio: f64 = 1.0, in 0.0..=1.0;
+        /// Probability of a loss in the good state.
+        good_loss_ratio: f64 = 0.0, in 0.0..=1.0;
+    }
 }
 
 impl GilbertElliott {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// The first key outside its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        for (key, step) in [("to_bad", self.to_bad), ("to_good", self.to_good)] {
-            ParameterError::check(key, step, 1e-9..=1.0, "1e-9 to 1")?;
-        }
-        check_loss_ratios(self.bad_loss_ratio, self.good_loss_ratio)
-    }
-
     /// Share of the messages that meet the bad state in the long run.
     pub fn bad_ratio(&self) -> f64 {
         self.to_bad / (self.to_bad + self.to_good)
     }
+}
 
-    /// Share of the messages lost in the long run.
-    pub fn loss_ratio(&self) -> f64 {
+impl Law for GilbertElliott {
+    fn loss_ratio(&self) -> f64 {
         let bad = self.bad_ratio();
         bad * self.bad_loss_ratio + (1.0 - bad) * self.good_loss_ratio
+    }
+
+    fn text(&self) -> String {
+        format!(
+            "Gilbert-Elliott loss, per message good to bad {} and back {}, lost {} in bad and {} in \
+             good (loss ratio {:.6})",
+            self.to_bad,
+            self.to_good,
+            self.bad_loss_ratio,
+            self.good_loss_ratio,
+            self.loss_ratio()
+        )
+    }
+
+    fn start(&self, mut own: RandomStream, _shared: RandomStream) -> Box<dyn Losses> {
+        Box::new(Chain {
+            law: *self,
+            is_bad: own.chance(self.bad_ratio()),
+            random: own,
+        })
     }
 }
 
 /// The chain at work.
-#[derive(Debug, Clone)]
-pub(super) struct Chain {
+#[derive(Debug)]
+struct Chain {
     law: GilbertElliott,
     is_bad: bool,
+    random: RandomStream,
 }
 
-impl Chain {
-    pub(super) fn new(law: GilbertElliott, random: &mut RandomStream) -> Self {
-        Self {
-            law,
-            is_bad: random.chance(law.bad_ratio()),
-        }
-    }
-
-    /// Decides the fate of the next message; always takes two numbers of the stream.
-    pub(super) fn is_lost(&mut self, random: &mut RandomStream) -> bool {
+impl Losses for Chain {
+    /// Always takes two numbers of the stream.
+    fn is_lost(&mut self, _now: Instant) -> bool {
         let law = &self.law;
         let (loss_ratio, step) = if self.is_bad {
             (law.bad_loss_ratio, law.to_good)
         } else {
             (law.good_loss_ratio, law.to_bad)
         };
-        let is_lost = random.chance(loss_ratio);
-        self.is_bad ^= random.chance(step);
+        let is_lost = self.random.chance(loss_ratio);
+        self.is_bad ^= self.random.chance(step);
         is_lost
     }
 }

@@ -7,9 +7,9 @@ use super::*;
 const COUNT: usize = 2_000_000;
 const ERRORS_MAX: f64 = 5.0;
 
-fn process(law: LossLaw, seed: u64, channel: &str) -> LossProcess {
+fn process(law: LossLaw, seed: u64, channel: &str) -> Box<dyn Losses> {
     let shared = RandomStream::new(seed, "bursts of the link");
-    LossProcess::new(law, RandomStream::new(seed, channel), shared).unwrap()
+    law.start(RandomStream::new(seed, channel), shared).unwrap()
 }
 
 /// The fates of messages one period apart.
@@ -205,7 +205,7 @@ fn numbers_outside_their_range_are_refused_by_name() {
         })
     };
     for (law, key) in [
-        (LossLaw::bernoulli(1.1), "loss_ratio"),
+        (LossLaw::bernoulli(1.1), "ratio"),
         (chain(0.0, 0.5, 1.0, 0.0), "to_bad"),
         (chain(0.5, f64::NAN, 1.0, 0.0), "to_good"),
         (chain(0.5, 0.5, 1.5, 0.0), "bad_loss_ratio"),
@@ -215,5 +215,26 @@ fn numbers_outside_their_range_are_refused_by_name() {
         (bursts(10, 10, 2.0), "bad_loss_ratio"),
     ] {
         assert_eq!(law.check().unwrap_err().key, key, "{law:?}");
+    }
+}
+
+#[test]
+fn each_law_stands_in_the_table_of_the_documentation_with_all_its_keys() {
+    let page = include_str!("../../../../docs/link-models.md");
+    for name in LossLaw::NAMES {
+        let mut law = LossLaw::named(name).unwrap();
+        assert_eq!(law.name(), *name);
+        let row = page
+            .lines()
+            .find(|line| line.starts_with(&format!("| `{name}` |")));
+        let row = row.unwrap_or_else(|| panic!("{name} has no row"));
+        for field in law.options().fields() {
+            let key = field.key;
+            assert!(row.contains(&format!("`{key}`")), "{name}: {key} in {row}");
+            assert!(
+                field.is_required || field.check().is_ok(),
+                "{name}: default of {key}"
+            );
+        }
     }
 }

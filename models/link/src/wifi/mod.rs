@@ -23,7 +23,7 @@ mod tests;
 use core::time::Duration;
 
 pub use preset::WifiPreset;
-pub use spec::{AccessCategory, PowerSave, WIFI_FIELDS, WifiField, WifiSpec};
+pub use spec::{AccessCategory, PowerSave, WifiSpec};
 
 use crate::outages::OutageLink;
 use crate::spec::Way;

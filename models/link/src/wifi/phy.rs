@@ -111,12 +111,6 @@ impl Phy {
     pub(crate) fn response_ns(&self, mcs: usize) -> i64 {
         self.response_ns[mcs]
     }
-
-    /// Data rate, Mbit/s.
-    #[cfg(test)]
-    pub(crate) fn rate_mbps(&self, mcs: usize) -> f64 {
-        self.data_bits[mcs] as f64 * 1e3 / self.symbol_ns as f64
-    }
 }
 
 /// `N_SD` of a full-width resource unit (27.5).
@@ -151,6 +145,11 @@ pub(crate) fn nanoseconds(ns: f64) -> i64 {
 mod tests {
     use super::*;
 
+    /// Data rate, Mbit/s.
+    fn rate_mbps(phy: &Phy, mcs: usize) -> f64 {
+        phy.data_bits[mcs] as f64 * 1e3 / phy.symbol_ns as f64
+    }
+
     fn phy(channel_width_mhz: u32, stream_count: u32, guard_interval_us: f64) -> Phy {
         Phy::new(&WifiSpec {
             channel_width_mhz,
@@ -175,12 +174,12 @@ mod tests {
             (160, 11, 1201.0),
         ];
         for (width, mcs, rate) in printed {
-            let found = phy(width, 1, 0.8).rate_mbps(mcs);
+            let found = rate_mbps(&phy(width, 1, 0.8), mcs);
             assert!((found - rate).abs() < 0.11, "{width} MHz, {mcs}: {found}");
-            let two = phy(width, 2, 0.8).rate_mbps(mcs);
+            let two = rate_mbps(&phy(width, 2, 0.8), mcs);
             assert!((two / found - 2.0).abs() < 1e-3, "{two}");
         }
-        assert!((phy(80, 1, 3.2).rate_mbps(11) - 510.4).abs() < 0.11);
+        assert!((rate_mbps(&phy(80, 1, 3.2), 11) - 510.4).abs() < 0.11);
     }
 
     #[test]

@@ -15,9 +15,8 @@ use hil_core::link_model::{Fate, LinkModel, PerfectLink};
 use hil_core::random::RandomStream;
 use hil_core::study::Watch;
 use hil_core::time::{Instant, duration_ns};
-use hil_link::bernoulli::BernoulliLink;
 use hil_link::outages::{OutageLink, Outages};
-use hil_link::spec::Way;
+use hil_link::spec::{LinkPlace, LinkSpec, Way};
 use hil_link::wifi::{WifiLink, WifiPreset};
 use hil_stats::series::Sample;
 
@@ -237,9 +236,9 @@ fn link(channel: Channel, seed: u64, way: Way) -> Box<dyn LinkModel> {
     match channel {
         Channel::Perfect => Box::new(PerfectLink),
         Channel::Loss(ratio) => {
-            let stream = RandomStream::new(seed, direction);
-            let link = BernoulliLink::new(core::time::Duration::ZERO, ratio, stream);
-            Box::new(link.expect("conditions name ratios"))
+            let link = LinkSpec::fixed(core::time::Duration::ZERO, ratio);
+            link.build(&LinkPlace::alone(seed, direction))
+                .expect("conditions name ratios")
         }
         Channel::Outages(outages) => {
             let stream = RandomStream::new(seed, OUTAGE_STREAM);

@@ -110,7 +110,8 @@ fn chain_fit(
     method: &str,
     losses: &[bool],
     chain: Chain,
-    numbers: (u32, usize),
+    parameter_count: usize,
+    fitted_to_bursts_count: usize,
 ) -> Result<Fit, String> {
     if chain.to_bad <= 0.0 || chain.to_good <= 0.0 {
         return Err(format!(
@@ -127,8 +128,13 @@ fn chain_fit(
         ..LinkSpec::default()
     };
     spec.check().map_err(|why| format!("{law}: {why}"))?;
-    let mut fit = Fit::new(law, method, numbers.0, Some(chain.log_likelihood(losses)));
-    fit.bursts = burst_test(losses, &chain, numbers.1);
+    let mut fit = Fit::new(
+        law,
+        method,
+        parameter_count,
+        Some(chain.log_likelihood(losses)),
+    );
+    fit.bursts = burst_test(losses, &chain, fitted_to_bursts_count);
     let [good, bad] = chain.loss;
     fit.parameters = format!(
         "to bad {:.6}, to good {:.6}, lost in good {good:.6}, in bad {bad:.6}",
@@ -144,7 +150,7 @@ fn chain_fit(
 
 fn gilbert_fit(losses: &[bool], chain: Chain) -> Result<Fit, String> {
     let method = "shares of the steps between loss and delivery (largest likelihood)";
-    chain_fit("gilbert", method, losses, chain, (2, 1))
+    chain_fit("gilbert", method, losses, chain, 2, 1)
 }
 
 /// Stretches of `losses` one after another; all of them when they are few. The joints are steps that
@@ -191,7 +197,7 @@ fn elliott_fit(all: &[bool], gilbert: Chain) -> Result<Fit, String> {
     let best = found.reduce(|a, b| if b.1 > a.1 { b } else { a });
     let chain = best.map_or(gilbert, |(chain, _)| chain.good_first());
     let method = "expectation and maximisation (Baum and Welch), best of 4 beginnings";
-    chain_fit("gilbert-elliott", method, all, chain, (4, 2))
+    chain_fit("gilbert-elliott", method, all, chain, 4, 2)
 }
 
 /// A link that fails and recovers in continuous time, asked at the times of publication: the

@@ -30,7 +30,7 @@ pub struct Fit {
     /// Its parameters, in words.
     pub parameters: String,
     /// Numbers it has.
-    pub parameter_count: u32,
+    pub parameter_count: usize,
     /// Natural logarithm of the likelihood of the trace; `None` for a law without a density.
     pub log_likelihood: Option<f64>,
     /// Akaike's criterion, 2 k - 2 ln L: smaller is better.
@@ -49,14 +49,14 @@ pub struct Fit {
 }
 
 impl Fit {
-    fn new(law: &str, method: &str, parameter_count: u32, log_likelihood: Option<f64>) -> Self {
+    fn new(law: &str, method: &str, parameter_count: usize, log_likelihood: Option<f64>) -> Self {
         Self {
             law: law.to_owned(),
             method: method.to_owned(),
             parameters: String::new(),
             parameter_count,
             log_likelihood,
-            aic: log_likelihood.map(|ln| 2.0 * f64::from(parameter_count) - 2.0 * ln),
+            aic: log_likelihood.map(|ln| 2.0 * parameter_count as f64 - 2.0 * ln),
             bursts: None,
             ks_distance: None,
             ks_probability: None,

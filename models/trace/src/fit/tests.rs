@@ -1,13 +1,19 @@
 //! Fits of traces whose laws are known: the law is found again, its parameters come out, and a
 //! wrong law is refused.
 
+use core::time::Duration;
+
 use super::chain::Chain;
-use super::delay::Law;
 use super::*;
 use crate::{TraceFate, TraceHeader, TraceRecord};
 use hil_core::random::RandomStream;
+use hil_link::delay::{DelayLaw, Exponential, LogNormal, Normal, Pareto, Uniform};
 
 const PERIOD_NS: i64 = 10_000_000;
+
+const fn ms(count: u64) -> Duration {
+    Duration::from_millis(count)
+}
 
 #[allow(clippy::cast_possible_truncation, reason = "delays below a minute")]
 fn trace(losses: &[bool], mut draw: impl FnMut() -> f64) -> Trace {
@@ -105,39 +111,31 @@ fn expectation_and_maximisation_finds_all_four_numbers() {
 #[test]
 fn each_delay_law_is_found_again() {
     let laws = [
-        (
-            "normal",
-            Law::Normal {
-                mean: 0.02,
-                deviation: 0.002,
-            },
-        ),
-        (
-            "exponential",
-            Law::Exponential {
-                min: 0.004,
-                mean_excess: 0.003,
-            },
-        ),
-        (
-            "log-normal",
-            Law::LogNormal {
-                min: 0.001,
-                mu: -5.5,
-                sigma: 0.5,
-            },
-        ),
-        (
-            "uniform",
-            Law::Uniform {
-                min: 0.001,
-                max: 0.009,
-            },
-        ),
+        DelayLaw::Normal(Normal {
+            mean: ms(20),
+            deviation: ms(2),
+            ..Normal::TEMPLATE
+        }),
+        DelayLaw::Exponential(Exponential {
+            min: ms(4),
+            mean_excess: ms(3),
+            ..Exponential::TEMPLATE
+        }),
+        DelayLaw::LogNormal(LogNormal {
+            min: ms(1),
+            median: Duration::from_secs_f64((-5.5_f64).exp()),
+            sigma: 0.5,
+            ..LogNormal::TEMPLATE
+        }),
+        DelayLaw::Uniform(Uniform {
+            min: ms(1),
+            max: ms(9),
+        }),
     ];
-    for (name, law) in laws {
+    for law in laws {
+        let (name, density) = (law.name(), law.density());
         let mut random = RandomStream::new(11, name);
-        let trace = trace(&[false; 1_500], || law.draw(&mut random));
+        let trace = trace(&[false; 1_500], || density.draw(&mut random));
         let fit = TraceFit::of(&trace, 5);
         let own = find(&fit.delay, name);
         assert!(
@@ -148,11 +146,13 @@ fn each_delay_law_is_found_again() {
         let least = fit.delay.fits[0].aic.unwrap();
         assert!(own.aic.unwrap() < least + 10.0, "{name}: {:#?}", fit.delay);
     }
-    let pareto = Law::Pareto {
-        min: 0.002,
-        scale: 0.004,
+    let pareto = DelayLaw::Pareto(Pareto {
+        min: ms(2),
+        scale: ms(4),
         shape: 3.0,
-    };
+        ..Pareto::TEMPLATE
+    });
+    let pareto = pareto.density();
     let mut random = RandomStream::new(12, "pareto");
     let heavy = TraceFit::of(&trace(&[false; 3_000], || pareto.draw(&mut random)), 5);
     assert_eq!(heavy.delay.fits[0].law, "pareto", "{:#?}", heavy.delay);

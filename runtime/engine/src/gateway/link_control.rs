@@ -10,7 +10,6 @@ use std::time::Duration;
 use hil_link::condition::{
     LinkCondition, LinkConditionRecord, LinkOrder, OrderOutcome, order_channel,
 };
-use hil_link::switched::Replacement;
 
 use super::GatewayError;
 use super::link_switch::SwitchHandle;
@@ -179,7 +178,10 @@ impl ControlLine {
         }
     }
 
-    fn prepare(&mut self, order: &LinkOrder) -> Result<Vec<Replacement>, OrderOutcome> {
+    fn prepare(
+        &mut self,
+        order: &LinkOrder,
+    ) -> Result<Vec<super::link_switch::Replacement>, OrderOutcome> {
         let condition = order.condition().ok_or(OrderOutcome::Malformed)?;
         if !self.switches.iter().all(|one| one.can_hold(condition)) {
             return Err(OrderOutcome::NoRoom);

@@ -6,13 +6,36 @@ use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_core::time::Instant;
 use hil_link::condition::LinkCondition;
 use hil_link::spec::LinkPlace;
-use hil_link::switched::{Replacement, SwitchedLink};
 
 use hil_topology::emulation::{EmulationError, EmulationLaunch};
 use hil_topology::emulation_room::EmulationRoom;
 
 /// Changes that may wait at a time for the thread to see them.
 const CHANGES_MAX: usize = 16;
+
+/// The link in the place of the topology's; `None` for the topology's own. That was offered nothing
+/// meanwhile, so its random draws are where they were; outages, which are a matter of time, went on.
+pub(super) type Replacement = Option<Box<dyn LinkModel>>;
+
+/// A link on which everything is lost.
+#[derive(Debug, Default)]
+struct CutLink {
+    lost_count: u64,
+}
+
+impl LinkModel for CutLink {
+    fn offer(&mut self, _now: Instant, _length_bytes: usize) -> Fate {
+        self.lost_count += 1;
+        Fate::Lost
+    }
+
+    fn loss_causes(&self) -> Option<LossCauses> {
+        Some(LossCauses {
+            outage_count: self.lost_count,
+            ..LossCauses::default()
+        })
+    }
+}
 
 /// A change and the instant from which it holds.
 #[derive(Debug)]
@@ -21,10 +44,14 @@ struct Change {
     replacement: Replacement,
 }
 
-/// A link that changes when it is told to. Looking for a change costs one atomic read.
+/// A link that changes when it is told to: what was offered before keeps its fate. Looking for a change
+/// costs one atomic read.
 #[derive(Debug)]
 pub(super) struct LinkSwitch<L> {
-    link: SwitchedLink<L>,
+    own: L,
+    replacement: Replacement,
+    /// Losses of former replacements.
+    lost: LossCauses,
     changes: rtrb::Consumer<Change>,
     former: rtrb::Producer<Replacement>,
 }
@@ -56,7 +83,9 @@ pub(super) fn switch<L: LinkModel>(
         former: from_thread,
     };
     let link = LinkSwitch {
-        link: SwitchedLink::new(link),
+        own: link,
+        replacement: None,
+        lost: LossCauses::default(),
         changes,
         former,
     };
@@ -64,22 +93,26 @@ pub(super) fn switch<L: LinkModel>(
 }
 
 impl<L: LinkModel> LinkSwitch<L> {
-    /// Puts into force what is due at `now`.
-    fn turn(&mut self, now: Instant) {
-        while self.changes.peek().is_ok_and(|change| change.from <= now) {
-            let Ok(change) = self.changes.pop() else {
-                return;
-            };
-            let former = self.link.switch(change.replacement);
-            let _no_place = self.former.push(former);
-        }
+    /// Puts `replacement` in force, and gives back what was, so that it can be dropped where there is
+    /// time.
+    fn put(&mut self, replacement: Replacement) -> Replacement {
+        self.lost = self.lost.plus(self.replacement_lost());
+        core::mem::replace(&mut self.replacement, replacement)
+    }
+
+    fn replacement_lost(&self) -> LossCauses {
+        let causes = self.replacement.as_ref().and_then(LinkModel::loss_causes);
+        causes.unwrap_or_default()
     }
 }
 
 impl<L: LinkModel> LinkModel for LinkSwitch<L> {
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
-        self.turn(now);
-        self.link.offer(now, length_bytes)
+        self.attend(now);
+        match &mut self.replacement {
+            None => self.own.offer(now, length_bytes),
+            Some(link) => link.offer(now, length_bytes),
+        }
     }
 
     fn offer_numbered(
@@ -88,20 +121,31 @@ impl<L: LinkModel> LinkModel for LinkSwitch<L> {
         length_bytes: usize,
         message: MessageNumber,
     ) -> Fate {
-        self.turn(now);
-        self.link.offer_numbered(now, length_bytes, message)
+        self.attend(now);
+        match &mut self.replacement {
+            None => self.own.offer_numbered(now, length_bytes, message),
+            Some(link) => link.offer_numbered(now, length_bytes, message),
+        }
     }
 
+    /// Puts in force what is due.
     fn attend(&mut self, now: Instant) {
-        self.turn(now);
+        while self.changes.peek().is_ok_and(|change| change.from <= now) {
+            let Ok(change) = self.changes.pop() else {
+                return;
+            };
+            let former = self.put(change.replacement);
+            let _no_place = self.former.push(former);
+        }
     }
 
     fn replay_tally(&self) -> Option<ReplayTally> {
-        self.link.replay_tally()
+        self.own.replay_tally()
     }
 
     fn loss_causes(&self) -> Option<LossCauses> {
-        self.link.loss_causes()
+        let own = self.own.loss_causes()?;
+        Some(own.plus(self.lost).plus(self.replacement_lost()))
     }
 }
 
@@ -132,10 +176,10 @@ impl SwitchHandle {
         number: u64,
     ) -> Result<Replacement, EmulationError> {
         if condition == LinkCondition::Cut {
-            return Ok(Replacement::Cut);
+            return Ok(Some(Box::new(CutLink::default())));
         }
         let Some(spec) = condition.spec() else {
-            return Ok(Replacement::None);
+            return Ok(None);
         };
         let link = spec.build(&LinkPlace {
             seed: self.emulation.seed,
@@ -143,7 +187,7 @@ impl SwitchHandle {
             channel: &format!("{}.by-hand.{number}", self.channel),
             way: self.emulation.way,
         })?;
-        Ok(Replacement::Link(link))
+        Ok(Some(link))
     }
 
     /// Has `replacement` hold from `from` on. Call it when [`Self::is_free`].
@@ -224,5 +268,69 @@ mod tests {
         }
         assert!(!handle.is_free());
         assert!(handle.build(fixed(1, 1.5), 1).is_err());
+    }
+
+    fn link(spec: &LinkSpec, channel: &str) -> Box<dyn LinkModel> {
+        spec.build(&LinkPlace::alone(3, channel)).unwrap()
+    }
+
+    fn switched_from(spec: &LinkSpec) -> LinkSwitch<Box<dyn LinkModel>> {
+        let (mut switched, _handle) = switched();
+        switched.own = link(spec, "a");
+        switched
+    }
+
+    /// Offers `count` messages a millisecond apart from `first` on, and gives their fates.
+    fn offer(link: &mut dyn LinkModel, first: u32, count: u32) -> Vec<Fate> {
+        let of = |index: u32| link.offer(Instant::ZERO + MS * index, 64);
+        (first..first + count).map(of).collect()
+    }
+
+    #[test]
+    fn what_is_offered_after_a_change_meets_it_and_nothing_before_does() {
+        let mut untouched = link(&LinkSpec::fixed(5 * MS, 0.25), "a");
+        let mut switched = switched_from(&LinkSpec::fixed(5 * MS, 0.25));
+        assert_eq!(offer(&mut switched, 0, 500), offer(&mut untouched, 0, 500));
+        let by_hand = link(&LinkSpec::fixed(50 * MS, 0.0), "a.by-hand.1");
+        assert!(switched.put(Some(by_hand)).is_none());
+        for (index, fate) in (500..).zip(offer(&mut switched, 500, 500)) {
+            let due = Instant::ZERO + MS * (index + 50);
+            assert_eq!(fate, Fate::Delivered(due));
+        }
+        assert!(switched.put(Some(Box::new(CutLink::default()))).is_some());
+        assert_eq!(offer(&mut switched, 1_000, 100), [Fate::Lost; 100]);
+        // The draws of the topology's link go on where they were.
+        drop(switched.put(None));
+        let fates = offer(&mut switched, 1_100, 500);
+        assert_eq!(fates, offer(&mut untouched, 1_100, 500));
+        let lost = untouched.loss_causes().unwrap().total();
+        let causes = switched.loss_causes().unwrap();
+        assert_eq!(causes.total(), lost + 100);
+        assert_eq!(causes.outage_count, 100, "a cut is an outage");
+    }
+
+    #[test]
+    fn losses_of_a_replacement_stay_counted_after_it_went() {
+        let mut switched = switched_from(&LinkSpec::default());
+        drop(switched.put(Some(link(&LinkSpec::fixed(MS, 0.5), "a.by-hand.1"))));
+        let is_lost = |fate: &Fate| *fate == Fate::Lost;
+        let fates = offer(&mut switched, 0, 2_000);
+        let lost = fates.iter().filter(|fate| is_lost(fate)).count() as u64;
+        assert!((850..1_150).contains(&lost), "{lost}");
+        assert_eq!(switched.loss_causes().unwrap().chance_count, lost);
+        drop(switched.put(None));
+        assert_eq!(switched.loss_causes().unwrap().chance_count, lost);
+    }
+
+    #[test]
+    fn equal_seeds_give_equal_changed_links() {
+        let run = || {
+            let mut switched = switched_from(&LinkSpec::fixed(MS, 0.1));
+            let mut fates = offer(&mut switched, 0, 300);
+            drop(switched.put(Some(link(&LinkSpec::fixed(9 * MS, 0.3), "a.by-hand.1"))));
+            fates.extend(offer(&mut switched, 300, 300));
+            fates
+        };
+        assert_eq!(run(), run());
     }
 }

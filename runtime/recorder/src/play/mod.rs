@@ -5,7 +5,6 @@ mod schedule;
 mod source;
 mod target;
 
-use std::path::PathBuf;
 use std::thread;
 use std::time::Duration;
 
@@ -17,35 +16,15 @@ use hil_platform::words::counted_plainly;
 use hil_rundir::manifest::ChannelDescription;
 
 use crate::cli::PlayOptions;
+use crate::failure::Failure;
 use schedule::{Punctuality, Schedule};
-pub(crate) use source::SourceError;
 use source::{Material, known_channels, read};
-pub(crate) use target::TargetError;
 use target::{Outlet, Target};
 
 /// Longest sleep without looking for a signal or the end of the run.
 const SLEEP_MAX: Duration = Duration::from_millis(50);
 /// From the moment all is ready to the first message.
 const LEAD: Duration = Duration::from_millis(2);
-
-/// Why nothing was played, or why it broke off.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum PlayError {
-    /// Nothing was chosen.
-    #[error("which channel is to be played? Give --only CHANNEL; {} has {known}", file.display())]
-    NoneChosen {
-        /// The file.
-        file: PathBuf,
-        /// Its channels.
-        known: String,
-    },
-    /// What should be played.
-    #[error(transparent)]
-    Source(#[from] SourceError),
-    /// Where it should go.
-    #[error(transparent)]
-    Target(#[from] TargetError),
-}
 
 /// How it ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,12 +40,13 @@ pub(crate) fn play(
     options: &PlayOptions,
     signals: &Signals,
     console: &mut Console,
-) -> Result<PlayEnd, PlayError> {
+) -> Result<PlayEnd, Failure> {
     if options.only.is_empty() {
-        return Err(PlayError::NoneChosen {
-            known: known_channels(&options.file)?,
-            file: options.file.clone(),
-        });
+        return Err(Failure::usage(format!(
+            "which channel is to be played? Give --only CHANNEL; {} has {}",
+            options.file.display(),
+            known_channels(&options.file)?
+        )));
     }
     let target = Target::find(options.into.as_deref())?;
     let channels = options.only.iter().map(|name| target.channel(name));
@@ -120,7 +100,7 @@ struct Player<'a> {
 
 impl Player<'_> {
     /// Plays the rounds; gives why it ended before the recording did, `None` at its end.
-    fn play(&mut self, material: &Material, is_looped: bool) -> Result<Option<PlayEnd>, PlayError> {
+    fn play(&mut self, material: &Material, is_looped: bool) -> Result<Option<PlayEnd>, Failure> {
         while !self.target.has_begun() {
             if let Some(end) = self.ended() {
                 return Ok(Some(end));

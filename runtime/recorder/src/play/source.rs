@@ -1,78 +1,17 @@
 //! The messages of some topics of an MCAP file, as they lay in memory, in the order of their times.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use hil_platform::words::counted_plainly;
-use hil_rundir::layout::LayoutFault;
 use hil_rundir::manifest::ChannelDescription;
 use mcap::records::Record;
 
-use crate::decode::{DecodeFault, Decoder};
-use crate::scan::{ScanError, scan};
+use crate::codec::Codec;
+use crate::failure::Failure;
+use crate::scan::{ScanEnd, Visit, scan};
 use crate::schema::Schema;
 use crate::topics::topic_of;
-
-/// Why a file cannot be played into a channel.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum SourceError {
-    /// The file.
-    #[error(transparent)]
-    Scan(#[from] ScanError),
-    /// Not in it.
-    #[error("{}: no topic {topic}; it has {known}", path.display())]
-    NoTopic {
-        /// The file.
-        path: PathBuf,
-        /// The topic of the channel.
-        topic: String,
-        /// The topics it has.
-        known: String,
-    },
-    /// The layout of the live channel.
-    #[error("channel {channel}: {fault}")]
-    Layout {
-        /// The channel.
-        channel: String,
-        /// What is wrong with its layout.
-        fault: LayoutFault,
-    },
-    /// Another message, or the same with another layout.
-    #[error(
-        "{}: its messages of {channel} are {found}, and that channel of the run carries {wanted}",
-        path.display()
-    )]
-    OtherMessage {
-        /// The file.
-        path: PathBuf,
-        /// The channel.
-        channel: String,
-        /// What the file has.
-        found: String,
-        /// What the channel carries.
-        wanted: String,
-    },
-    /// One of its messages.
-    #[error("{}: message {place} of topic {topic}: {fault}", path.display())]
-    Message {
-        /// The file.
-        path: PathBuf,
-        /// The topic.
-        topic: String,
-        /// Its place on the topic, from 1.
-        place: u64,
-        /// What is wrong with it.
-        fault: DecodeFault,
-    },
-    /// Nothing on its topics.
-    #[error("{}: no message on {topics}", path.display())]
-    Empty {
-        /// The file.
-        path: PathBuf,
-        /// The topics.
-        topics: String,
-    },
-}
 
 /// One recorded message.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -97,21 +36,25 @@ pub(crate) struct Material {
 struct Wanted {
     topic: String,
     channel: String,
-    decoder: Decoder,
+    codec: Codec,
     schema: Schema,
     count: u64,
 }
 
+/// A file that cannot be read is the wrong argument here.
+fn scanned(path: &Path, visit: &mut Visit<'_>) -> Result<ScanEnd, Failure> {
+    scan(path, visit).map_err(Failure::usage)
+}
+
 /// The channels of a run whose messages a file has, with their number, in words.
-pub(crate) fn known_channels(path: &Path) -> Result<String, SourceError> {
+pub(crate) fn known_channels(path: &Path) -> Result<String, Failure> {
     let mut channels: BTreeMap<u16, (String, u64)> = BTreeMap::new();
-    scan(path, &mut |_, record| {
+    scanned(path, &mut |_, record| {
         match record {
             Record::Channel(topic) => {
                 // What is made of messages names their channel, and no message.
                 let is_own = topic.metadata.contains_key("message");
-                let channel = topic.metadata.get("channel").filter(|_| is_own);
-                if let Some(channel) = channel {
+                if let Some(channel) = topic.metadata.get("channel").filter(|_| is_own) {
                     let known = channels.entry(topic.id);
                     known.or_insert_with(|| (channel.clone(), 0));
                 }
@@ -137,89 +80,81 @@ pub(crate) fn known_channels(path: &Path) -> Result<String, SourceError> {
 }
 
 /// Reads the messages of `channels`, whose layouts are those of the run they go into.
-pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Material, SourceError> {
-    let mut reading = Reading::new(path, channels)?;
+pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Material, Failure> {
+    let wanted = channels.iter().map(|channel| {
+        let (codec, schema) = if channel.fields.is_empty() {
+            Codec::opaque(channel.size_bytes)
+        } else {
+            Codec::typed(&channel.message, &channel.fields, channel.size_bytes)
+                .map_err(|fault| Failure::usage(format!("channel {}: {fault}", channel.name)))?
+        };
+        Ok(Wanted {
+            topic: topic_of(&channel.name),
+            channel: channel.name.clone(),
+            codec,
+            schema,
+            count: 0,
+        })
+    });
+    let mut reading = Reading {
+        wanted: wanted.collect::<Result<_, Failure>>()?,
+        schemas: BTreeMap::new(),
+        topics: BTreeMap::new(),
+        messages: Vec::new(),
+    };
+    let file = path.display();
     let mut fault = None;
-    let end = scan(path, &mut |_, record| {
+    let end = scanned(path, &mut |_, record| {
         fault = reading.visit(record).err();
         fault.is_none()
     })?;
     if let Some(fault) = fault {
-        return Err(fault);
+        let words = format!("{file}: {fault}");
+        return Err(Failure { words, ..fault });
     }
     let known: Vec<String> = reading
         .topics
         .into_values()
         .map(|(topic, _)| topic)
         .collect();
-    if let Some(absent) = reading
-        .wanted
-        .iter()
-        .find(|one| !known.contains(&one.topic))
-    {
-        return Err(SourceError::NoTopic {
-            path: path.to_owned(),
-            topic: absent.topic.clone(),
-            known: known.join(", "),
-        });
+    let mut wanted = reading.wanted.iter();
+    if let Some(absent) = wanted.find(|one| !known.contains(&one.topic)) {
+        let (topic, known) = (&absent.topic, known.join(", "));
+        return Err(Failure::usage(format!(
+            "{file}: no topic {topic}; it has {known}"
+        )));
     }
     let mut timed = reading.messages;
-    timed.sort_by_key(|(at_ns, _)| *at_ns);
-    let Some(first_ns) = timed.first().map(|(at_ns, _)| *at_ns) else {
-        let topics = reading.wanted.iter().map(|one| one.topic.as_str());
-        return Err(SourceError::Empty {
-            path: path.to_owned(),
-            topics: topics.collect::<Vec<_>>().join(", "),
-        });
+    timed.sort_by_key(|one| one.after_ns);
+    let Some(first_ns) = timed.first().map(|one| one.after_ns) else {
+        let topics: Vec<String> = reading.wanted.into_iter().map(|one| one.topic).collect();
+        let topics = topics.join(", ");
+        return Err(Failure::usage(format!("{file}: no message on {topics}")));
     };
-    let messages = timed.into_iter().map(|(at_ns, recorded)| Recorded {
-        after_ns: at_ns - first_ns,
-        ..recorded
-    });
+    for one in &mut timed {
+        one.after_ns -= first_ns;
+    }
     Ok(Material {
-        messages: messages.collect(),
+        messages: timed,
         losses: end.losses.into_iter().map(|loss| loss.why).collect(),
     })
 }
 
-struct Reading<'a> {
-    path: &'a Path,
+struct Reading {
     wanted: Vec<Wanted>,
-    schemas: BTreeMap<u16, (String, Vec<u8>)>,
+    schemas: BTreeMap<u16, Schema>,
     /// By the file's number: its topic, and which of the wanted it is.
     topics: BTreeMap<u16, (String, Option<usize>)>,
-    messages: Vec<(u64, Recorded)>,
+    /// With their times on the recording's axis.
+    messages: Vec<Recorded>,
 }
 
-impl<'a> Reading<'a> {
-    fn new(path: &'a Path, channels: &[&ChannelDescription]) -> Result<Self, SourceError> {
-        let wanted = channels.iter().map(|channel| {
-            let made = Decoder::new(&channel.message, &channel.fields, channel.size_bytes);
-            let (decoder, schema) = made.map_err(|fault| SourceError::Layout {
-                channel: channel.name.clone(),
-                fault,
-            })?;
-            Ok(Wanted {
-                topic: topic_of(&channel.name),
-                channel: channel.name.clone(),
-                decoder,
-                schema,
-                count: 0,
-            })
-        });
-        Ok(Self {
-            path,
-            wanted: wanted.collect::<Result<_, SourceError>>()?,
-            schemas: BTreeMap::new(),
-            topics: BTreeMap::new(),
-            messages: Vec::new(),
-        })
-    }
-
-    fn visit(&mut self, record: Record<'_>) -> Result<(), SourceError> {
+impl Reading {
+    fn visit(&mut self, record: Record<'_>) -> Result<(), Failure> {
         match record {
             Record::Schema { header, data } => {
-                self.schemas.insert(header.id, (header.name, data.to_vec()));
+                let (name, data) = (header.name, data.into_owned());
+                self.schemas.insert(header.id, Schema { name, data });
             }
             Record::Channel(channel) => {
                 let mut all = self.wanted.iter();
@@ -230,23 +165,20 @@ impl<'a> Reading<'a> {
                 self.topics.insert(channel.id, (channel.topic, place));
             }
             Record::Message { header, data } => {
-                let Some((_, Some(place))) = self.topics.get(&header.channel_id) else {
+                let Some((topic, Some(place))) = self.topics.get(&header.channel_id) else {
                     return Ok(());
                 };
                 let wanted = &mut self.wanted[*place];
                 wanted.count += 1;
-                let payload = wanted.decoder.decode(&data);
-                let recorded = Recorded {
-                    after_ns: 0,
+                let payload = wanted.codec.decode(&data).map_err(|fault| {
+                    let count = wanted.count;
+                    Failure::failed(format!("message {count} of topic {topic}: {fault}"))
+                })?;
+                self.messages.push(Recorded {
+                    after_ns: header.publish_time,
                     channel: *place,
-                    payload: payload.map_err(|fault| SourceError::Message {
-                        path: self.path.to_owned(),
-                        topic: wanted.topic.clone(),
-                        place: wanted.count,
-                        fault,
-                    })?,
-                };
-                self.messages.push((header.publish_time, recorded));
+                    payload,
+                });
             }
             _ => {}
         }
@@ -254,24 +186,21 @@ impl<'a> Reading<'a> {
     }
 
     /// The file's schema must be the one that the live channel's layout gives.
-    fn check(&self, wanted: &Wanted, schema_id: u16) -> Result<(), SourceError> {
+    fn check(&self, wanted: &Wanted, schema_id: u16) -> Result<(), Failure> {
         let schema = self.schemas.get(&schema_id);
-        let name = schema.map_or("an unknown schema", |(name, _)| name.as_str());
-        if schema
-            .is_some_and(|(name, data)| *name == wanted.schema.name && *data == wanted.schema.data)
-        {
+        if schema == Some(&wanted.schema) {
             return Ok(());
         }
-        let laid_out = if name == wanted.schema.name {
+        let found = schema.map_or("an unknown schema", |schema| schema.name.as_str());
+        let (channel, name) = (&wanted.channel, &wanted.schema.name);
+        let fields = if found == name {
             " with other fields"
         } else {
             ""
         };
-        Err(SourceError::OtherMessage {
-            path: self.path.to_owned(),
-            channel: wanted.channel.clone(),
-            found: name.to_owned(),
-            wanted: format!("{}{laid_out}", wanted.schema.name),
-        })
+        Err(Failure::usage(format!(
+            "its messages of {channel} are {found}, and that channel of the run carries \
+             {name}{fields}"
+        )))
     }
 }

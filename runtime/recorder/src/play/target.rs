@@ -3,7 +3,6 @@
 
 use std::env;
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant as WallInstant};
@@ -12,11 +11,12 @@ use hil_core::message::Envelope;
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::live_run::LiveRun;
 use hil_rundir::manifest::{ChannelDescription, Manifest};
-use hil_rundir::select::SelectError;
 use hil_rundir::select::select;
 use hil_rundir::status::has_begun;
-use hil_shm::{Census, ChannelError, Domain, DomainError, RawOutput};
+use hil_shm::{Census, Domain, RawOutput};
 use serde_json::Value;
+
+use crate::failure::Failure;
 
 /// How long a writer that died may take to lose its place: supervisors look ten times a second.
 const DEAD_WRITER_GOES_WITHIN: Duration = Duration::from_secs(1);
@@ -24,62 +24,6 @@ const DEAD_WRITER_GOES_WITHIN: Duration = Duration::from_secs(1);
 const ANNOUNCED_WITHIN: Duration = Duration::from_secs(5);
 /// How often it looks again.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
-
-/// Why there is no channel to play into.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum TargetError {
-    /// The run.
-    #[error(transparent)]
-    Select(#[from] SelectError),
-    /// A process of a run that has no folder here.
-    #[error(
-        "HIL_CARD is {}, which is not in a run's folder: {why}",
-        card.display()
-    )]
-    Card {
-        /// The card.
-        card: PathBuf,
-        /// What is missing.
-        why: String,
-    },
-    /// Its manifest.
-    #[error("{run}: cannot read its manifest: {source}")]
-    Manifest {
-        /// The run.
-        run: String,
-        /// Why.
-        source: io::Error,
-    },
-    /// Not one of its channels.
-    #[error("run {run} has no channel {channel:?} whose producer is on this host; it has {known}")]
-    NoChannel {
-        /// The run.
-        run: String,
-        /// What was asked for.
-        channel: String,
-        /// What could be.
-        known: String,
-    },
-    /// Somebody writes it.
-    #[error(
-        "channel {channel} of run {run} has a writer, {writer}: two writers at once would be \
-         two truths; end that one, or let this program run in its place (docs/terminal.md)"
-    )]
-    HasWriter {
-        /// The channel.
-        channel: String,
-        /// The run.
-        run: String,
-        /// Who should be writing it.
-        writer: String,
-    },
-    /// The shared memory.
-    #[error(transparent)]
-    Domain(#[from] DomainError),
-    /// The channel in it.
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-}
 
 /// A run to play into.
 #[derive(Debug)]
@@ -101,15 +45,15 @@ pub(crate) struct Outlet {
 
 impl Target {
     /// The run called `into`; without a name the one that started this program, else the only one.
-    pub(crate) fn find(into: Option<&str>) -> Result<Self, TargetError> {
+    pub(crate) fn find(into: Option<&str>) -> Result<Self, Failure> {
         let card = env::var_os("HIL_CARD").map(PathBuf::from);
         let (run, is_ours) = match (into, card) {
             (None, Some(card)) => (run_of_card(&card)?, true),
-            (into, _) => (select(into)?, false),
+            (into, _) => (select(into).map_err(Failure::usage)?, false),
         };
-        let manifest = run.manifest().map_err(|source| TargetError::Manifest {
-            run: run.name.clone(),
-            source,
+        let manifest = run.manifest().map_err(|source| {
+            let name = &run.name;
+            Failure::usage(format!("{name}: cannot read its manifest: {source}"))
         })?;
         Ok(Self {
             run,
@@ -119,34 +63,33 @@ impl Target {
     }
 
     /// The channel called `name`, whose producer must be on this host.
-    pub(crate) fn channel(&self, name: &str) -> Result<&ChannelDescription, TargetError> {
+    pub(crate) fn channel(&self, name: &str) -> Result<&ChannelDescription, Failure> {
         let is_fit = |channel: &&ChannelDescription| {
             let from = channel.from_host.as_deref();
             channel.to_host.is_some() && self.run.hosts().any(|host| Some(host) == from)
         };
-        let mut fit = self.manifest.channels.iter().filter(is_fit);
-        fit.clone()
-            .find(|channel| channel.name == name)
-            .ok_or_else(|| TargetError::NoChannel {
-                run: self.run.name.clone(),
-                channel: name.to_owned(),
-                known: fit
-                    .by_ref()
-                    .map(|channel| channel.name.as_str())
-                    .collect::<Vec<_>>()
-                    .join(", "),
-            })
+        let fit: Vec<_> = self.manifest.channels.iter().filter(is_fit).collect();
+        let found = fit.iter().find(|channel| channel.name == name);
+        found.copied().ok_or_else(|| {
+            let known: Vec<&str> = fit.iter().map(|channel| channel.name.as_str()).collect();
+            Failure::usage(format!(
+                "run {} has no channel {name:?} whose producer is on this host; it has {}",
+                self.run.name,
+                known.join(", ")
+            ))
+        })
     }
 
     /// The shared memory of the producer's host of `channel`.
-    pub(crate) fn domain(&self, channel: &ChannelDescription) -> Result<Domain, TargetError> {
+    pub(crate) fn domain(&self, channel: &ChannelDescription) -> Result<Domain, Failure> {
         let host = channel.from_host.as_deref().unwrap_or_default();
-        let address = self.run.domain(host).map_err(DomainError::Address)?;
-        Ok(if self.is_ours {
-            Domain::open(&address)?
+        let address = self.run.domain(host).map_err(Failure::failed)?;
+        let opened = if self.is_ours {
+            Domain::open(&address)
         } else {
-            Domain::observe(&address)?
-        })
+            Domain::observe(&address)
+        };
+        opened.map_err(Failure::failed)
     }
 
     /// Becomes the writer of `channel`.
@@ -154,23 +97,27 @@ impl Target {
         &self,
         domain: &Domain,
         channel: &ChannelDescription,
-    ) -> Result<Outlet, TargetError> {
+    ) -> Result<Outlet, Failure> {
         let name = &channel.name;
-        let refused = || TargetError::HasWriter {
-            channel: name.clone(),
-            run: self.run.name.clone(),
-            writer: self.writer(name),
+        let writer_count = || Census::of(domain, name).map(|census| census.writer_count);
+        let refused = || {
+            Failure::usage(format!(
+                "channel {name} of run {} has a writer, {}: two writers at once would be two truths; \
+                 end that one, or let this program run in its place (docs/terminal.md)",
+                self.run.name,
+                self.writer(name)
+            ))
         };
         let asked = WallInstant::now();
-        while Census::of(domain, name)?.writer_count > 0 {
+        while writer_count().map_err(Failure::failed)? > 0 {
             if asked.elapsed() > DEAD_WRITER_GOES_WITHIN {
                 return Err(refused());
             }
             thread::sleep(LOOK_PERIOD);
         }
-        let output = RawOutput::open(domain, name, true)?;
+        let output = RawOutput::open(domain, name, true).map_err(Failure::failed)?;
         // Another may have come between the question and the answer.
-        if Census::of(domain, name)?.writer_count > 1 {
+        if writer_count().map_err(Failure::failed)? > 1 {
             return Err(refused());
         }
         // Producers of one channel never start twice within a microsecond on one host.
@@ -184,21 +131,18 @@ impl Target {
 
     /// The process whose card has `channel` among its outputs.
     fn writer(&self, channel: &str) -> String {
-        let cards = self.run.folder.join("cards");
-        let cards = fs::read_dir(cards).into_iter().flatten().flatten();
-        let mut writers = cards.filter_map(|card| {
+        let cards = fs::read_dir(self.run.folder.join("cards"));
+        let mut writers = cards.into_iter().flatten().flatten().filter_map(|card| {
             let text = fs::read_to_string(card.path()).ok()?;
             let card: Value = serde_json::from_str(&text).ok()?;
             let mut outputs = card["outputs"].as_array()?.iter();
-            outputs
-                .any(|output| output["name"] == channel)
-                .then(|| card["process"].as_str().map(str::to_owned))?
+            let writes = outputs.any(|output| output["name"] == channel);
+            let name = card["process"].as_str().filter(|_| writes)?;
+            Some(format!("process {name}"))
         });
-        let writer = writers.next();
-        writer.map_or_else(
-            || "another program".to_owned(),
-            |name| format!("process {name}"),
-        )
+        writers
+            .next()
+            .unwrap_or_else(|| "another program".to_owned())
     }
 
     /// True once the run has begun: what is published before nobody counts.
@@ -214,37 +158,38 @@ impl Target {
 
 impl Outlet {
     /// Publishes `payload` with the next number.
-    pub(crate) fn publish(&mut self, payload: &[u8]) -> Result<(), TargetError> {
+    pub(crate) fn publish(&mut self, payload: &[u8]) -> Result<(), Failure> {
         let (sequence, epoch) = (self.next, self.epoch);
-        self.output.publish_with(payload, || Envelope {
+        let envelope = || Envelope {
             sequence,
             published_ns: MonotonicClock::now().as_ns(),
             epoch,
             ..Envelope::default()
-        })?;
+        };
+        let published = self.output.publish_with(payload, envelope);
+        published.map_err(Failure::failed)?;
         self.next += 1;
         Ok(())
     }
 }
 
 /// The run in whose folder the card lies: it started this program.
-fn run_of_card(card: &Path) -> Result<LiveRun, TargetError> {
-    let failed = |why: String| TargetError::Card {
-        card: card.to_owned(),
-        why,
+fn run_of_card(card: &Path) -> Result<LiveRun, Failure> {
+    let failed = |why: &str| {
+        let card = card.display();
+        Failure::usage(format!(
+            "HIL_CARD is {card}, which is not in a run's folder: {why}"
+        ))
     };
-    let folder = fs::canonicalize(card)
-        .map_err(|error| failed(error.to_string()))?
-        .parent()
-        .and_then(Path::parent)
-        .map(Path::to_owned)
-        .ok_or_else(|| failed("it has no folder above".to_owned()))?;
+    let real = fs::canonicalize(card).map_err(|error| failed(&error.to_string()))?;
+    let folder = real.parent().and_then(Path::parent);
+    let folder = folder.ok_or_else(|| failed("it has no folder above"))?;
     let asked = WallInstant::now();
     loop {
-        match LiveRun::read(&folder) {
+        match LiveRun::read(folder) {
             Ok(run) => return Ok(run),
             Err(error) if asked.elapsed() > ANNOUNCED_WITHIN => {
-                return Err(failed(error.to_string()));
+                return Err(failed(&error.to_string()));
             }
             Err(_) => thread::sleep(LOOK_PERIOD),
         }

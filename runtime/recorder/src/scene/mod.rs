@@ -4,40 +4,42 @@
 //! one as far as the same messages reached it in time: not those that only another host has, and not
 //! those before it began.
 
-mod arms;
-mod fleet;
-mod shapes;
+mod draw;
 #[cfg(test)]
 mod tests;
-pub(crate) mod waiting;
 
-use foxglove::messages::{
-    FrameTransforms, SceneEntity, SceneEntityDeletion, SceneUpdate, Timestamp,
-    scene_entity_deletion,
-};
+use std::collections::BTreeMap;
+
+use foxglove::messages::{FrameTransforms, SceneUpdate};
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::message::Message;
 use hil_fleet::messages::{Mission, State, Truth};
 use prost::Message as _;
 use serde_json::Value;
 
+use crate::newest::Newest;
 use crate::sink::{Sink, Topic};
 use crate::topics::{Names, timestamp, well_known};
 use crate::view::arms::ArmsView;
-use crate::view::fleet::FleetView;
+use crate::view::fleet::{FleetView, MANY_ROBOTS};
 use crate::writer::Stamp;
 
 /// Between two pictures, of the run's time: 20 Hz.
 const PERIOD_NS: u64 = 50_000_000;
 /// The same for fleets of many robots.
 const LARGE_PERIOD_NS: u64 = 200_000_000;
-/// Robots from which on a fleet counts as large.
-const MANY_ROBOTS: usize = 64;
 /// Between two pictures of the ground: whoever opens one of several files, or the middle of a
 /// stream, has it within this time.
 const GROUND_PERIOD_NS: u64 = 10_000_000_000;
 /// Nothing is drawn of a silence longer than this: one damaged time must not make a million pictures.
 const SILENCE_NS: u64 = 2_000_000_000;
+
+/// Whatever was published so long before the newest message has come, when nothing more waits.
+const BEHIND_NS: i64 = 150_000_000;
+/// Messages that wait at most. A recorder that begins late has a long past to read; the oldest go on
+/// then before their time, and the picture of that moment may lack one of them. The same when a
+/// ground takes long to make; that is said.
+const WAITING_MAX: usize = 50_000;
 
 /// A message that says something of the scene.
 #[derive(Debug, Clone, Copy)]
@@ -54,11 +56,6 @@ pub(crate) struct Heard<'a> {
     pub(crate) published_ns: i64,
 }
 
-/// True when messages of this name say anything of a scene.
-pub(crate) fn concerns(message: &str) -> bool {
-    is_of_fleet(message) || is_of_arms(message)
-}
-
 fn is_of_fleet(message: &str) -> bool {
     [State::NAME, Mission::NAME, Truth::NAME].contains(&message)
 }
@@ -68,23 +65,37 @@ pub(crate) fn is_of_arms(message: &str) -> bool {
     [EgmCommand::NAME, EgmFeedback::NAME].contains(&message)
 }
 
+/// A message that waits for those before it.
+#[derive(Debug)]
+struct Waiting {
+    channel: String,
+    message: String,
+    payload: Vec<u8>,
+    published_ns: i64,
+}
+
 /// The scene's topics, and what they show.
 #[derive(Debug)]
 pub(crate) struct Scene {
     fleet: Option<FleetView>,
     arms: ArmsView,
-    /// `/live/map`, once it is known.
-    map: Option<Value>,
     moving: Topic,
     ground: Topic,
     frames: Topic,
     /// The first message's time.
     origin_ns: Option<u64>,
-    newest_ns: u64,
     next_ns: u64,
     ground_due_ns: u64,
     picture_count: u64,
     ground_count: u64,
+    /// Messages of a run that goes come channel by channel, the scene wants them in order of time: they
+    /// wait until what could come before them has come, and until there is a ground to draw them on. By
+    /// time, then by arrival.
+    waiting: BTreeMap<(u64, u64), Waiting>,
+    arrived_count: u64,
+    newest: Newest,
+    /// Messages that went on before the ground was known.
+    groundless_count: u64,
 }
 
 impl Scene {
@@ -104,16 +115,18 @@ impl Scene {
         Self {
             fleet: is_fleet.then(|| FleetView::new(parameters)),
             arms: ArmsView::new(),
-            map: None,
             moving,
             ground,
             frames: Topic::new(frames, well_known::<FrameTransforms>(), &[]),
             origin_ns: None,
-            newest_ns: 0,
             next_ns: 0,
             ground_due_ns: 0,
             picture_count: 0,
             ground_count: 0,
+            waiting: BTreeMap::new(),
+            arrived_count: 0,
+            newest: Newest::default(),
+            groundless_count: 0,
         }
     }
 
@@ -122,15 +135,32 @@ impl Scene {
         let Some(fleet) = &mut self.fleet else {
             return true;
         };
-        if self.map.is_none() {
-            self.map = fleet.new_map();
-        }
-        self.map.is_some() || fleet.problem.is_some()
+        fleet.new_map();
+        fleet.map().is_some() || fleet.problem.is_some()
     }
 
-    /// Why a fleet has no ground.
-    pub(crate) fn problem(&self) -> Option<&str> {
-        self.fleet.as_ref()?.problem.as_deref()
+    /// True while the ground is being made that messages wait for.
+    pub(crate) fn awaits_ground(&mut self) -> bool {
+        self.arrived_count > 0 && !self.is_ready()
+    }
+
+    /// What the scene lacks, once it is finished.
+    pub(crate) fn problems(&mut self) -> Vec<String> {
+        let fleet = self.fleet.as_ref();
+        let problem = fleet.and_then(|fleet| fleet.problem.clone());
+        let mut problems: Vec<String> = problem.into_iter().collect();
+        if self.groundless_count > 0 {
+            problems.push(format!(
+                "the scene of the first {} messages was drawn before the fleet's ways were planned: \
+                 it lacks sections and ways ahead",
+                self.groundless_count
+            ));
+        }
+        if self.awaits_ground() {
+            let why = "the fleet's ways were not planned in time";
+            problems.push(format!("/scene/ground is missing: {why}"));
+        }
+        problems
     }
 
     /// Lets `sink` hear now of the topics that messages of these names lead to.
@@ -178,7 +208,6 @@ impl Scene {
             self.ground_due_ns = heard.at_ns;
         }
         self.draw_until(heard.at_ns, sink)?;
-        self.newest_ns = self.newest_ns.max(heard.at_ns);
         let at_ns = signed(heard.at_ns);
         if is_fleets {
             if let Some(fleet) = &mut self.fleet {
@@ -192,11 +221,77 @@ impl Scene {
         Ok(())
     }
 
-    /// Draws what the last messages said.
+    /// Takes a message in whatever order.
+    ///
+    /// # Errors
+    /// When the sink cannot take a picture.
+    pub(crate) fn hold<S: Sink>(
+        &mut self,
+        heard: &Heard<'_>,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        if !is_of_fleet(heard.message) && !is_of_arms(heard.message) {
+            return Ok(());
+        }
+        let waiting = Waiting {
+            channel: heard.channel.to_owned(),
+            message: heard.message.to_owned(),
+            payload: heard.payload.to_vec(),
+            published_ns: heard.published_ns,
+        };
+        let key = (heard.at_ns, self.arrived_count);
+        self.waiting.insert(key, waiting);
+        self.arrived_count += 1;
+        self.newest.take(signed(heard.at_ns));
+        let excess_count = self.waiting.len().saturating_sub(WAITING_MAX);
+        self.take_until(u64::MAX, excess_count, sink)
+    }
+
+    /// Nothing more has come for now: takes what waits and is old enough.
+    ///
+    /// # Errors
+    /// When the sink cannot take a picture.
+    pub(crate) fn settle<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        if self.awaits_ground() {
+            return Ok(());
+        }
+        let newest_ns = self.newest.get().unwrap_or_default();
+        let until_ns = newest_ns.saturating_sub(BEHIND_NS).max(0);
+        self.take_until(until_ns.cast_unsigned(), usize::MAX, sink)
+    }
+
+    /// Takes at most so many of the messages that wait, those until `until_ns`.
+    fn take_until<S: Sink>(
+        &mut self,
+        until_ns: u64,
+        count_max: usize,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        for _ in 0..count_max {
+            let first = self.waiting.first_entry();
+            let Some(first) = first.filter(|first| first.key().0 <= until_ns) else {
+                break;
+            };
+            let ((at_ns, _), one) = first.remove_entry();
+            let heard = Heard {
+                channel: &one.channel,
+                message: &one.message,
+                payload: &one.payload,
+                at_ns,
+                published_ns: one.published_ns,
+            };
+            self.groundless_count += u64::from(!self.is_ready());
+            self.take(&heard, sink)?;
+        }
+        Ok(())
+    }
+
+    /// Takes everything that waits, and draws what the last messages said.
     ///
     /// # Errors
     /// When the sink cannot take the picture.
     pub(crate) fn finish<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        self.take_until(u64::MAX, usize::MAX, sink)?;
         if self.origin_ns.is_none() {
             return Ok(());
         }
@@ -233,25 +328,25 @@ impl Scene {
                 && let Some(size) = fleet.vehicle_size_m()
             {
                 let picture = fleet.picture(now_ns, origin_ns);
-                let update = fleet::moving(&picture, size, time);
+                let update = draw::moving(&picture, size, time);
                 self.moving.write(sink, stamp, &update.encode_to_vec())?;
                 self.picture_count += 1;
             }
         } else if self.arms.is_known() {
             let picture = self.arms.picture(now_ns, origin_ns);
-            let update = arms::shapes(&picture, time);
+            let update = draw::arms(&picture, time);
             self.moving.write(sink, stamp, &update.encode_to_vec())?;
-            let frames = arms::transforms(&picture, time);
+            let frames = draw::transforms(&picture, time);
             self.frames.write(sink, stamp, &frames.encode_to_vec())?;
             self.picture_count += 1;
         }
         if at_ns >= self.ground_due_ns
-            && let Some(map) = &self.map
+            && let Some(map) = self.fleet.as_ref().and_then(FleetView::map)
         {
             self.ground_due_ns = at_ns.saturating_add(GROUND_PERIOD_NS);
             let stamp = Stamp::new(at_ns, self.ground_count);
             self.ground_count += 1;
-            let update = fleet::ground(map, time);
+            let update = draw::ground(map, time);
             self.ground.write(sink, stamp, &update.encode_to_vec())?;
         }
         Ok(())
@@ -260,17 +355,4 @@ impl Scene {
 
 fn signed(at_ns: u64) -> i64 {
     i64::try_from(at_ns).unwrap_or(i64::MAX)
-}
-
-/// A whole picture: it takes the place of all that the topic showed before, so that any one message
-/// of a file is enough to see the scene.
-fn entire(entities: Vec<SceneEntity>, at: Timestamp) -> SceneUpdate {
-    SceneUpdate {
-        deletions: vec![SceneEntityDeletion {
-            timestamp: Some(at),
-            r#type: scene_entity_deletion::Type::All.into(),
-            id: String::new(),
-        }],
-        entities,
-    }
 }

@@ -6,7 +6,6 @@ use bytemuck::Zeroable;
 use hil_arm::yumi::arm::RIGHT_START_RAD;
 use serde_json::json;
 
-use super::waiting::LiveScene;
 use super::*;
 use crate::schema::Schema;
 
@@ -118,7 +117,7 @@ fn wait_for(is_ready: &mut dyn FnMut() -> bool) {
 #[test]
 fn a_live_file_has_the_pictures_of_one_made_in_order() {
     let (mut ordered, mut kept) = (crossing(), Kept::default());
-    let mut live = LiveScene::new(crossing());
+    let mut live = crossing();
     let mut kept_live = Kept::default();
     wait_for(&mut || ordered.is_ready());
     for number in 0..200 {
@@ -133,7 +132,7 @@ fn a_live_file_has_the_pictures_of_one_made_in_order() {
         for robot in 0..2 {
             for number in 10 * piece..10 * piece + 10 {
                 let (state, at_ns) = state(robot, number);
-                live.take(&told(&state, at_ns), &mut kept_live).unwrap();
+                live.hold(&told(&state, at_ns), &mut kept_live).unwrap();
             }
         }
         live.settle(&mut kept_live).unwrap();
@@ -150,19 +149,19 @@ fn a_live_file_has_the_pictures_of_one_made_in_order() {
 
 #[test]
 fn one_damaged_time_does_not_hurry_a_live_scene() {
-    let mut live = LiveScene::new(crossing());
+    let mut live = crossing();
     let mut kept = Kept::default();
     for number in 0..20 {
         let (state, at_ns) = state(0, number);
         let at_ns = if number == 10 { at_ns << 20 } else { at_ns };
-        live.take(&told(&state, at_ns), &mut kept).unwrap();
+        live.hold(&told(&state, at_ns), &mut kept).unwrap();
     }
     wait_for(&mut || live.is_ready());
     live.settle(&mut kept).unwrap();
     // The second robot's file is read after the first one's.
     for number in 0..20 {
         let (state, at_ns) = state(1, number);
-        live.take(&told(&state, at_ns), &mut kept).unwrap();
+        live.hold(&told(&state, at_ns), &mut kept).unwrap();
     }
     live.finish(&mut kept).unwrap();
     let scenes = kept.scenes();
@@ -177,12 +176,12 @@ fn one_damaged_time_does_not_hurry_a_live_scene() {
 #[test]
 fn a_scene_that_is_finished_before_its_ground_says_what_it_lacks() {
     // Which of the two happens depends on how fast the ground is made; each is said.
-    let mut live = LiveScene::new(crossing());
+    let mut live = crossing();
     let mut kept = Kept::default();
-    assert!(live.is_ready(), "nothing waits for a ground");
+    assert!(!live.awaits_ground(), "nothing waits for a ground");
     for number in 0..20 {
         let (state, at_ns) = state(0, number);
-        live.take(&told(&state, at_ns), &mut kept).unwrap();
+        live.hold(&told(&state, at_ns), &mut kept).unwrap();
     }
     live.settle(&mut kept).unwrap();
     live.finish(&mut kept).unwrap();
@@ -212,7 +211,7 @@ fn a_silence_is_not_drawn_and_a_silent_robot_fades() {
 fn the_ground_comes_once_it_is_known_and_again_after_ten_seconds() {
     let (mut scene, mut kept) = (crossing(), Kept::default());
     wait_for(&mut || scene.is_ready());
-    assert_eq!(scene.problem(), None);
+    assert_eq!(scene.problems(), [""; 0]);
     for number in 0..=1050 {
         let (state, at_ns) = state(0, number);
         scene.take(&told(&state, at_ns), &mut kept).unwrap();

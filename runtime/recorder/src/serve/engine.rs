@@ -9,11 +9,12 @@ use hil_platform::console::Console;
 use serde_json::{Value, json};
 
 use super::parameters::Links;
-use super::recording::{Recording, Target};
+use super::recording::Recording;
 use super::source::{Progress, Source, Warning};
 use super::viewers::Viewers;
+use crate::cli::RecordOptions;
 use crate::view::Body;
-use crate::view::facts::RunFacts;
+use crate::view::fleet::{FleetView, MANY_ROBOTS};
 use crate::view::state::RunState;
 
 /// Between two pictures of robots and arms.
@@ -56,41 +57,6 @@ pub(crate) struct Shown {
     pub(crate) playback_speed: Option<f64>,
     /// Its folder and resolved topology, if it goes on: its links can be changed.
     pub(crate) links: Option<(PathBuf, Value)>,
-    /// What became known of what is amiss, once a second.
-    warnings: Vec<Warning>,
-    /// Ticks skipped, by process, and of which hosts they are known, as often.
-    overruns: [Value; 2],
-}
-
-impl Shown {
-    /// A run of which nothing has been read.
-    pub(crate) fn new(
-        facts: RunFacts,
-        source: Box<dyn Source>,
-        playback_speed: Option<f64>,
-        links: Option<(PathBuf, Value)>,
-    ) -> Self {
-        Self {
-            state: RunState::new(facts),
-            source,
-            playback_speed,
-            links,
-            warnings: Vec::new(),
-            overruns: [Value::Null, Value::Null],
-        }
-    }
-
-    fn look_for_warnings(&mut self) {
-        self.warnings = self.source.warnings();
-        let own = self.state.problem();
-        self.warnings.extend(own.map(|what| Warning {
-            process: None,
-            what: what.to_owned(),
-        }));
-        let overruns = self.source.overruns();
-        let overruns = overruns.map(|all| [json!(all.processes), json!(all.hosts)]);
-        self.overruns = overruns.unwrap_or_default();
-    }
 }
 
 /// Which run is shown, and how it stands.
@@ -112,7 +78,7 @@ pub(crate) struct Engine {
     /// Parameters as they were told last.
     told: Vec<Parameter>,
     /// Where what is shown is recorded, and the recording.
-    target: Option<Target>,
+    target: Option<RecordOptions>,
     recording: Option<Recording>,
     /// Recordings that were begun.
     recorded_count: usize,
@@ -123,7 +89,7 @@ pub(crate) struct Engine {
 
 impl Engine {
     /// Nothing is shown yet.
-    pub(crate) fn new(viewers: Viewers, links: Links, target: Option<Target>) -> Self {
+    pub(crate) fn new(viewers: Viewers, links: Links, target: Option<RecordOptions>) -> Self {
         Self {
             shown: None,
             viewers,
@@ -139,7 +105,6 @@ impl Engine {
 
     /// From now on shows this run.
     pub(crate) fn show(&mut self, shown: Shown, console: &mut Console) {
-        self.viewers.forget();
         let words = self.viewers.offer(&shown.state.facts);
         for words in words.unwrap_or_else(|error| vec![error.to_string()]) {
             console.warn(&words);
@@ -164,7 +129,7 @@ impl Engine {
         let shown = self.shown.as_ref()?;
         Some(Showing {
             name: &shown.state.facts.name,
-            is_over: shown.state.is_over(),
+            is_over: shown.state.how_ended.is_some(),
             is_playback: shown.playback_speed.is_some(),
         })
     }
@@ -189,94 +154,91 @@ impl Engine {
 
     /// Reads what came and shows what is due.
     pub(crate) fn round(&mut self, console: &mut Console) {
+        let Self { viewers, due, .. } = self;
         let Some(shown) = &mut self.shown else {
             let now_ns = realtime_ns();
-            if is_due(&mut self.due.run, RUN_PERIOD) {
-                self.viewers
-                    .live("/live/run", now_ns, waiting(self.viewers.count()));
+            if is_due(&mut due.run, RUN_PERIOD) {
+                let run = waiting(viewers.server.client_count());
+                viewers.live("/live/run", now_ns, run);
             }
-            self.viewers.welcome(now_ns);
+            viewers.welcome(now_ns);
             return;
         };
-        let is_last = read(shown, &mut self.viewers, &mut self.due, console);
-        let now_ns = shown.source.now_ns();
-        let due = &mut self.due;
-        pictures(shown, &mut self.viewers, due, now_ns, is_last);
-        if is_due(&mut self.due.run, RUN_PERIOD) {
-            shown.look_for_warnings();
+        let Shown { state, source, .. } = shown;
+        if !state.facts.has_one_clock && source.has_one_clock() {
+            state.compare_clocks();
+        }
+        let progress = source.poll(&mut |record| {
+            state.take(record);
+            if let Body::Message(payload) = &record.body {
+                viewers.message(record.channel, record.at_ns, payload);
+            }
+        });
+        for problem in source.take_problems() {
+            console.warn(&problem);
+        }
+        let now_ns = source.now_ns();
+        let mut is_over = state.how_ended.is_some();
+        match progress {
+            Progress::Going => {}
+            Progress::Rewound => {
+                state.rewind();
+                is_over = false;
+                *due = Due::default();
+            }
+            Progress::Ended(how) => {
+                state.ended_ns.get_or_insert(now_ns);
+                if !is_over {
+                    *due = Due::default();
+                } else if state.how_ended.as_ref() != Some(&how) {
+                    due.run = None;
+                }
+                state.how_ended = Some(how);
+            }
+        }
+        if let Some(map) = state.fleet.as_mut().and_then(FleetView::new_map) {
+            viewers.live("/live/map", now_ns, json!(map));
+        }
+        // After the end the last picture stays, the one with what came in the last look.
+        if !is_over {
+            pictures(state, viewers, due, now_ns);
+        }
+        if is_due(&mut due.run, RUN_PERIOD) {
             if let Some(recording) = &mut self.recording {
                 recording.look(console);
             }
-            let mut run = words(shown, &self.links, self.viewers.count(), now_ns);
+            let mut run = words(shown, &self.links, viewers.server.client_count(), now_ns);
             let file = self.recording.as_ref().map(|recording| &recording.path);
             run["recorder"]["file"] = json!(file);
-            self.viewers.live("/live/run", now_ns, run);
+            viewers.live("/live/run", now_ns, run);
             let parameters = self.links.list();
             if parameters != self.told {
                 self.told.clone_from(&parameters);
-                self.viewers.server.publish_parameter_values(parameters);
+                viewers.server.publish_parameter_values(parameters);
             }
         }
-        self.viewers.welcome(now_ns);
+        viewers.welcome(now_ns);
     }
 }
 
-/// Takes what came; true when it was the last.
-fn read(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, console: &mut Console) -> bool {
-    let Shown { state, source, .. } = shown;
-    if !state.facts.has_one_clock && source.has_one_clock() {
-        state.compare_clocks();
-    }
-    let progress = source.poll(&mut |record| {
-        state.take(record);
-        if let Body::Message(payload) = &record.body {
-            viewers.message(record.channel, record.at_ns, payload);
-        }
-    });
-    for problem in source.take_problems() {
-        console.warn(&problem);
-    }
-    match progress {
-        Progress::Going => {}
-        Progress::Rewound => {
-            state.rewind();
-            *due = Due::default();
-        }
-        Progress::Ended(how) => {
-            let is_last = !state.is_over();
-            if state.end(how, source.now_ns()) {
-                due.run = None;
-            }
-            if is_last {
-                *due = Due::default();
-            }
-            return is_last;
-        }
-    }
-    false
-}
-
-fn pictures(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, now_ns: i64, is_last: bool) {
-    let is_over = shown.state.is_over();
-    let state = &mut shown.state;
-    if let Some(map) = state.new_map() {
-        viewers.live("/live/map", now_ns, map);
-    }
-    // After the end the last picture stays, the one with what came in the last look.
-    if is_over && !is_last {
-        return;
-    }
-    let period = if state.is_small() {
-        PICTURE_PERIOD
-    } else {
+/// Shows robots, arms, channels and single messages, each when it is due.
+fn pictures(state: &mut RunState, viewers: &mut Viewers, due: &mut Due, now_ns: i64) {
+    let robot_count = state.fleet.as_ref().map_or(0, FleetView::robot_count);
+    let period = if robot_count > MANY_ROBOTS {
         LARGE_PICTURE_PERIOD
+    } else {
+        PICTURE_PERIOD
     };
-    if is_due(&mut due.picture, period) {
-        if let Some(fleet) = state.fleet(now_ns) {
-            viewers.live("/live/fleet", now_ns, fleet);
+    if is_due(&mut due.picture, period)
+        && let Some(origin_ns) = state.origin_ns
+    {
+        if let Some(fleet) = &mut state.fleet {
+            let picture = json!(fleet.picture(now_ns, origin_ns));
+            viewers.live("/live/fleet", now_ns, picture);
         }
-        if let Some(arms) = state.arms(now_ns) {
-            viewers.live("/live/arms", now_ns, arms);
+        if state.arms.is_known() {
+            let picture = json!(state.arms.picture(now_ns, origin_ns));
+            viewers.live("/live/arms", now_ns, picture);
         }
     }
     if is_due(&mut due.channels, CHANNELS_PERIOD) {
@@ -285,8 +247,8 @@ fn pictures(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, now_ns: i64
         for loss in losses {
             viewers.live("/live/losses", now_ns, loss);
         }
-        for place in 0..state.facts.channels.len() {
-            for stamps in state.shown(place) {
+        for (place, account) in state.accounts.iter_mut().enumerate() {
+            for stamps in account.take_shown() {
                 viewers.latency(place, now_ns, &stamps);
             }
         }
@@ -294,9 +256,11 @@ fn pictures(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, now_ns: i64
 }
 
 /// `/live/run`.
-fn words(shown: &Shown, links: &Links, viewer_count: usize, now_ns: i64) -> Value {
-    let is_over = shown.state.is_over() || shown.playback_speed.is_some();
-    let listed = shown.state.facts.links.iter().map(|link| {
+fn words(shown: &mut Shown, links: &Links, viewer_count: usize, now_ns: i64) -> Value {
+    let Shown { state, source, .. } = shown;
+    let is_playback = shown.playback_speed.is_some();
+    let is_over = state.how_ended.is_some() || is_playback;
+    let listed = state.facts.links.iter().map(|link| {
         let ways = ["forward", "backward"];
         let ways = ways.map(|way| links.describe(&link.name, &link.via, way, is_over));
         json!({
@@ -304,15 +268,21 @@ fn words(shown: &Shown, links: &Links, viewer_count: usize, now_ns: i64) -> Valu
             "from_host": link.between[0], "to_host": link.between[1], "directions": ways,
         })
     });
-    let mut run = shown.state.run(now_ns);
+    let mut warnings = source.warnings();
+    let problem = state.fleet.as_ref().and_then(|fleet| fleet.problem.clone());
+    warnings.extend(problem.map(|what| Warning {
+        process: None,
+        what,
+    }));
+    let overruns = source.overruns();
+    let mut run = state.run(now_ns);
     run["links"] = listed.collect();
-    run["is_playback"] = json!(shown.playback_speed.is_some());
+    run["is_playback"] = json!(is_playback);
     run["speed"] = json!(shown.playback_speed.unwrap_or(1.0));
-    run["warnings"] = json!(shown.warnings);
-    let [overruns, hosts] = &shown.overruns;
-    run["overruns"] = overruns.clone();
-    run["overrun_hosts"] = hosts.clone();
-    run["recorder"]["missed_count"] = json!(shown.source.missed_count());
+    run["warnings"] = json!(warnings);
+    run["overruns"] = json!(overruns.as_ref().map(|all| &all.processes));
+    run["overrun_hosts"] = json!(overruns.as_ref().map(|all| &all.hosts));
+    run["recorder"]["missed_count"] = json!(source.missed_count());
     run["recorder"]["viewer_count"] = json!(viewer_count);
     run
 }

@@ -8,9 +8,7 @@ mod front;
 mod head;
 mod page;
 mod parameters;
-mod playback;
 mod recording;
-mod running;
 mod source;
 mod viewers;
 
@@ -18,93 +16,34 @@ pub(crate) use access::{host, origin};
 
 use std::fs;
 use std::net::{IpAddr, SocketAddr};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
-use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
+use hil_platform::signals::Signals;
 use hil_rundir::live_run::LiveRun;
 use hil_rundir::run_folder::RunFolder;
-use hil_rundir::select::SelectError;
-use hil_rundir::select::select;
-use hil_watch::FeedError;
+use hil_rundir::select::{SelectError, select};
 use tokio::runtime::Runtime;
 
-use crate::cli::ServeOptions;
+use crate::cli::{RecordOptions, ServeOptions};
+use crate::failure::{Exit, Failure};
 use crate::split::prepare;
-use crate::writer::WriteError;
+use crate::view::state::RunState;
 use access::{Access, NO_ORIGIN, Refusal};
 use engine::{Engine, Showing, Shown};
 use front::{Door, Front, GONE_AFTER};
 use parameters::Links;
-use playback::Playback;
-use recording::Target;
-use running::Running;
+use source::{Playback, Running};
 use viewers::Viewers;
 
+/// What a kill may lose at most of a recording.
+const FLUSH: Duration = Duration::from_secs(1);
 /// Between two looks for a run that begins.
 const WAIT_PERIOD: Duration = Duration::from_millis(300);
-
-/// Why nothing is served.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum ServeError {
-    /// Nothing to play back.
-    #[error(transparent)]
-    Run(#[from] crate::run::RunError),
-    /// A run's folder in which nothing is yet.
-    #[error("the run in {folder} has not begun yet; --wait waits for it")]
-    NotBegun {
-        /// The folder.
-        folder: PathBuf,
-    },
-    /// No run goes on, or it is not clear which is meant.
-    #[error("{0}; --wait waits for one, and the folder of a finished run is played back")]
-    Select(#[from] SelectError),
-    /// A run that goes on cannot be watched.
-    #[error(transparent)]
-    Feed(#[from] FeedError),
-    /// Nowhere to record it.
-    #[error("--record: {0}")]
-    Record(#[from] WriteError),
-    /// To be recorded, but over.
-    #[error(
-        "--record: the run in {folder} is over and would only be played back; `hil-recorder convert \
-         {folder} -o FILE` makes a file of it"
-    )]
-    Over {
-        /// The run's folder.
-        folder: PathBuf,
-    },
-    /// The socket.
-    #[error(
-        "cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free"
-    )]
-    Socket {
-        /// Where.
-        address: SocketAddr,
-        /// What the system said.
-        why: std::io::Error,
-    },
-    /// What is behind the socket.
-    #[error("cannot listen behind the socket on loopback: {0}")]
-    Hidden(String),
-    /// The page.
-    #[error(
-        "cannot serve the page at {address}: {why}; --http-port takes another, 0 any that is free"
-    )]
-    Page {
-        /// Where.
-        address: SocketAddr,
-        /// What the system said.
-        why: std::io::Error,
-    },
-    /// Threads, mostly.
-    #[error("cannot begin: {0}")]
-    Runtime(#[from] std::io::Error),
-}
 
 /// Serves until a signal comes; the exit code, which says whether what was to be recorded is.
 ///
@@ -114,25 +53,38 @@ pub(crate) fn serve(
     options: &ServeOptions,
     signals: &Signals,
     console: &mut Console,
-) -> Result<i32, ServeError> {
+) -> Result<Exit, Failure> {
     if let Some(output) = &options.record {
-        prepare(output, None, false)?;
+        prepare(output, None, false).map_err(|error| {
+            let failure = Failure::from(error);
+            let words = format!("--record: {failure}");
+            Failure { words, ..failure }
+        })?;
     }
     let shown = first(options, signals, console)?;
     if signals.received().is_some() {
-        return Ok(EXIT_INTERRUPTED);
+        return Ok(Exit::Interrupted);
     }
     let links = Links::begin();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("viewers")
         .enable_all()
-        .build()?;
+        .build()
+        .map_err(|error| Failure::failed(format!("cannot begin: {error}")))?;
     let access = Arc::new(admitted(options));
     let (viewers, front) = open(options, &runtime, &links, &access, console)?;
-    let target = options.record.clone().map(|path| Target {
-        path,
-        has_scene: !options.no_scene,
+    let target = options.record.clone().map(|output| RecordOptions {
+        run: None,
+        output,
+        wait: false,
+        below: None,
+        from_now: false,
+        split_size: None,
+        flush: FLUSH,
+        force: false,
+        no_scene: options.no_scene,
+        folder: None,
     });
     let mut engine = Engine::new(viewers, links, target);
     match shown {
@@ -160,7 +112,11 @@ pub(crate) fn serve(
         console.say(&account);
     }
     console.say("ended");
-    Ok(i32::from(!is_recorded))
+    Ok(if is_recorded {
+        Exit::Done
+    } else {
+        Exit::Failed
+    })
 }
 
 /// What is shown first; `None` when it has to be waited for.
@@ -168,23 +124,27 @@ fn first(
     options: &ServeOptions,
     signals: &Signals,
     console: &mut Console,
-) -> Result<Option<Shown>, ServeError> {
+) -> Result<Option<Shown>, Failure> {
     let wanted = options.run.as_deref();
     let folder = wanted.map(Path::new).filter(|path| path.is_dir());
     // Asked before whether it goes on, so that one that begins in between is not played back.
     if let Some(folder) = folder.filter(|folder| has_not_begun(folder)) {
-        let folder = folder.to_owned();
+        let folder = folder.display();
+        let why = format!("the run in {folder} has not begun yet; --wait waits for it");
         return if options.wait {
             Ok(None)
         } else {
-            Err(ServeError::NotBegun { folder })
+            Err(Failure::failed(why))
         };
     }
     let goes_on = |folder: &&Path| LiveRun::read(folder).is_ok_and(|run| run.is_held());
     if let Some(folder) = folder.filter(|folder| !goes_on(folder)) {
         if options.record.is_some() {
-            let folder = folder.to_owned();
-            return Err(ServeError::Over { folder });
+            let folder = folder.display();
+            return Err(Failure::usage(format!(
+                "--record: the run in {folder} is over and would only be played back; \
+                 `hil-recorder convert {folder} -o FILE` makes a file of it"
+            )));
         }
         let progress = Progress::begin();
         let (speed, repeats) = (options.speed, options.repeats);
@@ -196,13 +156,20 @@ fn first(
         for words in playback.words() {
             console.warn(words);
         }
-        let source = Box::new(playback);
-        return Ok(Some(Shown::new(facts, source, Some(options.speed), None)));
+        return Ok(Some(Shown {
+            state: RunState::new(facts),
+            source: Box::new(playback),
+            playback_speed: Some(options.speed),
+            links: None,
+        }));
     }
     match select(wanted) {
         Ok(run) => Ok(Some(watch(run)?)),
         Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if options.wait => Ok(None),
-        Err(error) => Err(error.into()),
+        Err(error) => {
+            let cure = "--wait waits for one, and the folder of a finished run is played back";
+            Err(Failure::usage(format!("{error}; {cure}")))
+        }
     }
 }
 
@@ -215,12 +182,15 @@ fn has_not_begun(folder: &Path) -> bool {
     !is_told && records.is_ok_and(|mut records| records.next().is_none())
 }
 
-fn watch(run: LiveRun) -> Result<Shown, ServeError> {
+fn watch(run: LiveRun) -> Result<Shown, Failure> {
     let folder = run.folder.clone();
-    let (running, facts) = Running::open(run)?;
-    let topology = running.topology().clone();
-    let links = Some((folder, topology));
-    Ok(Shown::new(facts, Box::new(running), None, links))
+    let (running, facts) = Running::open(run).map_err(Failure::failed)?;
+    Ok(Shown {
+        state: RunState::new(facts),
+        links: Some((folder, running.topology().clone())),
+        source: Box::new(running),
+        playback_speed: None,
+    })
 }
 
 /// Shows a run that has begun, where none is shown or the one shown gives way to it. `said` is what
@@ -280,17 +250,27 @@ fn open(
     links: &Links,
     access: &Arc<Access>,
     console: &mut Console,
-) -> Result<(Viewers, Front), ServeError> {
+) -> Result<(Viewers, Front), Failure> {
     let runtime = runtime.handle();
     let address = SocketAddr::new(options.host, options.port);
-    let door = Door::take(runtime, address, GONE_AFTER)
-        .map_err(|why| ServeError::Socket { address, why })?;
+    let door = Door::take(runtime, address, GONE_AFTER).map_err(|why| {
+        Failure::failed(format!(
+            "cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free"
+        ))
+    })?;
     let socket = SocketAddr::new(options.host, door.port());
-    let viewers = Viewers::begin(runtime, Arc::new(links.clone()))
-        .map_err(|error| ServeError::Hidden(error.to_string()))?;
+    let viewers = Viewers::begin(runtime, Arc::new(links.clone())).map_err(|error| {
+        Failure::failed(format!(
+            "cannot listen behind the socket on loopback: {error}"
+        ))
+    })?;
     let address = SocketAddr::new(options.host, options.http_port);
-    let page = page::serve(runtime, address, door.port(), Arc::clone(access))
-        .map_err(|why| ServeError::Page { address, why })?;
+    let page = page::serve(runtime, address, door.port(), Arc::clone(access)).map_err(|why| {
+        Failure::failed(format!(
+            "cannot serve the page at {address}: {why}; --http-port takes another, 0 any that is \
+                 free"
+        ))
+    })?;
     let front = door.open(runtime, viewers.address, Arc::clone(access), page.port());
     if !options.host.is_loopback() {
         console.warn(

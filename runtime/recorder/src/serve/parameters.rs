@@ -23,7 +23,7 @@ use foxglove::websocket::{
 };
 use hil_link::condition::LinkCondition;
 use hil_topology::read_duration;
-use hil_watch::link::{LinkDirection, RunLinks};
+use hil_watch::link::RunLinks;
 use serde_json::{Value, json};
 
 /// How often it is looked whether somebody else changed a link.
@@ -35,22 +35,8 @@ const DELAY: &str = "delay_ms";
 const LOSS: &str = "loss_ratio";
 const CUT: &str = "is_cut";
 
-/// One direction of a link.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-struct Direction {
-    link: String,
-    /// `forward` or `backward`.
-    way: String,
-}
-
-impl Direction {
-    fn new(link: &str, way: &str) -> Self {
-        Self {
-            link: link.to_owned(),
-            way: way.to_owned(),
-        }
-    }
-}
+/// What each direction does, by its name: `<link>.<forward or backward>`.
+type Wishes = BTreeMap<String, Wish>;
 
 /// What a direction does, as far as it has numbers.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -115,26 +101,28 @@ pub(crate) struct Links {
     ask: SyncSender<Request>,
     /// Beside the queue, so that it is not lost when viewers fill that.
     change: Arc<Mutex<Option<Change>>>,
-    known: Arc<Mutex<BTreeMap<Direction, Wish>>>,
+    wishes: Arc<Mutex<Wishes>>,
 }
 
 impl Links {
     /// Begins without a run. The thread ends with the last of its clones.
     pub(crate) fn begin() -> Self {
         let (ask, asked) = sync_channel(WAITING_MAX);
-        let change = Arc::new(Mutex::new(None));
-        let known = Arc::new(Mutex::new(BTreeMap::new()));
+        let links = Self {
+            ask,
+            change: Arc::default(),
+            wishes: Arc::default(),
+        };
         let worker = Worker {
             run: None,
             folder: None,
             launches: BTreeMap::new(),
-            change: Arc::clone(&change),
-            known: Arc::clone(&known),
+            change: Arc::clone(&links.change),
             topology: Value::Null,
-            wishes: BTreeMap::new(),
+            wishes: Arc::clone(&links.wishes),
         };
         thread::spawn(move || worker.work(&asked));
-        Self { ask, change, known }
+        links
     }
 
     /// From now on, the links of the run in `folder` with this resolved topology; those of no run
@@ -148,8 +136,7 @@ impl Links {
     /// What the direction `way` of `link` does: `condition`, `is_settable` and `why_not` of
     /// `/live/run`.
     pub(crate) fn describe(&self, link: &str, via: &str, way: &str, is_over: bool) -> Value {
-        let key = Direction::new(link, way);
-        let wish = locked(&self.known).get(&key).copied();
+        let wish = locked(&self.wishes).get(&format!("{link}.{way}")).copied();
         let condition = wish
             .map(|wish| json!({ DELAY: wish.delay_ms, LOSS: wish.loss_ratio, CUT: wish.is_cut }));
         let why_not = match wish {
@@ -166,11 +153,7 @@ impl Links {
 
     /// Every parameter with its present value.
     pub(crate) fn list(&self) -> Vec<Parameter> {
-        let known = locked(&self.known);
-        known
-            .iter()
-            .flat_map(|(key, wish)| parameters_of(key, wish))
-            .collect()
+        named(&locked(&self.wishes), &[])
     }
 }
 
@@ -208,9 +191,8 @@ struct Worker {
     /// The launch files when the links were opened.
     launches: BTreeMap<OsString, u64>,
     change: Arc<Mutex<Option<Change>>>,
-    known: Arc<Mutex<BTreeMap<Direction, Wish>>>,
     topology: Value,
-    wishes: BTreeMap<Direction, Wish>,
+    wishes: Arc<Mutex<Wishes>>,
 }
 
 impl Worker {
@@ -219,13 +201,18 @@ impl Worker {
             let request = asked.recv_timeout(LOOK_PERIOD);
             let change = locked(&self.change).take();
             if let Some(Change(run)) = change {
-                self.show(run);
+                let (folder, topology) = run.unzip();
+                self.run = None;
+                self.folder = folder;
+                self.topology = topology.unwrap_or_default();
+                locked(&self.wishes).clear();
+                self.look();
             }
             match request {
                 Ok(Request::Wake) => {}
                 Ok(Request::Get(names, responder)) => {
                     self.look();
-                    responder.respond(self.named(&names));
+                    responder.respond(named(&locked(&self.wishes), &names));
                 }
                 Ok(Request::Set(parameters, client, responder)) => {
                     let mut names = Vec::new();
@@ -237,7 +224,7 @@ impl Worker {
                     }
                     self.look();
                     // What they are now, whether the wish was granted or not.
-                    responder.respond(self.named(&names));
+                    responder.respond(named(&locked(&self.wishes), &names));
                 }
                 Err(RecvTimeoutError::Timeout) => self.look(),
                 Err(RecvTimeoutError::Disconnected) => return,
@@ -245,69 +232,50 @@ impl Worker {
         }
     }
 
-    fn show(&mut self, run: Option<(PathBuf, Value)>) {
-        self.wishes.clear();
-        self.run = None;
-        let (folder, topology) = run.unzip();
-        self.folder = folder;
-        self.topology = topology.unwrap_or_default();
-        self.look();
-    }
-
-    /// Gateways begin after the run is announced, one after the other, and may begin again. The
-    /// links are opened anew only then: to open one that replays a trace is to read the trace.
-    fn open(&mut self) {
+    /// Takes over what the gateways have on record.
+    fn look(&mut self) {
         let Some(folder) = &self.folder else {
             return;
         };
+        // Gateways begin after the run is announced, one after the other, and may begin again. The links
+        // are opened anew only then: to open one that replays a trace is to read the trace.
         let launches = launches_in(folder);
-        if self.run.is_some() && launches == self.launches {
-            return;
-        }
-        if let Ok(run) = RunLinks::open(folder) {
+        if (self.run.is_none() || launches != self.launches)
+            && let Ok(run) = RunLinks::open(folder)
+        {
             self.run = Some(run);
             self.launches = launches;
         }
-    }
-
-    /// Takes over what the gateways have on record.
-    fn look(&mut self) {
-        self.open();
-        if let Some(run) = &self.run {
-            for direction in run.directions() {
-                let Ok((condition, _)) = run.condition(direction) else {
-                    continue;
-                };
-                let key = key_of(direction);
-                let before = self.wishes.get(&key).copied();
-                let wish = wish_of(condition, before, &self.topology, &key);
-                self.wishes.insert(key, wish);
+        let Some(run) = &self.run else {
+            return;
+        };
+        for direction in run.directions() {
+            if let Ok((condition, _)) = run.condition(direction) {
+                let spec = &self.topology["links"][&direction.link][direction.way.word()];
+                let mut wishes = locked(&self.wishes);
+                let name = direction.name();
+                let before = wishes.get(&name).copied();
+                wishes.insert(name, wish_of(condition, before, spec));
             }
         }
-        locked(&self.known).clone_from(&self.wishes);
-    }
-
-    fn named(&self, names: &[String]) -> Vec<Parameter> {
-        let all = self
-            .wishes
-            .iter()
-            .flat_map(|(key, wish)| parameters_of(key, wish));
-        all.filter(|one| names.is_empty() || names.contains(&one.name))
-            .collect()
     }
 
     fn set(&mut self, parameter: &Parameter) -> Result<(), String> {
-        let run = self
-            .run
-            .as_mut()
-            .ok_or("no run goes on whose links could be changed")?;
-        let (direction, what) = meant(run, &parameter.name)?;
-        let key = key_of(&direction);
-        let wish = self.wishes.get(&key).copied().unwrap_or_default();
-        let wish = wish.with(&what, parameter)?;
-        run.set(&direction, wish.condition())
+        let run = self.run.as_mut();
+        let run = run.ok_or("no run goes on whose links could be changed")?;
+        let unknown = "a link's parameter is called link.<link>.<forward or backward>.<what>";
+        let inner = parameter.name.strip_prefix("link.").ok_or(unknown)?;
+        let (direction, what) = inner.rsplit_once('.').ok_or(unknown)?;
+        let found = run.named(direction).map_err(|error| error.to_string())?;
+        let [direction] = &found[..] else {
+            return Err(unknown.to_owned());
+        };
+        let name = direction.name();
+        let wish = locked(&self.wishes).get(&name).copied();
+        let wish = wish.unwrap_or_default().with(what, parameter)?;
+        run.set(direction, wish.condition())
             .map_err(|error| error.to_string())?;
-        self.wishes.insert(key, wish);
+        locked(&self.wishes).insert(name, wish);
         Ok(())
     }
 }
@@ -321,28 +289,9 @@ fn locked<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
 fn launches_in(folder: &Path) -> BTreeMap<OsString, u64> {
     let entries = fs::read_dir(folder.join("launch"));
     let entries = entries.into_iter().flatten().flatten();
-    let files = entries.filter_map(|entry| {
-        let length = entry.metadata().ok()?.len();
-        Some((entry.file_name(), length))
-    });
-    files.collect()
-}
-
-fn key_of(direction: &LinkDirection) -> Direction {
-    Direction::new(&direction.link, direction.way.word())
-}
-
-/// The direction and the part of it that `name` means.
-fn meant(run: &RunLinks, name: &str) -> Result<(LinkDirection, String), String> {
-    let unknown =
-        || "a link's parameter is called link.<link>.<forward or backward>.<what>".to_owned();
-    let inner = name.strip_prefix("link.").ok_or_else(unknown)?;
-    let (direction, what) = inner.rsplit_once('.').ok_or_else(unknown)?;
-    let found = run.named(direction).map_err(|error| error.to_string())?;
-    match <[LinkDirection; 1]>::try_from(found) {
-        Ok([direction]) => Ok((direction, what.to_owned())),
-        Err(_) => Err(unknown()),
-    }
+    entries
+        .filter_map(|entry| Some((entry.file_name(), entry.metadata().ok()?.len())))
+        .collect()
 }
 
 fn number(parameter: &Parameter) -> Option<f64> {
@@ -363,13 +312,17 @@ fn within(value: f64, max: f64, unit: &str) -> Result<f64, String> {
     is_within.then_some(value).ok_or_else(range)
 }
 
-/// What a direction does, by the gateway's record; numbers of the topology where that has some.
-fn wish_of(
-    condition: LinkCondition,
-    before: Option<Wish>,
-    topology: &Value,
-    key: &Direction,
-) -> Wish {
+/// What a direction does, by the gateway's record; numbers of `spec`, what the topology says of it, where
+/// that has some.
+fn wish_of(condition: LinkCondition, before: Option<Wish>, spec: &Value) -> Wish {
+    let of_topology = || {
+        let delay = spec["delay"].as_str().and_then(read_duration);
+        Wish {
+            delay_ms: delay.map(|delay| delay.as_secs_f64() * 1e3),
+            loss_ratio: spec["loss_ratio"].as_f64(),
+            ..Wish::default()
+        }
+    };
     match condition {
         LinkCondition::Fixed { delay, loss_ratio } => Wish {
             delay_ms: Some(delay.as_secs_f64() * 1e3),
@@ -379,40 +332,30 @@ fn wish_of(
         },
         LinkCondition::Cut => Wish {
             is_cut: true,
-            ..before.unwrap_or_else(|| of_topology(topology, key))
+            ..before.unwrap_or_else(of_topology)
         },
-        LinkCondition::Topology => of_topology(topology, key),
+        LinkCondition::Topology => of_topology(),
     }
 }
 
-/// What the topology gives numbers for.
-fn of_topology(topology: &Value, key: &Direction) -> Wish {
-    let spec = &topology["links"][&key.link][&key.way];
-    let delay = spec["delay"].as_str().and_then(read_duration);
-    Wish {
-        delay_ms: delay.map(|delay| delay.as_secs_f64() * 1e3),
-        loss_ratio: spec["loss_ratio"].as_f64(),
-        is_set: false,
-        is_cut: false,
-    }
-}
-
-fn parameters_of(key: &Direction, wish: &Wish) -> Vec<Parameter> {
-    let named = |what: &str| format!("link.{}.{}.{what}", key.link, key.way);
-    let numbers = [(DELAY, wish.delay_ms), (LOSS, wish.loss_ratio)];
-    let numbers = numbers.into_iter().filter_map(|(what, value)| {
-        Some(Parameter {
-            name: named(what),
-            r#type: Some(ParameterType::Float64),
-            value: Some(ParameterValue::Float64(value?)),
-        })
+/// The parameters with these names, all of them without one.
+fn named(wishes: &Wishes, names: &[String]) -> Vec<Parameter> {
+    let all = wishes.iter().flat_map(|(direction, wish)| {
+        let parameter = |what: &str, r#type, value| Parameter {
+            name: format!("link.{direction}.{what}"),
+            r#type,
+            value: Some(value),
+        };
+        let number = |what, value: Option<f64>| {
+            let value = ParameterValue::Float64(value?);
+            Some(parameter(what, Some(ParameterType::Float64), value))
+        };
+        let cut = parameter(CUT, None, ParameterValue::Bool(wish.is_cut));
+        let numbers = [number(DELAY, wish.delay_ms), number(LOSS, wish.loss_ratio)];
+        numbers.into_iter().flatten().chain([cut])
     });
-    let cut = Parameter {
-        name: named(CUT),
-        r#type: None,
-        value: Some(ParameterValue::Bool(wish.is_cut)),
-    };
-    numbers.chain([cut]).collect()
+    all.filter(|one| names.is_empty() || names.contains(&one.name))
+        .collect()
 }
 
 #[cfg(test)]
@@ -431,20 +374,16 @@ mod tests {
     /// What the gateway is asked for when the link is cut and then no longer, with a look at its
     /// record between.
     fn cut_and_back(wish: Wish) -> LinkCondition {
-        let key = Direction::new("hop", "forward");
         let cut = after(wish, CUT, ParameterValue::Bool(true));
         assert_eq!(cut.condition(), LinkCondition::Cut);
-        let seen = wish_of(LinkCondition::Cut, Some(cut), &Value::Null, &key);
+        let seen = wish_of(LinkCondition::Cut, Some(cut), &Value::Null);
         after(seen, CUT, ParameterValue::Bool(false)).condition()
     }
 
     #[test]
     fn a_link_that_was_cut_does_afterwards_what_it_did_before() {
-        let key = Direction::new("hop", "forward");
-        let topology = json!({ "links": { "hop": { "forward": {
-            "delay": "5 ms", "loss_ratio": 0.1,
-        }}}});
-        let wish = wish_of(LinkCondition::Topology, None, &topology, &key);
+        let spec = json!({ "delay": "5 ms", "loss_ratio": 0.1 });
+        let wish = wish_of(LinkCondition::Topology, None, &spec);
         assert_eq!(wish.loss_ratio, Some(0.1));
         assert_eq!(cut_and_back(wish), LinkCondition::Topology);
 
@@ -457,10 +396,10 @@ mod tests {
             delay: Duration::from_millis(250),
             loss_ratio: 0.25,
         };
-        let others = wish_of(fixed, Some(wish), &topology, &key);
+        let others = wish_of(fixed, Some(wish), &spec);
         assert_eq!(cut_and_back(others), fixed);
         // Somebody cut it before anybody looked.
-        let unseen = wish_of(LinkCondition::Cut, None, &topology, &key);
+        let unseen = wish_of(LinkCondition::Cut, None, &spec);
         let uncut = after(unseen, CUT, ParameterValue::Bool(false));
         assert_eq!(uncut.condition(), LinkCondition::Topology);
     }

@@ -5,25 +5,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
 
 use hil_platform::console::Console;
-use hil_platform::words::counted_plainly;
 
-use crate::record::{RecordError, Recorded, Request, Which, record};
+use crate::cli::RecordOptions;
+use crate::failure::Failure;
+use crate::record::{Recorded, record};
 use crate::split::another;
-
-/// What a kill may lose at most.
-const FLUSH: Duration = Duration::from_secs(1);
-
-/// Where what is shown is recorded, and how.
-#[derive(Debug, Clone)]
-pub(super) struct Target {
-    /// The file, or the folder that files are written into.
-    pub(super) path: PathBuf,
-    /// Draw the scene.
-    pub(super) has_scene: bool,
-}
 
 /// A run that is being recorded.
 #[derive(Debug)]
@@ -32,30 +20,24 @@ pub(super) struct Recording {
     pub(super) path: PathBuf,
     /// No file came of it.
     pub(super) has_failed: bool,
-    thread: Option<JoinHandle<Result<Recorded, RecordError>>>,
+    thread: Option<JoinHandle<Result<Recorded, Failure>>>,
     stop: Arc<AtomicBool>,
 }
 
 impl Recording {
-    /// Records the run in `folder`, the `number`th that this server records, from its first message on. Its name would not do: two runs may
-    /// bear one.
-    pub(super) fn begin(folder: &Path, target: &Target, number: usize) -> Self {
-        let path = another(&target.path, number);
-        let request = Request {
-            run: Which::In(folder.to_owned()),
+    /// Records the run in `folder`, the `number`th that this server records, from its first message on,
+    /// to `target`. Its name would not do: two runs may bear one.
+    pub(super) fn begin(folder: &Path, target: &RecordOptions, number: usize) -> Self {
+        let path = another(&target.output, number);
+        let options = RecordOptions {
+            folder: Some(folder.to_owned()),
             output: path.clone(),
-            waits: false,
-            below: None,
-            from_now: false,
-            split_bytes: None,
-            flush: FLUSH,
-            force: false,
-            has_scene: target.has_scene,
+            ..target.clone()
         };
         let stop = Arc::new(AtomicBool::new(false));
         let is_stopped = Arc::clone(&stop);
         let thread = thread::spawn(move || {
-            record(&request, &mut |_| {
+            record(&options, &mut |_| {
                 is_stopped.load(Ordering::Relaxed).then_some("the server")
             })
         });
@@ -96,11 +78,9 @@ impl Recording {
                 for words in &recorded.words {
                     console.warn(words);
                 }
-                let files = recorded.paths.iter().map(|path| path.display().to_string());
                 console.say(&format!(
-                    "{}: {} of the run; missed {}",
-                    files.collect::<Vec<_>>().join(", "),
-                    counted_plainly(recorded.message_count, "message"),
+                    "{}; missed {}",
+                    recorded.files(),
                     recorded.missed.values().sum::<u64>()
                 ));
             }

@@ -17,8 +17,8 @@ use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
 use super::front::hidden_address;
-use crate::channel::{ChannelTopics, Wanted, typed};
 use crate::net::MessageLatency;
+use crate::run_topics::{ChannelTopics, Wanted};
 use crate::schema::Schema;
 use crate::sink::Sink;
 use crate::topics::Names;
@@ -164,17 +164,15 @@ impl Viewers {
         })
     }
 
-    /// Viewers that are connected.
-    pub(crate) fn count(&self) -> usize {
-        self.server.client_count()
-    }
-
     /// Offers the topics of a run's channels in place of those before; what is kept as bytes, and
     /// why.
     ///
     /// # Errors
     /// When a topic cannot be offered.
     pub(crate) fn offer(&mut self, facts: &RunFacts) -> Result<Vec<String>, FoxgloveError> {
+        for live in self.live.values_mut() {
+            live.last = None;
+        }
         for channel in self.offered.topics.drain(..) {
             channel.close();
         }
@@ -186,16 +184,15 @@ impl Viewers {
         let wanted = facts.channels.iter().map(|one| Wanted {
             name: &one.name,
             described: one.described.as_ref(),
-            typed: typed(one.described.as_ref()),
+            recorded_bytes: Vec::new(),
         });
         let mut words = Vec::new();
         for mut channel in ChannelTopics::of_all(wanted.collect(), &mut names) {
             channel.own.declare(&mut self.offered)?;
             channel.declare_views(&mut self.offered)?;
-            let is_taken = facts
-                .channel(&channel.name)
-                .is_some_and(|(_, one)| one.is_taken());
-            if is_taken {
+            // Of others the manifest says that they are recorded only.
+            let described = facts.channel(&channel.name).map(|(_, one)| &one.described);
+            if described.is_some_and(|one| one.as_ref().is_none_or(|one| one.to_host.is_some())) {
                 channel.latency.declare(&mut self.offered)?;
             }
             if let Some(why) = channel.untyped() {
@@ -238,13 +235,6 @@ impl Viewers {
         let stamp = PartialMetadata::with_log_time(u64::try_from(at_ns).unwrap_or(0));
         live.channel.log_with_meta(&text, stamp);
         live.last = (topic != LOSSES).then_some(text);
-    }
-
-    /// Forgets the last state of a live topic, which is of a run before.
-    pub(crate) fn forget(&mut self) {
-        for live in self.live.values_mut() {
-            live.last = None;
-        }
     }
 
     /// Tells those who came since the last call what the others know already.

@@ -1,15 +1,15 @@
 //! The account of one channel while its run goes on: how often, how long, how many lost. It says
 //! less than the account of a finished run: what is not known yet is no loss.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
+use hil_core::record::EgressRecord;
 use hil_rundir::live_run::Stage;
+use hil_stats::histogram::LatencySummary;
 use hil_watch::Record;
 use serde_json::{Value, json};
 
 use super::facts::ChannelFacts;
-use super::join::{Joined, LINK_SEGMENTS, LOCAL_SEGMENTS, Way};
-use super::window::{Recent, Samples, WINDOW_NS};
 use super::{Body, LiveRecord, seconds};
 use crate::net::{MessageId, MessageLatency, Noted};
 
@@ -80,16 +80,13 @@ impl Account {
     /// The account of `channel`; `has_one_clock` says that stamps of both ends compare.
     pub(crate) fn new(channel: &ChannelFacts, has_one_clock: bool) -> Self {
         let has_link = channel.link.is_some();
-        let count = if has_link {
-            LINK_SEGMENTS.len()
-        } else {
-            LOCAL_SEGMENTS.len()
+        let way = Way {
+            has_link,
+            has_one_clock,
         };
         Self {
-            way: Way {
-                has_link,
-                has_one_clock,
-            },
+            segments: way.segments().iter().map(|_| Samples::default()).collect(),
+            way,
             is_by_message: channel.is_by_message,
             under_way: BTreeMap::new(),
             lost: BTreeMap::new(),
@@ -99,7 +96,6 @@ impl Account {
             counts: Counts::default(),
             rate: Recent::default(),
             window_lost: Recent::default(),
-            segments: (0..count).map(|_| Samples::default()).collect(),
             whole: Samples::default(),
             left_ns: None,
             arrived_ns: None,
@@ -155,10 +151,9 @@ impl Account {
             self.counts.lost = self.counts.lost.saturating_sub(1);
             self.untold.retain(|(number, _)| *number != sequence);
         }
-        let newest = self.newest.insert(epoch, sequence).unwrap_or(sequence);
-        if newest > sequence {
-            self.newest.insert(epoch, newest);
-        }
+        let known = self.newest.entry(epoch).or_insert(sequence);
+        let newest = *known;
+        *known = newest.max(sequence);
         // Where nobody here saw them leave, the numbers passed over are all that tells of them.
         if self.counts.sent.is_none() {
             let from = newest.saturating_add(1).max(sequence.saturating_sub(1000));
@@ -189,15 +184,9 @@ impl Account {
     /// Decides about messages that have been under way for long enough.
     pub(crate) fn settle(&mut self, now_ns: i64) {
         let due_ns = now_ns - LOST_AFTER_NS;
-        let old = self.under_way.iter();
-        let old: Vec<MessageId> = old
-            .filter(|(_, joined)| joined.first_ns <= due_ns)
-            .map(|(key, _)| *key)
-            .collect();
-        for key in old {
-            let Some(joined) = self.under_way.remove(&key) else {
-                continue;
-            };
+        let is_old = |_: &MessageId, joined: &mut Joined| joined.first_ns <= due_ns;
+        let old: Vec<_> = self.under_way.extract_if(.., is_old).collect();
+        for (key, joined) in old {
             if self.is_lost(key, &joined) {
                 self.counts.lost += 1;
                 self.window_lost.add(now_ns, 1);
@@ -237,55 +226,35 @@ impl Account {
         origin_ns: Option<i64>,
     ) -> Option<Value> {
         let mut lost = core::mem::take(&mut self.untold);
+        if lost.is_empty() {
+            return None;
+        }
         lost.sort_unstable();
         let first_ns = lost.iter().filter_map(|(_, published)| *published).min();
-        let sequences: Vec<u64> = lost
-            .iter()
-            .map(|(number, _)| *number)
-            .take(LISTED_MAX)
-            .collect();
-        (!lost.is_empty()).then(|| {
-            json!({
-                "at_s": at_s, "channel": name, "sequences": sequences, "count": lost.len(),
-                "first_at_s": first_ns
-                    .zip(origin_ns)
-                    .map(|(ns, origin_ns)| seconds(ns.saturating_sub(origin_ns))),
-            })
-        })
+        let ends = first_ns.zip(origin_ns);
+        let first_at_s = ends.map(|(ns, origin_ns)| seconds(ns.saturating_sub(origin_ns)));
+        let sequences = lost.iter().map(|(number, _)| *number).take(LISTED_MAX);
+        Some(json!({
+            "at_s": at_s, "channel": name, "sequences": sequences.collect::<Vec<_>>(),
+            "count": lost.len(), "first_at_s": first_at_s,
+        }))
     }
 
     /// The channel's entry in `/live/channels`.
     pub(crate) fn figures(&mut self, name: &str, now_ns: i64) -> Value {
-        let names: &[&str] = if self.way.has_link {
-            &LINK_SEGMENTS
-        } else {
-            &LOCAL_SEGMENTS
-        };
-        let segments: Vec<Value> = names
-            .iter()
-            .zip(&mut self.segments)
-            .map(|(name, samples)| {
-                let mut figures = samples.figures(now_ns);
-                figures["name"] = json!(name);
-                figures
-            })
+        let named = self.way.segments().iter().zip(&mut self.segments);
+        let segments: Vec<Value> = named
+            .map(|(name, samples)| samples.figures(name, now_ns))
             .collect();
-        let one_way = self.whole.is_available.then(|| {
-            let mut figures = self.whole.figures(now_ns);
-            figures["name"] = json!("published-taken");
-            figures
-        });
+        let one_way = self.whole.is_available;
+        let one_way = one_way.then(|| self.whole.figures("published-taken", now_ns));
         let can_tell = self.way.has_link && self.counts.received.is_some();
         let window_lost = self.window_lost.count(now_ns);
-        let silent_ns = self
-            .arrived_ns
-            .filter(|_| self.way.has_link)
-            .map(|ns| now_ns - ns);
+        let arrived_ns = self.arrived_ns.filter(|_| self.way.has_link);
         let counts = &self.counts;
         // What no process here has to do with has no rate here.
-        let is_seen = [counts.published(), counts.received, counts.taken]
-            .iter()
-            .any(Option::is_some);
+        let seen = [counts.published(), counts.received, counts.taken];
+        let is_seen = seen.iter().any(Option::is_some);
         let rate_hz = self.rate.count(now_ns) as f64 * 1e9 / WINDOW_NS as f64;
         let rate_hz = is_seen.then_some(rate_hz);
         json!({
@@ -300,7 +269,7 @@ impl Account {
             "one_way": one_way,
             "clock_bound_us": self.way.has_one_clock.then_some(0.0),
             "link_state": self.link_state(now_ns),
-            "silent_s": silent_ns.map(|ns| seconds(ns.max(0))),
+            "silent_s": arrived_ns.map(|ns| seconds((now_ns - ns).max(0))),
         })
     }
 
@@ -322,6 +291,220 @@ impl Account {
             "up"
         }
     }
+}
+
+/// The segments of a channel over a link, in order.
+const LINK_SEGMENTS: [&str; 7] = [
+    "published-taken by gateway",
+    "taken by gateway-handed",
+    "handed-TX stamp",
+    "TX stamp-RX stamp",
+    "RX stamp-received",
+    "received-forwarded",
+    "forwarded-taken",
+];
+
+/// The only segment of a channel that stays in shared memory.
+const LOCAL_SEGMENTS: [&str; 1] = ["published-taken"];
+
+/// What decides which lengths a channel's stamps give.
+#[derive(Debug, Clone, Copy)]
+struct Way {
+    /// It crosses a link.
+    has_link: bool,
+    /// Stamps of both ends compare.
+    has_one_clock: bool,
+}
+
+impl Way {
+    /// The names of its segments.
+    const fn segments(self) -> &'static [&'static str] {
+        if self.has_link {
+            &LINK_SEGMENTS
+        } else {
+            &LOCAL_SEGMENTS
+        }
+    }
+}
+
+/// One message on its way.
+#[derive(Debug, Clone, Default)]
+struct Joined {
+    /// Its stamps.
+    stamps: MessageLatency,
+    /// When the first of its records was known.
+    first_ns: i64,
+    is_refused: bool,
+    has_ingress: bool,
+    /// Segments already counted, by bit; the last bit is the whole way.
+    counted: u16,
+}
+
+/// The bit of the whole way, published to taken.
+const WHOLE: usize = 15;
+
+impl Joined {
+    /// A message first heard of at `at_ns`.
+    fn new(message: MessageId, at_ns: i64) -> Self {
+        Self {
+            stamps: MessageLatency::new(message),
+            first_ns: at_ns,
+            ..Self::default()
+        }
+    }
+
+    /// Takes a record of it; of its arrivals only the first.
+    fn note(&mut self, record: &Record) {
+        self.stamps.note(record);
+        match record {
+            Record::Egress(one) => {
+                self.is_refused = one.flags & EgressRecord::REFUSED_BY_KERNEL != 0;
+            }
+            Record::Ingress(_) => self.has_ingress = true,
+            _ => {}
+        }
+    }
+
+    /// True when it reached the other gateway, or its consumer said so.
+    fn has_arrived(&self) -> bool {
+        self.has_ingress || self.stamps.taken_ns.is_some()
+    }
+
+    /// True when it was handed to the link, or the kernel refused it there.
+    fn has_left(&self) -> bool {
+        self.is_refused || self.stamps.handed_ns.is_some()
+    }
+
+    /// Hears of each segment whose two ends are known now and were not before: its place among
+    /// [`Way::segments`], `None` for the whole way, and its length.
+    fn news(&mut self, way: Way, hear: &mut dyn FnMut(Option<usize>, i64)) {
+        let one = &self.stamps;
+        let mut counted = self.counted;
+        let mut offer = |bit: usize, length_ns: Option<i64>| {
+            let is_new = counted & (1 << bit) == 0;
+            if let Some(length_ns) = length_ns.filter(|_| is_new) {
+                counted |= 1 << bit;
+                hear((bit != WHOLE).then_some(bit), length_ns);
+            }
+        };
+        let whole =
+            span(one.published_ns, one.taken_ns).filter(|_| way.has_one_clock || !way.has_link);
+        if way.has_link {
+            let tx_ns = minus(one.tx_realtime_ns, one.sender_realtime_offset_ns);
+            let rx_ns = minus(one.rx_realtime_ns, one.receiver_realtime_offset_ns);
+            let wire = span(one.tx_realtime_ns, one.rx_realtime_ns).filter(|_| way.has_one_clock);
+            let segments = [
+                span(one.published_ns, one.gateway_taken_ns),
+                span(one.gateway_taken_ns, one.handed_ns),
+                span(one.handed_ns, tx_ns),
+                wire,
+                span(rx_ns, one.received_ns),
+                span(one.received_ns, one.forwarded_ns),
+                span(one.forwarded_ns, one.taken_ns),
+            ];
+            for (bit, length_ns) in segments.into_iter().enumerate() {
+                offer(bit, length_ns);
+            }
+        } else {
+            offer(0, whole);
+        }
+        offer(WHOLE, whole);
+        self.counted = counted;
+        self.stamps.delay_ns = whole;
+    }
+}
+
+fn minus(ns: Option<i64>, offset_ns: Option<i64>) -> Option<i64> {
+    ns.zip(offset_ns)
+        .and_then(|(ns, offset)| ns.checked_sub(offset))
+}
+
+fn span(from_ns: Option<i64>, to_ns: Option<i64>) -> Option<i64> {
+    minus(to_ns, from_ns)
+}
+
+/// How far back figures look, nanoseconds.
+const WINDOW_NS: i64 = 1_000_000_000;
+
+/// Values kept at most; beyond, the oldest go, and figures are of the newest.
+const SAMPLES_MAX: usize = 4096;
+
+/// Records are read some time after they were written; a window that ends now would lack the newest.
+/// It ends with the newest that is known, but no longer ago than this, nanoseconds.
+const READ_LATE_NS: i64 = 250_000_000;
+
+/// Instants kept apart at most; of a faster channel several count as one.
+const INSTANTS_MAX: usize = 8192;
+
+/// How many things happened within the window.
+#[derive(Debug, Default)]
+struct Recent {
+    instants: VecDeque<(i64, u64)>,
+}
+
+impl Recent {
+    /// `count` things happened at `at_ns`.
+    fn add(&mut self, at_ns: i64, count: u64) {
+        let is_full = self.instants.len() >= INSTANTS_MAX;
+        match self.instants.back_mut() {
+            // What comes out of order counts with the newest: it was learned then.
+            Some((last, sum)) if is_full || *last >= at_ns => *sum += count,
+            _ => self.instants.push_back((at_ns, count)),
+        }
+    }
+
+    /// How many happened in the window before `now_ns`.
+    fn count(&mut self, now_ns: i64) -> u64 {
+        let newest_ns = self.instants.back().map_or(now_ns, |(at, _)| *at);
+        let end_ns = newest_ns.clamp(now_ns - READ_LATE_NS, now_ns.max(newest_ns));
+        let begin_ns = end_ns - WINDOW_NS;
+        while self.instants.front().is_some_and(|(at, _)| *at <= begin_ns) {
+            self.instants.pop_front();
+        }
+        self.instants.iter().map(|(_, count)| count).sum()
+    }
+}
+
+/// Durations measured within the window.
+#[derive(Debug, Default)]
+struct Samples {
+    values: VecDeque<(i64, i64)>,
+    /// True once there was one: whether this host has the two stages at all.
+    is_available: bool,
+}
+
+impl Samples {
+    /// `value_ns` was learned at `at_ns`.
+    fn add(&mut self, at_ns: i64, value_ns: i64) {
+        self.is_available = true;
+        if self.values.len() == SAMPLES_MAX {
+            self.values.pop_front();
+        }
+        self.values.push_back((at_ns, value_ns));
+    }
+
+    /// `p50_us`, `p99_us`, `max_us`, `count` and `is_available` of the window before `now_ns`, as `name`.
+    fn figures(&mut self, name: &str, now_ns: i64) -> Value {
+        let oldest_ns = now_ns - WINDOW_NS;
+        while self.values.front().is_some_and(|(at, _)| *at <= oldest_ns) {
+            self.values.pop_front();
+        }
+        let values: Vec<i64> = self.values.iter().map(|(_, value)| *value).collect();
+        let summary = LatencySummary::of_samples(&values);
+        let of =
+            |figure: fn(&LatencySummary) -> i64| summary.as_ref().map(figure).map(microseconds);
+        json!({
+            "name": name,
+            "p50_us": of(|one| one.p50_ns), "p99_us": of(|one| one.p99_ns),
+            "max_us": of(|one| one.max_ns),
+            "count": values.len(), "is_available": self.is_available,
+        })
+    }
+}
+
+/// To a tenth, as far as any stamp means something.
+fn microseconds(ns: i64) -> f64 {
+    (ns as f64 / 100.0).round() / 10.0
 }
 
 #[cfg(test)]

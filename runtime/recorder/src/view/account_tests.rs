@@ -1,7 +1,7 @@
 //! Tests of [`super`]: messages of a link that loses some.
 
 use super::*;
-use hil_core::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
+use hil_core::record::{IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
 
 const MS: i64 = 1_000_000;
 
@@ -231,4 +231,38 @@ fn shared_memory_has_one_segment_and_loses_nothing_that_we_know_of() {
         (&figures["lost_count"], &figures["link_state"]),
         (&Value::Null, &json!("none"))
     );
+}
+
+#[test]
+fn what_is_older_than_a_second_does_not_count() {
+    let mut recent = Recent::default();
+    for tick in 0..300 {
+        recent.add(tick * 10_000_000, 1);
+    }
+    assert_eq!(recent.count(3_000_000_000), 100);
+    assert_eq!(recent.count(3_200_000_000), 100);
+    assert_eq!(recent.count(3_500_000_000), 74);
+    assert_eq!(recent.count(9_000_000_000), 0);
+}
+
+#[test]
+fn percentiles_are_those_of_the_window() {
+    let mut samples = Samples::default();
+    assert_eq!(samples.figures("x", 0)["is_available"], false);
+    assert_eq!(samples.figures("x", 0)["p50_us"], Value::Null);
+    samples.add(0, 900_000);
+    for index in 1..=100 {
+        samples.add(WINDOW_NS + index, index * 1000);
+    }
+    let figures = samples.figures("x", WINDOW_NS + 200);
+    assert_eq!(figures["count"], 100);
+    assert_eq!(figures["p50_us"], 50.0);
+    assert_eq!(figures["p99_us"], 99.0);
+    assert_eq!(figures["max_us"], 100.0);
+    let later = samples.figures("x", 3 * WINDOW_NS);
+    assert_eq!(
+        (&later["count"], &later["max_us"]),
+        (&json!(0), &Value::Null)
+    );
+    assert_eq!(later["is_available"], true);
 }

@@ -1,16 +1,54 @@
 //! The arms as their messages tell of them: commanded and measured joints, and where these put the
 //! links. Kinematics and shapes are those of the models, as in the robot's URDF.
 
-use hil_arm::egm::messages::{EgmCommand, EgmFeedback, Side};
+use hil_arm::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
 use hil_arm::yumi::arm::Arm;
-use hil_arm::yumi::description;
-use hil_arm::yumi::description::Rod;
+use hil_arm::yumi::description::{self, Rod};
 use hil_arm::yumi::{Joints, Pose};
 use hil_core::message::Message;
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::{rounded, seconds};
 use crate::topics::{read, side_of};
+
+/// Position, and the quaternion w, x, y, z.
+pub(crate) type Frame = [f64; 7];
+
+/// `/live/arms`.
+#[derive(Debug, Serialize)]
+pub(crate) struct ArmsPicture {
+    at_s: f64,
+    body: Value,
+    fingers: Value,
+    pub(crate) shapes: Vec<Shape>,
+    pub(crate) arms: Vec<ArmPicture>,
+}
+
+/// A link of an arm, from one frame to another.
+#[derive(Debug, Serialize)]
+pub(crate) struct Shape {
+    pub(crate) from: usize,
+    pub(crate) to: usize,
+    pub(crate) radius_m: f64,
+}
+
+/// An arm.
+#[derive(Debug, Serialize)]
+pub(crate) struct ArmPicture {
+    pub(crate) side: &'static str,
+    pub(crate) state: Option<&'static str>,
+    pub(crate) session: Option<u32>,
+    queue_count: Option<u32>,
+    flags: Vec<&'static str>,
+    desired_rad: Option<Joints>,
+    measured_rad: Option<Joints>,
+    desired_age_s: Option<f64>,
+    measured_age_s: Option<f64>,
+    pub(crate) tool_error_mm: Option<f64>,
+    pub(crate) desired_frames: Option<Vec<Frame>>,
+    pub(crate) measured_frames: Option<Vec<Frame>>,
+}
 
 /// Both arms.
 #[derive(Debug)]
@@ -68,43 +106,47 @@ impl ArmsView {
     }
 
     /// `/live/arms` at `now_ns`; `origin_ns` is the run's beginning.
-    pub(crate) fn picture(&self, now_ns: i64, origin_ns: i64) -> Value {
-        let shapes = description::link_radii_m();
-        let shapes = shapes.iter().enumerate();
-        let shapes: Vec<Value> = shapes
-            .map(|(from, radius_m)| json!({ "from": from, "to": from + 1, "radius_m": radius_m }))
-            .collect();
-        let arms: Vec<Value> = self.arms.iter().map(|arm| arm.picture(now_ns)).collect();
-        let fingers = description::fingers().map(rod);
-        let body = description::body().map(rod);
-        json!({
-            "at_s": seconds(now_ns - origin_ns),
-            "body": body, "shapes": shapes, "fingers": fingers, "arms": arms,
-        })
+    pub(crate) fn picture(&self, now_ns: i64, origin_ns: i64) -> ArmsPicture {
+        let radii_m = description::link_radii_m();
+        let shapes = radii_m.iter().enumerate();
+        let shapes = shapes.map(|(from, radius_m)| Shape {
+            from,
+            to: from + 1,
+            radius_m: *radius_m,
+        });
+        ArmsPicture {
+            at_s: seconds(now_ns - origin_ns),
+            body: json!(description::body().map(rod)),
+            fingers: json!(description::fingers().map(rod)),
+            shapes: shapes.collect(),
+            arms: self.arms.iter().map(|arm| arm.picture(now_ns)).collect(),
+        }
     }
 }
 
 impl OneArm {
-    fn picture(&self, now_ns: i64) -> Value {
+    fn picture(&self, now_ns: i64) -> ArmPicture {
         let desired = self.command.map(|(command, _)| command.position_rad);
         let measured = self.feedback.map(|(feedback, _)| feedback.measured_rad);
         let [desired, measured] = [desired, measured].map(|joints| joints.filter(is_finite));
         let age = |at_ns: Option<i64>| at_ns.map(|at_ns| seconds((now_ns - at_ns).max(0)));
         let feedback = self.feedback.as_ref().map(|(feedback, _)| feedback);
         let state = feedback.and_then(EgmFeedback::session_state);
-        json!({
-            "side": self.side.word(),
-            "state": state.map(hil_arm::egm::messages::SessionState::word),
-            "session": feedback.map(|one| one.session),
-            "queue_count": feedback.map(|one| one.queue_count),
-            "flags": self.flags(),
-            "desired_rad": desired, "measured_rad": measured,
-            "desired_age_s": age(self.command.map(|(_, at_ns)| at_ns)),
-            "measured_age_s": age(self.feedback.map(|(_, at_ns)| at_ns)),
-            "tool_error_mm": desired.zip(measured).map(|(one, other)| self.tool_error_mm(&one, &other)),
-            "desired_frames": desired.map(|joints| self.frames(&joints)),
-            "measured_frames": measured.map(|joints| self.frames(&joints)),
-        })
+        let ends = desired.zip(measured);
+        ArmPicture {
+            side: self.side.word(),
+            state: state.map(SessionState::word),
+            session: feedback.map(|one| one.session),
+            queue_count: feedback.map(|one| one.queue_count),
+            flags: self.flags(),
+            desired_rad: desired,
+            measured_rad: measured,
+            desired_age_s: age(self.command.map(|(_, at_ns)| at_ns)),
+            measured_age_s: age(self.feedback.map(|(_, at_ns)| at_ns)),
+            tool_error_mm: ends.map(|(one, other)| self.tool_error_mm(&one, &other)),
+            desired_frames: desired.map(|joints| self.frames(&joints)),
+            measured_frames: measured.map(|joints| self.frames(&joints)),
+        }
     }
 
     fn flags(&self) -> Vec<&'static str> {
@@ -139,11 +181,11 @@ impl OneArm {
         rounded(1000.0 * squares.sum::<f64>().sqrt())
     }
 
-    fn frames(&self, joints: &Joints) -> Vec<Vec<f64>> {
+    fn frames(&self, joints: &Joints) -> Vec<Frame> {
         let frames = self.arm.frames(joints).map(Pose::from);
         let numbers = frames.iter().map(|frame| {
-            let numbers = frame.position_m.iter().chain(&frame.quaternion_wxyz);
-            numbers.map(|number| (number * 1e4).round() / 1e4).collect()
+            let ([x, y, z], [w, i, j, k]) = (frame.position_m, frame.quaternion_wxyz);
+            [x, y, z, w, i, j, k].map(|number| (number * 1e4).round() / 1e4)
         });
         numbers.collect()
     }
@@ -177,7 +219,7 @@ mod tests {
         view.take("egm/right/command", EgmCommand::NAME, bytes, 0);
         let bytes = bytemuck::bytes_of(&feedback);
         view.take("egm/right/feedback", EgmFeedback::NAME, bytes, 500_000_000);
-        let picture = view.picture(1_000_000_000, 0);
+        let picture = json!(view.picture(1_000_000_000, 0));
         let [right, left] = [0, 1].map(|arm| &picture["arms"][arm]);
         assert_eq!(
             (&right["state"], &right["flags"]),
@@ -216,7 +258,7 @@ mod tests {
             bytemuck::bytes_of(&feedback),
             0,
         );
-        let error_mm = view.picture(0, 0)["arms"][0]["tool_error_mm"]
+        let error_mm = json!(view.picture(0, 0))["arms"][0]["tool_error_mm"]
             .as_f64()
             .unwrap();
         // The tool is some tenths of a metre off the first joint's axis.

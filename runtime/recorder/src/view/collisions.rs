@@ -7,6 +7,7 @@ use hil_core::time::Instant;
 use hil_fleet::geometry::{Footprint, Pose};
 use hil_fleet::messages::Truth;
 use hil_fleet::referee::{Referee, SCAN_PERIOD};
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::ground::Ground;
@@ -19,6 +20,19 @@ const WAITING_MAX: usize = 200_000;
 /// Collisions listed.
 const LISTED_MAX: usize = 100;
 
+/// A collision.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Collision {
+    pub(crate) at_s: f64,
+    pub(crate) fleet: u32,
+    pub(crate) robots: [u32; 2],
+    pub(crate) x_m: f64,
+    pub(crate) y_m: f64,
+    /// `truth` or `states`.
+    pub(crate) basis: &'static str,
+    pub(crate) kind: Value,
+}
+
 /// Finds collisions.
 #[derive(Debug, Default)]
 pub(crate) struct Collisions {
@@ -29,7 +43,8 @@ pub(crate) struct Collisions {
     next: Option<Instant>,
     known_count: usize,
     overlapping: BTreeSet<(u32, u32, u32)>,
-    listed: VecDeque<Value>,
+    /// The last of them.
+    pub(crate) listed: VecDeque<Collision>,
     count: u64,
     /// Collisions are those of the robots' true motion.
     pub(crate) has_truth: bool,
@@ -58,30 +73,33 @@ impl Collisions {
         let Some(referee) = &mut self.referee else {
             return;
         };
-        let first = self
-            .waiting
-            .front()
-            .map(|truth| Instant::from_ns(truth.at_ns));
-        let Some(begin) = self.next.or(first) else {
+        let first = self.waiting.front();
+        let first = first.map(|truth| Instant::from_ns(truth.at_ns));
+        let Some(mut at) = self.next.or(first) else {
             return;
         };
-        self.next = Some(scan(referee, &mut self.waiting, begin, now_ns));
-        let incidents = referee.incidents();
-        let listed: Vec<Value> = incidents[self.known_count..]
-            .iter()
-            .map(|one| {
-                json!({
-                    "at_s": seconds(one.at.as_ns() - origin_ns),
-                    "fleet": one.fleet_id, "robots": one.robots,
-                    "x_m": rounded(one.position_m[0]), "y_m": rounded(one.position_m[1]),
-                    "basis": "truth", "kind": one.kind,
-                })
-            })
-            .collect();
-        self.known_count = incidents.len();
-        for one in listed {
-            self.list(one);
+        while at.as_ns() + BEHIND_NS <= now_ns {
+            let before = |truth: &mut Truth| truth.at_ns <= at.as_ns();
+            while let Some(truth) = self.waiting.pop_front_if(before) {
+                referee.on_truth(&truth);
+            }
+            referee.scan(at);
+            at = at + SCAN_PERIOD;
         }
+        self.next = Some(at);
+        let incidents = referee.incidents();
+        let news = incidents[self.known_count..].iter().map(|one| Collision {
+            at_s: seconds(one.at.as_ns() - origin_ns),
+            fleet: one.fleet_id,
+            robots: one.robots,
+            x_m: rounded(one.position_m[0]),
+            y_m: rounded(one.position_m[1]),
+            basis: "truth",
+            kind: json!(one.kind),
+        });
+        let news: Vec<Collision> = news.collect();
+        self.known_count = incidents.len();
+        news.into_iter().for_each(|one| self.list(one));
     }
 
     /// Looks at reported poses instead: `robots` of one fleet, with the footprint of all.
@@ -104,18 +122,21 @@ impl Collisions {
                 if !is_overlap {
                     self.overlapping.remove(&key);
                 } else if self.overlapping.insert(key) {
-                    self.list(json!({
-                        "at_s": at_s, "fleet": fleet, "robots": [one, other],
-                        "x_m": rounded(0.5 * (pose.x_m + there.x_m)),
-                        "y_m": rounded(0.5 * (pose.y_m + there.y_m)),
-                        "basis": "states", "kind": "overlap",
-                    }));
+                    self.list(Collision {
+                        at_s,
+                        fleet,
+                        robots: [*one, *other],
+                        x_m: rounded(0.5 * (pose.x_m + there.x_m)),
+                        y_m: rounded(0.5 * (pose.y_m + there.y_m)),
+                        basis: "states",
+                        kind: json!("overlap"),
+                    });
                 }
             }
         }
     }
 
-    fn list(&mut self, one: Value) {
+    fn list(&mut self, one: Collision) {
         self.count += 1;
         if self.listed.len() == LISTED_MAX {
             self.listed.pop_front();
@@ -123,32 +144,8 @@ impl Collisions {
         self.listed.push_back(one);
     }
 
-    /// The last of them, and how many there were; a count that lacks something is not known.
-    pub(crate) fn listed(&self) -> (Vec<Value>, Option<u64>) {
-        let count = (self.forgotten_count == 0).then_some(self.count);
-        (self.listed.iter().cloned().collect(), count)
+    /// How many there were; a count that lacks something is not known.
+    pub(crate) fn count(&self) -> Option<u64> {
+        (self.forgotten_count == 0).then_some(self.count)
     }
-}
-
-/// Gives the referee all records up to each look, from `begin` on; the time of the next look.
-fn scan(
-    referee: &mut Referee,
-    waiting: &mut VecDeque<Truth>,
-    begin: Instant,
-    now_ns: i64,
-) -> Instant {
-    let mut at = begin;
-    while at.as_ns() + BEHIND_NS <= now_ns {
-        while waiting
-            .front()
-            .is_some_and(|truth| truth.at_ns <= at.as_ns())
-        {
-            if let Some(truth) = waiting.pop_front() {
-                referee.on_truth(&truth);
-            }
-        }
-        referee.scan(at);
-        at = at + SCAN_PERIOD;
-    }
-    at
 }

@@ -63,12 +63,6 @@ impl ChannelFacts {
     pub(crate) fn message(&self) -> Option<&str> {
         self.described.as_ref().map(|one| one.message.as_str())
     }
-
-    /// False where the manifest says that nobody takes its messages: they are recorded only.
-    pub(crate) fn is_taken(&self) -> bool {
-        let described = self.described.as_ref();
-        described.is_none_or(|one| one.to_host.is_some())
-    }
 }
 
 /// A link.
@@ -90,19 +84,13 @@ impl RunFacts {
         recorded: &[String],
         clocks: &Clocks,
     ) -> Self {
-        let mut facts = Self {
-            name: name.to_owned(),
-            has_one_clock: clocks.has_one_clock == Some(true),
-            ..Self::default()
-        };
-        if let Some(manifest) = manifest {
-            facts.describe(manifest);
-        }
+        let mut facts = manifest.map(Self::described).unwrap_or_default();
+        facts.name = name.to_owned();
+        facts.has_one_clock = clocks.has_one_clock == Some(true);
         for name in recorded {
             if facts.channel(name).is_none() {
-                let name = name.clone();
                 facts.channels.push(ChannelFacts {
-                    name,
+                    name: name.clone(),
                     via: "unknown".to_owned(),
                     ..ChannelFacts::default()
                 });
@@ -110,77 +98,57 @@ impl RunFacts {
         }
         for channel in &mut facts.channels {
             let [from, to] = &channel.hosts;
-            let from_ns = clocks.offset_ns(from.as_deref());
-            let to_ns = to
-                .as_deref()
-                .map_or(from_ns, |to| clocks.offset_ns(Some(to)));
-            channel.offsets_ns = [from_ns, to_ns];
+            let to = to.as_ref().or(from.as_ref());
+            channel.offsets_ns =
+                [from.as_ref(), to].map(|host| clocks.offset_ns(host.map(String::as_str)));
         }
         facts
     }
 
-    fn describe(&mut self, manifest: &Manifest) {
+    fn described(manifest: &Manifest) -> Self {
         let topology = &manifest.topology;
-        let text = |value: &Value| value.as_str().map(str::to_owned);
-        self.case = text(&topology["case"]["name"]);
-        self.parameters = topology["case"]["parameters"].clone();
-        let duration = topology["run"]["duration"].as_str();
-        self.duration = duration.and_then(hil_topology::read_duration);
-        self.hosts_here.clone_from(&manifest.hosts_here);
-        self.hosts = names(&topology["hosts"]);
-        self.identity = Some((manifest.topology_hash.clone(), manifest.seed));
-        for name in names(&topology["links"]) {
+        let case = &topology["case"];
+        let links = names(&topology["links"]).map(|name| {
             let link = &topology["links"][&name];
-            let ends = [0, 1].map(|end| text(&link["between"][end]));
-            self.links.push(LinkFacts {
+            LinkFacts {
                 via: text(&link["via"]).unwrap_or_default(),
-                between: ends,
+                between: [0, 1].map(|end| text(&link["between"][end])),
                 name,
-            });
-        }
+            }
+        });
         let channels = manifest.channels.iter();
-        self.channels = channels.map(|one| self.described(one, topology)).collect();
-    }
-
-    fn described(&self, one: &ChannelDescription, topology: &Value) -> ChannelFacts {
-        let own = &topology["channels"][&one.name];
-        let crosses = one.to_host.is_some() && one.to_host != one.from_host;
-        let link = own["link"].as_str().filter(|_| crosses);
-        let via = match (&one.to_host, link) {
-            (None, _) => "record",
-            (_, Some(link)) => topology["links"][link]["via"].as_str().unwrap_or("unknown"),
-            _ => "shared-memory",
-        };
-        ChannelFacts {
-            name: one.name.clone(),
-            described: Some(one.clone()),
-            ends: self.ends(&one.name, topology),
-            hosts: [one.from_host.clone(), one.to_host.clone()],
-            via: via.to_owned(),
-            link: link.map(str::to_owned),
-            is_by_message: one.to_host.is_none(),
-            offsets_ns: [0; 2],
+        let channels = channels.map(|one| {
+            let own = &topology["channels"][&one.name];
+            let crosses = one.to_host.is_some() && one.to_host != one.from_host;
+            let link = own["link"].as_str().filter(|_| crosses);
+            let via = match (&one.to_host, link) {
+                (None, _) => "record",
+                (_, Some(link)) => topology["links"][link]["via"].as_str().unwrap_or("unknown"),
+                _ => "shared-memory",
+            };
+            ChannelFacts {
+                name: one.name.clone(),
+                described: Some(one.clone()),
+                ends: ends(&one.name, topology),
+                hosts: [one.from_host.clone(), one.to_host.clone()],
+                via: via.to_owned(),
+                link: link.map(str::to_owned),
+                is_by_message: one.to_host.is_none(),
+                offsets_ns: [0; 2],
+            }
+        });
+        let duration = topology["run"]["duration"].as_str();
+        Self {
+            case: text(&case["name"]),
+            parameters: case["parameters"].clone(),
+            duration: duration.and_then(hil_topology::read_duration),
+            hosts_here: manifest.hosts_here.clone(),
+            hosts: names(&topology["hosts"]).collect(),
+            identity: Some((manifest.topology_hash.clone(), manifest.seed)),
+            channels: channels.collect(),
+            links: links.collect(),
+            ..Self::default()
         }
-    }
-
-    /// Processes at the ends of a channel: as the file says, or those with the case's roles.
-    fn ends(&self, channel: &str, topology: &Value) -> [Option<String>; 2] {
-        let own = &topology["channels"][channel];
-        if let Some(from) = own["from"].as_str() {
-            return [Some(from.to_owned()), own["to"].as_str().map(str::to_owned)];
-        }
-        let registry = shipped();
-        let case = self.case.as_deref().and_then(|name| registry.find(name));
-        let spec = case.and_then(|case| case.channels.iter().find(|one| one.name == channel));
-        let Some(spec) = spec else {
-            return [None, None];
-        };
-        let with_role = |role: &str| {
-            let processes = names(&topology["processes"]);
-            let mut processes = processes.into_iter();
-            processes.find(|name| topology["processes"][name]["role"] == role)
-        };
-        [with_role(spec.from), spec.to.and_then(with_role)]
     }
 
     /// The channel called `name`, with its place.
@@ -205,17 +173,36 @@ impl RunFacts {
     }
 }
 
-/// Keys of a table, in order.
-fn names(table: &Value) -> Vec<String> {
-    let table = table.as_object();
-    table.map_or_else(Vec::new, |table| table.keys().cloned().collect())
-}
-
-/// The cases that are shipped.
-fn shipped() -> Registry {
+/// Processes at the ends of a channel: as the file says, or those with the case's roles.
+fn ends(channel: &str, topology: &Value) -> [Option<String>; 2] {
+    let own = &topology["channels"][channel];
+    if own["from"].is_string() {
+        return [text(&own["from"]), text(&own["to"])];
+    }
     let mut registry = Registry::default();
     registry.add::<Fleet>();
     registry.add::<Teleoperation>();
     registry.add::<Shuttle>();
-    registry
+    let case = topology["case"]["name"].as_str();
+    let case = case.and_then(|name| registry.find(name));
+    let spec = case.and_then(|case| case.channels.iter().find(|one| one.name == channel));
+    let with_role = |role: &str| {
+        let mut processes = names(&topology["processes"]);
+        processes.find(|name| topology["processes"][name]["role"] == role)
+    };
+    let ends = spec.map(|spec| [with_role(spec.from), spec.to.and_then(with_role)]);
+    ends.unwrap_or_default()
+}
+
+fn text(value: &Value) -> Option<String> {
+    value.as_str().map(str::to_owned)
+}
+
+/// Keys of a table, in order.
+fn names(table: &Value) -> impl Iterator<Item = String> {
+    table
+        .as_object()
+        .into_iter()
+        .flatten()
+        .map(|(key, _)| key.clone())
 }

@@ -1,20 +1,25 @@
 //! The fleet as its messages tell of it: where each robot last was, how far it may go, who waits.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::mpsc::{Receiver, TryRecvError};
 
 use hil_core::message::Message;
 use hil_fleet::geometry::{Footprint, Pose};
 use hil_fleet::messages::{Mission, NO_AUTHORITY, Phase, State, TO_GOAL, Truth};
 use hil_fleet::path::{Path, PathId};
 use hil_fleet::scenario::Scene;
-use serde_json::{Value, json};
+use hil_fleet::world::World;
+use serde::Serialize;
+use serde_json::Value;
 
-use super::collisions::Collisions;
-use super::ground::{Ground, Made, Making, points};
-use super::sections::{Areas, OnPath, of_pair};
+use super::collisions::{Collision, Collisions};
+use super::ground::{self, Ground, MapPicture, points};
+use super::sections::{Areas, OnPath, Point, SectionPicture, of_pair};
 use super::{rounded, seconds};
 use crate::topics::read;
 
+/// Robots from which on a fleet's picture is drawn more seldom.
+pub(crate) const MANY_ROBOTS: usize = 64;
 /// A state older than this is shown as stale.
 const STALE_NS: i64 = 1_000_000_000;
 /// Points of a way ahead.
@@ -25,6 +30,42 @@ const PAIRED_MAX: usize = 64;
 const SECTIONS_MAX: usize = 400;
 /// Robots shown at all: a damaged record must not fill the memory.
 const ROBOTS_MAX: usize = 64 * 448;
+
+/// `/live/fleet`.
+#[derive(Debug, Serialize)]
+pub(crate) struct FleetPicture {
+    pub(crate) at_s: f64,
+    pub(crate) robots: Vec<RobotPicture>,
+    /// `None` where the ground is not known, or a fleet is too large to look at its pairs.
+    pub(crate) sections: Option<Vec<SectionPicture>>,
+    pub(crate) collisions: VecDeque<Collision>,
+    collision_count: Option<u64>,
+    basis: &'static str,
+}
+
+/// A robot of it.
+#[derive(Debug, Serialize)]
+pub(crate) struct RobotPicture {
+    pub(crate) fleet: u32,
+    pub(crate) id: u32,
+    pub(crate) x_m: f64,
+    pub(crate) y_m: f64,
+    pub(crate) heading_rad: f64,
+    speed_mps: f64,
+    pub(crate) age_s: f64,
+    pub(crate) is_stale: bool,
+    pub(crate) phase: &'static str,
+    pub(crate) is_waiting: bool,
+    mission: Option<u32>,
+    path: Option<u32>,
+    goal: Option<usize>,
+    path_index: Option<usize>,
+    granted_index: Option<usize>,
+    last_index: Option<usize>,
+    granted_m: Option<f64>,
+    pub(crate) ahead: Vec<Point>,
+    pub(crate) granted: Vec<Point>,
+}
 
 /// Which robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -39,7 +80,7 @@ pub(crate) struct FleetView {
     robots: BTreeMap<Id, Robot>,
     collisions: Collisions,
     vehicle: Option<Footprint>,
-    making: Option<Making>,
+    making: Option<Receiver<Result<Box<Ground>, String>>>,
     ground: Option<Box<Ground>>,
     areas: Option<Areas>,
     /// From the robots' monotonic clock to the axis.
@@ -63,10 +104,9 @@ impl Robot {
     }
 
     fn path_of(&self, mission: u32) -> Option<PathId> {
-        let known = self.missions.iter().find(|(known, _)| *known == mission);
-        known
-            .filter(|_| mission != 0)
-            .map(|(_, path)| PathId(*path))
+        let mut known = self.missions.iter().filter(|_| mission != 0);
+        let (_, path) = known.find(|(known, _)| *known == mission)?;
+        Some(PathId(*path))
     }
 }
 
@@ -79,7 +119,7 @@ impl FleetView {
             robots: BTreeMap::new(),
             collisions: Collisions::default(),
             vehicle,
-            making: Some(Making::begin(parameters.clone())),
+            making: Some(ground::make(parameters.clone())),
             ground: None,
             areas: None,
             offset_ns: 0,
@@ -138,18 +178,26 @@ impl FleetView {
     }
 
     /// Looks whether the ground has been made; the map, the first time.
-    pub(crate) fn new_map(&mut self) -> Option<Value> {
-        match self.making.as_ref()?.look() {
-            Made::NotYet => return None,
-            Made::Not(why) => self.problem = Some(format!("no map of the fleet: {why}")),
-            Made::Ground(ground) => {
+    pub(crate) fn new_map(&mut self) -> Option<&MapPicture> {
+        match self.making.as_ref()?.try_recv() {
+            Err(TryRecvError::Empty) => return None,
+            Err(TryRecvError::Disconnected) => {
+                self.problem = Some("no map of the fleet: making the map failed".to_owned());
+            }
+            Ok(Err(why)) => self.problem = Some(format!("no map of the fleet: {why}")),
+            Ok(Ok(ground)) => {
                 self.collisions.begin(&ground);
                 self.areas = Some(Areas::new(ground.scene.world.vehicle.footprint));
                 self.ground = Some(ground);
             }
         }
         self.making = None;
-        self.ground.as_ref().map(|ground| ground.map.clone())
+        self.map()
+    }
+
+    /// `/live/map`, once it is known.
+    pub(crate) fn map(&self) -> Option<&MapPicture> {
+        self.ground.as_ref().map(|ground| &ground.map)
     }
 
     /// Length and width of a vehicle, metres.
@@ -164,29 +212,32 @@ impl FleetView {
     }
 
     /// `/live/fleet` at `now_ns`; `origin_ns` is the run's beginning, both on the axis.
-    pub(crate) fn picture(&mut self, now_ns: i64, origin_ns: i64) -> Value {
+    pub(crate) fn picture(&mut self, now_ns: i64, origin_ns: i64) -> FleetPicture {
         let at_s = seconds(now_ns - origin_ns);
         let offset_ns = self.offset_ns;
         self.collisions
             .look(now_ns - offset_ns, origin_ns - offset_ns);
         self.look_at_states(now_ns, at_s);
         let scene = self.ground.as_ref().map(|ground| &ground.scene);
-        let robots: Vec<Value> = self
-            .robots
-            .iter()
+        let robots = self.robots.iter();
+        let robots = robots
             .filter_map(|(id, robot)| picture_of(*id, robot, scene, now_ns))
             .collect();
         let sections = self.sections();
-        let (collisions, count) = self.collisions.listed();
-        let basis = if self.collisions.has_truth {
+        let collisions = &self.collisions;
+        let basis = if collisions.has_truth {
             "truth"
         } else {
             "states"
         };
-        json!({
-            "at_s": at_s, "robots": robots, "sections": sections,
-            "collisions": collisions, "collision_count": count, "basis": basis,
-        })
+        FleetPicture {
+            at_s,
+            robots,
+            sections,
+            collisions: collisions.listed.clone(),
+            collision_count: collisions.count(),
+            basis,
+        }
     }
 
     fn look_at_states(&mut self, now_ns: i64, at_s: f64) {
@@ -203,16 +254,14 @@ impl FleetView {
             }
         }
         for (fleet, robots) in fleets {
-            let known = robots.len() <= PAIRED_MAX;
-            if known {
-                self.collisions
-                    .look_at_states(fleet, &robots, &vehicle, at_s);
+            if robots.len() <= PAIRED_MAX {
+                let collisions = &mut self.collisions;
+                collisions.look_at_states(fleet, &robots, &vehicle, at_s);
             }
         }
     }
 
-    /// `None` where the ground is not known, or a fleet is too large to look at its pairs.
-    fn sections(&mut self) -> Option<Vec<Value>> {
+    fn sections(&mut self) -> Option<Vec<SectionPicture>> {
         let world = &self.ground.as_ref()?.scene.world;
         let areas = self.areas.as_mut()?;
         let mut fleets: BTreeMap<u32, Vec<OnPath>> = BTreeMap::new();
@@ -240,15 +289,12 @@ impl FleetView {
     }
 }
 
-fn on_path(id: u32, robot: &Robot, world: &hil_fleet::world::World) -> Option<OnPath> {
+fn on_path(id: u32, robot: &Robot, world: &World) -> Option<OnPath> {
     let (state, _) = robot.state?;
-    let is_under_way = matches!(
-        Phase::of(state.phase),
-        Some(Phase::Driving | Phase::AtPoint)
-    );
-    let path = robot
-        .path_of(state.header.mission_id)
-        .filter(|_| is_under_way)?;
+    let (Phase::Driving | Phase::AtPoint) = Phase::of(state.phase)? else {
+        return None;
+    };
+    let path = robot.path_of(state.header.mission_id)?;
     let index = usize::try_from(state.path_index).ok()?;
     let granted = granted(&state, world.paths.get(path)?).unwrap_or(index);
     Some(OnPath {
@@ -264,13 +310,11 @@ fn granted(state: &State, path: &Path) -> Option<usize> {
     match state.authority_index {
         TO_GOAL => Some(path.last_index()),
         NO_AUTHORITY => None,
-        index => usize::try_from(index)
-            .ok()
-            .map(|index| index.min(path.last_index())),
+        index => Some(usize::try_from(index).ok()?.min(path.last_index())),
     }
 }
 
-fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Option<Value> {
+fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Option<RobotPicture> {
     let (state, at_ns) = robot.state?;
     let phase = Phase::of(state.phase)?;
     let word = match phase {
@@ -281,39 +325,47 @@ fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Opti
     };
     let is_standing = state.speed_mps.abs() < 1e-3;
     let mission = state.header.mission_id;
-    let mut picture = json!({
-        "fleet": id.fleet, "id": id.robot,
-        "x_m": rounded(state.x_m), "y_m": rounded(state.y_m),
-        "heading_rad": rounded(state.heading_rad), "speed_mps": rounded(state.speed_mps.into()),
-        "age_s": seconds((now_ns - at_ns).max(0)), "is_stale": now_ns - at_ns > STALE_NS,
-        "phase": word,
-        "is_waiting": phase == Phase::AtPoint || (phase == Phase::Driving && is_standing),
-        "mission": (mission != 0).then_some(mission),
-        "path": null, "goal": null, "path_index": null, "granted_index": null,
-        "last_index": null, "granted_m": null, "ahead": [], "granted": [],
-    });
-    let id = robot.path_of(mission);
-    let path = id.and_then(|id| scene?.world.paths.get(id));
-    if let (Some(id), Some(path)) = (id, path) {
-        let here = usize::try_from(state.path_index)
-            .unwrap_or(0)
-            .min(path.last_index());
+    let mut picture = RobotPicture {
+        fleet: id.fleet,
+        id: id.robot,
+        x_m: rounded(state.x_m),
+        y_m: rounded(state.y_m),
+        heading_rad: rounded(state.heading_rad),
+        speed_mps: rounded(state.speed_mps.into()),
+        age_s: seconds((now_ns - at_ns).max(0)),
+        is_stale: now_ns - at_ns > STALE_NS,
+        phase: word,
+        is_waiting: phase == Phase::AtPoint || (phase == Phase::Driving && is_standing),
+        mission: (mission != 0).then_some(mission),
+        path: None,
+        goal: None,
+        path_index: None,
+        granted_index: None,
+        last_index: None,
+        granted_m: None,
+        ahead: Vec::new(),
+        granted: Vec::new(),
+    };
+    if let (Some(id), Some(scene)) = (robot.path_of(mission), scene)
+        && let Some(path) = scene.world.paths.get(id)
+    {
+        let last = path.last_index();
+        let here = usize::try_from(state.path_index).unwrap_or(0).min(last);
         let granted = granted(&state, path);
-        let route = scene.and_then(|scene| scene.world.routes.iter().find(|one| one.path == id));
-        picture["path"] = json!(id.0);
-        picture["goal"] = json!(route.map(|route| route.to));
-        picture["path_index"] = json!(here);
-        picture["last_index"] = json!(path.last_index());
-        picture["granted_index"] = json!(granted);
+        let mut routes = scene.world.routes.iter();
+        picture.path = Some(id.0);
+        picture.goal = routes.find(|one| one.path == id).map(|route| route.to);
+        picture.path_index = Some(here);
+        picture.last_index = Some(last);
+        picture.granted_index = granted;
         if matches!(phase, Phase::Driving | Phase::AtPoint) {
-            let ahead = points(path, here, path.last_index(), AHEAD_MAX);
-            picture["ahead"] = json!(ahead);
+            picture.ahead = points(path, here, last, AHEAD_MAX);
         }
         if let Some(granted) = granted {
             let way_m = path.way_to_m(granted) - state.travelled_m;
-            picture["granted_m"] = json!(rounded(way_m.max(0.0)));
+            picture.granted_m = Some(rounded(way_m.max(0.0)));
             if granted > here {
-                picture["granted"] = json!(points(path, here, granted, AHEAD_MAX));
+                picture.granted = points(path, here, granted, AHEAD_MAX);
             }
         }
     }

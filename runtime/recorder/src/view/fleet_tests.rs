@@ -3,6 +3,7 @@
 use super::*;
 use bytemuck::Zeroable;
 use hil_fleet::messages::{Header, TruthKind};
+use serde_json::json;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
@@ -13,7 +14,7 @@ fn view() -> (FleetView, Value) {
     let mut view = FleetView::new(&json!({ "world": { "scenario": "crossing" } }));
     let deadline = Instant::now() + Duration::from_mins(1);
     loop {
-        if let Some(map) = view.new_map() {
+        if let Some(map) = view.new_map().map(|map| json!(map)) {
             return (view, map);
         }
         assert!(view.problem.is_none() && Instant::now() < deadline);
@@ -59,7 +60,7 @@ fn a_robot_is_shown_on_its_path_with_what_it_was_granted() {
     );
     assert_eq!(map["conflict_areas"].as_array().map(Vec::len), Some(1));
     tell(&mut view, 0, [-20.0, 0.0], 3, 5 * S);
-    let picture = view.picture(7 * S, 4 * S);
+    let picture = json!(view.picture(7 * S, 4 * S));
     let robot = &picture["robots"][0];
     assert_eq!(
         (&picture["at_s"], &robot["age_s"]),
@@ -92,11 +93,11 @@ fn robots_that_report_the_same_place_collide_once_until_they_part() {
     let meet = |view: &mut FleetView, x_m: f64, at_ns: i64| {
         tell(view, 0, [x_m, 0.0], 66, at_ns);
         tell(view, 1, [0.0, 0.0], 66, at_ns);
-        view.picture(at_ns, 0)["collision_count"].clone()
+        json!(view.picture(at_ns, 0))["collision_count"].clone()
     };
     let counts = [0.0, 0.1, 9.0, 0.0].map(|x_m| meet(&mut view, x_m, S));
     assert_eq!(counts, [1, 1, 1, 2]);
-    let picture = view.picture(S, 0);
+    let picture = json!(view.picture(S, 0));
     assert_eq!(picture["collisions"][0]["robots"], json!([0, 1]));
     assert_eq!(picture["collisions"][0]["basis"], "states");
     assert_eq!(picture["sections"][0]["inside"], json!([0, 1]));
@@ -119,12 +120,12 @@ fn the_referee_judges_where_the_truth_is_recorded() {
         };
         view.take(Truth::NAME, bytemuck::bytes_of(&truth), 0, 0);
     }
-    let early = view.picture(S / 2, 0);
+    let early = json!(view.picture(S / 2, 0));
     assert_eq!(
         (&early["basis"], &early["collision_count"]),
         (&json!("truth"), &json!(0))
     );
-    let late = view.picture(3 * S, 0);
+    let late = json!(view.picture(3 * S, 0));
     assert_ne!(late["collision_count"], 0);
     let at_s = late["collisions"][0]["at_s"].as_f64().unwrap();
     // Both reach the other's side after 2.75 m of 4 m, at 2 m/s.
@@ -136,10 +137,10 @@ fn nonsense_is_not_shown() {
     let (mut view, _) = view();
     tell(&mut view, 0, [f64::NAN, 0.0], 3, 0);
     view.take(State::NAME, &[1, 2, 3], 0, 0);
-    assert_eq!(view.picture(0, 0)["robots"], json!([]));
+    assert_eq!(json!(view.picture(0, 0))["robots"], json!([]));
     tell(&mut view, 0, [0.0, 0.0], i32::MAX, 0);
     assert_eq!(
-        view.picture(0, 0)["robots"].as_array().map(Vec::len),
+        json!(view.picture(0, 0))["robots"].as_array().map(Vec::len),
         Some(1)
     );
 }

@@ -1,17 +1,20 @@
 //! The ground of a fleet, made from the run's parameters as its own processes make it: map, paths,
 //! vehicle. Planning the paths takes seconds, so it is done beside everything else.
 
-use std::sync::mpsc::{Receiver, TryRecvError, channel};
+use std::error::Error;
+use std::sync::mpsc::{Receiver, channel};
 use std::thread;
 
+use hil_core::case_study::ParameterError;
 use hil_fleet::FleetParameters;
-use hil_fleet::geometry::{Bounds, Footprint, Pose};
+use hil_fleet::geometry::{Bounds, Footprint};
 use hil_fleet::path::{Path, PathId};
-use hil_fleet::scenario::Scene;
+use hil_fleet::scenario::{Scenario, Scene};
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::rounded;
-use super::sections::Areas;
+use super::sections::{Areas, Point};
 
 /// Points of all paths that are shown: more would be a picture of megabytes.
 const POINTS_MAX: usize = 20_000;
@@ -25,85 +28,65 @@ pub(crate) struct Ground {
     pub(crate) scene: Scene,
     /// What was set.
     pub(crate) parameters: FleetParameters,
-    /// `/live/map`.
-    pub(crate) map: Value,
+    /// What is shown of it.
+    pub(crate) map: MapPicture,
 }
 
-/// A ground that is being made.
-#[derive(Debug)]
-pub(crate) struct Making {
-    result: Receiver<Result<Box<Ground>, String>>,
+/// `/live/map`.
+#[derive(Debug, Serialize)]
+pub(crate) struct MapPicture {
+    case: &'static str,
+    scenario: Scenario,
+    pub(crate) bounds: Bounds,
+    pub(crate) obstacles: Vec<Bounds>,
+    pub(crate) bays: Vec<BayPicture>,
+    pub(crate) footprint: Footprint,
+    paths: Vec<Value>,
+    pub(crate) conflict_areas: Vec<Vec<Point>>,
+    pub(crate) fleet_count: u32,
+    robot_count: usize,
 }
 
-/// What became of it.
-pub(crate) enum Made {
-    /// Not yet.
-    NotYet,
-    /// Here.
-    Ground(Box<Ground>),
-    /// It cannot be made, and why.
-    Not(String),
+/// Where a vehicle parks.
+#[derive(Debug, Serialize)]
+pub(crate) struct BayPicture {
+    pub(crate) id: usize,
+    pub(crate) x_m: f64,
+    pub(crate) y_m: f64,
+    pub(crate) heading_rad: f64,
 }
 
-impl Making {
-    /// Begins to make the ground of the fleet with these `[case.parameters]`.
-    pub(crate) fn begin(parameters: Value) -> Self {
-        let (give, result) = channel();
-        thread::spawn(move || {
-            // Nobody may be there any more to take it.
-            let _is_wanted = give.send(make(parameters)).is_ok();
-        });
-        Self { result }
-    }
-
-    /// Looks whether it is done.
-    pub(crate) fn look(&self) -> Made {
-        match self.result.try_recv() {
-            Ok(Ok(ground)) => Made::Ground(ground),
-            Ok(Err(why)) => Made::Not(why),
-            Err(TryRecvError::Empty) => Made::NotYet,
-            Err(TryRecvError::Disconnected) => Made::Not("making the map failed".to_owned()),
-        }
-    }
+/// Begins to make the ground of the fleet with these `[case.parameters]`; it comes, or why not.
+pub(crate) fn make(parameters: Value) -> Receiver<Result<Box<Ground>, String>> {
+    let (give, result) = channel();
+    thread::spawn(move || {
+        let made = || -> Result<Box<Ground>, Box<dyn Error>> {
+            let parameters: FleetParameters = serde_json::from_value(parameters)?;
+            let scene = parameters.world.build()?;
+            Ok(Box::new(Ground {
+                map: map(&parameters, &scene)?,
+                scene,
+                parameters,
+            }))
+        };
+        // Nobody may be there any more to take it.
+        let _is_wanted = give.send(made().map_err(|error| error.to_string())).is_ok();
+    });
+    result
 }
 
-fn make(parameters: Value) -> Result<Box<Ground>, String> {
-    let parameters: FleetParameters =
-        serde_json::from_value(parameters).map_err(|error| error.to_string())?;
-    let scene = parameters
-        .world
-        .build()
-        .map_err(|error| error.to_string())?;
-    let map = map(&parameters, &scene).map_err(|error| error.to_string())?;
-    Ok(Box::new(Ground {
-        scene,
-        parameters,
-        map,
-    }))
-}
-
-fn map(
-    parameters: &FleetParameters,
-    scene: &Scene,
-) -> Result<Value, hil_core::case_study::ParameterError> {
+fn map(parameters: &FleetParameters, scene: &Scene) -> Result<MapPicture, ParameterError> {
     let known = parameters.world.map()?;
     let world = &scene.world;
     let vehicle = &world.vehicle.footprint;
-    let bounds = known
-        .as_ref()
-        .map_or_else(|| around(scene), |map| map.bounds);
+    let bounds = known.as_ref().map(|map| map.bounds);
     let bays = world.bays.iter().enumerate();
-    let bays: Vec<_> = bays
-        .map(|(id, bay)| {
-            let Pose {
-                x_m,
-                y_m,
-                heading_rad,
-            } = bay.pose;
-            json!({ "id": id, "x_m": rounded(x_m), "y_m": rounded(y_m),
-                    "heading_rad": rounded(heading_rad) })
-        })
-        .collect();
+    let bays = bays.map(|(id, bay)| BayPicture {
+        id,
+        x_m: rounded(bay.pose.x_m),
+        y_m: rounded(bay.pose.y_m),
+        heading_rad: rounded(bay.pose.heading_rad),
+    });
     let forward = world.routes.iter().filter(|route| route.path.0 % 2 == 0);
     let each = POINTS_MAX / forward.clone().count().max(1);
     let paths: Vec<_> = forward
@@ -113,23 +96,22 @@ fn map(
             json!({ "id": route.path.0, "from": route.from, "to": route.to, "points": points })
         })
         .collect();
-    let scenario = serde_json::to_value(parameters.world.scenario).unwrap_or(Value::Null);
-    Ok(json!({
-        "case": "fleet",
-        "scenario": scenario,
-        "bounds": bounds,
-        "obstacles": known.map_or_else(Vec::new, |map| map.obstacles),
-        "bays": bays,
-        "footprint": { "length_m": vehicle.length_m, "width_m": vehicle.width_m },
-        "paths": paths,
-        "conflict_areas": conflict_areas(scene, vehicle),
-        "fleet_count": parameters.fleets,
-        "robot_count": scene.starts.len(),
-    }))
+    Ok(MapPicture {
+        case: "fleet",
+        scenario: parameters.world.scenario,
+        bounds: bounds.unwrap_or_else(|| around(scene)),
+        obstacles: known.map_or_else(Vec::new, |map| map.obstacles),
+        bays: bays.collect(),
+        footprint: *vehicle,
+        paths,
+        conflict_areas: conflict_areas(scene, vehicle),
+        fleet_count: parameters.fleets,
+        robot_count: scene.starts.len(),
+    })
 }
 
 /// The ground on which vehicles of two shuttle lines can meet.
-fn conflict_areas(scene: &Scene, vehicle: &Footprint) -> Vec<Value> {
+fn conflict_areas(scene: &Scene, vehicle: &Footprint) -> Vec<Vec<Point>> {
     let world = &scene.world;
     let line = |start: &usize| -> Option<PathId> {
         let partner = scene.partners[*start]?;
@@ -148,7 +130,7 @@ fn conflict_areas(scene: &Scene, vehicle: &Footprint) -> Vec<Value> {
                 }
                 let area = areas.of(world, *one, *other, section);
                 if !area.is_empty() {
-                    shown.push(json!(area));
+                    shown.push(area.to_vec());
                 }
             }
         }
@@ -178,7 +160,7 @@ fn around(scene: &Scene) -> Bounds {
 }
 
 /// At most about `count_max` points of `path` from one pose to another, both ends among them.
-pub(crate) fn points(path: &Path, from: usize, to: usize, count_max: usize) -> Vec<[f64; 2]> {
+pub(crate) fn points(path: &Path, from: usize, to: usize, count_max: usize) -> Vec<Point> {
     let to = to.min(path.last_index());
     let from = from.min(to);
     let step = (to - from).div_ceil(count_max.max(1)).max(1);

@@ -7,15 +7,12 @@
 
 mod account;
 pub(crate) mod arms;
-mod collisions;
+pub(crate) mod collisions;
 pub(crate) mod facts;
 pub(crate) mod fleet;
-mod ground;
-mod join;
-mod polygon;
-mod sections;
+pub(crate) mod ground;
+pub(crate) mod sections;
 pub(crate) mod state;
-mod window;
 
 use hil_watch::Record;
 

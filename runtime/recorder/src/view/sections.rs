@@ -3,13 +3,12 @@
 
 use std::collections::BTreeMap;
 
-use hil_fleet::geometry::{Footprint, Pose};
+use hil_fleet::geometry::Footprint;
 use hil_fleet::path::{Path, PathId};
 use hil_fleet::section::Side;
 use hil_fleet::world::World;
-use serde_json::{Value, json};
+use serde::Serialize;
 
-use super::polygon::{Point, hull, shared};
 use super::rounded;
 
 /// Poses of a path's part whose ground makes its hull.
@@ -71,21 +70,24 @@ impl Areas {
     }
 }
 
-/// Corners of the vehicle at poses of the path's part, its ends among them.
-fn covered(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point> {
+/// Some poses of the path's part, its ends among them.
+fn part(path: &Path, from: usize, to: usize) -> Vec<usize> {
     let to = to.min(path.last_index());
     let step = to.saturating_sub(from).div_ceil(POSES_MAX).max(1);
-    let poses = path.poses();
-    let part = (from..to).step_by(step).chain([to]);
-    let at = |pose: &Pose| vehicle.at(pose).corners();
-    part.flat_map(|index| at(&poses[index])).collect()
+    (from..to).step_by(step).chain([to]).collect()
+}
+
+/// Corners of the vehicle along the path's part.
+fn covered(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point> {
+    let part = part(path, from, to).into_iter();
+    part.flat_map(|index| vehicle.at(&path.poses()[index]).corners())
+        .collect()
 }
 
 /// The strip that a vehicle covers along the path's part.
 fn strip(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point> {
-    let to = to.min(path.last_index());
-    let step = to.saturating_sub(from).div_ceil(POSES_MAX).max(1);
-    let part = (from..to).step_by(step).chain([to]);
+    let indices = part(path, from, to);
+    let last = indices.last().copied();
     let beside = |index: usize, side: f64| {
         let pose = &path.poses()[index];
         let (sine, cosine) = pose.heading_rad.sin_cos();
@@ -93,20 +95,15 @@ fn strip(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point>
         // A vehicle at an end of the part reaches beyond it by half its length.
         let along_m = match index {
             index if index == from => -0.5 * vehicle.length_m,
-            index if index == to => 0.5 * vehicle.length_m,
+            index if Some(index) == last => 0.5 * vehicle.length_m,
             _ => 0.0,
         };
         // Backwards, the way goes against the heading.
-        let along_m = if is_backwards(path) {
-            -along_m
-        } else {
-            along_m
-        };
+        let along_m = along_m * if is_backwards(path) { -1.0 } else { 1.0 };
         let x_m = pose.x_m + along_m * cosine - across_m * sine;
         let y_m = pose.y_m + along_m * sine + across_m * cosine;
         [rounded(x_m), rounded(y_m)]
     };
-    let indices: Vec<usize> = part.collect();
     let left = indices.iter().map(|index| beside(*index, 1.0));
     let right = indices.iter().rev().map(|index| beside(*index, -1.0));
     left.chain(right).collect()
@@ -117,6 +114,67 @@ fn is_backwards(path: &Path) -> bool {
     let [one, other] = [&path.poses()[0], &path.poses()[1]];
     let (sine, cosine) = one.heading_rad.sin_cos();
     (other.x_m - one.x_m) * cosine + (other.y_m - one.y_m) * sine < 0.0
+}
+
+/// A point, metres. Corners of convex polygons go counter-clockwise.
+pub(crate) type Point = [f64; 2];
+
+/// Twice the area of the triangle; above 0 when it goes counter-clockwise.
+fn turn(a: Point, b: Point, c: Point) -> f64 {
+    (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+}
+
+/// The convex hull of `points` (Andrew's monotone chain); fewer than three corners when they lie on
+/// a line.
+fn hull(mut points: Vec<Point>) -> Vec<Point> {
+    points.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
+    points.dedup();
+    if points.len() < 3 {
+        return points;
+    }
+    let mut corners: Vec<Point> = Vec::with_capacity(points.len());
+    let half = |corners: &mut Vec<Point>, point: Point, floor: usize| {
+        while corners.len() >= floor + 2
+            && turn(
+                corners[corners.len() - 2],
+                corners[corners.len() - 1],
+                point,
+            ) <= 0.0
+        {
+            corners.pop();
+        }
+        corners.push(point);
+    };
+    for point in &points {
+        half(&mut corners, *point, 0);
+    }
+    let floor = corners.len() - 1;
+    for point in points.iter().rev().skip(1) {
+        half(&mut corners, *point, floor);
+    }
+    corners.pop();
+    corners
+}
+
+/// What two convex polygons share (Sutherland and Hodgman 1974); empty when they do not meet.
+fn shared(one: &[Point], other: &[Point]) -> Vec<Point> {
+    let mut left = one.to_vec();
+    for (index, from) in other.iter().enumerate() {
+        let to = other[(index + 1) % other.len()];
+        let corners = core::mem::take(&mut left);
+        for (index, corner) in corners.iter().enumerate() {
+            let next = corners[(index + 1) % corners.len()];
+            let (here, there) = (turn(*from, to, *corner), turn(*from, to, next));
+            if here >= 0.0 {
+                left.push(*corner);
+            }
+            if (here > 0.0 && there < 0.0) || (here < 0.0 && there > 0.0) {
+                let share = here / (here - there);
+                left.push([0, 1].map(|axis| corner[axis] + share * (next[axis] - corner[axis])));
+            }
+        }
+    }
+    if left.len() < 3 { Vec::new() } else { left }
 }
 
 /// A robot on a mission.
@@ -132,6 +190,18 @@ pub(crate) struct OnPath {
     pub(crate) granted: usize,
 }
 
+/// A section of two robots.
+#[derive(Debug, PartialEq, Serialize)]
+pub(crate) struct SectionPicture {
+    pub(crate) id: String,
+    pub(crate) fleet: u32,
+    pub(crate) robots: [u32; 2],
+    pub(crate) may_pass: Vec<u32>,
+    pub(crate) inside: Vec<u32>,
+    pub(crate) is_contested: bool,
+    pub(crate) polygon: Vec<Point>,
+}
+
 /// The sections that two robots of `fleet` still have before them or are in, as `/live/fleet`
 /// lists them.
 pub(crate) fn of_pair(
@@ -140,7 +210,7 @@ pub(crate) fn of_pair(
     fleet: u32,
     one: &OnPath,
     other: &OnPath,
-) -> Vec<Value> {
+) -> Vec<SectionPicture> {
     let mut list = Vec::new();
     let sections = world.sections.between(one.path, other.path);
     for (index, section) in sections.iter().enumerate() {
@@ -161,15 +231,15 @@ pub(crate) fn of_pair(
         let other_way = (other.index, other.granted);
         let meeting = section.first_conflict(Side::First, one.index, other_way);
         let is_contested = meeting.is_some_and(|pose| pose <= one.granted);
-        list.push(json!({
-            "id": format!("{fleet}:{}-{}:{index}", one.robot, other.robot),
-            "fleet": fleet,
-            "robots": [one.robot, other.robot],
-            "may_pass": may_pass,
-            "inside": inside,
-            "is_contested": is_contested,
-            "polygon": areas.of(world, one.path, other.path, index),
-        }));
+        list.push(SectionPicture {
+            id: format!("{fleet}:{}-{}:{index}", one.robot, other.robot),
+            fleet,
+            robots: [one.robot, other.robot],
+            may_pass,
+            inside,
+            is_contested,
+            polygon: areas.of(world, one.path, other.path, index).to_vec(),
+        });
     }
     list
 }
@@ -178,6 +248,7 @@ pub(crate) fn of_pair(
 mod tests {
     use super::*;
     use hil_fleet::scenario::{Scenario, Scene, WorldParameters};
+    use serde_json::{Value, json};
 
     fn crossing() -> Scene {
         let parameters = WorldParameters {
@@ -199,7 +270,8 @@ mod tests {
 
     fn listed(scene: &Scene, one: &OnPath, other: &OnPath) -> Vec<Value> {
         let mut areas = Areas::new(scene.world.vehicle.footprint);
-        of_pair(&scene.world, &mut areas, 0, one, other)
+        let list = of_pair(&scene.world, &mut areas, 0, one, other);
+        list.iter().map(|section| json!(section)).collect()
     }
 
     #[test]
@@ -262,5 +334,35 @@ mod tests {
             );
         }
         assert!(path.length_m() > 20.0);
+    }
+
+    fn area_of(corners: &[Point]) -> f64 {
+        let count = corners.len();
+        let parts = 1..count.saturating_sub(1);
+        0.5 * parts
+            .map(|index| turn(corners[0], corners[index], corners[index + 1]))
+            .sum::<f64>()
+    }
+
+    #[test]
+    fn a_hull_has_the_corners_only() {
+        let inside =
+            (0..50).map(|n| [f64::from(n % 7) / 7.0 + 0.05, f64::from(n % 5) / 5.0 + 0.05]);
+        let mut points: Vec<Point> = inside.collect();
+        points.extend([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.5, 0.0]]);
+        let corners = hull(points);
+        assert_eq!(corners.len(), 4);
+        assert!((area_of(&corners) - 1.0).abs() < 1e-12);
+        assert_eq!(hull(vec![[1.0, 1.0]; 9]).len(), 1);
+    }
+
+    #[test]
+    fn squares_share_their_overlap() {
+        let square =
+            |x: f64, y: f64| hull(vec![[x, y], [x + 2.0, y], [x + 2.0, y + 2.0], [x, y + 2.0]]);
+        let both = shared(&square(0.0, 0.0), &square(1.5, 1.0));
+        assert!((area_of(&both) - 0.5).abs() < 1e-12, "{both:?}");
+        assert!(shared(&square(0.0, 0.0), &square(5.0, 0.0)).is_empty());
+        assert!((area_of(&shared(&square(0.0, 0.0), &square(0.0, 0.0))) - 4.0).abs() < 1e-12);
     }
 }

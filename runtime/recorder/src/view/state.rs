@@ -8,10 +8,6 @@ use super::arms::ArmsView;
 use super::facts::RunFacts;
 use super::fleet::FleetView;
 use super::{Body, LiveRecord, seconds};
-use crate::net::MessageLatency;
-
-/// Robots from which on the fleet's picture is drawn more seldom.
-const MANY_ROBOTS: usize = 64;
 
 /// A run while it goes on.
 #[derive(Debug)]
@@ -19,13 +15,17 @@ pub(crate) struct RunState {
     /// What was known before.
     pub(crate) facts: RunFacts,
     /// How it ended; `None` while records come.
-    how_ended: Option<String>,
-    accounts: Vec<Account>,
-    fleet: Option<FleetView>,
-    arms: ArmsView,
+    pub(crate) how_ended: Option<String>,
+    /// Of each channel.
+    pub(crate) accounts: Vec<Account>,
+    /// Of a run whose case is a fleet.
+    pub(crate) fleet: Option<FleetView>,
+    /// Whatever the case is.
+    pub(crate) arms: ArmsView,
     /// The first record's time.
-    origin_ns: Option<i64>,
-    ended_ns: Option<i64>,
+    pub(crate) origin_ns: Option<i64>,
+    /// When it ended.
+    pub(crate) ended_ns: Option<i64>,
     read_count: u64,
 }
 
@@ -92,14 +92,6 @@ impl RunState {
         }
     }
 
-    /// It ended, and how; true when that is news.
-    pub(crate) fn end(&mut self, how: String, now_ns: i64) -> bool {
-        self.ended_ns.get_or_insert(now_ns);
-        let is_news = self.how_ended.as_ref() != Some(&how);
-        self.how_ended = Some(how);
-        is_news
-    }
-
     /// Seconds from the first record to now or to the end.
     pub(crate) fn elapsed_s(&self, now_ns: i64) -> Option<f64> {
         let now_ns = self.ended_ns.unwrap_or(now_ns);
@@ -110,7 +102,11 @@ impl RunState {
     /// `/live/run`, without what only the server knows.
     pub(crate) fn run(&self, now_ns: i64) -> Value {
         let facts = &self.facts;
-        let state = if self.is_over() { "ended" } else { "running" };
+        let state = if self.how_ended.is_some() {
+            "ended"
+        } else {
+            "running"
+        };
         json!({
             "name": facts.name, "case": facts.case, "state": state,
             "how": self.how_ended,
@@ -122,16 +118,6 @@ impl RunState {
             "channels": facts.channels_json(),
             "recorder": { "read_count": self.read_count },
         })
-    }
-
-    /// True when no more records come.
-    pub(crate) fn is_over(&self) -> bool {
-        self.how_ended.is_some()
-    }
-
-    /// What went wrong in here.
-    pub(crate) fn problem(&self) -> Option<&str> {
-        self.fleet.as_ref()?.problem.as_deref()
     }
 
     /// `/live/channels`, and each `/live/losses` since the last call.
@@ -152,36 +138,5 @@ impl RunState {
         }
         let channels = json!({ "at_s": at_s, "window_s": 1, "channels": channels });
         (channels, losses)
-    }
-
-    /// Stamps of single messages of the channel with this place, some of those whose way is over.
-    pub(crate) fn shown(&mut self, channel: usize) -> Vec<MessageLatency> {
-        self.accounts[channel].take_shown()
-    }
-
-    /// `/live/map` when it is new.
-    pub(crate) fn new_map(&mut self) -> Option<Value> {
-        self.fleet.as_mut()?.new_map()
-    }
-
-    /// True when the fleet's picture is worth drawing in every round.
-    pub(crate) fn is_small(&self) -> bool {
-        let robots = self.fleet.as_ref().map(FleetView::robot_count);
-        robots.is_none_or(|count| count <= MANY_ROBOTS)
-    }
-
-    /// `/live/fleet`.
-    pub(crate) fn fleet(&mut self, now_ns: i64) -> Option<Value> {
-        let origin_ns = self.origin_ns?;
-        let fleet = self.fleet.as_mut()?;
-        Some(fleet.picture(now_ns, origin_ns))
-    }
-
-    /// `/live/arms`.
-    pub(crate) fn arms(&self, now_ns: i64) -> Option<Value> {
-        let origin_ns = self.origin_ns?;
-        self.arms
-            .is_known()
-            .then(|| self.arms.picture(now_ns, origin_ns))
     }
 }

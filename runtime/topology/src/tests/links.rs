@@ -3,6 +3,7 @@
 
 use hil_link::delay::{Exponential, Histogram, LogNormal, Normal, Pareto, Uniform};
 use hil_link::loss::{Bursts, GilbertElliott};
+use hil_link::options::Slot;
 use hil_link::rate::RateLimit;
 use hil_link::reordering::{Duplication, Reordering};
 
@@ -41,22 +42,36 @@ fn every_delay_law_can_be_written_and_is_written_back() {
         ),
         (
             "law = \"normal\"\nmean = \"20 ms\"\ndeviation = \"5 ms\"",
-            DelayLaw::Normal(Normal::new(ms(20), ms(5))),
+            DelayLaw::Normal(Normal {
+                mean: ms(20),
+                deviation: ms(5),
+                ..Normal::TEMPLATE
+            }),
         ),
         (
             "law = \"log-normal\"\nmin = \"1 ms\"\nmedian = \"2 ms\"\nsigma = 0.7\nmax = \"90 ms\"",
             DelayLaw::LogNormal(LogNormal {
+                min: ms(1),
+                median: ms(2),
+                sigma: 0.7,
                 max: ms(90),
-                ..LogNormal::new(ms(1), ms(2), 0.7)
             }),
         ),
         (
             "law = \"exponential\"\nmean_excess = \"3 ms\"",
-            DelayLaw::Exponential(Exponential::new(ms(0), ms(3))),
+            DelayLaw::Exponential(Exponential {
+                mean_excess: ms(3),
+                ..Exponential::TEMPLATE
+            }),
         ),
         (
             "law = \"pareto\"\nmin = \"1 ms\"\nscale = \"2 ms\"\nshape = 2.5",
-            DelayLaw::Pareto(Pareto::new(ms(1), ms(2), 2.5)),
+            DelayLaw::Pareto(Pareto {
+                min: ms(1),
+                scale: ms(2),
+                shape: 2.5,
+                ..Pareto::TEMPLATE
+            }),
         ),
         (
             "law = \"histogram\"\nedges = [\"1 ms\", \"2 ms\", \"9 ms\"]\nweights = [3, 0.5]",
@@ -73,6 +88,32 @@ fn every_delay_law_can_be_written_and_is_written_back() {
         if !law.is_fixed() {
             let text = format!("[links.hop.delay]\nreorders = true\n{text}");
             assert!(specs(&text).0.reorders);
+        }
+    }
+}
+
+#[test]
+fn every_delay_law_of_the_list_is_read_with_its_required_keys_and_written_back() {
+    for name in DelayLaw::NAMES {
+        let mut law = DelayLaw::named(name).unwrap();
+        let mut text = format!("[links.hop.delay]\nlaw = \"{name}\"\n");
+        let mut has_list = false;
+        for field in law.options().fields() {
+            let value = match field.slot {
+                _ if !field.is_required => continue,
+                Slot::Duration(..) => "\"3 ms\"".to_owned(),
+                Slot::Number(_, range) => {
+                    format!("{:?}", 1.5_f64.clamp(*range.start(), *range.end()))
+                }
+                _ => {
+                    has_list = true;
+                    continue;
+                }
+            };
+            text.push_str(&format!("{} = {value}\n", field.key));
+        }
+        if !has_list {
+            assert_eq!(specs(&text).0.delay.name(), *name);
         }
     }
 }
@@ -154,8 +195,7 @@ fn defaults_of_the_file_are_those_of_the_models() {
         specs("rate = { bits_per_second = 1000 }").0.rate.unwrap(),
         specs("").0.outages,
     );
-    assert_eq!(rate.queue_bytes, hil_link::rate::QUEUE_BYTES_DEFAULT);
-    assert_eq!(rate.overhead_bytes, hil_link::rate::OVERHEAD_BYTES_DEFAULT);
+    assert_eq!((rate.queue_bytes, rate.overhead_bytes), (150_000, 28));
     assert_eq!(outages, hil_link::outages::Outages::default());
     assert_eq!(limits::LINK_DELAY.max, hil_link::delay::DELAY_MAX);
 }

@@ -1,6 +1,7 @@
 //! A radio in a topology file: presets, what differs from them, and what is refused.
 
-use hil_link::wifi::{AccessCategory, PowerSave, WIFI_FIELDS, WifiPreset};
+use hil_link::options::{Options, Slot};
+use hil_link::wifi::{AccessCategory, PowerSave, WifiPreset};
 
 use super::faulty::GOOD;
 use super::*;
@@ -51,12 +52,13 @@ fn a_table_says_what_differs_from_its_preset_and_is_written_back() {
 
 #[test]
 fn every_number_of_a_radio_is_refused_by_name_outside_its_range() {
-    for field in &WIFI_FIELDS {
-        let text = with(&format!(
-            "[links.hop.wifi]\n{} = {}\n",
-            field.key,
-            field.high + 1.0
-        ));
+    for field in WifiPreset::ShortRange.spec().fields() {
+        let above = match field.slot {
+            Slot::Number(_, range) => (range.end() + 1.0).to_string(),
+            Slot::Count(_, range) => (range.end() + 1).to_string(),
+            _ => continue,
+        };
+        let text = with(&format!("[links.hop.wifi]\n{} = {above}\n", field.key));
         let errors = parse("faulty.toml", &text, &[], &known()).unwrap_err();
         let [error] = errors.errors() else {
             panic!("{}: {errors}", field.key);
