@@ -19,9 +19,7 @@ use hil_teleoperation::swing::swing_bvh;
 
 use crate::arguments::{Cli, Command, RunArgs};
 use crate::cases;
-use hil_engine::face;
-use hil_engine::gateway;
-use hil_engine::process::{component, own_program};
+use hil_engine::process::{own_program, worker};
 use hil_engine::security::cli::KeyCommand;
 use hil_engine::security::{KeyFileError, PreSharedKey};
 use hil_engine::supervisor;
@@ -73,14 +71,12 @@ pub(crate) fn run(registry: &Registry) -> ExitCode {
 
 fn run_command(command: Command, registry: &Registry, console: &mut Console) -> u8 {
     match command {
-        Command::Component { launch } => code_of(component::run(&launch, registry), console),
+        Command::Worker { launch } => code_of(worker::run(&launch, registry), console),
         Command::Become {
             supervisor,
             program,
         } => code_of(own_program::become_program(supervisor, &program), console),
         Command::CardGuard(args) => code_of(guard::run(&args), console),
-        Command::Face { launch } => code_of(face::process::run(&launch), console),
-        Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
         Command::Simulate {
             topology,
             overrides,

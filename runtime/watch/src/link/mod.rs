@@ -23,8 +23,7 @@ use serde_json::Value;
 
 use hil_platform::clock::MonotonicClock;
 use hil_platform::domain_address::{DomainAddress, DomainAddressError};
-use hil_rundir::launch;
-use hil_rundir::launch::GatewayLaunch;
+use hil_rundir::launch::{self, GatewayWork, Work, WorkerLaunch};
 use hil_rundir::link_orders::{in_force, orders_on_record};
 use hil_rundir::manifest::Manifest;
 use hil_rundir::record::RecordFileError;
@@ -192,8 +191,10 @@ impl RunLinks {
         let manifest: Manifest =
             serde_json::from_str(&text).map_err(|error| failed(io::Error::other(error)))?;
         let mut directions: Vec<LinkDirection> = Vec::new();
-        for launch in gateway_launches(folder).map_err(failed)? {
-            add_directions(&mut directions, &launch);
+        for launch in newest_launches(folder).map_err(failed)? {
+            if let Work::Gateway(work) = &launch.work {
+                add_directions(&mut directions, &launch, work);
+            }
         }
         directions.sort_by_key(LinkDirection::name);
         Ok(Self {
@@ -373,13 +374,12 @@ fn confirmed(
     })
 }
 
-/// The last start of each gateway of the run in `folder` on this host.
-fn gateway_launches(folder: &Path) -> io::Result<Vec<GatewayLaunch>> {
-    let mut newest: BTreeMap<String, GatewayLaunch> = BTreeMap::new();
+/// The last start of each process of the run in `folder` on this host.
+fn newest_launches(folder: &Path) -> io::Result<Vec<WorkerLaunch>> {
+    let mut newest: BTreeMap<String, WorkerLaunch> = BTreeMap::new();
     for entry in fs::read_dir(folder.join("launch"))? {
         let path = entry?.path();
-        // Components and faces have launch files of another form.
-        let Ok(launch) = launch::read::<GatewayLaunch>(&path) else {
+        let Ok(launch) = launch::read::<WorkerLaunch>(&path) else {
             continue;
         };
         let known = newest.get(&launch.process);
@@ -390,8 +390,8 @@ fn gateway_launches(folder: &Path) -> io::Result<Vec<GatewayLaunch>> {
     Ok(newest.into_values().collect())
 }
 
-fn add_directions(directions: &mut Vec<LinkDirection>, launch: &GatewayLaunch) {
-    for one in &launch.directions {
+fn add_directions(directions: &mut Vec<LinkDirection>, launch: &WorkerLaunch, work: &GatewayWork) {
+    for one in &work.directions {
         let Some(emulation) = &one.emulation else {
             continue;
         };
