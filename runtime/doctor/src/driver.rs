@@ -52,8 +52,8 @@ pub(super) fn asker() -> impl FnMut(&str) -> Driver {
     let mut opened = open();
     move |interface| match &mut opened {
         Ok((talk, family)) => Driver {
-            coalescing: ask(talk, (*family, COALESCE_GET), interface, Coalescing::decode),
-            ring: ask(talk, (*family, RINGS_GET), interface, Ring::decode),
+            coalescing: ask(talk, *family, COALESCE_GET, interface, Coalescing::decode),
+            ring: ask(talk, *family, RINGS_GET, interface, Ring::decode),
         },
         Err(reason) => Driver {
             coalescing: Err(reason.clone()),
@@ -72,7 +72,8 @@ fn open() -> Result<(Conversation, u16), String> {
 
 fn ask<T>(
     talk: &mut Conversation,
-    to: (u16, u8),
+    family: u16,
+    command: u8,
     interface: &str,
     decode: fn(Attributes<'_>) -> Option<T>,
 ) -> Result<T, String> {
@@ -82,9 +83,13 @@ fn ask<T>(
         return Err("a name too long".to_owned());
     }
     let header = encode_attributes(&[(HEADER_DEVICE_NAME, &name)]);
-    let answer = talk.ask(to, false, &[(HEADER, &header)], |_, attributes| {
-        decode(attributes)
-    });
+    let answer = talk.ask(
+        family,
+        command,
+        false,
+        &[(HEADER, &header)],
+        |_, attributes| decode(attributes),
+    );
     match answer {
         Ok(found) => found
             .into_iter()
