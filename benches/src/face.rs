@@ -3,7 +3,7 @@
 //! supervisor would do around them, and the stop-watch.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -22,7 +22,7 @@ use hil_platform::domain_address::DomainAddress;
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
 use hil_report::face_figures::{FaceFigures, figures};
-use hil_rundir::face_launch::{ArmLaunch, FaceLaunch, FaceSettings};
+use hil_rundir::launch::{ArmLaunch, FaceSettings};
 use hil_rundir::record::{RecordFile, Recorder};
 use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, Waiter,
@@ -142,15 +142,15 @@ impl Pair {
         let mut recorders = Vec::new();
         let listens_at = hosts.network.free_address(1)?;
         for host in 0..2 {
-            let launch = launch(host, &addresses[host], listens_at, &folder);
+            let settings = settings(host, listens_at);
             let mut recorder = Recorder::new(&folder, WRITERS[host], 0);
             let opened = hosts.network.on(host, || {
-                OpenedArm::open(&launch, &launch.face.arms[0], &mut recorder)
+                OpenedArm::open(&settings, &settings.arms[0], &mut recorder)
             })?;
             recorder.start()?;
             recorders.push(recorder);
             threads.push(face(
-                launch,
+                settings,
                 opened,
                 (host, &addresses[host]),
                 (&stop, &ready),
@@ -333,12 +333,7 @@ fn feedback(cycle: u64) -> EgmFeedback {
     }
 }
 
-fn launch(
-    host: usize,
-    address: &DomainAddress,
-    listens_at: std::net::SocketAddr,
-    records: &Path,
-) -> FaceLaunch {
+fn settings(host: usize, listens_at: std::net::SocketAddr) -> FaceSettings {
     let channel = |(name, message): (&str, MessageType)| CardChannel {
         name: name.to_owned(),
         message_name: message.name.to_owned(),
@@ -353,32 +348,26 @@ fn launch(
     } else {
         (FaceKind::Sensor, command, feedback)
     };
-    FaceLaunch {
-        process: WRITERS[host].to_owned(),
-        instance: 0,
-        domain: address.to_string(),
-        records: records.to_owned(),
+    FaceSettings {
+        role: "bench".to_owned(),
+        kind,
+        axes: 7,
+        robotware: 7,
+        cycle_ns: 4_000_000,
+        planned_lead_ns: 16_000_000,
         wait: WaitMode::Block,
-        face: FaceSettings {
-            role: "bench".to_owned(),
-            kind,
-            axes: 7,
-            robotware: 7,
-            cycle_ns: 4_000_000,
-            planned_lead_ns: 16_000_000,
-            send: FaceSend::Coupled,
-            timestamps: Timestamps::Software,
-            dscp: 0,
-            interface: None,
-            arms: vec![ArmLaunch {
-                arm: ArmSide::Right,
-                address: listens_at,
-                input,
-                output,
-                realtime: RealtimeRequest::default(),
-            }],
-            spare: Vec::new(),
-        },
+        send: FaceSend::Coupled,
+        timestamps: Timestamps::Software,
+        dscp: 0,
+        interface: None,
+        arms: vec![ArmLaunch {
+            arm: ArmSide::Right,
+            address: listens_at,
+            input,
+            output,
+            realtime: RealtimeRequest::default(),
+        }],
+        spare: Vec::new(),
     }
 }
 
@@ -400,7 +389,7 @@ fn party(
 }
 
 fn face(
-    launch: FaceLaunch,
+    settings: FaceSettings,
     opened: OpenedArm,
     (cpu, address): (usize, &DomainAddress),
     around: Around<'_>,
@@ -408,7 +397,7 @@ fn face(
     let address = address.clone();
     party(cpu, around, move |stop| {
         let domain = Domain::open(&address)?;
-        let mut joined = opened.connect(&launch, &launch.face.arms[0], &domain)?;
+        let mut joined = opened.connect(&settings, &settings.arms[0], &domain)?;
         Ok(joined.run(stop)?)
     })
 }

@@ -232,7 +232,7 @@ kill_supervisor() { pc "$1" systemctl kill --kill-whom=main --signal=KILL hil-ru
 hang_supervisor() { pc "$1" systemctl kill --kill-whom=main --signal=STOP hil-runtime@long.service; }
 
 # The robot's process, by the launch file that it was given.
-hang_robot() { pc "$1" pkill --signal STOP --uid hil --full 'component --launch .*/robot'; }
+hang_robot() { pc "$1" pkill --signal STOP --uid hil --full 'worker --launch .*/robot'; }
 
 watchdog_fired() {
     local count

@@ -14,7 +14,7 @@ use hil_core::message::MessageType;
 use hil_core::record::{EgressRecord, IngressRecord};
 use hil_engine::gateway::Surroundings;
 use hil_engine::gateway::direction;
-use hil_engine::gateway::direction::{Direction, Opened};
+use hil_engine::gateway::direction::{Direction, OpenDirection};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
@@ -75,8 +75,8 @@ pub struct Joint {
     pub host: usize,
     /// The host's shared memory.
     pub address: DomainAddress,
-    egress: (DirectionLaunch, Opened),
-    ingress: (DirectionLaunch, Opened),
+    egress: (DirectionLaunch, OpenDirection),
+    ingress: (DirectionLaunch, OpenDirection),
     surroundings: Arc<Surroundings>,
 }
 
@@ -84,7 +84,7 @@ pub struct Joint {
 #[derive(Debug)]
 pub struct Loose {
     launch: DirectionLaunch,
-    opened: Opened,
+    opened: OpenDirection,
     surroundings: Arc<Surroundings>,
 }
 
@@ -264,7 +264,7 @@ impl Hosts {
                 let recorder = self.recorders[host].as_mut();
                 let recorder = recorder.expect("plans are added before recording starts");
                 let opened = self.network.on(host, || {
-                    direction::open(&launch, recorder, &RunStart::default()).map(|(_, one)| one)
+                    direction::open(&launch, recorder, &RunStart::default())
                 })?;
                 let slot = usize::from(side == Side::Ingress);
                 ends[host][slot] = Some((launch, opened));

@@ -300,9 +300,9 @@ pub enum Command {
         #[arg(long, default_value_t = 125.0)]
         rate: f64,
     },
-    /// Run one component; started by a run, not by hand.
+    /// Run a component, gateway, clock path or adapter; started by a run, not by hand.
     #[command(hide = true)]
-    Component {
+    Worker {
         /// Launch file written by the supervisor.
         #[arg(long)]
         launch: PathBuf,
@@ -329,20 +329,6 @@ pub enum Command {
     /// Wait for the end of the program that set a network card up; not for use by hand.
     #[command(hide = true)]
     CardGuard(CardGuardArgs),
-    /// Speak with a foreign EGM program; started by a run, not by hand.
-    #[command(hide = true)]
-    Face {
-        /// Launch file written by the supervisor.
-        #[arg(long)]
-        launch: PathBuf,
-    },
-    /// Run the gateway of one link; started by a run, not by hand.
-    #[command(hide = true)]
-    Gateway {
-        /// Launch file written by the supervisor.
-        #[arg(long)]
-        launch: PathBuf,
-    },
 }
 
 #[cfg(test)]
@@ -372,7 +358,7 @@ mod tests {
         ] {
             assert!(names.iter().any(|one| one == name), "{name}: {names:?}");
         }
-        for hidden in ["component", "gateway", "become", "help"] {
+        for hidden in ["worker", "become", "help"] {
             let hidden = format!("hil-runtime-{hidden}.1");
             assert!(!names.contains(&hidden), "{hidden}");
         }

@@ -5,6 +5,7 @@ mod doctor_work;
 mod live_work;
 mod report_work;
 
+use core::fmt::Display;
 use std::collections::BTreeMap;
 use std::env;
 use std::fs;
@@ -19,34 +20,24 @@ use hil_teleoperation::swing::swing_bvh;
 
 use crate::arguments::{Cli, Command, RunArgs};
 use crate::cases;
-use hil_engine::face;
-use hil_engine::gateway;
-use hil_engine::process::{component, own_program};
-use hil_engine::security::cli::KeyCommand;
+use hil_engine::process::{own_program, worker};
 use hil_engine::security::{KeyFileError, PreSharedKey};
-use hil_engine::supervisor;
-use hil_engine::supervisor::{PeerError, RunError, RunOptions};
+use hil_engine::supervisor::{self, PeerError, RunError, RunOptions};
 use hil_nic::card_clock::guard;
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
-use hil_probe;
-use hil_report::analysis;
-use hil_report::analysis::{AnalysisError, Concluded};
-use hil_report::compare;
-use hil_report::compare::cli::CompareArgs;
-use hil_report::terminal;
-use hil_report::terminal::Style;
-use hil_report::trace;
+use hil_report::analysis::{self, AnalysisError, Concluded};
+use hil_report::terminal::{self, Style};
+use hil_report::{compare, trace};
 use hil_rundir::run_result::{Outcome, RunResult};
-use hil_topology;
-use hil_topology::documents;
 use hil_topology::emulation_room::check_emulation;
 use hil_topology::registry::Registry;
-use hil_topology::trace_source;
-use hil_topology::{HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
+use hil_topology::{
+    HOST_VARIABLE, HostChoice, MachineIdentity, Topology, TopologyErrors, documents, trace_source,
+    which_host,
+};
 use hil_watch::link;
-use hil_watch::link::cli::LinkCommand;
 
 /// Exit codes, as `--help` lists them (after `sysexits.h`, which systemd knows).
 mod exit {
@@ -64,23 +55,60 @@ mod exit {
 pub(crate) fn run(registry: &Registry) -> ExitCode {
     let cli = Cli::parse();
     let mut console = Console::new(cli.run.quiet);
-    let code = match cli.command {
+    let outcome = match cli.command {
         None => run_topology(&cli.run, registry, &mut console),
         Some(command) => run_command(command, registry, &mut console),
     };
+    let code = outcome.unwrap_or_else(|refusal| {
+        if let Some(text) = refusal.text {
+            console.error(&text);
+        }
+        refusal.code
+    });
     ExitCode::from(code)
 }
 
-fn run_command(command: Command, registry: &Registry, console: &mut Console) -> u8 {
+/// What stops a command.
+pub(crate) struct Refusal {
+    code: u8,
+    /// Why; `None` when it has been said.
+    text: Option<String>,
+}
+
+impl Refusal {
+    fn new(code: u8, why: impl Display) -> Self {
+        Self {
+            code,
+            text: Some(why.to_string()),
+        }
+    }
+}
+
+/// It was asked for what cannot be.
+fn usage(why: impl Display) -> Refusal {
+    Refusal::new(exit::USAGE, why)
+}
+
+/// It was tried and did not come about.
+fn failed(why: impl Display) -> Refusal {
+    Refusal::new(exit::FAILED, why)
+}
+
+fn run_command(
+    command: Command,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    let done = |()| exit::RAN;
     match command {
-        Command::Component { launch } => code_of(component::run(&launch, registry), console),
+        Command::Worker { launch } => worker::run(&launch, registry).map(done).map_err(failed),
         Command::Become {
             supervisor,
             program,
-        } => code_of(own_program::become_program(supervisor, &program), console),
-        Command::CardGuard(args) => code_of(guard::run(&args), console),
-        Command::Face { launch } => code_of(face::process::run(&launch), console),
-        Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
+        } => own_program::become_program(supervisor, &program)
+            .map(done)
+            .map_err(failed),
+        Command::CardGuard(args) => guard::run(&args).map(done).map_err(failed),
         Command::Simulate {
             topology,
             overrides,
@@ -94,28 +122,46 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         } => {
             overrides
                 .extend(sections.map(|count| format!("case.parameters.tables.sections={count}")));
-            case_work::tables(&topology, &overrides, &batch, registry)
+            case_work::tables(&topology, &overrides, &batch, registry, console)
         }
-        Command::Calibrate(args) => case_work::calibrate(args, registry),
+        Command::Calibrate(args) => case_work::calibrate(args, registry, console),
         Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
         Command::Report(args) => report_work::report(&args, registry, console),
-        Command::Compare(args) => compare(&args, console),
-        Command::Trace { command } => match trace::work::work(command, columns(), console) {
+        Command::Compare(args) => Ok(match compare::work::work(&args, console) {
+            compare::work::End::Passed => exit::RAN,
+            compare::work::End::Failed => exit::FAILED,
+            compare::work::End::Refused => exit::USAGE,
+        }),
+        Command::Trace { command } => Ok(match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
             trace::work::End::Failed => exit::FAILED,
             trace::work::End::Refused => exit::USAGE,
-        },
-        Command::Link { command } => change_link(&command, console),
+        }),
+        Command::Link { command } => Ok(match link::work::work(&command, console) {
+            link::work::End::Done => exit::RAN,
+            link::work::End::Failed => exit::FAILED,
+            link::work::End::Refused => exit::USAGE,
+        }),
         Command::Doctor(args) => doctor_work::doctor(&args, registry, console),
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
-        Command::Probe(args) => hil_probe::run(&args, console),
-        Command::Documents { folder } => write_documents(&folder, console),
-        Command::Sweep => sweep(),
-        Command::Key { command } => key(&command, console),
+        Command::Probe(args) => Ok(hil_probe::run(&args, console)),
+        Command::Documents { folder } => documents::write(Cli::command(), &folder)
+            .and_then(|_paths| documents::write_schema(&hil_topology::schema(), &folder))
+            .and_then(|_path| documents::write_robot(&folder))
+            .map(|_path| exit::RAN)
+            .map_err(failed),
+        Command::Sweep => {
+            supervisor::sweep();
+            Ok(exit::RAN)
+        }
+        Command::Key { command } => {
+            console.result(&command.work().map_err(usage)?);
+            Ok(exit::RAN)
+        }
         Command::Cases => {
             console.result(&cases::list(registry));
-            exit::RAN
+            Ok(exit::RAN)
         }
         Command::Motion {
             output,
@@ -130,62 +176,11 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
     }
 }
 
-fn write_documents(folder: &Path, console: &mut Console) -> u8 {
-    let written = documents::write(Cli::command(), folder)
-        .and_then(|_paths| documents::write_schema(&hil_topology::schema(), folder))
-        .and_then(|_path| documents::write_robot(folder));
-    code_of(written.map(drop), console)
-}
-
-fn sweep() -> u8 {
-    supervisor::sweep();
-    exit::RAN
-}
-
-fn compare(args: &CompareArgs, console: &mut Console) -> u8 {
-    match compare::work::work(args, console) {
-        compare::work::End::Passed => exit::RAN,
-        compare::work::End::Failed => exit::FAILED,
-        compare::work::End::Refused => exit::USAGE,
-    }
-}
-
-fn key(command: &KeyCommand, console: &mut Console) -> u8 {
-    match command.work() {
-        Ok(text) => {
-            console.result(&text);
-            exit::RAN
-        }
-        Err(error) => {
-            console.error(&error.to_string());
-            exit::USAGE
-        }
-    }
-}
-
-fn change_link(command: &LinkCommand, console: &mut Console) -> u8 {
-    match link::work::work(command, console) {
-        link::work::End::Done => exit::RAN,
-        link::work::End::Failed => exit::FAILED,
-        link::work::End::Refused => exit::USAGE,
-    }
-}
-
-fn code_of<E: core::fmt::Display>(outcome: Result<(), E>, console: &mut Console) -> u8 {
-    match outcome {
-        Ok(()) => exit::RAN,
-        Err(error) => {
-            console.error(&error.to_string());
-            exit::FAILED
-        }
-    }
-}
-
 /// Takes over the signals that end programs, or says why it cannot.
-fn signals(console: &mut Console) -> Result<Signals, u8> {
+fn signals() -> Result<Signals, Refusal> {
     Signals::install().map_err(|error| {
-        console.error(&format!("cannot handle signals: {error}"));
-        exit::INTERNAL
+        let text = format!("cannot handle signals: {error}");
+        Refusal::new(exit::INTERNAL, text)
     })
 }
 
@@ -194,46 +189,43 @@ fn load(
     overrides: &[String],
     registry: &Registry,
     console: &mut Console,
-) -> Option<Topology> {
-    match hil_topology::load(path, overrides, registry.known()) {
-        Ok(topology) => Some(topology),
-        Err(errors) => {
-            console.faults(&errors.render(io::stderr().is_terminal()));
-            None
-        }
-    }
+) -> Result<Topology, Refusal> {
+    loaded(
+        hil_topology::load(path, overrides, registry.known()),
+        console,
+    )
 }
 
-fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u8 {
+/// The topology, or all its faults said.
+fn loaded(
+    topology: Result<Topology, TopologyErrors>,
+    console: &mut Console,
+) -> Result<Topology, Refusal> {
+    topology.map_err(|errors| {
+        console.faults(&errors.render(io::stderr().is_terminal()));
+        Refusal {
+            code: exit::USAGE,
+            text: None,
+        }
+    })
+}
+
+fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> Result<u8, Refusal> {
     let Some(path) = &args.topology else {
-        console.error("no topology given; try --topology deploy/topologies/local.toml or --help");
-        return exit::USAGE;
+        let hint = "no topology given; try --topology deploy/topologies/local.toml or --help";
+        return Err(usage(hint));
     };
-    let Some(topology) = load(path, &args.overrides, registry, console) else {
-        return exit::USAGE;
-    };
-    if let Err(error) = trace_source::check(&topology) {
-        console.error(&error.to_string());
-        return exit::USAGE;
-    }
+    let topology = load(path, &args.overrides, registry, console)?;
+    trace_source::check(&topology).map_err(usage)?;
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
         return show_check(path, &topology, None, console);
     }
-    let hosts = match hosts_here(&topology, args.host.as_deref()) {
-        Ok(hosts) => hosts,
-        Err(text) => {
-            console.error(&text);
-            return exit::USAGE;
-        }
-    };
+    let hosts = hosts_here(&topology, args.host.as_deref()).map_err(usage)?;
     if args.check {
         return show_check(path, &topology, Some(&hosts), console);
     }
-    let signals = match signals(console) {
-        Ok(signals) => signals,
-        Err(code) => return code,
-    };
+    let signals = signals()?;
     let options = RunOptions {
         hosts,
         domain_root: args.domain_root.clone(),
@@ -242,52 +234,38 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         layouts: layouts(&topology, registry),
     };
     console.serve();
-    match supervisor::run(&topology, &options, &signals, console) {
-        Ok(result) => {
-            let is_incomplete = result.has_gaps();
-            let code = match exit_code(&result.outcome) {
-                exit::RAN if is_incomplete => exit::FAILED,
-                code => code,
-            };
-            let concluded = Progress::begin().during(console, "drawing up the account", |_| {
-                let written = result.write().map_err(AnalysisError::from);
-                let analysed = written.and_then(|()| analysis::analyse(&result.folder, registry));
-                // What the folder cannot give back, because its disk is full, is still in memory.
-                analysed.or_else(|error| {
-                    let concluded = analysis::conclude(
-                        &topology,
-                        &result,
-                        registry,
-                        &path,
-                        &options.command_line,
-                    )?;
-                    Ok::<_, AnalysisError>(Concluded {
-                        unwritten: concluded.unwritten.or(Some(error)),
-                        ..concluded
-                    })
-                })
-            });
-            match concluded {
-                Ok(Concluded { summary, unwritten }) => {
-                    console.result(&terminal::render(&summary, columns(), Style::Coloured));
-                    if code != exit::RAN {
-                        console.error(&complaint(&result));
-                    }
-                    let Some(error) = unwritten else { return code };
-                    console.error(&format!("{error}; the report is only what is printed here"));
-                    code.max(exit::FAILED)
-                }
-                Err(error) => {
-                    console.error(&format!("the run is over but its report failed: {error}"));
-                    exit::INTERNAL
-                }
-            }
-        }
-        Err(error) => {
-            console.error(&error.to_string());
-            exit_code_of_error(&error)
-        }
+    let result = supervisor::run(&topology, &options, &signals, console)
+        .map_err(|error| Refusal::new(exit_code_of_error(&error), error))?;
+    let code = match exit_code(&result.outcome) {
+        exit::RAN if result.has_gaps() => exit::FAILED,
+        code => code,
+    };
+    let concluded = Progress::begin().during(console, "drawing up the account", |_| {
+        let written = result.write().map_err(AnalysisError::from);
+        let analysed = written.and_then(|()| analysis::analyse(&result.folder, registry));
+        // What the folder cannot give back, because its disk is full, is still in memory.
+        analysed.or_else(|error| {
+            let concluded =
+                analysis::conclude(&topology, &result, registry, &path, &options.command_line)?;
+            Ok::<_, AnalysisError>(Concluded {
+                unwritten: concluded.unwritten.or(Some(error)),
+                ..concluded
+            })
+        })
+    });
+    let Concluded { summary, unwritten } = concluded.map_err(|error| {
+        let text = format!("the run is over but its report failed: {error}");
+        Refusal::new(exit::INTERNAL, text)
+    })?;
+    console.result(&terminal::render(&summary, columns(), Style::Coloured));
+    if code != exit::RAN {
+        console.error(&complaint(&result));
     }
+    if let Some(error) = unwritten {
+        console.error(&format!("{error}; the report is only what is printed here"));
+        return Ok(code.max(exit::FAILED));
+    }
+    Ok(code)
 }
 
 /// The fields of the messages of the topology's case, by channel.
@@ -320,18 +298,16 @@ fn show_check(
     topology: &Topology,
     hosts: Option<&[String]>,
     console: &mut Console,
-) -> u8 {
-    if let Err(error) = check_emulation(topology) {
-        console.error(&format!(
+) -> Result<u8, Refusal> {
+    check_emulation(topology).map_err(|error| {
+        usage(format!(
             "{}: the file is valid and can be simulated, but no gateway can keep its emulated \
              link: {error}",
             path.display()
-        ));
-        return exit::USAGE;
-    }
+        ))
+    })?;
     if let Some(text) = topology.unsaid_security() {
-        console.error(&format!("{}: {text}", path.display()));
-        return exit::USAGE;
+        return Err(usage(format!("{}: {text}", path.display())));
     }
     // As comments, so that what is printed is a topology as a whole.
     let clock_paths = topology.clock_paths().map(|clock| {
@@ -339,13 +315,8 @@ fn show_check(
         let words = clock.describe();
         format!("\n# {words}, UDP ports {asking} and {answering}\n")
     });
-    let key = match hosts.map_or(Ok(None), |hosts| key_here(topology, hosts)) {
-        Ok(key) => key,
-        Err(error) => {
-            console.error(&error.to_string());
-            return exit::FORBIDDEN;
-        }
-    };
+    let key = hosts.map_or(Ok(None), |hosts| key_here(topology, hosts));
+    let key = key.map_err(|error| Refusal::new(exit::FORBIDDEN, error))?;
     let key = key.map(|(file, key)| {
         let (file, fingerprint) = (file.display(), key.fingerprint());
         format!("\n# {file}: the key {fingerprint}, which the other hosts must have as well\n")
@@ -357,7 +328,7 @@ fn show_check(
         clock_paths.collect::<Vec<_>>().concat(),
         key.unwrap_or_default()
     ));
-    exit::RAN
+    Ok(exit::RAN)
 }
 
 /// Why a run does not end with exit code 0, for those who do not read its report.
@@ -451,26 +422,17 @@ fn write_motion(
     output: Option<&Path>,
     text: Result<String, ParameterError>,
     console: &mut Console,
-) -> u8 {
-    let text = match text {
-        Ok(text) => text,
-        Err(error) => {
-            console.error(&error.to_string());
-            return exit::USAGE;
+) -> Result<u8, Refusal> {
+    let text = text.map_err(usage)?;
+    match output {
+        None => {
+            console.result(&text);
         }
-    };
-    let Some(path) = output else {
-        console.result(&text);
-        return exit::RAN;
-    };
-    match fs::write(path, text) {
-        Ok(()) => {
+        Some(path) => {
+            let written = fs::write(path, text);
+            written.map_err(|error| failed(format!("{}: {error}", path.display())))?;
             console.say(&format!("wrote {}", path.display()));
-            exit::RAN
-        }
-        Err(error) => {
-            console.error(&format!("{}: {error}", path.display()));
-            exit::FAILED
         }
     }
+    Ok(exit::RAN)
 }

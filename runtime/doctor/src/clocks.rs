@@ -66,7 +66,7 @@ fn between(own: Option<&HostDiscipline>, name: &str, other: Option<&HostDiscipli
         let whose = if own.is_none() { "this host" } else { name };
         return Finding::cannot_tell(id, format!("the kernel of {whose} says nothing")).of(name);
     };
-    match common_bound_ns(("this host", own), (name, other)) {
+    match common_bound_ns("this host", own, name, other) {
         Ok(bound_ns) => Finding::ok(
             id,
             format!("apart by at most {} us", bound_ns.div_ceil(1_000)),

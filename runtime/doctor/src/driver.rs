@@ -3,7 +3,8 @@
 
 use nix::sys::socket::SockProtocol;
 
-use super::{Finding, finding::Severity};
+use super::Finding;
+use super::finding::Severity;
 use hil_nic::radio::conversation::Conversation;
 use hil_nic::radio::netlink::{Attributes, encode_attributes, u32_at};
 
@@ -82,10 +83,13 @@ fn ask<T>(
         return Err("a name too long".to_owned());
     }
     let header = encode_attributes(&[(HEADER_DEVICE_NAME, &name)]);
-    let header: &[(u16, &[u8])] = &[(HEADER, &header)];
-    let answer = talk.ask((family, command), false, header, |_, attributes| {
-        decode(attributes)
-    });
+    let answer = talk.ask(
+        family,
+        command,
+        false,
+        &[(HEADER, &header)],
+        |_, attributes| decode(attributes),
+    );
     match answer {
         Ok(found) => found
             .into_iter()

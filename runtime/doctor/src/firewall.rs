@@ -48,8 +48,7 @@ pub(super) fn chains() -> Result<Vec<Chain>, String> {
         Err(error) => return Err(format!("nfnetlink: {error}")),
     };
     let all_families = 0;
-    let to = (GET_CHAINS, all_families);
-    let asked = talk.ask(to, true, &[], Chain::decode);
+    let asked = talk.ask(GET_CHAINS, all_families, true, &[], Chain::decode);
     asked.map_err(|error| match error.raw_os_error().map(Errno::from_raw) {
         Some(Errno::EPERM | Errno::EACCES) => {
             "needs root (CAP_NET_ADMIN) to see the rules".to_owned()

@@ -264,7 +264,7 @@ fn set_timer_slack(slack: Duration) -> Result<(), Refusal> {
 
 fn schedule(policy: libc::c_int, priority: u8) -> Result<(), Refusal> {
     let set = set_scheduler(policy, priority);
-    set.map_err(|errno| explain(errno, (policy, priority)))?;
+    set.map_err(|errno| explain(errno, policy, priority))?;
     let actual = current_policy();
     if actual & !libc::SCHED_RESET_ON_FORK == policy & !libc::SCHED_RESET_ON_FORK {
         return Ok(());
@@ -273,7 +273,7 @@ fn schedule(policy: libc::c_int, priority: u8) -> Result<(), Refusal> {
     Err(Refusal::new(Errno::EAGAIN, reason, "report this kernel"))
 }
 
-fn explain(errno: Errno, (policy, priority): (libc::c_int, u8)) -> Refusal {
+fn explain(errno: Errno, policy: libc::c_int, priority: u8) -> Refusal {
     match policy {
         libc::SCHED_OTHER => explain_raising(errno),
         _ => explain_scheduling(errno, priority, &HostFiles::of_this_host()),

@@ -7,39 +7,21 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use hil_arm::egm::face::{Axes, RobotWare};
+use hil_arm::egm::messages::Side as ArmSide;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
-use hil_topology::Timestamps;
 use hil_topology::emulation::EmulationLaunch;
+use hil_topology::{CardChannel, FaceKind, FaceSend, Timestamps};
 
-/// How to start one component here.
+/// How to start one process of the run that this binary plays.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct ComponentLaunch {
-    /// Name of the process in the topology.
-    pub process: String,
-    /// How often it was restarted before.
-    pub instance: u32,
-    /// File with the [`ProcessCard`](hil_topology::ProcessCard).
-    pub card: PathBuf,
-    /// The shared memory to join, a [`DomainAddress`](hil_platform::domain_address::DomainAddress).
-    pub domain: String,
-    /// What to ask of the kernel.
-    pub realtime: RealtimeRequest,
-    /// How to wait for messages and ticks.
-    pub wait: WaitMode,
-    /// Folder for record files.
-    pub records: PathBuf,
-}
-
-/// How to start the gateway of one link on one host.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GatewayLaunch {
-    /// Name of the process, e.g. `gateway-hop-robot-pc`.
+pub struct WorkerLaunch {
+    /// Name of the process in the topology, or of a gateway, e.g. `gateway-hop-robot-pc`.
     pub process: String,
     /// How often it was restarted before.
     pub instance: u32,
@@ -47,14 +29,44 @@ pub struct GatewayLaunch {
     pub domain: String,
     /// Folder for record files.
     pub records: PathBuf,
+    /// Its hops are sealed: the first word on its standard input is the run's secret.
+    pub is_sealed: bool,
+    /// What it does.
+    pub work: Work,
+}
+
+/// What a process of the run does.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Work {
+    /// Plays a role of the case.
+    Component(ComponentWork),
+    /// Carries channels over a link, or is one end of a clock path.
+    Gateway(GatewayWork),
+    /// Speaks a robot maker's own protocol with a foreign program.
+    Adapter(FaceSettings),
+}
+
+/// What a component is told.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ComponentWork {
+    /// File with the [`ProcessCard`](hil_topology::ProcessCard).
+    pub card: PathBuf,
+    /// What to ask of the kernel.
+    pub realtime: RealtimeRequest,
+    /// How to wait for messages and ticks.
+    pub wait: WaitMode,
+}
+
+/// What the gateway of one link on one host is told.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GatewayWork {
     /// One thread each.
     pub directions: Vec<DirectionLaunch>,
     /// How long it waits for the peer's answer before it is ready without; `None` waits on.
-    #[serde(default)]
     pub ready_within: Option<Duration>,
-    /// Its hops are sealed: the first word on its standard input is the run's secret.
-    #[serde(default)]
-    pub is_sealed: bool,
 }
 
 /// One channel direction through a gateway.
@@ -142,6 +154,72 @@ pub struct SocketLaunch {
     pub path_mtu_bytes: usize,
     /// Kernel stamps to ask for.
     pub timestamps: Timestamps,
+}
+
+/// What a process is told that speaks with a foreign program.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FaceSettings {
+    /// The role that the foreign program plays.
+    pub role: String,
+    /// Which side of the protocol we are.
+    pub kind: FaceKind,
+    /// Joints of an arm on the wire, 6 or 7.
+    pub axes: u8,
+    /// Generation of the robot's software, 6 or 7.
+    pub robotware: u8,
+    /// The robot's cycle as the case has it.
+    pub cycle_ns: u64,
+    /// How far its planned joints are ahead of the measured.
+    pub planned_lead_ns: u64,
+    /// How to wait.
+    pub wait: WaitMode,
+    /// When a sensor face sends.
+    pub send: FaceSend,
+    /// Kernel stamps to ask for.
+    pub timestamps: Timestamps,
+    /// Differentiated-services code point (RFC 2474), 0..=63.
+    pub dscp: u8,
+    /// Interface to bind to.
+    pub interface: Option<String>,
+    /// One thread and one socket each.
+    pub arms: Vec<ArmLaunch>,
+    /// Channels whose messages the protocol has no place for: taken, recorded and dropped.
+    pub spare: Vec<CardChannel>,
+}
+
+impl FaceSettings {
+    /// [`FaceSettings::axes`] in the words of the protocol.
+    pub const fn axes(&self) -> Axes {
+        match self.axes {
+            6 => Axes::Six,
+            _ => Axes::Seven,
+        }
+    }
+
+    /// [`FaceSettings::robotware`] in the words of the protocol.
+    pub const fn robotware(&self) -> RobotWare {
+        match self.robotware {
+            6 => RobotWare::Six,
+            _ => RobotWare::Seven,
+        }
+    }
+}
+
+/// One arm of a face.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ArmLaunch {
+    /// Which arm.
+    pub arm: ArmSide,
+    /// Where the foreign program listens (robot face), or where we do (sensor face).
+    pub address: SocketAddr,
+    /// The channel whose messages go out.
+    pub input: CardChannel,
+    /// The channel that what comes in is published on.
+    pub output: CardChannel,
+    /// What to ask of the kernel.
+    pub realtime: RealtimeRequest,
 }
 
 /// A launch file or card cannot be used.

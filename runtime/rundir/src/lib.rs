@@ -5,7 +5,6 @@
 pub mod announcement;
 pub mod card_story;
 pub mod event;
-pub mod face_launch;
 pub mod face_record;
 pub mod launch;
 pub mod layout;

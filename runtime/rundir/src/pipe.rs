@@ -2,7 +2,7 @@
 //! the child's standard input and output. Messages of channels never go this way.
 
 use std::io::{self, BufRead, Write};
-use std::sync::atomic::{AtomicI64, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
@@ -255,16 +255,12 @@ pub struct StallFigures {
     pub threshold_ns: u64,
 }
 
-const WAITING: u8 = 0;
-const STARTED: u8 = 1;
-const STOPPING: u8 = 2;
-
 /// The supervisor's latest word, readable without a system call.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Orders {
-    state: Arc<AtomicU8>,
+    stop: Arc<AtomicBool>,
     start: RunStart,
-    seal: Arc<Mutex<Receiver<RunSeal>>>,
+    seal: Mutex<Receiver<RunSeal>>,
 }
 
 /// When the run began, for whoever counts from there; readable without a system call.
@@ -301,11 +297,10 @@ impl Orders {
     /// # Errors
     /// When the system gives no thread.
     pub fn listen() -> io::Result<Self> {
-        let state = Arc::new(AtomicU8::new(WAITING));
-        let shared = Arc::clone(&state);
+        let stop = Arc::new(AtomicBool::new(false));
         let start = RunStart::default();
-        let began = start.clone();
         let (sealed, seal) = channel();
+        let (stopped, began) = (Arc::clone(&stop), start.clone());
         thread::Builder::new()
             .name("orders".to_owned())
             .spawn(move || {
@@ -316,17 +311,14 @@ impl Orders {
                             // A gateway of plain hops asks for none.
                             let _unasked = sealed.send(seal).is_err();
                         }
-                        Some(ToProcess::Start { at_ns }) => {
-                            began.set(Instant::from_ns(at_ns));
-                            shared.store(STARTED, Ordering::Release);
-                        }
+                        Some(ToProcess::Start { at_ns }) => began.set(Instant::from_ns(at_ns)),
                         Some(ToProcess::Stop) | None => break,
                     }
                 }
-                shared.store(STOPPING, Ordering::Release);
+                stopped.store(true, Ordering::Release);
             })?;
-        let seal = Arc::new(Mutex::new(seal));
-        Ok(Self { state, start, seal })
+        let seal = Mutex::new(seal);
+        Ok(Self { stop, start, seal })
     }
 
     /// When the run began.
@@ -334,10 +326,9 @@ impl Orders {
         self.start.clone()
     }
 
-    /// Ends the process as an order to stop would, from whichever thread calls it.
-    pub fn stopper(&self) -> impl Fn() + Send + use<> {
-        let state = Arc::clone(&self.state);
-        move || state.store(STOPPING, Ordering::Release)
+    /// Set once the process should end, by an order or by whichever thread sets it.
+    pub fn stop_flag(&self) -> &Arc<AtomicBool> {
+        &self.stop
     }
 
     /// Waits up to `limit` for the run's secret; once.
@@ -348,17 +339,18 @@ impl Orders {
 
     /// True once the process should end.
     pub fn is_stopping(&self) -> bool {
-        self.state.load(Ordering::Acquire) == STOPPING
+        self.stop.load(Ordering::Acquire)
     }
 
-    /// Waits for the start; false when told to stop instead.
+    /// Waits for the start; false when told to stop before.
     pub fn wait_for_start(&self) -> bool {
-        loop {
-            match self.state.load(Ordering::Acquire) {
-                WAITING => thread::sleep(Duration::from_micros(200)),
-                state => return state == STARTED,
+        while !self.is_stopping() {
+            if self.start.get().is_some() {
+                return true;
             }
+            thread::sleep(Duration::from_micros(200));
         }
+        false
     }
 }
 

@@ -194,7 +194,8 @@ pub const HEARING_MAX: Duration = Duration::from_secs(3);
 /// How well `host` is heard at `now` when it was last at `heard_ns`.
 pub fn hearing(
     host: &str,
-    (heard_ns, now): (Option<i64>, Instant),
+    heard_ns: Option<i64>,
+    now: Instant,
     left_out_count: usize,
 ) -> HostHearing {
     let silent = heard_ns.map(|at| now.saturating_duration_since(Instant::from_ns(at)));
@@ -224,10 +225,10 @@ pub fn overruns(folder: &Path, now: Instant) -> io::Result<Overruns> {
         .collect();
     let here = here
         .into_iter()
-        .map(|host| hearing(host, (Some(status.written_ns), now), 0));
+        .map(|host| hearing(host, Some(status.written_ns), now, 0));
     let elsewhere = status.elsewhere.iter();
     let elsewhere =
-        elsewhere.map(|host| hearing(&host.name, (host.heard_ns, now), host.left_out_count));
+        elsewhere.map(|host| hearing(&host.name, host.heard_ns, now, host.left_out_count));
     let hosts = here.chain(elsewhere).collect();
     let own = status.processes.iter().map(|one| ProcessOverruns {
         process: one.name.clone(),

@@ -19,7 +19,6 @@
 //!
 //! Ports are not [`Send`]: open each in the thread that uses it. A [`Domain`] can be shared.
 
-mod ahead;
 mod census;
 mod degradation;
 mod domain;
@@ -46,7 +45,6 @@ pub use members::ForeignNodes;
 pub use observer::observer_depth;
 pub use ports::{ShmInput, ShmOutput, TypedInput, TypedOutput};
 pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
-pub use sequence::{InputCounters, OutputSettings, Stamp};
-pub use sequence::{SequenceTracker, Sequencer};
+pub use sequence::{InputCounters, OutputSettings, SequenceTracker, Sequencer, Stamp};
 pub use type_info::TypeInfo;
 pub use wake::{WAITER_CHANNELS_MAX, Waiter, Wake};

@@ -25,7 +25,6 @@ use iceoryx2::service::marker::{CustomHeaderMarker, CustomPayloadMarker};
 use iceoryx2::service::port_factory::publish_subscribe;
 use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
 
-use super::ahead::Ahead;
 use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
@@ -235,11 +234,23 @@ fn loan(publisher: &BytePublisher) -> Result<ByteLoan, LoanError> {
     unsafe { publisher.loan_custom_payload(1) }
 }
 
+/// Memory for a writer's next message, borrowed once the last one has left rather than while the
+/// next one waits: iceoryx2 0.10 collects returned chunks and allocates its own bookkeeping with
+/// every loan. None if the last attempt failed; the next message asks again.
+struct Ahead(Option<ByteLoan>);
+
+impl fmt::Debug for Ahead {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let is_lent = self.0.is_some();
+        f.debug_struct("Ahead").field("is_lent", &is_lent).finish()
+    }
+}
+
 /// Publishes bytes with a given envelope: the far end of a gateway.
 #[derive(Debug)]
 pub struct RawOutput {
     // Before the publisher: it goes first.
-    next: Ahead<ByteLoan>,
+    next: Ahead,
     channel: String,
     message: TypeInfo,
     publisher: BytePublisher,
@@ -286,7 +297,7 @@ impl RawOutput {
         Ok(Self {
             channel: channel.to_owned(),
             message,
-            next: Ahead::keep(loan(&publisher)),
+            next: Ahead(loan(&publisher).ok()),
             publisher,
             notifier,
             failures,
@@ -329,9 +340,9 @@ impl RawOutput {
             ChannelError::refused(&self.channel, operation, error)
         };
         self.check_size(payload.len())?;
-        let mut memory = self
-            .next
-            .take(|| loan(&self.publisher))
+        let lent = self.next.0.take();
+        let mut memory = lent
+            .map_or_else(|| loan(&self.publisher), Ok)
             .map_err(|error| refused("get memory", &error))?;
         let target = memory.payload_mut();
         self.check_size(target.len())?;
@@ -352,7 +363,7 @@ impl RawOutput {
                 .notify()
                 .map_err(|error| refused("wake its readers", &error))?;
         }
-        self.next = Ahead::keep(loan(&self.publisher));
+        self.next = Ahead(loan(&self.publisher).ok());
         Ok(())
     }
 

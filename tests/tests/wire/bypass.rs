@@ -17,7 +17,9 @@ use hil_protocol::{
     ArrivalStamps, ChannelIdentity, EgressBridge, EgressEvent, EgressSettings, IngressBridge,
     IngressSettings, LocalRefusal, PeerState, Refusal,
 };
-use hil_rundir::launch::{DirectionLaunch, GatewayLaunch, Side, SocketLaunch, Transport, write};
+use hil_rundir::launch::{
+    DirectionLaunch, GatewayWork, Side, SocketLaunch, Transport, Work, WorkerLaunch, write,
+};
 use hil_shm::{ChannelHolder, ChannelSettings, Domain};
 use hil_shuttle::ShuttleCommand;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
@@ -79,7 +81,7 @@ struct Gateway {
 impl Gateway {
     fn start(launch: &Path) -> Self {
         let mut command = Command::new(hil_runtime_binary());
-        command.arg("gateway").arg("--launch").arg(launch);
+        command.arg("worker").arg("--launch").arg(launch);
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         let process = command.stderr(Stdio::piped()).spawn().unwrap();
         Self { process }
@@ -167,14 +169,16 @@ fn domain(folder: &RunFolder, name: &str) -> (ChannelHolder, Domain) {
 fn launch(folder: &RunFolder, name: &str, domain: &Domain, direction: DirectionLaunch) -> Gateway {
     let records = folder.join(format!("records-{name}"));
     std::fs::create_dir(&records).unwrap();
-    let launch = GatewayLaunch {
+    let launch = WorkerLaunch {
         process: name.to_owned(),
         instance: 0,
         domain: domain.address().to_string(),
         records,
-        directions: vec![direction],
-        ready_within: None,
         is_sealed: false,
+        work: Work::Gateway(GatewayWork {
+            directions: vec![direction],
+            ready_within: None,
+        }),
     };
     let path = folder.join(format!("{name}.json"));
     write(&path, &launch).unwrap();

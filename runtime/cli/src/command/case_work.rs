@@ -1,7 +1,6 @@
 //! The commands that need a case but no run: virtual time, tables, calibration, and the replay of
 //! a finished run.
 
-use std::io::IsTerminal;
 use std::path::Path;
 
 use crate::arguments::CalibrateArgs;
@@ -9,19 +8,13 @@ use hil_core::study::Batch;
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
-use hil_report::replay;
-use hil_report::simulate;
-use hil_report::study;
-use hil_report::study::BatchArgs;
-use hil_report::study::{StudyEnd, StudyError, Wanted};
-use hil_report::terminal;
-use hil_report::terminal::Style;
+use hil_report::study::{self, BatchArgs, StudyEnd, StudyError, Wanted};
+use hil_report::terminal::{self, Style};
+use hil_report::{replay, simulate};
 use hil_rundir::run_folder::RunFolder;
-use hil_topology;
 use hil_topology::registry::Registry;
-use hil_topology::{Topology, TopologyErrors};
 
-use super::{columns, exit, interrupted, load, signals};
+use super::{Refusal, columns, exit, failed, interrupted, load, loaded, signals, usage};
 
 /// `simulate`, with its report and the run's folder.
 pub(super) fn simulate(
@@ -30,17 +23,12 @@ pub(super) fn simulate(
     output: Option<&Path>,
     registry: &Registry,
     console: &mut Console,
-) -> u8 {
-    let signals = match signals(console) {
-        Ok(signals) => signals,
-        Err(code) => return code,
-    };
+) -> Result<u8, Refusal> {
+    let signals = signals()?;
     // Virtual time does not look at signals.
     let watch =
         signals.end_program_unless_over("a run in virtual time is shown whole or not at all");
-    let Some(topology) = load(file, overrides, registry, console) else {
-        return exit::USAGE;
-    };
+    let topology = load(file, overrides, registry, console)?;
     let progress = Progress::begin();
     let outcome = output
         .map_or(Ok(()), simulate::check_output)
@@ -49,24 +37,12 @@ pub(super) fn simulate(
                 progress.show(console, Some(share), "in virtual time");
             })
         });
-    let mut simulated = match outcome {
-        Ok(simulated) => simulated,
-        Err(error) => {
-            console.error(&error.to_string());
-            return exit::USAGE;
-        }
-    };
+    let mut simulated = outcome.map_err(usage)?;
     let written = output.map_or(Ok(()), |folder| simulated.write(folder));
     let page = terminal::render(&simulated.summary, columns(), Style::Coloured);
     drop(watch);
     console.result(&page);
-    match written {
-        Ok(()) => exit::RAN,
-        Err(error) => {
-            console.error(&error.to_string());
-            exit::FAILED
-        }
-    }
+    written.map(|()| exit::RAN).map_err(failed)
 }
 
 /// `tables`.
@@ -75,42 +51,27 @@ pub(super) fn tables(
     overrides: &[String],
     batch: &BatchArgs,
     registry: &Registry,
-) -> u8 {
-    let mut console = Console::new(batch.quiet);
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    *console = Console::new(batch.quiet);
     // Before the preparation, which takes its time and must not end without a word.
-    let signals = match signals(&mut console) {
-        Ok(signals) => signals,
-        Err(code) => return code,
-    };
+    let signals = signals()?;
     let topology = hil_topology::load_case(path, overrides, registry.known());
-    let Some(topology) = loaded(topology, &mut console) else {
-        return exit::USAGE;
-    };
+    let topology = loaded(topology, console)?;
     let study = study::batch_of(&topology, registry, Wanted::Tables);
-    compute(study, batch, &signals, &mut console)
+    compute(study, batch, &signals, console)
 }
 
 /// `calibrate`.
-pub(super) fn calibrate(args: CalibrateArgs, registry: &Registry) -> u8 {
-    let mut console = Console::new(args.batch.quiet);
-    let signals = match signals(&mut console) {
-        Ok(signals) => signals,
-        Err(code) => return code,
-    };
-    let (figure, value) = match wanted_figure(args.mlr, args.figure.as_deref()) {
-        Ok(wanted) => wanted,
-        Err(text) => {
-            console.error(&text);
-            return exit::USAGE;
-        }
-    };
-    let entry = match registry.find_by_prefix(&args.case) {
-        Ok(entry) => entry,
-        Err(error) => {
-            console.error(&error.to_string());
-            return exit::USAGE;
-        }
-    };
+pub(super) fn calibrate(
+    args: CalibrateArgs,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    *console = Console::new(args.batch.quiet);
+    let signals = signals()?;
+    let (figure, value) = wanted_figure(args.mlr, args.figure.as_deref()).map_err(usage)?;
+    let entry = registry.find_by_prefix(&args.case).map_err(usage)?;
     if entry.name != args.case {
         console.say(&format!("{:?} is taken for case {}", args.case, entry.name));
     }
@@ -124,18 +85,15 @@ pub(super) fn calibrate(args: CalibrateArgs, registry: &Registry) -> u8 {
         Some(path) => hil_topology::load_case(path, &overrides, known),
         None => hil_topology::case_by_name(entry.name, &overrides, known),
     };
-    let Some(topology) = loaded(topology, &mut console) else {
-        return exit::USAGE;
-    };
+    let topology = loaded(topology, console)?;
     let named = topology.case().map_or("no case", |case| case.name.as_str());
     if named != entry.name {
         let text = format!("the topology names {named}, not case {}", entry.name);
-        console.error(&text);
-        return exit::USAGE;
+        return Err(usage(text));
     }
     let wanted = Wanted::Calibration { figure, value };
     let study = study::batch_of(&topology, registry, wanted);
-    compute(study, &args.batch, &signals, &mut console)
+    compute(study, &args.batch, &signals, console)
 }
 
 /// The figure asked for, and its value.
@@ -161,69 +119,46 @@ fn wanted_figure(mlr: Option<f64>, figure: Option<&str>) -> Result<(&str, f64), 
     }
 }
 
-fn loaded(topology: Result<Topology, TopologyErrors>, console: &mut Console) -> Option<Topology> {
-    match topology {
-        Ok(topology) => Some(topology),
-        Err(errors) => {
-            console.faults(&errors.render(std::io::stderr().is_terminal()));
-            None
-        }
-    }
-}
-
 fn compute(
     study: Result<Box<dyn Batch>, StudyError>,
     args: &BatchArgs,
     signals: &Signals,
     console: &mut Console,
-) -> u8 {
-    let study = match study {
-        Ok(study) => study,
-        Err(error) => {
-            console.error(&error.to_string());
-            return exit::USAGE;
-        }
-    };
-    match study::run(study.as_ref(), args, signals, console) {
-        Ok(StudyEnd::Passed) => exit::RAN,
-        Ok(StudyEnd::Missed) => {
-            console
-                .error("a criterion is missed: the lines marked MISSED at the end of the tables");
-            exit::FAILED
-        }
-        Ok(StudyEnd::Interrupted) => interrupted(),
-        Err(error) => {
-            console.error(&error.to_string());
-            exit::FAILED
-        }
+) -> Result<u8, Refusal> {
+    let study = study.map_err(usage)?;
+    match study::run(study.as_ref(), args, signals, console).map_err(failed)? {
+        StudyEnd::Passed => Ok(exit::RAN),
+        StudyEnd::Missed => Err(failed(
+            "a criterion is missed: the lines marked MISSED at the end of the tables",
+        )),
+        StudyEnd::Interrupted => Ok(interrupted()),
     }
 }
 
 /// `replay`.
-pub(super) fn replay(run: &Path, json: bool, registry: &Registry, console: &mut Console) -> u8 {
+pub(super) fn replay(
+    run: &Path,
+    json: bool,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
     let folder = RunFolder::existing(run);
     let replayed = Progress::begin().during(console, "reading messages", |stage| {
         replay::replay(&folder, registry, &|share, words| {
             stage.tell(share, words);
         })
     });
-    let replayed = match replayed {
-        Ok(replayed) => replayed,
-        Err(error) => {
-            console.error(&error.to_string());
-            return exit::USAGE;
-        }
-    };
+    let replayed = replayed.map_err(usage)?;
     console.result(&if json {
         replayed.json()
     } else {
         replayed.text()
     });
-    if replayed.is_identical() {
+    Ok(if replayed.is_identical() {
         exit::RAN
     } else {
         exit::FAILED
-    }
+    })
 }
 
 #[cfg(test)]

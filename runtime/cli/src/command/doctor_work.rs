@@ -4,8 +4,7 @@ use std::fs;
 use std::io::IsTerminal;
 use std::path::Path;
 
-use super::{exit, hosts_here, interrupted, load, signals};
-use hil_doctor;
+use super::{Refusal, exit, hosts_here, interrupted, load, signals, usage};
 use hil_doctor::cli::DoctorArgs;
 use hil_doctor::latency::{LatencyReport, LatencyRequest, Watch, measure};
 use hil_doctor::{DoctorReport, DoctorRequest, Plan, Severity};
@@ -16,22 +15,14 @@ use hil_platform::signals::Signals;
 use hil_topology::registry::Registry;
 
 /// `doctor`.
-pub(super) fn doctor(args: &DoctorArgs, registry: &Registry, console: &mut Console) -> u8 {
-    let request = match request(args, registry, console) {
-        Ok(request) => request,
-        Err(code) => return code,
-    };
-    let latency = match latency_request(args, &request) {
-        Ok(latency) => latency,
-        Err(text) => {
-            console.error(&text);
-            return exit::USAGE;
-        }
-    };
-    let signals = match signals(console) {
-        Ok(signals) => signals,
-        Err(code) => return code,
-    };
+pub(super) fn doctor(
+    args: &DoctorArgs,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    let request = request(args, registry, console)?;
+    let latency = latency_request(args, &request).map_err(usage)?;
+    let signals = signals()?;
     let watch = signals.end_program_unless_over(
         "the doctor describes a host whole or not at all; a card it was trying is put back",
     );
@@ -58,13 +49,13 @@ pub(super) fn doctor(args: &DoctorArgs, registry: &Registry, console: &mut Conso
         report.to_text(true)
     };
     console.result(&text);
-    if is_interrupted {
+    Ok(if is_interrupted {
         interrupted()
     } else if args.strict && report.worst_severity() >= Severity::Warning {
         exit::HOST_UNFIT
     } else {
         exit::RAN
-    }
+    })
 }
 
 /// What a topology, and another host's report, have the doctor look at beside the host itself.
@@ -72,21 +63,14 @@ fn request(
     args: &DoctorArgs,
     registry: &Registry,
     console: &mut Console,
-) -> Result<DoctorRequest, u8> {
+) -> Result<DoctorRequest, Refusal> {
     let mut request = DoctorRequest::default();
     if let Some(path) = &args.other {
-        let other = other_report(path).map_err(|text| {
-            console.error(&text);
-            exit::USAGE
-        })?;
-        request.other = Some(other);
+        request.other = Some(other_report(path).map_err(usage)?);
     }
     if let Some(path) = &args.topology {
-        let topology = load(path, &args.overrides, registry, console).ok_or(exit::USAGE)?;
-        let here = hosts_here(&topology, args.host.as_deref()).map_err(|text| {
-            console.error(&text);
-            exit::USAGE
-        })?;
+        let topology = load(path, &args.overrides, registry, console)?;
+        let here = hosts_here(&topology, args.host.as_deref()).map_err(usage)?;
         request.plan = Some(Plan::of(&topology, &here));
     }
     Ok(request)

@@ -1,31 +1,23 @@
 //! The commands that look at a run while it goes: `channel` and `top`.
 
-use super::{columns_or, exit, interrupted, signals};
+use super::{Refusal, columns_or, exit, failed, interrupted, signals, usage};
 use hil_platform::console::Console;
 use hil_topology::registry::Registry;
-use hil_watch::live::channel;
-use hil_watch::live::channel::End;
+use hil_watch::live::channel::{self, End};
 use hil_watch::live::cli::{ChannelArgs, TopArgs};
-use hil_watch::live::top;
-use hil_watch::live::top::{TopEnd, TopError};
+use hil_watch::live::top::{self, TopEnd, TopError};
 
 /// `channel`.
-pub(super) fn channel(args: ChannelArgs, registry: &Registry, console: &mut Console) -> u8 {
-    let signals = match signals(console) {
-        Ok(signals) => signals,
-        Err(code) => return code,
-    };
-    match channel::run(args, registry, &signals, console) {
-        Ok(End::Done) => exit::RAN,
-        Ok(End::Interrupted) => interrupted(),
-        Err(error) => {
-            console.error(&error.to_string());
-            if error.is_usage() {
-                exit::USAGE
-            } else {
-                exit::FAILED
-            }
-        }
+pub(super) fn channel(
+    args: ChannelArgs,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    match channel::run(args, registry, &signals()?, console) {
+        Ok(End::Done) => Ok(exit::RAN),
+        Ok(End::Interrupted) => Ok(interrupted()),
+        Err(error) if error.is_usage() => Err(usage(error)),
+        Err(error) => Err(failed(error)),
     }
 }
 
@@ -33,21 +25,23 @@ pub(super) fn channel(args: ChannelArgs, registry: &Registry, console: &mut Cons
 const PLAIN_COLUMNS: usize = 132;
 
 /// `top`.
-pub(super) fn top(args: &TopArgs, registry: &Registry, console: &mut Console) -> u8 {
-    let signals = match signals(console) {
-        Ok(signals) => signals,
-        Err(code) => return code,
-    };
-    match top::run(args, columns_or(PLAIN_COLUMNS), registry, &signals, console) {
-        Ok(TopEnd::Done) => exit::RAN,
-        Ok(TopEnd::Interrupted) => interrupted(),
+pub(super) fn top(
+    args: &TopArgs,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    let signals = signals()?;
+    let columns = columns_or(PLAIN_COLUMNS);
+    match top::run(args, columns, registry, &signals, console) {
+        Ok(TopEnd::Done) => Ok(exit::RAN),
+        Ok(TopEnd::Interrupted) => Ok(interrupted()),
         Err(error) => {
-            console.error(&error.to_string());
-            match error {
+            let code = match error {
                 TopError::Observe(_) => exit::USAGE,
                 TopError::Terminal(_) => exit::FAILED,
                 TopError::Json(_) => exit::INTERNAL,
-            }
+            };
+            Err(Refusal::new(code, error))
         }
     }
 }

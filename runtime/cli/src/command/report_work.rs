@@ -7,30 +7,21 @@ use crate::arguments::ReportArgs;
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_report::analysis;
-use hil_report::page;
 use hil_report::page::read::Material;
-use hil_report::page::{Format, read, write};
+use hil_report::page::{self, Format, read, write};
 use hil_report::summary::{RunSummary, SummaryError};
-use hil_report::terminal;
-use hil_report::terminal::Style;
+use hil_report::terminal::{self, Style};
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::Registry;
 
-use super::{columns, exit};
-
-/// What stops a report, with its exit code.
-struct Refusal(u8, String);
-
-fn usage(text: impl core::fmt::Display) -> Refusal {
-    Refusal(exit::USAGE, text.to_string())
-}
-
-fn failed(text: impl core::fmt::Display) -> Refusal {
-    Refusal(exit::FAILED, text.to_string())
-}
+use super::{Refusal, columns, exit, failed, usage};
 
 /// `report`.
-pub(super) fn report(args: &ReportArgs, registry: &Registry, console: &mut Console) -> u8 {
+pub(super) fn report(
+    args: &ReportArgs,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
     let is_file = args.output.is_some()
         || args.format.is_some()
         || args.template.is_some()
@@ -39,16 +30,10 @@ pub(super) fn report(args: &ReportArgs, registry: &Registry, console: &mut Conso
         if let [run] = args.runs.as_slice() {
             return show(run, registry, console);
         }
-        console.error("several runs need --output or --format, e.g. -o report.html");
-        return exit::USAGE;
+        let text = "several runs need --output or --format, e.g. -o report.html";
+        return Err(usage(text));
     }
-    match to_files(args, console) {
-        Ok(()) => exit::RAN,
-        Err(Refusal(code, text)) => {
-            console.error(&text);
-            code
-        }
-    }
+    to_files(args, console).map(|()| exit::RAN)
 }
 
 fn to_files(args: &ReportArgs, console: &mut Console) -> Result<(), Refusal> {
@@ -170,7 +155,7 @@ fn figures(
 }
 
 /// The report as the run printed it.
-fn show(run: &Path, registry: &Registry, console: &mut Console) -> u8 {
+fn show(run: &Path, registry: &Registry, console: &mut Console) -> Result<u8, Refusal> {
     let folder = RunFolder::existing(run);
     if !folder.summary().is_file() && folder.result().is_file() {
         // The run ended, and what was to draw up its account did not come to that.
@@ -179,39 +164,27 @@ fn show(run: &Path, registry: &Registry, console: &mut Console) -> u8 {
             analysis::analyse(&RunFolder::existing(&root), registry)
         });
         if let Some(error) = analysed.map_or_else(Some, |concluded| concluded.unwritten) {
-            console.error(&error.to_string());
-            return exit::FAILED;
+            return Err(failed(error));
         }
     }
     let progress = Progress::begin();
     let text = progress.during(console, "reading the summary", |_| {
         fs::read_to_string(folder.summary())
     });
-    let text = match text {
-        Ok(text) => text,
-        Err(error) => {
-            let path = folder.summary();
-            let text = if folder.manifest().is_file() {
-                "this run never began or was killed outright, so it left no summary".to_owned()
-            } else {
-                format!("not a run's folder: {error}")
-            };
-            console.error(&format!("{}: {text}", path.display()));
-            return exit::USAGE;
-        }
-    };
+    let path = folder.summary();
+    let text = text.map_err(|error| {
+        let text = if folder.manifest().is_file() {
+            "this run never began or was killed outright, so it left no summary".to_owned()
+        } else {
+            format!("not a run's folder: {error}")
+        };
+        usage(format!("{}: {text}", path.display()))
+    })?;
     let page = progress.during(console, "laying out the report", |_| {
         let summary = RunSummary::from_json(&text)?;
         Ok::<_, SummaryError>(terminal::render(&summary, columns(), Style::Coloured))
     });
-    match page {
-        Ok(page) => {
-            console.result(&page);
-            exit::RAN
-        }
-        Err(error) => {
-            console.error(&format!("{}: {error}", folder.summary().display()));
-            exit::USAGE
-        }
-    }
+    let page = page.map_err(|error| usage(format!("{}: {error}", path.display())))?;
+    console.result(&page);
+    Ok(exit::RAN)
 }

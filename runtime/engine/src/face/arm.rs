@@ -9,11 +9,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use hil_core::message::Envelope;
 use hil_core::time::Instant;
 
-use super::FaceError;
 use super::line::Line;
 use crate::gateway::poll_descriptors;
+use crate::gateway::stamp_tracker::STAMP_PATIENCE_NS;
 use crate::process::pulse::Pulse;
 use crate::process::recording::{RecordedInput, RecordedOutput};
+use crate::process::worker::WorkerError;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy};
 use hil_rundir::pipe::{CountByName, RefusalCount};
@@ -27,8 +28,6 @@ const LOOK_PERIOD_NS: i64 = 500_000;
 /// So many looks at most clear what waits before and after the run: more than a socket's buffer
 /// and a channel hold, so that only a peer that goes on sending meets this end.
 const CLEARING_TURNS_MAX: usize = 65_536;
-/// Patience for a stamp that is under way; see `line`.
-const STAMP_WAIT_NS: i64 = 20_000_000;
 
 /// What the thread works with, whichever face it is.
 #[derive(Debug)]
@@ -56,7 +55,7 @@ pub(super) struct Attention {
 /// What one of the two faces does.
 pub(super) trait Work: Debug {
     /// Moves what waits at both ends, at most one message each way; false when nothing waited.
-    fn turn(&mut self, arm: &mut Arm) -> Result<bool, FaceError>;
+    fn turn(&mut self, arm: &mut Arm) -> Result<bool, WorkerError>;
 
     /// The face's own next appointment.
     fn next_due(&self) -> Option<Instant>;
@@ -76,7 +75,11 @@ impl Arm {
     ///
     /// # Errors
     /// When a channel or the socket itself breaks.
-    pub(super) fn run(&mut self, work: &mut dyn Work, stop: &AtomicBool) -> Result<(), FaceError> {
+    pub(super) fn run(
+        &mut self,
+        work: &mut dyn Work,
+        stop: &AtomicBool,
+    ) -> Result<(), WorkerError> {
         // A robot that was there before us has filled the socket with what is old news by now.
         for _ in 0..CLEARING_TURNS_MAX {
             if self.line.receive(self.buffer.as_mut_slice())?.is_none() {
@@ -102,7 +105,7 @@ impl Arm {
     }
 
     /// One look at both ends and, now and then, at the socket's reports.
-    pub(super) fn turn(&mut self, work: &mut dyn Work) -> Result<bool, FaceError> {
+    pub(super) fn turn(&mut self, work: &mut dyn Work) -> Result<bool, WorkerError> {
         let has_moved = work.turn(self)?;
         let now = MonotonicClock::now();
         let since_look = now.ns_since(self.attention.looked);
@@ -121,11 +124,11 @@ impl Arm {
     }
 
     /// Waits for a message, a datagram, a stamp or an appointment.
-    fn rest(&mut self, due: Option<Instant>) -> Result<(), FaceError> {
+    fn rest(&mut self, due: Option<Instant>) -> Result<(), WorkerError> {
         let now = MonotonicClock::now();
         let mut due = due;
         if self.line.awaits_stamps() {
-            let patience = Instant::from_ns(now.as_ns() + STAMP_WAIT_NS);
+            let patience = Instant::from_ns(now.as_ns() + STAMP_PATIENCE_NS);
             due = Some(due.map_or(patience, |due| due.min(patience)));
         }
         let own = self.wait.pause(now, due);

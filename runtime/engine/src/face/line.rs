@@ -1,25 +1,21 @@
 //! The socket of one arm with the transmit stamps that are still to come from it. It knows no
 //! message: robot and sensor face do.
 
-use hil_core::record::UNAVAILABLE;
-use hil_core::time::Instant;
-use hil_net::{TransmitStage, TxToken};
-use hil_transport::udp::UdpSender;
-use hil_transport::udp_server::UdpServer;
-use hil_transport::{DatagramSender, Received, SendRefusal, SenderCounters};
 use std::net::SocketAddr;
 use std::os::fd::BorrowedFd;
 
-use super::FaceError;
-use crate::gateway::GatewayError;
+use hil_core::record::UNAVAILABLE;
+use hil_core::time::Instant;
+use hil_net::TransmitStage;
+use hil_transport::udp::UdpSender;
+use hil_transport::udp_server::UdpServer;
+use hil_transport::{DatagramSender, Received, SenderCounters};
+
 use crate::gateway::kernel_clock::KernelClock;
+use crate::gateway::stamp_tracker::{STAMP_PATIENCE_NS, StampTracker};
+use crate::process::worker::WorkerError;
 use hil_rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
 use hil_rundir::record::RecordSink;
-
-/// Datagrams whose transmit stamps may be outstanding; a power of two.
-const PENDING: usize = 64;
-/// A stamp that has not come by then does not come.
-const STAMP_PATIENCE_NS: i64 = 20_000_000;
 
 /// Which end of the protocol's UDP the socket is.
 #[derive(Debug)]
@@ -46,18 +42,11 @@ impl Socket {
     }
 }
 
-#[derive(Debug, Clone, Copy)]
-struct Pending {
-    token: TxToken,
-    record: FaceSentRecord,
-}
-
 /// The socket, its records and the clock of its stamps.
 #[derive(Debug)]
 pub(super) struct Line {
     socket: Socket,
-    pending: [Option<Pending>; PENDING],
-    pending_count: usize,
+    pending: StampTracker<FaceSentRecord>,
     sent: RecordSink,
     received: RecordSink,
     clock: KernelClock,
@@ -67,13 +56,13 @@ pub(super) struct Line {
 impl Line {
     pub(super) fn new(
         socket: Socket,
-        (sent, received): (RecordSink, RecordSink),
+        sent: RecordSink,
+        received: RecordSink,
         has_stamps: bool,
-    ) -> Result<Self, FaceError> {
+    ) -> Result<Self, WorkerError> {
         Ok(Self {
             socket,
-            pending: [None; PENDING],
-            pending_count: 0,
+            pending: StampTracker::new(),
             sent,
             received,
             clock: KernelClock::read()?,
@@ -96,16 +85,14 @@ impl Line {
             realtime_offset_ns: self.clock.offset_ns(),
             ..record
         };
-        let sent: Result<TxToken, SendRefusal> = self.socket.sender_mut().send(datagram);
+        let sent = self.socket.sender_mut().send(datagram);
         match sent {
             Ok(token) if self.has_stamps => {
-                let slot = slot_of(token);
-                if let Some(old) = self.pending[slot].take() {
-                    self.retire(&old);
+                let handed = Instant::from_ns(record.handed_ns);
+                if let Some(displaced) = self.pending.expect(token, handed, record) {
+                    self.sent.push(&displaced);
                 }
-                self.pending[slot] = Some(Pending { token, record });
-                self.pending_count += 1;
-                while self.pending_count > 0 && self.take_stamp() {}
+                while self.awaits_stamps() && self.take_stamp() {}
             }
             Ok(_) => self.sent.push(&record),
             Err(_counted) => self.sent.push(&FaceSentRecord {
@@ -122,45 +109,31 @@ impl Line {
         let Some(stamp) = self.socket.sender_mut().next_stamp() else {
             return false;
         };
-        let slot = slot_of(stamp.token);
-        let pending = self.pending[slot];
-        let pending = pending.filter(|one| one.token == stamp.token);
-        if let (Some(mut pending), Some(software_ns), TransmitStage::Sent) =
-            (pending, stamp.stamps.software_ns, stamp.stage)
+        if let (Some(software_ns), TransmitStage::Sent) = (stamp.stamps.software_ns, stamp.stage)
+            && let Some(record) = self.pending.take(stamp.token)
         {
-            self.pending[slot] = None;
-            pending.record.tx_software_ns = software_ns;
-            self.retire(&pending);
+            self.sent.push(&FaceSentRecord {
+                tx_software_ns: software_ns,
+                ..record
+            });
         }
         true
-    }
-
-    fn retire(&mut self, pending: &Pending) {
-        self.pending_count -= 1;
-        self.sent.push(&pending.record);
     }
 
     /// Takes every stamp and report there is, gives up those that are overdue at `now`, and reads
     /// the clocks again when it is time to.
     pub(super) fn look_after(&mut self, now: Instant) {
         while self.take_stamp() {}
-        if self.pending_count > 0 {
-            for slot in 0..PENDING {
-                let is_overdue = self.pending[slot].is_some_and(|one| {
-                    now.as_ns().saturating_sub(one.record.handed_ns) > STAMP_PATIENCE_NS
-                });
-                if is_overdue && let Some(old) = self.pending[slot].take() {
-                    self.retire(&old);
-                }
-            }
+        while let Some(overdue) = self.pending.take_overdue(now, STAMP_PATIENCE_NS) {
+            self.sent.push(&overdue);
         }
         self.clock.refresh(now);
     }
 
     /// The next datagram, if one has come.
-    pub(super) fn receive(&mut self, buffer: &mut [u8]) -> Result<Option<Received>, FaceError> {
+    pub(super) fn receive(&mut self, buffer: &mut [u8]) -> Result<Option<Received>, WorkerError> {
         let received = self.socket.sender_mut().receive(buffer);
-        Ok(received.map_err(GatewayError::Socket)?)
+        received.map_err(WorkerError::Socket)
     }
 
     /// Notes a datagram that was received at `received_at` and became a message.
@@ -185,7 +158,7 @@ impl Line {
 
     /// True while stamps are still to come.
     pub(super) const fn awaits_stamps(&self) -> bool {
-        self.pending_count > 0
+        !self.pending.is_empty()
     }
 
     /// What to wait on.
@@ -202,8 +175,4 @@ impl Line {
     pub(super) const fn clock_step_count(&self) -> u64 {
         self.clock.step_count()
     }
-}
-
-fn slot_of(token: TxToken) -> usize {
-    token.0 as usize % PENDING
 }

@@ -12,21 +12,20 @@ use hil_net::timestamping::TimestampMode;
 use hil_transport::udp::{GrantedOptions, UdpSender, UdpSettings};
 use hil_transport::udp_server::UdpServer;
 
-use super::FaceError;
 use super::arm::{Arm, Attention, DATAGRAM_BYTES_MAX, Work};
 use super::line::{Line, Socket};
 use super::robot::RobotWork;
 use super::sensor::SensorWork;
 use crate::gateway::socket::timestamp_mode;
 use crate::process::pulse::Pulse;
-use crate::process::recording::{Destination, RecordedInput, RecordedOutput};
-use hil_platform::clock::MonotonicClock;
+use crate::process::recording::{Destination, RecordedInput, RecordedOutput, output_settings};
+use crate::process::worker::WorkerError;
 use hil_platform::wait::{WaitMode, WaitStrategy};
-use hil_rundir::face_launch::{ArmLaunch, FaceLaunch};
 use hil_rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
+use hil_rundir::launch::{ArmLaunch, FaceSettings};
 use hil_rundir::pipe::{CountByName, CounterGroup, FaceReport};
 use hil_rundir::record::{RecordKind, RecordSink, Recorder};
-use hil_shm::{Domain, OutputSettings, ShmInput, ShmOutput, Waiter};
+use hil_shm::{Domain, ShmInput, ShmOutput, Waiter};
 use hil_topology::FaceKind;
 
 /// Records a ring holds.
@@ -54,15 +53,15 @@ impl OpenedArm {
     /// # Errors
     /// When the kernel refuses a socket option or a file cannot be made.
     pub fn open(
-        launch: &FaceLaunch,
+        face: &FaceSettings,
         arm: &ArmLaunch,
         recorder: &mut Recorder,
-    ) -> Result<Self, FaceError> {
-        let settings = socket_settings(launch, arm);
-        let (socket, granted, what) = match launch.face.kind {
+    ) -> Result<Self, WorkerError> {
+        let settings = socket_settings(face, arm);
+        let (socket, granted, what) = match face.kind {
             FaceKind::Robot => {
                 let socket = UdpSender::open(&settings)?;
-                let from = socket.local_address().map_err(FaceError::Address)?;
+                let from = socket.local_address().map_err(WorkerError::Address)?;
                 let what = format!("from port {} to {}", from.port(), settings.peer);
                 let granted = socket.granted();
                 (Socket::Client(Box::new(socket)), granted, what)
@@ -82,7 +81,7 @@ impl OpenedArm {
         let message_size = size_of::<Envelope>() + arm.output.message_size_bytes;
         let has_stamps = settings.timestamps != TimestampMode::Off;
         Ok(Self {
-            line: Line::new(socket, (sent, received), has_stamps)?,
+            line: Line::new(socket, sent, received, has_stamps)?,
             taken: sink(RecordKind::Taken, input, size_of::<TakenRecord>())?,
             published: sink(RecordKind::Published, output, size_of::<PublishedRecord>())?,
             messages: sink(RecordKind::Message, output, message_size)?,
@@ -98,10 +97,10 @@ impl OpenedArm {
     /// When a channel does not appear or is of another type.
     pub fn connect(
         self,
-        launch: &FaceLaunch,
+        face: &FaceSettings,
         arm: &ArmLaunch,
         domain: &Domain,
-    ) -> Result<JoinedArm, FaceError> {
+    ) -> Result<JoinedArm, WorkerError> {
         let report = FaceReport {
             arm: arm.arm,
             outgoing: arm.input.name.clone(),
@@ -112,31 +111,29 @@ impl OpenedArm {
             facts: self.facts.clone(),
         };
         Ok(JoinedArm {
-            arm: self.join(launch, arm, domain)?,
-            work: match launch.face.kind {
-                FaceKind::Robot => Box::new(RobotWork::new(&launch.face, arm.arm)),
-                FaceKind::Sensor => Box::new(SensorWork::new(&launch.face, arm.arm)),
+            arm: self.join(face, arm, domain)?,
+            work: match face.kind {
+                FaceKind::Robot => Box::new(RobotWork::new(face, arm.arm)),
+                FaceKind::Sensor => Box::new(SensorWork::new(face, arm.arm)),
             },
             report,
         })
     }
 
-    fn join(self, launch: &FaceLaunch, arm: &ArmLaunch, domain: &Domain) -> Result<Arm, FaceError> {
+    fn join(
+        self,
+        face: &FaceSettings,
+        arm: &ArmLaunch,
+        domain: &Domain,
+    ) -> Result<Arm, WorkerError> {
         let command = MessageType::of::<EgmCommand>();
         let feedback = MessageType::of::<EgmFeedback>();
-        let (outgoing, incoming) = match launch.face.kind {
+        let (outgoing, incoming) = match face.kind {
             FaceKind::Robot => (feedback, command),
             FaceKind::Sensor => (command, feedback),
         };
-        // Writers of one channel never start twice within a microsecond on one host.
-        let epoch = u32::try_from(MonotonicClock::now().as_ns() / 1000 % i64::from(u32::MAX))
-            .expect("the remainder is below u32::MAX");
-        let settings = OutputSettings {
-            epoch,
-            ..OutputSettings::default()
-        };
         let [taken, given] = self.counts;
-        let waiter = (launch.wait != WaitMode::Spin)
+        let waiter = (face.wait != WaitMode::Spin)
             .then(|| Waiter::open(domain, &[arm.input.name.as_str()]))
             .transpose()?;
         Ok(Arm {
@@ -144,7 +141,7 @@ impl OpenedArm {
                 port: ShmInput::open(domain, &arm.input.name, &outgoing, arm.input.depth)?,
                 sink: self.taken,
                 taken,
-                wait: WaitStrategy::new(launch.wait),
+                wait: WaitStrategy::new(face.wait),
             },
             output: RecordedOutput {
                 destination: Destination::Channel {
@@ -152,7 +149,7 @@ impl OpenedArm {
                         domain,
                         &arm.output.name,
                         &incoming,
-                        settings,
+                        output_settings(),
                     )?),
                     sink: self.published,
                 },
@@ -161,7 +158,7 @@ impl OpenedArm {
             },
             waiter,
             line: self.line,
-            wait: WaitStrategy::new(launch.wait),
+            wait: WaitStrategy::new(face.wait),
             buffer: Box::new([0; DATAGRAM_BYTES_MAX]),
             attention: Attention::default(),
             early_count: 0,
@@ -183,7 +180,7 @@ impl JoinedArm {
     ///
     /// # Errors
     /// When a channel or the socket itself breaks.
-    pub fn run(&mut self, stop: &AtomicBool) -> Result<(), FaceError> {
+    pub fn run(&mut self, stop: &AtomicBool) -> Result<(), WorkerError> {
         self.arm.run(self.work.as_mut(), stop)
     }
 
@@ -191,7 +188,7 @@ impl JoinedArm {
     ///
     /// # Errors
     /// As [`JoinedArm::run`].
-    pub fn turn(&mut self) -> Result<bool, FaceError> {
+    pub fn turn(&mut self) -> Result<bool, WorkerError> {
         self.arm.turn(self.work.as_mut())
     }
 
@@ -214,21 +211,21 @@ impl JoinedArm {
     }
 }
 
-fn socket_settings(launch: &FaceLaunch, arm: &ArmLaunch) -> UdpSettings {
+fn socket_settings(face: &FaceSettings, arm: &ArmLaunch) -> UdpSettings {
     let any: IpAddr = if arm.address.is_ipv4() {
         Ipv4Addr::UNSPECIFIED.into()
     } else {
         Ipv6Addr::UNSPECIFIED.into()
     };
-    let local = match launch.face.kind {
+    let local = match face.kind {
         FaceKind::Robot => SocketAddr::new(any, 0),
         FaceKind::Sensor => arm.address,
     };
     UdpSettings {
-        interface: launch.face.interface.clone(),
+        interface: face.interface.clone(),
         // 0 is the kernel's default; setting it would only reset the priority.
-        dscp: (launch.face.dscp > 0).then_some(launch.face.dscp),
-        timestamps: timestamp_mode(launch.face.timestamps),
+        dscp: (face.dscp > 0).then_some(face.dscp),
+        timestamps: timestamp_mode(face.timestamps),
         ..UdpSettings::new(local, arm.address)
     }
 }

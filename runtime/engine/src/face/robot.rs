@@ -10,12 +10,12 @@ use hil_core::endpoint::{InputPort, OutputPort};
 use hil_core::record::UNAVAILABLE;
 use hil_core::time::Instant;
 
-use super::FaceError;
 use super::arm::{Arm, DATAGRAM_BYTES_MAX, Work, published_here_ns, since_1970};
 use super::peer::{Peer, refusals};
+use crate::process::worker::WorkerError;
 use hil_platform::clock::MonotonicClock;
-use hil_rundir::face_launch::FaceSettings;
 use hil_rundir::face_record::FaceSentRecord;
+use hil_rundir::launch::FaceSettings;
 use hil_rundir::pipe::{CountByName, CounterGroup, RefusalCount};
 
 /// The robot's side of one arm.
@@ -49,7 +49,7 @@ impl RobotWork {
     }
 
     /// Sends the oldest waiting feedback; false when none waits.
-    fn forward(&mut self, arm: &mut Arm) -> Result<bool, FaceError> {
+    fn forward(&mut self, arm: &mut Arm) -> Result<bool, WorkerError> {
         let Arm { input, line, .. } = arm;
         let mut take = |envelope: &_, payload: &[u8]| {
             let taken = MonotonicClock::now();
@@ -80,7 +80,7 @@ impl RobotWork {
     }
 
     /// Publishes the command in the oldest waiting datagram; false when none waits.
-    fn hear(&mut self, arm: &mut Arm) -> Result<bool, FaceError> {
+    fn hear(&mut self, arm: &mut Arm) -> Result<bool, WorkerError> {
         let Some(received) = arm.line.receive(arm.buffer.as_mut_slice())? else {
             return Ok(false);
         };
@@ -96,7 +96,7 @@ impl RobotWork {
 }
 
 impl Work for RobotWork {
-    fn turn(&mut self, arm: &mut Arm) -> Result<bool, FaceError> {
+    fn turn(&mut self, arm: &mut Arm) -> Result<bool, WorkerError> {
         let has_forwarded = self.forward(arm)?;
         Ok(self.hear(arm)? || has_forwarded)
     }

@@ -13,12 +13,12 @@ use hil_core::endpoint::{InputPort, OutputPort};
 use hil_core::record::UNAVAILABLE;
 use hil_core::time::Instant;
 
-use super::FaceError;
 use super::arm::{Arm, DATAGRAM_BYTES_MAX, Work, published_here_ns};
 use super::peer::{Peer, refusals};
+use crate::process::worker::WorkerError;
 use hil_platform::clock::MonotonicClock;
-use hil_rundir::face_launch::FaceSettings;
 use hil_rundir::face_record::FaceSentRecord;
+use hil_rundir::launch::FaceSettings;
 use hil_rundir::pipe::{CountByName, CounterGroup, FaceRefusal, RefusalCount};
 use hil_topology::FaceSend;
 
@@ -91,7 +91,7 @@ impl SensorWork {
     }
 
     /// Publishes the feedback in the oldest waiting datagram; false when none waits.
-    fn hear(&mut self, arm: &mut Arm) -> Result<bool, FaceError> {
+    fn hear(&mut self, arm: &mut Arm) -> Result<bool, WorkerError> {
         let Some(received) = arm.line.receive(arm.buffer.as_mut_slice())? else {
             return Ok(false);
         };
@@ -137,7 +137,7 @@ impl SensorWork {
     }
 
     /// Takes the oldest waiting command of our controller; false when none waits.
-    fn take(&mut self, arm: &mut Arm) -> Result<bool, FaceError> {
+    fn take(&mut self, arm: &mut Arm) -> Result<bool, WorkerError> {
         let mut take = |envelope: &_, payload: &[u8]| {
             let at = MonotonicClock::now();
             let Ok(command) = bytemuck::try_pod_read_unaligned::<EgmCommand>(payload) else {
@@ -186,7 +186,7 @@ impl SensorWork {
 }
 
 impl Work for SensorWork {
-    fn turn(&mut self, arm: &mut Arm) -> Result<bool, FaceError> {
+    fn turn(&mut self, arm: &mut Arm) -> Result<bool, WorkerError> {
         let has_heard = self.hear(arm)?;
         let has_taken = self.take(arm)?;
         let has_sent = self.send(arm);

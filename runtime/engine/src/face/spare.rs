@@ -2,16 +2,14 @@
 //! server or an arm the topology gives no address: recorded as taken, counted and dropped, so that
 //! their channels' accounts close. It is not measured and has a thread of normal priority.
 
-use std::sync::Arc;
-use std::thread::{self, JoinHandle};
-
 use hil_core::message::Envelope;
-use hil_core::record::{TakenRecord, UNAVAILABLE};
+use hil_core::record::TakenRecord;
 
-use super::{FaceError, Gate};
-use crate::gateway::GatewayError;
+use crate::process::recording::forwarded_ns;
+use crate::process::worker::{JobWork, WorkerError};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::WAIT_MAX;
+use hil_rundir::pipe::{Orders, ProcessReport};
 use hil_rundir::record::{RecordKind, RecordSink, Recorder};
 use hil_shm::{Domain, RawInput, Waiter};
 use hil_topology::CardChannel;
@@ -33,7 +31,7 @@ impl Spare {
     pub(super) fn open(
         channels: &[CardChannel],
         recorder: &mut Recorder,
-    ) -> Result<Self, FaceError> {
+    ) -> Result<Self, WorkerError> {
         let mut opened = Vec::new();
         for channel in channels {
             let size = size_of::<TakenRecord>();
@@ -43,47 +41,45 @@ impl Spare {
         Ok(Self { channels: opened })
     }
 
-    /// Takes their messages until the gate closes.
+    /// Joins the channels.
     ///
     /// # Errors
-    /// When the system gives no thread.
-    pub(super) fn spawn(
-        self,
-        domain: &Arc<Domain>,
-        gate: &Arc<Gate>,
-    ) -> Result<JoinHandle<Result<(), FaceError>>, FaceError> {
-        let (domain, gate) = (Arc::clone(domain), Arc::clone(gate));
-        let spawned = thread::Builder::new()
-            .name("spare".to_owned())
-            .spawn(move || self.take_all(&domain, &gate));
-        Ok(spawned.map_err(GatewayError::Thread)?)
+    /// When a channel does not appear.
+    pub(super) fn connect(self, domain: &Domain) -> Result<JoinedSpare, WorkerError> {
+        let names = self.channels.iter().map(|(one, _)| one.name.as_str());
+        let waiter = Waiter::open(domain, &names.collect::<Vec<_>>())?;
+        let mut channels = Vec::new();
+        for (channel, sink) in self.channels {
+            let input = RawInput::open(domain, &channel.name, channel.depth)?;
+            channels.push((input, sink));
+        }
+        Ok(JoinedSpare { channels, waiter })
     }
+}
 
-    fn take_all(self, domain: &Domain, gate: &Gate) -> Result<(), FaceError> {
-        if self.channels.is_empty() {
-            return Ok(());
-        }
-        let names: Vec<&str> = self
-            .channels
-            .iter()
-            .map(|(one, _)| one.name.as_str())
-            .collect();
-        let mut waiter = Waiter::open(domain, &names)?;
-        let mut inputs = Vec::new();
-        for (channel, _) in &self.channels {
-            inputs.push(RawInput::open(domain, &channel.name, channel.depth)?);
-        }
-        let mut sinks: Vec<RecordSink> = self.channels.into_iter().map(|(_, sink)| sink).collect();
+/// The channels nobody speaks for, joined.
+pub(super) struct JoinedSpare {
+    channels: Vec<(RawInput, RecordSink)>,
+    waiter: Waiter,
+}
+
+impl JobWork for JoinedSpare {
+    fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
         loop {
-            let is_last = gate.is_closed();
-            for (input, sink) in inputs.iter_mut().zip(&mut sinks) {
+            let is_last = orders.is_stopping();
+            for (input, sink) in &mut self.channels {
                 while input.receive(&mut |envelope, _| sink.push(&taken(envelope)))? {}
             }
             if is_last {
                 return Ok(());
             }
-            waiter.wait(WAIT_MAX)?;
+            self.waiter.wait(WAIT_MAX)?;
         }
+    }
+
+    /// What it took is in its records.
+    fn report(&mut self) -> ProcessReport {
+        ProcessReport::default()
     }
 }
 
@@ -91,11 +87,7 @@ fn taken(envelope: &Envelope) -> TakenRecord {
     TakenRecord {
         sequence: envelope.sequence,
         published_ns: envelope.published_ns,
-        forwarded_ns: if envelope.is_forwarded() {
-            envelope.forwarded_ns
-        } else {
-            UNAVAILABLE
-        },
+        forwarded_ns: forwarded_ns(envelope),
         taken_ns: MonotonicClock::now().as_ns(),
         epoch: envelope.epoch,
         reserved: 0,

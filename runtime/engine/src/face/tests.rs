@@ -24,7 +24,7 @@ use super::{JoinedArm, OpenedArm};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
-use hil_rundir::face_launch::{ArmLaunch, FaceLaunch, FaceSettings};
+use hil_rundir::launch::{ArmLaunch, FaceSettings};
 use hil_rundir::pipe::FaceRefusal;
 use hil_rundir::record::Recorder;
 use hil_shm::{ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput};
@@ -72,13 +72,11 @@ impl Bench {
                 free.local_addr().unwrap()
             }
         };
-        let launch = launch(kind, address, &folder);
+        let face = settings(kind, address);
         let mut recorder = Recorder::new(&folder, "face", 0);
-        let opened = OpenedArm::open(&launch, &launch.face.arms[0], &mut recorder).unwrap();
+        let opened = OpenedArm::open(&face, &face.arms[0], &mut recorder).unwrap();
         let member = Domain::open(owner.address()).unwrap();
-        let joined = opened
-            .connect(&launch, &launch.face.arms[0], &member)
-            .unwrap();
+        let joined = opened.connect(&face, &face.arms[0], &member).unwrap();
         let (out, back) = match kind {
             FaceKind::Robot => ((FEEDBACK, feedback), (COMMAND, command)),
             FaceKind::Sensor => ((COMMAND, command), (FEEDBACK, feedback)),
@@ -153,7 +151,7 @@ impl Bench {
     }
 }
 
-fn launch(kind: FaceKind, address: SocketAddr, folder: &std::path::Path) -> FaceLaunch {
+fn settings(kind: FaceKind, address: SocketAddr) -> FaceSettings {
     let channel = |name: &str, message: MessageType| CardChannel {
         name: name.to_owned(),
         message_name: message.name.to_owned(),
@@ -168,32 +166,26 @@ fn launch(kind: FaceKind, address: SocketAddr, folder: &std::path::Path) -> Face
         FaceKind::Robot => (feedback, command),
         FaceKind::Sensor => (command, feedback),
     };
-    FaceLaunch {
-        process: "face".to_owned(),
-        instance: 0,
-        domain: String::new(),
-        records: folder.to_owned(),
+    FaceSettings {
+        role: "test".to_owned(),
+        kind,
+        axes: 7,
+        robotware: 7,
+        cycle_ns: 4_000_000,
+        planned_lead_ns: 16_000_000,
         wait: WaitMode::Spin,
-        face: FaceSettings {
-            role: "test".to_owned(),
-            kind,
-            axes: 7,
-            robotware: 7,
-            cycle_ns: 4_000_000,
-            planned_lead_ns: 16_000_000,
-            send: FaceSend::Coupled,
-            timestamps: Timestamps::Software,
-            dscp: 0,
-            interface: None,
-            arms: vec![ArmLaunch {
-                arm: Side::Right,
-                address,
-                input,
-                output,
-                realtime: RealtimeRequest::default(),
-            }],
-            spare: Vec::new(),
-        },
+        send: FaceSend::Coupled,
+        timestamps: Timestamps::Software,
+        dscp: 0,
+        interface: None,
+        arms: vec![ArmLaunch {
+            arm: Side::Right,
+            address,
+            input,
+            output,
+            realtime: RealtimeRequest::default(),
+        }],
+        spare: Vec::new(),
     }
 }
 

@@ -1,26 +1,29 @@
 //! Switches kernel stamps on before the measured threads start, finds out by sending which really
 //! come, and says what the sockets of a hop are to ask for. It opens no socket of a channel.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use hil_net::interface::interface_with_address;
 use hil_net::timestamping::TimestampMode;
-use hil_transport::probe::{Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe};
+use hil_transport::probe::{
+    Availability, DISCARD_PORT, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
+};
 
-use super::GatewayError;
-use super::direction;
-use super::process::PROBE_BOUND;
+use super::WorkerError;
 use super::socket::stamps_of;
 use super::stamp_plan::StampPlan;
 use hil_nic::radio::sampler::Sampler;
 use hil_nic::radio::socket::RadioSocket;
-use hil_rundir::launch::{DirectionLaunch, GatewayLaunch, Side, Transport};
+use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side, Transport};
 use hil_rundir::radio_record::RadioRecord;
 use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder};
 use hil_topology::Timestamps;
 
+/// How long each half of the stamp probe may take; a restart must not wait long for it.
+pub(crate) const PROBE_BOUND: Duration = Duration::from_millis(300);
 /// How long each half of the probe may take where a card is to stamp: its driver answers from a
 /// worker of normal priority.
 const CARD_PROBE_BOUND: Duration = Duration::from_secs(1);
@@ -47,21 +50,6 @@ pub(crate) struct RadioHop {
     pub(crate) socket: RadioSocket,
 }
 
-/// A radio's sampler that has not started.
-#[derive(Debug)]
-pub(super) struct PreparedSampler {
-    radio: RadioHop,
-    sink: RecordSink,
-}
-
-impl PreparedSampler {
-    /// Starts it; call from a thread of normal priority.
-    pub(super) fn start(self, stop: Arc<AtomicBool>) -> Result<Sampler, GatewayError> {
-        let RadioHop { interface, socket } = self.radio;
-        Sampler::start(interface, socket, self.sink, stop).map_err(GatewayError::Thread)
-    }
-}
-
 impl Arming {
     /// What the sockets of `direction` are to ask for.
     pub(crate) fn plan(&self, direction: &DirectionLaunch) -> StampPlan {
@@ -78,27 +66,37 @@ impl Arming {
         plan.on_radio(self.is_wireless && is_datagram)
     }
 
-    /// Opens the record file of the hop's radio, if it has one. Where it cannot be opened the run
-    /// goes on without samples, and a fact says so.
-    pub(super) fn prepare_sampler(
+    /// Starts the sampler of the hop's radio, if it has one, until `stop` is set; call it from a thread
+    /// of normal priority. Where its record file cannot be opened the run goes on without samples, and
+    /// a fact says so.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub(super) fn start_sampler(
         &mut self,
         process: &str,
         recorder: &mut Recorder,
-    ) -> Option<PreparedSampler> {
-        let radio = self.radio.take()?;
-        match open_sink((process, &radio.interface), recorder) {
-            Ok(sink) => Some(PreparedSampler { radio, sink }),
+        stop: Arc<AtomicBool>,
+    ) -> Result<Option<Sampler>, WorkerError> {
+        let Some(RadioHop { interface, socket }) = self.radio.take() else {
+            return Ok(None);
+        };
+        match open_sink(process, &interface, recorder) {
+            Ok(sink) => Sampler::start(interface, socket, sink, stop)
+                .map(Some)
+                .map_err(WorkerError::Thread),
             Err(error) => {
                 let text = format!("unavailable: {error}");
                 self.facts.push(("radio samples".to_owned(), text));
-                None
+                Ok(None)
             }
         }
     }
 }
 
 fn open_sink(
-    (process, interface): (&str, &str),
+    process: &str,
+    interface: &str,
     recorder: &mut Recorder,
 ) -> Result<RecordSink, RecordFileError> {
     let name = format!("{process}/{interface}");
@@ -108,9 +106,9 @@ fn open_sink(
 
 /// Switches kernel stamps on and finds out whether they really come, and whether the hop is a
 /// radio's.
-pub(super) fn arm(launch: &GatewayLaunch) -> Arming {
-    let (radio, mut facts) = find_radio(launch);
-    let mut sockets = launch.directions.iter().map(|one| one.socket.transport);
+pub(super) fn arm(work: &GatewayWork) -> Arming {
+    let (radio, mut facts) = find_radio(work);
+    let mut sockets = work.directions.iter().map(|one| one.socket.transport);
     if sockets.any(|transport| transport == Transport::Tcp) {
         let why = "unavailable over TCP: the kernel stamps bytes of a stream, not messages";
         facts.insert(0, ("kernel stamps".to_owned(), why.to_owned()));
@@ -122,12 +120,12 @@ pub(super) fn arm(launch: &GatewayLaunch) -> Arming {
             radio,
         };
     }
-    let mut directions = launch.directions.iter();
+    let mut directions = work.directions.iter();
     let stamped = directions.find(|one| one.socket.timestamps != Timestamps::Off);
     let settings = stamped.map(|direction| ProbeSettings {
         timestamps: stamps_of(&direction.socket),
         interface: direction.socket.interface.clone(),
-        transmit_target: Some(direction::probe_target(direction)),
+        transmit_target: Some(SocketAddr::new(direction.peer.ip(), DISCARD_PORT)),
         proof_count: 5,
         bound: PROBE_BOUND,
     });
@@ -145,8 +143,8 @@ pub(super) fn arm(launch: &GatewayLaunch) -> Arming {
 }
 
 /// The radio of the hop's interface, and what it is used as. A wired hop says nothing of radios.
-fn find_radio(launch: &GatewayLaunch) -> (Option<RadioHop>, Vec<(String, String)>) {
-    let Some(interface) = launch.directions.iter().find_map(interface_of) else {
+fn find_radio(work: &GatewayWork) -> (Option<RadioHop>, Vec<(String, String)>) {
+    let Some(interface) = work.directions.iter().find_map(interface_of) else {
         return (None, Vec::new());
     };
     let label = || "radio".to_owned();
@@ -262,12 +260,12 @@ mod tests {
         std::fs::create_dir_all(&folder).unwrap();
         let mut recorder = Recorder::new(&folder, "gateway", 0);
         let process = format!("gateway-{}-robot-pc", "l".repeat(80));
-        let error = open_sink((&process, "wlan0"), &mut recorder).unwrap_err();
+        let error = open_sink(&process, "wlan0", &mut recorder).unwrap_err();
         assert!(
             error.to_string().contains("longer than 96 bytes"),
             "{error}"
         );
-        let sink = open_sink(("gateway-air-robot-pc", "wlan0"), &mut recorder);
+        let sink = open_sink("gateway-air-robot-pc", "wlan0", &mut recorder);
         assert!(sink.is_ok());
         std::fs::remove_dir_all(&folder).unwrap();
     }

@@ -1,7 +1,6 @@
 //! One channel direction of a gateway from its launch description to its final counters: opens
 //! the socket in the normal thread, the shared-memory port in the pinned one.
 
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::time::Duration;
@@ -10,7 +9,6 @@ use hil_core::link_model::ReplayTally;
 use hil_core::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
 use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings, SettingsError};
 use hil_transport::tcp::ConnectionTally;
-use hil_transport::{DatagramReceiver, DatagramSender};
 
 use super::egress::{Attention, Egress};
 use super::gathering::Gathering;
@@ -20,7 +18,7 @@ use super::line::Line;
 use super::link_switch::SwitchHandle;
 use super::socket::{Ends, OpenSocket, stamps_of};
 use super::stamp_plan::StampPlan;
-use super::{GatewayError, Surroundings};
+use super::{Surroundings, WorkerError};
 use super::{counters, stream};
 use crate::process::pulse::Pulse;
 use hil_platform::clock::MonotonicClock;
@@ -38,17 +36,25 @@ const SYNC_PERIOD: Duration = Duration::from_millis(100);
 /// The same on a clock path, which has nothing else to do: clocks stray by 2 us at most in between,
 /// which is less than the fastest exchange leaves open.
 const CLOCK_PATH_PERIOD: Duration = Duration::from_millis(10);
-type Sinks = (RecordSink, RecordSink);
 
 /// A direction whose socket and files are open and whose port is not.
 #[derive(Debug)]
-pub struct Opened {
+pub struct OpenDirection {
     socket: OpenSocket,
     sinks: Sinks,
     count: Arc<AtomicU64>,
     is_established: Arc<AtomicBool>,
     pulse: Pulse,
     plan: StampPlan,
+}
+
+/// The record rings of a direction.
+#[derive(Debug)]
+struct Sinks {
+    /// One record for each message.
+    messages: RecordSink,
+    /// Round trips of a sender, follow-ups of a receiver.
+    exchanges: RecordSink,
 }
 
 /// A direction at work.
@@ -71,17 +77,17 @@ enum Way {
 ///
 /// # Errors
 /// When the kernel refuses a socket option or a file cannot be made.
-pub fn open<'a>(
-    launch: &'a DirectionLaunch,
+pub fn open(
+    launch: &DirectionLaunch,
     recorder: &mut Recorder,
     start: &RunStart,
-) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
+) -> Result<OpenDirection, WorkerError> {
     let plan = StampPlan::asked(stamps_of(&launch.socket));
-    let socket = OpenSocket::open(launch, start, (plan, None))?;
-    Ok((launch, Opened::new(launch, recorder, (socket, plan))?))
+    let socket = OpenSocket::open(launch, plan, start, None)?;
+    OpenDirection::new(launch, recorder, socket, plan)
 }
 
-fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, GatewayError> {
+fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, WorkerError> {
     let channel = &launch.channel;
     let mut sink = |kind, size| {
         // Files of messages would say that a channel carried none.
@@ -91,18 +97,18 @@ fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks
         recorder.sink(kind, channel, size, RING_RECORDS)
     };
     Ok(match launch.side {
-        Side::Egress => (
-            sink(RecordKind::Egress, size_of::<EgressRecord>())?,
-            sink(RecordKind::RoundTrip, size_of::<RoundTripRecord>())?,
-        ),
-        Side::Ingress => (
-            sink(RecordKind::Ingress, size_of::<IngressRecord>())?,
-            sink(RecordKind::FollowUp, size_of::<FollowUpRecord>())?,
-        ),
+        Side::Egress => Sinks {
+            messages: sink(RecordKind::Egress, size_of::<EgressRecord>())?,
+            exchanges: sink(RecordKind::RoundTrip, size_of::<RoundTripRecord>())?,
+        },
+        Side::Ingress => Sinks {
+            messages: sink(RecordKind::Ingress, size_of::<IngressRecord>())?,
+            exchanges: sink(RecordKind::FollowUp, size_of::<FollowUpRecord>())?,
+        },
     })
 }
 
-impl Opened {
+impl OpenDirection {
     /// The direction of an open socket, with its record files.
     ///
     /// # Errors
@@ -110,8 +116,9 @@ impl Opened {
     pub(super) fn new(
         launch: &DirectionLaunch,
         recorder: &mut Recorder,
-        (socket, plan): (OpenSocket, StampPlan),
-    ) -> Result<Self, GatewayError> {
+        socket: OpenSocket,
+        plan: StampPlan,
+    ) -> Result<Self, WorkerError> {
         Ok(Self {
             socket,
             sinks: open_sinks(launch, recorder)?,
@@ -155,33 +162,71 @@ impl Opened {
     pub fn connect(
         self,
         launch: &DirectionLaunch,
-        surroundings: &Surroundings,
-    ) -> Result<Direction, GatewayError> {
-        let OpenSocket {
-            ends,
-            facts,
-            replay,
-            ..
-        } = self.socket;
-        let way = match ends {
-            Ends::Sender(sender, datagram_bytes_max) => Way::Egress(Box::new(egress(
-                (sender, datagram_bytes_max),
-                self.sinks,
-                (self.count, self.is_established),
-                (launch, surroundings, self.plan),
-            )?)),
-            Ends::Receiver(receiver) => Way::Ingress(Box::new(ingress(
-                receiver,
-                self.sinks,
-                self.count,
-                (launch, surroundings),
-            )?)),
+        around: &Surroundings,
+    ) -> Result<Direction, WorkerError> {
+        let way = match self.socket.ends {
+            Ends::Sender(sender, datagram_max_bytes) => {
+                let bridge = egress_bridge(datagram_max_bytes, launch, around)?;
+                let input = (!launch.is_clock_path)
+                    .then(|| RawInput::open(&around.domain, &launch.channel, launch.depth))
+                    .transpose()?;
+                let waiter = (launch.wait != WaitMode::Spin && input.is_some())
+                    .then(|| Waiter::open(&around.domain, &[launch.channel.as_str()]))
+                    .transpose()?;
+                let Sinks {
+                    messages,
+                    exchanges,
+                } = self.sinks;
+                Way::Egress(Box::new(Egress {
+                    input,
+                    waiter,
+                    bridge,
+                    line: Line::new(sender, messages, exchanges, around.session, self.plan)?,
+                    wait: WaitStrategy::new(launch.wait),
+                    sent: self.count,
+                    stop: Arc::clone(&around.stop),
+                    attention: Attention::default(),
+                    gathering: Gathering::of_replies(),
+                    is_established: self.is_established,
+                }))
+            }
+            Ends::Receiver(receiver) => {
+                let settings = IngressSettings::new(
+                    Surroundings::identity(launch),
+                    around.session,
+                    around.fingerprint,
+                    around.clock_id,
+                );
+                let output = (!launch.is_clock_path)
+                    .then(|| RawOutput::open(&around.domain, &launch.channel, true))
+                    .transpose()?;
+                Way::Ingress(Box::new(Ingress {
+                    receiver,
+                    is_emulated: launch.emulation.is_some(),
+                    bridge: IngressBridge::new(settings)?,
+                    output,
+                    wait: WaitStrategy::new(launch.wait),
+                    peer: launch.peer,
+                    notes: Notes {
+                        messages: self.sinks.messages,
+                        follow_ups: self.sinks.exchanges,
+                    },
+                    received: self.count,
+                    stop: Arc::clone(&around.stop),
+                    foreign_count: 0,
+                    stray_count: 0,
+                    gathering: Gathering::of_messages(),
+                    clock: KernelClock::read()?,
+                    response: None,
+                    buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
+                }))
+            }
         };
         Ok(Direction {
             way,
             pulse: self.pulse,
-            facts,
-            replay,
+            facts: self.socket.facts,
+            replay: self.socket.replay,
         })
     }
 }
@@ -189,7 +234,8 @@ impl Opened {
 /// A bridge over a path that takes datagrams of so many bytes.
 pub(super) fn egress_bridge(
     datagram_max_bytes: usize,
-    (launch, around): (&DirectionLaunch, &Surroundings),
+    launch: &DirectionLaunch,
+    around: &Surroundings,
 ) -> Result<EgressBridge, SettingsError> {
     EgressBridge::new(EgressSettings {
         channel: Surroundings::identity(launch),
@@ -205,78 +251,12 @@ pub(super) fn egress_bridge(
     })
 }
 
-fn egress(
-    (sender, datagram_max_bytes): (Box<dyn DatagramSender>, usize),
-    sinks: Sinks,
-    (count, is_established): (Arc<AtomicU64>, Arc<AtomicBool>),
-    (launch, around, plan): (&DirectionLaunch, &Surroundings, StampPlan),
-) -> Result<Egress, GatewayError> {
-    let bridge = egress_bridge(datagram_max_bytes, (launch, around))?;
-    let input = (!launch.is_clock_path)
-        .then(|| RawInput::open(&around.domain, &launch.channel, launch.depth))
-        .transpose()?;
-    let waiter = (launch.wait != WaitMode::Spin && input.is_some())
-        .then(|| Waiter::open(&around.domain, &[launch.channel.as_str()]))
-        .transpose()?;
-    Ok(Egress {
-        input,
-        waiter,
-        bridge,
-        line: Line::new(sender, sinks, around.session, plan)?,
-        wait: WaitStrategy::new(launch.wait),
-        sent: count,
-        stop: Arc::clone(&around.stop),
-        attention: Attention::default(),
-        gathering: Gathering::of_replies(),
-        is_established,
-    })
-}
-
-fn ingress(
-    receiver: Box<dyn DatagramReceiver>,
-    sinks: Sinks,
-    count: Arc<AtomicU64>,
-    (launch, around): (&DirectionLaunch, &Surroundings),
-) -> Result<Ingress, GatewayError> {
-    let identity = Surroundings::identity(launch);
-    let settings = IngressSettings::new(
-        identity,
-        around.session,
-        around.fingerprint,
-        around.clock_id,
-    );
-    let (messages, follow_ups) = sinks;
-    let output = (!launch.is_clock_path)
-        .then(|| RawOutput::open(&around.domain, &launch.channel, true))
-        .transpose()?;
-    Ok(Ingress {
-        receiver,
-        is_emulated: launch.emulation.is_some(),
-        bridge: IngressBridge::new(settings)?,
-        output,
-        wait: WaitStrategy::new(launch.wait),
-        peer: launch.peer,
-        notes: Notes {
-            messages,
-            follow_ups,
-        },
-        received: count,
-        stop: Arc::clone(&around.stop),
-        foreign_count: 0,
-        stray_count: 0,
-        gathering: Gathering::of_messages(),
-        clock: KernelClock::read()?,
-        response: None,
-        buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
-    })
-}
-
 impl Direction {
     /// Carries messages until told to stop.
     ///
     /// # Errors
     /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
-    pub fn run(&mut self) -> Result<(), GatewayError> {
+    pub fn run(&mut self) -> Result<(), WorkerError> {
         match &mut self.way {
             Way::Egress(egress) => egress.run(&self.pulse),
             Way::Ingress(ingress) => ingress.run(&self.pulse),
@@ -287,7 +267,7 @@ impl Direction {
     ///
     /// # Errors
     /// As [`Direction::run`].
-    pub fn step(&mut self) -> Result<bool, GatewayError> {
+    pub fn step(&mut self) -> Result<bool, WorkerError> {
         match &mut self.way {
             Way::Egress(egress) => egress.step(),
             Way::Ingress(ingress) => ingress.step(),
@@ -298,7 +278,7 @@ impl Direction {
     ///
     /// # Errors
     /// When waiting itself fails.
-    pub fn rest(&mut self) -> Result<(), GatewayError> {
+    pub fn rest(&mut self) -> Result<(), WorkerError> {
         match &mut self.way {
             Way::Egress(egress) => egress.rest(),
             Way::Ingress(ingress) => ingress.rest(),
@@ -308,42 +288,39 @@ impl Direction {
     /// Every counter of the direction.
     pub fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
         let now = MonotonicClock::now();
-        let (direction, peer_state, mut counters, (stream, seal)) = match &self.way {
-            Way::Egress(egress) => (
-                Side::Egress,
-                counters::egress_state(egress),
-                counters::of_egress(egress),
+        let mut facts = self.facts.clone();
+        let (peer_state, mut counters, stream, seal) = match &self.way {
+            Way::Egress(egress) => {
+                let sender = egress.line.sender();
                 (
-                    egress.line.sender().stream_figures(now),
-                    egress.line.sender().seal_counts(),
-                ),
-            ),
-            Way::Ingress(ingress) => (
-                Side::Ingress,
-                counters::ingress_state(ingress),
-                counters::of_ingress(ingress),
+                    counters::egress_state(egress),
+                    counters::of_egress(egress),
+                    sender.stream_figures(now),
+                    sender.seal_counts(),
+                )
+            }
+            Way::Ingress(ingress) => {
+                if launch.socket.dscp > 0 {
+                    let counters = ingress.receiver.counters();
+                    facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
+                }
                 (
+                    counters::ingress_state(ingress),
+                    counters::of_ingress(ingress),
                     ingress.receiver.stream_figures(now),
                     ingress.receiver.seal_counts(),
-                ),
-            ),
+                )
+            }
         };
-        let mut facts = self.facts.clone();
-        if let Way::Ingress(ingress) = &self.way
-            && launch.socket.dscp > 0
-        {
-            let counters = ingress.receiver.counters();
-            facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
-        }
         counters.extend(seal.iter().flat_map(counters::of_seal));
         if let Some(figures) = &stream {
             counters.extend(stream::counters(figures));
             facts.extend(stream::facts(figures, launch.side));
         }
-        let stalls = stream.filter(|_| direction == Side::Egress);
+        let stalls = stream.filter(|_| launch.side == Side::Egress);
         DirectionReport {
             channel: launch.channel.clone(),
-            direction,
+            direction: launch.side,
             peer_state,
             counters,
             facts,
@@ -351,9 +328,4 @@ impl Direction {
             replay: self.replay.as_ref().map(ReplayTally::counts),
         }
     }
-}
-
-/// Where a transmit probe of this direction may go: the peer's discard port.
-pub(crate) fn probe_target(launch: &DirectionLaunch) -> SocketAddr {
-    SocketAddr::new(launch.peer.ip(), hil_transport::probe::DISCARD_PORT)
 }

@@ -11,8 +11,9 @@ use hil_protocol::egress::RoundTrip;
 use hil_protocol::{EgressBridge, EgressEvent, LocalRefusal, PeerState};
 
 use super::gathering::Gathering;
-use super::line::{Line, STAMP_PATIENCE_NS};
-use super::{GatewayError, poll_descriptors};
+use super::line::Line;
+use super::stamp_tracker::STAMP_PATIENCE_NS;
+use super::{WorkerError, poll_descriptors};
 use crate::process::pulse::Pulse;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy};
@@ -58,7 +59,7 @@ impl Egress {
     ///
     /// # Errors
     /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
-    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), GatewayError> {
+    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), WorkerError> {
         while !self.stop.load(Ordering::Acquire) {
             if !self.step()? {
                 self.rest()?;
@@ -73,7 +74,7 @@ impl Egress {
 
     /// Sends one waiting message, or else looks after stamps, replies and appointments; false when
     /// no message waited and none was announced.
-    pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
+    pub(crate) fn step(&mut self) -> Result<bool, WorkerError> {
         let moved = self.forward()?;
         if moved && !self.attention.is_overdue {
             // A producer faster than the socket must not keep replies and orders waiting for ever.
@@ -116,7 +117,7 @@ impl Egress {
     }
 
     /// Sends the oldest waiting message; false when none waited.
-    fn forward(&mut self) -> Result<bool, GatewayError> {
+    fn forward(&mut self) -> Result<bool, WorkerError> {
         let Self {
             input,
             bridge,
@@ -162,13 +163,13 @@ impl Egress {
     }
 
     /// Takes the peer's replies.
-    fn hear(&mut self) -> Result<(), GatewayError> {
+    fn hear(&mut self) -> Result<(), WorkerError> {
         let mut buffer = [0; REPLY_BYTES_MAX];
         while let Some(received) = self
             .line
             .sender
             .receive(&mut buffer)
-            .map_err(GatewayError::Socket)?
+            .map_err(WorkerError::Socket)?
         {
             let now = MonotonicClock::now();
             let arrival = self.line.clock.arrival(&received, now);
@@ -186,7 +187,7 @@ impl Egress {
                 }
                 Ok(EgressEvent::Refused(status)) => {
                     if self.bridge.peer_state() == PeerState::Refused(status) {
-                        return Err(GatewayError::Refused(status));
+                        return Err(WorkerError::Refused(status));
                     }
                 }
                 Ok(EgressEvent::Accepted { .. } | EgressEvent::GreetAgain) | Err(_) => {}
@@ -214,11 +215,11 @@ impl Egress {
     }
 
     /// Waits for a message, a stamp, a reply or an appointment.
-    pub(crate) fn rest(&mut self) -> Result<(), GatewayError> {
+    pub(crate) fn rest(&mut self) -> Result<(), WorkerError> {
         let now = MonotonicClock::now();
         let dues = [self.bridge.next_wakeup(), self.line.sender.next_due()];
         let mut due = dues.into_iter().flatten().min();
-        if self.line.pending_count > 0 {
+        if self.line.awaits_stamps() {
             // A stamp makes the socket readable, but an overdue one must be given up in time.
             let patience = Instant::from_ns(now.as_ns() + STAMP_PATIENCE_NS);
             due = Some(due.map_or(patience, |due| due.min(patience)));

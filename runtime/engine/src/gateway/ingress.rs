@@ -16,7 +16,7 @@ use hil_transport::{DatagramReceiver, Received};
 
 use super::gathering::Gathering;
 use super::kernel_clock::KernelClock;
-use super::{GatewayError, poll_descriptors};
+use super::{WorkerError, poll_descriptors};
 use crate::process::pulse::Pulse;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy, release};
@@ -97,7 +97,7 @@ impl Ingress {
     ///
     /// # Errors
     /// When the channel or the socket itself breaks.
-    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), GatewayError> {
+    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), WorkerError> {
         while !self.stop.load(Ordering::Acquire) {
             if !self.step()? {
                 self.rest()?;
@@ -111,7 +111,7 @@ impl Ingress {
     /// Delivers one waiting datagram, or else does what is due; false when none waited. Asking
     /// for a second one at once would cost a system call that a message just delivered, or the
     /// thread's other work, would have to wait for.
-    pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
+    pub(crate) fn step(&mut self) -> Result<bool, WorkerError> {
         if let Some(at) = self.take()? {
             if self.bridge.has_reply() {
                 self.answer();
@@ -129,7 +129,7 @@ impl Ingress {
     }
 
     /// Takes one datagram and gives when; `None` when none waits.
-    fn take(&mut self) -> Result<Option<Instant>, GatewayError> {
+    fn take(&mut self) -> Result<Option<Instant>, WorkerError> {
         // Only a link model asks what time it is.
         let now = if self.is_emulated {
             MonotonicClock::now()
@@ -139,7 +139,7 @@ impl Ingress {
         let Some(received) = self
             .receiver
             .receive(now, &mut self.buffer)
-            .map_err(GatewayError::Socket)?
+            .map_err(WorkerError::Socket)?
         else {
             return Ok(None);
         };
@@ -220,7 +220,7 @@ impl Ingress {
     }
 
     /// Waits for a datagram or an appointment.
-    pub(crate) fn rest(&mut self) -> Result<(), GatewayError> {
+    pub(crate) fn rest(&mut self) -> Result<(), WorkerError> {
         let now = MonotonicClock::now();
         let due = self.receiver.next_due();
         let pause = if self.is_emulated {

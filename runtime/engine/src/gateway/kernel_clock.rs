@@ -7,7 +7,7 @@ use hil_net::clock_pair::ClockPair;
 use hil_protocol::{ArrivalStamps, StampSource};
 use hil_transport::Received;
 
-use super::GatewayError;
+use super::WorkerError;
 
 /// Reads of a clock pair of which the narrowest counts.
 const PAIR_ATTEMPTS: u32 = 5;
@@ -24,8 +24,8 @@ pub(crate) struct KernelClock {
 
 impl KernelClock {
     /// Reads both clocks.
-    pub(crate) fn read() -> Result<Self, GatewayError> {
-        let pair = ClockPair::read(PAIR_ATTEMPTS).map_err(GatewayError::Clock)?;
+    pub(crate) fn read() -> Result<Self, WorkerError> {
+        let pair = ClockPair::read(PAIR_ATTEMPTS).map_err(WorkerError::Clock)?;
         Ok(Self {
             pair,
             step_count: 0,

@@ -14,15 +14,11 @@ use hil_transport::{DatagramSender, SendRefusal};
 
 use super::kernel_clock::KernelClock;
 use super::stamp_plan::StampPlan;
-use super::{GatewayError, poll_descriptors};
+use super::stamp_tracker::{STAMP_PATIENCE_NS, StampTracker};
+use super::{WorkerError, poll_descriptors};
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::record::RecordSink;
 
-/// Datagrams whose stamps and reports may be outstanding; a power of two.
-const PENDING: usize = 256;
-/// A stamp that has not come by then does not come: drivers deliver within a millisecond or so,
-/// and a record must not wait for ever.
-pub(super) const STAMP_PATIENCE_NS: i64 = 20_000_000;
 /// A radio reports after its last retry, with other stations and its queue before that; the driver
 /// of a card that stamps fetches the stamp from a worker of normal priority.
 const LATE_PATIENCE_NS: i64 = 200_000_000;
@@ -33,10 +29,7 @@ const HAND_OVER_MAX: Duration = Duration::from_millis(200);
 #[derive(Debug)]
 pub(crate) struct Line {
     pub(super) sender: Box<dyn DatagramSender>,
-    pending: Box<[Option<Pending>]>,
-    pub(super) pending_count: usize,
-    /// At or before the slot of the oldest that is pending: tokens go round the slots in order.
-    oldest: usize,
+    pending: StampTracker<Pending>,
     records: RecordSink,
     pub(super) round_trips: RecordSink,
     pub(super) session: u32,
@@ -49,7 +42,6 @@ pub(crate) struct Line {
 
 #[derive(Debug, Clone, Copy)]
 struct Pending {
-    token: TxToken,
     kind: Kind,
     sequence: u64,
     handed: Instant,
@@ -63,15 +55,14 @@ struct Pending {
 impl Line {
     pub(crate) fn new(
         sender: Box<dyn DatagramSender>,
-        (records, round_trips): (RecordSink, RecordSink),
+        records: RecordSink,
+        round_trips: RecordSink,
         session: u32,
         awaited: StampPlan,
-    ) -> Result<Self, GatewayError> {
+    ) -> Result<Self, WorkerError> {
         Ok(Self {
             sender,
-            pending: vec![None; PENDING].into_boxed_slice(),
-            pending_count: 0,
-            oldest: 0,
+            pending: StampTracker::new(),
             records,
             round_trips,
             session,
@@ -113,7 +104,7 @@ impl Line {
                 None
             };
             match sent {
-                Ok(token) => self.expect_stamp(token, (kind, sequence), handed, record),
+                Ok(token) => self.expect_stamp(token, kind, sequence, handed, record),
                 Err(refusal) => {
                     let is_established = bridge.peer_state() == PeerState::Established;
                     bridge.on_transmit_failed(handed, failure(refusal, is_established));
@@ -136,7 +127,8 @@ impl Line {
     fn expect_stamp(
         &mut self,
         token: TxToken,
-        (kind, sequence): (Kind, u64),
+        kind: Kind,
+        sequence: u64,
         handed: Instant,
         record: Option<EgressRecord>,
     ) {
@@ -146,18 +138,7 @@ impl Line {
             }
             return;
         }
-        let slot = slot_of(token);
-        if let Some(old) = self.pending[slot].take() {
-            self.retire(old);
-        }
-        if self.pending_count == 0 {
-            self.oldest = slot;
-        } else if self.oldest == slot {
-            // Gone round once: the newest takes this slot, and the oldest is in a later one.
-            self.oldest = (slot + 1) % PENDING;
-        }
-        self.pending[slot] = Some(Pending {
-            token,
+        let pending = Pending {
             kind,
             sequence,
             handed,
@@ -165,14 +146,20 @@ impl Line {
             is_stamped: false,
             is_card_stamped: false,
             is_reported: false,
-        });
-        self.pending_count += 1;
+        };
+        let displaced = self.pending.expect(token, handed, pending);
+        self.retire(displaced);
+    }
+
+    /// True while stamps or reports are still to come.
+    pub(super) const fn awaits_stamps(&self) -> bool {
+        !self.pending.is_empty()
     }
 
     /// Takes the stamps that are still to come, as far as they have come; asks no further, as
     /// each look is a system call.
     fn take_due_stamps(&mut self, bridge: &mut EgressBridge) {
-        while self.pending_count > 0 && self.take_stamp(bridge) {}
+        while self.awaits_stamps() && self.take_stamp(bridge) {}
     }
 
     /// Takes every stamp there is, and with them the reports of the network.
@@ -195,12 +182,10 @@ impl Line {
     }
 
     fn note_stamp(&mut self, bridge: &mut EgressBridge, stamp: TransmitStamp) {
-        let slot = slot_of(stamp.token);
         let offset = self.clock.offset_ns();
         let is_departure = stamp.stage == TransmitStage::Sent;
         let counts = is_departure || self.awaited.is_before_queue_final();
-        let pending = self.pending[slot].as_mut();
-        let Some(pending) = pending.filter(|one| one.token == stamp.token) else {
+        let Some(pending) = self.pending.find(stamp.token) else {
             return;
         };
         // Of a message in pieces only the last piece's stamp is the message's.
@@ -227,13 +212,11 @@ impl Line {
                 record.tx_hardware_ns = hardware_ns;
             }
         }
-        self.retire_if_complete(slot);
+        self.retire_if_complete(stamp.token);
     }
 
     fn note_report(&mut self, report: RadioReport) {
-        let slot = slot_of(report.token);
-        let pending = self.pending[slot].as_mut();
-        let Some(pending) = pending.filter(|one| one.token == report.token) else {
+        let Some(pending) = self.pending.find(report.token) else {
             return;
         };
         pending.is_reported = true;
@@ -244,17 +227,18 @@ impl Line {
                 EgressRecord::RADIO_UNACKNOWLEDGED
             };
         }
-        self.retire_if_complete(slot);
+        self.retire_if_complete(report.token);
     }
 
-    fn retire_if_complete(&mut self, slot: usize) {
+    fn retire_if_complete(&mut self, token: TxToken) {
         let awaited = self.awaited;
-        let is_complete = self.pending[slot].is_some_and(|one| {
+        let is_complete = self.pending.find(token).is_some_and(|one| {
             (one.is_stamped || !awaited.awaits_software())
                 && (one.is_card_stamped || !awaited.awaits_hardware())
                 && (one.is_reported || !awaited.asks_radio)
         });
-        if is_complete && let Some(pending) = self.pending[slot].take() {
+        if is_complete {
+            let pending = self.pending.take(token);
             self.retire(pending);
         }
     }
@@ -273,9 +257,8 @@ impl Line {
         }
     }
 
-    fn retire(&mut self, pending: Pending) {
-        self.pending_count -= 1;
-        if let Some(record) = pending.record {
+    fn retire(&mut self, pending: Option<Pending>) {
+        if let Some(record) = pending.and_then(|one| one.record) {
             self.finish(record);
         }
     }
@@ -296,26 +279,17 @@ impl Line {
     /// Gives up on stamps and reports that are overdue at `now`.
     pub(super) fn expire(&mut self, now: Instant) {
         let patience_ns = self.patience_ns();
-        // Something is pending, so the walk ends within one round.
-        while self.pending_count > 0 {
-            match self.pending[self.oldest] {
-                Some(one) if now.ns_since(one.handed) <= patience_ns => return,
-                Some(one) => {
-                    self.pending[self.oldest] = None;
-                    self.retire(one);
-                }
-                None => {}
-            }
-            self.oldest = (self.oldest + 1) % PENDING;
+        while let Some(overdue) = self.pending.take_overdue(now, patience_ns) {
+            self.retire(Some(overdue));
         }
     }
 
     /// Waits a bounded time for what is still to come of the last datagrams.
-    pub(super) fn settle(&mut self, bridge: &mut EgressBridge) -> Result<(), GatewayError> {
+    pub(super) fn settle(&mut self, bridge: &mut EgressBridge) -> Result<(), WorkerError> {
         let end = MonotonicClock::now() + Duration::from_nanos(self.patience_ns().unsigned_abs());
         loop {
             self.take_stamps(bridge);
-            if self.pending_count == 0 || MonotonicClock::now() >= end {
+            if !self.awaits_stamps() || MonotonicClock::now() >= end {
                 self.expire(Instant::from_ns(i64::MAX));
                 return Ok(());
             }
@@ -326,7 +300,7 @@ impl Line {
     }
 
     /// Gives the kernel what the transport still holds, for a bounded time.
-    pub(super) fn hand_over(&mut self) -> Result<(), GatewayError> {
+    pub(super) fn hand_over(&mut self) -> Result<(), WorkerError> {
         let end = MonotonicClock::now() + HAND_OVER_MAX;
         loop {
             let now = MonotonicClock::now();
@@ -355,10 +329,6 @@ fn note_software(record: &mut EgressRecord, software_ns: i64, is_departure: bool
     }
 }
 
-fn slot_of(token: TxToken) -> usize {
-    token.0 as usize % PENDING
-}
-
 /// What a refusal means for the conversation. That there is no connection yet says nothing of a
 /// peer that has not been heard of; that there is none any more says that it is gone.
 fn failure(refusal: SendRefusal, is_established: bool) -> TransmitFailure {
@@ -376,92 +346,7 @@ fn failure(refusal: SendRefusal, is_established: bool) -> TransmitFailure {
 
 #[cfg(test)]
 mod tests {
-    use std::io;
-    use std::os::fd::BorrowedFd;
-
-    use hil_net::timestamping::TimestampMode;
-    use hil_transport::{Received, SenderCounters};
-
     use super::*;
-    use hil_rundir::record::{RecordKind, Recorder};
-
-    /// Sends nothing and hears nothing.
-    #[derive(Debug)]
-    struct Silent;
-
-    impl DatagramSender for Silent {
-        fn send(&mut self, _datagram: &[u8]) -> Result<TxToken, SendRefusal> {
-            Ok(TxToken(0))
-        }
-
-        fn next_stamp(&mut self) -> Option<TransmitStamp> {
-            None
-        }
-
-        fn receive(&mut self, _buffer: &mut [u8]) -> io::Result<Option<Received>> {
-            Ok(None)
-        }
-
-        fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
-            None
-        }
-
-        fn counters(&self) -> SenderCounters {
-            SenderCounters::default()
-        }
-    }
-
-    fn silent_line(folder: &std::path::Path) -> Line {
-        std::fs::create_dir_all(folder).unwrap();
-        let mut recorder = Recorder::new(folder, "gateway", 0);
-        let mut sink = |kind| recorder.sink(kind, "x", 8, 16).unwrap();
-        let sinks = (sink(RecordKind::Egress), sink(RecordKind::RoundTrip));
-        let plan = StampPlan::asked(TimestampMode::Software);
-        Line::new(Box::new(Silent), sinks, 1, plan).unwrap()
-    }
-
-    #[test]
-    fn what_is_overdue_goes_and_the_rest_stays_however_often_tokens_go_round() {
-        let folder = std::env::temp_dir().join(format!("hil-line-{}", std::process::id()));
-        let mut line = silent_line(&folder);
-        let spacing_ns = 1_000_000;
-        let kept = usize::try_from(STAMP_PATIENCE_NS / spacing_ns).unwrap() + 1;
-        // Past the wrap of the tokens, and of the slots many times.
-        let first = u32::MAX - 700;
-        for step in 0..2_000_u32 {
-            let now = Instant::from_ns(i64::from(step) * spacing_ns);
-            let token = TxToken(first.wrapping_add(step));
-            line.expect_stamp(token, (Kind::Data, u64::from(step)), now, None);
-            // Every third is stamped at once, and for a while all are.
-            if step % 3 == 0 || (800..1_200).contains(&step) {
-                let slot = slot_of(token);
-                let pending = line.pending[slot].as_mut().unwrap();
-                pending.is_stamped = true;
-                line.retire_if_complete(slot);
-            }
-            line.expire(now);
-            let left = line.pending.iter().flatten();
-            let is_timely = |one: &Pending| now.ns_since(one.handed) <= STAMP_PATIENCE_NS;
-            assert!(left.clone().all(is_timely), "step {step}");
-            assert_eq!(left.count(), line.pending_count, "step {step}");
-            assert!(line.pending_count <= kept);
-        }
-        assert!(line.pending_count > kept / 2, "{}", line.pending_count);
-        // Without a look in between the slots go round over what waits; the end takes it all.
-        for step in 2_000..2_600_u32 {
-            let token = TxToken(first.wrapping_add(step));
-            let now = Instant::from_ns(i64::from(step) * spacing_ns);
-            line.expect_stamp(token, (Kind::Data, u64::from(step)), now, None);
-        }
-        assert_eq!(line.pending_count, PENDING);
-        line.expire(Instant::from_ns(
-            (2_599 - 9) * spacing_ns + STAMP_PATIENCE_NS,
-        ));
-        assert_eq!(line.pending_count, 10, "the oldest went first");
-        line.expire(Instant::from_ns(i64::MAX));
-        assert_eq!(line.pending_count, 0);
-        std::fs::remove_dir_all(&folder).unwrap();
-    }
 
     #[test]
     fn a_departure_replaces_a_stamp_before_the_queue_in_either_order() {

@@ -11,10 +11,10 @@ use hil_link::condition::{
     LinkCondition, LinkConditionRecord, LinkOrder, OrderOutcome, order_channel,
 };
 
-use super::GatewayError;
+use super::WorkerError;
 use super::link_switch::SwitchHandle;
 use hil_platform::clock::MonotonicClock;
-use hil_rundir::launch::GatewayLaunch;
+use hil_rundir::launch::WorkerLaunch;
 use hil_rundir::link_orders::condition_header;
 use hil_rundir::pipe::{FromProcess, say};
 use hil_rundir::record::file::RecordHeader;
@@ -52,9 +52,9 @@ impl LinkControl {
     /// When the channel of a direction is not there.
     pub(super) fn open(
         domain: &Domain,
-        launch: &GatewayLaunch,
+        launch: &WorkerLaunch,
         switches: Vec<SwitchHandle>,
-    ) -> Result<Self, GatewayError> {
+    ) -> Result<Self, WorkerError> {
         let mut lines: Vec<ControlLine> = Vec::new();
         for switch in switches {
             let emulation = switch.emulation();
@@ -209,7 +209,7 @@ struct ConditionBook {
 }
 
 impl ConditionBook {
-    fn new(launch: &GatewayLaunch, channel: String) -> Self {
+    fn new(launch: &WorkerLaunch, channel: String) -> Self {
         Self {
             channel,
             folder: launch.records.clone(),

@@ -1,8 +1,7 @@
 //! Where the condition of an emulated link changes under a thread that carries messages: changes come
 //! to it ready made through a bounded ring, and what they replace goes back to be dropped elsewhere.
 
-use hil_core::link_model::ReplayTally;
-use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
+use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber, ReplayTally};
 use hil_core::time::Instant;
 use hil_link::condition::LinkCondition;
 use hil_link::spec::LinkPlace;
@@ -70,7 +69,8 @@ pub(super) struct SwitchHandle {
 pub(super) fn switch<L: LinkModel>(
     link: L,
     channel: &str,
-    (emulation, room): (&EmulationLaunch, EmulationRoom),
+    emulation: &EmulationLaunch,
+    room: EmulationRoom,
 ) -> (LinkSwitch<L>, SwitchHandle) {
     let (to_thread, changes) = rtrb::RingBuffer::new(CHANGES_MAX);
     // Whoever sends a change empties this ring first, so there is always a place.
@@ -224,7 +224,7 @@ mod tests {
             trace: None,
         };
         let room = emulation.room(64).unwrap();
-        switch(emulation.model("a/b").unwrap(), "a/b", (&emulation, room))
+        switch(emulation.model("a/b").unwrap(), "a/b", &emulation, room)
     }
 
     fn send(handle: &mut SwitchHandle, at: u32, condition: LinkCondition, number: u64) {

@@ -1,317 +1,242 @@
-//! The process of one link's gateway on one host: one thread per channel direction. This thread
-//! opens and arms the sockets, because kernel stamps are switched on by a worker that a spinning
-//! real-time thread would starve; then it only reports.
+//! The process of one link's gateway on one host, or of one end of a clock path: one thread per
+//! channel direction. The process's own thread opens and arms the sockets, because kernel stamps are
+//! switched on by a worker that a spinning real-time thread would starve; then it only looks after
+//! connections and orders. A gateway that starts with the run says at once what is wrong with its
+//! path; one that comes back while the run goes on waits for a path that is away, as one that never
+//! left would.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::io;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, Sender, channel};
-use std::thread::{self, JoinHandle};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
 use std::time::Duration;
 
-use super::connection::Connection;
-use super::direction::Opened;
-use super::link_control::LinkControl;
-use super::opening::{OpenSockets, open_sockets};
-use super::{GatewayError, Surroundings};
 use hil_core::time::Instant;
+use hil_protocol::SettingsError;
+use hil_transport::udp::UdpError;
 
-use crate::process::pulse::Pulses;
-use crate::process::usage::add_usage;
+use super::arming::{self, Arming};
+use super::connection::Connection;
+use super::direction::{Direction, OpenDirection, egress_bridge};
+use super::link_control::LinkControl;
+use super::socket::{Ends, OpenSocket};
+use super::{Surroundings, WorkerError};
+use crate::process::worker::{Counter, Job, JobWork, Opened, open_domain, warn_of_spinning};
 use hil_nic::radio::sampler::Sampler;
 use hil_platform::clock::MonotonicClock;
-use hil_platform::realtime;
-use hil_platform::realtime::{RealtimeGrant, SpinAdvice};
 use hil_platform::wait::WaitMode;
-use hil_rundir::launch::{DirectionLaunch, GatewayLaunch, Side, read};
-use hil_rundir::pipe::{ChannelProgress, DirectionReport, FromProcess, Orders, ProcessReport, say};
+use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side, WorkerLaunch};
+use hil_rundir::pipe::{FromProcess, Orders, ProcessReport, say};
 use hil_rundir::record::Recorder;
-use hil_shm::{Domain, DomainError};
+use hil_rundir::run_seal::RunSeal;
 
-const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
-/// How often orders and threads are looked at.
-const WATCH_PERIOD: Duration = Duration::from_millis(5);
 /// How long the run's secret may take, which the supervisor writes as soon as the process is there.
 const SEAL_PATIENCE: Duration = Duration::from_secs(5);
-/// How long each half of the stamp probe may take; a restart must not wait long for it.
-pub(crate) const PROBE_BOUND: Duration = Duration::from_millis(300);
+/// How often a path that is away is looked for.
+const RETRY_PERIOD: Duration = Duration::from_millis(50);
 
-/// Runs the gateway described by the launch file until told to stop.
+/// Opens the sockets and record files of the gateway of `launch`; call it from a thread of normal
+/// priority. Without jobs when told to stop before there was a path.
 ///
 /// # Errors
-/// When a socket or channel cannot be opened or breaks; the supervisor is told as well.
-pub fn run(launch: &Path) -> Result<(), GatewayError> {
-    let outcome = prepare_and_live(launch);
-    if let Err(error) = &outcome {
-        say(&FromProcess::Failed(error.to_string()));
-    }
-    outcome
-}
-
-fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
-    let orders = Orders::listen().map_err(GatewayError::Thread)?;
-    let launch: GatewayLaunch = read(path)?;
+/// When a socket or file cannot be opened, and at the start of a run also when there is no path.
+pub(crate) fn open<'a>(
+    launch: &'a WorkerLaunch,
+    work: &'a GatewayWork,
+    orders: &Orders,
+    recorder: &mut Recorder,
+) -> Result<Opened<'a>, WorkerError> {
     let seal = launch
         .is_sealed
         .then(|| orders.wait_for_seal(SEAL_PATIENCE));
     if matches!(seal, Some(None)) {
-        return Err(GatewayError::SecretMissing);
+        return Err(WorkerError::SecretMissing);
     }
     let seal = seal.flatten();
-    let domain = Domain::open(&launch.domain.parse().map_err(DomainError::Address)?)?;
-    let surroundings = Arc::new(Surroundings::new(domain)?);
-    warn_of_shared_cpus(&launch);
-    let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
-    let sockets = open_sockets(&launch, &orders, (seal.as_ref(), &surroundings))?;
-    let Some(OpenSockets { mut armed, sockets }) = sockets else {
-        return finish(Vec::new(), recorder, &[]);
+    let stop = Arc::clone(orders.stop_flag());
+    let surroundings = Arc::new(Surroundings {
+        stop: Arc::clone(&stop),
+        ..Surroundings::new(open_domain(launch)?)?
+    });
+    warn_of_shared_cpus(work);
+    let mut away = Away::default();
+    let (mut armed, sockets) = loop {
+        let armed = arming::arm(work);
+        match open_sockets(work, &armed, orders, seal.as_ref(), &surroundings) {
+            Ok(sockets) => break (armed, sockets),
+            Err(error) if launch.instance > 0 && is_away(&error) => away.note(&error),
+            Err(error) => return Err(error),
+        }
+        if orders.is_stopping() {
+            return Ok(Opened::default());
+        }
+        thread::sleep(RETRY_PERIOD);
     };
-    let mut opened = Vec::new();
-    for (direction, socket) in launch.directions.iter().zip(sockets) {
-        opened.push((direction, Opened::new(direction, &mut recorder, socket)?));
+    armed.facts.extend(away.fact());
+    let mut directions = Vec::new();
+    for (direction, socket) in work.directions.iter().zip(sockets) {
+        let plan = armed.plan(direction);
+        let opened = OpenDirection::new(direction, recorder, socket, plan)?;
+        directions.push((direction, opened));
     }
-    let sampler = armed.prepare_sampler(&launch.process, &mut recorder);
-    let switches = opened.iter_mut().filter_map(|(_, one)| one.take_switch());
-    let switches = switches.collect();
-    let mut control = LinkControl::open(&surroundings.domain, &launch, switches)?;
-    let on_failure = orders.stopper();
-    recorder
-        .start_and_tell(on_failure)
-        .map_err(GatewayError::Thread)?;
-    let stop = Arc::clone(&surroundings.stop);
-    let sampler = sampler.map(|one| one.start(stop)).transpose()?;
-    let counters: Vec<Counter> = opened
-        .iter()
-        .map(|(launch, one)| counter(launch, one))
-        .collect();
-    let established: Vec<_> = opened.iter().map(|(_, one)| one.is_established()).collect();
-    let mut pulses = Pulses::of(opened.iter().map(|(_, one)| one.pulse()));
-    let mut watched: Vec<_> = opened
-        .iter()
-        .filter_map(|(launch, one)| Some(Connection::new(launch, one.tally()?)))
-        .collect();
-    let (sender, ready) = channel();
-    let mut threads = Vec::new();
-    for (direction, one) in opened {
-        warn_of_spinning(&direction.channel, direction.wait, direction.realtime.cpu);
-        threads.push(spawn(
-            direction.clone(),
-            one,
-            Arc::clone(&surroundings),
-            sender.clone(),
-        )?);
-    }
-    drop(sender);
-    if wait_until_open(&ready, threads.len()) {
-        let patience = launch.ready_within.map(|within| Patience {
-            until: MonotonicClock::now() + within,
-            launch: &launch,
-        });
-        let hops = (counters.as_slice(), established.as_slice());
-        let beside = (watched.as_mut_slice(), &mut control, &mut pulses);
-        watch(&orders, &threads, hops, (beside, patience));
-    }
-    surroundings.stop.store(true, Ordering::Release);
-    armed.facts.extend(sampler.map(Sampler::finish));
-    finish(threads, recorder, &armed.facts)
+    let switches = directions.iter_mut();
+    let switches = switches.filter_map(|(_, one)| one.take_switch()).collect();
+    let gateway = GatewayWatch {
+        work,
+        instance: launch.instance,
+        established: directions
+            .iter()
+            .map(|(_, one)| one.is_established())
+            .collect(),
+        given_up: None,
+        connections: directions
+            .iter()
+            .filter_map(|(direction, one)| Some(Connection::new(direction, one.tally()?)))
+            .collect(),
+        control: LinkControl::open(&surroundings.domain, launch, switches)?,
+        sampler: armed.start_sampler(&launch.process, recorder, stop)?,
+    };
+    let jobs = directions.into_iter().map(|(direction, opened)| {
+        let spinner = format!("{}: ", direction.channel);
+        warn_of_spinning(&spinner, direction.wait, direction.realtime.cpu);
+        job(direction, opened, Arc::clone(&surroundings))
+    });
+    Ok(Opened {
+        jobs: jobs.collect(),
+        armed: Some(armed),
+        gateway: Some(gateway),
+        skipped_ticks: None,
+    })
 }
 
-/// A gateway that is ready without its peer after a while.
-struct Patience<'a> {
-    until: Instant,
-    launch: &'a GatewayLaunch,
+/// The socket of every direction, in their order.
+fn open_sockets(
+    work: &GatewayWork,
+    armed: &Arming,
+    orders: &Orders,
+    seal: Option<&RunSeal>,
+    around: &Surroundings,
+) -> Result<Vec<OpenSocket>, WorkerError> {
+    let open = |direction: &DirectionLaunch| {
+        let plan = armed.plan(direction);
+        let socket = OpenSocket::open(direction, plan, &orders.run_start(), seal)?;
+        if let Ends::Sender(_, longest) = &socket.ends {
+            // A path may be too narrow for the gateways' own exchanges; the thread would only end.
+            egress_bridge(*longest, direction, around)?;
+        }
+        Ok(socket)
+    };
+    work.directions.iter().map(open).collect()
 }
 
-impl Patience<'_> {
-    fn warning(&self) -> String {
-        let peers = self.launch.directions.iter();
+/// The job of one direction.
+fn job<'a>(
+    launch: &'a DirectionLaunch,
+    opened: OpenDirection,
+    around: Arc<Surroundings>,
+) -> Job<'a> {
+    let (way, what) = match launch.side {
+        Side::Egress => ("out", "sent"),
+        Side::Ingress => ("in", "received"),
+    };
+    Job {
+        name: format!("{way} {}", launch.channel),
+        counters: vec![Counter {
+            channel: launch.channel.clone(),
+            what,
+            count: opened.count(),
+        }],
+        pulse: Some(opened.pulse()),
+        connect: Box::new(move |thread| {
+            thread.claim(&launch.realtime);
+            let direction = opened.connect(launch, &around)?;
+            Ok(Box::new(DirectionWork { launch, direction }))
+        }),
+    }
+}
+
+/// A direction at work, with what it was told.
+struct DirectionWork<'a> {
+    launch: &'a DirectionLaunch,
+    direction: Direction,
+}
+
+impl JobWork for DirectionWork<'_> {
+    /// The peers greet each other before the run starts.
+    fn run(&mut self, _orders: &Orders) -> Result<(), WorkerError> {
+        self.direction.run()
+    }
+
+    fn report(&mut self) -> ProcessReport {
+        ProcessReport {
+            directions: vec![self.direction.report(self.launch)],
+            ..ProcessReport::default()
+        }
+    }
+}
+
+/// What a gateway looks after beside its directions, from the thread of the process.
+#[derive(Debug)]
+pub(crate) struct GatewayWatch<'a> {
+    work: &'a GatewayWork,
+    instance: u32,
+    established: Vec<Arc<AtomicBool>>,
+    /// When it is ready without its peer, once it has asked.
+    given_up: Option<Instant>,
+    connections: Vec<Connection>,
+    control: LinkControl,
+    sampler: Option<Sampler>,
+}
+
+impl GatewayWatch<'_> {
+    /// True once the peer takes messages, which would be refused before, or has been waited for long
+    /// enough. Asked until it is, once every direction is connected.
+    pub(crate) fn is_ready(&mut self, now: Instant) -> bool {
+        let mut flags = self.established.iter();
+        if flags.all(|one| one.load(Ordering::Acquire)) {
+            return true;
+        }
+        let Some(within) = self.work.ready_within else {
+            return false;
+        };
+        if now < *self.given_up.get_or_insert(now + within) {
+            return false;
+        }
+        let peers = self.work.directions.iter();
         let peers: Vec<String> = peers.map(|one| one.peer.to_string()).collect();
-        let within_s = self.launch.ready_within.unwrap_or_default().as_secs_f64();
-        let peers = peers.join(", ");
-        let then = match self.launch.instance {
+        let then = match self.instance {
             0 => "the run begins without it",
             _ => "it goes on asking",
         };
-        format!("no answer from {peers} within {within_s:.1} s: {then}")
+        say(&FromProcess::Warning(format!(
+            "no answer from {} within {:.1} s: {then}",
+            peers.join(", "),
+            within.as_secs_f64()
+        )));
+        true
     }
-}
 
-/// Says when every direction is ready and how many messages passed, until told to stop or a
-/// thread ends.
-fn watch(
-    orders: &Orders,
-    threads: &[JoinHandle<Lived>],
-    (counters, established): (&[Counter], &[Arc<AtomicBool>]),
-    ((connections, control, pulses), patience): (
-        (&mut [Connection], &mut LinkControl, &mut Pulses),
-        Option<Patience<'_>>,
-    ),
-) {
-    let mut is_ready = false;
-    let mut told = MonotonicClock::now();
-    while !orders.is_stopping() && !threads.iter().any(JoinHandle::is_finished) {
-        let now = MonotonicClock::now();
-        // Messages published before the peer has greeted back would be refused.
-        if !is_ready {
-            let is_established = established.iter().all(|one| one.load(Ordering::Acquire));
-            let given_up = patience.as_ref().filter(|patience| now >= patience.until);
-            if let Some(patience) = given_up.filter(|_| !is_established) {
-                say(&FromProcess::Warning(patience.warning()));
-            }
-            is_ready = is_established || given_up.is_some();
-            if is_ready {
-                say(&FromProcess::Ready);
-            }
-        }
-        if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
-            told = now;
-            report_progress(counters);
-            say_if_alive(pulses);
-        }
+    /// Tells of connections that come and go, and does what was ordered.
+    pub(crate) fn look_after(&mut self, now: Instant, is_ready: bool) {
         if is_ready {
-            for connection in &mut *connections {
+            for connection in &mut self.connections {
                 connection.tell(now);
             }
         }
-        control.attend();
-        thread::sleep(WATCH_PERIOD);
+        self.control.attend();
     }
-}
 
-/// Channel, what happened to its messages, and how many.
-pub(crate) type Counter = (String, &'static str, Arc<AtomicU64>);
-
-fn counter(launch: &DirectionLaunch, opened: &Opened) -> Counter {
-    let what = match launch.side {
-        Side::Egress => "sent",
-        Side::Ingress => "received",
-    };
-    (launch.channel.clone(), what, opened.count())
-}
-
-/// Says that the threads of this process turn, if they do.
-pub(crate) fn say_if_alive(pulses: &mut Pulses) {
-    if pulses.have_all_beaten() {
-        say(&FromProcess::Alive);
-    }
-}
-
-pub(crate) fn report_progress(counters: &[Counter]) {
-    let progress = counters
-        .iter()
-        .map(|(channel, what, count)| ChannelProgress {
-            channel: channel.clone(),
-            what: (*what).to_owned(),
-            count: count.load(Ordering::Relaxed),
-        });
-    say(&FromProcess::Progress(progress.collect()));
-}
-
-/// One direction's thread: its real-time grant, then its counters and outcome.
-struct Lived {
-    grant: RealtimeGrant,
-    /// `None` when it could not connect.
-    report: Option<DirectionReport>,
-    outcome: Result<(), GatewayError>,
-}
-
-fn spawn(
-    launch: DirectionLaunch,
-    opened: Opened,
-    surroundings: Arc<Surroundings>,
-    ready: Sender<bool>,
-) -> Result<JoinHandle<Lived>, GatewayError> {
-    let name = match launch.side {
-        Side::Egress => format!("out {}", launch.channel),
-        Side::Ingress => format!("in {}", launch.channel),
-    };
-    let live = move || {
-        let grant = realtime::apply(&launch.realtime);
-        match opened.connect(&launch, &surroundings) {
-            Ok(mut direction) => {
-                // The process waits for this word; it cannot have left.
-                let _left = ready.send(true).is_err();
-                let outcome = direction.run();
-                Lived {
-                    grant,
-                    report: Some(direction.report(&launch)),
-                    outcome,
-                }
-            }
-            Err(error) => {
-                let _left = ready.send(false).is_err();
-                Lived {
-                    grant,
-                    report: None,
-                    outcome: Err(error),
-                }
-            }
-        }
-    };
-    thread::Builder::new()
-        .name(name)
-        .spawn(live)
-        .map_err(GatewayError::Thread)
-}
-
-/// True when all of `count` threads said that they are open.
-pub(crate) fn wait_until_open(ready: &Receiver<bool>, count: usize) -> bool {
-    let opened = (0..count).filter(|_| ready.recv() == Ok(true)).count();
-    opened == count
-}
-
-fn finish(
-    threads: Vec<JoinHandle<Lived>>,
-    recorder: Recorder,
-    stamp_facts: &[(String, String)],
-) -> Result<(), GatewayError> {
-    let mut report = ProcessReport::default();
-    let mut outcome = Ok(());
-    for thread in threads {
-        let name = thread.thread().name().unwrap_or("gateway").to_owned();
-        match thread.join() {
-            Ok(lived) => {
-                report.realtime.push((name, lived.grant));
-                report.directions.extend(lived.report.map(|mut direction| {
-                    direction.facts.extend_from_slice(stamp_facts);
-                    direction
-                }));
-                outcome = outcome.and(lived.outcome);
-            }
-            Err(_) => outcome = outcome.and(Err(GatewayError::Panicked)),
-        }
-    }
-    let written = recorder.finish();
-    let problem = written.problem();
-    report.recorder_dropped = written.dropped_count;
-    report.recorder_failures = written.failures;
-    add_usage(&mut report);
-    say(&FromProcess::Finished(Box::new(report)));
-    outcome.and(problem.map_or(Ok(()), |text| Err(GatewayError::Unrecorded(text))))
-}
-
-/// Says what a spinning thread, of the channel or arm `name`, will lose or take on its CPU.
-pub(crate) fn warn_of_spinning(name: &str, wait: WaitMode, cpu: Option<usize>) {
-    if wait != WaitMode::Spin {
-        return;
-    }
-    match cpu.map(realtime::spin_advice) {
-        Some(SpinAdvice::Fine) => {}
-        Some(SpinAdvice::Warn(why)) => {
-            say(&FromProcess::Warning(format!("{name}: wait = spin: {why}")));
-        }
-        None => {
-            let text = format!("{name}: wait = spin without a cpu of its own");
-            say(&FromProcess::Warning(text));
-        }
+    /// Waits for the end of the radio's sampler; says what it did.
+    pub(crate) fn finish(self) -> Option<(String, String)> {
+        self.sampler.map(Sampler::finish)
     }
 }
 
 /// Threads that spin on one CPU wait for each other, and the wait shows as delay.
-fn warn_of_shared_cpus(launch: &GatewayLaunch) {
+fn warn_of_shared_cpus(work: &GatewayWork) {
     let mut spinning: BTreeMap<usize, Vec<&str>> = BTreeMap::new();
-    for direction in launch
+    for direction in work
         .directions
         .iter()
         .filter(|one| one.wait == WaitMode::Spin)
@@ -330,5 +255,93 @@ fn warn_of_shared_cpus(launch: &GatewayLaunch) {
             channels.join(" and ")
         );
         say(&FromProcess::Warning(text));
+    }
+}
+
+/// Whether `error` is the path's, which may come back: no route, no interface that is up, no address, or a
+/// path too narrow for now.
+fn is_away(error: &WorkerError) -> bool {
+    match error {
+        WorkerError::Udp(UdpError::Refused { source, .. }) => matches!(
+            source.kind(),
+            io::ErrorKind::NetworkUnreachable
+                | io::ErrorKind::HostUnreachable
+                | io::ErrorKind::NetworkDown
+                | io::ErrorKind::AddrNotAvailable
+        ),
+        WorkerError::Settings(error) => matches!(
+            error,
+            SettingsError::DatagramTooSmall { .. } | SettingsError::TooManyFragments { .. }
+        ),
+        _ => false,
+    }
+}
+
+/// A path that is not there.
+#[derive(Debug, Default)]
+struct Away {
+    attempt_count: u64,
+    since: Option<Instant>,
+}
+
+impl Away {
+    /// Counts an attempt in vain; the first is told at once.
+    fn note(&mut self, error: &WorkerError) {
+        self.attempt_count += 1;
+        if self.since.is_none() {
+            self.since = Some(MonotonicClock::now());
+            let text = format!("{error}: waiting for the link");
+            say(&FromProcess::Warning(text));
+        }
+    }
+
+    /// How long it was away, for the report.
+    fn fact(&self) -> Option<(String, String)> {
+        let waited = MonotonicClock::now().saturating_duration_since(self.since?);
+        let (seconds, count) = (waited.as_secs_f64(), self.attempt_count);
+        let text = format!("{seconds:.3} s before this start, {count} attempts in vain");
+        Some(("waited for the link".to_owned(), text))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_path_that_is_away_is_waited_for_and_a_wrong_setting_is_not() {
+        let refused = |errno: i32| {
+            WorkerError::Udp(UdpError::Refused {
+                option: "connect",
+                value: String::new(),
+                source: io::Error::from_raw_os_error(errno),
+            })
+        };
+        let away = [
+            libc::ENETUNREACH,
+            libc::EHOSTUNREACH,
+            libc::ENETDOWN,
+            libc::EADDRNOTAVAIL,
+        ];
+        assert!(away.into_iter().all(|errno| is_away(&refused(errno))));
+        let wrong = [libc::ENODEV, libc::EADDRINUSE, libc::EPERM, libc::EINVAL];
+        assert!(!wrong.into_iter().any(|errno| is_away(&refused(errno))));
+        let narrow = SettingsError::DatagramTooSmall {
+            value: 72,
+            bound: 132,
+        };
+        assert!(is_away(&narrow.into()));
+        assert!(!is_away(&SettingsError::Zero { key: "sync_period" }.into()));
+    }
+
+    #[test]
+    fn how_long_a_path_was_away_is_told_and_one_that_was_there_is_not() {
+        let mut away = Away::default();
+        assert_eq!(away.fact(), None);
+        away.note(&WorkerError::SecretMissing);
+        away.note(&WorkerError::SecretMissing);
+        let (label, text) = away.fact().unwrap();
+        assert_eq!(label, "waited for the link");
+        assert!(text.ends_with("2 attempts in vain"), "{text}");
     }
 }

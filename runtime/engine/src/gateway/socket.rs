@@ -5,12 +5,10 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use hil_core::link_model::ReplayTally;
-use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
+use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber, ReplayTally};
 use hil_core::time::{Instant, RemoteInstant};
 use hil_net::timestamping::TimestampMode;
-use hil_protocol::wire;
-use hil_protocol::wire::Kind;
+use hil_protocol::wire::{self, Kind};
 use hil_transport::emulated::{EmulatedReceiver, EmulatedSettings};
 use hil_transport::sealed::{SealedReceiver, SealedSender};
 use hil_transport::tcp::{
@@ -20,7 +18,7 @@ use hil_transport::tcp::{
 use hil_transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
 use hil_transport::{DatagramReceiver, DatagramSender};
 
-use super::GatewayError;
+use super::WorkerError;
 use super::link_switch::{SwitchHandle, switch};
 use super::stamp_plan::StampPlan;
 use hil_nic::radio::category;
@@ -30,8 +28,6 @@ use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
 use hil_rundir::pipe::RunStart;
 use hil_rundir::run_seal::RunSeal;
 use hil_topology::Timestamps;
-use hil_topology::emulation::{EmulationError, EmulationLaunch};
-use hil_topology::emulation_room::EmulationRoom;
 
 /// IP and UDP headers of a datagram.
 const IPV4_HEADERS: usize = 20 + 8;
@@ -59,15 +55,16 @@ pub(super) enum Ends {
 }
 
 impl OpenSocket {
-    /// Opens it; call it from a thread of normal priority.
+    /// Opens it; call it from a thread of normal priority. `start` is told when the run starts.
     pub(super) fn open(
         launch: &DirectionLaunch,
+        plan: StampPlan,
         start: &RunStart,
-        (plan, seal): (StampPlan, Option<&RunSeal>),
-    ) -> Result<Self, GatewayError> {
+        seal: Option<&RunSeal>,
+    ) -> Result<Self, WorkerError> {
         let settings = udp_settings(launch, plan);
         let mut opened = match launch.socket.transport {
-            Transport::Udp => Self::open_udp(&settings, (launch, plan), (start, seal)),
+            Transport::Udp => Self::open_udp(&settings, launch, start, seal),
             Transport::Tcp => Self::open_tcp(&settings, launch, seal),
         }?;
         opened.facts.push(security_fact(seal));
@@ -76,14 +73,15 @@ impl OpenSocket {
 
     fn open_udp(
         settings: &UdpSettings,
-        (launch, plan): (&DirectionLaunch, StampPlan),
-        (start, seal): (&RunStart, Option<&RunSeal>),
-    ) -> Result<Self, GatewayError> {
-        let (ends, mut facts, (replay, switch)) = match launch.side {
+        launch: &DirectionLaunch,
+        start: &RunStart,
+        seal: Option<&RunSeal>,
+    ) -> Result<Self, WorkerError> {
+        let mut opened = match launch.side {
             Side::Egress => {
                 let sender = UdpSender::open(settings)?;
                 let mut facts = socket_facts(settings, sender.granted());
-                if plan.asks_radio {
+                if settings.wants_radio_reports {
                     facts.push(access_category(sender.granted()));
                 }
                 let mtu = sender.path_mtu();
@@ -92,41 +90,46 @@ impl OpenSocket {
                 facts.push(("path MTU".to_owned(), text));
                 let longest = datagram_bytes_max(launch, mtu);
                 let sender = sealed_sender(sender, launch, seal)?;
-                (Ends::Sender(sender, longest), facts, (None, None))
+                Self::new(Ends::Sender(sender, longest), facts)
             }
             Side::Ingress => {
                 let receiver = UdpReceiver::open(settings)?;
                 let facts = socket_facts(settings, receiver.granted());
                 // Below the link model, which must not meet what a stranger sends.
                 let receiver = sealed_receiver(receiver, launch, seal)?;
-                let (receiver, replay, switch) = emulate(receiver, launch, start)?;
-                (Ends::Receiver(receiver), facts, (replay, switch))
+                emulate(receiver, facts, launch, start)?
             }
         };
         if let Some(emulation) = &launch.emulation {
-            facts.push((
+            opened.facts.push((
                 "link model behind the socket, part of RX stamp → received by gateway".to_owned(),
                 emulation.describe(),
             ));
             if launch.side == Side::Ingress {
-                let room = room(emulation, launch)?;
-                facts.push(("room of the link model".to_owned(), room.to_string()));
+                let room = emulation.room(launch.size_bytes)?;
+                let fact = ("room of the link model".to_owned(), room.to_string());
+                opened.facts.push(fact);
             }
         }
-        Ok(Self {
+        Ok(opened)
+    }
+
+    /// A socket without a connection to tell of or a link model behind it.
+    const fn new(ends: Ends, facts: Vec<(String, String)>) -> Self {
+        Self {
             ends,
             facts,
             tally: None,
-            replay,
-            switch,
-        })
+            replay: None,
+            switch: None,
+        }
     }
 
     fn open_tcp(
         common: &UdpSettings,
         launch: &DirectionLaunch,
         seal: Option<&RunSeal>,
-    ) -> Result<Self, GatewayError> {
+    ) -> Result<Self, WorkerError> {
         let settings = TcpSettings {
             interface: common.interface.clone(),
             dscp: common.dscp,
@@ -161,11 +164,8 @@ impl OpenSocket {
         );
         facts.push(("TCP".to_owned(), options));
         Ok(Self {
-            ends,
-            facts,
             tally,
-            replay: None,
-            switch: None,
+            ..Self::new(ends, facts)
         })
     }
 }
@@ -174,11 +174,11 @@ fn sealed_sender(
     sender: impl DatagramSender + 'static,
     launch: &DirectionLaunch,
     seal: Option<&RunSeal>,
-) -> Result<Box<dyn DatagramSender>, GatewayError> {
+) -> Result<Box<dyn DatagramSender>, WorkerError> {
     let Some(seal) = seal else {
         return Ok(Box::new(sender));
     };
-    let initiator = seal.initiator(launch).map_err(GatewayError::Session)?;
+    let initiator = seal.initiator(launch).map_err(WorkerError::Session)?;
     Ok(Box::new(SealedSender::new(sender, initiator)))
 }
 
@@ -186,11 +186,11 @@ fn sealed_receiver(
     receiver: impl DatagramReceiver + 'static,
     launch: &DirectionLaunch,
     seal: Option<&RunSeal>,
-) -> Result<Box<dyn DatagramReceiver>, GatewayError> {
+) -> Result<Box<dyn DatagramReceiver>, WorkerError> {
     let Some(seal) = seal else {
         return Ok(Box::new(receiver));
     };
-    let responder = seal.responder(launch).map_err(GatewayError::Session)?;
+    let responder = seal.responder(launch).map_err(WorkerError::Session)?;
     Ok(Box::new(SealedReceiver::new(
         receiver,
         responder,
@@ -271,13 +271,6 @@ fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String,
     facts
 }
 
-fn room(
-    emulation: &EmulationLaunch,
-    launch: &DirectionLaunch,
-) -> Result<EmulationRoom, EmulationError> {
-    emulation.room(launch.size_bytes)
-}
-
 /// The longest datagram of the channel: as long as a message needs, with room for the greetings and
 /// clock exchanges that share its socket, and no longer than the path takes.
 fn held_bytes_max(launch: &DirectionLaunch) -> usize {
@@ -285,30 +278,24 @@ fn held_bytes_max(launch: &DirectionLaunch) -> usize {
     message.max(512).min(launch.socket.path_mtu_bytes)
 }
 
-/// A receiver, what its link model met of the trace that it replays, and where the model is changed.
-type Emulated = (
-    Box<dyn DatagramReceiver>,
-    Option<ReplayTally>,
-    Option<SwitchHandle>,
-);
-
 /// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
 /// pass freely: the model stands for what happens to the robot's messages.
 fn emulate(
     receiver: Box<dyn DatagramReceiver>,
+    facts: Vec<(String, String)>,
     launch: &DirectionLaunch,
     start: &RunStart,
-) -> Result<Emulated, GatewayError> {
+) -> Result<OpenSocket, WorkerError> {
     let Some(emulation) = &launch.emulation else {
-        return Ok((receiver, None, None));
+        return Ok(OpenSocket::new(Ends::Receiver(receiver), facts));
     };
     let link = SinceStart {
         link: emulation.model(&launch.channel)?,
         start: start.clone(),
     };
-    let room = room(emulation, launch)?;
+    let room = emulation.room(launch.size_bytes)?;
     let replay = link.replay_tally();
-    let (link, switch) = switch(link, &launch.channel, (emulation, room));
+    let (link, switch) = switch(link, &launch.channel, emulation, room);
     let settings = EmulatedSettings {
         capacity_count: room.capacity_count,
         datagram_bytes_max: held_bytes_max(launch),
@@ -318,7 +305,11 @@ fn emulate(
     let is_exempt =
         |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
     let receiver = EmulatedReceiver::new(receiver, Box::new(link), is_exempt, settings);
-    Ok((Box::new(receiver), replay, Some(switch)))
+    Ok(OpenSocket {
+        replay,
+        switch: Some(switch),
+        ..OpenSocket::new(Ends::Receiver(Box::new(receiver)), facts)
+    })
 }
 
 /// Which message of its channel a datagram carries, or a part of.

@@ -1,144 +1,99 @@
 //! The process of one component: the same endpoint that virtual time drives, on shared-memory
 //! ports and a real clock.
 
-use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::thread;
-use std::time::Duration;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use hil_core::component::Role;
-use hil_core::endpoint::{Endpoint, PortCountError};
+use hil_core::endpoint::Endpoint;
 use hil_core::message::{Envelope, MessageType};
 use hil_core::record::{PublishedRecord, TakenRecord};
 
-use super::pulse::{Pulse, Pulses};
-use super::recording::{Destination, RecordedInput, RecordedOutput};
-use super::usage::add_usage;
-use hil_platform::clock::{MonotonicClock, Wake};
-use hil_platform::realtime;
-use hil_platform::realtime::SpinAdvice;
-use hil_platform::wait::{Pause, WaitMode, WaitStrategy};
-use hil_rundir::launch::{ComponentLaunch, LaunchError, read};
-use hil_rundir::pipe::{ChannelProgress, FromProcess, Orders, ProcessReport, say};
-use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder};
-use hil_shm::{
-    ChannelError, Domain, DomainError, OutputSettings, Sequencer, ShmInput, ShmOutput, Waiter,
+use super::pulse::Pulse;
+use super::recording::{Destination, RecordedInput, RecordedOutput, output_settings};
+use super::worker::{
+    Counter, Job, JobWork, NO_TIMER, Opened, WorkerError, open_domain, warn_of_spinning,
 };
-use hil_topology::registry::{CaseError, Registry};
+use hil_platform::clock::{MonotonicClock, Wake};
+use hil_platform::wait::{Pause, WaitMode, WaitStrategy};
+use hil_rundir::launch::{ComponentWork, WorkerLaunch, read};
+use hil_rundir::pipe::{Orders, ProcessReport};
+use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder};
+use hil_shm::{ChannelError, Domain, Sequencer, ShmInput, ShmOutput, Waiter};
+use hil_topology::registry::Registry;
 use hil_topology::{CardChannel, ProcessCard};
 
 /// Records a ring holds: 4 s at 4 kHz, far more than the writer's period needs.
 const RING_RECORDS: usize = 16_384;
-const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
-/// Stands for the skipped ticks of a role that never ticks.
-const NO_TIMER: u64 = u64::MAX;
-
-/// Why a component cannot run.
-#[derive(Debug, thiserror::Error)]
-pub enum ComponentError {
-    /// The launch file.
-    #[error(transparent)]
-    Launch(#[from] LaunchError),
-    /// A case that this program does not know.
-    #[error("this binary has no case {0}; it was built without the case the supervisor knows")]
-    UnknownCase(String),
-    /// A role that the case does not have.
-    #[error("case {case} has no role {role}")]
-    UnknownRole {
-        /// The case.
-        case: String,
-        /// The role asked for.
-        role: String,
-    },
-    /// The case refused its parameters.
-    #[error(transparent)]
-    Case(#[from] CaseError),
-    /// A record file.
-    #[error(transparent)]
-    Record(#[from] RecordFileError),
-    /// The shared-memory domain.
-    #[error(transparent)]
-    Domain(#[from] DomainError),
-    /// A channel.
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-    /// The number of its channels.
-    #[error(transparent)]
-    Ports(#[from] PortCountError),
-    /// No thread.
-    #[error("cannot start a thread: {0}")]
-    Thread(#[from] std::io::Error),
-    /// A record file could not be written any more.
-    #[error("{0}")]
-    Unrecorded(String),
-}
 
 type ComponentEndpoint = Endpoint<RecordedInput, RecordedOutput>;
 
-/// Runs the component described by the launch file until told to stop.
+/// Opens the record files of the component of `launch`; the rest is made in its thread, which is the
+/// measured one.
 ///
 /// # Errors
-/// When the component cannot be made or a channel breaks; the supervisor is told as well.
-pub fn run(launch: &Path, registry: &Registry) -> Result<(), ComponentError> {
-    let outcome = prepare_and_live(launch, registry);
-    if let Err(error) = &outcome {
-        say(&FromProcess::Failed(error.to_string()));
-    }
-    outcome
-}
-
-fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentError> {
-    let orders = Orders::listen()?;
-    let launch: ComponentLaunch = read(path)?;
-    let card: ProcessCard = read(&launch.card)?;
-    let asked = MonotonicClock::now();
-    let role = make_role(&card, registry)?;
-    let prepared_in = MonotonicClock::now().saturating_duration_since(asked);
+/// When a file cannot be read or made.
+pub(super) fn open<'a>(
+    launch: &'a WorkerLaunch,
+    work: &'a ComponentWork,
+    registry: &'a Registry,
+    recorder: &mut Recorder,
+) -> Result<Opened<'a>, WorkerError> {
+    let card: ProcessCard = read(&work.card)?;
     let counts = Counts::of(&card);
-    let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
-    let sinks = Sinks::open(&card, &mut recorder)?;
-    recorder.start_and_tell(orders.stopper())?;
-    let progress = counts.report_progress()?;
-
-    // Everything below runs on this thread, which from here on is the measured one.
-    let domain = Domain::open(&launch.domain.parse().map_err(DomainError::Address)?)?;
-    let mut waiter = open_waiter(&domain, &card, launch.wait)?;
-    let endpoint = connect(role, &domain, &card, launch.wait, (sinks, &counts))?;
-    warn_of_spinning(&launch);
-    let grant = realtime::apply(&launch.realtime);
-    say(&FromProcess::Ready);
-    let mut report = ProcessReport {
-        realtime: vec![("main".to_owned(), grant)],
-        preparation_s: Some(prepared_in.as_secs_f64()),
-        ..ProcessReport::default()
+    let sinks = Sinks::open(&card, recorder)?;
+    let skipped_ticks = Some(Arc::clone(&counts.skipped));
+    let job = Job {
+        name: "main".to_owned(),
+        counters: counts.taken.iter().chain(&counts.given).cloned().collect(),
+        pulse: Some(counts.pulse.clone()),
+        connect: Box::new(move |thread| {
+            let asked = MonotonicClock::now();
+            let role = make_role(&card, registry)?;
+            let prepared_in = MonotonicClock::now().saturating_duration_since(asked);
+            let domain = open_domain(launch)?;
+            let waiter = open_waiter(&domain, &card, work.wait)?;
+            let endpoint = connect(role, &domain, &card, work.wait, sinks, &counts)?;
+            warn_of_spinning("", work.wait, work.realtime.cpu);
+            thread.claim(&work.realtime);
+            Ok(Box::new(Component {
+                endpoint,
+                waiter,
+                wait: WaitStrategy::new(work.wait),
+                counts,
+                report: ProcessReport {
+                    preparation_s: Some(prepared_in.as_secs_f64()),
+                    ..ProcessReport::default()
+                },
+                _domain: domain,
+            }))
+        }),
     };
-    let mut lived = Ok(());
-    if orders.wait_for_start() {
-        let how = (launch.wait, &counts);
-        lived = live(endpoint, waiter.as_mut(), &orders, how, &mut report);
-        progress.store(false, Ordering::Release);
-    }
-    drop(waiter);
-    let outcome = recorder.finish();
-    let problem = outcome.problem();
-    report.recorder_dropped = outcome.dropped_count;
-    report.recorder_failures = outcome.failures;
-    add_usage(&mut report);
-    say(&FromProcess::Finished(Box::new(report)));
-    lived?;
-    problem.map_or(Ok(()), |text| Err(ComponentError::Unrecorded(text)))
+    Ok(Opened {
+        jobs: vec![job],
+        skipped_ticks,
+        ..Opened::default()
+    })
 }
 
-fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, ComponentError> {
+/// A component at work.
+struct Component {
+    endpoint: ComponentEndpoint,
+    waiter: Option<Waiter>,
+    wait: WaitStrategy,
+    counts: Counts,
+    report: ProcessReport,
+    /// Outlives the ports.
+    _domain: Domain,
+}
+
+fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, WorkerError> {
     let name = card.case.clone().unwrap_or_default();
-    let entry = registry
-        .find(&name)
-        .ok_or(ComponentError::UnknownCase(name))?;
+    let entry = registry.find(&name).ok_or(WorkerError::UnknownCase(name))?;
     let parameters = serde_json::to_value(&card.parameters).unwrap_or_default();
     let case = entry.make(parameters, card.seed)?;
     let role = card.role.clone().unwrap_or_default();
-    case.role(&role).ok_or(ComponentError::UnknownRole {
+    case.role(&role).ok_or(WorkerError::UnknownRole {
         case: entry.name.to_owned(),
         role,
     })
@@ -146,85 +101,38 @@ fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, C
 
 /// Live counters of a component's ports, in port order.
 struct Counts {
-    taken: Vec<Count>,
-    given: Vec<Count>,
+    taken: Vec<Counter>,
+    given: Vec<Counter>,
     /// Ticks that passed without the role; [`NO_TIMER`] for one that has none.
     skipped: Arc<AtomicU64>,
     pulse: Pulse,
 }
 
-/// How many messages of a channel went which way.
-struct Count {
-    channel: String,
-    what: &'static str,
-    so_far: Arc<AtomicU64>,
-}
-
 impl Counts {
     fn of(card: &ProcessCard) -> Self {
-        let count = |channel: &CardChannel, what| Count {
+        let counter = |channel: &CardChannel, what| Counter {
             channel: channel.name.clone(),
             what,
-            so_far: Arc::default(),
+            count: Arc::default(),
         };
         let given = |channel: &CardChannel| {
-            let is_recorded_only = channel.is_recorded_only;
-            count(
-                channel,
-                if is_recorded_only {
-                    "recorded"
-                } else {
-                    "published"
-                },
-            )
+            let what = if channel.is_recorded_only {
+                "recorded"
+            } else {
+                "published"
+            };
+            counter(channel, what)
         };
         Self {
-            taken: card.inputs.iter().map(|one| count(one, "taken")).collect(),
+            taken: card
+                .inputs
+                .iter()
+                .map(|one| counter(one, "taken"))
+                .collect(),
             given: card.outputs.iter().map(given).collect(),
             skipped: Arc::new(AtomicU64::new(NO_TIMER)),
             pulse: Pulse::default(),
         }
-    }
-
-    /// Tells the supervisor the counts a few times a second, from a thread of its own.
-    fn report_progress(&self) -> Result<Arc<AtomicBool>, std::io::Error> {
-        let all: Vec<(ChannelProgress, Arc<AtomicU64>)> = self
-            .taken
-            .iter()
-            .chain(&self.given)
-            .map(|one| {
-                let progress = ChannelProgress {
-                    channel: one.channel.clone(),
-                    what: one.what.to_owned(),
-                    count: 0,
-                };
-                (progress, Arc::clone(&one.so_far))
-            })
-            .collect();
-        let skipped = Arc::clone(&self.skipped);
-        let mut pulses = Pulses::of([self.pulse.clone()]);
-        let is_running = Arc::new(AtomicBool::new(true));
-        let running = Arc::clone(&is_running);
-        thread::Builder::new()
-            .name("progress".to_owned())
-            .spawn(move || {
-                while running.load(Ordering::Acquire) {
-                    thread::sleep(PROGRESS_PERIOD);
-                    if pulses.have_all_beaten() {
-                        say(&FromProcess::Alive);
-                    }
-                    let counts = all.iter().map(|(progress, count)| ChannelProgress {
-                        count: count.load(Ordering::Relaxed),
-                        ..progress.clone()
-                    });
-                    say(&FromProcess::Progress(counts.collect()));
-                    let skipped = skipped.load(Ordering::Relaxed);
-                    if skipped != NO_TIMER {
-                        say(&FromProcess::SkippedTicks(skipped));
-                    }
-                }
-            })?;
-        Ok(is_running)
     }
 }
 
@@ -269,15 +177,10 @@ fn connect(
     domain: &Domain,
     card: &ProcessCard,
     wait: WaitMode,
-    (sinks, counts): (Sinks, &Counts),
-) -> Result<ComponentEndpoint, ComponentError> {
-    // Producers of one channel never start twice within a microsecond on one host.
-    let epoch = u32::try_from(MonotonicClock::now().as_ns() / 1000 % i64::from(u32::MAX))
-        .expect("the remainder is below u32::MAX");
-    let settings = OutputSettings {
-        epoch,
-        ..OutputSettings::default()
-    };
+    sinks: Sinks,
+    counts: &Counts,
+) -> Result<ComponentEndpoint, WorkerError> {
+    let settings = output_settings();
     let mut inputs = Vec::new();
     let declared: Vec<MessageType> = role.inputs().to_vec();
     for (((channel, message), sink), taken) in card
@@ -290,7 +193,7 @@ fn connect(
         inputs.push(RecordedInput {
             port: ShmInput::open(domain, &channel.name, &message, channel.depth)?,
             sink,
-            taken: Arc::clone(&taken.so_far),
+            taken: Arc::clone(&taken.count),
             wait: WaitStrategy::new(wait),
         });
     }
@@ -314,7 +217,7 @@ fn connect(
         outputs.push(RecordedOutput {
             destination,
             messages: sinks.messages,
-            given: Arc::clone(&given.so_far),
+            given: Arc::clone(&given.count),
         });
     }
     Ok(Endpoint::new(role, inputs, outputs)?)
@@ -337,77 +240,63 @@ fn open_waiter(
     Waiter::open(domain, &names).map(Some)
 }
 
-fn warn_of_spinning(launch: &ComponentLaunch) {
-    if launch.wait != WaitMode::Spin {
-        return;
+impl JobWork for Component {
+    fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
+        if !orders.wait_for_start() {
+            return Ok(());
+        }
+        self.endpoint.start(MonotonicClock::now());
+        while !orders.is_stopping() {
+            let ticks = self.report.ticks;
+            self.turn()?;
+            self.counts.pulse.beat();
+            if self.report.ticks != ticks {
+                let skipped = self.endpoint.role().skipped_ticks();
+                self.counts.skipped.store(skipped, Ordering::Relaxed);
+            }
+        }
+        Ok(())
     }
-    match launch.realtime.cpu.map(realtime::spin_advice) {
-        Some(SpinAdvice::Fine) => {}
-        Some(SpinAdvice::Warn(why)) => say(&FromProcess::Warning(format!("wait = spin: {why}"))),
-        None => say(&FromProcess::Warning(
-            "wait = spin without a cpu of its own".to_owned(),
-        )),
+
+    fn report(&mut self) -> ProcessReport {
+        let inputs = self.endpoint.inputs_mut().iter();
+        let deaf = inputs.map(|one| one.port.counters().connection_failure_count);
+        let deaf: u64 = deaf.sum();
+        let outputs = self.endpoint.outputs_mut().iter();
+        let unheard = outputs.map(RecordedOutput::connection_failure_count);
+        let unheard: u64 = unheard.sum();
+        ProcessReport {
+            skipped_ticks: self.endpoint.role().skipped_ticks(),
+            outbox_dropped: self.endpoint.role().outbox_dropped(),
+            connection_failures: deaf + unheard,
+            ..self.report.clone()
+        }
     }
 }
 
-fn live(
-    mut endpoint: ComponentEndpoint,
-    mut waiter: Option<&mut Waiter>,
-    orders: &Orders,
-    (mode, counts): (WaitMode, &Counts),
-    report: &mut ProcessReport,
-) -> Result<(), ChannelError> {
-    let own_wait = WaitStrategy::new(mode);
-    endpoint.start(MonotonicClock::now());
-    let mut outcome = Ok(());
-    while outcome.is_ok() && !orders.is_stopping() {
-        let ticks = report.ticks;
-        outcome = turn(&mut endpoint, &mut waiter, &own_wait, report);
-        counts.pulse.beat();
-        if report.ticks != ticks {
-            let skipped = &counts.skipped;
-            skipped.store(endpoint.role().skipped_ticks(), Ordering::Relaxed);
+impl Component {
+    /// Does what there is to do, then waits for more.
+    fn turn(&mut self) -> Result<(), ChannelError> {
+        let activity = self.endpoint.poll(MonotonicClock::now())?;
+        self.report.malformed_count += activity.malformed_count;
+        self.report.ticks += activity.tick_count;
+        let now = MonotonicClock::now();
+        let mut pause = self.wait.pause(now, self.endpoint.role().next_tick());
+        for input in self.endpoint.inputs_mut() {
+            pause = pause.sooner(input.wait.pause(now, None));
         }
-    }
-    report.skipped_ticks = endpoint.role().skipped_ticks();
-    report.outbox_dropped = endpoint.role().outbox_dropped();
-    let inputs = endpoint.inputs_mut().iter();
-    report.connection_failures = inputs
-        .map(|one| one.port.counters().connection_failure_count)
-        .sum();
-    let outputs = endpoint.outputs_mut().iter();
-    report.connection_failures += outputs
-        .map(RecordedOutput::connection_failure_count)
-        .sum::<u64>();
-    outcome
-}
-
-/// Does what there is to do, then waits for more.
-fn turn(
-    endpoint: &mut ComponentEndpoint,
-    waiter: &mut Option<&mut Waiter>,
-    own_wait: &WaitStrategy,
-    report: &mut ProcessReport,
-) -> Result<(), ChannelError> {
-    let activity = endpoint.poll(MonotonicClock::now())?;
-    report.malformed_count += activity.malformed_count;
-    report.ticks += activity.tick_count;
-    let now = MonotonicClock::now();
-    let mut pause = own_wait.pause(now, endpoint.role().next_tick());
-    for input in endpoint.inputs_mut() {
-        pause = pause.sooner(input.wait.pause(now, None));
-    }
-    match (pause, waiter) {
-        (Pause::Spin, _) => core::hint::spin_loop(),
-        (Pause::Sleep(until), Some(waiter)) => {
-            waiter.wait_until(Some(until))?;
+        match (pause, &mut self.waiter) {
+            (Pause::Spin, _) => core::hint::spin_loop(),
+            (Pause::Sleep(until), Some(waiter)) => {
+                waiter.wait_until(Some(until))?;
+            }
+            (Pause::Sleep(until), None) => {
+                // An interrupted sleep only means looking again a little early.
+                let (Wake::Due | Wake::Interrupted) = MonotonicClock::sleep_until(until);
+            }
         }
-        (Pause::Sleep(until), None) => {
-            // An interrupted sleep only means looking again a little early.
-            let (Wake::Due | Wake::Interrupted) = MonotonicClock::sleep_until(until);
-        }
+        Ok(())
     }
-    Ok(())
 }
 
 #[cfg(test)]

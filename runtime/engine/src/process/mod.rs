@@ -1,8 +1,8 @@
-//! The processes a supervisor starts: what it tells them, what they say, and the component
-//! process itself. The gateway process is in [`crate::gateway`].
+//! The processes a supervisor starts: their shell, and the component process itself. Gateway and
+//! adapter are in [`crate::gateway`] and [`crate::face`].
 
-pub mod component;
+mod component;
 pub mod own_program;
-pub mod pulse;
+pub(crate) mod pulse;
 pub(crate) mod recording;
-pub(crate) mod usage;
+pub mod worker;

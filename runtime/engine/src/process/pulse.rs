@@ -8,12 +8,12 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// The turns of one loop. No loop of ours waits for more than [`hil_platform::wait::WAIT_MAX`] at once, so
 /// that one without a turn in a second hangs, or gets no processor.
 #[derive(Debug, Clone, Default)]
-pub struct Pulse(Arc<AtomicU64>);
+pub(crate) struct Pulse(Arc<AtomicU64>);
 
 impl Pulse {
     /// One more turn; only the loop itself calls this. Costs a store to memory that nobody else
     /// writes.
-    pub fn beat(&self) {
+    pub(crate) fn beat(&self) {
         let turns = self.0.load(Ordering::Relaxed);
         self.0.store(turns.wrapping_add(1), Ordering::Relaxed);
     }
@@ -25,13 +25,13 @@ impl Pulse {
 
 /// Looks at the loops of a process.
 #[derive(Debug)]
-pub struct Pulses {
+pub(crate) struct Pulses {
     loops: Vec<(Pulse, u64)>,
 }
 
 impl Pulses {
     /// Of these loops.
-    pub fn of(loops: impl IntoIterator<Item = Pulse>) -> Self {
+    pub(crate) fn of(loops: impl IntoIterator<Item = Pulse>) -> Self {
         let loops = loops.into_iter().map(|one| {
             let turns = one.turns();
             (one, turns)
@@ -42,7 +42,7 @@ impl Pulses {
     }
 
     /// True when every loop has turned since this was last true; always of no loops.
-    pub fn have_all_beaten(&mut self) -> bool {
+    pub(crate) fn have_all_beaten(&mut self) -> bool {
         let have_all = self.loops.iter().all(|(one, seen)| one.turns() != *seen);
         if have_all {
             for (one, seen) in &mut self.loops {

@@ -12,7 +12,7 @@ use hil_core::time::Instant;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::WaitStrategy;
 use hil_rundir::record::RecordSink;
-use hil_shm::{ChannelError, Sequencer, ShmInput, ShmOutput};
+use hil_shm::{ChannelError, OutputSettings, Sequencer, ShmInput, ShmOutput};
 
 /// A consumer's port.
 #[derive(Debug)]
@@ -58,11 +58,23 @@ impl InputPort for RecordedInput {
     }
 }
 
-fn forwarded_ns(envelope: &Envelope) -> i64 {
+/// When a gateway of this host published the message of `envelope`, if one did.
+pub(crate) fn forwarded_ns(envelope: &Envelope) -> i64 {
     if envelope.is_forwarded() {
         envelope.forwarded_ns
     } else {
         UNAVAILABLE
+    }
+}
+
+/// The settings of a producer that starts now: producers of one channel never start twice within a
+/// microsecond on one host.
+pub(crate) fn output_settings() -> OutputSettings {
+    let epoch = u32::try_from(MonotonicClock::now().as_ns() / 1000 % i64::from(u32::MAX))
+        .expect("the remainder is below u32::MAX");
+    OutputSettings {
+        epoch,
+        ..OutputSettings::default()
     }
 }
 
@@ -129,7 +141,6 @@ mod tests {
     use super::*;
     use hil_core::run_log::RunLog;
     use hil_rundir::record::{RecordFile, RecordKind, Recorder};
-    use hil_shm::OutputSettings;
     use std::{env, fs, process};
 
     #[test]

@@ -92,7 +92,10 @@ impl Why {
 }
 
 /// Both halves of a connection that proved the key.
-pub(crate) type Secured = (SecureReader, SecureWriter);
+pub(crate) struct Secured {
+    pub(crate) reader: SecureReader,
+    pub(crate) writer: SecureWriter,
+}
 
 /// A connection that is read until a deadline, however slowly its bytes come.
 #[derive(Debug)]
@@ -153,7 +156,8 @@ impl Read for TimedStream {
 pub(crate) fn ask(
     mut stream: TimedStream,
     key: &PreSharedKey,
-    (own, other): (&str, &str),
+    own: &str,
+    other: &str,
 ) -> Result<Secured, GreetingError> {
     let mut noise = builder(key)?.build_initiator().map_err(io::Error::other)?;
     let mut message = [0; MESSAGE_BYTES_MAX];
@@ -236,7 +240,10 @@ fn secure(stream: TimedStream, noise: HandshakeState) -> Result<Secured, Greetin
     let keys = noise.into_stateless_transport_mode();
     let keys = Arc::new(keys.map_err(io::Error::other)?);
     let writer = SecureWriter::new(stream.try_clone()?, Arc::clone(&keys));
-    Ok((SecureReader::new(stream, keys), writer))
+    Ok(Secured {
+        reader: SecureReader::new(stream, keys),
+        writer,
+    })
 }
 
 fn send(mut stream: &TcpStream, kind: u8, body: &[u8]) -> io::Result<()> {

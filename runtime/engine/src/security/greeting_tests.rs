@@ -42,7 +42,7 @@ fn shake(
 ) -> [Result<Secured, GreetingError>; 2] {
     let [here, there] = connected();
     let theirs = theirs.clone();
-    let asking = thread::spawn(move || ask(timed(there), &theirs, (name, "a")));
+    let asking = thread::spawn(move || ask(timed(there), &theirs, name, "a"));
     let answered = answered(here, ours);
     [answered, asking.join().unwrap()]
 }
@@ -51,8 +51,8 @@ fn shake(
 fn with_one_key_both_ends_talk_and_the_wire_shows_nothing() {
     let key = key("one");
     let [here, there] = shake(&key, &key, "b");
-    let (mut reader, _writer) = here.unwrap();
-    let (_reader, mut writer) = there.unwrap();
+    let (mut here, there) = (here.unwrap(), there.unwrap());
+    let mut writer = there.writer;
     let long: Vec<u8> = (0..100_000_u32)
         .map(|index| index.to_le_bytes()[0])
         .collect();
@@ -63,10 +63,10 @@ fn with_one_key_both_ends_talk_and_the_wire_shows_nothing() {
         writer
     });
     let mut read = vec![0; long.len()];
-    reader.read_exact(&mut read).unwrap();
+    here.reader.read_exact(&mut read).unwrap();
     assert_eq!(read, long);
     drop(sending.join().unwrap().stream().shutdown(Shutdown::Both));
-    assert_eq!(reader.read(&mut read).unwrap(), 0, "an end is an end");
+    assert_eq!(here.reader.read(&mut read).unwrap(), 0, "an end is an end");
 }
 
 #[test]
@@ -92,7 +92,7 @@ fn a_stranger_gets_no_more_bytes_than_it_sent_whatever_it_says() {
     let recorded = {
         let [mut here, there] = connected();
         let asking = key.clone();
-        let thread = thread::spawn(move || ask(timed(there), &asking, ("b", "a")).is_err());
+        let thread = thread::spawn(move || ask(timed(there), &asking, "b", "a").is_err());
         let mut first = vec![0; 8 + 32 + NAMES_BYTES_MIN + 16];
         here.read_exact(&mut first).unwrap();
         drop(here);
@@ -111,7 +111,7 @@ fn a_stranger_gets_no_more_bytes_than_it_sent_whatever_it_says() {
         there.shutdown(Shutdown::Write).unwrap();
         let outcome = answered(here, &key);
         // Played back whole, it gets the second message and must then seal with keys it lacks.
-        let is_stuck = outcome.is_ok_and(|(mut reader, _)| reader.read(&mut [0]).unwrap_or(0) == 0);
+        let is_stuck = outcome.is_ok_and(|mut one| one.reader.read(&mut [0]).unwrap_or(0) == 0);
         assert_eq!(is_stuck, round == 0);
         let mut heard = Vec::new();
         let _reset = there.read_to_end(&mut heard).is_err();
@@ -128,12 +128,11 @@ fn a_stranger_gets_no_more_bytes_than_it_sent_whatever_it_says() {
 fn a_forged_record_ends_the_connection() {
     let key = key("forged");
     let [here, there] = shake(&key, &key, "b");
-    let (mut reader, _writer) = here.unwrap();
-    let (_reader, writer) = there.unwrap();
-    let mut raw = writer.stream();
+    let (mut here, there) = (here.unwrap(), there.unwrap());
+    let mut raw = there.writer.stream();
     raw.write_all(&[20, 0]).unwrap();
     raw.write_all(&[7; 20]).unwrap();
-    let error = reader.read(&mut [0; 8]).unwrap_err();
+    let error = here.reader.read(&mut [0; 8]).unwrap_err();
     assert_eq!(error.kind(), io::ErrorKind::InvalidData);
 }
 

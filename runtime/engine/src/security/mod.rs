@@ -8,5 +8,4 @@ pub(crate) mod greeting;
 pub mod key_file;
 
 pub(crate) use channel::{SecureReader, SecureWriter};
-pub(crate) use greeting::TimedStream;
 pub use key_file::{KeyFileError, PreSharedKey};

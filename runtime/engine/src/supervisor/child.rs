@@ -18,8 +18,15 @@ use zeroize::Zeroizing;
 use hil_platform::systemd;
 use hil_rundir::pipe::{FromProcess, ToProcess};
 
-/// A word from a process: which one (index and instance), and what.
-pub(crate) type Word = (usize, u32, FromProcess);
+/// A word from a process.
+#[derive(Debug)]
+pub(crate) struct Word {
+    /// Which process.
+    pub(crate) index: usize,
+    /// Which start of it.
+    pub(crate) instance: u32,
+    pub(crate) said: FromProcess,
+}
 
 /// A running (or finished) child process.
 #[derive(Debug)]
@@ -45,7 +52,8 @@ impl Child {
     pub(crate) fn spawn_speaking(
         command: Command,
         log: &Path,
-        (index, instance): (usize, u32),
+        index: usize,
+        instance: u32,
         words: SyncSender<Word>,
     ) -> io::Result<Self> {
         let mut command = prepared(command, log)?;
@@ -62,9 +70,14 @@ impl Child {
             .spawn(move || {
                 for line in BufReader::new(output).lines() {
                     let Ok(line) = line else { return };
-                    let word = serde_json::from_str(&line)
+                    let said = serde_json::from_str(&line)
                         .unwrap_or_else(|_not_ours| FromProcess::Warning(format!("said: {line}")));
-                    if words.send((index, instance, word)).is_err() {
+                    let word = Word {
+                        index,
+                        instance,
+                        said,
+                    };
+                    if words.send(word).is_err() {
                         return;
                     }
                 }
@@ -235,12 +248,14 @@ mod tests {
         let log = env::temp_dir().join(format!("hil-child-{}.log", std::process::id()));
         let (sender, words) = sync_channel(8);
         let mut child =
-            Child::spawn_speaking(shell("echo '\"ready\"'; echo hello"), &log, (3, 1), sender)
+            Child::spawn_speaking(shell("echo '\"ready\"'; echo hello"), &log, 3, 1, sender)
                 .unwrap();
         assert!(child.end(Instant::now() + Duration::from_secs(10)));
-        assert_eq!(words.recv().unwrap(), (3, 1, FromProcess::Ready));
-        let (_, _, word) = words.recv().unwrap();
-        assert_eq!(word, FromProcess::Warning("said: hello".to_owned()));
+        let word = words.recv().unwrap();
+        assert_eq!((word.index, word.instance), (3, 1));
+        assert_eq!(word.said, FromProcess::Ready);
+        let said = words.recv().unwrap().said;
+        assert_eq!(said, FromProcess::Warning("said: hello".to_owned()));
         fs::remove_file(log).unwrap();
     }
 

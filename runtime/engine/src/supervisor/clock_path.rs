@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::plan::{ProcessPlan, ProcessTask};
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
-use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side, SocketLaunch, Transport};
 use hil_topology::{ClockPath, Host, OnExit, Timestamps, Topology, clock_process_name};
 
 /// Name of the message type that a clock path announces and never sends.
@@ -37,12 +37,10 @@ pub(super) fn on<'a>(
         Some(ProcessPlan {
             name: clock_process_name(&path, &host.name),
             host: host.name.clone(),
-            task: ProcessTask::ClockPath {
+            task: ProcessTask::ClockPath(GatewayWork {
                 directions: vec![direction(&path, host, side)],
-                ready_within: READY_WITHIN_MAX.min(start_timeout / 2),
-            },
-            realtime: RealtimeRequest::default(),
-            wait: WaitMode::Block,
+                ready_within: Some(READY_WITHIN_MAX.min(start_timeout / 2)),
+            }),
             on_exit: OnExit::Restart {
                 limit: RESTART_LIMIT,
             },
@@ -107,10 +105,11 @@ mod tests {
     fn ends(topology: &Topology, host: &str) -> Vec<(String, DirectionLaunch, Duration)> {
         let host = topology.host(host).unwrap();
         let plans = on(topology, host).map(|plan| match plan.task {
-            ProcessTask::ClockPath {
-                mut directions,
-                ready_within,
-            } => (plan.name, directions.remove(0), ready_within),
+            ProcessTask::ClockPath(mut work) => (
+                plan.name,
+                work.directions.remove(0),
+                work.ready_within.unwrap(),
+            ),
             other => panic!("{other:?}"),
         });
         plans.collect()

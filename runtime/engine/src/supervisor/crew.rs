@@ -13,13 +13,11 @@ use std::time::Duration;
 use hil_core::time::{Instant, duration_ns};
 
 use super::child::{Child, Word, describe_exit, last_line};
-use super::launching::write_launch;
 use super::plan::{ProcessPlan, ProcessTask};
 use crate::process::own_program;
 use hil_platform::clock::MonotonicClock;
-use hil_rundir::event::EventKind;
-use hil_rundir::event::{Event, Interruption};
-use hil_rundir::launch::{LaunchError, write};
+use hil_rundir::event::{Event, EventKind, Interruption};
+use hil_rundir::launch::{ComponentWork, LaunchError, Work, WorkerLaunch, write};
 use hil_rundir::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::run_seal::RunSeal;
@@ -139,40 +137,67 @@ impl Crew {
         let (name, instance) = (member.plan.name.clone(), member.restart_count);
         let log = self.folder.log(&name);
         let domain = self.places[&member.plan.host].clone();
-        let spawned = if let ProcessTask::Foreign {
-            card,
-            command,
-            environment,
-        } = &member.plan.task
-        {
-            let card_path = self.folder.card(&name);
-            write(&card_path, card)?;
-            let mut program = Command::new(&self.own_program);
-            program.args([
-                "become",
-                "--supervisor",
-                &std::process::id().to_string(),
-                "--",
-            ]);
-            program.args(command).envs(environment);
-            program
-                .env("HIL_DOMAIN", &domain)
-                .env("HIL_CARD", &card_path);
-            member.is_ready = true;
-            Child::spawn_foreign(program, &log).map_err(|error| (command[0].clone(), error))
-        } else {
-            let launch = self.folder.launch(&name, instance);
-            let is_sealed = self.seal.is_some();
-            let word = write_launch(member, (&self.folder, is_sealed), &launch, domain)?;
-            let mut program = Command::new(&self.own_program);
-            program.arg(word).arg("--launch").arg(&launch);
-            member.is_ready = false;
-            Child::spawn_speaking(program, &log, (index, instance), self.sender.clone())
-                .map_err(|error| (self.own_program.display().to_string(), error))
+        let mut program = Command::new(&self.own_program);
+        let work = match &member.plan.task {
+            ProcessTask::Component {
+                card,
+                realtime,
+                wait,
+            } => {
+                let card_path = self.folder.card(&name);
+                write(&card_path, card)?;
+                Some(Work::Component(ComponentWork {
+                    card: card_path,
+                    realtime: realtime.clone(),
+                    wait: *wait,
+                }))
+            }
+            ProcessTask::Gateway(work) | ProcessTask::ClockPath(work) => {
+                Some(Work::Gateway(work.clone()))
+            }
+            ProcessTask::Adapter(face) => Some(Work::Adapter(face.clone())),
+            ProcessTask::Foreign {
+                card,
+                command,
+                environment,
+            } => {
+                let card_path = self.folder.card(&name);
+                write(&card_path, card)?;
+                let supervisor = std::process::id().to_string();
+                program
+                    .args(["become", "--supervisor", &supervisor, "--"])
+                    .args(command)
+                    .envs(environment)
+                    .env("HIL_DOMAIN", &domain)
+                    .env("HIL_CARD", &card_path);
+                None
+            }
         };
-        let mut child = spawned.map_err(|(program, source)| CrewError::Spawn {
+        // A user's own program says nothing: being started is all that is known of it.
+        member.is_ready = work.is_none();
+        let spawned = match work {
+            None => Child::spawn_foreign(program, &log),
+            Some(work) => {
+                let launch = WorkerLaunch {
+                    process: name.clone(),
+                    instance,
+                    domain,
+                    records: self.folder.records(),
+                    is_sealed: self.seal.is_some() && member.plan.is_gateway(),
+                    work,
+                };
+                let path = self.folder.launch(&name, instance);
+                write(&path, &launch)?;
+                program.arg("worker").arg("--launch").arg(&path);
+                Child::spawn_speaking(program, &log, index, instance, self.sender.clone())
+            }
+        };
+        let mut child = spawned.map_err(|source| CrewError::Spawn {
             process: name,
-            program,
+            program: match &member.plan.task {
+                ProcessTask::Foreign { command, .. } => command[0].clone(),
+                _ => self.own_program.display().to_string(),
+            },
             source,
         })?;
         if let Some(seal) = self.seal.as_ref().filter(|_| member.plan.is_gateway()) {
@@ -182,7 +207,6 @@ impl Crew {
         member.child = Some(child);
         member.seen_alive = now;
         if member.is_ready && self.started.is_some() {
-            // A user's own program says nothing: being started is all that is known of it.
             self.close_interruptions(index, now);
         }
         Ok(())
@@ -313,13 +337,18 @@ impl Crew {
     }
 
     fn listen(&mut self) {
-        while let Ok((index, instance, word)) = self.words.try_recv() {
+        while let Ok(Word {
+            index,
+            instance,
+            said,
+        }) = self.words.try_recv()
+        {
             let now = MonotonicClock::now();
             if self.members[index].restart_count != instance {
                 continue;
             }
             let member = &mut self.members[index];
-            match word {
+            match said {
                 FromProcess::Alive => member.heard = now,
                 FromProcess::Ready => {
                     member.is_ready = true;

@@ -2,7 +2,7 @@
 //! connection is greeted in a thread of its own, for a bounded time, and there is a bounded number of
 //! them; what becomes of one that said who it is decides `meet.rs`.
 
-use std::io::{self, BufReader, BufWriter, Read, Write};
+use std::io::{self, Read, Write};
 use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,10 +11,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use super::frame::{Frame, PeerHello, PeerMessage, read_frame_within, write_message};
-use super::peer::{ControlEnds, ControlReader, ControlWriter};
+use super::peer::{ControlEnds, ControlReader};
 use crate::security::PreSharedKey;
-use crate::security::greeting;
-use crate::security::greeting::{GreetingError, MAGIC, TimedStream, Why};
+use crate::security::greeting::{self, GreetingError, MAGIC, TimedStream, Why};
 
 /// How long a greeting may take altogether.
 pub(super) const GREETING_TIMEOUT: Duration = Duration::from_secs(3);
@@ -32,7 +31,11 @@ pub(super) const KEY_NEEDED: &str = "this host speaks with holders of its key on
 #[derive(Debug)]
 pub(super) enum Arrived {
     /// It said who it is, with the key where one is needed.
-    Peer(IpAddr, Box<(ControlEnds, PeerHello)>),
+    Peer {
+        ip: IpAddr,
+        ends: Box<ControlEnds>,
+        hello: PeerHello,
+    },
     /// It was turned away, and why.
     TurnedAway(IpAddr, &'static str),
     /// It came with a key where none is used.
@@ -133,8 +136,13 @@ pub(super) struct Door {
     alive: Arc<()>,
 }
 
-/// What became of a connection, and whether it had to make way.
-type Word = (Arrived, bool);
+/// What became of a connection.
+#[derive(Debug)]
+struct Word {
+    arrived: Arrived,
+    /// It had to make way.
+    is_crowded_out: bool,
+}
 
 impl Door {
     pub(super) fn open(address: SocketAddr, admission: Admission) -> io::Result<Self> {
@@ -179,7 +187,10 @@ impl Door {
     /// than were admitted, so looking until there is none comes to an end.
     pub(super) fn look(&mut self) -> Option<Arrived> {
         loop {
-            let (arrived, is_crowded_out) = self.arrived.try_recv().ok()?;
+            let Word {
+                arrived,
+                is_crowded_out,
+            } = self.arrived.try_recv().ok()?;
             match arrived {
                 Arrived::Nobody if is_crowded_out => self.counts.crowded_out += 1,
                 Arrived::Nobody => self.counts.nobody += 1,
@@ -187,7 +198,7 @@ impl Door {
                     self.counts.turned_away += 1;
                     return Some(arrived);
                 }
-                Arrived::Peer(..) | Arrived::Keyed(_) => return Some(arrived),
+                Arrived::Peer { .. } | Arrived::Keyed(_) => return Some(arrived),
             }
         }
     }
@@ -224,9 +235,13 @@ impl Door {
         let alive = Arc::clone(&self.alive);
         let greet = move || {
             let arrived = greet(stream, ip, &admission).unwrap_or(Arrived::Nobody);
-            known.store(matches!(arrived, Arrived::Peer(..)), Ordering::Release);
+            known.store(matches!(arrived, Arrived::Peer { .. }), Ordering::Release);
             // Nobody listens once all hosts are here.
-            let word = (arrived, crowded_out.load(Ordering::Acquire));
+            let is_crowded_out = crowded_out.load(Ordering::Acquire);
+            let word = Word {
+                arrived,
+                is_crowded_out,
+            };
             let _late = sender.send(word).is_err();
             // Counted among the threads until here.
             drop(alive);
@@ -273,10 +288,7 @@ fn greet(stream: TcpStream, ip: IpAddr, admission: &Admission) -> io::Result<Arr
             let is_awaited =
                 |theirs: &str, ours: &str| ours == admission.own && admission.awaits(theirs, ip);
             match greeting::answer(stream, key, is_awaited) {
-                Ok((reader, writer)) => {
-                    let reader = ControlReader::Secured(Box::new(reader));
-                    say_who((reader, ControlWriter::Secured(writer)), ip)
-                }
+                Ok(secured) => say_who(secured.into(), ip),
                 Err(GreetingError::Refused(why)) => Ok(Arrived::TurnedAway(ip, turned_away(why))),
                 Err(GreetingError::Connection(error)) => Err(error),
             }
@@ -302,10 +314,11 @@ const fn turned_away(why: Why) -> &'static str {
 
 /// A plain end that shows that it is one of ours hears why it gets no further.
 fn refuse_plain(stream: TimedStream, start: [u8; 4], ip: IpAddr) -> io::Result<Arrived> {
-    let (mut reader, mut writer) = plain_ends(stream, start)?;
-    let hello = read_frame_within(&mut reader, HELLO_BYTES_MAX)?;
+    let mut ends = plain_ends(stream, start)?;
+    let hello = read_frame_within(&mut ends.reader, HELLO_BYTES_MAX)?;
     if matches!(hello, Frame::Message(PeerMessage::Hello(_))) {
-        write_message(&mut writer, &PeerMessage::Refused(KEY_NEEDED.to_owned()))?;
+        let refused = PeerMessage::Refused(KEY_NEEDED.to_owned());
+        write_message(&mut ends.writer, &refused)?;
         return Ok(Arrived::TurnedAway(
             ip,
             "came without a key, which this run needs",
@@ -316,22 +329,27 @@ fn refuse_plain(stream: TimedStream, start: [u8; 4], ip: IpAddr) -> io::Result<A
 
 /// Both halves of a plain connection of which `start` has been read.
 fn plain_ends(stream: TimedStream, start: [u8; 4]) -> io::Result<ControlEnds> {
-    let writer = BufWriter::new(stream.try_clone()?);
-    let mut reader = BufReader::with_capacity(8192, stream);
-    reader.get_mut().put_back(start);
-    Ok((ControlReader::Plain(reader), ControlWriter::Plain(writer)))
+    let mut ends = ControlEnds::plain(stream)?;
+    if let ControlReader::Plain(reader) = &mut ends.reader {
+        reader.get_mut().put_back(start);
+    }
+    Ok(ends)
 }
 
 fn say_who(mut ends: ControlEnds, ip: IpAddr) -> io::Result<Arrived> {
     Ok(match read_hello(&mut ends)? {
-        PeerMessage::Hello(hello) => Arrived::Peer(ip, Box::new((ends, hello))),
+        PeerMessage::Hello(hello) => Arrived::Peer {
+            ip,
+            ends: Box::new(ends),
+            hello,
+        },
         _ => Arrived::Nobody,
     })
 }
 
 /// The first word of the other end.
 pub(super) fn read_hello(ends: &mut ControlEnds) -> io::Result<PeerMessage> {
-    match read_frame_within(&mut ends.0, HELLO_BYTES_MAX)? {
+    match read_frame_within(&mut ends.reader, HELLO_BYTES_MAX)? {
         Frame::Message(message) => Ok(message),
         Frame::Chunk(_) => Err(io::Error::new(
             io::ErrorKind::InvalidData,
@@ -343,22 +361,19 @@ pub(super) fn read_hello(ends: &mut ControlEnds) -> io::Result<PeerMessage> {
 /// Opens a connection that this host made to `other`.
 pub(super) fn knock(
     stream: TcpStream,
-    (own, other): (&str, &str),
+    own: &str,
+    other: &str,
     key: Option<&PreSharedKey>,
 ) -> Result<ControlEnds, GreetingError> {
     let stream = prepare(stream)?;
-    let Some(key) = key else {
-        let writer = BufWriter::new(stream.try_clone()?);
-        let reader = ControlReader::Plain(BufReader::new(stream));
-        return Ok((reader, ControlWriter::Plain(writer)));
-    };
-    let (reader, writer) = greeting::ask(stream, key, (own, other))?;
-    let reader = ControlReader::Secured(Box::new(reader));
-    Ok((reader, ControlWriter::Secured(writer)))
+    match key {
+        Some(key) => Ok(greeting::ask(stream, key, own, other)?.into()),
+        None => Ok(ControlEnds::plain(stream)?),
+    }
 }
 
 /// Says `message`, whatever becomes of it.
 pub(super) fn say(ends: &mut ControlEnds, message: &PeerMessage) -> io::Result<()> {
-    write_message(&mut ends.1, message)?;
-    ends.1.flush()
+    write_message(&mut ends.writer, message)?;
+    ends.writer.flush()
 }

@@ -34,7 +34,8 @@ pub(crate) struct Received {
 pub(crate) fn exchange(
     peers: &mut [Peer],
     is_first_host: bool,
-    (records, story): (&Path, &HostStory),
+    records: &Path,
+    story: &HostStory,
 ) -> Received {
     let mut all = Received::default();
     let own = record_files(records).unwrap_or_else(|error| {
@@ -47,17 +48,16 @@ pub(crate) fn exchange(
             all.problems.push(format!("{}: {error}", peer.hello.host));
         }
     }
-    let given = (own.as_slice(), core::slice::from_ref(story));
     if is_first_host {
         let received = collect(peers, records);
-        distribute(peers, given, (&received, records), &mut all);
+        distribute(peers, &own, story, &received, records, &mut all);
         for one in received {
             all.stories.extend(one.stories);
             all.problems.extend(one.problems);
         }
     } else {
         for peer in peers.iter_mut() {
-            give_and_take(peer, given, records, &mut all);
+            give_and_take(peer, &own, story, records, &mut all);
         }
     }
     all
@@ -93,8 +93,10 @@ fn collect(peers: &mut [Peer], records: &Path) -> Vec<Received> {
 /// Sends every peer what it does not have yet, all at once.
 fn distribute(
     peers: &mut [Peer],
-    (own, own_story): (&[PathBuf], &[HostStory]),
-    (received, records): (&[Received], &Path),
+    own: &[PathBuf],
+    own_story: &HostStory,
+    received: &[Received],
+    records: &Path,
     all: &mut Received,
 ) {
     let sent = thread::scope(|scope| {
@@ -105,7 +107,7 @@ fn distribute(
                 .enumerate()
                 .filter(|(other, _)| *other != index);
             let mut files = own.to_vec();
-            let mut stories = own_story.to_vec();
+            let mut stories = vec![own_story.clone()];
             for (_, other) in others {
                 files.extend(other.names.iter().map(|name| records.join(name)));
                 stories.extend(other.stories.iter().cloned());
@@ -128,14 +130,15 @@ fn distribute(
 /// Sends in a thread of its own: two ends that only send would wait for each other for ever.
 fn give_and_take(
     peer: &mut Peer,
-    (own, own_story): (&[PathBuf], &[HostStory]),
+    own: &[PathBuf],
+    own_story: &HostStory,
     records: &Path,
     all: &mut Received,
 ) {
     let host = peer.hello.host.clone();
     let (writer, inbox) = peer.halves();
     let (received, sent) = thread::scope(|scope| {
-        let sending = scope.spawn(|| give_all(writer, own, own_story));
+        let sending = scope.spawn(|| give_all(writer, own, std::slice::from_ref(own_story)));
         let received = take_from(&host, inbox, records);
         (received, join_sending(sending))
     });

@@ -55,10 +55,12 @@ pub(super) fn read_key(
 /// # Errors
 /// When they do not come, do not fit, or hold another key.
 pub(super) fn gather(
-    (topology, key): (&Topology, Option<&PreSharedKey>),
+    topology: &Topology,
+    key: Option<&PreSharedKey>,
     hosts: &[&Host],
     domains: &Domains,
-    (signals, console): (&Signals, &mut Console),
+    signals: &Signals,
+    console: &mut Console,
 ) -> Result<Gathered, RunError> {
     let nobody = Gathered {
         peers: Vec::new(),
@@ -73,7 +75,7 @@ pub(super) fn gather(
         return Ok(nobody);
     }
     let is_first = is_here(first, hosts);
-    let meeting = meeting((topology, key), hosts, address);
+    let meeting = meeting(topology, key, hosts, address);
     let hello = PeerHello {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         topology_hash: topology.hash(),
@@ -129,7 +131,8 @@ fn protection(key: Option<&PreSharedKey>, seal: Option<&RunSeal>) -> HopProtecti
 }
 
 fn meeting(
-    (topology, key): (&Topology, Option<&PreSharedKey>),
+    topology: &Topology,
+    key: Option<&PreSharedKey>,
     hosts: &[&Host],
     address: SocketAddr,
 ) -> Meeting {

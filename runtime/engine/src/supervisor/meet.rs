@@ -220,9 +220,12 @@ fn host(
         door.admit_waiting().map_err(listen)?;
         while let Some(arrived) = door.look() {
             match arrived {
-                Arrived::Peer(ip, arrived) => {
-                    let (ends, theirs) = *arrived;
-                    if let Some(peer) = welcome(ends, (ip, theirs), meeting, hello)? {
+                Arrived::Peer {
+                    ip,
+                    ends,
+                    hello: theirs,
+                } => {
+                    if let Some(peer) = welcome(*ends, ip, theirs, meeting, hello)? {
                         // One that gave up and came again: its first connection is a dead one.
                         peers.retain(|known| known.hello.host != peer.hello.host);
                         peers.push(peer);
@@ -258,7 +261,8 @@ fn host(
 /// Greets one that said who it is; `None` when it is nobody of this run, or not at its own address.
 fn welcome(
     mut ends: ControlEnds,
-    (ip, theirs): (IpAddr, PeerHello),
+    ip: IpAddr,
+    theirs: PeerHello,
     meeting: &Meeting,
     hello: &PeerHello,
 ) -> Result<Option<Peer>, PeerError> {
@@ -301,7 +305,7 @@ fn join(
             patience.wait(&name)?;
             continue;
         };
-        match greet(stream, (hello, &name), meeting.key.as_ref()) {
+        match greet(stream, hello, &name, meeting.key.as_ref()) {
             Ok((ends, PeerMessage::Hello(theirs))) => {
                 if let Some(reason) = misfit(hello, &theirs) {
                     return Err(PeerError::Mismatch {
@@ -338,10 +342,11 @@ fn join(
 /// What the first host answers to this one's name.
 fn greet(
     stream: TcpStream,
-    (hello, other): (&PeerHello, &str),
+    hello: &PeerHello,
+    other: &str,
     key: Option<&PreSharedKey>,
 ) -> Result<(ControlEnds, PeerMessage), GreetingError> {
-    let mut ends = knock(stream, (&hello.host, other), key)?;
+    let mut ends = knock(stream, &hello.host, other, key)?;
     say(&mut ends, &PeerMessage::Hello(hello.clone()))?;
     let answer = read_hello(&mut ends)?;
     Ok((ends, answer))

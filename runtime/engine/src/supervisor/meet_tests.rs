@@ -17,14 +17,14 @@ fn hello(host: &str, hash: u64, domain: u8) -> PeerHello {
 }
 
 fn pair(left: &PeerHello, right: &PeerHello) -> [Result<Vec<Peer>, PeerError>; 2] {
-    pair_with((left, None), (right, None))
+    pair_with(left, None, right, None)
 }
 
-type End<'a> = (&'a PeerHello, Option<PreSharedKey>);
-
 fn pair_with(
-    (left, left_key): End<'_>,
-    (right, right_key): End<'_>,
+    left: &PeerHello,
+    left_key: Option<PreSharedKey>,
+    right: &PeerHello,
+    right_key: Option<PreSharedKey>,
 ) -> [Result<Vec<Peer>, PeerError>; 2] {
     let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
     let address = probe.local_addr().unwrap();
@@ -73,7 +73,7 @@ fn key(name: &str) -> PreSharedKey {
 fn with_one_key_two_hosts_meet_and_with_two_or_one_alone_both_say_why() {
     let (a, b) = (hello("a", 1, 1), hello("b", 1, 2));
     let (one, other) = (key("one"), key("other"));
-    let [left, right] = pair_with((&a, Some(one.clone())), (&b, Some(one.clone())));
+    let [left, right] = pair_with(&a, Some(one.clone()), &b, Some(one.clone()));
     let (mut left, mut right) = (left.unwrap(), right.unwrap());
     left[0].say(&PeerMessage::Ready);
     let event = right[0].receive(Duration::from_secs(5));
@@ -86,7 +86,7 @@ fn with_one_key_two_hosts_meet_and_with_two_or_one_alone_both_say_why() {
         (Some(one.clone()), None, "key"),
         (None, Some(one), "plain"),
     ] {
-        for outcome in pair_with((&a, ours.clone()), (&b, theirs.clone())) {
+        for outcome in pair_with(&a, ours.clone(), &b, theirs.clone()) {
             let error = outcome.map(|_| ()).unwrap_err();
             assert!(matches!(error, PeerError::Key { .. }), "{error}");
             assert!(error.to_string().contains(word), "{error}");

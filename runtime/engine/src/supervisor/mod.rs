@@ -11,7 +11,6 @@ pub(crate) mod exchange;
 pub mod frame;
 mod gathering;
 mod heartbeat;
-mod launching;
 pub(crate) mod meet;
 mod outcome;
 pub(crate) mod peer;

@@ -8,7 +8,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
-use crate::security::{SecureReader, SecureWriter, TimedStream};
+use crate::security::greeting::{Secured, TimedStream};
+use crate::security::{SecureReader, SecureWriter};
 
 /// Frames that may wait between the reader thread and the supervisor.
 const INBOX_FRAMES: usize = 256;
@@ -81,7 +82,31 @@ impl Write for ControlWriter {
 }
 
 /// Both halves.
-pub(super) type ControlEnds = (ControlReader, ControlWriter);
+#[derive(Debug)]
+pub(super) struct ControlEnds {
+    pub(super) reader: ControlReader,
+    pub(super) writer: ControlWriter,
+}
+
+impl ControlEnds {
+    /// Of a connection that is not secured.
+    pub(super) fn plain(stream: TimedStream) -> io::Result<Self> {
+        let writer = BufWriter::new(stream.try_clone()?);
+        Ok(Self {
+            reader: ControlReader::Plain(BufReader::new(stream)),
+            writer: ControlWriter::Plain(writer),
+        })
+    }
+}
+
+impl From<Secured> for ControlEnds {
+    fn from(secured: Secured) -> Self {
+        Self {
+            reader: ControlReader::Secured(Box::new(secured.reader)),
+            writer: ControlWriter::Secured(secured.writer),
+        }
+    }
+}
 
 /// One connected peer.
 #[derive(Debug)]
@@ -99,7 +124,11 @@ pub(crate) struct Peer {
 
 impl Peer {
     /// Listens to the connection in a thread of its own.
-    pub(super) fn new((mut input, writer): ControlEnds, hello: PeerHello) -> io::Result<Self> {
+    pub(super) fn new(ends: ControlEnds, hello: PeerHello) -> io::Result<Self> {
+        let ControlEnds {
+            reader: mut input,
+            writer,
+        } = ends;
         input.wait_for_ever()?;
         let (sender, inbox) = sync_channel(INBOX_FRAMES);
         thread::Builder::new()

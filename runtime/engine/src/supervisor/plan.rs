@@ -18,8 +18,9 @@ use hil_platform::realtime::{RealtimeRequest, SchedulingPolicy};
 use hil_platform::wait::WaitMode;
 use hil_rundir::announcement;
 use hil_rundir::event::ProcessKind;
-use hil_rundir::face_launch::{ArmLaunch, FaceSettings};
-use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_rundir::launch::{
+    ArmLaunch, DirectionLaunch, FaceSettings, GatewayWork, Side, SocketLaunch, Transport,
+};
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
 use hil_topology::gateway_name;
@@ -57,8 +58,6 @@ pub(crate) struct ProcessPlan {
     pub(crate) name: String,
     pub(crate) host: String,
     pub(crate) task: ProcessTask,
-    pub(crate) realtime: RealtimeRequest,
-    pub(crate) wait: WaitMode,
     pub(crate) on_exit: OnExit,
 }
 
@@ -66,18 +65,17 @@ pub(crate) struct ProcessPlan {
 #[derive(Debug)]
 pub(crate) enum ProcessTask {
     /// A role of the case, in this binary.
-    Component(ProcessCard),
-    /// The gateway of one link, in this binary.
-    Gateway(Vec<DirectionLaunch>),
-    /// One end of a clock path: a gateway that carries no messages.
-    ClockPath {
-        /// One.
-        directions: Vec<DirectionLaunch>,
-        /// How long the run may wait for the other end.
-        ready_within: Duration,
+    Component {
+        card: ProcessCard,
+        realtime: RealtimeRequest,
+        wait: WaitMode,
     },
+    /// The gateway of one link, in this binary.
+    Gateway(GatewayWork),
+    /// One end of a clock path: a gateway that carries no messages.
+    ClockPath(GatewayWork),
     /// What speaks with a foreign program, in this binary.
-    Face(FaceSettings),
+    Adapter(FaceSettings),
     /// The user's own program.
     Foreign {
         card: ProcessCard,
@@ -94,7 +92,7 @@ impl ProcessPlan {
 
     /// True for what exchanges clocks and nothing else.
     pub(crate) fn is_clock_path(&self) -> bool {
-        matches!(self.task, ProcessTask::ClockPath { .. })
+        matches!(self.task, ProcessTask::ClockPath(_))
     }
 
     /// True for what has datagrams of ours on the network.
@@ -104,16 +102,16 @@ impl ProcessPlan {
 
     /// True for what carries messages instead of making them: a gateway, or a face.
     pub(crate) fn is_carrier(&self) -> bool {
-        matches!(self.task, ProcessTask::Gateway(_) | ProcessTask::Face(_))
+        matches!(self.task, ProcessTask::Gateway(_) | ProcessTask::Adapter(_))
     }
 
     /// What it is.
     pub(crate) fn kind(&self) -> ProcessKind {
         match &self.task {
-            ProcessTask::Component(_) => ProcessKind::Component,
+            ProcessTask::Component { .. } => ProcessKind::Component,
             ProcessTask::Gateway(_) => ProcessKind::Gateway,
-            ProcessTask::ClockPath { .. } => ProcessKind::ClockPath,
-            ProcessTask::Face(_) => ProcessKind::Adapter,
+            ProcessTask::ClockPath(_) => ProcessKind::ClockPath,
+            ProcessTask::Adapter(_) => ProcessKind::Adapter,
             ProcessTask::Foreign { .. } => ProcessKind::OwnProgram,
         }
     }
@@ -121,9 +119,11 @@ impl ProcessPlan {
     /// The role of the case that it plays, or that a foreign program plays through it.
     pub(crate) fn role(&self) -> Option<String> {
         match &self.task {
-            ProcessTask::Component(card) | ProcessTask::Foreign { card, .. } => card.role.clone(),
-            ProcessTask::Face(face) => Some(face.role.clone()),
-            ProcessTask::Gateway(_) | ProcessTask::ClockPath { .. } => None,
+            ProcessTask::Component { card, .. } | ProcessTask::Foreign { card, .. } => {
+                card.role.clone()
+            }
+            ProcessTask::Adapter(face) => Some(face.role.clone()),
+            ProcessTask::Gateway(_) | ProcessTask::ClockPath(_) => None,
         }
     }
 }
@@ -183,7 +183,11 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
         .process_card(&process.name)
         .expect("the process is of this topology");
     let task = match &process.program {
-        Program::BuiltIn { .. } => ProcessTask::Component(card),
+        Program::BuiltIn { .. } => ProcessTask::Component {
+            card,
+            realtime: realtime(&process.execution, 0),
+            wait: wait_mode(process.execution.wait),
+        },
         Program::Command {
             command,
             environment,
@@ -196,15 +200,13 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
         Program::Egm { role, face } => {
             let host = topology.host(&process.host);
             let interface = host.and_then(|host| host.interface.clone());
-            ProcessTask::Face(face_settings(role, face, (&card, process), interface))
+            ProcessTask::Adapter(face_settings(role, face, &card, process, interface))
         }
     };
     ProcessPlan {
         name: process.name.clone(),
         host: process.host.clone(),
         task,
-        realtime: realtime(&process.execution, 0),
-        wait: wait_mode(process.execution.wait),
         on_exit: process.on_exit,
     }
 }
@@ -212,7 +214,8 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
 fn face_settings(
     role: &str,
     face: &EgmFace,
-    (card, process): (&ProcessCard, &Process),
+    card: &ProcessCard,
+    process: &Process,
     interface: Option<String>,
 ) -> FaceSettings {
     let mut arms = Vec::new();
@@ -253,6 +256,7 @@ fn face_settings(
         robotware: face.robotware,
         cycle_ns: nanoseconds(cycle),
         planned_lead_ns: nanoseconds(cycle) * delay_cycles,
+        wait: wait_mode(process.execution.wait),
         send: face.send,
         timestamps: face.timestamps,
         dscp: face.dscp,
@@ -307,9 +311,10 @@ fn gateways_on(topology: &Topology, host: &Host) -> Vec<ProcessPlan> {
             plans.push(ProcessPlan {
                 name: gateway_name(&link.name, &host.name),
                 host: host.name.clone(),
-                task: ProcessTask::Gateway(directions),
-                realtime: RealtimeRequest::default(),
-                wait: wait_mode(hop.gateway.execution.wait),
+                task: ProcessTask::Gateway(GatewayWork {
+                    directions,
+                    ready_within: None,
+                }),
                 on_exit: hop.gateway.on_exit,
             });
         }

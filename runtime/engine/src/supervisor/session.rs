@@ -14,8 +14,7 @@ use super::elsewhere::{Elsewhere, greeting, own_ticks};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
 use super::gathering::{gather, read_key};
-use super::outcome::meaning;
-use super::outcome::{Heard, RunError, RunOptions};
+use super::outcome::{Heard, RunError, RunOptions, meaning};
 use super::peer::{Peer, PeerEvent};
 use super::plan::{ProcessPlan, plan};
 use super::teller::Teller;
@@ -27,8 +26,7 @@ use hil_platform::host_facts::HostFacts;
 use hil_platform::signals::Signals;
 use hil_rundir::announcement::Announcement;
 use hil_rundir::event::{Event, HostStory, ProcessStory, disciplines};
-use hil_rundir::manifest;
-use hil_rundir::manifest::ManifestContent;
+use hil_rundir::manifest::{self, ManifestContent};
 use hil_rundir::protection::RunSecurity;
 use hil_rundir::run_folder::{RunFolder, utc_text};
 use hil_rundir::run_result::{Outcome, RunResult};
@@ -92,8 +90,7 @@ pub fn run(
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
-    let meant = (topology, key.as_ref());
-    let gathered = gather(meant, &hosts, &domains, (signals, console))?;
+    let gathered = gather(topology, key.as_ref(), &hosts, &domains, signals, console)?;
     let peers = gathered.peers;
     let here = clock_id()?;
     let crew = Crew::new(plan.processes, domains.addresses(), &folder, gathered.seal)?;
@@ -133,9 +130,9 @@ pub fn run(
         Err(outcome) => outcome,
         Ok(()) => session.watch(start, topology.run().duration),
     };
-    let span = (start, MonotonicClock::now());
+    let end = MonotonicClock::now();
     session.stop(&outcome);
-    Ok(session.conclude(folder, outcome, span, (started, facts)))
+    Ok(session.conclude(folder, outcome, start, end, started, facts))
 }
 
 /// The longest delay of each trace that a link of `topology` replays, by channel: known since before
@@ -368,8 +365,9 @@ impl Session<'_> {
     }
 
     fn tell(&mut self, phase: Phase) {
-        let run = (self.topology, &mut self.crew, &self.elsewhere);
-        self.teller.tell(phase, run, self.console);
+        let (topology, crew, elsewhere) = (self.topology, &mut self.crew, &self.elsewhere);
+        self.teller
+            .tell(phase, topology, crew, elsewhere, self.console);
     }
 
     /// Ends components everywhere first, then gateways, so that what is under way arrives, and last
@@ -408,15 +406,17 @@ impl Session<'_> {
         mut self,
         folder: RunFolder,
         outcome: Outcome,
-        span: (Instant, Instant),
-        (started, facts): (String, HostFacts),
+        start: Instant,
+        end: Instant,
+        started: String,
+        facts: HostFacts,
     ) -> RunResult {
         let own_hosts = self.own_hosts();
         let watch = core::mem::take(&mut self.cards);
         let (cards, mut problems) = watch.finish();
         let own = HostStory {
             hosts: own_hosts.clone(),
-            span,
+            span: (start, end),
             events: self.crew.events().to_vec(),
             discipline: self.discipline(),
             processes: self.stories(),
@@ -430,7 +430,7 @@ impl Session<'_> {
                 .progress("exchanging records with the other host");
             let records = folder.records();
             let first = self.is_first_host;
-            let received = exchange(&mut self.peers, first, (&records, &own));
+            let received = exchange(&mut self.peers, first, &records, &own);
             problems.extend(received.problems);
             stories.extend(received.stories);
         }

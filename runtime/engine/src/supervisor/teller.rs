@@ -42,7 +42,9 @@ impl Teller {
     pub(super) fn tell(
         &mut self,
         phase: Phase,
-        (topology, crew, elsewhere): (&Topology, &mut Crew, &Elsewhere),
+        topology: &Topology,
+        crew: &mut Crew,
+        elsewhere: &Elsewhere,
         console: &mut Console,
     ) {
         let is_due = self

@@ -48,7 +48,8 @@ impl Conversation {
     /// When it does not answer.
     pub fn family(&mut self, name: &[u8], group: &[u8]) -> io::Result<Option<(u16, Option<u32>)>> {
         let asked = self.ask(
-            (CONTROL_FAMILY, control::GET_FAMILY),
+            CONTROL_FAMILY,
+            control::GET_FAMILY,
             false,
             &[(control::FAMILY_NAME, name)],
             |_, attributes| nl80211::family(attributes, group),
@@ -66,7 +67,8 @@ impl Conversation {
     /// What the kernel refused with, or that it did not answer in time.
     pub fn ask<T>(
         &mut self,
-        (family, command): (u16, u8),
+        family: u16,
+        command: u8,
         is_dump: bool,
         attributes: &[(u16, &[u8])],
         mut take: impl FnMut(u8, Attributes<'_>) -> Option<T>,

@@ -151,8 +151,8 @@ impl RadioSocket {
         attributes: &[(u16, &[u8])],
         take: impl FnMut(u8, Attributes<'_>) -> Option<T>,
     ) -> io::Result<Vec<T>> {
-        let to = (self.family, command);
-        self.requests.ask(to, is_dump, attributes, take)
+        self.requests
+            .ask(self.family, command, is_dump, attributes, take)
     }
 }
 

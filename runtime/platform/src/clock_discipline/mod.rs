@@ -186,8 +186,10 @@ impl HostDiscipline {
 /// # Errors
 /// Why nothing can be said.
 pub fn common_bound_ns(
-    (one_name, one): (&str, &HostDiscipline),
-    (other_name, other): (&str, &HostDiscipline),
+    one_name: &str,
+    one: &HostDiscipline,
+    other_name: &str,
+    other: &HostDiscipline,
 ) -> Result<u64, String> {
     let of = |name: &str, host: &HostDiscipline| {
         let stated = host.reference.clone().zip(host.bound_ns);
@@ -230,11 +232,11 @@ mod tests {
     #[test]
     fn bounds_add_up_only_under_one_reference() {
         let (near, far) = (following("ptp a", 300), following("ptp a", 900));
-        assert_eq!(common_bound_ns(("x", &near), ("y", &far)), Ok(1_200));
+        assert_eq!(common_bound_ns("x", &near, "y", &far), Ok(1_200));
         let other = following("ptp b", 300);
-        let why = common_bound_ns(("x", &near), ("y", &other)).unwrap_err();
+        let why = common_bound_ns("x", &near, "y", &other).unwrap_err();
         assert_eq!(why, "x follows ptp a, y follows ptp b");
-        let why = common_bound_ns(("x", &near), ("y", &nobody())).unwrap_err();
+        let why = common_bound_ns("x", &near, "y", &nobody()).unwrap_err();
         assert_eq!(why, format!("on y, {NOBODY}"));
     }
 

@@ -103,7 +103,8 @@ fn a_refusal_despite_the_capability_points_at_the_control_group() {
 
 #[test]
 fn what_lets_a_thread_up_again_is_said_as_systemd_reads_it() {
-    let refusal = explain(Errno::EPERM, SchedulingPolicy::Other.of_kernel());
+    let (policy, priority) = SchedulingPolicy::Other.of_kernel();
+    let refusal = explain(Errno::EPERM, policy, priority);
     assert_eq!(
         refusal.fix,
         "needs CAP_SYS_NICE or LimitNICE=+0 in the unit"

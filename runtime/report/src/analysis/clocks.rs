@@ -243,7 +243,7 @@ fn disciplined(
         let told = records.result.disciplines.get(host);
         told.ok_or_else(|| format!("{host} told nothing of its system clock"))
     };
-    let bound_ns = clock_discipline::common_bound_ns((from, of(from)?), (to, of(to)?))?;
+    let bound_ns = clock_discipline::common_bound_ns(from, of(from)?, to, of(to)?)?;
     let realtime = |host: &str| {
         let offset_ns = records.realtime_offset_ns(host);
         offset_ns.ok_or_else(|| format!("{host} recorded no system clock, or stepped it"))

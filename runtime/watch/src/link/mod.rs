@@ -5,8 +5,12 @@
 pub mod cli;
 pub mod work;
 
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
-use std::{collections::BTreeMap, fs, io, thread, time::Duration};
+use std::thread;
+use std::time::Duration;
 
 use hil_core::case_study::ParameterError;
 use hil_core::message::Envelope;
@@ -19,7 +23,7 @@ use serde_json::Value;
 
 use hil_platform::clock::MonotonicClock;
 use hil_platform::domain_address::{DomainAddress, DomainAddressError};
-use hil_rundir::launch::{self, GatewayLaunch};
+use hil_rundir::launch::{self, GatewayWork, Work, WorkerLaunch};
 use hil_rundir::link_orders::{in_force, orders_on_record};
 use hil_rundir::manifest::Manifest;
 use hil_rundir::record::RecordFileError;
@@ -169,32 +173,7 @@ pub struct RunLinks {
     records: PathBuf,
     directions: Vec<LinkDirection>,
     /// Every link of the topology and what carries it.
-    carried: BTreeMap<String, Carrier>,
-}
-
-/// What carries a link.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Carrier {
-    /// A model of a network.
-    Emulated,
-    /// Something real, by the topology's word for it.
-    Real(String),
-}
-
-impl Carrier {
-    fn from_word(word: &str) -> Self {
-        match word {
-            "emulated" => Self::Emulated,
-            real => Self::Real(real.to_owned()),
-        }
-    }
-
-    fn word(&self) -> &str {
-        match self {
-            Self::Emulated => "emulated",
-            Self::Real(word) => word,
-        }
-    }
+    carried: BTreeMap<String, String>,
 }
 
 impl RunLinks {
@@ -212,8 +191,10 @@ impl RunLinks {
         let manifest: Manifest =
             serde_json::from_str(&text).map_err(|error| failed(io::Error::other(error)))?;
         let mut directions: Vec<LinkDirection> = Vec::new();
-        for launch in gateway_launches(folder).map_err(failed)? {
-            add_directions(&mut directions, &launch);
+        for launch in newest_launches(folder).map_err(failed)? {
+            if let Work::Gateway(work) = &launch.work {
+                add_directions(&mut directions, &launch, work);
+            }
         }
         directions.sort_by_key(LinkDirection::name);
         Ok(Self {
@@ -228,9 +209,10 @@ impl RunLinks {
         &self.directions
     }
 
-    /// Every link of the run and what carries it.
-    pub fn carried(&self) -> &BTreeMap<String, Carrier> {
-        &self.carried
+    /// Every link of the run with the topology's word for what carries it.
+    pub fn carried(&self) -> impl Iterator<Item = (&str, &str)> {
+        let pairs = self.carried.iter();
+        pairs.map(|(link, via)| (link.as_str(), via.as_str()))
     }
 
     /// Every order that was given to `direction`, oldest first.
@@ -270,11 +252,11 @@ impl RunLinks {
                 asked: name.to_owned(),
                 known: self.known(),
             }),
-            Some(Carrier::Real(via)) => Err(LinkError::NotEmulated {
+            Some(via) if via != "emulated" => Err(LinkError::NotEmulated {
                 link,
                 via: via.clone(),
             }),
-            Some(Carrier::Emulated) => Err(LinkError::Elsewhere {
+            Some(_) => Err(LinkError::Elsewhere {
                 link,
                 way: way.unwrap_or(Way::Forward),
             }),
@@ -299,7 +281,7 @@ impl RunLinks {
             return "none".to_owned();
         }
         let words = self.carried.iter();
-        let words = words.map(|(link, carrier)| format!("{link} ({})", carrier.word()));
+        let words = words.map(|(link, via)| format!("{link} ({via})"));
         words.collect::<Vec<_>>().join(", ")
     }
 
@@ -392,13 +374,12 @@ fn confirmed(
     })
 }
 
-/// The last start of each gateway of the run in `folder` on this host.
-fn gateway_launches(folder: &Path) -> io::Result<Vec<GatewayLaunch>> {
-    let mut newest: BTreeMap<String, GatewayLaunch> = BTreeMap::new();
+/// The last start of each process of the run in `folder` on this host.
+fn newest_launches(folder: &Path) -> io::Result<Vec<WorkerLaunch>> {
+    let mut newest: BTreeMap<String, WorkerLaunch> = BTreeMap::new();
     for entry in fs::read_dir(folder.join("launch"))? {
         let path = entry?.path();
-        // Components and faces have launch files of another form.
-        let Ok(launch) = launch::read::<GatewayLaunch>(&path) else {
+        let Ok(launch) = launch::read::<WorkerLaunch>(&path) else {
             continue;
         };
         let known = newest.get(&launch.process);
@@ -409,8 +390,8 @@ fn gateway_launches(folder: &Path) -> io::Result<Vec<GatewayLaunch>> {
     Ok(newest.into_values().collect())
 }
 
-fn add_directions(directions: &mut Vec<LinkDirection>, launch: &GatewayLaunch) {
-    for one in &launch.directions {
+fn add_directions(directions: &mut Vec<LinkDirection>, launch: &WorkerLaunch, work: &GatewayWork) {
+    for one in &work.directions {
         let Some(emulation) = &one.emulation else {
             continue;
         };
@@ -437,11 +418,11 @@ fn add_directions(directions: &mut Vec<LinkDirection>, launch: &GatewayLaunch) {
 }
 
 /// What carries each link, by the manifest's topology.
-fn carried(topology: &Value) -> BTreeMap<String, Carrier> {
+fn carried(topology: &Value) -> BTreeMap<String, String> {
     let links = topology.get("links").and_then(Value::as_object);
     let words = links.into_iter().flatten().filter_map(|(name, link)| {
         let via = link.get("via")?.as_str()?;
-        Some((name.clone(), Carrier::from_word(via)))
+        Some((name.clone(), via.to_owned()))
     });
     words.collect()
 }

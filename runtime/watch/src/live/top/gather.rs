@@ -150,7 +150,7 @@ fn elsewhere(status: &RunStatus) -> Vec<ElsewhereRow> {
             Some((one.name.clone(), count))
         });
         ElsewhereRow {
-            hearing: status::hearing(&host.name, (host.heard_ns, now), host.left_out_count),
+            hearing: status::hearing(&host.name, host.heard_ns, now, host.left_out_count),
             overruns: skipped.collect(),
         }
     });
