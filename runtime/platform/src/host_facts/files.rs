@@ -1,9 +1,8 @@
 //! Reads the kernel's text files (`/proc`, `/sys`, `/etc`) below a root that tests can move.
 //! It writes nothing and interprets nothing beyond numbers and CPU lists.
 
-use std::fs;
-use std::io;
 use std::path::PathBuf;
+use std::{fs, io};
 
 use super::Fact;
 
