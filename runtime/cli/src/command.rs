@@ -7,11 +7,10 @@ mod report_work;
 
 use core::fmt::Display;
 use std::collections::BTreeMap;
-use std::env;
-use std::fs;
 use std::io::{self, ErrorKind, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::{env, fs};
 
 use clap::{CommandFactory as _, Parser};
 use hil_core::case_study::ParameterError;

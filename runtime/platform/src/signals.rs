@@ -1,11 +1,9 @@
 //! Ctrl-C and SIGTERM as a flag the supervisor looks at. A second one ends the program at once.
 
-use std::io;
-use std::process;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::thread;
 use std::time::Duration;
+use std::{io, process, thread};
 
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::flag;

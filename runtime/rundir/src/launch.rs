@@ -1,11 +1,10 @@
 //! What a supervisor tells a process it starts. A component learns its role and its channels and
 //! nothing of hosts, links or gateways: its card is byte-identical in a local and a split run.
 
-use std::fs;
-use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+use std::{fs, io};
 
 use hil_arm::egm::face::{Axes, RobotWare};
 use hil_arm::egm::messages::Side as ArmSide;

@@ -2,11 +2,9 @@
 //! folder, twice a second. It is for people who look on; nothing in the run reads it.
 
 use std::collections::BTreeSet;
-use std::fmt;
-use std::fs;
-use std::io;
 use std::path::Path;
 use std::time::Duration;
+use std::{fmt, fs, io};
 
 use hil_core::time::Instant;
 use serde::{Deserialize, Serialize};

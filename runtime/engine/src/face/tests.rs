@@ -1,13 +1,10 @@
 //! One arm of each face against a plain socket that plays the foreign program: what goes out, what
 //! comes in, and what is a state instead of an error.
 
-use std::env;
-use std::fs;
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::path::PathBuf;
-use std::process;
-use std::thread;
 use std::time::Duration;
+use std::{env, fs, process, thread};
 
 use bytemuck::{Zeroable, bytes_of};
 use hil_arm::egm::face::{

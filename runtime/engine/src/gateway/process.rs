@@ -6,11 +6,10 @@
 //! left would.
 
 use std::collections::BTreeMap;
-use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
 use std::time::Duration;
+use std::{io, thread};
 
 use hil_core::time::Instant;
 use hil_protocol::SettingsError;

@@ -1,11 +1,10 @@
 //! A user's own program as a process of the run: found before the run begins, and bound to its
 //! supervisor, so that it cannot outlive it.
 
-use std::env;
-use std::io;
 use std::os::unix::process::{CommandExt, parent_id};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::{env, io};
 
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;

@@ -3,14 +3,13 @@
 //! and that they turn, and reports what became of them. What a job does is its own business.
 
 use std::any::Any;
-use std::io;
 use std::panic::resume_unwind;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
-use std::thread;
 use std::time::Duration;
+use std::{io, thread};
 
 use hil_core::endpoint::PortCountError;
 use hil_protocol::SettingsError;
@@ -21,10 +20,9 @@ use nix::sys::time::TimeValLike;
 
 use super::component;
 use super::pulse::{Pulse, Pulses};
-use crate::face;
-use crate::gateway;
 use crate::gateway::arming::Arming;
 use crate::gateway::process::GatewayWatch;
+use crate::{face, gateway};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::realtime::{self, RealtimeGrant, RealtimeRequest, SpinAdvice};
 use hil_platform::wait::WaitMode;

@@ -233,9 +233,8 @@ pub(crate) fn last_line(log: &Path) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::env;
-    use std::fs;
     use std::sync::mpsc::sync_channel;
+    use std::{env, fs};
 
     fn shell(script: &str) -> Command {
         let mut command = Command::new("sh");

@@ -90,7 +90,6 @@ mod tests {
     use super::*;
     use hil_rundir::event::ProcessKind;
     use hil_shuttle::Shuttle;
-    use hil_topology;
     use hil_topology::registry::Registry;
 
     fn topology(overrides: &[&str]) -> Topology {

@@ -2,13 +2,12 @@
 //! by policy, stopped in order. Each single one is a [`Child`].
 
 use std::collections::BTreeMap;
-use std::env;
-use std::io;
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::{Command, ExitStatus};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
+use std::{env, io};
 
 use hil_core::time::{Instant, duration_ns};
 

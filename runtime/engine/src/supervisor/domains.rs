@@ -2,18 +2,18 @@
 //! created and held, so that the processes it starts only ever open.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
 use std::path::{Path, PathBuf};
-use std::thread;
 use std::time::{Duration, Instant as WallInstant};
+use std::{fs, thread};
 
 use hil_link::condition::{LinkOrder, ORDER_TYPE_NAME};
 
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::gateway::link_control::ORDERS_MAX;
 use hil_rundir::announcement::withdraw_abandoned;
-use hil_shm::observer_depth;
-use hil_shm::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo};
+use hil_shm::{
+    ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo, observer_depth,
+};
 use hil_topology::Channel;
 
 /// Writers at a time: one, and its successor while the dead one is not cleaned up yet.

@@ -1,10 +1,9 @@
 //! Bringing the hosts of a run together: the first host of the topology listens, the others connect
 //! to it, and both ends check that they fit. What they say to each other afterwards is not here.
 
-use std::io;
 use std::net::{IpAddr, SocketAddr, TcpStream};
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{io, thread};
 
 use socket2::{Domain, Socket, Type};
 

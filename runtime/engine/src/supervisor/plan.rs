@@ -23,10 +23,10 @@ use hil_rundir::launch::{
 };
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
-use hil_topology::gateway_name;
 use hil_topology::{
     CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process,
     ProcessCard, Program, Scheduling, Topology, Via, Wait, command_channel, feedback_channel,
+    gateway_name,
 };
 
 /// Everything one supervisor is responsible for.

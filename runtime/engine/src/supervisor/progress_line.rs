@@ -49,7 +49,6 @@ fn rank(channel: &Channel) -> u8 {
 mod tests {
     use super::*;
     use hil_teleoperation::Teleoperation;
-    use hil_topology;
     use hil_topology::registry::Registry;
 
     #[test]

@@ -226,9 +226,7 @@ mod tests {
     use super::*;
     use crate::record::RecordFile;
     use hil_core::record::PublishedRecord;
-    use std::env;
-    use std::fs;
-    use std::process;
+    use std::{env, fs, process};
 
     fn record(sequence: u64) -> PublishedRecord {
         PublishedRecord {
