@@ -3,7 +3,7 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, UdpSocket};
 
-use super::finding::{Answer, Checked, Finding, Severity, settled};
+use super::finding::{Answer, Checked, Finding, settled};
 use super::network::Interfaces;
 use super::plan::{LinkLoad, Peer, Plan};
 use hil_platform::host_facts::HostFiles;
@@ -200,6 +200,7 @@ fn mtu(files: &HostFiles, present: &Interfaces, load: &LinkLoad) -> Checked {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::finding::Severity;
     use crate::network::Interface;
     use hil_platform::host_facts::FakeHost;
 

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Gaps, LatencyReport, Quantiles, Surroundings, Wakeups};
-use crate::finding::{Answer, Checked, Finding, Severity};
+use crate::finding::{Answer, Checked, Finding};
 use hil_platform::host_facts::Fact;
 use hil_platform::words::counted_plainly;
 
