@@ -7,38 +7,36 @@ pub(super) enum ByteOrder {
     Big,
 }
 
-impl ByteOrder {
-    pub(super) fn u16(self, bytes: &[u8], offset: usize) -> Option<u16> {
-        let array = array_at(bytes, offset)?;
-        Some(match self {
-            Self::Little => u16::from_le_bytes(array),
-            Self::Big => u16::from_be_bytes(array),
-        })
+/// Bytes, and the order of the numbers among them.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Numbers<'a> {
+    pub(super) order: ByteOrder,
+    pub(super) bytes: &'a [u8],
+}
+
+impl Numbers<'_> {
+    pub(super) fn u16(self, offset: usize) -> Option<u16> {
+        self.lowest_first(offset).map(u16::from_le_bytes)
     }
 
-    pub(super) fn u32(self, bytes: &[u8], offset: usize) -> Option<u32> {
-        let array = array_at(bytes, offset)?;
-        Some(match self {
-            Self::Little => u32::from_le_bytes(array),
-            Self::Big => u32::from_be_bytes(array),
-        })
+    pub(super) fn u32(self, offset: usize) -> Option<u32> {
+        self.lowest_first(offset).map(u32::from_le_bytes)
     }
 
-    pub(super) fn u64(self, bytes: &[u8], offset: usize) -> Option<u64> {
-        let array = array_at(bytes, offset)?;
-        Some(match self {
-            Self::Little => u64::from_le_bytes(array),
-            Self::Big => u64::from_be_bytes(array),
-        })
+    pub(super) fn u64(self, offset: usize) -> Option<u64> {
+        self.lowest_first(offset).map(u64::from_le_bytes)
+    }
+
+    fn lowest_first<const N: usize>(self, offset: usize) -> Option<[u8; N]> {
+        let mut array = array_at(self.bytes, offset)?;
+        if self.order == ByteOrder::Big {
+            array.reverse();
+        }
+        Some(array)
     }
 }
 
 /// `N` bytes from `offset`; `None` when they are not all there.
 pub(super) fn array_at<const N: usize>(bytes: &[u8], offset: usize) -> Option<[u8; N]> {
-    bytes.get(offset..offset.checked_add(N)?)?.try_into().ok()
-}
-
-/// Big-endian, as networks have it.
-pub(super) fn net_u16(bytes: &[u8], offset: usize) -> Option<u16> {
-    array_at(bytes, offset).map(u16::from_be_bytes)
+    bytes.get(offset..)?.first_chunk().copied()
 }

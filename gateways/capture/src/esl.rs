@@ -13,7 +13,7 @@
 //! gives a frame with several port bits to the lowest port, and so do we. Its stamps start at any
 //! value: two ports of one device can be subtracted, a port and a PC cannot.
 
-use super::bytes::{ByteOrder, array_at};
+use super::bytes::array_at;
 
 /// Bytes of the header.
 pub const HEADER_BYTES: usize = 16;
@@ -47,10 +47,8 @@ impl EslHeader {
 
     /// How many ports are named: one, unless the file is not what it seems.
     pub fn port_count(&self) -> usize {
-        FLAG_BITS
-            .iter()
-            .filter(|bit| self.flags & **bit != 0)
-            .count()
+        let named = FLAG_BITS.iter().filter(|bit| self.flags & **bit != 0);
+        named.count()
     }
 
     /// True when the device counted the frame as damaged.
@@ -73,8 +71,8 @@ impl EslHeader {
             return None;
         }
         Some(Self {
-            flags: ByteOrder::Little.u16(bytes, 6)?,
-            stamp_ns: ByteOrder::Little.u64(bytes, 8)?,
+            flags: u16::from_le_bytes(array_at(bytes, 6)?),
+            stamp_ns: u64::from_le_bytes(array_at(bytes, 8)?),
         })
     }
 }

@@ -22,31 +22,28 @@ const MAGIC: [u8; 4] = *b"HILG";
 /// Bytes of a frame before the payload of a UDP datagram at most, with a tag and IP options.
 const BEFORE_PAYLOAD_BYTES: usize = 18 + 60 + 8;
 
-/// What a flow's datagrams hold.
+/// What a flow's datagrams hold, and by what one of them is known again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FlowKind {
     /// Our own.
     Hil,
     /// Externally guided motion, either direction.
     Egm,
-    /// Anything.
-    Udp(UdpIdentity),
+    /// Anything, known by its whole payload.
+    Payload,
+    /// Anything, known by a number in it.
+    Number(NumberField),
 }
 
-/// By what a datagram of any protocol is known again.
+/// A number in a payload that counts up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum UdpIdentity {
-    /// Its whole payload.
-    Payload,
-    /// A number in it.
-    Number {
-        /// First byte, from the start of the payload.
-        offset: u16,
-        /// 1..=8.
-        bytes: u8,
-        /// Lowest byte first.
-        is_little_endian: bool,
-    },
+pub struct NumberField {
+    /// First byte, from the start of the payload.
+    offset: u16,
+    /// 1..=8.
+    bytes: u8,
+    /// Lowest byte first.
+    is_little_endian: bool,
 }
 
 /// One flow to follow.
@@ -93,27 +90,24 @@ impl FromStr for FlowFilter {
         let mut filter = Self::of(match kind {
             "hil" => FlowKind::Hil,
             "egm" => FlowKind::Egm,
-            "udp" => FlowKind::Udp(UdpIdentity::Payload),
+            "udp" => FlowKind::Payload,
             other => return Err(FlowError::Kind(other.to_owned())),
         });
         for condition in conditions.split(',').filter(|part| !part.is_empty()) {
-            let (key, value) = condition
-                .split_once('=')
-                .ok_or_else(|| FlowError::Condition(condition.to_owned()))?;
+            let unknown = || FlowError::Condition(condition.to_owned());
+            let (key, value) = condition.split_once('=').ok_or_else(unknown)?;
             match (key, &mut filter.kind) {
                 ("port", _) => filter.packets.port = Some(port("port", value)?),
                 ("sport", _) => filter.packets.source_port = Some(port("sport", value)?),
                 ("dport", _) => filter.packets.destination_port = Some(port("dport", value)?),
                 ("src", _) => filter.packets.source = Some(address("src", value)?),
                 ("dst", _) => filter.packets.destination = Some(address("dst", value)?),
-                ("id", FlowKind::Udp(identity)) => *identity = number(value)?,
-                _ => return Err(FlowError::Condition(condition.to_owned())),
+                ("id", kind @ (FlowKind::Payload | FlowKind::Number(_))) => *kind = number(value)?,
+                _ => return Err(unknown()),
             }
         }
-        if let (Some(source), Some(destination)) =
-            (filter.packets.source, filter.packets.destination)
-            && source.is_ipv4() != destination.is_ipv4()
-        {
+        let ends = filter.packets.source.zip(filter.packets.destination);
+        if ends.is_some_and(|(from, to)| from.is_ipv4() != to.is_ipv4()) {
             return Err(FlowError::Families);
         }
         if filter.kind != FlowKind::Hil && filter == Self::of(filter.kind) {
@@ -123,61 +117,51 @@ impl FromStr for FlowFilter {
     }
 }
 
+impl FlowError {
+    fn value(key: &'static str, value: &str, expected: &'static str) -> Self {
+        Self::Value {
+            key,
+            value: value.to_owned(),
+            expected,
+        }
+    }
+}
+
 fn port(key: &'static str, value: &str) -> Result<u16, FlowError> {
     let parsed = value.parse().ok().filter(|port| *port != 0);
-    parsed.ok_or_else(|| FlowError::Value {
-        key,
-        value: value.to_owned(),
-        expected: "a port is 1 to 65535",
-    })
+    parsed.ok_or_else(|| FlowError::value(key, value, "a port is 1 to 65535"))
 }
 
 fn address(key: &'static str, value: &str) -> Result<IpAddr, FlowError> {
-    value.parse().map_err(|_unsaid| FlowError::Value {
-        key,
-        value: value.to_owned(),
-        expected: "an IPv4 or IPv6 address without port",
-    })
+    let expected = "an IPv4 or IPv6 address without port";
+    let parsed = value.parse().ok();
+    parsed.ok_or_else(|| FlowError::value(key, value, expected))
 }
 
-fn number(value: &str) -> Result<UdpIdentity, FlowError> {
+fn number(value: &str) -> Result<FlowKind, FlowError> {
     let expected = "`payload`, or OFFSET+BYTES[le] with 0 to 1400 and 1 to 8, e.g. 2+2";
-    let wrong = || FlowError::Value {
-        key: "id",
-        value: value.to_owned(),
-        expected,
-    };
+    let wrong = || FlowError::value("id", value, expected);
     if value == "payload" {
-        return Ok(UdpIdentity::Payload);
+        return Ok(FlowKind::Payload);
     }
-    let (digits, is_little_endian) = match value.strip_suffix("le") {
-        Some(digits) => (digits, true),
-        None => (value, false),
-    };
-    let (offset, bytes) = digits.split_once('+').ok_or_else(wrong)?;
+    let digits = value.strip_suffix("le");
+    let (offset, bytes) = digits.unwrap_or(value).split_once('+').ok_or_else(wrong)?;
     let offset = offset.parse().ok().filter(|at| *at <= 1400);
     let bytes = bytes.parse().ok().filter(|count| (1..=8).contains(count));
-    Ok(UdpIdentity::Number {
+    Ok(FlowKind::Number(NumberField {
         offset: offset.ok_or_else(wrong)?,
         bytes: bytes.ok_or_else(wrong)?,
-        is_little_endian,
-    })
+        is_little_endian: digits.is_some(),
+    }))
 }
 
 impl fmt::Display for FlowFilter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (word, identity) = match self.kind {
+        let (word, field) = match self.kind {
             FlowKind::Hil => ("hil", None),
             FlowKind::Egm => ("egm", None),
-            FlowKind::Udp(UdpIdentity::Payload) => ("udp", None),
-            FlowKind::Udp(UdpIdentity::Number {
-                offset,
-                bytes,
-                is_little_endian,
-            }) => {
-                let order = if is_little_endian { "le" } else { "" };
-                ("udp", Some(format!("id={offset}+{bytes}{order}")))
-            }
+            FlowKind::Payload => ("udp", None),
+            FlowKind::Number(field) => ("udp", Some(field)),
         };
         let packets = &self.packets;
         let conditions = [
@@ -186,7 +170,10 @@ impl fmt::Display for FlowFilter {
             packets.destination_port.map(|port| format!("dport={port}")),
             packets.source.map(|address| format!("src={address}")),
             packets.destination.map(|address| format!("dst={address}")),
-            identity,
+            field.map(|field| {
+                let order = if field.is_little_endian { "le" } else { "" };
+                format!("id={}+{}{order}", field.offset, field.bytes)
+            }),
         ];
         let conditions: Vec<String> = conditions.into_iter().flatten().collect();
         let colon = if conditions.is_empty() { "" } else { ":" };
@@ -234,9 +221,7 @@ pub struct OwnHeader {
     pub sequence: u64,
     /// When it was handed to the kernel, sender's monotonic clock, nanoseconds.
     pub handed_ns: i64,
-    /// Which piece of the message.
-    pub fragment_index: u16,
-    /// Of how many.
+    /// Pieces of the message.
     pub fragment_count: u16,
 }
 
@@ -250,40 +235,30 @@ pub enum Unidentified {
 }
 
 impl FlowFilter {
-    const fn of(kind: FlowKind) -> Self {
-        Self {
-            kind,
-            packets: PacketFilter {
-                port: None,
-                source_port: None,
-                destination_port: None,
-                source: None,
-                destination: None,
-                magic: match kind {
-                    FlowKind::Hil => Some(MAGIC),
-                    FlowKind::Egm | FlowKind::Udp(_) => None,
-                },
-            },
-        }
+    fn of(kind: FlowKind) -> Self {
+        let packets = PacketFilter {
+            magic: (kind == FlowKind::Hil).then_some(MAGIC),
+            ..PacketFilter::default()
+        };
+        Self { kind, packets }
     }
 
     /// Our own datagrams, whatever their addresses.
-    pub const fn hil() -> Self {
+    pub fn hil() -> Self {
         Self::of(FlowKind::Hil)
     }
 
     /// True when addresses and ports are as asked.
     pub fn has_addresses_of(&self, datagram: &UdpDatagram<'_>) -> bool {
         let (from, to) = (datagram.source, datagram.destination);
-        let is = |wanted: Option<u16>, port: u16| wanted.is_none_or(|one| one == port);
         let wanted = &self.packets;
-        wanted
-            .port
-            .is_none_or(|port| from.port() == port || to.port() == port)
-            && is(wanted.source_port, from.port())
-            && is(wanted.destination_port, to.port())
-            && wanted.source.is_none_or(|address| address == from.ip())
-            && wanted.destination.is_none_or(|address| address == to.ip())
+        let is_port = |wanted: Option<u16>, port| wanted.is_none_or(|one| one == port);
+        let is_address = |wanted: Option<IpAddr>, address| wanted.is_none_or(|one| one == address);
+        (is_port(wanted.port, from.port()) || is_port(wanted.port, to.port()))
+            && is_port(wanted.source_port, from.port())
+            && is_port(wanted.destination_port, to.port())
+            && is_address(wanted.source, from.ip())
+            && is_address(wanted.destination, to.ip())
     }
 
     /// By what the datagram is known again.
@@ -293,8 +268,9 @@ impl FlowFilter {
     pub fn identify(&self, datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
         match self.kind {
             FlowKind::Hil => own(datagram),
-            FlowKind::Egm => egm(datagram),
-            FlowKind::Udp(identity) => any(identity, datagram),
+            FlowKind::Egm => whole(datagram, egm),
+            FlowKind::Payload => whole(datagram, |_| Ok(None)),
+            FlowKind::Number(field) => numbered(datagram, field),
         }
     }
 
@@ -302,19 +278,26 @@ impl FlowFilter {
     pub fn snap_bytes(&self) -> usize {
         match self.kind {
             FlowKind::Hil => BEFORE_PAYLOAD_BYTES + HEADER_BYTES,
-            FlowKind::Udp(UdpIdentity::Number { offset, bytes, .. }) => {
-                BEFORE_PAYLOAD_BYTES + usize::from(offset) + usize::from(bytes)
-            }
-            FlowKind::Egm | FlowKind::Udp(UdpIdentity::Payload) => BEFORE_PAYLOAD_BYTES + 1472,
+            FlowKind::Number(field) => BEFORE_PAYLOAD_BYTES + field.end(),
+            FlowKind::Egm | FlowKind::Payload => BEFORE_PAYLOAD_BYTES + 1472,
         }
+    }
+}
+
+impl NumberField {
+    /// Behind its last byte.
+    fn end(self) -> usize {
+        usize::from(self.offset) + usize::from(self.bytes)
     }
 }
 
 fn own(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
     let payload = datagram.payload;
-    let is_ours = payload.len() < 4 || payload.starts_with(&MAGIC);
-    let Some(bytes) = payload.get(..HEADER_BYTES).filter(|_| is_ours) else {
-        return Err(if is_ours && datagram.is_cut_short() {
+    if payload.len() >= MAGIC.len() && !payload.starts_with(&MAGIC) {
+        return Err(Unidentified::Foreign);
+    }
+    let Some(bytes) = payload.get(..HEADER_BYTES) else {
+        return Err(if datagram.is_cut_short() {
             Unidentified::CutShort
         } else {
             Unidentified::Foreign
@@ -342,83 +325,73 @@ fn own(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
             epoch: header.epoch,
             sequence: header.sequence,
             handed_ns: header.handed_ns,
-            fragment_index: header.fragment_index,
             fragment_count: header.fragment_count,
         }),
     })
 }
 
-fn egm(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
+/// The identity by a hash of the whole payload, with the number that it counts with 32 bits.
+fn whole(
+    datagram: &UdpDatagram<'_>,
+    count: impl FnOnce(&[u8]) -> Result<Option<u32>, Unidentified>,
+) -> Result<DatagramIdentity, Unidentified> {
     if datagram.is_cut_short() {
         return Err(Unidentified::CutShort);
     }
-    let payload = datagram.payload;
+    let number = count(datagram.payload)?;
+    Ok(DatagramIdentity {
+        key: hash(datagram.payload),
+        number: number.map(|number| Numbered::in_one_series(number.into(), 32)),
+        own: None,
+    })
+}
+
+impl Numbered {
+    const fn in_one_series(number: u64, bits: u8) -> Self {
+        Self {
+            series: 0,
+            number,
+            bits: Some(bits),
+            is_piece: false,
+        }
+    }
+}
+
+/// The count of an EGM message.
+fn egm(payload: &[u8]) -> Result<Option<u32>, Unidentified> {
     // Robot and sensor messages both carry the header in field 1, so the wrong one may decode.
     let header = match wire::message_type(payload) {
         Some(wire::MessageType::Data) => wire::decode_robot(payload).ok().and_then(|m| m.header),
         Some(wire::MessageType::Correction) => {
             wire::decode_sensor(payload).ok().and_then(|m| m.header)
         }
-        Some(wire::MessageType::PathCorrection) => wire::decode_path_correction(payload)
-            .ok()
-            .and_then(|m| m.header),
+        Some(wire::MessageType::PathCorrection) => {
+            let message = wire::decode_path_correction(payload).ok();
+            message.and_then(|m| m.header)
+        }
         _ => None,
     };
-    let header = header.ok_or(Unidentified::Foreign)?;
-    Ok(DatagramIdentity {
-        key: hash(payload),
-        number: header.seqno.map(|seqno| Numbered {
-            series: 0,
-            number: seqno.into(),
-            bits: Some(32),
-            is_piece: false,
-        }),
-        own: None,
-    })
+    Ok(header.ok_or(Unidentified::Foreign)?.seqno)
 }
 
-fn any(
-    identity: UdpIdentity,
+fn numbered(
     datagram: &UdpDatagram<'_>,
+    field: NumberField,
 ) -> Result<DatagramIdentity, Unidentified> {
-    let UdpIdentity::Number {
-        offset,
-        bytes,
-        is_little_endian,
-    } = identity
-    else {
-        if datagram.is_cut_short() {
-            return Err(Unidentified::CutShort);
-        }
-        return Ok(DatagramIdentity {
-            key: hash(datagram.payload),
-            number: None,
-            own: None,
-        });
-    };
-    let (from, to) = (
-        usize::from(offset),
-        usize::from(offset) + usize::from(bytes),
-    );
-    if datagram.payload_bytes < to {
+    if datagram.payload_bytes < field.end() {
         return Err(Unidentified::Foreign);
     }
-    let field = datagram.payload.get(from..to);
-    let field = field.ok_or(Unidentified::CutShort)?;
+    let bytes = datagram.payload.get(usize::from(field.offset)..field.end());
+    let bytes = bytes.ok_or(Unidentified::CutShort)?;
     let add = |sum: u64, byte: &u8| sum << 8 | u64::from(*byte);
-    let number = if is_little_endian {
-        field.iter().rev().fold(0, add)
+    let number = if field.is_little_endian {
+        bytes.iter().rev().fold(0, add)
     } else {
-        field.iter().fold(0, add)
+        bytes.iter().fold(0, add)
     };
     Ok(DatagramIdentity {
         key: number,
-        number: Some(Numbered {
-            series: 0,
-            number,
-            bits: Some(8 * bytes),
-            is_piece: false,
-        }),
+        number: Some(Numbered::in_one_series(number, 8 * field.bytes)),
         own: None,
     })
 }

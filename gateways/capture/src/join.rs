@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
 
 use hil_core::random::RandomStream;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
-use hil_stats::statistics::{CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, wilson};
+use hil_stats::statistics::{CONFIDENCE, IntervalNs, block_bootstrap_quantile, wilson};
 use serde::{Deserialize, Serialize};
 
 use super::observe::{Observation, Point, Seen, Stream};
@@ -111,6 +111,33 @@ pub struct Joined {
     pub figures: JoinFigures,
 }
 
+/// What one of the two points saw of the stream, in time.
+struct Side<'a> {
+    point: &'a Point,
+    /// See [`Seen::span_ns`].
+    watched_ns: Option<(i64, i64)>,
+    seen: Vec<Observation>,
+}
+
+impl<'a> Side<'a> {
+    fn of(stream: &Stream, point: &'a Point, seen: &Seen) -> Option<Self> {
+        let list = seen.streams.get(stream).cloned();
+        let mut list = list.or_else(|| seen.span_ns.map(|_watched| Vec::new()))?;
+        list.sort_by_key(|one| one.stamp_ns);
+        Some(Self {
+            point,
+            watched_ns: seen.span_ns,
+            seen: list,
+        })
+    }
+
+    /// It was watched all of this time.
+    fn covers(&self, from_ns: i64, to_ns: i64) -> bool {
+        let covers = |(from, to)| from_ns >= from && to_ns <= to;
+        self.watched_ns.is_some_and(covers)
+    }
+}
+
 /// Joins what two points saw of `stream`; `None` when neither saw anything of it, or one did not and
 /// nothing tells that it was watched. Stamps of one datagram lie at most `window_ns` apart.
 ///
@@ -118,17 +145,15 @@ pub struct Joined {
 /// by there at all is for the caller to know: see [`super::pairing`].
 pub fn join(
     stream: &Stream,
-    (a, seen_a): (&Point, &Seen),
-    (b, seen_b): (&Point, &Seen),
+    a: &Point,
+    seen_a: &Seen,
+    b: &Point,
+    seen_b: &Seen,
     window_ns: i64,
 ) -> Option<Joined> {
-    let list = |seen: &Seen| {
-        let list = seen.streams.get(stream).map(|list| sorted(list));
-        list.or_else(|| seen.span_ns.map(|_watched| Vec::new()))
-    };
-    let mut sides = [(a, seen_a, list(seen_a)?), (b, seen_b, list(seen_b)?)];
-    let is_empty = [sides[0].2.is_empty(), sides[1].2.is_empty()];
-    if is_empty == [true; 2] {
+    let mut first = Side::of(stream, a, seen_a)?;
+    let mut second = Side::of(stream, b, seen_b)?;
+    if first.seen.is_empty() && second.seen.is_empty() {
         return None;
     }
     // Through a host with two taps the way is in, then out; but both then read one clock.
@@ -138,56 +163,37 @@ pub fn join(
         (Direction::Inbound, Direction::Outbound) => Some(true),
         _ => None,
     };
-    let mut matches = Matches::of(&sides[0].2, &sides[1].2, window_ns);
+    let mut matches = Matches::of(&first.seen, &second.seen, window_ns);
     let is_swapped = by_direction.unwrap_or_else(|| {
         let is_early =
-            |pair: &&(usize, usize)| sides[1].2[pair.1].stamp_ns < sides[0].2[pair.0].stamp_ns;
+            |pair: &&(usize, usize)| second.seen[pair.1].stamp_ns < first.seen[pair.0].stamp_ns;
+        let early_count = matches.pairs.iter().filter(is_early).count();
         // The one point that saw it is the first.
-        is_empty[0] || 2 * matches.pairs.iter().filter(is_early).count() > matches.pairs.len()
+        first.seen.is_empty() || 2 * early_count > matches.pairs.len()
     });
     if is_swapped {
-        sides.reverse();
-        matches = Matches::of(&sides[0].2, &sides[1].2, window_ns);
+        core::mem::swap(&mut first, &mut second);
+        matches = Matches::of(&first.seen, &second.seen, window_ns);
     }
     let order = match by_direction {
         Some(_) => OrderSource::PacketDirection,
         None => OrderSource::Stamps,
     };
-    let [
-        (first_point, seen_first, first),
-        (second_point, seen_second, second),
-    ] = sides;
-    let pairs: Vec<Pair> = matches
-        .pairs
-        .iter()
-        .map(|&(i, j)| Pair {
-            first: first[i],
-            second: second[j],
-        })
-        .collect();
-    let watched = (seen_first.span_ns, seen_second.span_ns);
-    let figures = Tally {
-        first: &first,
-        second: &second,
-        pairs: &pairs,
-        matches: &matches,
-    }
-    .figures(order, watched);
+    let pair = |&(i, j): &(usize, usize)| Pair {
+        first: first.seen[i],
+        second: second.seen[j],
+    };
+    let pairs: Vec<Pair> = matches.pairs.iter().map(pair).collect();
     Some(Joined {
-        first_point: *first_point,
-        second_point: *second_point,
+        first_point: *first.point,
+        second_point: *second.point,
+        figures: figures(order, &first, &second, &pairs, &matches),
         pairs,
-        figures,
     })
 }
 
-fn sorted(list: &[Observation]) -> Vec<Observation> {
-    let mut list = list.to_vec();
-    list.sort_by_key(|one| one.stamp_ns);
-    list
-}
-
 /// Who belongs to whom, by positions.
+#[derive(Default)]
 struct Matches {
     /// In the order of the first point.
     pairs: Vec<(usize, usize)>,
@@ -207,178 +213,121 @@ impl Matches {
         for (index, one) in second.iter().enumerate() {
             by_key.entry(one.identity.key).or_default().1.push(index);
         }
-        let mut matches = Self {
-            pairs: Vec::with_capacity(first.len().min(second.len())),
-            only_first: Vec::new(),
-            only_second: Vec::new(),
-            duplicates: Vec::new(),
-        };
+        let mut matches = Self::default();
         for (from, to) in by_key.values() {
-            matches.add_key((first, from), (second, to), window_ns);
+            let (mut i, mut j, mut newest_match) = (0, 0, None);
+            while j < to.len() {
+                let arrival_ns = second[to[j]].stamp_ns;
+                let since = |at: i64| arrival_ns.saturating_sub(at);
+                match from.get(i).map(|index| since(first[*index].stamp_ns)) {
+                    Some(delay_ns) if delay_ns > window_ns => {
+                        matches.only_first.push(from[i]);
+                        i += 1;
+                        continue;
+                    }
+                    Some(delay_ns) if delay_ns >= -window_ns => {
+                        matches.pairs.push((from[i], to[j]));
+                        newest_match = Some(arrival_ns);
+                        i += 1;
+                    }
+                    _ if newest_match.is_some_and(|at| since(at) <= window_ns) => {
+                        matches.duplicates.push(to[j]);
+                    }
+                    _ => matches.only_second.push(to[j]),
+                }
+                j += 1;
+            }
+            matches.only_first.extend(&from[i..]);
         }
         matches.pairs.sort_unstable();
         matches.only_first.sort_unstable();
         matches
     }
+}
 
-    fn add_key(
-        &mut self,
-        (first, from): (&[Observation], &[usize]),
-        (second, to): (&[Observation], &[usize]),
-        window_ns: i64,
-    ) {
-        let (mut i, mut j, mut newest_match) = (0, 0, None);
-        while j < to.len() {
-            let arrival_ns = second[to[j]].stamp_ns;
-            let delay_ns = from
-                .get(i)
-                .map(|index| arrival_ns.saturating_sub(first[*index].stamp_ns));
-            match delay_ns {
-                Some(delay_ns) if delay_ns > window_ns => {
-                    self.only_first.push(from[i]);
-                    i += 1;
-                }
-                Some(delay_ns) if delay_ns >= -window_ns => {
-                    self.pairs.push((from[i], to[j]));
-                    newest_match = Some(arrival_ns);
-                    (i, j) = (i + 1, j + 1);
-                }
-                _ => {
-                    let is_again = newest_match
-                        .is_some_and(|at: i64| arrival_ns.saturating_sub(at) <= window_ns);
-                    let list = if is_again {
-                        &mut self.duplicates
-                    } else {
-                        &mut self.only_second
-                    };
-                    list.push(to[j]);
-                    j += 1;
-                }
-            }
+fn figures(
+    order: OrderSource,
+    first: &Side<'_>,
+    second: &Side<'_>,
+    pairs: &[Pair],
+    matches: &Matches,
+) -> JoinFigures {
+    let delays: Vec<i64> = pairs.iter().map(Pair::delay_ns).collect();
+    let fastest = delays.iter().min().copied().unwrap_or(0);
+    let slowest = delays.iter().max().copied().unwrap_or(0);
+    // A datagram would have had its other stamp while the point was watched, however fast or slow it
+    // was among those seen; the rest of what was seen at one point only lies at an edge.
+    let mut lost = matches.only_first.clone();
+    lost.retain(|index| {
+        let at = first.seen[*index].stamp_ns;
+        second.covers(at.saturating_add(fastest), at.saturating_add(slowest))
+    });
+    let unexplained = matches.only_second.iter().filter(|index| {
+        let at = second.seen[**index].stamp_ns;
+        first.covers(at.saturating_sub(slowest), at.saturating_sub(fastest))
+    });
+    let unexplained_count = unexplained.count();
+    let only_count = matches.only_first.len() + matches.only_second.len();
+    let matched_count = pairs.len() as u64;
+    let lost_count = lost.len() as u64;
+    let judged_count = matched_count + lost_count;
+    let ratio_interval = |count: u64, of: u64| {
+        let interval = wilson(count, of, CONFIDENCE)?;
+        Some((interval.low, interval.high))
+    };
+    // Positions of departure in the order of arrival.
+    let mut arrivals: Vec<usize> = (0..pairs.len()).collect();
+    arrivals.sort_by_key(|departure| pairs[*departure].second.stamp_ns);
+    let (reordered_count, reordering_extent_max) = reordering(&arrivals);
+    let in_arrival = arrivals.iter().map(|departure| delays[*departure]);
+    let jitter = jitter_ns(&Vec::from_iter(in_arrival));
+    let delay_interval = |quantile: f64, name: &str| {
+        let mut random = RandomStream::new(0, name);
+        block_bootstrap_quantile(&delays, quantile, CONFIDENCE, &mut random)
+    };
+    let unmatched = "no datagram was seen at both points";
+    let variation = delays.iter().map(|delay| delay.saturating_sub(fastest));
+    let gaps = second.seen.windows(2);
+    let gaps = gaps.map(|pair| pair[1].stamp_ns.saturating_sub(pair[0].stamp_ns));
+    JoinFigures {
+        order,
+        first_count: first.seen.len() as u64,
+        second_count: second.seen.len() as u64,
+        matched_count,
+        lost_count,
+        edge_count: (only_count - lost.len() - unexplained_count) as u64,
+        duplicated_count: matches.duplicates.len() as u64,
+        unexplained_count: unexplained_count as u64,
+        loss_ratio: (judged_count > 0).then(|| lost_count as f64 / judged_count as f64),
+        loss_interval: ratio_interval(lost_count, judged_count),
+        loss_bursts: bursts(&lost),
+        delay: distribution(delays.iter().copied(), unmatched),
+        delay_p50_interval: delay_interval(0.5, "probe delay p50"),
+        delay_p99_interval: delay_interval(0.99, "probe delay p99"),
+        variation: distribution(variation, unmatched),
+        jitter_last_ns: jitter.map(|(last, _)| last),
+        jitter_mean_ns: jitter.map(|(_, mean)| mean),
+        reordered_count,
+        reordered_interval: ratio_interval(reordered_count, matched_count),
+        reordering_extent_max,
+        arrival_interval: distribution(gaps, "fewer than two arrivals"),
+    }
+}
+
+/// How many were overtaken, and the largest extent.
+fn reordering(arrivals: &[usize]) -> (u64, u64) {
+    // Running maxima only grow, so the earliest overtaker is found by bisection.
+    let mut tops: Vec<usize> = Vec::with_capacity(arrivals.len());
+    let (mut count, mut extent_max) = (0, 0);
+    for (position, departure) in arrivals.iter().enumerate() {
+        let earliest = tops.partition_point(|top| top < departure);
+        if earliest < position {
+            count += 1;
+            extent_max = extent_max.max((position - earliest) as u64);
         }
-        self.only_first.extend(&from[i..]);
+        tops.push(tops.last().map_or(*departure, |top| *top.max(departure)));
     }
-}
-
-struct Tally<'a> {
-    first: &'a [Observation],
-    second: &'a [Observation],
-    pairs: &'a [Pair],
-    matches: &'a Matches,
-}
-
-type Span = Option<(i64, i64)>;
-
-impl Tally<'_> {
-    fn figures(&self, order: OrderSource, watched: (Span, Span)) -> JoinFigures {
-        let delays: Vec<i64> = self.pairs.iter().map(Pair::delay_ns).collect();
-        let extremes = (
-            delays.iter().min().copied().unwrap_or(0),
-            delays.iter().max().copied().unwrap_or(0),
-        );
-        let (lost, unexplained) = self.judged(extremes, watched);
-        let only_count = self.matches.only_first.len() + self.matches.only_second.len();
-        let judged = (self.pairs.len() + lost.len()) as u64;
-        let lost_count = lost.len() as u64;
-        let ratio = |count: u64, of: u64| wilson(count, of, CONFIDENCE).map(ends);
-        let (reordered_count, reordering_extent_max) = self.reordering();
-        let jitter = jitter_ns(&self.by_arrival());
-        let interval = |quantile: f64, name: &str| {
-            let mut random = RandomStream::new(0, name);
-            block_bootstrap_quantile(&delays, quantile, CONFIDENCE, &mut random)
-        };
-        JoinFigures {
-            order,
-            first_count: self.first.len() as u64,
-            second_count: self.second.len() as u64,
-            matched_count: self.pairs.len() as u64,
-            lost_count,
-            edge_count: (only_count - lost.len() - unexplained) as u64,
-            duplicated_count: self.matches.duplicates.len() as u64,
-            unexplained_count: unexplained as u64,
-            loss_ratio: (judged > 0).then(|| lost_count as f64 / judged as f64),
-            loss_interval: ratio(lost_count, judged),
-            loss_bursts: bursts(&lost),
-            delay: distribution(
-                delays.iter().copied(),
-                "no datagram was seen at both points",
-            ),
-            delay_p50_interval: interval(0.5, "probe delay p50"),
-            delay_p99_interval: interval(0.99, "probe delay p99"),
-            variation: distribution(
-                delays.iter().map(|delay| delay.saturating_sub(extremes.0)),
-                "no datagram was seen at both points",
-            ),
-            jitter_last_ns: jitter.map(|(last, _)| last),
-            jitter_mean_ns: jitter.map(|(_, mean)| mean),
-            reordered_count,
-            reordered_interval: ratio(reordered_count, self.pairs.len() as u64),
-            reordering_extent_max,
-            arrival_interval: distribution(
-                self.second
-                    .windows(2)
-                    .map(|pair| pair[1].stamp_ns.saturating_sub(pair[0].stamp_ns)),
-                "fewer than two arrivals",
-            ),
-        }
-    }
-
-    /// Positions of what was lost, and how many were unexplained; the rest of what was seen at one
-    /// point only lies at an edge.
-    fn judged(&self, (fastest, slowest): (i64, i64), watched: (Span, Span)) -> (Vec<usize>, usize) {
-        let is_lost = |index: &&usize| {
-            is_covered(self.first[**index].stamp_ns, (fastest, slowest), watched.1)
-        };
-        let back = (-slowest, -fastest);
-        let is_unexplained =
-            |index: &&usize| is_covered(self.second[**index].stamp_ns, back, watched.0);
-        let only_second = self.matches.only_second.iter();
-        (
-            self.matches
-                .only_first
-                .iter()
-                .filter(is_lost)
-                .copied()
-                .collect(),
-            only_second.filter(is_unexplained).count(),
-        )
-    }
-
-    /// Positions of departure, and pairs, in the order of arrival.
-    fn by_arrival(&self) -> Vec<(usize, Pair)> {
-        let mut list: Vec<(usize, Pair)> = self.pairs.iter().copied().enumerate().collect();
-        list.sort_by_key(|(_, pair)| pair.second.stamp_ns);
-        list
-    }
-
-    /// How many were overtaken, and the largest extent.
-    fn reordering(&self) -> (u64, u64) {
-        let arrivals = self.by_arrival();
-        // Running maxima only grow, so the earliest overtaker is found by bisection.
-        let mut tops: Vec<usize> = Vec::with_capacity(arrivals.len());
-        let (mut count, mut extent_max) = (0, 0);
-        for (position, (departure, _)) in arrivals.iter().enumerate() {
-            let earliest = tops.partition_point(|top| top < departure);
-            if earliest < position {
-                count += 1;
-                extent_max = extent_max.max((position - earliest) as u64);
-            }
-            tops.push(tops.last().map_or(*departure, |top| *top.max(departure)));
-        }
-        (count, extent_max)
-    }
-}
-
-/// True when a datagram stamped `at` would have had its other stamp within `watched`, however fast
-/// or slow it was among those seen.
-fn is_covered(at: i64, (fastest, slowest): (i64, i64), watched: Span) -> bool {
-    watched.is_some_and(|(from, to)| {
-        at.saturating_add(fastest) >= from && at.saturating_add(slowest) <= to
-    })
-}
-
-fn ends(interval: Interval) -> (f64, f64) {
-    (interval.low, interval.high)
+    (count, extent_max)
 }
 
 /// Lengths of runs of neighbouring positions, and how many of each.
@@ -396,13 +345,14 @@ fn distribution(values: impl Iterator<Item = i64>, reason: &str) -> Distribution
     histogram.distribution(reason)
 }
 
-/// RFC 3550 section 6.4.1 over the arrivals: the last estimate and the mean of all.
-fn jitter_ns(arrivals: &[(usize, Pair)]) -> Option<(f64, f64)> {
+/// RFC 3550 section 6.4.1 over the delays in the order of arrival: the last estimate and the mean of
+/// all.
+fn jitter_ns(delays: &[i64]) -> Option<(f64, f64)> {
     let (mut jitter, mut sum) = (0.0, 0.0);
-    for pair in arrivals.windows(2) {
-        let difference = pair[1].1.delay_ns().saturating_sub(pair[0].1.delay_ns());
+    for pair in delays.windows(2) {
+        let difference = pair[1].saturating_sub(pair[0]);
         jitter += (difference.unsigned_abs() as f64 - jitter) / 16.0;
         sum += jitter;
     }
-    (arrivals.len() > 1).then(|| (jitter, sum / (arrivals.len() - 1) as f64))
+    (delays.len() > 1).then(|| (jitter, sum / (delays.len() - 1) as f64))
 }

@@ -2,9 +2,9 @@
 //! and bare IP; IPv4 with options, IPv6 with extension headers. Fragments are told apart, not put
 //! together; checksums are not checked, since a capture on the sending host sees them unfinished.
 
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::net::{IpAddr, SocketAddr};
 
-use super::bytes::{array_at, net_u16};
+use super::bytes::array_at;
 use hil_net::link_type;
 
 const UDP: u8 = 17;
@@ -55,46 +55,31 @@ pub enum NoDatagram {
     Malformed,
 }
 
-impl NoDatagram {
-    /// The words a report prints.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::UnknownLinkType => "link layer not supported",
-            Self::NotIp => "not IP",
-            Self::NotUdp => "not UDP",
-            Self::LaterFragment => "later IP fragments",
-            Self::CutShort => "captured too short for the headers",
-            Self::Malformed => "malformed headers",
-        }
-    }
-}
-
 /// Looks for a UDP datagram in a frame of the given [`link_type`].
 ///
 /// # Errors
 /// Why there is none.
 pub fn udp_datagram(link: u16, frame: &[u8]) -> Result<UdpDatagram<'_>, NoDatagram> {
-    let (protocol, at) = match link {
-        link_type::ETHERNET => (net_u16(frame, 12), 14),
-        link_type::LINUX_SLL => (net_u16(frame, 14), 16),
-        link_type::LINUX_SLL2 => (net_u16(frame, 0), 20),
+    let net_u16 = |at| {
+        let word = array_at(frame, at).map(u16::from_be_bytes);
+        word.ok_or(NoDatagram::CutShort)
+    };
+    let (mut protocol, mut at) = match link {
+        link_type::ETHERNET => (net_u16(12)?, 14),
+        link_type::LINUX_SLL => (net_u16(14)?, 16),
+        link_type::LINUX_SLL2 => (net_u16(0)?, 20),
         link_type::RAW | link_type::IPV4 | link_type::IPV6 => return ip(frame, None),
         _ => return Err(NoDatagram::UnknownLinkType),
     };
-    let (mut protocol, mut at) = (protocol.ok_or(NoDatagram::CutShort)?, at);
     let mut vlan = None;
     for _ in 0..NESTING_MAX {
         match protocol {
             0x8100 | 0x88a8 | 0x9100 => {
-                let tag = net_u16(frame, at).ok_or(NoDatagram::CutShort)?;
-                vlan = Some(tag & 0x0fff);
-                protocol = net_u16(frame, at + 2).ok_or(NoDatagram::CutShort)?;
+                vlan = Some(net_u16(at)? & 0x0fff);
+                protocol = net_u16(at + 2)?;
                 at += 4;
             }
-            0x0800 | 0x86dd => {
-                let packet = frame.get(at..).ok_or(NoDatagram::CutShort)?;
-                return ip(packet, vlan);
-            }
+            0x0800 | 0x86dd => return ip(frame.get(at..).ok_or(NoDatagram::CutShort)?, vlan),
             _ => return Err(NoDatagram::NotIp),
         }
     }
@@ -102,19 +87,36 @@ pub fn udp_datagram(link: u16, frame: &[u8]) -> Result<UdpDatagram<'_>, NoDatagr
 }
 
 fn ip(packet: &[u8], vlan: Option<u16>) -> Result<UdpDatagram<'_>, NoDatagram> {
-    match packet.first().map(|byte| byte >> 4) {
-        Some(4) => ipv4(packet, vlan),
-        Some(6) => ipv6(packet, vlan),
-        Some(_) => Err(NoDatagram::Malformed),
-        None => Err(NoDatagram::CutShort),
+    let network = match packet.first().map(|byte| byte >> 4) {
+        Some(4) => ipv4(packet)?,
+        Some(6) => ipv6(packet)?,
+        Some(_) => return Err(NoDatagram::Malformed),
+        None => return Err(NoDatagram::CutShort),
+    };
+    let header: [u8; 8] = array_at(network.segment, 0).ok_or(NoDatagram::CutShort)?;
+    let word = |at: usize| u16::from_be_bytes([header[at], header[at + 1]]);
+    let length_bytes = usize::from(word(4));
+    let fits = length_bytes <= network.segment_bytes || network.is_fragmented;
+    if length_bytes < UDP_HEADER_BYTES || !fits {
+        return Err(NoDatagram::Malformed);
     }
+    let end = length_bytes.min(network.segment.len());
+    Ok(UdpDatagram {
+        source: SocketAddr::new(network.source, word(0)),
+        destination: SocketAddr::new(network.destination, word(2)),
+        dscp: network.dscp,
+        vlan,
+        payload_bytes: length_bytes - UDP_HEADER_BYTES,
+        payload: &network.segment[UDP_HEADER_BYTES..end],
+        is_fragmented: network.is_fragmented,
+    })
 }
 
 /// What the IP layer tells of the UDP part behind it.
 struct Network<'a> {
-    addresses: (IpAddr, IpAddr),
+    source: IpAddr,
+    destination: IpAddr,
     dscp: u8,
-    vlan: Option<u16>,
     /// The UDP header and payload, without what pads the frame.
     segment: &'a [u8],
     /// Bytes of `segment` on the wire.
@@ -122,7 +124,12 @@ struct Network<'a> {
     is_fragmented: bool,
 }
 
-fn ipv4(packet: &[u8], vlan: Option<u16>) -> Result<UdpDatagram<'_>, NoDatagram> {
+/// `N` bytes of a header that is there.
+fn part<const N: usize>(header: &[u8], at: usize) -> [u8; N] {
+    array_at(header, at).unwrap_or([0; N])
+}
+
+fn ipv4(packet: &[u8]) -> Result<Network<'_>, NoDatagram> {
     let fixed: [u8; 20] = array_at(packet, 0).ok_or(NoDatagram::CutShort)?;
     let header_bytes = usize::from(fixed[0] & 0x0f) * 4;
     let total_bytes = usize::from(u16::from_be_bytes([fixed[2], fixed[3]]));
@@ -136,77 +143,49 @@ fn ipv4(packet: &[u8], vlan: Option<u16>) -> Result<UdpDatagram<'_>, NoDatagram>
     if fragment & 0x1fff != 0 {
         return Err(NoDatagram::LaterFragment);
     }
-    let address = |at: usize| {
-        let octets: [u8; 4] = array_at(&fixed, at).unwrap_or_default();
-        IpAddr::V4(Ipv4Addr::from(octets))
-    };
     let end = total_bytes.min(packet.len());
-    udp(&Network {
-        addresses: (address(12), address(16)),
+    Ok(Network {
+        source: part::<4>(&fixed, 12).into(),
+        destination: part::<4>(&fixed, 16).into(),
         dscp: fixed[1] >> 2,
-        vlan,
         segment: packet.get(header_bytes..end).ok_or(NoDatagram::CutShort)?,
         segment_bytes: total_bytes - header_bytes,
         is_fragmented: fragment & 0x2000 != 0,
     })
 }
 
-fn ipv6(packet: &[u8], vlan: Option<u16>) -> Result<UdpDatagram<'_>, NoDatagram> {
+fn ipv6(packet: &[u8]) -> Result<Network<'_>, NoDatagram> {
     let fixed: [u8; 40] = array_at(packet, 0).ok_or(NoDatagram::CutShort)?;
     let total_bytes = 40 + usize::from(u16::from_be_bytes([fixed[4], fixed[5]]));
     let traffic_class = (fixed[0] & 0x0f) << 4 | fixed[1] >> 4;
-    let address = |at: usize| {
-        let octets: [u8; 16] = array_at(&fixed, at).unwrap_or_default();
-        IpAddr::V6(Ipv6Addr::from(octets))
-    };
     let (mut next, mut at, mut is_fragmented) = (fixed[6], 40, false);
     for _ in 0..NESTING_MAX {
-        let header: [u8; 8] = match next {
-            0 | 43 | 44 | 60 => array_at(packet, at).ok_or(NoDatagram::CutShort)?,
-            UDP => {
-                let end = total_bytes.min(packet.len());
-                return udp(&Network {
-                    addresses: (address(8), address(24)),
-                    dscp: traffic_class >> 2,
-                    vlan,
-                    segment: packet.get(at..end).ok_or(NoDatagram::CutShort)?,
-                    segment_bytes: total_bytes.checked_sub(at).ok_or(NoDatagram::Malformed)?,
-                    is_fragmented,
-                });
-            }
-            _ => return Err(NoDatagram::NotUdp),
-        };
+        if next == UDP {
+            let end = total_bytes.min(packet.len());
+            return Ok(Network {
+                source: part::<16>(&fixed, 8).into(),
+                destination: part::<16>(&fixed, 24).into(),
+                dscp: traffic_class >> 2,
+                segment: packet.get(at..end).ok_or(NoDatagram::CutShort)?,
+                segment_bytes: total_bytes.checked_sub(at).ok_or(NoDatagram::Malformed)?,
+                is_fragmented,
+            });
+        }
+        if !matches!(next, 0 | 43 | 44 | 60) {
+            return Err(NoDatagram::NotUdp);
+        }
+        let header: [u8; 8] = array_at(packet, at).ok_or(NoDatagram::CutShort)?;
+        at += 8;
         if next == 44 {
             let field = u16::from_be_bytes([header[2], header[3]]);
             if field & 0xfff8 != 0 {
                 return Err(NoDatagram::LaterFragment);
             }
             is_fragmented |= field & 1 != 0;
-            at += 8;
         } else {
-            at += 8 + 8 * usize::from(header[1]);
+            at += 8 * usize::from(header[1]);
         }
         next = header[0];
     }
     Err(NoDatagram::Malformed)
-}
-
-fn udp<'a>(network: &Network<'a>) -> Result<UdpDatagram<'a>, NoDatagram> {
-    let header: [u8; 8] = array_at(network.segment, 0).ok_or(NoDatagram::CutShort)?;
-    let word = |at: usize| u16::from_be_bytes([header[at], header[at + 1]]);
-    let length_bytes = usize::from(word(4));
-    let fits = length_bytes <= network.segment_bytes || network.is_fragmented;
-    if length_bytes < UDP_HEADER_BYTES || !fits {
-        return Err(NoDatagram::Malformed);
-    }
-    let end = length_bytes.min(network.segment.len());
-    Ok(UdpDatagram {
-        source: SocketAddr::new(network.addresses.0, word(0)),
-        destination: SocketAddr::new(network.addresses.1, word(2)),
-        dscp: network.dscp,
-        vlan: network.vlan,
-        payload_bytes: length_bytes - UDP_HEADER_BYTES,
-        payload: &network.segment[UDP_HEADER_BYTES..end],
-        is_fragmented: network.is_fragmented,
-    })
 }

@@ -11,7 +11,6 @@ use super::flow::{DatagramIdentity, FlowFilter, FlowKind, Unidentified};
 use super::link::{NoDatagram, udp_datagram};
 use super::{CaptureInterface, CapturedPacket, esl};
 use hil_net::{Direction, link_type};
-use hil_protocol::wire::Kind;
 
 /// A place where datagrams were seen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -110,11 +109,10 @@ pub struct PacketCounts {
 }
 
 /// Takes packets and keeps what is followed.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Observer {
     flows: Vec<FlowFilter>,
     seen: BTreeMap<Point, Seen>,
-    newest_ns: BTreeMap<Point, i64>,
     counts: PacketCounts,
 }
 
@@ -123,9 +121,7 @@ impl Observer {
     pub fn new(flows: &[FlowFilter]) -> Self {
         Self {
             flows: flows.to_vec(),
-            seen: BTreeMap::new(),
-            newest_ns: BTreeMap::new(),
-            counts: PacketCounts::default(),
+            ..Self::default()
         }
     }
 
@@ -142,33 +138,23 @@ impl Observer {
         if packet.link_type == link_type::ETHERNET
             && let Some((header, inner)) = esl::split(frame)
         {
-            self.count_esl(&header);
+            self.counts.esl_count += 1;
+            self.counts.esl_damaged_count += u64::from(header.is_damaged());
+            self.counts.esl_port_unclear_count += u64::from(header.port_count() != 1);
             frame = inner;
             point.esl_port = header.port();
             stamp_ns = i64::try_from(header.stamp_ns).ok();
         }
+        let counts = &mut self.counts;
         let Some(stamp_ns) = stamp_ns else {
-            self.counts.stampless_count += 1;
+            counts.stampless_count += 1;
             return;
         };
-        let newest = self.newest_ns.entry(point).or_insert(stamp_ns);
-        self.counts.backward_stamp_count += u64::from(stamp_ns < *newest);
-        *newest = stamp_ns.max(*newest);
         let seen = self.seen.entry(point).or_default();
         let (first, last) = seen.span_ns.unwrap_or((stamp_ns, stamp_ns));
+        counts.backward_stamp_count += u64::from(stamp_ns < last);
         seen.span_ns = Some((first.min(stamp_ns), last.max(stamp_ns)));
-        self.follow(point, stamp_ns, packet.link_type, frame);
-    }
-
-    fn count_esl(&mut self, header: &esl::EslHeader) {
-        self.counts.esl_count += 1;
-        self.counts.esl_damaged_count += u64::from(header.is_damaged());
-        self.counts.esl_port_unclear_count += u64::from(header.port_count() != 1);
-    }
-
-    fn follow(&mut self, point: Point, stamp_ns: i64, link: u16, frame: &[u8]) {
-        let counts = &mut self.counts;
-        let datagram = match udp_datagram(link, frame) {
+        let datagram = match udp_datagram(packet.link_type, frame) {
             Ok(datagram) => datagram,
             Err(reason) => {
                 *match reason {
@@ -197,7 +183,6 @@ impl Observer {
                         destination: datagram.destination,
                         own: identity.own.map(|own| (own.channel, own.kind as u8)),
                     };
-                    let seen = self.seen.entry(point).or_default();
                     seen.streams.entry(stream).or_default().push(Observation {
                         stamp_ns,
                         payload_bytes: u32::try_from(datagram.payload_bytes).unwrap_or(u32::MAX),
@@ -205,13 +190,9 @@ impl Observer {
                     });
                     return;
                 }
-                Err(reason) => {
-                    let is_ours = flow.kind == FlowKind::Hil;
-                    // Following our own means looking at everything: what is not ours is nobody's.
-                    if !(is_ours && reason == Unidentified::Foreign) {
-                        why = Some(reason);
-                    }
-                }
+                // Following our own means looking at everything: what is not ours is nobody's.
+                Err(Unidentified::Foreign) if flow.kind == FlowKind::Hil => {}
+                Err(reason) => why = Some(reason),
             }
         }
         *match why {
@@ -236,8 +217,8 @@ impl Observer {
         &self.seen
     }
 
-    /// Widens the time a point was watched to what its file says; a file may have been watching
-    /// longer than its packets tell.
+    /// Widens the time a point was watched to what its file says, after the last packet of the file;
+    /// it may have been watching longer than its packets tell.
     /// An interface of which the file has no packet but tells how long it was watched has points too.
     pub fn widen(&mut self, file_index: usize, interfaces: &[CaptureInterface]) {
         for (interface_index, interface) in interfaces.iter().enumerate() {
@@ -248,46 +229,33 @@ impl Observer {
             if interface.has_card_clock() {
                 continue;
             }
-            let point = |direction| Point {
-                file_index,
-                interface_index,
-                esl_port: None,
-                direction,
-            };
-            let is_here = |one: &Point| (one.file_index, one.interface_index);
-            let mut here = self
-                .seen
-                .keys()
-                .filter(|one| is_here(one) == (file_index, interface_index));
-            if here.any(|one| one.esl_port.is_some() || one.direction == Direction::Unknown) {
+            let has_other_points = self.seen.keys().any(|one| {
+                (one.file_index, one.interface_index) == (file_index, interface_index)
+                    && (one.esl_port.is_some() || one.direction == Direction::Unknown)
+            });
+            if has_other_points {
                 continue;
             }
             for direction in [Direction::Inbound, Direction::Outbound] {
-                let seen = self.seen.entry(point(direction)).or_default();
+                let point = Point {
+                    file_index,
+                    interface_index,
+                    esl_port: None,
+                    direction,
+                };
+                let seen = self.seen.entry(point).or_default();
                 seen.span_ns.get_or_insert((start, end));
             }
         }
         for (point, seen) in &mut self.seen {
-            if point.file_index != file_index || point.esl_port.is_some() {
-                continue;
-            }
-            let Some(interface) = interfaces.get(point.interface_index) else {
-                continue;
-            };
-            if let Some((first, last)) = &mut seen.span_ns {
+            if point.file_index == file_index
+                && point.esl_port.is_none()
+                && let Some(interface) = interfaces.get(point.interface_index)
+                && let Some((first, last)) = &mut seen.span_ns
+            {
                 *first = interface.start_ns.map_or(*first, |start| start.min(*first));
                 *last = interface.end_ns.map_or(*last, |end| end.max(*last));
             }
         }
-    }
-
-    /// Datagrams of our own protocol seen at `point`, by kind.
-    pub fn own_count(&self, point: &Point, kind: Kind) -> u64 {
-        let streams = self.seen.get(point).map(|seen| seen.streams.iter());
-        let of_kind = |(stream, _): &(&Stream, &Vec<Observation>)| {
-            stream.own.is_some_and(|(_, code)| code == kind as u8)
-        };
-        let streams = streams.into_iter().flatten().filter(of_kind);
-        streams.map(|(_, list)| list.len() as u64).sum()
     }
 }

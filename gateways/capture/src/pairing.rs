@@ -14,23 +14,22 @@ use hil_net::Direction;
 /// Every stream at every two points it passed or should have passed. Stamps of one datagram lie at
 /// most `window_ns` apart.
 pub fn join_all(observer: &Observer, window_ns: i64) -> Vec<(Stream, Joined)> {
-    let points: Vec<_> = observer.seen().iter().collect();
+    let points: Vec<(&Point, &Seen)> = observer.seen().iter().collect();
     let mut found = Vec::new();
-    for (index, a) in points.iter().enumerate() {
-        for stream in a.1.streams.keys() {
-            let others = points.iter().enumerate();
+    for (index, (a, seen_a)) in points.iter().enumerate() {
+        for stream in seen_a.streams.keys() {
             let saw_it = |seen: &Seen| seen.streams.contains_key(stream);
-            let is_elsewhere = others.clone().any(|(at, b)| at != index && saw_it(b.1));
-            for (at, b) in others.filter(|(at, _)| *at != index) {
+            let others = points.iter().enumerate().filter(|(at, _)| *at != index);
+            let is_elsewhere = others.clone().any(|(_, (_, seen))| saw_it(seen));
+            for (at, (b, seen_b)) in others {
                 let is_wanted = if is_elsewhere {
                     // Each two once.
-                    at > index && saw_it(b.1)
+                    at > index && saw_it(seen_b)
                 } else {
-                    is_expected(stream, a.0, b, observer)
+                    is_expected(stream, a, b, observer)
                 };
-                if let Some(joined) = join(stream, *a, *b, window_ns).filter(|_| is_wanted) {
-                    found.push((*stream, joined));
-                }
+                let joined = join(stream, a, seen_a, b, seen_b, window_ns);
+                found.extend(joined.filter(|_| is_wanted).map(|joined| (*stream, joined)));
             }
         }
     }
@@ -39,10 +38,8 @@ pub fn join_all(observer: &Observer, window_ns: i64) -> Vec<(Stream, Joined)> {
 }
 
 /// True when `stream`, seen at `at`, was to be seen at the other point.
-fn is_expected(stream: &Stream, at: &Point, other: &(&Point, &Seen), observer: &Observer) -> bool {
-    let (point, seen) = *other;
+fn is_expected(stream: &Stream, at: &Point, point: &Point, observer: &Observer) -> bool {
     let place = |point: &Point| (point.file_index, point.interface_index, point.esl_port);
-    let is_same_file = at.file_index == point.file_index;
     // Out here, in there; into a host and out of it, or out of another whose capture has missed it.
     let is_on_its_way = match (at.direction, point.direction) {
         (Direction::Outbound, direction) => direction == Direction::Inbound,
@@ -52,22 +49,18 @@ fn is_expected(stream: &Stream, at: &Point, other: &(&Point, &Seen), observer: &
     if place(at) == place(point) || !is_on_its_way {
         return false;
     }
-    let ends = |one: &Stream| (one.source.ip(), one.destination.ip());
-    let (source, destination) = ends(stream);
+    let (source, destination) = (stream.source.ip(), stream.destination.ip());
     let here = observer.seen().iter();
-    let mut here = here
-        .filter(|(one, _)| place(one) == place(point))
-        .flat_map(|(_, seen)| seen.streams.keys())
-        .peekable();
+    let here = here.filter(|(one, _)| place(one) == place(point));
+    let mut here = here.flat_map(|(_, seen)| seen.streams.keys()).peekable();
     let has_followed = here.peek().is_some();
     let is_between_them = here.any(|one| {
-        let pair = ends(one);
-        pair == (source, destination) || pair == (destination, source)
+        let (from, to) = (one.source.ip(), one.destination.ip());
+        (from == source && to == destination) || (from == destination && to == source)
     });
+    let mut own = observer.seen()[point].streams.keys();
+    let has_its_target = own.any(|one| one.destination.ip() == destination);
+    let is_first_of_a_file = !has_followed && at.file_index != point.file_index;
     let leaves = at.direction != Direction::Inbound;
-    let has_its_target = seen
-        .streams
-        .keys()
-        .any(|one| one.destination.ip() == destination);
-    is_between_them || (leaves && (has_its_target || (!has_followed && !is_same_file)))
+    is_between_them || (leaves && (has_its_target || is_first_of_a_file))
 }

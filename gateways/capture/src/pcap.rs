@@ -1,7 +1,7 @@
 //! The pcap file: a header of 24 bytes, then records of 16 bytes and the packet
 //! (draft-ietf-opsawg-pcap). It has one interface, no names and no way back after a broken length.
 
-use super::bytes::ByteOrder;
+use super::bytes::{ByteOrder, Numbers};
 use super::reader::{Found, Next, Window};
 use super::{CaptureInterface, Problem};
 use hil_net::Direction;
@@ -13,35 +13,27 @@ const RECORD_HEADER_BYTES: usize = 16;
 /// What the magic number told.
 #[derive(Debug)]
 pub(super) struct PcapFile {
-    order: ByteOrder,
-    fraction_ns: i64,
+    pub(super) order: ByteOrder,
+    /// Nanoseconds to one unit of a stamp's fraction.
+    pub(super) fraction_ns: i64,
 }
 
 impl PcapFile {
     pub(super) const HEADER_BYTES: u64 = 24;
 
-    pub(super) const fn new(order: ByteOrder, fraction_ns: i64) -> Self {
-        Self { order, fraction_ns }
+    fn numbers<'a>(&self, window: &'a Window) -> Numbers<'a> {
+        let (order, bytes) = (self.order, window.bytes());
+        Numbers { order, bytes }
     }
 
     /// The interface of the file header; `Ok(None)` while it is not all there.
     pub(super) fn header(&self, window: &Window) -> Result<Option<CaptureInterface>, Problem> {
-        let bytes = window.bytes();
-        let fields = (
-            self.order.u16(bytes, 4),
-            self.order.u16(bytes, 6),
-            self.order.u32(bytes, 16),
-            self.order.u32(bytes, 20),
-        );
-        let (Some(major), Some(minor), Some(snap_bytes), Some(network)) = fields else {
-            if !window.is_complete() {
-                return Ok(None);
-            }
-            return Err(Problem::Truncated {
-                what: "the file header",
-                available_bytes: bytes.len() as u64,
-                expected_bytes: Self::HEADER_BYTES,
-            });
+        let bytes = self.numbers(window);
+        let (Some(major), Some(minor), Some(snap_bytes), Some(network)) =
+            (bytes.u16(4), bytes.u16(6), bytes.u32(16), bytes.u32(20))
+        else {
+            let missing = window.missing("the file header", Self::HEADER_BYTES);
+            return missing.map_or(Ok(None), Err);
         };
         if (major, minor) != (2, 4) {
             return Err(Problem::Version { major, minor });
@@ -56,64 +48,40 @@ impl PcapFile {
     }
 
     pub(super) fn next(&self, window: &Window) -> Next {
-        let bytes = window.bytes();
-        if bytes.is_empty() {
+        let bytes = self.numbers(window);
+        if bytes.bytes.is_empty() {
             return Next::NeedsMore;
         }
-        let fields = (
-            self.order.u32(bytes, 0),
-            self.order.u32(bytes, 4),
-            self.order.u32(bytes, 8),
-            self.order.u32(bytes, 12),
-        );
-        let (Some(seconds), Some(fraction), Some(captured), Some(original_bytes)) = fields else {
-            return missing(window, "a record header", RECORD_HEADER_BYTES as u64);
+        let (Some(seconds), Some(fraction), Some(captured), Some(original_bytes)) =
+            (bytes.u32(0), bytes.u32(4), bytes.u32(8), bytes.u32(12))
+        else {
+            return window.needs("a record header", RECORD_HEADER_BYTES as u64);
         };
         if captured > CAPTURED_BYTES_MAX {
-            return Next::Fault(
-                Problem::Length {
-                    what: "a record's captured length",
-                    length: captured.into(),
-                    min: 0,
-                    max: CAPTURED_BYTES_MAX.into(),
-                },
-                None,
-            );
+            let problem = Problem::Length {
+                what: "a record's captured length",
+                length: captured.into(),
+                min: 0,
+                max: CAPTURED_BYTES_MAX.into(),
+            };
+            return Next::Fault(problem, None);
         }
         let fraction_ns = i64::from(fraction) * self.fraction_ns;
         if fraction_ns >= 1_000_000_000 {
-            return Next::Fault(
-                Problem::Malformed("a stamp's fraction is a second or more"),
-                None,
-            );
+            let problem = Problem::Malformed("a stamp's fraction is a second or more");
+            return Next::Fault(problem, None);
         }
         let end = RECORD_HEADER_BYTES + captured as usize;
-        if bytes.len() < end {
-            return missing(window, "a record", end as u64);
+        if bytes.bytes.len() < end {
+            return window.needs("a record", end as u64);
         }
-        Next::Packet(Found {
-            offset: window.offset(),
+        let found = Found {
             interface_index: 0,
             stamp_ns: Some(i64::from(seconds) * 1_000_000_000 + fraction_ns),
             original_bytes,
             direction: Direction::Unknown,
-            data: (RECORD_HEADER_BYTES, end),
-            record_bytes: end as u64,
-        })
+            data: RECORD_HEADER_BYTES..end,
+        };
+        Next::Packet(found, end as u64)
     }
-}
-
-/// More is needed, or, when there is no more, what is missing.
-pub(super) fn missing(window: &Window, what: &'static str, expected_bytes: u64) -> Next {
-    if !window.is_complete() {
-        return Next::NeedsMore;
-    }
-    Next::Fault(
-        Problem::Truncated {
-            what,
-            available_bytes: window.bytes().len() as u64,
-            expected_bytes,
-        },
-        None,
-    )
 }

@@ -2,19 +2,18 @@
 //! (draft-ietf-opsawg-pcapng). Section, interface, packet, simple packet and statistics blocks are
 //! read; blocks of other types are passed over, as the draft asks.
 
-use super::bytes::{ByteOrder, array_at};
-use super::pcap::missing;
+use super::bytes::{ByteOrder, Numbers, array_at};
 use super::reader::{Found, Next, Window};
 use super::{CaptureInterface, Problem};
 use hil_net::Direction;
 
-const SECTION: u32 = 0x0a0d_0d0a;
-const INTERFACE: u32 = 1;
+pub(super) const SECTION: u32 = 0x0a0d_0d0a;
+pub(super) const INTERFACE: u32 = 1;
 const OBSOLETE_PACKET: u32 = 2;
 const SIMPLE_PACKET: u32 = 3;
-const STATISTICS: u32 = 5;
-const ENHANCED_PACKET: u32 = 6;
-const BYTE_ORDER_MAGIC: u32 = 0x1a2b_3c4d;
+pub(super) const STATISTICS: u32 = 5;
+pub(super) const ENHANCED_PACKET: u32 = 6;
+pub(super) const BYTE_ORDER_MAGIC: u32 = 0x1a2b_3c4d;
 const BLOCK_BYTES_MIN: u32 = 12;
 /// Largest block taken for one; the same as Wireshark's.
 const BLOCK_BYTES_MAX: u32 = 16 * 1024 * 1024;
@@ -39,19 +38,23 @@ impl PcapngFile {
             return Next::NeedsMore;
         }
         if bytes.len() < BLOCK_BYTES_MIN as usize {
-            return missing(window, "a block", BLOCK_BYTES_MIN.into());
+            return window.needs("a block", BLOCK_BYTES_MIN.into());
         }
-        if let Err(problem) = self.note_order(bytes) {
-            return self.lost(window, problem);
+        // A section says the order of its numbers.
+        if array_at(bytes, 0) == Some(SECTION.to_be_bytes()) {
+            self.order = match array_at(bytes, 8).map(u32::from_le_bytes) {
+                Some(BYTE_ORDER_MAGIC) => Some(ByteOrder::Little),
+                Some(other) if other.swap_bytes() == BYTE_ORDER_MAGIC => Some(ByteOrder::Big),
+                _ => return self.lost(window, Problem::Malformed("no byte-order magic")),
+            };
         }
         let Some(order) = self.order else {
-            return self.lost(
-                window,
-                Problem::Malformed("a block before the first section"),
-            );
+            let problem = Problem::Malformed("a block before the first section");
+            return self.lost(window, problem);
         };
-        let (Some(kind), Some(length)) = (order.u32(bytes, 0), order.u32(bytes, 4)) else {
-            return missing(window, "a block", BLOCK_BYTES_MIN.into());
+        let block = Numbers { order, bytes };
+        let (Some(kind), Some(length)) = (block.u32(0), block.u32(4)) else {
+            return window.needs("a block", BLOCK_BYTES_MIN.into());
         };
         let is_sound = (BLOCK_BYTES_MIN..=BLOCK_BYTES_MAX).contains(&length);
         if !is_sound || !length.is_multiple_of(4) {
@@ -64,58 +67,36 @@ impl PcapngFile {
             return self.lost(window, problem);
         }
         if bytes.len() < length as usize {
-            return missing(window, "a block", length.into());
+            return window.needs("a block", length.into());
         }
-        let second = order.u32(bytes, length as usize - 4).unwrap_or(0);
+        let second = block.u32(length as usize - 4).unwrap_or(0);
         if second != length {
             let first = length;
             return self.lost(window, Problem::LengthsDiffer { first, second });
         }
-        let body = Body {
-            order,
-            bytes: &bytes[8..length as usize - 4],
-        };
+        let body = block.part(&bytes[8..length as usize - 4]);
         let length = u64::from(length);
+        let base = self.interface_base;
         let outcome = match kind {
-            SECTION => return self.section(window, &body, interfaces.len(), length),
-            INTERFACE => describe(&body, interfaces),
+            SECTION => return self.section(window, body, interfaces.len(), length),
+            INTERFACE => describe(body, interfaces).map(|()| None),
             ENHANCED_PACKET | OBSOLETE_PACKET | SIMPLE_PACKET => {
-                let base = self.interface_base;
-                return match packet(kind, &body, interfaces, base) {
-                    Ok(found) => Next::Packet(Found {
-                        offset: window.offset(),
-                        record_bytes: length,
-                        ..found
-                    }),
-                    Err(problem) => Next::Fault(problem, Some(length)),
-                };
+                packet(kind, body, interfaces, base).map(Some)
             }
-            STATISTICS => statistics(&body, interfaces, self.interface_base),
-            _ => Ok(()),
+            STATISTICS => statistics(body, interfaces, base).map(|()| None),
+            _ => Ok(None),
         };
         match outcome {
-            Ok(()) => Next::Passed(length),
+            Ok(Some(found)) => Next::Packet(found, length),
+            Ok(None) => Next::Passed(length),
             Err(problem) => Next::Fault(problem, Some(length)),
         }
-    }
-
-    /// A section says the order of its numbers.
-    fn note_order(&mut self, bytes: &[u8]) -> Result<(), Problem> {
-        if array_at(bytes, 0) != Some(SECTION.to_be_bytes()) {
-            return Ok(());
-        }
-        self.order = match array_at(bytes, 8).map(u32::from_le_bytes) {
-            Some(BYTE_ORDER_MAGIC) => Some(ByteOrder::Little),
-            Some(other) if other.swap_bytes() == BYTE_ORDER_MAGIC => Some(ByteOrder::Big),
-            _ => return Err(Problem::Malformed("no byte-order magic")),
-        };
-        Ok(())
     }
 
     fn section(
         &mut self,
         window: &Window,
-        body: &Body<'_>,
+        body: Numbers<'_>,
         interface_count: usize,
         length: u64,
     ) -> Next {
@@ -130,14 +111,10 @@ impl PcapngFile {
             return self.lost(window, problem);
         };
         self.interface_base = interface_count;
-        self.section_end = (section_bytes.cast_signed() >= 0)
-            .then(|| {
-                window
-                    .offset()
-                    .checked_add(length)?
-                    .checked_add(section_bytes)
-            })
-            .flatten();
+        // A negative length is one that the writer did not know.
+        let is_known = section_bytes.cast_signed() >= 0;
+        let end = window.offset.checked_add(length).filter(|_| is_known);
+        self.section_end = end.and_then(|end| end.checked_add(section_bytes));
         if major != 1 {
             return self.lost(window, Problem::Version { major, minor });
         }
@@ -146,38 +123,25 @@ impl PcapngFile {
 
     /// The next block cannot be found from this one: go on at the next section, if it is known.
     fn lost(&self, window: &Window, problem: Problem) -> Next {
-        let end = self.section_end.filter(|end| *end > window.offset());
-        Next::Fault(problem, end.map(|end| end - window.offset()))
+        let end = self.section_end.filter(|end| *end > window.offset);
+        Next::Fault(problem, end.map(|end| end - window.offset))
     }
 }
 
-struct Body<'a> {
-    order: ByteOrder,
-    bytes: &'a [u8],
-}
-
-impl<'a> Body<'a> {
-    fn u16(&self, offset: usize) -> Option<u16> {
-        self.order.u16(self.bytes, offset)
-    }
-
-    fn u32(&self, offset: usize) -> Option<u32> {
-        self.order.u32(self.bytes, offset)
-    }
-
-    fn u64(&self, offset: usize) -> Option<u64> {
-        self.order.u64(self.bytes, offset)
+impl<'a> Numbers<'a> {
+    const fn part(self, bytes: &'a [u8]) -> Self {
+        Self { bytes, ..self }
     }
 
     /// A stamp as two halves, the upper first, in either byte order.
-    fn stamp(&self, offset: usize) -> Option<u64> {
+    fn stamp(self, offset: usize) -> Option<u64> {
         let (high, low) = (self.u32(offset)?, self.u32(offset + 4)?);
         Some(u64::from(high) << 32 | u64::from(low))
     }
 
     /// Calls `take` with code and value of each option from `offset` to the end mark.
     fn options(
-        &self,
+        self,
         offset: usize,
         mut take: impl FnMut(u16, &'a [u8]) -> Result<(), Problem>,
     ) -> Result<(), Problem> {
@@ -200,12 +164,10 @@ impl<'a> Body<'a> {
     }
 }
 
-fn describe(body: &Body<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result<(), Problem> {
-    let (Some(link_type), Some(snap_bytes)) = (body.u16(0), body.u32(4)) else {
-        return Err(Problem::Malformed(
-            "an interface block shorter than 8 bytes",
-        ));
-    };
+fn describe(body: Numbers<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result<(), Problem> {
+    const SHORT: Problem = Problem::Malformed("an interface block shorter than 8 bytes");
+    let link_type = body.u16(0).ok_or(SHORT)?;
+    let snap_bytes = body.u32(4).ok_or(SHORT)?;
     if interfaces.len() >= INTERFACE_COUNT_MAX {
         return Err(Problem::Malformed("more than 4096 interfaces"));
     }
@@ -218,12 +180,10 @@ fn describe(body: &Body<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result<(
     let outcome = body.options(8, |code, value| {
         match (code, value) {
             (2, name) => interface.name = Some(String::from_utf8_lossy(name).into_owned()),
-            (3, text) => {
-                interface.description = Some(String::from_utf8_lossy(text).into_owned());
-            }
+            (3, text) => interface.description = Some(String::from_utf8_lossy(text).into_owned()),
             (9, &[resolution]) => interface.unit_ns = unit_ns(resolution)?,
             (14, seconds) => {
-                let seconds = body.order.u64(seconds, 0).map(u64::cast_signed);
+                let seconds = body.part(seconds).u64(0).map(u64::cast_signed);
                 let offset_ns = seconds.and_then(|s| s.checked_mul(1_000_000_000));
                 interface.offset_ns = offset_ns.ok_or(Problem::Malformed(
                     "if_tsoffset does not fit into nanoseconds",
@@ -262,7 +222,7 @@ fn in_ns(units: u64, interface: &CaptureInterface) -> Result<i64, Problem> {
 
 fn packet(
     kind: u32,
-    body: &Body<'_>,
+    body: Numbers<'_>,
     interfaces: &[CaptureInterface],
     base: usize,
 ) -> Result<Found, Problem> {
@@ -298,11 +258,10 @@ fn packet(
         });
     }
     let mut direction = Direction::Unknown;
-    let stamp_ns = if kind == SIMPLE_PACKET {
-        None
-    } else {
+    let mut stamp_ns = None;
+    if kind != SIMPLE_PACKET {
         body.options(end.next_multiple_of(4), |code, value| {
-            if let (2, Some(flags)) = (code, body.order.u32(value, 0)) {
+            if let (2, Some(flags)) = (code, body.part(value).u32(0)) {
                 direction = match flags & 3 {
                     1 => Direction::Inbound,
                     2 => Direction::Outbound,
@@ -311,38 +270,29 @@ fn packet(
             }
             Ok(())
         })?;
-        Some(in_ns(body.stamp(4).ok_or(SHORT)?, interface)?)
-    };
+        stamp_ns = Some(in_ns(body.stamp(4).ok_or(SHORT)?, interface)?);
+    }
     Ok(Found {
-        offset: 0,
         interface_index,
         stamp_ns,
         original_bytes,
         direction,
-        data: (8 + header_bytes, 8 + end),
-        record_bytes: 0,
+        data: 8 + header_bytes..8 + end,
     })
 }
 
 fn statistics(
-    body: &Body<'_>,
+    body: Numbers<'_>,
     interfaces: &mut [CaptureInterface],
     base: usize,
 ) -> Result<(), Problem> {
-    let Some(index) = body.u32(0) else {
-        return Err(Problem::Malformed(
-            "a statistics block shorter than 12 bytes",
-        ));
-    };
+    const SHORT: Problem = Problem::Malformed("a statistics block shorter than 12 bytes");
+    let index = body.u32(0).ok_or(SHORT)?;
     let count = interfaces.len() - base;
-    let Some(interface) = interfaces[base..].get_mut(index as usize) else {
-        return Err(Problem::UnknownInterface { index, count });
-    };
+    let interface = interfaces[base..].get_mut(index as usize);
+    let interface = interface.ok_or(Problem::UnknownInterface { index, count })?;
     body.options(12, |code, value| {
-        let halves = Body {
-            order: body.order,
-            bytes: value,
-        };
+        let halves = body.part(value);
         match (code, value.len()) {
             (2, 8) => interface.start_ns = Some(in_ns(halves.stamp(0).unwrap_or(0), interface)?),
             (3, 8) => interface.end_ns = Some(in_ns(halves.stamp(0).unwrap_or(0), interface)?),

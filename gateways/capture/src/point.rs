@@ -62,21 +62,16 @@ pub fn single_point_figures(observations: &[Observation]) -> Option<PointFigures
     let mut interval = LatencyHistogram::default();
     let mut longest: Option<GapFigures> = None;
     for pair in stamps.windows(2) {
-        let length_ns = pair[1].saturating_sub(pair[0]);
+        let (from_ns, length_ns) = (pair[0], pair[1].saturating_sub(pair[0]));
         interval.record(length_ns);
         if longest.is_none_or(|gap| length_ns > gap.length_ns) {
-            longest = Some(GapFigures {
-                from_ns: pair[0],
-                length_ns,
-            });
+            longest = Some(GapFigures { from_ns, length_ns });
         }
     }
+    let payloads = observations.iter().map(|one| u64::from(one.payload_bytes));
     Some(PointFigures {
         datagram_count: observations.len() as u64,
-        payload_bytes: observations
-            .iter()
-            .map(|one| u64::from(one.payload_bytes))
-            .sum(),
+        payload_bytes: payloads.sum(),
         first_ns,
         last_ns,
         interval: interval.distribution("fewer than two datagrams"),
@@ -99,20 +94,11 @@ struct Unwrapped {
 }
 
 impl Unwrapped {
-    fn from(first: &Numbered) -> Self {
-        let mut count = Self {
-            top: 0,
-            restart_count: 0,
-        };
-        count.begin(first);
-        count
-    }
-
-    fn begin(&mut self, first: &Numbered) {
-        self.top = match first.bits {
+    const fn first_top(first: &Numbered) -> u64 {
+        match first.bits {
             Some(bits @ ..64) => (1 << bits) + first.number,
             _ => first.number,
-        };
+        }
     }
 
     /// The number as it would be if the count never wrapped.
@@ -139,7 +125,7 @@ impl Unwrapped {
             self.top = self.top.saturating_add(ahead);
         } else {
             self.restart_count += 1;
-            self.begin(one);
+            self.top = Self::first_top(one);
         }
         self.top
     }
@@ -155,8 +141,10 @@ fn number_figures(observations: &[Observation]) -> Option<NumberFigures> {
     let (mut has_pieces, mut repeated_count) = (false, 0);
     for one in in_time {
         let numbered = one.identity.number?;
-        let count = counts.entry(numbered.series);
-        let count = count.or_insert_with(|| Unwrapped::from(&numbered));
+        let count = counts.entry(numbered.series).or_insert_with(|| Unwrapped {
+            top: Unwrapped::first_top(&numbered),
+            restart_count: 0,
+        });
         let number = count.take(&numbered);
         figures.reordered_count += u64::from(number < count.top);
         let list = series.entry((numbered.series, count.restart_count));
@@ -180,9 +168,8 @@ fn number_figures(observations: &[Observation]) -> Option<NumberFigures> {
     figures.step = most.map_or(1, |(step, _)| *step);
     for (difference, count) in &steps {
         let between = difference.div_ceil(figures.step).saturating_sub(1);
-        figures.skipped_count = figures
-            .skipped_count
-            .saturating_add(between.saturating_mul(*count));
+        let skipped = between.saturating_mul(*count);
+        figures.skipped_count = figures.skipped_count.saturating_add(skipped);
     }
     Some(figures)
 }

@@ -6,7 +6,9 @@
 //! reading goes on only if the section says where the next one begins. pcap has no such marks, so
 //! its first fault ends the file.
 
-use super::bytes::ByteOrder;
+use core::ops::Range;
+
+use super::bytes::{ByteOrder, array_at};
 use super::pcap::PcapFile;
 use super::pcapng::PcapngFile;
 use super::{CaptureFault, CaptureInterface, CapturedPacket, Problem};
@@ -52,7 +54,7 @@ impl Format {
 pub(super) struct Window {
     buffer: Vec<u8>,
     start: usize,
-    offset: u64,
+    pub(super) offset: u64,
     /// Bytes to drop as they come.
     owed_bytes: u64,
     is_complete: bool,
@@ -63,16 +65,23 @@ impl Window {
         &self.buffer[self.start..]
     }
 
-    pub(super) fn offset(&self) -> u64 {
-        self.offset
+    /// What is wrong when less than `expected_bytes` of `what` are there; `None` while more may come.
+    pub(super) fn missing(&self, what: &'static str, expected_bytes: u64) -> Option<Problem> {
+        self.is_complete.then(|| Problem::Truncated {
+            what,
+            available_bytes: self.bytes().len() as u64,
+            expected_bytes,
+        })
     }
 
-    pub(super) fn is_complete(&self) -> bool {
-        self.is_complete
+    /// More is needed, or, when there is no more, what is missing.
+    pub(super) fn needs(&self, what: &'static str, expected_bytes: u64) -> Next {
+        let missing = self.missing(what, expected_bytes);
+        missing.map_or(Next::NeedsMore, |problem| Next::Fault(problem, None))
     }
 
     /// Drops `length` bytes, also such as have not come yet.
-    pub(super) fn skip(&mut self, length: u64) {
+    fn skip(&mut self, length: u64) {
         let here = self.bytes().len() as u64;
         let now = length.min(here);
         self.start += usize::try_from(now).expect("at most what is in memory");
@@ -90,22 +99,21 @@ impl Window {
     }
 }
 
-/// Where a packet's bytes lie in the window, and what is known of it.
-#[derive(Debug, Clone, Copy)]
+/// What is known of the packet at the front of the window, and where its bytes lie in it.
+#[derive(Debug, Clone)]
 pub(super) struct Found {
-    pub(super) offset: u64,
     pub(super) interface_index: usize,
     pub(super) stamp_ns: Option<i64>,
     pub(super) original_bytes: u32,
     pub(super) direction: Direction,
-    pub(super) data: (usize, usize),
-    pub(super) record_bytes: u64,
+    pub(super) data: Range<usize>,
 }
 
 /// What a format makes of the bytes at the front of the window.
 #[derive(Debug)]
 pub(super) enum Next {
-    Packet(Found),
+    /// A packet, whose record or block has so many bytes.
+    Packet(Found, u64),
     /// So many bytes were something else.
     Passed(u64),
     NeedsMore,
@@ -113,8 +121,9 @@ pub(super) enum Next {
     Fault(Problem, Option<u64>),
 }
 
-#[derive(Debug)]
+#[derive(Debug, Default)]
 enum State {
+    #[default]
     Unknown,
     Pcap(PcapFile),
     Pcapng(PcapngFile),
@@ -133,7 +142,7 @@ enum State {
 /// assert_eq!(fault.offset, 0);
 /// assert!(matches!(reader.next_step(), Step::Ended));
 /// ```
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct CaptureReader {
     window: Window,
     state: State,
@@ -141,18 +150,6 @@ pub struct CaptureReader {
     interfaces: Vec<CaptureInterface>,
     /// The packet given out last, dropped at the next step.
     given_bytes: u64,
-}
-
-impl Default for CaptureReader {
-    fn default() -> Self {
-        Self {
-            window: Window::default(),
-            state: State::Unknown,
-            format: None,
-            interfaces: Vec::new(),
-            given_bytes: 0,
-        }
-    }
 }
 
 impl CaptureReader {
@@ -183,59 +180,47 @@ impl CaptureReader {
     pub fn next_step(&mut self) -> Step<'_> {
         self.window.skip(core::mem::take(&mut self.given_bytes));
         loop {
-            if matches!(self.state, State::Ended) {
-                return Step::Ended;
-            }
-            if self.window.owed_bytes > 0 {
+            if self.window.owed_bytes > 0 && !matches!(self.state, State::Ended) {
                 return self.wait();
             }
             let next = match &mut self.state {
-                State::Unknown => match self.recognise() {
-                    Some(step) => return step,
-                    None => continue,
-                },
+                State::Unknown => self.recognise(),
                 State::Pcap(file) => file.next(&self.window),
                 State::Pcapng(file) => file.next(&self.window, &mut self.interfaces),
                 State::Ended => return Step::Ended,
             };
             match next {
                 Next::Passed(length) => self.window.skip(length),
-                Next::Packet(found) => {
-                    self.given_bytes = found.record_bytes;
-                    let (from, to) = found.data;
+                Next::Packet(found, record_bytes) => {
+                    self.given_bytes = record_bytes;
                     let interface = &self.interfaces[found.interface_index];
                     return Step::Packet(CapturedPacket {
-                        offset: found.offset,
+                        offset: self.window.offset,
                         interface_index: found.interface_index,
                         link_type: interface.link_type,
                         stamp_ns: found.stamp_ns,
                         original_bytes: found.original_bytes,
                         is_card_stamped: interface.has_card_clock(),
                         direction: found.direction,
-                        data: &self.window.bytes()[from..to],
+                        data: &self.window.bytes()[found.data],
                     });
                 }
                 Next::NeedsMore if !self.window.is_complete => return Step::NeedsMore,
-                Next::NeedsMore => {
-                    self.state = State::Ended;
-                    return Step::Ended;
+                Next::NeedsMore => self.state = State::Ended,
+                Next::Fault(problem, go_on) => {
+                    let fault = CaptureFault {
+                        offset: self.window.offset,
+                        problem,
+                        is_passed: go_on.is_some(),
+                    };
+                    match go_on {
+                        Some(length) => self.window.skip(length),
+                        None => self.state = State::Ended,
+                    }
+                    return Step::Fault(fault);
                 }
-                Next::Fault(problem, go_on) => return self.fault(problem, go_on),
             }
         }
-    }
-
-    fn fault(&mut self, problem: Problem, go_on: Option<u64>) -> Step<'static> {
-        let fault = CaptureFault {
-            offset: self.window.offset(),
-            problem,
-            is_passed: go_on.is_some(),
-        };
-        match go_on {
-            Some(length) => self.window.skip(length),
-            None => self.state = State::Ended,
-        }
-        Step::Fault(fault)
     }
 
     /// Bytes that are passed over have not come yet.
@@ -256,57 +241,40 @@ impl CaptureReader {
         })
     }
 
-    /// Looks at the first four bytes; `None` when the format is known now.
-    fn recognise(&mut self) -> Option<Step<'static>> {
+    /// Looks at the first four bytes and, of pcap, at the file header.
+    fn recognise(&mut self) -> Next {
         let bytes = self.window.bytes();
-        let Some(magic) = super::bytes::array_at::<4>(bytes, 0) else {
-            if !self.window.is_complete {
-                return Some(Step::NeedsMore);
+        let Some(magic) = array_at::<4>(bytes, 0) else {
+            if self.window.is_complete && bytes.is_empty() {
+                return Next::Fault(Problem::Empty, None);
             }
-            let available_bytes = bytes.len() as u64;
-            let problem = if available_bytes == 0 {
-                Problem::Empty
-            } else {
-                Problem::Truncated {
-                    what: "the file's magic number",
-                    available_bytes,
-                    expected_bytes: 4,
-                }
-            };
-            return Some(self.fault(problem, None));
+            return self.window.needs("the file's magic number", 4);
         };
-        let (format, state) = match magic {
-            [0x0a, 0x0d, 0x0d, 0x0a] => (Format::Pcapng, State::Pcapng(PcapngFile::default())),
-            [0xd4, 0xc3, 0xb2, 0xa1] => micro(ByteOrder::Little),
-            [0xa1, 0xb2, 0xc3, 0xd4] => micro(ByteOrder::Big),
-            [0x4d, 0x3c, 0xb2, 0xa1] => nano(ByteOrder::Little),
-            [0xa1, 0xb2, 0x3c, 0x4d] => nano(ByteOrder::Big),
-            _ => return Some(self.fault(Problem::Foreign(magic), None)),
-        };
-        if let State::Pcap(file) = &state {
-            match file.header(&self.window) {
-                Ok(Some(interface)) => self.interfaces.push(interface),
-                Ok(None) => return Some(Step::NeedsMore),
-                Err(problem) => return Some(self.fault(problem, None)),
+        let (format, order) = match magic {
+            [0x0a, 0x0d, 0x0d, 0x0a] => {
+                self.format = Some(Format::Pcapng);
+                self.state = State::Pcapng(PcapngFile::default());
+                return Next::Passed(0);
             }
-            self.window.skip(PcapFile::HEADER_BYTES);
+            [0xd4, 0xc3, 0xb2, 0xa1] => (Format::PcapMicroseconds, ByteOrder::Little),
+            [0xa1, 0xb2, 0xc3, 0xd4] => (Format::PcapMicroseconds, ByteOrder::Big),
+            [0x4d, 0x3c, 0xb2, 0xa1] => (Format::PcapNanoseconds, ByteOrder::Little),
+            [0xa1, 0xb2, 0x3c, 0x4d] => (Format::PcapNanoseconds, ByteOrder::Big),
+            _ => return Next::Fault(Problem::Foreign(magic), None),
+        };
+        let fraction_ns = if format == Format::PcapMicroseconds {
+            1000
+        } else {
+            1
+        };
+        let file = PcapFile { order, fraction_ns };
+        match file.header(&self.window) {
+            Ok(Some(interface)) => self.interfaces.push(interface),
+            Ok(None) => return Next::NeedsMore,
+            Err(problem) => return Next::Fault(problem, None),
         }
         self.format = Some(format);
-        self.state = state;
-        None
+        self.state = State::Pcap(file);
+        Next::Passed(PcapFile::HEADER_BYTES)
     }
-}
-
-fn micro(order: ByteOrder) -> (Format, State) {
-    (
-        Format::PcapMicroseconds,
-        State::Pcap(PcapFile::new(order, 1000)),
-    )
-}
-
-fn nano(order: ByteOrder) -> (Format, State) {
-    (
-        Format::PcapNanoseconds,
-        State::Pcap(PcapFile::new(order, 1)),
-    )
 }

@@ -3,14 +3,15 @@
 //! the owner writes out. It decides nothing about which packets are kept.
 
 use super::CaptureInterface;
+use super::pcapng::{BYTE_ORDER_MAGIC, ENHANCED_PACKET, INTERFACE, SECTION, STATISTICS};
 use hil_net::Direction;
 
 const NANOSECONDS: u8 = 9;
 
 /// Begins a file: who wrote it, and on what. All blocks go to the end of `out`.
 pub fn begin(out: &mut Vec<u8>, application: &str, operating_system: &str) {
-    block(out, 0x0a0d_0d0a, |body| {
-        body.extend_from_slice(&0x1a2b_3c4d_u32.to_le_bytes());
+    block(out, SECTION, |body| {
+        body.extend_from_slice(&BYTE_ORDER_MAGIC.to_le_bytes());
         body.extend_from_slice(&1_u16.to_le_bytes());
         body.extend_from_slice(&0_u16.to_le_bytes());
         // Length unknown: the file may be cut off at any time.
@@ -24,7 +25,7 @@ pub fn begin(out: &mut Vec<u8>, application: &str, operating_system: &str) {
 /// Describes an interface; packets name it by its position among those described. `filter` is what
 /// a packet had to be to be kept.
 pub fn interface(out: &mut Vec<u8>, interface: &CaptureInterface, filter: &str) {
-    block(out, 1, |body| {
+    block(out, INTERFACE, |body| {
         body.extend_from_slice(&interface.link_type.to_le_bytes());
         body.extend_from_slice(&0_u16.to_le_bytes());
         body.extend_from_slice(&interface.snap_bytes.to_le_bytes());
@@ -61,9 +62,9 @@ pub struct PacketToWrite<'a> {
 /// Appends a packet.
 pub fn packet(out: &mut Vec<u8>, packet: &PacketToWrite<'_>) {
     let captured: usize = packet.data.iter().map(|piece| piece.len()).sum();
-    block(out, 6, |body| {
+    block(out, ENHANCED_PACKET, |body| {
         body.extend_from_slice(&packet.interface_index.to_le_bytes());
-        stamp(body, packet.stamp_ns);
+        body.extend_from_slice(&halves(packet.stamp_ns));
         body.extend_from_slice(&length(captured).to_le_bytes());
         body.extend_from_slice(&packet.original_bytes.to_le_bytes());
         for piece in packet.data {
@@ -89,14 +90,9 @@ pub fn statistics(
     (received_count, dropped_count): (u64, u64),
     comment: Option<&str>,
 ) {
-    let halves = |value: u64| {
-        let mut bytes = Vec::with_capacity(8);
-        stamp(&mut bytes, value);
-        bytes
-    };
-    block(out, 5, |body| {
+    block(out, STATISTICS, |body| {
         body.extend_from_slice(&interface_index.to_le_bytes());
-        stamp(body, span_ns.1);
+        body.extend_from_slice(&halves(span_ns.1));
         if let Some(comment) = comment {
             option(body, 1, comment.as_bytes());
         }
@@ -131,10 +127,9 @@ fn pad(body: &mut Vec<u8>, length_bytes: usize) {
     body.extend_from_slice(&[0; 3][..length_bytes.next_multiple_of(4) - length_bytes]);
 }
 
-/// The upper half comes first, whatever the byte order.
-fn stamp(body: &mut Vec<u8>, units: u64) {
-    body.extend_from_slice(&((units >> 32) as u32).to_le_bytes());
-    body.extend_from_slice(&((units & 0xffff_ffff) as u32).to_le_bytes());
+/// A stamp: the upper half comes first, whatever the byte order.
+fn halves(units: u64) -> [u8; 8] {
+    units.rotate_left(32).to_le_bytes()
 }
 
 fn length(bytes: usize) -> u32 {

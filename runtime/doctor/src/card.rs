@@ -2,7 +2,7 @@
 //! comes back when something is sent, and where their clock stands. Other interfaces have no
 //! finding here; what they claim is said beside.
 
-use super::Finding;
+use super::finding::{Finding, Severity};
 use super::network::{Interfaces, StampQuery};
 use hil_nic::card_clock::probing::{CardProbe, Delivery};
 
@@ -15,24 +15,19 @@ pub(super) fn examine(
     query: StampQuery<'_>,
     probe: &dyn Fn(&str, u32) -> CardProbe,
 ) -> Vec<Finding> {
-    names
-        .iter()
-        .filter_map(|name| {
-            // What is missing, or does not answer, is a finding of the network already.
-            let interface = present.get(name)?;
-            let claims = query(name).ok()?;
-            let index = claims.phc_index?;
-            Some(judge(name, index, interface.has_link, &probe(name, index)))
-        })
-        .collect()
+    let cards = names.iter().filter_map(|name| {
+        // What is missing, or does not answer, is a finding of the network already.
+        let interface = present.get(name)?;
+        let index = query(name).ok()?.phc_index?;
+        Some(judge(index, interface.has_link, &probe(name, index)).of(name))
+    });
+    cards.collect()
 }
 
-fn judge(name: &str, index: u32, has_link: bool, probe: &CardProbe) -> Finding {
+fn judge(index: u32, has_link: bool, probe: &CardProbe) -> Finding {
     let id = "card";
-    let setting = match &probe.setting {
-        Ok(setting) => setting.clone(),
-        Err(reason) => format!("setting unknown ({reason})"),
-    };
+    let unknown = |reason| format!("setting unknown ({reason})");
+    let setting = probe.setting.clone().unwrap_or_else(unknown);
     let clock = match &probe.clock {
         Ok(pair) => format!(
             "/dev/ptp{index} is {} ns against the system clock, within {} ns",
@@ -40,42 +35,42 @@ fn judge(name: &str, index: u32, has_link: bool, probe: &CardProbe) -> Finding {
         ),
         Err(reason) => format!("clock not readable ({reason})"),
     };
-    let delivery = match &probe.tx_hardware {
-        Ok(Delivery::Delivered) => "delivers hardware transmit stamps".to_owned(),
-        Ok(Delivery::AdvertisedOnly) => {
-            "hardware transmit stamps advertised but never delivered".to_owned()
+    let unprobed: String;
+    let (delivery, severity, why, fix) = match &probe.tx_hardware {
+        Ok(Delivery::Delivered) => ("delivers hardware transmit stamps", Severity::Ok, "", ""),
+        Ok(Delivery::AdvertisedOnly) => (
+            "hardware transmit stamps advertised but never delivered",
+            Severity::Note,
+            "the driver advertises what its card does not do: a run that asks for hardware stamps \
+             gets software stamps and says so",
+            "leave timestamps = \"software\", or use another card",
+        ),
+        Ok(Delivery::NotOffered) => (
+            "offers no hardware transmit stamps",
+            Severity::Note,
+            "the card has a clock and does not stamp what it sends",
+            "leave timestamps = \"software\"",
+        ),
+        Err(reason) => {
+            unprobed = format!("not probed ({reason})");
+            (
+                unprobed.as_str(),
+                Severity::CannotTell,
+                "whether the card delivers the stamps it advertises is not known",
+                "run the doctor with CAP_NET_ADMIN and an address on the interface",
+            )
         }
-        Ok(Delivery::NotOffered) => "offers no hardware transmit stamps".to_owned(),
-        Err(reason) => format!("not probed ({reason})"),
     };
     let value = format!("{setting}; {delivery}; {clock}");
     if !has_link {
         return Finding::note(id, format!("{value}; link down"))
-            .of(name)
             .because("nothing leaves an interface without a link, so no stamp can come")
             .fixed_by("connect it and run the doctor again");
     }
-    match &probe.tx_hardware {
-        Ok(Delivery::Delivered) => explain_clock(Finding::ok(id, value).of(name), probe),
-        Ok(Delivery::AdvertisedOnly) => Finding::note(id, value)
-            .of(name)
-            .because(
-                "the driver advertises what its card does not do: a run that asks for hardware \
-                 stamps gets software stamps and says so",
-            )
-            .fixed_by("leave timestamps = \"software\", or use another card"),
-        Ok(Delivery::NotOffered) => Finding::note(id, value)
-            .of(name)
-            .because("the card has a clock and does not stamp what it sends")
-            .fixed_by("leave timestamps = \"software\""),
-        Err(_) => Finding::cannot_tell(id, value)
-            .of(name)
-            .because("whether the card delivers the stamps it advertises is not known")
-            .fixed_by("run the doctor with CAP_NET_ADMIN and an address on the interface"),
+    let finding = Finding::new(id, severity, value);
+    if severity != Severity::Ok {
+        return finding.because(why).fixed_by(fix);
     }
-}
-
-fn explain_clock(finding: Finding, probe: &CardProbe) -> Finding {
     match &probe.clock {
         Ok(pair) if pair.card_offset_ns.unsigned_abs() > FOREIGN_OFFSET_NS => finding.because(
             "the card's clock is on another time scale (PTP's TAI is 37 s ahead) or was never \
@@ -107,7 +102,7 @@ mod tests {
 
     #[test]
     fn a_card_that_delivers_is_good_and_its_clock_is_told_with_its_bound() {
-        let finding = judge("eth0", 2, true, &probe(Ok(Delivery::Delivered)));
+        let finding = judge(2, true, &probe(Ok(Delivery::Delivered)));
         assert_eq!(finding.severity, Severity::Ok);
         assert!(finding.value.contains("transmit off"), "{}", finding.value);
         let clock = "/dev/ptp2 is 37000000120 ns against the system clock, within 900 ns";
@@ -117,7 +112,7 @@ mod tests {
 
     #[test]
     fn a_card_that_only_advertises_is_called_that() {
-        let finding = judge("eth0", 0, true, &probe(Ok(Delivery::AdvertisedOnly)));
+        let finding = judge(0, true, &probe(Ok(Delivery::AdvertisedOnly)));
         assert_eq!(finding.severity, Severity::Note);
         let words = "advertised but never delivered";
         assert!(finding.value.contains(words), "{}", finding.value);
@@ -126,10 +121,10 @@ mod tests {
     #[test]
     fn what_could_not_be_found_out_is_told_with_the_reason() {
         let refused = Err("switching the card's stamps on needs CAP_NET_ADMIN".to_owned());
-        let finding = judge("eth0", 0, true, &probe(refused));
+        let finding = judge(0, true, &probe(refused));
         assert_eq!(finding.severity, Severity::CannotTell);
         assert!(finding.value.contains("CAP_NET_ADMIN"), "{}", finding.value);
-        let finding = judge("eth0", 0, false, &probe(Ok(Delivery::AdvertisedOnly)));
+        let finding = judge(0, false, &probe(Ok(Delivery::AdvertisedOnly)));
         assert!(finding.value.ends_with("link down"), "{}", finding.value);
     }
 

@@ -186,63 +186,6 @@ const RIGHTS: &[Entry] = &[
     },
 ];
 
-const MEMORY: &[Entry] = &[
-    Entry {
-        id: "shared_memory",
-        title: "Shared memory in /dev/shm",
-        source: "statvfs of /dev/shm",
-        why: "channels live there: one that outgrows the space ends its process with SIGBUS",
-        fix: "mount -o remount,size=1G,mode=1777 /dev/shm (--shm-size=1g for a container)",
-    },
-    Entry {
-        id: "shared_memory_leftovers",
-        title: "Segments of ended runs",
-        source: "/dev/shm, the locks of the domains below the runtime folder",
-        why: "a run that was killed leaves its segments; they take room from the next one until it sweeps them",
-        fix: "start any run, which removes them, or rm those named here",
-    },
-    Entry {
-        id: "iceoryx2_nodes",
-        title: "Stale iceoryx2 nodes",
-        source: "iceoryx2's list of nodes, of its default domain",
-        why: "a dead node holds its slots, and a service it died making refuses every later open; runs have \
-              domains of their own, so this concerns other iceoryx2 programs",
-        fix: "start any program of that domain, which cleans up; with none running rm -r /tmp/iceoryx2 \
-              /dev/shm/iox2_*",
-    },
-    Entry {
-        id: "runtime_folder",
-        title: "Folder for sockets and service files",
-        source: "tried: may this user write there",
-        why: "channels keep their sockets and locks there; a fallback among temporary files may be cleaned up \
-              or hidden under a run",
-        fix: "RuntimeDirectory=hil in the unit, or install -d -o USER /run/hil",
-    },
-    Entry {
-        id: "remove_ipc",
-        title: "Segments survive a log-out",
-        source: "RemoveIPC= in /etc/systemd/logind.conf and logind.conf.d, the user's id",
-        why: "logind removes the shared memory of a normal user at log-out, under a run that goes on",
-        fix: "run as a system user (User=hil), or printf '[Login]\\nRemoveIPC=no\\n' > \
-              /etc/systemd/logind.conf.d/hil.conf and systemctl restart systemd-logind",
-    },
-    Entry {
-        id: "private_tmp",
-        title: "Temporary folder of its own",
-        source: "/proc/self/mountinfo",
-        why: "with PrivateTmp= programs outside the unit do not see channels whose files are in /tmp",
-        fix: "PrivateTmp=no in the unit, or RuntimeDirectory=hil",
-    },
-    Entry {
-        id: "run_disk",
-        title: "Room for the run's folder",
-        source: "statvfs of run.record; /proc/self/mountinfo",
-        why: "records that find no room are lost and counted, and a folder on the network stalls the writer \
-              for 1000 us and more",
-        fix: "--set run.record='\"/var/tmp/hil\"', or make room: du -sh runs/*",
-    },
-];
-
 const NETWORK: &[Entry] = &[
     Entry {
         id: "interface",
@@ -376,6 +319,63 @@ const CLOCKS: &[Entry] = &[
         source: "clock_reference of both hosts; the other's from its report (--with FILE), {}",
         why: "it bounds every one-way delay between the two before the runtime's own exchanges do",
         fix: "on the other host: hil-runtime doctor --json > other.json; here: hil-runtime doctor --with other.json",
+    },
+];
+
+const MEMORY: &[Entry] = &[
+    Entry {
+        id: "shared_memory",
+        title: "Shared memory in /dev/shm",
+        source: "statvfs of /dev/shm",
+        why: "channels live there: one that outgrows the space ends its process with SIGBUS",
+        fix: "mount -o remount,size=1G,mode=1777 /dev/shm (--shm-size=1g for a container)",
+    },
+    Entry {
+        id: "shared_memory_leftovers",
+        title: "Segments of ended runs",
+        source: "/dev/shm, the locks of the domains below the runtime folder",
+        why: "a run that was killed leaves its segments; they take room from the next one until it sweeps them",
+        fix: "start any run, which removes them, or rm those named here",
+    },
+    Entry {
+        id: "iceoryx2_nodes",
+        title: "Stale iceoryx2 nodes",
+        source: "iceoryx2's list of nodes, of its default domain",
+        why: "a dead node holds its slots, and a service it died making refuses every later open; runs have \
+              domains of their own, so this concerns other iceoryx2 programs",
+        fix: "start any program of that domain, which cleans up; with none running rm -r /tmp/iceoryx2 \
+              /dev/shm/iox2_*",
+    },
+    Entry {
+        id: "runtime_folder",
+        title: "Folder for sockets and service files",
+        source: "tried: may this user write there",
+        why: "channels keep their sockets and locks there; a fallback among temporary files may be cleaned up \
+              or hidden under a run",
+        fix: "RuntimeDirectory=hil in the unit, or install -d -o USER /run/hil",
+    },
+    Entry {
+        id: "remove_ipc",
+        title: "Segments survive a log-out",
+        source: "RemoveIPC= in /etc/systemd/logind.conf and logind.conf.d, the user's id",
+        why: "logind removes the shared memory of a normal user at log-out, under a run that goes on",
+        fix: "run as a system user (User=hil), or printf '[Login]\\nRemoveIPC=no\\n' > \
+              /etc/systemd/logind.conf.d/hil.conf and systemctl restart systemd-logind",
+    },
+    Entry {
+        id: "private_tmp",
+        title: "Temporary folder of its own",
+        source: "/proc/self/mountinfo",
+        why: "with PrivateTmp= programs outside the unit do not see channels whose files are in /tmp",
+        fix: "PrivateTmp=no in the unit, or RuntimeDirectory=hil",
+    },
+    Entry {
+        id: "run_disk",
+        title: "Room for the run's folder",
+        source: "statvfs of run.record; /proc/self/mountinfo",
+        why: "records that find no room are lost and counted, and a folder on the network stalls the writer \
+              for 1000 us and more",
+        fix: "--set run.record='\"/var/tmp/hil\"', or make room: du -sh runs/*",
     },
 ];
 

@@ -3,11 +3,10 @@
 
 use std::net::IpAddr;
 
-use super::Finding;
+use super::finding::{Answer, Checked, Finding};
 use super::network::{StampQuery, describe, has_software_both_ways};
 use hil_topology::ClockEnd;
 
-const ID: &str = "clock_path";
 /// What a run makes of a clock path that it cannot use.
 const GOES_ON: &str = "the run would go on with the clock exchanges of the data path, whose bound is as wide as that \
                        path is slow";
@@ -20,46 +19,43 @@ pub(super) fn examine(
     end: Option<&ClockEnd>,
     interface_of: InterfaceOf<'_>,
     stamps: StampQuery<'_>,
-) -> Finding {
+) -> Checked {
+    let id = "clock_path";
     let Some(end) = end else {
-        return Finding::note(ID, "the topology names no clock_address of this host").fixed_by(
+        let value = "the topology names no clock_address of this host";
+        return Ok(Finding::note(id, value).fixed_by(
             "clock_address and clock_interface of both hosts in the topology (docs/clocks.md)",
+        ));
+    };
+    let unusable = |value, fix| Ok(Finding::error(id, value).because(GOES_ON).fixed_by(fix));
+    let (address, port) = (end.address, end.port);
+    let Some(interface) = interface_of(address).told(id)? else {
+        let on = end.interface.as_deref().unwrap_or("<interface>");
+        return unusable(
+            format!("no interface has {address}, the clock_address"),
+            format!("ip address add {address}/24 dev {on}"),
         );
     };
-    let address = end.address;
-    let interface = match interface_of(address) {
-        Ok(Some(interface)) => interface,
-        Ok(None) => {
-            let value = format!("no interface has {address}, the clock_address");
-            let fix = end.interface.as_deref().unwrap_or("<interface>");
-            return Finding::error(ID, value)
-                .because(GOES_ON)
-                .fixed_by(format!("ip address add {address}/24 dev {fix}"));
-        }
-        Err(reason) => return Finding::cannot_tell(ID, reason),
-    };
-    if let Some(named) = end.interface.as_ref().filter(|named| **named != interface) {
-        let value = format!("{address} is on {interface}, and clock_interface says {named}");
-        return Finding::error(ID, value)
-            .because(GOES_ON)
-            .fixed_by(format!("clock_interface = \"{interface}\""));
+    if let Some(named) = &end.interface
+        && *named != interface
+    {
+        return unusable(
+            format!("{address} is on {interface}, and clock_interface says {named}"),
+            format!("clock_interface = \"{interface}\""),
+        );
     }
-    let claims = match stamps(&interface) {
-        Ok(claims) => claims,
-        Err(reason) => return Finding::cannot_tell(ID, reason),
-    };
-    let port = end.port;
+    let claims = stamps(&interface).told(id)?;
     let claimed = describe(&claims);
     let value = format!("{address} on {interface}, UDP from port {port}; {claimed}");
     if has_software_both_ways(&claims) {
-        return Finding::ok(ID, value);
+        return Ok(Finding::ok(id, value));
     }
-    Finding::note(ID, value)
+    Ok(Finding::note(id, value)
         .because(
             "without kernel stamps both ways the time to wake up counts as the path's, and the \
              bound is that much wider",
         )
-        .fixed_by("use an interface whose driver has software stamps (ethtool -T shows them)")
+        .fixed_by("use an interface whose driver has software stamps (ethtool -T shows them)"))
 }
 
 #[cfg(test)]
@@ -67,7 +63,7 @@ mod tests {
     use hil_net::timestamping::TimestampCapabilities;
 
     use super::*;
-    use crate::finding::Severity;
+    use crate::finding::{Severity, settled};
     use hil_topology::ClockEnd;
 
     fn end(interface: Option<&str>) -> ClockEnd {
@@ -97,7 +93,7 @@ mod tests {
                 .map(|name| name.map(str::to_owned))
                 .map_err(str::to_owned)
         };
-        examine(Some(&end(interface)), &of, &query)
+        settled(examine(Some(&end(interface)), &of, &query))
     }
 
     #[test]
@@ -126,7 +122,7 @@ mod tests {
             Severity::CannotTell
         );
         let query = |name: &str| panic!("{name} was asked");
-        let unnamed = examine(None, &|_| Ok(None), &query);
+        let unnamed = settled(examine(None, &|_| Ok(None), &query));
         assert_eq!(unnamed.severity, Severity::Note, "looked at, and not there");
     }
 }

@@ -3,7 +3,7 @@
 
 use std::hint::black_box;
 
-use super::{Finding, finding::Severity};
+use super::finding::{Answer, Checked, Finding, Severity, settled};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::clock_discipline::{HostDiscipline, common_bound_ns};
 
@@ -19,31 +19,29 @@ pub(super) fn examine(
 ) -> Vec<Finding> {
     let mut findings = vec![read_cost(cheapest_read_ns())];
     findings.extend(steering(found));
-    findings.extend(other.map(|(name, other)| between(found.as_ref().ok(), name, other)));
+    let own = found.as_ref().ok();
+    findings.extend(other.map(|(name, other)| settled(between(own, name, other)).of(name)));
     findings
 }
 
 /// The cheapest of 20 batches: the cost itself, with the scheduler's interruptions left out.
 fn cheapest_read_ns() -> f64 {
     const READ_COUNT: u32 = 5000;
-    (0..20)
-        .map(|_| {
-            let start = MonotonicClock::now();
-            for _ in 0..READ_COUNT {
-                black_box(MonotonicClock::now());
-            }
-            MonotonicClock::now().ns_since(start) as f64 / f64::from(READ_COUNT)
-        })
-        .fold(f64::INFINITY, f64::min)
+    let batches = (0..20).map(|_| {
+        let start = MonotonicClock::now();
+        for _ in 0..READ_COUNT {
+            black_box(MonotonicClock::now());
+        }
+        MonotonicClock::now().ns_since(start) as f64 / f64::from(READ_COUNT)
+    });
+    batches.fold(f64::INFINITY, f64::min)
 }
 
 fn read_cost(cost_ns: f64) -> Finding {
-    let severity = if cost_ns < READ_COST_NS_OK {
-        Severity::Ok
-    } else if cost_ns < READ_COST_NS_BAD {
-        Severity::Note
-    } else {
-        Severity::Warning
+    let severity = match cost_ns {
+        ..READ_COST_NS_OK => Severity::Ok,
+        ..READ_COST_NS_BAD => Severity::Note,
+        _ => Severity::Warning,
     };
     Finding::new("clock_read_cost", severity, format!("{cost_ns:.0} ns"))
 }
@@ -60,53 +58,49 @@ fn steering(found: &Result<HostDiscipline, String>) -> [Finding; 2] {
 }
 
 /// How far apart the clocks of this host and of another may be.
-fn between(own: Option<&HostDiscipline>, name: &str, other: Option<&HostDiscipline>) -> Finding {
+fn between(own: Option<&HostDiscipline>, name: &str, other: Option<&HostDiscipline>) -> Checked {
     let id = "clock_between_hosts";
-    let (Some(own), Some(other)) = (own, other) else {
-        let whose = if own.is_none() { "this host" } else { name };
-        return Finding::cannot_tell(id, format!("the kernel of {whose} says nothing")).of(name);
-    };
-    match common_bound_ns("this host", own, name, other) {
-        Ok(bound_ns) => Finding::ok(
-            id,
-            format!("apart by at most {} us", bound_ns.div_ceil(1_000)),
-        )
-        .of(name)
-        .because(format!("{}; {name}: {}", own.basis, other.basis)),
+    let silent = |whose| format!("the kernel of {whose} says nothing");
+    let own = own.ok_or(silent("this host")).told(id)?;
+    let other = other.ok_or(silent(name)).told(id)?;
+    Ok(match common_bound_ns(("this host", own), (name, other)) {
+        Ok(bound_ns) => {
+            let value = format!("apart by at most {} us", bound_ns.div_ceil(1_000));
+            let why = format!("{}; {name}: {}", own.basis, other.basis);
+            Finding::ok(id, value).because(why)
+        }
         Err(why) => Finding::note(id, format!("no bound: {why}"))
-            .of(name)
             .fixed_by("keep both on one reference with chronyd, or ptp4l and phc2sys"),
-    }
+    })
 }
 
 /// What one-way figures to another host could rest on besides clock exchanges.
 fn judge_reference(found: &HostDiscipline) -> Finding {
-    if let Some((reference, bound_ns)) = found.reference.as_ref().zip(found.bound_ns) {
-        let value = format!("{reference}, within ±{} us", bound_ns.div_ceil(1_000));
-        return Finding::ok(REFERENCE, value).because(found.basis.clone());
-    }
-    Finding::note(REFERENCE, found.basis.clone())
+    let basis = found.basis.clone();
+    let (Some(reference), Some(bound_ns)) = (&found.reference, found.bound_ns) else {
+        return Finding::note(REFERENCE, basis);
+    };
+    let value = format!("{reference}, within ±{} us", bound_ns.div_ceil(1_000));
+    Finding::ok(REFERENCE, value).because(basis)
 }
 
 fn judge_discipline(found: &HostDiscipline) -> Finding {
+    let is_synchronised = found.is_kernel_synchronised;
     let value = format!(
-        "{}, claimed error {} us, estimate {} us, rate {:+} ppb",
-        if found.is_kernel_synchronised {
-            "synchronised"
-        } else {
-            "not synchronised"
-        },
+        "{}synchronised, claimed error {} us, estimate {} us, rate {:+} ppb",
+        if is_synchronised { "" } else { "not " },
         found.kernel_max_error_us,
         found.kernel_estimated_error_us,
         found.frequency_ppb
     );
-    if found.is_kernel_synchronised {
-        // ptp4l and phc2sys leave maxerror alone or write a constant into it.
-        let why = "the claimed error is the daemon's word: chronyd and ntpd keep it, ptp4l and \
-                   phc2sys do not, so it is no bound under PTP";
-        return Finding::ok(SYNCHRONISATION, value).because(why);
+    if !is_synchronised {
+        return Finding::note(SYNCHRONISATION, value);
     }
-    Finding::note(SYNCHRONISATION, value)
+    // ptp4l and phc2sys leave maxerror alone or write a constant into it.
+    Finding::ok(SYNCHRONISATION, value).because(
+        "the claimed error is the daemon's word: chronyd and ntpd keep it, ptp4l and phc2sys do \
+         not, so it is no bound under PTP",
+    )
 }
 
 #[cfg(test)]
@@ -180,14 +174,15 @@ mod tests {
         own.reference = Some("ptp a".to_owned());
         own.bound_ns = Some(4_000);
         let other = own.clone();
-        let finding = between(Some(&own), "robot-pc", Some(&other));
+        let finding = settled(between(Some(&own), "robot-pc", Some(&other)));
         assert_eq!(finding.severity, Severity::Ok);
-        assert_eq!(finding.id, "clock_between_hosts.robot-pc");
+        let named = finding.clone().of("robot-pc");
+        assert_eq!(named.id, "clock_between_hosts.robot-pc");
         assert_eq!(finding.value, "apart by at most 8 us");
-        let finding = between(Some(&own), "robot-pc", Some(&kept()));
+        let finding = settled(between(Some(&own), "robot-pc", Some(&kept())));
         assert_eq!(finding.severity, Severity::Note);
         assert!(finding.value.contains("on robot-pc"), "{}", finding.value);
-        let finding = between(Some(&own), "robot-pc", None);
+        let finding = settled(between(Some(&own), "robot-pc", None));
         assert_eq!(finding.severity, Severity::CannotTell);
     }
 }

@@ -3,8 +3,7 @@
 
 use nix::sys::socket::SockProtocol;
 
-use super::Finding;
-use super::finding::Severity;
+use super::finding::{Answer, Checked, Finding, Severity, settled};
 use hil_nic::radio::conversation::Conversation;
 use hil_nic::radio::netlink::{Attributes, encode_attributes, u32_at};
 
@@ -27,12 +26,8 @@ const COALESCING_US_NOTE: u32 = 10;
 /// Bursts of a few channels at 1 kHz, over a stall of the CPU of some milliseconds.
 const RING_MIN: u32 = 128;
 
-/// What an interface answers; each in words where it does not.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Driver {
-    coalescing: Result<Coalescing, String>,
-    ring: Result<Ring, String>,
-}
+/// A socket to ask one driver after the other, with the number of the family; or why there is none.
+pub(super) type Line = Result<(Conversation, u16), String>;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Coalescing {
@@ -47,22 +42,7 @@ struct Ring {
     places_max: u32,
 }
 
-/// Asks one driver after the other over one socket; what keeps it from that is every answer.
-pub(super) fn asker() -> impl FnMut(&str) -> Driver {
-    let mut opened = open();
-    move |interface| match &mut opened {
-        Ok((talk, family)) => Driver {
-            coalescing: ask(talk, *family, COALESCE_GET, interface, Coalescing::decode),
-            ring: ask(talk, *family, RINGS_GET, interface, Ring::decode),
-        },
-        Err(reason) => Driver {
-            coalescing: Err(reason.clone()),
-            ring: Err(reason.clone()),
-        },
-    }
-}
-
-fn open() -> Result<(Conversation, u16), String> {
+pub(super) fn open() -> Line {
     let words = |error: std::io::Error| format!("netlink: {error}");
     let mut talk = Conversation::open(SockProtocol::NetlinkGeneric).map_err(words)?;
     let found = talk.family(b"ethtool\0", b"").map_err(words)?;
@@ -71,41 +51,34 @@ fn open() -> Result<(Conversation, u16), String> {
 }
 
 fn ask<T>(
-    talk: &mut Conversation,
-    family: u16,
+    line: &mut Line,
     command: u8,
     interface: &str,
     decode: fn(Attributes<'_>) -> Option<T>,
 ) -> Result<T, String> {
-    let mut name = interface.as_bytes().to_vec();
-    name.push(0);
+    let (talk, family) = line.as_mut().map_err(|reason| reason.clone())?;
+    let name = [interface.as_bytes(), b"\0"].concat();
     if name.len() > libc::IFNAMSIZ {
         return Err("a name too long".to_owned());
     }
     let header = encode_attributes(&[(HEADER_DEVICE_NAME, &name)]);
-    let answer = talk.ask(
-        family,
-        command,
-        false,
-        &[(HEADER, &header)],
-        |_, attributes| decode(attributes),
-    );
-    match answer {
-        Ok(found) => found
-            .into_iter()
-            .next()
-            .ok_or_else(|| "the driver answered without the figures".to_owned()),
-        Err(error) if error.raw_os_error() == Some(libc::EOPNOTSUPP) => {
-            Err("its driver has no such setting".to_owned())
-        }
-        Err(error) => Err(error.to_string()),
-    }
+    let decode = |_, attributes: Attributes<'_>| decode(attributes);
+    let answer = talk.ask((*family, command), false, &[(HEADER, &header)], decode);
+    let found = answer.map_err(|error| match error.raw_os_error() {
+        Some(libc::EOPNOTSUPP) => "its driver has no such setting".to_owned(),
+        _ => error.to_string(),
+    })?;
+    let first = found.into_iter().next();
+    first.ok_or("the driver answered without the figures".to_owned())
+}
+
+fn word(attributes: Attributes<'_>, number: u16) -> Option<u32> {
+    u32_at(attributes.find(number)?, 0)
 }
 
 impl Coalescing {
     fn decode(attributes: Attributes<'_>) -> Option<Self> {
-        let word = |number| attributes.find(number).and_then(|bytes| u32_at(bytes, 0));
-        let (rx_us, tx_us) = (word(COALESCE_RX_US), word(COALESCE_TX_US));
+        let [rx_us, tx_us] = [COALESCE_RX_US, COALESCE_TX_US].map(|of| word(attributes, of));
         let adaptive = attributes.find(COALESCE_ADAPTIVE_RX);
         (rx_us.is_some() || tx_us.is_some()).then(|| Self {
             rx_us,
@@ -117,71 +90,55 @@ impl Coalescing {
 
 impl Ring {
     fn decode(attributes: Attributes<'_>) -> Option<Self> {
-        let word = |number| attributes.find(number).and_then(|bytes| u32_at(bytes, 0));
         Some(Self {
-            places: word(RINGS_RX)?,
-            places_max: word(RINGS_RX_MAX)?,
+            places: word(attributes, RINGS_RX)?,
+            places_max: word(attributes, RINGS_RX_MAX)?,
         })
     }
 }
 
 /// The two findings of an interface that has a device behind it.
-pub(super) fn examine(interface: &str, driver: &Driver) -> Vec<Finding> {
-    vec![
-        coalescing(driver.coalescing.as_ref()).of(interface),
-        ring(driver.ring.as_ref()).of(interface),
-    ]
+pub(super) fn examine(interface: &str, line: &mut Line) -> [Finding; 2] {
+    let coalescing = coalescing(ask(line, COALESCE_GET, interface, Coalescing::decode));
+    let ring = ring(ask(line, RINGS_GET, interface, Ring::decode));
+    [coalescing, ring].map(|checked| settled(checked).of(interface))
 }
 
-fn coalescing(found: Result<&Coalescing, &String>) -> Finding {
+fn coalescing(found: Result<Coalescing, String>) -> Checked {
     let id = "coalescing";
-    let found = match found {
-        Ok(found) => found,
-        Err(reason) => return Finding::cannot_tell(id, reason),
-    };
+    let found = found.told(id)?;
     let in_words = |us: Option<u32>| us.map_or("unknown".to_owned(), |us| format!("{us} us"));
     let (rx, tx) = (in_words(found.rx_us), in_words(found.tx_us));
-    let adaptive = if found.is_adaptive {
-        ", adaptive: it changes with the traffic"
+    let longest_us = found.rx_us.max(found.tx_us).unwrap_or(0);
+    let (severity, adaptive) = if found.is_adaptive {
+        let words = ", adaptive: it changes with the traffic";
+        (Severity::Warning, words)
     } else {
-        ""
+        let severity = Severity::rising(longest_us, COALESCING_US_OK, COALESCING_US_NOTE);
+        (severity, "")
     };
-    let value = format!("receive {rx}, send {tx}{adaptive}");
-    let longest = found.rx_us.max(found.tx_us).unwrap_or(0);
-    let severity = if found.is_adaptive || longest > COALESCING_US_NOTE {
-        Severity::Warning
-    } else if longest > COALESCING_US_OK {
-        Severity::Note
-    } else {
-        Severity::Ok
-    };
-    Finding::new(id, severity, value)
+    Ok(Finding::new(
+        id,
+        severity,
+        format!("receive {rx}, send {tx}{adaptive}"),
+    ))
 }
 
-fn ring(found: Result<&Ring, &String>) -> Finding {
+fn ring(found: Result<Ring, String>) -> Checked {
     let id = "ring";
-    let found = match found {
-        Ok(found) => found,
-        Err(reason) => return Finding::cannot_tell(id, reason),
-    };
+    let found = found.told(id)?;
     let value = format!("{} places of at most {}", found.places, found.places_max);
-    if found.places >= RING_MIN || found.places == found.places_max {
-        Finding::ok(id, value)
-    } else {
-        Finding::note(id, value)
-    }
+    let is_long = found.places >= RING_MIN || found.places == found.places_max;
+    Ok(Finding::new(
+        id,
+        Severity::ok_if(is_long, Severity::Note),
+        value,
+    ))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn severities(driver: &Driver) -> [Severity; 2] {
-        let findings = examine("eth0", driver);
-        assert_eq!(findings[0].id, "coalescing.eth0");
-        assert!(findings[0].fix.contains("ethtool -C eth0"), "{findings:?}");
-        [findings[0].severity, findings[1].severity]
-    }
 
     #[test]
     fn answers_are_decoded_by_their_numbers() {
@@ -202,40 +159,39 @@ mod tests {
 
     #[test]
     fn waiting_cards_and_short_rings_are_told_and_silence_is_no_pass() {
-        let driver = |us, is_adaptive, places| Driver {
-            coalescing: Ok(Coalescing {
+        let severities = |us, is_adaptive, places| {
+            let waits = coalescing(Ok(Coalescing {
                 rx_us: Some(us),
                 tx_us: None,
                 is_adaptive,
-            }),
-            ring: Ok(Ring {
+            }));
+            let holds = ring(Ok(Ring {
                 places,
                 places_max: 4096,
-            }),
+            }));
+            [waits, holds].map(|checked| settled(checked).severity)
         };
-        let good = severities(&driver(0, false, 256));
-        assert_eq!(good, [Severity::Ok, Severity::Ok]);
-        let tuned = severities(&driver(5, false, 4096));
-        assert_eq!(tuned, [Severity::Note, Severity::Ok]);
-        let bad = severities(&driver(50, false, 64));
-        assert_eq!(bad, [Severity::Warning, Severity::Note]);
-        assert_eq!(severities(&driver(0, true, 64))[0], Severity::Warning);
-        let silent = Driver {
-            coalescing: Err("no".to_owned()),
-            ring: Err("no".to_owned()),
-        };
-        let silent = severities(&silent);
+        assert_eq!(severities(0, false, 256), [Severity::Ok, Severity::Ok]);
+        assert_eq!(severities(5, false, 4096), [Severity::Note, Severity::Ok]);
+        let bad = [Severity::Warning, Severity::Note];
+        assert_eq!(severities(50, false, 64), bad);
+        assert_eq!(severities(0, true, 64)[0], Severity::Warning);
+        let silent = [coalescing(Err("no".to_owned())), ring(Err("no".to_owned()))];
+        let silent = silent.map(|checked| settled(checked).severity);
         assert_eq!(silent, [Severity::CannotTell, Severity::CannotTell]);
     }
 
     #[test]
     fn loopback_says_that_it_has_neither() {
-        let found = asker()("lo");
-        assert!(
-            found.coalescing.is_err() && found.ring.is_err(),
-            "{found:?}"
-        );
-        let missing = asker()("no-such-device");
-        assert!(missing.ring.is_err(), "{missing:?}");
+        let mut line = open();
+        for name in ["lo", "no-such-device"] {
+            let [waits, holds] = examine(name, &mut line);
+            assert_eq!(waits.id, format!("coalescing.{name}"));
+            let fix = format!("ethtool -C {name}");
+            assert!(waits.fix.contains(&fix), "{waits:?}");
+            for finding in [waits, holds] {
+                assert_eq!(finding.severity, Severity::CannotTell, "{finding:?}");
+            }
+        }
     }
 }

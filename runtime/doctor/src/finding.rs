@@ -1,5 +1,6 @@
 //! One line of the doctor's report. It holds words only; each examiner keeps its own thresholds.
 
+use hil_platform::host_facts::Fact;
 use serde::{Deserialize, Serialize};
 
 use super::catalogue;
@@ -52,6 +53,20 @@ impl Severity {
             Self::CannotTell => "cannot_tell",
             Self::Warning => "warning",
             Self::Error => "error",
+        }
+    }
+
+    /// Ok where `is_ok`.
+    pub(super) const fn ok_if(is_ok: bool, otherwise: Self) -> Self {
+        if is_ok { Self::Ok } else { otherwise }
+    }
+
+    /// Ok up to `ok_max`, a note up to `note_max`, a warning above.
+    pub(super) fn rising<T: PartialOrd>(value: T, ok_max: T, note_max: T) -> Self {
+        if value > note_max {
+            Self::Warning
+        } else {
+            Self::ok_if(value <= ok_max, Self::Note)
         }
     }
 }
@@ -140,5 +155,45 @@ impl Finding {
     pub(super) fn read_from(mut self, source: impl Into<String>) -> Self {
         self.source = source.into();
         self
+    }
+}
+
+/// A check that ends early with a [`Severity::CannotTell`] where the host gives no answer.
+pub(super) type Checked = Result<Finding, Box<Finding>>;
+
+/// The finding of a check, however it ended.
+pub(super) fn settled(checked: Checked) -> Finding {
+    checked.unwrap_or_else(|unknown| *unknown)
+}
+
+/// An answer of the host, or the reason why there is none.
+pub(super) trait Answer<T>: Sized {
+    /// The answer, or the reason.
+    fn known(self) -> Result<T, String>;
+
+    /// The answer, or the finding `id` with the reason.
+    fn told(self, id: &str) -> Result<T, Box<Finding>> {
+        self.told_as(id, |reason| reason)
+    }
+
+    /// As [`Self::told`], with other words around the reason.
+    fn told_as(self, id: &str, words: impl Fn(String) -> String) -> Result<T, Box<Finding>> {
+        let unknown = |reason| Box::new(Finding::cannot_tell(id, words(reason)));
+        self.known().map_err(unknown)
+    }
+}
+
+impl<T> Answer<T> for Fact<T> {
+    fn known(self) -> Result<T, String> {
+        match self {
+            Self::Available(answer) => Ok(answer),
+            Self::Unavailable(reason) => Err(reason),
+        }
+    }
+}
+
+impl<T, E: Into<String>> Answer<T> for Result<T, E> {
+    fn known(self) -> Result<T, String> {
+        self.map_err(Into::into)
     }
 }

@@ -1,14 +1,14 @@
 //! Whether packets are filtered on their way in or out: the kernel's own list of base chains, whoever
 //! filled them (nft, iptables-nft, firewalld, ufw). It reads chains, not the meaning of their rules.
 
-use nix::errno::Errno;
 use nix::sys::socket::SockProtocol;
 
-use super::Finding;
-use super::plan::{Protocol, WantedPort};
+use super::finding::{Answer, Checked, Finding};
+use super::plan::WantedPort;
+use super::ports::by_protocol;
 use hil_nic::radio::conversation::Conversation;
 use hil_nic::radio::netlink::{Attributes, u32_at};
-use hil_platform::host_facts::{Fact, HostFiles};
+use hil_platform::host_facts::HostFiles;
 
 /// `NFNL_SUBSYS_NFTABLES` and `NFT_MSG_GETCHAIN` of `linux/netfilter`.
 const GET_CHAINS: u16 = (10 << 8) | 4;
@@ -48,9 +48,9 @@ pub(super) fn chains() -> Result<Vec<Chain>, String> {
         Err(error) => return Err(format!("nfnetlink: {error}")),
     };
     let all_families = 0;
-    let asked = talk.ask(GET_CHAINS, all_families, true, &[], Chain::decode);
-    asked.map_err(|error| match error.raw_os_error().map(Errno::from_raw) {
-        Some(Errno::EPERM | Errno::EACCES) => {
+    let asked = talk.ask((GET_CHAINS, all_families), true, &[], Chain::decode);
+    asked.map_err(|error| match error.raw_os_error() {
+        Some(libc::EPERM | libc::EACCES) => {
             "needs root (CAP_NET_ADMIN) to see the rules".to_owned()
         }
         _ => format!("nfnetlink does not list the chains: {error}"),
@@ -62,11 +62,8 @@ impl Chain {
     fn decode(family: u8, attributes: Attributes<'_>) -> Option<Self> {
         let number = |bytes: &[u8]| u32_at(bytes, 0).map(u32::from_be);
         let hook = Attributes::nested(attributes.find(CHAIN_HOOK)?).find(HOOK_NUMBER)?;
-        let hook = number(hook)?;
-        if hook == FORWARD {
-            return None;
-        }
-        let hook = match (family, hook) {
+        let hook = match (family, number(hook)?) {
+            (_, FORWARD) => return None,
             (NETDEV, 0) => "ingress",
             (NETDEV, _) => "egress",
             (_, hook) => HOOKS.get(usize::try_from(hook).ok()?).copied()?,
@@ -90,94 +87,70 @@ pub(super) fn examine(
     files: &HostFiles,
     found: Result<Vec<Chain>, String>,
     wanted: &[WantedPort],
-) -> Finding {
+) -> Checked {
     let id = "firewall";
-    let chains = match found {
-        Ok(chains) => chains,
-        Err(reason) => {
-            return Finding::cannot_tell(id, reason)
-                .fixed_by("sudo hil-runtime doctor, or sudo nft list ruleset");
-        }
-    };
-    let words: Vec<String> = chains
-        .iter()
-        .filter(|chain| chain.rule_count > 0 || chain.is_dropping)
-        .map(|chain| {
+    let chains = found.map_err(|reason| {
+        Finding::cannot_tell(id, reason)
+            .fixed_by("sudo hil-runtime doctor, or sudo nft list ruleset")
+    })?;
+    let mut words = Vec::new();
+    for chain in &chains {
+        if chain.rule_count > 0 || chain.is_dropping {
             let policy = if chain.is_dropping { "drop" } else { "accept" };
-            let Chain {
-                name,
-                hook,
-                rule_count,
-                ..
-            } = chain;
-            format!("{name} ({hook}): {rule_count} rules, else {policy}")
-        })
-        .collect();
-    if chains.iter().any(|chain| chain.is_dropping) {
-        return Finding::warning(id, words.join("; ")).fixed_by(cure(wanted));
-    }
-    let legacy = match legacy_tables(files) {
-        Fact::Available(tables) => tables,
-        Fact::Unavailable(reason) => {
-            return Finding::cannot_tell(id, format!("iptables' own tables: {reason}"));
+            let (name, hook, count) = (&chain.name, chain.hook, chain.rule_count);
+            words.push(format!("{name} ({hook}): {count} rules, else {policy}"));
         }
-    };
-    if !legacy.is_empty() {
+    }
+    let words = words.join("; ");
+    if chains.iter().any(|chain| chain.is_dropping) {
+        return Ok(Finding::warning(id, words).fixed_by(cure(wanted)));
+    }
+    let mut legacy = Vec::new();
+    for path in ["/proc/net/ip_tables_names", "/proc/net/ip6_tables_names"] {
+        // Without the old interface there is no such file.
+        if files.locate(path).exists() {
+            let unknown = |reason| format!("iptables' own tables: {reason}");
+            let tables = files.read(path).told_as(id, unknown)?;
+            legacy.extend(tables.lines().map(str::to_owned));
+        }
+    }
+    Ok(if !legacy.is_empty() {
         let value = format!(
             "tables of legacy iptables are loaded: {}",
             legacy.join(", ")
         );
-        return Finding::note(id, value).fixed_by("iptables-legacy -S shows their rules");
-    }
-    if words.is_empty() {
+        Finding::note(id, value).fixed_by("iptables-legacy -S shows their rules")
+    } else if words.is_empty() {
         Finding::ok(id, "no rules on the way in or out")
     } else {
-        Finding::note(id, words.join("; "))
+        Finding::note(id, words)
             .fixed_by("nft list ruleset shows whether the ports of the topology get through")
-    }
+    })
 }
 
 /// Opens the ports of the topology.
 fn cure(wanted: &[WantedPort]) -> String {
-    let rules = [Protocol::Udp, Protocol::Tcp].map(|protocol| {
-        let own = wanted.iter().filter(|one| one.protocol == protocol);
-        let mut ports: Vec<u16> = own.map(|one| one.address.port()).collect();
-        ports.sort_unstable();
-        ports.dedup();
+    let mut rules = Vec::new();
+    for (protocol, ports) in by_protocol(wanted) {
         let ports: Vec<String> = ports.iter().map(ToString::to_string).collect();
-        (!ports.is_empty()).then(|| {
-            let (word, ports) = (protocol.word(), ports.join(", "));
-            format!("nft add rule inet filter input {word} dport {{ {ports} }} accept")
-        })
-    });
-    let rules: Vec<String> = rules.into_iter().flatten().collect();
+        let (word, ports) = (protocol.word(), ports.join(", "));
+        rules.push(format!(
+            "nft add rule inet filter input {word} dport {{ {ports} }} accept"
+        ));
+    }
     if rules.is_empty() {
-        "hil-runtime doctor --topology FILE names the ports to open; nft list ruleset shows the rules".to_owned()
-    } else {
-        rules.join("; ")
+        return "hil-runtime doctor --topology FILE names the ports to open; nft list ruleset shows \
+                the rules"
+            .to_owned();
     }
-}
-
-/// The tables of the old interface that are in use.
-fn legacy_tables(files: &HostFiles) -> Fact<Vec<String>> {
-    let mut tables = Vec::new();
-    for path in ["/proc/net/ip_tables_names", "/proc/net/ip6_tables_names"] {
-        // Without the old interface there is no such file.
-        if !files.locate(path).exists() {
-            continue;
-        }
-        match files.read(path) {
-            Fact::Available(text) => tables.extend(text.lines().map(str::to_owned)),
-            Fact::Unavailable(reason) => return Fact::Unavailable(reason),
-        }
-    }
-    Fact::Available(tables)
+    rules.join("; ")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::finding::Severity;
+    use crate::finding::{Severity, settled};
+    use crate::plan::Protocol;
     use hil_nic::radio::netlink::encode_attributes;
     use hil_platform::host_facts::FakeHost;
 
@@ -208,7 +181,7 @@ mod tests {
     }
 
     fn judged(found: Result<Vec<Chain>, String>, files: &[(&str, &str)]) -> Finding {
-        examine(&FakeHost::with(files).files(), found, &wanted())
+        settled(examine(&FakeHost::with(files).files(), found, &wanted()))
     }
 
     #[test]

@@ -1,10 +1,12 @@
 //! Where the interrupts of the network cards strike, against the CPUs that the topology pins to. It
 //! moves none.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-use super::{Finding, network::has_device, plan::Plan};
-use hil_platform::host_facts::{Fact, HostFiles, format_cpu_list};
+use super::finding::{Answer, Checked, Finding, settled};
+use super::network::has_device;
+use super::plan::Plan;
+use hil_platform::host_facts::{HostFiles, format_cpu_list};
 
 /// An interrupt of a card.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -19,77 +21,53 @@ struct Interrupt {
 }
 
 pub(super) fn examine(files: &HostFiles, interfaces: &[String], plan: &Plan) -> Vec<Finding> {
-    interfaces
-        .iter()
-        // Without a device there are no interrupts: loopback, veth, bridges.
-        .filter(|name| has_device(files, name))
-        .map(|name| judge(name, &interrupts_of(files, name), plan))
-        .collect()
+    // Without a device there are no interrupts: loopback, veth, bridges.
+    let cards = interfaces.iter().filter(|name| has_device(files, name));
+    let judged = cards.map(|name| settled(judge(files, name, plan)).of(name));
+    judged.collect()
 }
 
-fn device(interface: &str) -> String {
-    format!("/sys/class/net/{interface}/device")
-}
-
-fn judge(interface: &str, found: &Fact<Vec<Interrupt>>, plan: &Plan) -> Finding {
+fn judge(files: &HostFiles, interface: &str, plan: &Plan) -> Checked {
     let id = "interrupts";
-    let found = match found {
-        Fact::Available(found) => found,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason).of(interface),
-    };
-    let where_to: Vec<String> = found
-        .iter()
-        .map(|one| {
-            let cpus = format_cpu_list(&one.effective);
-            format!("{} on CPU {cpus}", one.number)
-        })
-        .collect();
-    let value = where_to.join(", ");
-    let pinned = plan.cpus();
-    let struck = |one: &&Interrupt| one.effective.iter().any(|cpu| pinned.contains(cpu));
-    let may_strike = |one: &&Interrupt| one.allowed.iter().any(|cpu| pinned.contains(cpu));
-    let hit: Vec<&Interrupt> = found.iter().filter(struck).collect();
-    if !hit.is_empty() {
-        let mut words = Vec::new();
-        for pin in &plan.pins {
-            let own = hit.iter().filter(|one| one.effective.contains(&pin.cpu));
-            let counts = own.map(|one| one.counts.get(pin.cpu).copied().unwrap_or_default());
-            let counts: Vec<u64> = counts.collect();
-            if !counts.is_empty() {
-                let (cpu, of, total) = (pin.cpu, &pin.of, counts.iter().sum::<u64>());
-                words.push(format!(
-                    "CPU {cpu} is pinned to by {of} ({total} struck there so far)"
-                ));
-            }
+    let found = interrupts_of(files, interface).told(id)?;
+    let in_words =
+        |one: &Interrupt| format!("{} on CPU {}", one.number, format_cpu_list(&one.effective));
+    let value = found.iter().map(in_words).collect::<Vec<_>>().join(", ");
+    let mut struck = Vec::new();
+    for pin in &plan.pins {
+        let own = found.iter().filter(|one| one.effective.contains(&pin.cpu));
+        let counts = own.map(|one| one.counts.get(pin.cpu).copied().unwrap_or_default());
+        let counts: Vec<u64> = counts.collect();
+        if !counts.is_empty() {
+            let (cpu, of, total) = (pin.cpu, &pin.of, counts.iter().sum::<u64>());
+            struck.push(format!(
+                "CPU {cpu} is pinned to by {of} ({total} struck there so far)"
+            ));
         }
-        return Finding::warning(id, format!("{value}; {}", words.join(", ")))
-            .of(interface)
-            .fixed_by(cure(found, &pinned));
     }
-    if found.iter().any(|one| may_strike(&one)) {
-        return Finding::note(
+    let pinned = plan.cpus();
+    let mut allowed = found.iter().flat_map(|one| &one.allowed);
+    Ok(if !struck.is_empty() {
+        Finding::warning(id, format!("{value}; {}", struck.join(", ")))
+            .fixed_by(cure(&found, &pinned))
+    } else if allowed.any(|cpu| pinned.contains(cpu)) {
+        Finding::note(
             id,
             format!("{value}; the setting allows pinned CPUs as well"),
         )
-        .of(interface)
-        .fixed_by(cure(found, &pinned));
-    }
-    Finding::ok(id, value).of(interface)
+        .fixed_by(cure(&found, &pinned))
+    } else {
+        Finding::ok(id, value)
+    })
 }
 
 fn cure(found: &[Interrupt], pinned: &[usize]) -> String {
-    let mut free: Vec<usize> = found
-        .iter()
-        .flat_map(|one| &one.allowed)
-        .copied()
-        .filter(|cpu| !pinned.contains(cpu))
-        .collect();
-    free.sort_unstable();
-    free.dedup();
+    let allowed = found.iter().flat_map(|one| &one.allowed).copied();
+    let free: BTreeSet<usize> = allowed.filter(|cpu| !pinned.contains(cpu)).collect();
     if free.is_empty() {
         return "pin to fewer CPUs: the topology leaves none for interrupts".to_owned();
     }
-    let cpus = format_cpu_list(&free);
+    let cpus = format_cpu_list(&Vec::from_iter(free));
     let numbers: Vec<String> = found.iter().map(|one| one.number.to_string()).collect();
     format!(
         "for i in {}; do echo {cpus} > /proc/irq/$i/smp_affinity_list; done",
@@ -99,52 +77,48 @@ fn cure(found: &[Interrupt], pinned: &[usize]) -> String {
 
 /// The message-signalled interrupts of the device behind `interface`, else those whose line in
 /// `/proc/interrupts` names it.
-fn interrupts_of(files: &HostFiles, interface: &str) -> Fact<Vec<Interrupt>> {
-    files.read("/proc/interrupts").and_then(|text| {
-        let lines = lines_of(&text);
-        let device = device(interface);
-        // A virtio device sits on a PCI device that has the interrupts.
-        let folders = [
-            format!("{device}/msi_irqs"),
-            format!("{device}/../msi_irqs"),
-        ];
-        let listed = folders.iter().find_map(|folder| {
-            let names = files.list(folder).available().cloned()?;
-            Some(names.iter().filter_map(|name| name.parse().ok()).collect())
-        });
-        let numbers: Vec<u32> = listed.unwrap_or_else(|| {
+fn interrupts_of(files: &HostFiles, interface: &str) -> Result<Vec<Interrupt>, String> {
+    let lines = lines_of(&files.read("/proc/interrupts").known()?);
+    let device = format!("/sys/class/net/{interface}/device");
+    // A virtio device sits on a PCI device that has the interrupts.
+    let folders = ["msi_irqs", "../msi_irqs"].map(|folder| format!("{device}/{folder}"));
+    let list = |folder: &String| files.list(folder).known().ok();
+    let listed = folders.iter().find_map(list);
+    let numbers: Vec<u32> = match listed {
+        Some(names) => names.iter().filter_map(|name| name.parse().ok()).collect(),
+        None => {
             let own = lines.iter().filter(|(_, line)| line.names(interface));
             own.map(|(number, _)| *number).collect()
-        });
+        }
+    };
+    let mut found = Vec::new();
+    for number in numbers {
         // A vector that nobody asked for has no line and strikes nowhere.
-        let numbers: Vec<u32> = numbers
-            .into_iter()
-            .filter(|number| lines.contains_key(number))
-            .collect();
-        if numbers.is_empty() {
-            return Fact::Unavailable(format!(
-                "neither {device}/msi_irqs nor /proc/interrupts names an interrupt of {interface}"
-            ));
-        }
-        let mut found = Vec::new();
-        for number in numbers {
-            let allowed = files.read_cpu_list(&format!("/proc/irq/{number}/smp_affinity_list"));
-            let allowed = match allowed {
-                Fact::Available(cpus) => cpus,
-                Fact::Unavailable(reason) => return Fact::Unavailable(reason),
-            };
-            let path = format!("/proc/irq/{number}/effective_affinity_list");
-            let effective = files.read_cpu_list(&path);
-            let effective = effective.available().filter(|cpus| !cpus.is_empty());
-            found.push(Interrupt {
-                number,
-                effective: effective.unwrap_or(&allowed).clone(),
-                counts: lines[&number].counts.clone(),
-                allowed,
-            });
-        }
-        Fact::Available(found)
-    })
+        let Some(line) = lines.get(&number) else {
+            continue;
+        };
+        let cpus = |file: &str| {
+            files
+                .read_cpu_list(&format!("/proc/irq/{number}/{file}"))
+                .known()
+        };
+        let allowed = cpus("smp_affinity_list")?;
+        let effective = cpus("effective_affinity_list").ok();
+        found.push(Interrupt {
+            number,
+            effective: effective
+                .filter(|cpus| !cpus.is_empty())
+                .unwrap_or(allowed.clone()),
+            counts: line.counts.clone(),
+            allowed,
+        });
+    }
+    if found.is_empty() {
+        return Err(format!(
+            "neither {device}/msi_irqs nor /proc/interrupts names an interrupt of {interface}"
+        ));
+    }
+    Ok(found)
 }
 
 /// One line of `/proc/interrupts`.
@@ -158,20 +132,19 @@ impl Line {
     /// Drivers call their interrupts `eth0`, `eth0-rx-0` or `i915_eth0:0`.
     fn names(&self, interface: &str) -> bool {
         let is_name = |c: char| c.is_ascii_alphanumeric() || c == '.' || c == '_';
-        self.words
-            .split(|c: char| !is_name(c))
-            .any(|word| word == interface)
+        let mut words = self.words.split(|c: char| !is_name(c));
+        words.any(|word| word == interface)
     }
 }
 
 fn lines_of(text: &str) -> BTreeMap<u32, Line> {
-    let header = text.lines().next().unwrap_or_default();
+    let mut lines = text.lines();
     // Columns are those of the CPUs that are online; a gap in their numbers is a gap here.
+    let header = lines.next().unwrap_or_default().split_whitespace();
     let columns: Vec<usize> = header
-        .split_whitespace()
         .filter_map(|word| word.strip_prefix("CPU")?.parse().ok())
         .collect();
-    let lines = text.lines().skip(1).filter_map(|line| {
+    let parsed = lines.filter_map(|line| {
         let (number, rest) = line.split_once(':')?;
         let number = number.trim().parse().ok()?;
         let mut words = rest.split_whitespace();
@@ -182,7 +155,7 @@ fn lines_of(text: &str) -> BTreeMap<u32, Line> {
         let words = words.collect::<Vec<_>>().join(" ");
         Some((number, Line { counts, words }))
     });
-    lines.collect()
+    parsed.collect()
 }
 
 #[cfg(test)]

@@ -1,11 +1,13 @@
 //! The kernel: how it preempts, what it keeps back from real-time tasks, how it was built, what else
 //! it does in the background. It reads settings only; what they cost is measured by the wake-ups.
 
-use super::{Finding, finding::Severity, plan::Plan};
+use super::finding::{Answer, Checked, Finding, Severity, settled};
+use super::plan::Plan;
 use hil_platform::host_facts::{
-    Fact, HostFiles, KernelOptions, PreemptionMode, RealtimeThrottle, boot_parameter, clocksource,
+    HostFiles, KernelOptions, PreemptionMode, RealtimeThrottle, boot_parameter, clocksource,
     format_cpu_list, has_fair_server, load_average, online_cpus, preemption, virtual_machine,
 };
+use hil_platform::realtime::GrantOutcome;
 
 /// Clocks that are read in user space through the vDSO; any other is a system call.
 const FAST_CLOCKS: [&str; 4] = [
@@ -18,207 +20,169 @@ const FAIR_SERVER_FOLDER: &str = "/sys/kernel/debug/sched/fair_server";
 /// Runnable tasks per CPU above which the host counts as busy.
 const LOAD_PER_CPU_BUSY: f64 = 0.5;
 
-/// `is_fifo_granted` is what a trial found, where there was one.
-pub(super) fn examine(
-    files: &HostFiles,
-    plan: &Plan,
-    is_fifo_granted: Option<bool>,
-) -> Vec<Finding> {
-    vec![
+/// `fifo` is what a trial of `SCHED_FIFO` came to, where there was one.
+pub(super) fn examine(files: &HostFiles, plan: &Plan, fifo: Option<&GrantOutcome>) -> Vec<Finding> {
+    let checks = [
         preemption_model(files),
         throttle(files, plan),
         fair_server(files, plan),
-        group_scheduling(files, is_fifo_granted),
+        group_scheduling(files, fifo),
         clock_source(files),
         huge_pages(files),
         irqbalance(files, plan),
         machine(files),
         load(files),
-    ]
+    ];
+    checks.map(settled).into()
 }
 
-fn preemption_model(files: &HostFiles) -> Finding {
+fn preemption_model(files: &HostFiles) -> Checked {
     let id = "preemption";
-    let found = match preemption(files) {
-        Fact::Available(found) => found,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+    let found = preemption(files).told(id)?;
+    let severity = match found.mode.told(id)? {
+        PreemptionMode::Realtime | PreemptionMode::Full => Severity::Ok,
+        PreemptionMode::Lazy => Severity::Note,
+        PreemptionMode::Voluntary | PreemptionMode::None => Severity::Warning,
     };
-    let severity = match found.mode {
-        Fact::Available(PreemptionMode::Realtime | PreemptionMode::Full) => Severity::Ok,
-        Fact::Available(PreemptionMode::Lazy) => Severity::Note,
-        Fact::Available(PreemptionMode::Voluntary | PreemptionMode::None) => Severity::Warning,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
-    Finding::new(id, severity, found.words).read_from(found.source)
+    Ok(Finding::new(id, severity, found.words).read_from(found.source))
 }
 
-/// What takes time from busy pollers matters more where the topology has some.
-fn worse_when_spinning(plan: &Plan) -> Severity {
-    if plan.spins() {
+/// What takes time from busy pollers matters more where there are some.
+pub(super) fn worse_when_spinning(spins: bool) -> Severity {
+    if spins {
         Severity::Warning
     } else {
         Severity::Note
     }
 }
 
-fn throttle(files: &HostFiles, plan: &Plan) -> Finding {
+fn throttle(files: &HostFiles, plan: &Plan) -> Checked {
     let id = "realtime_throttle";
-    let throttle = match RealtimeThrottle::read(files) {
-        Fact::Available(throttle) => throttle,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
+    let throttle = RealtimeThrottle::read(files).told(id)?;
     let (runtime_us, period_us) = (throttle.runtime_us, throttle.period_us);
     if !throttle.is_active() {
-        return Finding::ok(id, format!("none (sched_rt_runtime_us={runtime_us})"));
+        let value = format!("none (sched_rt_runtime_us={runtime_us})");
+        return Ok(Finding::ok(id, value));
     }
-    let lost_us = period_us - runtime_us;
-    let value = format!("{lost_us} us of every {period_us} us");
-    Finding::new(id, worse_when_spinning(plan), value)
+    let value = format!("{} us of every {period_us} us", period_us - runtime_us);
+    Ok(Finding::new(id, worse_when_spinning(plan.spins()), value))
 }
 
-fn fair_server(files: &HostFiles, plan: &Plan) -> Finding {
+/// Each CPU with the microseconds of every second that it lends to normal tasks.
+fn lent_us(files: &HostFiles) -> Result<Vec<(usize, i64)>, String> {
+    let mut found = Vec::new();
+    for name in files.list(FAIR_SERVER_FOLDER).known()? {
+        if let Some(cpu) = name.strip_prefix("cpu").and_then(|cpu| cpu.parse().ok()) {
+            let runtime_ns = files.read_number(&format!("{FAIR_SERVER_FOLDER}/{name}/runtime"));
+            found.push((cpu, runtime_ns.known()? / 1000));
+        }
+    }
+    Ok(found)
+}
+
+fn fair_server(files: &HostFiles, plan: &Plan) -> Checked {
     let id = "fair_server";
-    match has_fair_server(files) {
-        Fact::Available(false) => return Finding::ok(id, "none before Linux 6.12"),
-        Fact::Available(true) => {}
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+    if !has_fair_server(files).told(id)? {
+        return Ok(Finding::ok(id, "none before Linux 6.12"));
     }
-    let runtimes = files.list(FAIR_SERVER_FOLDER).and_then(|cpus| {
-        let read = |cpu: &String| {
-            let path = format!("{FAIR_SERVER_FOLDER}/{cpu}/runtime");
-            files.read_number(&path).map(|ns| (cpu.clone(), ns / 1000))
-        };
-        let mut found = Vec::new();
-        for cpu in cpus.iter().filter(|name| name.starts_with("cpu")) {
-            match read(cpu) {
-                Fact::Available(one) => found.push(one),
-                Fact::Unavailable(reason) => return Fact::Unavailable(reason),
-            }
-        }
-        Fact::Available(found)
-    });
-    let runtimes = match runtimes {
-        Fact::Available(runtimes) if !runtimes.is_empty() => runtimes,
-        Fact::Available(_) => {
-            return Finding::cannot_tell(id, format!("{FAIR_SERVER_FOLDER} lists no CPU"));
-        }
-        Fact::Unavailable(reason) => {
-            let why = format!("{reason}; the kernel's default is 50000 us per second");
-            return Finding::cannot_tell(id, why)
-                .fixed_by("as root: mount -t debugfs none /sys/kernel/debug, then run this again");
-        }
-    };
-    let lent: Vec<usize> = runtimes
-        .iter()
-        .filter(|(_, us)| *us > 0)
-        .filter_map(|(cpu, _)| cpu.strip_prefix("cpu")?.parse().ok())
-        .collect();
-    if lent.is_empty() {
-        return Finding::ok(id, "switched off on every CPU");
+    let found = lent_us(files).map_err(|reason| {
+        let why = format!("{reason}; the kernel's default is 50000 us per second");
+        Finding::cannot_tell(id, why)
+            .fixed_by("as root: mount -t debugfs none /sys/kernel/debug, then run this again")
+    })?;
+    let most = found.iter().map(|(_, us)| *us).max();
+    let most = most.ok_or(format!("{FAIR_SERVER_FOLDER} lists no CPU"));
+    let most = most.told(id)?;
+    let lending = found.iter().filter(|(_, us)| *us > 0);
+    let lending: Vec<usize> = lending.map(|(cpu, _)| *cpu).collect();
+    if lending.is_empty() {
+        return Ok(Finding::ok(id, "switched off on every CPU"));
     }
-    let most = runtimes.iter().map(|(_, us)| *us).max().unwrap_or(0);
-    let value = format!("{most} us per second on CPU {}", format_cpu_list(&lent));
-    Finding::new(id, worse_when_spinning(plan), value)
+    let value = format!("{most} us per second on CPU {}", format_cpu_list(&lending));
+    Ok(Finding::new(id, worse_when_spinning(plan.spins()), value))
 }
 
-fn group_scheduling(files: &HostFiles, is_fifo_granted: Option<bool>) -> Finding {
+fn group_scheduling(files: &HostFiles, fifo: Option<&GrantOutcome>) -> Checked {
     let id = "rt_group_sched";
-    let options = match KernelOptions::read(files) {
-        Fact::Available(options) => options,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
-    if !options.has("RT_GROUP_SCHED") {
-        return Finding::ok(id, "not built in").read_from(options.source);
-    }
-    let booted = boot_parameter(files, "rt_group_sched");
-    let is_off = match booted.available() {
+    let options = KernelOptions::read(files).told(id)?;
+    let is_off = match boot_parameter(files, "rt_group_sched").available() {
         Some(Some(value)) => value == "0",
         _ => options.has("RT_GROUP_SCHED_DEFAULT_DISABLED"),
     };
-    if is_off {
-        return Finding::ok(id, "built in and switched off").read_from(options.source);
-    }
-    let (severity, here) = match is_fifo_granted {
-        Some(true) => (
+    let (severity, value) = match fifo {
+        _ if !options.has("RT_GROUP_SCHED") => (Severity::Ok, "not built in"),
+        _ if is_off => (Severity::Ok, "built in and switched off"),
+        Some(GrantOutcome::Granted) => (
             Severity::Note,
-            "this group has a budget: SCHED_FIFO was granted",
+            "built in; this group has a budget: SCHED_FIFO was granted",
         ),
-        Some(false) => (Severity::Error, "SCHED_FIFO was refused"),
+        Some(_) => (Severity::Error, "built in; SCHED_FIFO was refused"),
         None => (
             Severity::Warning,
-            "whether this group has a budget was not tried",
+            "built in; whether this group has a budget was not tried",
         ),
     };
-    Finding::new(id, severity, format!("built in; {here}")).read_from(options.source)
+    Ok(Finding::new(id, severity, value).read_from(options.source))
 }
 
-fn clock_source(files: &HostFiles) -> Finding {
+fn clock_source(files: &HostFiles) -> Checked {
     let id = "clocksource";
-    match clocksource(files) {
-        Fact::Available(name) if FAST_CLOCKS.contains(&name.as_str()) => Finding::ok(id, name),
-        Fact::Available(name) => Finding::warning(id, name),
-        Fact::Unavailable(reason) => Finding::cannot_tell(id, reason),
-    }
+    let name = clocksource(files).told(id)?;
+    let is_fast = FAST_CLOCKS.contains(&name.as_str());
+    Ok(Finding::new(
+        id,
+        Severity::ok_if(is_fast, Severity::Warning),
+        name,
+    ))
 }
 
-fn huge_pages(files: &HostFiles) -> Finding {
+fn huge_pages(files: &HostFiles) -> Checked {
     let id = "transparent_huge_pages";
-    let modes = match files.read("/sys/kernel/mm/transparent_hugepage/enabled") {
-        Fact::Available(modes) => modes,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+    let modes = files.read("/sys/kernel/mm/transparent_hugepage/enabled");
+    let modes = modes.told(id)?;
+    let (_, rest) = modes.split_once('[').unwrap_or_default();
+    let Some((mode, _)) = rest.split_once(']') else {
+        return Err(format!("no mode is marked in `{modes}`")).told(id);
     };
-    let marked = modes
-        .split_once('[')
-        .and_then(|(_, rest)| rest.split_once(']'));
-    match marked {
-        Some(("always", _)) => Finding::note(id, "always"),
-        Some((mode, _)) => Finding::ok(id, mode),
-        None => Finding::cannot_tell(id, format!("no mode is marked in `{modes}`")),
-    }
+    Ok(Finding::new(
+        id,
+        Severity::ok_if(mode != "always", Severity::Note),
+        mode,
+    ))
 }
 
-fn irqbalance(files: &HostFiles, plan: &Plan) -> Finding {
+fn irqbalance(files: &HostFiles, plan: &Plan) -> Checked {
     let id = "irqbalance";
-    let commands = match files.process_names() {
-        Fact::Available(commands) => commands,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
+    let commands = files.process_names().told(id)?;
     if !commands.iter().any(|command| command == "irqbalance") {
-        return Finding::ok(id, "not running");
+        return Ok(Finding::ok(id, "not running"));
     }
     if plan.pins.is_empty() {
-        Finding::note(id, "running")
-    } else {
-        let cpus = format_cpu_list(&plan.cpus());
-        Finding::warning(id, format!("running, and CPU {cpus} is pinned to")).fixed_by(format!(
-            "systemctl stop irqbalance, or IRQBALANCE_BANNED_CPULIST={cpus} in \
-             /etc/default/irqbalance"
-        ))
+        return Ok(Finding::note(id, "running"));
     }
+    let cpus = format_cpu_list(&plan.cpus());
+    let value = format!("running, and CPU {cpus} is pinned to");
+    Ok(Finding::warning(id, value).fixed_by(format!(
+        "systemctl stop irqbalance, or IRQBALANCE_BANNED_CPULIST={cpus} in /etc/default/irqbalance"
+    )))
 }
 
-fn machine(files: &HostFiles) -> Finding {
+fn machine(files: &HostFiles) -> Checked {
     let id = "virtual_machine";
-    match virtual_machine(files) {
-        Fact::Available(answer) if answer == "no" => Finding::ok(id, answer),
-        Fact::Available(answer) => Finding::note(id, answer),
-        Fact::Unavailable(reason) => Finding::cannot_tell(id, reason),
-    }
+    let answer = virtual_machine(files).told(id)?;
+    Ok(Finding::new(
+        id,
+        Severity::ok_if(answer == "no", Severity::Note),
+        answer,
+    ))
 }
 
-fn load(files: &HostFiles) -> Finding {
+fn load(files: &HostFiles) -> Checked {
     let id = "load";
-    let (minute, words) = match load_average(files) {
-        Fact::Available(load) => load,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
-    let cpus = match online_cpus(files) {
-        Fact::Available(cpus) => cpus.len(),
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
-    let per_cpu = minute / cpus.max(1) as f64;
-    let severity = Severity::of_size(per_cpu, LOAD_PER_CPU_BUSY, 1.0);
-    Finding::new(id, severity, format!("{words}, {cpus} CPUs"))
+    let (minute, words) = load_average(files).told(id)?;
+    let cpus = online_cpus(files).told(id)?.len();
+    let severity = Severity::rising(minute / cpus.max(1) as f64, LOAD_PER_CPU_BUSY, 1.0);
+    Ok(Finding::new(id, severity, format!("{words}, {cpus} CPUs")))
 }
 
 #[cfg(test)]

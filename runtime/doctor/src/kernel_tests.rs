@@ -4,7 +4,7 @@ use super::*;
 use crate::plan::Pin;
 use hil_platform::host_facts::FakeHost;
 
-type Look = fn(&HostFiles) -> Finding;
+type Look = fn(&HostFiles) -> Checked;
 
 const RELEASE: &str = "/proc/sys/kernel/osrelease";
 const VERSION: &str = "/proc/sys/kernel/version";
@@ -22,8 +22,8 @@ fn spinning() -> Plan {
     }
 }
 
-fn of(files: &[(&str, &str)], look: impl Fn(&HostFiles) -> Finding) -> Finding {
-    look(&FakeHost::with(files).files())
+fn of(files: &[(&str, &str)], look: impl Fn(&HostFiles) -> Checked) -> Finding {
+    settled(look(&FakeHost::with(files).files()))
 }
 
 #[test]
@@ -55,7 +55,9 @@ fn folders_in_place_of_files_are_told_as_unreadable() {
         throttle(&host.files(), &Plan::default()),
         load(&host.files()),
         machine(&host.files()),
-    ] {
+    ]
+    .map(settled)
+    {
         assert_eq!(finding.severity, Severity::CannotTell, "{finding:?}");
         assert!(finding.value.contains("directory"), "{finding:?}");
     }
@@ -135,12 +137,17 @@ fn the_fair_server_is_read_per_cpu() {
 #[test]
 fn group_scheduling_is_judged_with_the_trial() {
     let on = [(RELEASE, "6.12.1"), (BUILT, "CONFIG_RT_GROUP_SCHED=y")];
-    for (granted, expected) in [
-        (Some(true), Severity::Note),
-        (Some(false), Severity::Error),
+    let refused = GrantOutcome::Refused {
+        error: "EPERM".to_owned(),
+        reason: "RLIMIT_RTPRIO is 0".to_owned(),
+        fix: "needs CAP_SYS_NICE".to_owned(),
+    };
+    for (tried, expected) in [
+        (Some(&GrantOutcome::Granted), Severity::Note),
+        (Some(&refused), Severity::Error),
         (None, Severity::Warning),
     ] {
-        let finding = of(&on, |files| group_scheduling(files, granted));
+        let finding = of(&on, |files| group_scheduling(files, tried));
         assert_eq!(finding.severity, expected);
         assert_eq!(finding.source, BUILT);
     }

@@ -3,29 +3,37 @@
 //! qualification.
 
 mod claims;
-mod loops;
-mod render;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use hil_core::time::PeriodicTimer;
 use hil_stats::histogram::LatencyHistogram;
 use nix::sys::mman::munlockall;
+use nix::sys::resource::{UsageWho, getrusage};
 use serde::{Deserialize, Serialize};
 
 pub use self::claims::{Claim, Standing};
+pub(super) use self::claims::{judge, us_up};
+use super::finding::Answer;
+use hil_platform::clock::{MonotonicClock, Wake};
 use hil_platform::host_facts::{
     Fact, HostFiles, ProcessorTicks, RealtimeThrottle, format_cpu_list, load_average, online_cpus,
     virtual_machine,
 };
 use hil_platform::progress::Stage;
+use hil_platform::realtime::{RealtimeGrant, RealtimeRequest, SchedulingPolicy, apply};
 
 /// A busy poller holds its CPU at real-time priority; the kernel's own threads there wait this long at
 /// most.
 const SPIN_MAX: Duration = Duration::from_secs(10);
 /// How often the coordinating thread looks at the wish to stop.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
+/// Longer values make the histogram allocate; by then the measurement is spoilt anyway.
+const ROOM_NS: u64 = 10_000_000_000;
+/// Instants that one stall may be counted for; a stall longer than that is a host that slept.
+const STALL_INSTANTS_MAX: u64 = 1_000_000;
 
 /// What to measure.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -56,13 +64,13 @@ impl LatencyRequest {
 
     /// What is about to happen and how long it takes, for whoever waits.
     pub fn announcement(&self) -> String {
-        let seconds = |duration: Duration| duration.as_secs_f64();
+        let (wakeups, spinning) = (self.duration, self.spin_total());
         format!(
             "measuring on CPU {}: {} s of wake-ups, {} s of busy polling; Ctrl-C gives what there is so \
              far",
             format_cpu_list(&self.cpus),
-            seconds(self.duration),
-            seconds(self.spin_total()),
+            wakeups.as_secs_f64(),
+            spinning.as_secs_f64(),
         )
     }
 
@@ -74,6 +82,15 @@ impl LatencyRequest {
     /// How long a busy poller spins on each CPU.
     fn spin_duration(&self) -> Duration {
         self.duration.min(SPIN_MAX)
+    }
+
+    /// Each of the CPUs; one place anywhere where none was asked for.
+    fn places(&self) -> Vec<Option<usize>> {
+        if self.cpus.is_empty() {
+            vec![None]
+        } else {
+            self.cpus.iter().copied().map(Some).collect()
+        }
     }
 }
 
@@ -201,17 +218,6 @@ pub struct LatencyReport {
     pub claims: Vec<Claim>,
 }
 
-impl LatencyReport {
-    /// The wake-ups of the CPU that was latest at p99.
-    pub fn worst(&self) -> Option<(&Wakeups, Quantiles)> {
-        let with_figures = self
-            .wakeups
-            .iter()
-            .filter_map(|one| Some((one, one.lateness?)));
-        with_figures.max_by_key(|(_, lateness)| lateness.p99_ns)
-    }
-}
-
 /// How far it is, and whether to go on.
 pub struct Watch<'a> {
     /// True as soon as somebody wants it to end.
@@ -229,58 +235,65 @@ impl core::fmt::Debug for Watch<'_> {
     }
 }
 
-/// The steps of a measurement, for its progress.
-struct Steps<'a> {
-    watch: &'a Watch<'a>,
-    since: Instant,
-    whole: Duration,
-}
-
-impl Steps<'_> {
-    fn tell(&self, words: &str) {
-        if let Some(stage) = self.watch.stage {
-            let whole_s = self.whole.as_secs_f64().max(1e-9);
-            stage.tell(Some(self.since.elapsed().as_secs_f64() / whole_s), words);
-        }
-    }
-
-    /// Sets `stop` when somebody wants it, looks until `is_over`.
-    fn attend(&self, words: &str, stop: &AtomicBool, is_over: &dyn Fn() -> bool) {
-        while !is_over() {
-            if (self.watch.is_stopped)() {
-                stop.store(true, Ordering::Release);
-            }
-            self.tell(words);
-            thread::sleep(LOOK_PERIOD);
-        }
-    }
-}
-
 /// Measures, for [`LatencyRequest::duration`] per part: wake-ups on all CPUs at once, then a busy
 /// poller on one CPU after the other. A wish to stop ends it with what there is.
 pub fn measure(request: &LatencyRequest, files: &HostFiles, watch: &Watch<'_>) -> LatencyReport {
-    let was_locked = is_locked(files);
+    let locked = files.read_field("/proc/self/status", "VmLck");
+    let was_unlocked = locked.known().is_ok_and(|amount| amount.starts_with("0 "));
     let load_before = load_average(files).map(|(_, words)| words);
     let ticks_before = ProcessorTicks::read(files);
-    let whole = if request.is_thorough {
-        request.duration + request.spin_total()
-    } else {
-        request.duration
-    };
-    let steps = Steps {
-        watch,
-        since: Instant::now(),
-        whole,
-    };
-    let wakeups = wakeups(request, &steps);
-    let mut gaps = Vec::new();
+    let since = Instant::now();
+    let mut whole = request.duration;
     if request.is_thorough {
-        let throttle = RealtimeThrottle::read(files);
-        let throttle = throttle.available().copied().filter(|one| one.is_active());
-        gaps = spin(request, files, &steps, throttle);
+        whole += request.spin_total();
+    }
+    let whole_s = whole.as_secs_f64().max(1e-9);
+    // Sets `stop` when somebody wants it, looks until `is_over`.
+    let attend = |words: &str, stop: &AtomicBool, is_over: &dyn Fn() -> bool| {
+        while !is_over() {
+            if (watch.is_stopped)() {
+                stop.store(true, Ordering::Release);
+            }
+            if let Some(stage) = watch.stage {
+                stage.tell(Some(since.elapsed().as_secs_f64() / whole_s), words);
+            }
+            thread::sleep(LOOK_PERIOD);
+        }
+    };
+    let stop = &AtomicBool::new(false);
+    let wakeups = thread::scope(|scope| {
+        let start = |cpu| scope.spawn(move || wake(request, cpu, stop));
+        let threads: Vec<_> = request.places().into_iter().map(start).collect();
+        let is_over = || threads.iter().all(thread::ScopedJoinHandle::is_finished);
+        attend("wake-ups", stop, &is_over);
+        // A thread that panicked has no figures to show.
+        let joined = threads.into_iter().map(thread::ScopedJoinHandle::join);
+        joined.filter_map(Result::ok).collect()
+    });
+    let throttle = RealtimeThrottle::read(files);
+    let throttle = throttle.available().filter(|one| one.is_active());
+    let throttle_ns = throttle.map(|one| (one.period_us - one.runtime_us) * 1000);
+    // On the only CPU a poller at real-time priority would stop the whole host, this program too.
+    let is_alone = online_cpus(files).known().is_ok_and(|cpus| cpus.len() < 2);
+    let priority = (!is_alone).then_some(request.priority);
+    let duration = request.spin_duration();
+    let mut gaps = Vec::new();
+    for cpu in request.places() {
+        if !request.is_thorough || (watch.is_stopped)() {
+            break;
+        }
+        let stop = AtomicBool::new(false);
+        let on = cpu.map_or_else(String::new, |cpu| format!(" on CPU {cpu}"));
+        gaps.extend(thread::scope(|scope| {
+            let thread = scope.spawn(|| spin(cpu, priority, duration, throttle_ns, &stop));
+            attend(&format!("busy polling{on}"), &stop, &|| {
+                thread.is_finished()
+            });
+            thread.join().ok()
+        }));
     }
     // Only what this measurement locked is released.
-    if !was_locked {
+    if was_unlocked {
         let _released = munlockall().is_ok();
     }
     let ticks_after = ProcessorTicks::read(files);
@@ -304,79 +317,118 @@ pub fn measure(request: &LatencyRequest, files: &HostFiles, watch: &Watch<'_>) -
     report
 }
 
-fn is_locked(files: &HostFiles) -> bool {
-    let locked = files.read_field("/proc/self/status", "VmLck");
-    locked
-        .available()
-        .is_none_or(|amount| !amount.starts_with("0 "))
-}
-
 fn ns(duration: Duration) -> u64 {
     u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// Each of the CPUs; one place anywhere where none was asked for.
-fn places(request: &LatencyRequest) -> Vec<Option<usize>> {
-    if request.cpus.is_empty() {
-        vec![None]
-    } else {
-        request.cpus.iter().copied().map(Some).collect()
-    }
-}
-
-fn wakeups(request: &LatencyRequest, steps: &Steps<'_>) -> Vec<Wakeups> {
-    let stop = AtomicBool::new(false);
-    thread::scope(|scope| {
-        let threads: Vec<_> = places(request)
-            .into_iter()
-            .map(|cpu| {
-                let stop = &stop;
-                scope.spawn(move || loops::wake(request, cpu, stop))
-            })
-            .collect();
-        let is_over = || threads.iter().all(thread::ScopedJoinHandle::is_finished);
-        steps.attend("wake-ups", &stop, &is_over);
-        // A thread that panicked has no figures to show.
-        threads
-            .into_iter()
-            .filter_map(|thread| thread.join().ok())
-            .collect()
+/// Pins this thread, locks memory, takes the priority; says what became of each.
+fn prepare(cpu: Option<usize>, priority: Option<u8>) -> RealtimeGrant {
+    apply(&RealtimeRequest {
+        cpu,
+        policy: match priority {
+            Some(priority) => SchedulingPolicy::Fifo { priority },
+            None => SchedulingPolicy::Other,
+        },
+        lock_memory: true,
+        ..RealtimeRequest::default()
     })
 }
 
-fn spin(
-    request: &LatencyRequest,
-    files: &HostFiles,
-    steps: &Steps<'_>,
-    throttle: Option<RealtimeThrottle>,
-) -> Vec<Gaps> {
-    let mut found = Vec::new();
-    // On the only CPU a poller at real-time priority would stop the whole host, this program too.
-    let is_alone = online_cpus(files)
-        .available()
-        .is_some_and(|cpus| cpus.len() < 2);
-    for cpu in places(request) {
-        if (steps.watch.is_stopped)() {
-            break;
+fn in_words(grant: &RealtimeGrant) -> Vec<String> {
+    grant.items.iter().map(ToString::to_string).collect()
+}
+
+/// Times that the kernel took the CPU away from this thread so far.
+fn preempted_count() -> Option<u64> {
+    let usage = getrusage(UsageWho::RUSAGE_THREAD).ok()?;
+    u64::try_from(usage.involuntary_context_switches()).ok()
+}
+
+/// Sleeps to the instants of a grid until the time is over or `stop` is set. It neither allocates,
+/// locks nor logs while it measures.
+fn wake(request: &LatencyRequest, cpu: Option<usize>, stop: &AtomicBool) -> Wakeups {
+    let grant = prepare(cpu, Some(request.priority));
+    let mut histogram = LatencyHistogram::with_room(ROOM_NS);
+    let period_ns = i64::try_from(ns(request.period)).unwrap_or(i64::MAX);
+    let mut timer = PeriodicTimer::new(request.period);
+    let preempted_before = preempted_count();
+    let start = MonotonicClock::now();
+    let end = start + request.duration;
+    timer.start(start + request.period);
+    let mut skipped_count = 0;
+    while let Some(due) = timer.next()
+        && due <= end
+        && !stop.load(Ordering::Relaxed)
+    {
+        if MonotonicClock::sleep_until(due) == Wake::Interrupted {
+            continue;
         }
-        let stop = AtomicBool::new(false);
-        let settings = loops::Spin {
-            cpu,
-            priority: (!is_alone).then_some(request.priority),
-            duration: request.spin_duration(),
-            throttle_ns: throttle.map(|one| (one.period_us - one.runtime_us) * 1000),
-        };
-        let words = cpu.map_or("busy polling".to_owned(), |cpu| {
-            format!("busy polling on CPU {cpu}")
-        });
-        let gaps = thread::scope(|scope| {
-            let thread = scope.spawn(|| loops::spin(&settings, &stop));
-            steps.attend(&words, &stop, &|| thread.is_finished());
-            thread.join().ok()
-        });
-        found.extend(gaps);
+        let now = MonotonicClock::now();
+        let mut late_ns = now.ns_since(due);
+        histogram.record(late_ns);
+        let tick = timer.poll(now);
+        // What passed meanwhile was late too, each by a period less: left out, a stall of ten
+        // periods would count as one wake-up and the quantiles would not see the rest.
+        let passed = tick.map_or(0, |tick| tick.skipped_count);
+        for _ in 0..passed.min(STALL_INSTANTS_MAX) {
+            late_ns -= period_ns;
+            histogram.record(late_ns);
+            skipped_count += 1;
+        }
     }
-    found
+    let measured = MonotonicClock::now().ns_since(start);
+    let preempted = preempted_before.zip(preempted_count());
+    Wakeups {
+        cpu,
+        is_as_asked: grant.is_complete(),
+        scheduling: in_words(&grant),
+        measured_ns: u64::try_from(measured).unwrap_or(0),
+        count: histogram.count(),
+        skipped_count,
+        preempted_count: preempted.map(|(before, after)| after.saturating_sub(before)),
+        lateness: Quantiles::of(&histogram),
+    }
+}
+
+/// Looks at the clock without pause until the time is over or `stop` is set, at `SCHED_FIFO` where a
+/// priority is given. `throttle_ns` is what the real-time throttle keeps back per period. It neither
+/// allocates, locks nor logs while it measures.
+fn spin(
+    cpu: Option<usize>,
+    priority: Option<u8>,
+    duration: Duration,
+    throttle_ns: Option<i64>,
+    stop: &AtomicBool,
+) -> Gaps {
+    let grant = prepare(cpu, priority);
+    let mut histogram = LatencyHistogram::with_room(ROOM_NS);
+    let kept_back_ns = throttle_ns.unwrap_or(0);
+    let (mut look_count, mut lost_ns, mut throttle_like_count) = (0, 0, 0);
+    let start = MonotonicClock::now();
+    let end = start + duration;
+    let mut last = start;
+    while last < end && !stop.load(Ordering::Relaxed) {
+        let now = MonotonicClock::now();
+        look_count += 1;
+        let gap_ns = now.ns_since(last);
+        last = now;
+        if gap_ns > Gaps::LEAST_NS {
+            histogram.record(gap_ns);
+            lost_ns += gap_ns.unsigned_abs();
+            let is_throttle_like = (gap_ns - kept_back_ns).abs() <= kept_back_ns / 10;
+            throttle_like_count += u64::from(is_throttle_like);
+        }
+    }
+    Gaps {
+        cpu,
+        scheduling: in_words(&grant),
+        measured_ns: u64::try_from(last.ns_since(start)).unwrap_or(0),
+        look_count,
+        count: histogram.count(),
+        lost_ns,
+        throttle_like_count: throttle_ns.map(|_| throttle_like_count),
+        length: Quantiles::of(&histogram),
+    }
 }
 
 #[cfg(test)]
@@ -441,6 +493,52 @@ mod tests {
         assert_eq!(
             serde_json::from_str::<LatencyReport>(&text).unwrap(),
             report
+        );
+    }
+
+    #[test]
+    fn a_poller_sees_no_gap_shorter_than_the_least_and_ends_in_time() {
+        let spun = |is_stopped| {
+            let stop = AtomicBool::new(is_stopped);
+            spin(
+                None,
+                None,
+                Duration::from_millis(30),
+                Some(50_000_000),
+                &stop,
+            )
+        };
+        let gaps = spun(false);
+        assert!(gaps.measured_ns >= 30_000_000, "{gaps:?}");
+        assert!(gaps.look_count > 1000, "{gaps:?}");
+        assert!(gaps.lost_ns <= gaps.measured_ns, "{gaps:?}");
+        assert_eq!(gaps.length.is_some(), gaps.count > 0);
+        assert!(gaps.length.is_none_or(|one| one.p50_ns > Gaps::LEAST_NS));
+        let stopped = spun(true);
+        assert_eq!((stopped.look_count, stopped.count), (0, 0));
+    }
+
+    #[test]
+    fn no_time_means_no_figures() {
+        let request = LatencyRequest {
+            duration: Duration::ZERO,
+            ..LatencyRequest::brief(None)
+        };
+        let wakeups = wake(&request, None, &AtomicBool::new(false));
+        assert_eq!((wakeups.count, wakeups.lateness), (0, None));
+    }
+
+    #[test]
+    fn a_cpu_that_does_not_exist_is_told_and_not_passed_over() {
+        let request = LatencyRequest {
+            duration: Duration::from_millis(5),
+            ..LatencyRequest::brief(None)
+        };
+        let wakeups = wake(&request, Some(1000), &AtomicBool::new(false));
+        assert!(!wakeups.is_as_asked);
+        assert!(
+            wakeups.scheduling[0].starts_with("cpu 1000 refused"),
+            "{wakeups:?}"
         );
     }
 }

@@ -28,7 +28,6 @@ mod radio;
 mod render;
 mod shared_memory;
 mod storage;
-mod wakeup;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -37,10 +36,11 @@ use hil_net::interface::interface_with_address;
 use hil_net::timestamping::TimestampCapabilities;
 use serde::{Deserialize, Serialize};
 
+use self::finding::{Answer, settled};
 pub use self::finding::{Finding, Severity};
+use self::latency::LatencyReport;
+use self::network::StampQuery;
 pub use self::plan::{LinkLoad, Peer, Pin, Plan, Protocol, WantedPort};
-use self::privileges::Rights;
-use self::{latency::LatencyReport, network::StampQuery};
 use hil_nic::card_clock::probing::probe_card;
 use hil_platform::clock_discipline::HostDiscipline;
 use hil_platform::domain_address::domain_base_candidates;
@@ -107,19 +107,22 @@ impl DoctorReport {
     }
 
     fn recount(&mut self) {
-        let counts =
-            Severity::ALL.map(|severity| (severity.word().to_owned(), self.count(severity)));
-        self.counts = counts.into();
+        let count = |severity: Severity| (severity.word().to_owned(), self.count(severity));
+        self.counts = Severity::ALL.map(count).into();
     }
 
     fn count(&self, severity: Severity) -> usize {
-        let own = self.findings.iter().filter(|one| one.severity == severity);
-        own.count()
+        self.of_severity(severity).count()
+    }
+
+    fn of_severity(&self, severity: Severity) -> impl Iterator<Item = &Finding> {
+        let all = self.findings.iter();
+        all.filter(move |one| one.severity == severity)
     }
 
     /// Takes a measurement in, with its finding.
     pub fn add_latency(&mut self, measured: LatencyReport) {
-        self.findings.push(wakeup::judge(&measured));
+        self.findings.push(settled(latency::judge(&measured)));
         self.latency = Some(measured);
         self.recount();
     }
@@ -129,11 +132,6 @@ impl DoctorReport {
     pub fn worst_severity(&self) -> Severity {
         let severities = self.findings.iter().map(|finding| finding.severity);
         severities.max().unwrap_or(Severity::Ok)
-    }
-
-    /// The finding with this identifier.
-    pub fn find(&self, id: &str) -> Option<&Finding> {
-        self.findings.iter().find(|finding| finding.id == id)
     }
 
     /// The report as indented JSON.
@@ -150,14 +148,13 @@ impl DoctorReport {
     /// When the text is no report of this form.
     pub fn from_json(text: &str) -> Result<Self, String> {
         let read: Self = serde_json::from_str(text).map_err(|error| error.to_string())?;
-        if read.schema == Self::SCHEMA {
-            Ok(read)
-        } else {
+        if read.schema != Self::SCHEMA {
             let (found, known) = (read.schema, Self::SCHEMA);
-            Err(format!(
+            return Err(format!(
                 "its schema is `{found}`, this program reads `{known}`"
-            ))
+            ));
         }
+        Ok(read)
     }
 }
 
@@ -169,20 +166,47 @@ pub fn examine(request: &DoctorRequest) -> DoctorReport {
     let stamps: StampQuery<'_> =
         &|interface| TimestampCapabilities::query(interface).map_err(|error| error.to_string());
     let files = &request.files;
-    let plan = request.plan.clone().unwrap_or_default();
-    let rights = Rights::tried();
-    let mut findings = Vec::new();
-    findings.extend(kernel::examine(files, &plan, rights.is_fifo_granted()));
-    findings.extend(processors::examine(files, &plan));
-    findings.extend(privileges::examine(files, &rights));
-    examine_network(request, &plan, stamps, &mut findings);
+    let plan = &request.plan.clone().unwrap_or_default();
+    let fifo = privileges::try_fifo();
+    let mut findings = kernel::examine(files, plan, fifo.as_ref());
+    findings.extend(processors::examine(files, plan));
+    findings.extend(privileges::examine(files, fifo.as_ref()));
+    let present = match network::interfaces().told("interface") {
+        Ok(present) => present,
+        Err(unknown) => {
+            findings.push(unknown.of("any"));
+            network::Interfaces::new()
+        }
+    };
+    let names = network::wanted(&present, plan);
+    findings.extend(network::examine(files, &present, &names, stamps));
+    findings.extend(card::examine(&present, &names, stamps, &probe_card));
+    findings.extend(radio::examine(&names));
+    findings.extend(interrupts::examine(files, &names, plan));
+    let mut line = driver::open();
+    for name in names.iter().filter(|name| network::has_device(files, name)) {
+        findings.extend(driver::examine(name, &mut line));
+    }
+    let source = &paths::source_towards;
+    findings.extend(paths::examine(files, &present, plan, source));
+    findings.extend(ports::examine(files, &plan.ports));
+    let firewall = firewall::examine(files, firewall::chains(), &plan.ports);
+    findings.push(settled(firewall));
+    if request.plan.is_some() {
+        let interface_of = |address| {
+            interface_with_address(address).map_err(|error| format!("getifaddrs: {error}"))
+        };
+        let end = plan.clock_end.as_ref();
+        findings.push(settled(clock_path::examine(end, &interface_of, stamps)));
+    }
     let discipline = HostDiscipline::gather();
     let other = request.other.as_ref();
     let other = other.map(|(name, report)| (name.as_str(), report.clock.as_ref()));
     findings.extend(clocks::examine(&discipline, other));
     let folders = &request.runtime_folders;
     findings.extend(shared_memory::examine(files, folders, ForeignNodes::list()));
-    let runtime_folder = shared_memory::usable(folders).unwrap_or(Path::new("/run/hil"));
+    let usable = shared_memory::first_usable(folders).map(|index| folders[index].as_path());
+    let runtime_folder = usable.unwrap_or(Path::new("/run/hil"));
     let record_folder = if plan.record_folder.as_os_str().is_empty() {
         Path::new("runs")
     } else {
@@ -193,46 +217,6 @@ pub fn examine(request: &DoctorRequest) -> DoctorReport {
         host: HostFacts::gather_from(files),
         clock: discipline.ok(),
         ..DoctorReport::of(findings)
-    }
-}
-
-fn examine_network(
-    request: &DoctorRequest,
-    plan: &Plan,
-    stamps: StampQuery<'_>,
-    findings: &mut Vec<Finding>,
-) {
-    let files = &request.files;
-    let present = match network::interfaces() {
-        Ok(present) => present,
-        Err(reason) => {
-            findings.push(Finding::cannot_tell("interface", reason).of("any"));
-            network::Interfaces::new()
-        }
-    };
-    let names = network::wanted(&present, plan);
-    findings.extend(network::examine(files, &present, &names, stamps));
-    findings.extend(card::examine(&present, &names, stamps, &probe_card));
-    findings.extend(radio::examine(&names));
-    findings.extend(interrupts::examine(files, &names, plan));
-    let mut ask_driver = driver::asker();
-    for name in names.iter().filter(|name| network::has_device(files, name)) {
-        findings.extend(driver::examine(name, &ask_driver(name)));
-    }
-    findings.extend(paths::examine(
-        files,
-        &present,
-        plan,
-        &paths::source_towards,
-    ));
-    findings.extend(ports::examine(files, &plan.ports));
-    findings.push(firewall::examine(files, firewall::chains(), &plan.ports));
-    if request.plan.is_some() {
-        let interface_of = |address| {
-            interface_with_address(address).map_err(|error| format!("getifaddrs: {error}"))
-        };
-        let end = plan.clock_end.as_ref();
-        findings.push(clock_path::examine(end, &interface_of, stamps));
     }
 }
 

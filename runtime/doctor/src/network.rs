@@ -2,15 +2,17 @@
 //! buffer. Claims only: drivers lie, so a run probes its stamps by sending and reports the share that
 //! came back.
 
-use std::{collections::BTreeMap, net::IpAddr};
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::IpAddr;
 
 use hil_net::timestamping::TimestampCapabilities;
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 use nix::net::if_::InterfaceFlags;
 use nix::sys::socket::SockaddrStorage;
 
-use super::{Finding, finding::Severity, plan::Plan};
-use hil_platform::host_facts::{Fact, HostFiles};
+use super::finding::{Answer, Checked, Finding, Severity, settled};
+use super::plan::Plan;
+use hil_platform::host_facts::HostFiles;
 
 /// A second of 1 kHz messages with their stamps; the kernel charges about 800 bytes for each.
 const BUFFER_BYTES_MIN: i64 = 1024 * 1024;
@@ -56,10 +58,9 @@ pub(super) fn interfaces() -> Result<Interfaces, String> {
     let mut found = Interfaces::new();
     for entry in entries {
         let one = found.entry(entry.interface_name.clone()).or_default();
+        let running = InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING;
         one.is_up |= entry.flags.contains(InterfaceFlags::IFF_UP);
-        one.has_link |= entry
-            .flags
-            .contains(InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING);
+        one.has_link |= entry.flags.contains(running);
         one.addresses.extend(address_of(&entry));
     }
     Ok(found)
@@ -84,27 +85,28 @@ fn address_of(entry: &InterfaceAddress) -> Option<(IpAddr, u32)> {
 
 /// The names to look at: those of the plan, by name or address, else every one that is up.
 pub(super) fn wanted(present: &Interfaces, plan: &Plan) -> Vec<String> {
-    let has_own = |interface: &Interface| {
+    let mut names = BTreeSet::from_iter(plan.interfaces.iter().cloned());
+    for (name, interface) in present {
         let mut own = interface.addresses.iter();
-        own.any(|(address, _)| plan.addresses.contains(address))
-    };
-    let by_address = present.iter().filter(|(_, one)| has_own(one));
-    let mut names: Vec<String> = by_address.map(|(name, _)| name.clone()).collect();
-    names.extend(plan.interfaces.iter().cloned());
+        if own.any(|(address, _)| plan.addresses.contains(address)) {
+            names.insert(name.clone());
+        }
+    }
     if names.is_empty() {
         let up = present.iter().filter(|(_, one)| one.is_up);
         names.extend(up.map(|(name, _)| name.clone()));
     }
-    names.sort();
-    names.dedup();
-    names
+    names.into_iter().collect()
 }
 
 /// True for an interface with hardware, or a paravirtual device, behind it.
 pub(super) fn has_device(files: &HostFiles, name: &str) -> bool {
-    files
-        .locate(&format!("/sys/class/net/{name}/device"))
-        .exists()
+    has_entry(files, name, "device")
+}
+
+fn has_entry(files: &HostFiles, name: &str, entry: &str) -> bool {
+    let path = format!("/sys/class/net/{name}/{entry}");
+    files.locate(&path).exists()
 }
 
 pub(super) fn examine(
@@ -113,55 +115,37 @@ pub(super) fn examine(
     names: &[String],
     query: StampQuery<'_>,
 ) -> Vec<Finding> {
-    let mut findings: Vec<Finding> = names
-        .iter()
-        .map(|name| match present.get(name) {
-            Some(one) => stamps(files, name, one, query),
-            None => missing(name, present),
-        })
-        .collect();
-    findings.push(buffers(files));
-    findings
-}
-
-fn missing(name: &str, present: &Interfaces) -> Finding {
-    let known: Vec<&str> = present.keys().map(String::as_str).collect();
-    Finding::error("interface", "there is none of this name")
-        .of(name)
-        .fixed_by(format!("name one of {}", known.join(", ")))
-}
-
-fn stamps(files: &HostFiles, name: &str, interface: &Interface, query: StampQuery<'_>) -> Finding {
-    let claims = match query(name) {
-        Ok(claims) => claims,
-        Err(reason) => return Finding::cannot_tell("timestamps", reason).of(name),
-    };
-    let is_wireless = ["wireless", "phy80211"].iter().any(|entry| {
-        files
-            .locate(&format!("/sys/class/net/{name}/{entry}"))
-            .exists()
+    let stamps = names.iter().map(|name| {
+        let Some(interface) = present.get(name) else {
+            let known: Vec<&str> = present.keys().map(String::as_str).collect();
+            return Finding::error("interface", "there is none of this name")
+                .of(name)
+                .fixed_by(format!("name one of {}", known.join(", ")));
+        };
+        let is_wireless = ["wireless", "phy80211"];
+        let is_wireless = is_wireless
+            .iter()
+            .any(|entry| has_entry(files, name, entry));
+        let claims = query(name).told("timestamps");
+        settled(claims.map(|claims| judge(&claims, is_wireless, interface))).of(name)
     });
-    judge(name, &claims, is_wireless, interface)
+    stamps.chain([settled(buffers(files))]).collect()
 }
 
-fn judge(
-    name: &str,
-    claims: &TimestampCapabilities,
-    is_wireless: bool,
-    interface: &Interface,
-) -> Finding {
-    let value = format!(
-        "{}{}{}",
-        describe(claims),
-        if is_wireless { ", wireless" } else { "" },
-        if interface.has_link {
-            ""
-        } else {
-            ", link down"
-        }
+fn judge(claims: &TimestampCapabilities, is_wireless: bool, interface: &Interface) -> Finding {
+    let claimed = describe(claims);
+    let wireless = if is_wireless { ", wireless" } else { "" };
+    let link = if interface.has_link {
+        ""
+    } else {
+        ", link down"
+    };
+    let is_good = has_software_both_ways(claims) && !is_wireless;
+    let finding = Finding::new(
+        "timestamps",
+        Severity::ok_if(is_good, Severity::Note),
+        format!("{claimed}{wireless}{link}"),
     );
-    let severity = Severity::Note.unless(has_software_both_ways(claims) && !is_wireless);
-    let finding = Finding::new("timestamps", severity, value).of(name);
     if is_wireless {
         return finding
             .because(
@@ -179,20 +163,18 @@ fn judge(
     finding
 }
 
-fn buffers(files: &HostFiles) -> Finding {
+/// A network namespace other than the first one hides these limits.
+fn buffers(files: &HostFiles) -> Checked {
     let id = "udp_buffers";
-    let read = |name: &str| files.read_number(&format!("/proc/sys/net/core/{name}"));
-    match (read("rmem_max"), read("wmem_max")) {
-        (Fact::Available(receive), Fact::Available(send)) => {
-            let is_enough = receive >= BUFFER_BYTES_MIN && send >= BUFFER_BYTES_MIN;
-            let value = format!("receive {receive} bytes, send {send} bytes");
-            Finding::new(id, Severity::Note.unless(is_enough), value)
-        }
-        // A network namespace other than the first one hides these limits.
-        (Fact::Unavailable(reason), _) | (_, Fact::Unavailable(reason)) => {
-            Finding::cannot_tell(id, reason)
-        }
-    }
+    let read = |name: &str| {
+        files
+            .read_number(&format!("/proc/sys/net/core/{name}"))
+            .told(id)
+    };
+    let (receive, send) = (read("rmem_max")?, read("wmem_max")?);
+    let severity = Severity::ok_if(receive.min(send) >= BUFFER_BYTES_MIN, Severity::Note);
+    let value = format!("receive {receive} bytes, send {send} bytes");
+    Ok(Finding::new(id, severity, value))
 }
 
 #[cfg(test)]
@@ -220,7 +202,7 @@ mod tests {
     };
 
     fn judged(claims: &TimestampCapabilities, is_wireless: bool) -> Finding {
-        judge("x", claims, is_wireless, &present("x", [10, 0, 0, 1]).1)
+        judge(claims, is_wireless, &present("x", [10, 0, 0, 1]).1)
     }
 
     fn present(name: &str, address: [u8; 4]) -> (String, Interface) {
@@ -250,7 +232,7 @@ mod tests {
         assert_eq!(judged(&VETH, true).severity, Severity::Note);
         assert_eq!(judged(&DEAF, false).severity, Severity::Note);
         assert!(
-            judge("x", &VETH, false, &Interface::default())
+            judge(&VETH, false, &Interface::default())
                 .value
                 .ends_with("link down")
         );
@@ -318,7 +300,13 @@ mod tests {
                 ("/proc/sys/net/core/wmem_max", bytes),
             ])
         };
-        assert_eq!(buffers(&files("212992").files()).severity, Severity::Note);
-        assert_eq!(buffers(&files("4194304").files()).severity, Severity::Ok);
+        assert_eq!(
+            settled(buffers(&files("212992").files())).severity,
+            Severity::Note
+        );
+        assert_eq!(
+            settled(buffers(&files("4194304").files())).severity,
+            Severity::Ok
+        );
     }
 }

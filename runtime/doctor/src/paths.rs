@@ -1,11 +1,12 @@
 //! The ways to the peers of the topology: the route each takes, this host's own addresses, and the
 //! largest message against the largest packet. It sends nothing.
 
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, UdpSocket};
 
+use super::finding::{Answer, Checked, Finding, settled};
+use super::network::Interfaces;
 use super::plan::{LinkLoad, Peer, Plan};
-use super::{Finding, network::Interfaces};
-use hil_platform::host_facts::{Fact, HostFiles};
+use hil_platform::host_facts::HostFiles;
 
 /// The discard port (RFC 863); nothing is sent to it.
 const ANY_PORT: u16 = 9;
@@ -19,13 +20,11 @@ pub(super) fn source_towards(peer: IpAddr) -> Result<IpAddr, String> {
         IpAddr::V4(_) => Ipv4Addr::UNSPECIFIED.into(),
         IpAddr::V6(_) => Ipv6Addr::UNSPECIFIED.into(),
     };
-    let chosen = UdpSocket::bind(SocketAddr::new(own, 0)).and_then(|socket| {
-        socket.connect(SocketAddr::new(peer, ANY_PORT))?;
-        socket.local_addr()
+    let chosen = UdpSocket::bind((own, 0)).and_then(|socket| {
+        socket.connect((peer, ANY_PORT))?;
+        Ok(socket.local_addr()?.ip())
     });
-    chosen
-        .map(|address| address.ip())
-        .map_err(|error| error.to_string())
+    chosen.map_err(|error| error.to_string())
 }
 
 pub(super) fn examine(
@@ -34,21 +33,18 @@ pub(super) fn examine(
     plan: &Plan,
     source: SourceTowards<'_>,
 ) -> Vec<Finding> {
-    let mut findings = vec![addresses(present, plan)];
+    let mut findings = vec![settled(addresses(present, plan))];
     let peers = plan.peers.iter();
     findings.extend(peers.map(|peer| route(files, present, peer, source).of(&peer.name)));
     let loads = plan.loads.iter();
-    findings.extend(loads.map(|load| mtu(files, present, load).of(&load.link)));
+    findings.extend(loads.map(|load| settled(mtu(files, present, load)).of(&load.link)));
     findings
 }
 
 /// The interface that has `address`.
 fn owner(present: &Interfaces, address: IpAddr) -> Option<&str> {
-    let has_it = |interface: &super::network::Interface| {
-        interface.addresses.iter().any(|(one, _)| *one == address)
-    };
     let mut all = present.iter();
-    all.find(|(_, one)| has_it(one))
+    all.find(|(_, one)| one.addresses.iter().any(|(own, _)| *own == address))
         .map(|(name, _)| name.as_str())
 }
 
@@ -65,10 +61,8 @@ fn route(
         return Finding::error(id, format!("no interface has {own}, this host's address"))
             .fixed_by(format!("ip address add {own}/24 dev {to}"));
     };
-    if let Some(named) = peer
-        .interface
-        .as_ref()
-        .filter(|name| *name != own_interface)
+    if let Some(named) = &peer.interface
+        && named != own_interface
     {
         let value = format!("{own} is on {own_interface}, and interface says {named}");
         return Finding::error(id, value).fixed_by(format!("interface = \"{own_interface}\""));
@@ -79,19 +73,18 @@ fn route(
             .because("what is sent there never leaves the host: no network is measured")
             .fixed_by("give the two hosts different addresses in the topology");
     }
+    let misled = |value| {
+        let fix = format!("ip route add {address} dev {own_interface} src {own}");
+        Finding::error(id, value).fixed_by(fix)
+    };
     let chosen = match source(*address) {
         Ok(chosen) => chosen,
-        Err(reason) => {
-            return Finding::error(id, format!("none to {address}: {reason}")).fixed_by(format!(
-                "ip route add {address} dev {own_interface} src {own}"
-            ));
-        }
+        Err(reason) => return misled(format!("none to {address}: {reason}")),
     };
     let by = owner(present, chosen).unwrap_or("an unknown interface");
     if by != own_interface {
-        let value = format!("{address} by {by} from {chosen}, not by {own_interface} from {own}");
-        return Finding::error(id, value).fixed_by(format!(
-            "ip route add {address} dev {own_interface} src {own}"
+        return misled(format!(
+            "{address} by {by} from {chosen}, not by {own_interface} from {own}"
         ));
     }
     if let Some(device) = unanswered(files, *address) {
@@ -107,15 +100,14 @@ fn route(
 
 /// The interface on which the kernel asked for `address` and got no answer.
 fn unanswered(files: &HostFiles, address: IpAddr) -> Option<String> {
-    let table = files.read("/proc/net/arp");
-    let lines = table.available()?.lines();
-    let mut own = lines
-        .map(|line| line.split_whitespace().collect::<Vec<_>>())
-        .filter(|words| words.first().and_then(|word| word.parse().ok()) == Some(address));
-    // Address, type, flags, hardware address, mask, device; without flags the entry is incomplete.
-    own.find_map(|words| {
-        (words.get(2) == Some(&"0x0")).then(|| words.last().map(|w| (*w).to_owned()))
-    })?
+    let table = files.read("/proc/net/arp").known().ok()?;
+    table.lines().find_map(|line| {
+        // Address, type, flags, hardware address, mask, device; without flags the entry is
+        // incomplete.
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let is_it = words.first()?.parse() == Ok(address) && words.get(2) == Some(&"0x0");
+        is_it.then(|| words.last().map(|device| (*device).to_owned()))?
+    })
 }
 
 /// The network part of an address.
@@ -124,98 +116,85 @@ fn subnet(address: Ipv4Addr, prefix: u32) -> u32 {
     address.to_bits() & mask
 }
 
-fn addresses(present: &Interfaces, plan: &Plan) -> Finding {
+fn addresses(present: &Interfaces, plan: &Plan) -> Checked {
     let id = "addresses";
-    let all: Vec<(&str, Ipv4Addr, u32)> = present
-        .iter()
-        .filter(|(_, interface)| interface.is_up)
-        .flat_map(|(name, interface)| {
-            let v4 = interface.addresses.iter().filter_map(|(address, prefix)| {
-                let IpAddr::V4(address) = address else {
-                    return None;
-                };
-                Some((name.as_str(), *address, *prefix))
-            });
-            v4.filter(|(_, address, _)| !address.is_loopback())
-        })
-        .collect();
-    let pairs = all
-        .iter()
-        .enumerate()
-        .flat_map(|(index, one)| all[index + 1..].iter().map(move |other| (one, other)));
-    for ((name, address, prefix), (other, there, other_prefix)) in pairs {
-        if name == other {
-            continue;
+    let mut all: Vec<(&str, Ipv4Addr, u32)> = Vec::new();
+    for (name, interface) in present.iter().filter(|(_, interface)| interface.is_up) {
+        for (address, prefix) in &interface.addresses {
+            match address {
+                IpAddr::V4(address) if !address.is_loopback() => {
+                    all.push((name, *address, *prefix));
+                }
+                _ => {}
+            }
         }
-        if address == there {
-            let value = format!("{address} is on {name} and on {other}");
-            return Finding::error(id, value)
-                .fixed_by(format!("ip address del {there}/{other_prefix} dev {other}"));
-        }
-        let shorter = *prefix.min(other_prefix);
-        let is_shared = shorter < 32 && subnet(*address, shorter) == subnet(*there, shorter);
-        if is_shared {
-            let value = format!(
-                "{address}/{prefix} on {name} and {there}/{other_prefix} on {other} overlap"
-            );
-            let own = [IpAddr::V4(*address), IpAddr::V4(*there)];
-            let is_used = own.iter().any(|one| plan.addresses.contains(one));
-            return if is_used {
-                Finding::warning(id, value)
-            } else {
-                Finding::note(id, value)
-            };
+    }
+    for (index, (name, address, prefix)) in all.iter().enumerate() {
+        let others = all[index + 1..].iter().filter(|(other, ..)| other != name);
+        for (other, there, other_prefix) in others {
+            if address == there {
+                let value = format!("{address} is on {name} and on {other}");
+                return Ok(Finding::error(id, value)
+                    .fixed_by(format!("ip address del {there}/{other_prefix} dev {other}")));
+            }
+            let shorter = *prefix.min(other_prefix);
+            if shorter < 32 && subnet(*address, shorter) == subnet(*there, shorter) {
+                let value = format!(
+                    "{address}/{prefix} on {name} and {there}/{other_prefix} on {other} overlap"
+                );
+                let is_used = |own: &Ipv4Addr| plan.addresses.contains(&IpAddr::V4(*own));
+                return Ok(if is_used(address) || is_used(there) {
+                    Finding::warning(id, value)
+                } else {
+                    Finding::note(id, value)
+                });
+            }
         }
     }
     if all.is_empty() {
-        return Finding::cannot_tell(id, "no interface that is up has an IPv4 address");
+        return Err("no interface that is up has an IPv4 address").told(id);
     }
-    let words: Vec<String> = all
-        .iter()
-        .map(|(name, address, prefix)| format!("{address}/{prefix} on {name}"))
-        .collect();
-    Finding::ok(id, words.join(", "))
+    let in_words =
+        |(name, address, prefix): &(&str, Ipv4Addr, u32)| format!("{address}/{prefix} on {name}");
+    let words: Vec<String> = all.iter().map(in_words).collect();
+    Ok(Finding::ok(id, words.join(", ")))
 }
 
-fn mtu(files: &HostFiles, present: &Interfaces, load: &LinkLoad) -> Finding {
+fn mtu(files: &HostFiles, present: &Interfaces, load: &LinkLoad) -> Checked {
     let id = "mtu";
     let message = format!("{} of {} bytes", load.channel, load.message_bytes);
     if load.is_stream {
-        return Finding::ok(id, format!("{message}: TCP cuts its own segments"));
+        return Ok(Finding::ok(
+            id,
+            format!("{message}: TCP cuts its own segments"),
+        ));
     }
-    let Some(interface) = owner(present, load.own) else {
-        return Finding::cannot_tell(id, format!("{message}: no interface has {}", load.own));
-    };
+    let interface = owner(present, load.own);
+    let interface = interface.ok_or(format!("{message}: no interface has {}", load.own));
+    let interface = interface.told(id)?;
     let path = format!("/sys/class/net/{interface}/mtu");
-    let own = files.read_number(&path);
-    let own = match own.and_then(|mtu| match usize::try_from(mtu) {
-        Ok(mtu) => Fact::Available(mtu),
-        Err(_negative) => Fact::Unavailable(format!("{path}: {mtu} is no size")),
-    }) {
-        Fact::Available(mtu) => mtu,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
+    let mtu = files.read_number(&path).told(id)?;
+    let own = usize::try_from(mtu).map_err(|_negative| format!("{path}: {mtu} is no size"));
+    let own = own.told(id)?;
     let configured = load.path_mtu_bytes;
     let Some(count) = load.datagram_count(own.min(configured)) else {
         let value = format!("{message}: {interface} carries {own} bytes, less than the headers");
-        return Finding::error(id, value);
+        return Ok(Finding::error(id, value));
     };
     let packet = load.packet_bytes();
     let value = format!(
         "{message} is a packet of {packet}; {interface} carries {own}, path_mtu_bytes {configured}"
     );
     if count > 1 {
-        return Finding::note(id, format!("{value}: {count} datagrams"));
+        return Ok(Finding::note(id, format!("{value}: {count} datagrams")));
     }
     if configured > own {
-        return Finding::note(id, value)
-            .because(
-                "the gateway takes the smaller of the two; this file says more than this host's \
-                 interface carries",
-            )
-            .fixed_by(format!("path_mtu_bytes = {own}"));
+        let why = "the gateway takes the smaller of the two; this file says more than this \
+                   host's interface carries";
+        let fix = format!("path_mtu_bytes = {own}");
+        return Ok(Finding::note(id, value).because(why).fixed_by(fix));
     }
-    Finding::ok(id, value)
+    Ok(Finding::ok(id, value))
 }
 
 #[cfg(test)]
@@ -312,7 +291,7 @@ mod tests {
                 addresses: own.iter().map(|text| text.parse().unwrap()).collect(),
                 ..Plan::default()
             };
-            addresses(&present(entries), &plan)
+            settled(addresses(&present(entries), &plan))
         };
         let double = [("eth0", "10.0.0.1", 24), ("eth1", "10.0.0.1", 24)];
         assert_eq!(judged(&double, &[]).severity, Severity::Error);
@@ -344,7 +323,7 @@ mod tests {
     }
 
     fn mtu_of(host: &FakeHost, load: &LinkLoad) -> Finding {
-        mtu(&host.files(), &two_networks(), load)
+        settled(mtu(&host.files(), &two_networks(), load))
     }
 
     #[test]

@@ -14,7 +14,7 @@ const IPV4_HEADERS: usize = 28;
 const IPV6_HEADERS: usize = 48;
 
 /// A CPU that something is pinned to.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Pin {
     /// The CPU.
     pub cpu: usize,
@@ -54,7 +54,7 @@ pub struct WantedPort {
 }
 
 /// A host that this one talks to.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Peer {
     /// Its name in the topology.
     pub name: String,
@@ -86,22 +86,24 @@ pub struct LinkLoad {
 impl LinkLoad {
     /// Bytes of the IP packet that the message would be in one piece.
     pub(super) fn packet_bytes(&self) -> usize {
-        self.headers() + wire::HEADER_BYTES + self.message_bytes
+        self.headers_bytes() + self.message_bytes
     }
 
     /// Datagrams of one message where a packet has at most `mtu` bytes; `None` when not even the
     /// headers fit.
     pub(super) fn datagram_count(&self, mtu: usize) -> Option<usize> {
-        let budget = mtu.checked_sub(self.headers() + wire::HEADER_BYTES)?;
+        let budget = mtu.checked_sub(self.headers_bytes())?;
         (budget > 0).then(|| self.message_bytes.div_ceil(budget).max(1))
     }
 
-    fn headers(&self) -> usize {
-        if self.own.is_ipv4() {
+    /// Bytes of the headers of IP, UDP and the datagram.
+    fn headers_bytes(&self) -> usize {
+        let below = if self.own.is_ipv4() {
             IPV4_HEADERS
         } else {
             IPV6_HEADERS
-        }
+        };
+        below + wire::HEADER_BYTES
     }
 }
 
@@ -130,37 +132,62 @@ impl Plan {
     /// The plan of the hosts called `here`, which run on this machine.
     pub fn of(topology: &Topology, here: &[String]) -> Self {
         let is_here = |host: &Host| here.contains(&host.name);
-        let own: Vec<&Host> = topology.hosts().iter().filter(|h| is_here(h)).collect();
-        let ends = own.iter().filter_map(|host| host.clock.clone());
         let mut plan = Self {
             record_folder: PathBuf::from(&topology.run().record_folder),
-            clock_end: ends.clone().next(),
-            addresses: own.iter().filter_map(|host| host.address).collect(),
             ..Self::default()
         };
-        let clock_interfaces = ends.clone().filter_map(|end| end.interface);
-        let interfaces = own.iter().filter_map(|host| host.interface.clone());
-        plan.interfaces = interfaces.chain(clock_interfaces).collect();
-        plan.addresses.extend(ends.map(|end| end.address));
-        for host in &own {
+        for host in topology.hosts().iter().filter(|host| is_here(host)) {
+            plan.addresses.extend(host.address);
+            plan.interfaces.extend(host.interface.clone());
+            if let Some(end) = &host.clock {
+                plan.addresses.push(end.address);
+                plan.interfaces.extend(end.interface.clone());
+                plan.clock_end.get_or_insert_with(|| end.clone());
+            }
             for process in topology.processes_on(&host.name) {
                 plan.pin(&process.name, &process.execution);
-                plan.listen_for_face(&process.name, &process.program);
+                // A sensor face listens; a robot face sends from a port of the kernel's choice.
+                if let Program::Egm { face, .. } = &process.program
+                    && face.kind == FaceKind::Sensor
+                {
+                    let sides = [Side::Right, Side::Left].into_iter();
+                    for address in sides.filter_map(|side| face.address(side)) {
+                        plan.bind(Protocol::Udp, address, &process.name);
+                    }
+                }
             }
         }
         for crossing in topology.crossings() {
             plan.cross(&crossing, &is_here);
         }
-        plan.meet(topology, &is_here);
-        plan.tidy();
+        // The supervisors meet at the first host; clock paths have ports of their own.
+        let first = topology.hosts().first().filter(|host| is_here(host));
+        if let Some(address) = first.and_then(Host::control_address) {
+            plan.bind(Protocol::Tcp, address, "control_port");
+        }
+        for path in topology.clock_paths() {
+            for (host, address) in [(path.from, path.asking), (path.to, path.answering)] {
+                if is_here(host) {
+                    plan.bind(Protocol::Udp, address, &path.name());
+                }
+            }
+        }
+        sort_unique(&mut plan.pins);
+        sort_unique(&mut plan.ports);
+        sort_unique(&mut plan.interfaces);
+        sort_unique(&mut plan.addresses);
+        sort_unique(&mut plan.peers);
+        // The longest of each link stays.
+        plan.loads
+            .sort_by(|a, b| (&a.link, b.message_bytes).cmp(&(&b.link, a.message_bytes)));
+        plan.loads.dedup_by(|later, first| later.link == first.link);
         plan
     }
 
     /// The CPUs of the pins, each once.
     pub fn cpus(&self) -> Vec<usize> {
         let mut cpus: Vec<usize> = self.pins.iter().map(|pin| pin.cpu).collect();
-        cpus.sort_unstable();
-        cpus.dedup();
+        sort_unique(&mut cpus);
         cpus
     }
 
@@ -177,36 +204,18 @@ impl Plan {
         }));
     }
 
-    /// A sensor face listens; a robot face sends from a port of the kernel's choice.
-    fn listen_for_face(&mut self, process: &str, program: &Program) {
-        let Program::Egm { face, .. } = program else {
-            return;
-        };
-        if face.kind == FaceKind::Sensor {
-            let sides = [Side::Right, Side::Left].into_iter();
-            self.ports
-                .extend(
-                    sides
-                        .filter_map(|side| face.address(side))
-                        .map(|address| WantedPort {
-                            protocol: Protocol::Udp,
-                            address,
-                            of: process.to_owned(),
-                        }),
-                );
-        }
-    }
-
     fn cross(&mut self, crossing: &Crossing<'_>, is_here: &dyn Fn(&Host) -> bool) {
         let (from, to, channel) = (crossing.from_host, crossing.to_host, crossing.channel);
         let is_stream = matches!(crossing.link.via, Via::Tcp(_));
-        let name = format!("gateway of {}", crossing.link.name);
         if is_here(from) || is_here(to) {
+            let name = format!("gateway of {}", crossing.link.name);
             self.pin(&name, &crossing.hop.gateway.execution);
         }
+        let at = |host: &Host, port| SocketAddr::new(host.gateway_address(), port);
         if is_here(from) {
             if !is_stream {
-                self.bind(from, Protocol::Udp, crossing.ports.sender, &channel.name);
+                let address = at(from, crossing.ports.sender);
+                self.bind(Protocol::Udp, address, &channel.name);
             }
             self.loads.push(LinkLoad {
                 link: crossing.link.name.clone(),
@@ -224,15 +233,15 @@ impl Plan {
             } else {
                 Protocol::Udp
             };
-            self.bind(to, protocol, crossing.ports.receiver, &channel.name);
+            self.bind(protocol, at(to, crossing.ports.receiver), &channel.name);
             self.face(to, from);
         }
     }
 
-    fn bind(&mut self, host: &Host, protocol: Protocol, port: u16, of: &str) {
+    fn bind(&mut self, protocol: Protocol, address: SocketAddr, of: &str) {
         self.ports.push(WantedPort {
             protocol,
-            address: SocketAddr::new(host.gateway_address(), port),
+            address,
             of: of.to_owned(),
         });
     }
@@ -248,48 +257,11 @@ impl Plan {
             });
         }
     }
+}
 
-    /// The supervisors meet at the first host; clock paths have ports of their own.
-    fn meet(&mut self, topology: &Topology, is_here: &dyn Fn(&Host) -> bool) {
-        let first = topology.hosts().first().filter(|host| is_here(host));
-        self.ports.extend(
-            first
-                .and_then(Host::control_address)
-                .map(|address| WantedPort {
-                    protocol: Protocol::Tcp,
-                    address,
-                    of: "control_port".to_owned(),
-                }),
-        );
-        for path in topology.clock_paths() {
-            let ends = [(path.from, path.asking), (path.to, path.answering)];
-            let own = ends.into_iter().filter(|(host, _)| is_here(host));
-            self.ports.extend(own.map(|(_, address)| WantedPort {
-                protocol: Protocol::Udp,
-                address,
-                of: path.name(),
-            }));
-        }
-    }
-
-    fn tidy(&mut self) {
-        self.pins
-            .sort_by(|a, b| (a.cpu, &a.of).cmp(&(b.cpu, &b.of)));
-        self.pins.dedup();
-        self.ports.sort();
-        self.ports.dedup();
-        self.interfaces.sort();
-        self.interfaces.dedup();
-        self.addresses.sort();
-        self.addresses.dedup();
-        self.peers
-            .sort_by(|a, b| (&a.name, a.own).cmp(&(&b.name, b.own)));
-        self.peers.dedup();
-        // The longest of each link stays.
-        self.loads
-            .sort_by(|a, b| (&a.link, b.message_bytes).cmp(&(&b.link, a.message_bytes)));
-        self.loads.dedup_by(|later, first| later.link == first.link);
-    }
+fn sort_unique<T: Ord>(list: &mut Vec<T>) {
+    list.sort();
+    list.dedup();
 }
 
 #[cfg(test)]

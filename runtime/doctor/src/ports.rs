@@ -1,11 +1,12 @@
 //! The ports of the topology against those that other programs hold, from the kernel's socket tables.
 //! It binds none itself: a port tried a moment before a run would be in the run's way.
 
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::collections::BTreeSet;
+use std::net::{IpAddr, SocketAddr};
 
-use super::Finding;
+use super::finding::{Answer, Checked, Finding, settled};
 use super::plan::{Protocol, WantedPort};
-use hil_platform::host_facts::{Fact, HostFiles};
+use hil_platform::host_facts::{Fact, HostFiles, format_cpu_list};
 
 /// `TCP_LISTEN` in the socket tables.
 const LISTENING: &str = "0A";
@@ -19,42 +20,41 @@ struct Bound {
 
 /// `None` when the topology needs no ports.
 pub(super) fn examine(files: &HostFiles, wanted: &[WantedPort]) -> Option<Finding> {
+    (!wanted.is_empty()).then(|| settled(check(files, wanted)))
+}
+
+fn check(files: &HostFiles, wanted: &[WantedPort]) -> Checked {
     let id = "ports";
-    if wanted.is_empty() {
-        return None;
-    }
-    let mut taken = Vec::new();
-    for protocol in [Protocol::Udp, Protocol::Tcp] {
-        let mut own = wanted
-            .iter()
-            .filter(|one| one.protocol == protocol)
-            .peekable();
-        if own.peek().is_none() {
-            continue;
+    let (mut taken, mut free) = (Vec::new(), Vec::new());
+    for (protocol, ports) in by_protocol(wanted) {
+        let word = protocol.word();
+        let bound = bound(files, protocol).told(id)?;
+        for one in wanted.iter().filter(|one| one.protocol == protocol) {
+            let (address, of) = (one.address, &one.of);
+            if let Some(other) = bound.iter().find(|bound| collide(bound.address, address)) {
+                let holder = holder(files, other.inode);
+                taken.push(format!("{word} {address} of {of} is held by {holder}"));
+            }
         }
-        let bound = match bound(files, protocol) {
-            Fact::Available(bound) => bound,
-            Fact::Unavailable(reason) => return Some(Finding::cannot_tell(id, reason)),
-        };
-        taken.extend(own.filter_map(|one| {
-            let other = bound
-                .iter()
-                .find(|bound| collide(bound.address, one.address))?;
-            Some((one, *other))
-        }));
+        // `udp 7400-7403, tcp 7399`.
+        let ports: Vec<usize> = ports.into_iter().map(usize::from).collect();
+        free.push(format!("{word} {}", format_cpu_list(&ports)));
     }
-    if taken.is_empty() {
-        return Some(Finding::ok(id, format!("free: {}", list(wanted))));
-    }
-    let words: Vec<String> = taken
-        .iter()
-        .map(|(one, other)| {
-            let holder = holder(files, other.inode);
-            let (word, address) = (one.protocol.word(), one.address);
-            format!("{word} {address} of {} is held by {holder}", one.of)
-        })
-        .collect();
-    Some(Finding::error(id, words.join("; ")))
+    Ok(if taken.is_empty() {
+        Finding::ok(id, format!("free: {}", free.join(", ")))
+    } else {
+        Finding::error(id, taken.join("; "))
+    })
+}
+
+/// The ports of each protocol that has some, in ascending order.
+pub(super) fn by_protocol(wanted: &[WantedPort]) -> Vec<(Protocol, BTreeSet<u16>)> {
+    let ports = [Protocol::Udp, Protocol::Tcp].map(|protocol| {
+        let own = wanted.iter().filter(|one| one.protocol == protocol);
+        (protocol, own.map(|one| one.address.port()).collect())
+    });
+    let has_some = |(_, ports): &(Protocol, BTreeSet<u16>)| !ports.is_empty();
+    ports.into_iter().filter(has_some).collect()
 }
 
 /// Two sockets cannot have both, unless they agreed to.
@@ -63,36 +63,15 @@ fn collide(one: SocketAddr, other: SocketAddr) -> bool {
     one.port() == other.port() && (is_any || one.ip() == other.ip())
 }
 
-/// `udp 7400-7403, tcp 7399`.
-fn list(wanted: &[WantedPort]) -> String {
-    let parts = [Protocol::Udp, Protocol::Tcp].map(|protocol| {
-        let own = wanted.iter().filter(|one| one.protocol == protocol);
-        let mut ports: Vec<usize> = own.map(|one| usize::from(one.address.port())).collect();
-        ports.sort_unstable();
-        ports.dedup();
-        (!ports.is_empty()).then(|| {
-            let ports = hil_platform::host_facts::format_cpu_list(&ports);
-            format!("{} {ports}", protocol.word())
-        })
-    });
-    parts.into_iter().flatten().collect::<Vec<_>>().join(", ")
-}
-
-fn bound(files: &HostFiles, protocol: Protocol) -> Fact<Vec<Bound>> {
-    let word = protocol.word();
-    let first = format!("/proc/net/{word}");
-    let second = format!("/proc/net/{word}6");
-    files.read(&first).and_then(|text| {
-        let mut found = parse(&text, protocol);
-        // A kernel without IPv6 has no such file.
-        if files.locate(&second).exists() {
-            match files.read(&second) {
-                Fact::Available(text) => found.extend(parse(&text, protocol)),
-                Fact::Unavailable(reason) => return Fact::Unavailable(reason),
-            }
-        }
-        Fact::Available(found)
-    })
+fn bound(files: &HostFiles, protocol: Protocol) -> Result<Vec<Bound>, String> {
+    let first = format!("/proc/net/{}", protocol.word());
+    let second = format!("{first}6");
+    let mut found = parse(&files.read(&first).known()?, protocol);
+    // A kernel without IPv6 has no such file.
+    if files.locate(&second).exists() {
+        found.extend(parse(&files.read(&second).known()?, protocol));
+    }
+    Ok(found)
 }
 
 fn parse(text: &str, protocol: Protocol) -> Vec<Bound> {
@@ -118,12 +97,9 @@ fn address(text: &str) -> Option<SocketAddr> {
         let word = u32::from_str_radix(address.get(index..index + 8)?, 16).ok()?;
         bytes.extend(word.to_ne_bytes());
     }
-    let ip: IpAddr = match bytes.len() {
-        4 => Ipv4Addr::from(<[u8; 4]>::try_from(bytes).ok()?).into(),
-        16 => {
-            let ip = Ipv6Addr::from(<[u8; 16]>::try_from(bytes).ok()?);
-            ip.to_ipv4_mapped().map_or(IpAddr::V6(ip), IpAddr::V4)
-        }
+    let ip = match bytes.len() {
+        4 => IpAddr::V4(<[u8; 4]>::try_from(bytes).ok()?.into()),
+        16 => IpAddr::V6(<[u8; 16]>::try_from(bytes).ok()?.into()).to_canonical(),
         _ => return None,
     };
     Some(SocketAddr::new(ip, port))
@@ -131,20 +107,13 @@ fn address(text: &str) -> Option<SocketAddr> {
 
 /// Who has the socket open, as far as this user may see.
 fn holder(files: &HostFiles, inode: u64) -> String {
-    let wanted = format!("socket:[{inode}]");
-    let processes = files.list("/proc");
-    let processes = processes.available().cloned().unwrap_or_default();
-    let numbers = processes
-        .iter()
-        .filter(|name| name.bytes().all(|byte| byte.is_ascii_digit()));
-    for process in numbers {
+    let wanted = Fact::Available(format!("socket:[{inode}]"));
+    let processes = files.list("/proc").known().unwrap_or_default();
+    let is_number = |name: &&String| name.bytes().all(|byte| byte.is_ascii_digit());
+    for process in processes.iter().filter(is_number) {
         let folder = format!("/proc/{process}/fd");
-        let descriptors = files.list(&folder);
-        let mut open = descriptors.available().into_iter().flatten();
-        let is_it = |one: &String| {
-            files.link_target(&format!("{folder}/{one}")) == Fact::Available(wanted.clone())
-        };
-        if open.any(is_it) {
+        let mut open = files.list(&folder).known().unwrap_or_default().into_iter();
+        if open.any(|one| files.link_target(&format!("{folder}/{one}")) == wanted) {
             let command = files.read(&format!("/proc/{process}/comm")).to_text();
             return format!("{command} (process {process})");
         }

@@ -9,94 +9,65 @@ use nix::sys::mman::{MlockAllFlags, mlockall, munlockall};
 use nix::sys::resource::Resource;
 use nix::unistd::{Uid, User};
 
-use super::Finding;
+use super::finding::{Answer, Checked, Finding, settled};
 use hil_platform::host_facts::{CAP_IPC_LOCK, CAP_SYS_NICE, Fact, HostFiles, limit};
 use hil_platform::realtime::{GrantOutcome, RealtimeRequest, SchedulingPolicy, apply};
 
 /// A typical priority of a control loop, above the interrupt threads of `PREEMPT_RT`.
 const TRIED_PRIORITY: u8 = 80;
 
-/// What the tries came to.
-#[derive(Debug)]
-pub(super) struct Rights {
-    /// `SCHED_FIFO`; `None` when the trial itself failed.
-    pub(super) fifo: Option<GrantOutcome>,
-}
-
-impl Rights {
-    /// Tries.
-    pub(super) fn tried() -> Self {
-        let trial = thread::spawn(|| {
-            let policy = SchedulingPolicy::Fifo {
+/// What becomes of a wish for `SCHED_FIFO`; `None` when the trial itself failed.
+pub(super) fn try_fifo() -> Option<GrantOutcome> {
+    let trial = thread::spawn(|| {
+        apply(&RealtimeRequest {
+            policy: SchedulingPolicy::Fifo {
                 priority: TRIED_PRIORITY,
-            };
-            apply(&RealtimeRequest {
-                policy,
-                ..RealtimeRequest::default()
-            })
-        });
-        let grant = trial.join().ok();
-        Self {
-            fifo: grant.and_then(|mut grant| Some(grant.items.pop()?.outcome)),
-        }
-    }
-
-    /// `SCHED_FIFO` was granted; `None` when that is not known.
-    pub(super) fn is_fifo_granted(&self) -> Option<bool> {
-        let outcome = self.fifo.as_ref()?;
-        Some(*outcome == GrantOutcome::Granted)
-    }
+            },
+            ..RealtimeRequest::default()
+        })
+    });
+    Some(trial.join().ok()?.items.pop()?.outcome)
 }
 
-pub(super) fn examine(files: &HostFiles, rights: &Rights) -> Vec<Finding> {
+/// `tried` is what [`try_fifo`] came to.
+pub(super) fn examine(files: &HostFiles, tried: Option<&GrantOutcome>) -> Vec<Finding> {
     let rtprio = limit(Resource::RLIMIT_RTPRIO, "");
     let memlock = limit(Resource::RLIMIT_MEMLOCK, " bytes");
     vec![
-        fifo(files, rights.fifo.as_ref(), &rtprio.to_text()),
-        memory_lock(files, &memlock.to_text(), try_lock),
+        settled(fifo(files, tried, &rtprio.to_text())),
+        settled(memory_lock(files, &memlock.to_text(), try_lock)),
     ]
 }
 
-fn user() -> String {
-    let found = User::from_uid(Uid::current()).ok().flatten();
-    found.map_or_else(|| Uid::current().to_string(), |user| user.name)
-}
-
-fn limit_line(name: &str, value: &str, file: &str) -> String {
-    let user = user();
+fn limit_line(name: &str, value: &str, in_unit: &str, file: &str) -> String {
+    let user = User::from_uid(Uid::current()).ok().flatten();
+    let user = user.map_or_else(|| Uid::current().to_string(), |user| user.name);
     format!(
         "echo \"{user} - {name} {value}\" | sudo tee /etc/security/limits.d/{file} and log in again; \
-         in a unit Limit{}={}",
-        name.to_uppercase(),
-        if value == "unlimited" {
-            "infinity"
-        } else {
-            value
-        }
+         in a unit Limit{}={in_unit}",
+        name.to_uppercase()
     )
 }
 
-fn fifo(files: &HostFiles, tried: Option<&GrantOutcome>, rtprio: &str) -> Finding {
+fn fifo(files: &HostFiles, tried: Option<&GrantOutcome>, rtprio: &str) -> Checked {
     let id = "fifo";
-    let rights = format!(
-        "RLIMIT_RTPRIO {rtprio}, CAP_SYS_NICE {}",
-        held(files, CAP_SYS_NICE)
-    );
-    match tried {
-        None => Finding::cannot_tell(id, format!("the trial thread died; {rights}")),
-        Some(GrantOutcome::Granted) => {
+    let capability = held(files, CAP_SYS_NICE);
+    let rights = format!("RLIMIT_RTPRIO {rtprio}, CAP_SYS_NICE {capability}");
+    let tried = tried.ok_or(format!("the trial thread died; {rights}"));
+    Ok(match tried.told(id)? {
+        GrantOutcome::Granted => {
             Finding::ok(id, format!("priority {TRIED_PRIORITY} granted; {rights}"))
         }
-        Some(GrantOutcome::Refused { error, reason, fix }) => {
+        GrantOutcome::Refused { error, reason, fix } => {
             let value = format!("priority {TRIED_PRIORITY} refused ({error}); {rights}");
-            if held(files, CAP_SYS_NICE) == "held" {
+            if capability == "held" {
                 // Then it is not for want of rights.
-                Finding::error(id, format!("{value}: {reason}")).fixed_by(fix.clone())
+                Finding::error(id, format!("{value}: {reason}")).fixed_by(fix)
             } else {
-                Finding::error(id, value).fixed_by(limit_line("rtprio", "90", "90-hil.conf"))
+                Finding::error(id, value).fixed_by(limit_line("rtprio", "90", "90", "90-hil.conf"))
             }
         }
-    }
+    })
 }
 
 /// Locks what is there and releases it again.
@@ -109,37 +80,24 @@ fn memory_lock(
     files: &HostFiles,
     memlock: &str,
     trial: impl FnOnce() -> Result<(), Errno>,
-) -> Finding {
+) -> Checked {
     let id = "memory_lock";
-    let rights = format!(
-        "RLIMIT_MEMLOCK {memlock}, CAP_IPC_LOCK {}",
-        held(files, CAP_IPC_LOCK)
-    );
+    let capability = held(files, CAP_IPC_LOCK);
+    let rights = format!("RLIMIT_MEMLOCK {memlock}, CAP_IPC_LOCK {capability}");
     // Somebody else's lock must survive the trial, so a locked process is not tried.
-    let locked = match files.read_field("/proc/self/status", "VmLck") {
-        Fact::Available(locked) => locked,
-        Fact::Unavailable(reason) => {
-            return Finding::cannot_tell(id, format!("not tried: {reason}; {rights}"));
-        }
-    };
+    let locked = files.read_field("/proc/self/status", "VmLck");
+    let locked = locked.told_as(id, |reason| format!("not tried: {reason}; {rights}"))?;
     if !locked.starts_with("0 ") {
-        return Finding::ok(id, format!("in force ({locked}); {rights}"));
+        return Ok(Finding::ok(id, format!("in force ({locked}); {rights}")));
     }
-    match trial() {
-        Ok(()) => Finding::ok(id, format!("granted; {rights}")),
-        Err(errno) => {
-            // The kernel says "out of memory" for what is beyond the limit.
-            let why = match errno {
-                Errno::ENOMEM => "more than the limit",
-                _ => errno.desc(),
-            };
-            Finding::error(id, format!("refused ({why}); {rights}")).fixed_by(limit_line(
-                "memlock",
-                "unlimited",
-                "91-hil.conf",
-            ))
-        }
-    }
+    let why = match trial() {
+        Ok(()) => return Ok(Finding::ok(id, format!("granted; {rights}"))),
+        // The kernel says "out of memory" for what is beyond the limit.
+        Err(Errno::ENOMEM) => "more than the limit",
+        Err(errno) => errno.desc(),
+    };
+    let fix = limit_line("memlock", "unlimited", "infinity", "91-hil.conf");
+    Ok(Finding::error(id, format!("refused ({why}); {rights}")).fixed_by(fix))
 }
 
 fn held(files: &HostFiles, capability: u32) -> &'static str {
@@ -164,7 +122,7 @@ mod tests {
     #[test]
     fn the_trials_say_what_the_limits_are() {
         let files = HostFiles::of_this_host();
-        for finding in examine(&files, &Rights::tried()) {
+        for finding in examine(&files, try_fifo().as_ref()) {
             assert_ne!(finding.severity, Severity::CannotTell, "{finding:?}");
         }
     }
@@ -177,10 +135,12 @@ mod tests {
             reason: "RLIMIT_RTPRIO is 0".to_owned(),
             fix: "needs CAP_SYS_NICE".to_owned(),
         };
-        let finding = fifo(&host.files(), Some(&refused), "0");
+        let finding = settled(fifo(&host.files(), Some(&refused), "0"));
         assert_eq!(finding.severity, Severity::Error);
         assert!(finding.fix.contains("- rtprio 90\""), "{}", finding.fix);
-        let locking = memory_lock(&host.files(), "65536 bytes", || Err(Errno::ENOMEM));
+        let locking = settled(memory_lock(&host.files(), "65536 bytes", || {
+            Err(Errno::ENOMEM)
+        }));
         assert_eq!(locking.severity, Severity::Error);
         assert!(
             locking.fix.contains("LimitMEMLOCK=infinity"),
@@ -197,16 +157,20 @@ mod tests {
     #[test]
     fn what_was_not_tried_is_not_ok() {
         let silent = FakeHost::with(&[]);
-        let finding = fifo(&silent.files(), None, "0");
+        let finding = settled(fifo(&silent.files(), None, "0"));
         assert_eq!(finding.severity, Severity::CannotTell);
-        let finding = memory_lock(&silent.files(), "1", || panic!("tried in the dark"));
+        let finding = settled(memory_lock(&silent.files(), "1", || {
+            panic!("tried in the dark")
+        }));
         assert_eq!(finding.severity, Severity::CannotTell);
     }
 
     #[test]
     fn memory_that_is_already_locked_stays_locked() {
         let host = FakeHost::with(&[("/proc/self/status", "VmLck:\t  5120 kB\n")]);
-        let finding = memory_lock(&host.files(), "1", || panic!("tried all the same"));
+        let finding = settled(memory_lock(&host.files(), "1", || {
+            panic!("tried all the same")
+        }));
         assert!(
             finding.value.starts_with("in force (5120 kB)"),
             "{finding:?}"
@@ -217,9 +181,9 @@ mod tests {
     #[test]
     fn granted_is_ok() {
         let host = FakeHost::with(&[UNLOCKED]);
-        let granted = fifo(&host.files(), Some(&GrantOutcome::Granted), "90");
+        let granted = settled(fifo(&host.files(), Some(&GrantOutcome::Granted), "90"));
         assert_eq!(granted.severity, Severity::Ok);
-        let locked = memory_lock(&host.files(), "unlimited", || Ok(()));
+        let locked = settled(memory_lock(&host.files(), "unlimited", || Ok(())));
         assert_eq!(locked.severity, Severity::Ok);
     }
 }

@@ -2,7 +2,11 @@
 //! deep they sleep, with whom they share a core. It reads settings only; what they cost is measured
 //! by the wake-ups.
 
-use super::{Finding, finding::Severity, plan::Plan};
+use std::collections::BTreeSet;
+
+use super::finding::{Answer, Checked, Finding, Severity, settled};
+use super::kernel::worse_when_spinning;
+use super::plan::Plan;
 use hil_platform::host_facts::{
     CPU_FOLDER, Fact, HostFiles, IsolatedCpus, KernelOptions, format_cpu_list, governors,
     online_cpus,
@@ -15,62 +19,48 @@ const IDLE_EXIT_US_NOTE: i64 = 100;
 
 pub(super) fn examine(files: &HostFiles, plan: &Plan) -> Vec<Finding> {
     let isolation = IsolatedCpus::read(files);
-    let without_tick = isolation.nohz_full.clone();
-    let without_tick = match (without_tick, KernelOptions::read(files)) {
+    let without_tick = match (isolation.nohz_full, KernelOptions::read(files)) {
         // A kernel without the option has no such file, and ticks everywhere.
         (Fact::Unavailable(_), Fact::Available(options)) if !options.has("NO_HZ_FULL") => {
             Fact::Available(Vec::new())
         }
         (found, _) => found,
     };
-    vec![
-        covered("isolated_cpus", &isolation.isolated, plan),
-        covered("nohz_full", &without_tick, plan),
-        covered("rcu_nocbs", &isolation.without_callbacks, plan),
+    let checks = [
+        covered("isolated_cpus", isolation.isolated, plan),
+        covered("nohz_full", without_tick, plan),
+        covered("rcu_nocbs", isolation.without_callbacks, plan),
         governor(files, plan),
         idle_states(files, plan),
         siblings(files, plan),
-    ]
+    ];
+    checks.map(settled).into()
 }
 
 /// Whether the pinned CPUs are among those that were set apart.
-fn covered(id: &str, apart: &Fact<Vec<usize>>, plan: &Plan) -> Finding {
-    let apart = match apart {
-        Fact::Available(cpus) => cpus,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
-    let value = format_cpu_list(apart);
+fn covered(id: &str, apart: Fact<Vec<usize>>, plan: &Plan) -> Checked {
+    let apart = apart.told(id)?;
+    let value = format_cpu_list(&apart);
     if plan.pins.is_empty() {
-        return if apart.is_empty() {
+        return Ok(if apart.is_empty() {
             Finding::note(id, value)
         } else {
             let value = format!("{value}; the topology pins nothing, or none was given");
             Finding::ok(id, value)
-        };
+        });
     }
-    let outside: Vec<_> = plan
-        .pins
-        .iter()
-        .filter(|pin| !apart.contains(&pin.cpu))
-        .collect();
-    if outside.is_empty() {
-        return Finding::ok(id, value);
+    let outside = plan.pins.iter().filter(|pin| !apart.contains(&pin.cpu));
+    let (mut words, mut cpus, mut spins) = (Vec::new(), Vec::new(), false);
+    for pin in outside {
+        let what = if pin.spins { ", which busy-polls" } else { "" };
+        words.push(format!("{} ({}{what})", pin.cpu, pin.of));
+        cpus.push(pin.cpu);
+        spins |= pin.spins;
     }
-    let spins = outside.iter().any(|pin| pin.spins);
-    let severity = if spins {
-        Severity::Warning
-    } else {
-        Severity::Note
-    };
-    let words: Vec<String> = outside
-        .iter()
-        .map(|pin| {
-            let what = if pin.spins { ", which busy-polls" } else { "" };
-            format!("{} ({}{what})", pin.cpu, pin.of)
-        })
-        .collect();
+    if words.is_empty() {
+        return Ok(Finding::ok(id, value));
+    }
     let value = format!("{value}; pinned to outside: {}", words.join(", "));
-    let mut cpus: Vec<usize> = outside.iter().map(|pin| pin.cpu).collect();
     cpus.dedup();
     let cpus = format_cpu_list(&cpus);
     let parameter = if id == "isolated_cpus" {
@@ -78,140 +68,106 @@ fn covered(id: &str, apart: &Fact<Vec<usize>>, plan: &Plan) -> Finding {
     } else {
         id
     };
-    Finding::new(id, severity, value).fixed_by(format!("boot with {parameter}={cpus}"))
+    let finding = Finding::new(id, worse_when_spinning(spins), value);
+    Ok(finding.fixed_by(format!("boot with {parameter}={cpus}")))
 }
 
-fn governor(files: &HostFiles, plan: &Plan) -> Finding {
+fn governor(files: &HostFiles, plan: &Plan) -> Checked {
     let id = "governor";
-    let found = match governors(files, &plan.cpus()) {
-        Fact::Available(found) => found,
-        Fact::Unavailable(reason) => {
-            let why = format!("{reason}: no cpufreq driver, as in most virtual machines");
-            return Finding::cannot_tell(id, why);
-        }
-    };
-    let slow: Vec<usize> = found
-        .iter()
-        .filter(|(_, governor)| governor != "performance")
-        .map(|(cpu, _)| *cpu)
-        .collect();
-    if slow.is_empty() {
-        return Finding::ok(id, "performance");
+    let absent =
+        |reason: String| format!("{reason}: no cpufreq driver, as in most virtual machines");
+    let mut slow = governors(files, &plan.cpus()).told_as(id, absent)?;
+    slow.retain(|(_, governor)| governor != "performance");
+    let (cpus, names): (Vec<usize>, BTreeSet<String>) = slow.into_iter().unzip();
+    if cpus.is_empty() {
+        return Ok(Finding::ok(id, "performance"));
     }
-    let mut names: Vec<&str> = found
-        .iter()
-        .filter(|(cpu, _)| slow.contains(cpu))
-        .map(|(_, governor)| governor.as_str())
-        .collect();
-    names.sort_unstable();
-    names.dedup();
-    let cpus = format_cpu_list(&slow);
-    Finding::warning(id, format!("{} on CPU {cpus}", names.join(", ")))
-        .fixed_by(format!("cpupower -c {cpus} frequency-set -g performance"))
+    let (cpus, names) = (format_cpu_list(&cpus), Vec::from_iter(names).join(", "));
+    Ok(Finding::warning(id, format!("{names} on CPU {cpus}"))
+        .fixed_by(format!("cpupower -c {cpus} frequency-set -g performance")))
 }
 
-/// The enabled idle state of a CPU with the longest way out.
-fn deepest_idle(files: &HostFiles, cpu: usize) -> Fact<(i64, String)> {
+/// The enabled idle state of a CPU with the longest way out, and the microseconds of it.
+fn deepest_idle(files: &HostFiles, cpu: usize) -> Result<(i64, String), String> {
     let folder = format!("{CPU_FOLDER}/cpu{cpu}/cpuidle");
-    files.list(&folder).and_then(|states| {
-        let mut deepest: Option<(i64, String)> = None;
-        for state in states.iter().filter(|name| name.starts_with("state")) {
-            let file = |name: &str| format!("{folder}/{state}/{name}");
-            if files.read_number(&file("disable")) == Fact::Available(1) {
-                continue;
-            }
-            let exit_us = match files.read_number(&file("latency")) {
-                Fact::Available(us) => us,
-                Fact::Unavailable(reason) => return Fact::Unavailable(reason),
-            };
-            if deepest.as_ref().is_none_or(|(us, _)| exit_us > *us) {
-                deepest = Some((exit_us, files.read(&file("name")).to_text()));
-            }
+    let mut deepest: Option<(i64, String)> = None;
+    let states = files.list(&folder).known()?;
+    for state in states.iter().filter(|name| name.starts_with("state")) {
+        let file = |name: &str| format!("{folder}/{state}/{name}");
+        if files.read_number(&file("disable")) == Fact::Available(1) {
+            continue;
         }
-        deepest.map_or_else(
-            || Fact::Unavailable(format!("{folder} has no enabled state")),
-            Fact::Available,
-        )
-    })
+        let exit_us = files.read_number(&file("latency")).known()?;
+        if deepest.as_ref().is_none_or(|(us, _)| exit_us > *us) {
+            deepest = Some((exit_us, files.read(&file("name")).to_text()));
+        }
+    }
+    deepest.ok_or_else(|| format!("{folder} has no enabled state"))
 }
 
-fn idle_states(files: &HostFiles, plan: &Plan) -> Finding {
+fn idle_states(files: &HostFiles, plan: &Plan) -> Checked {
     let id = "idle_states";
     let cpus = if plan.pins.is_empty() {
-        match online_cpus(files) {
-            Fact::Available(cpus) => cpus,
-            Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-        }
+        online_cpus(files).told(id)?
     } else {
         plan.cpus()
     };
+    let absent =
+        |reason: String| format!("{reason}: no cpuidle driver, as in most virtual machines");
     let mut worst: Option<(i64, String)> = None;
     for cpu in cpus {
-        match deepest_idle(files, cpu) {
-            Fact::Available((us, name)) => {
-                if worst.as_ref().is_none_or(|(most, _)| us > *most) {
-                    worst = Some((us, format!("{name} on CPU {cpu}, {us} us to leave")));
-                }
-            }
-            Fact::Unavailable(reason) => {
-                let why = format!("{reason}: no cpuidle driver, as in most virtual machines");
-                return Finding::cannot_tell(id, why);
-            }
+        let (us, name) = deepest_idle(files, cpu).told_as(id, absent)?;
+        if worst.as_ref().is_none_or(|(most, _)| us > *most) {
+            worst = Some((us, format!("{name} on CPU {cpu}, {us} us to leave")));
         }
     }
-    let Some((exit_us, words)) = worst else {
-        return Finding::cannot_tell(id, "no CPU is online");
-    };
+    let (exit_us, words) = worst.ok_or("no CPU is online").told(id)?;
     // What a program that holds the file open asked for; the kernel then avoids deeper states.
-    let held = files.read_word("/dev/cpu_dma_latency");
-    let (bound, also) = match &held {
-        Fact::Available(us) if i64::from(*us) < exit_us => (
-            i64::from(*us),
-            format!("; /dev/cpu_dma_latency holds it at {us} us"),
+    let (bound_us, also) = match files.read_word("/dev/cpu_dma_latency") {
+        Fact::Available(us) if i64::from(us) < exit_us => (
+            us.into(),
+            format!("/dev/cpu_dma_latency holds it at {us} us"),
         ),
-        Fact::Available(_) => (exit_us, "; nobody holds /dev/cpu_dma_latency".to_owned()),
-        Fact::Unavailable(reason) => (exit_us, format!("; a bound on it is unknown ({reason})")),
+        Fact::Available(_) => (exit_us, "nobody holds /dev/cpu_dma_latency".to_owned()),
+        Fact::Unavailable(reason) => (exit_us, format!("a bound on it is unknown ({reason})")),
     };
-    let severity = Severity::of_size(bound, IDLE_EXIT_US_OK, IDLE_EXIT_US_NOTE);
-    Finding::new(id, severity, format!("{words}{also}"))
+    let severity = Severity::rising(bound_us, IDLE_EXIT_US_OK, IDLE_EXIT_US_NOTE);
+    Ok(Finding::new(id, severity, format!("{words}; {also}")))
 }
 
-fn siblings(files: &HostFiles, plan: &Plan) -> Finding {
+fn siblings(files: &HostFiles, plan: &Plan) -> Checked {
     let id = "smt";
-    let active = match files.read(&format!("{CPU_FOLDER}/smt/active")) {
-        Fact::Available(active) => active,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
-    if active != "1" {
-        return Finding::ok(id, "none");
+    if files.read(&format!("{CPU_FOLDER}/smt/active")).told(id)? != "1" {
+        return Ok(Finding::ok(id, "none"));
     }
     let pinned = plan.cpus();
     if pinned.is_empty() {
-        return Finding::note(id, "in use; the topology pins nothing, or none was given");
+        let value = "in use; the topology pins nothing, or none was given";
+        return Ok(Finding::note(id, value));
     }
     let isolated = IsolatedCpus::read(files).isolated;
-    let isolated = isolated.available().cloned().unwrap_or_default();
+    let isolated = isolated.known().unwrap_or_default();
     let mut shared = Vec::new();
     for cpu in &pinned {
         let path = format!("{CPU_FOLDER}/cpu{cpu}/topology/thread_siblings_list");
-        let group = match files.read_cpu_list(&path) {
-            Fact::Available(group) => group,
-            Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-        };
-        for other in group.into_iter().filter(|other| other != cpu) {
-            if pinned.contains(&other) {
-                shared.push(format!("CPU {cpu} shares with CPU {other}, pinned too"));
+        for other in files.read_cpu_list(&path).told(id)? {
+            let how = if pinned.contains(&other) {
+                "pinned too"
             } else if !isolated.contains(&other) {
-                shared.push(format!(
-                    "CPU {cpu} shares with CPU {other}, open to all tasks"
-                ));
+                "open to all tasks"
+            } else {
+                continue;
+            };
+            if other != *cpu {
+                shared.push(format!("CPU {cpu} shares with CPU {other}, {how}"));
             }
         }
     }
     if shared.is_empty() {
-        return Finding::ok(id, "in use; those of the pinned CPUs are isolated and idle");
+        let value = "in use; those of the pinned CPUs are isolated and idle";
+        return Ok(Finding::ok(id, value));
     }
-    Finding::warning(id, shared.join("; "))
+    Ok(Finding::warning(id, shared.join("; ")))
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! The radios of this host: what each is used as, and whether it sleeps to save power. Wired
 //! interfaces have no finding here.
 
-use super::{Finding, finding::Severity};
+use super::finding::{Finding, Severity};
 use hil_nic::radio::nl80211::Station;
 use hil_nic::radio::socket::{RadioError, RadioSocket};
 
@@ -39,34 +39,35 @@ fn judge(
         Ok(stations) => bitrate(stations),
         Err(reason) => (format!("bitrate unknown ({reason})"), None),
     };
-    match power_save {
-        Ok(true) => Finding::warning(id, format!("{what}, power save on, {rate}")),
-        Ok(false) if kbps.is_some_and(|kbps| kbps < BITRATE_KBPS_MIN) => {
-            Finding::warning(id, format!("{what}, power save off, {rate}"))
-                .fixed_by("bring the hosts and the access point nearer, or take another channel")
-        }
-        Ok(false) => {
-            let severity = Severity::Note.unless(kbps.is_some());
-            Finding::new(id, severity, format!("{what}, power save off, {rate}"))
-        }
+    let is_on = match power_save {
+        Ok(is_on) => is_on,
         Err(reason) => {
             let value = format!("{what}, power save unknown: {reason}; {rate}");
-            Finding::cannot_tell(id, value)
+            return Finding::cannot_tell(id, value);
         }
+    };
+    let mode = if is_on { "on" } else { "off" };
+    let value = format!("{what}, power save {mode}, {rate}");
+    if is_on {
+        Finding::warning(id, value)
+    } else if kbps.is_some_and(|kbps| kbps < BITRATE_KBPS_MIN) {
+        Finding::warning(id, value)
+            .fixed_by("bring the hosts and the access point nearer, or take another channel")
+    } else {
+        Finding::new(id, Severity::ok_if(kbps.is_some(), Severity::Note), value)
     }
 }
 
 /// The slowest bitrate towards a station, in words and kbit/s; there is none without an association.
 fn bitrate(stations: &[Station]) -> (String, Option<u32>) {
     let rates = stations.iter().filter_map(|station| station.transmit?.kbps);
-    match (stations.len(), rates.min()) {
-        (0, _) => ("not associated".to_owned(), None),
-        (_, Some(kbps)) => {
-            let mbps = f64::from(kbps) / 1000.0;
-            (format!("sends at {mbps:.1} Mbit/s"), Some(kbps))
-        }
-        (_, None) => ("bitrate not told by the driver".to_owned(), None),
-    }
+    let slowest = rates.min();
+    let words = match slowest {
+        Some(kbps) => format!("sends at {:.1} Mbit/s", f64::from(kbps) / 1000.0),
+        None if stations.is_empty() => "not associated".to_owned(),
+        None => "bitrate not told by the driver".to_owned(),
+    };
+    (words, slowest)
 }
 
 #[cfg(test)]

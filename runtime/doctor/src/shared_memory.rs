@@ -1,20 +1,21 @@
 //! Where channels live: `/dev/shm` and the runtime folder. It looks and does not clean: removing
 //! another run's segments is a decision, and the run may be alive.
 
+use std::collections::BTreeMap;
+use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
-use std::{collections::BTreeMap, fs};
 
 use nix::sys::statvfs::statvfs;
 use nix::unistd::{AccessFlags, access};
 
-use super::{Finding, finding::Severity};
-use hil_platform::host_facts::{Fact, HostFiles};
+use super::finding::{Answer, Checked, Finding, Severity, settled};
+use super::storage::{MEBIBYTE, nearest_existing};
+use hil_platform::host_facts::HostFiles;
 use hil_shm::{Domain, ForeignNodes};
 
 /// Below this a handful of channels with large samples does not fit.
-const FREE_BYTES_MIN: u64 = 64 * 1024 * 1024;
-const MEBIBYTE: u64 = 1024 * 1024;
+const FREE_BYTES_MIN: u64 = 64 * MEBIBYTE;
 /// Runs named in one line.
 const SHOWN_MAX: usize = 4;
 
@@ -25,8 +26,8 @@ pub(super) fn examine(
 ) -> Vec<Finding> {
     vec![
         space(&files.locate("/dev/shm")),
-        leftovers(files, runtime_folders),
-        foreign_nodes(nodes),
+        settled(leftovers(files, runtime_folders)),
+        settled(foreign_nodes(nodes)),
         runtime_folder(runtime_folders),
     ]
 }
@@ -52,19 +53,18 @@ fn space(shm: &Path) -> Finding {
     );
     let rights = AccessFlags::R_OK | AccessFlags::W_OK | AccessFlags::X_OK;
     if access(shm, rights).is_err() {
-        return Finding::error(id, value)
+        Finding::error(id, value)
             .because("this user may not create segments, so no channel can be opened")
-            .fixed_by("chmod 1777 /dev/shm");
-    }
-    if free_bytes < FREE_BYTES_MIN {
-        return Finding::error(id, value);
-    }
-    if mode != 0o1777 {
-        return Finding::note(id, value)
+            .fixed_by("chmod 1777 /dev/shm")
+    } else if free_bytes < FREE_BYTES_MIN {
+        Finding::error(id, value)
+    } else if mode != 0o1777 {
+        Finding::note(id, value)
             .because("other users cannot create, or may remove, segments here")
-            .fixed_by("chmod 1777 /dev/shm");
+            .fixed_by("chmod 1777 /dev/shm")
+    } else {
+        Finding::ok(id, value)
     }
-    Finding::ok(id, value)
 }
 
 /// Whether a file in `/dev/shm` carries the prefix of a run: `h`, eight characters, `_`.
@@ -76,109 +76,69 @@ fn is_of_a_run(name: &str) -> bool {
         && bytes[1..9].iter().all(u8::is_ascii_alphanumeric)
 }
 
-/// What is known of the run behind a prefix.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Standing {
-    /// Its supervisor holds the lock.
-    GoesOn,
-    /// Nobody holds the lock.
-    Ended,
-    /// Its folder is nowhere that this user looks.
-    Unplaced,
-}
-
-fn leftovers(files: &HostFiles, runtime_folders: &[PathBuf]) -> Finding {
+fn leftovers(files: &HostFiles, runtime_folders: &[PathBuf]) -> Checked {
     let id = "shared_memory_leftovers";
-    let names = match files.list("/dev/shm") {
-        Fact::Available(names) => names,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
+    let names = files.list("/dev/shm").told(id)?;
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
     for name in names.iter().filter(|name| is_of_a_run(name)) {
         *counts.entry(&name[..10]).or_default() += 1;
     }
     if counts.is_empty() {
-        return Finding::ok(id, "none");
+        return Ok(Finding::ok(id, "none"));
     }
-    let locks = match files.read("/proc/locks") {
-        Fact::Available(locks) => locks,
-        Fact::Unavailable(reason) => {
-            let count = counts.len();
-            let why =
-                format!("segments of {count} runs, and whether they go on is unknown: {reason}");
-            return Finding::cannot_tell(id, why);
-        }
-    };
+    let count = counts.len();
+    let locks = files.read("/proc/locks").told_as(id, |reason| {
+        format!("segments of {count} runs, and whether they go on is unknown: {reason}")
+    })?;
     let roots = domains_below(runtime_folders);
-    let standing = |prefix: &str| match roots.get(prefix) {
-        Some(root) if is_locked(&locks, root) => Standing::GoesOn,
-        Some(_) => Standing::Ended,
-        None => Standing::Unplaced,
-    };
-    let with_standing = counts
-        .iter()
-        .map(|(prefix, count)| (*prefix, *count, standing(prefix)));
-    judge_leftovers(&with_standing.collect::<Vec<_>>())
-}
-
-/// Of each run with segments: its prefix, how many, and its standing.
-fn judge_leftovers(runs: &[(&str, usize, Standing)]) -> Finding {
-    let id = "shared_memory_leftovers";
-    let of = |wanted: Standing| runs.iter().filter(move |(_, _, one)| *one == wanted);
-    let going = of(Standing::GoesOn).count();
-    let stale: Vec<_> = of(Standing::Ended).chain(of(Standing::Unplaced)).collect();
-    if stale.is_empty() {
-        return Finding::ok(id, format!("none; {going} runs go on"));
+    let (mut ended, mut unplaced, mut going, mut file_count) = (Vec::new(), Vec::new(), 0, 0);
+    for (prefix, count) in counts {
+        match roots.get(prefix) {
+            // Its supervisor holds the lock.
+            Some(root) if is_locked(&locks, root) => {
+                going += 1;
+                continue;
+            }
+            Some(_) => ended.push(format!("{prefix}*")),
+            // Its folder is nowhere that this user looks.
+            None => unplaced.push(format!("{prefix}*")),
+        }
+        file_count += count;
     }
-    let file_count: usize = stale.iter().map(|(_, count, _)| count).sum();
-    let shown = stale.iter().take(SHOWN_MAX);
-    let mut shown: Vec<String> = shown.map(|(prefix, ..)| format!("{prefix}*")).collect();
-    if stale.len() > SHOWN_MAX {
-        shown.push("...".to_owned());
+    if file_count == 0 {
+        return Ok(Finding::ok(id, format!("none; {going} runs go on")));
     }
     let kinds = [
-        (of(Standing::Ended).count(), "ended"),
-        (
-            of(Standing::Unplaced).count(),
-            "of which no folder is found",
-        ),
+        (ended.len(), "ended"),
+        (unplaced.len(), "of which no folder is found"),
         (going, "go on, their files not counted"),
     ];
-    let kinds: Vec<String> = kinds
-        .iter()
-        .filter(|(count, _)| *count > 0)
-        .map(|(count, words)| format!("{count} {words}"))
-        .collect();
-    let value = format!(
-        "{file_count} files, {}; of runs: {}",
-        shown.join(" "),
-        kinds.join(", ")
-    );
-    let finding = Finding::note(id, value);
-    let unplaced = of(Standing::Unplaced).map(|(prefix, ..)| format!("/dev/shm/{prefix}*"));
-    let unplaced: Vec<String> = unplaced.collect();
-    if unplaced.is_empty() {
-        return finding;
+    let kinds = kinds.iter().filter(|(count, _)| *count > 0);
+    let kinds = kinds.map(|(count, words)| format!("{count} {words}"));
+    let kinds = kinds.collect::<Vec<_>>().join(", ");
+    let unplaced_paths = unplaced.iter().map(|prefix| format!("/dev/shm/{prefix}"));
+    let unplaced_paths = unplaced_paths.collect::<Vec<_>>().join(" ");
+    let mut shown = [ended, unplaced].concat();
+    if shown.len() > SHOWN_MAX {
+        shown.truncate(SHOWN_MAX);
+        shown.push("...".to_owned());
     }
-    finding.fixed_by(format!(
-        "if no other user's run goes on: rm {}; any start of a run removes those of ended runs",
-        unplaced.join(" ")
-    ))
+    let shown = shown.join(" ");
+    let finding = Finding::note(id, format!("{file_count} files, {shown}; of runs: {kinds}"));
+    if unplaced_paths.is_empty() {
+        return Ok(finding);
+    }
+    Ok(finding.fixed_by(format!(
+        "if no other user's run goes on: rm {unplaced_paths}; any start of a run removes those of ended runs"
+    )))
 }
 
 /// The prefix and the root of every domain in `folders`.
 fn domains_below(folders: &[PathBuf]) -> BTreeMap<String, PathBuf> {
-    let entries = folders
-        .iter()
-        .filter_map(|folder| fs::read_dir(folder).ok());
-    entries
-        .flatten()
-        .flatten()
-        .filter_map(|entry| {
-            let root = entry.path();
-            Some((Domain::prefix_at(&root)?, root))
-        })
-        .collect()
+    let entries = folders.iter().flat_map(fs::read_dir).flatten().flatten();
+    let roots = entries.map(|entry| entry.path());
+    let with_prefix = roots.filter_map(|root| Some((Domain::prefix_at(&root)?, root)));
+    with_prefix.collect()
 }
 
 /// Whether somebody holds the exclusive lock on `root`. Asking for the lock would be in the way of a
@@ -195,51 +155,34 @@ fn is_locked(locks: &str, root: &Path) -> bool {
     })
 }
 
-fn foreign_nodes(found: Result<ForeignNodes, String>) -> Finding {
+fn foreign_nodes(found: Result<ForeignNodes, String>) -> Checked {
     let id = "iceoryx2_nodes";
-    match found {
-        Ok(nodes) => {
-            let (living, dead) = (nodes.living, nodes.dead);
-            let hidden = nodes.hidden;
-            let value = format!("{dead} dead, {living} alive, {hidden} of other users or damaged");
-            if dead == 0 && hidden == 0 {
-                Finding::ok(id, value)
-            } else {
-                Finding::note(id, value)
-            }
-        }
-        Err(reason) => Finding::cannot_tell(id, reason),
-    }
+    let nodes = found.told(id)?;
+    let (living, dead, hidden) = (nodes.living, nodes.dead, nodes.hidden);
+    let value = format!("{dead} dead, {living} alive, {hidden} of other users or damaged");
+    let severity = Severity::ok_if(dead == 0 && hidden == 0, Severity::Note);
+    Ok(Finding::new(id, severity, value))
 }
 
-/// The folder exists, or can be made.
-fn is_usable(folder: &Path) -> bool {
+/// Which of the folders is the first that exists, or can be made, for this user.
+pub(super) fn first_usable(folders: &[PathBuf]) -> Option<usize> {
     let rights = AccessFlags::W_OK | AccessFlags::X_OK;
-    let existing = folder.ancestors().find(|one| one.exists());
-    existing.is_some_and(|one| one.is_dir() && access(one, rights).is_ok())
-}
-
-/// The first of the folders that this user may use.
-pub(super) fn usable(folders: &[PathBuf]) -> Option<&Path> {
-    let found = folders.iter().find(|folder| is_usable(folder));
-    found.map(PathBuf::as_path)
+    let is_usable = |folder: &Path| folder.is_dir() && access(folder, rights).is_ok();
+    let mut nearest = folders.iter().map(|folder| nearest_existing(folder));
+    nearest.position(|folder| folder.is_some_and(is_usable))
 }
 
 fn runtime_folder(folders: &[PathBuf]) -> Finding {
     let id = "runtime_folder";
-    let Some(index) = folders.iter().position(|folder| is_usable(folder)) else {
-        let tried: Vec<String> = folders.iter().map(|f| f.display().to_string()).collect();
-        return Finding::error(id, format!("none writable of {}", tried.join(", ")));
-    };
-    let (first, chosen) = (folders[0].display(), folders[index].display());
-    if index == 0 {
-        return Finding::ok(id, format!("{chosen} is writable"));
+    let shown: Vec<String> = folders.iter().map(|f| f.display().to_string()).collect();
+    match first_usable(folders) {
+        None => Finding::error(id, format!("none writable of {}", shown.join(", "))),
+        Some(0) => Finding::ok(id, format!("{} is writable", shown[0])),
+        Some(index) => {
+            let (first, chosen) = (&shown[0], &shown[index]);
+            Finding::note(id, format!("{chosen} is writable, {first} is not"))
+        }
     }
-    Finding::new(
-        id,
-        Severity::Note,
-        format!("{chosen} is writable, {first} is not"),
-    )
 }
 
 #[cfg(test)]
@@ -267,7 +210,7 @@ mod tests {
 
     fn judged(host: &FakeHost) -> Finding {
         let files = host.files();
-        leftovers(&files, &[files.locate("/run/hil")])
+        settled(leftovers(&files, &[files.locate("/run/hil")]))
     }
 
     #[test]
@@ -335,15 +278,15 @@ mod tests {
     #[test]
     fn dead_nodes_are_a_note_and_an_unreadable_list_is_not_ok() {
         let nodes = |living, dead| {
-            foreign_nodes(Ok(ForeignNodes {
+            settled(foreign_nodes(Ok(ForeignNodes {
                 living,
                 dead,
                 hidden: 0,
-            }))
+            })))
         };
         assert_eq!(nodes(3, 0).severity, Severity::Ok);
         assert_eq!(nodes(3, 1).severity, Severity::Note);
-        let unreadable = foreign_nodes(Err("no".to_owned()));
+        let unreadable = settled(foreign_nodes(Err("no".to_owned())));
         assert_eq!(unreadable.severity, Severity::CannotTell);
     }
 }

@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use nix::sys::statvfs::statvfs;
 use nix::unistd::{AccessFlags, Uid, access};
 
-use super::{Finding, finding::Severity};
+use super::finding::{Answer, Checked, Finding, Severity, settled};
 use hil_platform::host_facts::{Fact, HostFiles};
 
-const MEBIBYTE: u64 = 1024 * 1024;
+pub(super) const MEBIBYTE: u64 = 1024 * 1024;
 /// Below this a run of an hour does not fit.
 const FREE_BYTES_WARNING: u64 = 1024 * MEBIBYTE;
 /// And below this not even a short one.
@@ -33,11 +33,12 @@ pub(super) fn examine(
     record_folder: &Path,
     runtime_folder: &Path,
 ) -> Vec<Finding> {
-    vec![
+    let checks = [
         remove_ipc(files, Uid::current().as_raw()),
         private_tmp(files, runtime_folder),
         run_disk(files, record_folder),
-    ]
+    ];
+    checks.map(settled).into()
 }
 
 /// Later files, and later lines, override earlier ones.
@@ -48,61 +49,41 @@ const LOGIND: [&str; 4] = [
     "/etc/systemd/logind.conf.d",
 ];
 
-fn remove_ipc(files: &HostFiles, user: u32) -> Finding {
+fn remove_ipc(files: &HostFiles, user: u32) -> Checked {
     let id = "remove_ipc";
     if !files.locate("/run/systemd/system").exists() {
-        return Finding::ok(id, "yes (systemd does not run here)");
+        return Ok(Finding::ok(id, "yes (systemd does not run here)"));
     }
-    let mut texts = Vec::new();
-    for place in LOGIND {
-        let folder = files.locate(place);
-        if !folder.exists() {
-            continue;
+    let mut setting: Option<String> = None;
+    for place in LOGIND.iter().filter(|place| files.locate(place).exists()) {
+        let mut paths = vec![(*place).to_owned()];
+        if files.locate(place).is_dir() {
+            paths = files.list(place).told(id)?;
+            paths.retain(|name| Path::new(name).extension().is_some_and(|end| end == "conf"));
+            paths = paths.iter().map(|name| format!("{place}/{name}")).collect();
         }
-        let paths = if folder.is_dir() {
-            files.list(place).map(|names| {
-                let names = names.into_iter().filter(|name| {
-                    Path::new(name)
-                        .extension()
-                        .is_some_and(|extension| extension == "conf")
-                });
-                names.map(|name| format!("{place}/{name}")).collect()
-            })
-        } else {
-            Fact::Available(vec![place.to_owned()])
-        };
-        let read = paths.and_then(|paths: Vec<String>| {
-            for path in paths {
-                match files.read(&path) {
-                    Fact::Available(text) => texts.push(text),
-                    Fact::Unavailable(reason) => return Fact::Unavailable(reason),
-                }
-            }
-            Fact::Available(())
-        });
-        if let Fact::Unavailable(reason) = read {
-            return Finding::cannot_tell(id, reason);
+        for path in paths {
+            let text = files.read(&path).told(id)?;
+            let lines = text.lines().map(str::trim);
+            let last = lines
+                .filter_map(|line| line.strip_prefix("RemoveIPC="))
+                .next_back();
+            setting = last.map(str::to_owned).or(setting);
         }
     }
-    let lines = texts.iter().flat_map(|text| text.lines());
-    let setting = lines
-        .filter_map(|line| line.trim().strip_prefix("RemoveIPC="))
-        .next_back();
-    let is_kept = setting.is_some_and(|value| {
-        ["no", "false", "off", "0"].contains(&value.trim().to_lowercase().as_str())
-    });
-    let value = setting.map_or(
-        "RemoveIPC= is not set, so yes by default".to_owned(),
-        |value| format!("RemoveIPC={value}"),
-    );
-    if is_kept {
+    let value = match &setting {
+        None => "RemoveIPC= is not set, so yes by default".to_owned(),
+        Some(value) => format!("RemoveIPC={value}"),
+    };
+    let word = setting.unwrap_or_default().trim().to_lowercase();
+    Ok(if ["no", "false", "off", "0"].contains(&word.as_str()) {
         Finding::ok(id, value)
     } else if user <= SYSTEM_USER_MAX {
         let value = format!("{value}; user {user} is a system user, whose segments stay");
         Finding::ok(id, value)
     } else {
         Finding::warning(id, value)
-    }
+    })
 }
 
 /// One line of `mountinfo`: where it is mounted, from which folder of its file system, of which type.
@@ -113,43 +94,43 @@ struct Mount {
     kind: String,
 }
 
-fn mounts(files: &HostFiles) -> Fact<Vec<Mount>> {
-    files.read("/proc/self/mountinfo").map(|text| {
-        let mounts = text.lines().filter_map(|line| {
-            let (left, right) = line.split_once(" - ")?;
-            let words: Vec<&str> = left.split(' ').collect();
-            Some(Mount {
-                root: (*words.get(3)?).to_owned(),
-                // Blanks in a path are written as octal digits.
-                point: PathBuf::from(words.get(4)?.replace("\\040", " ")),
-                kind: right.split(' ').next()?.to_owned(),
-            })
-        });
-        mounts.collect()
-    })
+fn mounts(files: &HostFiles) -> Result<Vec<Mount>, String> {
+    let text = files.read("/proc/self/mountinfo").known()?;
+    let mounts = text.lines().filter_map(|line| {
+        let (left, right) = line.split_once(" - ")?;
+        let words: Vec<&str> = left.split(' ').collect();
+        Some(Mount {
+            root: (*words.get(3)?).to_owned(),
+            // Blanks in a path are written as octal digits.
+            point: PathBuf::from(words.get(4)?.replace("\\040", " ")),
+            kind: right.split(' ').next()?.to_owned(),
+        })
+    });
+    Ok(mounts.collect())
 }
 
-fn private_tmp(files: &HostFiles, runtime_folder: &Path) -> Finding {
+fn private_tmp(files: &HostFiles, runtime_folder: &Path) -> Checked {
     let id = "private_tmp";
-    let mounts = match mounts(files) {
-        Fact::Available(mounts) => mounts,
-        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
-    };
+    let mounts = mounts(files).told(id)?;
     let is_private = mounts
         .iter()
         .any(|mount| mount.point == Path::new("/tmp") && mount.root.contains("/systemd-private-"));
-    if !is_private {
-        return Finding::ok(id, "no, /tmp is everybody's");
-    }
     let folder = runtime_folder.display();
-    if runtime_folder.starts_with("/tmp") {
+    Ok(if !is_private {
+        Finding::ok(id, "no, /tmp is everybody's")
+    } else if runtime_folder.starts_with("/tmp") {
         Finding::warning(
             id,
             format!("yes, and channels have their files in {folder}"),
         )
     } else {
         Finding::note(id, format!("yes; channels have their files in {folder}"))
-    }
+    })
+}
+
+/// The folder itself, or the nearest above it that exists.
+pub(super) fn nearest_existing(folder: &Path) -> Option<&Path> {
+    folder.ancestors().find(|one| one.exists())
 }
 
 /// What is known of a disk.
@@ -162,42 +143,31 @@ struct Disk {
     kind: Fact<String>,
 }
 
-fn run_disk(files: &HostFiles, record_folder: &Path) -> Finding {
-    let id = "run_disk";
-    match disk_of(files, record_folder) {
-        Fact::Available(disk) => judge(record_folder, &disk),
-        Fact::Unavailable(reason) => Finding::cannot_tell(id, reason),
-    }
+fn run_disk(files: &HostFiles, record_folder: &Path) -> Checked {
+    let disk = disk_of(files, record_folder).told("run_disk")?;
+    Ok(judge(record_folder, &disk))
 }
 
-fn disk_of(files: &HostFiles, record_folder: &Path) -> Fact<Disk> {
-    let absolute = match std::path::absolute(record_folder) {
-        Ok(absolute) => absolute,
-        Err(error) => return Fact::Unavailable(format!("{}: {error}", record_folder.display())),
-    };
-    let existing = absolute.ancestors().find(|one| one.exists());
-    let existing = existing.unwrap_or(Path::new("/"));
+fn disk_of(files: &HostFiles, record_folder: &Path) -> Result<Disk, String> {
+    let absolute = std::path::absolute(record_folder)
+        .map_err(|error| format!("{}: {error}", record_folder.display()))?;
+    let existing = nearest_existing(&absolute).unwrap_or(Path::new("/"));
     let folder = existing.canonicalize().unwrap_or(existing.to_owned());
-    let status = match statvfs(&folder) {
-        Ok(status) => status,
-        Err(errno) => return Fact::Unavailable(format!("{}: {}", folder.display(), errno.desc())),
-    };
+    let status =
+        statvfs(&folder).map_err(|errno| format!("{}: {}", folder.display(), errno.desc()))?;
     let kind = mounts(files).and_then(|mounts| {
-        let own = mounts
-            .iter()
-            .filter(|mount| folder.starts_with(&mount.point));
+        let holds_it = |mount: &Mount| folder.starts_with(&mount.point);
+        let own = mounts.into_iter().filter(holds_it);
         // The last of equal ones covers the others.
         let nearest = own.max_by_key(|mount| mount.point.as_os_str().len());
-        nearest.map_or_else(
-            || Fact::Unavailable(format!("no mount holds {}", folder.display())),
-            |mount| Fact::Available(mount.kind.clone()),
-        )
+        let nearest = nearest.ok_or_else(|| format!("no mount holds {}", folder.display()))?;
+        Ok(nearest.kind)
     });
-    Fact::Available(Disk {
+    Ok(Disk {
         is_writable: access(&folder, AccessFlags::W_OK | AccessFlags::X_OK).is_ok(),
         free_bytes: status.blocks_available() * status.fragment_size(),
         folder,
-        kind,
+        kind: kind.map_or_else(Fact::Unavailable, Fact::Available),
     })
 }
 
@@ -210,18 +180,11 @@ fn judge(record_folder: &Path, disk: &Disk) -> Finding {
     if !disk.is_writable {
         return Finding::error(id, format!("{value}; this user may not write there"));
     }
-    let is_remote = disk
-        .kind
-        .available()
-        .is_some_and(|kind| REMOTE.contains(&kind.as_str()));
-    let severity = if disk.free_bytes < FREE_BYTES_ERROR {
-        Severity::Error
-    } else if disk.free_bytes < FREE_BYTES_WARNING || is_remote {
-        Severity::Warning
-    } else if disk.kind.available().is_none() {
-        Severity::CannotTell
-    } else {
-        Severity::Ok
+    let severity = match (disk.free_bytes, disk.kind.available()) {
+        (..FREE_BYTES_ERROR, _) => Severity::Error,
+        (..FREE_BYTES_WARNING, _) => Severity::Warning,
+        (_, None) => Severity::CannotTell,
+        (_, Some(kind)) => Severity::ok_if(!REMOTE.contains(&kind.as_str()), Severity::Warning),
     };
     Finding::new(id, severity, value)
 }
@@ -265,7 +228,7 @@ mod tests {
             ),
         ] {
             let host = FakeHost::with(&files);
-            let finding = remove_ipc(&host.files(), user);
+            let finding = settled(remove_ipc(&host.files(), user));
             assert_eq!(finding.severity, expected, "{files:?}: {finding:?}");
         }
     }
@@ -276,14 +239,14 @@ mod tests {
             41 30 8:1 /tmp/systemd-private-1a-hil.service-x/tmp /tmp rw - ext4 /dev/sda1 rw\n";
         let look = |text: &str, folder: &str| {
             let host = FakeHost::with(&[("/proc/self/mountinfo", text)]);
-            private_tmp(&host.files(), Path::new(folder)).severity
+            settled(private_tmp(&host.files(), Path::new(folder))).severity
         };
         assert_eq!(look(mounted, "/tmp/hil-1000"), Severity::Warning);
         assert_eq!(look(mounted, "/run/hil"), Severity::Note);
         let shared = mounted.lines().next().unwrap();
         assert_eq!(look(shared, "/tmp/hil-1000"), Severity::Ok);
         let silent = FakeHost::with(&[]);
-        let finding = private_tmp(&silent.files(), Path::new("/run/hil"));
+        let finding = settled(private_tmp(&silent.files(), Path::new("/run/hil")));
         assert_eq!(finding.severity, Severity::CannotTell);
     }
 
@@ -321,7 +284,7 @@ mod tests {
         let line = format!("41 30 8:1 / {} rw - xfs /dev/sda1 rw", here.display());
         let info = FakeHost::with(&[("/proc/self/mountinfo", line.as_str())]);
         let disk = disk_of(&info.files(), &here.join("not/yet"));
-        let disk = disk.available().unwrap();
+        let disk = disk.unwrap();
         assert_eq!(disk.folder, here);
         assert_eq!(disk.kind, Fact::Available("xfs".to_owned()));
     }

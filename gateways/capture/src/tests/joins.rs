@@ -58,7 +58,7 @@ const ALWAYS: (i64, i64) = (i64::MIN / 2, i64::MAX / 2);
 fn joined(first: Vec<Observation>, second: Vec<Observation>) -> Joined {
     let (a, b) = (point(0, Direction::Outbound), point(1, Direction::Inbound));
     let (first, second) = (seen(first, ALWAYS), seen(second, ALWAYS));
-    join(&STREAM(), (&a, &first), (&b, &second), WINDOW_NS).unwrap()
+    join(&STREAM(), &a, &first, &b, &second, WINDOW_NS).unwrap()
 }
 
 #[test]
@@ -146,7 +146,7 @@ fn what_leaves_at_the_edge_of_the_other_capture_is_not_lost() {
         .collect();
     let (a, b) = (point(0, Direction::Outbound), point(1, Direction::Inbound));
     let sides = (seen(first, ALWAYS), seen(second, watched));
-    let figures = join(&STREAM(), (&a, &sides.0), (&b, &sides.1), WINDOW_NS)
+    let figures = join(&STREAM(), &a, &sides.0, &b, &sides.1, WINDOW_NS)
         .unwrap()
         .figures;
     assert_eq!(figures.lost_count, 1);
@@ -176,7 +176,7 @@ fn the_order_of_points_comes_from_directions_or_else_from_stamps() {
     ] {
         let (a, b) = (point(0, directions.0), point(1, directions.1));
         let sides = (seen(early.clone(), ALWAYS), seen(late.clone(), ALWAYS));
-        let joined = join(&STREAM(), (&a, &sides.0), (&b, &sides.1), WINDOW_NS).unwrap();
+        let joined = join(&STREAM(), &a, &sides.0, &b, &sides.1, WINDOW_NS).unwrap();
         assert_eq!(joined.figures.order, order);
         assert_eq!(joined.figures.delay.measured().unwrap().p50_ns, expected_ns);
     }
@@ -337,7 +337,7 @@ fn through_a_host_with_two_taps_the_stamps_tell_the_order() {
     );
     let (a, mut b) = (point(0, Direction::Inbound), point(0, Direction::Outbound));
     b.interface_index = 1;
-    let joined = join(&STREAM(), (&b, &left), (&a, &came), WINDOW_NS).unwrap();
+    let joined = join(&STREAM(), &b, &left, &a, &came, WINDOW_NS).unwrap();
     assert_eq!(joined.figures.order, OrderSource::Stamps);
     assert_eq!(joined.figures.delay.measured().unwrap().p50_ns, 70);
 }

@@ -3,17 +3,21 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Gaps, LatencyReport, Quantiles};
+use super::{Gaps, LatencyReport, Quantiles, Surroundings, Wakeups};
+use crate::finding::{Answer, Checked, Finding};
 use hil_platform::host_facts::Fact;
+use hil_platform::words::counted_plainly;
 
 /// Wake-ups beyond a quantile without which it is an anecdote.
 const BEYOND_MIN: u64 = 10;
 /// What the host adds may be this part of the period at most.
 const PERIOD_PARTS: i64 = 10;
 /// Deadlines that control loops have: 1 kHz, EGM's 250 Hz, 100 Hz.
-const DEADLINE_RATES_HZ: [i64; 3] = [1_000, 250, 100];
+const DEADLINES: [(i64, &str); 3] = [(1_000, "1 kHz"), (250, "250 Hz"), (100, "100 Hz")];
 /// Milliseconds per second that a busy poller may lose to what is not its work.
 const LOST_MS_PER_S_MAX: f64 = 1.0;
+/// A wake-up p99 below this leaves room for claims in tens of microseconds.
+const P99_NS_OK: i64 = 100_000;
 
 /// Whether a claim can be made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,15 +47,67 @@ pub struct Claim {
 }
 
 impl Claim {
-    fn new(id: &str, claim: &str, rule: &str, standing: Standing, why: String) -> Self {
+    fn new(
+        id: impl Into<String>,
+        claim: impl Into<String>,
+        rule: &str,
+        standing: Standing,
+        why: impl Into<String>,
+    ) -> Self {
         Self {
-            id: id.to_owned(),
-            claim: claim.to_owned(),
+            id: id.into(),
+            claim: claim.into(),
             standing,
-            why,
+            why: why.into(),
             rule: rule.to_owned(),
         }
     }
+}
+
+impl Surroundings {
+    /// A hypervisor runs below, as far as is known.
+    fn is_virtual_machine(&self) -> bool {
+        matches!(&self.virtual_machine, Fact::Available(answer) if answer != "no")
+    }
+}
+
+fn period_ns(report: &LatencyReport) -> i64 {
+    i64::try_from(report.period_ns).unwrap_or(i64::MAX)
+}
+
+/// The finding that a measurement of wake-ups comes to: that of the CPU that was latest at p99.
+pub(crate) fn judge(measured: &LatencyReport) -> Checked {
+    let id = "wakeup_latency";
+    let figures = |one: &Wakeups| Some((one.count, one.is_as_asked, one.lateness?));
+    let with_figures = measured.wakeups.iter().filter_map(figures);
+    let worst = with_figures.max_by_key(|(.., lateness)| lateness.p99_ns);
+    let worst = worst.ok_or("no wake-up fell into the measuring time");
+    let (count, is_as_asked, lateness) = worst.told(id)?;
+    let [p50, p99, max] =
+        [lateness.p50_ns, lateness.p99_ns, lateness.max_ns].map(|ns| ns as f64 / 1000.0);
+    let how = if is_as_asked {
+        format!("SCHED_FIFO {}", measured.priority)
+    } else {
+        "not at the priority asked for".to_owned()
+    };
+    let value = format!("p50 {p50:.0} us, p99 {p99:.0} us, max {max:.0} us of {count} ({how})");
+    let below = if measured.surroundings.is_virtual_machine() {
+        "; this is a virtual machine, whose tail comes from below and stays when it is idle"
+    } else {
+        ""
+    };
+    let why = format!(
+        "of blocking operations, medians above about {p50:.0} us and p99 above about {p99:.0} us \
+         can be claimed here; single delays up to {max:.0} us may be the host's own{below}"
+    );
+    Ok(match lateness.p99_ns {
+        ..P99_NS_OK => {
+            Finding::ok(id, value).fixed_by("hil-runtime doctor --latency 60s for the tail")
+        }
+        ns if ns < period_ns(measured) => Finding::warning(id, value),
+        _ => Finding::error(id, value),
+    }
+    .because(why))
 }
 
 /// The least that is known of all CPUs, and the worst that was seen on one.
@@ -63,63 +119,127 @@ struct Worst {
     lateness: Quantiles,
 }
 
-fn worst(report: &LatencyReport) -> Option<Worst> {
-    let figures = report
-        .wakeups
-        .iter()
-        .map(|one| one.lateness.map(|lateness| (one.count, lateness)));
-    // A CPU without figures leaves nothing to claim of all.
-    let figures: Vec<(u64, Quantiles)> = figures.collect::<Option<_>>()?;
-    let most = |of: fn(&Quantiles) -> i64| figures.iter().map(|(_, one)| of(one)).max();
-    Some(Worst {
-        period_ns: i64::try_from(report.period_ns).unwrap_or(i64::MAX),
-        count: figures.iter().map(|(count, _)| *count).min()?,
-        lateness: Quantiles {
-            p50_ns: most(|one| one.p50_ns)?,
-            p99_ns: most(|one| one.p99_ns)?,
-            p999_ns: most(|one| one.p999_ns)?,
-            max_ns: most(|one| one.max_ns)?,
-        },
-    })
+impl Worst {
+    fn of(report: &LatencyReport) -> Option<Self> {
+        let (mut count, mut lateness) = (u64::MAX, None::<Quantiles>);
+        for one in &report.wakeups {
+            // A CPU without figures leaves nothing to claim of all.
+            let (own, worst) = (one.lateness?, lateness.get_or_insert_default());
+            count = count.min(one.count);
+            worst.p50_ns = worst.p50_ns.max(own.p50_ns);
+            worst.p99_ns = worst.p99_ns.max(own.p99_ns);
+            worst.p999_ns = worst.p999_ns.max(own.p999_ns);
+            worst.max_ns = worst.max_ns.max(own.max_ns);
+        }
+        Some(Self {
+            period_ns: period_ns(report),
+            count,
+            lateness: lateness?,
+        })
+    }
+
+    /// The complaint, where too few wake-ups lie beyond the quantile.
+    fn too_few(&self, permille: u64) -> Option<String> {
+        let (count, needed) = (self.count, needed_count(permille));
+        let is_short = count < needed;
+        is_short.then(|| format!("{count} wake-ups, and {needed} are needed: measure longer"))
+    }
+
+    /// The rule of `permille` of delays that end in a blocking receive.
+    fn quantile(&self, id: &str, claim: &str, permille: u64, late_ns: i64) -> Claim {
+        let (late, tenth_ns) = (us_up(late_ns), self.period_ns / PERIOD_PARTS);
+        let (standing, why) = if let Some(why) = self.too_few(permille) {
+            (Standing::NotMeasured, why)
+        } else if late_ns <= tenth_ns {
+            (Standing::Supportable, format!("to ±{late} us"))
+        } else {
+            let tenth = us_up(tenth_ns);
+            let why = format!("the host's own wake-up is {late} us there, more than {tenth} us");
+            (Standing::NotSupportable, why)
+        };
+        Claim::new(id, claim, QUANTILE_RULE, standing, why)
+    }
+
+    fn variation(&self) -> Claim {
+        let spread = us_up(self.lateness.p99_ns - self.lateness.p50_ns);
+        let (standing, why) = if self.count < needed_count(990) {
+            let why = format!("{} wake-ups are too few for a p99", self.count);
+            (Standing::NotMeasured, why)
+        } else {
+            let why = format!("from {spread} us up; less is the host's own");
+            (Standing::Supportable, why)
+        };
+        let rule =
+            "what differs by less than p99 minus p50 of the host's own wake-up may be the host's";
+        Claim::new("variation", "delay variation", rule, standing, why)
+    }
+
+    fn deadline(&self, rate_hz: i64, rate: &str) -> Claim {
+        let period_ns = 1_000_000_000 / rate_hz;
+        let tenth_ns = period_ns / PERIOD_PARTS;
+        let (p999_ns, max_ns) = (self.lateness.p999_ns, self.lateness.max_ns);
+        let (tail, max, tenth) = (us_up(p999_ns), us_up(max_ns), us_up(tenth_ns));
+        // One miss is enough to know; that there is none takes many wake-ups.
+        let (standing, why) = if max_ns >= period_ns {
+            let why = format!("the host alone missed one: a wake-up was {max} us late");
+            (Standing::NotSupportable, why)
+        } else if let Some(why) = self.too_few(999) {
+            (Standing::NotMeasured, why)
+        } else if p999_ns > tenth_ns {
+            let why = format!("99.9 % wake-up is {tail} us, more than {tenth} us");
+            (Standing::NotSupportable, why)
+        } else {
+            let why = format!("99.9 % wake-up is {tail} us, the latest {max} us");
+            (Standing::Supportable, why)
+        };
+        Claim::new(
+            format!("deadline_{rate_hz}_hz"),
+            format!("deadline misses at {rate}"),
+            "supportable if the host's own wake-up stays within a tenth of the period at 99.9 % (at least 10 \
+         wake-ups beyond) and never misses one itself",
+            standing,
+            why,
+        )
+    }
 }
 
 /// All claims, from the easiest to the hardest.
 pub(super) fn derive(report: &LatencyReport) -> Vec<Claim> {
-    let Some(worst) = worst(report) else {
+    let Some(worst) = Worst::of(report) else {
         return vec![Claim::new(
             "median",
             "medians of delays",
             QUANTILE_RULE,
             Standing::NotMeasured,
-            "no wake-up fell into the time".to_owned(),
+            "no wake-up fell into the time",
         )];
     };
     let of = worst.lateness;
+    let (latest, count) = (us_up(of.max_ns), worst.count);
     let mut claims = vec![
-        quantile("median", "medians of delays", 500, of.p50_ns, &worst),
-        quantile("p99", "99 % quantiles of delays", 990, of.p99_ns, &worst),
-        quantile(
-            "p999",
-            "99.9 % quantiles of delays",
-            999,
-            of.p999_ns,
-            &worst,
+        worst.quantile("median", "medians of delays", 500, of.p50_ns),
+        worst.quantile("p99", "99 % quantiles of delays", 990, of.p99_ns),
+        worst.quantile("p999", "99.9 % quantiles of delays", 999, of.p999_ns),
+        worst.variation(),
+        Claim::new(
+            "largest",
+            "largest delays",
+            "the largest of any number of wake-ups bounds nothing but itself",
+            Standing::NotSupportable,
+            format!("the host alone was {latest} us late once in {count}, and may be later"),
         ),
-        variation(&worst),
-        largest(&worst),
     ];
-    let deadlines = DEADLINE_RATES_HZ.iter().map(|rate| deadline(*rate, &worst));
-    claims.extend(deadlines);
-    claims.extend(
-        report
-            .gaps
-            .iter()
-            .map(|gaps| busy_polling(gaps, worst.period_ns)),
-    );
-    if let Fact::Available(answer) = &report.surroundings.virtual_machine
-        && answer != "no"
-    {
-        claims.push(below());
+    claims.extend(DEADLINES.map(|(rate_hz, rate)| worst.deadline(rate_hz, rate)));
+    let gaps = report.gaps.iter();
+    claims.extend(gaps.map(|gaps| busy_polling(gaps, worst.period_ns)));
+    if report.surroundings.is_virtual_machine() {
+        claims.push(Claim::new(
+            "tail_cause",
+            "tails as this system's own",
+            "below a hypervisor the tail is not this system's alone, whatever steal time says",
+            Standing::NotSupportable,
+            "a virtual machine: long wake-ups may come from below, also when nothing runs here",
+        ));
     }
     claims
 }
@@ -127,109 +247,23 @@ pub(super) fn derive(report: &LatencyReport) -> Vec<Claim> {
 const QUANTILE_RULE: &str = "supportable to what the host's own wake-up takes at that quantile, if at least 10 \
                              wake-ups lie beyond it and it stays within a tenth of the period";
 
-/// The rule of `permille` of delays that end in a blocking receive.
-fn quantile(id: &str, claim: &str, permille: u64, late_ns: i64, worst: &Worst) -> Claim {
-    let Worst {
-        count, period_ns, ..
-    } = *worst;
-    let late = us(late_ns);
-    let needed = needed_count(permille);
-    let (standing, why) = if count < needed {
-        let why = format!("{count} wake-ups, and {needed} are needed: measure longer");
-        (Standing::NotMeasured, why)
-    } else if late_ns <= period_ns / PERIOD_PARTS {
-        (Standing::Supportable, format!("to ±{late} us"))
-    } else {
-        let tenth = us(period_ns / PERIOD_PARTS);
-        let why = format!("the host's own wake-up is {late} us there, more than {tenth} us");
-        (Standing::NotSupportable, why)
-    };
-    Claim::new(id, claim, QUANTILE_RULE, standing, why)
-}
-
 /// Wake-ups of which enough lie beyond the quantile.
 fn needed_count(permille: u64) -> u64 {
     BEYOND_MIN * 1000 / (1000 - permille).max(1)
-}
-
-fn variation(worst: &Worst) -> Claim {
-    let spread = us(worst.lateness.p99_ns - worst.lateness.p50_ns);
-    let (standing, why) = if worst.count < needed_count(990) {
-        let why = format!("{} wake-ups are too few for a p99", worst.count);
-        (Standing::NotMeasured, why)
-    } else {
-        let why = format!("from {spread} us up; less is the host's own");
-        (Standing::Supportable, why)
-    };
-    let rule =
-        "what differs by less than p99 minus p50 of the host's own wake-up may be the host's";
-    Claim::new("variation", "delay variation", rule, standing, why)
-}
-
-fn largest(worst: &Worst) -> Claim {
-    let (max, count) = (us(worst.lateness.max_ns), worst.count);
-    let why = format!("the host alone was {max} us late once in {count}, and may be later");
-    let rule = "the largest of any number of wake-ups bounds nothing but itself";
-    Claim::new(
-        "largest",
-        "largest delays",
-        rule,
-        Standing::NotSupportable,
-        why,
-    )
-}
-
-fn deadline(rate_hz: i64, worst: &Worst) -> Claim {
-    let period_ns = 1_000_000_000 / rate_hz;
-    let tenth_ns = period_ns / PERIOD_PARTS;
-    let Quantiles {
-        p999_ns, max_ns, ..
-    } = worst.lateness;
-    let (tail, max) = (us(p999_ns), us(max_ns));
-    // One miss is enough to know; that there is none takes many wake-ups.
-    let (standing, why) = if max_ns >= period_ns {
-        let why = format!("the host alone missed one: a wake-up was {max} us late");
-        (Standing::NotSupportable, why)
-    } else if worst.count < needed_count(999) {
-        let (count, needed) = (worst.count, needed_count(999));
-        let why = format!("{count} wake-ups, and {needed} are needed: measure longer");
-        (Standing::NotMeasured, why)
-    } else if p999_ns > tenth_ns {
-        let why = format!("99.9 % wake-up is {tail} us, more than {} us", us(tenth_ns));
-        (Standing::NotSupportable, why)
-    } else {
-        let why = format!("99.9 % wake-up is {tail} us, the latest {max} us");
-        (Standing::Supportable, why)
-    };
-    let rate = if rate_hz >= 1000 {
-        format!("{} kHz", rate_hz / 1000)
-    } else {
-        format!("{rate_hz} Hz")
-    };
-    Claim::new(
-        &format!("deadline_{rate_hz}_hz"),
-        &format!("deadline misses at {rate}"),
-        "supportable if the host's own wake-up stays within a tenth of the period at 99.9 % (at least 10 \
-         wake-ups beyond) and never misses one itself",
-        standing,
-        why,
-    )
 }
 
 fn busy_polling(gaps: &Gaps, period_ns: i64) -> Claim {
     let lost = gaps.lost_ms_per_s();
     let longest_ns = gaps.length.map_or(0, |length| length.max_ns);
     let throttled = match gaps.throttle_like_count {
-        Some(count) if count > 0 => {
-            let gaps = if count == 1 { "gap" } else { "gaps" };
-            format!("; {count} {gaps} as long as what sched_rt_runtime_us keeps back")
+        None | Some(0) => String::new(),
+        Some(count) => {
+            let gaps = counted_plainly(count, "gap");
+            format!("; {gaps} as long as what sched_rt_runtime_us keeps back")
         }
-        _ => String::new(),
     };
-    let why = format!(
-        "it loses {lost:.1} ms per s, {} us at most at a time{throttled}",
-        us(longest_ns)
-    );
+    let longest = us_up(longest_ns);
+    let why = format!("it loses {lost:.1} ms per s, {longest} us at most at a time{throttled}");
     let standing = if gaps.measured_ns == 0 {
         Standing::NotMeasured
     } else if lost < LOST_MS_PER_S_MAX && longest_ns <= period_ns / PERIOD_PARTS {
@@ -237,37 +271,28 @@ fn busy_polling(gaps: &Gaps, period_ns: i64) -> Claim {
     } else {
         Standing::NotSupportable
     };
-    let (id, claim) = match gaps.cpu {
-        Some(cpu) => (
-            format!("busy_polling_cpu{cpu}"),
-            format!("busy polling on CPU {cpu}"),
-        ),
-        None => ("busy_polling".to_owned(), "busy polling".to_owned()),
+    let [id, on] = match gaps.cpu {
+        Some(cpu) => [format!("_cpu{cpu}"), format!(" on CPU {cpu}")],
+        None => [String::new(), String::new()],
     };
-    let rule = "supportable if gaps over 10 us take less than 1 ms per second and none a tenth of the period";
-    Claim::new(&id, &claim, rule, standing, why)
-}
-
-fn below() -> Claim {
     Claim::new(
-        "tail_cause",
-        "tails as this system's own",
-        "below a hypervisor the tail is not this system's alone, whatever steal time says",
-        Standing::NotSupportable,
-        "a virtual machine: long wake-ups may come from below, also when nothing runs here"
-            .to_owned(),
+        format!("busy_polling{id}"),
+        format!("busy polling{on}"),
+        "supportable if gaps over 10 us take less than 1 ms per second and none a tenth of the period",
+        standing,
+        why,
     )
 }
 
 /// Microseconds, rounded up: a bound is not rounded in its own favour.
-pub(super) fn us(ns: i64) -> i64 {
+pub(crate) fn us_up(ns: i64) -> i64 {
     ns.max(0).unsigned_abs().div_ceil(1000).cast_signed()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Surroundings, Wakeups};
     use super::*;
+    use crate::finding::{Severity, settled};
 
     fn report(count: u64, lateness_us: [i64; 4]) -> LatencyReport {
         let [p50, p99, p999, max] = lateness_us.map(|us| us * 1000);
@@ -403,5 +428,29 @@ mod tests {
         report.surroundings.virtual_machine = Fact::Available("yes".to_owned());
         let claim = found(&report, "tail_cause");
         assert_eq!(claim.standing, Standing::NotSupportable);
+    }
+
+    #[test]
+    fn the_finding_follows_the_measured_noise() {
+        let measured = |p99_us, max_us| {
+            let mut report = report(1000, [25, p99_us, 6000, max_us]);
+            report.surroundings.virtual_machine = Fact::Available("yes".to_owned());
+            report
+        };
+        let ok = settled(judge(&measured(65, 7000)));
+        assert_eq!(ok.severity, Severity::Ok);
+        for words in [
+            "p99 above about 65 us",
+            "single delays up to 7000 us",
+            "virtual machine",
+        ] {
+            assert!(ok.why.contains(words), "{}", ok.why);
+        }
+        let loud = settled(judge(&measured(400, 7000)));
+        assert_eq!(loud.severity, Severity::Warning);
+        let mut late = measured(3000, 7000);
+        assert_eq!(settled(judge(&late)).severity, Severity::Error);
+        late.wakeups[0].lateness = None;
+        assert_eq!(settled(judge(&late)).severity, Severity::CannotTell);
     }
 }
