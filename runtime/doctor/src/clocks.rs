@@ -63,7 +63,7 @@ fn between(own: Option<&HostDiscipline>, name: &str, other: Option<&HostDiscipli
     let silent = |whose| format!("the kernel of {whose} says nothing");
     let own = own.ok_or(silent("this host")).told(id)?;
     let other = other.ok_or(silent(name)).told(id)?;
-    Ok(match common_bound_ns(("this host", own), (name, other)) {
+    Ok(match common_bound_ns("this host", own, name, other) {
         Ok(bound_ns) => {
             let value = format!("apart by at most {} us", bound_ns.div_ceil(1_000));
             let why = format!("{}; {name}: {}", own.basis, other.basis);

@@ -63,7 +63,7 @@ fn ask<T>(
     }
     let header = encode_attributes(&[(HEADER_DEVICE_NAME, &name)]);
     let decode = |_, attributes: Attributes<'_>| decode(attributes);
-    let answer = talk.ask((*family, command), false, &[(HEADER, &header)], decode);
+    let answer = talk.ask(*family, command, false, &[(HEADER, &header)], decode);
     let found = answer.map_err(|error| match error.raw_os_error() {
         Some(libc::EOPNOTSUPP) => "its driver has no such setting".to_owned(),
         _ => error.to_string(),

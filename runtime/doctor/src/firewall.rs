@@ -48,7 +48,7 @@ pub(super) fn chains() -> Result<Vec<Chain>, String> {
         Err(error) => return Err(format!("nfnetlink: {error}")),
     };
     let all_families = 0;
-    let asked = talk.ask((GET_CHAINS, all_families), true, &[], Chain::decode);
+    let asked = talk.ask(GET_CHAINS, all_families, true, &[], Chain::decode);
     asked.map_err(|error| match error.raw_os_error() {
         Some(libc::EPERM | libc::EACCES) => {
             "needs root (CAP_NET_ADMIN) to see the rules".to_owned()

@@ -5,12 +5,8 @@
 pub mod cli;
 pub mod work;
 
-use std::collections::BTreeMap;
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
-use std::thread;
-use std::time::Duration;
+use std::{collections::BTreeMap, fs, io, thread, time::Duration};
 
 use hil_core::case_study::ParameterError;
 use hil_core::message::Envelope;
@@ -173,7 +169,32 @@ pub struct RunLinks {
     records: PathBuf,
     directions: Vec<LinkDirection>,
     /// Every link of the topology and what carries it.
-    carried: BTreeMap<String, String>,
+    carried: BTreeMap<String, Carrier>,
+}
+
+/// What carries a link.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Carrier {
+    /// A model of a network.
+    Emulated,
+    /// Something real, by the topology's word for it.
+    Real(String),
+}
+
+impl Carrier {
+    fn from_word(word: &str) -> Self {
+        match word {
+            "emulated" => Self::Emulated,
+            real => Self::Real(real.to_owned()),
+        }
+    }
+
+    fn word(&self) -> &str {
+        match self {
+            Self::Emulated => "emulated",
+            Self::Real(word) => word,
+        }
+    }
 }
 
 impl RunLinks {
@@ -209,10 +230,9 @@ impl RunLinks {
         &self.directions
     }
 
-    /// Every link of the run with the topology's word for what carries it.
-    pub fn carried(&self) -> impl Iterator<Item = (&str, &str)> {
-        let pairs = self.carried.iter();
-        pairs.map(|(link, via)| (link.as_str(), via.as_str()))
+    /// Every link of the run and what carries it.
+    pub fn carried(&self) -> &BTreeMap<String, Carrier> {
+        &self.carried
     }
 
     /// Every order that was given to `direction`, oldest first.
@@ -252,11 +272,11 @@ impl RunLinks {
                 asked: name.to_owned(),
                 known: self.known(),
             }),
-            Some(via) if via != "emulated" => Err(LinkError::NotEmulated {
+            Some(Carrier::Real(via)) => Err(LinkError::NotEmulated {
                 link,
                 via: via.clone(),
             }),
-            Some(_) => Err(LinkError::Elsewhere {
+            Some(Carrier::Emulated) => Err(LinkError::Elsewhere {
                 link,
                 way: way.unwrap_or(Way::Forward),
             }),
@@ -281,7 +301,7 @@ impl RunLinks {
             return "none".to_owned();
         }
         let words = self.carried.iter();
-        let words = words.map(|(link, via)| format!("{link} ({via})"));
+        let words = words.map(|(link, carrier)| format!("{link} ({})", carrier.word()));
         words.collect::<Vec<_>>().join(", ")
     }
 
@@ -418,11 +438,11 @@ fn add_directions(directions: &mut Vec<LinkDirection>, launch: &WorkerLaunch, wo
 }
 
 /// What carries each link, by the manifest's topology.
-fn carried(topology: &Value) -> BTreeMap<String, String> {
+fn carried(topology: &Value) -> BTreeMap<String, Carrier> {
     let links = topology.get("links").and_then(Value::as_object);
     let words = links.into_iter().flatten().filter_map(|(name, link)| {
         let via = link.get("via")?.as_str()?;
-        Some((name.clone(), via.to_owned()))
+        Some((name.clone(), Carrier::from_word(via)))
     });
     words.collect()
 }
