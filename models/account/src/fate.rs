@@ -5,8 +5,7 @@ use super::figures::{Gap, InterruptionFigures};
 use super::join::{Join, Joined, Key};
 use super::stage::{MessageFate, Side};
 use super::{AccountContext, ChannelPath, ChannelRecords, Interruption, PathProcess, RunSpan};
-use hil_core::record::stamp;
-use hil_core::record::{EgressRecord, IngressRecord};
+use hil_core::record::{EgressRecord, IngressRecord, stamp};
 use hil_core::time::{Instant, RemoteInstant, duration_ns};
 
 /// Judges messages in key order.

@@ -3,8 +3,7 @@
 
 use super::stage::MessageFate;
 use super::{AccountContext, ChannelRecords, each_judged};
-use hil_core::record::EgressRecord;
-use hil_core::record::stamp;
+use hil_core::record::{EgressRecord, stamp};
 
 /// What became of a message behind the sending radio.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -7,8 +7,9 @@ use std::rc::Rc;
 use super::follow_up::FollowUps;
 use super::source::each;
 use super::{ChannelRecords, RecordSource};
-use hil_core::record::stamp;
-use hil_core::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
+use hil_core::record::{
+    EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE, stamp,
+};
 use hil_stats::in_order::{InOrder, in_order};
 
 /// A message's place: the order of the producer's starts, then the sequence number.

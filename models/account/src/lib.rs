@@ -49,8 +49,7 @@ pub use outage::{
     OutageFinder, Standing, foregoing, outages,
 };
 pub use passage::passages;
-pub use source::RecordSource;
-pub use source::each;
+pub use source::{RecordSource, each};
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
 

@@ -2,6 +2,8 @@
 //! 32 poses each sort out most pairs; along what remains, the distance (or depth) of two footprints
 //! says how many poses certainly stay apart (or together). The result is that of trying all.
 
+use core::ops::Range;
+
 use crate::geometry::{Bounds, Footprint, OrientedBox};
 use crate::path::Path;
 
@@ -57,15 +59,15 @@ impl CoveredPath {
     }
 
     /// The ranges of poses whose blocks meet `bounds`, neighbouring ones joined.
-    fn ranges_near(&self, bounds: &Bounds, ranges: &mut Vec<(usize, usize)>) {
+    fn ranges_near(&self, bounds: &Bounds, ranges: &mut Vec<Range<usize>>) {
         ranges.clear();
         for (block, around) in self.blocks.iter().enumerate() {
             if around.meets(bounds) {
                 let begin = block * BLOCK;
                 let end = (begin + BLOCK).min(self.boxes.len());
                 match ranges.last_mut() {
-                    Some(last) if last.1 == begin => last.1 = end,
-                    _ => ranges.push((begin, end)),
+                    Some(last) if last.end == begin => last.end = end,
+                    _ => ranges.push(begin..end),
                 }
             }
         }
@@ -126,8 +128,8 @@ fn runs_of(first: &CoveredPath, second: &CoveredPath) -> Vec<Run> {
         let begin = block * BLOCK;
         let end = (begin + BLOCK).min(first.boxes.len());
         for row in begin..end {
-            for &range in &ranges {
-                add_runs(&mut runs, (row, &first.boxes[row]), second, range);
+            for range in &ranges {
+                add_runs(&mut runs, row, &first.boxes[row], second, range.clone());
             }
         }
     }
@@ -136,15 +138,16 @@ fn runs_of(first: &CoveredPath, second: &CoveredPath) -> Vec<Run> {
 
 fn add_runs(
     runs: &mut Vec<Run>,
-    (row, here): (usize, &OrientedBox),
+    row: usize,
+    here: &OrientedBox,
     second: &CoveredPath,
-    (begin, end): (usize, usize),
+    range: Range<usize>,
 ) {
     let number = |index: usize| u32::try_from(index).expect("a path has fewer than 2^32 poses");
-    let (mut index, mut open) = (begin, None);
-    while index < end {
+    let (mut index, mut open) = (range.start, None);
+    while index < range.end {
         let gap_m = here.gap_m(&second.boxes[index]);
-        let next = (index + second.certain(gap_m.abs())).min(end);
+        let next = (index + second.certain(gap_m.abs())).min(range.end);
         if gap_m < 0.0 {
             open.get_or_insert(index);
         } else if let Some(first) = open.take() {
@@ -160,7 +163,7 @@ fn add_runs(
         runs.push(Run {
             row: number(row),
             first: number(first),
-            last: number(end - 1),
+            last: number(range.end - 1),
         });
     }
 }

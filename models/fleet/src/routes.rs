@@ -68,10 +68,11 @@ impl<'a> Connector<'a> {
     pub(crate) fn new(
         map: &'a Map,
         vehicle: &'a Vehicle,
-        (turning_radius_m, spacing_m): (f64, f64),
+        turning_radius_m: f64,
+        spacing_m: f64,
     ) -> Result<Self, ParameterError> {
         map.check(vehicle)?;
-        let planner = Planner::around_parked(map, vehicle, turning_radius_m)
+        let planner = Planner::new(map.space_around_parked(vehicle), turning_radius_m)
             .map_err(|error| ParameterError::new("world.turning_radius_m", error.to_string()))?;
         Ok(Self {
             map,
@@ -121,7 +122,7 @@ impl<'a> Connector<'a> {
                 let key = format!("world.bays[{from}]");
                 ParameterError::new(&key, format!("has no path to bay {to}: {error}"))
             })?;
-            self.summary.expanded_count += plan.expanded_count();
+            self.summary.expanded_count += plan.expanded_count;
             poses.extend(plan.poses(FINER * self.spacing_m));
         }
         poses.push(goal);
@@ -160,7 +161,8 @@ impl<'a> Connector<'a> {
 pub(crate) fn lifted(
     connection: &Connection,
     tile: usize,
-    (bay_count, height_m): (usize, f64),
+    bay_count: usize,
+    height_m: f64,
 ) -> Connection {
     let rise_m = tile as f64 * height_m;
     Connection {

@@ -7,8 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::analytic;
 use crate::geometry::{Bounds, Footprint, Pose};
-use crate::layout;
-use crate::layout::BAYS_PER_SIDE;
+use crate::layout::{self, BAYS_PER_SIDE};
 use crate::map::Map;
 use crate::section::MergePolicy;
 use crate::world::{BayIndex, Vehicle, World};

@@ -1,9 +1,8 @@
 //! Critical sections of two paths: connected sets of pose pairs at which two vehicles would
 //! overlap (Lv et al., section II.B). Who goes first is the coordinator's business.
 
-use crate::geometry::{Footprint, floor_index};
+use crate::geometry::floor_index;
 use crate::overlap::{CoveredPath, Run, components};
-use crate::path::Path;
 
 /// One of the two paths of a section.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,6 +25,25 @@ impl Side {
 
     const fn index(self) -> usize {
         self as usize
+    }
+}
+
+/// A range of poses of a path, both ends included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Span {
+    /// First pose.
+    pub lower: usize,
+    /// Last pose.
+    pub upper: usize,
+}
+
+impl Span {
+    /// One pose.
+    pub const fn at(index: usize) -> Self {
+        Self {
+            lower: index,
+            upper: index,
+        }
     }
 }
 
@@ -75,20 +93,15 @@ impl Section {
         (first <= last).then_some((first as usize, last as usize))
     }
 
-    /// First pose at or after `from` on `side` that overlaps any of the poses `leader_from..=
-    /// leader_to` of the other path: where a follower must not go yet.
-    pub fn first_conflict(
-        &self,
-        side: Side,
-        from: usize,
-        (leader_from, leader_to): (usize, usize),
-    ) -> Option<usize> {
-        if leader_from > self.end(side.other()) || leader_to < self.start(side.other()) {
+    /// First pose at or after `from` on `side` that overlaps any of the poses of `leader`
+    /// on the other path: where a follower must not go yet.
+    pub fn first_conflict(&self, side: Side, from: usize, leader: Span) -> Option<usize> {
+        if leader.lower > self.end(side.other()) || leader.upper < self.start(side.other()) {
             return None;
         }
         (from.max(self.start(side))..=self.end(side)).find(|&index| {
             self.partners(side, index)
-                .is_some_and(|(first, last)| first <= leader_to && leader_from <= last)
+                .is_some_and(|(first, last)| first <= leader.upper && leader.lower <= last)
         })
     }
 
@@ -174,20 +187,6 @@ impl SectionSide {
     }
 }
 
-/// The critical sections of two paths for one kind of vehicle, in order along the first path.
-pub fn sections_between(
-    first: &Path,
-    second: &Path,
-    footprint: &Footprint,
-    merge: MergePolicy,
-) -> Vec<Section> {
-    let (rows, columns) = (
-        CoveredPath::new(first, footprint),
-        CoveredPath::new(second, footprint),
-    );
-    sections_of(&rows, &columns, merge)
-}
-
 /// As [`sections_between`], of paths whose ground is known already.
 pub(crate) fn sections_of(
     first: &CoveredPath,
@@ -240,26 +239,42 @@ fn merged(parts: Vec<Vec<Run>>, gap: [u32; 2]) -> Vec<Vec<Run>> {
     open.into_iter().map(|(_, runs)| runs).collect()
 }
 
+/// The critical sections of two paths for one kind of vehicle, in order along the first path.
+#[cfg(test)]
+pub(crate) fn sections_between(
+    first: &crate::path::Path,
+    second: &crate::path::Path,
+    footprint: &crate::geometry::Footprint,
+    merge: MergePolicy,
+) -> Vec<Section> {
+    let (rows, columns) = (
+        CoveredPath::new(first, footprint),
+        CoveredPath::new(second, footprint),
+    );
+    sections_of(&rows, &columns, merge)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Pose;
+    use crate::geometry::{Footprint, Pose};
+    use crate::path::Path;
 
     const CART: Footprint = Footprint {
         length_m: 2.0,
         width_m: 1.0,
     };
 
-    fn line(from: (f64, f64), to: (f64, f64)) -> Path {
-        let heading = (to.1 - from.1).atan2(to.0 - from.0);
-        let ends = [from, to].map(|(x, y)| Pose::new(x, y, heading));
+    fn line(from: [f64; 2], to: [f64; 2]) -> Path {
+        let heading = (to[1] - from[1]).atan2(to[0] - from[0]);
+        let ends = [from, to].map(|[x, y]| Pose::new(x, y, heading));
         Path::new(&ends, 0.1).unwrap()
     }
 
     #[test]
     fn a_right_angle_crossing_has_the_section_of_its_closed_form() {
-        let east = line((-10.0, 0.0), (10.0, 0.0));
-        let north = line((0.0, -10.0), (0.0, 10.0));
+        let east = line([-10.0, 0.0], [10.0, 0.0]);
+        let north = line([0.0, -10.0], [0.0, 10.0]);
         let sections = sections_between(&east, &north, &CART, MergePolicy::Never);
         assert_eq!(sections.len(), 1);
         // Overlap while both |x| and |y| are below half a length plus half a width, 1.5 m; the
@@ -272,21 +287,25 @@ mod tests {
 
     #[test]
     fn a_follower_may_go_as_far_as_the_leader_has_cleared() {
-        let east = line((0.0, 0.0), (20.0, 0.0));
+        let east = line([0.0, 0.0], [20.0, 0.0]);
         let sections = sections_between(&east, &east, &CART, MergePolicy::Never);
         assert_eq!(sections.len(), 1);
         // A leader at 10 m still covers 9 m to the end; the follower's front is 1 m ahead of it.
-        let first = sections[0].first_conflict(Side::Second, 0, (100, 200));
+        let beyond = Span {
+            lower: 100,
+            upper: 200,
+        };
+        let first = sections[0].first_conflict(Side::Second, 0, beyond);
         assert_eq!(first, Some(81));
         assert_eq!(
-            sections[0].first_conflict(Side::Second, 0, (100, 100)),
+            sections[0].first_conflict(Side::Second, 0, Span::at(100)),
             Some(81)
         );
     }
 
     #[test]
     fn sections_nearer_than_a_vehicle_merge_only_on_request() {
-        let east = line((-10.0, 0.0), (10.0, 0.0));
+        let east = line([-10.0, 0.0], [10.0, 0.0]);
         let poses = [
             Pose::new(-3.0, 5.0, -core::f64::consts::FRAC_PI_2),
             Pose::new(-3.0, -2.0, -core::f64::consts::FRAC_PI_2),

@@ -171,28 +171,6 @@ fn partition(count: u64, holds: impl Fn(u64) -> bool) -> u64 {
     yes
 }
 
-/// The order-statistics interval of a quantile of independent samples in ascending order; see
-/// [`quantile_ranks`].
-///
-/// # Panics
-/// When `quantile` or `confidence` is not inside 0..1.
-pub fn quantile_interval(
-    ascending_ns: &[i64],
-    quantile: f64,
-    confidence: f64,
-) -> Option<IntervalNs> {
-    let (low, high) = quantile_ranks(ascending_ns.len() as u64, quantile, confidence)?;
-    let at = |rank: u64| {
-        usize::try_from(rank - 1)
-            .ok()
-            .map(|index| ascending_ns[index])
-    };
-    Some(IntervalNs {
-        low_ns: at(low)?,
-        high_ns: at(high)?,
-    })
-}
-
 /// The percentile interval of a quantile by resampling non-overlapping blocks (Carlstein 1986)
 /// of consecutive samples, each about the square root of the sample count long. `None` below 100
 /// samples. Equal samples and streams give equal intervals.
@@ -284,6 +262,25 @@ mod tests {
                 (1_000_000.0 + 10_000.0 * state) as i64
             })
             .collect()
+    }
+
+    /// The order-statistics interval of a quantile of independent samples in ascending order; see
+    /// [`quantile_ranks`].
+    fn quantile_interval(
+        ascending_ns: &[i64],
+        quantile: f64,
+        confidence: f64,
+    ) -> Option<IntervalNs> {
+        let (low, high) = quantile_ranks(ascending_ns.len() as u64, quantile, confidence)?;
+        let at = |rank: u64| {
+            usize::try_from(rank - 1)
+                .ok()
+                .map(|index| ascending_ns[index])
+        };
+        Some(IntervalNs {
+            low_ns: at(low)?,
+            high_ns: at(high)?,
+        })
     }
 
     #[test]

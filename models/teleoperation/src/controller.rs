@@ -259,7 +259,8 @@ impl Controller {
     fn on_feedback(
         &mut self,
         now: Instant,
-        (side, feedback): (Side, &EgmFeedback),
+        side: Side,
+        feedback: &EgmFeedback,
         out: &mut Outbox<ControllerOutput>,
     ) {
         if self.guided.include(side) {
@@ -292,10 +293,10 @@ impl Component for Controller {
         match input {
             ControllerInput::Frame(frame) => self.on_frame(frame, out),
             ControllerInput::RightFeedback(feedback) => {
-                self.on_feedback(now, (Side::Right, feedback), out);
+                self.on_feedback(now, Side::Right, feedback, out);
             }
             ControllerInput::LeftFeedback(feedback) => {
-                self.on_feedback(now, (Side::Left, feedback), out);
+                self.on_feedback(now, Side::Left, feedback, out);
             }
             ControllerInput::Response(response) => self.client.on_response(response),
         }

@@ -47,7 +47,8 @@ pub(crate) fn linear_path(
     arm: &Arm,
     from_rad: &Joints,
     target: &Isometry3<f64>,
-    (duration_s, cycle_s): (f64, f64),
+    duration_s: f64,
+    cycle_s: f64,
 ) -> Option<Vec<Joints>> {
     let tool = arm.tool(from_rad);
     let mut tracker = Tracker::new(*arm.chain(), *from_rad);
@@ -105,7 +106,7 @@ mod tests {
         let tool = arm.tool(&RIGHT_START_RAD);
         let target = Isometry3::translation(0.0, 0.1, 0.05) * tool;
         let duration_s = linear_duration_s(&arm, &RIGHT_START_RAD, &target, 0.1).unwrap();
-        let path = linear_path(&arm, &RIGHT_START_RAD, &target, (duration_s, CYCLE_S)).unwrap();
+        let path = linear_path(&arm, &RIGHT_START_RAD, &target, duration_s, CYCLE_S).unwrap();
         let way = target.translation.vector - tool.translation.vector;
         let step_m = way.norm() / path.len() as f64;
         for (index, q_rad) in path.iter().enumerate() {
@@ -122,12 +123,12 @@ mod tests {
         let tool = arm.tool(&RIGHT_START_RAD);
         let far = Isometry3::translation(0.6, 0.0, 0.0) * tool;
         assert_eq!(
-            linear_path(&arm, &RIGHT_START_RAD, &far, (6.0, CYCLE_S)),
+            linear_path(&arm, &RIGHT_START_RAD, &far, 6.0, CYCLE_S),
             None
         );
         let near = Isometry3::translation(0.0, 0.1, 0.0) * tool;
         assert_eq!(
-            linear_path(&arm, &RIGHT_START_RAD, &near, (0.02, CYCLE_S)),
+            linear_path(&arm, &RIGHT_START_RAD, &near, 0.02, CYCLE_S),
             None
         );
         let beyond = Isometry3::translation(1e5, 0.0, 0.0);

@@ -286,7 +286,7 @@ impl MotionServer {
             .map(|(side, from_rad, target)| {
                 let arm = &self.arms[side.index()];
                 let why = MotionRefusal::Unreachable;
-                linear_path(arm, from_rad, target, (duration_s, self.cycle_s))
+                linear_path(arm, from_rad, target, duration_s, self.cycle_s)
                     .ok_or(Refusal { why, side: *side })
             })
             .collect()

@@ -3,27 +3,13 @@
 
 use serde::Serialize;
 
-use hil_stats::histogram::LatencyHistogram;
-
 /// Figures of one coordinator since its start.
 #[derive(Debug, Clone, Default)]
 pub struct CoordinatorCounters {
     /// The plain counts.
     pub counts: CoordinatorCounts,
-    /// Age of the state each decision rests on, per driving robot and control cycle,
-    /// nanoseconds. Empty unless robots and controller share a clock.
-    pub state_age: LatencyHistogram,
     /// What only the safe rules count.
     pub safe: SafeCounts,
-}
-
-impl CoordinatorCounters {
-    /// Adds what another coordinator counted.
-    pub fn merge(&mut self, other: &Self) {
-        self.counts.merge(&other.counts);
-        self.state_age.merge(&other.state_age);
-        self.safe.merge(&other.safe);
-    }
 }
 
 macro_rules! counts {

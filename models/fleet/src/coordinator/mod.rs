@@ -2,6 +2,14 @@
 //! period. A pure state machine; what carries the messages, and how badly, it does not know.
 
 #[cfg(test)]
+impl Coordinator {
+    /// What it knows of its robots.
+    pub(crate) fn roster(&self) -> &Roster {
+        &self.roster
+    }
+}
+
+#[cfg(test)]
 mod closed_loop;
 pub mod counters;
 mod legacy;
@@ -18,10 +26,11 @@ use crate::coordinator::counters::CoordinatorCounters;
 use crate::coordinator::legacy::LegacyRules;
 use crate::coordinator::parameters::{CoordinatorMode, CoordinatorParameters};
 use crate::coordinator::policy::OrderingPolicy;
-use crate::coordinator::roster::{MissionSupply, Roster, SectionKind};
+use crate::coordinator::roster::Roster;
 use crate::coordinator::safe::SafeRules;
 use crate::coordinator::safe::reservation::Traffic;
 use crate::messages::{State, ToRobot};
+use crate::mission::MissionSource;
 use crate::scenario::Scene;
 use hil_core::time::Instant;
 
@@ -60,9 +69,8 @@ pub struct Coordinator {
     roster: Roster,
     rules: Box<dyn Rules>,
     policy: Box<dyn OrderingPolicy>,
-    missions: Box<dyn MissionSupply>,
+    missions: MissionSource,
     counters: CoordinatorCounters,
-    clock_is_shared: bool,
 }
 
 impl Coordinator {
@@ -71,34 +79,22 @@ impl Coordinator {
         scene: &Scene,
         parameters: &CoordinatorParameters,
         fleet_id: u32,
-        missions: impl MissionSupply + 'static,
+        missions: MissionSource,
     ) -> Self {
-        let (kind, rules): (_, Box<dyn Rules>) = match parameters.mode {
-            CoordinatorMode::Legacy => {
-                let rules = LegacyRules::new(scene, parameters);
-                (SectionKind::Exact, Box::new(rules))
-            }
+        let rules: Box<dyn Rules> = match parameters.mode {
+            CoordinatorMode::Legacy => Box::new(LegacyRules::new(scene, parameters)),
             CoordinatorMode::Safe => {
-                // The roster's sections are only counted here, as in the other mode.
-                let rules = SafeRules::new(&scene.world, &scene.starts, parameters, fleet_id);
-                (SectionKind::Exact, Box::new(rules))
+                let starts = &scene.starts;
+                Box::new(SafeRules::new(&scene.world, starts, parameters, fleet_id))
             }
         };
         Self {
-            roster: Roster::new(scene, parameters, fleet_id, kind),
+            roster: Roster::new(scene, parameters, fleet_id),
             rules,
             policy: parameters.policy.policy(),
-            missions: Box::new(missions),
+            missions,
             counters: CoordinatorCounters::default(),
-            clock_is_shared: parameters.clock_is_shared,
         }
-    }
-
-    /// The same coordinator with a user's own ordering policy.
-    #[must_use]
-    pub fn with_policy(mut self, policy: Box<dyn OrderingPolicy>) -> Self {
-        self.policy = policy;
-        self
     }
 
     /// Takes a robot's state in.
@@ -119,15 +115,7 @@ impl Coordinator {
         let counts = &mut self.counters.counts;
         counts.cycle_count += 1;
         self.roster.settle(counts);
-        self.roster
-            .dispatch(now, self.missions.as_mut(), counts, send);
-        if self.clock_is_shared {
-            let driving = self.roster.robots().iter();
-            for state in driving.filter_map(|view| view.state) {
-                let age_ns = now.as_ns().saturating_sub(state.sampled_ns);
-                self.counters.state_age.record(age_ns);
-            }
-        }
+        self.roster.dispatch(now, &mut self.missions, counts, send);
         self.rules.decide(&mut Cycle {
             now,
             roster: &mut self.roster,
@@ -149,10 +137,5 @@ impl Coordinator {
     /// What it counted so far.
     pub fn counters(&self) -> &CoordinatorCounters {
         &self.counters
-    }
-
-    /// What it knows of its robots.
-    pub fn roster(&self) -> &Roster {
-        &self.roster
     }
 }

@@ -1,7 +1,6 @@
 //! What the coordinator knows of its robots: the newest states, their missions, the bays and the
 //! sections ahead of them. It sends missions; who may go how far is decided elsewhere.
 
-use core::fmt::Debug;
 use core::time::Duration;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -10,59 +9,18 @@ use crate::coordinator::counters::CoordinatorCounts;
 use crate::coordinator::parameters::CoordinatorParameters;
 use crate::coordinator::sections::SectionBook;
 pub use crate::coordinator::view::{ActiveMission, RobotView};
-use crate::messages::MessageOrder;
-use crate::messages::{Header, State, ToRobot};
+use crate::messages::{Header, MessageOrder, State, ToRobot};
 use crate::mission::MissionSource;
 use crate::path::Path;
 use crate::scenario::Scene;
-use crate::world::{BayIndex, Route, SectionLibrary, World};
+use crate::world::{BayIndex, Route, World};
 use hil_core::time::Instant;
-
-/// Where missions come from.
-pub trait MissionSupply: Debug {
-    /// The next way of `robot`, which is parked in bay `at`; `None` if there is none now. The
-    /// goal must be a bay for which `is_free` holds.
-    fn next(
-        &mut self,
-        robot: usize,
-        at: BayIndex,
-        is_free: &dyn Fn(BayIndex) -> bool,
-    ) -> Option<Route>;
-
-    /// How long a robot stays parked before its next mission.
-    fn parking(&self) -> Duration;
-}
-
-impl MissionSupply for MissionSource {
-    fn next(
-        &mut self,
-        robot: usize,
-        at: BayIndex,
-        is_free: &dyn Fn(BayIndex) -> bool,
-    ) -> Option<Route> {
-        self.next(robot, at, is_free)
-    }
-
-    fn parking(&self) -> Duration {
-        self.parking()
-    }
-}
-
-/// Which of the world's section libraries a coordinator goes by.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SectionKind {
-    /// Overlap of the exact footprints at the poses.
-    Exact,
-    /// Grown so that no overlap hides between two poses.
-    Guarded,
-}
 
 /// The robots of a fleet as their coordinator sees them.
 #[derive(Debug)]
 pub struct Roster {
     world: Arc<World>,
     fleet_id: u32,
-    kind: SectionKind,
     message_order: MessageOrder,
     missions_per_cycle: u32,
     stuck_after: Duration,
@@ -83,12 +41,7 @@ impl Roster {
     ///
     /// # Panics
     /// When a start is no bay of the world.
-    pub fn new(
-        scene: &Scene,
-        parameters: &CoordinatorParameters,
-        fleet_id: u32,
-        kind: SectionKind,
-    ) -> Self {
+    pub fn new(scene: &Scene, parameters: &CoordinatorParameters, fleet_id: u32) -> Self {
         let mut bay_users = vec![0; scene.world.bays.len()];
         let mut robots = Vec::with_capacity(scene.starts.len());
         for &bay in &scene.starts {
@@ -101,7 +54,6 @@ impl Roster {
         }
         Self {
             fleet_id,
-            kind,
             message_order: parameters.message_order,
             missions_per_cycle: parameters.missions_per_cycle,
             stuck_after: parameters.stuck_after(),
@@ -112,11 +64,6 @@ impl Roster {
             world: Arc::clone(&scene.world),
             next_reset: Instant::ZERO,
         }
-    }
-
-    /// The world.
-    pub fn world(&self) -> &Arc<World> {
-        &self.world
     }
 
     /// The fleet's number.
@@ -238,7 +185,7 @@ impl Roster {
     pub fn dispatch(
         &mut self,
         now: Instant,
-        missions: &mut dyn MissionSupply,
+        missions: &mut MissionSource,
         counts: &mut CoordinatorCounts,
         send: &mut dyn FnMut(ToRobot),
     ) {
@@ -298,7 +245,6 @@ impl Roster {
             last_progress: now,
         });
         self.bay_users[route.to] += 1;
-        let library = self.library(&world);
         for other in (0..self.robots.len()).filter(|&other| other != robot) {
             let view = &self.robots[other];
             let Some(mission) = &view.mission else {
@@ -310,15 +256,8 @@ impl Roster {
             } else {
                 ([other, robot], [theirs, route.path], [index, 0])
             };
-            let sections = library.between(paths[0], paths[1]);
+            let sections = world.sections.between(paths[0], paths[1]);
             self.sections.add(robots, sections, indices);
-        }
-    }
-
-    fn library<'a>(&self, world: &'a World) -> &'a SectionLibrary {
-        match self.kind {
-            SectionKind::Exact => &world.sections,
-            SectionKind::Guarded => &world.guarded_sections,
         }
     }
 

@@ -120,7 +120,7 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
                     delay_ms,
                 } => (loss_ratio, delay_ms),
                 Condition::HardwareInTheLoop(network) => {
-                    cells.extend(wifi_cell(base, scenario, (*row, network)));
+                    cells.extend(wifi_cell(base, scenario, *row, network));
                     continue;
                 }
             };
@@ -128,8 +128,8 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
             cells.extend(copies.iter().map(|&copies| Cell {
                 scenario,
                 place: Place::Published { row: *row, copies },
-                setup: original(base, (delay_ms, law), (loss_ratio, copies)),
-                demand: demand_of(scenario, (loss_ratio, delay_ms), copies),
+                setup: original(base, delay_ms, law, loss_ratio, copies),
+                demand: demand_of(scenario, loss_ratio, delay_ms, copies),
             }));
         }
         if scenario == Scenario::Harbor {
@@ -141,11 +141,7 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
 
 /// The original's mechanisms: believed delivery, stepped tracker whose steps the delay stretches,
 /// status read past the network, the delay known to the coordinator.
-fn original(
-    base: &Setup,
-    (delay_ms, law): (f64, DelayLaw),
-    (loss_ratio, copies): (f64, u32),
-) -> Setup {
+fn original(base: &Setup, delay_ms: f64, law: DelayLaw, loss_ratio: f64, copies: u32) -> Setup {
     let mut setup = base.clone();
     setup.robot.tracker = TrackerKind::LegacyRk4;
     setup.robot.step_inflation = true;
@@ -174,14 +170,15 @@ fn original(
 fn wifi_cell(
     base: &Setup,
     scenario: Scenario,
-    (row, network): (PublishedRow, PublishedNetwork),
+    row: PublishedRow,
+    network: PublishedNetwork,
 ) -> Option<Cell> {
     let preset = match network {
         PublishedNetwork::ShortRange => WifiPreset::ShortRange,
         PublishedNetwork::LongRange => WifiPreset::LongRange,
         PublishedNetwork::Ethernet => return None,
     };
-    let mut setup = original(base, (0.0, DelayLaw::Constant), (0.0, 1));
+    let mut setup = original(base, 0.0, DelayLaw::Constant, 0.0, 1);
     setup.robot.step_inflation = false;
     setup.links.status_path = StatusPath::Network;
     setup.links.wifi = Some(preset.spec());
@@ -194,7 +191,7 @@ fn wifi_cell(
 }
 
 /// What our figures must come to, from the published ones and a prototype of the algorithm.
-fn demand_of(scenario: Scenario, (loss_ratio, delay_ms): (f64, f64), copies: u32) -> Demand {
+fn demand_of(scenario: Scenario, loss_ratio: f64, delay_ms: f64, copies: u32) -> Demand {
     let is_lossy = loss_ratio > 0.0;
     let is_long = delay_ms > 99.0;
     match (scenario, is_lossy) {
@@ -213,7 +210,7 @@ fn demand_of(scenario: Scenario, (loss_ratio, delay_ms): (f64, f64), copies: u32
 /// Harbor, 100 ms, no loss, with one thing changed; the last changes all that the network could
 /// be blamed for, and keeps the nominal steps.
 fn variants(base: &Setup, law: DelayLaw) -> Vec<Cell> {
-    let row = || original(base, (100.0, law), (0.0, 1));
+    let row = || original(base, 100.0, law, 0.0, 1);
     let variant = |text, demand, change: fn(&mut Setup)| {
         let mut setup = row();
         change(&mut setup);

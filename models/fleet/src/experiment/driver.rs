@@ -81,13 +81,13 @@ impl Experiment {
     pub fn new(scene: &Scene, setup: &Setup, seed: u64) -> Result<Self, ParameterError> {
         setup.check()?;
         let robots: Vec<_> = (0..scene.starts.len())
-            .map(|robot| robot_of(scene, &setup.robot, (seed, robot)))
+            .map(|robot| robot_of(scene, &setup.robot, seed, robot))
             .collect();
         let links = &setup.links;
         let status_count = links.status_keeps_order.then_some(scene.starts.len());
         Ok(Self {
             now: Instant::ZERO,
-            coordinator: coordinator_of(scene, &setup.coordinator, &setup.missions, (FLEET, seed)),
+            coordinator: coordinator_of(scene, &setup.coordinator, &setup.missions, FLEET, seed),
             agenda: Agenda::new(robots.len()),
             robots,
             referee: Referee::new(scene, 1),
@@ -337,7 +337,7 @@ impl Network {
     }
 }
 
-fn robot_of(scene: &Scene, parameters: &RobotParameters, (seed, robot): (u64, usize)) -> Robot {
+fn robot_of(scene: &Scene, parameters: &RobotParameters, seed: u64, robot: usize) -> Robot {
     let robot = u32::try_from(robot).expect("at most a few hundred robots");
     let random = robot_stream(seed, FLEET, robot);
     Robot::new(scene, parameters, FLEET, robot, random)

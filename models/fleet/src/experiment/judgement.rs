@@ -75,10 +75,12 @@ pub(crate) fn criteria(study: &FleetStudy, results: &Results<'_>) -> Vec<Criteri
     if has_mechanisms {
         criteria.extend(safe_criteria(results));
         criteria.extend(SCENARIOS.map(|scenario| {
-            throughput(scenario_name(scenario), {
-                let of = |mode| results.mechanism(scenario, Mechanism::Clean, mode);
-                (of(CoordinatorMode::Legacy), of(CoordinatorMode::Safe))
-            })
+            let of = |mode| results.mechanism(scenario, Mechanism::Clean, mode);
+            throughput(
+                scenario_name(scenario),
+                of(CoordinatorMode::Legacy),
+                of(CoordinatorMode::Safe),
+            )
         }));
         criteria.extend(SCENARIOS.map(|scenario| {
             let of = |mechanism| results.mechanism(scenario, mechanism, CoordinatorMode::Legacy);
@@ -186,10 +188,7 @@ fn safe_criteria(results: &Results<'_>) -> [Criterion; 3] {
     ]
 }
 
-fn throughput(
-    scenario: &str,
-    (legacy, safe): (Option<&FleetTally>, Option<&FleetTally>),
-) -> Criterion {
+fn throughput(scenario: &str, legacy: Option<&FleetTally>, safe: Option<&FleetTally>) -> Criterion {
     let rate = |tally: Option<&FleetTally>| {
         let is_telling = |tally: &&FleetTally| tally.section_count() >= RATE_SECTIONS_MIN;
         tally.filter(is_telling)?.missions_per_hour()

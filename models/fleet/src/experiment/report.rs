@@ -5,8 +5,7 @@ use crate::coordinator::parameters::CoordinatorMode;
 use crate::experiment::cells::{
     Cell as Experiment, Demand, Mechanism, Place, SCENARIOS, published_rows, scenario_name,
 };
-use crate::experiment::judgement;
-use crate::experiment::judgement::verdict_of;
+use crate::experiment::judgement::{self, verdict_of};
 use crate::experiment::published::{Condition, PublishedRow};
 use crate::experiment::study::{FleetStudy, worlds_text};
 use crate::experiment::tally::{FleetTally, collision_interval};

@@ -5,8 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::experiment::cells::{Cell, SCENARIOS, mechanism_cells, published_cells, scenario_name};
 use crate::experiment::driver::Experiment;
-use crate::experiment::report;
-use crate::experiment::report::Results;
+use crate::experiment::report::{self, Results};
 use crate::experiment::setup::Setup;
 use crate::experiment::tally::FleetTally;
 use crate::parameters::FleetParameters;
@@ -235,7 +234,7 @@ impl Study for FleetStudy {
             let is_standing = until.ns_since(newest_at) > STAND_NS;
             if count >= task.sections || is_standing {
                 let mut tally = experiment.tally();
-                tally.conclude((seed, task.replica), cell, scene);
+                tally.conclude(seed, task.replica, cell, scene);
                 tally.stand_count = u64::from(is_standing);
                 return Some(tally);
             }

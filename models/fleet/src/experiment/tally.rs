@@ -4,7 +4,6 @@ use crate::coordinator::counters::{CoordinatorCounts, SafeCounts};
 use crate::experiment::cells::Cell;
 use crate::experiment::driver::Experiment;
 use crate::referee::Tally;
-use crate::robot::RobotCounters;
 use crate::scenario::Scene;
 use hil_core::time::Instant;
 use hil_link::impaired::LinkCounts;
@@ -19,8 +18,6 @@ pub struct FleetTally {
     pub coordinator: CoordinatorCounts,
     /// What the safe mode's rules counted; zeros in the legacy mode.
     pub safe: SafeCounts,
-    /// What the robots counted.
-    pub robots: RobotCounters,
     /// What became of authorities and missions on their way.
     pub commands: LinkCounts,
     /// What became of states on their way.
@@ -56,17 +53,12 @@ const COLLIDED_MAX: usize = 8;
 impl FleetTally {
     pub(crate) fn of(experiment: &Experiment) -> Self {
         let [commands, status] = experiment.link_counts();
-        let mut robots = RobotCounters::default();
-        for robot in experiment.robots() {
-            robots.add(robot.counters());
-        }
         let run_s = experiment.now().seconds_since(Instant::ZERO);
         let first_at = experiment.incidents().first();
         Self {
             referee: *experiment.referee().tally(),
             coordinator: experiment.coordinator().counters().counts,
             safe: experiment.coordinator().counters().safe,
-            robots,
             commands,
             status,
             superseded_count: experiment.superseded_count(),
@@ -85,7 +77,7 @@ impl FleetTally {
     }
 
     /// Adds what only the study knows of a run.
-    pub(crate) fn conclude(&mut self, (seed, replica): (u64, u64), cell: &Cell, scene: &Scene) {
+    pub(crate) fn conclude(&mut self, seed: u64, replica: u64, cell: &Cell, scene: &Scene) {
         let robot = &cell.setup.robot;
         self.stop_error_bound_m = robot.stop_error_bound_m(&scene.world.vehicle);
         for run in &mut self.collided {
@@ -98,7 +90,6 @@ impl FleetTally {
         merge_referee(&mut self.referee, &other.referee);
         self.coordinator.merge(&other.coordinator);
         self.safe.merge(&other.safe);
-        self.robots.add(&other.robots);
         merge_link(&mut self.commands, &other.commands);
         merge_link(&mut self.status, &other.status);
         self.superseded_count += other.superseded_count;

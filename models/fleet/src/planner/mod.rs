@@ -9,17 +9,12 @@ mod grid;
 mod search;
 mod shorten;
 pub(crate) mod space;
-pub mod trajectory;
 
 use crate::geometry::{Pose, floor_index};
-use crate::map::Map;
-use crate::path::{Path, PathError};
 use crate::planner::grid::Distances;
 use crate::planner::search::Search;
 use crate::planner::shorten::shortened;
 use crate::planner::space::{Space, extent};
-use crate::planner::trajectory::Trajectory;
-use crate::world::Vehicle;
 
 pub use crate::planner::dubins::Segment;
 pub use crate::planner::space::Blocker;
@@ -39,7 +34,7 @@ pub struct Plan {
     start: Pose,
     goal: Pose,
     segments: Vec<Segment>,
-    expanded_count: u64,
+    pub(crate) expanded_count: u64,
 }
 
 /// Why there is no plan.
@@ -120,21 +115,6 @@ impl core::fmt::Display for At<'_> {
 }
 
 impl Plan {
-    /// Its arcs and straight lines in order.
-    pub fn segments(&self) -> &[Segment] {
-        &self.segments
-    }
-
-    /// Whole way, metres.
-    pub fn length_m(&self) -> f64 {
-        self.segments.iter().map(|segment| segment.length_m).sum()
-    }
-
-    /// States expanded to find it.
-    pub fn expanded_count(&self) -> u64 {
-        self.expanded_count
-    }
-
     /// Poses along the way, at most `spacing_m` apart, from the very start to the very goal.
     pub fn poses(&self, spacing_m: f64) -> Vec<Pose> {
         let mut poses = vec![self.start];
@@ -152,40 +132,6 @@ impl Plan {
         }
         poses
     }
-
-    /// The path with its poses at most `spacing_m` apart.
-    ///
-    /// # Errors
-    /// When the spacing is not a positive number, or start and goal are the same.
-    pub fn path(&self, spacing_m: f64) -> Result<Path, PathError> {
-        if !(spacing_m > 0.0 && spacing_m.is_finite()) {
-            return Err(PathError::Spacing { spacing_m });
-        }
-        // Chords between poses so near are shorter than their arcs by less than a micrometre.
-        Path::new(&self.poses(0.1 * spacing_m), spacing_m)
-    }
-}
-
-impl Plan {
-    /// The fastest run along the plan for a vehicle that begins and ends at rest.
-    pub fn trajectory(&self, vehicle: &Vehicle) -> Trajectory {
-        let limits = (vehicle.speed_max_mps, vehicle.acceleration_mps2);
-        Trajectory::new(self.length_m(), limits.0, limits.1)
-    }
-}
-
-/// Plans the path from `start` to `goal` around the map's obstacles; bays count as empty.
-///
-/// # Errors
-/// When there is none; see [`PlanError`].
-pub fn plan(
-    map: &Map,
-    vehicle: &Vehicle,
-    turning_radius_m: f64,
-    start: &Pose,
-    goal: &Pose,
-) -> Result<Plan, PlanError> {
-    Planner::new(map, vehicle, turning_radius_m)?.plan(start, goal)
 }
 
 /// Plans path after path on one map, faster than each alone when goals repeat.
@@ -199,27 +145,11 @@ pub struct Planner {
 }
 
 impl Planner {
-    /// A planner for the map's obstacles; bays count as empty.
+    /// A planner for a free space.
     ///
     /// # Errors
     /// When the turning radius is no positive number or small beyond reason for the ground.
-    pub fn new(map: &Map, vehicle: &Vehicle, turning_radius_m: f64) -> Result<Self, PlanError> {
-        Self::within(map.space(vehicle), turning_radius_m)
-    }
-
-    /// A planner that also keeps clear of vehicles parked in all bays of the map.
-    ///
-    /// # Errors
-    /// As [`new`](Self::new).
-    pub fn around_parked(
-        map: &Map,
-        vehicle: &Vehicle,
-        turning_radius_m: f64,
-    ) -> Result<Self, PlanError> {
-        Self::within(map.space_around_parked(vehicle), turning_radius_m)
-    }
-
-    fn within(space: Space, turning_radius_m: f64) -> Result<Self, PlanError> {
+    pub(crate) fn new(space: Space, turning_radius_m: f64) -> Result<Self, PlanError> {
         if !(turning_radius_m > 0.0 && turning_radius_m.is_finite()) {
             return Err(PlanError::TurningRadius { turning_radius_m });
         }
@@ -264,8 +194,9 @@ impl Planner {
             Some(index) => self.distances.remove(index),
             None => (goal, Distances::new(&self.space, &goal)),
         };
-        let ends = (&start, &goal);
-        let found = self.search.run(&self.space, &latest.1, ends, EXPANDED_MAX);
+        let found = self
+            .search
+            .run(&self.space, &latest.1, &start, &goal, EXPANDED_MAX);
         self.distances.push(latest);
         if self.distances.len() > GOALS_MAX {
             self.distances.remove(0);
@@ -278,8 +209,7 @@ impl Planner {
                 expanded_count,
             });
         };
-        let limits = (self.turning_radius_m, &goal);
-        let segments = shortened(&self.space, &start, &segments, limits);
+        let segments = shortened(&self.space, &start, &goal, &segments, self.turning_radius_m);
         Ok(Plan {
             start,
             goal,

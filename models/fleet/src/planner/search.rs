@@ -98,7 +98,8 @@ impl Search {
         &mut self,
         space: &Space,
         distances: &Distances,
-        (start, goal): (&Pose, &Pose),
+        start: &Pose,
+        goal: &Pose,
         expanded_max: u64,
     ) -> Found {
         self.costs.fill(f64::INFINITY);
@@ -108,7 +109,7 @@ impl Search {
             curvature_per_m: 0.0,
             length_m: 0.0,
         };
-        self.offer(distances, goal, (*start, stand, 0, 0.0));
+        self.offer(distances, goal, *start, stand, 0, 0.0);
         let mut expanded_count = 0;
         while let Some(Reverse(open)) = self.open.pop() {
             let here = self.reached[open.number as usize];
@@ -140,7 +141,7 @@ impl Search {
                 {
                     continue;
                 }
-                self.offer(distances, goal, (pose, segment, open.number, cost));
+                self.offer(distances, goal, pose, segment, open.number, cost);
             }
         }
         Found {
@@ -153,7 +154,10 @@ impl Search {
         &mut self,
         distances: &Distances,
         goal: &Pose,
-        (pose, segment, parent, cost): (Pose, Segment, u32, f64),
+        pose: Pose,
+        segment: Segment,
+        parent: u32,
+        cost: f64,
     ) {
         let Some(around_m) = distances.metres(&pose) else {
             return;

@@ -12,8 +12,9 @@ const ANCHORS_MAX: f64 = 96.0;
 pub(crate) fn shortened(
     space: &Space,
     start: &Pose,
+    goal: &Pose,
     segments: &[Segment],
-    (turning_radius_m, goal): (f64, &Pose),
+    turning_radius_m: f64,
 ) -> Vec<Segment> {
     let anchors = anchors(start, segments, goal, 0.25 * turning_radius_m);
     let step_m = space.step_m(turning_radius_m);

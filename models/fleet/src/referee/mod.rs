@@ -22,7 +22,6 @@ use std::sync::Arc;
 
 pub use self::tally::{Cause, Incident, IncidentKind, Tally};
 
-use crate::geometry::OrientedBox;
 use crate::messages::{Truth, TruthKind};
 use crate::path::PathId;
 use crate::referee::pairs::PairFinder;
@@ -149,14 +148,15 @@ impl Referee {
         start: Instant,
         end: Instant,
     ) {
-        self.replay_seeing(records, (start, end), &mut |_, _| {});
+        self.replay_seeing(records, start, end, &mut |_, _| {});
     }
 
     /// As [`Self::replay`]; `see` looks on after every scan.
     pub(crate) fn replay_seeing(
         &mut self,
         records: &mut dyn Iterator<Item = Truth>,
-        (start, end): (Instant, Instant),
+        start: Instant,
+        end: Instant,
         see: &mut dyn FnMut(Instant, &Self),
     ) {
         let mut pending = records.next();
@@ -215,8 +215,8 @@ impl Referee {
             .map_or(0, |path| path.index_at(truth.travelled_m));
         let first = truth.fleet_id as usize * self.per_fleet;
         let fleet = first..first + self.per_fleet;
-        let shared = (&*self.world, &mut self.tally);
-        self.sections.begin(robot, fleet, &self.tracks, shared);
+        self.sections
+            .begin(robot, fleet, &self.tracks, &self.world, &mut self.tally);
     }
 
     fn end_mission(&mut self, robot: usize, has_passed: bool) {
@@ -242,7 +242,7 @@ impl Referee {
         let [one, other] = pair.map(|robot| &self.tracks[robot as usize]);
         let vehicle = &self.world.vehicle;
         let covered = [one, other].map(|track| track.covered(vehicle));
-        let gap_m = axis_gap_m(&covered[0], &covered[1]);
+        let gap_m = covered[0].gap_m(&covered[1]);
         let least_m = self.tally.separation_min_m.unwrap_or(f64::INFINITY);
         if gap_m < least_m {
             let distance_m = covered[0].distance_m(&covered[1]);
@@ -303,25 +303,6 @@ impl Referee {
     }
 }
 
-/// Largest gap between the two along one of their axes: their distance at least; negative exactly
-/// when they overlap.
-fn axis_gap_m(one: &OrientedBox, other: &OrientedBox) -> f64 {
-    let offset = [
-        other.centre[0] - one.centre[0],
-        other.centre[1] - one.centre[1],
-    ];
-    let cosine = (one.axis[0] * other.axis[0] + one.axis[1] * other.axis[1]).abs();
-    let sine = (one.axis[0] * other.axis[1] - one.axis[1] * other.axis[0]).abs();
-    let gap = |from: &OrientedBox, to: &OrientedBox| {
-        let along = (offset[0] * from.axis[0] + offset[1] * from.axis[1]).abs();
-        let across = (offset[1] * from.axis[0] - offset[0] * from.axis[1]).abs();
-        let along = along - (from.half_m[0] + to.half_m[0] * cosine + to.half_m[1] * sine);
-        along.max(across - (from.half_m[1] + to.half_m[0] * sine + to.half_m[1] * cosine))
-    };
-    gap(one, other).max(gap(other, one))
-}
-
-/// The track of a robot of `scene` after `truth`, for tests of other modules.
 #[cfg(test)]
 pub(crate) fn test_track(scene: &Scene, truth: &Truth) -> Track {
     let mut track = Track::standing(scene.world.bays[0].pose);

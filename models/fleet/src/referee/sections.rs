@@ -53,7 +53,8 @@ impl ActiveSections {
         robot: usize,
         fleet: core::ops::Range<usize>,
         tracks: &[Track],
-        (world, tally): (&World, &mut Tally),
+        world: &World,
+        tally: &mut Tally,
     ) {
         for other in fleet.filter(|other| *other != robot && tracks[*other].is_driving) {
             let (own, their) = (&tracks[robot], &tracks[other]);

@@ -52,9 +52,10 @@ pub struct RobotCounters {
     pub skipped_ticks_count: u64,
 }
 
+#[cfg(test)]
 impl RobotCounters {
     /// Adds the counts of another robot.
-    pub fn add(&mut self, other: &Self) {
+    pub(crate) fn add(&mut self, other: &Self) {
         self.missions_started_count += other.missions_started_count;
         self.missions_done_count += other.missions_done_count;
         self.missions_repeated_count += other.missions_repeated_count;

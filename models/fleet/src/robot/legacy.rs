@@ -111,7 +111,7 @@ impl LegacyTracker {
             self.speed_mps,
             is_braking,
         );
-        let (way_m, speed_mps) = runge_kutta((self.way_m, self.speed_mps), step_s, |speed| {
+        let (way_m, speed_mps) = runge_kutta(self.way_m, self.speed_mps, step_s, |speed| {
             acceleration(self.limits, self.limits.speed_max_mps, speed, is_braking)
         });
         // A step that ends at a negative speed may end behind where it began; robots do not.
@@ -134,7 +134,7 @@ impl LegacyTracker {
                 let step_m = speed_mps * self.half_period_s;
                 return way_m + step_m * ((spare_m / step_m).floor() + 1.0);
             }
-            (way_m, speed_mps) = runge_kutta((way_m, speed_mps), self.half_period_s, |speed| {
+            (way_m, speed_mps) = runge_kutta(way_m, speed_mps, self.half_period_s, |speed| {
                 acceleration(self.limits, top, speed, false)
             });
         }
@@ -168,7 +168,8 @@ fn acceleration(limits: Limits, top_mps: f64, speed_mps: f64, is_braking: bool) 
 
 /// One classical fourth-order step of way and speed.
 fn runge_kutta(
-    (way_m, speed_mps): (f64, f64),
+    way_m: f64,
+    speed_mps: f64,
     step_s: f64,
     acceleration: impl Fn(f64) -> f64,
 ) -> (f64, f64) {
@@ -191,7 +192,7 @@ fn braking_table(limits: Limits, step_s: f64) -> Box<[(f64, f64)]> {
     let (mut way_m, mut speed_mps) = (0.0, 0.0);
     let mut table = vec![(speed_mps, way_m)];
     while speed_mps < top_mps {
-        (way_m, speed_mps) = runge_kutta((way_m, speed_mps), step_s, |speed| {
+        (way_m, speed_mps) = runge_kutta(way_m, speed_mps, step_s, |speed| {
             acceleration(limits, top_mps, speed, false)
         });
         table.push((speed_mps, way_m));

@@ -195,11 +195,6 @@ impl Robot {
         &self.counters
     }
 
-    /// The path it stands or drives on, or came by; `None` in a bay without paths.
-    pub fn path(&self) -> Option<&Arc<Path>> {
-        self.path.as_ref()
-    }
-
     fn is_under_way(&self) -> bool {
         matches!(self.phase, Phase::Driving | Phase::AtPoint)
     }

@@ -6,8 +6,7 @@ use std::sync::Arc;
 use crate::messages::{Authority, Header, MessageOrder, Mission, Phase, Truth, TruthKind};
 use crate::path::{Path, PathId};
 use crate::robot::Robot;
-use crate::robot::authority;
-use crate::robot::authority::{Grant, Proposal, Verdict, is_newer, reach_of};
+use crate::robot::authority::{self, Grant, Proposal, Verdict, is_newer, reach_of};
 use hil_core::time::Instant;
 
 impl Robot {

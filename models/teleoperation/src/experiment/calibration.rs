@@ -198,7 +198,7 @@ impl Search<'_, '_> {
             if (tried.ratio() - target).abs() < NEAR_RATIO * target {
                 break;
             }
-            next = between(low, high, (target, highest));
+            next = between(low, high, target, highest);
         }
         let nearest = |a: &&Try, b: &&Try| {
             let apart = |tried: &Try| (tried.ratio() - target).abs();
@@ -271,7 +271,7 @@ fn power_law(tries: &[Try]) -> (f64, f64) {
 
 /// The next rate to try: on the line between both sides in logarithms, kept off its ends; without
 /// one side, four times as far.
-fn between(low: Option<Try>, high: Option<Try>, (target, highest): (f64, f64)) -> f64 {
+fn between(low: Option<Try>, high: Option<Try>, target: f64, highest: f64) -> f64 {
     match (low, high) {
         (Some(low), Some(high)) => {
             let log = |tried: Try| tried.ratio().max(1e-5).ln();

@@ -4,7 +4,7 @@
 use crate::experiment::conditions::{Condition, base, conditions};
 use crate::experiment::drive::{Tally, drive};
 use crate::experiment::parameters::TableParameters;
-use crate::experiment::report;
+use crate::experiment::report::{self, Row};
 use crate::experiment::trajectory::Trajectory;
 use crate::{Teleoperation, TeleoperationParameters};
 use hil_arm::egm::parameters::{ControllerSettings, Preset};
@@ -113,7 +113,10 @@ impl Study for MotionLossStudy {
             .conditions
             .iter()
             .zip(runs)
-            .map(|(condition, runs)| (condition, runs.iter().flatten().copied().collect()))
+            .map(|(condition, runs)| Row {
+                condition,
+                runs: runs.iter().flatten().copied().collect(),
+            })
             .collect();
         report::report(self, &results)
     }

@@ -1,10 +1,10 @@
 //! How old the reference in use was, and whether it grew older and older: the mark of a queue that
 //! never drains.
 
-use crate::score::figure::figure;
 use crate::score::record::{Feedback, Record};
 use hil_arm::egm::messages::EgmFeedback;
 use hil_core::score::Metric;
+use hil_stats::metric::label;
 
 /// Median, tail and greatest age, and its slope.
 pub(crate) fn metrics(record: &Record) -> [Metric; 4] {
@@ -16,9 +16,9 @@ pub(crate) fn metrics(record: &Record) -> [Metric; 4] {
         "time since the command in use arrived, its wait in the queue included, in {} messages",
         ages_ns.len()
     );
-    let age = |name, label, value: Option<i64>| {
+    let age = |name, text, value: Option<i64>| {
         let value_ms = value.map(|age_ns| age_ns as f64 * 1e-6);
-        figure((name, label, "ms"), value_ms, method.clone(), missing)
+        label(name, text, "ms").measured(value_ms, method.clone(), missing)
     };
     let mut quantile = |share: f64| {
         let last = ages_ns.len().checked_sub(1)?;
@@ -48,12 +48,12 @@ pub(crate) fn metrics(record: &Record) -> [Metric; 4] {
             "age of the reference in use, greatest",
             greatest,
         ),
-        figure(
-            (
-                "reference_age_ms_per_s",
-                "growth of the reference's age",
-                "ms/s",
-            ),
+        label(
+            "reference_age_ms_per_s",
+            "growth of the reference's age",
+            "ms/s",
+        )
+        .measured(
             slope,
             "least squares within each session, holds left out; above zero the queue grows for \
              ever",

@@ -5,7 +5,6 @@
 //! that the fastest answered command brings together; what needs better than that is unavailable.
 
 mod age;
-mod figure;
 mod joint_error;
 pub(crate) mod loops;
 mod lost;
@@ -17,7 +16,6 @@ pub(crate) mod sessions;
 mod tests;
 
 use crate::messages::HumanFrame;
-use crate::score::figure::{count, estimated, figure};
 use crate::score::joint_error::JointError;
 use crate::score::loops::{LoopCounter, Loops, LossCause};
 use crate::score::record::Record;
@@ -27,6 +25,7 @@ use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::case_study::{ErrorSeries, Metric, Score};
 use hil_core::plot::PlotSeries;
 use hil_core::run_log::RunLog;
+use hil_stats::metric::label;
 use hil_stats::series::{Estimate, Sample, lag_s, peak_to_peak};
 use hil_stats::statistics::{CONFIDENCE, poisson};
 
@@ -168,8 +167,7 @@ impl Run {
         let counter = self.counter.text();
         let sent = loops.map(|loops| loops.sent_count() as f64);
         let executed = loops.map(|loops| loops.executed_count as f64);
-        let ratio = figure(
-            ("motion_loss_ratio", "motion loss rate", "1"),
+        let ratio = label("motion_loss_ratio", "motion loss rate", "1").measured(
             loops.map(Loops::loss_ratio),
             format!("(sent - executed) / sent, {counter}; interval of a Poisson count"),
             missing,
@@ -180,14 +178,12 @@ impl Run {
             Some((lost.low / sent, (lost.high / sent).min(1.0)))
         });
         let mut metrics = vec![
-            figure(
-                ("motion_loops_sent_count", "motion loops sent", "1"),
+            label("motion_loops_sent_count", "motion loops sent", "1").measured(
                 sent,
                 format!("{}, {counter}", self.sent.what),
                 missing,
             ),
-            figure(
-                ("motion_loops_executed_count", "motion loops executed", "1"),
+            label("motion_loops_executed_count", "motion loops executed", "1").measured(
                 executed,
                 format!("as measured, {counter}"),
                 missing,
@@ -207,52 +203,48 @@ impl Run {
                 .cause_of(lost.due_ns, self.counter.period_ns);
             kinds[cause.kind()] += 1;
         }
-        let by = |names: (&'static str, &'static str), kind: usize, what: &str| {
+        let by = |name, text, kind: usize, what: &str| {
             let value = loops.map(|_| kinds[kind] as f64);
-            figure((names.0, names.1, "1"), value, what, missing)
+            label(name, text, "1").measured(value, what, missing)
         };
         [
             by(
-                ("loops_lost_by_trip_count", "loops lost without a session"),
+                "loops_lost_by_trip_count",
+                "loops lost without a session",
                 0,
                 "sent peaks that no executed one answers, with no session in part of their loop",
             ),
             by(
-                ("loops_lost_by_hold_count", "loops lost in a hold"),
+                "loops_lost_by_hold_count",
+                "loops lost in a hold",
                 1,
                 "of the others, those with a hold in their loop",
             ),
             by(
-                (
-                    "loops_lost_by_clipping_count",
-                    "loops lost to inverse kinematics",
-                ),
+                "loops_lost_by_clipping_count",
+                "loops lost to inverse kinematics",
                 2,
                 "of the others, those with limited or unreachable commands in their loop",
             ),
             by(
-                (
-                    "loops_lost_by_throttling_count",
-                    "loops lost to MaxSpeedDeviation",
-                ),
+                "loops_lost_by_throttling_count",
+                "loops lost to MaxSpeedDeviation",
                 3,
                 "of the others, those with MaxSpeedDeviation binding in a fifth of their loop",
             ),
             by(
-                (
-                    "loops_lost_by_merging_count",
-                    "loops merged with a neighbour",
-                ),
+                "loops_lost_by_merging_count",
+                "loops merged with a neighbour",
                 4,
                 "the others: too little motion between two peaks",
             ),
             by(
-                ("loops_lost_unseen_count", "loops lost without feedback"),
+                "loops_lost_unseen_count",
+                "loops lost without feedback",
                 5,
                 "of those with a session, as far as is known: no feedback in part of their loop",
             ),
-            figure(
-                ("loops_extra_count", "executed loops that answer none", "1"),
+            label("loops_extra_count", "executed loops that answer none", "1").measured(
                 loops.map(|loops| loops.extra_count as f64),
                 "a motion of the robot's own, or one loop cut in two; each hides one lost loop in \
                  the motion loss rate",
@@ -262,10 +254,10 @@ impl Run {
     }
 
     fn tracking_lag(&self, log: &RunLog) -> Metric {
-        let names = ("tracking_lag_ms", "tracking lag", "ms");
+        let label = label("tracking_lag_ms", "tracking lag", "ms");
         if !self.has_one_clock {
             let missing = "commands and feedback were stamped by two clocks that are not aligned";
-            return figure(names, None, "", missing);
+            return label.unavailable(missing);
         }
         let lag = lag_s(&self.record.sent_y(), &self.moved, 0.5 * self.period_s);
         let in_ms = |lag: Estimate| Estimate {
@@ -273,15 +265,10 @@ impl Run {
             interval: lag.interval.map(|(low, high)| (low * 1e3, high * 1e3)),
         };
         let clock = log.clock_words(lag.map(|lag| lag.value));
-        estimated(
-            names,
-            lag.map(in_ms),
-            format!(
+        label.estimated(lag.map(in_ms), format!(
                 "highest cross-correlation of the right tool's y, commanded and measured, on a 4 ms \
                  grid; interval from blocks of the run{clock}"
-            ),
-            "commands and feedback overlap for less than two motion periods, or nothing moved",
-        )
+            ), "commands and feedback overlap for less than two motion periods, or nothing moved")
     }
 
     fn tool_travel(&self) -> Metric {
@@ -290,12 +277,12 @@ impl Run {
             reason = "a period of at most a minute in nanoseconds"
         )]
         let travel = peak_to_peak(self.followed(), (self.period_s * 1e9) as i64);
-        estimated(
-            (
-                "tool_y_m_peak_to_peak",
-                "side-to-side travel of the right tool",
-                "m",
-            ),
+        label(
+            "tool_y_m_peak_to_peak",
+            "side-to-side travel of the right tool",
+            "m",
+        )
+        .estimated(
             travel,
             "mean over whole motion periods of following the human of highest minus lowest \
              measured y",
@@ -327,13 +314,11 @@ impl Run {
         };
         let of = commands.len();
         [
-            count(
-                ("ik_failure_count", "inverse kinematics failures"),
+            label("ik_failure_count", "inverse kinematics failures", "1").count(
                 flagged(EgmCommand::UNREACHABLE),
                 format!("commands flagged unreachable, of {of}"),
             ),
-            count(
-                ("ik_limited_count", "commands held back by a limit"),
+            label("ik_limited_count", "commands held back by a limit", "1").count(
                 flagged(LIMITED),
                 format!("commands flagged as limited in speed, position or jump, of {of}"),
             ),

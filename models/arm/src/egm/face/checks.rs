@@ -62,7 +62,8 @@ pub(super) enum Sender {
 pub(super) fn joints_of(
     joints: Option<&EgmJoints>,
     external: Option<&EgmJoints>,
-    (axes, sender): (Axes, Sender),
+    axes: Axes,
+    sender: Sender,
     held_rad: f64,
 ) -> Result<Option<Joints>, Refusal> {
     let robot = joints.map_or(&[][..], |list| &list.joints);

@@ -210,11 +210,11 @@ impl RobotFace {
         wire::merge(datagram, &mut self.sensor)
             .map_err(|error| checks::undecodable(error, datagram, MessageType::Correction))?;
         let header = checks::header_of(self.sensor.header.as_ref(), MessageType::Correction)?;
-        let form = (self.settings.axes, Sender::Sensor);
+        let (axes, sender) = (self.settings.axes, Sender::Sensor);
 
         let planned = self.sensor.planned.as_ref().ok_or(Refusal::MissingJoints)?;
         let (joints, external) = (planned.joints.as_ref(), planned.external_joints.as_ref());
-        let position_rad = checks::joints_of(joints, external, form, held_rad)?;
+        let position_rad = checks::joints_of(joints, external, axes, sender, held_rad)?;
         let position_rad = checks::commanded(&position_rad.ok_or(Refusal::MissingJoints)?)?;
 
         let mut command = EgmCommand {
@@ -225,7 +225,7 @@ impl RobotFace {
         };
         if let Some(speed) = &self.sensor.speed_ref {
             let (joints, external) = (speed.joints.as_ref(), speed.external_joints.as_ref());
-            if let Some(speed_rad_per_s) = checks::joints_of(joints, external, form, 0.0)? {
+            if let Some(speed_rad_per_s) = checks::joints_of(joints, external, axes, sender, 0.0)? {
                 checks::speeds(&speed_rad_per_s)?;
                 command.speed_rad_per_s = speed_rad_per_s;
                 command.flags |= EgmCommand::HAS_SPEED;

@@ -7,7 +7,7 @@ use crate::coordinator::policy::{Contest, OrderingPolicy};
 use crate::coordinator::roster::Roster;
 use crate::coordinator::sections::ActiveSection;
 use crate::messages::TO_GOAL;
-use crate::section::Side;
+use crate::section::{Side, Span};
 
 /// What the coordinator believes of a robot when it orders a section.
 #[derive(Debug, Clone, Copy, Default)]
@@ -159,16 +159,18 @@ fn among_unstoppable(
     let mut decision = Decision::fixed(leader);
     let (leading, waiting) = (belief(leader), belief(leader.other()));
     let stands_at = waiting.held_at().unwrap_or(0).max(waiting.index);
-    let sweep = (leading.index, active.end(leader));
+    let sweep = Span {
+        lower: leading.index,
+        upper: active.end(leader),
+    };
     let is_in_the_way = active
         .section()
         .partners(leader.other(), stands_at)
-        .is_some_and(|(from, to)| from <= sweep.1 && sweep.0 <= to);
+        .is_some_and(|(from, to)| from <= sweep.upper && sweep.lower <= to);
     if is_in_the_way {
-        let conflict =
-            active
-                .section()
-                .first_conflict(leader, leading.index, (stands_at, stands_at));
+        let conflict = active
+            .section()
+            .first_conflict(leader, leading.index, Span::at(stands_at));
         decision.leader_wait = conflict.map(|index| index.saturating_sub(trailing_points));
     }
     decision
@@ -187,7 +189,10 @@ pub(crate) fn wait_index(
     let conflict = if leader_index <= active.start(leader) {
         start
     } else {
-        let sweep = (leader_index, active.end(leader));
+        let sweep = Span {
+            lower: leader_index,
+            upper: active.end(leader),
+        };
         active
             .section()
             .first_conflict(waiting, start, sweep)

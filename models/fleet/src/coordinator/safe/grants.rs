@@ -12,7 +12,7 @@ use crate::coordinator::safe::SafeRules;
 use crate::coordinator::safe::horizon::{lookahead_s, reach_m};
 use crate::coordinator::safe::liveness::{Verdict, section_start};
 use crate::coordinator::safe::reservation::Contact;
-use crate::section::Side;
+use crate::section::{Side, Span};
 use hil_core::time::Instant;
 
 /// A robot that could use more way in this cycle.
@@ -245,7 +245,10 @@ impl SafeRules {
                 let entry = contact.section().first_conflict(
                     Side::Second,
                     span.lower,
-                    (from, contact.own.upper),
+                    Span {
+                        lower: from,
+                        upper: contact.own.upper,
+                    },
                 )?;
                 let end = entry.checked_sub(self.margin.above + 1)?;
                 let is_useful = end >= earliest && entry <= span.upper;

@@ -28,8 +28,8 @@
 //! The search is a heuristic, as the question itself is NP-hard: failing to find a plan withholds
 //! an extension that might have been harmless, and costs time but neither safety nor liveness.
 
-use crate::coordinator::safe::reservation::{Contact, Span, Traffic};
-use crate::section::Side;
+use crate::coordinator::safe::reservation::{Contact, Traffic};
+use crate::section::{Side, Span};
 
 /// How far from the end of its authority a robot may come to stand, in poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -375,6 +375,6 @@ fn conflict_of_other(contact: &Contact, from: usize, to: usize, taken: Span) -> 
     }
     contact
         .section()
-        .first_conflict(Side::Second, from, (taken.lower, taken.upper))
+        .first_conflict(Side::Second, from, taken)
         .filter(|index| *index <= to)
 }

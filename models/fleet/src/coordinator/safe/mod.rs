@@ -35,10 +35,11 @@ use crate::coordinator::safe::horizon::{CycleTime, RoundTrip};
 use crate::coordinator::safe::lease::LeaseWatch;
 use crate::coordinator::safe::ledger::{Ledger, StateEffect};
 use crate::coordinator::safe::liveness::{Plan, StopMargin};
-use crate::coordinator::safe::reservation::{Span, Traffic};
+use crate::coordinator::safe::reservation::Traffic;
 use crate::coordinator::{Cycle, Rules};
 use crate::messages::{Authority, Header, State, TO_GOAL, ToRobot};
 use crate::path::PathId;
+use crate::section::Span;
 use crate::world::World;
 use hil_core::time::Instant;
 
