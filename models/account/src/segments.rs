@@ -117,7 +117,7 @@ pub(super) struct SegmentBook<'a> {
     end_to_end_bounds_ns: Bounds,
     residual: LatencyHistogram,
     closing: ClosingFigures,
-    coverage: StampCoverage,
+    pub(super) coverage: StampCoverage,
 }
 
 impl<'a> SegmentBook<'a> {
@@ -417,10 +417,6 @@ impl<'a> SegmentBook<'a> {
                 ..self.closing.clone()
             }),
         }
-    }
-
-    pub(super) const fn coverage(&self) -> StampCoverage {
-        self.coverage
     }
 }
 

@@ -3,13 +3,13 @@
 
 use std::sync::Arc;
 
-use crate::analytic::Line;
 use crate::geometry::{Pose, wrap_angle};
 use crate::map::{Map, MapBay};
 use crate::path::{Path, PathLibrary};
 use crate::planner::At;
-use crate::routes::{Connection, Connector, Network, lifted};
-use crate::scenario::{BaySide, PlanningSummary, Scene, WorldParameters};
+use crate::scenario::{
+    BaySide, Connection, Connector, Line, Network, PlanningSummary, Scene, WorldParameters, lifted,
+};
 use crate::world::{Bay, Route, Vehicle, World};
 use hil_core::case_study::ParameterError;
 

@@ -1,10 +1,8 @@
 //! Motion files in the BVH text format (Biovision hierarchy): reader and writer on text. It opens
 //! no file, and it does not interpret the motion: see [`super::motion`].
 //!
-//! [`BvhReader`] reads line by line and frame by frame, so the text may come from anywhere and
-//! need never end; [`Bvh::parse`] reads a whole file with it. Numbers and keywords may be spread
-//! over lines at will; every error names the line it was found on. No input makes the reader
-//! panic, recurse or reserve more memory than the text's own size.
+//! Numbers and keywords may be spread over lines at will; every error names the line it was found
+//! on. No input makes the reader panic, recurse or reserve more memory than the text's own size.
 
 use core::fmt::Write as _;
 

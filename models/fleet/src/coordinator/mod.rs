@@ -2,14 +2,6 @@
 //! period. A pure state machine; what carries the messages, and how badly, it does not know.
 
 #[cfg(test)]
-impl Coordinator {
-    /// What it knows of its robots.
-    pub(crate) fn roster(&self) -> &Roster {
-        &self.roster
-    }
-}
-
-#[cfg(test)]
 mod closed_loop;
 pub mod counters;
 mod legacy;
@@ -18,7 +10,6 @@ pub mod policy;
 pub mod roster;
 pub mod safe;
 pub mod sections;
-mod view;
 
 use core::fmt::Debug;
 
@@ -66,7 +57,8 @@ pub(crate) trait Rules: Debug {
 /// One fleet's coordinator.
 #[derive(Debug)]
 pub struct Coordinator {
-    roster: Roster,
+    /// What it knows of its robots.
+    pub(crate) roster: Roster,
     rules: Box<dyn Rules>,
     policy: Box<dyn OrderingPolicy>,
     missions: MissionSource,
@@ -112,10 +104,8 @@ impl Coordinator {
 
     /// One control cycle; gives each message to `send`.
     pub fn on_cycle(&mut self, now: Instant, send: &mut dyn FnMut(ToRobot)) {
-        let counts = &mut self.counters.counts;
-        counts.cycle_count += 1;
-        self.roster.settle(counts);
-        self.roster.dispatch(now, &mut self.missions, counts, send);
+        self.roster.settle(&mut self.counters.counts);
+        self.roster.dispatch(now, &mut self.missions, send);
         self.rules.decide(&mut Cycle {
             now,
             roster: &mut self.roster,

@@ -5,7 +5,7 @@ use core::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::coordinator::policy::PolicyName;
-use crate::coordinator::safe::parameters::SafeParameters;
+use crate::coordinator::safe::SafeParameters;
 use crate::messages::MessageOrder;
 use hil_core::case_study::ParameterError;
 

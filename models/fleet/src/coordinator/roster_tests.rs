@@ -43,8 +43,7 @@ impl Bench {
         };
         let (now, counts) = (seconds(now_s), &mut self.counts);
         self.roster.settle(counts);
-        self.roster
-            .dispatch(now, &mut self.missions, counts, &mut send);
+        self.roster.dispatch(now, &mut self.missions, &mut send);
         self.roster.reset_stuck(now, counts, &mut send);
         given
     }
@@ -96,9 +95,9 @@ fn names(sent: &[Mission]) -> Vec<(u32, u32, u32)> {
 fn one_mission_begins_per_cycle_and_is_repeated_until_a_state_shows_it() {
     let mut bench = Bench::new(MessageOrder::Legacy);
     assert_eq!(names(&bench.cycle(0)), [(0, 1, 0)]);
-    assert_eq!(bench.roster.sections().iter().count(), 0);
+    assert_eq!(bench.roster.sections.iter().count(), 0);
     assert_eq!(names(&bench.cycle(1)), [(0, 1, 0), (1, 1, 0)]);
-    assert_eq!(bench.roster.sections().iter().count(), 1);
+    assert_eq!(bench.roster.sections.iter().count(), 1);
     bench.report(1, 1, 1, 0);
     let sent = bench.cycle(2);
     assert_eq!(names(&sent), [(1, 1, 0)]);

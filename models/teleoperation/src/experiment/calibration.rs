@@ -4,6 +4,7 @@
 use crate::Teleoperation;
 use crate::experiment::conditions::{back_after, base, changed, without_time_out};
 use crate::experiment::drive::{Channel, Setup, drive};
+use crate::experiment::report::column;
 use crate::experiment::study::seed_of;
 use crate::experiment::trajectory::Trajectory;
 use hil_arm::egm::parameters::ControllerSettings;
@@ -333,10 +334,6 @@ impl Study for Calibration {
             }],
         }
     }
-}
-
-const fn column(name: &'static str, label: &'static str) -> Column {
-    Column { name, label }
 }
 
 const COLUMNS: [Column; 8] = [

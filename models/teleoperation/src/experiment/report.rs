@@ -54,7 +54,7 @@ fn notes(study: &MotionLossStudy) -> Vec<String> {
     ]
 }
 
-const fn column(name: &'static str, label: &'static str) -> Column {
+pub(super) const fn column(name: &'static str, label: &'static str) -> Column {
     Column { name, label }
 }
 
@@ -210,10 +210,10 @@ fn criteria(row: &Row<'_>, is_fitted: bool) -> Vec<Criterion> {
 }
 
 fn nothing_lost(condition: &Condition, runs: &[&Tally], nor_tripped: bool) -> Criterion {
-    let lost: u64 = runs.iter().map(|run| run.missing_count()).sum();
-    let unanswered: u64 = runs.iter().flat_map(|run| run.lost_counts).sum();
-    let extra: u64 = runs.iter().map(|run| run.extra_count).sum();
-    let trips: u64 = runs.iter().map(|run| run.trip_count).sum();
+    let lost = sum(runs, Tally::missing_count);
+    let unanswered = sum(runs, |run| run.lost_counts.iter().sum());
+    let extra = sum(runs, |run| run.extra_count);
+    let trips = sum(runs, |run| run.trip_count);
     let trips_text = if nor_tripped {
         " and no session ends"
     } else {
@@ -228,7 +228,7 @@ fn nothing_lost(condition: &Condition, runs: &[&Tally], nor_tripped: bool) -> Cr
 }
 
 fn sent(runs: &[&Tally]) -> u64 {
-    runs.iter().map(|run| run.sent_count).sum()
+    sum(runs, |run| run.sent_count)
 }
 
 /// Runs of which a mean says something.
@@ -241,7 +241,7 @@ fn mean_in_range(
     high: f64,
     is_fitted: bool,
 ) -> Criterion {
-    let rates: Vec<f64> = runs.iter().map(|run| run.loss_ratio()).collect();
+    let rates = rates_of(runs);
     let mean = rates.iter().sum::<f64>() / rates.len().max(1) as f64;
     let is_judged = is_fitted && runs.len() >= RUNS_MIN;
     Criterion {

@@ -247,19 +247,17 @@ impl Reading {
     }
 
     fn end_throttle(&mut self, end_ns: i64) {
-        if let Some(begin_ns) = self.throttle_began_ns.take() {
-            let throttled = &mut self.sessions.evidence.throttled;
-            throttled.push(Span { begin_ns, end_ns });
-        }
+        let evidence = &mut self.sessions.evidence;
+        evidence
+            .throttled
+            .extend(Span::ended(&mut self.throttle_began_ns, end_ns));
     }
 
-    fn end_hold(&mut self, at_ns: i64) {
-        if let Some(begin_ns) = self.hold_began_ns.take() {
-            self.sessions.evidence.holds.push(Span {
-                begin_ns,
-                end_ns: at_ns,
-            });
-        }
+    fn end_hold(&mut self, end_ns: i64) {
+        let evidence = &mut self.sessions.evidence;
+        evidence
+            .holds
+            .extend(Span::ended(&mut self.hold_began_ns, end_ns));
     }
 
     fn pause(&mut self, session: u32, begin_ns: i64, until_ns: Option<i64>, end_ns: i64) {
@@ -308,26 +306,14 @@ pub(crate) fn events(log: &RunLog) -> impl Iterator<Item = EgmEvent> + '_ {
 
 /// True for an event of the right arm.
 pub(crate) fn is_right(event: &EgmEvent) -> bool {
-    usize::try_from(event.side) == Ok(Side::Right.index())
+    event.side == Side::Right.number()
 }
 
 fn ends(log: &RunLog) -> Vec<(u32, Option<EndCause>)> {
     events(log)
         .filter(|event| is_right(event) && event.kind == EgmEventKind::Ended as u32)
-        .map(|event| (event.session, cause_of(&event)))
+        .map(|event| (event.session, EndCause::from_number(event.cause)))
         .collect()
-}
-
-/// Why the session of an [`EgmEventKind::Ended`] ended.
-pub(crate) fn cause_of(event: &EgmEvent) -> Option<EndCause> {
-    [
-        EndCause::CommTimeout,
-        EndCause::ConditionTime,
-        EndCause::PositionDeviation,
-        EndCause::Requested,
-    ]
-    .into_iter()
-    .find(|cause| *cause as u32 == event.cause)
 }
 
 fn refused(log: &RunLog) -> u64 {
@@ -344,18 +330,11 @@ fn clipped(record: &Record) -> Vec<Span> {
     for command in &record.commands {
         if command.is_clipped() {
             begin_ns.get_or_insert(command.at_ns);
-        } else if let Some(begin_ns) = begin_ns.take() {
-            spans.push(Span {
-                begin_ns,
-                end_ns: command.at_ns,
-            });
+        } else {
+            spans.extend(Span::ended(&mut begin_ns, command.at_ns));
         }
     }
-    if let (Some(begin_ns), Some(last)) = (begin_ns, record.commands.last()) {
-        spans.push(Span {
-            begin_ns,
-            end_ns: last.at_ns,
-        });
-    }
+    let last = record.commands.last();
+    spans.extend(last.and_then(|last| Span::ended(&mut begin_ns, last.at_ns)));
     spans
 }

@@ -9,7 +9,6 @@ use prost::Message;
 use crate::egm::face::checks::{self, Sender};
 use crate::egm::face::{Axes, REORDERING_MAX_MS, RobotWare};
 use crate::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
-use crate::egm::wire::joints::{EXTERNAL_PLACE, WireJoints};
 use crate::egm::wire::messages::{
     EgmCartesian, EgmClock, EgmEuler, EgmFeedBack, EgmHeader, EgmJoints, EgmPlanned, EgmPose,
     EgmQuaternion, EgmSensor, EgmSpeedRef, EgmTimestamp, MessageType,
@@ -17,7 +16,7 @@ use crate::egm::wire::messages::{
 use crate::egm::wire::robot::{
     EgmMciState, EgmMotorState, EgmRapidCtrlExecState, EgmRobot, MciState, MotorState, RapidState,
 };
-use crate::egm::wire::{self, DatagramCounts, Refusal};
+use crate::egm::wire::{self, DatagramCounts, EXTERNAL_PLACE, Refusal, WireJoints};
 use crate::yumi::arm::{Arm, SPEED_MAX_RAD_PER_S};
 use crate::yumi::{Joints, Pose};
 

@@ -65,17 +65,6 @@ struct Move {
     to: usize,
 }
 
-/// Whether an extension may be given.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Verdict {
-    /// The plan stays valid.
-    Keeps,
-    /// Another plan was found and taken.
-    Reorders,
-    /// No plan was found.
-    Withheld,
-}
-
 /// The plan a coordinator keeps, and room for looking for another.
 #[derive(Debug)]
 pub(crate) struct Plan {
@@ -128,7 +117,7 @@ impl Plan {
     /// no plan was found.
     pub(crate) fn admit(&mut self, traffic: &Traffic, robot: usize, may_reorder: bool) -> bool {
         self.spans.clear();
-        self.spans.extend_from_slice(traffic.spans());
+        self.spans.extend_from_slice(&traffic.spans);
         for step in &self.moves {
             let last = traffic.last(step.robot);
             self.spans[step.robot] = self.margin.standing(step.to, last);
@@ -150,27 +139,21 @@ impl Plan {
         }
     }
 
-    /// Whether `robot` may reserve up to `upper`, which is free of all reservations now.
+    /// Whether `robot` may reserve up to `upper`, which is free of all reservations now: the plan
+    /// stays valid, or another is found and taken.
     pub(crate) fn extend(
         &mut self,
         traffic: &Traffic,
         robot: usize,
         upper: usize,
         may_reorder: bool,
-    ) -> Verdict {
-        if self.keeps(traffic, robot, upper) {
-            return Verdict::Keeps;
-        }
-        if !may_reorder {
-            return Verdict::Withheld;
-        }
-        self.begin_search(traffic, robot);
-        self.spans[robot].upper = upper;
-        if self.search(traffic) {
-            Verdict::Reorders
-        } else {
-            Verdict::Withheld
-        }
+    ) -> bool {
+        self.keeps(traffic, robot, upper)
+            || may_reorder && {
+                self.begin_search(traffic, robot);
+                self.spans[robot].upper = upper;
+                self.search(traffic)
+            }
     }
 
     /// Whether the plan stays valid when `robot` reserves up to `upper`. Only the moves of robots
@@ -233,7 +216,7 @@ impl Plan {
     /// plan finishes them, `first` before all.
     fn begin_search(&mut self, traffic: &Traffic, first: usize) {
         self.spans.clear();
-        self.spans.extend_from_slice(traffic.spans());
+        self.spans.extend_from_slice(&traffic.spans);
         self.is_pending.fill(false);
         self.is_pending[first] = true;
         self.pending.clear();

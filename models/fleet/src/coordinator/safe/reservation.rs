@@ -53,7 +53,8 @@ struct Way {
 pub struct Traffic {
     world: Arc<World>,
     ways: Vec<Option<Way>>,
-    spans: Vec<Span>,
+    /// All reservations.
+    pub(crate) spans: Vec<Span>,
     /// Per robot its contacts, by robot and along the path.
     contacts: Vec<Vec<Contact>>,
 }
@@ -96,11 +97,6 @@ impl Traffic {
     /// The reservation of `robot`.
     pub fn span(&self, robot: usize) -> Span {
         self.spans[robot]
-    }
-
-    /// All reservations.
-    pub(crate) fn spans(&self) -> &[Span] {
-        &self.spans
     }
 
     /// Last pose of the path `robot` is on; 0 for a robot in a bay that no path touches.
