@@ -62,23 +62,33 @@ impl Extent {
 
 /// Measures one case for one round.
 fn measure(
-    (end, case, index): (&mut NearEnd, &CasePlan, usize),
-    (turns, far): (&Turns, &Thread),
+    end: &mut NearEnd,
+    case: &CasePlan,
+    index: usize,
+    turns: &Turns,
+    far: &Thread,
     far_party: &Party,
-    (extent, count): (Extent, &mut u64),
+    extent: Extent,
+    count: &mut u64,
 ) -> Vec<u64> {
     match end {
         NearEnd::PingPong(side) => {
-            ping((turns, far), index, side.as_mut(), (count, extent.slice)).whole
+            ping(turns, far, index, side.as_mut(), count, extent.slice).whole
         }
         NearEnd::Gateway(shared, column) => shared.column(*column, |case, side| {
-            ping((turns, far), case, side, (count, extent.slice))
+            ping(turns, far, case, side, count, extent.slice)
         }),
         NearEnd::Hop { side, noted, usage } => {
-            let time = (extent.paced_slice, PERIOD);
-            let listening = (far_party, noted.as_ref());
-            let (samples, [before, after]) =
-                pace((turns, far), index, side.as_mut(), time, listening);
+            let (samples, [before, after]) = pace(
+                turns,
+                far,
+                index,
+                side.as_mut(),
+                extent.paced_slice,
+                PERIOD,
+                far_party,
+                noted.as_ref(),
+            );
             usage.add(before, after);
             samples
         }
@@ -106,14 +116,7 @@ fn run(setup: &mut Setup, cases: &[CasePlan], extent: Extent) -> Comparison {
         .enumerate()
         .map(|(index, (end, case))| {
             let (far, mut count) = (far.clone(), 0);
-            move || {
-                measure(
-                    (end, case, index),
-                    (turns, &far),
-                    far_party,
-                    (extent, &mut count),
-                )
-            }
+            move || measure(end, case, index, turns, &far, far_party, extent, &mut count)
         })
         .collect();
     let mut contestants: Vec<_> = rounds
@@ -226,7 +229,8 @@ fn print_usage(setup: &Setup, cases: &[CasePlan]) {
 fn print_segments(
     hosts: &Hosts,
     title: &str,
-    (plan, woken): (Plan, [Vec<u64>; 2]),
+    plan: Plan,
+    woken: [Vec<u64>; 2],
 ) -> Result<(), SetupError> {
     // In the two-thread cases the application is no party of its own, and the last message of a
     // round lies in its socket until the next round: medians tell, the tail does not.
@@ -308,7 +312,8 @@ fn print_coverage(setup: &Setup, cases: &[CasePlan]) {
 fn report(
     mut setup: Setup,
     cases: &[CasePlan],
-    (outcome, cpu_count): (&Comparison, usize),
+    outcome: &Comparison,
+    cpu_count: usize,
 ) -> Result<(), SetupError> {
     for (row, case) in outcome.rows.iter().zip(cases) {
         let reference = &outcome.rows[case.reference];
@@ -349,12 +354,13 @@ fn report(
             print_segments(
                 &setup.hosts,
                 case.title,
-                (before.plan, [Vec::new(), Vec::new()]),
+                before.plan,
+                [Vec::new(), Vec::new()],
             )?;
         }
     }
     for (case, woken) in woken {
-        print_segments(&setup.hosts, case.title, (case.plan, woken))?;
+        print_segments(&setup.hosts, case.title, case.plan, woken)?;
     }
     println!();
     for verdict in &verdicts {
@@ -386,7 +392,7 @@ fn measure_all(cpu_count: usize) -> Result<(), SetupError> {
     let before = MachineTime::read();
     let outcome = run(&mut setup, &cases, extent);
     println!("{}", stolen_text(before, MachineTime::read()));
-    report(setup, &cases, (&outcome, cpu_count))
+    report(setup, &cases, &outcome, cpu_count)
 }
 
 fn main() -> ExitCode {

@@ -69,7 +69,7 @@ struct Tapped {
 }
 
 fn measure() -> Result<(), SetupError> {
-    let arguments = Arguments::read((30, 1.0))?;
+    let arguments = Arguments::read(30, 1.0)?;
     // Built before anything is measured, not between.
     println!("binary: {}", hil_runtime_binary().display());
     let drainer = Drainer::start();

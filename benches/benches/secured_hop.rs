@@ -148,7 +148,7 @@ fn trip(hop: &mut Hop, datagram: &[u8]) -> Option<u64> {
 }
 
 /// Round trips of one hop for one turn, nanoseconds, and how many were lost.
-fn turn(hop: &mut Hop, size: usize, (length, number): (Duration, &mut u64)) -> (Vec<u64>, u64) {
+fn turn(hop: &mut Hop, size: usize, length: Duration, number: &mut u64) -> (Vec<u64>, u64) {
     let began = WallInstant::now();
     let (mut trips, mut lost_count) = (Vec::new(), 0);
     while began.elapsed() < length {
@@ -162,7 +162,7 @@ fn turn(hop: &mut Hop, size: usize, (length, number): (Duration, &mut u64)) -> (
 }
 
 /// Both hops in every round, in an order drawn by lot.
-fn compare(hops: &mut [Hop; 2], size: usize, (rounds, length): (u64, Duration)) {
+fn compare(hops: &mut [Hop; 2], size: usize, rounds: u64, length: Duration) {
     let mut lots = RandomStream::new(SEED, "turns");
     let mut ratios: [Vec<f64>; 3] = Default::default();
     let mut all: [Vec<u64>; 2] = Default::default();
@@ -171,7 +171,7 @@ fn compare(hops: &mut [Hop; 2], size: usize, (rounds, length): (u64, Duration)) 
         let mut found = [None, None];
         let first = usize::from(lots.chance(0.5));
         for kind in [first, 1 - first] {
-            let (mut trips, lost_count) = turn(&mut hops[kind], size, (length, &mut number));
+            let (mut trips, lost_count) = turn(&mut hops[kind], size, length, &mut number);
             found[kind] = Quantiles::of(&mut trips);
             lost[kind] += lost_count;
             all[kind].append(&mut trips);
@@ -351,7 +351,7 @@ fn measure() -> Result<(), SetupError> {
     let mut hops = [open(&network, 0)?, open(&network, 1)?];
     for size in SIZES {
         let before = MachineTime::read();
-        compare(&mut hops, size, (rounds, length));
+        compare(&mut hops, size, rounds, length);
         println!("  {}", stolen_text(before, MachineTime::read()));
     }
     Ok(())

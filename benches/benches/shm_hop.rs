@@ -94,7 +94,7 @@ fn sides(address: &DomainAddress, is_ping: bool) -> Vec<Box<dyn Side>> {
             let outward = if is_ping { "ping" } else { "pong" };
             let homeward = if is_ping { "pong" } else { "ping" };
             let name = |way: &str| format!("{stem}/{placement}/{way}");
-            (name(outward), name(homeward))
+            [name(outward), name(homeward)]
         };
         sides.push(Box::new(Bare::open(&node, names("bare-spin"), false)));
         sides.push(Box::new(Stamped::open(&node, names("stamped-spin"))));
@@ -124,8 +124,8 @@ fn bare_node(address: &DomainAddress) -> Node<ipc::Service> {
 }
 
 impl Bare {
-    fn open(node: &Node<ipc::Service>, names: (String, String), is_blocking: bool) -> Self {
-        let [out, back] = [names.0, names.1].map(|name| name.as_str().try_into().unwrap());
+    fn open(node: &Node<ipc::Service>, names: [String; 2], is_blocking: bool) -> Self {
+        let [out, back] = names.map(|name| name.as_str().try_into().unwrap());
         let service = |name| {
             let builder = node.service_builder(name).publish_subscribe::<Line>();
             builder
@@ -181,8 +181,8 @@ struct Stamped {
 }
 
 impl Stamped {
-    fn open(node: &Node<ipc::Service>, names: (String, String)) -> Self {
-        let [out, back] = [names.0, names.1].map(|name| name.as_str().try_into().unwrap());
+    fn open(node: &Node<ipc::Service>, names: [String; 2]) -> Self {
+        let [out, back] = names.map(|name| name.as_str().try_into().unwrap());
         let service = |name| {
             let builder = node.service_builder(name).publish_subscribe::<Line>();
             let builder = builder.user_header::<Line>().subscriber_max_buffer_size(1);
@@ -225,7 +225,7 @@ fn settings(notifies_readers: bool) -> OutputSettings {
 }
 
 impl Typed {
-    fn open(domain: &Domain, (out, back): (String, String), is_blocking: bool) -> Self {
+    fn open(domain: &Domain, [out, back]: [String; 2], is_blocking: bool) -> Self {
         Self {
             output: TypedOutput::open(domain, &out, settings(is_blocking)).unwrap(),
             input: TypedInput::open(domain, &back, 1).unwrap(),
@@ -262,7 +262,7 @@ struct Bytes {
 }
 
 impl Bytes {
-    fn open(domain: &Domain, (out, back): (String, String)) -> Self {
+    fn open(domain: &Domain, [out, back]: [String; 2]) -> Self {
         let message = MessageType::of::<Line>();
         Self {
             output: ShmOutput::open(domain, &out, &message, settings(false)).unwrap(),

@@ -138,6 +138,10 @@ impl Pair {
         let far = Arc::new(FarTimes::default());
         let stop = Arc::new(AtomicBool::new(false));
         let (ready, refused) = channel();
+        let context = ThreadContext {
+            stop: &stop,
+            refused: &ready,
+        };
         let mut threads = Vec::new();
         let mut recorders = Vec::new();
         let listens_at = hosts.network.free_address(1)?;
@@ -149,18 +153,13 @@ impl Pair {
             })?;
             recorder.start()?;
             recorders.push(recorder);
-            threads.push(face(
-                settings,
-                opened,
-                (host, &addresses[host]),
-                (&stop, &ready),
-            ));
+            threads.push(face(settings, opened, host, &addresses[host], context));
         }
         hosts.start_recording()?;
         for joint in joints {
-            threads.extend(gateways(joint, (&stop, &ready)));
+            threads.extend(gateways(joint, context));
         }
-        threads.push(controller(&addresses[1], &far, (&stop, &ready)));
+        threads.push(controller(&addresses[1], &far, context));
         let ways = [
             Way::open(&domains[1], ["direct/out", "direct/back"], untyped())?,
             Way::open(&domains[0], ["gateways/out", "gateways/back"], untyped())?,
@@ -371,16 +370,22 @@ fn settings(host: usize, listens_at: std::net::SocketAddr) -> FaceSettings {
     }
 }
 
-/// What every thread is told: when to stop, and where to say what the kernel refused it.
-type Around<'a> = (&'a Arc<AtomicBool>, &'a Sender<Vec<String>>);
+/// What every thread is told.
+#[derive(Clone, Copy)]
+struct ThreadContext<'a> {
+    /// Set when the threads are to stop.
+    stop: &'a Arc<AtomicBool>,
+    /// Takes what the kernel refused a thread.
+    refused: &'a Sender<Vec<String>>,
+}
 
 /// A thread of its own on the CPU of its host.
 fn party(
     cpu: usize,
-    (stop, refused): Around<'_>,
+    context: ThreadContext<'_>,
     work: impl FnOnce(&AtomicBool) -> Result<(), SetupError> + Send + 'static,
 ) -> JoinHandle<Result<(), String>> {
-    let (stop, refused) = (Arc::clone(stop), refused.clone());
+    let (stop, refused) = (Arc::clone(context.stop), context.refused.clone());
     thread::spawn(move || {
         // Nobody listens any more once the bench is over.
         let _over = refused.send(claim(cpu)).is_err();
@@ -391,21 +396,22 @@ fn party(
 fn face(
     settings: FaceSettings,
     opened: OpenedArm,
-    (cpu, address): (usize, &DomainAddress),
-    around: Around<'_>,
+    cpu: usize,
+    address: &DomainAddress,
+    context: ThreadContext<'_>,
 ) -> JoinHandle<Result<(), String>> {
     let address = address.clone();
-    party(cpu, around, move |stop| {
+    party(cpu, context, move |stop| {
         let domain = Domain::open(&address)?;
         let mut joined = opened.connect(&settings, &settings.arms[0], &domain)?;
         Ok(joined.run(stop)?)
     })
 }
 
-fn gateways(joint: Joint, around: Around<'_>) -> [JoinHandle<Result<(), String>>; 2] {
+fn gateways(joint: Joint, context: ThreadContext<'_>) -> [JoinHandle<Result<(), String>>; 2] {
     let cpu = joint.host;
     joint.split().map(|loose| {
-        party(cpu, around, move |stop| {
+        party(cpu, context, move |stop| {
             let (_launch, mut direction) = loose.connect()?;
             while !stop.load(Ordering::Acquire) {
                 if !direction.step()? {
@@ -421,10 +427,10 @@ fn gateways(joint: Joint, around: Around<'_>) -> [JoinHandle<Result<(), String>>
 fn controller(
     address: &DomainAddress,
     times: &Arc<FarTimes>,
-    around: Around<'_>,
+    context: ThreadContext<'_>,
 ) -> JoinHandle<Result<(), String>> {
     let (address, times) = (address.clone(), Arc::clone(times));
-    party(1, around, move |stop| {
+    party(1, context, move |stop| {
         let domain = Domain::open(&address)?;
         let [feedback, command] = typed().map(|one| one.1);
         let mut ways = [

@@ -1,7 +1,6 @@
 //! What the machine was like while a bench ran. It describes; it does not tune.
 
-use std::fs;
-use std::io;
+use std::{fs, io};
 
 use nix::sched::{CpuSet, sched_setaffinity};
 use nix::unistd::Pid;

@@ -10,12 +10,11 @@ mod arguments;
 
 pub use arguments::Arguments;
 
-use std::fs;
 use std::ops::Range;
 use std::path::Path;
 use std::process::ExitCode;
-use std::thread;
 use std::time::Duration;
+use std::{fs, thread};
 
 use hil_core::random::RandomStream;
 use hil_core::record::{TakenRecord, UNAVAILABLE};
@@ -135,13 +134,13 @@ impl<const N: usize> Contest<N> {
             trial = trial.set(setting);
         }
         let mut hosts = [
-            start(&trial, (lab, 0), &arguments.pins)?,
-            start(&trial, (lab, 1), &arguments.pins)?,
+            start(&trial, lab, 0, &arguments.pins)?,
+            start(&trial, lab, 1, &arguments.pins)?,
         ];
         let folder = trial.folder("-control-pc", LIMIT);
         thread::sleep(WARM_UP);
         let before = MachineTime::read();
-        let rounds = take_rounds::<N>((arguments.round_count, arguments.turn), take)?;
+        let rounds = take_rounds::<N>(arguments.round_count, arguments.turn, take)?;
         println!("{}", stolen_text(before, MachineTime::read()));
         for host in &hosts {
             host.signal(Signal::SIGINT)?;
@@ -236,11 +235,7 @@ fn verdict(ratio: &TypicalRatio, aim: f64) -> &'static str {
 }
 
 /// Starts the run of one host, whose processes stay on its processor, if it has one.
-fn start(
-    trial: &Trial,
-    (lab, index): (&Lab, usize),
-    pins: &[usize],
-) -> Result<ChildGuard, SetupError> {
+fn start(trial: &Trial, lab: &Lab, index: usize, pins: &[usize]) -> Result<ChildGuard, SetupError> {
     let Some(cpu) = pins.get(index).copied() else {
         return Ok(trial.start_on(lab.host(index)));
     };
@@ -254,7 +249,8 @@ fn start(
 
 /// Every kind twice a round: there in an order drawn by lot, and back.
 fn take_rounds<const N: usize>(
-    (round_count, turn): (usize, Duration),
+    round_count: usize,
+    turn: Duration,
     take: Take<'_>,
 ) -> Result<Vec<Round<N>>, SetupError> {
     let mut lots = RandomStream::new(SEED, "turns");
@@ -462,7 +458,7 @@ mod tests {
     fn every_kind_has_its_turns_there_and_back_and_not_always_in_one_order() {
         let turn = Duration::from_secs(1);
         let mut taken = Vec::new();
-        let rounds = take_rounds::<3>((12, turn), &mut |kind, length| {
+        let rounds = take_rounds::<3>(12, turn, &mut |kind, length| {
             taken.push((kind, length.as_secs()));
             Ok(0..1)
         });

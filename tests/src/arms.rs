@@ -1,6 +1,7 @@
 //! What a run's records say of an arm: its sessions, when commands arrived, whether each joint
 //! followed. It starts nothing.
 
+use core::ops::Range;
 use std::fs;
 
 use hil_arm::egm::messages::{EgmArrival, EgmCommand, EgmEvent, EgmEventKind, EgmFeedback, Side};
@@ -93,11 +94,9 @@ impl Arms {
 
     /// Which way each joint of `side` was commanded to go while the first one went up: its
     /// correlation with it, between -1 and 1.
-    pub fn sense(&self, side: Side, (from_ns, until_ns): (i64, i64)) -> [f64; JOINT_COUNT] {
+    pub fn sense(&self, side: Side, window_ns: Range<i64>) -> [f64; JOINT_COUNT] {
         let commands = self.commands(side);
-        let inside = commands
-            .iter()
-            .filter(|(at, _)| (from_ns..until_ns).contains(at));
+        let inside = commands.iter().filter(|(at, _)| window_ns.contains(at));
         let joints: Vec<_> = inside.map(|(_, command)| command.position_rad).collect();
         core::array::from_fn(|joint| {
             let pairs = |a: usize, b: usize| joints.iter().map(|q| (q[a], q[b])).collect();
@@ -106,19 +105,14 @@ impl Arms {
         })
     }
 
-    /// How each joint of `side` followed between `from_ns` and `until_ns`, chain order. A joint
+    /// How each joint of `side` followed in `window_ns`, chain order. A joint
     /// is compared with its command `lag_ns` before.
-    pub fn follow(
-        &self,
-        side: Side,
-        (from_ns, until_ns): (i64, i64),
-        lag_ns: i64,
-    ) -> [Follow; JOINT_COUNT] {
+    pub fn follow(&self, side: Side, window_ns: Range<i64>, lag_ns: i64) -> [Follow; JOINT_COUNT] {
         let commands = self.commands(side);
         let mut pairs: Vec<(EgmCommand, EgmFeedback)> = Vec::new();
         for (at_ns, feedback) in self.feedbacks(side) {
             let next = commands.partition_point(|(sent_ns, _)| *sent_ns <= at_ns - lag_ns);
-            if (from_ns..until_ns).contains(&at_ns) && next > 0 {
+            if window_ns.contains(&at_ns) && next > 0 {
                 pairs.push((commands[next - 1].1, feedback));
             }
         }

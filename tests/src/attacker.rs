@@ -55,7 +55,7 @@ impl Flood {
 
 impl Attacker {
     /// Joins a namespace called `namespace` to the bridge of the namespace `first`. It takes the address
-    /// `as_host` and knows where `towards` is.
+    /// `as_host` and knows that `target` has the link address `hardware`.
     ///
     /// # Panics
     /// When it cannot be built.
@@ -63,9 +63,9 @@ impl Attacker {
         first: &str,
         namespace: &str,
         as_host: Ipv4Addr,
-        towards: (Ipv4Addr, &str),
+        target: Ipv4Addr,
+        hardware: &str,
     ) -> Self {
-        let (target, hardware) = towards;
         // From here on dropping it cleans up.
         let attacker = Self {
             namespace: namespace.to_owned(),
@@ -162,8 +162,10 @@ impl Attacker {
     /// When it has no socket, or nothing to send.
     pub fn flood(
         &self,
-        (from, to): (SocketAddrV4, SocketAddrV4),
-        (span, rate): (Duration, u32),
+        from: SocketAddrV4,
+        to: SocketAddrV4,
+        span: Duration,
+        rate: u32,
         datagrams: &[Vec<u8>],
     ) -> Flood {
         assert!(!datagrams.is_empty(), "nothing to send");

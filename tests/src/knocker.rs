@@ -37,7 +37,8 @@ pub struct Knocked {
 /// When no socket can be had there.
 pub fn knock(
     host: &LabHost,
-    (from, to): (Ipv4Addr, SocketAddrV4),
+    from: Ipv4Addr,
+    to: SocketAddrV4,
     rate: u32,
     is_over: &AtomicBool,
 ) -> Knocked {

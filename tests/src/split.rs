@@ -2,6 +2,7 @@
 //! nothing but that the run went as planned.
 #![allow(clippy::print_stdout, reason = "a test's figures are its result")]
 
+use core::ops::Range;
 use std::time::Duration;
 
 use hil_core::record::TakenRecord;
@@ -123,14 +124,14 @@ pub fn refused(direction: &DirectionSummary) -> u64 {
     refused.map(|one| one.count).sum()
 }
 
-/// How long the messages of `channel` that were published between `from_ns` and `until_ns` took over the hop
+/// How long the messages of `channel` that were published in `window_ns` took over the hop
 /// (until the receiving gateway published them) and end to end.
 ///
 /// # Panics
 /// When the records cannot be read.
-pub fn delays(files: &RunFiles, channel: &str, (from_ns, until_ns): (i64, i64)) -> [Latencies; 2] {
+pub fn delays(files: &RunFiles, channel: &str, window_ns: Range<i64>) -> [Latencies; 2] {
     let mut taken: Vec<TakenRecord> = records(files, channel, "taken");
-    taken.retain(|one| (from_ns..until_ns).contains(&one.published_ns));
+    taken.retain(|one| window_ns.contains(&one.published_ns));
     let hop = taken.iter().map(|one| one.forwarded_ns - one.published_ns);
     let whole = taken.iter().map(|one| one.taken_ns - one.published_ns);
     [Latencies::of(hop.collect()), Latencies::of(whole.collect())]

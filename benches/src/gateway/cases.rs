@@ -64,10 +64,12 @@ pub fn case_plans(cpu_count: usize) -> Vec<CasePlan> {
             for is_stamped in [true, false] {
                 let stamps = if is_stamped { "stamps" } else { "no stamps" };
                 let name = |what: &str| format!("{what} {} {size} B {stamps}", word(wait));
-                let traits = (size, wait, is_stamped);
-                let echo = list.add(Kind::Echo, name("UDP echo"), traits, None);
-                list.add(Kind::Gateway, name("put-gateways-take"), traits, Some(echo));
-                list.add(Kind::BetweenGateways, name("gateways"), traits, Some(echo));
+                let mut add = |kind, what, reference| {
+                    list.add(kind, name(what), size, wait, is_stamped, reference)
+                };
+                let echo = add(Kind::Echo, "UDP echo", None);
+                add(Kind::Gateway, "put-gateways-take", Some(echo));
+                add(Kind::BetweenGateways, "gateways", Some(echo));
                 if is_stamped && wait == BLOCK {
                     blocking_echo.insert(size, echo);
                 }
@@ -75,24 +77,24 @@ pub fn case_plans(cpu_count: usize) -> Vec<CasePlan> {
         }
     }
     let plain = "plain UDP echo block 64 B no stamps".to_owned();
-    list.add(Kind::Plain, plain, (64, BLOCK, false), None);
+    list.add(Kind::Plain, plain, 64, BLOCK, false, None);
     let mut spinning = None;
     for wait in [WaitMode::Spin, WaitMode::Hybrid, BLOCK] {
         let name = format!("one hop {} 64 B 1 kHz", word(wait));
-        let hop = list.add(Kind::Hop, name, (64, wait, true), spinning);
+        let hop = list.add(Kind::Hop, name, 64, wait, true, spinning);
         spinning.get_or_insert(hop);
     }
     for (size, echo) in blocking_echo {
         let kind = Kind::Applications { is_paced: false };
         let name = format!("applications block {size} B");
-        list.add(kind, name, (size, BLOCK, true), Some(echo));
+        list.add(kind, name, size, BLOCK, true, Some(echo));
     }
     let spin = (cpu_count >= PARTY_COUNT).then_some(WaitMode::Spin);
     let mut reference = None;
     for wait in spin.into_iter().chain([BLOCK, WaitMode::Hybrid]) {
         let kind = Kind::Applications { is_paced: true };
         let name = format!("applications {} 64 B 1 kHz", word(wait));
-        let case = list.add(kind, name, (64, wait, true), reference);
+        let case = list.add(kind, name, 64, wait, true, reference);
         reference.get_or_insert(case);
     }
     list.cases
@@ -128,7 +130,9 @@ impl List {
         &mut self,
         kind: Kind,
         title: String,
-        (size_bytes, wait, is_stamped): (usize, WaitMode, bool),
+        size_bytes: usize,
+        wait: WaitMode,
+        is_stamped: bool,
         reference: Option<usize>,
     ) -> usize {
         let case = self.cases.len();

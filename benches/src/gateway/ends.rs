@@ -172,7 +172,7 @@ impl Setup {
         });
         let mut near: Vec<NearEnd> = Vec::new();
         for (case, end) in near_ends.into_iter().enumerate() {
-            let connected = connect(end, near.last(), (case, &turns, cpu_count))?;
+            let connected = connect(end, near.last(), case, &turns, cpu_count)?;
             near.push(connected);
         }
         greet_near(&mut near, &remaining)?;
@@ -225,7 +225,9 @@ fn open_case(
 fn connect(
     end: Loose,
     before: Option<&NearEnd>,
-    (case, turns, cpu_count): (usize, &Arc<Turns>, usize),
+    case: usize,
+    turns: &Arc<Turns>,
+    cpu_count: usize,
 ) -> Result<NearEnd, SetupError> {
     Ok(match end {
         Loose::Ready(side) => NearEnd::PingPong(side),

@@ -2,19 +2,16 @@
 //! gateway direction at either end, opened as the gateway process opens it.
 
 use std::error::Error;
-use std::fs;
 use std::path::PathBuf;
-use std::process;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{fs, process, thread};
 
 use hil_core::message::MessageType;
 use hil_core::record::{EgressRecord, IngressRecord};
 use hil_engine::gateway::Surroundings;
-use hil_engine::gateway::direction;
-use hil_engine::gateway::direction::{Direction, OpenDirection};
+use hil_engine::gateway::direction::{self, Direction, OpenDirection};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
@@ -314,7 +311,8 @@ impl Hosts {
         &self,
         plan: &Plan,
         host: usize,
-        (kind, keeper): (&str, usize),
+        kind: &str,
+        keeper: usize,
     ) -> Result<RecordFile, SetupError> {
         let channel = plan.channel_of(host).replace('/', ".");
         let name = format!("{channel}.{kind}.h{keeper}.0.rec");

@@ -4,8 +4,7 @@
 use std::fs;
 use std::time::{Duration, Instant};
 
-use hil_platform::realtime;
-use hil_platform::realtime::{RealtimeRequest, SchedulingPolicy};
+use hil_platform::realtime::{self, RealtimeRequest, SchedulingPolicy};
 use nix::unistd::gettid;
 
 /// Real-time priority that benches ask for: above ordinary work, below interrupt threads.

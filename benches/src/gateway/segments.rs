@@ -33,12 +33,12 @@ pub fn segments(
 ) -> Result<[Option<Quantiles>; 7], SetupError> {
     let mut samples: [Vec<u64>; 7] = Default::default();
     for host in 0..2 {
-        let sent = hosts.records(plan, host, ("egress", host))?;
+        let sent = hosts.records(plan, host, "egress", host)?;
         let sent: BTreeMap<(u32, u64), EgressRecord> = sent
             .records()
             .map(|record: EgressRecord| ((record.epoch, record.sequence), record))
             .collect();
-        let received = hosts.records(plan, host, ("ingress", 1 - host))?;
+        let received = hosts.records(plan, host, "ingress", 1 - host)?;
         for arrival in received.records::<IngressRecord>() {
             if let Some(departure) = sent.get(&(arrival.epoch, arrival.sequence)) {
                 split(departure, &arrival, &mut samples);

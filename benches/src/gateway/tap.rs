@@ -8,8 +8,7 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use hil_capture::flow::FlowFilter;
-use hil_capture::writer;
-use hil_capture::writer::PacketToWrite;
+use hil_capture::writer::{self, PacketToWrite};
 use hil_net::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
 
 use super::hosts::SetupError;

@@ -124,10 +124,12 @@ pub struct RoundTrips {
 
 /// Round trips of `side` for `slice` while the far thread answers `case`.
 pub fn ping(
-    (turns, far): (&Turns, &Thread),
+    turns: &Turns,
+    far: &Thread,
     case: usize,
     side: &mut dyn Side,
-    (count, slice): (&mut u64, Duration),
+    count: &mut u64,
+    slice: Duration,
 ) -> RoundTrips {
     // Lets ordinary work have the processors before they are taken for a slice.
     thread::sleep(Duration::from_millis(3));
@@ -191,11 +193,14 @@ fn sample(slice: Duration, mut round_trip: impl FnMut() -> Option<u64>) -> Round
 /// Sends a message every `period` for `slice` while the far thread listens as `case`, after a
 /// while in which it learns the period; gives what the far thread used.
 pub fn pace(
-    (turns, far): (&Turns, &Thread),
+    turns: &Turns,
+    far: &Thread,
     case: usize,
     side: &mut dyn Side,
-    (slice, period): (Duration, Duration),
-    (listening, noted): (&Party, &Mutex<Vec<u64>>),
+    slice: Duration,
+    period: Duration,
+    listening: &Party,
+    noted: &Mutex<Vec<u64>>,
 ) -> (Vec<u64>, [Used; 2]) {
     // A case that spun has starved ordinary work, and the kernel pays that back.
     thread::sleep(PACE_REST);

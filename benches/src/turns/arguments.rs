@@ -31,7 +31,7 @@ impl Arguments {
     ///
     /// # Errors
     /// At a word it does not know, or a value that is no number.
-    pub fn read((round_count, turn_s): (usize, f64)) -> Result<Self, SetupError> {
+    pub fn read(round_count: usize, turn_s: f64) -> Result<Self, SetupError> {
         let said = |name| std::env::var(name).ok();
         let of_environment = [
             ("--rounds", said(ROUNDS_VARIABLE)),
@@ -43,12 +43,13 @@ impl Arguments {
             given.extend(value.into_iter().flat_map(|value| [word.to_owned(), value]));
         }
         given.extend(std::env::args().skip(1).filter(|word| word != "--bench"));
-        Self::of(given.into_iter(), (round_count, turn_s))
+        Self::of(given.into_iter(), round_count, turn_s)
     }
 
     fn of(
         mut given: impl Iterator<Item = String>,
-        (round_count, turn_s): (usize, f64),
+        round_count: usize,
+        turn_s: f64,
     ) -> Result<Self, SetupError> {
         let mut read = Self {
             round_count,
@@ -84,13 +85,13 @@ mod tests {
         let words = [
             "--rounds", "7", "--pin", "0,1", "--turn", "0.5", "--rounds", "9",
         ];
-        let read = Arguments::of(words.map(str::to_owned).into_iter(), (60, 1.5)).unwrap();
+        let read = Arguments::of(words.map(str::to_owned).into_iter(), 60, 1.5).unwrap();
         assert_eq!(
             (read.round_count, read.turn),
             (9, Duration::from_millis(500))
         );
         assert_eq!(read.pins, [0, 1]);
-        let read = Arguments::of(core::iter::empty(), (60, 1.5)).unwrap();
+        let read = Arguments::of(core::iter::empty(), 60, 1.5).unwrap();
         assert_eq!(
             (read.round_count, read.turn),
             (60, Duration::from_millis(1500))
@@ -101,7 +102,7 @@ mod tests {
             ["--what", "1"],
             ["--pin", "0-1"],
         ] {
-            assert!(Arguments::of(words.map(str::to_owned).into_iter(), (1, 1.0)).is_err());
+            assert!(Arguments::of(words.map(str::to_owned).into_iter(), 1, 1.0).is_err());
         }
     }
 }

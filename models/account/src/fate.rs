@@ -5,8 +5,7 @@ use super::figures::{Gap, InterruptionFigures};
 use super::join::{Join, Joined, Key};
 use super::stage::{MessageFate, Side};
 use super::{AccountContext, ChannelPath, ChannelRecords, Interruption, PathProcess, RunSpan};
-use hil_core::record::stamp;
-use hil_core::record::{EgressRecord, IngressRecord};
+use hil_core::record::{EgressRecord, IngressRecord, stamp};
 use hil_core::time::{Instant, RemoteInstant, duration_ns};
 
 /// Judges messages in key order.
@@ -51,8 +50,8 @@ impl<'a> Judge<'a> {
             files: *records,
             is_gateway: context.path.is_gateway(),
             path,
-            last_egress: join.last_egress(),
-            last_taken: join.last_taken(),
+            last_egress: join.last_egress,
+            last_taken: join.last_taken,
             producer_end_ns: producer_end.or_else(|| to_producer(consumer_end?)),
             consumer_end_ns: consumer_end.or_else(|| to_consumer(producer_end?)),
             flight_ns: duration_ns(context.flight_time_max),

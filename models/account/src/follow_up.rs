@@ -3,8 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use super::ChannelRecords;
-use super::source::each;
+use super::{ChannelRecords, each};
 
 /// A number that no stamp was reported for.
 const NONE: i32 = i32::MIN;

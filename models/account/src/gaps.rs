@@ -5,9 +5,8 @@ use std::collections::BTreeMap;
 
 use super::figures::{BurstCount, Gap, Gaps};
 use super::join::Key;
-use super::source::each;
 use super::stage::{MessageFate, Side};
-use super::{AccountContext, ChannelRecords, Interruption};
+use super::{AccountContext, ChannelRecords, Interruption, each};
 use hil_core::record::stamp;
 use hil_stats::histogram::LatencyHistogram;
 use hil_stats::in_order::in_order;

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use std::rc::Rc;
 
 use super::follow_up::FollowUps;
-use super::source::each;
-use super::{ChannelRecords, RecordSource};
-use hil_core::record::stamp;
-use hil_core::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
+use super::{ChannelRecords, RecordSource, each};
+use hil_core::record::{
+    EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE, stamp,
+};
 use hil_stats::in_order::{InOrder, in_order};
 
 /// A message's place: the order of the producer's starts, then the sequence number.
@@ -207,9 +207,12 @@ pub(super) struct Join<'a> {
     ingress: Cursor<'a, IngressRecord>,
     taken: Cursor<'a, TakenRecord>,
     follow_ups: FollowUps,
-    last_egress: Option<Key>,
-    last_taken: Option<Key>,
-    epoch_count: u64,
+    /// The last message the sending gateway took.
+    pub(super) last_egress: Option<Key>,
+    /// The last message the consumer took.
+    pub(super) last_taken: Option<Key>,
+    /// Starts of the producer that left a message.
+    pub(super) epoch_count: u64,
     next: Key,
 }
 
@@ -235,21 +238,6 @@ impl<'a> Join<'a> {
                 sequence: 0,
             },
         }
-    }
-
-    /// Starts of the producer that left a message.
-    pub(super) const fn epoch_count(&self) -> u64 {
-        self.epoch_count
-    }
-
-    /// The last message the sending gateway took.
-    pub(super) const fn last_egress(&self) -> Option<Key> {
-        self.last_egress
-    }
-
-    /// The last message the consumer took.
-    pub(super) const fn last_taken(&self) -> Option<Key> {
-        self.last_taken
     }
 
     fn gather(&mut self, key: Key) -> Joined {

@@ -21,7 +21,6 @@ mod fate;
 mod figures;
 mod follow_up;
 mod gaps;
-mod handed;
 mod join;
 pub mod network;
 mod outage;
@@ -30,13 +29,13 @@ pub mod radio;
 #[cfg(test)]
 mod random_fates;
 mod segments;
-mod source;
 mod stage;
 mod story;
 pub mod synthetic;
 #[cfg(test)]
 mod tests;
 
+use core::fmt::Debug;
 use core::time::Duration;
 
 pub use figures::{
@@ -49,8 +48,6 @@ pub use outage::{
     OutageFinder, Standing, foregoing, outages,
 };
 pub use passage::passages;
-pub use source::RecordSource;
-pub use source::each;
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
 
@@ -316,7 +313,7 @@ impl<'a> AccountContext<'a> {
 pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> ChannelAccount {
     let records = records.on(context.path);
     let join = join::Join::new(&records);
-    let producer_restart_count = join.epoch_count().saturating_sub(1);
+    let producer_restart_count = join.epoch_count.saturating_sub(1);
     let mut judge = fate::Judge::new(&records, context, &join);
     let mut book = segments::SegmentBook::new(&records, context);
     let mut bursts = gaps::Bursts::default();
@@ -356,7 +353,7 @@ pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Ch
         hardware_wire: book.hardware_wire(),
         end_to_end: book.end_to_end(&mut random),
         closing: book.closing(),
-        coverage: book.coverage(),
+        coverage: book.coverage,
         round_trip: round_trip(context),
         loss_bursts: bursts.finish(),
         gaps,
@@ -398,4 +395,40 @@ fn round_trip(context: &AccountContext<'_>) -> hil_stats::histogram::Distributio
         histogram.record(*round_trip_ns);
     }
     histogram.distribution("no clock exchange took place")
+}
+
+/// The records of one kind, in the order they were written.
+pub trait RecordSource<R>: Debug {
+    /// How many.
+    fn count(&self) -> u64;
+
+    /// All of them from the first on; every call gives the same ones.
+    fn each(&self) -> Box<dyn Iterator<Item = R> + '_>;
+}
+
+impl<R: Copy + Debug> RecordSource<R> for Vec<R> {
+    fn count(&self) -> u64 {
+        self.len() as u64
+    }
+
+    fn each(&self) -> Box<dyn Iterator<Item = R> + '_> {
+        Box::new(self.iter().copied())
+    }
+}
+
+impl<R: Copy + Debug, const N: usize> RecordSource<R> for [R; N] {
+    fn count(&self) -> u64 {
+        N as u64
+    }
+
+    fn each(&self) -> Box<dyn Iterator<Item = R> + '_> {
+        Box::new(self.iter().copied())
+    }
+}
+
+/// The records of a file that may not be at hand; none when it is not.
+pub fn each<'a, R: 'a>(
+    source: Option<&'a dyn RecordSource<R>>,
+) -> impl Iterator<Item = R> + use<'a, R> {
+    source.into_iter().flat_map(RecordSource::each)
 }

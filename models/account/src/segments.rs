@@ -6,8 +6,7 @@ use super::join::Joined;
 use super::stage::{Side, Stage};
 use super::{AccountContext, ChannelPath, ChannelRecords, ORDER_TOLERANCE_NS, RESIDUAL_LIMIT_NS};
 use hil_core::random::RandomStream;
-use hil_core::record::EgressRecord;
-use hil_core::record::stamp;
+use hil_core::record::{EgressRecord, stamp};
 use hil_core::time::RemoteInstant;
 use hil_stats::bounds::Bounds;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
@@ -118,7 +117,7 @@ pub(super) struct SegmentBook<'a> {
     end_to_end_bounds_ns: Bounds,
     residual: LatencyHistogram,
     closing: ClosingFigures,
-    coverage: StampCoverage,
+    pub(super) coverage: StampCoverage,
 }
 
 impl<'a> SegmentBook<'a> {
@@ -185,7 +184,7 @@ impl<'a> SegmentBook<'a> {
             is_ordered &= length_ns >= -ORDER_TOLERANCE_NS.saturating_add_unsigned(bound_ns);
         }
         self.count_hardware(joined);
-        self.close(joined, &timeline, (sum_ns, is_ordered));
+        self.close(joined, &timeline, sum_ns, is_ordered);
     }
 
     /// A length and how far it may be off. On one clock, two kernel stamps are compared raw, so
@@ -204,7 +203,7 @@ impl<'a> SegmentBook<'a> {
         Some((to.host_ns.saturating_sub(local.as_ns()), bound_ns))
     }
 
-    fn close(&mut self, joined: &Joined, timeline: &Timeline, (sum_ns, is_ordered): (i64, bool)) {
+    fn close(&mut self, joined: &Joined, timeline: &Timeline, sum_ns: i64, is_ordered: bool) {
         let Some(taken) = joined.taken.filter(|_| self.path.is_aligned()) else {
             return;
         };
@@ -418,10 +417,6 @@ impl<'a> SegmentBook<'a> {
                 ..self.closing.clone()
             }),
         }
-    }
-
-    pub(super) const fn coverage(&self) -> StampCoverage {
-        self.coverage
     }
 }
 

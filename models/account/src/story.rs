@@ -8,8 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::join::Joined;
 use super::stage::MessageFate;
 use super::{AccountContext, ChannelRecords, each_judged};
-use hil_core::record::IngressRecord;
-use hil_core::record::stamp;
+use hil_core::record::{IngressRecord, stamp};
 use hil_core::time::RemoteInstant;
 
 /// What became of one message.

@@ -26,7 +26,7 @@ pub(super) struct Line {
 /// The estimate over one stretch.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Anchors {
-    points: Vec<Anchor>,
+    pub(super) points: Vec<Anchor>,
     line: Option<Line>,
 }
 
@@ -58,10 +58,6 @@ impl Anchors {
 
     pub(super) const fn line(&self) -> Option<Line> {
         self.line
-    }
-
-    pub(super) fn points(&self) -> &[Anchor] {
-        &self.points
     }
 
     /// The estimated offset at `at_ns`, between its neighbours or beyond the ends by the line.

@@ -139,14 +139,14 @@ pub(super) fn stretches(constraints: &[Constraint], settings: &ClockSettings) ->
     let (mut start, mut from_ns) = (0, i64::MIN);
     while start < constraints.len() {
         let Some(after) = first_contradiction(&constraints[start..], settings) else {
-            found.push(stretch(&constraints[start..], (from_ns, i64::MAX)));
+            found.push(stretch(&constraints[start..], from_ns, i64::MAX));
             break;
         };
         let after = start + after;
         let before = last_contradiction(&constraints[start..=after], settings)
             .map_or(start, |index| start + index);
         let zone = (constraints[before].first_ns, constraints[after].last_ns);
-        found.push(stretch(&constraints[start..before], (from_ns, zone.0)));
+        found.push(stretch(&constraints[start..before], from_ns, zone.0));
         from_ns = zone.1;
         let later = &constraints[after + 1..];
         let under_way = later.iter().take_while(|one| one.first_ns < from_ns);
@@ -157,7 +157,7 @@ pub(super) fn stretches(constraints: &[Constraint], settings: &ClockSettings) ->
 }
 
 /// Those of `constraints` that lie wholly in the span.
-fn stretch(constraints: &[Constraint], (from_ns, until_ns): (i64, i64)) -> Stretch {
+fn stretch(constraints: &[Constraint], from_ns: i64, until_ns: i64) -> Stretch {
     let inside = constraints
         .iter()
         .filter(|one| one.first_ns >= from_ns && one.last_ns <= until_ns);

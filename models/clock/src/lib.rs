@@ -30,7 +30,6 @@
 mod anchors;
 mod band;
 mod exchange;
-mod figures;
 mod map;
 #[cfg(test)]
 mod simulated;
@@ -38,8 +37,8 @@ mod simulated;
 mod tests;
 
 pub use exchange::{Exchange, Requester, StampKind};
-pub use figures::{ClockFigures, ClockStep, OffsetFigures};
-pub use map::{ClockMap, Localised};
+
+pub use map::{ClockFigures, ClockMap, ClockStep, Localised, OffsetFigures};
 
 use serde::{Deserialize, Serialize};
 

@@ -60,18 +60,18 @@ impl Tally {
                 let failure = format!("seed {seed}: {truth:?} not in {localised:?}");
                 self.failures.push(failure);
             }
-            self.compare_width(remote.as_ns(), localised, (&map, &spans));
+            self.compare_width(remote.as_ns(), localised, &map, &spans);
         }
     }
 
-    fn compare_width(&mut self, at_ns: i64, one: Localised, (map, spans): (&ClockMap, &[Span])) {
+    fn compare_width(&mut self, at_ns: i64, one: Localised, map: &ClockMap, spans: &[Span]) {
         let mut steps = map.figures().steps.iter();
         let (from_ns, until_ns) = (at_ns - WINDOW_NS, at_ns + WINDOW_NS);
         if steps.any(|step| step.from_ns < until_ns && from_ns < step.until_ns) {
             return;
         }
-        let before = narrowest(spans, (from_ns, at_ns), at_ns);
-        let after = narrowest(spans, (at_ns, until_ns), at_ns);
+        let before = narrowest(spans, from_ns, at_ns, at_ns);
+        let after = narrowest(spans, at_ns, until_ns, at_ns);
         let Some((before, after)) = before.zip(after) else {
             return;
         };
@@ -94,7 +94,7 @@ type Span = (i64, i64, i64);
 
 /// The narrowest that an exchange within the span leaves for the offset at `at_ns`: its round trip,
 /// 1 µs for each of four stamps, and 200 ppm of the time to it, both ways.
-fn narrowest(spans: &[Span], (from_ns, until_ns): (i64, i64), at_ns: i64) -> Option<i64> {
+fn narrowest(spans: &[Span], from_ns: i64, until_ns: i64, at_ns: i64) -> Option<i64> {
     let inside = spans
         .iter()
         .filter(|(first_ns, last_ns, _)| *first_ns >= from_ns && *last_ns <= until_ns);

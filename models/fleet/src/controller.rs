@@ -5,7 +5,6 @@ use core::time::Duration;
 use std::collections::VecDeque;
 
 use crate::coordinator::Coordinator;
-use crate::coordinator::counters::CoordinatorCounters;
 use crate::coordinator::parameters::CoordinatorParameters;
 use crate::messages::{State, ToRobot};
 use crate::mission::{MissionParameters, MissionSource};
@@ -20,7 +19,6 @@ pub struct Controller {
     fleets: Vec<Beat>,
     /// Decided but not given yet: an outbox holds less than a large fleet can be told at once.
     waiting: VecDeque<ToRobot>,
-    unknown_count: u64,
 }
 
 /// A coordinator and its timer.
@@ -38,33 +36,19 @@ impl Controller {
         scene: &Scene,
         parameters: &CoordinatorParameters,
         missions: &MissionParameters,
-        (fleet_count, seed): (u32, u64),
+        fleet_count: u32,
+        seed: u64,
     ) -> Self {
         let period = parameters.control_period();
         let fleets = (0..fleet_count).map(|fleet| Beat {
-            coordinator: coordinator_of(scene, parameters, missions, (fleet, seed)),
+            coordinator: coordinator_of(scene, parameters, missions, fleet, seed),
             timer: PeriodicTimer::new(period),
             offset: period * fleet / fleet_count.max(1),
         });
         Self {
             fleets: fleets.collect(),
             waiting: VecDeque::with_capacity(OUTBOX_CAPACITY),
-            unknown_count: 0,
         }
-    }
-
-    /// What all coordinators together have counted.
-    pub fn counters(&self) -> CoordinatorCounters {
-        let mut sum = CoordinatorCounters::default();
-        for beat in &self.fleets {
-            sum.merge(beat.coordinator.counters());
-        }
-        sum
-    }
-
-    /// States of fleets that are not here.
-    pub fn unknown_count(&self) -> u64 {
-        self.unknown_count
     }
 }
 
@@ -73,7 +57,8 @@ pub(crate) fn coordinator_of(
     scene: &Scene,
     parameters: &CoordinatorParameters,
     missions: &MissionParameters,
-    (fleet, seed): (u32, u64),
+    fleet: u32,
+    seed: u64,
 ) -> Coordinator {
     let random = RandomStream::new(seed, &format!("fleet/{fleet}/missions"));
     let source = MissionSource::new(missions, scene, random);
@@ -91,9 +76,8 @@ impl Component for Controller {
     }
 
     fn on_message(&mut self, now: Instant, input: &State, _out: &mut Outbox<ToRobot>) {
-        match self.fleets.get_mut(input.header.fleet_id as usize) {
-            Some(beat) => beat.coordinator.on_state(now, input),
-            None => self.unknown_count += 1,
+        if let Some(beat) = self.fleets.get_mut(input.header.fleet_id as usize) {
+            beat.coordinator.on_state(now, input);
         }
     }
 

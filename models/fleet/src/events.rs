@@ -6,7 +6,7 @@ use core::time::Duration;
 use std::collections::BTreeMap;
 
 use crate::case::{FLEET_AUTHORITY, FLEET_MISSION, FLEET_TRUTH};
-use crate::messages::{Authority, Mission, Truth, TruthKind};
+use crate::messages::{Authority, Header, Mission, Truth, TruthKind};
 use crate::referee::{Incident, IncidentKind};
 use hil_core::case_study::{MessageRef, ScoreEvent, Severity};
 use hil_core::message::Message;
@@ -24,8 +24,29 @@ const READING: Duration = Duration::from_millis(20);
 /// Copies of one command that an event names.
 const COPIES_NAMED_MAX: usize = 4;
 
-/// What a robot was told: fleet, robot, mission, and the number of the authority.
-type Key = (u32, u32, u32, u32);
+/// A command to a robot: an authority by its number, or with 0 the mission itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Key {
+    fleet_id: u32,
+    robot_id: u32,
+    mission_id: u32,
+    sequence: u32,
+}
+
+impl Key {
+    fn of(to: &Header, sequence: u32) -> Self {
+        Self {
+            fleet_id: to.fleet_id,
+            robot_id: to.robot_id,
+            mission_id: to.mission_id,
+            sequence,
+        }
+    }
+
+    fn with(self, sequence: u32) -> Self {
+        Self { sequence, ..self }
+    }
+}
 
 /// The events of a run, in order of time. The log must hold the truth in its own order.
 pub(crate) fn events(log: &RunLog, incidents: &[Incident]) -> Vec<ScoreEvent> {
@@ -61,7 +82,7 @@ struct Sent {
 #[derive(Debug, Default)]
 struct Orders {
     authorities: BTreeMap<Key, Vec<Sent>>,
-    missions: BTreeMap<(u32, u32, u32), Vec<Sent>>,
+    missions: BTreeMap<Key, Vec<Sent>>,
     /// Controller and robots read one clock, or theirs are aligned: their times compare.
     has_one_clock: bool,
     /// How much later than its effect a command may seem to have left.
@@ -76,13 +97,11 @@ impl Orders {
             ..Self::default()
         };
         for (sent, authority) in sent::<Authority>(log, FLEET_AUTHORITY) {
-            let to = &authority.header;
-            let key = (to.fleet_id, to.robot_id, to.mission_id, authority.sequence);
+            let key = Key::of(&authority.header, authority.sequence);
             orders.authorities.entry(key).or_default().push(sent);
         }
         for (sent, mission) in sent::<Mission>(log, FLEET_MISSION) {
-            let to = &mission.header;
-            let key = (to.fleet_id, to.robot_id, to.mission_id);
+            let key = Key::of(&mission.header, 0);
             orders.missions.entry(key).or_default().push(sent);
         }
         orders
@@ -92,15 +111,10 @@ impl Orders {
         self.authorities.get(&key).map_or(&[], Vec::as_slice)
     }
 
-    /// What was sent of a mission's authorities after number `after` and below `below`.
-    fn between(
-        &self,
-        (fleet, robot, mission): (u32, u32, u32),
-        after: u32,
-        below: u32,
-    ) -> Vec<Sent> {
-        let from = (fleet, robot, mission, after.saturating_add(1));
-        let to = (fleet, robot, mission, below);
+    /// What was sent of a mission's authorities after `after` and below number `below`.
+    fn between(&self, after: Key, below: u32) -> Vec<Sent> {
+        let from = after.with(after.sequence.saturating_add(1));
+        let to = after.with(below);
         if from >= to {
             return Vec::new();
         }
@@ -194,8 +208,7 @@ impl Watch {
         let number = truth.caused_by_sequence;
         let before = self.heard;
         self.heard = before.max(number);
-        let robot = (truth.fleet_id, truth.robot_id, truth.mission_id);
-        let missed = orders.between(robot, before, number);
+        let missed = orders.between(key(truth).with(before), number);
         let copies = orders.authority(key(truth));
         // What was sent before the robot had the mission had to wait for it, not for the network.
         let begun = self.begun.filter(|_| orders.has_one_clock);
@@ -210,7 +223,7 @@ impl Watch {
             None
         } else {
             let held_up = orders.held_up(copies, at(truth));
-            words(truth, kind, held_up, (before, !missed.is_empty()))
+            words(truth, kind, held_up, before, !missed.is_empty())
         };
         let event = said.map(|what| orders.named(event(severity, truth, what), sent.clone()));
         (event, sent)
@@ -223,7 +236,8 @@ fn words(
     truth: &Truth,
     kind: TruthKind,
     held_up: Option<(f64, usize)>,
-    (before, has_missed): (u32, bool),
+    before: u32,
+    has_missed: bool,
 ) -> Option<String> {
     let (who, number, mission) = (name(truth), truth.caused_by_sequence, truth.mission_id);
     let order = format!("authority {number} of mission {mission}");
@@ -259,8 +273,7 @@ fn words(
 }
 
 fn mission_held_up(truth: &Truth, orders: &Orders) -> Option<ScoreEvent> {
-    let key = (truth.fleet_id, truth.robot_id, truth.mission_id);
-    let copies = orders.missions.get(&key)?;
+    let copies = orders.missions.get(&key(truth).with(0))?;
     let (late_s, copy_count) = orders.held_up(copies, at(truth))?;
     let what = format!(
         "{} began mission {} {late_s:.2} s after it was first sent, {} before",
@@ -272,8 +285,7 @@ fn mission_held_up(truth: &Truth, orders: &Orders) -> Option<ScoreEvent> {
 }
 
 fn lease_ended(truth: &Truth, orders: &Orders) -> ScoreEvent {
-    let robot = (truth.fleet_id, truth.robot_id, truth.mission_id);
-    let unheard = orders.between(robot, truth.caused_by_sequence, u32::MAX);
+    let unheard = orders.between(key(truth), u32::MAX);
     let what = format!(
         "{} braked: the lease of authority {} of mission {} ended",
         name(truth),
@@ -304,11 +316,15 @@ fn incident(incident: &Incident, orders: &Orders, led_to: &BTreeMap<Key, Vec<Sen
         .zip(incident.mission_ids)
         .zip(incident.causes);
     sides.fold(event, |event, ((robot, mission), cause)| {
-        let robot = (incident.fleet_id, *robot, mission);
-        let taken = cause.caused_by_sequence;
-        let last = led_to.get(&(robot.0, robot.1, robot.2, taken));
+        let taken = Key {
+            fleet_id: incident.fleet_id,
+            robot_id: *robot,
+            mission_id: mission,
+            sequence: cause.caused_by_sequence,
+        };
+        let last = led_to.get(&taken);
         let event = orders.named(event, last.cloned().unwrap_or_default());
-        orders.named(event, orders.between(robot, taken, u32::MAX))
+        orders.named(event, orders.between(taken, u32::MAX))
     })
 }
 
@@ -321,12 +337,12 @@ fn notice(truth: &Truth, what: String) -> ScoreEvent {
 }
 
 fn key(truth: &Truth) -> Key {
-    (
-        truth.fleet_id,
-        truth.robot_id,
-        truth.mission_id,
-        truth.caused_by_sequence,
-    )
+    Key {
+        fleet_id: truth.fleet_id,
+        robot_id: truth.robot_id,
+        mission_id: truth.mission_id,
+        sequence: truth.caused_by_sequence,
+    }
 }
 
 fn at(truth: &Truth) -> Instant {

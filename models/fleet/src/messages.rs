@@ -50,14 +50,9 @@ pub enum Phase {
 
 impl Phase {
     /// The phase a message names; `None` for an unknown number.
-    pub const fn of(number: u8) -> Option<Self> {
-        match number {
-            0 => Some(Self::Parked),
-            1 => Some(Self::Driving),
-            2 => Some(Self::AtPoint),
-            3 => Some(Self::Done),
-            _ => None,
-        }
+    pub fn of(number: u8) -> Option<Self> {
+        let phases = [Self::Parked, Self::Driving, Self::AtPoint, Self::Done];
+        phases.get(usize::from(number)).copied()
     }
 }
 
@@ -234,7 +229,7 @@ pub enum TruthKind {
 
 impl TruthKind {
     /// The kind a record names; `None` for an unknown number.
-    pub const fn of(number: u32) -> Option<Self> {
+    pub fn of(number: u32) -> Option<Self> {
         const KINDS: [TruthKind; 10] = [
             TruthKind::Motion,
             TruthKind::MissionStarted,
@@ -247,11 +242,7 @@ impl TruthKind {
             TruthKind::LeaseEnded,
             TruthKind::Replaced,
         ];
-        if (number as usize) < KINDS.len() {
-            Some(KINDS[number as usize])
-        } else {
-            None
-        }
+        KINDS.get(number as usize).copied()
     }
 }
 

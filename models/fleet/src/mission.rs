@@ -52,12 +52,8 @@ impl MissionParameters {
     /// # Errors
     /// Names the key, below `missions`, and its range.
     pub fn check(&self) -> Result<(), ParameterError> {
-        ParameterError::check(
-            "missions.parking_s",
-            self.parking_s,
-            0.0..=3600.0,
-            "0 to 3600",
-        )
+        let allowed = 0.0..=3600.0;
+        ParameterError::check("missions.parking_s", self.parking_s, allowed, "0 to 3600")
     }
 }
 
@@ -65,7 +61,8 @@ impl MissionParameters {
 #[derive(Debug, Clone)]
 pub struct MissionSource {
     mode: MissionMode,
-    parking: Duration,
+    /// How long a robot stays in a bay before its next mission.
+    pub(crate) parking: Duration,
     left_counts: Vec<u32>,
     scene: Scene,
     random: RandomStream,
@@ -126,11 +123,6 @@ impl MissionSource {
         // Without a limit the count never runs out within a run's mission numbers.
         self.left_counts[robot] -= 1;
         Some(*route)
-    }
-
-    /// How long a robot stays in a bay before its next mission.
-    pub fn parking(&self) -> Duration {
-        self.parking
     }
 }
 

@@ -2,7 +2,7 @@
 //! messages by their ids and decides nothing.
 
 use crate::messages::{FromRobot, Header, ToRobot, Truth};
-use crate::robot::{Robot, RobotCounters, RobotParameters};
+use crate::robot::{Robot, RobotParameters};
 use crate::scenario::Scene;
 use hil_core::component::{Component, Outbox};
 use hil_core::random::RandomStream;
@@ -48,20 +48,6 @@ impl Robots {
             started: None,
             unknown_count: 0,
         }
-    }
-
-    /// The robots, fleet by fleet.
-    pub fn robots(&self) -> &[Robot] {
-        &self.members
-    }
-
-    /// What all robots together have counted.
-    pub fn counters(&self) -> RobotCounters {
-        let mut sum = RobotCounters::default();
-        for robot in &self.members {
-            sum.add(robot.counters());
-        }
-        sum
     }
 
     /// Messages to robots that are not here.
@@ -162,9 +148,22 @@ impl Component for Robots {
 }
 
 #[cfg(test)]
+impl Robots {
+    /// What all robots together have counted.
+    pub(crate) fn counters(&self) -> crate::robot::RobotCounters {
+        let mut sum = crate::robot::RobotCounters::default();
+        for robot in &self.members {
+            sum.add(robot.counters());
+        }
+        sum
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
     use crate::messages::{Authority, TO_GOAL};
+    use crate::robot::RobotCounters;
     use crate::robot::tests::{authority, mission, scene};
     use crate::scenario::Scenario;
     use hil_core::component::OUTBOX_CAPACITY;

@@ -1,17 +1,22 @@
 //! `[case.parameters.world]`: which vehicle, which map, how many robots; checked and built into
 //! the [`World`] a fleet shares. It says nothing about who goes when.
+//!
+//! The small scenarios are straight lines without obstacles, whose critical sections, waiting points
+//! and times have a closed form. On a map the paths between bays are planned so that it is
+//! well-formed: robots leave and enter bays straight, and no path touches a vehicle parked in a
+//! third bay.
 
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::analytic;
 use crate::geometry::{Bounds, Footprint, Pose};
-use crate::layout;
-use crate::layout::BAYS_PER_SIDE;
-use crate::map::Map;
+use crate::map::{self, BAYS_PER_SIDE, Map, raised};
+use crate::path::{Path, PathLibrary};
+use crate::planner::space::Space;
+use crate::planner::{At, Planner, Segment};
 use crate::section::MergePolicy;
-use crate::world::{BayIndex, Vehicle, World};
+use crate::world::{BayIndex, Route, Vehicle, World};
 use hil_core::case_study::ParameterError;
 
 /// Where the fleet drives.
@@ -159,12 +164,12 @@ impl WorldParameters {
         self.check()?;
         let vehicle = self.vehicle();
         match self.scenario {
-            Scenario::Crossing => self.lines(vehicle, &analytic::crossing(&vehicle)),
-            Scenario::HeadOn => self.lines(vehicle, &analytic::head_on(&vehicle)),
-            Scenario::Following => self.lines(vehicle, &analytic::following(&vehicle)),
-            Scenario::ThreeCycle => self.lines(vehicle, &analytic::three_cycle(&vehicle)),
-            Scenario::Harbor => self.hall(vehicle, &layout::harbor(self.clearance_m())),
-            Scenario::Warehouse => self.hall(vehicle, &layout::warehouse(self.clearance_m())),
+            Scenario::Crossing => self.lines(vehicle, &crossing(&vehicle)),
+            Scenario::HeadOn => self.lines(vehicle, &head_on(&vehicle)),
+            Scenario::Following => self.lines(vehicle, &following(&vehicle)),
+            Scenario::ThreeCycle => self.lines(vehicle, &three_cycle(&vehicle)),
+            Scenario::Harbor => self.hall(vehicle, &map::harbor(self.clearance_m())),
+            Scenario::Warehouse => self.hall(vehicle, &map::warehouse(self.clearance_m())),
             Scenario::Custom => self.custom(vehicle),
         }
     }
@@ -176,10 +181,8 @@ impl WorldParameters {
     /// When `custom` lacks its bounds.
     pub fn map(&self) -> Result<Option<Map>, ParameterError> {
         Ok(match self.scenario {
-            Scenario::Harbor => Some(layout::harbor(self.clearance_m()).stacked(self.tiles())),
-            Scenario::Warehouse => {
-                Some(layout::warehouse(self.clearance_m()).stacked(self.tiles()))
-            }
+            Scenario::Harbor => Some(map::harbor(self.clearance_m()).stacked(self.tiles())),
+            Scenario::Warehouse => Some(map::warehouse(self.clearance_m()).stacked(self.tiles())),
             Scenario::Custom => Some(self.custom_map()?),
             _ => None,
         })
@@ -223,30 +226,20 @@ impl WorldParameters {
 
     fn check(&self) -> Result<(), ParameterError> {
         let vehicle = self.vehicle();
-        let size = (0.05..=100.0, "0.05 to 100");
-        let rate = (0.01..=100.0, "0.01 to 100");
-        let spacing = (0.01..=5.0, "0.01 to 5");
-        let radius = (0.05..=1000.0, "0.05 to 1000");
+        let (length_m, width_m) = (vehicle.footprint.length_m, vehicle.footprint.width_m);
         let numbers = [
-            ("world.length_m", vehicle.footprint.length_m, &size),
-            ("world.width_m", vehicle.footprint.width_m, &size),
-            ("world.speed_max_mps", vehicle.speed_max_mps, &rate),
-            ("world.acceleration_mps2", vehicle.acceleration_mps2, &rate),
-            ("world.path_spacing_m", self.path_spacing_m, &spacing),
-            ("world.turning_radius_m", self.turning_radius_m(), &radius),
-            (
-                "world.clearance_m",
-                self.clearance_m(),
-                &(0.0..=100.0, "0 to 100"),
-            ),
-            (
-                "world.robots",
-                f64::from(self.robots),
-                &(1.0..=448.0, "1 to 448"),
-            ),
+            ("length_m", length_m, 0.05, 100.0),
+            ("width_m", width_m, 0.05, 100.0),
+            ("speed_max_mps", vehicle.speed_max_mps, 0.01, 100.0),
+            ("acceleration_mps2", vehicle.acceleration_mps2, 0.01, 100.0),
+            ("path_spacing_m", self.path_spacing_m, 0.01, 5.0),
+            ("turning_radius_m", self.turning_radius_m(), 0.05, 1000.0),
+            ("clearance_m", self.clearance_m(), 0.0, 100.0),
+            ("robots", f64::from(self.robots), 1.0, 448.0),
         ];
-        for (key, value, (allowed, text)) in numbers {
-            ParameterError::check(key, value, allowed.clone(), text)?;
+        for (key, value, min, max) in numbers {
+            let key = format!("world.{key}");
+            ParameterError::check(&key, value, min..=max, &format!("{min} to {max}"))?;
         }
         if self.scenario != Scenario::Custom {
             let given = [
@@ -262,6 +255,251 @@ impl WorldParameters {
         }
         Ok(())
     }
+}
+
+/// Planned paths are handed on as poses so much nearer than those of the path: the chord is
+/// shorter than its arc by less than a ten-thousandth.
+const FINER: f64 = 0.25;
+
+/// Poses of a path from bay to bay.
+#[derive(Debug, Clone)]
+pub(crate) struct Connection {
+    pub(crate) from: BayIndex,
+    pub(crate) to: BayIndex,
+    pub(crate) poses: Vec<Pose>,
+}
+
+/// Paths and routes in the making.
+#[derive(Debug, Default)]
+pub(crate) struct Network {
+    pub(crate) paths: PathLibrary,
+    pub(crate) routes: Vec<Route>,
+}
+
+impl Network {
+    /// Adds a connection and the way back.
+    pub(crate) fn add(
+        &mut self,
+        connection: &Connection,
+        spacing_m: f64,
+    ) -> Result<(), ParameterError> {
+        let (from, to) = (connection.from, connection.to);
+        let path = Path::new(&connection.poses, spacing_m).map_err(|error| {
+            ParameterError::new(
+                "world.paths",
+                format!("from bay {from} to bay {to}: {error}"),
+            )
+        })?;
+        let path = self.paths.add(path);
+        self.routes.push(Route { from, to, path });
+        self.routes.push(Route {
+            from: to,
+            to: from,
+            path: path.reversed(),
+        });
+        Ok(())
+    }
+}
+
+/// Plans connections on one map.
+pub(crate) struct Connector<'a> {
+    map: &'a Map,
+    vehicle: &'a Vehicle,
+    planner: Planner,
+    space: Space,
+    spacing_m: f64,
+    pub(crate) summary: PlanningSummary,
+}
+
+impl<'a> Connector<'a> {
+    pub(crate) fn new(
+        map: &'a Map,
+        vehicle: &'a Vehicle,
+        turning_radius_m: f64,
+        spacing_m: f64,
+    ) -> Result<Self, ParameterError> {
+        map.check(vehicle)?;
+        let planner = Planner::new(map.space_around_parked(vehicle), turning_radius_m)
+            .map_err(|error| ParameterError::new("world.turning_radius_m", error.to_string()))?;
+        Ok(Self {
+            map,
+            vehicle,
+            planner,
+            space: map.space_with_half_clearance(vehicle),
+            spacing_m,
+            summary: PlanningSummary::default(),
+        })
+    }
+
+    /// The connections from every left bay to every right bay for which `is_wanted`.
+    pub(crate) fn connect(
+        &mut self,
+        is_wanted: &dyn Fn(BayIndex, BayIndex) -> bool,
+    ) -> Result<Vec<Connection>, ParameterError> {
+        let mut connections = Vec::new();
+        // The goal in the outer loop: the planner keeps what it knows of a goal.
+        for to in self.map.bays_of(BaySide::Right) {
+            for from in self.map.bays_of(BaySide::Left) {
+                if is_wanted(from, to) {
+                    connections.push(self.connection(from, to)?);
+                }
+            }
+        }
+        connections.sort_by_key(|connection| (connection.from, connection.to));
+        Ok(connections)
+    }
+
+    fn connection(&mut self, from: BayIndex, to: BayIndex) -> Result<Connection, ParameterError> {
+        let [start, goal] = [from, to].map(|bay| self.map.bays[bay].pose);
+        // So far from its bay that a vehicle keeps its clearance from one parked there.
+        let straight_m = self.vehicle.footprint.length_m + 2.0 * self.map.clearance_m;
+        let ahead = |pose: &Pose, way_m: f64| {
+            let straight = Segment {
+                curvature_per_m: 0.0,
+                length_m: way_m,
+            };
+            straight.pose_after(pose, way_m)
+        };
+        let mut stops = vec![ahead(&start, straight_m)];
+        stops.extend(self.map.lanes_between(from, to));
+        stops.push(ahead(&goal, -straight_m));
+        let mut poses = vec![start];
+        for leg in stops.windows(2) {
+            let plan = self.planner.plan(&leg[0], &leg[1]).map_err(|error| {
+                let key = format!("world.bays[{from}]");
+                ParameterError::new(&key, format!("has no path to bay {to}: {error}"))
+            })?;
+            self.summary.expanded_count += plan.expanded_count;
+            poses.extend(plan.poses(FINER * self.spacing_m));
+        }
+        poses.push(goal);
+        self.summary.planned_count += 1;
+        let connection = Connection { from, to, poses };
+        self.check(&connection, "world.bays")?;
+        Ok(connection)
+    }
+
+    /// Checks that a path keeps half the map's clearance from obstacles, the edge and vehicles in
+    /// third bays.
+    pub(crate) fn check(&self, connection: &Connection, key: &str) -> Result<(), ParameterError> {
+        let (from, to) = (connection.from, connection.to);
+        let error = |problem: String| Err(ParameterError::new(key, problem));
+        // Straight stretches are given by their ends; fill them in.
+        let footprint = &self.vehicle.footprint;
+        let step_m = 0.25 * footprint.width_m.min(footprint.length_m);
+        let path = match Path::new(&connection.poses, step_m) {
+            Ok(path) => path,
+            Err(problem) => return error(problem.to_string()),
+        };
+        for pose in path.poses() {
+            if let Some(blocker) = self.space.blocker_but(&[from, to], pose) {
+                return error(format!(
+                    "path from bay {from} to bay {to} comes nearer than {} m to {blocker} at {}",
+                    0.5 * self.map.clearance_m,
+                    At(pose)
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The connection, so many tiles of `bay_count` bays and `height_m` higher up.
+pub(crate) fn lifted(
+    connection: &Connection,
+    tile: usize,
+    bay_count: usize,
+    height_m: f64,
+) -> Connection {
+    let rise_m = tile as f64 * height_m;
+    Connection {
+        from: connection.from + tile * bay_count,
+        to: connection.to + tile * bay_count,
+        poses: connection
+            .poses
+            .iter()
+            .map(|pose| raised(pose, rise_m))
+            .collect(),
+    }
+}
+
+/// What a small scenario lays out for one robot: the way from its start to its goal, as corner
+/// poses.
+pub(crate) type Line = Vec<Pose>;
+
+/// Half the way of the crossing and the way before and beyond the triangle, in vehicle lengths.
+const APPROACH: f64 = 10.0;
+/// Half the corridor of the head-on scenario, in vehicle lengths.
+const CORRIDOR: f64 = 5.0;
+/// From a bay of the head-on scenario to where the vehicle bears away, in vehicle lengths.
+const RUN_UP: f64 = 3.0;
+/// From the corridor's axis to a bay's, in vehicle widths.
+const BEARING_AWAY: f64 = 3.0;
+/// From the follower's start to the leader's, in vehicle lengths.
+const HEADWAY: f64 = 3.0;
+
+/// Robot 0 drives east, robot 1 north; the lines cross at the origin, half way of both.
+pub(crate) fn crossing(vehicle: &Vehicle) -> Vec<Line> {
+    let way_m = APPROACH * vehicle.footprint.length_m;
+    let north = core::f64::consts::FRAC_PI_2;
+    vec![
+        vec![Pose::new(-way_m, 0.0, 0.0), Pose::new(way_m, 0.0, 0.0)],
+        vec![Pose::new(0.0, -way_m, north), Pose::new(0.0, way_m, north)],
+    ]
+}
+
+/// Two robots swap sides through a corridor for one: both bear to their left at its end, into
+/// bays beside each other. They keep their heading while they bear away (all wheels steered), so
+/// that all footprints stay upright and overlap has a closed form.
+pub(crate) fn head_on(vehicle: &Vehicle) -> Vec<Line> {
+    let corridor_m = CORRIDOR * vehicle.footprint.length_m;
+    let aside_m = BEARING_AWAY * vehicle.footprint.width_m;
+    let end_m = corridor_m + aside_m + RUN_UP * vehicle.footprint.length_m;
+    let along = |side: f64, heading_rad: f64| {
+        [
+            (-end_m, aside_m),
+            (-corridor_m - aside_m, aside_m),
+            (-corridor_m, 0.0),
+            (corridor_m, 0.0),
+            (corridor_m + aside_m, aside_m),
+            (end_m, aside_m),
+        ]
+        .map(|(x_m, y_m)| Pose::new(side * x_m, side * y_m, heading_rad))
+        .to_vec()
+    };
+    vec![along(1.0, 0.0), along(-1.0, core::f64::consts::PI)]
+}
+
+/// Robot 1 follows robot 0 along one line and stops as far behind it as it began.
+pub(crate) fn following(vehicle: &Vehicle) -> Vec<Line> {
+    let headway_m = HEADWAY * vehicle.footprint.length_m;
+    let way_m = 2.0 * APPROACH * vehicle.footprint.length_m;
+    let from = |x_m| vec![Pose::new(x_m, 0.0, 0.0), Pose::new(x_m + way_m, 0.0, 0.0)];
+    vec![from(headway_m), from(0.0)]
+}
+
+/// Three robots, each along one side of a triangle and beyond. The sides are one vehicle long, so
+/// a robot stands in its first section as long as it waits for its second: when each goes first
+/// at its first corner, none can leave.
+pub(crate) fn three_cycle(vehicle: &Vehicle) -> Vec<Line> {
+    let side_m = vehicle.footprint.length_m;
+    let way_m = APPROACH * side_m;
+    (0..3)
+        .map(|side| {
+            let heading_rad = f64::from(side) * core::f64::consts::TAU / 3.0;
+            let (sine, cosine) = heading_rad.sin_cos();
+            // The middle of the side lies to the right of the centre, an inradius away.
+            let inradius_m = side_m / 12.0_f64.sqrt();
+            let middle = [inradius_m * sine, -inradius_m * cosine];
+            [-1.0, 1.0]
+                .map(|end| {
+                    let way_m = end * (0.5 * side_m + way_m);
+                    let (x_m, y_m) = (middle[0] + way_m * cosine, middle[1] + way_m * sine);
+                    Pose::new(x_m, y_m, crate::geometry::wrap_angle(heading_rad))
+                })
+                .to_vec()
+        })
+        .collect()
 }
 
 #[cfg(test)]

@@ -3,13 +3,13 @@
 
 use std::sync::Arc;
 
-use crate::analytic::Line;
 use crate::geometry::{Pose, wrap_angle};
 use crate::map::{Map, MapBay};
 use crate::path::{Path, PathLibrary};
 use crate::planner::At;
-use crate::routes::{Connection, Connector, Network, lifted};
-use crate::scenario::{BaySide, PlanningSummary, Scene, WorldParameters};
+use crate::scenario::{
+    BaySide, Connection, Connector, Line, Network, PlanningSummary, Scene, WorldParameters, lifted,
+};
 use crate::world::{Bay, Route, Vehicle, World};
 use hil_core::case_study::ParameterError;
 
@@ -19,22 +19,22 @@ const END_TOLERANCE: f64 = 1e-3;
 impl WorldParameters {
     /// A built-in map, as often as the robots need it. Robots start in left bays.
     pub(super) fn hall(&self, vehicle: Vehicle, tile: &Map) -> Result<Scene, ParameterError> {
-        let limits = (self.turning_radius_m(), self.path_spacing_m);
+        let (radius_m, spacing_m) = (self.turning_radius_m(), self.path_spacing_m);
         let count = self.tiles();
         let (bay_count, height_m) = (tile.bays.len(), tile.height_m());
-        let mut connector = Connector::new(tile, &vehicle, limits)?;
+        let mut connector = Connector::new(tile, &vehicle, radius_m, spacing_m)?;
         let within = connector.connect(&|_, _| true)?;
         let mut planning = connector.summary;
         let mut network = Network::default();
         for number in 0..count {
             for connection in &within {
-                let lifted = lifted(connection, number, (bay_count, height_m));
+                let lifted = lifted(connection, number, bay_count, height_m);
                 network.add(&lifted, self.path_spacing_m)?;
             }
         }
         if count > 1 {
             let pair = tile.stacked(2);
-            let mut connector = Connector::new(&pair, &vehicle, limits)?;
+            let mut connector = Connector::new(&pair, &vehicle, radius_m, spacing_m)?;
             // To the nearer bays of the neighbour only, lest paths grow in number with no use.
             let near_m = pair.bays[..2 * bay_count].iter();
             let near: Vec<_> = near_m
@@ -47,7 +47,7 @@ impl WorldParameters {
             planning.expanded_count += connector.summary.expanded_count;
             for number in 0..count - 1 {
                 for connection in &across {
-                    let lifted = lifted(connection, number, (bay_count, height_m));
+                    let lifted = lifted(connection, number, bay_count, height_m);
                     network.add(&lifted, self.path_spacing_m)?;
                 }
             }
@@ -82,8 +82,8 @@ impl WorldParameters {
                 return Err(ParameterError::new("world.bays", problem.to_lowercase()));
             }
         }
-        let limits = (self.turning_radius_m(), self.path_spacing_m);
-        let mut connector = Connector::new(&map, &vehicle, limits)?;
+        let (radius_m, spacing_m) = (self.turning_radius_m(), self.path_spacing_m);
+        let mut connector = Connector::new(&map, &vehicle, radius_m, spacing_m)?;
         let connections = if self.paths.is_empty() {
             connector.connect(&|_, _| true)?
         } else {

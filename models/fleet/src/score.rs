@@ -13,17 +13,14 @@ use hil_core::case_study::{ErrorSeries, Metric, Score};
 use hil_core::run_log::RunLog;
 use hil_core::time::Instant;
 use hil_stats::histogram::{LatencyHistogram, LatencySummary};
+use hil_stats::metric::{Label, label};
 
 /// Scores a run.
 pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
     let truths = truths(log);
     let Some((start, end)) = span(&truths) else {
         return Score {
-            metrics: vec![unavailable(
-                COLLISIONS,
-                "1",
-                "the robots left no record of their motion",
-            )],
+            metrics: vec![COLLISIONS.unavailable("the robots left no record of their motion")],
             ..Score::default()
         };
     };
@@ -43,67 +40,42 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
     score
 }
 
-type Label = (&'static str, &'static str);
-
-const COLLISIONS: Label = ("section_collisions_count", "collisions, section checker");
-
-fn metric((name, label): Label, value: f64, unit: &'static str, method: &str) -> Metric {
-    Metric {
-        name,
-        label,
-        value: Some(value),
-        interval: None,
-        unit,
-        method: method.to_owned(),
-    }
-}
-
-fn unavailable((name, label): Label, unit: &'static str, why: &str) -> Metric {
-    Metric {
-        value: None,
-        ..metric((name, label), 0.0, unit, why)
-    }
-}
-
-fn count(label: Label, value: u64, method: &str) -> Metric {
-    metric(label, value as f64, "1", method)
-}
+const COLLISIONS: Label = label(
+    "section_collisions_count",
+    "collisions, section checker",
+    "1",
+);
 
 fn collisions(tally: &Tally) -> Vec<Metric> {
     let passed = tally.sections_passed_count;
     let collided = tally.section_collisions_count;
-    let label = ("collision_ratio", "collisions per critical section");
+    let named = label("collision_ratio", "collisions per critical section", "1");
     let mut ratio = if passed == 0 {
-        unavailable(label, "1", "no robot has passed a critical section")
+        named.unavailable("no robot has passed a critical section")
     } else {
         let method = "section checker over sections passed; interval of Clopper and Pearson";
-        metric(label, collided as f64 / passed as f64, "1", method)
+        named.known(collided as f64 / passed as f64, method)
     };
     ratio.interval = collision_interval(collided, passed).filter(|_| ratio.value.is_some());
     vec![
-        count(
-            COLLISIONS,
+        COLLISIONS.count(
             collided,
             "both robots in a section and overlapping at the last path poses they passed, looked \
              at every 30 ms",
         ),
-        count(
-            ("overlaps_count", "collisions, exact"),
+        label("overlaps_count", "collisions, exact", "1").count(
             tally.overlaps_count,
             "footprints overlapping where the robots truly were, looked at every 30 ms",
         ),
-        count(
-            ("outside_count", "collisions outside any section"),
+        label("outside_count", "collisions outside any section", "1").count(
             tally.outside_count,
             "exact collisions that began where no critical section is",
         ),
-        count(
-            ("critical_sections_count", "critical sections passed"),
+        label("critical_sections_count", "critical sections passed", "1").count(
             passed,
             "of two missions under way at once, driven through to the end",
         ),
-        count(
-            ("encounters_count", "encounters"),
+        label("encounters_count", "encounters", "1").count(
             tally.encounters_count,
             "critical sections that both robots were in at the same time",
         ),
@@ -112,78 +84,69 @@ fn collisions(tally: &Tally) -> Vec<Metric> {
 }
 
 fn distances(case: &Fleet, tally: &Tally) -> Vec<Metric> {
-    let least = ("separation_m_min", "smallest distance of two robots");
+    let least = label("separation_m_min", "smallest distance of two robots", "m");
     let bound_m = case
         .parameters()
         .robot
         .stop_error_bound_m(&case.scene().world.vehicle);
     vec![
         tally.separation_min_m.map_or_else(
-            || unavailable(least, "m", "no two robots came near each other"),
-            |value| metric(least, value, "m", "between footprints; 0 when they overlap"),
+            || least.unavailable("no two robots came near each other"),
+            |value| least.known(value, "between footprints; 0 when they overlap"),
         ),
-        metric(
-            ("stop_error_m_max", "farthest past an authority"),
+        label("stop_error_m_max", "farthest past an authority", "m").known(
             tally.stop_error_max_m,
-            "m",
-            &format!("of authorities that came in time; the tracker's bound is {bound_m:.3} m"),
+            format!("of authorities that came in time; the tracker's bound is {bound_m:.3} m"),
         ),
-        metric(
-            ("late_overshoot_m_max", "farthest past a late authority"),
-            tally.late_overshoot_max_m,
+        label(
+            "late_overshoot_m_max",
+            "farthest past a late authority",
             "m",
+        )
+        .known(
+            tally.late_overshoot_max_m,
             "of authorities that came when the robot could not stop there any more",
         ),
     ]
 }
 
 fn commands(tally: &Tally) -> Vec<Metric> {
-    [
-        (
-            ("authorities_applied_count", "authorities applied"),
-            tally.authorities_applied_count,
-            "taken in time to stop at",
-        ),
-        (
-            ("authorities_late_count", "authorities too late"),
+    vec![
+        label("authorities_applied_count", "authorities applied", "1")
+            .count(tally.authorities_applied_count, "taken in time to stop at"),
+        label("authorities_late_count", "authorities too late", "1").count(
             tally.authorities_late_count,
             "the robot could not stop there any more and went past",
         ),
-        (
-            ("authorities_ignored_count", "authorities ignored"),
+        label("authorities_ignored_count", "authorities ignored", "1").count(
             tally.authorities_ignored_count,
             "behind the robot when they came",
         ),
-        (
-            ("authorities_refused_count", "authorities refused"),
+        label("authorities_refused_count", "authorities refused", "1").count(
             tally.authorities_refused_count,
             "the robot could not stop there and kept the old one",
         ),
-        (
-            ("stale_count", "commands passed over"),
+        label("stale_count", "commands passed over", "1").count(
             tally.stale_count,
             "older than what the robot had, or a repeat of it",
         ),
-        (
-            ("leases_ended_count", "leases ended"),
+        label("leases_ended_count", "leases ended", "1").count(
             tally.leases_ended_count,
             "the robot braked because no newer authority came",
         ),
     ]
-    .map(|(label, value, method)| count(label, value, method))
-    .into()
 }
 
 /// Robots that stand still on a mission, over time. Some always wait for others at a section; what a
 /// network holds up or loses makes more of them wait, and longer.
 pub(crate) fn errors(case: &Fleet, log: &RunLog) -> Vec<ErrorSeries> {
     let truths = truths(log);
-    let Some(span) = span(&truths) else {
+    let Some((start, end)) = span(&truths) else {
         return Vec::new();
     };
     let mut samples = Vec::new();
     let mut referee = Referee::new(case.scene(), case.parameters().fleets);
-    referee.replay_seeing(&mut truths.into_iter(), span, &mut |now, referee| {
+    referee.replay_seeing(&mut truths.into_iter(), start, end, &mut |now, referee| {
         samples.push((now, referee.standing_count() as f64));
     });
     vec![ErrorSeries {
@@ -212,11 +175,11 @@ fn span(truths: &[Truth]) -> Option<(Instant, Instant)> {
 /// How old the newest state was on which each authority rests.
 fn ages(log: &RunLog) -> Vec<Metric> {
     let labels = [
-        ("state_age_s_p50", "age of state at decision, median"),
-        ("state_age_s_p99", "age of state at decision, 99 %"),
-        ("state_age_s_max", "age of state at decision, largest"),
+        label("state_age_s_p50", "age of state at decision, median", "s"),
+        label("state_age_s_p99", "age of state at decision, 99 %", "s"),
+        label("state_age_s_max", "age of state at decision, largest", "s"),
     ];
-    let none = |why: &str| labels.map(|label| unavailable(label, "s", why)).into();
+    let none = |why: &str| labels.map(|label| label.unavailable(why)).into();
     if !log.has_one_clock() {
         return none("states and authorities were stamped by two clocks that are not aligned");
     }
@@ -252,7 +215,7 @@ fn ages(log: &RunLog) -> Vec<Metric> {
         let clock = log.clock_words(Some(seconds));
         let method =
             format!("sampled by the robot to authority sent, of {count} authorities{clock}");
-        metric(label, seconds, "s", &method)
+        label.known(seconds, method)
     });
     figures.collect()
 }
@@ -260,30 +223,21 @@ fn ages(log: &RunLog) -> Vec<Metric> {
 fn work(tally: &Tally, run_s: f64) -> Vec<Metric> {
     let per_hour = 3600.0 * tally.missions_done_count as f64 / run_s;
     vec![
-        count(
-            ("missions_count", "missions done"),
+        label("missions_count", "missions done", "1").count(
             tally.missions_done_count,
             "driven to their goal, all fleets together",
         ),
-        metric(
-            ("missions_per_hour", "missions per hour"),
+        label("missions_per_hour", "missions per hour", "1").known(
             per_hour,
-            "1",
-            &format!("all fleets together, over {run_s:.1} s; missions under way do not count"),
+            format!("all fleets together, over {run_s:.1} s; missions under way do not count"),
         ),
-        metric(
-            ("travelled_km", "way driven"),
-            tally.travelled_m * 1e-3,
-            "km",
-            "by all robots of all fleets",
-        ),
-        count(
-            ("resets_count", "resets"),
+        label("travelled_km", "way driven", "km")
+            .known(tally.travelled_m * 1e-3, "by all robots of all fleets"),
+        label("resets_count", "resets", "1").count(
             tally.replaced_count,
             "robots put at their goal to clear a stuck fleet",
         ),
-        count(
-            ("unsound_records_count", "unsound records"),
+        label("unsound_records_count", "unsound records", "1").count(
             tally.unsound_count,
             "records of motion that name nothing known or no finite motion",
         ),

@@ -1,9 +1,11 @@
 //! Critical sections of two paths: connected sets of pose pairs at which two vehicles would
 //! overlap (Lv et al., section II.B). Who goes first is the coordinator's business.
 
-use crate::geometry::{Footprint, floor_index};
-use crate::overlap::{CoveredPath, Run, components};
-use crate::path::Path;
+use core::ops::Range;
+use std::sync::{Arc, OnceLock};
+
+use crate::geometry::{Bounds, Footprint, OrientedBox, floor_index};
+use crate::path::{Path, PathId, PathLibrary};
 
 /// One of the two paths of a section.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,6 +28,25 @@ impl Side {
 
     const fn index(self) -> usize {
         self as usize
+    }
+}
+
+/// A range of poses of a path, both ends included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Span {
+    /// First pose.
+    pub lower: usize,
+    /// Last pose.
+    pub upper: usize,
+}
+
+impl Span {
+    /// One pose.
+    pub const fn at(index: usize) -> Self {
+        Self {
+            lower: index,
+            upper: index,
+        }
     }
 }
 
@@ -75,20 +96,15 @@ impl Section {
         (first <= last).then_some((first as usize, last as usize))
     }
 
-    /// First pose at or after `from` on `side` that overlaps any of the poses `leader_from..=
-    /// leader_to` of the other path: where a follower must not go yet.
-    pub fn first_conflict(
-        &self,
-        side: Side,
-        from: usize,
-        (leader_from, leader_to): (usize, usize),
-    ) -> Option<usize> {
-        if leader_from > self.end(side.other()) || leader_to < self.start(side.other()) {
+    /// First pose at or after `from` on `side` that overlaps any of the poses of `leader`
+    /// on the other path: where a follower must not go yet.
+    pub fn first_conflict(&self, side: Side, from: usize, leader: Span) -> Option<usize> {
+        if leader.lower > self.end(side.other()) || leader.upper < self.start(side.other()) {
             return None;
         }
         (from.max(self.start(side))..=self.end(side)).find(|&index| {
             self.partners(side, index)
-                .is_some_and(|(first, last)| first <= leader_to && leader_from <= last)
+                .is_some_and(|(first, last)| first <= leader.upper && leader.lower <= last)
         })
     }
 
@@ -174,20 +190,6 @@ impl SectionSide {
     }
 }
 
-/// The critical sections of two paths for one kind of vehicle, in order along the first path.
-pub fn sections_between(
-    first: &Path,
-    second: &Path,
-    footprint: &Footprint,
-    merge: MergePolicy,
-) -> Vec<Section> {
-    let (rows, columns) = (
-        CoveredPath::new(first, footprint),
-        CoveredPath::new(second, footprint),
-    );
-    sections_of(&rows, &columns, merge)
-}
-
 /// As [`sections_between`], of paths whose ground is known already.
 pub(crate) fn sections_of(
     first: &CoveredPath,
@@ -240,26 +242,363 @@ fn merged(parts: Vec<Vec<Run>>, gap: [u32; 2]) -> Vec<Vec<Run>> {
     open.into_iter().map(|(_, runs)| runs).collect()
 }
 
+/// The critical sections of two paths for one kind of vehicle, in order along the first path.
+#[cfg(test)]
+pub(crate) fn sections_between(
+    first: &Path,
+    second: &Path,
+    footprint: &Footprint,
+    merge: MergePolicy,
+) -> Vec<Section> {
+    let (rows, columns) = (
+        CoveredPath::new(first, footprint),
+        CoveredPath::new(second, footprint),
+    );
+    sections_of(&rows, &columns, merge)
+}
+
+/// Sections of one pair of paths, once known.
+type Cell = OnceLock<Arc<[Section]>>;
+
+/// The critical sections of every two paths, each computed when first asked for and kept. Only
+/// paths near each other have a place to keep them, so a large world costs no more than many
+/// small ones.
+pub struct SectionLibrary {
+    paths: PathLibrary,
+    footprint: Footprint,
+    merge: MergePolicy,
+    none: Arc<[Section]>,
+    /// Per path without direction.
+    covered: Vec<OnceLock<CoveredPath>>,
+    near: Vec<Near>,
+}
+
+/// The pairs of one path, without direction, and those not before it in the library.
+#[derive(Debug, Default)]
+struct Near {
+    /// The other paths, ascending.
+    others: Vec<usize>,
+    /// Per other path: own direction, the other's direction (times 2), which comes first (times
+    /// 4).
+    cells: Vec<[Cell; 8]>,
+}
+
+impl core::fmt::Debug for SectionLibrary {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        // Which sections were asked for yet says nothing of the world.
+        f.debug_struct("SectionLibrary")
+            .field("paths", &self.paths.len())
+            .field("footprint", &self.footprint)
+            .field("merge", &self.merge)
+            .finish_non_exhaustive()
+    }
+}
+
+impl SectionLibrary {
+    /// A library without any section computed yet.
+    pub fn new(paths: PathLibrary, footprint: Footprint, merge: MergePolicy) -> Self {
+        let forward = paths.ids().step_by(2).filter_map(|id| paths.get(id));
+        let around: Vec<_> = forward
+            .map(|path| bounds_of(path, footprint.radius_m()))
+            .collect();
+        let near = around.iter().enumerate().map(|(low, bounds)| {
+            let others = around.iter().enumerate().skip(low);
+            let others: Vec<_> = others
+                .filter(|(_, other)| bounds.meets(other))
+                .map(|(high, _)| high)
+                .collect();
+            let cells = others.iter().map(|_| <[Cell; 8]>::default()).collect();
+            Near { others, cells }
+        });
+        Self {
+            near: near.collect(),
+            covered: around.iter().map(|_| OnceLock::new()).collect(),
+            paths,
+            footprint,
+            merge,
+            none: Arc::new([]),
+        }
+    }
+
+    /// The footprint whose overlaps count.
+    pub fn footprint(&self) -> &Footprint {
+        &self.footprint
+    }
+
+    /// The sections of two paths, `first` being [`Side::First`]. Several threads may ask at once;
+    /// each pair is the same whoever computed it.
+    ///
+    /// # Panics
+    /// When a path is not in the library.
+    pub fn between(&self, first: PathId, second: PathId) -> &Arc<[Section]> {
+        assert!(
+            first.index().max(second.index()) < self.paths.len(),
+            "paths {first} and {second} are of this library of {} ids",
+            self.paths.len()
+        );
+        let is_mirrored = first.index() / 2 > second.index() / 2;
+        let (low, high) = if is_mirrored {
+            (second, first)
+        } else {
+            (first, second)
+        };
+        let near = &self.near[low.index() / 2];
+        let Ok(place) = near.others.binary_search(&(high.index() / 2)) else {
+            return &self.none;
+        };
+        let cells = &near.cells[place];
+        let forward = cells[0]
+            .get_or_init(|| sections_of(self.covered(low), self.covered(high), self.merge).into());
+        let variant = (low.index() & 1) + 2 * (high.index() & 1) + 4 * usize::from(is_mirrored);
+        if variant == 0 {
+            return forward;
+        }
+        cells[variant].get_or_init(|| {
+            let turned = |section: &Section| {
+                let mut section = section.clone();
+                for (side, path) in [(Side::First, low), (Side::Second, high)] {
+                    if path.index() & 1 == 1 {
+                        section = section.reversed(side, self.path(path).last_index());
+                    }
+                }
+                if is_mirrored {
+                    section.mirrored()
+                } else {
+                    section
+                }
+            };
+            let mut sections: Vec<_> = forward.iter().map(turned).collect();
+            sort(&mut sections);
+            sections.into()
+        })
+    }
+
+    fn covered(&self, id: PathId) -> &CoveredPath {
+        self.covered[id.index() / 2].get_or_init(|| {
+            let forward = PathId(id.0 & !1);
+            CoveredPath::new(self.path(forward), &self.footprint)
+        })
+    }
+
+    fn path(&self, id: PathId) -> &Path {
+        self.paths.get(id).expect("a path of this library")
+    }
+}
+
+/// A rectangle around all that a vehicle of this radius covers along the path.
+fn bounds_of(path: &Path, radius_m: f64) -> Bounds {
+    let mut bounds = Bounds {
+        x_min_m: f64::INFINITY,
+        x_max_m: f64::NEG_INFINITY,
+        y_min_m: f64::INFINITY,
+        y_max_m: f64::NEG_INFINITY,
+    };
+    for pose in path.poses() {
+        bounds = bounds.joined(&Bounds {
+            x_min_m: pose.x_m - radius_m,
+            x_max_m: pose.x_m + radius_m,
+            y_min_m: pose.y_m - radius_m,
+            y_max_m: pose.y_m + radius_m,
+        });
+    }
+    bounds
+}
+
+/// Poses in a block of the broad phase.
+const BLOCK: usize = 32;
+/// What rounding can make of a distance, metres, with room.
+const ROUNDING_M: f64 = 1e-9;
+
+/// The ground a vehicle covers along a path.
+#[derive(Debug, Clone)]
+pub(crate) struct CoveredPath {
+    footprint: Footprint,
+    spacing_m: f64,
+    boxes: Vec<OrientedBox>,
+    /// Around each [`BLOCK`] poses.
+    blocks: Vec<Bounds>,
+    /// What any point of the vehicle moves between neighbouring poses, at most.
+    motion_m: f64,
+}
+
+impl CoveredPath {
+    pub(crate) fn new(path: &Path, footprint: &Footprint) -> Self {
+        let boxes: Vec<_> = path.poses().iter().map(|pose| footprint.at(pose)).collect();
+        let around = |block: &[OrientedBox]| {
+            let bounds = block.iter().map(OrientedBox::bounds);
+            bounds.reduce(|all, one| all.joined(&one))
+        };
+        let motions = path.poses().windows(2).map(|two| {
+            let half_turn = 0.5 * (two[1].heading_rad - two[0].heading_rad);
+            two[0].distance_m(&two[1]) + 2.0 * footprint.radius_m() * half_turn.sin().abs()
+        });
+        Self {
+            footprint: *footprint,
+            spacing_m: path.spacing_m(),
+            blocks: boxes.chunks(BLOCK).filter_map(around).collect(),
+            motion_m: motions.fold(0.0, f64::max),
+            boxes,
+        }
+    }
+
+    pub(crate) fn footprint(&self) -> &Footprint {
+        &self.footprint
+    }
+
+    pub(crate) fn spacing_m(&self) -> f64 {
+        self.spacing_m
+    }
+
+    /// Poses whose certain fate `distance_m` tells, the present one among them.
+    fn certain(&self, distance_m: f64) -> usize {
+        let steps = (distance_m - ROUNDING_M) / self.motion_m;
+        floor_index(steps).clamp(1, self.boxes.len())
+    }
+
+    /// The ranges of poses whose blocks meet `bounds`, neighbouring ones joined.
+    fn ranges_near(&self, bounds: &Bounds, ranges: &mut Vec<Range<usize>>) {
+        ranges.clear();
+        for (block, around) in self.blocks.iter().enumerate() {
+            if around.meets(bounds) {
+                let begin = block * BLOCK;
+                let end = (begin + BLOCK).min(self.boxes.len());
+                match ranges.last_mut() {
+                    Some(last) if last.end == begin => last.end = end,
+                    _ => ranges.push(begin..end),
+                }
+            }
+        }
+    }
+}
+
+/// Poses of the second path, without a gap, that one pose of the first overlaps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct Run {
+    /// Pose of the first path.
+    pub(crate) row: u32,
+    /// First pose of the second path.
+    pub(crate) first: u32,
+    /// Last pose of the second path.
+    pub(crate) last: u32,
+}
+
+/// The overlapping pose pairs of two paths as sets connected along rows, columns and diagonals,
+/// each as runs in order of rows.
+pub(crate) fn components(first: &CoveredPath, second: &CoveredPath) -> Vec<Vec<Run>> {
+    let runs = runs_of(first, second);
+    let mut parents: Vec<usize> = (0..runs.len()).collect();
+    let (mut above, mut begin) = (0..0, 0);
+    while begin < runs.len() {
+        let row = runs[begin].row;
+        let end = begin + runs[begin..].partition_point(|run| run.row == row);
+        let mut upper = above.clone().peekable();
+        let is_next = above.end > above.start && runs[above.start].row + 1 == row;
+        for lower in begin..end {
+            // Both rows are in order, so one pass over each finds all touching pairs.
+            while is_next
+                && upper
+                    .next_if(|&up| runs[up].last + 1 < runs[lower].first)
+                    .is_some()
+            {}
+            let mut touching = upper.clone();
+            while let Some(up) = touching.next_if(|&up| runs[up].first <= runs[lower].last + 1) {
+                if is_next {
+                    join(&mut parents, up, lower);
+                }
+            }
+        }
+        above = begin..end;
+        begin = end;
+    }
+    let mut parts: Vec<Vec<Run>> = vec![Vec::new(); runs.len()];
+    for (index, run) in runs.iter().enumerate() {
+        parts[root(&mut parents, index)].push(*run);
+    }
+    parts.retain(|part| !part.is_empty());
+    parts
+}
+
+fn runs_of(first: &CoveredPath, second: &CoveredPath) -> Vec<Run> {
+    let (mut runs, mut ranges) = (Vec::new(), Vec::new());
+    for (block, around) in first.blocks.iter().enumerate() {
+        second.ranges_near(around, &mut ranges);
+        let begin = block * BLOCK;
+        let end = (begin + BLOCK).min(first.boxes.len());
+        for row in begin..end {
+            for range in &ranges {
+                add_runs(&mut runs, row, &first.boxes[row], second, range.clone());
+            }
+        }
+    }
+    runs
+}
+
+fn add_runs(
+    runs: &mut Vec<Run>,
+    row: usize,
+    here: &OrientedBox,
+    second: &CoveredPath,
+    range: Range<usize>,
+) {
+    let number = |index: usize| u32::try_from(index).expect("a path has fewer than 2^32 poses");
+    let (mut index, mut open) = (range.start, None);
+    while index < range.end {
+        let gap_m = here.gap_m(&second.boxes[index]);
+        let next = (index + second.certain(gap_m.abs())).min(range.end);
+        if gap_m < 0.0 {
+            open.get_or_insert(index);
+        } else if let Some(first) = open.take() {
+            runs.push(Run {
+                row: number(row),
+                first: number(first),
+                last: number(index - 1),
+            });
+        }
+        index = next;
+    }
+    if let Some(first) = open {
+        runs.push(Run {
+            row: number(row),
+            first: number(first),
+            last: number(range.end - 1),
+        });
+    }
+}
+
+fn root(parents: &mut [usize], mut index: usize) -> usize {
+    while parents[index] != index {
+        parents[index] = parents[parents[index]];
+        index = parents[index];
+    }
+    index
+}
+
+fn join(parents: &mut [usize], a: usize, b: usize) {
+    let (a, b) = (root(parents, a), root(parents, b));
+    parents[a.max(b)] = a.min(b);
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Pose;
+    use crate::geometry::{Footprint, Pose};
+    use Path;
 
     const CART: Footprint = Footprint {
         length_m: 2.0,
         width_m: 1.0,
     };
 
-    fn line(from: (f64, f64), to: (f64, f64)) -> Path {
-        let heading = (to.1 - from.1).atan2(to.0 - from.0);
-        let ends = [from, to].map(|(x, y)| Pose::new(x, y, heading));
+    fn line(from: [f64; 2], to: [f64; 2]) -> Path {
+        let heading = (to[1] - from[1]).atan2(to[0] - from[0]);
+        let ends = [from, to].map(|[x, y]| Pose::new(x, y, heading));
         Path::new(&ends, 0.1).unwrap()
     }
 
     #[test]
     fn a_right_angle_crossing_has_the_section_of_its_closed_form() {
-        let east = line((-10.0, 0.0), (10.0, 0.0));
-        let north = line((0.0, -10.0), (0.0, 10.0));
+        let east = line([-10.0, 0.0], [10.0, 0.0]);
+        let north = line([0.0, -10.0], [0.0, 10.0]);
         let sections = sections_between(&east, &north, &CART, MergePolicy::Never);
         assert_eq!(sections.len(), 1);
         // Overlap while both |x| and |y| are below half a length plus half a width, 1.5 m; the
@@ -272,21 +611,25 @@ mod tests {
 
     #[test]
     fn a_follower_may_go_as_far_as_the_leader_has_cleared() {
-        let east = line((0.0, 0.0), (20.0, 0.0));
+        let east = line([0.0, 0.0], [20.0, 0.0]);
         let sections = sections_between(&east, &east, &CART, MergePolicy::Never);
         assert_eq!(sections.len(), 1);
         // A leader at 10 m still covers 9 m to the end; the follower's front is 1 m ahead of it.
-        let first = sections[0].first_conflict(Side::Second, 0, (100, 200));
+        let beyond = Span {
+            lower: 100,
+            upper: 200,
+        };
+        let first = sections[0].first_conflict(Side::Second, 0, beyond);
         assert_eq!(first, Some(81));
         assert_eq!(
-            sections[0].first_conflict(Side::Second, 0, (100, 100)),
+            sections[0].first_conflict(Side::Second, 0, Span::at(100)),
             Some(81)
         );
     }
 
     #[test]
     fn sections_nearer_than_a_vehicle_merge_only_on_request() {
-        let east = line((-10.0, 0.0), (10.0, 0.0));
+        let east = line([-10.0, 0.0], [10.0, 0.0]);
         let poses = [
             Pose::new(-3.0, 5.0, -core::f64::consts::FRAC_PI_2),
             Pose::new(-3.0, -2.0, -core::f64::consts::FRAC_PI_2),
@@ -299,3 +642,7 @@ mod tests {
         assert!(count(MergePolicy::WithinVehicle) <= 2);
     }
 }
+
+#[cfg(test)]
+#[path = "section_tests.rs"]
+mod section_library_tests;

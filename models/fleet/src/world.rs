@@ -7,7 +7,7 @@ use crate::geometry::{Footprint, Pose, wrap_angle};
 use crate::path::{Path, PathId, PathLibrary};
 use crate::section::MergePolicy;
 
-pub use crate::section_library::SectionLibrary;
+pub use crate::section::SectionLibrary;
 
 /// A vehicle of Table I of the seed paper.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -79,14 +79,13 @@ impl CaseStudy for Shuttle {
     type Parameters = ShuttleParameters;
 
     fn new(parameters: Self::Parameters, _seed: u64) -> Result<Self, ParameterError> {
-        ParameterError::check("rate_hz", parameters.rate_hz, 1.0..=10_000.0, "1 to 10000")?;
-        ParameterError::check("gain_per_s", parameters.gain_per_s, 0.0..=100.0, "0 to 100")?;
-        ParameterError::check(
-            "speed_max_mps",
-            parameters.speed_max_mps,
-            0.0..=10.0,
-            "0 to 10",
-        )?;
+        for (key, value, min, max) in [
+            ("rate_hz", parameters.rate_hz, 1.0, 10_000.0),
+            ("gain_per_s", parameters.gain_per_s, 0.0, 100.0),
+            ("speed_max_mps", parameters.speed_max_mps, 0.0, 10.0),
+        ] {
+            ParameterError::check(key, value, min..=max, &format!("{min} to {max}"))?;
+        }
         Ok(Self { parameters })
     }
 

@@ -31,7 +31,7 @@ pub fn in_order<K: Ord + Copy, T, I: Iterator<Item = (K, T)>>(
             strays.push((key, value));
             continue;
         }
-        insert(&mut window, (key, ()));
+        insert(&mut window, key, ());
         if window.len() > WINDOW {
             floor = window.pop_front().map(|first| first.0);
         }
@@ -46,12 +46,12 @@ pub fn in_order<K: Ord + Copy, T, I: Iterator<Item = (K, T)>>(
 }
 
 /// Puts `entry` behind those whose keys are not above its own.
-fn insert<K: Ord + Copy, T>(window: &mut VecDeque<(K, T)>, entry: (K, T)) {
-    if window.back().is_none_or(|last| last.0 <= entry.0) {
-        window.push_back(entry);
+fn insert<K: Ord + Copy, T>(window: &mut VecDeque<(K, T)>, key: K, value: T) {
+    if window.back().is_none_or(|last| last.0 <= key) {
+        window.push_back((key, value));
     } else {
-        let place = window.partition_point(|one| one.0 <= entry.0);
-        window.insert(place, entry);
+        let place = window.partition_point(|one| one.0 <= key);
+        window.insert(place, (key, value));
     }
 }
 
@@ -63,7 +63,7 @@ impl<K: Ord + Copy, T, I: Iterator<Item = (K, T)>> InOrder<K, T, I> {
         {
             // The strays are at hand.
             if self.floor.is_none_or(|floor| key >= floor) {
-                insert(&mut self.window, (key, value));
+                insert(&mut self.window, key, value);
             }
         }
         let held = self.window.front().map(|entry| entry.0);

@@ -8,6 +8,7 @@ pub mod correlation;
 pub mod goodness;
 pub mod histogram;
 pub mod in_order;
+pub mod metric;
 pub mod resampling;
 pub mod samples;
 pub mod series;

@@ -1,6 +1,8 @@
 //! Resampling of blocks of successive samples, for intervals of quantiles. Which intervals a report shows
 //! is decided elsewhere; see [`super::statistics::block_bootstrap_quantile`].
 
+use core::ops::Range;
+
 use super::samples::Samples;
 use super::special::ceil_count;
 use super::statistics::{BLOCK_COUNT_MIN, IntervalNs, RESAMPLE_COUNT};
@@ -47,7 +49,7 @@ impl BlockResampling {
         resampling.pivots = resampling.pivots();
         for pivot in &resampling.pivots {
             for block in 0..block_count {
-                let reached = resampling.reach(block, *pivot, (0, length));
+                let reached = resampling.reach(block, *pivot, 0..length);
                 let reached = u32::try_from(reached).expect("a block has fewer samples");
                 resampling.reached.push(reached);
             }
@@ -73,7 +75,8 @@ impl BlockResampling {
     }
 
     /// Samples of `block` that do not exceed `value`, which are at least and at most so many.
-    fn reach(&self, block: usize, value: i64, (mut low, mut high): (usize, usize)) -> usize {
+    fn reach(&self, block: usize, value: i64, places: Range<usize>) -> usize {
+        let (mut low, mut high) = (places.start, places.end);
         let start = block * self.length;
         while low < high {
             let middle = usize::midpoint(low, high);
@@ -130,7 +133,7 @@ impl BlockResampling {
         let above = low.checked_sub(1);
         let range = |block: usize| {
             let least = above.map_or(0, |above| row(above)[block] as usize);
-            (least, row(low)[block] as usize)
+            least..row(low)[block] as usize
         };
         let reaches = |value: i64| {
             let each = drawn.iter();

@@ -162,7 +162,7 @@ fn best_lag(leading: &[f64], delayed: &[f64], lag_max: usize) -> Option<f64> {
     // Shift 0 is the largest lead, LEAD_MAX no lag.
     let shift_max = lag_max + LEAD_MAX;
     let correlate =
-        |shift: usize, stride: usize| correlation(leading, delayed, (shift, shift_max), stride);
+        |shift: usize, stride: usize| correlation(leading, delayed, shift, shift_max, stride);
     let best_of = |shifts: &mut dyn Iterator<Item = usize>, stride| {
         shifts
             .filter_map(|shift| Some((shift, correlate(shift, stride)?)))
@@ -187,7 +187,8 @@ fn best_lag(leading: &[f64], delayed: &[f64], lag_max: usize) -> Option<f64> {
 fn correlation(
     leading: &[f64],
     delayed: &[f64],
-    (shift, shift_max): (usize, usize),
+    shift: usize,
+    shift_max: usize,
     stride: usize,
 ) -> Option<f64> {
     let stretch = delayed.len().checked_sub(shift_max)?;

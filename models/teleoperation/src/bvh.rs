@@ -1,13 +1,10 @@
 //! Motion files in the BVH text format (Biovision hierarchy): reader and writer on text. It opens
 //! no file, and it does not interpret the motion: see [`super::motion`].
 //!
-//! [`BvhReader`] reads line by line and frame by frame, so the text may come from anywhere and
-//! need never end; [`Bvh::parse`] reads a whole file with it. Numbers and keywords may be spread
-//! over lines at will; every error names the line it was found on. No input makes the reader
-//! panic, recurse or reserve more memory than the text's own size.
+//! Numbers and keywords may be spread over lines at will; every error names the line it was found
+//! on. No input makes the reader panic, recurse or reserve more memory than the text's own size.
 
 use core::fmt::Write as _;
-use core::ops::Range;
 
 use crate::skeleton::{Channel, Skeleton};
 
@@ -91,16 +88,32 @@ impl Bvh {
     /// # Errors
     /// The first line that is not as the format says.
     pub fn parse(text: &str) -> Result<Self, BvhError> {
-        let mut reader = BvhReader::new(text.lines())?;
-        let mut values = Vec::new();
-        while reader.words.advance() {
-            values.push(reader.words.present_number("a channel value")?);
+        let mut words = Words::new(text);
+        words.keyword("HIERARCHY", "the keyword HIERARCHY")?;
+        words.keyword("ROOT", "the keyword ROOT")?;
+        let skeleton = parse_hierarchy(&mut words)?;
+        words.keyword("MOTION", "the keyword MOTION")?;
+        words.keyword("Frames:", "the keyword Frames:")?;
+        let count_line = words.line();
+        let frame_count: usize = words.parsed("a frame count")?;
+        words.keyword("Frame", "the keywords Frame Time:")?;
+        words.keyword("Time:", "the keywords Frame Time:")?;
+        let frame_time_s = words.number("a frame time in seconds")?;
+        if !(1e-6..=10.0).contains(&frame_time_s) {
+            return Err(words.error(BvhProblem::OutOfRange {
+                what: "frame time",
+                value: frame_time_s.to_string(),
+                allowed: "0.000001 to 10 s",
+            }));
         }
-        let channel_count = reader.skeleton.channel_count();
-        let frame_count = reader.announced_frame_count;
+        let mut values = Vec::new();
+        while words.advance() {
+            values.push(words.present_number("a channel value")?);
+        }
+        let channel_count = skeleton.channel_count();
         if frame_count.checked_mul(channel_count) != Some(values.len()) || values.is_empty() {
             return Err(BvhError {
-                line: reader.count_line,
+                line: count_line,
                 problem: BvhProblem::FrameCount {
                     frame_count,
                     channel_count,
@@ -109,8 +122,8 @@ impl Bvh {
             });
         }
         Ok(Self {
-            skeleton: reader.skeleton,
-            frame_time_s: reader.frame_time_s,
+            skeleton,
+            frame_time_s,
             values,
         })
     }
@@ -137,92 +150,8 @@ impl Bvh {
     }
 }
 
-/// Reads a motion file as its lines come in: the hierarchy at once, then a frame at a time.
-#[derive(Debug)]
-pub struct BvhReader<L> {
-    words: Words<L>,
-    skeleton: Skeleton,
-    frame_time_s: f64,
-    announced_frame_count: usize,
-    count_line: usize,
-}
-
-impl<L: Iterator<Item: AsRef<str>>> BvhReader<L> {
-    /// Reads up to the frame time; `lines` come without their line ends.
-    ///
-    /// # Errors
-    /// The first line that is not as the format says.
-    pub fn new(lines: L) -> Result<Self, BvhError> {
-        let mut words = Words::new(lines);
-        words.keyword("HIERARCHY", "the keyword HIERARCHY")?;
-        words.keyword("ROOT", "the keyword ROOT")?;
-        let skeleton = parse_hierarchy(&mut words)?;
-        words.keyword("MOTION", "the keyword MOTION")?;
-        words.keyword("Frames:", "the keyword Frames:")?;
-        let count_line = words.line();
-        let announced_frame_count = words.parsed("a frame count")?;
-        words.keyword("Frame", "the keywords Frame Time:")?;
-        words.keyword("Time:", "the keywords Frame Time:")?;
-        let frame_time_s = words.number("a frame time in seconds")?;
-        if !(1e-6..=10.0).contains(&frame_time_s) {
-            return Err(words.error(BvhProblem::OutOfRange {
-                what: "frame time",
-                value: frame_time_s.to_string(),
-                allowed: "0.000001 to 10 s",
-            }));
-        }
-        Ok(Self {
-            words,
-            skeleton,
-            frame_time_s,
-            announced_frame_count,
-            count_line,
-        })
-    }
-
-    /// The joints and what their channels mean.
-    pub fn skeleton(&self) -> &Skeleton {
-        &self.skeleton
-    }
-
-    /// Time from one frame to the next, seconds.
-    pub fn frame_time_s(&self) -> f64 {
-        self.frame_time_s
-    }
-
-    /// Frames the header speaks of; a live source may send any number.
-    pub fn announced_frame_count(&self) -> usize {
-        self.announced_frame_count
-    }
-
-    /// Line of the newest word, counted from 1.
-    pub fn line(&self) -> usize {
-        self.words.line()
-    }
-
-    /// Reads the next frame into `values`, which is cleared first; false at the end of the lines,
-    /// and for a skeleton without channels.
-    ///
-    /// # Errors
-    /// A word that is no number, or lines that end within a frame. The words before it are gone.
-    pub fn next_frame(&mut self, values: &mut Vec<f64>) -> Result<bool, BvhError> {
-        values.clear();
-        let channel_count = self.skeleton.channel_count();
-        if channel_count == 0 || !self.words.advance() {
-            return Ok(false);
-        }
-        values.push(self.words.present_number("a channel value")?);
-        while values.len() < channel_count {
-            values.push(self.words.number("a channel value")?);
-        }
-        Ok(true)
-    }
-}
-
 /// Reads from the root's name to the brace that closes the root.
-fn parse_hierarchy<L: Iterator<Item: AsRef<str>>>(
-    words: &mut Words<L>,
-) -> Result<Skeleton, BvhError> {
+fn parse_hierarchy(words: &mut Words<'_>) -> Result<Skeleton, BvhError> {
     const EXPECTED: &str = "JOINT, End Site or a closing brace";
     let mut skeleton = Skeleton::default();
     let mut open: Vec<usize> = Vec::new();
@@ -249,13 +178,13 @@ fn parse_hierarchy<L: Iterator<Item: AsRef<str>>>(
 }
 
 /// Reads a joint's name, offset and channels; its children and closing brace come after.
-fn parse_joint<L: Iterator<Item: AsRef<str>>>(
-    words: &mut Words<L>,
+fn parse_joint(
+    words: &mut Words<'_>,
     skeleton: &mut Skeleton,
     parent: Option<usize>,
 ) -> Result<usize, BvhError> {
     words.next("a joint name")?;
-    let name = words.present().to_owned();
+    let name = words.present.to_owned();
     if skeleton.joints().len() >= JOINT_COUNT_MAX {
         return Err(words.error(BvhProblem::OutOfRange {
             what: "joint count",
@@ -283,70 +212,55 @@ fn parse_joint<L: Iterator<Item: AsRef<str>>>(
         const EXPECTED: &str = "a channel name such as Xrotation";
         words.next("a channel name")?;
         let channel =
-            Channel::from_name(words.present()).ok_or_else(|| words.unexpected(EXPECTED))?;
+            Channel::from_name(words.present).ok_or_else(|| words.unexpected(EXPECTED))?;
         channels.push(channel);
     }
     Ok(skeleton.push(&name, parent, offset, &channels))
 }
 
-/// The lines' words, one at a time.
+/// The words of a text, one after the other.
 #[derive(Debug)]
-struct Words<L> {
-    lines: L,
-    /// The line under way.
-    text: String,
+struct Words<'a> {
+    lines: core::str::Lines<'a>,
     line_count: usize,
-    /// Where in the line the newest word lies.
-    word: Range<usize>,
+    /// The rest of the line behind the present word.
+    rest: &'a str,
+    present: &'a str,
 }
 
-impl<L: Iterator<Item: AsRef<str>>> Words<L> {
-    fn new(lines: L) -> Self {
+impl<'a> Words<'a> {
+    fn new(text: &'a str) -> Self {
         Self {
-            lines,
-            text: String::new(),
+            lines: text.trim_start_matches('\u{feff}').lines(),
             line_count: 0,
-            word: 0..0,
+            rest: "",
+            present: "",
         }
     }
 
-    /// Line of the newest word, counted from 1.
+    /// The line of the present word, counted from 1.
     fn line(&self) -> usize {
         self.line_count.max(1)
     }
 
-    /// Goes to the next word; false when there is none.
+    /// Goes to the next word; false at the end.
     fn advance(&mut self) -> bool {
         loop {
-            let rest = &self.text[self.word.end..];
-            let trimmed = rest.trim_start();
+            let trimmed = self.rest.trim_start();
             if let Some(word) = trimmed.split_whitespace().next() {
-                let start = self.text.len() - trimmed.len();
-                self.word = start..start + word.len();
+                (self.present, self.rest) = (word, &trimmed[word.len()..]);
                 return true;
             }
             let Some(next) = self.lines.next() else {
                 return false;
             };
-            self.text.clear();
-            // A byte order mark may stand before everything else.
-            let is_first = self.line_count == 0;
-            self.text.push_str(match next.as_ref() {
-                text if is_first => text.trim_start_matches('\u{feff}'),
-                text => text,
-            });
-            self.word = 0..0;
+            self.rest = next;
             self.line_count += 1;
         }
     }
 
-    /// The newest word.
-    fn present(&self) -> &str {
-        &self.text[self.word.clone()]
-    }
-
     fn is(&self, keyword: &str) -> bool {
-        self.present().eq_ignore_ascii_case(keyword)
+        self.present.eq_ignore_ascii_case(keyword)
     }
 
     fn next(&mut self, expected: &'static str) -> Result<(), BvhError> {
@@ -368,7 +282,7 @@ impl<L: Iterator<Item: AsRef<str>>> Words<L> {
 
     fn parsed<T: core::str::FromStr>(&mut self, expected: &'static str) -> Result<T, BvhError> {
         self.next(expected)?;
-        let parsed = self.present().parse().ok();
+        let parsed = self.present.parse().ok();
         parsed.ok_or_else(|| self.unexpected(expected))
     }
 
@@ -379,7 +293,7 @@ impl<L: Iterator<Item: AsRef<str>>> Words<L> {
 
     /// The newest word as a finite number.
     fn present_number(&self, expected: &'static str) -> Result<f64, BvhError> {
-        let parsed = self.present().parse().ok();
+        let parsed = self.present.parse().ok();
         parsed
             .filter(|value: &f64| value.is_finite())
             .ok_or_else(|| self.unexpected(expected))
@@ -388,7 +302,7 @@ impl<L: Iterator<Item: AsRef<str>>> Words<L> {
     fn unexpected(&self, expected: &'static str) -> BvhError {
         self.error(BvhProblem::Unexpected {
             expected,
-            found: self.present().chars().take(40).collect(),
+            found: self.present.chars().take(40).collect(),
         })
     }
 

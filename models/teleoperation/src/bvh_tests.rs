@@ -22,51 +22,6 @@ fn a_small_file_is_read_as_written() {
 }
 
 #[test]
-fn frames_come_one_at_a_time_from_a_text_that_is_still_being_written() {
-    let mut seen_count = 0;
-    let lines = SMALL.lines().inspect(|_| seen_count += 1);
-    let mut reader = BvhReader::new(lines).unwrap();
-    assert_eq!(reader.announced_frame_count(), 2);
-    assert!((reader.frame_time_s() - 0.008).abs() < 1e-15);
-    assert_eq!(reader.line(), 18);
-    let mut frame = Vec::new();
-    assert_eq!(reader.next_frame(&mut frame), Ok(true));
-    assert_eq!((reader.line(), frame.len()), (19, 9));
-    assert_eq!(reader.next_frame(&mut frame), Ok(true));
-    assert!((frame[7] + 20.0).abs() < 1e-15);
-    assert_eq!(reader.next_frame(&mut frame), Ok(false));
-    assert_eq!(seen_count, 20);
-}
-
-#[test]
-fn a_stream_that_breaks_off_or_turns_to_nonsense_names_the_line() {
-    let read = |text: &str| {
-        let mut reader = BvhReader::new(text.lines().map(str::to_owned)).unwrap();
-        let mut frame = Vec::new();
-        loop {
-            match reader.next_frame(&mut frame) {
-                Ok(true) => {}
-                Ok(false) => return None,
-                Err(error) => return Some(error.to_string()),
-            }
-        }
-    };
-    assert_eq!(read(SMALL), None);
-    // More frames than announced are no error of a stream.
-    assert_eq!(read(&format!("{SMALL}0 95 0 0 0 0 1 2 3\n")), None);
-    let broken_off = read(&format!("{SMALL}\n0 95 0\n")).unwrap();
-    assert_eq!(
-        broken_off,
-        "line 22: expected a channel value, found the end of the text"
-    );
-    let nonsense = read(&SMALL.replace("-2e1", "down")).unwrap();
-    assert_eq!(
-        nonsense,
-        "line 20: expected a channel value, found \"down\""
-    );
-}
-
-#[test]
 fn windows_line_ends_and_a_byte_order_mark_change_nothing() {
     let windows = format!("\u{feff}{}", SMALL.replace('\n', "\r\n"));
     assert_eq!(Bvh::parse(&windows), Bvh::parse(SMALL));

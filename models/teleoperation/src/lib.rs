@@ -15,7 +15,7 @@
 //!
 //! 1. [`messages`] and [`hil_arm::egm::messages`]: what the roles tell each other.
 //! 2. [`motion`] with [`swing`], [`bvh`], [`skeleton`]: where the hand is.
-//! 3. [`mapping`] with [`hil_arm::yumi`]: from the hand to the joints.
+//! 3. The follower with [`hil_arm::yumi`]: from the hand to the joints.
 //! 4. [`hil_arm::egm::controller`]: from the commands to the motion.
 //! 5. `score`: what the robot made of it.
 //! 6. [`experiment`]: thousands of loops over channels that a table names, in virtual time.
@@ -52,11 +52,8 @@ mod controller;
 pub mod experiment;
 mod follower;
 mod human;
-pub mod mapping;
 pub mod messages;
 pub mod motion;
-mod motion_client;
-mod motion_path;
 mod motion_server;
 mod parameters;
 mod replay;

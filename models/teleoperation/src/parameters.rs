@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::bvh::Bvh;
 use crate::experiment::TableParameters;
-use crate::mapping::MappingSettings;
+use crate::follower::MappingSettings;
 use crate::motion::{Motion, Recording};
 use crate::swing::Swing;
 use hil_arm::egm::messages::EgmStartParameters;
@@ -236,45 +236,20 @@ impl TeleoperationParameters {
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
         let ranges = [
-            (
-                "motion_period_s",
-                self.motion_period_s,
-                0.5..=60.0,
-                "0.5 to 60",
-            ),
-            ("motion_start_s", self.motion_start_s, 0.0..=60.0, "0 to 60"),
-            ("rate_hz", self.rate_hz, 10.0..=1000.0, "10 to 1000"),
-            ("amplitude_m", self.amplitude_m, 0.01..=0.4, "0.01 to 0.4"),
-            (
-                "loop_variation_ratio",
-                self.loop_variation_ratio,
-                0.0..=0.05,
-                "0 to 0.05",
-            ),
-            (
-                "mapping_scale_ratio",
-                self.mapping_scale_ratio,
-                0.1..=2.0,
-                "0.1 to 2",
-            ),
-            ("jump_max_m", self.jump_max_m, 0.001..=1.0, "0.001 to 1"),
-            ("send_hz", self.send_hz(), 1.0..=1000.0, "1 to 1000"),
-            ("blend_s", self.blend_s, 0.1..=10.0, "0.1 to 10"),
-            (
-                "trigger_after_s",
-                self.trigger_after_s,
-                0.0..=60.0,
-                "0 to 60",
-            ),
-            (
-                "motion_unit_m",
-                self.motion_unit_m,
-                1e-4..=1.0,
-                "0.0001 to 1",
-            ),
+            ("motion_period_s", self.motion_period_s, 0.5, 60.0),
+            ("motion_start_s", self.motion_start_s, 0.0, 60.0),
+            ("rate_hz", self.rate_hz, 10.0, 1000.0),
+            ("amplitude_m", self.amplitude_m, 0.01, 0.4),
+            ("loop_variation_ratio", self.loop_variation_ratio, 0.0, 0.05),
+            ("mapping_scale_ratio", self.mapping_scale_ratio, 0.1, 2.0),
+            ("jump_max_m", self.jump_max_m, 0.001, 1.0),
+            ("send_hz", self.send_hz(), 1.0, 1000.0),
+            ("blend_s", self.blend_s, 0.1, 10.0),
+            ("trigger_after_s", self.trigger_after_s, 0.0, 60.0),
+            ("motion_unit_m", self.motion_unit_m, 1e-4, 1.0),
         ];
-        for (key, value, allowed, allowed_text) in ranges {
-            ParameterError::check(key, value, allowed, allowed_text)?;
+        for (key, value, min, max) in ranges {
+            ParameterError::check(key, value, min..=max, &format!("{min} to {max}"))?;
         }
         if let Some(send_hz) = self.send_hz
             && self.send != SendPolicy::Free

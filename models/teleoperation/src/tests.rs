@@ -59,7 +59,7 @@ fn track(frame_count: u64, rate_hz: f64) -> Tracked {
     let origin = hand;
     let settings = case.parameters.mapping(false);
     let mut follower = Follower::engage(arm, RIGHT_START_RAD, settings, &hand);
-    let mut clutch = mapping::Clutch::engage(settings, &origin, &arm.tool(&RIGHT_START_RAD));
+    let mut clutch = follower::Clutch::engage(settings, &origin, &arm.tool(&RIGHT_START_RAD));
     let mut tracked = Tracked::default();
     for frame in 0..frame_count {
         hand = player.at(frame as f64 * frame_s).right_hand;

@@ -31,20 +31,6 @@ impl Severity {
         Self::Error,
     ];
 
-    /// Ok where `is_well` holds, else this.
-    pub(super) const fn unless(self, is_well: bool) -> Self {
-        if is_well { Self::Ok } else { self }
-    }
-
-    /// Ok up to `ok`, a note up to `note`, beyond it a warning.
-    pub(super) fn of_size<T: PartialOrd>(value: T, ok: T, note: T) -> Self {
-        if value > note {
-            Self::Warning
-        } else {
-            Self::Note.unless(value <= ok)
-        }
-    }
-
     /// The word in the JSON.
     pub const fn word(self) -> &'static str {
         match self {

@@ -235,13 +235,13 @@ fn fill(folder: &Path) {
 
 fn traffic(stage: &Stage, injection: &Injection) {
     let (to, from) = (injection.host, 1 - injection.host);
-    let hosts = (stage.lab().host(from), stage.lab().host(to));
-    let how = (injection.length, injection.seed);
+    let (from, to) = (stage.lab().host(from), stage.lab().host(to));
+    let (length, seed) = (injection.length, injection.seed);
     let sent = match injection.kind {
-        Kind::Flood => forger::flood(hosts, false, how),
-        Kind::Forge => forger::flood(hosts, true, how),
-        Kind::Copy => forger::copy(hosts, Forgery::Copy, how),
-        _ => forger::copy(hosts, Forgery::Damage, how),
+        Kind::Flood => forger::flood(from, to, false, length, seed),
+        Kind::Forge => forger::flood(from, to, true, length, seed),
+        Kind::Copy => forger::copy(from, to, Forgery::Copy, length, seed),
+        _ => forger::copy(from, to, Forgery::Damage, length, seed),
     };
     assert!(sent.is_ok(), "no traffic: {sent:?}");
 }

@@ -141,7 +141,7 @@ pub fn play(plan: &Plan) -> Report {
     // Outside of what the hosts have for themselves.
     let keys = RunFolder::new("chaos-key");
     let key = plan.is_sealed.then(|| hop_key(keys.path()));
-    let mut guards = [0, 1].map(|host| start(lab.host(host), plan, (&record, key.as_deref())));
+    let mut guards = [0, 1].map(|host| start(lab.host(host), plan, &record, key.as_deref()));
     let supervisors = [guards[0].pid(), guards[1].pid()];
     let stage = Stage {
         lab,
@@ -212,7 +212,7 @@ fn mount_disk(host: &LabHost, folder: &Path) {
     assert!(mounted.is_ok(), "{mounted:?}");
 }
 
-fn start(host: &LabHost, plan: &Plan, (record, key): (&Path, Option<&Path>)) -> ChildGuard {
+fn start(host: &LabHost, plan: &Plan, record: &Path, key: Option<&Path>) -> ChildGuard {
     let settings = [
         format!("run.record=\"{}\"", record.display()),
         format!("run.duration=\"{} ms\"", RUN_LENGTH.as_millis()),

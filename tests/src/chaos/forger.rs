@@ -33,9 +33,11 @@ pub enum Forgery {
 /// # Errors
 /// When no socket can be had there.
 pub fn flood(
-    (from, to): (&LabHost, &LabHost),
+    from: &LabHost,
+    to: &LabHost,
     looks_real: bool,
-    (length, seed): (Duration, u64),
+    length: Duration,
+    seed: u64,
 ) -> io::Result<u64> {
     let own = SocketAddr::from((from.address(), 0));
     let socket = from.on_network(|| UdpSocket::bind(own))?;
@@ -103,9 +105,11 @@ fn knock(from: &LabHost, target: Ipv4Addr, looks_real: bool) {
 /// # Errors
 /// When no raw socket can be had there.
 pub fn copy(
-    (from, to): (&LabHost, &LabHost),
+    from: &LabHost,
+    to: &LabHost,
     forgery: Forgery,
-    (length, seed): (Duration, u64),
+    length: Duration,
+    seed: u64,
 ) -> io::Result<u64> {
     let raw = |host: &LabHost| {
         host.on_network(|| {

@@ -41,7 +41,7 @@ impl Verdict {
         let mut verdict = Self::default();
         let mut summaries = [None, None];
         for host in 0..2 {
-            summaries[host] = verdict.judge_host(plan, stage, (host, ends[host].as_ref()));
+            summaries[host] = verdict.judge_host(plan, stage, host, ends[host].as_ref());
             verdict.judge_deliveries(stage, host);
         }
         if let [Some(first), Some(second)] = &summaries {
@@ -68,7 +68,8 @@ impl Verdict {
         &mut self,
         plan: &Plan,
         stage: &Stage,
-        (host, end): (usize, Option<&Finished>),
+        host: usize,
+        end: Option<&Finished>,
     ) -> Option<RunSummary> {
         let Some(end) = end else {
             "did not end".clone_into(&mut self.ends[host]);
@@ -105,7 +106,7 @@ impl Verdict {
             }
             return None;
         };
-        self.judge_end(plan, host, (&summary, code));
+        self.judge_end(plan, host, &summary, code);
         self.judge_accounts(plan, host, &summary);
         Some(summary)
     }
@@ -138,7 +139,7 @@ impl Verdict {
         }
     }
 
-    fn judge_end(&mut self, plan: &Plan, host: usize, (summary, code): (&RunSummary, i32)) {
+    fn judge_end(&mut self, plan: &Plan, host: usize, summary: &RunSummary, code: i32) {
         let outcome = summary.run.outcome;
         let fits = match outcome {
             // 1: it completed, but records are missing, and it says so.

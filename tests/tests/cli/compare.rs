@@ -91,8 +91,8 @@ fn a_worse_link_is_found_and_scripts_get_their_exit_code() {
     }
     let differences = json["differences"].to_string();
     assert!(differences.contains("topology"), "{differences}");
-    check_conditions((near, again, far));
-    check_repetitions((near, again), (far, farther));
+    check_conditions(near, again, far);
+    check_repetitions([near, again], [far, farther]);
     let (code, text, _) = compare(&["--format", "md"], &[near, again]);
     assert_eq!(code, Some(0));
     assert!(text.contains("| shuttle/command | loss |"), "{text}");
@@ -103,7 +103,7 @@ fn a_worse_link_is_found_and_scripts_get_their_exit_code() {
     assert_eq!((lines[care - 1], lines[care + 1]), ("", ""), "{text}");
 }
 
-fn check_conditions((near, again, far): (&Path, &Path, &Path)) {
+fn check_conditions(near: &Path, again: &Path, far: &Path) {
     for (condition, folders, expected) in [
         ("p50 > 1.2x", [near, far], 1),
         ("p50 > 1.2x", [far, near], 0),
@@ -135,15 +135,15 @@ fn check_conditions((near, again, far): (&Path, &Path, &Path)) {
     assert_eq!(code, Some(2), "one run is none to compare");
 }
 
-fn check_repetitions(base: (&Path, &Path), new: (&Path, &Path)) {
+fn check_repetitions(base: [&Path; 2], new: [&Path; 2]) {
     let path = |path: &Path| path.to_str().unwrap().to_owned();
     let arguments = [
         "--base".to_owned(),
-        path(base.0),
-        path(base.1),
+        path(base[0]),
+        path(base[1]),
         "--new".to_owned(),
-        path(new.0),
-        path(new.1),
+        path(new[0]),
+        path(new[1]),
         "--format".to_owned(),
         "json".to_owned(),
     ];

@@ -66,7 +66,7 @@ fn p99_us(face: &FaceSummary, name: &str) -> f64 {
 }
 
 /// What the controller's host and the robot's host must have recorded of one arm.
-fn assert_driven((here, there): (&Arms, &Arms), side: Side, arm: &Arm) {
+fn assert_driven(here: &Arms, there: &Arms, side: Side, arm: &Arm) {
     let story = there.story(side);
     println!("{story}");
     // The robot may time out before its sensor is there, and surely when it has gone.
@@ -80,8 +80,8 @@ fn assert_driven((here, there): (&Arms, &Arms), side: Side, arm: &Arm) {
     );
 
     // Both hosts read one clock here.
-    let window = (first + 5 * SECOND_NS, last);
-    let is_inside = |at: &i64| (window.0..window.1).contains(at);
+    let window_ns = first + 5 * SECOND_NS..last;
+    let is_inside = |at: &i64| window_ns.contains(at);
     let commanded = here
         .commands(side)
         .into_iter()
@@ -101,7 +101,7 @@ fn assert_driven((here, there): (&Arms, &Arms), side: Side, arm: &Arm) {
         side.word(),
         load_average()
     );
-    for (place, follow) in here.follow(side, window, LAG_NS).iter().enumerate() {
+    for (place, follow) in here.follow(side, window_ns, LAG_NS).iter().enumerate() {
         println!("{} arm, chain place {place}: {follow:?}", side.word());
         if follow.commanded_deg >= SWING_DEG_MIN {
             assert!(
@@ -144,7 +144,7 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
 
     let (here, there) = (Arms::of(&sensor_files), Arms::of(&robot_files));
     for (side, arm) in [(Side::Right, Arm::right()), (Side::Left, Arm::left())] {
-        assert_driven((&here, &there), side, &arm);
+        assert_driven(&here, &there, side, &arm);
     }
     judge([&sensor_files.summary(), &robot_files.summary()]);
     sensor_files.assert_nothing_left_on(lab.host(0));

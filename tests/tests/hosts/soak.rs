@@ -57,7 +57,7 @@ struct Story {
     peak_bytes: u64,
 }
 
-fn start(lab: &Lab, record: &RunFolder, (index, duration): (usize, Duration)) -> Soak {
+fn start(lab: &Lab, record: &RunFolder, index: usize, duration: Duration) -> Soak {
     let folder = record.join(index.to_string());
     fs::create_dir(&folder).unwrap();
     let trial = Trial::shipped("shuttle-split.toml", &folder)
@@ -125,7 +125,7 @@ fn eight_channels_at_a_kilohertz_leave_every_process_as_large_as_it_was() {
     // One after the other: an account at the end takes processors from the runs that go on.
     let longer = |index: usize| duration + duration.mul_f64(index as f64 / 16.0);
     let mut soaks: Vec<Soak> = (0..RUN_COUNT)
-        .map(|index| start(&lab, &record, (index, longer(index))))
+        .map(|index| start(&lab, &record, index, longer(index)))
         .collect();
     let (stories, shared) = watch(&lab, &soaks, duration);
     let peaks = finish(&mut soaks);

@@ -145,7 +145,7 @@ struct Phase {
 }
 
 /// A run of `span` on which the stranger only listens, or else attacks.
-fn play(record: &Path, (lab, stranger): (&Lab, &Attacker), span: Duration, attacks: bool) -> Phase {
+fn play(record: &Path, lab: &Lab, stranger: &Attacker, span: Duration, attacks: bool) -> Phase {
     let duration = format!("run.duration=\"{} s\"", span.as_secs() + 6);
     let trial = Trial::shipped("shuttle-split.toml", record)
         .set(&format!("links.hop.port={PORT}"))
@@ -175,22 +175,22 @@ fn play(record: &Path, (lab, stranger): (&Lab, &Attacker), span: Duration, attac
         let flood = if attacks {
             let from = SocketAddrV4::new(ADDRESSES[0], PORT);
             let to = SocketAddrV4::new(ADDRESSES[1], PORT + 1);
-            stranger.flood((from, to), (span, RATE), &datagrams)
+            stranger.flood(from, to, span, RATE, &datagrams)
         } else {
             thread::sleep(span);
             Flood::default()
         };
         (flood, watching.join().unwrap())
     });
-    let window = (from_ns, MonotonicClock::now().as_ns());
+    let window_ns = from_ns..MonotonicClock::now().as_ns();
     let worked_ns = ingress_ns(gateway) - worked_ns;
     let files = [0, 1].map(|index| split.files(index).clone());
     let summaries = split.finish();
     Phase {
         summaries,
         flood,
-        commands: delays(&files[1], CHANNELS[0], window),
-        states: delays(&files[0], CHANNELS[1], window),
+        commands: delays(&files[1], CHANNELS[0], window_ns.clone()),
+        states: delays(&files[0], CHANNELS[1], window_ns),
         memory,
         ingress_ns: worked_ns,
         backlog_drops: backlog_drops() - dropped,
@@ -302,17 +302,17 @@ fn a_stranger_with_a_hosts_address_gets_nothing_in_and_stops_nothing() {
     // The name of the lab with another host number, so that the next lab sweeps what a kill leaves.
     let name = format!("{}2", first.strip_suffix('0').unwrap());
     let hardware = hardware_address(&lab);
-    let stranger = Attacker::join(&first, &name, ADDRESSES[0], (ADDRESSES[1], &hardware));
+    let stranger = Attacker::join(&first, &name, ADDRESSES[0], ADDRESSES[1], &hardware);
     let span = attack_span();
     let (quiet, record) = (RunFolder::new("quiet"), RunFolder::new("attacked"));
     println!("quiet run:");
-    let calm = play(quiet.path(), (&lab, &stranger), span, false);
+    let calm = play(quiet.path(), &lab, &stranger, span, false);
     assert_eq!(
         account(&calm.summaries[1], CHANNELS[0]).fates.lost_count(),
         0
     );
     println!("attacked run:");
-    let attacked = play(record.path(), (&lab, &stranger), span, true);
+    let attacked = play(record.path(), &lab, &stranger, span, true);
     let ingress = direction(&attacked.summaries[1], CHANNELS[0], "ingress");
     println!(
         "{} datagrams of the stranger in {:?}, {:.0} a second; the thread that takes commands had {:.2} us of \
@@ -401,7 +401,7 @@ fn connections_that_never_become_a_greeting_keep_no_run_from_its_start_or_end() 
         // One from the address of the host that is awaited, one from an address that is not.
         let knocking = [ADDRESSES[1], FOREIGN].map(|from| {
             let (lab, is_over) = (&lab, &is_over);
-            scope.spawn(move || knock(lab.host(1), (from, control), KNOCKS_HZ, is_over))
+            scope.spawn(move || knock(lab.host(1), from, control, KNOCKS_HZ, is_over))
         });
         let run = run_knocked_at(&lab, &trial, &is_over);
         (knocking.map(|one| one.join().unwrap()), run)

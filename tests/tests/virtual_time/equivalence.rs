@@ -219,7 +219,8 @@ fn virtual_run<C: CaseStudy>(case: &C, seed: u64, links: Links) -> SimulationRes
 
 fn stepped_run<C: CaseStudy>(
     case: &C,
-    (seed, links): (u64, Links),
+    seed: u64,
+    links: Links,
     datagram_max_bytes: usize,
 ) -> (SimulationResult, Rc<RefCell<Counts>>) {
     let counts = Rc::default();
@@ -237,7 +238,7 @@ fn stepped_run<C: CaseStudy>(
 fn check_equality<C: CaseStudy>(case: &C, links: Links, datagram_max_bytes: usize) {
     let seed = 3;
     let simulated = virtual_run(case, seed, links);
-    let (stepped, counts) = stepped_run(case, (seed, links), datagram_max_bytes);
+    let (stepped, counts) = stepped_run(case, seed, links, datagram_max_bytes);
     let counts = counts.borrow();
     println!("{} over {datagram_max_bytes} bytes: {counts:?}", C::NAME);
     assert_eq!(simulated.channels, stepped.channels);
@@ -278,18 +279,18 @@ fn teleoperation_over_the_wire_codec_is_the_simulated_teleoperation() {
 #[test]
 fn the_score_follows_from_the_messages_alone() {
     let case = teleoperation(3);
-    let (stepped, _) = stepped_run(&case, (3, perfect), DATAGRAM_BYTES[0]);
+    let (stepped, _) = stepped_run(&case, 3, perfect, DATAGRAM_BYTES[0]);
     let simulated = virtual_run(&case, 3, perfect);
     assert_eq!(case.score(&stepped.log), case.score(&simulated.log));
 }
 
 #[test]
 fn equal_seeds_give_equal_runs_and_unequal_seeds_do_not() {
-    let run = |seed| stepped_run(&shuttle(seed), (seed, lossy), DATAGRAM_BYTES[0]).0;
+    let run = |seed| stepped_run(&shuttle(seed), seed, lossy, DATAGRAM_BYTES[0]).0;
     assert!(run(8) == run(8));
     // Neighbours on purpose: a generator seeded with `seed | 1` would give one stream.
     assert!(run(8) != run(9));
-    let run = |seed| stepped_run(&teleoperation(seed), (seed, lossy), DATAGRAM_BYTES[0]).0;
+    let run = |seed| stepped_run(&teleoperation(seed), seed, lossy, DATAGRAM_BYTES[0]).0;
     assert!(run(8) == run(8));
     assert!(run(8) != run(9));
 }

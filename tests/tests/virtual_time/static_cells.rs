@@ -57,8 +57,8 @@ fn the_papers_static_cells_lose_and_delay_as_they_say() {
         for delay_ms in [0, 10, 50, 100] {
             let summary = simulate(delay_ms, loss_ratio);
             let (mut offered_count, mut lost_count) = (0, 0);
-            for channel in CHANNELS {
-                let (offered, lost) = check(&summary, channel, (delay_ms, loss_ratio));
+            for (name, least_count) in CHANNELS {
+                let (offered, lost) = check(&summary, name, least_count, delay_ms, loss_ratio);
                 offered_count += offered;
                 lost_count += lost;
             }
@@ -73,8 +73,10 @@ fn the_papers_static_cells_lose_and_delay_as_they_say() {
 /// Checks one channel; gives how many messages it offered to the link and how many that lost.
 fn check(
     summary: &RunSummary,
-    (name, least_count): (&str, u64),
-    (delay_ms, loss_ratio): (u64, f64),
+    name: &str,
+    least_count: u64,
+    delay_ms: u64,
+    loss_ratio: f64,
 ) -> (u64, u64) {
     let channel = summary.channels.iter().find(|one| one.name == name);
     let channel = channel.unwrap();

@@ -161,7 +161,7 @@ fn check_condition(page: &mut Page<'_>, way: &str, channel: &str) {
 }
 
 /// The recorder goes and comes back: the page says so, and goes on by itself.
-fn check_return(page: &mut Page<'_>, shown: &mut Shown, (root, host): (&Path, &LabHost)) {
+fn check_return(page: &mut Page<'_>, shown: &mut Shown, root: &Path, host: &LabHost) {
     let socket = page
         .addresses()
         .into_iter()
@@ -225,7 +225,7 @@ fn the_live_page_shows_a_fleet_and_changes_its_links() {
     vanish(&mut page);
     assert_clean(&mut page, "the live page of a fleet");
     // From here on the browser itself complains of the lost connection.
-    check_return(&mut page, &mut shown, (&root, host));
+    check_return(&mut page, &mut shown, &root, host);
     drop(page);
     shown.end();
 }

@@ -52,7 +52,7 @@ impl Server {
 
     /// Asks to look on, as a browser or a program does.
     fn ask(&self, host: &str, origin: Option<&str>) -> Asked {
-        Asked::to_look_on(&self.socket, (host, origin))
+        Asked::to_look_on(&self.socket, host, origin)
     }
 
     fn ask_as_program(&self) -> Asked {
@@ -73,7 +73,7 @@ struct Asked {
 }
 
 impl Asked {
-    fn to_look_on(address: &str, (host, origin): (&str, Option<&str>)) -> Self {
+    fn to_look_on(address: &str, host: &str, origin: Option<&str>) -> Self {
         let origin = origin.map_or_else(String::new, |origin| format!("Origin: {origin}\r\n"));
         let request = format!(
             "GET / HTTP/1.1\r\nHost: {host}\r\n{origin}Upgrade: websocket\r\n\
@@ -267,12 +267,12 @@ fn viewers_whose_cable_was_pulled_lose_their_seats() {
     let port = server.socket.rsplit(':').next().unwrap();
     let [local, remote] = [Ipv4Addr::LOCALHOST, here.address()].map(|one| format!("{one}:{port}"));
     let look_on = || {
-        let mut asked = Asked::to_look_on(&remote, (&remote, None));
+        let mut asked = Asked::to_look_on(&remote, &remote, None);
         asked.is_let_in();
         asked
     };
     let viewers: Vec<Asked> = there.on_network(|| (0..SEATS).map(|_| look_on()).collect());
-    let ask = || here.on_network(|| Asked::to_look_on(&local, (&local, None)));
+    let ask = || here.on_network(|| Asked::to_look_on(&local, &local, None));
     let full = format!("{SEATS} look on already");
     assert_refused(&ask().answer(), "503", &full);
     there.set_link(INTERFACE, "down");

@@ -142,7 +142,7 @@ fn visits(arrivals_ns: &[i64]) -> Vec<(i64, i64)> {
 }
 
 /// Checks what must hold while a client is there.
-fn assert_driven(arms: &Arms, (first, last): (i64, i64)) {
+fn assert_driven(arms: &Arms, first: i64, last: i64) {
     let story = arms.story(Side::Right);
     let events = arms.events(Side::Right);
     let ended = of_kind(&events, EgmEventKind::Ended);
@@ -183,8 +183,8 @@ fn assert_driven(arms: &Arms, (first, last): (i64, i64)) {
     );
 
     // The ramps of client and robot are over by then.
-    let follows = arms.follow(Side::Right, (first + 3 * SECOND_NS, last), LAG_NS);
-    let senses = arms.sense(Side::Right, (first + 3 * SECOND_NS, last));
+    let follows = arms.follow(Side::Right, first + 3 * SECOND_NS..last, LAG_NS);
+    let senses = arms.sense(Side::Right, first + 3 * SECOND_NS..last);
     for (place, follow) in follows.iter().enumerate() {
         let asked_deg = AMPLITUDES_DEG[CHAIN_TO_WIRE[place]];
         println!("chain place {place}: {follow:?}, {asked_deg} deg asked");
@@ -251,7 +251,7 @@ fn driven_twice(script: &str, restart: &str, span: Duration) -> Option<(Arms, Eg
     let [first, second] = visits[..] else {
         panic!("two visits, not {visits:?}");
     };
-    assert_driven(&arms, first);
+    assert_driven(&arms, first.0, first.1);
     let ended = assert_timed_out(&arms, first.1);
     // The second client may find a session under way or wait for the next; then it stays.
     let events = arms.events(Side::Right);

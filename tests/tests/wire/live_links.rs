@@ -1,6 +1,7 @@
 //! Emulated links changed while a run goes on: messages meet the condition in force when the gateway
 //! receives them, the report names every change, and whoever gives orders may die.
 
+use core::ops::Range;
 use std::path::Path;
 use std::process::{Command, Output};
 use std::thread;
@@ -70,11 +71,11 @@ fn orders(files: &RunFiles, way: &str) -> Vec<LinkConditionRecord> {
     found
 }
 
-/// Delays that the model asked for, of messages received from `from_ns` up to `until_ns`.
-fn requested(files: &RunFiles, channel: &str, (from_ns, until_ns): (i64, i64)) -> Vec<i64> {
+/// Delays that the model asked for, of messages received in `window_ns`.
+fn requested(files: &RunFiles, channel: &str, window_ns: Range<i64>) -> Vec<i64> {
     let arrivals = records::<IngressRecord>(files, channel, "ingress").into_iter();
     let within = arrivals.filter(|one| one.emulated_ns != UNAVAILABLE);
-    let within = within.filter(|one| (from_ns..until_ns).contains(&one.emulated_ns));
+    let within = within.filter(|one| window_ns.contains(&one.emulated_ns));
     within
         .map(|one| {
             assert!(one.received_ns >= one.due_ns, "never early");
@@ -130,7 +131,7 @@ fn a_change_holds_for_messages_received_from_then_on_and_the_report_names_it() {
     check_messages(&files);
     check_report(&files);
     recorder.wait_within(LIMIT).unwrap().assert_success();
-    check_recordings(&files, (&live, &record.join("converted.mcap")));
+    check_recordings(&files, &live, &record.join("converted.mcap"));
 }
 
 /// What we look at of an `hil.LinkCondition.v1`.
@@ -155,7 +156,7 @@ struct Condition {
 }
 
 /// The changes are in a recording beside the messages that met them, live and converted alike.
-fn check_recordings(files: &RunFiles, (live, converted): (&Path, &Path)) {
+fn check_recordings(files: &RunFiles, live: &Path, converted: &Path) {
     let output = recorder(&["convert", "--output"], &[converted, files.root()]);
     assert_code(&output, 0);
     for way in ["forward", "backward"] {
@@ -229,11 +230,11 @@ fn check_messages(files: &RunFiles) {
             "{delays:?}"
         );
     };
-    all(requested(files, BACKWARD, (0, at[0])), OWN_NS);
-    all(requested(files, BACKWARD, (certain[0], at[1])), BY_HAND_NS);
-    assert!(requested(files, BACKWARD, (certain[1], at[2])).is_empty());
-    all(requested(files, BACKWARD, (certain[2], i64::MAX)), OWN_NS);
-    all(requested(files, FORWARD, (0, i64::MAX)), OWN_NS);
+    all(requested(files, BACKWARD, 0..at[0]), OWN_NS);
+    all(requested(files, BACKWARD, certain[0]..at[1]), BY_HAND_NS);
+    assert!(requested(files, BACKWARD, certain[1]..at[2]).is_empty());
+    all(requested(files, BACKWARD, certain[2]..i64::MAX), OWN_NS);
+    all(requested(files, FORWARD, 0..i64::MAX), OWN_NS);
     // Handed to the kernel of the same clock a moment before it is received.
     let margin_ns = 20_000_000;
     let within = |ns: i64| (certain[0]..at[1] - margin_ns).contains(&ns);
@@ -323,7 +324,7 @@ fn whoever_gives_orders_may_die_and_a_restarted_gateway_keeps_the_condition() {
     let orders = orders(&files, "backward");
     let resumed = orders.last().unwrap();
     assert_eq!(resumed.request, orders[count - 1].request);
-    let delays = requested(&files, BACKWARD, (resumed.certain_ns, i64::MAX));
+    let delays = requested(&files, BACKWARD, resumed.certain_ns..i64::MAX);
     assert!(delays.len() > 100, "{}", delays.len());
     assert!(delays.iter().all(|delay| *delay == BY_HAND_NS));
     assert_every_message_is_accounted_for(&files.summary());

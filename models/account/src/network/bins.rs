@@ -69,7 +69,8 @@ impl NetworkBins {
     /// where the receiver had them. `width_ns` is above zero.
     pub fn of<P: Passages + ?Sized>(
         passages: &P,
-        (duration_ns, width_ns): (i64, i64),
+        duration_ns: i64,
+        width_ns: i64,
         place: &Place<'_>,
     ) -> Self {
         let width_ns = width_ns.max(1);
@@ -109,7 +110,7 @@ impl NetworkBins {
             bin.delay_p50_ns = last.map(|_| delays_ns.at_share(0.5));
         }
         drop(delays_ns);
-        silences(&mut bins, passages, (duration_ns, width_ns), place);
+        silences(&mut bins, passages, duration_ns, width_ns, place);
         Self {
             width_ns,
             bins,
@@ -196,7 +197,8 @@ fn index_of(ns: i64, width_ns: i64, count: usize) -> Option<usize> {
 fn silences<P: Passages + ?Sized>(
     bins: &mut [NetworkBin],
     passages: &P,
-    (duration_ns, width_ns): (i64, i64),
+    duration_ns: i64,
+    width_ns: i64,
     place: &Place<'_>,
 ) {
     let received = || {

@@ -382,8 +382,8 @@ fn bins_hold_what_happened_in_their_time() {
     let mut all = passages(1_000, |one| (300..355).contains(&one));
     all[105].delay_bound_ns = 25_000;
     let duration_ns = 1_000 * PERIOD_NS;
-    let shape = (duration_ns, bin_width_ns(duration_ns));
-    let binned = NetworkBins::of(&all, shape, &|at: Moment| Some(at.ns));
+    let width_ns = bin_width_ns(duration_ns);
+    let binned = NetworkBins::of(&all, duration_ns, width_ns, &|at: Moment| Some(at.ns));
     assert_eq!((binned.width_ns, binned.bins.len()), (100_000_000, 100));
     let lost: Vec<u64> = binned.bins[29..37]
         .iter()
@@ -430,7 +430,7 @@ fn bins_are_on_the_axis_that_moments_are_put_on() {
         Side::Producer => (at.ns < 900 * PERIOD_NS).then_some(at.ns),
         Side::Consumer => Some(at.ns - AHEAD_NS),
     };
-    let binned = NetworkBins::of(&all, (1_000 * PERIOD_NS, 100_000_000), &place);
+    let binned = NetworkBins::of(&all, 1_000 * PERIOD_NS, 100_000_000, &place);
     assert_eq!(binned.unplaced_count, 100);
     let sent_count: u64 = binned.bins.iter().map(|bin| bin.sent_count).sum();
     assert_eq!(sent_count, 900);

@@ -1,20 +1,24 @@
 //! Messages of guided motion as they lie in shared memory. Layout only; SI units and radians; joints
 //! in chain order, see [`crate::yumi`]. The maker's own datagrams are in [`crate::egm::wire`].
 
-mod motion;
-mod numbers;
-
-pub use motion::{
-    EgmStartParameters, MotionArrival, MotionKind, MotionOutcome, MotionRefusal, MotionRequest,
-    MotionResponse,
-};
-
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
 use crate::yumi::{Joints, Pose};
 use hil_core::layout::Field;
 use hil_core::message::Message;
+
+/// Makes a message of a structure whose layout is stated: its name, its size in bytes.
+macro_rules! message {
+    ($structure:ident, $name:literal, $bytes:literal) => {
+        impl Message for $structure {
+            const NAME: &'static str = $name;
+            const FIELDS: &'static [Field] = Self::LAYOUT;
+        }
+
+        const _: () = assert!(size_of::<$structure>() == $bytes);
+    };
+}
 
 /// One of the robot's two arms, each a motion task of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -32,18 +36,12 @@ impl Side {
 
     /// 0 for right, 1 for left: its number in messages.
     pub const fn index(self) -> usize {
-        match self {
-            Self::Right => 0,
-            Self::Left => 1,
-        }
+        self as usize
     }
 
     /// As [`Side::index`], as messages carry it.
     pub const fn number(self) -> u32 {
-        match self {
-            Self::Right => 0,
-            Self::Left => 1,
-        }
+        self as u32
     }
 
     /// `right` or `left`.
@@ -101,12 +99,7 @@ hil_core::layout!(EgmCommand {
     flags
 });
 
-impl Message for EgmCommand {
-    const NAME: &'static str = "hil.EgmCommand.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
-}
-
-const _: () = assert!(size_of::<EgmCommand>() == 144);
+message!(EgmCommand, "hil.EgmCommand.v1", 144);
 
 /// From the robot, every cycle: where one arm is.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
@@ -184,12 +177,7 @@ hil_core::layout!(EgmFeedback {
     flags
 });
 
-impl Message for EgmFeedback {
-    const NAME: &'static str = "hil.EgmFeedback.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
-}
-
-const _: () = assert!(size_of::<EgmFeedback>() == 216);
+message!(EgmFeedback, "hil.EgmFeedback.v1", 216);
 
 /// What an arm's motion task is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -210,20 +198,6 @@ pub enum SessionState {
 }
 
 impl SessionState {
-    const ALL: [Self; 6] = [
-        Self::Idle,
-        Self::Moving,
-        Self::Waiting,
-        Self::Activating,
-        Self::Running,
-        Self::Stopping,
-    ];
-
-    /// The state with this number.
-    pub fn from_number(number: u32) -> Option<Self> {
-        Self::ALL.into_iter().find(|state| *state as u32 == number)
-    }
-
     /// One word for a log line.
     pub const fn word(self) -> &'static str {
         match self {
@@ -274,12 +248,7 @@ hil_core::layout!(EgmEvent {
     cause
 });
 
-impl Message for EgmEvent {
-    const NAME: &'static str = "hil.EgmEvent.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
-}
-
-const _: () = assert!(size_of::<EgmEvent>() == 56);
+message!(EgmEvent, "hil.EgmEvent.v1", 56);
 
 /// What an [`EgmEvent`] tells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -364,9 +333,269 @@ hil_core::layout!(EgmArrival {
     command
 });
 
-impl Message for EgmArrival {
-    const NAME: &'static str = "hil.EgmArrival.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
+message!(EgmArrival, "hil.EgmArrival.v1", 160);
+
+/// To the motion server: do something that guided motion is not, or start and stop that.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct MotionRequest {
+    /// The sender's number; the responses carry it.
+    pub request_id: u64,
+    /// [`MotionKind`] as a number.
+    pub kind: u32,
+    /// Bit 0: right arm, bit 1: left arm; several at once are done together.
+    pub arms: u32,
+    /// Target of a joint motion, right then left.
+    pub joints_rad: [Joints; 2],
+    /// Target of a linear motion in the body frame, right then left.
+    pub poses: [Pose; 2],
+    /// Speed of a motion: share of the joints' own limits (joint motion, home), or m/s of the
+    /// tool (linear); 0 takes the controller's default.
+    pub speed: f64,
+    /// Parameters of [`MotionKind::EgmStart`].
+    pub egm: EgmStartParameters,
 }
 
-const _: () = assert!(size_of::<EgmArrival>() == 160);
+impl MotionRequest {
+    /// Bit of `side` in [`MotionRequest::arms`].
+    pub const fn bit(side: Side) -> u32 {
+        1 << side.index()
+    }
+}
+
+hil_core::layout!(MotionRequest {
+    request_id,
+    kind,
+    arms,
+    joints_rad,
+    poses,
+    speed,
+    egm
+});
+
+message!(MotionRequest, "hil.MotionRequest.v1", 312);
+
+/// What a session shall differ in from the controller's own settings; NaN keeps the setting.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct EgmStartParameters {
+    /// `CommTimeout`, s.
+    pub comm_timeout_s: f64,
+    /// `CondTime`, s.
+    pub condition_time_s: f64,
+    /// `MaxSpeedDeviation`, rad/s.
+    pub max_speed_deviation_rad_per_s: f64,
+    /// `MaxPosDeviation`, rad.
+    pub max_position_deviation_rad: f64,
+    /// `RampInTime`, s.
+    pub ramp_in_s: f64,
+    /// `PosCorrGain`, 0..=1.
+    pub position_correction_ratio: f64,
+    /// Proportional position gain, 1/s.
+    pub position_gain_per_s: f64,
+    /// Low-pass corner, Hz; 0 switches it off.
+    pub low_pass_hz: f64,
+}
+
+hil_core::layout!(EgmStartParameters {
+    comm_timeout_s,
+    condition_time_s,
+    max_speed_deviation_rad_per_s,
+    max_position_deviation_rad,
+    ramp_in_s,
+    position_correction_ratio,
+    position_gain_per_s,
+    low_pass_hz
+});
+
+impl EgmStartParameters {
+    /// Keeps every setting.
+    pub const KEEP: Self = Self {
+        comm_timeout_s: f64::NAN,
+        condition_time_s: f64::NAN,
+        max_speed_deviation_rad_per_s: f64::NAN,
+        max_position_deviation_rad: f64::NAN,
+        ramp_in_s: f64::NAN,
+        position_correction_ratio: f64::NAN,
+        position_gain_per_s: f64::NAN,
+        low_pass_hz: f64::NAN,
+    };
+}
+
+/// What a request asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u32)]
+pub enum MotionKind {
+    /// Only the state.
+    GetState = 0,
+    /// A joint motion (`MoveAbsJ`).
+    MoveJoints = 1,
+    /// A straight line of the tool (`MoveL`) of at most 5000 cycles, i.e. 20 s at 4 ms.
+    MoveLinear = 2,
+    /// Start guided motion.
+    EgmStart = 3,
+    /// Stop guided motion.
+    EgmStop = 4,
+    /// A joint motion to the home posture.
+    Home = 5,
+}
+
+/// From the motion server: at once when a request is taken or refused, and once more when what
+/// it began has ended.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct MotionResponse {
+    /// [`MotionRequest::request_id`].
+    pub request_id: u64,
+    /// [`MotionRequest::kind`].
+    pub kind: u32,
+    /// [`MotionOutcome`] as a number.
+    pub outcome: u32,
+    /// [`MotionRefusal`] as a number when refused, otherwise 0.
+    pub refusal: u32,
+    /// [`Side::index`] of the arm at fault when refused.
+    pub refused_side: u32,
+    /// [`SessionState`] of right and left arm.
+    pub states: [u32; 2],
+    /// Measured joints of right and left arm.
+    pub measured_rad: [Joints; 2],
+}
+
+hil_core::layout!(MotionResponse {
+    request_id,
+    kind,
+    outcome,
+    refusal,
+    refused_side,
+    states,
+    measured_rad
+});
+
+message!(MotionResponse, "hil.MotionResponse.v1", 144);
+
+/// How a request stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u32)]
+pub enum MotionOutcome {
+    /// Taken; a motion or activation is under way.
+    Accepted = 1,
+    /// What was asked is reached.
+    Done = 2,
+    /// Not taken; see [`MotionResponse::refusal`].
+    Refused = 3,
+    /// Taken, but something else ended it.
+    Interrupted = 4,
+}
+
+/// Why a request was not taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u32)]
+pub enum MotionRefusal {
+    /// No such kind.
+    UnknownKind = 1,
+    /// No arm, or one that does not exist.
+    NoArm = 2,
+    /// A number is not finite or outside its range, or a linear motion is so slow that it would
+    /// last more than 5000 cycles.
+    BadNumber = 3,
+    /// The target is outside a joint's limits.
+    OutsideLimits = 4,
+    /// No joint position puts the tool there, or none on the straight line to it.
+    Unreachable = 5,
+    /// Another motion is under way.
+    Busy = 6,
+    /// Guided motion runs, and the request needs it not to.
+    GuidedMotionRuns = 7,
+}
+
+/// To the record: a request as it arrived at the motion server.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct MotionArrival {
+    /// When, on the robot's clock.
+    pub at_ns: i64,
+    /// The request.
+    pub request: MotionRequest,
+}
+
+hil_core::layout!(MotionArrival { at_ns, request });
+
+message!(MotionArrival, "hil.MotionArrival.v1", 320);
+
+impl Side {
+    /// The side with this number, see [`Side::index`].
+    pub fn from_index(index: u32) -> Option<Self> {
+        Self::BOTH.into_iter().find(|side| side.number() == index)
+    }
+}
+
+macro_rules! read_back {
+    ($($kind:ident: $what:literal, [$($variant:ident),+ $(,)?];)+) => {$(
+        impl $kind {
+            #[doc = concat!("The ", $what, " with this number.")]
+            pub fn from_number(number: u32) -> Option<Self> {
+                [$(Self::$variant),+].into_iter().find(|known| *known as u32 == number)
+            }
+        }
+    )+};
+}
+
+read_back! {
+    EgmEventKind: "kind of event", [
+        Started, Activating, Running, Ended, SpeedThrottled, SpeedFree, HoldBegan, HoldEnded,
+        CommandRefused, QueueOverflow, MotionBegan, MotionEnded,
+    ];
+    SessionState: "state", [Idle, Moving, Waiting, Activating, Running, Stopping];
+    EndCause: "cause", [CommTimeout, ConditionTime, PositionDeviation, Requested];
+    CommandRefusal: "refusal", [NotFinite, OutsideLimits, NoSession];
+    MotionKind: "kind of request", [
+        GetState, MoveJoints, MoveLinear, EgmStart, EgmStop, Home,
+    ];
+    MotionOutcome: "outcome", [Accepted, Done, Refused, Interrupted];
+    MotionRefusal: "refusal", [
+        UnknownKind, NoArm, BadNumber, OutsideLimits, Unreachable, Busy, GuidedMotionRuns,
+    ];
+}
+
+impl MotionKind {
+    /// A few words for a log line.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::GetState => "state",
+            Self::MoveJoints => "joint motion",
+            Self::MoveLinear => "linear motion",
+            Self::EgmStart => "start of guided motion",
+            Self::EgmStop => "stop of guided motion",
+            Self::Home => "motion to the home posture",
+        }
+    }
+}
+
+#[cfg(test)]
+mod numbers_tests {
+    use super::*;
+
+    /// Numbers `from..to` must read back as themselves, those around as nothing.
+    fn check<T>(from: u32, to: u32, read: fn(u32) -> Option<T>, number: fn(T) -> u32) {
+        for candidate in 0..50 {
+            let known = (from..to).contains(&candidate).then_some(candidate);
+            assert_eq!(read(candidate).map(number), known);
+        }
+        assert!(read(u32::MAX).is_none());
+    }
+
+    #[test]
+    fn every_number_reads_back_as_the_one_written() {
+        check(0, 12, EgmEventKind::from_number, |kind| kind as u32);
+        check(1, 5, EndCause::from_number, |cause| cause as u32);
+        check(1, 4, CommandRefusal::from_number, |refusal| refusal as u32);
+        check(0, 6, MotionKind::from_number, |kind| kind as u32);
+        check(1, 5, MotionOutcome::from_number, |outcome| outcome as u32);
+        check(1, 8, MotionRefusal::from_number, |refusal| refusal as u32);
+        check(0, 6, SessionState::from_number, |state| state as u32);
+        check(0, 2, Side::from_index, |side| match side {
+            Side::Right => 0,
+            Side::Left => 1,
+        });
+    }
+}

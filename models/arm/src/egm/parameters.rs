@@ -1,12 +1,10 @@
 //! `[case.parameters.egm]`: every setting of the simulated controller, presets of them, and their
 //! ranges. Names follow the maker's where it has one.
 
-mod written;
-
 use core::ops::RangeInclusive;
 use core::time::Duration;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::egm::controller::DELAY_CYCLES_MAX;
 use crate::egm::messages::{EgmStartParameters, MotionRefusal, Side};
@@ -104,66 +102,47 @@ pub struct EgmParameters {
     /// Where the other keys come from.
     pub preset: Preset,
     /// Controller cycle, 1000..=100000 us; real controllers were seen at 4032, simulated at 4000.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub cycle_us: Option<f64>,
     /// Queue policy.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub queue: Option<QueuePolicy>,
     /// Commands the queue holds, 1..=100000; further ones are dropped and counted.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub queue_capacity: Option<u32>,
     /// Default Proportional Position Gain, 0..=20 1/s.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub position_gain_per_s: Option<f64>,
     /// Default Low Pass Filter Bandwidth, 0..=100 Hz; 0 switches it off.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub low_pass_hz: Option<f64>,
     /// `PosCorrGain`, 0..=1; 0 is pure speed control.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub position_correction_ratio: Option<f64>,
     /// `RampInTime`, 0..=10 s: the share of the correction grows from 0 to 1 over it.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub ramp_in_s: Option<f64>,
     /// `RampOutTime`, 0..=10 s: how long a stop by `ramp-down` takes.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub ramp_out_s: Option<f64>,
     /// `MaxSpeedDeviation`, 0.01..=1000 deg/s: all joints are slowed by one ratio.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub max_speed_deviation_deg_per_s: Option<f64>,
     /// `MaxPosDeviation`, 0.1..=1000 deg from where the session started; beyond, it ends.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub max_position_deviation_deg: Option<f64>,
     /// Half the convergence window, 0.001..=100 deg.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub convergence_deg: Option<f64>,
     /// `CondTime`, 0..=1000000 s: converged for so long, the session ends.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub condition_time_s: Option<f64>,
     /// `CommTimeout`, 0.004..=1000000 s: without a message for so long, the session ends. A
     /// refused one does not count.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub comm_timeout_s: Option<f64>,
     /// What a requested stop does.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub stop_mode: Option<StopMode>,
     /// What starts the first session.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<StartMode>,
     /// Whose program does so with `start = "power-on"`.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub arms: Option<GuidedArms>,
     /// What follows a session that ended by itself.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub restart: Option<RestartPolicy>,
     /// Wait of `wait_then_restart`, 0..=60 s; refused with a policy that never waits.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub restart_wait_s: Option<f64>,
     /// How long setting a session up takes (fine point, synchronisation, set-up), 0..=60 s.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub activation_s: Option<f64>,
     /// Cycles by which the measured joints lag the planned ones, 0..=16: the maker's control lag
     /// of 10 to 20 ms, filtering level included.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub control_delay_cycles: Option<u32>,
 }
 
@@ -214,68 +193,121 @@ pub struct ControllerSettings {
 
 impl ControllerSettings {
     /// The settings of a preset.
+    ///
+    /// # Panics
+    /// Never: the presets are within their ranges.
     pub fn of(preset: Preset) -> Self {
-        // The maker's defaults; `RampInTime` and the set-up time have none in its manual.
-        let abb = Self {
-            cycle: Duration::from_millis(4),
-            queue: QueuePolicy::Fifo1,
-            queue_capacity: 1000,
-            position_gain_per_s: 5.0,
-            low_pass_hz: 20.0,
-            position_correction_ratio: 1.0,
-            ramp_in_s: 0.5,
-            ramp_out_s: 0.5,
-            max_speed_deviation_rad_per_s: 1_f64.to_radians(),
-            max_position_deviation_rad: 1000_f64.to_radians(),
-            convergence_rad: 0.5_f64.to_radians(),
-            condition_time_s: 1.0,
-            comm_timeout_s: 1.0,
-            stop_mode: StopMode::Hold,
-            start: StartMode::Request,
-            arms: GuidedArms::Both,
-            restart: RestartPolicy::AutoRetry,
-            restart_wait_s: 1.0,
-            activation_s: 0.5,
-            control_delay_cycles: 4,
+        let parameters = EgmParameters {
+            preset,
+            ..EgmParameters::default()
         };
-        match preset {
-            Preset::AbbDefault => abb,
-            Preset::Raw => Self {
-                position_gain_per_s: 20.0,
-                low_pass_hz: 100.0,
-                ramp_in_s: 0.005,
-                max_speed_deviation_rad_per_s: 1000_f64.to_radians(),
-                condition_time_s: 1e6,
-                control_delay_cycles: 3,
-                ..abb
-            },
-            Preset::KthYumi => Self {
-                max_speed_deviation_rad_per_s: 400_f64.to_radians(),
-                condition_time_s: 500.0,
-                ramp_in_s: 0.1,
-                ..abb
-            },
-            Preset::Paper => Self {
-                position_gain_per_s: 20.0,
-                max_speed_deviation_rad_per_s: 400_f64.to_radians(),
-                condition_time_s: 500.0,
-                ramp_in_s: 0.1,
-                restart: RestartPolicy::WaitThenRestart,
-                restart_wait_s: 1.5,
-                activation_s: 0.5,
-                ..abb
-            },
-        }
+        parameters
+            .settings()
+            .expect("presets are within their ranges")
     }
 }
 
 impl EgmParameters {
+    /// A preset with each of its values.
+    fn of(preset: Preset) -> Self {
+        // The maker's defaults; `RampInTime` and the set-up time have none in its manual.
+        let abb = Self {
+            preset,
+            cycle_us: Some(4000.0),
+            queue: Some(QueuePolicy::Fifo1),
+            queue_capacity: Some(1000),
+            position_gain_per_s: Some(5.0),
+            low_pass_hz: Some(20.0),
+            position_correction_ratio: Some(1.0),
+            ramp_in_s: Some(0.5),
+            ramp_out_s: Some(0.5),
+            max_speed_deviation_deg_per_s: Some(1.0),
+            max_position_deviation_deg: Some(1000.0),
+            convergence_deg: Some(0.5),
+            condition_time_s: Some(1.0),
+            comm_timeout_s: Some(1.0),
+            stop_mode: Some(StopMode::Hold),
+            start: Some(StartMode::Request),
+            arms: Some(GuidedArms::Both),
+            restart: Some(RestartPolicy::AutoRetry),
+            restart_wait_s: Some(1.0),
+            activation_s: Some(0.5),
+            control_delay_cycles: Some(4),
+        };
+        match preset {
+            Preset::AbbDefault => abb,
+            Preset::Raw => Self {
+                position_gain_per_s: Some(20.0),
+                low_pass_hz: Some(100.0),
+                ramp_in_s: Some(0.005),
+                max_speed_deviation_deg_per_s: Some(1000.0),
+                condition_time_s: Some(1e6),
+                control_delay_cycles: Some(3),
+                ..abb
+            },
+            Preset::KthYumi => Self {
+                max_speed_deviation_deg_per_s: Some(400.0),
+                condition_time_s: Some(500.0),
+                ramp_in_s: Some(0.1),
+                ..abb
+            },
+            Preset::Paper => Self {
+                position_gain_per_s: Some(20.0),
+                max_speed_deviation_deg_per_s: Some(400.0),
+                condition_time_s: Some(500.0),
+                ramp_in_s: Some(0.1),
+                restart: Some(RestartPolicy::WaitThenRestart),
+                restart_wait_s: Some(1.5),
+                ..abb
+            },
+        }
+    }
+
+    /// The same settings with every key in force written out: those left out have the preset's
+    /// values. `restart_wait_s` is not in force with a policy that never waits.
+    #[must_use]
+    pub fn spelled_out(&self) -> Self {
+        let preset = Self::of(self.preset);
+        let restart = self.restart.or(preset.restart);
+        let is_waiting = restart == Some(RestartPolicy::WaitThenRestart);
+        let wait_s = preset.restart_wait_s.filter(|_| is_waiting);
+        Self {
+            preset: self.preset,
+            cycle_us: self.cycle_us.or(preset.cycle_us),
+            queue: self.queue.or(preset.queue),
+            queue_capacity: self.queue_capacity.or(preset.queue_capacity),
+            position_gain_per_s: self.position_gain_per_s.or(preset.position_gain_per_s),
+            low_pass_hz: self.low_pass_hz.or(preset.low_pass_hz),
+            position_correction_ratio: self
+                .position_correction_ratio
+                .or(preset.position_correction_ratio),
+            ramp_in_s: self.ramp_in_s.or(preset.ramp_in_s),
+            ramp_out_s: self.ramp_out_s.or(preset.ramp_out_s),
+            max_speed_deviation_deg_per_s: self
+                .max_speed_deviation_deg_per_s
+                .or(preset.max_speed_deviation_deg_per_s),
+            max_position_deviation_deg: self
+                .max_position_deviation_deg
+                .or(preset.max_position_deviation_deg),
+            convergence_deg: self.convergence_deg.or(preset.convergence_deg),
+            condition_time_s: self.condition_time_s.or(preset.condition_time_s),
+            comm_timeout_s: self.comm_timeout_s.or(preset.comm_timeout_s),
+            stop_mode: self.stop_mode.or(preset.stop_mode),
+            start: self.start.or(preset.start),
+            arms: self.arms.or(preset.arms),
+            restart,
+            restart_wait_s: self.restart_wait_s.or(wait_s),
+            activation_s: self.activation_s.or(preset.activation_s),
+            control_delay_cycles: self.control_delay_cycles.or(preset.control_delay_cycles),
+        }
+    }
+
     /// The arms that guided motion shall move: with [`StartMode::Request`], all that are asked to.
     pub fn guided_arms(&self) -> GuidedArms {
-        let preset = ControllerSettings::of(self.preset);
-        match self.start.unwrap_or(preset.start) {
-            StartMode::Request => GuidedArms::Both,
-            StartMode::PowerOn => self.arms.unwrap_or(preset.arms),
+        let all = self.spelled_out();
+        match all.start {
+            Some(StartMode::PowerOn) => all.arms.unwrap_or(GuidedArms::Both),
+            Some(StartMode::Request) | None => GuidedArms::Both,
         }
     }
 
@@ -284,62 +316,58 @@ impl EgmParameters {
     /// # Errors
     /// The first key outside its range, as `egm.<key>`.
     pub fn settings(&self) -> Result<ControllerSettings, ParameterError> {
-        let preset = ControllerSettings::of(self.preset);
-        let (speed_deg, position_deg) = (
-            MAX_SPEED_DEVIATION_DEG_PER_S.key(self.max_speed_deviation_deg_per_s)?,
-            MAX_POSITION_DEVIATION_DEG.key(self.max_position_deviation_deg)?,
-        );
-        let cycle = CYCLE_US.key(self.cycle_us)?;
-        let capacity = QUEUE_CAPACITY.key(self.queue_capacity.map(f64::from))?;
-        let delay = CONTROL_DELAY_CYCLES.key(self.control_delay_cycles.map(f64::from))?;
-        let convergence = CONVERGENCE_DEG.key(self.convergence_deg)?;
-        let restart_wait = RESTART_WAIT_S.key(self.restart_wait_s)?;
-        let restart = self.restart.unwrap_or(preset.restart);
-        if let Some(wait_s) = restart_wait
-            && restart != RestartPolicy::WaitThenRestart
-        {
-            let problem =
-                format!("{wait_s} has no effect: it needs egm.restart = \"wait_then_restart\"");
+        const STATED: &str = "a preset states every key";
+        let all = self.spelled_out();
+        let speed_deg_per_s = MAX_SPEED_DEVIATION_DEG_PER_S.of(all.max_speed_deviation_deg_per_s)?;
+        let position_deg = MAX_POSITION_DEVIATION_DEG.of(all.max_position_deviation_deg)?;
+        let capacity = QUEUE_CAPACITY.of(all.queue_capacity.map(f64::from))?;
+        let delay_cycles = CONTROL_DELAY_CYCLES.of(all.control_delay_cycles.map(f64::from))?;
+        let restart = all.restart.expect(STATED);
+        let wait_s = all.restart_wait_s.or(Self::of(self.preset).restart_wait_s);
+        let restart_wait_s = RESTART_WAIT_S.of(wait_s)?;
+        if self.restart_wait_s.is_some() && restart != RestartPolicy::WaitThenRestart {
+            let problem = format!(
+                "{restart_wait_s} has no effect: it needs egm.restart = \"wait_then_restart\""
+            );
             return Err(ParameterError::new(RESTART_WAIT_S.key, problem));
         }
         Ok(ControllerSettings {
-            cycle: cycle.map_or(preset.cycle, |us| Duration::from_secs_f64(us * 1e-6)),
-            queue: self.queue.unwrap_or(preset.queue),
-            queue_capacity: capacity.map_or(preset.queue_capacity, whole),
-            position_gain_per_s: POSITION_GAIN_PER_S
-                .key(self.position_gain_per_s)?
-                .unwrap_or(preset.position_gain_per_s),
-            low_pass_hz: LOW_PASS_HZ
-                .key(self.low_pass_hz)?
-                .unwrap_or(preset.low_pass_hz),
+            cycle: Duration::from_secs_f64(CYCLE_US.of(all.cycle_us)? * 1e-6),
+            queue: all.queue.expect(STATED),
+            queue_capacity: whole(capacity),
+            position_gain_per_s: POSITION_GAIN_PER_S.of(all.position_gain_per_s)?,
+            low_pass_hz: LOW_PASS_HZ.of(all.low_pass_hz)?,
             position_correction_ratio: POSITION_CORRECTION_RATIO
-                .key(self.position_correction_ratio)?
-                .unwrap_or(preset.position_correction_ratio),
-            ramp_in_s: RAMP_IN_S.key(self.ramp_in_s)?.unwrap_or(preset.ramp_in_s),
-            ramp_out_s: RAMP_OUT_S
-                .key(self.ramp_out_s)?
-                .unwrap_or(preset.ramp_out_s),
-            max_speed_deviation_rad_per_s: speed_deg
-                .map_or(preset.max_speed_deviation_rad_per_s, f64::to_radians),
-            max_position_deviation_rad: position_deg
-                .map_or(preset.max_position_deviation_rad, f64::to_radians),
-            convergence_rad: convergence.map_or(preset.convergence_rad, f64::to_radians),
-            condition_time_s: CONDITION_TIME_S
-                .key(self.condition_time_s)?
-                .unwrap_or(preset.condition_time_s),
-            comm_timeout_s: COMM_TIMEOUT_S
-                .key(self.comm_timeout_s)?
-                .unwrap_or(preset.comm_timeout_s),
-            stop_mode: self.stop_mode.unwrap_or(preset.stop_mode),
-            start: self.start.unwrap_or(preset.start),
-            arms: self.arms.unwrap_or(preset.arms),
+                .of(all.position_correction_ratio)?,
+            ramp_in_s: RAMP_IN_S.of(all.ramp_in_s)?,
+            ramp_out_s: RAMP_OUT_S.of(all.ramp_out_s)?,
+            max_speed_deviation_rad_per_s: speed_deg_per_s.to_radians(),
+            max_position_deviation_rad: position_deg.to_radians(),
+            convergence_rad: CONVERGENCE_DEG.of(all.convergence_deg)?.to_radians(),
+            condition_time_s: CONDITION_TIME_S.of(all.condition_time_s)?,
+            comm_timeout_s: COMM_TIMEOUT_S.of(all.comm_timeout_s)?,
+            stop_mode: all.stop_mode.expect(STATED),
+            start: all.start.expect(STATED),
+            arms: all.arms.expect(STATED),
             restart,
-            restart_wait_s: restart_wait.unwrap_or(preset.restart_wait_s),
-            activation_s: ACTIVATION_S
-                .key(self.activation_s)?
-                .unwrap_or(preset.activation_s),
-            control_delay_cycles: delay.map_or(preset.control_delay_cycles, whole),
+            restart_wait_s,
+            activation_s: ACTIVATION_S.of(all.activation_s)?,
+            control_delay_cycles: whole(delay_cycles),
         })
+    }
+}
+
+/// Writes every key in force, so that a record of a run needs no table of presets to be read.
+impl Serialize for EgmParameters {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived function, which a type's own name finds before the trait's.
+        Self::serialize(&self.spelled_out(), serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for EgmParameters {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        Self::deserialize(deserializer)
     }
 }
 
@@ -404,22 +432,22 @@ fn whole(number: f64) -> usize {
 struct Range {
     key: &'static str,
     allowed: RangeInclusive<f64>,
-    text: &'static str,
 }
 
 impl Range {
-    const fn new(key: &'static str, min: f64, max: f64, text: &'static str) -> Self {
+    const fn new(key: &'static str, min: f64, max: f64) -> Self {
         Self {
             key,
             allowed: min..=max,
-            text,
         }
     }
 
-    fn key(&self, value: Option<f64>) -> Result<Option<f64>, ParameterError> {
-        if let Some(value) = value {
-            ParameterError::check(self.key, value, self.allowed.clone(), self.text)?;
-        }
+    /// The value, checked; a preset states what a key does not.
+    fn of(&self, value: Option<f64>) -> Result<f64, ParameterError> {
+        let value = value.expect("a preset states every key");
+        let (min, max) = (self.allowed.start(), self.allowed.end());
+        let text = format!("{min} to {max}");
+        ParameterError::check(self.key, value, self.allowed.clone(), &text)?;
         Ok(value)
     }
 
@@ -434,33 +462,23 @@ impl Range {
     }
 }
 
-const CYCLE_US: Range = Range::new("egm.cycle_us", 1000.0, 100_000.0, "1000 to 100000");
-const QUEUE_CAPACITY: Range = Range::new("egm.queue_capacity", 1.0, 100_000.0, "1 to 100000");
-const POSITION_GAIN_PER_S: Range = Range::new("egm.position_gain_per_s", 0.0, 20.0, "0 to 20");
-const LOW_PASS_HZ: Range = Range::new("egm.low_pass_hz", 0.0, 100.0, "0 to 100");
-const POSITION_CORRECTION_RATIO: Range =
-    Range::new("egm.position_correction_ratio", 0.0, 1.0, "0 to 1");
-const RAMP_IN_S: Range = Range::new("egm.ramp_in_s", 0.0, 10.0, "0 to 10");
-const RAMP_OUT_S: Range = Range::new("egm.ramp_out_s", 0.0, 10.0, "0 to 10");
-const MAX_SPEED_DEVIATION_DEG_PER_S: Range = Range::new(
-    "egm.max_speed_deviation_deg_per_s",
-    0.01,
-    1000.0,
-    "0.01 to 1000",
-);
-const MAX_POSITION_DEVIATION_DEG: Range =
-    Range::new("egm.max_position_deviation_deg", 0.1, 1000.0, "0.1 to 1000");
-const CONVERGENCE_DEG: Range = Range::new("egm.convergence_deg", 0.001, 100.0, "0.001 to 100");
-const CONDITION_TIME_S: Range = Range::new("egm.condition_time_s", 0.0, 1e6, "0 to 1000000");
-const COMM_TIMEOUT_S: Range = Range::new("egm.comm_timeout_s", 0.004, 1e6, "0.004 to 1000000");
-const RESTART_WAIT_S: Range = Range::new("egm.restart_wait_s", 0.0, 60.0, "0 to 60");
-const ACTIVATION_S: Range = Range::new("egm.activation_s", 0.0, 60.0, "0 to 60");
-const CONTROL_DELAY_CYCLES: Range = Range::new(
-    "egm.control_delay_cycles",
-    0.0,
-    DELAY_CYCLES_MAX as f64,
-    "0 to 16",
-);
+const CYCLE_US: Range = Range::new("egm.cycle_us", 1000.0, 100_000.0);
+const QUEUE_CAPACITY: Range = Range::new("egm.queue_capacity", 1.0, 100_000.0);
+const POSITION_GAIN_PER_S: Range = Range::new("egm.position_gain_per_s", 0.0, 20.0);
+const LOW_PASS_HZ: Range = Range::new("egm.low_pass_hz", 0.0, 100.0);
+const POSITION_CORRECTION_RATIO: Range = Range::new("egm.position_correction_ratio", 0.0, 1.0);
+const RAMP_IN_S: Range = Range::new("egm.ramp_in_s", 0.0, 10.0);
+const RAMP_OUT_S: Range = Range::new("egm.ramp_out_s", 0.0, 10.0);
+const MAX_SPEED_DEVIATION_DEG_PER_S: Range =
+    Range::new("egm.max_speed_deviation_deg_per_s", 0.01, 1000.0);
+const MAX_POSITION_DEVIATION_DEG: Range = Range::new("egm.max_position_deviation_deg", 0.1, 1000.0);
+const CONVERGENCE_DEG: Range = Range::new("egm.convergence_deg", 0.001, 100.0);
+const CONDITION_TIME_S: Range = Range::new("egm.condition_time_s", 0.0, 1e6);
+const COMM_TIMEOUT_S: Range = Range::new("egm.comm_timeout_s", 0.004, 1e6);
+const RESTART_WAIT_S: Range = Range::new("egm.restart_wait_s", 0.0, 60.0);
+const ACTIVATION_S: Range = Range::new("egm.activation_s", 0.0, 60.0);
+const CONTROL_DELAY_CYCLES: Range =
+    Range::new("egm.control_delay_cycles", 0.0, DELAY_CYCLES_MAX as f64);
 
 #[cfg(test)]
 #[path = "parameters_tests.rs"]

@@ -230,16 +230,6 @@ pub fn within_limits(q_rad: &JointVector) -> (JointVector, bool) {
     (clipped, is_clipped)
 }
 
-/// The largest factor of at most 1 by which all `speeds_rad_per_s` keep their limits: one ratio
-/// for all joints, so that the direction of motion stays.
-pub fn speed_ratio(speeds_rad_per_s: &JointVector) -> f64 {
-    speeds_rad_per_s
-        .iter()
-        .zip(&SPEED_MAX_RAD_PER_S)
-        .map(|(speed, max)| max / speed.abs())
-        .fold(1.0, f64::min)
-}
-
 #[cfg(test)]
 #[path = "arm_tests.rs"]
 mod tests;

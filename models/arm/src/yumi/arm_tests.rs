@@ -126,10 +126,3 @@ fn start_postures_stay_clear_of_the_limits() {
         assert!(is_clipped && !within_limits(&inside).1);
     }
 }
-
-#[test]
-fn one_ratio_slows_all_joints_down_to_the_slowest_allowed() {
-    let fast = JointVector::from(SPEED_MAX_RAD_PER_S) * 2.0;
-    assert!((speed_ratio(&fast) - 0.5).abs() < 1e-15);
-    assert!((speed_ratio(&JointVector::zeros()) - 1.0).abs() < 1e-15);
-}

@@ -106,7 +106,7 @@ impl fmt::Display for Urdf {
                 "  <material name=\"{name}\"><color rgba=\"{color} 1\"/></material>"
             )?;
         }
-        write_link(out, ("body", "body"), &body())?;
+        write_link(out, "body", "body", &body())?;
         for ((side, _), arm) in SIDES.iter().zip(arms()) {
             write_arm(out, side, &arm)?;
         }
@@ -135,7 +135,7 @@ fn write_arm(out: &mut fmt::Formatter<'_>, side: &str, arm: &Arm) -> fmt::Result
             to_m: to_next.translation.vector.into(),
             radius_m,
         };
-        write_link(out, (&name(frame), side), &[rod])?;
+        write_link(out, &name(frame), side, &[rod])?;
         let (lower, upper) = (POSITION_MIN_RAD[frame], POSITION_MAX_RAD[frame]);
         let speed = SPEED_MAX_RAD_PER_S[frame];
         writeln!(
@@ -149,12 +149,13 @@ fn write_arm(out: &mut fmt::Formatter<'_>, side: &str, arm: &Arm) -> fmt::Result
             origin(&to_next),
         )?;
     }
-    write_link(out, (&name(JOINT_COUNT), side), &fingers())
+    write_link(out, &name(JOINT_COUNT), side, &fingers())
 }
 
 fn write_link(
     out: &mut fmt::Formatter<'_>,
-    (name, material): (&str, &str),
+    name: &str,
+    material: &str,
     rods: &[Rod],
 ) -> fmt::Result {
     writeln!(out, "  <link name=\"{name}\">")?;

@@ -3,9 +3,80 @@
 use nalgebra::Translation3;
 
 use super::*;
-use crate::yumi::arm::{MOUNT_TO_FIRST_JOINT_M, RIGHT_START_RAD};
+use crate::yumi::arm::{
+    MOUNT_TO_FIRST_JOINT_M, POSITION_MAX_RAD, POSITION_MIN_RAD, RIGHT_START_RAD,
+};
+use hil_core::random::RandomStream;
 
 const CHAIN: Chain = Chain::new(MOUNT_TO_FIRST_JOINT_M);
+
+const SEARCH_ITERATIONS_MAX: usize = 60;
+
+/// What a search found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Solution {
+    /// Joint positions within limits, chain order.
+    q_rad: Joints,
+    /// Random starts it took beyond the first.
+    restart_count: u32,
+}
+
+/// Joint positions that put the tool at `target` (arm base frame) from anywhere: starts at
+/// `seed_rad`, then at up to `restarts_max` random postures.
+///
+/// `None` means not found; with 50 restarts that happened to 38 of 40 000 random reachable poses.
+fn search(
+    chain: Chain,
+    target: &Isometry3<f64>,
+    seed_rad: &Joints,
+    restarts_max: u32,
+    random: &mut RandomStream,
+) -> Option<Solution> {
+    let mut q = JointVector::from(*seed_rad);
+    for restart_count in 0..=restarts_max {
+        if let Some(q_rad) = descend(chain, target, q) {
+            return Some(Solution {
+                q_rad: q_rad.into(),
+                restart_count,
+            });
+        }
+        q = random_posture(random).into();
+    }
+    None
+}
+
+/// A posture with every joint uniform within its limits.
+fn random_posture(random: &mut RandomStream) -> Joints {
+    core::array::from_fn(|joint| {
+        let (min, max) = (POSITION_MIN_RAD[joint], POSITION_MAX_RAD[joint]);
+        min + (max - min) * random.uniform()
+    })
+}
+
+fn descend(chain: Chain, target: &Isometry3<f64>, mut q: JointVector) -> Option<JointVector> {
+    let mut best_cost = f64::INFINITY;
+    let mut stalled_count = 0;
+    for _ in 0..SEARCH_ITERATIONS_MAX {
+        let state = chain.at(q.as_ref());
+        let error = task_error(&state, target);
+        if is_within(&error, 1.0) {
+            return Some(q);
+        }
+        let cost = cost(&error);
+        if cost < 0.98 * best_cost {
+            best_cost = cost;
+            stalled_count = 0;
+        } else {
+            stalled_count += 1;
+            if stalled_count > 8 {
+                return None;
+            }
+        }
+        let step = damped_step(&state.jacobian(), &error, &JointVector::zeros())?;
+        q = within_limits(&(q + step)).0;
+    }
+    None
+}
 
 #[test]
 fn of_random_reachable_poses_at_least_995_in_1000_are_found() {

@@ -48,7 +48,8 @@ impl ClosedLoop {
     pub(crate) fn new(
         scene: &Scene,
         parameters: &CoordinatorParameters,
-        (robot, missions): (&RobotParameters, &MissionParameters),
+        robot: &RobotParameters,
+        missions: &MissionParameters,
         channel: Channel,
         seed: u64,
     ) -> Self {
@@ -191,9 +192,16 @@ mod tests {
             mode: MissionMode::Shuttle,
             ..MissionParameters::default()
         };
-        let parameters = (&RobotParameters::default(), &missions);
+        let robot = RobotParameters::default();
         let coordinator = CoordinatorParameters::default();
-        ClosedLoop::new(&scene(scenario), &coordinator, parameters, channel, seed)
+        ClosedLoop::new(
+            &scene(scenario),
+            &coordinator,
+            &robot,
+            &missions,
+            channel,
+            seed,
+        )
     }
 
     #[test]

@@ -3,27 +3,13 @@
 
 use serde::Serialize;
 
-use hil_stats::histogram::LatencyHistogram;
-
 /// Figures of one coordinator since its start.
 #[derive(Debug, Clone, Default)]
 pub struct CoordinatorCounters {
     /// The plain counts.
     pub counts: CoordinatorCounts,
-    /// Age of the state each decision rests on, per driving robot and control cycle,
-    /// nanoseconds. Empty unless robots and controller share a clock.
-    pub state_age: LatencyHistogram,
     /// What only the safe rules count.
     pub safe: SafeCounts,
-}
-
-impl CoordinatorCounters {
-    /// Adds what another coordinator counted.
-    pub fn merge(&mut self, other: &Self) {
-        self.counts.merge(&other.counts);
-        self.state_age.merge(&other.state_age);
-        self.safe.merge(&other.safe);
-    }
 }
 
 macro_rules! counts {
@@ -46,8 +32,6 @@ macro_rules! counts {
 counts! {
     /// The plain counts of a coordinator.
     CoordinatorCounts:
-    /// Control cycles.
-    cycle_count,
     /// States taken over into a robot's view.
     states_accepted,
     /// States of robots without a mission, or of the mission before the present one.
@@ -62,12 +46,8 @@ counts! {
     states_duplicate,
     /// Of the reordered and duplicate states, those that the strict order dropped.
     states_dropped,
-    /// Missions begun.
-    missions_started,
     /// Missions whose end a state showed, those ended by a reset included.
     missions_done,
-    /// Mission messages sent, repeats included.
-    mission_messages,
     /// Decisions that changed a robot's authority.
     authority_changes,
     /// Authorities sent again because the robot did not show them in time.
@@ -84,8 +64,6 @@ counts! {
     artificial_dependencies,
     /// Cycles of waiting robots that broke up because one order was reversed.
     deadlocks_broken,
-    /// Control cycles with a cycle of waiting robots that no reversal could break.
-    deadlocked_cycles,
     /// Robots put at their goal because they made no way for too long.
     resets,
 }
@@ -93,24 +71,10 @@ counts! {
 counts! {
     /// Counts of the safe rules.
     SafeCounts:
-    /// Extensions of authority.
-    grants,
-    /// Authority messages sent, repeats included.
-    messages,
-    /// Shrinks of authority asked for.
-    shrinks,
-    /// Of these, applied by the robot.
-    shrinks_acknowledged,
-    /// Of these, refused because the robot could not stop any more.
-    shrinks_refused,
     /// Extensions not given because no order was found in which all could still finish.
     grants_withheld,
-    /// Extensions for which another order of all was found.
-    plans_reordered,
     /// Missions not begun in a cycle because no order with them was found, per cycle.
     admissions_deferred,
-    /// Cycles in which the order was kept because a robot had waited beyond its patience.
-    cycles_in_order,
     /// Robots that made no way for too long, once per standstill.
     stuck,
     /// States that say what cannot be.

@@ -10,7 +10,6 @@ pub mod policy;
 pub mod roster;
 pub mod safe;
 pub mod sections;
-mod view;
 
 use core::fmt::Debug;
 
@@ -18,10 +17,11 @@ use crate::coordinator::counters::CoordinatorCounters;
 use crate::coordinator::legacy::LegacyRules;
 use crate::coordinator::parameters::{CoordinatorMode, CoordinatorParameters};
 use crate::coordinator::policy::OrderingPolicy;
-use crate::coordinator::roster::{MissionSupply, Roster, SectionKind};
+use crate::coordinator::roster::Roster;
 use crate::coordinator::safe::SafeRules;
 use crate::coordinator::safe::reservation::Traffic;
 use crate::messages::{State, ToRobot};
+use crate::mission::MissionSource;
 use crate::scenario::Scene;
 use hil_core::time::Instant;
 
@@ -57,12 +57,12 @@ pub(crate) trait Rules: Debug {
 /// One fleet's coordinator.
 #[derive(Debug)]
 pub struct Coordinator {
-    roster: Roster,
+    /// What it knows of its robots.
+    pub(crate) roster: Roster,
     rules: Box<dyn Rules>,
     policy: Box<dyn OrderingPolicy>,
-    missions: Box<dyn MissionSupply>,
+    missions: MissionSource,
     counters: CoordinatorCounters,
-    clock_is_shared: bool,
 }
 
 impl Coordinator {
@@ -71,34 +71,22 @@ impl Coordinator {
         scene: &Scene,
         parameters: &CoordinatorParameters,
         fleet_id: u32,
-        missions: impl MissionSupply + 'static,
+        missions: MissionSource,
     ) -> Self {
-        let (kind, rules): (_, Box<dyn Rules>) = match parameters.mode {
-            CoordinatorMode::Legacy => {
-                let rules = LegacyRules::new(scene, parameters);
-                (SectionKind::Exact, Box::new(rules))
-            }
+        let rules: Box<dyn Rules> = match parameters.mode {
+            CoordinatorMode::Legacy => Box::new(LegacyRules::new(scene, parameters)),
             CoordinatorMode::Safe => {
-                // The roster's sections are only counted here, as in the other mode.
-                let rules = SafeRules::new(&scene.world, &scene.starts, parameters, fleet_id);
-                (SectionKind::Exact, Box::new(rules))
+                let starts = &scene.starts;
+                Box::new(SafeRules::new(&scene.world, starts, parameters, fleet_id))
             }
         };
         Self {
-            roster: Roster::new(scene, parameters, fleet_id, kind),
+            roster: Roster::new(scene, parameters, fleet_id),
             rules,
             policy: parameters.policy.policy(),
-            missions: Box::new(missions),
+            missions,
             counters: CoordinatorCounters::default(),
-            clock_is_shared: parameters.clock_is_shared,
         }
-    }
-
-    /// The same coordinator with a user's own ordering policy.
-    #[must_use]
-    pub fn with_policy(mut self, policy: Box<dyn OrderingPolicy>) -> Self {
-        self.policy = policy;
-        self
     }
 
     /// Takes a robot's state in.
@@ -116,18 +104,8 @@ impl Coordinator {
 
     /// One control cycle; gives each message to `send`.
     pub fn on_cycle(&mut self, now: Instant, send: &mut dyn FnMut(ToRobot)) {
-        let counts = &mut self.counters.counts;
-        counts.cycle_count += 1;
-        self.roster.settle(counts);
-        self.roster
-            .dispatch(now, self.missions.as_mut(), counts, send);
-        if self.clock_is_shared {
-            let driving = self.roster.robots().iter();
-            for state in driving.filter_map(|view| view.state) {
-                let age_ns = now.as_ns().saturating_sub(state.sampled_ns);
-                self.counters.state_age.record(age_ns);
-            }
-        }
+        self.roster.settle(&mut self.counters.counts);
+        self.roster.dispatch(now, &mut self.missions, send);
         self.rules.decide(&mut Cycle {
             now,
             roster: &mut self.roster,
@@ -149,10 +127,5 @@ impl Coordinator {
     /// What it counted so far.
     pub fn counters(&self) -> &CoordinatorCounters {
         &self.counters
-    }
-
-    /// What it knows of its robots.
-    pub fn roster(&self) -> &Roster {
-        &self.roster
     }
 }

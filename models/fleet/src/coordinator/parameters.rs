@@ -5,7 +5,7 @@ use core::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::coordinator::policy::PolicyName;
-use crate::coordinator::safe::parameters::SafeParameters;
+use crate::coordinator::safe::SafeParameters;
 use crate::messages::MessageOrder;
 use hil_core::case_study::ParameterError;
 
@@ -129,29 +129,9 @@ fn milliseconds(value: f64) -> Duration {
     Duration::from_secs_f64(value * 1e-3)
 }
 
-/// Copies of a message that the original sends on a channel losing `loss_ratio` of its packets,
-/// so that the way there and the way back both fail with at most `fault_ratio_max`:
-/// `ceil(ln(1 - sqrt(1 - fault_ratio_max)) / ln(loss_ratio))`, at least 1 and at most 10.
-pub fn replica_count(loss_ratio: f64, fault_ratio_max: f64) -> u32 {
-    let one_way_fault = 1.0 - (1.0 - fault_ratio_max).sqrt();
-    let needed = (one_way_fault.ln() / loss_ratio.ln()).ceil();
-    (1..10)
-        .find(|&count| f64::from(count) >= needed)
-        .unwrap_or(10)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn replicas_follow_the_originals_formula() {
-        for (fault_ratio_max, expected) in [(1e-2, 3), (1e-3, 4), (1e-6, 7), (1e-9, 10)] {
-            assert_eq!(replica_count(0.1, fault_ratio_max), expected);
-        }
-        assert_eq!(replica_count(0.0, 1e-2), 1);
-        assert_eq!(replica_count(0.9, 1e-2), 10);
-    }
 
     #[test]
     fn a_number_outside_its_range_is_named() {

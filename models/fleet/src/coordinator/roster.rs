@@ -1,73 +1,33 @@
 //! What the coordinator knows of its robots: the newest states, their missions, the bays and the
 //! sections ahead of them. It sends missions; who may go how far is decided elsewhere.
 
-use core::fmt::Debug;
 use core::time::Duration;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
 use crate::coordinator::counters::CoordinatorCounts;
 use crate::coordinator::parameters::CoordinatorParameters;
+use crate::coordinator::policy::Contender;
 use crate::coordinator::sections::SectionBook;
-pub use crate::coordinator::view::{ActiveMission, RobotView};
-use crate::messages::MessageOrder;
-use crate::messages::{Header, State, ToRobot};
+use crate::messages::{Header, MessageOrder, Mission, Phase, State, ToRobot};
 use crate::mission::MissionSource;
 use crate::path::Path;
 use crate::scenario::Scene;
-use crate::world::{BayIndex, Route, SectionLibrary, World};
+use crate::world::{BayIndex, Route, World};
 use hil_core::time::Instant;
-
-/// Where missions come from.
-pub trait MissionSupply: Debug {
-    /// The next way of `robot`, which is parked in bay `at`; `None` if there is none now. The
-    /// goal must be a bay for which `is_free` holds.
-    fn next(
-        &mut self,
-        robot: usize,
-        at: BayIndex,
-        is_free: &dyn Fn(BayIndex) -> bool,
-    ) -> Option<Route>;
-
-    /// How long a robot stays parked before its next mission.
-    fn parking(&self) -> Duration;
-}
-
-impl MissionSupply for MissionSource {
-    fn next(
-        &mut self,
-        robot: usize,
-        at: BayIndex,
-        is_free: &dyn Fn(BayIndex) -> bool,
-    ) -> Option<Route> {
-        self.next(robot, at, is_free)
-    }
-
-    fn parking(&self) -> Duration {
-        self.parking()
-    }
-}
-
-/// Which of the world's section libraries a coordinator goes by.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SectionKind {
-    /// Overlap of the exact footprints at the poses.
-    Exact,
-    /// Grown so that no overlap hides between two poses.
-    Guarded,
-}
 
 /// The robots of a fleet as their coordinator sees them.
 #[derive(Debug)]
 pub struct Roster {
     world: Arc<World>,
-    fleet_id: u32,
-    kind: SectionKind,
+    /// The fleet's number.
+    pub(crate) fleet_id: u32,
     message_order: MessageOrder,
     missions_per_cycle: u32,
     stuck_after: Duration,
     robots: Vec<RobotView>,
-    sections: SectionBook,
+    /// The sections that driving robots have ahead of them.
+    pub(crate) sections: SectionBook,
     /// Robots that stand in, leave or head for each bay.
     bay_users: Vec<u32>,
     /// Parked robots, the one that parked first in front.
@@ -83,12 +43,7 @@ impl Roster {
     ///
     /// # Panics
     /// When a start is no bay of the world.
-    pub fn new(
-        scene: &Scene,
-        parameters: &CoordinatorParameters,
-        fleet_id: u32,
-        kind: SectionKind,
-    ) -> Self {
+    pub fn new(scene: &Scene, parameters: &CoordinatorParameters, fleet_id: u32) -> Self {
         let mut bay_users = vec![0; scene.world.bays.len()];
         let mut robots = Vec::with_capacity(scene.starts.len());
         for &bay in &scene.starts {
@@ -101,7 +56,6 @@ impl Roster {
         }
         Self {
             fleet_id,
-            kind,
             message_order: parameters.message_order,
             missions_per_cycle: parameters.missions_per_cycle,
             stuck_after: parameters.stuck_after(),
@@ -114,24 +68,9 @@ impl Roster {
         }
     }
 
-    /// The world.
-    pub fn world(&self) -> &Arc<World> {
-        &self.world
-    }
-
-    /// The fleet's number.
-    pub fn fleet_id(&self) -> u32 {
-        self.fleet_id
-    }
-
     /// Every robot, by number.
     pub fn robots(&self) -> &[RobotView] {
         &self.robots
-    }
-
-    /// The sections that driving robots have ahead of them.
-    pub fn sections(&self) -> &SectionBook {
-        &self.sections
     }
 
     /// The same, to keep their order.
@@ -238,11 +177,10 @@ impl Roster {
     pub fn dispatch(
         &mut self,
         now: Instant,
-        missions: &mut dyn MissionSupply,
-        counts: &mut CoordinatorCounts,
+        missions: &mut MissionSource,
         send: &mut dyn FnMut(ToRobot),
     ) {
-        let parking = missions.parking();
+        let parking = missions.parking;
         let mut begun_count = 0;
         let mut position = 0;
         while begun_count < self.missions_per_cycle
@@ -264,13 +202,11 @@ impl Roster {
             };
             self.parked.remove(position);
             self.begin(now, robot, route);
-            counts.missions_started += 1;
             begun_count += 1;
         }
         for (robot_id, view) in (0..).zip(&mut self.robots) {
             let needs_repeat = |mission: &ActiveMission| !mission.is_shown || mission.is_reset;
             if view.mission.as_ref().is_some_and(needs_repeat) {
-                counts.mission_messages += 1;
                 send(view.mission_message(now, self.fleet_id, robot_id));
             }
         }
@@ -298,7 +234,6 @@ impl Roster {
             last_progress: now,
         });
         self.bay_users[route.to] += 1;
-        let library = self.library(&world);
         for other in (0..self.robots.len()).filter(|&other| other != robot) {
             let view = &self.robots[other];
             let Some(mission) = &view.mission else {
@@ -310,15 +245,8 @@ impl Roster {
             } else {
                 ([other, robot], [theirs, route.path], [index, 0])
             };
-            let sections = library.between(paths[0], paths[1]);
+            let sections = world.sections.between(paths[0], paths[1]);
             self.sections.add(robots, sections, indices);
-        }
-    }
-
-    fn library<'a>(&self, world: &'a World) -> &'a SectionLibrary {
-        match self.kind {
-            SectionKind::Exact => &world.sections,
-            SectionKind::Guarded => &world.guarded_sections,
         }
     }
 
@@ -349,7 +277,6 @@ impl Roster {
             mission.is_reset = true;
         }
         counts.resets += 1;
-        counts.mission_messages += 1;
         self.next_reset = now + RESET_PAUSE;
         send(view.mission_message(now, self.fleet_id, robot_id));
     }
@@ -379,6 +306,133 @@ fn clear_index(world: &World, bay: BayIndex, path: &Path) -> usize {
         .iter()
         .position(|pose| !footprint.at(pose).overlaps(&parked))
         .unwrap_or(path.last_index())
+}
+
+/// A mission on its way.
+#[derive(Debug, Clone)]
+pub struct ActiveMission {
+    /// Its number, from 1, per robot.
+    pub id: u32,
+    /// From where to where, on which path.
+    pub route: Route,
+    /// The path's poses.
+    pub path: Arc<Path>,
+    /// When it was first sent.
+    pub started: Instant,
+    /// A state showed it.
+    pub is_shown: bool,
+    /// The robot was told to stand at its goal at once.
+    pub is_reset: bool,
+    /// First pose at which the robot is clear of the bay it left.
+    pub(super) clear_index: usize,
+    pub(super) has_left_bay: bool,
+    /// When a state first showed the goal reached.
+    pub(super) done_at: Option<Instant>,
+    pub(super) best_index: usize,
+    pub(super) last_progress: Instant,
+}
+
+/// What the coordinator knows of one robot.
+#[derive(Debug, Clone, Default)]
+pub struct RobotView {
+    /// Newest state of the present mission; `None` before the first.
+    pub state: Option<State>,
+    /// The mission; `None` while the robot is parked.
+    pub mission: Option<ActiveMission>,
+    /// Where it is parked, or where its mission began.
+    pub bay: BayIndex,
+    /// When its last mission ended; `None` before the first.
+    pub parked_since: Option<Instant>,
+    /// Since when it stands at the end of its authority.
+    pub waiting_since: Option<Instant>,
+    pub(super) newest_header_id: Option<u32>,
+    pub(super) newest_mission_id: u32,
+    pub(super) mission_header_id: u32,
+    /// The index changed since the sections were last looked at.
+    pub(super) has_moved: bool,
+}
+
+impl RobotView {
+    /// Last pose of its path the robot reported to have passed; 0 before the first report.
+    pub fn index(&self) -> usize {
+        self.state
+            .map_or(0, |state| usize::try_from(state.path_index).unwrap_or(0))
+    }
+
+    /// Last pose of its mission's path; 0 without a mission.
+    pub fn last_index(&self) -> usize {
+        self.mission
+            .as_ref()
+            .map_or(0, |mission| mission.path.last_index())
+    }
+
+    /// The robot as an ordering policy sees it before a section that starts at `start`.
+    pub fn contender(&self, robot: usize, start: usize) -> Contender {
+        let index = self.index();
+        Contender {
+            robot,
+            index,
+            speed_mps: self.state.map_or(0.0, |state| f64::from(state.speed_mps)),
+            to_start: start.saturating_sub(index),
+            path_poses_left: self.last_index().saturating_sub(index),
+            mission_started: self
+                .mission
+                .as_ref()
+                .map_or(Instant::ZERO, |mission| mission.started),
+            waiting_since: self.waiting_since,
+            held_up_count: 0,
+        }
+    }
+
+    /// The message of the present mission; without one, of mission 0, which robots ignore.
+    pub(super) fn mission_message(
+        &mut self,
+        now: Instant,
+        fleet_id: u32,
+        robot_id: u32,
+    ) -> ToRobot {
+        self.mission_header_id = self.mission_header_id.wrapping_add(1);
+        let mut message = Mission {
+            header: Header {
+                fleet_id,
+                robot_id,
+                header_id: self.mission_header_id,
+                mission_id: 0,
+                sent_ns: now.as_ns(),
+            },
+            ..Mission::default()
+        };
+        if let Some(mission) = &self.mission {
+            message.header.mission_id = mission.id;
+            message.path_id = mission.route.path.0;
+            message.end_index = u32::try_from(mission.path.last_index()).unwrap_or(u32::MAX);
+            message.flags = u32::from(mission.is_reset) * Mission::REPLACE;
+            message.path_hash = mission.path.hash();
+        }
+        ToRobot::Mission(message)
+    }
+
+    pub(super) fn take(&mut self, now: Instant, state: &State) {
+        let old_index = self.index();
+        self.state = Some(*state);
+        let index = self.index();
+        self.has_moved |= index != old_index;
+        match Phase::of(state.phase) {
+            Some(Phase::AtPoint) => self.waiting_since = self.waiting_since.or(Some(now)),
+            _ => self.waiting_since = None,
+        }
+        let Some(mission) = &mut self.mission else {
+            return;
+        };
+        mission.is_shown = true;
+        if index > mission.best_index {
+            mission.best_index = index;
+            mission.last_progress = now;
+        }
+        if Phase::of(state.phase) == Some(Phase::Done) {
+            mission.done_at.get_or_insert(now);
+        }
+    }
 }
 
 #[cfg(test)]

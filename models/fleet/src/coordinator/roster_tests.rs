@@ -28,7 +28,7 @@ impl Bench {
             ..MissionParameters::default()
         };
         Self {
-            roster: Roster::new(&scene, &parameters, 4, SectionKind::Exact),
+            roster: Roster::new(&scene, &parameters, 4),
             missions: MissionSource::new(&missions, &scene, RandomStream::new(1, "missions")),
             counts: CoordinatorCounts::default(),
         }
@@ -43,13 +43,12 @@ impl Bench {
         };
         let (now, counts) = (seconds(now_s), &mut self.counts);
         self.roster.settle(counts);
-        self.roster
-            .dispatch(now, &mut self.missions, counts, &mut send);
+        self.roster.dispatch(now, &mut self.missions, &mut send);
         self.roster.reset_stuck(now, counts, &mut send);
         given
     }
 
-    fn report(&mut self, now_s: i64, header_id: u32, (mission_id, index): (u32, i32)) {
+    fn report(&mut self, now_s: i64, header_id: u32, mission_id: u32, index: i32) {
         let phase = if index == 134 {
             Phase::Done
         } else {
@@ -96,10 +95,10 @@ fn names(sent: &[Mission]) -> Vec<(u32, u32, u32)> {
 fn one_mission_begins_per_cycle_and_is_repeated_until_a_state_shows_it() {
     let mut bench = Bench::new(MessageOrder::Legacy);
     assert_eq!(names(&bench.cycle(0)), [(0, 1, 0)]);
-    assert_eq!(bench.roster.sections().iter().count(), 0);
+    assert_eq!(bench.roster.sections.iter().count(), 0);
     assert_eq!(names(&bench.cycle(1)), [(0, 1, 0), (1, 1, 0)]);
-    assert_eq!(bench.roster.sections().iter().count(), 1);
-    bench.report(1, 1, (1, 0));
+    assert_eq!(bench.roster.sections.iter().count(), 1);
+    bench.report(1, 1, 1, 0);
     let sent = bench.cycle(2);
     assert_eq!(names(&sent), [(1, 1, 0)]);
     assert_eq!((sent[0].header.header_id, sent[0].end_index), (2, 134));
@@ -110,7 +109,7 @@ fn a_robot_that_arrives_frees_its_sections_parks_and_goes_again() {
     let mut bench = Bench::new(MessageOrder::Legacy);
     bench.cycle(0);
     bench.cycle(1);
-    bench.report(40, 1, (1, 134));
+    bench.report(40, 1, 1, 134);
     assert_eq!(names(&bench.cycle(41)), [(1, 1, 0)]);
     let view = &bench.roster.robots()[0];
     assert!(view.mission.is_none());
@@ -119,7 +118,7 @@ fn a_robot_that_arrives_frees_its_sections_parks_and_goes_again() {
     assert_eq!(names(&bench.cycle(42)), [(1, 1, 0)]);
     assert_eq!(names(&bench.cycle(43)), [(0, 2, 0), (1, 1, 0)]);
     // A state of the mission that is over says nothing about the new one.
-    bench.report(43, 2, (1, 134));
+    bench.report(43, 2, 1, 134);
     assert_eq!(bench.counts.states_outdated, 1);
     assert!(bench.roster.robots()[0].mission.is_some());
 }
@@ -129,10 +128,10 @@ fn a_late_state_is_the_newest_in_order_of_arrival_and_dropped_in_strict_order() 
     for (order, expected) in [(MessageOrder::Legacy, 20), (MessageOrder::Strict, 30)] {
         let mut bench = Bench::new(order);
         bench.cycle(0);
-        bench.report(1, 7, (1, 10));
-        bench.report(2, 9, (1, 30));
-        bench.report(3, 8, (1, 20));
-        bench.report(4, 9, (1, expected));
+        bench.report(1, 7, 1, 10);
+        bench.report(2, 9, 1, 30);
+        bench.report(3, 8, 1, 20);
+        bench.report(4, 9, 1, expected);
         assert_eq!(
             i32::try_from(bench.roster.robots()[0].index()),
             Ok(expected)
@@ -193,7 +192,7 @@ fn a_robot_without_way_for_too_long_is_put_at_its_goal_and_only_one_at_a_time() 
     let mut bench = Bench::new(MessageOrder::Legacy);
     bench.cycle(0);
     bench.cycle(1);
-    bench.report(2, 1, (1, 8));
+    bench.report(2, 1, 1, 8);
     assert_eq!(names(&bench.cycle(120)), [(1, 1, 0)]);
     assert_eq!(bench.counts.resets, 0);
     assert_eq!(
@@ -203,7 +202,7 @@ fn a_robot_without_way_for_too_long_is_put_at_its_goal_and_only_one_at_a_time() 
     assert_eq!(names(&bench.cycle(123)), [(1, 1, Mission::REPLACE)]);
     let later = names(&bench.cycle(132));
     assert!(later.contains(&(0, 1, Mission::REPLACE)));
-    bench.report(133, 2, (1, 134));
+    bench.report(133, 2, 1, 134);
     bench.cycle(134);
     let counts = bench.counts;
     assert_eq!((counts.resets, counts.missions_done), (2, 1));
@@ -219,10 +218,10 @@ fn a_bay_is_free_again_only_when_who_left_it_is_clear_of_it() {
     bench.cycle(0);
     assert_eq!(bench.roster.bay_users, [1, 1, 1, 0]);
     // 2 m of vehicle are clear after 7 steps of 0.3 m.
-    bench.report(1, 1, (1, 6));
+    bench.report(1, 1, 1, 6);
     bench.roster.settle(&mut bench.counts);
     assert_eq!(bench.roster.bay_users, [1, 1, 1, 0]);
-    bench.report(2, 2, (1, 7));
+    bench.report(2, 2, 1, 7);
     bench.roster.settle(&mut bench.counts);
     assert_eq!(bench.roster.bay_users, [0, 1, 1, 0]);
 }

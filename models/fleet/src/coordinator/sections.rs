@@ -15,7 +15,6 @@ pub struct ActiveSection {
     position: usize,
     /// First and last pose per side, kept here because every cycle reads them.
     ranges: [(usize, usize); 2],
-    serial: u64,
     /// Who goes first, once somebody decided; kept over the cycles.
     pub leader: Option<Side>,
 }
@@ -49,11 +48,6 @@ impl ActiveSection {
     pub fn end(&self, side: Side) -> usize {
         self.ranges[side as usize].1
     }
-
-    /// Counts the sections of this book from 0; never used twice.
-    pub fn serial(&self) -> u64 {
-        self.serial
-    }
 }
 
 /// Every active section of a fleet, found by slot number and by robot.
@@ -62,7 +56,6 @@ pub struct SectionBook {
     slots: Vec<Option<ActiveSection>>,
     free: Vec<usize>,
     of_robot: Vec<Vec<usize>>,
-    next_serial: u64,
 }
 
 impl SectionBook {
@@ -95,14 +88,6 @@ impl SectionBook {
             .filter_map(|&slot| Some((slot, self.get(slot)?)))
     }
 
-    /// Every section once with its slot, in reproducible order.
-    pub fn iter(&self) -> impl Iterator<Item = (usize, &ActiveSection)> {
-        (0..self.of_robot.len()).flat_map(move |robot| {
-            self.of_robot(robot)
-                .filter(move |(_, active)| active.robots[0] == robot)
-        })
-    }
-
     /// Adds the sections of two robots' paths that neither has passed. `robots` ascend,
     /// `sections` have the first robot's path first, `passed` are the reported indices.
     pub(crate) fn add(
@@ -122,10 +107,8 @@ impl SectionBook {
                 sections: Arc::clone(sections),
                 position,
                 ranges,
-                serial: self.next_serial,
                 leader: None,
             };
-            self.next_serial += 1;
             let slot = self.free.pop().unwrap_or(self.slots.len());
             if slot == self.slots.len() {
                 self.slots.push(None);
@@ -162,5 +145,16 @@ impl SectionBook {
             removed_count += 1;
         }
         removed_count
+    }
+}
+
+#[cfg(test)]
+impl SectionBook {
+    /// Every section once with its slot, in reproducible order.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (usize, &ActiveSection)> {
+        (0..self.of_robot.len()).flat_map(move |robot| {
+            self.of_robot(robot)
+                .filter(move |(_, active)| active.robots[0] == robot)
+        })
     }
 }

@@ -1,14 +1,17 @@
 //! The cells of the tables: which experiments there are, and what each is held against. It runs
 //! none of them.
 
+use crate::coordinator::counters::{CoordinatorCounts, SafeCounts};
 use crate::coordinator::parameters::CoordinatorMode;
-use crate::experiment::published::{Condition, HARBOR, PublishedNetwork, PublishedRow, WAREHOUSE};
-use crate::experiment::setup::{Links, Setup, StatusPath};
+use crate::experiment::driver::{Experiment, Links, Setup, StatusPath};
 use crate::messages::MessageOrder;
+use crate::referee::Tally;
 use crate::robot::TrackerKind;
-use crate::scenario::Scenario;
-use hil_link::impaired::{DelayLaw, Impairments};
+use crate::scenario::{Scenario, Scene};
+use hil_core::time::Instant;
+use hil_link::impaired::{DelayLaw, Impairments, LinkCounts};
 use hil_link::wifi::WifiPreset;
+use hil_stats::statistics::clopper_pearson;
 
 /// Scenarios of the paper's tables.
 pub(crate) const SCENARIOS: [Scenario; 2] = [Scenario::Harbor, Scenario::Warehouse];
@@ -120,7 +123,7 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
                     delay_ms,
                 } => (loss_ratio, delay_ms),
                 Condition::HardwareInTheLoop(network) => {
-                    cells.extend(wifi_cell(base, scenario, (*row, network)));
+                    cells.extend(wifi_cell(base, scenario, *row, network));
                     continue;
                 }
             };
@@ -128,8 +131,8 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
             cells.extend(copies.iter().map(|&copies| Cell {
                 scenario,
                 place: Place::Published { row: *row, copies },
-                setup: original(base, (delay_ms, law), (loss_ratio, copies)),
-                demand: demand_of(scenario, (loss_ratio, delay_ms), copies),
+                setup: original(base, delay_ms, law, loss_ratio, copies),
+                demand: demand_of(scenario, loss_ratio, delay_ms, copies),
             }));
         }
         if scenario == Scenario::Harbor {
@@ -141,11 +144,7 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
 
 /// The original's mechanisms: believed delivery, stepped tracker whose steps the delay stretches,
 /// status read past the network, the delay known to the coordinator.
-fn original(
-    base: &Setup,
-    (delay_ms, law): (f64, DelayLaw),
-    (loss_ratio, copies): (f64, u32),
-) -> Setup {
+fn original(base: &Setup, delay_ms: f64, law: DelayLaw, loss_ratio: f64, copies: u32) -> Setup {
     let mut setup = base.clone();
     setup.robot.tracker = TrackerKind::LegacyRk4;
     setup.robot.step_inflation = true;
@@ -174,14 +173,15 @@ fn original(
 fn wifi_cell(
     base: &Setup,
     scenario: Scenario,
-    (row, network): (PublishedRow, PublishedNetwork),
+    row: PublishedRow,
+    network: PublishedNetwork,
 ) -> Option<Cell> {
     let preset = match network {
         PublishedNetwork::ShortRange => WifiPreset::ShortRange,
         PublishedNetwork::LongRange => WifiPreset::LongRange,
         PublishedNetwork::Ethernet => return None,
     };
-    let mut setup = original(base, (0.0, DelayLaw::Constant), (0.0, 1));
+    let mut setup = original(base, 0.0, DelayLaw::Constant, 0.0, 1);
     setup.robot.step_inflation = false;
     setup.links.status_path = StatusPath::Network;
     setup.links.wifi = Some(preset.spec());
@@ -194,7 +194,7 @@ fn wifi_cell(
 }
 
 /// What our figures must come to, from the published ones and a prototype of the algorithm.
-fn demand_of(scenario: Scenario, (loss_ratio, delay_ms): (f64, f64), copies: u32) -> Demand {
+fn demand_of(scenario: Scenario, loss_ratio: f64, delay_ms: f64, copies: u32) -> Demand {
     let is_lossy = loss_ratio > 0.0;
     let is_long = delay_ms > 99.0;
     match (scenario, is_lossy) {
@@ -213,7 +213,7 @@ fn demand_of(scenario: Scenario, (loss_ratio, delay_ms): (f64, f64), copies: u32
 /// Harbor, 100 ms, no loss, with one thing changed; the last changes all that the network could
 /// be blamed for, and keeps the nominal steps.
 fn variants(base: &Setup, law: DelayLaw) -> Vec<Cell> {
-    let row = || original(base, (100.0, law), (0.0, 1));
+    let row = || original(base, 100.0, law, 0.0, 1);
     let variant = |text, demand, change: fn(&mut Setup)| {
         let mut setup = row();
         change(&mut setup);
@@ -393,6 +393,272 @@ pub(crate) fn mechanism_cells(base: &Setup) -> Vec<Cell> {
     cells
 }
 
+/// Figures of one or more runs.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct FleetTally {
+    /// What the referee saw.
+    pub referee: Tally,
+    /// What the coordinators counted.
+    pub coordinator: CoordinatorCounts,
+    /// What the safe mode's rules counted; zeros in the legacy mode.
+    pub safe: SafeCounts,
+    /// What became of authorities and missions on their way.
+    pub commands: LinkCounts,
+    /// What became of states on their way.
+    pub status: LinkCounts,
+    /// States deleted on their way by a newer one.
+    pub superseded_count: u64,
+    /// Time run, seconds.
+    pub run_s: f64,
+    /// Time run times robots, seconds.
+    pub robot_s: f64,
+    /// Farthest a robot may stop past an authority that came in time, metres.
+    pub stop_error_bound_m: f64,
+    /// Runs that ended because the fleet stood.
+    pub stand_count: u64,
+    /// Runs with a collision.
+    pub collided: Vec<CollidedRun>,
+}
+
+/// Where to see a collision again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct CollidedRun {
+    /// Which of the cell's runs.
+    pub replica: u64,
+    /// Its seed.
+    pub seed: u64,
+    /// When the first collision was seen.
+    pub first_at: Instant,
+}
+
+/// Runs with a collision that a tally remembers.
+const COLLIDED_MAX: usize = 8;
+
+impl FleetTally {
+    pub(crate) fn of(experiment: &Experiment) -> Self {
+        let [commands, status] = experiment.link_counts();
+        let run_s = experiment.now().seconds_since(Instant::ZERO);
+        let first_at = experiment.incidents().first();
+        Self {
+            referee: *experiment.referee.tally(),
+            coordinator: experiment.coordinator.counters().counts,
+            safe: experiment.coordinator.counters().safe,
+            commands,
+            status,
+            superseded_count: experiment.superseded_count(),
+            run_s,
+            robot_s: run_s * experiment.robots().len() as f64,
+            collided: first_at
+                .map(|incident| CollidedRun {
+                    replica: 0,
+                    seed: 0,
+                    first_at: incident.at,
+                })
+                .into_iter()
+                .collect(),
+            ..Self::default()
+        }
+    }
+
+    /// Adds what only the study knows of a run.
+    pub(crate) fn conclude(&mut self, seed: u64, replica: u64, cell: &Cell, scene: &Scene) {
+        let robot = &cell.setup.robot;
+        self.stop_error_bound_m = robot.stop_error_bound_m(&scene.world.vehicle);
+        for run in &mut self.collided {
+            (run.seed, run.replica) = (seed, replica);
+        }
+    }
+
+    /// Adds another run.
+    pub fn merge(&mut self, other: &Self) {
+        merge_referee(&mut self.referee, &other.referee);
+        self.coordinator.merge(&other.coordinator);
+        self.safe.merge(&other.safe);
+        merge_link(&mut self.commands, &other.commands);
+        merge_link(&mut self.status, &other.status);
+        self.superseded_count += other.superseded_count;
+        self.run_s += other.run_s;
+        self.robot_s += other.robot_s;
+        self.stop_error_bound_m = self.stop_error_bound_m.max(other.stop_error_bound_m);
+        self.stand_count += other.stand_count;
+        let room = COLLIDED_MAX.saturating_sub(self.collided.len());
+        self.collided.extend(other.collided.iter().take(room));
+    }
+
+    /// Critical sections that a robot passed.
+    pub fn section_count(&self) -> u64 {
+        self.referee.sections_passed_count
+    }
+
+    /// Collisions by the original's checker: the count the tables' probability is of.
+    pub fn collision_count(&self) -> u64 {
+        self.referee.section_collisions_count
+    }
+
+    /// Collisions by any of the three checkers. The true overlaps include those outside every
+    /// section.
+    pub fn any_collision_count(&self) -> u64 {
+        self.referee.section_collisions_count + self.referee.overlaps_count
+    }
+
+    /// Collisions per critical section; `None` without sections.
+    pub fn collision_ratio(&self) -> Option<f64> {
+        let sections = self.section_count();
+        (sections > 0).then(|| self.collision_count() as f64 / sections as f64)
+    }
+
+    /// The 95 % interval of [`FleetTally::collision_ratio`]; `None` without sections.
+    pub fn collision_interval(&self) -> Option<(f64, f64)> {
+        collision_interval(self.collision_count(), self.section_count())
+    }
+
+    /// Missions driven to their end per hour of the fleet; `None` before it ran.
+    pub fn missions_per_hour(&self) -> Option<f64> {
+        (self.run_s > 0.0).then(|| 3600.0 * self.referee.missions_done_count as f64 / self.run_s)
+    }
+}
+
+/// The exact interval (Clopper and Pearson 1934) of collisions per critical section, 95 %.
+pub(crate) fn collision_interval(collisions: u64, sections: u64) -> Option<(f64, f64)> {
+    // One section can see two collisions; more collisions than sections are no proportion.
+    if collisions > sections {
+        return None;
+    }
+    clopper_pearson(collisions, sections, 0.95).map(|interval| (interval.low, interval.high))
+}
+
+fn merge_link(sum: &mut LinkCounts, other: &LinkCounts) {
+    sum.offered_count += other.offered_count;
+    sum.lost_count += other.lost_count;
+    sum.duplicated_count += other.duplicated_count;
+    sum.held_count += other.held_count;
+    sum.stalled_count += other.stalled_count;
+}
+
+fn merge_referee(sum: &mut Tally, other: &Tally) {
+    sum.sections_created_count += other.sections_created_count;
+    sum.sections_passed_count += other.sections_passed_count;
+    sum.sections_dropped_count += other.sections_dropped_count;
+    sum.encounters_count += other.encounters_count;
+    sum.section_collisions_count += other.section_collisions_count;
+    sum.overlaps_count += other.overlaps_count;
+    sum.outside_count += other.outside_count;
+    sum.separation_min_m = match (sum.separation_min_m, other.separation_min_m) {
+        (Some(one), Some(other)) => Some(one.min(other)),
+        (one, other) => one.or(other),
+    };
+    sum.stop_error_max_m = sum.stop_error_max_m.max(other.stop_error_max_m);
+    sum.late_overshoot_max_m = sum.late_overshoot_max_m.max(other.late_overshoot_max_m);
+    sum.travelled_m += other.travelled_m;
+    sum.missions_started_count += other.missions_started_count;
+    sum.missions_done_count += other.missions_done_count;
+    sum.replaced_count += other.replaced_count;
+    sum.authorities_applied_count += other.authorities_applied_count;
+    sum.authorities_late_count += other.authorities_late_count;
+    sum.authorities_ignored_count += other.authorities_ignored_count;
+    sum.authorities_refused_count += other.authorities_refused_count;
+    sum.stale_count += other.stale_count;
+    sum.leases_ended_count += other.leases_ended_count;
+    sum.scans_count += other.scans_count;
+    sum.unsound_count += other.unsound_count;
+}
+
+/// One row.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct PublishedRow {
+    /// What the paper's first columns say.
+    pub(crate) condition: Condition,
+    /// "Total CS counts".
+    pub(crate) sections: u64,
+    /// "Collision counts".
+    pub(crate) collisions: u64,
+}
+
+/// Under what a row was obtained.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Condition {
+    /// Static modelling: packet loss ratio and packet delay.
+    Static {
+        /// Packet loss ratio.
+        loss_ratio: f64,
+        /// Packet delay.
+        delay_ms: f64,
+    },
+    /// Hardware in the loop, over this network.
+    HardwareInTheLoop(PublishedNetwork),
+}
+
+/// A network of the paper's own measurements.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum PublishedNetwork {
+    /// A wire.
+    Ethernet,
+    /// A radio at 20 m.
+    ShortRange,
+    /// A radio at 35 m.
+    LongRange,
+}
+
+impl core::fmt::Display for PublishedNetwork {
+    /// What the paper calls it.
+    fn fmt(&self, formatter: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        formatter.write_str(match self {
+            Self::Ethernet => "Ethernet",
+            Self::ShortRange => "short-range Wi-Fi 6",
+            Self::LongRange => "long-range Wi-Fi 6",
+        })
+    }
+}
+
+const fn fixed(loss_ratio: f64, delay_ms: f64, sections: u64, collisions: u64) -> PublishedRow {
+    PublishedRow {
+        condition: Condition::Static {
+            loss_ratio,
+            delay_ms,
+        },
+        sections,
+        collisions,
+    }
+}
+
+const fn measured(network: PublishedNetwork, sections: u64, collisions: u64) -> PublishedRow {
+    PublishedRow {
+        condition: Condition::HardwareInTheLoop(network),
+        sections,
+        collisions,
+    }
+}
+
+/// Table II, harbor.
+pub(crate) const HARBOR: [PublishedRow; 11] = [
+    fixed(0.0, 0.0, 10_018, 0),
+    fixed(0.0, 10.0, 10_001, 0),
+    fixed(0.0, 50.0, 10_003, 0),
+    fixed(0.0, 100.0, 10_018, 5),
+    fixed(0.1, 0.0, 10_003, 0),
+    fixed(0.1, 10.0, 10_007, 0),
+    fixed(0.1, 50.0, 10_092, 0),
+    fixed(0.1, 100.0, 10_061, 18),
+    measured(PublishedNetwork::Ethernet, 10_819, 0),
+    measured(PublishedNetwork::ShortRange, 15_489, 14),
+    measured(PublishedNetwork::LongRange, 10_004, 23),
+];
+
+/// Table III, warehouse.
+pub(crate) const WAREHOUSE: [PublishedRow; 11] = [
+    fixed(0.0, 0.0, 13_859, 0),
+    fixed(0.0, 10.0, 10_001, 0),
+    fixed(0.0, 50.0, 10_001, 0),
+    fixed(0.0, 100.0, 10_015, 0),
+    fixed(0.1, 0.0, 10_002, 0),
+    fixed(0.1, 10.0, 10_001, 0),
+    fixed(0.1, 50.0, 10_037, 0),
+    fixed(0.1, 100.0, 21_645, 0),
+    measured(PublishedNetwork::Ethernet, 10_004, 1),
+    measured(PublishedNetwork::ShortRange, 10_155, 15),
+    measured(PublishedNetwork::LongRange, 17_394, 40),
+];
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -420,6 +686,29 @@ mod tests {
         for cell in mechanism_cells(&Setup::default()) {
             let is_safe = cell.setup.coordinator.mode == CoordinatorMode::Safe;
             assert_eq!(cell.demand == Demand::NoneAtAll, is_safe);
+        }
+    }
+}
+
+#[cfg(test)]
+mod published_tests {
+    use super::*;
+
+    #[test]
+    fn the_counts_give_the_printed_probabilities() {
+        // The paper's last column, per 1000, where it is not zero.
+        let printed = [
+            (&HARBOR[3], 0.499_102),
+            (&HARBOR[7], 1.789_087),
+            (&HARBOR[9], 0.903_867),
+            (&HARBOR[10], 2.299_080),
+            (&WAREHOUSE[8], 0.099_960),
+            (&WAREHOUSE[9], 1.477_105),
+            (&WAREHOUSE[10], 2.299_644),
+        ];
+        for (row, expected) in printed {
+            let ratio = 1e3 * row.collisions as f64 / row.sections as f64;
+            assert!((ratio - expected).abs() < 1e-6, "{row:?}: {ratio}");
         }
     }
 }

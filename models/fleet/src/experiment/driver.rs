@@ -2,25 +2,29 @@
 //! processes, with messages as values instead of bytes and no log. It decides nothing; what it
 //! adds is the order of events.
 
+use core::cmp::Reverse;
 use core::time::Duration;
+use std::collections::BinaryHeap;
+
+use serde::{Deserialize, Serialize};
 
 use crate::controller::coordinator_of;
 use crate::coordinator::Coordinator;
-use crate::experiment::agenda::Agenda;
-use crate::experiment::path::Path;
-use crate::experiment::post::{Letter, Post, Rank};
-use crate::experiment::setup::{Setup, StatusPath};
-use crate::experiment::tally::FleetTally;
-use crate::messages::{State, ToRobot, Truth};
+use crate::coordinator::parameters::CoordinatorParameters;
+use crate::experiment::cells::FleetTally;
+use crate::messages::{Authority, Mission, State, ToRobot, Truth};
+use crate::mission::MissionParameters;
 use crate::referee::{Incident, Referee, SCAN_PERIOD};
 use crate::robot::{Robot, RobotParameters};
 use crate::robots::robot_stream;
 use crate::scenario::Scene;
 use hil_core::case_study::ParameterError;
+use hil_core::link_model::LinkModel;
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
-use hil_link::impaired::LinkCounts;
+use hil_link::impaired::{ImpairedLink, Impairments, LinkCounts};
 use hil_link::spec::Way;
+use hil_link::wifi::{WifiLink, WifiSpec};
 
 /// The number of the only fleet of an experiment.
 const FLEET: u32 = 0;
@@ -29,10 +33,10 @@ const FLEET: u32 = 0;
 #[derive(Debug)]
 pub struct Experiment {
     now: Instant,
-    coordinator: Coordinator,
+    pub(crate) coordinator: Coordinator,
     robots: Vec<Robot>,
     agenda: Agenda,
-    referee: Referee,
+    pub(crate) referee: Referee,
     network: Network,
     cycle: Cycle,
     next_scan: Instant,
@@ -81,13 +85,13 @@ impl Experiment {
     pub fn new(scene: &Scene, setup: &Setup, seed: u64) -> Result<Self, ParameterError> {
         setup.check()?;
         let robots: Vec<_> = (0..scene.starts.len())
-            .map(|robot| robot_of(scene, &setup.robot, (seed, robot)))
+            .map(|robot| robot_of(scene, &setup.robot, seed, robot))
             .collect();
         let links = &setup.links;
         let status_count = links.status_keeps_order.then_some(scene.starts.len());
         Ok(Self {
             now: Instant::ZERO,
-            coordinator: coordinator_of(scene, &setup.coordinator, &setup.missions, (FLEET, seed)),
+            coordinator: coordinator_of(scene, &setup.coordinator, &setup.missions, FLEET, seed),
             agenda: Agenda::new(robots.len()),
             robots,
             referee: Referee::new(scene, 1),
@@ -278,16 +282,8 @@ impl Experiment {
         self.referee.incidents()
     }
 
-    pub(crate) fn coordinator(&self) -> &Coordinator {
-        &self.coordinator
-    }
-
     pub(crate) fn robots(&self) -> &[Robot] {
         &self.robots
-    }
-
-    pub(crate) fn referee(&self) -> &Referee {
-        &self.referee
     }
 
     /// What became of commands and of states on their way.
@@ -337,8 +333,346 @@ impl Network {
     }
 }
 
-fn robot_of(scene: &Scene, parameters: &RobotParameters, (seed, robot): (u64, usize)) -> Robot {
+fn robot_of(scene: &Scene, parameters: &RobotParameters, seed: u64, robot: usize) -> Robot {
     let robot = u32::try_from(robot).expect("at most a few hundred robots");
     let random = robot_stream(seed, FLEET, robot);
     Robot::new(scene, parameters, FLEET, robot, random)
+}
+
+/// No event.
+pub(crate) const NEVER: Instant = Instant::from_ns(i64::MAX);
+
+/// A tournament over a fixed number of entries: the first is known at once, a change costs the
+/// logarithm of their number. Of entries at one instant, the lowest index wins.
+#[derive(Debug, Clone)]
+pub(crate) struct Agenda {
+    /// Node `i` has the children `2 i` and `2 i + 1`; the leaves begin at `leaf_start`. A node
+    /// holds the winner's index.
+    winners: Vec<u32>,
+    due: Vec<Instant>,
+    leaf_start: usize,
+}
+
+impl Agenda {
+    /// An agenda of `count` entries without events.
+    pub(crate) fn new(count: usize) -> Self {
+        let leaf_start = count.max(1).next_power_of_two();
+        let index = |leaf: usize| u32::try_from(leaf).expect("fewer than 2^32 robots");
+        let mut winners = vec![0; 2 * leaf_start];
+        for leaf in 0..leaf_start {
+            winners[leaf_start + leaf] = index(leaf);
+        }
+        let mut agenda = Self {
+            winners,
+            due: vec![NEVER; leaf_start],
+            leaf_start,
+        };
+        for node in (1..leaf_start).rev() {
+            agenda.play(node);
+        }
+        agenda
+    }
+
+    /// The earliest event and whose it is.
+    pub(crate) fn first(&self) -> (Instant, usize) {
+        let winner = self.winners[1] as usize;
+        (self.due[winner], winner)
+    }
+
+    /// Sets the next event of `entry`.
+    pub(crate) fn set(&mut self, entry: usize, due: Instant) {
+        self.due[entry] = due;
+        let mut node = (self.leaf_start + entry) >> 1;
+        while node > 0 {
+            self.play(node);
+            node /= 2;
+        }
+    }
+
+    fn play(&mut self, node: usize) {
+        let (left, right) = (self.winners[2 * node], self.winners[2 * node + 1]);
+        let is_right = self.due[right as usize] < self.due[left as usize];
+        self.winners[node] = if is_right { right } else { left };
+    }
+}
+
+/// One direction.
+#[derive(Debug)]
+pub(crate) enum Path {
+    Impaired(Box<ImpairedLink>),
+    Wifi(Box<WifiLink>),
+}
+
+impl Path {
+    /// Commands go forward, states backward.
+    ///
+    /// # Errors
+    /// When a number of `links` is outside its range.
+    pub(crate) fn new(links: &Links, way: Way, seed: u64) -> Result<Self, ParameterError> {
+        let (impairments, name) = match way {
+            Way::Forward => (links.commands, "fleet commands"),
+            Way::Backward => (links.status, "fleet status"),
+        };
+        let own = RandomStream::new(seed, name);
+        Ok(match &links.wifi {
+            None => {
+                let stalls = RandomStream::new(seed, "fleet stalls");
+                Self::Impaired(Box::new(ImpairedLink::new(impairments, own, stalls)?))
+            }
+            Some(wifi) => {
+                let shared = RandomStream::new(seed, "fleet radio");
+                Self::Wifi(Box::new(WifiLink::new(wifi, way, own, shared)?))
+            }
+        })
+    }
+
+    /// Offers a message; hands each of its arrivals to `deliver`.
+    pub(crate) fn offer(
+        &mut self,
+        now: Instant,
+        length_bytes: usize,
+        deliver: &mut dyn FnMut(Instant),
+    ) {
+        match self {
+            Self::Impaired(link) => link.offer(now, deliver),
+            Self::Wifi(link) => {
+                if let Some(at) = link.offer(now, length_bytes).arrival() {
+                    deliver(at);
+                }
+            }
+        }
+    }
+
+    /// What became of the messages so far.
+    pub(crate) fn counts(&self) -> LinkCounts {
+        match self {
+            Self::Impaired(link) => link.counts(),
+            Self::Wifi(link) => {
+                let counts = link.counts();
+                LinkCounts {
+                    offered_count: counts.offered_count,
+                    lost_count: counts.offered_count - counts.delivered_count,
+                    held_count: counts.held_count,
+                    ..LinkCounts::default()
+                }
+            }
+        }
+    }
+}
+
+/// Header of a datagram between gateways; only a radio's airtime depends on it.
+const HEADER_BYTES: usize = 72;
+
+/// A message under way.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Letter {
+    /// To the coordinator.
+    State(State),
+    /// To a robot.
+    Authority(Authority),
+    /// To a robot.
+    Mission(Mission),
+}
+
+impl Letter {
+    /// Bytes of the message behind our datagram's header.
+    pub(crate) const fn length_bytes(&self) -> usize {
+        HEADER_BYTES
+            + match self {
+                Self::State(_) => size_of::<State>(),
+                Self::Authority(_) => size_of::<Authority>(),
+                Self::Mission(_) => size_of::<Mission>(),
+            }
+    }
+
+    /// At one instant, ports are served in the order in which an endpoint polls them.
+    const fn rank(&self) -> Rank {
+        match self {
+            Self::State(_) => Rank::State,
+            Self::Authority(_) => Rank::Authority,
+            Self::Mission(_) => Rank::Mission,
+        }
+    }
+}
+
+/// What comes first of several things at one instant: the coordinator takes states and decides,
+/// the robots take authorities, then missions, then move; last the referee looks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Rank {
+    State,
+    Cycle,
+    Authority,
+    Mission,
+    Robot,
+    Scan,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Flight {
+    at: Instant,
+    rank: Rank,
+    order: u64,
+    slot: usize,
+}
+
+/// Letters under way, the earliest arrival first; of those at one instant and port, the one
+/// posted first.
+#[derive(Debug, Default)]
+pub(crate) struct Post {
+    flights: BinaryHeap<Reverse<Flight>>,
+    letters: Vec<Letter>,
+    free: Vec<usize>,
+    posted_count: u64,
+}
+
+impl Post {
+    /// Puts a letter under way.
+    pub(crate) fn post(&mut self, at: Instant, letter: Letter) {
+        let slot = if let Some(slot) = self.free.pop() {
+            self.letters[slot] = letter;
+            slot
+        } else {
+            self.letters.push(letter);
+            self.letters.len() - 1
+        };
+        self.flights.push(Reverse(Flight {
+            at,
+            rank: letter.rank(),
+            order: self.posted_count,
+            slot,
+        }));
+        self.posted_count += 1;
+    }
+
+    /// When the next letter arrives and at which port.
+    pub(crate) fn next(&self) -> Option<(Instant, Rank)> {
+        let Reverse(flight) = self.flights.peek()?;
+        Some((flight.at, flight.rank))
+    }
+
+    /// Takes the next letter, whenever it arrives.
+    pub(crate) fn take(&mut self) -> Option<Letter> {
+        let Reverse(flight) = self.flights.pop()?;
+        self.free.push(flight.slot);
+        Some(self.letters[flight.slot])
+    }
+}
+
+/// How the coordinator learns what the robots do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum StatusPath {
+    /// It reads their true state at each decision, whatever the network does; missions reach the
+    /// robots at once. The original since 2020.
+    Bypass,
+    /// By messages over the network.
+    #[default]
+    Network,
+}
+
+/// What lies between coordinator and robots.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Links {
+    /// Whether states go over the network at all.
+    pub status_path: StatusPath,
+    /// A radio, commands forward and states backward, in place of both impairments.
+    pub wifi: Option<WifiSpec>,
+    /// What authorities and missions meet.
+    pub commands: Impairments,
+    /// What states meet.
+    pub status: Impairments,
+    /// A newer state deletes those still under way that it overtakes, as in the original.
+    pub status_keeps_order: bool,
+}
+
+/// One experiment.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Setup {
+    /// How robots drive and take orders.
+    pub robot: RobotParameters,
+    /// Who goes first, and how it is told.
+    pub coordinator: CoordinatorParameters,
+    /// Where robots are sent.
+    pub missions: MissionParameters,
+    /// What lies between.
+    pub links: Links,
+    /// A control cycle takes up to this much longer than its period, uniform, seconds.
+    pub overrun_max_s: f64,
+}
+
+impl Setup {
+    /// Checks every number against its range.
+    ///
+    /// # Errors
+    /// The first key outside its range.
+    pub fn check(&self) -> Result<(), ParameterError> {
+        self.robot.check()?;
+        self.coordinator.check()?;
+        self.missions.check()?;
+        if let Some(wifi) = &self.links.wifi {
+            wifi.check()?;
+        }
+        self.links.commands.check()?;
+        self.links.status.check()?;
+        let overrun_s = self.overrun_max_s;
+        ParameterError::check("overrun_max_s", overrun_s, 0.0..=600.0, "0 to 600")
+    }
+}
+
+#[cfg(test)]
+mod agenda_tests {
+    use super::*;
+    use hil_core::random::RandomStream;
+
+    #[test]
+    fn the_first_entry_is_the_earliest_whatever_changed() {
+        for count in [1, 2, 3, 7, 8, 100] {
+            let mut agenda = Agenda::new(count);
+            let mut plain = vec![NEVER; count];
+            assert_eq!(agenda.first(), (NEVER, 0));
+            let mut random = RandomStream::new(count as u64, "agenda");
+            for _ in 0..2_000 {
+                let entry = usize::try_from(random.next_u64() % count as u64).unwrap();
+                let at = Instant::from_ns(i64::try_from(random.next_u64() % 50).unwrap());
+                agenda.set(entry, at);
+                plain[entry] = at;
+                let expected = (0..count).min_by_key(|&entry| plain[entry]).unwrap();
+                assert_eq!(agenda.first(), (plain[expected], expected));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod post_tests {
+    use super::*;
+    use crate::messages::Header;
+
+    fn authority(sequence: u32) -> Letter {
+        Letter::Authority(Authority {
+            sequence,
+            ..Authority::default()
+        })
+    }
+
+    #[test]
+    fn letters_arrive_by_time_then_port_then_order() {
+        let (early, late) = (Instant::from_ns(1), Instant::from_ns(2));
+        let mut post = Post::default();
+        let mission = Letter::Mission(Mission::default());
+        let state = Letter::State(State {
+            header: Header::default(),
+            ..State::default()
+        });
+        post.post(late, authority(1));
+        for letter in [mission, authority(2), authority(3), state] {
+            post.post(early, letter);
+        }
+        assert_eq!(post.next(), Some((early, Rank::State)));
+        let taken: Vec<_> = core::iter::from_fn(|| post.take()).collect();
+        let expected = [state, authority(2), authority(3), mission, authority(1)];
+        assert_eq!(taken, expected);
+        post.post(late, mission);
+        assert_eq!(post.letters.len(), 5, "a slot is used again");
+    }
 }

@@ -2,24 +2,16 @@
 //! cells of the published tables, and the table of mechanisms. The machines inside are those that
 //! run as processes; only their surroundings differ.
 
-mod agenda;
 mod cells;
 mod driver;
-mod judgement;
-mod path;
-mod post;
-pub mod published;
 mod report;
-mod setup;
 mod study;
-mod tally;
 #[cfg(test)]
 mod tests;
 
-pub use driver::{Experiment, Observer};
-pub use setup::{Links, Setup, StatusPath};
+pub use cells::FleetTally;
+pub use driver::{Experiment, Links, Observer, Setup, StatusPath};
 pub use study::{TableParameters, TablePart};
-pub use tally::FleetTally;
 
+pub(crate) use cells::collision_interval;
 pub(crate) use study::FleetStudy;
-pub(crate) use tally::collision_interval;

@@ -3,13 +3,12 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::experiment::cells::{Cell, SCENARIOS, mechanism_cells, published_cells, scenario_name};
-use crate::experiment::driver::Experiment;
-use crate::experiment::report;
-use crate::experiment::report::Results;
-use crate::experiment::setup::Setup;
-use crate::experiment::tally::FleetTally;
-use crate::parameters::FleetParameters;
+use crate::case::FleetParameters;
+use crate::experiment::cells::{
+    Cell, FleetTally, SCENARIOS, mechanism_cells, published_cells, scenario_name,
+};
+use crate::experiment::driver::{Experiment, Setup};
+use crate::experiment::report::{self, Results};
 use crate::scenario::{Scenario, Scene, WorldParameters};
 use hil_core::case_study::ParameterError;
 use hil_core::random::RandomStream;
@@ -65,15 +64,11 @@ impl TableParameters {
             let problem = "[] leaves nothing to compute; name published, mechanisms or both";
             return Err(ParameterError::new("tables.parts", problem));
         }
-        ParameterError::check(
-            "tables.sections",
-            self.sections as f64,
-            1.0..=1e9,
-            "1 to 1000000000",
-        )?;
+        let (all, each) = (self.sections as f64, self.sections_per_task as f64);
+        ParameterError::check("tables.sections", all, 1.0..=1e9, "1 to 1000000000")?;
         ParameterError::check(
             "tables.sections_per_task",
-            self.sections_per_task as f64,
+            each,
             100.0..=1e6,
             "100 to 1000000",
         )
@@ -84,9 +79,11 @@ impl TableParameters {
 #[derive(Debug)]
 pub(crate) struct FleetStudy {
     parameters: TableParameters,
-    seed: u64,
+    /// The seed all tasks' seeds come from.
+    pub(crate) seed: u64,
     scenes: Vec<(Scenario, Scene)>,
-    cells: Vec<Cell>,
+    /// The cells in order.
+    pub(crate) cells: Vec<Cell>,
 }
 
 /// One task: a run of one cell.
@@ -152,19 +149,9 @@ impl FleetStudy {
         })
     }
 
-    /// The cells in order.
-    pub(crate) fn cells(&self) -> &[Cell] {
-        &self.cells
-    }
-
     /// What the tables were asked for.
     pub(crate) fn parameters(&self) -> &TableParameters {
         &self.parameters
-    }
-
-    /// The seed all tasks' seeds come from.
-    pub(crate) fn seed(&self) -> u64 {
-        self.seed
     }
 
     /// The world of a scenario.
@@ -235,7 +222,7 @@ impl Study for FleetStudy {
             let is_standing = until.ns_since(newest_at) > STAND_NS;
             if count >= task.sections || is_standing {
                 let mut tally = experiment.tally();
-                tally.conclude((seed, task.replica), cell, scene);
+                tally.conclude(seed, task.replica, cell, scene);
                 tally.stand_count = u64::from(is_standing);
                 return Some(tally);
             }

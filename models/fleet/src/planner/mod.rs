@@ -2,27 +2,18 @@
 //! forwards, around obstacles, from any start to any goal pose. It reads no clock; what a plan
 //! cost is counted in expanded states.
 //!
-//! A search over poses finds a way, which is then shortened; [`trajectory`] adds time.
+//! A search over poses finds a way, which is then shortened.
 
 pub(crate) mod dubins;
-mod grid;
 mod search;
-mod shorten;
 pub(crate) mod space;
-pub mod trajectory;
 
 use crate::geometry::{Pose, floor_index};
-use crate::map::Map;
-use crate::path::{Path, PathError};
-use crate::planner::grid::Distances;
-use crate::planner::search::Search;
-use crate::planner::shorten::shortened;
-use crate::planner::space::{Space, extent};
-use crate::planner::trajectory::Trajectory;
-use crate::world::Vehicle;
-
 pub use crate::planner::dubins::Segment;
+use crate::planner::dubins::shortest;
+use crate::planner::search::{Distances, Search};
 pub use crate::planner::space::Blocker;
+use crate::planner::space::{Space, extent};
 
 /// States a plan may expand before it gives up.
 pub const EXPANDED_MAX: u64 = 200_000;
@@ -39,7 +30,7 @@ pub struct Plan {
     start: Pose,
     goal: Pose,
     segments: Vec<Segment>,
-    expanded_count: u64,
+    pub(crate) expanded_count: u64,
 }
 
 /// Why there is no plan.
@@ -120,21 +111,6 @@ impl core::fmt::Display for At<'_> {
 }
 
 impl Plan {
-    /// Its arcs and straight lines in order.
-    pub fn segments(&self) -> &[Segment] {
-        &self.segments
-    }
-
-    /// Whole way, metres.
-    pub fn length_m(&self) -> f64 {
-        self.segments.iter().map(|segment| segment.length_m).sum()
-    }
-
-    /// States expanded to find it.
-    pub fn expanded_count(&self) -> u64 {
-        self.expanded_count
-    }
-
     /// Poses along the way, at most `spacing_m` apart, from the very start to the very goal.
     pub fn poses(&self, spacing_m: f64) -> Vec<Pose> {
         let mut poses = vec![self.start];
@@ -152,40 +128,6 @@ impl Plan {
         }
         poses
     }
-
-    /// The path with its poses at most `spacing_m` apart.
-    ///
-    /// # Errors
-    /// When the spacing is not a positive number, or start and goal are the same.
-    pub fn path(&self, spacing_m: f64) -> Result<Path, PathError> {
-        if !(spacing_m > 0.0 && spacing_m.is_finite()) {
-            return Err(PathError::Spacing { spacing_m });
-        }
-        // Chords between poses so near are shorter than their arcs by less than a micrometre.
-        Path::new(&self.poses(0.1 * spacing_m), spacing_m)
-    }
-}
-
-impl Plan {
-    /// The fastest run along the plan for a vehicle that begins and ends at rest.
-    pub fn trajectory(&self, vehicle: &Vehicle) -> Trajectory {
-        let limits = (vehicle.speed_max_mps, vehicle.acceleration_mps2);
-        Trajectory::new(self.length_m(), limits.0, limits.1)
-    }
-}
-
-/// Plans the path from `start` to `goal` around the map's obstacles; bays count as empty.
-///
-/// # Errors
-/// When there is none; see [`PlanError`].
-pub fn plan(
-    map: &Map,
-    vehicle: &Vehicle,
-    turning_radius_m: f64,
-    start: &Pose,
-    goal: &Pose,
-) -> Result<Plan, PlanError> {
-    Planner::new(map, vehicle, turning_radius_m)?.plan(start, goal)
 }
 
 /// Plans path after path on one map, faster than each alone when goals repeat.
@@ -199,27 +141,11 @@ pub struct Planner {
 }
 
 impl Planner {
-    /// A planner for the map's obstacles; bays count as empty.
+    /// A planner for a free space.
     ///
     /// # Errors
     /// When the turning radius is no positive number or small beyond reason for the ground.
-    pub fn new(map: &Map, vehicle: &Vehicle, turning_radius_m: f64) -> Result<Self, PlanError> {
-        Self::within(map.space(vehicle), turning_radius_m)
-    }
-
-    /// A planner that also keeps clear of vehicles parked in all bays of the map.
-    ///
-    /// # Errors
-    /// As [`new`](Self::new).
-    pub fn around_parked(
-        map: &Map,
-        vehicle: &Vehicle,
-        turning_radius_m: f64,
-    ) -> Result<Self, PlanError> {
-        Self::within(map.space_around_parked(vehicle), turning_radius_m)
-    }
-
-    fn within(space: Space, turning_radius_m: f64) -> Result<Self, PlanError> {
+    pub(crate) fn new(space: Space, turning_radius_m: f64) -> Result<Self, PlanError> {
         if !(turning_radius_m > 0.0 && turning_radius_m.is_finite()) {
             return Err(PlanError::TurningRadius { turning_radius_m });
         }
@@ -264,8 +190,9 @@ impl Planner {
             Some(index) => self.distances.remove(index),
             None => (goal, Distances::new(&self.space, &goal)),
         };
-        let ends = (&start, &goal);
-        let found = self.search.run(&self.space, &latest.1, ends, EXPANDED_MAX);
+        let found = self
+            .search
+            .run(&self.space, &latest.1, &start, &goal, EXPANDED_MAX);
         self.distances.push(latest);
         if self.distances.len() > GOALS_MAX {
             self.distances.remove(0);
@@ -278,8 +205,7 @@ impl Planner {
                 expanded_count,
             });
         };
-        let limits = (self.turning_radius_m, &goal);
-        let segments = shortened(&self.space, &start, &segments, limits);
+        let segments = shortened(&self.space, &start, &goal, &segments, self.turning_radius_m);
         Ok(Plan {
             start,
             goal,
@@ -301,6 +227,75 @@ fn joined(segments: Vec<Segment>) -> Vec<Segment> {
         }
     }
     joined
+}
+
+/// Poses at which a way may be cut, at most: the work grows with the square.
+const ANCHORS_MAX: f64 = 96.0;
+
+/// The shortest free chain of Dubins ways between poses of the way, which begins at `start`.
+pub(crate) fn shortened(
+    space: &Space,
+    start: &Pose,
+    goal: &Pose,
+    segments: &[Segment],
+    turning_radius_m: f64,
+) -> Vec<Segment> {
+    let anchors = anchors(start, segments, goal, 0.25 * turning_radius_m);
+    let step_m = space.step_m(turning_radius_m);
+    let mut best: Vec<(f64, usize, Vec<Segment>)> = vec![(0.0, 0, Vec::new())];
+    for (index, (pose, along)) in anchors.iter().enumerate().skip(1) {
+        // The way as it was is always there; it counts from the anchor before.
+        let before = &best[index - 1];
+        let kept_m: f64 = along.iter().map(|segment| segment.length_m).sum();
+        let mut found = (before.0 + kept_m, index - 1, along.clone());
+        for (from, (cut, _)) in anchors[..index].iter().enumerate() {
+            // Cheap bound first: nothing is shorter than straight.
+            if best[from].0 + cut.distance_m(pose) >= found.0 - 1e-9 {
+                continue;
+            }
+            let way = shortest(cut, pose, turning_radius_m);
+            let length_m = best[from].0 + way.length_m;
+            if length_m < found.0 - 1e-9 && space.is_way_free(cut, &way.segments, step_m) {
+                found = (length_m, from, way.segments.to_vec());
+            }
+        }
+        best.push(found);
+    }
+    let (mut index, mut parts) = (best.len() - 1, Vec::new());
+    while index > 0 {
+        parts.push(&best[index].2);
+        index = best[index].1;
+    }
+    parts.into_iter().rev().flatten().copied().collect()
+}
+
+/// Poses along the way, each with the segments that lead to it from the one before.
+fn anchors(
+    start: &Pose,
+    segments: &[Segment],
+    goal: &Pose,
+    spacing_m: f64,
+) -> Vec<(Pose, Vec<Segment>)> {
+    let length_m: f64 = segments.iter().map(|segment| segment.length_m).sum();
+    let spacing_m = spacing_m.max(length_m / ANCHORS_MAX);
+    let mut anchors = vec![(*start, Vec::new())];
+    let mut from = *start;
+    for segment in segments.iter().filter(|segment| segment.length_m > 1e-9) {
+        let count = floor_index((segment.length_m / spacing_m).ceil().max(1.0));
+        for _ in 0..count {
+            let part = Segment {
+                length_m: segment.length_m / count as f64,
+                ..*segment
+            };
+            from = part.pose_after(&from, part.length_m);
+            anchors.push((from, vec![part]));
+        }
+    }
+    // The sum of many arcs ends a rounding error beside the goal; the last cut is the goal.
+    if let Some(last) = anchors.last_mut() {
+        last.0 = *goal;
+    }
+    anchors
 }
 
 #[cfg(test)]

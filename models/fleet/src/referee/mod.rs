@@ -11,26 +11,22 @@
 
 mod pairs;
 mod sections;
-mod tally;
-mod track;
-
 #[cfg(test)]
 mod tests;
 
 use core::time::Duration;
 use std::sync::Arc;
 
-pub use self::tally::{Cause, Incident, IncidentKind, Tally};
+use serde::Serialize;
 
-use crate::geometry::OrientedBox;
+use crate::geometry::{OrientedBox, Pose, floor_index};
 use crate::messages::{Truth, TruthKind};
-use crate::path::PathId;
+use crate::path::{Path, PathId};
 use crate::referee::pairs::PairFinder;
 use crate::referee::sections::ActiveSections;
-use crate::referee::track::Track;
 use crate::robot::NO_PATH;
 use crate::scenario::Scene;
-use crate::world::World;
+use crate::world::{Vehicle, World};
 use hil_core::time::Instant;
 
 /// From scan to scan.
@@ -149,14 +145,15 @@ impl Referee {
         start: Instant,
         end: Instant,
     ) {
-        self.replay_seeing(records, (start, end), &mut |_, _| {});
+        self.replay_seeing(records, start, end, &mut |_, _| {});
     }
 
     /// As [`Self::replay`]; `see` looks on after every scan.
     pub(crate) fn replay_seeing(
         &mut self,
         records: &mut dyn Iterator<Item = Truth>,
-        (start, end): (Instant, Instant),
+        start: Instant,
+        end: Instant,
         see: &mut dyn FnMut(Instant, &Self),
     ) {
         let mut pending = records.next();
@@ -215,8 +212,8 @@ impl Referee {
             .map_or(0, |path| path.index_at(truth.travelled_m));
         let first = truth.fleet_id as usize * self.per_fleet;
         let fleet = first..first + self.per_fleet;
-        let shared = (&*self.world, &mut self.tally);
-        self.sections.begin(robot, fleet, &self.tracks, shared);
+        self.sections
+            .begin(robot, fleet, &self.tracks, &self.world, &mut self.tally);
     }
 
     fn end_mission(&mut self, robot: usize, has_passed: bool) {
@@ -242,7 +239,7 @@ impl Referee {
         let [one, other] = pair.map(|robot| &self.tracks[robot as usize]);
         let vehicle = &self.world.vehicle;
         let covered = [one, other].map(|track| track.covered(vehicle));
-        let gap_m = axis_gap_m(&covered[0], &covered[1]);
+        let gap_m = covered[0].gap_m(&covered[1]);
         let least_m = self.tally.separation_min_m.unwrap_or(f64::INFINITY);
         if gap_m < least_m {
             let distance_m = covered[0].distance_m(&covered[1]);
@@ -285,7 +282,6 @@ impl Referee {
 
     fn add_incident(&mut self, at: Instant, pair: [u32; 2], kind: IncidentKind) {
         if self.incidents.len() >= INCIDENTS_MAX {
-            self.tally.incidents_dropped_count += 1;
             return;
         }
         let [one, other] = pair.map(|robot| &self.tracks[robot as usize]);
@@ -303,28 +299,252 @@ impl Referee {
     }
 }
 
-/// Largest gap between the two along one of their axes: their distance at least; negative exactly
-/// when they overlap.
-fn axis_gap_m(one: &OrientedBox, other: &OrientedBox) -> f64 {
-    let offset = [
-        other.centre[0] - one.centre[0],
-        other.centre[1] - one.centre[1],
-    ];
-    let cosine = (one.axis[0] * other.axis[0] + one.axis[1] * other.axis[1]).abs();
-    let sine = (one.axis[0] * other.axis[1] - one.axis[1] * other.axis[0]).abs();
-    let gap = |from: &OrientedBox, to: &OrientedBox| {
-        let along = (offset[0] * from.axis[0] + offset[1] * from.axis[1]).abs();
-        let across = (offset[1] * from.axis[0] - offset[0] * from.axis[1]).abs();
-        let along = along - (from.half_m[0] + to.half_m[0] * cosine + to.half_m[1] * sine);
-        along.max(across - (from.half_m[1] + to.half_m[0] * sine + to.half_m[1] * cosine))
-    };
-    gap(one, other).max(gap(other, one))
-}
-
-/// The track of a robot of `scene` after `truth`, for tests of other modules.
 #[cfg(test)]
 pub(crate) fn test_track(scene: &Scene, truth: &Truth) -> Track {
     let mut track = Track::standing(scene.world.bays[0].pose);
     track.take(truth, scene.world.paths.get(PathId(truth.path_id)));
     track
+}
+
+/// A robot's motion from its last record on, and where it was at the last scan.
+#[derive(Debug, Clone)]
+pub(crate) struct Track {
+    pub(crate) path: Option<Arc<Path>>,
+    pub(crate) path_id: PathId,
+    pub(crate) mission_id: u32,
+    pub(crate) is_driving: bool,
+    /// Its last authority came too late to stop at.
+    pub(crate) is_late: bool,
+    pub(crate) cause: Cause,
+    since: Instant,
+    way_m: f64,
+    speed_mps: f64,
+    acceleration_mps2: f64,
+    /// At the last scan.
+    pub(crate) seen_m: f64,
+    /// Last pose passed at the last scan.
+    pub(crate) index: usize,
+    /// Reference point at the last scan, metres.
+    pub(crate) position: [f64; 2],
+    /// It stands elsewhere than at the scan before.
+    pub(crate) has_moved: bool,
+    stand: Pose,
+}
+
+impl Track {
+    /// A robot nothing is known of but where it stands.
+    pub(crate) fn standing(stand: Pose) -> Self {
+        Self {
+            path: None,
+            path_id: PathId(u32::MAX),
+            mission_id: 0,
+            is_driving: false,
+            is_late: false,
+            cause: Cause::default(),
+            since: Instant::ZERO,
+            way_m: 0.0,
+            speed_mps: 0.0,
+            acceleration_mps2: 0.0,
+            seen_m: 0.0,
+            index: 0,
+            position: [stand.x_m, stand.y_m],
+            has_moved: true,
+            stand,
+        }
+    }
+
+    /// Goes over to a record's motion; gives the way driven since the last record.
+    pub(crate) fn take(&mut self, truth: &Truth, path: Option<&Arc<Path>>) -> f64 {
+        let is_same_way = self.path_id.0 == truth.path_id && self.mission_id == truth.mission_id;
+        let driven_m = if is_same_way {
+            (truth.travelled_m - self.way_m).max(0.0)
+        } else {
+            0.0
+        };
+        if self.path_id.0 != truth.path_id {
+            self.path_id = PathId(truth.path_id);
+            self.path = path.map(Arc::clone);
+        }
+        if !is_same_way {
+            self.has_moved = true;
+            // No way compares equal to it: the next look takes the robot as moved.
+            self.seen_m = f64::NAN;
+        }
+        self.mission_id = truth.mission_id;
+        self.since = Instant::from_ns(truth.at_ns);
+        self.way_m = truth.travelled_m;
+        self.speed_mps = truth.speed_mps;
+        self.acceleration_mps2 = truth.acceleration_mps2;
+        driven_m
+    }
+
+    /// Way along its path at `now`; never backwards, and not beyond where it comes to rest.
+    pub(crate) fn way_at_m(&self, now: Instant) -> f64 {
+        if self.speed_mps <= 0.0 && self.acceleration_mps2 <= 0.0 {
+            return self.way_m;
+        }
+        let mut elapsed_s = now.seconds_since(self.since).max(0.0);
+        if self.acceleration_mps2 < 0.0 {
+            elapsed_s = elapsed_s.min(self.speed_mps / -self.acceleration_mps2);
+        }
+        self.way_m + (self.speed_mps + 0.5 * self.acceleration_mps2 * elapsed_s) * elapsed_s
+    }
+
+    /// Looks where it is at `now`; true when it has passed another pose since the last look.
+    pub(crate) fn look(&mut self, now: Instant) -> bool {
+        let way_m = self.way_at_m(now);
+        self.has_moved = way_m.to_bits() != self.seen_m.to_bits();
+        if !self.has_moved {
+            return false;
+        }
+        self.seen_m = way_m;
+        let Some(path) = &self.path else {
+            self.position = [self.stand.x_m, self.stand.y_m];
+            return false;
+        };
+        let position = way_m / path.spacing_m();
+        // As the path's own rule for an index, without dividing once more.
+        let index = floor_index(position + 1e-9).min(path.last_index());
+        let here = &path.poses()[index];
+        let next = &path.poses()[(index + 1).min(path.last_index())];
+        let ratio = (position - index as f64).clamp(0.0, 1.0);
+        self.position = [
+            here.x_m + ratio * (next.x_m - here.x_m),
+            here.y_m + ratio * (next.y_m - here.y_m),
+        ];
+        let has_passed = index != self.index;
+        self.index = index;
+        has_passed
+    }
+
+    /// The ground it covered at the last look.
+    pub(crate) fn covered(&self, vehicle: &Vehicle) -> OrientedBox {
+        let pose = match &self.path {
+            Some(path) => path.pose_at(self.seen_m),
+            None => self.stand,
+        };
+        vehicle.footprint.at(&pose)
+    }
+
+    /// The ground it would cover at the last pose passed, as the original looks at it.
+    pub(crate) fn covered_at_index(&self, vehicle: &Vehicle) -> OrientedBox {
+        let pose = match &self.path {
+            Some(path) => path.poses()[self.index],
+            None => self.stand,
+        };
+        vehicle.footprint.at(&pose)
+    }
+}
+
+/// Counts of one run, all fleets together.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Tally {
+    /// Critical sections of two missions under way at once, both still ahead.
+    pub sections_created_count: u64,
+    /// Of those, the ones a robot drove through to the end: the original's count.
+    pub sections_passed_count: u64,
+    /// Of those, the ones that ended because a robot was replaced.
+    pub sections_dropped_count: u64,
+    /// Of those, the ones both robots were in at the same time.
+    pub encounters_count: u64,
+    /// Sections with a collision by the original's checker: both robots in the section, and
+    /// footprints overlapping at the last path poses passed. One count per section until they
+    /// separate.
+    pub section_collisions_count: u64,
+    /// Times two robots of a fleet overlapped where they truly were, until they separated.
+    pub overlaps_count: u64,
+    /// Of those, the ones that began outside every section of the two: the section list misses
+    /// them.
+    pub outside_count: u64,
+    /// Smallest distance between two robots of a fleet, metres; `None` when none came near.
+    pub separation_min_m: Option<f64>,
+    /// Farthest a robot went past an authority that came in time, metres.
+    pub stop_error_max_m: f64,
+    /// Farthest a robot went past an authority that came too late, metres.
+    pub late_overshoot_max_m: f64,
+    /// Way driven, metres.
+    pub travelled_m: f64,
+    /// Missions begun.
+    pub missions_started_count: u64,
+    /// Missions driven to their goal.
+    pub missions_done_count: u64,
+    /// Robots put at their goal to clear a stuck fleet.
+    pub replaced_count: u64,
+    /// Authorities applied in time.
+    pub authorities_applied_count: u64,
+    /// Authorities applied too late to stop at.
+    pub authorities_late_count: u64,
+    /// Authorities behind the robot, ignored.
+    pub authorities_ignored_count: u64,
+    /// Authorities refused because the robot could not stop at them.
+    pub authorities_refused_count: u64,
+    /// Older or repeated messages passed over.
+    pub stale_count: u64,
+    /// Leases that ended.
+    pub leases_ended_count: u64,
+    /// Scans made.
+    pub scans_count: u64,
+    /// Truth records that name an unknown fleet, robot, path or kind, or no finite motion.
+    pub unsound_count: u64,
+}
+
+impl Tally {
+    pub(crate) fn count_kind(&mut self, kind: TruthKind) {
+        match kind {
+            TruthKind::Motion => {}
+            TruthKind::MissionStarted => self.missions_started_count += 1,
+            TruthKind::MissionDone => self.missions_done_count += 1,
+            TruthKind::AuthorityApplied => self.authorities_applied_count += 1,
+            TruthKind::AuthorityLate => self.authorities_late_count += 1,
+            TruthKind::AuthorityIgnored => self.authorities_ignored_count += 1,
+            TruthKind::AuthorityRefused => self.authorities_refused_count += 1,
+            TruthKind::MessageStale => self.stale_count += 1,
+            TruthKind::LeaseEnded => self.leases_ended_count += 1,
+            TruthKind::Replaced => self.replaced_count += 1,
+        }
+    }
+}
+
+/// What an incident is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum IncidentKind {
+    /// A collision by the original's checker.
+    Section,
+    /// Two robots overlapped where they truly were, within a section.
+    Overlap,
+    /// The same, outside every section.
+    Outside,
+}
+
+/// Something that must not happen, with what led to it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Incident {
+    /// The scan that saw it.
+    pub at: Instant,
+    /// What it is.
+    pub kind: IncidentKind,
+    /// In which fleet.
+    pub fleet_id: u32,
+    /// The two robots, the smaller number first.
+    pub robots: [u32; 2],
+    /// Their missions, also when done; 0 before the first.
+    pub mission_ids: [u32; 2],
+    /// Whether each was on its mission, and not parked.
+    pub is_under_way: [bool; 2],
+    /// Half way between the two, map frame, metres.
+    pub position_m: [f64; 2],
+    /// Per robot, what became of its last authority.
+    pub causes: [Cause; 2],
+}
+
+/// What became of the authority a robot got last before an incident.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct Cause {
+    /// A [`TruthKind`] as a number; 0 when it had none.
+    pub kind: u32,
+    /// `sequence` of the authority message; 0 when it had none.
+    pub caused_by_sequence: u32,
+    /// When, nanoseconds on the robots' clock.
+    pub at_ns: i64,
 }

@@ -1,7 +1,7 @@
 //! Which robots are near enough to look at closely: all pairs of a small fleet, a uniform grid
 //! for a large one. It knows positions only and allocates nothing after its making.
 
-use crate::referee::track::Track;
+use crate::referee::Track;
 
 /// Fleets up to this size are compared pair by pair.
 const ALL_PAIRS_MAX: usize = 16;
@@ -128,7 +128,7 @@ fn pair(first: usize, second: usize) -> [u32; 2] {
     [as_u32(first), as_u32(second)]
 }
 
-fn as_u32(index: usize) -> u32 {
+pub(super) fn as_u32(index: usize) -> u32 {
     u32::try_from(index).unwrap_or(NONE)
 }
 

@@ -2,8 +2,8 @@
 //! robot has driven through. It counts them and knows who is inside; geometry is not its
 //! business.
 
-use crate::referee::tally::Tally;
-use crate::referee::track::Track;
+use crate::referee::pairs::as_u32;
+use crate::referee::{Tally, Track};
 use crate::section::Side;
 use crate::world::World;
 
@@ -53,7 +53,8 @@ impl ActiveSections {
         robot: usize,
         fleet: core::ops::Range<usize>,
         tracks: &[Track],
-        (world, tally): (&World, &mut Tally),
+        world: &World,
+        tally: &mut Tally,
     ) {
         for other in fleet.filter(|other| *other != robot && tracks[*other].is_driving) {
             let (own, their) = (&tracks[robot], &tracks[other]);
@@ -181,8 +182,4 @@ impl ActiveSections {
         }
         self.free.push(id);
     }
-}
-
-fn as_u32(index: usize) -> u32 {
-    u32::try_from(index).unwrap_or(u32::MAX)
 }

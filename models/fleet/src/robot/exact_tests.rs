@@ -3,8 +3,7 @@
 use core::time::Duration;
 
 use crate::geometry::floor_index;
-use crate::robot::exact::ExactTracker;
-use crate::robot::tracker::Limits;
+use crate::robot::tracker::{ExactTracker, Limits};
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 

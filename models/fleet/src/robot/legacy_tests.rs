@@ -2,8 +2,7 @@
 
 use core::time::Duration;
 
-use crate::robot::legacy::LegacyTracker;
-use crate::robot::tracker::Limits;
+use crate::robot::tracker::{LegacyTracker, Limits};
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 

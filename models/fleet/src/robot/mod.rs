@@ -3,32 +3,27 @@
 //! of other robots and reads no clock.
 
 mod authority;
-mod counters;
-mod exact;
-mod legacy;
-mod orders;
-mod parameters;
-mod tracker;
-
 #[cfg(test)]
 mod exact_tests;
 #[cfg(test)]
 mod legacy_tests;
 #[cfg(test)]
 pub(crate) mod tests;
+mod tracker;
 
+use core::time::Duration;
 use std::sync::Arc;
 
-pub use self::counters::RobotCounters;
-pub use self::parameters::{RobotParameters, TrackerKind};
+use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Pose, floor_index};
-use crate::messages::{Authority, Header, MessageOrder, Phase, State, Truth, TruthKind};
+use crate::messages::{Authority, Header, MessageOrder, Mission, Phase, State, Truth, TruthKind};
 use crate::path::{Path, PathId};
-use crate::robot::authority::Grant;
+use crate::robot::authority::{Grant, Proposal, Verdict, is_newer, reach_of};
 use crate::robot::tracker::{Limits, Tracker};
 use crate::scenario::Scene;
-use crate::world::{BayIndex, World};
+use crate::world::{BayIndex, Vehicle, World};
+use hil_core::case_study::ParameterError;
 use hil_core::random::RandomStream;
 use hil_core::time::{Instant, duration_ns};
 
@@ -195,11 +190,6 @@ impl Robot {
         &self.counters
     }
 
-    /// The path it stands or drives on, or came by; `None` in a bay without paths.
-    pub fn path(&self) -> Option<&Arc<Path>> {
-        self.path.as_ref()
-    }
-
     fn is_under_way(&self) -> bool {
         matches!(self.phase, Phase::Driving | Phase::AtPoint)
     }
@@ -265,7 +255,6 @@ impl Robot {
         if self.phase == Phase::Driving {
             let reach_m = path.way_to_m(self.grant.reach(path.last_index()));
             let error_m = way_m - reach_m;
-            self.counters.stop_count += 1;
             let worst_m = if self.grant.is_late {
                 &mut self.counters.late_overshoot_max_m
             } else {
@@ -400,4 +389,444 @@ fn whole_ns(value: f64) -> i64 {
 )]
 fn single(value: f64) -> f32 {
     value as f32
+}
+
+impl Robot {
+    /// Takes a mission when it is newer, fits the robot's map and place, and none is under way. A
+    /// mission flagged [`Mission::REPLACE`], newer or the one under way, puts the robot at its end.
+    pub fn on_mission(&mut self, now: Instant, mission: &Mission, truth: &mut dyn FnMut(Truth)) {
+        self.advance(now, truth);
+        let is_in_order = in_order(&mut self.newest_mission_header, &mission.header);
+        if !is_in_order {
+            self.counters.out_of_order_count += 1;
+        }
+        let is_replacing = mission.flags & Mission::REPLACE != 0;
+        let is_present = mission.header.mission_id == self.mission_id;
+        let may_replace = is_replacing && is_present && self.is_under_way();
+        let is_new = is_newer(mission.header.mission_id, self.mission_id);
+        let is_passed_over = !is_in_order && self.order == MessageOrder::Strict;
+        if is_passed_over || !(is_new || may_replace) {
+            self.counters.missions_repeated_count += 1;
+            truth(self.record(now, TruthKind::MessageStale, 0));
+            return;
+        }
+        if self.is_under_way() && !is_replacing {
+            self.counters.missions_busy_count += 1;
+            return;
+        }
+        let Some(path) = self.path_of(mission) else {
+            self.counters.missions_refused_count += 1;
+            return;
+        };
+        if is_replacing {
+            self.replace(now, mission, path, truth);
+            return;
+        }
+        if !self.stands_at_start_of(now, &path) {
+            self.counters.missions_refused_count += 1;
+            return;
+        }
+        self.begin(now, mission, path);
+        self.hasten(now);
+        self.counters.missions_started_count += 1;
+        truth(self.record(now, TruthKind::MissionStarted, 0));
+        let mission_id = self.mission_id;
+        let kept = self.early.take();
+        if let Some(authority) = kept.filter(|kept| kept.header.mission_id == mission_id) {
+            self.judge(now, &authority, truth);
+        }
+    }
+
+    /// Judges an authority by the rules its flag names and does as they say.
+    pub fn on_authority(
+        &mut self,
+        now: Instant,
+        authority: &Authority,
+        truth: &mut dyn FnMut(Truth),
+    ) {
+        self.advance(now, truth);
+        let is_in_order = in_order(&mut self.newest_authority_header, &authority.header);
+        if !is_in_order {
+            self.counters.out_of_order_count += 1;
+        }
+        let is_passed_over = !is_in_order && self.order == MessageOrder::Strict;
+        let is_of_mission = self.is_under_way() && authority.header.mission_id == self.mission_id;
+        if is_passed_over || !is_of_mission {
+            let is_early = is_newer(authority.header.mission_id, self.mission_id);
+            if is_early && !is_passed_over {
+                self.counters.early_count += 1;
+                if self.keep_early(authority) {
+                    return;
+                }
+            } else {
+                self.counters.stale_count += 1;
+            }
+            truth(self.record(now, TruthKind::MessageStale, authority.sequence));
+            return;
+        }
+        self.judge(now, authority, truth);
+    }
+
+    /// Keeps an acknowledged authority that overtook its mission, which goes another way: the
+    /// coordinator counts it as in force from the moment it was sent. One with a lease is not
+    /// kept, as its time would begin too late. False when it is passed over.
+    fn keep_early(&mut self, authority: &Authority) -> bool {
+        let is_lasting = authority.flags & Authority::ACKNOWLEDGED != 0 && authority.lease_ns == 0;
+        let is_newest = self.early.is_none_or(|kept| {
+            let (new, old) = (&authority.header, &kept.header);
+            is_newer(new.mission_id, old.mission_id)
+                || (new.mission_id == old.mission_id && is_newer(authority.sequence, kept.sequence))
+        });
+        if is_lasting && is_newest {
+            self.early = Some(*authority);
+        }
+        is_lasting && is_newest
+    }
+
+    /// Judges an authority of the mission under way.
+    fn judge(&mut self, now: Instant, authority: &Authority, truth: &mut dyn FnMut(Truth)) {
+        let Some(proposal) = self.proposal(now, authority) else {
+            truth(self.record(now, TruthKind::MessageStale, authority.sequence));
+            return;
+        };
+        let verdict = if authority.flags & Authority::ACKNOWLEDGED == 0 {
+            authority::original(&self.grant, &proposal)
+        } else {
+            authority::acknowledged(&self.grant, &proposal)
+        };
+        self.count(verdict);
+        if verdict != Verdict::Stale {
+            self.grant.newest = Some(authority.sequence);
+            self.carry_out(now, authority, verdict);
+        }
+        truth(self.record(now, verdict.kind(), authority.sequence));
+        let is_taken = matches!(verdict, Verdict::Apply | Verdict::ApplyLate);
+        if is_taken && self.update_phase(now) == TruthKind::MissionDone {
+            truth(self.record(now, TruthKind::MissionDone, authority.sequence));
+        }
+    }
+
+    fn carry_out(&mut self, now: Instant, authority: &Authority, verdict: Verdict) {
+        match verdict {
+            Verdict::Apply | Verdict::ApplyLate => {
+                self.grant.index = authority.authority_index;
+                self.grant.applied = Some(authority.sequence);
+                self.grant.is_refused = false;
+                self.grant.has_lapsed = false;
+                self.grant.is_late = verdict == Verdict::ApplyLate;
+                self.grant.lease_end = lease_end(now, authority.lease_ns);
+                if let Some(path) = &self.path {
+                    let reach = self.grant.reach(path.last_index());
+                    self.tracker.aim(now, path.way_to_m(reach));
+                }
+            }
+            Verdict::Unchanged => self.grant.applied = Some(authority.sequence),
+            Verdict::Refuse => {
+                self.grant.applied = Some(authority.sequence);
+                self.grant.is_refused = true;
+            }
+            Verdict::Ignore | Verdict::Stale => {}
+        }
+    }
+
+    fn proposal(&self, now: Instant, authority: &Authority) -> Option<Proposal> {
+        let path = self.path.as_ref()?;
+        let reach = reach_of(authority.authority_index, path.last_index())?;
+        let motion = self.tracker.motion(now);
+        Some(Proposal {
+            index: authority.authority_index,
+            sequence: authority.sequence,
+            reach,
+            reach_now: self.grant.reach(path.last_index()),
+            passed: path.index_at(motion.way_m),
+            can_stop: self.tracker.can_stop_at(now, path.way_to_m(reach)),
+        })
+    }
+
+    fn count(&mut self, verdict: Verdict) {
+        let counters = &mut self.counters;
+        match verdict {
+            Verdict::Apply => {}
+            Verdict::ApplyLate => counters.late_count += 1,
+            Verdict::Unchanged => counters.unchanged_count += 1,
+            Verdict::Ignore => counters.ignored_count += 1,
+            Verdict::Refuse => counters.refused_count += 1,
+            Verdict::Stale => counters.stale_count += 1,
+        }
+    }
+
+    /// The path a mission names, if this robot's map agrees with it.
+    fn path_of(&self, mission: &Mission) -> Option<Arc<Path>> {
+        let path = self.world.paths.get(PathId(mission.path_id))?;
+        let is_whole = mission.start_index == 0 && mission.end_index as usize == path.last_index();
+        (is_whole && mission.path_hash == path.hash()).then(|| Arc::clone(path))
+    }
+
+    /// True when the path begins within one pose spacing of where the robot stands.
+    fn stands_at_start_of(&self, now: Instant, path: &Path) -> bool {
+        let here = match &self.path {
+            Some(own) => own.pose_at(self.tracker.motion(now).way_m),
+            None => self.stand,
+        };
+        here.distance_m(&path.poses()[0]) <= path.spacing_m()
+    }
+
+    fn begin(&mut self, now: Instant, mission: &Mission, path: Arc<Path>) {
+        self.mission_id = mission.header.mission_id;
+        self.path_id = mission.path_id;
+        self.tracker.place(now, 0.0, path.length_m());
+        self.path = Some(path);
+        self.accounted_m = 0.0;
+        self.grant = Grant::NONE;
+        self.phase = Phase::AtPoint;
+    }
+
+    fn replace(
+        &mut self,
+        now: Instant,
+        mission: &Mission,
+        path: Arc<Path>,
+        truth: &mut dyn FnMut(Truth),
+    ) {
+        let length_m = path.length_m();
+        self.account(self.tracker.motion(now).way_m);
+        self.begin(now, mission, path);
+        self.tracker.place(now, length_m, length_m);
+        self.accounted_m = length_m;
+        self.phase = Phase::Done;
+        self.hasten(now);
+        truth(self.record(now, TruthKind::Replaced, 0));
+    }
+}
+
+/// Notes a message's `header_id`; false when it is not newer than the newest.
+fn in_order(newest: &mut Option<u32>, header: &Header) -> bool {
+    if newest.is_some_and(|newest| !is_newer(header.header_id, newest)) {
+        return false;
+    }
+    *newest = Some(header.header_id);
+    true
+}
+
+fn lease_end(now: Instant, lease_ns: i64) -> Option<Instant> {
+    (lease_ns > 0).then(|| Instant::from_ns(now.as_ns().saturating_add(lease_ns)))
+}
+
+/// Counted since the robot was made.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct RobotCounters {
+    /// Missions begun.
+    pub missions_started_count: u64,
+    /// Missions driven to their goal.
+    pub missions_done_count: u64,
+    /// Missions passed over because they were the present one again, or an older one.
+    pub missions_repeated_count: u64,
+    /// Missions not taken because another was under way.
+    pub missions_busy_count: u64,
+    /// Missions refused: unknown path, another hash, another range, or not where the robot stands.
+    pub missions_refused_count: u64,
+    /// Authorities that named the authority in force already (original's rules).
+    pub unchanged_count: u64,
+    /// Authorities that came too late to stop at; the robot went past (original's rules).
+    pub late_count: u64,
+    /// Authorities behind the robot, ignored; it drove on (original's rules).
+    pub ignored_count: u64,
+    /// Authorities refused because the robot could not stop at them (acknowledged rules).
+    pub refused_count: u64,
+    /// Authorities passed over: older, repeated, or for a mission that is over.
+    pub stale_count: u64,
+    /// Authorities that came before their mission: passed over by the original's rules, kept for
+    /// it by the acknowledged ones.
+    pub early_count: u64,
+    /// Authorities and missions whose `header_id` was not newer than the newest of their kind.
+    pub out_of_order_count: u64,
+    /// Leases that ended before a newer authority came.
+    pub leases_ended_count: u64,
+    /// Farthest it came to rest past an authority that came in time, metres.
+    pub stop_error_max_m: f64,
+    /// Farthest it came to rest past an authority that came too late, metres.
+    pub late_overshoot_max_m: f64,
+    /// Way driven, metres.
+    pub travelled_m: f64,
+    /// States given.
+    pub states_count: u64,
+    /// Ticks that went by without a call.
+    pub skipped_ticks_count: u64,
+}
+
+#[cfg(test)]
+impl RobotCounters {
+    /// Adds the counts of another robot.
+    pub(crate) fn add(&mut self, other: &Self) {
+        self.missions_started_count += other.missions_started_count;
+        self.missions_done_count += other.missions_done_count;
+        self.missions_repeated_count += other.missions_repeated_count;
+        self.missions_busy_count += other.missions_busy_count;
+        self.missions_refused_count += other.missions_refused_count;
+        self.unchanged_count += other.unchanged_count;
+        self.late_count += other.late_count;
+        self.ignored_count += other.ignored_count;
+        self.refused_count += other.refused_count;
+        self.stale_count += other.stale_count;
+        self.early_count += other.early_count;
+        self.out_of_order_count += other.out_of_order_count;
+        self.leases_ended_count += other.leases_ended_count;
+        self.stop_error_max_m = self.stop_error_max_m.max(other.stop_error_max_m);
+        self.late_overshoot_max_m = self.late_overshoot_max_m.max(other.late_overshoot_max_m);
+        self.travelled_m += other.travelled_m;
+        self.states_count += other.states_count;
+        self.skipped_ticks_count += other.skipped_ticks_count;
+    }
+}
+
+/// How a robot follows its path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TrackerKind {
+    /// Piecewise constant acceleration in closed form; stops at its authority without error.
+    #[default]
+    Exact,
+    /// The original's: a numerical integration whose decisions fall on its ticks.
+    LegacyRk4,
+}
+
+/// `[case.parameters.robot]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RobotParameters {
+    /// How a robot follows its path.
+    pub tracker: TrackerKind,
+    /// From tick to tick, and so from state to state, of a robot under way, 1..=1000 ms.
+    pub tracking_period_ms: f64,
+    /// From state to state of a robot without a mission, 1..=10000 ms.
+    pub parked_period_ms: f64,
+    /// True lengthens each tick of the legacy tracker by U[0, `inflation_delay_ms`), as the
+    /// original does when a message delay is configured. Without effect on the exact tracker.
+    pub step_inflation: bool,
+    /// How much `step_inflation` lengthens a tick at most, 0..=10000 ms.
+    pub inflation_delay_ms: f64,
+    /// What becomes of authorities and missions that arrive out of order or twice.
+    pub message_order: MessageOrder,
+}
+
+impl Default for RobotParameters {
+    fn default() -> Self {
+        Self {
+            tracker: TrackerKind::Exact,
+            tracking_period_ms: 30.0,
+            parked_period_ms: 300.0,
+            step_inflation: false,
+            inflation_delay_ms: 0.0,
+            message_order: MessageOrder::Legacy,
+        }
+    }
+}
+
+impl RobotParameters {
+    /// Checks every number against its range.
+    ///
+    /// # Errors
+    /// The first key outside its range; keys begin with `robot.`.
+    pub fn check(&self) -> Result<(), ParameterError> {
+        let ranges = [
+            (
+                "robot.tracking_period_ms",
+                self.tracking_period_ms,
+                1.0,
+                1000.0,
+            ),
+            (
+                "robot.parked_period_ms",
+                self.parked_period_ms,
+                1.0,
+                10_000.0,
+            ),
+            (
+                "robot.inflation_delay_ms",
+                self.inflation_delay_ms,
+                0.0,
+                10_000.0,
+            ),
+        ];
+        for (key, value, min, max) in ranges {
+            ParameterError::check(key, value, min..=max, &format!("{min} to {max}"))?;
+        }
+        Ok(())
+    }
+
+    /// How far past an authority that came in time a robot can come to rest, at most.
+    ///
+    /// The exact tracker: 0. The legacy tracker: `3 v T + v TT / 2` with `v` the largest speed,
+    /// `T` the longest tick and `TT` the tracking period: it brakes up to a tick late, it may have
+    /// gone past `v` by what a tick adds, its braking table has steps of half a period, and it
+    /// judges whether an order comes in time by where its last tick left it. Without the last of
+    /// these the bound is `2 v T + v TT / 2`, which orders of the last moment do pass.
+    pub fn stop_error_bound_m(&self, vehicle: &Vehicle) -> f64 {
+        match self.tracker {
+            TrackerKind::Exact => 0.0,
+            TrackerKind::LegacyRk4 => {
+                let period_s = 1e-3 * self.tracking_period_ms;
+                let longest_s = period_s + 1e-3 * self.inflation_ms();
+                vehicle.speed_max_mps * (3.0 * longest_s + 0.5 * period_s)
+            }
+        }
+    }
+
+    pub(crate) fn tracking_period(&self) -> Duration {
+        Duration::from_secs_f64(1e-3 * self.tracking_period_ms)
+    }
+
+    pub(crate) fn parked_period(&self) -> Duration {
+        Duration::from_secs_f64(1e-3 * self.parked_period_ms)
+    }
+
+    pub(crate) fn inflation_ms(&self) -> f64 {
+        if self.step_inflation && self.tracker == TrackerKind::LegacyRk4 {
+            self.inflation_delay_ms
+        } else {
+            0.0
+        }
+    }
+}
+
+#[cfg(test)]
+mod parameters_tests {
+    use super::*;
+    use crate::geometry::Footprint;
+
+    #[test]
+    fn each_number_outside_its_range_is_refused_by_name() {
+        let check = |key: &str, change: fn(&mut RobotParameters)| {
+            let mut parameters = RobotParameters::default();
+            change(&mut parameters);
+            assert_eq!(parameters.check().unwrap_err().key, key);
+        };
+        check("robot.tracking_period_ms", |p| p.tracking_period_ms = 0.0);
+        check("robot.parked_period_ms", |p| p.parked_period_ms = f64::NAN);
+        check("robot.inflation_delay_ms", |p| p.inflation_delay_ms = -1.0);
+        assert_eq!(RobotParameters::default().check(), Ok(()));
+    }
+
+    #[test]
+    fn the_harbor_bound_at_100_ms_is_the_sum_of_its_terms() {
+        let vehicle = Vehicle {
+            footprint: Footprint {
+                length_m: 14.8,
+                width_m: 3.0,
+            },
+            speed_max_mps: 6.0,
+            acceleration_mps2: 2.0,
+        };
+        let mut parameters = RobotParameters {
+            tracker: TrackerKind::LegacyRk4,
+            step_inflation: true,
+            inflation_delay_ms: 100.0,
+            ..RobotParameters::default()
+        };
+        assert!((parameters.stop_error_bound_m(&vehicle) - 2.43).abs() < 1e-12);
+        parameters.step_inflation = false;
+        assert!((parameters.stop_error_bound_m(&vehicle) - 0.63).abs() < 1e-12);
+        parameters.tracker = TrackerKind::Exact;
+        assert!(parameters.stop_error_bound_m(&vehicle).abs() < f64::EPSILON);
+    }
 }

@@ -4,6 +4,7 @@
 use crate::Teleoperation;
 use crate::experiment::conditions::{back_after, base, changed, without_time_out};
 use crate::experiment::drive::{Channel, Setup, drive};
+use crate::experiment::report::column;
 use crate::experiment::study::seed_of;
 use crate::experiment::trajectory::Trajectory;
 use hil_arm::egm::parameters::ControllerSettings;
@@ -198,7 +199,7 @@ impl Search<'_, '_> {
             if (tried.ratio() - target).abs() < NEAR_RATIO * target {
                 break;
             }
-            next = between(low, high, (target, highest));
+            next = between(low, high, target, highest);
         }
         let nearest = |a: &&Try, b: &&Try| {
             let apart = |tried: &Try| (tried.ratio() - target).abs();
@@ -271,7 +272,7 @@ fn power_law(tries: &[Try]) -> (f64, f64) {
 
 /// The next rate to try: on the line between both sides in logarithms, kept off its ends; without
 /// one side, four times as far.
-fn between(low: Option<Try>, high: Option<Try>, (target, highest): (f64, f64)) -> f64 {
+fn between(low: Option<Try>, high: Option<Try>, target: f64, highest: f64) -> f64 {
     match (low, high) {
         (Some(low), Some(high)) => {
             let log = |tried: Try| tried.ratio().max(1e-5).ln();
@@ -333,10 +334,6 @@ impl Study for Calibration {
             }],
         }
     }
-}
-
-const fn column(name: &'static str, label: &'static str) -> Column {
-    Column { name, label }
 }
 
 const COLUMNS: [Column; 8] = [

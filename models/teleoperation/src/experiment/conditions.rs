@@ -25,7 +25,11 @@ pub(crate) enum Expected {
     /// Not a single loop lost; and no session ended, if so.
     NothingLost { nor_tripped: bool },
     /// A published motion loss rate: so many of the published loops, and the range for the mean.
-    Published { lost: u32, mean: (f64, f64) },
+    Published {
+        lost: u32,
+        mean_low: f64,
+        mean_high: f64,
+    },
     /// Nothing.
     Open,
 }
@@ -50,13 +54,15 @@ pub(crate) const LONG_RANGE: Outages = Outages {
 /// 0.008 of the loops, and where our mean must lie.
 const SHORT_RANGE_PUBLISHED: Expected = Expected::Published {
     lost: 7,
-    mean: (0.006, 0.011),
+    mean_low: 0.006,
+    mean_high: 0.011,
 };
 
 /// 0.03 of the loops.
 const LONG_RANGE_PUBLISHED: Expected = Expected::Published {
     lost: 27,
-    mean: (0.022, 0.035),
+    mean_low: 0.022,
+    mean_high: 0.035,
 };
 
 /// Longer than any run.
@@ -134,15 +140,11 @@ fn static_rows(base: &Setup) -> Vec<Condition> {
         ("loss-0.3", 0.3),
         ("loss-0.5", 0.5),
     ];
+    let expected = Expected::NothingLost { nor_tripped: false };
     for (name, ratio) in losses {
         let setup = changed(base, |setup| setup.channel = Channel::Loss(ratio));
         let text = format!("independent losses, ratio {ratio}");
-        rows.push(row(
-            name,
-            text,
-            setup,
-            Expected::NothingLost { nor_tripped: false },
-        ));
+        rows.push(row(name, text, setup, expected));
     }
     rows
 }
@@ -155,45 +157,46 @@ fn text_of(outages: &Outages) -> String {
     )
 }
 
-fn under(base: &Setup, outages: Outages, change: impl FnOnce(&mut Setup)) -> Setup {
-    changed(base, |setup| {
+/// A row with outages and what else is changed; `note` is added to the text.
+fn outage_row(
+    base: &Setup,
+    name: &'static str,
+    outages: Outages,
+    note: &str,
+    expected: Expected,
+    change: impl FnOnce(&mut Setup),
+) -> Condition {
+    let setup = changed(base, |setup| {
         setup.channel = Channel::Outages(outages);
         change(setup);
-    })
+    });
+    row(name, text_of(&outages) + note, setup, expected)
 }
 
-fn outage_rows(base: &Setup) -> Vec<Condition> {
-    let holding = |setup: &mut Setup| without_time_out(&mut setup.settings);
-    let long = |per_hour| Outages {
-        mean_s: 2.0,
-        per_hour,
-        buffered: false,
+fn outage_rows(base: &Setup) -> [Condition; 4] {
+    let range = |name, outages, expected| outage_row(base, name, outages, "", expected, |_| {});
+    let hold = |name, per_hour| {
+        let outages = Outages {
+            mean_s: 2.0,
+            per_hour,
+            buffered: false,
+        };
+        outage_row(
+            base,
+            name,
+            outages,
+            "; no time-out",
+            Expected::Open,
+            |setup| {
+                without_time_out(&mut setup.settings);
+            },
+        )
     };
-    vec![
-        row(
-            "short-range",
-            text_of(&SHORT_RANGE),
-            under(base, SHORT_RANGE, |_| {}),
-            SHORT_RANGE_PUBLISHED,
-        ),
-        row(
-            "long-range",
-            text_of(&LONG_RANGE),
-            under(base, LONG_RANGE, |_| {}),
-            LONG_RANGE_PUBLISHED,
-        ),
-        row(
-            "hold-30",
-            format!("{}; no time-out", text_of(&long(30.0))),
-            under(base, long(30.0), holding),
-            Expected::Open,
-        ),
-        row(
-            "hold-100",
-            format!("{}; no time-out", text_of(&long(100.0))),
-            under(base, long(100.0), holding),
-            Expected::Open,
-        ),
+    [
+        range("short-range", SHORT_RANGE, SHORT_RANGE_PUBLISHED),
+        range("long-range", LONG_RANGE, LONG_RANGE_PUBLISHED),
+        hold("hold-30", 30.0),
+        hold("hold-100", 100.0),
     ]
 }
 
@@ -216,39 +219,32 @@ fn wifi_rows(base: &Setup) -> [Condition; 2] {
 }
 
 /// What the queue makes of messages that are late instead of lost.
-fn queue_rows(base: &Setup) -> Vec<Condition> {
-    let buffered = Outages {
-        buffered: true,
-        ..SHORT_RANGE
-    };
-    let coupled = |queue| {
-        under(base, buffered, |setup| {
-            setup.sending = Sending::Coupled;
-            setup.settings.queue = queue;
-        })
+fn queue_rows(base: &Setup) -> [Condition; 5] {
+    let buffered = |name, note, change: fn(&mut Setup)| {
+        let outages = Outages {
+            buffered: true,
+            ..SHORT_RANGE
+        };
+        outage_row(base, name, outages, note, Expected::Open, change)
     };
     let slow_cycle = |setup: &mut Setup| setup.settings.cycle = Duration::from_micros(4032);
-    vec![
-        row(
-            "buffered",
-            text_of(&buffered),
-            under(base, buffered, |_| {}),
-            Expected::Open,
-        ),
-        row(
+    [
+        buffered("buffered", "", |_| {}),
+        buffered(
             "buffered-coupled-fifo1",
-            format!(
-                "{}; one command per feedback, oldest first",
-                text_of(&buffered)
-            ),
-            coupled(QueuePolicy::Fifo1),
-            Expected::Open,
+            "; one command per feedback, oldest first",
+            |setup| {
+                setup.sending = Sending::Coupled;
+                setup.settings.queue = QueuePolicy::Fifo1;
+            },
         ),
-        row(
+        buffered(
             "buffered-coupled-latest",
-            format!("{}; one command per feedback, newest", text_of(&buffered)),
-            coupled(QueuePolicy::Latest),
-            Expected::Open,
+            "; one command per feedback, newest",
+            |setup| {
+                setup.sending = Sending::Coupled;
+                setup.settings.queue = QueuePolicy::Latest;
+            },
         ),
         row(
             "cycle-4032",
@@ -270,26 +266,26 @@ fn queue_rows(base: &Setup) -> Vec<Condition> {
 }
 
 /// The short range with other ways to come back.
-fn policy_rows(base: &Setup) -> Vec<Condition> {
-    let policy = |name, text: &str, change: fn(&mut ControllerSettings)| {
-        let setup = under(base, SHORT_RANGE, |setup| change(&mut setup.settings));
-        let text = format!("{}; {text}", text_of(&SHORT_RANGE));
-        row(name, text, setup, Expected::Open)
+fn policy_rows(base: &Setup) -> [Condition; 6] {
+    let policy = |name, note, change: fn(&mut ControllerSettings)| {
+        outage_row(base, name, SHORT_RANGE, note, Expected::Open, |setup| {
+            change(&mut setup.settings)
+        })
     };
-    vec![
-        policy("back-1s", "back after 1 s", |s| back_after(s, 1.0)),
-        policy("back-3s", "back after 3 s", |s| back_after(s, 3.0)),
-        policy("auto-retry", "restart at once", |s| {
-            s.restart = RestartPolicy::AutoRetry;
+    [
+        policy("back-1s", "; back after 1 s", |s| back_after(s, 1.0)),
+        policy("back-3s", "; back after 3 s", |s| back_after(s, 3.0)),
+        policy("auto-retry", "; restart at once", |s| {
+            s.restart = RestartPolicy::AutoRetry
         }),
-        policy("external-trigger", "restart when asked", |s| {
-            s.restart = RestartPolicy::ExternalTrigger;
+        policy("external-trigger", "; restart when asked", |s| {
+            s.restart = RestartPolicy::ExternalTrigger
         }),
-        policy("go-home-first", "home first", |s| {
-            s.restart = RestartPolicy::GoHomeFirst;
+        policy("go-home-first", "; home first", |s| {
+            s.restart = RestartPolicy::GoHomeFirst
         }),
-        policy("gain-5", "position gain 5 per s", |s| {
-            s.position_gain_per_s = 5.0;
+        policy("gain-5", "; position gain 5 per s", |s| {
+            s.position_gain_per_s = 5.0
         }),
     ]
 }

@@ -6,9 +6,8 @@ use std::collections::VecDeque;
 
 use crate::experiment::trajectory::{Trajectory, requested};
 use crate::score::loops::{Evidence, Loops, LossCause, Pause, PauseAfter, Span};
-use crate::score::sessions::cause_of;
 use hil_arm::egm::controller::Controller;
-use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EgmStartParameters, SessionState};
+use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EgmStartParameters, EndCause, SessionState};
 use hil_arm::egm::parameters::ControllerSettings;
 use hil_arm::yumi::arm::Arm;
 use hil_core::link_model::{Fate, LinkModel, PerfectLink};
@@ -162,7 +161,7 @@ impl<'a> Run<'a> {
 
     fn cycle(&mut self, at: Instant) {
         match self.setup.sending {
-            Sending::Frame => self.send_every(self.trajectory.frame_ns(), at),
+            Sending::Frame => self.send_every(self.trajectory.frame_ns, at),
             Sending::Free(period_ns) => self.send_every(period_ns, at),
             Sending::Coupled => self.answer(at),
         }
@@ -289,7 +288,8 @@ impl Happened {
                 self.end_hold(event.at_ns);
                 self.trip_count += 1;
                 self.end_running(event.at_ns);
-                self.pause_began = Some((event.at_ns, PauseAfter::Session(cause_of(event))));
+                let cause = EndCause::from_number(event.cause);
+                self.pause_began = Some((event.at_ns, PauseAfter::Session(cause)));
             }
             HOLD_BEGAN => self.hold_began_ns = Some(event.at_ns),
             HOLD_ENDED => self.end_hold(event.at_ns),
@@ -301,16 +301,15 @@ impl Happened {
     fn note_throttle(&mut self, at_ns: i64, is_throttled: bool) {
         if is_throttled {
             self.throttle_began_ns.get_or_insert(at_ns);
-        } else if let Some(begin_ns) = self.throttle_began_ns.take() {
-            let end_ns = at_ns;
-            self.evidence.throttled.push(Span { begin_ns, end_ns });
+        } else {
+            let throttled = &mut self.evidence.throttled;
+            throttled.extend(Span::ended(&mut self.throttle_began_ns, at_ns));
         }
     }
 
     fn end_hold(&mut self, end_ns: i64) {
-        if let Some(begin_ns) = self.hold_began_ns.take() {
-            self.evidence.holds.push(Span { begin_ns, end_ns });
-        }
+        let holds = &mut self.evidence.holds;
+        holds.extend(Span::ended(&mut self.hold_began_ns, end_ns));
     }
 
     fn end_pause(&mut self, end_ns: i64) {

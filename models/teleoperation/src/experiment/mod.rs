@@ -5,14 +5,12 @@
 mod calibration;
 mod conditions;
 mod drive;
-mod parameters;
 mod report;
 mod study;
 #[cfg(test)]
 mod tests;
 mod trajectory;
 
-pub use parameters::TableParameters;
-
 pub(crate) use calibration::Calibration;
 pub(crate) use study::MotionLossStudy;
+pub use study::TableParameters;

@@ -9,7 +9,13 @@ use hil_stats::series::Estimate;
 use hil_stats::statistics::{CONFIDENCE, poisson};
 
 /// A condition with the runs of it that ended.
-pub(crate) type Row<'a> = (&'a Condition, Vec<&'a Tally>);
+#[derive(Debug)]
+pub(crate) struct Row<'a> {
+    /// What it is about.
+    pub(crate) condition: &'a Condition,
+    /// The runs that ended.
+    pub(crate) runs: Vec<&'a Tally>,
+}
 
 /// The whole report.
 pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
@@ -48,7 +54,7 @@ fn notes(study: &MotionLossStudy) -> Vec<String> {
     ]
 }
 
-const fn column(name: &'static str, label: &'static str) -> Column {
+pub(super) const fn column(name: &'static str, label: &'static str) -> Column {
     Column { name, label }
 }
 
@@ -107,7 +113,12 @@ fn counts(rows: &[Row<'_>]) -> Table {
 }
 
 fn setups(rows: &[Row<'_>]) -> Table {
-    let named = |row: &Row<'_>| vec![Cell::text(row.0.name), Cell::text(&row.0.text)];
+    let named = |row: &Row<'_>| {
+        vec![
+            Cell::text(row.condition.name),
+            Cell::text(&row.condition.text),
+        ]
+    };
     Table {
         name: "motion-loss-conditions".to_owned(),
         title: "The conditions".to_owned(),
@@ -128,7 +139,8 @@ fn sum(runs: &[&Tally], count: impl Fn(&Tally) -> u64) -> u64 {
     runs.iter().map(|run| count(run)).sum()
 }
 
-fn rate_cells((condition, runs): &Row<'_>) -> Vec<Cell> {
+fn rate_cells(row: &Row<'_>) -> Vec<Cell> {
+    let runs = &row.runs;
     let mean = |figure: fn(&Tally) -> f64| {
         let total: f64 = runs.iter().map(|run| figure(run)).sum();
         (!runs.is_empty()).then(|| total / runs.len() as f64)
@@ -139,7 +151,7 @@ fn rate_cells((condition, runs): &Row<'_>) -> Vec<Cell> {
     let missing = poisson(sum(runs, Tally::missing_count), CONFIDENCE);
     let of_sent = |value: f64| value / sent as f64;
     vec![
-        Cell::text(condition.name),
+        Cell::text(row.condition.name),
         Cell::number(mean(Tally::loss_ratio), 5),
         Cell::number(deviation(&rates), 5),
         Cell::interval(interval.map(|(low, high)| (low.max(0.0), high)), 5),
@@ -152,12 +164,13 @@ fn rate_cells((condition, runs): &Row<'_>) -> Vec<Cell> {
     ]
 }
 
-fn count_cells((condition, runs): &Row<'_>) -> Vec<Cell> {
+fn count_cells(row: &Row<'_>) -> Vec<Cell> {
+    let runs = &row.runs;
     let rates = rates_of(runs);
     let lowest = rates.iter().copied().fold(f64::INFINITY, f64::min);
     let highest = rates.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let mut cells = vec![
-        Cell::text(condition.name),
+        Cell::text(row.condition.name),
         Cell::Count(runs.len() as u64),
         Cell::Count(sent(runs)),
         Cell::Count(sum(runs, |run| run.executed_count)),
@@ -180,24 +193,27 @@ pub(crate) fn deviation(values: &[f64]) -> Option<f64> {
     (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt())
 }
 
-fn criteria((condition, runs): &Row<'_>, is_fitted: bool) -> Vec<Criterion> {
+fn criteria(row: &Row<'_>, is_fitted: bool) -> Vec<Criterion> {
+    let Row { condition, runs } = row;
     match condition.expected {
         Expected::NothingLost { nor_tripped } => vec![nothing_lost(condition, runs, nor_tripped)],
-        Expected::Published { lost, mean } => {
-            vec![
-                mean_in_range(condition, runs, (mean, is_fitted)),
-                runs_in_interval(condition, runs, (lost, is_fitted)),
-            ]
-        }
+        Expected::Published {
+            lost,
+            mean_low,
+            mean_high,
+        } => vec![
+            mean_in_range(condition, runs, mean_low, mean_high, is_fitted),
+            runs_in_interval(condition, runs, lost, is_fitted),
+        ],
         Expected::Open => Vec::new(),
     }
 }
 
 fn nothing_lost(condition: &Condition, runs: &[&Tally], nor_tripped: bool) -> Criterion {
-    let lost: u64 = runs.iter().map(|run| run.missing_count()).sum();
-    let unanswered: u64 = runs.iter().flat_map(|run| run.lost_counts).sum();
-    let extra: u64 = runs.iter().map(|run| run.extra_count).sum();
-    let trips: u64 = runs.iter().map(|run| run.trip_count).sum();
+    let lost = sum(runs, Tally::missing_count);
+    let unanswered = sum(runs, |run| run.lost_counts.iter().sum());
+    let extra = sum(runs, |run| run.extra_count);
+    let trips = sum(runs, |run| run.trip_count);
     let trips_text = if nor_tripped {
         " and no session ends"
     } else {
@@ -212,7 +228,7 @@ fn nothing_lost(condition: &Condition, runs: &[&Tally], nor_tripped: bool) -> Cr
 }
 
 fn sent(runs: &[&Tally]) -> u64 {
-    runs.iter().map(|run| run.sent_count).sum()
+    sum(runs, |run| run.sent_count)
 }
 
 /// Runs of which a mean says something.
@@ -221,9 +237,11 @@ const RUNS_MIN: usize = 12;
 fn mean_in_range(
     condition: &Condition,
     runs: &[&Tally],
-    ((low, high), is_fitted): ((f64, f64), bool),
+    low: f64,
+    high: f64,
+    is_fitted: bool,
 ) -> Criterion {
-    let rates: Vec<f64> = runs.iter().map(|run| run.loss_ratio()).collect();
+    let rates = rates_of(runs);
     let mean = rates.iter().sum::<f64>() / rates.len().max(1) as f64;
     let is_judged = is_fitted && runs.len() >= RUNS_MIN;
     Criterion {
@@ -245,7 +263,8 @@ fn mean_in_range(
 fn runs_in_interval(
     condition: &Condition,
     runs: &[&Tally],
-    (lost, is_fitted): (u32, bool),
+    lost: u32,
+    is_fitted: bool,
 ) -> Criterion {
     let interval = poisson(u64::from(lost), CONFIDENCE);
     let of_published = |run: &&&Tally| {

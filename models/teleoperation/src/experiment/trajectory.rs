@@ -20,7 +20,8 @@ use hil_stats::series::{Sample, peaks};
 /// Right-arm commands frame by frame, and the loops in them.
 #[derive(Debug)]
 pub(crate) struct Trajectory {
-    frame_ns: i64,
+    /// From frame to frame.
+    pub(crate) frame_ns: i64,
     /// The frame at which the controller engages: the first in `commands`.
     first_frame: i64,
     commands: Vec<EgmCommand>,
@@ -76,11 +77,6 @@ impl Trajectory {
     /// When the first command is sent.
     pub(crate) fn begin_ns(&self) -> i64 {
         self.first_frame * self.frame_ns
-    }
-
-    /// From frame to frame.
-    pub(crate) fn frame_ns(&self) -> i64 {
-        self.frame_ns
     }
 
     /// What the controller would send at `at`: the newest frame's command.

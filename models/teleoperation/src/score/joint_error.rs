@@ -3,7 +3,6 @@
 
 use core::iter::Peekable;
 
-use crate::score::figure::figure;
 use crate::score::sessions::{events, is_right};
 use crate::{
     EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, HUMAN_FRAME, MOTION_RECEIVED, SendPolicy, Teleoperation,
@@ -18,6 +17,7 @@ use hil_arm::yumi::{JOINT_COUNT, Joints};
 use hil_core::case_study::Metric;
 use hil_core::run_log::RunLog;
 use hil_core::time::{Instant, duration_ns};
+use hil_stats::metric::{Label, label};
 use hil_stats::series::Estimate;
 
 /// Sums over all feedback after the first command.
@@ -98,21 +98,21 @@ impl JointError {
         let ratio = (square > 0.0).then(|| (total.square / square).sqrt());
         let mut metrics = vec![
             total.rms(
-                ("joint_error_rad_rms", "joint error, RMS", "rad"),
+                label("joint_error_rad_rms", "joint error, RMS", "rad"),
                 "newest command sent by then minus measured",
                 missing,
             ),
             total.greatest(
-                ("joint_error_rad_max", "joint error, largest", "rad"),
+                label("joint_error_rad_max", "joint error, largest", "rad"),
                 "newest command sent by then minus measured",
                 missing,
             ),
-            figure(
-                (
-                    "joint_error_ratio",
-                    "joint error relative to the commanded motion",
-                    "1",
-                ),
+            label(
+                "joint_error_ratio",
+                "joint error relative to the commanded motion",
+                "1",
+            )
+            .measured(
                 ratio,
                 format!(
                     "RMS error over RMS of the command about its mean; {} messages of feedback",
@@ -137,7 +137,7 @@ impl JointError {
         let (controller, network) = (&self.controller, &self.network);
         [
             controller.rms(
-                (
+                label(
                     "joint_error_controller_rad_rms",
                     "joint error of the servo alone, RMS",
                     "rad",
@@ -146,7 +146,7 @@ impl JointError {
                 missing,
             ),
             controller.greatest(
-                (
+                label(
                     "joint_error_controller_rad_max",
                     "joint error of the servo alone, largest",
                     "rad",
@@ -155,7 +155,7 @@ impl JointError {
                 missing,
             ),
             network.rms(
-                (
+                label(
                     "joint_error_network_rad_rms",
                     "joint error the network adds, RMS",
                     "rad",
@@ -164,7 +164,7 @@ impl JointError {
                 missing,
             ),
             network.greatest(
-                (
+                label(
                     "joint_error_network_rad_max",
                     "joint error the network adds, largest",
                     "rad",
@@ -224,12 +224,7 @@ impl ErrorSums {
         self.block.count += 1.0;
     }
 
-    fn rms(
-        &self,
-        names: (&'static str, &'static str, &'static str),
-        what: &str,
-        missing: &str,
-    ) -> Metric {
+    fn rms(&self, label: Label, what: &str, missing: &str) -> Metric {
         let values = self.count * JOINT_COUNT as f64;
         let rms = (self.count > 0.0).then(|| (self.square / values).sqrt());
         let interval = Estimate::of_mean(&self.blocks)
@@ -241,18 +236,13 @@ impl ErrorSums {
         );
         Metric {
             interval: rms.and(interval),
-            ..figure(names, rms, method, missing)
+            ..label.measured(rms, method, missing)
         }
     }
 
-    fn greatest(
-        &self,
-        names: (&'static str, &'static str, &'static str),
-        what: &str,
-        missing: &str,
-    ) -> Metric {
+    fn greatest(&self, label: Label, what: &str, missing: &str) -> Metric {
         let max = (self.count > 0.0).then_some(self.max);
-        figure(names, max, format!("{what}, any joint"), missing)
+        label.measured(max, format!("{what}, any joint"), missing)
     }
 }
 

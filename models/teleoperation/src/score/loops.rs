@@ -175,6 +175,13 @@ pub(crate) struct Span {
     pub(crate) end_ns: i64,
 }
 
+impl Span {
+    /// The stretch that began then, if one did, and ends now.
+    pub(crate) fn ended(began_ns: &mut Option<i64>, end_ns: i64) -> Option<Self> {
+        began_ns.take().map(|begin_ns| Self { begin_ns, end_ns })
+    }
+}
+
 /// A time without a running session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Pause {

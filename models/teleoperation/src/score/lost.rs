@@ -5,7 +5,7 @@ use crate::EGM_RIGHT_FEEDBACK;
 use crate::score::Run;
 use crate::score::loops::{Loops, LossCause, Span, within};
 use crate::score::record::Command;
-use crate::score::sessions::{cause_of, events, is_right};
+use crate::score::sessions::{events, is_right};
 use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EndCause};
 use hil_core::run_log::RunLog;
 use hil_core::score::{EVENTS_MAX, MessageRef, Score, ScoreEvent, Severity};
@@ -146,7 +146,7 @@ impl Run {
     fn session_event(&self, told: &EgmEvent) -> ScoreEvent {
         let named = event(severity_of(told), told.at_ns, told.describe());
         let is_timeout = told.kind == EgmEventKind::Ended as u32
-            && cause_of(told) == Some(EndCause::CommTimeout);
+            && EndCause::from_number(told.cause) == Some(EndCause::CommTimeout);
         if !is_timeout || !is_right(told) {
             return named;
         }
@@ -167,7 +167,8 @@ impl Run {
 /// binds keep the robot from what it was told; the rest is worth knowing.
 fn severity_of(told: &EgmEvent) -> Severity {
     let is = |kind: EgmEventKind| told.kind == kind as u32;
-    let ended_by_itself = is(EgmEventKind::Ended) && cause_of(told) != Some(EndCause::Requested);
+    let ended_by_itself =
+        is(EgmEventKind::Ended) && EndCause::from_number(told.cause) != Some(EndCause::Requested);
     if ended_by_itself
         || is(EgmEventKind::SpeedThrottled)
         || is(EgmEventKind::CommandRefused)

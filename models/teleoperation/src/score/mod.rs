@@ -4,8 +4,6 @@
 //! Where commands and feedback were stamped by two clocks, loops are still counted, on clocks
 //! that the fastest answered command brings together; what needs better than that is unavailable.
 
-mod age;
-mod figure;
 mod joint_error;
 pub(crate) mod loops;
 mod lost;
@@ -17,16 +15,17 @@ pub(crate) mod sessions;
 mod tests;
 
 use crate::messages::HumanFrame;
-use crate::score::figure::{count, estimated, figure};
 use crate::score::joint_error::JointError;
 use crate::score::loops::{LoopCounter, Loops, LossCause};
-use crate::score::record::Record;
+use crate::score::record::{Feedback, Record};
 use crate::score::sessions::Sessions;
 use crate::{HUMAN_FRAME, Teleoperation};
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
-use hil_core::case_study::{ErrorSeries, Metric, Score};
+use hil_core::case_study::{ErrorSeries, Score};
 use hil_core::plot::PlotSeries;
 use hil_core::run_log::RunLog;
+use hil_core::score::Metric;
+use hil_stats::metric::label;
 use hil_stats::series::{Estimate, Sample, lag_s, peak_to_peak};
 use hil_stats::statistics::{CONFIDENCE, poisson};
 
@@ -57,7 +56,7 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
         &run.moved,
         run.period_s,
     ));
-    metrics.extend(age::metrics(&run.record));
+    metrics.extend(age_metrics(&run.record));
     metrics.extend(run.sessions.metrics(&run.record));
     metrics.extend(run.inverse_kinematics());
     let mut score = Score {
@@ -168,8 +167,7 @@ impl Run {
         let counter = self.counter.text();
         let sent = loops.map(|loops| loops.sent_count() as f64);
         let executed = loops.map(|loops| loops.executed_count as f64);
-        let ratio = figure(
-            ("motion_loss_ratio", "motion loss rate", "1"),
+        let ratio = label("motion_loss_ratio", "motion loss rate", "1").measured(
             loops.map(Loops::loss_ratio),
             format!("(sent - executed) / sent, {counter}; interval of a Poisson count"),
             missing,
@@ -180,14 +178,12 @@ impl Run {
             Some((lost.low / sent, (lost.high / sent).min(1.0)))
         });
         let mut metrics = vec![
-            figure(
-                ("motion_loops_sent_count", "motion loops sent", "1"),
+            label("motion_loops_sent_count", "motion loops sent", "1").measured(
                 sent,
                 format!("{}, {counter}", self.sent.what),
                 missing,
             ),
-            figure(
-                ("motion_loops_executed_count", "motion loops executed", "1"),
+            label("motion_loops_executed_count", "motion loops executed", "1").measured(
                 executed,
                 format!("as measured, {counter}"),
                 missing,
@@ -207,52 +203,48 @@ impl Run {
                 .cause_of(lost.due_ns, self.counter.period_ns);
             kinds[cause.kind()] += 1;
         }
-        let by = |names: (&'static str, &'static str), kind: usize, what: &str| {
+        let by = |name, text, kind: usize, what: &str| {
             let value = loops.map(|_| kinds[kind] as f64);
-            figure((names.0, names.1, "1"), value, what, missing)
+            label(name, text, "1").measured(value, what, missing)
         };
         [
             by(
-                ("loops_lost_by_trip_count", "loops lost without a session"),
+                "loops_lost_by_trip_count",
+                "loops lost without a session",
                 0,
                 "sent peaks that no executed one answers, with no session in part of their loop",
             ),
             by(
-                ("loops_lost_by_hold_count", "loops lost in a hold"),
+                "loops_lost_by_hold_count",
+                "loops lost in a hold",
                 1,
                 "of the others, those with a hold in their loop",
             ),
             by(
-                (
-                    "loops_lost_by_clipping_count",
-                    "loops lost to inverse kinematics",
-                ),
+                "loops_lost_by_clipping_count",
+                "loops lost to inverse kinematics",
                 2,
                 "of the others, those with limited or unreachable commands in their loop",
             ),
             by(
-                (
-                    "loops_lost_by_throttling_count",
-                    "loops lost to MaxSpeedDeviation",
-                ),
+                "loops_lost_by_throttling_count",
+                "loops lost to MaxSpeedDeviation",
                 3,
                 "of the others, those with MaxSpeedDeviation binding in a fifth of their loop",
             ),
             by(
-                (
-                    "loops_lost_by_merging_count",
-                    "loops merged with a neighbour",
-                ),
+                "loops_lost_by_merging_count",
+                "loops merged with a neighbour",
                 4,
                 "the others: too little motion between two peaks",
             ),
             by(
-                ("loops_lost_unseen_count", "loops lost without feedback"),
+                "loops_lost_unseen_count",
+                "loops lost without feedback",
                 5,
                 "of those with a session, as far as is known: no feedback in part of their loop",
             ),
-            figure(
-                ("loops_extra_count", "executed loops that answer none", "1"),
+            label("loops_extra_count", "executed loops that answer none", "1").measured(
                 loops.map(|loops| loops.extra_count as f64),
                 "a motion of the robot's own, or one loop cut in two; each hides one lost loop in \
                  the motion loss rate",
@@ -262,10 +254,10 @@ impl Run {
     }
 
     fn tracking_lag(&self, log: &RunLog) -> Metric {
-        let names = ("tracking_lag_ms", "tracking lag", "ms");
+        let label = label("tracking_lag_ms", "tracking lag", "ms");
         if !self.has_one_clock {
             let missing = "commands and feedback were stamped by two clocks that are not aligned";
-            return figure(names, None, "", missing);
+            return label.unavailable(missing);
         }
         let lag = lag_s(&self.record.sent_y(), &self.moved, 0.5 * self.period_s);
         let in_ms = |lag: Estimate| Estimate {
@@ -273,15 +265,10 @@ impl Run {
             interval: lag.interval.map(|(low, high)| (low * 1e3, high * 1e3)),
         };
         let clock = log.clock_words(lag.map(|lag| lag.value));
-        estimated(
-            names,
-            lag.map(in_ms),
-            format!(
+        label.estimated(lag.map(in_ms), format!(
                 "highest cross-correlation of the right tool's y, commanded and measured, on a 4 ms \
                  grid; interval from blocks of the run{clock}"
-            ),
-            "commands and feedback overlap for less than two motion periods, or nothing moved",
-        )
+            ), "commands and feedback overlap for less than two motion periods, or nothing moved")
     }
 
     fn tool_travel(&self) -> Metric {
@@ -290,12 +277,12 @@ impl Run {
             reason = "a period of at most a minute in nanoseconds"
         )]
         let travel = peak_to_peak(self.followed(), (self.period_s * 1e9) as i64);
-        estimated(
-            (
-                "tool_y_m_peak_to_peak",
-                "side-to-side travel of the right tool",
-                "m",
-            ),
+        label(
+            "tool_y_m_peak_to_peak",
+            "side-to-side travel of the right tool",
+            "m",
+        )
+        .estimated(
             travel,
             "mean over whole motion periods of following the human of highest minus lowest \
              measured y",
@@ -327,16 +314,129 @@ impl Run {
         };
         let of = commands.len();
         [
-            count(
-                ("ik_failure_count", "inverse kinematics failures"),
+            label("ik_failure_count", "inverse kinematics failures", "1").count(
                 flagged(EgmCommand::UNREACHABLE),
                 format!("commands flagged unreachable, of {of}"),
             ),
-            count(
-                ("ik_limited_count", "commands held back by a limit"),
+            label("ik_limited_count", "commands held back by a limit", "1").count(
                 flagged(LIMITED),
                 format!("commands flagged as limited in speed, position or jump, of {of}"),
             ),
         ]
+    }
+}
+
+/// Median, tail and greatest age, and its slope.
+fn age_metrics(record: &Record) -> [Metric; 4] {
+    let has_age = |known: &&Feedback| known.is_running() && known.has(EgmFeedback::HAS_REFERENCE);
+    let with_age = || record.feedback.iter().filter(has_age);
+    let mut ages_ns: Vec<i64> = with_age().map(|known| known.reference_age_ns).collect();
+    let missing = "no feedback of a running session with a reference";
+    let method = format!(
+        "time since the command in use arrived, its wait in the queue included, in {} messages",
+        ages_ns.len()
+    );
+    let age = |name, text, value: Option<i64>| {
+        let value_ms = value.map(|age_ns| age_ns as f64 * 1e-6);
+        label(name, text, "ms").measured(value_ms, method.clone(), missing)
+    };
+    let mut quantile = |share: f64| {
+        let last = ages_ns.len().checked_sub(1)?;
+        #[allow(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a share of a length"
+        )]
+        let rank = (share * last as f64).round() as usize;
+        Some(*ages_ns.select_nth_unstable(rank).1)
+    };
+    let [median, tail, greatest] = [0.5, 0.99, 1.0].map(&mut quantile);
+    let slope = slope_ms_per_s(with_age().filter(|known| !known.has(EgmFeedback::HOLDING)));
+    [
+        age(
+            "reference_age_ms_p50",
+            "age of the reference in use, median",
+            median,
+        ),
+        age(
+            "reference_age_ms_p99",
+            "age of the reference in use, 99 %",
+            tail,
+        ),
+        age(
+            "reference_age_ms_max",
+            "age of the reference in use, greatest",
+            greatest,
+        ),
+        label(
+            "reference_age_ms_per_s",
+            "growth of the reference's age",
+            "ms/s",
+        )
+        .measured(
+            slope,
+            "least squares within each session, holds left out; above zero the queue grows for \
+             ever",
+            "no session long enough for a slope",
+        ),
+    ]
+}
+
+/// Shortest time over which a slope means anything.
+const SLOPE_SPAN_MIN_NS: i64 = 1_000_000_000;
+
+/// One slope for all sessions, each with a level of its own.
+fn slope_ms_per_s<'a>(feedback: impl Iterator<Item = &'a Feedback>) -> Option<f64> {
+    let (mut moment, mut square) = (0.0, 0.0);
+    let mut session: Option<Line> = None;
+    let mut close = |line: Option<Line>| {
+        if let Some(line) = line.filter(|line| line.newest_ns >= SLOPE_SPAN_MIN_NS) {
+            moment += line.moment;
+            square += line.square;
+        }
+    };
+    for known in feedback {
+        if session
+            .as_ref()
+            .is_none_or(|line| line.session != known.session)
+        {
+            close(session.take());
+            session = Some(Line {
+                session: known.session,
+                begin_ns: known.at_ns,
+                ..Line::default()
+            });
+        }
+        if let Some(line) = &mut session {
+            line.add(known.at_ns, known.reference_age_ns);
+        }
+    }
+    close(session);
+    (square > 0.0).then(|| moment / square)
+}
+
+/// Sums about the means of one session, by Welford's update.
+#[derive(Debug, Default)]
+struct Line {
+    session: u32,
+    begin_ns: i64,
+    newest_ns: i64,
+    count: f64,
+    time_mean_s: f64,
+    age_mean_ms: f64,
+    moment: f64,
+    square: f64,
+}
+
+impl Line {
+    fn add(&mut self, at_ns: i64, age_ns: i64) {
+        self.newest_ns = at_ns - self.begin_ns;
+        let (time_s, age) = (self.newest_ns as f64 * 1e-9, age_ns as f64 * 1e-6);
+        self.count += 1.0;
+        let time_off = time_s - self.time_mean_s;
+        self.time_mean_s += time_off / self.count;
+        self.age_mean_ms += (age - self.age_mean_ms) / self.count;
+        self.moment += time_off * (age - self.age_mean_ms);
+        self.square += time_off * (time_s - self.time_mean_s);
     }
 }

@@ -1,9 +1,9 @@
 //! Where the tool went against where it was sent: dynamic time warping, distance from the path and
 //! jerk. Time linear in the log's length: both searches look no farther than half a loop.
 
-use crate::score::figure::figure;
 use crate::score::record::Record;
 use hil_core::score::Metric;
+use hil_stats::metric::label;
 use hil_stats::series::{Sample, resampled};
 
 /// Warping and distances, as far as both signals are there.
@@ -19,35 +19,25 @@ pub(crate) fn metrics(
     let path_method = "nearest point of the path through the commanded tool positions within half \
                        a period, every 40 ms";
     [
-        figure(
-            ("tool_y_dtw_m", "tool y, dynamic time warping distance", "m"),
+        label("tool_y_dtw_m", "tool y, dynamic time warping distance", "m").measured(
             warped,
             "mean |commanded - measured| along the cheapest warping path, 7.5 Hz, at most half a \
              period apart",
             missing,
         ),
-        figure(
-            (
-                "tool_path_m_rms",
-                "distance of the tool from its path, RMS",
-                "m",
-            ),
-            distance.map(|(rms, _)| rms),
-            path_method,
-            missing,
-        ),
-        figure(
-            (
-                "tool_path_m_max",
-                "distance of the tool from its path, greatest",
-                "m",
-            ),
-            distance.map(|(_, max)| max),
-            path_method,
-            missing,
-        ),
-        figure(
-            ("tool_y_jerk_rms", "jerk of the tool's y, RMS", "m/s3"),
+        label(
+            "tool_path_m_rms",
+            "distance of the tool from its path, RMS",
+            "m",
+        )
+        .measured(distance.map(|(rms, _)| rms), path_method, missing),
+        label(
+            "tool_path_m_max",
+            "distance of the tool from its path, greatest",
+            "m",
+        )
+        .measured(distance.map(|(_, max)| max), path_method, missing),
+        label("tool_y_jerk_rms", "jerk of the tool's y, RMS", "m/s3").measured(
             jerk_rms(moved),
             "third difference of the measured y on a 16 ms grid",
             "less than a second of feedback with a tool position",

@@ -30,13 +30,16 @@ pub(crate) fn series(log: &RunLog) -> Vec<PlotSeries> {
         Some(first) => (first.at_ns, first.at_ns - record.shift_ns),
         None => (0, 0),
     };
-    let shift = (!log.has_one_clock()).then_some(record.shift_ns);
-    let rows = Thinned::of(log.raw(EGM_RIGHT_FEEDBACK).len());
+    let rows = RobotSeries {
+        log,
+        origin_ns: robot,
+        shift: (!log.has_one_clock()).then_some(record.shift_ns),
+    };
     let all = [
         input(log, human),
-        tool_y(log, rows, (robot, shift)),
-        joints(log, rows, (robot, shift)),
-        joint_error(log, rows, (robot, shift)),
+        rows.tool_y(),
+        rows.joints(),
+        rows.joint_error(),
     ];
     all.into_iter().flatten().collect()
 }
@@ -106,22 +109,13 @@ pub(crate) fn motion_loops(run: &Run) -> Option<PlotSeries> {
     })
 }
 
-/// Which rows are kept.
-#[derive(Debug, Clone, Copy)]
-struct Thinned {
-    every: usize,
+/// Of so many rows, every how many-th is kept.
+fn thinning(count: usize) -> usize {
+    count.div_ceil(ROWS_MAX).max(1)
 }
 
-impl Thinned {
-    fn of(count: usize) -> Self {
-        Self {
-            every: count.div_ceil(ROWS_MAX).max(1),
-        }
-    }
-
-    fn note(self) -> Option<String> {
-        (self.every > 1).then(|| format!("every {}th message is shown", self.every))
-    }
+fn thinning_note(every: usize) -> Option<String> {
+    (every > 1).then(|| format!("every {every}th message is shown"))
 }
 
 fn seconds(at: Instant, origin_ns: i64) -> f64 {
@@ -129,16 +123,16 @@ fn seconds(at: Instant, origin_ns: i64) -> f64 {
 }
 
 fn input(log: &RunLog, origin_ns: i64) -> Option<PlotSeries> {
-    let thinned = Thinned::of(log.raw(HUMAN_FRAME).len());
+    let every = thinning(log.raw(HUMAN_FRAME).len());
     let frames = log.messages::<HumanFrame>(HUMAN_FRAME);
     let values: Vec<f64> = frames
-        .step_by(thinned.every)
+        .step_by(every)
         .flat_map(|(at, frame)| [seconds(at, origin_ns), frame.right_hand.position_m[0]])
         .collect();
     (!values.is_empty()).then(|| PlotSeries {
         name: "fig6-input".to_owned(),
         title: "Input human motion: side-to-side position of the right hand".to_owned(),
-        notes: thinned.note().into_iter().collect(),
+        notes: thinning_note(every).into_iter().collect(),
         columns: vec![
             TIME,
             column(
@@ -169,53 +163,103 @@ fn paired(
         })
 }
 
-fn notes(log: &RunLog, rows: Thinned, shift: Option<i64>) -> Vec<String> {
-    let aligned = (log.clock_bound_ns() > 0).then(|| {
-        format!(
-            "commands and feedback were stamped by two clocks; the commands' stamps are on the \
-             robot's, by an alignment within {:.1} us",
-            log.clock_bound_ns() as f64 * 1e-3
-        )
-    });
-    let shifted = shift.map(|shift_ns| {
-        format!(
-            "commands and feedback were stamped by two clocks; {shift_ns} ns were added to the \
-             commands' stamps, as if the fastest had taken no time"
-        )
-    });
-    let clocks = shifted.or(aligned);
-    rows.note().into_iter().chain(clocks).collect()
+/// Series with a row for each feedback of the right arm.
+struct RobotSeries<'a> {
+    log: &'a RunLog,
+    /// Zero of the time column.
+    origin_ns: i64,
+    /// Added to the commands' stamps when their clock is not aligned with the robot's.
+    shift: Option<i64>,
 }
 
-fn tool_y(
-    log: &RunLog,
-    rows: Thinned,
-    (origin_ns, shift): (i64, Option<i64>),
-) -> Option<PlotSeries> {
-    let arm = Arm::right();
-    let commanded_m = |command: Option<EgmCommand>| {
-        command.map_or(f64::NAN, |known| {
-            arm.tool(&known.position_rad).translation.y
+impl RobotSeries<'_> {
+    /// The series whose columns behind the time `row` fills.
+    fn series(
+        &self,
+        name: &str,
+        title: &str,
+        note: Option<&str>,
+        columns: impl IntoIterator<Item = PlotColumn>,
+        row: impl Fn(&EgmFeedback, Option<EgmCommand>, &mut Vec<f64>),
+    ) -> Option<PlotSeries> {
+        let every = thinning(self.log.raw(EGM_RIGHT_FEEDBACK).len());
+        let mut values = Vec::new();
+        for (at, feedback, command) in paired(self.log, self.shift).step_by(every) {
+            values.push(seconds(at, self.origin_ns));
+            row(&feedback, command, &mut values);
+        }
+        let notes = note.map(str::to_owned).into_iter();
+        let notes = notes.chain(thinning_note(every)).chain(self.clock_note());
+        (!values.is_empty()).then(|| PlotSeries {
+            name: name.to_owned(),
+            title: title.to_owned(),
+            notes: notes.collect(),
+            columns: [TIME].into_iter().chain(columns).collect(),
+            values,
         })
-    };
-    let values: Vec<f64> = paired(log, shift)
-        .step_by(rows.every)
-        .flat_map(|(at, feedback, command)| {
-            let measured_m = arm.tool(&feedback.measured_rad).translation.y;
-            [seconds(at, origin_ns), measured_m, commanded_m(command)]
+    }
+
+    fn clock_note(&self) -> Option<String> {
+        if let Some(shift_ns) = self.shift {
+            return Some(format!(
+                "commands and feedback were stamped by two clocks; {shift_ns} ns were added to the \
+                 commands' stamps, as if the fastest had taken no time"
+            ));
+        }
+        let bound_ns = self.log.clock_bound_ns();
+        (bound_ns > 0).then(|| {
+            format!(
+                "commands and feedback were stamped by two clocks; the commands' stamps are on the \
+                 robot's, by an alignment within {:.1} us",
+                bound_ns as f64 * 1e-3
+            )
         })
-        .collect();
-    (!values.is_empty()).then(|| PlotSeries {
-        name: "fig7-9-tool-y".to_owned(),
-        title: "Robot position: y of the right tool, measured and commanded".to_owned(),
-        notes: notes(log, rows, shift),
-        columns: vec![
-            TIME,
-            column("measured_tool_y_m", "measured, robot's body frame", "m"),
-            column("commanded_tool_y_m", "newest command sent by then", "m"),
-        ],
-        values,
-    })
+    }
+
+    fn tool_y(&self) -> Option<PlotSeries> {
+        let arm = Arm::right();
+        self.series(
+            "fig7-9-tool-y",
+            "Robot position: y of the right tool, measured and commanded",
+            None,
+            [
+                column("measured_tool_y_m", "measured, robot's body frame", "m"),
+                column("commanded_tool_y_m", "newest command sent by then", "m"),
+            ],
+            |feedback, command, values| {
+                values.push(arm.tool(&feedback.measured_rad).translation.y);
+                values.push(command.map_or(f64::NAN, |known| {
+                    arm.tool(&known.position_rad).translation.y
+                }));
+            },
+        )
+    }
+
+    fn joints(&self) -> Option<PlotSeries> {
+        self.series(
+            "fig10-joints",
+            "Desired and measured joint positions",
+            Some(JOINT_NOTE),
+            DESIRED.into_iter().chain(MEASURED),
+            |feedback, command, values| {
+                values.extend(desired_rad(command));
+                values.extend(feedback.measured_rad);
+            },
+        )
+    }
+
+    fn joint_error(&self) -> Option<PlotSeries> {
+        self.series(
+            "fig11-joint-error",
+            "Joint position error: desired minus measured",
+            Some(JOINT_NOTE),
+            ERROR,
+            |feedback, command, values| {
+                let joints = desired_rad(command).into_iter().zip(feedback.measured_rad);
+                values.extend(joints.map(|(desired, measured)| desired - measured));
+            },
+        )
+    }
 }
 
 const DESIRED: [PlotColumn; JOINT_COUNT] = [
@@ -253,51 +297,4 @@ const JOINT_NOTE: &str = "right arm, joints in chain order, the maker's numbers;
 
 fn desired_rad(command: Option<EgmCommand>) -> Joints {
     command.map_or([f64::NAN; JOINT_COUNT], |known| known.position_rad)
-}
-
-fn joints(
-    log: &RunLog,
-    rows: Thinned,
-    (origin_ns, shift): (i64, Option<i64>),
-) -> Option<PlotSeries> {
-    let mut values = Vec::new();
-    for (at, feedback, command) in paired(log, shift).step_by(rows.every) {
-        values.push(seconds(at, origin_ns));
-        values.extend(desired_rad(command));
-        values.extend(feedback.measured_rad);
-    }
-    let columns = [TIME].into_iter().chain(DESIRED).chain(MEASURED);
-    (!values.is_empty()).then(|| PlotSeries {
-        name: "fig10-joints".to_owned(),
-        title: "Desired and measured joint positions".to_owned(),
-        notes: [JOINT_NOTE.to_owned()]
-            .into_iter()
-            .chain(notes(log, rows, shift))
-            .collect(),
-        columns: columns.collect(),
-        values,
-    })
-}
-
-fn joint_error(
-    log: &RunLog,
-    rows: Thinned,
-    (origin_ns, shift): (i64, Option<i64>),
-) -> Option<PlotSeries> {
-    let mut values = Vec::new();
-    for (at, feedback, command) in paired(log, shift).step_by(rows.every) {
-        values.push(seconds(at, origin_ns));
-        let desired = desired_rad(command);
-        values.extend((0..JOINT_COUNT).map(|joint| desired[joint] - feedback.measured_rad[joint]));
-    }
-    (!values.is_empty()).then(|| PlotSeries {
-        name: "fig11-joint-error".to_owned(),
-        title: "Joint position error: desired minus measured".to_owned(),
-        notes: [JOINT_NOTE.to_owned()]
-            .into_iter()
-            .chain(notes(log, rows, shift))
-            .collect(),
-        columns: [TIME].into_iter().chain(ERROR).collect(),
-        values,
-    })
 }

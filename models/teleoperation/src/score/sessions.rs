@@ -2,12 +2,12 @@
 //! of the robot's clock.
 
 use crate::EGM_EVENT;
-use crate::score::figure::{count, figure};
 use crate::score::loops::{Evidence, Pause, PauseAfter, Span};
 use crate::score::record::{Feedback, Record};
 use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EgmFeedback, EndCause, SessionState, Side};
 use hil_core::run_log::RunLog;
 use hil_core::score::Metric;
+use hil_stats::metric::label;
 
 /// For how long after a resume the arm catches up, nanoseconds.
 const CATCH_UP_NS: i64 = 500_000_000;
@@ -71,13 +71,11 @@ impl Sessions {
             "nothing was recorded"
         };
         let mut metrics = vec![
-            count(
-                ("egm_session_count", "guided-motion sessions"),
+            label("egm_session_count", "guided-motion sessions", "1").count(
                 (all > 0).then_some(self.count),
                 "times the right arm's session began to run",
             ),
-            count(
-                ("egm_trip_count", "sessions that ended by themselves"),
+            label("egm_trip_count", "sessions that ended by themselves", "1").count(
                 (all > 0).then_some(self.trips.len() as u64),
                 "ends by CommTimeout, CondTime, MaxPosDeviation or for a reason not recorded",
             ),
@@ -85,14 +83,12 @@ impl Sessions {
         let or_not_told = |missing| if tells_holds { missing } else { not_told };
         metrics.extend(self.reactivation());
         metrics.extend([
-            figure(
-                ("hold_count", "holds for want of commands", "1"),
+            label("hold_count", "holds for want of commands", "1").measured(
                 tells_holds.then_some(self.evidence.holds.len() as f64),
                 "rows of feedback flagged as holding",
                 not_told,
             ),
-            figure(
-                ("hold_time_ratio", "share of time held", "1"),
+            label("hold_time_ratio", "share of time held", "1").measured(
                 (tells_holds && self.running_count > 0)
                     .then(|| self.holding_count as f64 / self.running_count as f64),
                 format!(
@@ -101,8 +97,7 @@ impl Sessions {
                 ),
                 or_not_told("no feedback of a running session"),
             ),
-            figure(
-                ("throttled_time_ratio", "share of time throttled", "1"),
+            label("throttled_time_ratio", "share of time throttled", "1").measured(
                 (self.running_count > 0)
                     .then(|| self.throttled_count as f64 / self.running_count as f64),
                 format!(
@@ -111,12 +106,12 @@ impl Sessions {
                 ),
                 "no feedback of a running session",
             ),
-            figure(
-                (
-                    "resume_saturation_ratio",
-                    "speed-limited share of the time after a resume",
-                    "1",
-                ),
+            label(
+                "resume_saturation_ratio",
+                "speed-limited share of the time after a resume",
+                "1",
+            )
+            .measured(
                 (tells_holds && self.catching_up_count > 0)
                     .then(|| self.saturated_count as f64 / self.catching_up_count as f64),
                 format!(
@@ -126,8 +121,7 @@ impl Sessions {
                 ),
                 or_not_told("no hold ended and no session followed another"),
             ),
-            count(
-                ("commands_refused_count", "commands refused"),
+            label("commands_refused_count", "commands refused", "1").count(
                 self.refused_count,
                 "rows of commands refused one after the other for one reason count once",
             ),
@@ -148,14 +142,12 @@ impl Sessions {
             lengths.len()
         );
         [
-            figure(
-                ("reactivation_s_median", "time to re-activate, median", "s"),
+            label("reactivation_s_median", "time to re-activate, median", "s").measured(
                 seconds(lengths.get(lengths.len() / 2)),
                 method.clone(),
                 missing,
             ),
-            figure(
-                ("reactivation_s_max", "time to re-activate, longest", "s"),
+            label("reactivation_s_max", "time to re-activate, longest", "s").measured(
                 seconds(lengths.last()),
                 method,
                 missing,
@@ -241,8 +233,8 @@ impl Reading {
     fn begin(&mut self, at_ns: i64) {
         self.sessions.count += 1;
         self.end_unbegun(at_ns);
-        if let Some(ended) = self.ended.take() {
-            self.pause(ended, Some(at_ns), at_ns);
+        if let Some((session, ended_ns)) = self.ended.take() {
+            self.pause(session, ended_ns, Some(at_ns), at_ns);
             self.resumed_ns = Some(at_ns);
         }
     }
@@ -255,22 +247,20 @@ impl Reading {
     }
 
     fn end_throttle(&mut self, end_ns: i64) {
-        if let Some(begin_ns) = self.throttle_began_ns.take() {
-            let throttled = &mut self.sessions.evidence.throttled;
-            throttled.push(Span { begin_ns, end_ns });
-        }
+        let evidence = &mut self.sessions.evidence;
+        evidence
+            .throttled
+            .extend(Span::ended(&mut self.throttle_began_ns, end_ns));
     }
 
-    fn end_hold(&mut self, at_ns: i64) {
-        if let Some(begin_ns) = self.hold_began_ns.take() {
-            self.sessions.evidence.holds.push(Span {
-                begin_ns,
-                end_ns: at_ns,
-            });
-        }
+    fn end_hold(&mut self, end_ns: i64) {
+        let evidence = &mut self.sessions.evidence;
+        evidence
+            .holds
+            .extend(Span::ended(&mut self.hold_began_ns, end_ns));
     }
 
-    fn pause(&mut self, (session, begin_ns): (u32, i64), until_ns: Option<i64>, end_ns: i64) {
+    fn pause(&mut self, session: u32, begin_ns: i64, until_ns: Option<i64>, end_ns: i64) {
         let known = self.ends.iter().rfind(|(known, _)| *known == session);
         let cause = known.and_then(|(_, cause)| *cause);
         let span = Span { begin_ns, end_ns };
@@ -290,8 +280,8 @@ impl Reading {
             self.end_unbegun(last.at_ns);
             self.end_hold(last.at_ns);
             self.end_throttle(last.at_ns);
-            if let Some(ended) = self.ended.take() {
-                self.pause(ended, None, last.at_ns);
+            if let Some((session, ended_ns)) = self.ended.take() {
+                self.pause(session, ended_ns, None, last.at_ns);
             }
         }
         self.sessions
@@ -316,26 +306,14 @@ pub(crate) fn events(log: &RunLog) -> impl Iterator<Item = EgmEvent> + '_ {
 
 /// True for an event of the right arm.
 pub(crate) fn is_right(event: &EgmEvent) -> bool {
-    usize::try_from(event.side) == Ok(Side::Right.index())
+    event.side == Side::Right.number()
 }
 
 fn ends(log: &RunLog) -> Vec<(u32, Option<EndCause>)> {
     events(log)
         .filter(|event| is_right(event) && event.kind == EgmEventKind::Ended as u32)
-        .map(|event| (event.session, cause_of(&event)))
+        .map(|event| (event.session, EndCause::from_number(event.cause)))
         .collect()
-}
-
-/// Why the session of an [`EgmEventKind::Ended`] ended.
-pub(crate) fn cause_of(event: &EgmEvent) -> Option<EndCause> {
-    [
-        EndCause::CommTimeout,
-        EndCause::ConditionTime,
-        EndCause::PositionDeviation,
-        EndCause::Requested,
-    ]
-    .into_iter()
-    .find(|cause| *cause as u32 == event.cause)
 }
 
 fn refused(log: &RunLog) -> u64 {
@@ -352,18 +330,11 @@ fn clipped(record: &Record) -> Vec<Span> {
     for command in &record.commands {
         if command.is_clipped() {
             begin_ns.get_or_insert(command.at_ns);
-        } else if let Some(begin_ns) = begin_ns.take() {
-            spans.push(Span {
-                begin_ns,
-                end_ns: command.at_ns,
-            });
+        } else {
+            spans.extend(Span::ended(&mut begin_ns, command.at_ns));
         }
     }
-    if let (Some(begin_ns), Some(last)) = (begin_ns, record.commands.last()) {
-        spans.push(Span {
-            begin_ns,
-            end_ns: last.at_ns,
-        });
-    }
+    let last = record.commands.last();
+    spans.extend(last.and_then(|last| Span::ended(&mut begin_ns, last.at_ns)));
     spans
 }

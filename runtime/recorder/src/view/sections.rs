@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use hil_fleet::geometry::Footprint;
 use hil_fleet::path::{Path, PathId};
-use hil_fleet::section::Side;
+use hil_fleet::section::{Side, Span};
 use hil_fleet::world::World;
 use serde::Serialize;
 
@@ -228,7 +228,10 @@ pub(crate) fn of_pair(
         let inside = that(&|robot, side| robot.index >= section.start(side));
         let may_pass = that(&|robot, side| robot.granted >= section.start(side));
         // One may follow the other through it, as long as no two poses that they may take meet.
-        let other_way = (other.index, other.granted);
+        let other_way = Span {
+            lower: other.index,
+            upper: other.granted,
+        };
         let meeting = section.first_conflict(Side::First, one.index, other_way);
         let is_contested = meeting.is_some_and(|pose| pose <= one.granted);
         list.push(SectionPicture {

@@ -93,7 +93,7 @@ impl NetworkBuilder {
             self.add_event(one.channel, event, one.duration_ns, one.place);
         }
         let width_ns = bin_width_ns(one.duration_ns);
-        let bins = NetworkBins::of(one.passages, (one.duration_ns, width_ns), one.place);
+        let bins = NetworkBins::of(one.passages, one.duration_ns, width_ns, one.place);
         self.unplaced_message_count += bins.unplaced_count;
         self.bins.push((one.channel.to_owned(), bins));
     }

@@ -55,7 +55,7 @@ impl Reference {
 /// The law's numbers, computed once per session.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Law {
-    step_s: f64,
+    pub(super) step_s: f64,
     gain_per_s: f64,
     low_pass_share: f64,
     ramp_share_per_cycle: f64,
@@ -94,10 +94,6 @@ impl Law {
         let share = cycle as f64 * self.ramp_share_per_cycle;
         if share < 1.0 { share } else { 1.0 }
     }
-
-    pub(super) fn step_s(&self) -> f64 {
-        self.step_s
-    }
 }
 
 /// Which speed limit slowed the joints in a cycle.
@@ -117,7 +113,7 @@ pub(super) enum Binding {
 pub(super) struct Plan {
     q_rad: Joints,
     speed_rad_per_s: Joints,
-    is_at_limit: bool,
+    pub(super) is_at_limit: bool,
 }
 
 impl Plan {
@@ -131,10 +127,6 @@ impl Plan {
 
     pub(super) fn q_rad(&self) -> &Joints {
         &self.q_rad
-    }
-
-    pub(super) fn is_at_limit(&self) -> bool {
-        self.is_at_limit
     }
 
     pub(super) fn is_at_rest(&self) -> bool {
@@ -228,7 +220,7 @@ pub(crate) const DELAY_CYCLES_MAX: usize = 16;
 pub(super) struct Delay {
     points: [Joints; DELAY_CYCLES_MAX],
     next: usize,
-    cycles: usize,
+    pub(super) cycles: usize,
     measured_rad: Joints,
 }
 
@@ -257,9 +249,5 @@ impl Delay {
 
     pub(super) fn measured_rad(&self) -> &Joints {
         &self.measured_rad
-    }
-
-    pub(super) fn cycles(&self) -> usize {
-        self.cycles
     }
 }

@@ -19,7 +19,6 @@ mod describe;
 mod inbox;
 mod law;
 pub mod motion;
-mod ring;
 mod session;
 mod watch;
 
@@ -256,8 +255,8 @@ impl Controller {
             queue_count: wrapped(self.inbox.queued() as u64),
             flags: self.cycle_flags
                 | flag(self.has_reference, EgmFeedback::HAS_REFERENCE)
-                | flag(self.hold.is_holding(), EgmFeedback::HOLDING)
-                | flag(self.plan.is_at_limit(), EgmFeedback::AT_POSITION_LIMIT),
+                | flag(self.hold.is_holding, EgmFeedback::HOLDING)
+                | flag(self.plan.is_at_limit, EgmFeedback::AT_POSITION_LIMIT),
         }
     }
 

@@ -258,7 +258,7 @@ impl Controller {
             began_at: self.at,
             leads_to_session: track.is_none(),
             track,
-            settle_cycles: self.delay.cycles(),
+            settle_cycles: self.delay.cycles,
         });
     }
 
@@ -277,7 +277,7 @@ impl Controller {
             self.own_motion = Some(motion);
             return;
         };
-        if let Some(q_rad) = track.advance(self.law.step_s()) {
+        if let Some(q_rad) = track.advance(self.law.step_s) {
             self.plan.place(&q_rad);
         } else if motion.settle_cycles > 1 {
             motion.settle_cycles -= 1;
@@ -328,7 +328,7 @@ impl Controller {
             }
             return;
         };
-        let step_s = self.law.step_s();
+        let step_s = self.law.step_s;
         let next = motion
             .track
             .as_mut()

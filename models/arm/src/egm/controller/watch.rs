@@ -69,13 +69,7 @@ pub(super) struct ThrottleWatch {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct HoldWatch {
     taken_at: Instant,
-    is_holding: bool,
-}
-
-impl HoldWatch {
-    pub(super) fn is_holding(&self) -> bool {
-        self.is_holding
-    }
+    pub(super) is_holding: bool,
 }
 
 impl Controller {
@@ -209,7 +203,7 @@ impl Controller {
             return;
         };
         // The last cycle in which it bound counts in full.
-        let bound_ns = throttle.bound_at.ns_since(began_at) + ns(self.law.step_s());
+        let bound_ns = throttle.bound_at.ns_since(began_at) + ns(self.law.step_s);
         let allowed = self.session.settings.max_speed_deviation_rad_per_s;
         tell(EgmEvent {
             value: throttle.asked_rad_per_s.to_degrees(),

@@ -1,9 +1,10 @@
 //! What both faces demand of a message before its values are used.
 
 use crate::egm::face::Axes;
-use crate::egm::wire::joints::{EXTERNAL_PLACE, ROBOT_JOINT_COUNT, WireJoints};
 use crate::egm::wire::messages::{EgmHeader, EgmJoints};
-use crate::egm::wire::{MessageType, Refusal, WireError, message_type};
+use crate::egm::wire::{
+    EXTERNAL_PLACE, MessageType, ROBOT_JOINT_COUNT, Refusal, WireError, WireJoints, message_type,
+};
 use crate::yumi::arm::{POSITION_MAX_RAD, POSITION_MIN_RAD};
 use crate::yumi::{CHAIN_TO_MAKER, Joints};
 
@@ -62,7 +63,8 @@ pub(super) enum Sender {
 pub(super) fn joints_of(
     joints: Option<&EgmJoints>,
     external: Option<&EgmJoints>,
-    (axes, sender): (Axes, Sender),
+    axes: Axes,
+    sender: Sender,
     held_rad: f64,
 ) -> Result<Option<Joints>, Refusal> {
     let robot = joints.map_or(&[][..], |list| &list.joints);

@@ -9,7 +9,6 @@ use prost::Message;
 use crate::egm::face::checks::{self, Sender};
 use crate::egm::face::{Axes, REORDERING_MAX_MS, RobotWare};
 use crate::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
-use crate::egm::wire::joints::{EXTERNAL_PLACE, WireJoints};
 use crate::egm::wire::messages::{
     EgmCartesian, EgmClock, EgmEuler, EgmFeedBack, EgmHeader, EgmJoints, EgmPlanned, EgmPose,
     EgmQuaternion, EgmSensor, EgmSpeedRef, EgmTimestamp, MessageType,
@@ -17,7 +16,7 @@ use crate::egm::wire::messages::{
 use crate::egm::wire::robot::{
     EgmMciState, EgmMotorState, EgmRapidCtrlExecState, EgmRobot, MciState, MotorState, RapidState,
 };
-use crate::egm::wire::{self, DatagramCounts, Refusal};
+use crate::egm::wire::{self, DatagramCounts, EXTERNAL_PLACE, Refusal, WireJoints};
 use crate::yumi::arm::{Arm, SPEED_MAX_RAD_PER_S};
 use crate::yumi::{Joints, Pose};
 
@@ -210,11 +209,11 @@ impl RobotFace {
         wire::merge(datagram, &mut self.sensor)
             .map_err(|error| checks::undecodable(error, datagram, MessageType::Correction))?;
         let header = checks::header_of(self.sensor.header.as_ref(), MessageType::Correction)?;
-        let form = (self.settings.axes, Sender::Sensor);
+        let (axes, sender) = (self.settings.axes, Sender::Sensor);
 
         let planned = self.sensor.planned.as_ref().ok_or(Refusal::MissingJoints)?;
         let (joints, external) = (planned.joints.as_ref(), planned.external_joints.as_ref());
-        let position_rad = checks::joints_of(joints, external, form, held_rad)?;
+        let position_rad = checks::joints_of(joints, external, axes, sender, held_rad)?;
         let position_rad = checks::commanded(&position_rad.ok_or(Refusal::MissingJoints)?)?;
 
         let mut command = EgmCommand {
@@ -225,7 +224,7 @@ impl RobotFace {
         };
         if let Some(speed) = &self.sensor.speed_ref {
             let (joints, external) = (speed.joints.as_ref(), speed.external_joints.as_ref());
-            if let Some(speed_rad_per_s) = checks::joints_of(joints, external, form, 0.0)? {
+            if let Some(speed_rad_per_s) = checks::joints_of(joints, external, axes, sender, 0.0)? {
                 checks::speeds(&speed_rad_per_s)?;
                 command.speed_rad_per_s = speed_rad_per_s;
                 command.flags |= EgmCommand::HAS_SPEED;

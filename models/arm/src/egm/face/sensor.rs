@@ -162,7 +162,7 @@ impl SensorFace {
         let (Some(seqno), Some(tm)) = (header.seqno, header.tm) else {
             return Err(Refusal::MissingHeader);
         };
-        let (form, held_rad) = ((self.settings.axes, Sender::Robot), self.settings.held_rad);
+        let (axes, held_rad) = (self.settings.axes, self.settings.held_rad);
 
         let part = self
             .robot
@@ -170,12 +170,12 @@ impl SensorFace {
             .as_ref()
             .ok_or(Refusal::MissingJoints)?;
         let (joints, external) = (part.joints.as_ref(), part.external_joints.as_ref());
-        let measured_rad = checks::joints_of(joints, external, form, held_rad)?;
+        let measured_rad = checks::joints_of(joints, external, axes, Sender::Robot, held_rad)?;
         let tool = tool(part.cartesian.as_ref())?;
 
         let part = self.robot.planned.as_ref().ok_or(Refusal::MissingJoints)?;
         let (joints, external) = (part.joints.as_ref(), part.external_joints.as_ref());
-        let planned_rad = checks::joints_of(joints, external, form, held_rad)?;
+        let planned_rad = checks::joints_of(joints, external, axes, Sender::Robot, held_rad)?;
 
         let joints = [measured_rad, planned_rad].map(|list| list.ok_or(Refusal::MissingJoints));
         let [measured_rad, planned_rad] = joints;

@@ -3,8 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::egm::wire::joints::ROBOT_JOINT_COUNT;
-use crate::egm::wire::{DATAGRAM_BYTES_MAX, WireError};
+use crate::egm::wire::{DATAGRAM_BYTES_MAX, ROBOT_JOINT_COUNT, WireError};
 
 /// One datagram or command that is not taken.
 ///
@@ -97,98 +96,58 @@ impl From<WireError> for Refusal {
     }
 }
 
-/// A [`Refusal`] without its numbers: what is counted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-#[repr(usize)]
-pub enum Cause {
-    /// [`Refusal::TooLong`].
-    TooLong,
-    /// [`Refusal::NotProtobuf`].
-    NotProtobuf,
-    /// [`Refusal::MissingHeader`].
-    MissingHeader,
-    /// [`Refusal::WrongMessageType`].
-    WrongMessageType,
-    /// [`Refusal::MissingJoints`].
-    MissingJoints,
-    /// [`Refusal::WrongArity`].
-    WrongArity,
-    /// [`Refusal::NotFinite`].
-    NotFinite,
-    /// [`Refusal::OutsideLimits`].
-    OutsideLimits,
-    /// [`Refusal::TooFast`].
-    TooFast,
-    /// [`Refusal::NoSession`].
-    NoSession,
-    /// [`Refusal::Overtaken`].
-    Overtaken,
-}
-
-impl Cause {
-    /// Number of causes.
-    pub const COUNT: usize = 11;
-
-    /// Every cause, in the order of the counts.
-    pub const ALL: [Self; Self::COUNT] = [
-        Self::TooLong,
-        Self::NotProtobuf,
-        Self::MissingHeader,
-        Self::WrongMessageType,
-        Self::MissingJoints,
-        Self::WrongArity,
-        Self::NotFinite,
-        Self::OutsideLimits,
-        Self::TooFast,
-        Self::NoSession,
-        Self::Overtaken,
-    ];
-
-    /// A few words for a report.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::TooLong => "too long",
-            Self::NotProtobuf => "not protobuf",
-            Self::MissingHeader => "missing header",
-            Self::WrongMessageType => "wrong message type",
-            Self::MissingJoints => "no joints",
-            Self::WrongArity => "wrong number of joints",
-            Self::NotFinite => "not a finite number",
-            Self::OutsideLimits => "outside joint limits",
-            Self::TooFast => "too fast",
-            Self::NoSession => "no session",
-            Self::Overtaken => "overtaken",
+/// Makes [`Cause`] of the names of all refusals and a few words for each.
+macro_rules! causes {
+    ($($cause:ident: $label:literal),+ $(,)?) => {
+        /// A [`Refusal`] without its numbers: what is counted.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+        #[serde(rename_all = "snake_case")]
+        #[repr(usize)]
+        pub enum Cause {
+            $(#[doc = concat!("[`Refusal::", stringify!($cause), "`].")] $cause,)+
         }
-    }
+
+        impl Cause {
+            /// Every cause, in the order of the counts.
+            pub const ALL: [Self; Self::COUNT] = [$(Self::$cause),+];
+
+            /// Number of causes.
+            pub const COUNT: usize = [$($label),+].len();
+
+            /// A few words for a report.
+            pub const fn label(self) -> &'static str {
+                match self {
+                    $(Self::$cause => $label,)+
+                }
+            }
+        }
+
+        impl Refusal {
+            /// Its cause.
+            pub const fn cause(&self) -> Cause {
+                match self {
+                    $(Self::$cause { .. } => Cause::$cause,)+
+                }
+            }
+        }
+    };
 }
 
-const _: () = {
-    let mut index = 0;
-    while index < Cause::COUNT {
-        assert!(Cause::ALL[index] as usize == index);
-        index += 1;
-    }
-};
+causes! {
+    TooLong: "too long",
+    NotProtobuf: "not protobuf",
+    MissingHeader: "missing header",
+    WrongMessageType: "wrong message type",
+    MissingJoints: "no joints",
+    WrongArity: "wrong number of joints",
+    NotFinite: "not a finite number",
+    OutsideLimits: "outside joint limits",
+    TooFast: "too fast",
+    NoSession: "no session",
+    Overtaken: "overtaken",
+}
 
 impl Refusal {
-    /// Its cause.
-    pub const fn cause(&self) -> Cause {
-        match self {
-            Self::TooLong { .. } => Cause::TooLong,
-            Self::NotProtobuf => Cause::NotProtobuf,
-            Self::MissingHeader => Cause::MissingHeader,
-            Self::WrongMessageType { .. } => Cause::WrongMessageType,
-            Self::MissingJoints => Cause::MissingJoints,
-            Self::WrongArity { .. } => Cause::WrongArity,
-            Self::NotFinite { .. } => Cause::NotFinite,
-            Self::OutsideLimits { .. } => Cause::OutsideLimits,
-            Self::TooFast { .. } => Cause::TooFast,
-            Self::NoSession => Cause::NoSession,
-            Self::Overtaken { .. } => Cause::Overtaken,
-        }
-    }
-
     /// A few words for a report.
     pub const fn label(&self) -> &'static str {
         self.cause().label()

@@ -123,7 +123,7 @@ fn the_section_goes_away_when_the_leader_is_past_its_end() {
         [(1, TO_GOAL)]
     );
     assert_eq!(bench.coordinator.counters().counts.sections_obsolete, 1);
-    assert_eq!(bench.coordinator.roster().sections().iter().count(), 0);
+    assert_eq!(bench.coordinator.roster.sections.iter().count(), 0);
 }
 
 #[test]

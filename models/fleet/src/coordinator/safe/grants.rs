@@ -8,11 +8,10 @@ use core::time::Duration;
 use crate::coordinator::Cycle;
 use crate::coordinator::policy::Contest;
 use crate::coordinator::roster::Roster;
-use crate::coordinator::safe::SafeRules;
-use crate::coordinator::safe::horizon::{lookahead_s, reach_m};
-use crate::coordinator::safe::liveness::{Verdict, section_start};
+use crate::coordinator::safe::liveness::section_start;
 use crate::coordinator::safe::reservation::Contact;
-use crate::section::Side;
+use crate::coordinator::safe::{SafeRules, lookahead_s, reach_m};
+use crate::section::{Side, Span};
 use hil_core::time::Instant;
 
 /// A robot that could use more way in this cycle.
@@ -40,7 +39,6 @@ impl SafeRules {
             return;
         }
         let may_reorder = !self.is_anyone_starving(cycle.now);
-        self.counts.cycles_in_order += u64::from(!may_reorder);
         self.admit_all(cycle.now, may_reorder);
         let mut order = core::mem::take(&mut self.order);
         order.clear();
@@ -179,7 +177,7 @@ impl SafeRules {
         let to = margin.upper(candidate.want, last);
         let conflict = self
             .traffic
-            .first_conflict(robot, from, to, self.traffic.spans());
+            .first_conflict(robot, from, to, &self.traffic.spans);
         let mut end = candidate.want;
         if let Some((index, other)) = conflict {
             self.robots[robot].stopped_by = Some(other);
@@ -191,13 +189,10 @@ impl SafeRules {
                 break;
             }
             let upper = margin.upper(end, last);
-            match self.plan.extend(&self.traffic, robot, upper, may_reorder) {
-                Verdict::Withheld => self.counts.grants_withheld += 1,
-                verdict => {
-                    self.counts.plans_reordered += u64::from(verdict == Verdict::Reorders);
-                    return self.give(robot, end);
-                }
+            if self.plan.extend(&self.traffic, robot, upper, may_reorder) {
+                return self.give(robot, end);
             }
+            self.counts.grants_withheld += 1;
             let start = section_start(self.traffic.contacts(robot), upper);
             end = start.saturating_sub(margin.above + 1);
         }
@@ -205,7 +200,7 @@ impl SafeRules {
         let planned = self.plan.next_end(robot).map_or(0, |end| end.min(free_end));
         if planned > bound {
             let upper = margin.upper(planned, last);
-            if self.plan.extend(&self.traffic, robot, upper, false) != Verdict::Withheld {
+            if self.plan.extend(&self.traffic, robot, upper, false) {
                 return self.give(robot, planned);
             }
         }
@@ -215,7 +210,6 @@ impl SafeRules {
     fn give(&mut self, robot: usize, end: usize) -> bool {
         let is_given = self.robots[robot].ledger.send(end).is_some();
         if is_given {
-            self.counts.grants += 1;
             self.update_span(robot);
         }
         is_given
@@ -245,7 +239,10 @@ impl SafeRules {
                 let entry = contact.section().first_conflict(
                     Side::Second,
                     span.lower,
-                    (from, contact.own.upper),
+                    Span {
+                        lower: from,
+                        upper: contact.own.upper,
+                    },
                 )?;
                 let end = entry.checked_sub(self.margin.above + 1)?;
                 let is_useful = end >= earliest && entry <= span.upper;
@@ -261,7 +258,6 @@ impl SafeRules {
             view.spared_until = cycle.now + SPARED;
             view.waiting_since = view.waited_since.or(view.waiting_since);
             view.retracted = cycle.now;
-            self.counts.shrinks += 1;
         }
     }
 

@@ -28,8 +28,8 @@
 //! The search is a heuristic, as the question itself is NP-hard: failing to find a plan withholds
 //! an extension that might have been harmless, and costs time but neither safety nor liveness.
 
-use crate::coordinator::safe::reservation::{Contact, Span, Traffic};
-use crate::section::Side;
+use crate::coordinator::safe::reservation::{Contact, Traffic};
+use crate::section::{Side, Span};
 
 /// How far from the end of its authority a robot may come to stand, in poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,17 +63,6 @@ struct Move {
     robot: usize,
     /// Authority index at which it ends.
     to: usize,
-}
-
-/// Whether an extension may be given.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Verdict {
-    /// The plan stays valid.
-    Keeps,
-    /// Another plan was found and taken.
-    Reorders,
-    /// No plan was found.
-    Withheld,
 }
 
 /// The plan a coordinator keeps, and room for looking for another.
@@ -128,7 +117,7 @@ impl Plan {
     /// no plan was found.
     pub(crate) fn admit(&mut self, traffic: &Traffic, robot: usize, may_reorder: bool) -> bool {
         self.spans.clear();
-        self.spans.extend_from_slice(traffic.spans());
+        self.spans.extend_from_slice(&traffic.spans);
         for step in &self.moves {
             let last = traffic.last(step.robot);
             self.spans[step.robot] = self.margin.standing(step.to, last);
@@ -150,27 +139,21 @@ impl Plan {
         }
     }
 
-    /// Whether `robot` may reserve up to `upper`, which is free of all reservations now.
+    /// Whether `robot` may reserve up to `upper`, which is free of all reservations now: the plan
+    /// stays valid, or another is found and taken.
     pub(crate) fn extend(
         &mut self,
         traffic: &Traffic,
         robot: usize,
         upper: usize,
         may_reorder: bool,
-    ) -> Verdict {
-        if self.keeps(traffic, robot, upper) {
-            return Verdict::Keeps;
-        }
-        if !may_reorder {
-            return Verdict::Withheld;
-        }
-        self.begin_search(traffic, robot);
-        self.spans[robot].upper = upper;
-        if self.search(traffic) {
-            Verdict::Reorders
-        } else {
-            Verdict::Withheld
-        }
+    ) -> bool {
+        self.keeps(traffic, robot, upper)
+            || may_reorder && {
+                self.begin_search(traffic, robot);
+                self.spans[robot].upper = upper;
+                self.search(traffic)
+            }
     }
 
     /// Whether the plan stays valid when `robot` reserves up to `upper`. Only the moves of robots
@@ -233,7 +216,7 @@ impl Plan {
     /// plan finishes them, `first` before all.
     fn begin_search(&mut self, traffic: &Traffic, first: usize) {
         self.spans.clear();
-        self.spans.extend_from_slice(traffic.spans());
+        self.spans.extend_from_slice(&traffic.spans);
         self.is_pending.fill(false);
         self.is_pending[first] = true;
         self.pending.clear();
@@ -375,6 +358,6 @@ fn conflict_of_other(contact: &Contact, from: usize, to: usize, taken: Span) -> 
     }
     contact
         .section()
-        .first_conflict(Side::Second, from, (taken.lower, taken.upper))
+        .first_conflict(Side::Second, from, taken)
         .filter(|index| *index <= to)
 }

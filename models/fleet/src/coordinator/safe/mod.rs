@@ -6,8 +6,8 @@
 //! - `reservation`: which poses each robot has to itself; the safety invariant.
 //! - `liveness`: why every mission ends.
 //! - `grants`: who gets how much in a control cycle.
-//! - `horizon`: how much a robot needs so as not to brake for want of a message.
-//! - `lease`: authorities that end by themselves, where delays have a measured bound.
+//! - `RoundTrip`, `CycleTime`: how much a robot needs so as not to brake for want of a message.
+//! - `LeaseWatch`: authorities that end by themselves, where delays have a measured bound.
 //!
 //! **Safety.** Let `G` be the ledger's bound of a robot and `l` the furthest pose it is known to
 //! have passed. The robot never passes its authority by more than the stop margin `m`, so it is
@@ -17,11 +17,8 @@
 //! each pair of overlapping poses at most one is ever granted.
 
 mod grants;
-mod horizon;
-mod lease;
 pub mod ledger;
 mod liveness;
-pub mod parameters;
 pub mod reservation;
 #[cfg(test)]
 mod tests;
@@ -29,17 +26,20 @@ mod tests;
 use core::time::Duration;
 use std::sync::Arc;
 
+use serde::{Deserialize, Serialize};
+
 use crate::coordinator::counters::SafeCounts;
 use crate::coordinator::parameters::CoordinatorParameters;
-use crate::coordinator::safe::horizon::{CycleTime, RoundTrip};
-use crate::coordinator::safe::lease::LeaseWatch;
 use crate::coordinator::safe::ledger::{Ledger, StateEffect};
 use crate::coordinator::safe::liveness::{Plan, StopMargin};
-use crate::coordinator::safe::reservation::{Span, Traffic};
+use crate::coordinator::safe::reservation::Traffic;
 use crate::coordinator::{Cycle, Rules};
+use crate::geometry::floor_index;
 use crate::messages::{Authority, Header, State, TO_GOAL, ToRobot};
 use crate::path::PathId;
-use crate::world::World;
+use crate::section::Span;
+use crate::world::{Vehicle, World};
+use hil_core::case_study::ParameterError;
 use hil_core::time::Instant;
 
 /// The rules of the safe mode.
@@ -196,7 +196,6 @@ impl SafeRules {
             view.round_trip.sent(cycle.now, sequence);
             let is_goal = index == self.traffic.last(robot);
             let to = i32::try_from(index).expect("paths have fewer than 2^31 poses");
-            self.counts.messages += 1;
             (cycle.send)(ToRobot::Authority(Authority {
                 header: Header {
                     fleet_id: self.fleet_id,
@@ -252,7 +251,6 @@ impl Rules for SafeRules {
         }
         self.lease.on_state(now, state, &mut self.counts);
         let view = &mut self.robots[robot];
-        let was_shrinking = view.ledger.is_shrinking();
         let was_lower = view.ledger.lower();
         let tells_place = state.path_index >= i32::try_from(was_lower).unwrap_or(i32::MAX)
             && header.mission_id == view.ledger.mission_id();
@@ -269,11 +267,7 @@ impl Rules for SafeRules {
                 return;
             }
             StateEffect::Exceeded => self.counts.authorities_exceeded += 1,
-            StateEffect::Refused => self.counts.shrinks_refused += 1,
-            StateEffect::News => {
-                let is_agreed = was_shrinking && !view.ledger.is_shrinking();
-                self.counts.shrinks_acknowledged += u64::from(is_agreed);
-            }
+            StateEffect::Refused | StateEffect::News => {}
         }
         view.round_trip.shown(now, state.applied_sequence);
         if is_newest {
@@ -316,5 +310,343 @@ impl Rules for SafeRules {
 
     fn resets_stuck_robots(&self) -> bool {
         false
+    }
+}
+
+/// The lease and what watches its assumption.
+///
+/// Authorities that end by themselves: with a measured bound on delays, way can be taken back
+/// from a robot that does not answer. Off unless a lease is set; without one nothing here acts.
+///
+/// Let the retraction be first sent at `t`, the lease be `L`, the bound `D`. What was sent before
+/// arrives by `t + D` and ends by `t + D + L`; from then the robot brakes. A state received at `r`
+/// was sampled at `r - D` or later, so the robot's way is at most
+/// `s + v max(0, t + D + L - (r - D)) + v^2 / 2a`, where `s` is the way in that state and `v`, `a`
+/// its largest speed and deceleration. Beyond that, and beyond what the retraction leaves, it
+/// will not come; so after `t + D + L + v/a` that is the bound on its authority.
+///
+/// The bound is an assumption about the network. Where both ends share a clock each state's age
+/// checks it; one above the bound freezes all grants for as long as a lease may run on it. Only
+/// states are watched: a command that takes longer than the bound while states do not is not seen,
+/// and the lease is then no safer than the assumption. Without a lease nothing rests on it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct LeaseWatch {
+    lease_ns: i64,
+    delay_max_ns: i64,
+    clock_is_shared: bool,
+    frozen_until: Instant,
+}
+
+impl LeaseWatch {
+    pub(crate) fn new(parameters: &SafeParameters, clock_is_shared: bool) -> Self {
+        Self {
+            lease_ns: nanoseconds(parameters.lease_ms),
+            delay_max_ns: nanoseconds(parameters.delay_bound_ms),
+            clock_is_shared,
+            frozen_until: Instant::ZERO,
+        }
+    }
+
+    /// 0 without lease.
+    pub(crate) fn lease_ns(&self) -> i64 {
+        self.lease_ns
+    }
+
+    /// True when the robot's authority has to be sent anew so that it does not end.
+    pub(crate) fn renews(&self, ledger: &Ledger) -> bool {
+        self.lease_ns > 0 && ledger.newest().0 > 0 && !ledger.is_done()
+    }
+
+    /// Checks the age of a state against the bound.
+    pub(crate) fn on_state(&mut self, now: Instant, state: &State, counts: &mut SafeCounts) {
+        if self.lease_ns == 0 || !self.clock_is_shared {
+            return;
+        }
+        if now.as_ns().saturating_sub(state.sampled_ns) > self.delay_max_ns {
+            counts.delay_bound_violations += 1;
+            let pause_ns = self.lease_ns.saturating_add(self.delay_max_ns);
+            self.frozen_until = Instant::from_ns(now.as_ns().saturating_add(pause_ns));
+        }
+    }
+
+    pub(crate) fn is_frozen(&self, now: Instant) -> bool {
+        now < self.frozen_until
+    }
+}
+
+impl SafeRules {
+    /// Lowers the bounds of robots whose retracted authority has ended by itself.
+    pub(crate) fn expire_leases(&mut self, now: Instant) {
+        if self.lease.lease_ns == 0 || self.lease.is_frozen(now) {
+            return;
+        }
+        let vehicle = self.world.vehicle;
+        let braking_s = vehicle.speed_max_mps / vehicle.acceleration_mps2;
+        for robot in 0..self.robots.len() {
+            let view = &self.robots[robot];
+            let Some(path) = self
+                .traffic
+                .path(robot)
+                .filter(|_| view.ledger.is_shrinking())
+            else {
+                continue;
+            };
+            let ended_ns = view
+                .retracted
+                .as_ns()
+                .saturating_add(self.lease.delay_max_ns)
+                .saturating_add(self.lease.lease_ns);
+            let since_ended_s = now.seconds_since(Instant::from_ns(ended_ns));
+            if since_ended_s < braking_s {
+                continue;
+            }
+            let sampled_ns = view.heard.as_ns().saturating_sub(self.lease.delay_max_ns);
+            let driving_s = Instant::from_ns(ended_ns)
+                .seconds_since(Instant::from_ns(sampled_ns))
+                .max(0.0);
+            let spacing_m = self.world.path(path).spacing_m();
+            let way_m = spacing_m * (view.ledger.lower() + 1) as f64
+                + vehicle.speed_max_mps * driving_s
+                + 0.5 * vehicle.speed_max_mps * braking_s;
+            let furthest = floor_index((way_m / spacing_m).ceil());
+            let (_, asked) = view.ledger.newest();
+            let bound = furthest.max(asked);
+            if bound < view.ledger.bound() {
+                self.robots[robot].ledger.expire_to(bound);
+                self.counts.leases_expired += 1;
+                self.update_span(robot);
+            }
+        }
+    }
+}
+
+fn nanoseconds(milliseconds: f64) -> i64 {
+    let duration = Duration::from_secs_f64(milliseconds * 1e-3);
+    hil_core::time::duration_ns(duration)
+}
+
+/// Time from sending an authority to the first state that shows it, as seen by the sender alone,
+/// so that no clocks are compared. It follows a longer one at once and a shorter one slowly.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct RoundTrip {
+    estimate_s: f64,
+    asked: Option<(u32, Instant)>,
+}
+
+/// A peer that is silent for longer is not waited for with ever more authority.
+const ROUND_TRIP_MAX_S: f64 = 10.0;
+/// Part of the difference by which a shorter round trip lowers the estimate.
+const DECAY: f64 = 0.1;
+
+impl RoundTrip {
+    /// An authority with a new sequence is sent; one is timed at a time.
+    pub(crate) fn sent(&mut self, now: Instant, sequence: u32) {
+        if self.asked.is_none() {
+            self.asked = Some((sequence, now));
+        }
+    }
+
+    /// A state shows `sequence` applied.
+    pub(crate) fn shown(&mut self, now: Instant, sequence: u32) {
+        let Some((asked, at)) = self.asked else {
+            return;
+        };
+        if sequence < asked {
+            return;
+        }
+        self.asked = None;
+        let sample_s = now.seconds_since(at).clamp(0.0, ROUND_TRIP_MAX_S);
+        self.estimate_s = follow(self.estimate_s, sample_s);
+    }
+
+    /// A new mission numbers its authorities anew; the estimate is kept.
+    pub(crate) fn forget_question(&mut self) {
+        self.asked = None;
+    }
+
+    pub(crate) fn estimate_s(&self) -> f64 {
+        self.estimate_s
+    }
+}
+
+/// Time from one control cycle to the next as it really is: a host that overruns its period gives
+/// authority less often, so robots need more of it at once.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct CycleTime {
+    estimate_s: f64,
+    last: Option<Instant>,
+}
+
+impl CycleTime {
+    /// A cycle begins.
+    pub(crate) fn begin(&mut self, now: Instant) {
+        if let Some(last) = self.last.replace(now) {
+            let sample_s = now.seconds_since(last).clamp(0.0, ROUND_TRIP_MAX_S);
+            self.estimate_s = follow(self.estimate_s, sample_s);
+        }
+    }
+
+    /// What to expect, at least the nominal period.
+    pub(crate) fn expected_s(&self, nominal: Duration) -> f64 {
+        self.estimate_s.max(nominal.as_secs_f64())
+    }
+}
+
+/// Follows a larger sample at once and a smaller one slowly.
+fn follow(estimate_s: f64, sample_s: f64) -> f64 {
+    sample_s.max(estimate_s + DECAY * (sample_s - estimate_s))
+}
+
+/// Way a robot at `speed_mps` makes at most in `time_s`, and then needs to stop.
+pub(crate) fn reach_m(vehicle: &Vehicle, speed_mps: f64, time_s: f64) -> f64 {
+    let (speed_max_mps, acceleration_mps2) = (vehicle.speed_max_mps, vehicle.acceleration_mps2);
+    let speed_mps = speed_mps.clamp(0.0, speed_max_mps);
+    let accelerating_s = ((speed_max_mps - speed_mps) / acceleration_mps2).min(time_s);
+    let end_mps = speed_mps + acceleration_mps2 * accelerating_s;
+    0.5 * (speed_mps + end_mps) * accelerating_s
+        + end_mps * (time_s - accelerating_s)
+        + end_mps * end_mps / (2.0 * acceleration_mps2)
+}
+
+/// Seconds until an authority sent a control cycle from now is sure to be at the robot, counted
+/// from when the state known now was sampled.
+pub(crate) fn lookahead_s(cycle_s: f64, round_trip_s: f64, reserve_ms: f64) -> f64 {
+    cycle_s + round_trip_s + 1e-3 * reserve_ms
+}
+
+/// `[case.parameters.coordinator.safe]`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SafeParameters {
+    /// How far robots may stop from the end of their authority, 0..=1000 m; 0 for the exact
+    /// tracker, [`RobotParameters::stop_error_bound_m`](crate::robot::RobotParameters::stop_error_bound_m) for the stepped one.
+    pub stop_error_m: f64,
+    /// Authority beyond what a robot needs in order not to brake before the next one comes, as
+    /// time at its speed, 0..=60000 ms.
+    pub reserve_ms: f64,
+    /// How long a robot waits before the order of all is kept until it is through, 1..=100000 s.
+    pub patience_s: f64,
+    /// Take authority back, by acknowledged shrinks, where the policy prefers another robot.
+    pub takes_back: bool,
+    /// How long an authority holds after its receipt, 0..=3600000 ms; 0 for ever. Needs
+    /// `delay_bound_ms`.
+    pub lease_ms: f64,
+    /// Measured largest delay of a message either way, its error included, 0..=3600000 ms. Only
+    /// with a lease; with a shared clock it is watched.
+    pub delay_bound_ms: f64,
+}
+
+impl Default for SafeParameters {
+    fn default() -> Self {
+        Self {
+            stop_error_m: 0.0,
+            reserve_ms: 200.0,
+            patience_s: 60.0,
+            takes_back: true,
+            lease_ms: 0.0,
+            delay_bound_ms: 0.0,
+        }
+    }
+}
+
+impl SafeParameters {
+    /// Checks every number against its range.
+    ///
+    /// # Errors
+    /// Names the key, its value and its range.
+    pub fn check(&self) -> Result<(), ParameterError> {
+        let numbers = [
+            ("stop_error_m", self.stop_error_m, 0.0, 1000.0),
+            ("reserve_ms", self.reserve_ms, 0.0, 60_000.0),
+            ("patience_s", self.patience_s, 1.0, 100_000.0),
+            ("lease_ms", self.lease_ms, 0.0, 3_600_000.0),
+            ("delay_bound_ms", self.delay_bound_ms, 0.0, 3_600_000.0),
+        ];
+        for (key, value, min, max) in numbers {
+            let key = format!("coordinator.safe.{key}");
+            ParameterError::check(&key, value, min..=max, &format!("{min} to {max}"))?;
+        }
+        if self.lease_ms > 0.0 && self.delay_bound_ms <= 0.0 {
+            return Err(ParameterError::new(
+                "coordinator.safe.delay_bound_ms",
+                "0 is no bound; a lease needs the largest delay, in ms",
+            ));
+        }
+        Ok(())
+    }
+
+    /// See [`SafeParameters::patience_s`].
+    pub fn patience(&self) -> Duration {
+        Duration::from_secs_f64(self.patience_s)
+    }
+
+    /// The stop error in poses of `world`'s paths, one pose for rounding added.
+    pub(crate) fn stop_margin(&self, world: &World) -> StopMargin {
+        let spacing_m = world
+            .paths
+            .ids()
+            .filter_map(|id| world.paths.get(id))
+            .map(|path| path.spacing_m())
+            .fold(f64::INFINITY, f64::min);
+        let poses = floor_index((self.stop_error_m / spacing_m).ceil()) + 1;
+        StopMargin {
+            below: poses,
+            above: poses,
+        }
+    }
+}
+
+#[cfg(test)]
+mod horizon_tests {
+    use super::*;
+    use crate::geometry::Footprint;
+
+    const CART: Vehicle = Vehicle {
+        footprint: Footprint {
+            length_m: 2.0,
+            width_m: 0.5,
+        },
+        speed_max_mps: 2.0,
+        acceleration_mps2: 1.0,
+    };
+
+    #[test]
+    fn reach_follows_its_closed_form() {
+        let check = |speed, time, expected: f64| {
+            let reach = reach_m(&CART, speed, time);
+            assert!((reach - expected).abs() < 1e-12, "{reach} {expected}");
+        };
+        check(2.0, 0.0, 2.0);
+        check(2.0, 1.5, 5.0);
+        check(0.0, 1.0, 1.0);
+        check(0.0, 3.0, 2.0 + 2.0 + 2.0);
+    }
+
+    #[test]
+    fn cycles_that_overrun_count_as_long_as_they_are() {
+        let mut cycles = CycleTime::default();
+        let nominal = Duration::from_secs(1);
+        for s in [0, 1, 2, 6] {
+            cycles.begin(Instant::from_ns(s * 1_000_000_000));
+        }
+        assert!((cycles.expected_s(nominal) - 4.0).abs() < 1e-12);
+        for s in 7..100 {
+            cycles.begin(Instant::from_ns(s * 1_000_000_000));
+        }
+        assert!((cycles.expected_s(nominal) - 1.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn a_longer_round_trip_counts_at_once_and_a_shorter_one_slowly() {
+        let mut trip = RoundTrip::default();
+        let at = |ms: i64| Instant::from_ns(ms * 1_000_000);
+        trip.sent(at(0), 1);
+        trip.sent(at(1000), 2);
+        trip.shown(at(1400), 0);
+        trip.shown(at(1500), 2);
+        assert!((trip.estimate_s() - 1.5).abs() < 1e-12);
+        trip.sent(at(2000), 3);
+        trip.shown(at(2100), 3);
+        assert!((trip.estimate_s() - 1.36).abs() < 1e-12);
     }
 }

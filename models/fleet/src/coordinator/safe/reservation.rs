@@ -9,27 +9,8 @@
 use std::sync::Arc;
 
 use crate::path::PathId;
-use crate::section::{Section, Side};
+use crate::section::{Section, Side, Span};
 use crate::world::{BayIndex, World};
-
-/// A range of poses of a path, both ends included.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Span {
-    /// First pose.
-    pub lower: usize,
-    /// Last pose.
-    pub upper: usize,
-}
-
-impl Span {
-    /// One pose.
-    pub const fn at(index: usize) -> Self {
-        Self {
-            lower: index,
-            upper: index,
-        }
-    }
-}
 
 /// A critical section that lies ahead of one robot and, unless passed meanwhile, of another.
 #[derive(Debug, Clone)]
@@ -72,7 +53,8 @@ struct Way {
 pub struct Traffic {
     world: Arc<World>,
     ways: Vec<Option<Way>>,
-    spans: Vec<Span>,
+    /// All reservations.
+    pub(crate) spans: Vec<Span>,
     /// Per robot its contacts, by robot and along the path.
     contacts: Vec<Vec<Contact>>,
 }
@@ -115,11 +97,6 @@ impl Traffic {
     /// The reservation of `robot`.
     pub fn span(&self, robot: usize) -> Span {
         self.spans[robot]
-    }
-
-    /// All reservations.
-    pub(crate) fn spans(&self) -> &[Span] {
-        &self.spans
     }
 
     /// Last pose of the path `robot` is on; 0 for a robot in a bay that no path touches.
@@ -212,24 +189,6 @@ impl Traffic {
         })
     }
 
-    /// As [`Traffic::first_overlap`], from the section library alone: what tests check the
-    /// above against.
-    pub fn first_overlap_by_library(&self) -> Option<(usize, usize)> {
-        let library = &self.world.guarded_sections;
-        let count = self.robot_count();
-        let pairs =
-            (0..count).flat_map(|robot| (robot + 1..count).map(move |other| (robot, other)));
-        pairs
-            .filter_map(|(robot, other)| Some((robot, other, self.ways[robot]?, self.ways[other]?)))
-            .find(|&(robot, other, way, others)| {
-                let sections = library.between(way.path, others.path);
-                let (own, taken) = (self.spans[robot], self.spans[other]);
-                let mut sections = sections.iter();
-                sections.any(|section| common_pair(section, own, taken).is_some())
-            })
-            .map(|(robot, other, ..)| (robot, other))
-    }
-
     fn contacts_between(
         &self,
         first: PathId,
@@ -271,4 +230,25 @@ fn common_pair(section: &Section, own: Span, taken: Span) -> Option<(usize, usiz
             })
             .map(|partner| (index, partner))
     })
+}
+
+#[cfg(test)]
+impl Traffic {
+    /// As [`Traffic::first_overlap`], from the section library alone: what tests check the
+    /// above against.
+    pub(crate) fn first_overlap_by_library(&self) -> Option<(usize, usize)> {
+        let library = &self.world.guarded_sections;
+        let count = self.robot_count();
+        let pairs =
+            (0..count).flat_map(|robot| (robot + 1..count).map(move |other| (robot, other)));
+        pairs
+            .filter_map(|(robot, other)| Some((robot, other, self.ways[robot]?, self.ways[other]?)))
+            .find(|&(robot, other, way, others)| {
+                let sections = library.between(way.path, others.path);
+                let (own, taken) = (self.spans[robot], self.spans[other]);
+                let mut sections = sections.iter();
+                sections.any(|section| common_pair(section, own, taken).is_some())
+            })
+            .map(|(robot, other, ..)| (robot, other))
+    }
 }

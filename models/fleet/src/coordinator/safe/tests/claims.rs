@@ -4,7 +4,7 @@ use super::rig::{CONDITIONS, Chaos, Rig, RigSetup, safe_parameters};
 use super::world::random_scene;
 use crate::coordinator::parameters::CoordinatorParameters;
 use crate::coordinator::policy::PolicyName;
-use crate::coordinator::safe::parameters::SafeParameters;
+use crate::coordinator::safe::SafeParameters;
 use crate::mission::MissionMode;
 use crate::robot::{RobotParameters, TrackerKind};
 use crate::scenario::{Scenario, Scene, WorldParameters};
