@@ -21,8 +21,8 @@ pub(super) struct Judge<'a> {
     flight_ns: i64,
     interruptions: &'a [Interruption],
     lost_counts: Vec<u64>,
-    /// The interruption that cost the message judged last.
-    last_hit: Option<usize>,
+    /// The interruption that cost the message judged last, by its place in the context.
+    pub(super) last_hit: Option<usize>,
     /// Where the previous message of known place was, for those without any.
     previous_producer_ns: Option<i64>,
     previous_consumer_ns: Option<i64>,
@@ -70,11 +70,6 @@ impl<'a> Judge<'a> {
         self.previous_producer_ns = place.producer_ns.or(self.previous_producer_ns);
         self.previous_consumer_ns = place.consumer_ns.or(self.previous_consumer_ns);
         fate
-    }
-
-    /// The interruption that cost the message judged last, by its place in the context.
-    pub(super) const fn last_interruption(&self) -> Option<usize> {
-        self.last_hit
     }
 
     /// What each interruption cost, with the silence it caused.

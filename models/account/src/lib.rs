@@ -374,7 +374,7 @@ pub fn each_judged(
     let mut judge = fate::Judge::new(&records, context, &join);
     for joined in join {
         let fate = judge.judge(&joined);
-        take(&joined, fate, judge.last_interruption());
+        take(&joined, fate, judge.last_hit);
     }
 }
 

@@ -138,13 +138,13 @@ pub(super) fn stretches(constraints: &[Constraint], settings: &ClockSettings) ->
     let mut found = Vec::new();
     let (mut start, mut from_ns) = (0, i64::MIN);
     while start < constraints.len() {
-        let Some(after) = first_contradiction(&constraints[start..], settings) else {
+        let Some(after) = contradiction(constraints[start..].iter().enumerate(), settings) else {
             found.push(stretch(&constraints[start..], from_ns, i64::MAX));
             break;
         };
         let after = start + after;
-        let before = last_contradiction(&constraints[start..=after], settings)
-            .map_or(start, |index| start + index);
+        let until = constraints[start..=after].iter().enumerate().rev();
+        let before = contradiction(until, settings).map_or(start, |index| start + index);
         let zone = (constraints[before].first_ns, constraints[after].last_ns);
         found.push(stretch(&constraints[start..before], from_ns, zone.0));
         from_ns = zone.1;
@@ -166,14 +166,6 @@ fn stretch(constraints: &[Constraint], from_ns: i64, until_ns: i64) -> Stretch {
         from_ns,
         until_ns,
     }
-}
-
-fn first_contradiction(constraints: &[Constraint], settings: &ClockSettings) -> Option<usize> {
-    contradiction(constraints.iter().enumerate(), settings)
-}
-
-fn last_contradiction(constraints: &[Constraint], settings: &ClockSettings) -> Option<usize> {
-    contradiction(constraints.iter().enumerate().rev(), settings)
 }
 
 fn contradiction<'a>(

@@ -176,7 +176,7 @@ impl CaseStudy for Teleoperation {
 
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {
         parameters.check()?;
-        let settings = parameters.controller_settings()?;
+        let settings = parameters.egm.settings()?;
         let motion = parameters.motion()?;
         Ok(Self {
             parameters,

@@ -12,7 +12,7 @@ use crate::follower::MappingSettings;
 use crate::motion::{Motion, Recording};
 use crate::swing::Swing;
 use hil_arm::egm::messages::EgmStartParameters;
-use hil_arm::egm::parameters::{ControllerSettings, EgmParameters};
+use hil_arm::egm::parameters::EgmParameters;
 use hil_core::case_study::ParameterError;
 
 /// What the left arm does.
@@ -286,14 +286,6 @@ impl TeleoperationParameters {
     /// From frame to frame.
     pub(crate) fn frame_period(&self) -> Duration {
         Duration::from_secs_f64(1.0 / self.rate_hz)
-    }
-
-    /// The robot's settings in force.
-    ///
-    /// # Errors
-    /// The first key outside its range, as `egm.<key>`.
-    pub fn controller_settings(&self) -> Result<ControllerSettings, ParameterError> {
-        self.egm.settings()
     }
 
     pub(crate) fn mapping(&self, is_mirrored: bool) -> MappingSettings {

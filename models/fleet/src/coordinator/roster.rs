@@ -73,11 +73,6 @@ impl Roster {
         &self.robots
     }
 
-    /// The same, to keep their order.
-    pub fn sections_mut(&mut self) -> &mut SectionBook {
-        &mut self.sections
-    }
-
     /// Takes over a robot's state, if it is one of the robot's present mission.
     pub fn on_state(&mut self, now: Instant, state: &State, counts: &mut CoordinatorCounts) {
         let header = &state.header;

@@ -182,8 +182,7 @@ impl LegacyRules {
 
     fn keep_orders(&self, cycle: &mut Cycle<'_>) {
         for (slot, decision) in self.decisions.iter().enumerate() {
-            let (Some(active), Some(decision)) =
-                (cycle.roster.sections_mut().get_mut(slot), decision)
+            let (Some(active), Some(decision)) = (cycle.roster.sections.get_mut(slot), decision)
             else {
                 continue;
             };

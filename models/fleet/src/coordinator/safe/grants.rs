@@ -99,7 +99,7 @@ impl SafeRules {
         let path = self.world.path(self.traffic.path(robot)?);
         let time_s = lookahead_s(
             self.cycles.expected_s(self.control_period),
-            view.round_trip.estimate_s(),
+            view.round_trip.estimate_s,
             self.reserve_ms,
         );
         // The robot may be almost a pose beyond the one it passed last.

@@ -463,10 +463,6 @@ impl RoundTrip {
     pub(crate) fn forget_question(&mut self) {
         self.asked = None;
     }
-
-    pub(crate) fn estimate_s(&self) -> f64 {
-        self.estimate_s
-    }
 }
 
 /// Time from one control cycle to the next as it really is: a host that overruns its period gives
@@ -644,9 +640,9 @@ mod horizon_tests {
         trip.sent(at(1000), 2);
         trip.shown(at(1400), 0);
         trip.shown(at(1500), 2);
-        assert!((trip.estimate_s() - 1.5).abs() < 1e-12);
+        assert!((trip.estimate_s - 1.5).abs() < 1e-12);
         trip.sent(at(2000), 3);
         trip.shown(at(2100), 3);
-        assert!((trip.estimate_s() - 1.36).abs() < 1e-12);
+        assert!((trip.estimate_s - 1.36).abs() < 1e-12);
     }
 }
