@@ -223,7 +223,8 @@ pub(crate) struct LiveClocks {
     chosen: BTreeMap<String, Basis>,
     /// Of hosts whose clock is another one, by what their gateways noted; known at the end.
     noted_ns: BTreeMap<String, i64>,
-    has_one_clock: Option<bool>,
+    /// How the clocks stand, as far as it is known by now.
+    pub(crate) has_one_clock: Option<bool>,
 }
 
 impl LiveClocks {
@@ -247,11 +248,6 @@ impl LiveClocks {
 
     fn is_here(&self, host: &str) -> bool {
         host.is_empty() || self.hosts_here.iter().any(|here| here == host)
-    }
-
-    /// How the clocks stand, as far as it is known by now.
-    pub(crate) fn learn(&mut self, has_one_clock: Option<bool>) {
-        self.has_one_clock = has_one_clock;
     }
 
     /// True when stamps of both ends of a link compare.
@@ -360,7 +356,7 @@ mod tests {
         two.note("there", 99);
         assert_eq!(two.message_ns("there", &envelope(false)), Some(14));
         // What comes to be known later moves no time that was chosen.
-        two.learn(Some(true));
+        two.has_one_clock = Some(true);
         assert_eq!(two.message_ns("there", &envelope(true)), Some(1070));
         assert_eq!(two.words()["there/offset_ns"], "9");
     }

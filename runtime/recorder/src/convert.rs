@@ -1,7 +1,6 @@
 //! A finished run's folder as one recording. Everything is put on one axis of time, the instants of
 //! publication; what each topic looks like is decided in the modules it calls.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 use std::thread;
 use std::time::Duration;
@@ -99,10 +98,9 @@ pub(crate) fn convert(
         topic_count: recording.topic_count(),
         written_count: recording.finish()?,
         message_count: topics.counts.message_count,
-        missed: BTreeMap::new(),
         words,
         has_gaps: run.gaps.is_any(),
-        signal: None,
+        ..Recorded::default()
     })
 }
 

@@ -16,7 +16,7 @@ use crate::run_topics::{Drawn, Plan, RunTopics, Wanted};
 use crate::sink::Sink;
 
 /// What is known of one channel while its run goes.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct LiveChannel {
     receiving_host: String,
     joining: Joining,
@@ -265,10 +265,8 @@ impl LiveChannel {
         Self {
             receiving_host: one.to_host.clone().unwrap_or_default(),
             joining: Joining::new(announced.map_or(&[], |one| &one.noted)),
-            written: Seen::default(),
-            due: Seen::default(),
-            outstanding_count: 0,
             is_from_memory: channel.is_unrecorded(),
+            ..Self::default()
         }
     }
 

@@ -40,7 +40,7 @@ const GROUND_PAUSE: Duration = Duration::from_millis(20);
 const PROBLEMS_MAX: usize = 1000;
 
 /// What a recording, of a run that goes or of a folder, came to.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Recorded {
     /// The files, in order.
     pub(crate) paths: Vec<PathBuf>,
@@ -237,7 +237,7 @@ impl LiveRecording {
     }
 
     fn poll(&mut self) -> Result<Poll, WriteError> {
-        self.live.clocks.learn(self.feed.has_one_clock());
+        self.live.clocks.has_one_clock = self.feed.has_one_clock();
         let mut failed = None;
         let polled = self.feed.poll(&mut |event| {
             match &event {

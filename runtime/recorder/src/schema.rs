@@ -36,10 +36,15 @@ pub(crate) fn of_layout(
     size_bytes: usize,
 ) -> Result<Schema, LayoutFault> {
     layout::check(fields, size_bytes)?;
-    let (package, name) = protobuf_name(message);
-    let full = full_name(&package, &name);
-    let proto = record(&name, &format!(".{full}"), fields);
-    Ok(file(&package, &full, proto))
+    // `hil.EgmCommand.v1` is `v1` of the package `hil.EgmCommand`.
+    let full = message
+        .split('.')
+        .map(identifier)
+        .collect::<Vec<_>>()
+        .join(".");
+    let (package, name) = full.rsplit_once('.').unwrap_or(("", full.as_str()));
+    let proto = record(name, &format!(".{full}"), fields);
+    Ok(file(package, &full, proto))
 }
 
 /// The schema of the bytes of a message whose fields nobody stated: protobuf's own wrapper.
@@ -194,23 +199,8 @@ fn scalar_type(kind: &KindDescription) -> Type {
     }
 }
 
-/// Package and name for a message: `hil.EgmCommand.v1` is `v1` of `hil.EgmCommand`. What protobuf
-/// does not allow in names becomes `_`.
-fn protobuf_name(message: &str) -> (String, String) {
-    let parts: Vec<String> = message.split('.').map(identifier).collect();
-    let (last, package) = parts.split_last().expect("a split has at least one part");
-    (package.join("."), last.clone())
-}
-
-fn full_name(package: &str, name: &str) -> String {
-    if package.is_empty() {
-        name.to_owned()
-    } else {
-        format!("{package}.{name}")
-    }
-}
-
-/// `text` as protobuf allows names: letters, digits and `_`, no digit first.
+/// `text` as protobuf allows names: letters, digits and `_`, no digit first. What it does not allow becomes
+/// `_`.
 fn identifier(text: &str) -> String {
     let text = text.strip_prefix("r#").unwrap_or(text);
     let is_allowed = |c: char| c.is_ascii_alphanumeric() || c == '_';

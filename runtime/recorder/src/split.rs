@@ -84,14 +84,6 @@ struct Closing {
 }
 
 impl Closing {
-    /// Waits until one more may be on its way.
-    fn make_room(&mut self) -> Result<(), WriteError> {
-        while self.files.len() >= CLOSING_MAX {
-            self.join_oldest()?;
-        }
-        Ok(())
-    }
-
     /// Waits for all, whatever became of one; how many messages they hold, or the first failure.
     fn join_all(&mut self) -> Result<u64, WriteError> {
         let mut first = Ok(());
@@ -197,7 +189,9 @@ impl Files {
     /// When the next cannot be begun, or one of those before was not completed; how the others
     /// ended is said by [`Self::finish`].
     pub(crate) fn next(&mut self) -> Result<(), WriteError> {
-        self.closing.make_room()?;
+        while self.closing.files.len() >= CLOSING_MAX {
+            self.closing.join_oldest()?;
+        }
         let path = numbered(&self.target, self.done.len() + 2);
         check_target(&path, Path::new(""), self.may_replace)?;
         let next = Recording::create_live(&path)?;

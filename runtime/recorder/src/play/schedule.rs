@@ -17,7 +17,7 @@ pub(crate) struct Schedule {
 }
 
 /// How well the grid was kept.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Punctuality {
     /// Messages published.
     pub(crate) published_count: u64,
@@ -62,11 +62,8 @@ impl Punctuality {
     /// For messages on `channel_count` channels.
     pub(crate) fn of(channel_count: usize) -> Self {
         Self {
-            published_count: 0,
-            late_count: 0,
-            bunched_count: 0,
-            worst_ns: 0,
             last: vec![None; channel_count],
+            ..Self::default()
         }
     }
 

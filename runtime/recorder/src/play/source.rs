@@ -98,9 +98,7 @@ pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Mate
     });
     let mut reading = Reading {
         wanted: wanted.collect::<Result<_, Failure>>()?,
-        schemas: BTreeMap::new(),
-        topics: BTreeMap::new(),
-        messages: Vec::new(),
+        ..Reading::default()
     };
     let file = path.display();
     let mut fault = None;
@@ -140,6 +138,7 @@ pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Mate
     })
 }
 
+#[derive(Default)]
 struct Reading {
     wanted: Vec<Wanted>,
     schemas: BTreeMap<u16, Schema>,

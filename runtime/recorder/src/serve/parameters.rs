@@ -114,12 +114,9 @@ impl Links {
             wishes: Arc::default(),
         };
         let worker = Worker {
-            run: None,
-            folder: None,
-            launches: BTreeMap::new(),
             change: Arc::clone(&links.change),
-            topology: Value::Null,
             wishes: Arc::clone(&links.wishes),
+            ..Worker::default()
         };
         thread::spawn(move || worker.work(&asked));
         links
@@ -185,6 +182,7 @@ impl ParameterHandler for Links {
 }
 
 /// The thread that gives orders.
+#[derive(Default)]
 struct Worker {
     run: Option<RunLinks>,
     folder: Option<PathBuf>,

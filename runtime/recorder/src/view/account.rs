@@ -30,7 +30,7 @@ const LISTED_MAX: usize = 64;
 const SHOWN_MAX: usize = 5;
 
 /// One channel.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Account {
     way: Way,
     is_by_message: bool,
@@ -79,27 +79,15 @@ fn count(of: &mut Option<u64>) {
 impl Account {
     /// The account of `channel`; `has_one_clock` says that stamps of both ends compare.
     pub(crate) fn new(channel: &ChannelFacts, has_one_clock: bool) -> Self {
-        let has_link = channel.link.is_some();
         let way = Way {
-            has_link,
+            has_link: channel.link.is_some(),
             has_one_clock,
         };
         Self {
             segments: way.segments().iter().map(|_| Samples::default()).collect(),
             way,
             is_by_message: channel.is_by_message,
-            under_way: BTreeMap::new(),
-            lost: BTreeMap::new(),
-            newest: BTreeMap::new(),
-            untold: Vec::new(),
-            shown: Vec::new(),
-            counts: Counts::default(),
-            rate: Recent::default(),
-            window_lost: Recent::default(),
-            whole: Samples::default(),
-            left_ns: None,
-            arrived_ns: None,
-            period_ns: 0,
+            ..Self::default()
         }
     }
 
@@ -308,7 +296,7 @@ const LINK_SEGMENTS: [&str; 7] = [
 const LOCAL_SEGMENTS: [&str; 1] = ["published-taken"];
 
 /// What decides which lengths a channel's stamps give.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct Way {
     /// It crosses a link.
     has_link: bool,

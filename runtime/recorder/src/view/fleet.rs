@@ -75,7 +75,7 @@ struct Id {
 }
 
 /// The fleets of a run.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct FleetView {
     robots: BTreeMap<Id, Robot>,
     collisions: Collisions,
@@ -116,14 +116,9 @@ impl FleetView {
         let world = serde_json::from_value::<hil_fleet::FleetParameters>(parameters.clone());
         let vehicle = world.as_ref().ok().map(|one| one.world.vehicle().footprint);
         Self {
-            robots: BTreeMap::new(),
-            collisions: Collisions::default(),
             vehicle,
             making: Some(ground::make(parameters.clone())),
-            ground: None,
-            areas: None,
-            offset_ns: 0,
-            problem: None,
+            ..Self::default()
         }
     }
 
