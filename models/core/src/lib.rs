@@ -3,7 +3,7 @@
 //! Nothing here reads a clock, blocks, or touches a file, a socket or a thread: time enters as
 //! `now`, randomness as a seeded [`random::RandomStream`]. Read in this order:
 //!
-//! 1. [`time`] and [`message`]: instants, periodic timers, fixed-size messages.
+//! 1. [`time`] and [`mod@message`]: instants, periodic timers, fixed-size messages.
 //! 2. [`component`] and [`case_study`]: what a user writes.
 //! 3. [`endpoint`] and [`simulation`]: what drives it, in real and in virtual time.
 //! 4. [`link_model`]: what the driver asks of a link.

@@ -111,6 +111,48 @@ impl Envelope {
 
 const _: () = assert!(size_of::<Envelope>() == 64);
 
+/// Declares a structure of plain numbers whose fields can be read without its type; with a name
+/// it is a [`Message`]. The build fails unless the fields cover it, see
+/// [`layout!`](crate::layout!).
+///
+/// ```
+/// use bytemuck::{Pod, Zeroable};
+/// use hil_core::layout::FieldKind;
+/// use hil_core::message::Message;
+///
+/// hil_core::message! {
+///     /// What the wheels do.
+///     #[derive(Debug, Clone, Copy, Pod, Zeroable)]
+///     #[repr(C)]
+///     pub struct Wheels = "example.Wheels.v1" {
+///         /// Left and right.
+///         pub speed_mps: [f64; 2],
+///         /// Bits.
+///         pub flags: u64,
+///     }
+/// }
+/// assert_eq!(Wheels::NAME, "example.Wheels.v1");
+/// assert_eq!(Wheels::FIELDS[1].kind, FieldKind::U64);
+/// ```
+#[macro_export]
+macro_rules! message {
+    ($(#[$meta:meta])* $vis:vis struct $structure:ident $(= $name:literal)? {
+        $($(#[$field_meta:meta])* $field_vis:vis $field:ident: $kind:ty),+ $(,)?
+    }) => {
+        $(#[$meta])*
+        $vis struct $structure {
+            $($(#[$field_meta])* $field_vis $field: $kind,)+
+        }
+
+        $crate::layout!($structure { $($field),+ });
+
+        $(impl $crate::message::Message for $structure {
+            const NAME: &'static str = $name;
+            const FIELDS: &'static [$crate::layout::Field] = Self::LAYOUT;
+        })?
+    };
+}
+
 /// The messages one side of a component takes or gives: one [`Message`] type, or an enum made
 /// by [`message_set!`](crate::message_set) with one variant per port.
 pub trait MessageSet: Debug + Copy + 'static {

@@ -5,32 +5,23 @@
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
-use hil_core::layout::Field;
-use hil_core::message::Message;
-
-/// What the three messages between controller and robot begin with, 24 bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
-#[repr(C)]
-pub struct Header {
-    /// Which of the independent fleets that share the channel.
-    pub fleet_id: u32,
-    /// Robot within its fleet, from 0.
-    pub robot_id: u32,
-    /// Counts the sender's messages of this kind to or from this robot, from 1 (`headerId`).
-    pub header_id: u32,
-    /// The mission meant (`orderId`); 0 is none.
-    pub mission_id: u32,
-    /// When the sender gave the message, nanoseconds on its own clock.
-    pub sent_ns: i64,
+hil_core::message! {
+    /// What the three messages between controller and robot begin with, 24 bytes.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct Header {
+        /// Which of the independent fleets that share the channel.
+        pub fleet_id: u32,
+        /// Robot within its fleet, from 0.
+        pub robot_id: u32,
+        /// Counts the sender's messages of this kind to or from this robot, from 1 (`headerId`).
+        pub header_id: u32,
+        /// The mission meant (`orderId`); 0 is none.
+        pub mission_id: u32,
+        /// When the sender gave the message, nanoseconds on its own clock.
+        pub sent_ns: i64,
+    }
 }
-
-hil_core::layout!(Header {
-    fleet_id,
-    robot_id,
-    header_id,
-    mission_id,
-    sent_ns
-});
 
 /// What a receiver does with messages that arrive out of order or twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -70,41 +61,43 @@ impl Phase {
     }
 }
 
-/// Robot to controller, every tracking period (VDA 5050 `state`), 96 bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
-#[repr(C)]
-pub struct State {
-    /// Who, which mission, when.
-    pub header: Header,
-    /// When the robot sampled its motion, nanoseconds on its clock.
-    pub sampled_ns: i64,
-    /// Position in the map frame, metres.
-    pub x_m: f64,
-    /// Position in the map frame, metres.
-    pub y_m: f64,
-    /// Heading in the map frame, radians from the x axis, counter-clockwise.
-    pub heading_rad: f64,
-    /// Way travelled along the path, metres.
-    pub travelled_m: f64,
-    /// Speed along the path.
-    pub speed_mps: f32,
-    /// Acceleration along the path.
-    pub acceleration_mps2: f32,
-    /// Last path pose passed (`lastNodeSequenceId`); -1 without a mission.
-    pub path_index: i32,
-    /// Authority in force: last pose the robot may reach; [`TO_GOAL`] for the whole path,
-    /// [`NO_AUTHORITY`] when none came yet.
-    pub authority_index: i32,
-    /// `sequence` of the authority message last applied; 0 before the first.
-    pub applied_sequence: u32,
-    /// First pose at which the robot could still stop, were it told now.
-    pub stop_index: i32,
-    /// A [`Phase`].
-    pub phase: u8,
-    /// [`State::REFUSED`].
-    pub flags: u8,
-    /// Zero.
-    pub reserved: [u8; 6],
+hil_core::message! {
+    /// Robot to controller, every tracking period (VDA 5050 `state`), 96 bytes.
+    #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct State = "hil.FleetState.v1" {
+        /// Who, which mission, when.
+        pub header: Header,
+        /// When the robot sampled its motion, nanoseconds on its clock.
+        pub sampled_ns: i64,
+        /// Position in the map frame, metres.
+        pub x_m: f64,
+        /// Position in the map frame, metres.
+        pub y_m: f64,
+        /// Heading in the map frame, radians from the x axis, counter-clockwise.
+        pub heading_rad: f64,
+        /// Way travelled along the path, metres.
+        pub travelled_m: f64,
+        /// Speed along the path.
+        pub speed_mps: f32,
+        /// Acceleration along the path.
+        pub acceleration_mps2: f32,
+        /// Last path pose passed (`lastNodeSequenceId`); -1 without a mission.
+        pub path_index: i32,
+        /// Authority in force: last pose the robot may reach; [`TO_GOAL`] for the whole path,
+        /// [`NO_AUTHORITY`] when none came yet.
+        pub authority_index: i32,
+        /// `sequence` of the authority message last applied; 0 before the first.
+        pub applied_sequence: u32,
+        /// First pose at which the robot could still stop, were it told now.
+        pub stop_index: i32,
+        /// A [`Phase`].
+        pub phase: u8,
+        /// [`State::REFUSED`].
+        pub flags: u8,
+        /// Zero.
+        pub reserved: [u8; 6],
+    }
 }
 
 /// `authority_index`: the whole path.
@@ -127,46 +120,25 @@ impl State {
     }
 }
 
-hil_core::layout!(State {
-    header,
-    sampled_ns,
-    x_m,
-    y_m,
-    heading_rad,
-    travelled_m,
-    speed_mps,
-    acceleration_mps2,
-    path_index,
-    authority_index,
-    applied_sequence,
-    stop_index,
-    phase,
-    flags,
-    reserved
-});
-
-impl Message for State {
-    const NAME: &'static str = "hil.FleetState.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
-}
-
-/// Controller to robot: how far it may go (the end of VDA 5050's *base*), 48 bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
-#[repr(C)]
-pub struct Authority {
-    /// To whom, for which mission.
-    pub header: Header,
-    /// Grows with every change of this mission's authority, from 1 (`orderUpdateId`); a repeat
-    /// carries the same number.
-    pub sequence: u32,
-    /// Last pose the robot may reach; [`TO_GOAL`] for the whole path.
-    pub authority_index: i32,
-    /// How long the authority holds after its receipt; 0 for ever. A robot brakes when it ends.
-    pub lease_ns: i64,
-    /// `header_id` of the newest state the decision rests on; 0 if none.
-    pub echo_header_id: u32,
-    /// [`Authority::ACKNOWLEDGED`].
-    pub flags: u32,
+hil_core::message! {
+    /// Controller to robot: how far it may go (the end of VDA 5050's *base*), 48 bytes.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct Authority = "hil.FleetAuthority.v1" {
+        /// To whom, for which mission.
+        pub header: Header,
+        /// Grows with every change of this mission's authority, from 1 (`orderUpdateId`); a repeat
+        /// carries the same number.
+        pub sequence: u32,
+        /// Last pose the robot may reach; [`TO_GOAL`] for the whole path.
+        pub authority_index: i32,
+        /// How long the authority holds after its receipt; 0 for ever. A robot brakes when it ends.
+        pub lease_ns: i64,
+        /// `header_id` of the newest state the decision rests on; 0 if none.
+        pub echo_header_id: u32,
+        /// [`Authority::ACKNOWLEDGED`].
+        pub flags: u32,
+    }
 }
 
 impl Authority {
@@ -175,37 +147,25 @@ impl Authority {
     pub const ACKNOWLEDGED: u32 = 1;
 }
 
-hil_core::layout!(Authority {
-    header,
-    sequence,
-    authority_index,
-    lease_ns,
-    echo_header_id,
-    flags
-});
-
-impl Message for Authority {
-    const NAME: &'static str = "hil.FleetAuthority.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
-}
-
-/// Controller to robot: the path to drive (VDA 5050 `order`), repeated until a state shows the
-/// mission, 48 bytes. Path geometry is not sent: both ends make it, and compare by hash.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
-#[repr(C)]
-pub struct Mission {
-    /// To whom; `mission_id` is the new mission.
-    pub header: Header,
-    /// Which path, as [`PathId`](crate::path::PathId) numbers them.
-    pub path_id: u32,
-    /// Pose to start from; 0.
-    pub start_index: u32,
-    /// Pose to end at; the path's last.
-    pub end_index: u32,
-    /// [`Mission::REPLACE`].
-    pub flags: u32,
-    /// [`Path::hash`](crate::path::Path::hash) as the controller knows it.
-    pub path_hash: u64,
+hil_core::message! {
+    /// Controller to robot: the path to drive (VDA 5050 `order`), repeated until a state shows the
+    /// mission, 48 bytes. Path geometry is not sent: both ends make it, and compare by hash.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct Mission = "hil.FleetMission.v1" {
+        /// To whom; `mission_id` is the new mission.
+        pub header: Header,
+        /// Which path, as [`PathId`](crate::path::PathId) numbers them.
+        pub path_id: u32,
+        /// Pose to start from; 0.
+        pub start_index: u32,
+        /// Pose to end at; the path's last.
+        pub end_index: u32,
+        /// [`Mission::REPLACE`].
+        pub flags: u32,
+        /// [`Path::hash`](crate::path::Path::hash) as the controller knows it.
+        pub path_hash: u64,
+    }
 }
 
 impl Mission {
@@ -213,69 +173,37 @@ impl Mission {
     pub const REPLACE: u32 = 1;
 }
 
-hil_core::layout!(Mission {
-    header,
-    path_id,
-    start_index,
-    end_index,
-    flags,
-    path_hash
-});
-
-impl Message for Mission {
-    const NAME: &'static str = "hil.FleetMission.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
-}
-
-/// Robot to recorder, never over the network: its motion from this instant until the next such
-/// record, `s(t) = travelled + speed t + acceleration t^2 / 2`, never backwards. 64 bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
-#[repr(C)]
-pub struct Truth {
-    /// When, nanoseconds on the robots' clock.
-    pub at_ns: i64,
-    /// Which fleet.
-    pub fleet_id: u32,
-    /// Which robot.
-    pub robot_id: u32,
-    /// Its mission; 0 if none.
-    pub mission_id: u32,
-    /// The path whose poses `travelled_m` refers to; of a parked robot, the path it came by.
-    pub path_id: u32,
-    /// Way travelled along the path, metres.
-    pub travelled_m: f64,
-    /// Speed along the path.
-    pub speed_mps: f64,
-    /// Acceleration along the path.
-    pub acceleration_mps2: f64,
-    /// Authority in force, as in [`State`].
-    pub authority_index: i32,
-    /// `sequence` of the authority message that caused this record; 0 if none did.
-    pub caused_by_sequence: u32,
-    /// A [`TruthKind`].
-    pub kind: u32,
-    /// Zero.
-    pub reserved: u32,
-}
-
-hil_core::layout!(Truth {
-    at_ns,
-    fleet_id,
-    robot_id,
-    mission_id,
-    path_id,
-    travelled_m,
-    speed_mps,
-    acceleration_mps2,
-    authority_index,
-    caused_by_sequence,
-    kind,
-    reserved
-});
-
-impl Message for Truth {
-    const NAME: &'static str = "hil.FleetTruth.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
+hil_core::message! {
+    /// Robot to recorder, never over the network: its motion from this instant until the next such
+    /// record, `s(t) = travelled + speed t + acceleration t^2 / 2`, never backwards. 64 bytes.
+    #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct Truth = "hil.FleetTruth.v1" {
+        /// When, nanoseconds on the robots' clock.
+        pub at_ns: i64,
+        /// Which fleet.
+        pub fleet_id: u32,
+        /// Which robot.
+        pub robot_id: u32,
+        /// Its mission; 0 if none.
+        pub mission_id: u32,
+        /// The path whose poses `travelled_m` refers to; of a parked robot, the path it came by.
+        pub path_id: u32,
+        /// Way travelled along the path, metres.
+        pub travelled_m: f64,
+        /// Speed along the path.
+        pub speed_mps: f64,
+        /// Acceleration along the path.
+        pub acceleration_mps2: f64,
+        /// Authority in force, as in [`State`].
+        pub authority_index: i32,
+        /// `sequence` of the authority message that caused this record; 0 if none did.
+        pub caused_by_sequence: u32,
+        /// A [`TruthKind`].
+        pub kind: u32,
+        /// Zero.
+        pub reserved: u32,
+    }
 }
 
 /// Why a truth record was written.

@@ -12,46 +12,31 @@ use serde::{Deserialize, Serialize};
 
 use hil_core::case_study::{CaseStudy, ChannelSpec, ErrorSeries, Metric, ParameterError, Score};
 use hil_core::component::{Component, Outbox, Role, into_role};
-use hil_core::layout::Field;
-use hil_core::message::Message;
 use hil_core::run_log::RunLog;
 use hil_core::time::{Instant, PeriodicTimer};
 use hil_stats::series::Estimate;
 use hil_stats::special::ceil_count;
 
-/// Controller to robot: the speed to drive.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct ShuttleCommand {
-    /// Commanded speed along the rail.
-    pub speed_mps: f64,
-    /// Where the controller wants the cart, for the score.
-    pub target_m: f64,
+hil_core::message! {
+    /// Controller to robot: the speed to drive.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct ShuttleCommand = "hil.ShuttleCommand.v1" {
+        /// Commanded speed along the rail.
+        pub speed_mps: f64,
+        /// Where the controller wants the cart, for the score.
+        pub target_m: f64,
+    }
 }
 
-hil_core::layout!(ShuttleCommand {
-    speed_mps,
-    target_m
-});
-
-impl Message for ShuttleCommand {
-    const NAME: &'static str = "hil.ShuttleCommand.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
-}
-
-/// Robot to controller: where the cart is.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct ShuttleStatus {
-    /// Position along the rail.
-    pub position_m: f64,
-}
-
-hil_core::layout!(ShuttleStatus { position_m });
-
-impl Message for ShuttleStatus {
-    const NAME: &'static str = "hil.ShuttleStatus.v1";
-    const FIELDS: &'static [Field] = Self::LAYOUT;
+hil_core::message! {
+    /// Robot to controller: where the cart is.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct ShuttleStatus = "hil.ShuttleStatus.v1" {
+        /// Position along the rail.
+        pub position_m: f64,
+    }
 }
 
 /// `[case.parameters]` of the shuttle.
