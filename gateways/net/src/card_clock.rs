@@ -7,7 +7,9 @@ use std::fs::File;
 use std::io;
 use std::os::fd::{AsRawFd, RawFd};
 
-use nix::time::{ClockId, clock_gettime};
+use nix::time::ClockId;
+
+use crate::clock_pair::{nanoseconds, read_ns};
 
 /// A card's clock and the real-time clock at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -130,17 +132,6 @@ impl CardClock {
 /// The clock behind an open `/dev/ptpN` (`FD_TO_CLOCKID` of `clock_getres(2)`).
 const fn dynamic_clock(descriptor: RawFd) -> ClockId {
     ClockId::from_raw((!descriptor << 3) | 3)
-}
-
-fn read_ns(clock: ClockId) -> io::Result<i64> {
-    let time = clock_gettime(clock)?;
-    Ok(nanoseconds(time.tv_sec(), time.tv_nsec()))
-}
-
-const fn nanoseconds(seconds: i64, nanoseconds: i64) -> i64 {
-    seconds
-        .saturating_mul(1_000_000_000)
-        .saturating_add(nanoseconds)
 }
 
 /// `PTP_MAX_SAMPLES` of `linux/ptp_clock.h`.

@@ -93,12 +93,15 @@ pub fn monotonic_now() -> io::Result<Instant> {
     read_ns(ClockId::CLOCK_MONOTONIC).map(Instant::from_ns)
 }
 
-fn read_ns(clock: ClockId) -> io::Result<i64> {
+pub(crate) fn read_ns(clock: ClockId) -> io::Result<i64> {
     let time = clock_gettime(clock)?;
-    Ok(time
-        .tv_sec()
+    Ok(nanoseconds(time.tv_sec(), time.tv_nsec()))
+}
+
+pub(crate) const fn nanoseconds(seconds: i64, nanoseconds: i64) -> i64 {
+    seconds
         .saturating_mul(1_000_000_000)
-        .saturating_add(time.tv_nsec()))
+        .saturating_add(nanoseconds)
 }
 
 #[cfg(test)]

@@ -112,43 +112,32 @@ impl ControlData {
         let mut data = Self::default();
         let mut messages = Messages { rest: bytes };
         for message in &mut messages {
-            data.absorb(&message);
+            data.is_damaged |= data.absorb(&message).is_none();
         }
         data.is_damaged |= !messages.rest.is_empty();
         data
     }
 
-    fn absorb(&mut self, message: &Message<'_>) {
+    /// Takes what `message` says; `None` when it is cut short or nonsense.
+    fn absorb(&mut self, message: &Message<'_>) -> Option<()> {
         let payload = message.payload;
         match (message.level, message.kind) {
             (libc::SOL_SOCKET, libc::SCM_TIMESTAMPING | SCM_TIMESTAMPING_NEW) => {
-                match decode_stamps(payload) {
-                    Some(stamps) => self.stamps = stamps,
-                    None => self.is_damaged = true,
-                }
+                self.stamps = decode_stamps(payload)?;
             }
-            (libc::SOL_SOCKET, libc::SO_RXQ_OVFL) => match u32_at(payload, 0) {
-                Some(count) => self.drop_count = Some(count),
-                None => self.is_damaged = true,
-            },
-            (libc::SOL_SOCKET, SCM_WIFI_STATUS) => match u32_at(payload, 0) {
-                Some(status) => self.is_acknowledged = Some(status != 0),
-                None => self.is_damaged = true,
-            },
+            (libc::SOL_SOCKET, libc::SO_RXQ_OVFL) => self.drop_count = Some(u32_at(payload, 0)?),
+            (libc::SOL_SOCKET, SCM_WIFI_STATUS) => {
+                self.is_acknowledged = Some(u32_at(payload, 0)? != 0);
+            }
             (libc::SOL_IP, libc::IP_TOS) | (libc::SOL_IPV6, libc::IPV6_TCLASS) => {
-                match decode_class(payload) {
-                    Some(class) => self.traffic_class = Some(class),
-                    None => self.is_damaged = true,
-                }
+                self.traffic_class = Some(decode_class(payload)?);
             }
             (libc::SOL_IP, libc::IP_RECVERR) | (libc::SOL_IPV6, IPV6_RECVERR) => {
-                match decode_extended_error(payload) {
-                    Some(error) => self.extended_error = Some(error),
-                    None => self.is_damaged = true,
-                }
+                self.extended_error = Some(decode_extended_error(payload)?);
             }
             _ => {}
         }
+        Some(())
     }
 }
 

@@ -44,6 +44,8 @@
 //! | 73 | 1 | window_valid | 0: no message received yet, newest, bitmap and epoch are 0; 1 |
 //! | 74 | 6 | reserved | 0 |
 
+use bytemuck::checked::try_cast;
+
 use super::refusal::Refusal;
 use super::stamps::StampSource;
 use super::wire::{array_at, i64_at, u32_at, u64_at, write};
@@ -141,7 +143,7 @@ fn split_name(bytes: &[u8]) -> Result<(&str, &[u8]), Refusal> {
 }
 
 /// How a greeting was answered.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::CheckedBitPattern)]
 #[repr(u8)]
 pub enum HelloStatus {
     /// Messages will be taken.
@@ -173,19 +175,6 @@ impl HelloStatus {
             Self::UnknownChannel => "the channel is not carried there",
             Self::VersionMismatch => "the gateways speak different versions of the protocol",
             Self::GreetAgain => "the session is not known there",
-        }
-    }
-
-    const fn from_wire(code: u8) -> Option<Self> {
-        match code {
-            0 => Some(Self::Accepted),
-            1 => Some(Self::TypeMismatch),
-            2 => Some(Self::SizeMismatch),
-            3 => Some(Self::SharedDomain),
-            4 => Some(Self::UnknownChannel),
-            5 => Some(Self::VersionMismatch),
-            6 => Some(Self::GreetAgain),
-            _ => None,
         }
     }
 }
@@ -227,7 +216,7 @@ impl HelloAck {
             return Err(Refusal::ReservedNotZero);
         }
         Ok(Self {
-            status: HelloStatus::from_wire(body[0]).ok_or(Refusal::MalformedBody)?,
+            status: try_cast(body[0]).map_err(|_unknown| Refusal::MalformedBody)?,
             session: u32_at(body, 4),
             clock_id: u64_at(body, 8),
             domain: array_at(body, 16),
@@ -327,7 +316,7 @@ impl SyncResponse {
             t1_ns: i64_at(body, 0),
             t2_ns: i64_at(body, 8),
             t3_ns: i64_at(body, 16),
-            t2_source: StampSource::from_wire(body[72]).ok_or(Refusal::MalformedBody)?,
+            t2_source: try_cast(body[72]).map_err(|_unknown| Refusal::MalformedBody)?,
             window,
             sync_received_count: u32_at(body, 68),
         })

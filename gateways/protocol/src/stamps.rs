@@ -5,7 +5,7 @@ use core::net::SocketAddr;
 
 /// Which clock reading a stamp is. All stamps of this module are already on the host's
 /// *monotonic* clock; the owner of the socket converts kernel and hardware stamps first.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, bytemuck::CheckedBitPattern)]
 #[repr(u8)]
 pub enum StampSource {
     /// Read by the program, just before the send or just after the receive call.
@@ -15,17 +15,6 @@ pub enum StampSource {
     KernelSoftware = 1,
     /// Taken by the network card.
     Hardware = 2,
-}
-
-impl StampSource {
-    pub(crate) const fn from_wire(code: u8) -> Option<Self> {
-        match code {
-            0 => Some(Self::Application),
-            1 => Some(Self::KernelSoftware),
-            2 => Some(Self::Hardware),
-            _ => None,
-        }
-    }
 }
 
 /// When and from where a datagram arrived.

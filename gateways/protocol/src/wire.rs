@@ -63,7 +63,7 @@ pub const fn payload_budget_bytes(datagram_max_bytes: usize) -> usize {
 }
 
 /// What a datagram is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::CheckedBitPattern)]
 #[repr(u8)]
 pub enum Kind {
     /// A message or a fragment of one.
@@ -85,18 +85,8 @@ pub enum Kind {
 }
 
 impl Kind {
-    pub(crate) const fn from_wire(code: u8) -> Option<Self> {
-        match code {
-            1 => Some(Self::Data),
-            2 => Some(Self::SyncRequest),
-            3 => Some(Self::SyncResponse),
-            4 => Some(Self::Hello),
-            5 => Some(Self::HelloAck),
-            6 => Some(Self::Bye),
-            7 => Some(Self::KeyRequest),
-            8 => Some(Self::KeyAnswer),
-            _ => None,
-        }
+    pub(crate) fn from_wire(code: u8) -> Option<Self> {
+        bytemuck::checked::try_cast(code).ok()
     }
 }
 
@@ -110,6 +100,18 @@ pub struct FollowUpField {
 }
 
 impl FollowUpField {
+    /// The stamp of the datagram `sequence`.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "the low half is what travels"
+    )]
+    pub(crate) const fn new(sequence: u64, handed_to_tx_ns: u32) -> Self {
+        Self {
+            sequence_low: sequence as u32,
+            handed_to_tx_ns,
+        }
+    }
+
     /// The full sequence it belongs to, given the sequence of the datagram it rode on; `None`
     /// when it would lie before zero.
     pub const fn sequence(self, carried_by: u64) -> Option<u64> {

@@ -10,10 +10,8 @@
 //! Only a peer that the network reports unreachable, or that asks for a greeting, stops them until
 //! it has greeted back.
 
-mod answer;
 mod counts;
 mod exchange;
-mod settings;
 mod staging;
 mod transmit;
 
@@ -23,15 +21,20 @@ use core::time::Duration;
 use hil_core::message::Envelope;
 use hil_core::time::{Instant, PeriodicTimer};
 
-use super::body::{HelloStatus, ReceivedWindow};
-use super::channel::SettingsError;
-use super::refusal::{Refusal, RefusalCounts};
-use super::stamps::ArrivalStamps;
-use super::wire::{Header, Kind};
+use crate::body::{
+    HELLO_ACK_BODY_BYTES, Hello, HelloAck, HelloStatus, ReceivedWindow, SYNC_BODY_BYTES,
+    SyncResponse,
+};
+use crate::channel::{ChannelIdentity, SettingsError};
+use crate::fragment::FRAGMENT_COUNT_MAX;
+use crate::refusal::{Refusal, RefusalCounts};
+use crate::stamps::ArrivalStamps;
+use crate::wire::{
+    self, Body, HEADER_BYTES, Header, Kind, Prefix, TAG_BYTES, payload_budget_bytes,
+};
 
 pub use counts::{EgressCounts, LocalRefusal};
 pub use exchange::RoundTrip;
-pub use settings::EgressSettings;
 
 use exchange::Exchanges;
 use staging::Staging;
@@ -41,6 +44,80 @@ pub const HELLO_PERIOD: Duration = Duration::from_millis(50);
 /// Time between greetings after the peer refused the channel: it may be restarted with other
 /// settings, but soon is unlikely.
 pub const HELLO_PERIOD_REFUSED: Duration = Duration::from_secs(1);
+
+/// Settings of an [`EgressBridge`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EgressSettings {
+    /// The channel, as both hosts must see it.
+    pub channel: ChannelIdentity,
+    /// This gateway's start; must differ from its earlier ones.
+    pub session: u32,
+    /// Fingerprint of this host's shared-memory domain.
+    pub domain: [u8; 16],
+    /// Names this host's monotonic clock; equal ids on both hosts mean one clock.
+    pub clock_id: u64,
+    /// Largest datagram the path carries unfragmented: path MTU minus IP and UDP headers.
+    pub datagram_max_bytes: usize,
+    /// Time between clock exchanges.
+    pub sync_period: Duration,
+}
+
+impl EgressSettings {
+    /// Payload bytes of one datagram, the room for a tag taken off.
+    pub const fn payload_budget_bytes(&self) -> usize {
+        payload_budget_bytes(self.datagram_max_bytes)
+    }
+
+    /// Datagrams that the channel's largest message takes.
+    pub const fn fragment_count_max(&self) -> usize {
+        let budget = self.payload_budget_bytes();
+        if budget == 0 {
+            return usize::MAX;
+        }
+        let count = (self.channel.size_max_bytes as usize).div_ceil(budget);
+        if count == 0 { 1 } else { count }
+    }
+
+    fn hello(&self) -> Hello<'_> {
+        Hello {
+            domain: self.domain,
+            clock_id: self.clock_id,
+            size_max_bytes: self.channel.size_max_bytes,
+            alignment_bytes: self.channel.alignment_bytes,
+            channel_name: &self.channel.channel_name,
+            type_name: &self.channel.type_name,
+        }
+    }
+
+    /// Longest datagram that is not data.
+    fn control_bytes(&self) -> usize {
+        let body = self.hello().encoded_bytes().max(SYNC_BODY_BYTES);
+        HEADER_BYTES + body.max(HELLO_ACK_BODY_BYTES)
+    }
+
+    fn check(&self) -> Result<(), SettingsError> {
+        self.channel.check()?;
+        if self.sync_period.is_zero() {
+            return Err(SettingsError::Zero { key: "sync_period" });
+        }
+        let bound = self.control_bytes() + TAG_BYTES;
+        if self.datagram_max_bytes < bound {
+            return Err(SettingsError::DatagramTooSmall {
+                value: self.datagram_max_bytes,
+                bound,
+            });
+        }
+        let fragments = self.fragment_count_max();
+        if fragments > FRAGMENT_COUNT_MAX {
+            return Err(SettingsError::TooManyFragments {
+                size_bytes: self.channel.size_max_bytes,
+                fragments,
+                bound: FRAGMENT_COUNT_MAX,
+            });
+        }
+        Ok(())
+    }
+}
 
 /// Where the conversation with the receiving gateway stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -392,5 +469,131 @@ impl EgressBridge {
             return Err(LocalRefusal::TransmissionPending);
         }
         Ok(())
+    }
+
+    fn accept(
+        &mut self,
+        now: Instant,
+        arrival: ArrivalStamps,
+        bytes: &[u8],
+    ) -> Result<EgressEvent, Refusal> {
+        let datagram = wire::decode(bytes).inspect_err(|&refusal| {
+            if refusal == Refusal::UnsupportedVersion {
+                self.on_other_version(now, bytes);
+            }
+        })?;
+        let header = &datagram.header;
+        if header.channel != self.settings.channel.channel {
+            return Err(Refusal::UnknownChannel);
+        }
+        if let (Some(bound), Some(from)) = (self.peer, arrival.peer)
+            && bound != from
+        {
+            return Err(Refusal::ForeignSource);
+        }
+        if header.session != self.settings.session {
+            return Err(Refusal::UnknownSession);
+        }
+        match datagram.body {
+            Body::HelloAck(ack) => self.on_hello_ack(now, arrival, &ack),
+            Body::SyncResponse(response) => self.on_sync_response(header, &response, arrival),
+            _ => Err(Refusal::UnexpectedKind),
+        }
+    }
+
+    /// A greeting was answered in another version of the protocol: only the part of the header
+    /// that no version changes can be read.
+    fn on_other_version(&mut self, now: Instant, bytes: &[u8]) {
+        let is_answer = Prefix::decode(bytes).is_some_and(|prefix| {
+            prefix.kind == Some(Kind::HelloAck)
+                && prefix.session == self.settings.session
+                && prefix.channel == self.settings.channel.channel
+        });
+        if is_answer && self.state != PeerState::Established {
+            let refused = PeerState::Refused(HelloStatus::VersionMismatch);
+            self.greet_from(refused, now + HELLO_PERIOD_REFUSED);
+        }
+    }
+
+    fn on_hello_ack(
+        &mut self,
+        now: Instant,
+        arrival: ArrivalStamps,
+        ack: &HelloAck,
+    ) -> Result<EgressEvent, Refusal> {
+        let round_started_ns = self.round_started_ns.ok_or(Refusal::Unsolicited)?;
+        if ack.answers_handed_ns < round_started_ns {
+            return Err(Refusal::Stale);
+        }
+        if ack.answers_handed_ns > now.as_ns() {
+            return Err(Refusal::ImplausibleStamp);
+        }
+        match ack.status {
+            HelloStatus::Accepted => Ok(self.establish(now, arrival, ack)),
+            HelloStatus::GreetAgain => {
+                if self.state == PeerState::Established {
+                    self.counts.greet_again_count += 1;
+                    self.greet_from(PeerState::Greeting, now);
+                }
+                Ok(EgressEvent::GreetAgain)
+            }
+            status => {
+                self.greet_from(PeerState::Refused(status), now + HELLO_PERIOD_REFUSED);
+                Ok(EgressEvent::Refused(status))
+            }
+        }
+    }
+
+    fn establish(&mut self, now: Instant, arrival: ArrivalStamps, ack: &HelloAck) -> EgressEvent {
+        let is_peer_restart = self
+            .peer_session
+            .is_some_and(|session| session != ack.session);
+        self.counts.peer_restart_count += u64::from(is_peer_restart);
+        if self.state != PeerState::Established {
+            self.state = PeerState::Established;
+            self.sync_timer.start(now);
+        }
+        self.round_started_ns = Some(ack.answers_handed_ns);
+        self.peer = arrival.peer;
+        self.peer_session = Some(ack.session);
+        self.peer_clock_id = Some(ack.clock_id);
+        EgressEvent::Accepted {
+            peer_session: ack.session,
+            clock_is_shared: ack.clock_id == self.settings.clock_id,
+            is_peer_restart,
+        }
+    }
+
+    /// Leaves for a state in which the peer is greeted, first at `due`.
+    fn greet_from(&mut self, state: PeerState, due: Instant) {
+        if self.staging.abandon() {
+            self.counts.message_failed_count += 1;
+        }
+        // Refused and Down keep listening to answers of greetings that are still under way.
+        if self.state == PeerState::Established {
+            self.round_started_ns = None;
+        }
+        self.state = state;
+        self.peer = None;
+        self.hello_due = due;
+    }
+
+    fn on_sync_response(
+        &mut self,
+        header: &Header,
+        response: &SyncResponse,
+        arrival: ArrivalStamps,
+    ) -> Result<EgressEvent, Refusal> {
+        let round_trip = self.exchanges.close(header.sequence, response, arrival)?;
+        let earlier = header
+            .follow_up
+            .and_then(|field| self.exchanges.refine(header.sequence, field));
+        self.counts.round_trip_count += 1;
+        Ok(EgressEvent::RoundTrip {
+            round_trip,
+            earlier,
+            window: response.window,
+            sync_received_count: response.sync_received_count,
+        })
     }
 }

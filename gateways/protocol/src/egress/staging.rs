@@ -84,15 +84,7 @@ impl Staging {
     }
 
     pub(super) fn set_follow_up(&mut self, sequence: u64, handed_to_tx_ns: u32) {
-        #[expect(
-            clippy::cast_possible_truncation,
-            reason = "the low half is what travels"
-        )]
-        let sequence_low = sequence as u32;
-        self.follow_up = Some(FollowUpField {
-            sequence_low,
-            handed_to_tx_ns,
-        });
+        self.follow_up = Some(FollowUpField::new(sequence, handed_to_tx_ns));
     }
 
     pub(super) fn forget_follow_up(&mut self) {

@@ -4,7 +4,7 @@
 use hil_core::time::Instant;
 
 use super::{EgressBridge, HELLO_PERIOD, HELLO_PERIOD_REFUSED, LastTransmit, PeerState, Transmit};
-use crate::body::{Hello, SYNC_BODY_BYTES};
+use crate::body::SYNC_BODY_BYTES;
 use crate::wire::{HEADER_BYTES, Header, Kind};
 
 impl EgressBridge {
@@ -35,15 +35,7 @@ impl EgressBridge {
         let sequence = self.hello_sequence;
         self.hello_sequence += 1;
         self.counts.hello_sent_count += 1;
-        let channel = &self.settings.channel;
-        let hello = Hello {
-            domain: self.settings.domain,
-            clock_id: self.settings.clock_id,
-            size_max_bytes: channel.size_max_bytes,
-            alignment_bytes: channel.alignment_bytes,
-            channel_name: &channel.channel_name,
-            type_name: &channel.type_name,
-        };
+        let hello = self.settings.hello();
         let body_bytes = hello.encode(&mut self.control[HEADER_BYTES..]);
         self.transmit_control(now, Kind::Hello, (0, sequence), body_bytes)
     }

@@ -12,7 +12,6 @@
 mod delivery;
 mod replies;
 mod session;
-mod settings;
 
 use core::net::SocketAddr;
 use core::time::Duration;
@@ -20,7 +19,7 @@ use core::time::Duration;
 use hil_core::time::Instant;
 
 use super::body::{Hello, HelloStatus};
-use super::channel::SettingsError;
+use super::channel::{ChannelIdentity, SettingsError};
 use super::fragment::{Fragment, Reassembler, ReassemblyCounts};
 use super::refusal::{Refusal, RefusalCounts};
 use super::sequence::{Order, SequenceCounts, SequenceWindow};
@@ -29,7 +28,6 @@ use super::wire::{self, Body, Header, Kind, Prefix};
 
 pub use delivery::{Delivery, Disposition, FollowUp, IngressCounts, MessageInfo};
 pub use replies::ReplyCounts;
-pub use settings::IngressSettings;
 
 use delivery::{delivery_of, message_of, stream_of};
 use replies::{AckRequest, Replies, SyncRequest};
@@ -40,6 +38,57 @@ pub const REFUSAL_REPLY_PERIOD: Duration = Duration::from_millis(10);
 
 /// A message that skips more numbers than this is refused until its sender greets again.
 pub const SEQUENCE_JUMP_MAX: u64 = 1 << 20;
+
+/// Settings of an [`IngressBridge`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct IngressSettings {
+    /// The channel, as both hosts must see it.
+    pub channel: ChannelIdentity,
+    /// This gateway's start; must differ from its earlier ones.
+    pub session: u32,
+    /// Fingerprint of this host's shared-memory domain.
+    pub domain: [u8; 16],
+    /// Names this host's monotonic clock; equal ids on both hosts mean one clock.
+    pub clock_id: u64,
+    /// Incomplete messages held at a time; the oldest gives way.
+    pub reassembly_slots: usize,
+    /// An incomplete message older than this is given up; one period of the channel is a good
+    /// value.
+    pub reassembly_timeout: Duration,
+    /// True to deliver a message that is new but older than one already delivered; false for
+    /// newest-wins.
+    pub deliver_reordered: bool,
+}
+
+impl IngressSettings {
+    /// Four reassembly slots, 100 ms each, reordered messages delivered.
+    pub fn new(channel: ChannelIdentity, session: u32, domain: [u8; 16], clock_id: u64) -> Self {
+        Self {
+            channel,
+            session,
+            domain,
+            clock_id,
+            reassembly_slots: 4,
+            reassembly_timeout: Duration::from_millis(100),
+            deliver_reordered: true,
+        }
+    }
+
+    fn check(&self) -> Result<(), SettingsError> {
+        self.channel.check()?;
+        if self.reassembly_slots == 0 {
+            return Err(SettingsError::Zero {
+                key: "reassembly_slots",
+            });
+        }
+        if self.reassembly_timeout.is_zero() {
+            return Err(SettingsError::Zero {
+                key: "reassembly_timeout",
+            });
+        }
+        Ok(())
+    }
+}
 
 /// One datagram to send back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

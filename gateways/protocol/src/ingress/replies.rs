@@ -119,17 +119,8 @@ impl Replies {
     pub(super) fn set_transmit_stamp(&mut self, sequence: u64, handed_to_tx_ns: i64) {
         // u32::MAX stands for none on the wire.
         let delta = u32::try_from(handed_to_tx_ns).ok();
-        self.follow_up = delta.filter(|&delta| delta != u32::MAX).map(|delta| {
-            #[expect(
-                clippy::cast_possible_truncation,
-                reason = "the low half is what travels"
-            )]
-            let sequence_low = sequence as u32;
-            FollowUpField {
-                sequence_low,
-                handed_to_tx_ns: delta,
-            }
-        });
+        let delta = delta.filter(|&delta| delta != u32::MAX);
+        self.follow_up = delta.map(|delta| FollowUpField::new(sequence, delta));
     }
 
     pub(super) fn forget_transmit_stamp(&mut self) {

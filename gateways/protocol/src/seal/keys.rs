@@ -107,7 +107,8 @@ impl Root {
                 &secret,
                 label,
                 association.channel,
-                (&association.channel_name, [&[], &[]]),
+                &association.channel_name,
+                [&[], &[]],
             );
             hmac::Key::new(hmac::HMAC_SHA256, &*key)
         };
@@ -133,12 +134,7 @@ impl Root {
 
     fn generation(&self, label: &str, asking: &Salt, answering: &Salt) -> Generation {
         let salts: [&[u8]; 2] = [asking, answering];
-        let secret = expand(
-            &self.secret,
-            label,
-            self.channel,
-            (&self.channel_name, salts),
-        );
+        let secret = expand(&self.secret, label, self.channel, &self.channel_name, salts);
         Generation {
             secret,
             suite: self.suite,
@@ -186,7 +182,8 @@ fn expand(
     root: &hkdf::Prk,
     label: &str,
     channel: u16,
-    (name, [asking, answering]): (&str, [&[u8]; 2]),
+    name: &str,
+    [asking, answering]: [&[u8]; 2],
 ) -> Secret {
     let channel = channel.to_le_bytes();
     let name_bytes = u16::try_from(name.len()).unwrap_or(u16::MAX).to_le_bytes();

@@ -157,25 +157,9 @@ pub struct EgmPlanned {
     pub time_stamp: Option<EgmTimestamp>,
 }
 
-/// Where the robot is measured to be. On the wire it is laid out as [`EgmPlanned`] is.
-#[derive(Clone, PartialEq, prost::Message)]
-pub struct EgmFeedBack {
-    /// The robot's first six joints.
-    #[prost(message, optional, tag = "1")]
-    pub joints: Option<EgmJoints>,
-    /// The tool.
-    #[prost(message, optional, tag = "2")]
-    pub cartesian: Option<EgmPose>,
-    /// External axes; the seventh joint of a seven-axis arm is the first of them.
-    #[prost(message, optional, tag = "3")]
-    pub external_joints: Option<EgmJoints>,
-    /// When it was measured.
-    #[prost(message, optional, tag = "4")]
-    pub time: Option<EgmClock>,
-    /// The same in the time of the network; `RobotWare` 7.
-    #[prost(message, optional, tag = "5")]
-    pub time_stamp: Option<EgmTimestamp>,
-}
+/// Where the robot is measured to be, laid out as [`EgmPlanned`] is; its times say when it was
+/// measured.
+pub type EgmFeedBack = EgmPlanned;
 
 /// Speeds the sensor adds to the controller's position law.
 #[derive(Clone, PartialEq, prost::Message)]
