@@ -56,39 +56,21 @@ fn offers(entry: &CaseEntry) -> Vec<(&'static str, String)> {
     let has_replay = case
         .as_ref()
         .is_some_and(|case| case.replay(&RunLog::default()).is_some());
-    let none = || "none".to_owned();
-    let listed = |names: &[&str], words: String| match names {
-        [] => none(),
-        names => format!("{}{words}", names.join(", ")),
+    let offer = |is_there: bool, words: String| {
+        if is_there { words } else { "none".to_owned() }
     };
+    let figures = entry.calibrated_figures.join(", ");
+    let calibration = format!("{figures}; hil-runtime calibrate {name} --figure NAME=VALUE");
+    let series = format!("{}; in the folder of each run", entry.series.join(", "));
+    let tables = "hil-runtime tables --topology FILE".to_owned();
     vec![
-        (
-            "tables",
-            if has_tables {
-                "hil-runtime tables --topology FILE".to_owned()
-            } else {
-                none()
-            },
-        ),
-        (
-            "calibration",
-            listed(
-                entry.calibrated_figures,
-                format!("; hil-runtime calibrate {name} --figure NAME=VALUE"),
-            ),
-        ),
+        ("tables", offer(has_tables, tables)),
+        ("calibration", offer(!figures.is_empty(), calibration)),
         (
             "replay",
-            if has_replay {
-                "hil-runtime replay RUN".to_owned()
-            } else {
-                none()
-            },
+            offer(has_replay, "hil-runtime replay RUN".to_owned()),
         ),
-        (
-            "series",
-            listed(entry.series, "; in the folder of each run".to_owned()),
-        ),
+        ("series", offer(!entry.series.is_empty(), series)),
     ]
 }
 

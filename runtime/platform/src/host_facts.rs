@@ -6,21 +6,22 @@ mod files;
 mod kernel;
 mod processors;
 
+use core::fmt::Display;
+
 use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit};
 use nix::sys::utsname::uname;
 use serde::{Deserialize, Serialize};
 
 pub use self::fake::FakeHost;
-pub use self::files::HostFiles;
-pub use self::files::{CAP_IPC_LOCK, CAP_SYS_NICE, format_cpu_list};
+pub use self::files::{CAP_IPC_LOCK, CAP_SYS_NICE, HostFiles, format_cpu_list};
 pub use self::kernel::{
     KernelOptions, PreemptionMode, RealtimeThrottle, boot_parameter, clocksource, has_fair_server,
     kernel_release, preemption, virtual_machine,
 };
 pub use self::processors::{
-    CPU_FOLDER, governors, isolated_or_online, load_average, online_cpus, refuse_absent,
+    CPU_FOLDER, IsolatedCpus, ProcessorTicks, governors, isolated_or_online, load_average,
+    online_cpus, refuse_absent,
 };
-pub use self::processors::{IsolatedCpus, ProcessorTicks};
 
 /// Something the host was asked: an answer, or why there is none.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -33,6 +34,14 @@ pub enum Fact<T> {
 }
 
 impl<T> Fact<T> {
+    /// What was asked of `asked`; an error is the reason why there is no answer.
+    fn of<E: Display>(asked: &str, answer: Result<T, E>) -> Self {
+        match answer {
+            Ok(value) => Self::Available(value),
+            Err(error) => Self::Unavailable(format!("{asked}: {error}")),
+        }
+    }
+
     /// The answer, if there is one.
     pub fn available(&self) -> Option<&T> {
         match self {
@@ -139,22 +148,16 @@ impl HostFacts {
 }
 
 fn hostname() -> Fact<String> {
-    match nix::unistd::gethostname() {
-        Ok(name) => Fact::Available(name.to_string_lossy().into_owned()),
-        Err(errno) => Fact::Unavailable(format!("gethostname: {errno}")),
-    }
+    Fact::of("gethostname", nix::unistd::gethostname())
+        .map(|name| name.to_string_lossy().into_owned())
 }
 
 fn kernel_name() -> Fact<String> {
-    match uname() {
-        Ok(name) => Fact::Available(format!(
-            "{} {} {}",
-            name.sysname().to_string_lossy(),
-            name.release().to_string_lossy(),
-            name.machine().to_string_lossy()
-        )),
-        Err(errno) => Fact::Unavailable(format!("uname: {errno}")),
-    }
+    Fact::of("uname", uname()).map(|name| {
+        [name.sysname(), name.release(), name.machine()]
+            .map(|part| part.to_string_lossy())
+            .join(" ")
+    })
 }
 
 fn cores(files: &HostFiles) -> Fact<String> {
@@ -183,10 +186,7 @@ fn memory(files: &HostFiles) -> Fact<String> {
 
 /// The soft limit of this process on `resource`.
 pub(crate) fn soft_limit(resource: Resource) -> Fact<u64> {
-    match getrlimit(resource) {
-        Ok((soft, _hard)) => Fact::Available(soft),
-        Err(errno) => Fact::Unavailable(format!("getrlimit: {errno}")),
-    }
+    Fact::of("getrlimit", getrlimit(resource)).map(|(soft, _hard)| soft)
 }
 
 /// The limit of this process on `resource`, in `unit`.

@@ -5,12 +5,11 @@
 //! A few lines of our own, not the crate `sd-notify`: that one opens a blocking socket for every
 //! word, and a supervisor that waits for a busy system manager would look hung to it.
 
-use std::env;
 use std::ffi::OsStr;
-use std::io;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
+use std::{env, io};
 
 /// Variables by which systemd speaks to a service: for its main process, not for those it starts.
 pub const VARIABLES: [&str; 3] = ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"];

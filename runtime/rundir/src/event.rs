@@ -132,10 +132,7 @@ impl ProcessKind {
     /// True for what runs by a timer whose ticks this program counts. Without that count nobody can tell
     /// the host's delays from the network's.
     pub const fn counts_ticks(self) -> bool {
-        match self {
-            Self::Component => true,
-            Self::Gateway | Self::ClockPath | Self::Adapter | Self::OwnProgram => false,
-        }
+        matches!(self, Self::Component)
     }
 
     /// What a report calls a process of this kind that plays `role`.

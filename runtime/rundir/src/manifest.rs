@@ -2,10 +2,9 @@
 //! case study. It describes; who runs what is decided elsewhere.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io;
 use std::path::Path;
 use std::time::SystemTime;
+use std::{fs, io};
 
 use hil_core::layout::{Field, FieldKind, RESERVED};
 use serde::{Deserialize, Serialize};
@@ -13,7 +12,6 @@ use serde_json::{Value, json};
 
 use crate::run_folder::{RunFolder, utc_text};
 use hil_platform::host_facts::HostFacts;
-use hil_topology;
 use hil_topology::{KnownCases, Topology, TopologyErrors};
 
 /// Version of the layout of `manifest.json`. Within one, fields are only added.

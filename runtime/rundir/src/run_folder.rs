@@ -1,10 +1,9 @@
 //! The folder a run leaves behind: where each file lies. What the files say is decided by those
 //! who write them.
 
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
+use std::{fs, io};
 
 /// Paths of one run.
 ///

@@ -2,10 +2,9 @@
 //! folder. With the manifest and the records beside it, every figure can be computed again.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
+use std::{fs, io};
 
 use hil_core::time::Instant;
 use serde::{Deserialize, Serialize};

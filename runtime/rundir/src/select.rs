@@ -46,14 +46,12 @@ fn list(running: &[String]) -> String {
 /// The runs that go on this host, by name.
 pub fn running_runs() -> Vec<LiveRun> {
     let bases = domain_base_candidates();
-    let mut found: BTreeMap<PathBuf, LiveRun> = BTreeMap::new();
-    for base in &bases {
-        for run in running_runs_below(base) {
-            found.insert(run.folder.clone(), run);
-        }
-    }
-    let mut runs: Vec<LiveRun> = found.into_values().collect();
-    runs.sort_by(|one, other| one.name.cmp(&other.name));
+    let mut runs: Vec<LiveRun> = bases
+        .iter()
+        .flat_map(|base| running_runs_below(base))
+        .collect();
+    runs.sort_by(|one, other| (&one.name, &one.folder).cmp(&(&other.name, &other.folder)));
+    runs.dedup_by(|one, other| one.folder == other.folder);
     runs
 }
 

@@ -2,11 +2,10 @@
 //! keep a program waiting for half a minute, and by then the peers of a supervisor that waits, and its
 //! service manager, take it for dead.
 
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{Builder, JoinHandle};
+use std::{fs, io};
 
 use super::status::{FILE_NAME, RunStatus};
 

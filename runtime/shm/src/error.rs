@@ -2,10 +2,9 @@
 //! not errors.
 
 use core::fmt::{Debug, Write as _};
-use std::io;
 use std::path::PathBuf;
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{io, thread};
 
 use hil_platform::domain_address::DomainAddressError;
 

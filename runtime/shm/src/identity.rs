@@ -46,13 +46,8 @@ pub fn clock_id() -> Result<u64, DomainError> {
         }
     }
     let bytes = hash.0.to_le_bytes();
-    let (low, high) = bytes.split_at(8);
-    let fold = |half: &[u8]| {
-        half.iter()
-            .rev()
-            .fold(0, |sum, byte| sum << 8 | u64::from(*byte))
-    };
-    Ok(fold(low) ^ fold(high))
+    let [low, high] = [0, 1].map(|half| u64::from_le_bytes(bytes.as_chunks().0[half]));
+    Ok(low ^ high)
 }
 
 fn boot_id() -> Result<String, DomainError> {

@@ -1,6 +1,5 @@
 //! Sequence numbers of a channel: given by its writer, judged by its readers. Pure.
 
-use core::fmt;
 use core::time::Duration;
 use hil_platform::clock::MonotonicClock;
 
@@ -14,7 +13,7 @@ use hil_core::time::Instant;
 pub type Stamp = fn() -> Instant;
 
 /// How a writer behaves.
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy)]
 pub struct OutputSettings {
     /// Changes with every start of the writer, so that readers tell a restart from a loss.
     pub epoch: u32,
@@ -32,16 +31,6 @@ impl Default for OutputSettings {
             stamp: Some(MonotonicClock::now),
             notifies_readers: true,
         }
-    }
-}
-
-impl fmt::Debug for OutputSettings {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("OutputSettings")
-            .field("epoch", &self.epoch)
-            .field("reads_clock", &self.stamp.is_some())
-            .field("notifies_readers", &self.notifies_readers)
-            .finish()
     }
 }
 

@@ -9,6 +9,7 @@ use hil_core::time::Instant;
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::ipc;
+use iceoryx2::service::port_factory::event;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::TimeSpec;
@@ -138,13 +139,8 @@ impl Waiter {
 }
 
 fn open_listener(domain: &Domain, channel: &str) -> Result<Listener<ipc::Service>, ChannelError> {
-    let name = raw::service_name(channel)?;
     retry(domain.open_within(), || {
-        domain
-            .with_node(|node| node.service_builder(&name))
-            .event()
-            .open()
-            .map_err(|error| ChannelError::refused(channel, "open the wake-up service", &error))?
+        open_event(domain, channel)?
             .listener_builder()
             .create()
             .map_err(|error| ChannelError::refused(channel, "become a listener", &error))
@@ -156,15 +152,22 @@ pub(crate) fn open_notifier(
     domain: &Domain,
     channel: &str,
 ) -> Result<Notifier<ipc::Service>, ChannelError> {
+    open_event(domain, channel)?
+        .notifier_builder()
+        .create()
+        .map_err(|error| ChannelError::refused(channel, "become a notifier", &error))
+}
+
+fn open_event(
+    domain: &Domain,
+    channel: &str,
+) -> Result<event::PortFactory<ipc::Service>, ChannelError> {
     let name = raw::service_name(channel)?;
     domain
         .with_node(|node| node.service_builder(&name))
         .event()
         .open()
-        .map_err(|error| ChannelError::refused(channel, "open the wake-up service", &error))?
-        .notifier_builder()
-        .create()
-        .map_err(|error| ChannelError::refused(channel, "become a notifier", &error))
+        .map_err(|error| ChannelError::refused(channel, "open the wake-up service", &error))
 }
 
 /// Takes back announcements until a look finds none.

@@ -10,7 +10,6 @@ pub mod category;
 pub mod conversation;
 pub mod netlink;
 pub mod nl80211;
-mod noting;
 pub mod sampler;
 pub mod socket;
 

@@ -8,10 +8,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use super::nl80211::Station;
-use super::noting;
+use super::nl80211::{Happening, Rate, Station};
 use super::socket::RadioSocket;
+use hil_core::record::UNAVAILABLE;
 use hil_platform::clock::MonotonicClock;
+use hil_rundir::radio_record::{
+    NO_BYTE, NO_CODE, NO_RATE, NO_SIGNAL, RadioRecord, RateRecord, SAMPLE,
+};
 use hil_rundir::record::RecordSink;
 
 /// Time between two samples.
@@ -87,43 +90,38 @@ impl Sampler {
 }
 
 fn describe(tally: &Tally, interface: &str, hears_events: bool) -> String {
-    let mut text = format!("{} of {}", tally.sample_count, interface);
+    let mut parts = vec![format!("{} of {interface}", tally.sample_count)];
     if !hears_events {
-        text.push_str("; events of the association unavailable");
+        parts.push("events of the association unavailable".to_owned());
     } else if tally.event_count > 0 {
-        let words = format!("; {} events of the association", tally.event_count);
-        text.push_str(&words);
+        parts.push(format!("{} events of the association", tally.event_count));
     }
     if tally.overrun_count > 0 {
-        let words = format!(
-            "; the kernel threw events away {} times: roams may be missing",
+        parts.push(format!(
+            "the kernel threw events away {} times: roams may be missing",
             tally.overrun_count
-        );
-        text.push_str(&words);
+        ));
     }
     if let Some(error) = &tally.event_failure {
-        let words = format!("; events of the association broke off: {error}");
-        text.push_str(&words);
+        parts.push(format!("events of the association broke off: {error}"));
     }
     if tally.left_out_count > 0 {
-        let more = format!(
-            "; {} stations beyond {STATION_COUNT_MAX} left out",
-            tally.left_out_count
-        );
-        text.push_str(&more);
+        let count = tally.left_out_count;
+        parts.push(format!(
+            "{count} stations beyond {STATION_COUNT_MAX} left out"
+        ));
     }
     if let Some(error) = &tally.newest_failure {
-        let words = format!("; {} failed: {error}", tally.failed_count);
-        text.push_str(&words);
+        parts.push(format!("{} failed: {error}", tally.failed_count));
     }
-    text
+    parts.join("; ")
 }
 
 fn look(socket: &mut RadioSocket, sink: &mut RecordSink, tally: &mut Tally) {
     let at_ns = MonotonicClock::now().as_ns();
     let heard = socket.happenings(|happening| {
         tally.event_count += 1;
-        sink.push(&noting::happening(at_ns, &happening));
+        sink.push(&happening_record(at_ns, &happening));
     });
     match heard {
         Ok(overrun_count) => tally.overrun_count += overrun_count,
@@ -133,13 +131,56 @@ fn look(socket: &mut RadioSocket, sink: &mut RecordSink, tally: &mut Tally) {
         Ok(stations) => {
             tally.sample_count += 1;
             tally.left_out_count += stations.len().saturating_sub(STATION_COUNT_MAX) as u64;
-            let note = |station: &Station| sink.push(&noting::sample(at_ns, station));
+            let note = |station: &Station| sink.push(&sample_record(at_ns, station));
             stations.iter().take(STATION_COUNT_MAX).for_each(note);
         }
         Err(error) => {
             tally.failed_count += 1;
             tally.newest_failure = Some(error);
         }
+    }
+}
+
+/// A sample of `station`.
+fn sample_record(at_ns: i64, station: &Station) -> RadioRecord {
+    let count = |word: Option<u32>| word.map_or(UNAVAILABLE, i64::from);
+    let signal = |dbm: Option<i8>| dbm.map_or(NO_SIGNAL, i32::from);
+    RadioRecord {
+        rx_packets: count(station.rx_packets),
+        tx_packets: count(station.tx_packets),
+        tx_retries: count(station.tx_retries),
+        tx_failed: count(station.tx_failed),
+        beacon_losses: count(station.beacon_losses),
+        inactive_ms: count(station.inactive_ms),
+        connected_s: count(station.connected_s),
+        signal_dbm: signal(station.signal_dbm),
+        signal_average_dbm: signal(station.signal_average_dbm),
+        transmit: station.transmit.map_or(RateRecord::NONE, rate),
+        receive: station.receive.map_or(RateRecord::NONE, rate),
+        mac: station.mac,
+        event: SAMPLE,
+        ..RadioRecord::nothing(at_ns)
+    }
+}
+
+/// An event.
+fn happening_record(at_ns: i64, happening: &Happening) -> RadioRecord {
+    RadioRecord {
+        mac: happening.mac.unwrap_or_default(),
+        event: happening.command,
+        code: happening.code.unwrap_or(NO_CODE),
+        ..RadioRecord::nothing(at_ns)
+    }
+}
+
+fn rate(rate: Rate) -> RateRecord {
+    RateRecord {
+        kbps: rate.kbps.unwrap_or(NO_RATE),
+        width_mhz: rate.width_mhz,
+        generation: rate.generation as u8,
+        mcs: rate.mcs.unwrap_or(NO_BYTE),
+        stream_count: rate.stream_count.unwrap_or(NO_BYTE),
+        reserved: [0; 3],
     }
 }
 

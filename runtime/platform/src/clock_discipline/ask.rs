@@ -16,42 +16,10 @@ const LOOK_PERIOD: Duration = Duration::from_millis(5);
 /// Longer than any answer.
 const ANSWER_BYTES_MAX: u64 = 1 << 16;
 
-/// Which of the field's daemons run on this host.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-#[allow(
-    clippy::struct_excessive_bools,
-    reason = "a set of daemons, any of which may run beside any other"
-)]
-pub(super) struct Daemons {
-    pub(super) chronyd: bool,
-    pub(super) ptp4l: bool,
-    pub(super) phc2sys: bool,
-    pub(super) ntpd: bool,
-    pub(super) timesyncd: bool,
-}
-
-impl Daemons {
-    /// By the names of processes, as the kernel cuts them: at fifteen bytes.
-    fn named(names: impl Iterator<Item = String>) -> Self {
-        let mut found = Self::default();
-        for name in names {
-            match name.trim() {
-                "chronyd" => found.chronyd = true,
-                "ptp4l" => found.ptp4l = true,
-                "phc2sys" => found.phc2sys = true,
-                "ntpd" => found.ntpd = true,
-                "systemd-timesyn" => found.timesyncd = true,
-                _ => {}
-            }
-        }
-        found
-    }
-}
-
-/// Among the processes this one can see.
-pub(super) fn running_daemons() -> Daemons {
+/// The names of the processes that run here, as the kernel cuts them.
+pub(super) fn running_processes() -> Vec<String> {
     let names = HostFiles::of_this_host().process_names();
-    Daemons::named(names.available().into_iter().flatten().cloned())
+    names.available().cloned().unwrap_or_default()
 }
 
 pub(super) fn chrony() -> Result<ChronyTracking, String> {
@@ -111,18 +79,6 @@ fn answer(program: &str, arguments: &[&str]) -> Result<String, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn daemons_are_known_by_the_names_that_the_kernel_cuts() {
-        let names = ["systemd-timesyn\n", "bash\n", "phc2sys\n", "ntpdate\n"];
-        let found = Daemons::named(names.into_iter().map(str::to_owned));
-        let expected = Daemons {
-            phc2sys: true,
-            timesyncd: true,
-            ..Daemons::default()
-        };
-        assert_eq!(found, expected);
-    }
 
     #[test]
     fn a_tool_that_is_not_there_fails_or_hangs_is_an_error_and_one_that_answers_is_read() {

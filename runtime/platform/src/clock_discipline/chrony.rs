@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::ntp::{number, within};
+
 /// The fields of `chronyc -c tracking` that bound the clock's error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ChronyTracking {
@@ -36,17 +38,8 @@ impl ChronyTracking {
             let count = fields.len();
             return Err(format!("{count} fields, {FIELD_COUNT} expected: {line:?}"));
         }
-        let seconds = |index: usize, name: &str, lowest: f64| -> Result<f64, String> {
-            let text = fields[index];
-            let value: f64 = text
-                .parse()
-                .map_err(|error| format!("{name} {text:?}: {error}"))?;
-            // A day: a clock that far off has no bound worth the name.
-            if (lowest..=86_400.0).contains(&value) {
-                Ok(value)
-            } else {
-                Err(format!("{name} {value} s is outside {lowest} to 86400"))
-            }
+        let seconds = |index: usize, name: &str, lowest_s: f64| {
+            within(name, number(name, fields[index])?, lowest_s)
         };
         let stratum = fields[2]
             .parse()

@@ -13,7 +13,6 @@ pub use chrony::ChronyTracking;
 pub use ntp::NtpVariables;
 pub use ptp::PtpStatus;
 
-use self::ask::Daemons;
 use self::ntp::is_local_reference;
 use crate::realtime::clock_discipline;
 
@@ -22,6 +21,7 @@ use crate::realtime::clock_discipline;
 const PHC2SYS_ERROR_NS: u64 = 5_000;
 
 const LOCAL_CLOCK: &str = "; its own undisciplined clock, which is nobody else's reference";
+const NOT_KEPT: &str = "; the kernel says that nobody keeps the clock";
 const NOBODY: &str = "none of chronyd, ptp4l, ntpd and systemd-timesyncd runs here";
 
 /// What is known of how a host's system clock is steered.
@@ -61,27 +61,28 @@ impl HostDiscipline {
             bound_ns: None,
             basis: String::new(),
         };
-        found.believe(ask::running_daemons());
+        found.believe(&ask::running_processes());
         Ok(found)
     }
 
-    fn believe(&mut self, running: Daemons) {
-        if running.chronyd {
+    fn believe(&mut self, processes: &[String]) {
+        let runs = |daemon: &str| processes.iter().any(|name| name == daemon);
+        if runs("chronyd") {
             match ask::chrony() {
                 Ok(tracking) => self.believe_chrony(&tracking),
                 Err(why) => self.basis = format!("chronyd runs but says nothing: {why}"),
             }
-        } else if running.ptp4l {
+        } else if runs("ptp4l") {
             match ask::ptp() {
-                Ok(status) => self.believe_ptp(&status, running.phc2sys),
+                Ok(status) => self.believe_ptp(&status, runs("phc2sys")),
                 Err(why) => self.basis = format!("ptp4l runs but says nothing: {why}"),
             }
-        } else if running.ntpd {
+        } else if runs("ntpd") {
             match ask::ntp() {
                 Ok(variables) => self.believe_ntp(&variables),
                 Err(why) => self.basis = format!("ntpd runs but says nothing: {why}"),
             }
-        } else if running.timesyncd {
+        } else if runs("systemd-timesyn") {
             "systemd-timesyncd keeps the clock and publishes no bound of its error"
                 .clone_into(&mut self.basis);
         } else {
@@ -104,15 +105,7 @@ impl HostDiscipline {
             self.basis = format!("ntpd: {}; not synchronised", variables.reference);
             return;
         };
-        if variables.is_local() {
-            self.basis.push_str(LOCAL_CLOCK);
-        } else if self.is_kernel_synchronised {
-            self.reference = Some(format!("ntp {}", variables.reference));
-            self.bound_ns = Some(bound_ns);
-        } else {
-            self.basis
-                .push_str("; the kernel says that nobody keeps the clock");
-        }
+        self.follow(&variables.reference, bound_ns);
     }
 
     fn believe_chrony(&mut self, tracking: &ChronyTracking) {
@@ -124,16 +117,22 @@ impl HostDiscipline {
             tracking.root_delay_s,
             tracking.root_dispersion_s
         );
-        if !tracking.is_synchronised() {
+        if tracking.is_synchronised() {
+            self.follow(&tracking.reference, tracking.bound_ns());
+        } else {
             self.basis.push_str("; not synchronised");
-        } else if is_local_reference(&tracking.reference) {
+        }
+    }
+
+    /// Takes the bound of a synchronised NTP daemon, unless its clock is nobody's.
+    fn follow(&mut self, reference: &str, bound_ns: u64) {
+        if is_local_reference(reference) {
             self.basis.push_str(LOCAL_CLOCK);
         } else if !self.is_kernel_synchronised {
-            self.basis
-                .push_str("; the kernel says that nobody keeps the clock");
+            self.basis.push_str(NOT_KEPT);
         } else {
-            self.reference = Some(format!("ntp {}", tracking.reference));
-            self.bound_ns = Some(tracking.bound_ns());
+            self.reference = Some(format!("ntp {reference}"));
+            self.bound_ns = Some(bound_ns);
         }
     }
 
@@ -152,8 +151,7 @@ impl HostDiscipline {
         if !status.is_present {
             self.basis.push_str("; follows no other clock");
         } else if !self.is_kernel_synchronised {
-            self.basis
-                .push_str("; the kernel says that nobody keeps the clock");
+            self.basis.push_str(NOT_KEPT);
         } else if has_phc2sys {
             self.reference = Some(format!("ptp {}", status.grandmaster));
             self.bound_ns = Some(status.bound_ns().saturating_add(PHC2SYS_ERROR_NS));
@@ -318,17 +316,15 @@ mod tests {
     #[test]
     fn a_daemon_without_figures_is_named_all_the_same() {
         let mut host = nobody();
-        host.believe(Daemons {
-            timesyncd: true,
-            ..Daemons::default()
-        });
+        let names = ["systemd-timesyn", "bash", "ntpdate"].map(str::to_owned);
+        host.believe(&names);
         assert!(
             host.basis.starts_with("systemd-timesyncd keeps"),
             "{}",
             host.basis
         );
         assert_eq!((&host.reference, host.bound_ns), (&None, None));
-        host.believe(Daemons::default());
+        host.believe(&["bash", "ntpdate"].map(str::to_owned));
         assert_eq!(host.basis, NOBODY);
     }
 

@@ -42,13 +42,8 @@ impl NtpVariables {
             let text = value(name)?;
             u32::from_str_radix(text, radix).map_err(|error| format!("{name} {text:?}: {error}"))
         };
-        let seconds = |name: &str, lowest_s: f64| -> Result<f64, String> {
-            let text = value(name)?;
-            let value_ms: f64 = text
-                .parse()
-                .map_err(|error| format!("{name} {text:?}: {error}"))?;
-            within(name, value_ms / 1e3, lowest_s)
-        };
+        let seconds =
+            |name: &str, lowest_s: f64| within(name, number(name, value(name)?)? / 1e3, lowest_s);
         let instant_s = |name: &str| -> Result<f64, String> {
             let text = value(name)?;
             // Sixty-four bits, whole seconds before the point; then the same in words.
@@ -81,11 +76,6 @@ impl NtpVariables {
         self.leap != 3 && (1..16).contains(&self.stratum)
     }
 
-    /// True while its source is the local clock itself, which is the reference of nobody else.
-    pub fn is_local(&self) -> bool {
-        is_local_reference(&self.reference)
-    }
-
     /// Largest error of the system clock against the reference, nanoseconds; `None` when not
     /// synchronised. Root distance (RFC 5905, appendix A.5.5.2), the offset it has yet to correct,
     /// and what the clock may have strayed since the last update.
@@ -115,7 +105,12 @@ pub(super) fn is_local_reference(reference: &str) -> bool {
     })
 }
 
-fn within(name: &str, value_s: f64, lowest_s: f64) -> Result<f64, String> {
+pub(super) fn number(name: &str, text: &str) -> Result<f64, String> {
+    text.parse::<f64>()
+        .map_err(|error| format!("{name} {text:?}: {error}"))
+}
+
+pub(super) fn within(name: &str, value_s: f64, lowest_s: f64) -> Result<f64, String> {
     if (lowest_s..=SECONDS_MAX).contains(&value_s) {
         Ok(value_s)
     } else {

@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::ntp::number;
+
 /// What `ptp4l` says of its own clock.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PtpStatus {
@@ -37,11 +39,8 @@ impl PtpStatus {
             }
             Ok(value)
         };
-        let number = |name: &str| -> Result<f64, String> {
-            let text = value(name)?;
-            let number: f64 = text
-                .parse()
-                .map_err(|error| format!("{name} {text:?}: {error}"))?;
+        let number = |name: &str| {
+            let number = number(name, value(name)?)?;
             // Nine days in nanoseconds: a double holds them exactly.
             if number.abs() <= 8e14 {
                 Ok(number)

@@ -1,9 +1,8 @@
 //! Reads the kernel's text files (`/proc`, `/sys`, `/etc`) below a root that tests can move.
 //! It writes nothing and interprets nothing beyond numbers and CPU lists.
 
-use std::fs;
-use std::io;
 use std::path::PathBuf;
+use std::{fs, io};
 
 use super::Fact;
 
@@ -65,16 +64,14 @@ impl HostFiles {
 
     /// The names in a folder, sorted.
     pub fn list(&self, path: &str) -> Fact<Vec<String>> {
-        let entries = match fs::read_dir(self.locate(path)) {
-            Ok(entries) => entries,
-            Err(error) => return Fact::Unavailable(format!("{path}: {error}")),
-        };
-        let mut names: Vec<String> = entries
-            .flatten()
-            .map(|entry| entry.file_name().to_string_lossy().into_owned())
-            .collect();
-        names.sort();
-        Fact::Available(names)
+        Fact::of(path, fs::read_dir(self.locate(path))).map(|entries| {
+            let mut names: Vec<String> = entries
+                .flatten()
+                .map(|entry| entry.file_name().to_string_lossy().into_owned())
+                .collect();
+            names.sort();
+            names
+        })
     }
 
     /// The names of the processes that this one can see, cut at fifteen bytes as the kernel does.
@@ -99,10 +96,8 @@ impl HostFiles {
 
     /// Where the symbolic link `path` points, as it is written.
     pub fn link_target(&self, path: &str) -> Fact<String> {
-        match fs::read_link(self.locate(path)) {
-            Ok(target) => Fact::Available(target.to_string_lossy().into_owned()),
-            Err(error) => Fact::Unavailable(format!("{path}: {error}")),
-        }
+        Fact::of(path, fs::read_link(self.locate(path)))
+            .map(|target| target.to_string_lossy().into_owned())
     }
 
     /// The first number of a binary file: a signed 32-bit word in the host's order.
@@ -111,10 +106,7 @@ impl HostFiles {
             let mut word = [0; 4];
             io::Read::read_exact(&mut file, &mut word).map(|()| i32::from_ne_bytes(word))
         });
-        match read {
-            Ok(word) => Fact::Available(word),
-            Err(error) => Fact::Unavailable(format!("{path}: {error}")),
-        }
+        Fact::of(path, read)
     }
 
     /// The value behind `key` in a file of `key: value` lines, such as `/proc/meminfo`.

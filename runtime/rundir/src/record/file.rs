@@ -14,7 +14,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use bytemuck::Pod;
+use bytemuck::{CheckedBitPattern, Pod};
 use hil_account::card_clock::CardClockRecord;
 use hil_core::message::Envelope;
 use hil_core::record::{
@@ -31,65 +31,54 @@ const MAGIC: &[u8; 8] = b"HILREC01";
 /// Size of the file header.
 pub const HEADER_BYTES: usize = 128;
 
-/// What a record file holds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+/// What a record file holds; its number stands for it in the header.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
+#[repr(u32)]
 pub enum RecordKind {
     /// [`PublishedRecord`]s of a producer.
-    Published,
+    Published = 1,
     /// [`TakenRecord`]s of a consumer.
-    Taken,
+    Taken = 2,
     /// [`EgressRecord`]s of a sending gateway.
-    Egress,
+    Egress = 3,
     /// [`IngressRecord`]s of a receiving gateway.
-    Ingress,
+    Ingress = 4,
     /// [`FollowUpRecord`]s of a receiving gateway.
-    FollowUp,
+    FollowUp = 5,
     /// Messages: an [`Envelope`] and the payload.
-    Message,
+    Message = 6,
     /// [`RoundTripRecord`]s of a sending gateway.
-    RoundTrip,
+    RoundTrip = 7,
     /// [`FaceSentRecord`]s of a face: datagrams to a foreign program.
-    FaceSent,
+    FaceSent = 8,
     /// [`FaceReceivedRecord`]s of a face: datagrams of a foreign program.
-    FaceReceived,
+    FaceReceived = 9,
     /// [`CardClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
-    CardClock,
+    CardClock = 10,
     /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
-    Radio,
+    Radio = 15,
     /// [`LinkConditionRecord`]s of a gateway that emulates a link; the channel is that of the orders,
     /// `hil/link/<link>/<direction>`.
-    LinkCondition,
+    LinkCondition = 16,
 }
 
 impl RecordKind {
-    /// Every kind, with the number that stands for it in the header and its name in file names.
-    const ALL: [(Self, u32, &'static str); 12] = [
-        (Self::Published, 1, "published"),
-        (Self::Taken, 2, "taken"),
-        (Self::Egress, 3, "egress"),
-        (Self::Ingress, 4, "ingress"),
-        (Self::FollowUp, 5, "follow-up"),
-        (Self::Message, 6, "message"),
-        (Self::RoundTrip, 7, "round-trip"),
-        (Self::FaceSent, 8, "face-sent"),
-        (Self::FaceReceived, 9, "face-received"),
-        (Self::CardClock, 10, "card-clock"),
-        (Self::Radio, 15, "radio"),
-        (Self::LinkCondition, 16, "link-condition"),
-    ];
-
-    fn row(self) -> (Self, u32, &'static str) {
-        *Self::ALL
-            .iter()
-            .find(|row| row.0 == self)
-            .expect("ALL lists every kind")
-    }
-
-    fn from_number(number: u32) -> Option<Self> {
-        Self::ALL
-            .iter()
-            .find(|row| row.1 == number)
-            .map(|row| row.0)
+    /// In file names.
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Published => "published",
+            Self::Taken => "taken",
+            Self::Egress => "egress",
+            Self::Ingress => "ingress",
+            Self::FollowUp => "follow-up",
+            Self::Message => "message",
+            Self::RoundTrip => "round-trip",
+            Self::FaceSent => "face-sent",
+            Self::FaceReceived => "face-received",
+            Self::CardClock => "card-clock",
+            Self::Radio => "radio",
+            Self::LinkCondition => "link-condition",
+        }
     }
 
     /// Size of one record; `None` where it depends on the channel.
@@ -168,7 +157,7 @@ impl RecordHeader {
         let channel = self.channel.replace('/', ".");
         format!(
             "{channel}.{}.{writer}.{}.rec",
-            self.kind.row().2,
+            self.kind.name(),
             self.instance
         )
     }
@@ -185,7 +174,7 @@ impl RecordHeader {
         }
         let mut bytes = [0; HEADER_BYTES];
         bytes[..8].copy_from_slice(MAGIC);
-        bytes[8..12].copy_from_slice(&self.kind.row().1.to_le_bytes());
+        bytes[8..12].copy_from_slice(&(self.kind as u32).to_le_bytes());
         bytes[12..16].copy_from_slice(&self.record_bytes.to_le_bytes());
         bytes[16..20].copy_from_slice(&self.instance.to_le_bytes());
         bytes[32..32 + name.len()].copy_from_slice(name);
@@ -210,7 +199,7 @@ impl RecordHeader {
     /// The name of the process that wrote the file called `name`, which has this header; `None`
     /// when the name is not made as [`RecordHeader::file_name`] makes it.
     pub fn writer<'a>(&self, name: &'a str) -> Option<&'a str> {
-        let start = format!("{}.{}.", self.channel.replace('/', "."), self.kind.row().2);
+        let start = format!("{}.{}.", self.channel.replace('/', "."), self.kind.name());
         let end = format!(".{}.rec", self.instance);
         name.strip_prefix(&start)?.strip_suffix(&end)
     }
@@ -233,30 +222,22 @@ impl RecordHeader {
         if header[..8] != MAGIC[..] {
             return Err(malformed(path, 0, "not a record file"));
         }
-        let word = |at: usize| {
-            u32::from_le_bytes(
-                header[at..at + 4]
-                    .try_into()
-                    .expect("the slice is four bytes"),
-            )
-        };
-        let kind = RecordKind::from_number(word(8))
-            .ok_or_else(|| malformed(path, 8, "unknown record kind"))?;
+        let word = |at: usize| u32::from_le_bytes(core::array::from_fn(|byte| header[at + byte]));
+        let kind: RecordKind = bytemuck::checked::try_cast(word(8))
+            .map_err(|_unknown| malformed(path, 8, "unknown record kind"))?;
         let record_bytes = word(12);
         let least = size_of::<Envelope>();
-        let (fits, expected) = kind.record_bytes().map_or_else(
-            || {
-                (
-                    record_bytes as usize >= least,
-                    format!("at least {least} bytes"),
-                )
-            },
-            |size| (record_bytes as usize == size, format!("{size} bytes")),
-        );
+        let (fits, expected) = match kind.record_bytes() {
+            Some(size) => (record_bytes as usize == size, format!("{size} bytes")),
+            None => (
+                record_bytes as usize >= least,
+                format!("at least {least} bytes"),
+            ),
+        };
         if !fits {
             return Err(RecordFileError::OtherLayout {
                 path: path.to_owned(),
-                kind: kind.row().2,
+                kind: kind.name(),
                 found_bytes: record_bytes,
                 expected,
             });

@@ -1,12 +1,10 @@
 //! Processes killed at random moments, start-up included: the channel must stay usable, and the
 //! run must leave nothing. The children are this test binary itself.
 
-use std::env;
-use std::fs;
 use std::path::Path;
 use std::process::{self, Child, Command, Stdio};
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{env, fs, thread};
 
 use hil_core::endpoint::{InputPort, OutputPort};
 use hil_core::random::RandomStream;
