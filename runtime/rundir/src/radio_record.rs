@@ -150,17 +150,19 @@ impl RateRecord {
             7 => "EHT",
             _ => "legacy",
         };
-        let mut text = generation.to_owned();
-        if self.mcs != NO_BYTE {
-            let words = format!(" MCS {}", self.mcs);
-            text.push_str(&words);
-        }
-        if self.stream_count != NO_BYTE {
-            let words = format!(", {} spatial streams", self.stream_count);
-            text.push_str(&words);
-        }
-        let words = format!(", {} MHz", self.width_mhz);
-        text.push_str(&words);
-        Some(text)
+        let known = |value: u8, text: String| {
+            if value == NO_BYTE {
+                String::new()
+            } else {
+                text
+            }
+        };
+        let mcs = known(self.mcs, format!(" MCS {}", self.mcs));
+        let streams = format!(", {} spatial streams", self.stream_count);
+        let streams = known(self.stream_count, streams);
+        Some(format!(
+            "{generation}{mcs}{streams}, {} MHz",
+            self.width_mhz
+        ))
     }
 }

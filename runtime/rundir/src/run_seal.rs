@@ -1,7 +1,6 @@
 //! The secret of one run and the cipher of its hops, as supervisors hand them to each other and to their
 //! gateways. It goes through pipes and encrypted connections only, never into a file.
 
-use core::fmt;
 use std::io;
 
 use hil_protocol::seal::{Association, Initiator, Responder, Rotation, RunSecret, Suite};
@@ -15,36 +14,37 @@ use hil_platform::random::random_bytes;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunSeal {
-    secret: Secret,
-    cipher: Cipher,
+    #[serde(with = "secret")]
+    secret: RunSecret,
+    #[serde(with = "Cipher")]
+    cipher: Suite,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+/// How a [`Suite`] is written.
+#[derive(Serialize, Deserialize)]
+#[serde(remote = "Suite", rename_all = "kebab-case")]
 enum Cipher {
     Aes256Gcm,
-    Chacha20Poly1305,
+    #[serde(rename = "chacha20-poly1305")]
+    ChaCha20Poly1305,
 }
 
-#[derive(Clone, PartialEq, Eq)]
-struct Secret(RunSecret);
+/// How a [`RunSecret`] is written.
+mod secret {
+    use super::{Deserialize, Deserializer, RunSecret, Serialize, Serializer};
 
-impl fmt::Debug for Secret {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("..")
+    pub(super) fn serialize<S: Serializer>(
+        secret: &RunSecret,
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
+        secret.expose().serialize(serializer)
     }
-}
 
-impl Serialize for Secret {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        self.0.expose().serialize(serializer)
-    }
-}
-
-impl<'de> Deserialize<'de> for Secret {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(
+        deserializer: D,
+    ) -> Result<RunSecret, D::Error> {
         let mut bytes = <[u8; 32]>::deserialize(deserializer)?;
-        Ok(Self(RunSecret::new(&mut bytes)))
+        Ok(RunSecret::new(&mut bytes))
     }
 }
 
@@ -55,25 +55,19 @@ impl RunSeal {
     /// When the system gives no random numbers.
     pub fn fresh(suite: Suite) -> io::Result<Self> {
         Ok(Self {
-            secret: Secret(RunSecret::new(&mut random_bytes()?)),
-            cipher: match suite {
-                Suite::Aes256Gcm => Cipher::Aes256Gcm,
-                Suite::ChaCha20Poly1305 => Cipher::Chacha20Poly1305,
-            },
+            secret: RunSecret::new(&mut random_bytes()?),
+            cipher: suite,
         })
     }
 
     /// The cipher of every hop.
     pub fn suite(&self) -> Suite {
-        match self.cipher {
-            Cipher::Aes256Gcm => Suite::Aes256Gcm,
-            Cipher::Chacha20Poly1305 => Suite::ChaCha20Poly1305,
-        }
+        self.cipher
     }
 
     fn association(&self, launch: &DirectionLaunch) -> Association {
         Association {
-            secret: self.secret.0.clone(),
+            secret: self.secret.clone(),
             suite: self.suite(),
             channel: launch.channel_id,
             channel_name: launch.channel.clone(),

@@ -116,9 +116,7 @@ impl Domain {
     /// # Errors
     /// When the root path does not exist here or iceoryx2 refuses, e.g. for another user's domain.
     pub fn open(address: &DomainAddress) -> Result<Self, DomainError> {
-        let marker = address.root_path().join(MARKER);
-        fs::metadata(&marker).map_err(DomainError::io("find the run's", &marker))?;
-        Self::join(address.clone(), None)
+        Self::join_existing(address, None)
     }
 
     /// As [`Domain::open`], for a program that only looks on: the run ends without regard to it.
@@ -126,9 +124,13 @@ impl Domain {
     /// # Errors
     /// As [`Domain::open`].
     pub fn observe(address: &DomainAddress) -> Result<Self, DomainError> {
+        Self::join_existing(address, Some(members::observer_name()))
+    }
+
+    fn join_existing(address: &DomainAddress, name: Option<NodeName>) -> Result<Self, DomainError> {
         let marker = address.root_path().join(MARKER);
         fs::metadata(&marker).map_err(DomainError::io("find the run's", &marker))?;
-        Self::join(address.clone(), Some(members::observer_name()))
+        Self::join(address.clone(), name)
     }
 
     fn join(address: DomainAddress, name: Option<NodeName>) -> Result<Self, DomainError> {

@@ -102,7 +102,7 @@ impl OpeningKey {
     fn new(generation: &Generation) -> Self {
         Self {
             key: generation.key(),
-            window: ReplayWindow::new(),
+            window: ReplayWindow::default(),
         }
     }
 

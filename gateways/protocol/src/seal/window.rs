@@ -8,7 +8,7 @@ pub const WINDOW_LENGTH: u32 = 2048;
 const WORDS: usize = 32;
 const _: () = assert!(WORDS * 64 == WINDOW_LENGTH as usize);
 
-/// The window of one key.
+/// The window of one key; the default one is that of a key not used yet.
 #[derive(Debug, Clone, Default)]
 pub struct ReplayWindow {
     /// One past the newest number taken.
@@ -18,14 +18,6 @@ pub struct ReplayWindow {
 }
 
 impl ReplayWindow {
-    /// Of a key that was not used yet.
-    pub const fn new() -> Self {
-        Self {
-            end: 0,
-            taken: [0; WORDS],
-        }
-    }
-
     /// Takes `number`, once.
     ///
     /// # Errors
@@ -76,7 +68,7 @@ mod tests {
     fn in_any_order_each_number_is_taken_once_and_the_old_are_refused() {
         for seed in 0..20 {
             let mut random = RandomStream::new(seed, "window");
-            let mut window = ReplayWindow::new();
+            let mut window = ReplayWindow::default();
             let mut taken = BTreeSet::new();
             let mut newest: u32 = 0;
             for _ in 0..20_000 {
@@ -107,7 +99,7 @@ mod tests {
 
     #[test]
     fn the_last_number_there_is_can_be_taken_once() {
-        let mut window = ReplayWindow::new();
+        let mut window = ReplayWindow::default();
         assert_eq!(window.take(u32::MAX - 1), Ok(()));
         assert_eq!(window.take(u32::MAX - 1), Err(SealRefusal::Replayed));
         assert_eq!(window.take(0), Err(SealRefusal::TooOld));
