@@ -1,6 +1,7 @@
 //! Two hosts: a shared-memory domain each, channels there and back, and for each channel a
 //! gateway direction at either end, opened as the gateway process opens it.
 
+use std::collections::BTreeMap;
 use std::error::Error;
 use std::fs;
 use std::path::PathBuf;
@@ -18,7 +19,7 @@ use hil_engine::gateway::direction::{Direction, Opened};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
-use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch};
 use hil_rundir::pipe::RunStart;
 use hil_rundir::record::{RecordFile, RecordKind, RecordSink, Recorder};
 use hil_shm::{
@@ -356,7 +357,8 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
         local: unset,
         peer: unset,
         socket: SocketLaunch {
-            transport: Transport::Udp,
+            transport: "udp".to_owned(),
+            options: BTreeMap::new(),
             interface: None,
             dscp: 0,
             priority: None,

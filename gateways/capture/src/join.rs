@@ -18,7 +18,7 @@ use hil_stats::histogram::{Distribution, LatencyHistogram};
 use hil_stats::statistics::{CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, wilson};
 use serde::{Deserialize, Serialize};
 
-use super::observe::{Observation, Point, Seen, Stream};
+use super::observe::{Observation, Point, Seen, Span, Stream};
 use hil_net::Direction;
 
 /// Farthest that two stamps of one datagram may lie apart unless told otherwise.
@@ -118,13 +118,15 @@ pub struct Joined {
 /// by there at all is for the caller to know: see [`super::pairing`].
 pub fn join(
     stream: &Stream,
-    (a, seen_a): (&Point, &Seen),
-    (b, seen_b): (&Point, &Seen),
+    a: &Point,
+    seen_a: &Seen,
+    b: &Point,
+    seen_b: &Seen,
     window_ns: i64,
 ) -> Option<Joined> {
     let list = |seen: &Seen| {
         let list = seen.streams.get(stream).map(|list| sorted(list));
-        list.or_else(|| seen.span_ns.map(|_watched| Vec::new()))
+        list.or_else(|| seen.span.map(|_watched| Vec::new()))
     };
     let mut sides = [(a, seen_a, list(seen_a)?), (b, seen_b, list(seen_b)?)];
     let is_empty = [sides[0].2.is_empty(), sides[1].2.is_empty()];
@@ -165,14 +167,13 @@ pub fn join(
             second: second[j],
         })
         .collect();
-    let watched = (seen_first.span_ns, seen_second.span_ns);
     let figures = Tally {
         first: &first,
         second: &second,
         pairs: &pairs,
         matches: &matches,
     }
-    .figures(order, watched);
+    .figures(order, seen_first.span, seen_second.span);
     Some(Joined {
         first_point: *first_point,
         second_point: *second_point,
@@ -214,7 +215,7 @@ impl Matches {
             duplicates: Vec::new(),
         };
         for (from, to) in by_key.values() {
-            matches.add_key((first, from), (second, to), window_ns);
+            matches.add_key(first, from, second, to, window_ns);
         }
         matches.pairs.sort_unstable();
         matches.only_first.sort_unstable();
@@ -223,8 +224,10 @@ impl Matches {
 
     fn add_key(
         &mut self,
-        (first, from): (&[Observation], &[usize]),
-        (second, to): (&[Observation], &[usize]),
+        first: &[Observation],
+        from: &[usize],
+        second: &[Observation],
+        to: &[usize],
         window_ns: i64,
     ) {
         let (mut i, mut j, mut newest_match) = (0, 0, None);
@@ -267,16 +270,30 @@ struct Tally<'a> {
     matches: &'a Matches,
 }
 
-type Span = Option<(i64, i64)>;
-
 impl Tally<'_> {
-    fn figures(&self, order: OrderSource, watched: (Span, Span)) -> JoinFigures {
+    fn figures(
+        &self,
+        order: OrderSource,
+        watched_first: Option<Span>,
+        watched_second: Option<Span>,
+    ) -> JoinFigures {
         let delays: Vec<i64> = self.pairs.iter().map(Pair::delay_ns).collect();
-        let extremes = (
-            delays.iter().min().copied().unwrap_or(0),
-            delays.iter().max().copied().unwrap_or(0),
-        );
-        let (lost, unexplained) = self.judged(extremes, watched);
+        let fastest = delays.iter().min().copied().unwrap_or(0);
+        let slowest = delays.iter().max().copied().unwrap_or(0);
+        // The rest of what was seen at one point only lies at an edge.
+        let only_first = self.matches.only_first.iter().copied();
+        let lost: Vec<usize> = only_first
+            .filter(|at| is_covered(self.first[*at].stamp_ns, fastest, slowest, watched_second))
+            .collect();
+        let unexplained = self.matches.only_second.iter().filter(|at| {
+            is_covered(
+                self.second[**at].stamp_ns,
+                -slowest,
+                -fastest,
+                watched_first,
+            )
+        });
+        let unexplained = unexplained.count();
         let only_count = self.matches.only_first.len() + self.matches.only_second.len();
         let judged = (self.pairs.len() + lost.len()) as u64;
         let lost_count = lost.len() as u64;
@@ -306,7 +323,7 @@ impl Tally<'_> {
             delay_p50_interval: interval(0.5, "probe delay p50"),
             delay_p99_interval: interval(0.99, "probe delay p99"),
             variation: distribution(
-                delays.iter().map(|delay| delay.saturating_sub(extremes.0)),
+                delays.iter().map(|delay| delay.saturating_sub(fastest)),
                 "no datagram was seen at both points",
             ),
             jitter_last_ns: jitter.map(|(last, _)| last),
@@ -321,27 +338,6 @@ impl Tally<'_> {
                 "fewer than two arrivals",
             ),
         }
-    }
-
-    /// Positions of what was lost, and how many were unexplained; the rest of what was seen at one
-    /// point only lies at an edge.
-    fn judged(&self, (fastest, slowest): (i64, i64), watched: (Span, Span)) -> (Vec<usize>, usize) {
-        let is_lost = |index: &&usize| {
-            is_covered(self.first[**index].stamp_ns, (fastest, slowest), watched.1)
-        };
-        let back = (-slowest, -fastest);
-        let is_unexplained =
-            |index: &&usize| is_covered(self.second[**index].stamp_ns, back, watched.0);
-        let only_second = self.matches.only_second.iter();
-        (
-            self.matches
-                .only_first
-                .iter()
-                .filter(is_lost)
-                .copied()
-                .collect(),
-            only_second.filter(is_unexplained).count(),
-        )
     }
 
     /// Positions of departure, and pairs, in the order of arrival.
@@ -371,9 +367,9 @@ impl Tally<'_> {
 
 /// True when a datagram stamped `at` would have had its other stamp within `watched`, however fast
 /// or slow it was among those seen.
-fn is_covered(at: i64, (fastest, slowest): (i64, i64), watched: Span) -> bool {
-    watched.is_some_and(|(from, to)| {
-        at.saturating_add(fastest) >= from && at.saturating_add(slowest) <= to
+fn is_covered(at: i64, fastest: i64, slowest: i64, watched: Option<Span>) -> bool {
+    watched.is_some_and(|span| {
+        at.saturating_add(fastest) >= span.first_ns && at.saturating_add(slowest) <= span.last_ns
     })
 }
 

@@ -26,9 +26,11 @@ pub fn join_all(observer: &Observer, window_ns: i64) -> Vec<(Stream, Joined)> {
                     // Each two once.
                     at > index && saw_it(b.1)
                 } else {
-                    is_expected(stream, a.0, b, observer)
+                    is_expected(stream, a.0, b.0, b.1, observer)
                 };
-                if let Some(joined) = join(stream, *a, *b, window_ns).filter(|_| is_wanted) {
+                if let Some(joined) =
+                    join(stream, a.0, a.1, b.0, b.1, window_ns).filter(|_| is_wanted)
+                {
                     found.push((*stream, joined));
                 }
             }
@@ -38,9 +40,14 @@ pub fn join_all(observer: &Observer, window_ns: i64) -> Vec<(Stream, Joined)> {
     found
 }
 
-/// True when `stream`, seen at `at`, was to be seen at the other point.
-fn is_expected(stream: &Stream, at: &Point, other: &(&Point, &Seen), observer: &Observer) -> bool {
-    let (point, seen) = *other;
+/// True when `stream`, seen at `at`, was to be seen at `point`, which saw `seen`.
+fn is_expected(
+    stream: &Stream,
+    at: &Point,
+    point: &Point,
+    seen: &Seen,
+    observer: &Observer,
+) -> bool {
     let place = |point: &Point| (point.file_index, point.interface_index, point.esl_port);
     let is_same_file = at.file_index == point.file_index;
     // Out here, in there; into a host and out of it, or out of another whose capture has missed it.

@@ -5,7 +5,9 @@ use nix::errno::Errno;
 use nix::sys::socket::SockProtocol;
 
 use super::Finding;
-use super::plan::{Protocol, WantedPort};
+use hil_protocol::transport::IpProtocol;
+
+use super::plan::WantedPort;
 use hil_nic::radio::conversation::Conversation;
 use hil_nic::radio::netlink::{Attributes, u32_at};
 use hil_platform::host_facts::{Fact, HostFiles};
@@ -140,7 +142,7 @@ pub(super) fn examine(
 
 /// Opens the ports of the topology.
 fn cure(wanted: &[WantedPort]) -> String {
-    let rules = [Protocol::Udp, Protocol::Tcp].map(|protocol| {
+    let rules = [IpProtocol::Udp, IpProtocol::Tcp].map(|protocol| {
         let own = wanted.iter().filter(|one| one.protocol == protocol);
         let mut ports: Vec<u16> = own.map(|one| one.address.port()).collect();
         ports.sort_unstable();
@@ -196,9 +198,9 @@ mod tests {
 
     fn wanted() -> Vec<WantedPort> {
         [
-            (Protocol::Udp, 7400),
-            (Protocol::Udp, 7403),
-            (Protocol::Tcp, 7399),
+            (IpProtocol::Udp, 7400),
+            (IpProtocol::Udp, 7403),
+            (IpProtocol::Tcp, 7399),
         ]
         .map(|(protocol, port)| WantedPort {
             protocol,

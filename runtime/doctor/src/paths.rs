@@ -181,8 +181,8 @@ fn addresses(present: &Interfaces, plan: &Plan) -> Finding {
 fn mtu(files: &HostFiles, present: &Interfaces, load: &LinkLoad) -> Finding {
     let id = "mtu";
     let message = format!("{} of {} bytes", load.channel, load.message_bytes);
-    if load.is_stream {
-        return Finding::ok(id, format!("{message}: TCP cuts its own segments"));
+    if let Some(label) = load.cut_by {
+        return Finding::ok(id, format!("{message}: {label} cuts its own segments"));
     }
     let Some(interface) = owner(present, load.own) else {
         return Finding::cannot_tell(id, format!("{message}: no interface has {}", load.own));
@@ -339,7 +339,8 @@ mod tests {
             message_bytes,
             path_mtu_bytes: 1500,
             own: "10.77.0.1".parse().unwrap(),
-            is_stream,
+            header_bytes: 28,
+            cut_by: is_stream.then_some("TCP"),
         };
         mtu_of(&host, &load)
     }

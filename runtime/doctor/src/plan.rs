@@ -5,13 +5,10 @@ use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 
 use hil_arm::egm::messages::Side;
+use hil_protocol::transport::IpProtocol;
 use hil_protocol::wire;
 
-use hil_topology::{ClockEnd, Crossing, Execution, FaceKind, Host, Program, Topology, Via, Wait};
-
-/// Bytes of the IP and UDP headers before a datagram.
-const IPV4_HEADERS: usize = 28;
-const IPV6_HEADERS: usize = 48;
+use hil_topology::{ClockEnd, Crossing, Execution, FaceKind, Host, Program, Topology, Wait};
 
 /// A CPU that something is pinned to.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -24,29 +21,11 @@ pub struct Pin {
     pub spins: bool,
 }
 
-/// TCP or UDP.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Protocol {
-    /// Datagrams.
-    Udp,
-    /// Connections.
-    Tcp,
-}
-
-impl Protocol {
-    pub(super) const fn word(self) -> &'static str {
-        match self {
-            Self::Udp => "udp",
-            Self::Tcp => "tcp",
-        }
-    }
-}
-
 /// A port that a run binds on this host.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct WantedPort {
     /// Its protocol.
-    pub protocol: Protocol,
+    pub protocol: IpProtocol,
     /// Where.
     pub address: SocketAddr,
     /// What for.
@@ -79,29 +58,23 @@ pub struct LinkLoad {
     pub path_mtu_bytes: usize,
     /// Where it leaves.
     pub own: IpAddr,
-    /// True over TCP, where segments are the kernel's business.
-    pub is_stream: bool,
+    /// Bytes of a packet before a datagram.
+    pub header_bytes: usize,
+    /// The transport, where it cuts what it carries to the path itself.
+    pub cut_by: Option<&'static str>,
 }
 
 impl LinkLoad {
     /// Bytes of the IP packet that the message would be in one piece.
     pub(super) fn packet_bytes(&self) -> usize {
-        self.headers() + wire::HEADER_BYTES + self.message_bytes
+        self.header_bytes + wire::HEADER_BYTES + self.message_bytes
     }
 
     /// Datagrams of one message where a packet has at most `mtu` bytes; `None` when not even the
     /// headers fit.
     pub(super) fn datagram_count(&self, mtu: usize) -> Option<usize> {
-        let budget = mtu.checked_sub(self.headers() + wire::HEADER_BYTES)?;
+        let budget = mtu.checked_sub(self.header_bytes + wire::HEADER_BYTES)?;
         (budget > 0).then(|| self.message_bytes.div_ceil(budget).max(1))
-    }
-
-    fn headers(&self) -> usize {
-        if self.own.is_ipv4() {
-            IPV4_HEADERS
-        } else {
-            IPV6_HEADERS
-        }
     }
 }
 
@@ -189,7 +162,7 @@ impl Plan {
                     sides
                         .filter_map(|side| face.address(side))
                         .map(|address| WantedPort {
-                            protocol: Protocol::Udp,
+                            protocol: IpProtocol::Udp,
                             address,
                             of: process.to_owned(),
                         }),
@@ -199,42 +172,47 @@ impl Plan {
 
     fn cross(&mut self, crossing: &Crossing<'_>, is_here: &dyn Fn(&Host) -> bool) {
         let (from, to, channel) = (crossing.from_host, crossing.to_host, crossing.channel);
-        let is_stream = matches!(crossing.link.via, Via::Tcp(_));
+        let transport = crossing.hop.transport;
+        let capabilities = &transport.capabilities;
         let name = format!("gateway of {}", crossing.link.name);
         if is_here(from) || is_here(to) {
             self.pin(&name, &crossing.hop.gateway.execution);
         }
         if is_here(from) {
-            if !is_stream {
-                self.bind(from, Protocol::Udp, crossing.ports.sender, &channel.name);
-            }
+            self.bind(
+                from,
+                capabilities.sender_port,
+                crossing.ports.sender,
+                &channel.name,
+            );
             self.loads.push(LinkLoad {
                 link: crossing.link.name.clone(),
                 channel: channel.name.clone(),
                 message_bytes: channel.message.size_bytes,
                 path_mtu_bytes: crossing.hop.path_mtu_bytes,
                 own: from.gateway_address(),
-                is_stream,
+                header_bytes: capabilities.header_bytes(from.gateway_address()),
+                cut_by: capabilities.cuts_to_path.then_some(transport.label),
             });
             self.face(from, to);
         }
         if is_here(to) {
-            let protocol = if is_stream {
-                Protocol::Tcp
-            } else {
-                Protocol::Udp
-            };
-            self.bind(to, protocol, crossing.ports.receiver, &channel.name);
+            self.bind(
+                to,
+                capabilities.receiver_port,
+                crossing.ports.receiver,
+                &channel.name,
+            );
             self.face(to, from);
         }
     }
 
-    fn bind(&mut self, host: &Host, protocol: Protocol, port: u16, of: &str) {
-        self.ports.push(WantedPort {
+    fn bind(&mut self, host: &Host, protocol: Option<IpProtocol>, port: u16, of: &str) {
+        self.ports.extend(protocol.map(|protocol| WantedPort {
             protocol,
             address: SocketAddr::new(host.gateway_address(), port),
             of: of.to_owned(),
-        });
+        }));
     }
 
     /// `own` talks to `other`, as far as both have an address.
@@ -256,7 +234,7 @@ impl Plan {
             first
                 .and_then(Host::control_address)
                 .map(|address| WantedPort {
-                    protocol: Protocol::Tcp,
+                    protocol: IpProtocol::Tcp,
                     address,
                     of: "control_port".to_owned(),
                 }),
@@ -265,7 +243,7 @@ impl Plan {
             let ends = [(path.from, path.asking), (path.to, path.answering)];
             let own = ends.into_iter().filter(|(host, _)| is_here(host));
             self.ports.extend(own.map(|(_, address)| WantedPort {
-                protocol: Protocol::Udp,
+                protocol: IpProtocol::Udp,
                 address,
                 of: path.name(),
             }));
@@ -384,7 +362,8 @@ wait = "spin"
             message_bytes: 1400,
             path_mtu_bytes: 1500,
             own: IpAddr::from([10, 0, 0, 1]),
-            is_stream: false,
+            header_bytes: 28,
+            cut_by: None,
         };
         // 1500 - 28 - 72 leave exactly 1400.
         assert_eq!(load.packet_bytes(), 1500);

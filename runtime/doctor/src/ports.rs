@@ -4,7 +4,9 @@
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use super::Finding;
-use super::plan::{Protocol, WantedPort};
+use hil_protocol::transport::IpProtocol;
+
+use super::plan::WantedPort;
 use hil_platform::host_facts::{Fact, HostFiles};
 
 /// `TCP_LISTEN` in the socket tables.
@@ -24,7 +26,7 @@ pub(super) fn examine(files: &HostFiles, wanted: &[WantedPort]) -> Option<Findin
         return None;
     }
     let mut taken = Vec::new();
-    for protocol in [Protocol::Udp, Protocol::Tcp] {
+    for protocol in [IpProtocol::Udp, IpProtocol::Tcp] {
         let mut own = wanted
             .iter()
             .filter(|one| one.protocol == protocol)
@@ -65,7 +67,7 @@ fn collide(one: SocketAddr, other: SocketAddr) -> bool {
 
 /// `udp 7400-7403, tcp 7399`.
 fn list(wanted: &[WantedPort]) -> String {
-    let parts = [Protocol::Udp, Protocol::Tcp].map(|protocol| {
+    let parts = [IpProtocol::Udp, IpProtocol::Tcp].map(|protocol| {
         let own = wanted.iter().filter(|one| one.protocol == protocol);
         let mut ports: Vec<usize> = own.map(|one| usize::from(one.address.port())).collect();
         ports.sort_unstable();
@@ -78,7 +80,7 @@ fn list(wanted: &[WantedPort]) -> String {
     parts.into_iter().flatten().collect::<Vec<_>>().join(", ")
 }
 
-fn bound(files: &HostFiles, protocol: Protocol) -> Fact<Vec<Bound>> {
+fn bound(files: &HostFiles, protocol: IpProtocol) -> Fact<Vec<Bound>> {
     let word = protocol.word();
     let first = format!("/proc/net/{word}");
     let second = format!("/proc/net/{word}6");
@@ -95,10 +97,10 @@ fn bound(files: &HostFiles, protocol: Protocol) -> Fact<Vec<Bound>> {
     })
 }
 
-fn parse(text: &str, protocol: Protocol) -> Vec<Bound> {
+fn parse(text: &str, protocol: IpProtocol) -> Vec<Bound> {
     let lines = text.lines().skip(1).filter_map(|line| {
         let words: Vec<&str> = line.split_whitespace().collect();
-        if protocol == Protocol::Tcp && *words.get(3)? != LISTENING {
+        if protocol == IpProtocol::Tcp && *words.get(3)? != LISTENING {
             return None;
         }
         Some(Bound {
@@ -166,7 +168,7 @@ mod tests {
         format!("{HEADER}\n 0: {local} 00000000:0000 {state} 0:0 0:0 0 0 0 {inode} 2 0\n")
     }
 
-    fn wanted(protocol: Protocol) -> Vec<WantedPort> {
+    fn wanted(protocol: IpProtocol) -> Vec<WantedPort> {
         vec![WantedPort {
             protocol,
             address: "10.0.0.1:7400".parse().unwrap(),
@@ -201,7 +203,7 @@ mod tests {
         ];
         let host = FakeHost::with(&files);
         symlink("socket:[4711]", host.files().locate("/proc/77/fd/3")).unwrap();
-        let finding = examine(&host.files(), &wanted(Protocol::Udp)).unwrap();
+        let finding = examine(&host.files(), &wanted(IpProtocol::Udp)).unwrap();
         assert_eq!(finding.severity, Severity::Error);
         assert_eq!(
             finding.value,
@@ -215,9 +217,14 @@ mod tests {
         let connected = line(&local([10, 0, 0, 1]), "01", 1);
         let listening = line(&local([10, 0, 0, 1]), "0A", 1);
         for (path, table, protocol, expected) in [
-            ("/proc/net/udp", &elsewhere, Protocol::Udp, Severity::Ok),
-            ("/proc/net/tcp", &connected, Protocol::Tcp, Severity::Ok),
-            ("/proc/net/tcp", &listening, Protocol::Tcp, Severity::Error),
+            ("/proc/net/udp", &elsewhere, IpProtocol::Udp, Severity::Ok),
+            ("/proc/net/tcp", &connected, IpProtocol::Tcp, Severity::Ok),
+            (
+                "/proc/net/tcp",
+                &listening,
+                IpProtocol::Tcp,
+                Severity::Error,
+            ),
         ] {
             let host = FakeHost::with(&[(path, table.as_str())]);
             let finding = examine(&host.files(), &wanted(protocol)).unwrap();
@@ -228,11 +235,11 @@ mod tests {
     #[test]
     fn an_unreadable_table_is_no_pass_and_no_ports_no_finding() {
         let host = FakeHost::with(&[]);
-        let finding = examine(&host.files(), &wanted(Protocol::Udp)).unwrap();
+        let finding = examine(&host.files(), &wanted(IpProtocol::Udp)).unwrap();
         assert_eq!(finding.severity, Severity::CannotTell);
         assert_eq!(examine(&host.files(), &[]), None);
         let folder = FakeHost::with(&[("/proc/net/udp", HEADER), ("/proc/net/udp6/x", "")]);
-        let finding = examine(&folder.files(), &wanted(Protocol::Udp)).unwrap();
+        let finding = examine(&folder.files(), &wanted(IpProtocol::Udp)).unwrap();
         assert_eq!(finding.severity, Severity::CannotTell, "{finding:?}");
     }
 
@@ -240,7 +247,7 @@ mod tests {
     fn this_hosts_tables_show_a_socket_of_this_process() {
         let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
         let own = WantedPort {
-            protocol: Protocol::Udp,
+            protocol: IpProtocol::Udp,
             address: socket.local_addr().unwrap(),
             of: "test".to_owned(),
         };

@@ -30,7 +30,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use hil_transport::udp::UdpError;
+use hil_transport::socket::SocketError;
 
 use crate::gateway::GatewayError;
 use hil_rundir::launch::LaunchError;
@@ -56,7 +56,7 @@ pub enum FaceError {
     Record(#[from] RecordFileError),
     /// A socket could not be set up.
     #[error(transparent)]
-    Udp(#[from] UdpError),
+    Open(#[from] SocketError),
     /// The kernel does not tell a socket's address.
     #[error("cannot read the address of a socket: {0}")]
     Address(io::Error),

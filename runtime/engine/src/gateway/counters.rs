@@ -92,6 +92,7 @@ pub(super) fn of_egress(egress: &Egress) -> Vec<CountByName> {
 /// Everything a receiving direction counted.
 pub(super) fn of_ingress(ingress: &Ingress) -> Vec<CountByName> {
     let bridge = &ingress.bridge;
+    let socket = ingress.receiver.counters();
     let steps = ("clock_step_count", ingress.clock.step_count());
     let foreign = ("foreign source", ingress.foreign_count);
     let stray = ("message on a clock path", ingress.stray_count);
@@ -111,7 +112,7 @@ pub(super) fn of_ingress(ingress: &Ingress) -> Vec<CountByName> {
         ))
         .chain(CountByName::all(
             CounterGroup::Socket,
-            ingress.receiver.counters().iter(),
+            socket.iter().chain(socket.loss_causes()),
         ))
         .chain(CountByName::all(CounterGroup::Own, [steps]))
         .chain(CountByName::all(

@@ -8,9 +8,9 @@ use std::time::Duration;
 
 use hil_core::link_model::ReplayTally;
 use hil_core::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
+use hil_core::time::duration_ns;
 use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings, SettingsError};
-use hil_transport::tcp::ConnectionTally;
-use hil_transport::{DatagramReceiver, DatagramSender};
+use hil_transport::{ConnectionTally, DatagramReceiver, DatagramSender, Stalls};
 
 use super::egress::{Attention, Egress};
 use super::gathering::Gathering;
@@ -18,15 +18,14 @@ use super::ingress::{Ingress, Notes};
 use super::kernel_clock::KernelClock;
 use super::line::Line;
 use super::link_switch::SwitchHandle;
-use super::socket::{Ends, OpenSocket, stamps_of};
+use super::socket::{Ends, OpenSocket, timestamp_mode};
 use super::stamp_plan::StampPlan;
-use super::{GatewayError, Surroundings};
-use super::{counters, stream};
+use super::{GatewayError, Surroundings, counters};
 use crate::process::pulse::Pulse;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{WaitMode, WaitStrategy};
 use hil_rundir::launch::{DirectionLaunch, Side};
-use hil_rundir::pipe::{DirectionReport, RunStart};
+use hil_rundir::pipe::{CountByName, CounterGroup, DirectionReport, RunStart, StallFigures};
 use hil_rundir::record::{RecordKind, RecordSink, Recorder};
 use hil_shm::{RawInput, RawOutput, Waiter};
 
@@ -76,9 +75,9 @@ pub fn open<'a>(
     recorder: &mut Recorder,
     start: &RunStart,
 ) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
-    let plan = StampPlan::asked(stamps_of(&launch.socket));
-    let socket = OpenSocket::open(launch, start, (plan, None))?;
-    Ok((launch, Opened::new(launch, recorder, (socket, plan))?))
+    let plan = StampPlan::asked(timestamp_mode(launch.socket.timestamps));
+    let socket = OpenSocket::open(launch, start, plan, None)?;
+    Ok((launch, Opened::new(launch, recorder, socket, plan)?))
 }
 
 fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, GatewayError> {
@@ -110,7 +109,8 @@ impl Opened {
     pub(super) fn new(
         launch: &DirectionLaunch,
         recorder: &mut Recorder,
-        (socket, plan): (OpenSocket, StampPlan),
+        socket: OpenSocket,
+        plan: StampPlan,
     ) -> Result<Self, GatewayError> {
         Ok(Self {
             socket,
@@ -165,16 +165,21 @@ impl Opened {
         } = self.socket;
         let way = match ends {
             Ends::Sender(sender, datagram_bytes_max) => Way::Egress(Box::new(egress(
-                (sender, datagram_bytes_max),
+                sender,
+                datagram_bytes_max,
                 self.sinks,
-                (self.count, self.is_established),
-                (launch, surroundings, self.plan),
+                self.count,
+                self.is_established,
+                launch,
+                surroundings,
+                self.plan,
             )?)),
             Ends::Receiver(receiver) => Way::Ingress(Box::new(ingress(
                 receiver,
                 self.sinks,
                 self.count,
-                (launch, surroundings),
+                launch,
+                surroundings,
             )?)),
         };
         Ok(Direction {
@@ -189,7 +194,8 @@ impl Opened {
 /// A bridge over a path that takes datagrams of so many bytes.
 pub(super) fn egress_bridge(
     datagram_max_bytes: usize,
-    (launch, around): (&DirectionLaunch, &Surroundings),
+    launch: &DirectionLaunch,
+    around: &Surroundings,
 ) -> Result<EgressBridge, SettingsError> {
     EgressBridge::new(EgressSettings {
         channel: Surroundings::identity(launch),
@@ -206,12 +212,16 @@ pub(super) fn egress_bridge(
 }
 
 fn egress(
-    (sender, datagram_max_bytes): (Box<dyn DatagramSender>, usize),
+    sender: Box<dyn DatagramSender>,
+    datagram_max_bytes: usize,
     sinks: Sinks,
-    (count, is_established): (Arc<AtomicU64>, Arc<AtomicBool>),
-    (launch, around, plan): (&DirectionLaunch, &Surroundings, StampPlan),
+    count: Arc<AtomicU64>,
+    is_established: Arc<AtomicBool>,
+    launch: &DirectionLaunch,
+    around: &Surroundings,
+    plan: StampPlan,
 ) -> Result<Egress, GatewayError> {
-    let bridge = egress_bridge(datagram_max_bytes, (launch, around))?;
+    let bridge = egress_bridge(datagram_max_bytes, launch, around)?;
     let input = (!launch.is_clock_path)
         .then(|| RawInput::open(&around.domain, &launch.channel, launch.depth))
         .transpose()?;
@@ -236,7 +246,8 @@ fn ingress(
     receiver: Box<dyn DatagramReceiver>,
     sinks: Sinks,
     count: Arc<AtomicU64>,
-    (launch, around): (&DirectionLaunch, &Surroundings),
+    launch: &DirectionLaunch,
+    around: &Surroundings,
 ) -> Result<Ingress, GatewayError> {
     let identity = Surroundings::identity(launch);
     let settings = IngressSettings::new(
@@ -308,24 +319,20 @@ impl Direction {
     /// Every counter of the direction.
     pub fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
         let now = MonotonicClock::now();
-        let (direction, peer_state, mut counters, (stream, seal)) = match &self.way {
+        let (direction, peer_state, mut counters, transport, seal) = match &self.way {
             Way::Egress(egress) => (
                 Side::Egress,
                 counters::egress_state(egress),
                 counters::of_egress(egress),
-                (
-                    egress.line.sender().stream_figures(now),
-                    egress.line.sender().seal_counts(),
-                ),
+                egress.line.sender().report(now),
+                egress.line.sender().seal_counts(),
             ),
             Way::Ingress(ingress) => (
                 Side::Ingress,
                 counters::ingress_state(ingress),
                 counters::of_ingress(ingress),
-                (
-                    ingress.receiver.stream_figures(now),
-                    ingress.receiver.seal_counts(),
-                ),
+                ingress.receiver.report(now),
+                ingress.receiver.seal_counts(),
             ),
         };
         let mut facts = self.facts.clone();
@@ -336,20 +343,29 @@ impl Direction {
             facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
         }
         counters.extend(seal.iter().flat_map(counters::of_seal));
-        if let Some(figures) = &stream {
-            counters.extend(stream::counters(figures));
-            facts.extend(stream::facts(figures, launch.side));
-        }
-        let stalls = stream.filter(|_| direction == Side::Egress);
+        let own = CountByName::all(CounterGroup::Transport, transport.counters);
+        counters.extend(own);
+        let own = transport.facts.into_iter();
+        facts.extend(own.map(|(label, text)| (label.to_owned(), text)));
         DirectionReport {
             channel: launch.channel.clone(),
             direction,
             peer_state,
             counters,
             facts,
-            stalls: stalls.as_ref().map(stream::stalls),
+            stalls: transport.stalls.map(stall_figures),
             replay: self.replay.as_ref().map(ReplayTally::counts),
         }
+    }
+}
+
+fn stall_figures(stalls: Stalls) -> StallFigures {
+    let nanoseconds = |time| duration_ns(time).unsigned_abs();
+    StallFigures {
+        count: stalls.count,
+        total_ns: nanoseconds(stalls.total),
+        longest_ns: nanoseconds(stalls.longest),
+        threshold_ns: nanoseconds(stalls.threshold),
     }
 }
 

@@ -22,7 +22,6 @@ mod opening;
 pub mod process;
 pub(crate) mod socket;
 pub mod stamp_plan;
-mod stream;
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -33,7 +32,7 @@ use std::sync::atomic::AtomicBool;
 use hil_core::time::Instant;
 use hil_protocol::body::HelloStatus;
 use hil_protocol::{ChannelIdentity, SettingsError};
-use hil_transport::udp::UdpError;
+use hil_transport::socket::SocketError;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::TimeSpec;
@@ -61,7 +60,10 @@ pub enum GatewayError {
     Record(#[from] RecordFileError),
     /// A socket could not be set up.
     #[error(transparent)]
-    Udp(#[from] UdpError),
+    Open(#[from] SocketError),
+    /// A transport that this program does not have.
+    #[error("there is no transport called `{0}`")]
+    UnknownTransport(String),
     /// The bridge refused its settings.
     #[error(transparent)]
     Settings(#[from] SettingsError),

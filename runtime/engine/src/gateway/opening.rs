@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use hil_core::time::Instant;
 use hil_protocol::SettingsError;
-use hil_transport::udp::UdpError;
+use hil_transport::socket::SocketError;
 
 use super::arming::{self, Arming};
 use super::direction::egress_bridge;
@@ -38,11 +38,12 @@ pub(super) struct OpenSockets {
 pub(super) fn open_sockets(
     launch: &GatewayLaunch,
     orders: &Orders,
-    (seal, around): (Option<&RunSeal>, &Surroundings),
+    seal: Option<&RunSeal>,
+    around: &Surroundings,
 ) -> Result<Option<OpenSockets>, GatewayError> {
     let mut away = Away::default();
     loop {
-        match try_open(launch, orders, (seal, around)) {
+        match try_open(launch, orders, seal, around) {
             Ok(mut opened) => {
                 opened.armed.facts.extend(away.fact());
                 return Ok(Some(opened));
@@ -60,15 +61,16 @@ pub(super) fn open_sockets(
 fn try_open(
     launch: &GatewayLaunch,
     orders: &Orders,
-    (seal, around): (Option<&RunSeal>, &Surroundings),
+    seal: Option<&RunSeal>,
+    around: &Surroundings,
 ) -> Result<OpenSockets, GatewayError> {
     let armed = arming::arm(launch);
     let open = |direction: &DirectionLaunch| {
         let plan = armed.plan(direction);
-        let socket = OpenSocket::open(direction, &orders.run_start(), (plan, seal))?;
+        let socket = OpenSocket::open(direction, &orders.run_start(), plan, seal)?;
         if let Ends::Sender(_, longest) = &socket.ends {
             // A path may be too narrow for the gateways' own exchanges; the thread would only end.
-            egress_bridge(*longest, (direction, around))?;
+            egress_bridge(*longest, direction, around)?;
         }
         Ok((socket, plan))
     };
@@ -81,7 +83,7 @@ fn try_open(
 /// path too narrow for now.
 fn is_away(error: &GatewayError) -> bool {
     match error {
-        GatewayError::Udp(UdpError::Refused { source, .. }) => matches!(
+        GatewayError::Open(SocketError::Refused { source, .. }) => matches!(
             source.kind(),
             io::ErrorKind::NetworkUnreachable
                 | io::ErrorKind::HostUnreachable
@@ -130,7 +132,7 @@ mod tests {
     #[test]
     fn a_path_that_is_away_is_waited_for_and_a_wrong_setting_is_not() {
         let refused = |errno: i32| {
-            GatewayError::Udp(UdpError::Refused {
+            GatewayError::Open(SocketError::Refused {
                 option: "connect",
                 value: String::new(),
                 source: io::Error::from_raw_os_error(errno),

@@ -63,13 +63,14 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let surroundings = Arc::new(Surroundings::new(domain)?);
     warn_of_shared_cpus(&launch);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
-    let sockets = open_sockets(&launch, &orders, (seal.as_ref(), &surroundings))?;
+    let sockets = open_sockets(&launch, &orders, seal.as_ref(), &surroundings)?;
     let Some(OpenSockets { mut armed, sockets }) = sockets else {
         return finish(Vec::new(), recorder, &[]);
     };
     let mut opened = Vec::new();
-    for (direction, socket) in launch.directions.iter().zip(sockets) {
-        opened.push((direction, Opened::new(direction, &mut recorder, socket)?));
+    for (direction, (socket, plan)) in launch.directions.iter().zip(sockets) {
+        let one = Opened::new(direction, &mut recorder, socket, plan)?;
+        opened.push((direction, one));
     }
     let sampler = armed.prepare_sampler(&launch.process, &mut recorder);
     let switches = opened.iter_mut().filter_map(|(_, one)| one.take_switch());

@@ -1,24 +1,17 @@
 //! The socket of one channel direction: opened as its launch description says, behind a link model
 //! where it has one, with what the kernel granted. It moves no message.
 
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use hil_core::link_model::ReplayTally;
-use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
+use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber, ReplayTally};
 use hil_core::time::{Instant, RemoteInstant};
 use hil_net::timestamping::TimestampMode;
-use hil_protocol::wire;
-use hil_protocol::wire::Kind;
+use hil_protocol::wire::{self, Kind};
 use hil_transport::emulated::{EmulatedReceiver, EmulatedSettings};
-use hil_transport::sealed::{SealedReceiver, SealedSender};
-use hil_transport::tcp::{
-    ConnectionTally, KEEP_ALIVE_COUNT, KEEP_ALIVE_IDLE, KEEP_ALIVE_INTERVAL, TcpReceiver,
-    TcpSender, TcpSettings, USER_TIMEOUT,
-};
-use hil_transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
-use hil_transport::{DatagramReceiver, DatagramSender};
+use hil_transport::registry::{self, Transport};
+use hil_transport::socket::{GrantedOptions, SocketSettings};
+use hil_transport::{ConnectionTally, DatagramReceiver, DatagramSender};
 
 use super::GatewayError;
 use super::link_switch::{SwitchHandle, switch};
@@ -26,16 +19,12 @@ use super::stamp_plan::StampPlan;
 use hil_nic::radio::category;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::host_facts::{HostFiles, kernel_release};
-use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch};
 use hil_rundir::pipe::RunStart;
 use hil_rundir::run_seal::RunSeal;
 use hil_topology::Timestamps;
 use hil_topology::emulation::{EmulationError, EmulationLaunch};
 use hil_topology::emulation_room::EmulationRoom;
-
-/// IP and UDP headers of a datagram.
-const IPV4_HEADERS: usize = 20 + 8;
-const IPV6_HEADERS: usize = 40 + 8;
 
 /// A direction's socket and what is known of it.
 #[derive(Debug)]
@@ -63,139 +52,63 @@ impl OpenSocket {
     pub(super) fn open(
         launch: &DirectionLaunch,
         start: &RunStart,
-        (plan, seal): (StampPlan, Option<&RunSeal>),
+        plan: StampPlan,
+        seal: Option<&RunSeal>,
     ) -> Result<Self, GatewayError> {
-        let settings = udp_settings(launch, plan);
-        let mut opened = match launch.socket.transport {
-            Transport::Udp => Self::open_udp(&settings, (launch, plan), (start, seal)),
-            Transport::Tcp => Self::open_tcp(&settings, launch, seal),
-        }?;
-        opened.facts.push(security_fact(seal));
-        Ok(opened)
-    }
-
-    fn open_udp(
-        settings: &UdpSettings,
-        (launch, plan): (&DirectionLaunch, StampPlan),
-        (start, seal): (&RunStart, Option<&RunSeal>),
-    ) -> Result<Self, GatewayError> {
-        let (ends, mut facts, (replay, switch)) = match launch.side {
+        let transport = transport_of(&launch.socket)?;
+        let settings = socket_settings(launch, plan);
+        let mut opened = match launch.side {
             Side::Egress => {
-                let sender = UdpSender::open(settings)?;
-                let mut facts = socket_facts(settings, sender.granted());
+                let seal = seal.map(|seal| seal.initiator(launch)).transpose();
+                let seal = seal.map_err(GatewayError::Session)?;
+                let mut end = transport.open_sender(&settings, seal)?;
                 if plan.asks_radio {
-                    facts.push(access_category(sender.granted()));
+                    end.facts.push(access_category(end.granted));
                 }
-                let mtu = sender.path_mtu();
-                let configured = launch.socket.path_mtu_bytes;
-                let text = format!("{} bytes, {configured} configured", mtu.packet_bytes);
-                facts.push(("path MTU".to_owned(), text));
-                let longest = datagram_bytes_max(launch, mtu);
-                let sender = sealed_sender(sender, launch, seal)?;
-                (Ends::Sender(sender, longest), facts, (None, None))
+                Self {
+                    ends: Ends::Sender(end.sender, end.datagram_bytes_max),
+                    facts: end.facts,
+                    tally: end.connections,
+                    replay: None,
+                    switch: None,
+                }
             }
             Side::Ingress => {
-                let receiver = UdpReceiver::open(settings)?;
-                let facts = socket_facts(settings, receiver.granted());
-                // Below the link model, which must not meet what a stranger sends.
-                let receiver = sealed_receiver(receiver, launch, seal)?;
-                let (receiver, replay, switch) = emulate(receiver, launch, start)?;
-                (Ends::Receiver(receiver), facts, (replay, switch))
+                let seal = seal.map(|seal| seal.responder(launch)).transpose();
+                let seal = seal.map_err(GatewayError::Session)?;
+                let end = transport.open_receiver(&settings, seal)?;
+                // Above the seal: the link model must not meet what a stranger sends.
+                let (receiver, replay, switch) = emulate(end.receiver, launch, start)?;
+                Self {
+                    ends: Ends::Receiver(receiver),
+                    facts: end.facts,
+                    tally: None,
+                    replay,
+                    switch,
+                }
             }
         };
         if let Some(emulation) = &launch.emulation {
-            facts.push((
+            opened.facts.push((
                 "link model behind the socket, part of RX stamp → received by gateway".to_owned(),
                 emulation.describe(),
             ));
             if launch.side == Side::Ingress {
-                let room = room(emulation, launch)?;
-                facts.push(("room of the link model".to_owned(), room.to_string()));
+                let room = room(emulation, launch)?.to_string();
+                opened
+                    .facts
+                    .push(("room of the link model".to_owned(), room));
             }
         }
-        Ok(Self {
-            ends,
-            facts,
-            tally: None,
-            replay,
-            switch,
-        })
-    }
-
-    fn open_tcp(
-        common: &UdpSettings,
-        launch: &DirectionLaunch,
-        seal: Option<&RunSeal>,
-    ) -> Result<Self, GatewayError> {
-        let settings = TcpSettings {
-            interface: common.interface.clone(),
-            dscp: common.dscp,
-            priority: common.priority,
-            send_buffer_bytes: common.send_buffer_bytes,
-            receive_buffer_bytes: common.receive_buffer_bytes,
-            path_mtu_bytes: Some(launch.socket.path_mtu_bytes),
-            ..TcpSettings::new(common.local, common.peer, MonotonicClock::now)
-        };
-        let (ends, granted, tally) = match launch.side {
-            Side::Egress => {
-                let sender = TcpSender::open(settings)?;
-                let (granted, longest) = (sender.granted(), sender.datagram_bytes_max());
-                let tally = Some(sender.tally());
-                let sender = sealed_sender(sender, launch, seal)?;
-                (Ends::Sender(sender, longest), granted, tally)
-            }
-            Side::Ingress => {
-                let receiver = TcpReceiver::open(settings)?;
-                let granted = receiver.granted();
-                let receiver = sealed_receiver(receiver, launch, seal)?;
-                (Ends::Receiver(receiver), granted, None)
-            }
-        };
-        let mut facts = socket_facts(common, granted);
-        let options = format!(
-            "no delay; keep-alive after {} s, then {KEEP_ALIVE_COUNT} times every {} s; user \
-             time-out {} s",
-            KEEP_ALIVE_IDLE.as_secs(),
-            KEEP_ALIVE_INTERVAL.as_secs(),
-            USER_TIMEOUT.as_secs()
-        );
-        facts.push(("TCP".to_owned(), options));
-        Ok(Self {
-            ends,
-            facts,
-            tally,
-            replay: None,
-            switch: None,
-        })
+        opened.facts.push(security_fact(seal));
+        Ok(opened)
     }
 }
 
-fn sealed_sender(
-    sender: impl DatagramSender + 'static,
-    launch: &DirectionLaunch,
-    seal: Option<&RunSeal>,
-) -> Result<Box<dyn DatagramSender>, GatewayError> {
-    let Some(seal) = seal else {
-        return Ok(Box::new(sender));
-    };
-    let initiator = seal.initiator(launch).map_err(GatewayError::Session)?;
-    Ok(Box::new(SealedSender::new(sender, initiator)))
-}
-
-fn sealed_receiver(
-    receiver: impl DatagramReceiver + 'static,
-    launch: &DirectionLaunch,
-    seal: Option<&RunSeal>,
-) -> Result<Box<dyn DatagramReceiver>, GatewayError> {
-    let Some(seal) = seal else {
-        return Ok(Box::new(receiver));
-    };
-    let responder = seal.responder(launch).map_err(GatewayError::Session)?;
-    Ok(Box::new(SealedReceiver::new(
-        receiver,
-        responder,
-        launch.peer,
-    )))
+/// The transport that a hop is carried by.
+pub(super) fn transport_of(socket: &SocketLaunch) -> Result<&'static dyn Transport, GatewayError> {
+    let name = &socket.transport;
+    registry::named(name).ok_or_else(|| GatewayError::UnknownTransport(name.clone()))
 }
 
 fn security_fact(seal: Option<&RunSeal>) -> (String, String) {
@@ -206,11 +119,9 @@ fn security_fact(seal: Option<&RunSeal>) -> (String, String) {
     ("security".to_owned(), text)
 }
 
-fn udp_settings(launch: &DirectionLaunch, plan: StampPlan) -> UdpSettings {
+fn socket_settings(launch: &DirectionLaunch, plan: StampPlan) -> SocketSettings {
     let socket = &launch.socket;
-    UdpSettings {
-        local: launch.local,
-        peer: launch.peer,
+    SocketSettings {
         interface: socket.interface.clone(),
         // 0 is the kernel's default; setting it would only reset the priority.
         dscp: (socket.dscp > 0).then_some(socket.dscp),
@@ -219,14 +130,9 @@ fn udp_settings(launch: &DirectionLaunch, plan: StampPlan) -> UdpSettings {
         receive_buffer_bytes: Some(socket.receive_buffer_bytes),
         timestamps: plan.mode,
         wants_radio_reports: plan.asks_radio,
-    }
-}
-
-/// The kernel stamps to ask for: none of a stream, whose bytes have no stamp of their own.
-pub(super) const fn stamps_of(socket: &SocketLaunch) -> TimestampMode {
-    match socket.transport {
-        Transport::Tcp => TimestampMode::Off,
-        Transport::Udp => timestamp_mode(socket.timestamps),
+        path_mtu_bytes: Some(socket.path_mtu_bytes),
+        options: socket.options.clone(),
+        ..SocketSettings::new(launch.local, launch.peer)
     }
 }
 
@@ -244,31 +150,6 @@ fn access_category(granted: GrantedOptions) -> (String, String) {
     let release = kernel_release(&HostFiles::of_this_host());
     let text = category::describe(granted.priority, granted.dscp, &release.to_text());
     ("access category".to_owned(), text)
-}
-
-fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String, String)> {
-    let fact = |label: &str, text: String| (label.to_owned(), text);
-    let mut facts = vec![
-        fact(
-            "socket",
-            format!("{} to or from {}", settings.local, settings.peer),
-        ),
-        fact(
-            "send buffer granted",
-            format!("{} bytes", granted.send_buffer_bytes),
-        ),
-        fact(
-            "receive buffer granted",
-            format!("{} bytes", granted.receive_buffer_bytes),
-        ),
-    ];
-    let shortfalls = granted.shortfalls(settings);
-    facts.extend(
-        shortfalls
-            .into_iter()
-            .map(|text| fact("socket option", text)),
-    );
-    facts
 }
 
 fn room(
@@ -383,19 +264,6 @@ impl<L: LinkModel> LinkModel for SinceStart<L> {
             link.offer_numbered(at, length_bytes, message)
         })
     }
-}
-
-/// What a datagram may carry: as much as the topology says, but no more than the path takes.
-fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
-    let headers = match launch.peer.ip() {
-        IpAddr::V4(_) => IPV4_HEADERS,
-        IpAddr::V6(_) => IPV6_HEADERS,
-    };
-    let configured = launch.socket.path_mtu_bytes.saturating_sub(headers);
-    if path.is_assumed {
-        return configured;
-    }
-    configured.min(usize::try_from(path.datagram_bytes).unwrap_or(configured))
 }
 
 #[cfg(test)]
