@@ -146,7 +146,7 @@ fn check_conversation(mut hop: Hop) {
         0
     );
     let counts = hop.receiver.seal_counts().unwrap();
-    assert_eq!(counts.refused_total(), 0);
+    assert_eq!(counts.refused.total(), 0);
     assert_eq!(counts.opened_count, hop.ingress.counts().datagram_count);
     assert_eq!(counts.agreement_count, 1);
 }
@@ -202,5 +202,5 @@ fn a_stranger_is_refused_before_the_seal_and_a_copy_before_the_bridge() {
             .is_none()
     );
     let counts = receiver.seal_counts().unwrap();
-    assert_eq!(counts.refused(SealRefusal::ForeignSource), 1);
+    assert_eq!(counts.refused.get(SealRefusal::ForeignSource), 1);
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_protocol::transport::{Description, TransportOption};
+use hil_protocol::transport::Description;
 use hil_transport::registry::{self, Transport};
 
 use super::errors::{Fault, Place};
@@ -184,22 +184,17 @@ fn read_timestamps(reader: &mut Reader<'_>, transport: &Description) -> Timestam
 fn read_options(reader: &mut Reader<'_>, own: &Description) -> BTreeMap<String, i64> {
     let mut options = BTreeMap::new();
     for transport in transports() {
-        for TransportOption {
-            key,
-            default,
-            min,
-            max,
-        } in transport.options
-        {
+        for option in transport.options {
+            let key = option.key;
             let limit = limits::Limit {
-                default: *default,
-                min: *min,
-                max: *max,
+                default: option.default,
+                min: option.min,
+                max: option.max,
             };
             let value = integer(reader, key, &limit);
             if transport.name == own.name {
-                options.insert((*key).to_owned(), value);
-            } else if own.options.iter().all(|option| option.key != *key) {
+                options.insert(key.to_owned(), value);
+            } else if own.options.iter().all(|option| option.key != key) {
                 let why = format!("needs via = \"{}\"", transport.name);
                 reader.refuse_present(&[key], &why);
             }

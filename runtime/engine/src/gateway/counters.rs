@@ -128,15 +128,11 @@ pub(super) fn of_ingress(ingress: &Ingress) -> Vec<CountByName> {
 
 /// What the seal of a direction counted.
 pub(super) fn of_seal(counts: &SealCounts) -> Vec<CountByName> {
-    let kept = [
-        ("sealed_count", counts.sealed_count),
-        ("opened_count", counts.opened_count),
-        ("key_exchange_count", counts.key_exchange_count),
-        ("agreement_count", counts.agreement_count),
-        ("rotation_count", counts.rotation_count),
-    ];
-    CountByName::all(CounterGroup::Seal, kept)
-        .chain(CountByName::all(CounterGroup::Refused, counts.refusals()))
+    CountByName::all(CounterGroup::Seal, counts.iter())
+        .chain(CountByName::all(
+            CounterGroup::Refused,
+            counts.refused.iter(),
+        ))
         .collect()
 }
 

@@ -23,8 +23,6 @@ use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch};
 use hil_rundir::pipe::RunStart;
 use hil_rundir::run_seal::RunSeal;
 use hil_topology::Timestamps;
-use hil_topology::emulation::{EmulationError, EmulationLaunch};
-use hil_topology::emulation_room::EmulationRoom;
 
 /// A direction's socket and what is known of it.
 #[derive(Debug)]
@@ -94,7 +92,7 @@ impl OpenSocket {
                 emulation.describe(),
             ));
             if launch.side == Side::Ingress {
-                let room = room(emulation, launch)?.to_string();
+                let room = emulation.room(launch.size_bytes)?.to_string();
                 opened
                     .facts
                     .push(("room of the link model".to_owned(), room));
@@ -152,13 +150,6 @@ fn access_category(granted: GrantedOptions) -> (String, String) {
     ("access category".to_owned(), text)
 }
 
-fn room(
-    emulation: &EmulationLaunch,
-    launch: &DirectionLaunch,
-) -> Result<EmulationRoom, EmulationError> {
-    emulation.room(launch.size_bytes)
-}
-
 /// The longest datagram of the channel: as long as a message needs, with room for the greetings and
 /// clock exchanges that share its socket, and no longer than the path takes.
 fn held_bytes_max(launch: &DirectionLaunch) -> usize {
@@ -187,7 +178,7 @@ fn emulate(
         link: emulation.model(&launch.channel)?,
         start: start.clone(),
     };
-    let room = room(emulation, launch)?;
+    let room = emulation.room(launch.size_bytes)?;
     let replay = link.replay_tally();
     let (link, switch) = switch(link, &launch.channel, (emulation, room));
     let settings = EmulatedSettings {

@@ -6,6 +6,7 @@ use hil_link::outages::{Outage, OutageSchedule, Outages};
 use hil_link::spec::{LinkSpec, Way};
 use hil_link::trace::{TraceLink, TraceReplay};
 use hil_protocol::wire::Header;
+use hil_topology::emulation::EmulationLaunch;
 use hil_trace::{Trace, TraceFate, TraceHeader, TraceRecord};
 use hil_transport::queue::{QueueSettings, queue_pair};
 
