@@ -264,25 +264,6 @@ mod tests {
             .collect()
     }
 
-    /// The order-statistics interval of a quantile of independent samples in ascending order; see
-    /// [`quantile_ranks`].
-    fn quantile_interval(
-        ascending_ns: &[i64],
-        quantile: f64,
-        confidence: f64,
-    ) -> Option<IntervalNs> {
-        let (low, high) = quantile_ranks(ascending_ns.len() as u64, quantile, confidence)?;
-        let at = |rank: u64| {
-            usize::try_from(rank - 1)
-                .ok()
-                .map(|index| ascending_ns[index])
-        };
-        Some(IntervalNs {
-            low_ns: at(low)?,
-            high_ns: at(high)?,
-        })
-    }
-
     #[test]
     fn correlated_samples_widen_the_bootstrap_but_fool_the_order_statistics() {
         let mut stream = RandomStream::new(5, "series");
