@@ -28,7 +28,8 @@ use hil_net::timestamping::TimestampMode;
 use hil_protocol::seal::{Association, Initiator, Opened, Responder, Rotation, RunSecret, Suite};
 use hil_protocol::wire::{HEADER_BYTES, Header, Kind, TAG_BYTES};
 use hil_transport::sealed::{SealedReceiver, SealedSender};
-use hil_transport::udp::{UdpReceiver, UdpSender, UdpSettings};
+use hil_transport::socket::SocketSettings;
+use hil_transport::udp::{UdpReceiver, UdpSender};
 use hil_transport::{DatagramReceiver, DatagramSender};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use serde_json::json;
@@ -58,10 +59,10 @@ fn datagram(kind: Kind, sequence: u64, payload_bytes: usize) -> Vec<u8> {
     bytes
 }
 
-fn settings(local: SocketAddr, peer: SocketAddr) -> UdpSettings {
-    UdpSettings {
+fn settings(local: SocketAddr, peer: SocketAddr) -> SocketSettings {
+    SocketSettings {
         timestamps: TimestampMode::Off,
-        ..UdpSettings::new(local, peer)
+        ..SocketSettings::new(local, peer)
     }
 }
 

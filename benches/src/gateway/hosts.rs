@@ -1,6 +1,7 @@
 //! Two hosts: a shared-memory domain each, channels there and back, and for each channel a
 //! gateway direction at either end, opened as the gateway process opens it.
 
+use std::collections::BTreeMap;
 use std::error::Error;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -15,7 +16,7 @@ use hil_engine::gateway::direction::{self, Direction, OpenDirection};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
-use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch};
 use hil_rundir::pipe::RunStart;
 use hil_rundir::record::{RecordFile, RecordKind, RecordSink, Recorder};
 use hil_shm::{
@@ -354,7 +355,8 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
         local: unset,
         peer: unset,
         socket: SocketLaunch {
-            transport: Transport::Udp,
+            transport: "udp".to_owned(),
+            options: BTreeMap::new(),
             interface: None,
             dscp: 0,
             priority: None,

@@ -15,7 +15,8 @@ use hil_net::timestamping::TimestampMode;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::WaitMode;
 use hil_rundir::launch::DirectionLaunch;
-use hil_transport::udp::{UdpReceiver, UdpSender, UdpSettings};
+use hil_transport::socket::SocketSettings;
+use hil_transport::udp::{UdpReceiver, UdpSender};
 use hil_transport::{DatagramReceiver, DatagramSender};
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::TimeSpec;
@@ -86,13 +87,13 @@ impl EchoSide {
         let addresses = [ports(0)?, ports(1)?];
         let address = |host: usize, port: usize| addresses[host][port];
         let open = |host: usize| -> Result<Self, SetupError> {
-            let settings = |own: usize, peer: usize| UdpSettings {
+            let settings = |own: usize, peer: usize| SocketSettings {
                 timestamps: if plan.is_stamped {
                     TimestampMode::Software
                 } else {
                     TimestampMode::Off
                 },
-                ..UdpSettings::new(address(host, own), address(1 - host, peer))
+                ..SocketSettings::new(address(host, own), address(1 - host, peer))
             };
             // Port 0 of each host sends, port 1 receives.
             let (sender, receiver) = network.on(host, || {

@@ -18,7 +18,7 @@ use hil_stats::histogram::{Distribution, LatencyHistogram};
 use hil_stats::statistics::{CONFIDENCE, IntervalNs, block_bootstrap_quantile, wilson};
 use serde::{Deserialize, Serialize};
 
-use super::observe::{Observation, Point, Seen, Stream};
+use super::observe::{Observation, Point, Seen, Span, Stream};
 use hil_net::Direction;
 
 /// Farthest that two stamps of one datagram may lie apart unless told otherwise.
@@ -114,27 +114,27 @@ pub struct Joined {
 /// What one of the two points saw of the stream, in time.
 struct Side<'a> {
     point: &'a Point,
-    /// See [`Seen::span_ns`].
-    watched_ns: Option<(i64, i64)>,
+    /// See [`Seen::span`].
+    watched: Option<Span>,
     seen: Vec<Observation>,
 }
 
 impl<'a> Side<'a> {
     fn of(stream: &Stream, point: &'a Point, seen: &Seen) -> Option<Self> {
         let list = seen.streams.get(stream).cloned();
-        let mut list = list.or_else(|| seen.span_ns.map(|_watched| Vec::new()))?;
+        let mut list = list.or_else(|| seen.span.map(|_watched| Vec::new()))?;
         list.sort_by_key(|one| one.stamp_ns);
         Some(Self {
             point,
-            watched_ns: seen.span_ns,
+            watched: seen.span,
             seen: list,
         })
     }
 
     /// It was watched all of this time.
     fn covers(&self, from_ns: i64, to_ns: i64) -> bool {
-        let covers = |(from, to)| from_ns >= from && to_ns <= to;
-        self.watched_ns.is_some_and(covers)
+        self.watched
+            .is_some_and(|span| from_ns >= span.first_ns && to_ns <= span.last_ns)
     }
 }
 

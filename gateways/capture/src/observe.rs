@@ -64,11 +64,20 @@ pub struct Observation {
     pub identity: DatagramIdentity,
 }
 
+/// A time on a point's clock, nanoseconds, both ends included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Span {
+    /// When it begins.
+    pub first_ns: i64,
+    /// When it ends.
+    pub last_ns: i64,
+}
+
 /// What was seen at one point.
 #[derive(Debug, Clone, Default)]
 pub struct Seen {
     /// Stamps of the first and last packet of any kind, in time.
-    pub span_ns: Option<(i64, i64)>,
+    pub span: Option<Span>,
     /// Observations by stream, in the order of the file.
     pub streams: BTreeMap<Stream, Vec<Observation>>,
 }
@@ -151,9 +160,13 @@ impl Observer {
             return;
         };
         let seen = self.seen.entry(point).or_default();
-        let (first, last) = seen.span_ns.unwrap_or((stamp_ns, stamp_ns));
-        counts.backward_stamp_count += u64::from(stamp_ns < last);
-        seen.span_ns = Some((first.min(stamp_ns), last.max(stamp_ns)));
+        let span = seen.span.get_or_insert(Span {
+            first_ns: stamp_ns,
+            last_ns: stamp_ns,
+        });
+        counts.backward_stamp_count += u64::from(stamp_ns < span.last_ns);
+        span.first_ns = span.first_ns.min(stamp_ns);
+        span.last_ns = span.last_ns.max(stamp_ns);
         let datagram = match udp_datagram(packet.link_type, frame) {
             Ok(datagram) => datagram,
             Err(reason) => {
@@ -244,17 +257,20 @@ impl Observer {
                     direction,
                 };
                 let seen = self.seen.entry(point).or_default();
-                seen.span_ns.get_or_insert((start, end));
+                seen.span.get_or_insert(Span {
+                    first_ns: start,
+                    last_ns: end,
+                });
             }
         }
         for (point, seen) in &mut self.seen {
             if point.file_index == file_index
                 && point.esl_port.is_none()
                 && let Some(interface) = interfaces.get(point.interface_index)
-                && let Some((first, last)) = &mut seen.span_ns
+                && let Some(span) = &mut seen.span
             {
-                *first = interface.start_ns.map_or(*first, |start| start.min(*first));
-                *last = interface.end_ns.map_or(*last, |end| end.max(*last));
+                span.first_ns = span.first_ns.min(interface.start_ns.unwrap_or(i64::MAX));
+                span.last_ns = span.last_ns.max(interface.end_ns.unwrap_or(i64::MIN));
             }
         }
     }

@@ -81,23 +81,25 @@ pub fn packet(out: &mut Vec<u8>, packet: &PacketToWrite<'_>) {
     });
 }
 
-/// What an interface saw during `span_ns` (from and to, nanoseconds since 1970). The counts are of
-/// packets that passed the filter, and of those that found no room.
+/// What an interface saw between two times (nanoseconds since 1970). The counts are of packets that
+/// passed the filter, and of those that found no room.
 pub fn statistics(
     out: &mut Vec<u8>,
     interface_index: u32,
-    span_ns: (u64, u64),
-    (received_count, dropped_count): (u64, u64),
+    from_ns: u64,
+    to_ns: u64,
+    received_count: u64,
+    dropped_count: u64,
     comment: Option<&str>,
 ) {
     block(out, STATISTICS, |body| {
         body.extend_from_slice(&interface_index.to_le_bytes());
-        body.extend_from_slice(&halves(span_ns.1));
+        body.extend_from_slice(&halves(to_ns));
         if let Some(comment) = comment {
             option(body, 1, comment.as_bytes());
         }
-        option(body, 2, &halves(span_ns.0));
-        option(body, 3, &halves(span_ns.1));
+        option(body, 2, &halves(from_ns));
+        option(body, 3, &halves(to_ns));
         option(body, 4, &received_count.to_le_bytes());
         option(body, 7, &dropped_count.to_le_bytes());
         option(body, 0, &[]);

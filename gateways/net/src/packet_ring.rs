@@ -12,6 +12,7 @@
 
 use core::ffi::{c_int, c_uint};
 use core::num::NonZeroUsize;
+use core::ops::RangeInclusive;
 use core::ptr::NonNull;
 use core::sync::atomic::{AtomicU32, Ordering};
 use std::io;
@@ -27,9 +28,9 @@ use super::packet_socket::{self, bind, link_of, listen_to_all, option_length, se
 use super::ring_frame::RingPacket;
 
 /// Smallest and largest ring, bytes.
-pub const RING_BYTES: core::ops::RangeInclusive<usize> = (1 << 16)..=(1 << 28);
+pub const RING_BYTES: RangeInclusive<usize> = (1 << 16)..=(1 << 28);
 /// Fewest and most bytes kept of a packet.
-const SNAP_BYTES: (usize, usize) = (64, 65_536);
+const SNAP_BYTES: RangeInclusive<usize> = 64..=65_536;
 /// The kernel gives the ring in pieces of this size.
 const BLOCK_BYTES: usize = 1 << 16;
 /// Room in a frame before the packet: the kernel's header and address, and what aligns them.
@@ -150,9 +151,8 @@ impl PacketRing {
         filters: &[PacketFilter],
         settings: &RingSettings,
     ) -> Result<Self, RingError> {
-        check("snap_bytes", settings.snap_bytes as usize, SNAP_BYTES)?;
-        let (least, most) = (*RING_BYTES.start(), *RING_BYTES.end());
-        check("ring_bytes", settings.ring_bytes, (least, most))?;
+        check("snap_bytes", settings.snap_bytes as usize, &SNAP_BYTES)?;
+        check("ring_bytes", settings.ring_bytes, &RING_BYTES)?;
         let index = if_nametoindex(interface).map_err(|errno| RingError::Interface {
             interface: interface.to_owned(),
             source: errno.into(),
@@ -321,15 +321,19 @@ impl PacketRing {
     }
 }
 
-fn check(what: &'static str, value: usize, (min, max): (usize, usize)) -> Result<(), RingError> {
-    if (min..=max).contains(&value) {
+fn check(
+    what: &'static str,
+    value: usize,
+    allowed: &RangeInclusive<usize>,
+) -> Result<(), RingError> {
+    if allowed.contains(&value) {
         return Ok(());
     }
     Err(RingError::Size {
         what,
         value,
-        min,
-        max,
+        min: *allowed.start(),
+        max: *allowed.end(),
     })
 }
 

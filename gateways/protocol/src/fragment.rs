@@ -11,9 +11,9 @@ use core::time::Duration;
 
 use hil_core::time::Instant;
 
-use super::counters::named_counts;
 use super::refusal::Refusal;
 use super::sequence::Stream;
+use crate::counts;
 
 /// Most datagrams of one message.
 pub const FRAGMENT_COUNT_MAX: usize = 1024;
@@ -111,28 +111,21 @@ pub struct Assembled<'a> {
     pub handed_ns: i64,
 }
 
-/// What became of the messages that came in pieces.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct ReassemblyCounts {
-    /// Messages of which a first piece came.
-    pub started_count: u64,
-    /// Messages put together.
-    pub completed_count: u64,
-    /// Incomplete messages that gave way to a newer one.
-    pub evicted_count: u64,
-    /// Incomplete messages whose time was up.
-    pub timed_out_count: u64,
-    /// Incomplete messages given up because their session was over.
-    pub abandoned_count: u64,
+counts! {
+    /// What became of the messages that came in pieces.
+    pub struct ReassemblyCounts {
+        /// Messages of which a first piece came.
+        started_count,
+        /// Messages put together.
+        completed_count,
+        /// Incomplete messages that gave way to a newer one.
+        evicted_count,
+        /// Incomplete messages whose time was up.
+        timed_out_count,
+        /// Incomplete messages given up because their session was over.
+        abandoned_count,
+    }
 }
-
-named_counts!(ReassemblyCounts {
-    started_count,
-    completed_count,
-    evicted_count,
-    timed_out_count,
-    abandoned_count,
-});
 
 /// Puts messages together in a fixed number of slots.
 #[derive(Debug)]

@@ -9,6 +9,7 @@
 //! 3. [`egress`]: the sending host's half of a channel.
 //! 4. [`ingress`]: the receiving host's half.
 //! 5. [`seal`]: encryption and authentication, between a bridge and its transport.
+//! 6. [`transport`]: what is known of a transport before it is opened.
 //!
 //! One channel carries messages one way. Replies (acknowledged greetings, clock exchanges) travel
 //! the other way on the same pair of addresses.
@@ -64,6 +65,7 @@ pub mod refusal;
 pub mod seal;
 pub mod sequence;
 pub mod stamps;
+pub mod transport;
 pub mod wire;
 
 pub use channel::{ChannelIdentity, SettingsError};

@@ -1,29 +1,14 @@
 //! Every way a datagram can be refused, and a counter for each. A bad datagram is a count, never
 //! an error of the loop that received it.
 
-use core::fmt;
+use crate::counters::causes;
 
-macro_rules! refusals {
-    ($($(#[doc = $doc:literal])+ $variant:ident => $name:literal, $message:literal;)+) => {
-        /// Why a datagram was refused.
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
-        pub enum Refusal {
-            $($(#[doc = $doc])+ #[error($message)] $variant,)+
-        }
+causes! {
+    /// Why a datagram was refused.
+    pub enum Refusal;
+    /// One counter per [`Refusal`].
+    pub struct RefusalCounts;
 
-        impl Refusal {
-            /// All of them, in the order of checking where there is one.
-            pub const ALL: &'static [Self] = &[$(Self::$variant),+];
-
-            /// In words, as reports print it.
-            pub const fn name(self) -> &'static str {
-                match self { $(Self::$variant => $name,)+ }
-            }
-        }
-    };
-}
-
-refusals! {
     /// Shorter than the fixed header.
     TooShort => "shorter than the header", "datagram is shorter than the 72-byte header";
     /// Not a datagram of this protocol.
@@ -73,51 +58,6 @@ refusals! {
     DuplicateFragment => "duplicate fragment", "fragment arrived before";
     /// A reply to nothing that was asked, or a second reply.
     Unsolicited => "unsolicited", "reply answers no open request";
-}
-
-/// One counter per [`Refusal`].
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub struct RefusalCounts {
-    counts: [u64; Refusal::ALL.len()],
-}
-
-impl RefusalCounts {
-    /// Counts one datagram.
-    pub fn count(&mut self, refusal: Refusal) {
-        self.counts[refusal as usize] += 1;
-    }
-
-    /// How often `refusal` happened.
-    pub const fn get(&self, refusal: Refusal) -> u64 {
-        self.counts[refusal as usize]
-    }
-
-    /// Every counter with its name, zeros included, always in the same order.
-    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
-        Refusal::ALL
-            .iter()
-            .map(|&refusal| (refusal.name(), self.get(refusal)))
-    }
-
-    /// Datagrams refused for any reason.
-    pub fn total(&self) -> u64 {
-        self.counts.iter().sum()
-    }
-}
-
-impl Default for RefusalCounts {
-    fn default() -> Self {
-        Self {
-            counts: [0; Refusal::ALL.len()],
-        }
-    }
-}
-
-impl fmt::Debug for RefusalCounts {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let happened = self.iter().filter(|(_, count)| *count > 0);
-        f.debug_map().entries(happened).finish()
-    }
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@
 //! corrupted one can make the window follow a stream that is over.
 
 use super::body::ReceivedWindow;
-use super::counters::named_counts;
+use crate::counts;
 
 /// Sequence numbers the window remembers.
 pub const WINDOW_LENGTH: u64 = 1024;
@@ -47,37 +47,30 @@ pub enum Order {
     Late,
 }
 
-/// What became of a channel's messages so far.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct SequenceCounts {
-    /// Distinct messages received, reordered ones included.
-    pub received_count: u64,
-    /// Messages that never came, definitely.
-    pub lost_count: u64,
-    /// Messages received after a newer one.
-    pub reordered_count: u64,
-    /// Copies of messages received before.
-    pub duplicate_count: u64,
-    /// Messages too old to judge.
-    pub late_count: u64,
-    /// Streams that replaced an earlier one.
-    pub restart_count: u64,
-    /// Losses by the number of consecutive messages lost: entry i counts bursts of i + 1, the last
-    /// entry all longer ones as well.
-    pub loss_bursts: [u64; BURST_LENGTH_MAX],
-    /// Consecutive messages lost in the longest burst.
-    pub loss_burst_length_max: u64,
+counts! {
+    /// What became of a channel's messages so far.
+    pub struct SequenceCounts {
+        /// Distinct messages received, reordered ones included.
+        received_count,
+        /// Messages that never came, definitely.
+        lost_count,
+        /// Messages received after a newer one.
+        reordered_count,
+        /// Copies of messages received before.
+        duplicate_count,
+        /// Messages too old to judge.
+        late_count,
+        /// Streams that replaced an earlier one.
+        restart_count,
+        /// Consecutive messages lost in the longest burst.
+        loss_burst_length_max,
+    }
+    beside {
+        /// Losses by the number of consecutive messages lost: entry i counts bursts of i + 1, the last
+        /// entry all longer ones as well.
+        loss_bursts: [u64; BURST_LENGTH_MAX],
+    }
 }
-
-named_counts!(SequenceCounts {
-    received_count,
-    lost_count,
-    reordered_count,
-    duplicate_count,
-    late_count,
-    restart_count,
-    loss_burst_length_max,
-} beside { loss_bursts });
 
 /// The window and its counts.
 #[derive(Debug, Clone)]

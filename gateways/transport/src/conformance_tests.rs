@@ -5,6 +5,8 @@
     reason = "a test may step aside while a datagram is on its way"
 )]
 
+use std::io::ErrorKind;
+use std::net::{IpAddr, SocketAddr, UdpSocket};
 use std::thread;
 use std::time::Duration;
 
@@ -13,12 +15,16 @@ use hil_core::time::Instant;
 
 use super::emulated::{EmulatedReceiver, EmulatedSettings};
 use super::queue::{QueueSettings, queue_pair};
-use super::tcp::{TcpReceiver, TcpSender, TcpSettings};
-use super::udp::{UdpReceiver, UdpSender, UdpSettings};
+use super::registry::{self, OpenReceiver, OpenSender, Transport};
+use super::socket::{SocketError, SocketSettings};
+use super::tcp::{TcpReceiver, TcpSender};
+use super::udp::{UdpReceiver, UdpSender};
 use super::{DatagramReceiver, DatagramSender, Received, SendRefusal};
 use hil_net::clock_pair::monotonic_now;
 use hil_net::timestamping::TimestampMode;
 use hil_net::{KernelStamps, TransmitStamp, TxToken};
+use hil_protocol::seal::{Initiator, Responder};
+use hil_protocol::transport::Description;
 
 const BUFFER_BYTES: usize = 256;
 
@@ -84,7 +90,7 @@ fn check_order_and_content(
     name: &str,
     sender: &mut dyn DatagramSender,
     receiver: &mut dyn DatagramReceiver,
-) -> std::net::SocketAddr {
+) -> SocketAddr {
     let mut sources = Vec::new();
     for index in 0..20_u8 {
         let datagram = vec![index; usize::from(index) * 3];
@@ -130,7 +136,7 @@ fn check_replies(
     name: &str,
     sender: &mut dyn DatagramSender,
     receiver: &mut dyn DatagramReceiver,
-    source: std::net::SocketAddr,
+    source: SocketAddr,
 ) {
     receiver.reply(b"heard", source).unwrap();
     let mut buffer = [0; BUFFER_BYTES];
@@ -156,7 +162,7 @@ fn check_stamps(name: &str, sender: &mut dyn DatagramSender) {
 /// A sender and the receiver it is connected to, on the loopback address of `address`.
 pub(super) fn udp_pair(address: &str, mode: TimestampMode) -> (UdpSender, UdpReceiver) {
     let address = address.parse().unwrap();
-    let mut settings = UdpSettings::new(address, address);
+    let mut settings = SocketSettings::new(address, address);
     settings.timestamps = mode;
     let receiver = UdpReceiver::open(&settings).unwrap();
     settings.peer = receiver.local_address().unwrap();
@@ -166,10 +172,10 @@ pub(super) fn udp_pair(address: &str, mode: TimestampMode) -> (UdpSender, UdpRec
 /// A sender and the receiver it is connected to, on the loopback address of `address`.
 pub(super) fn tcp_pair(address: &str) -> (TcpSender, TcpReceiver) {
     let address = address.parse().unwrap();
-    let settings = TcpSettings::new(address, address, now);
+    let settings = SocketSettings::new(address, address);
     let mut receiver = TcpReceiver::open(settings).unwrap();
     let place = receiver.local_address().unwrap();
-    let mut sender = TcpSender::open(TcpSettings::new(address, place, now)).unwrap();
+    let mut sender = TcpSender::open(SocketSettings::new(address, place)).unwrap();
     within_bound("connection", || {
         sender.attend(now());
         receiver.attend(now());
@@ -185,37 +191,97 @@ fn made_up_stamps(token: TxToken) -> KernelStamps {
     }
 }
 
+/// An address of this host that no socket has.
+fn free_address(ip: IpAddr) -> SocketAddr {
+    UdpSocket::bind((ip, 0)).unwrap().local_addr().unwrap()
+}
+
+/// Both ends of `transport` on `ip`, connected where it connects; `None` where this host does not
+/// let it be opened.
+pub(super) fn opened(
+    transport: &dyn Transport,
+    ip: IpAddr,
+    mode: TimestampMode,
+    initiator: Option<Initiator>,
+    responder: Option<Responder>,
+) -> Option<(OpenSender, OpenReceiver)> {
+    let name = transport.description().name;
+    if UdpSocket::bind((ip, 0)).is_err() {
+        println!("skipped: this host has no {ip}");
+        return None;
+    }
+    let options = transport.description().options.iter();
+    let of_sender = SocketSettings {
+        timestamps: mode,
+        path_mtu_bytes: Some(1_500),
+        options: options
+            .map(|one| (one.key.to_owned(), one.default))
+            .collect(),
+        ..SocketSettings::new(free_address(ip), free_address(ip))
+    };
+    let of_receiver = SocketSettings {
+        local: of_sender.peer,
+        peer: of_sender.local,
+        ..of_sender.clone()
+    };
+    let mut receiver = match transport.open_receiver(&of_receiver, responder) {
+        Err(SocketError::Refused { source, .. })
+            if source.kind() == ErrorKind::PermissionDenied =>
+        {
+            println!("skipped: this host does not let {name} be opened");
+            return None;
+        }
+        receiver => receiver.unwrap(),
+    };
+    let mut sender = transport.open_sender(&of_sender, initiator).unwrap();
+    within_bound("connection", || {
+        sender.sender.attend(now());
+        receiver.receiver.attend(now());
+        let connections = sender.connections.as_ref();
+        connections
+            .is_none_or(|one| one.begun_count() > 0)
+            .then_some(())
+    });
+    Some((sender, receiver))
+}
+
+/// Every transport of the registry, over both versions of IP, with each kind of stamp that it has,
+/// by itself and behind a link that changes nothing.
 #[test]
-fn udp_keeps_the_promises_with_and_without_stamps() {
-    for mode in [
-        TimestampMode::Off,
-        TimestampMode::Software,
-        TimestampMode::Scheduled,
-        TimestampMode::Hardware,
-    ] {
-        let (mut sender, mut receiver) = udp_pair("127.0.0.1:0", mode);
-        check_conformance(&format!("udp {mode:?}"), &mut sender, &mut receiver);
+fn every_transport_keeps_the_promises() {
+    for transport in registry::ALL {
+        let Description {
+            name, capabilities, ..
+        } = transport.description();
+        let modes: &[TimestampMode] = match capabilities.unstamped_because {
+            Some(_) => &[TimestampMode::Off],
+            None => &[
+                TimestampMode::Off,
+                TimestampMode::Software,
+                TimestampMode::Scheduled,
+                TimestampMode::Hardware,
+            ],
+        };
+        for ip in ["127.0.0.1", "::1"].map(|ip| ip.parse().unwrap()) {
+            for mode in modes {
+                let opened = || opened(transport, ip, *mode, None, None);
+                let name = format!("{name} {ip} {mode:?}");
+                if let Some((mut sender, mut receiver)) = opened() {
+                    check_conformance(&name, &mut *sender.sender, &mut *receiver.receiver);
+                }
+                if let Some((mut sender, inner)) = opened() {
+                    let mut receiver = perfect(inner.receiver);
+                    let name = format!("emulated {name}");
+                    check_conformance(&name, &mut *sender.sender, &mut receiver);
+                }
+            }
+        }
     }
 }
 
-#[test]
-fn udp_over_ipv6_keeps_the_promises() {
-    if std::net::UdpSocket::bind("[::1]:0").is_err() {
-        println!("skipped: this host has no IPv6 loopback");
-        return;
-    }
-    let (mut sender, mut receiver) = udp_pair("[::1]:0", TimestampMode::Software);
-    check_conformance("udp over IPv6", &mut sender, &mut receiver);
-}
-
-#[test]
-fn tcp_keeps_the_promises() {
-    let (mut sender, mut receiver) = tcp_pair("127.0.0.1:0");
-    check_conformance("tcp", &mut sender, &mut receiver);
-    if std::net::UdpSocket::bind("[::1]:0").is_ok() {
-        let (mut sender, mut receiver) = tcp_pair("[::1]:0");
-        check_conformance("tcp over IPv6", &mut sender, &mut receiver);
-    }
+fn perfect(inner: Box<dyn DatagramReceiver>) -> EmulatedReceiver {
+    let settings = EmulatedSettings::default();
+    EmulatedReceiver::new(inner, Box::new(PerfectLink), |_| false, settings)
 }
 
 #[test]
@@ -231,18 +297,7 @@ fn the_queue_keeps_the_promises_with_and_without_stamps() {
 }
 
 #[test]
-fn a_perfect_emulated_link_keeps_the_promises_of_what_it_wraps() {
-    let settings = EmulatedSettings::default();
+fn a_perfect_emulated_link_keeps_the_promises_of_the_queue() {
     let (mut sender, inner) = queue_pair(&QueueSettings::default());
-    let mut receiver = EmulatedReceiver::new(inner, Box::new(PerfectLink), |_| false, settings);
-    check_conformance("emulated queue", &mut sender, &mut receiver);
-
-    let (mut sender, inner) = udp_pair("127.0.0.1:0", TimestampMode::Software);
-    let inner: Box<dyn DatagramReceiver> = Box::new(inner);
-    let mut receiver = EmulatedReceiver::new(inner, Box::new(PerfectLink), |_| true, settings);
-    check_conformance("emulated udp", &mut sender, &mut receiver);
-
-    let (mut sender, inner) = tcp_pair("127.0.0.1:0");
-    let mut receiver = EmulatedReceiver::new(inner, Box::new(PerfectLink), |_| false, settings);
-    check_conformance("emulated tcp", &mut sender, &mut receiver);
+    check_conformance("emulated queue", &mut sender, &mut perfect(Box::new(inner)));
 }

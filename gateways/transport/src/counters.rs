@@ -1,85 +1,114 @@
-//! What the two ends of a transport count. It counts nothing by itself.
+//! What the two ends of a transport count and report. It counts nothing by itself.
+
+use core::sync::atomic::{AtomicU64, Ordering};
+use core::time::Duration;
 
 use hil_core::link_model::LossCauses;
+use hil_protocol::counts;
 
 use super::{Received, SendRefusal};
 
-/// Everything a sender counts since it was opened.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct SenderCounters {
-    /// Datagrams the transport took.
-    pub sent_count: u64,
-    /// Sends refused with [`SendRefusal::PeerRefused`].
-    pub peer_refused_count: u64,
-    /// Sends refused with [`SendRefusal::Unreachable`].
-    pub unreachable_count: u64,
-    /// Sends refused with [`SendRefusal::QueueFull`].
-    pub queue_full_count: u64,
-    /// Sends refused with [`SendRefusal::TooLong`].
-    pub too_long_count: u64,
-    /// Sends refused with [`SendRefusal::NotConnected`].
-    pub not_connected_count: u64,
-    /// Sends refused with [`SendRefusal::Other`].
-    pub other_refusal_count: u64,
-    /// Transmit stamps handed out.
-    pub stamp_count: u64,
-    /// Transmit stamps that named no datagram of this sender, dropped.
-    pub unmatched_stamp_count: u64,
-    /// Transmit stamps dropped because nobody fetched them in time; known for a queue only, the
-    /// kernel does not tell.
-    pub stamp_overflow_count: u64,
-    /// Reports of the network (ICMP) about earlier datagrams, swallowed.
-    pub network_report_count: u64,
-    /// Reports of this host's stack about earlier datagrams (for instance their length),
-    /// swallowed.
-    pub local_report_count: u64,
-    /// Entries of the error queue that could not be read or understood, dropped.
-    pub undecodable_report_count: u64,
-    /// Replies received from the peer.
-    pub reply_count: u64,
-    /// Replies the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known as
-    /// of the newest reply received.
-    pub kernel_drop_count: u64,
-    /// Datagrams the peer radio acknowledged; asked for on wireless interfaces only.
-    pub radio_acknowledged_count: u64,
-    /// Datagrams the peer radio did not acknowledge.
-    pub radio_unacknowledged_count: u64,
-    /// Reports of the radio that name no send of ours or came too late to be matched, dropped.
-    pub radio_unmatched_count: u64,
-    /// Reports of the radio dropped because nobody took them in time.
-    pub radio_overflow_count: u64,
-    /// What the newest network or local report said.
-    pub newest_report: Option<SendRefusal>,
+/// What only one transport counts and has to tell of one of its ends, as a report shows it.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct EndReport {
+    /// Its counts by key. The key ends with the unit: `_count`, `_bytes`, `_us`.
+    pub counters: Vec<(&'static str, u64)>,
+    /// What a reader has to know besides: a label and words.
+    pub facts: Vec<(&'static str, String)>,
+    /// How often a sender stood still; `None` where nothing can.
+    pub stalls: Option<Stalls>,
 }
 
-impl SenderCounters {
-    /// Every counter with its name, in the order above.
-    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
-        [
-            ("sent_count", self.sent_count),
-            ("peer_refused_count", self.peer_refused_count),
-            ("unreachable_count", self.unreachable_count),
-            ("queue_full_count", self.queue_full_count),
-            ("too_long_count", self.too_long_count),
-            ("not_connected_count", self.not_connected_count),
-            ("other_refusal_count", self.other_refusal_count),
-            ("stamp_count", self.stamp_count),
-            ("unmatched_stamp_count", self.unmatched_stamp_count),
-            ("stamp_overflow_count", self.stamp_overflow_count),
-            ("network_report_count", self.network_report_count),
-            ("local_report_count", self.local_report_count),
-            ("undecodable_report_count", self.undecodable_report_count),
-            ("reply_count", self.reply_count),
-            ("kernel_drop_count", self.kernel_drop_count),
-            ("radio_acknowledged_count", self.radio_acknowledged_count),
-            (
-                "radio_unacknowledged_count",
-                self.radio_unacknowledged_count,
-            ),
-            ("radio_unmatched_count", self.radio_unmatched_count),
-            ("radio_overflow_count", self.radio_overflow_count),
-        ]
-        .into_iter()
+/// Spans in which the oldest byte that was sent waited longer for its acknowledgement than a
+/// transport in good health needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Stalls {
+    /// How many.
+    pub count: u64,
+    /// Their length together, each from when its first byte was sent.
+    pub total: Duration,
+    /// The longest.
+    pub longest: Duration,
+    /// What waits longer is stalled.
+    pub threshold: Duration,
+}
+
+/// How often connections came and went, for a thread that tells of it while another carries
+/// messages.
+#[derive(Debug, Default)]
+pub struct ConnectionTally {
+    begun: AtomicU64,
+    ended: AtomicU64,
+}
+
+impl ConnectionTally {
+    pub(crate) fn begin(&self) {
+        self.begun.fetch_add(1, Ordering::Release);
+    }
+
+    pub(crate) fn end(&self) {
+        self.ended.fetch_add(1, Ordering::Release);
+    }
+
+    /// Connections that came about.
+    pub fn begun_count(&self) -> u64 {
+        self.begun.load(Ordering::Acquire)
+    }
+
+    /// Connections that ended.
+    pub fn ended_count(&self) -> u64 {
+        self.ended.load(Ordering::Acquire)
+    }
+}
+
+counts! {
+    /// Everything a sender counts since it was opened.
+    pub struct SenderCounters {
+        /// Datagrams the transport took.
+        sent_count,
+        /// Sends refused with [`SendRefusal::PeerRefused`].
+        peer_refused_count,
+        /// Sends refused with [`SendRefusal::Unreachable`].
+        unreachable_count,
+        /// Sends refused with [`SendRefusal::QueueFull`].
+        queue_full_count,
+        /// Sends refused with [`SendRefusal::TooLong`].
+        too_long_count,
+        /// Sends refused with [`SendRefusal::NotConnected`].
+        not_connected_count,
+        /// Sends refused with [`SendRefusal::Other`].
+        other_refusal_count,
+        /// Transmit stamps handed out.
+        stamp_count,
+        /// Transmit stamps that named no datagram of this sender, dropped.
+        unmatched_stamp_count,
+        /// Transmit stamps dropped because nobody fetched them in time; known for a queue only, the
+        /// kernel does not tell.
+        stamp_overflow_count,
+        /// Reports of the network (ICMP) about earlier datagrams, swallowed.
+        network_report_count,
+        /// Reports of this host's stack about earlier datagrams (for instance their length),
+        /// swallowed.
+        local_report_count,
+        /// Entries of the error queue that could not be read or understood, dropped.
+        undecodable_report_count,
+        /// Replies received from the peer.
+        reply_count,
+        /// Replies the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known as
+        /// of the newest reply received.
+        kernel_drop_count,
+        /// Datagrams the peer radio acknowledged; asked for on wireless interfaces only.
+        radio_acknowledged_count,
+        /// Datagrams the peer radio did not acknowledge.
+        radio_unacknowledged_count,
+        /// Reports of the radio that name no send of ours or came too late to be matched, dropped.
+        radio_unmatched_count,
+        /// Reports of the radio dropped because nobody took them in time.
+        radio_overflow_count,
+    }
+    beside {
+        /// What the newest network or local report said.
+        newest_report: Option<SendRefusal>,
     }
 }
 
@@ -107,79 +136,62 @@ impl SenderCounters {
     }
 }
 
-/// Everything a receiver counts since it was opened.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct ReceiverCounters {
-    /// Datagrams handed to the caller.
-    pub received_count: u64,
-    /// Of those, with a software stamp. Divided by `received_count` it is the stamp coverage.
-    pub software_stamp_count: u64,
-    /// Of those, with a hardware stamp.
-    pub hardware_stamp_count: u64,
-    /// Of those, cut off because the buffer was too short.
-    pub truncated_count: u64,
-    /// Of those, with control data that was cut off or damaged, so stamps may be missing.
-    pub damaged_control_count: u64,
-    /// Datagrams without a readable source address, dropped.
-    pub sourceless_count: u64,
-    /// Datagrams the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known
-    /// as of the newest datagram received: drops after it show with the next one.
-    pub kernel_drop_count: u64,
-    /// Replies the transport took.
-    pub reply_count: u64,
-    /// Replies it refused.
-    pub reply_refused_count: u64,
-    /// Transmit stamps of replies handed out.
-    pub reply_stamp_count: u64,
-    /// Transmit stamps of replies that were asked for and did not come in time.
-    pub reply_stamp_missing_count: u64,
-    /// Datagrams the link model lost.
-    pub link_lost_count: u64,
-    /// Datagrams dropped because the emulation already held as many as it may.
-    pub link_overflow_count: u64,
-    /// What the lost ones were lost to; `None` without a link model, or for one that does not tell.
-    pub link_loss_causes: Option<LossCauses>,
-    /// Datagrams that arrived with the code point this end marks with; counted where it marks.
-    pub mark_kept_count: u64,
-    /// Datagrams that arrived with another code point: something on the way changed it, or the
-    /// sender marks otherwise.
-    pub mark_changed_count: u64,
-    /// The code point of the newest of those.
-    pub newest_other_dscp: Option<u8>,
+counts! {
+    /// Everything a receiver counts since it was opened.
+    pub struct ReceiverCounters {
+        /// Datagrams handed to the caller.
+        received_count,
+        /// Of those, with a software stamp. Divided by `received_count` it is the stamp coverage.
+        software_stamp_count,
+        /// Of those, with a hardware stamp.
+        hardware_stamp_count,
+        /// Of those, cut off because the buffer was too short.
+        truncated_count,
+        /// Of those, with control data that was cut off or damaged, so stamps may be missing.
+        damaged_control_count,
+        /// Datagrams without a readable source address, dropped.
+        sourceless_count,
+        /// Datagrams the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known
+        /// as of the newest datagram received: drops after it show with the next one.
+        kernel_drop_count,
+        /// Replies the transport took.
+        reply_count,
+        /// Replies it refused.
+        reply_refused_count,
+        /// Transmit stamps of replies handed out.
+        reply_stamp_count,
+        /// Transmit stamps of replies that were asked for and did not come in time.
+        reply_stamp_missing_count,
+        /// Datagrams the link model lost.
+        link_lost_count,
+        /// Datagrams dropped because the emulation already held as many as it may.
+        link_overflow_count,
+        /// Datagrams that arrived with the code point this end marks with; counted where it marks.
+        mark_kept_count,
+        /// Datagrams that arrived with another code point: something on the way changed it, or the
+        /// sender marks otherwise.
+        mark_changed_count,
+    }
+    beside {
+        /// What the lost ones were lost to; `None` without a link model, or for one that does not tell.
+        link_loss_causes: Option<LossCauses>,
+        /// The code point of the newest datagram that arrived with another one.
+        newest_other_dscp: Option<u8>,
+    }
 }
 
 impl ReceiverCounters {
-    /// Every counter with its name, in the order above.
-    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
-        [
-            ("received_count", self.received_count),
-            ("software_stamp_count", self.software_stamp_count),
-            ("hardware_stamp_count", self.hardware_stamp_count),
-            ("truncated_count", self.truncated_count),
-            ("damaged_control_count", self.damaged_control_count),
-            ("sourceless_count", self.sourceless_count),
-            ("kernel_drop_count", self.kernel_drop_count),
-            ("reply_count", self.reply_count),
-            ("reply_refused_count", self.reply_refused_count),
-            ("reply_stamp_count", self.reply_stamp_count),
-            ("reply_stamp_missing_count", self.reply_stamp_missing_count),
-            ("link_lost_count", self.link_lost_count),
-            ("link_overflow_count", self.link_overflow_count),
-            ("mark_kept_count", self.mark_kept_count),
-            ("mark_changed_count", self.mark_changed_count),
-        ]
-        .into_iter()
-        .chain(self.link_loss_causes.into_iter().flat_map(|causes| {
+    /// What the link model lost its datagrams to, with names; empty where nobody can tell.
+    pub fn loss_causes(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
+        self.link_loss_causes.into_iter().flat_map(|causes| {
             [
                 ("link_lost_to_outages_count", causes.outage_count),
                 ("link_lost_by_chance_count", causes.chance_count),
                 ("link_lost_to_full_queue_count", causes.queue_count),
             ]
-        }))
+        })
     }
-}
 
-impl ReceiverCounters {
     /// Compares the mark of an arrival with the one it should have; neither is known without
     /// marking.
     pub(crate) fn count_mark(&mut self, expected_dscp: Option<u8>, class: Option<u8>) {

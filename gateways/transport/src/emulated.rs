@@ -13,8 +13,7 @@ use std::os::fd::BorrowedFd;
 use hil_core::link_model::{LinkModel, MessageNumber};
 use hil_core::time::Instant;
 
-use super::tcp::StreamFigures;
-use super::{DatagramReceiver, EmulatedDelay, Received, ReceiverCounters, SendRefusal};
+use super::{DatagramReceiver, EmulatedDelay, EndReport, Received, ReceiverCounters, SendRefusal};
 use hil_protocol::seal::SealCounts;
 
 /// How much an emulated link may hold.
@@ -52,8 +51,8 @@ pub type NumberOf = fn(&[u8]) -> Option<MessageNumber>;
 type Position = Reverse<(Instant, u64, usize)>;
 
 /// A receiver whose arrivals pass a link model first.
-pub struct EmulatedReceiver<R> {
-    inner: R,
+pub struct EmulatedReceiver {
+    inner: Box<dyn DatagramReceiver>,
     link: Box<dyn LinkModel>,
     is_exempt: fn(&[u8]) -> bool,
     datagram_bytes_max: usize,
@@ -69,14 +68,14 @@ pub struct EmulatedReceiver<R> {
     counters: ReceiverCounters,
 }
 
-impl<R: DatagramReceiver> EmulatedReceiver<R> {
+impl EmulatedReceiver {
     /// Puts `inner` behind `link`. Datagrams that `is_exempt` accepts, such as handshakes, pass
     /// undelayed and without being offered, so that they do not change the fate of the others.
     ///
     /// # Panics
     /// When `settings` leaves no room for a datagram.
     pub fn new(
-        inner: R,
+        inner: Box<dyn DatagramReceiver>,
         link: Box<dyn LinkModel>,
         is_exempt: fn(&[u8]) -> bool,
         settings: EmulatedSettings,
@@ -112,11 +111,6 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
     /// Datagrams held now.
     pub fn held_count(&self) -> usize {
         self.order.len()
-    }
-
-    /// The receiver below.
-    pub fn inner(&self) -> &R {
-        &self.inner
     }
 
     /// Takes everything that has arrived below, at most as many as may be held.
@@ -185,7 +179,7 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
     }
 }
 
-impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
+impl DatagramReceiver for EmulatedReceiver {
     fn receive(&mut self, now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>> {
         self.pull(now)?;
         let Some(&Reverse((due, _, place))) = self.order.peek() else {
@@ -241,8 +235,8 @@ impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
         self.inner.attend(now);
     }
 
-    fn stream_figures(&self, now: Instant) -> Option<StreamFigures> {
-        self.inner.stream_figures(now)
+    fn report(&self, now: Instant) -> EndReport {
+        self.inner.report(now)
     }
 
     fn seal_counts(&self) -> Option<SealCounts> {
@@ -266,7 +260,7 @@ impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
     }
 }
 
-impl<R: fmt::Debug> fmt::Debug for EmulatedReceiver<R> {
+impl fmt::Debug for EmulatedReceiver {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         // Without the buffers, which are long and say nothing.
         f.debug_struct("EmulatedReceiver")

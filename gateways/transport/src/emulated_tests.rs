@@ -9,7 +9,7 @@ use hil_link::spec::{LinkPlace, LinkSpec};
 
 use super::*;
 use crate::DatagramSender;
-use crate::queue::{QueueReceiver, QueueSender, QueueSettings, queue_pair};
+use crate::queue::{QueueSender, QueueSettings, queue_pair};
 
 const MS: i64 = 1_000_000;
 
@@ -29,7 +29,7 @@ impl LinkModel for Listed {
 fn emulated(
     link: impl LinkModel + 'static,
     capacity_count: usize,
-) -> (QueueSender, EmulatedReceiver<QueueReceiver>) {
+) -> (QueueSender, EmulatedReceiver) {
     let (sender, inner) = queue_pair(&QueueSettings::default());
     let settings = EmulatedSettings {
         capacity_count,
@@ -38,7 +38,7 @@ fn emulated(
         number_of: None,
     };
     let is_handshake = |datagram: &[u8]| datagram.first() == Some(&b'h');
-    let receiver = EmulatedReceiver::new(inner, Box::new(link), is_handshake, settings);
+    let receiver = EmulatedReceiver::new(Box::new(inner), Box::new(link), is_handshake, settings);
     (sender, receiver)
 }
 
@@ -58,7 +58,7 @@ fn a_caller_that_was_held_up_does_not_make_a_datagram_early() {
         clock: Some(|| Instant::from_ns(8_000_000)),
         ..EmulatedSettings::default()
     };
-    let mut receiver = EmulatedReceiver::new(inner, Box::new(link), |_| false, settings);
+    let mut receiver = EmulatedReceiver::new(Box::new(inner), Box::new(link), |_| false, settings);
     sender.send(b"x").unwrap();
     let mut buffer = [0; 8];
     assert!(

@@ -1,6 +1,8 @@
 //! Transports: how a datagram leaves one gateway and reaches the other, and when the kernel saw
 //! it. They know no datagram layout; that is [`hil_protocol`].
 //!
+//! - [`registry`]: the list of transports, and what each is: a name, capabilities, and how its
+//!   ends are opened.
 //! - [`udp`]: the real network, with separate sockets for sending and receiving.
 //! - [`tcp`]: the real network as a stream, with what it costs in waiting.
 //! - [`udp_server`]: one socket that hears anyone and answers, for foreign protocols.
@@ -12,17 +14,16 @@
 //! A refused send or a report of the network is a state the caller sees, never an exit.
 #![forbid(unsafe_code)]
 
-mod boxed;
 mod counters;
 pub mod emulated;
 pub mod probe;
 pub mod queue;
+pub mod registry;
 pub mod sealed;
+pub mod socket;
 pub mod tcp;
 pub mod udp;
-mod udp_receiver;
 pub mod udp_server;
-mod udp_socket;
 
 #[cfg(test)]
 mod conformance_tests;
@@ -41,8 +42,7 @@ use std::os::fd::BorrowedFd;
 use hil_core::time::Instant;
 use thiserror::Error;
 
-pub use counters::{ReceiverCounters, SenderCounters};
-use tcp::StreamFigures;
+pub use counters::{ConnectionTally, EndReport, ReceiverCounters, SenderCounters, Stalls};
 
 use hil_net::radio::RadioReport;
 use hil_net::{KernelStamps, TransmitStamp, TxToken};
@@ -197,9 +197,9 @@ pub trait DatagramSender: Debug + Send {
         false
     }
 
-    /// What a transport with connections saw until `now`; `None` for one without.
-    fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
-        None
+    /// What only this transport counts and has to tell, until `now`.
+    fn report(&self, _now: Instant) -> EndReport {
+        EndReport::default()
     }
 
     /// What a transport behind the seal counted; `None` for a plain one.
@@ -258,9 +258,9 @@ pub trait DatagramReceiver: Debug + Send {
     /// descriptor has something and [`DatagramReceiver::receive`] gave nothing.
     fn attend(&mut self, _now: Instant) {}
 
-    /// What a transport with connections saw until `now`; `None` for one without.
-    fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
-        None
+    /// What only this transport counts and has to tell, until `now`.
+    fn report(&self, _now: Instant) -> EndReport {
+        EndReport::default()
     }
 
     /// What a transport behind the seal counted; `None` for a plain one.

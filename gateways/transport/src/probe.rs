@@ -13,7 +13,8 @@ use hil_core::time::Instant;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use thiserror::Error;
 
-use super::udp::{UdpError, UdpReceiver, UdpSender, UdpSettings};
+use super::socket::{SocketError, SocketSettings};
+use super::udp::{UdpReceiver, UdpSender};
 use super::{DatagramReceiver, DatagramSender, SendRefusal};
 use hil_net::clock_pair::monotonic_now;
 use hil_net::interface::interface_with_address;
@@ -120,7 +121,7 @@ pub enum ProbeError {
     },
     /// A probe socket could not be set up.
     #[error("probe socket: {0}")]
-    Socket(#[from] UdpError),
+    Socket(#[from] SocketError),
     /// Waiting or reading failed.
     #[error("probe of kernel stamps: {0}")]
     Io(#[from] io::Error),
@@ -182,7 +183,7 @@ pub fn arm_and_probe(settings: &ProbeSettings) -> Result<(ProbeReport, Sentinel)
 /// A pair over loopback: IPv4, or IPv6 on a host without it.
 fn open_loopback(mode: TimestampMode) -> Result<(UdpReceiver, UdpSender), ProbeError> {
     let open = |address: SocketAddr| -> Result<_, ProbeError> {
-        let mut settings = UdpSettings::new(address, address);
+        let mut settings = SocketSettings::new(address, address);
         settings.timestamps = mode;
         let receiver = UdpReceiver::open(&settings)?;
         settings.peer = receiver.local_address()?;
@@ -200,7 +201,7 @@ fn open_towards(settings: &ProbeSettings, target: SocketAddr) -> Result<UdpSende
         SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
         SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
     };
-    let mut udp = UdpSettings::new(unspecified, target);
+    let mut udp = SocketSettings::new(unspecified, target);
     udp.interface.clone_from(&settings.interface);
     udp.timestamps = settings.timestamps;
     Ok(UdpSender::open(&udp)?)

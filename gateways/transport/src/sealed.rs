@@ -7,9 +7,9 @@ use std::os::fd::BorrowedFd;
 
 use hil_core::time::Instant;
 
-use super::tcp::StreamFigures;
 use super::{
-    DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
+    DatagramReceiver, DatagramSender, EndReport, Received, ReceiverCounters, SendRefusal,
+    SenderCounters,
 };
 use hil_net::radio::RadioReport;
 use hil_net::{TransmitStamp, TxToken};
@@ -23,6 +23,30 @@ const BUFFER_BYTES: usize = u16::MAX as usize + TAG_BYTES;
 pub const REFUSED_PER_LOOK_MAX: usize = 16;
 /// Bytes of the longest greeting there is: its header, 40 bytes and two names of 255.
 const GREETING_BYTES_MAX: usize = 1024;
+
+/// A sender as a gateway owns it: behind the seal where the hop has one. Whatever the transport,
+/// one call through a pointer leads to the socket.
+pub fn sender(
+    sender: impl DatagramSender + 'static,
+    seal: Option<Initiator>,
+) -> Box<dyn DatagramSender> {
+    match seal {
+        Some(seal) => Box::new(SealedSender::new(sender, seal)),
+        None => Box::new(sender),
+    }
+}
+
+/// The same for a receiver of `peer`.
+pub fn receiver(
+    receiver: impl DatagramReceiver + 'static,
+    peer: SocketAddr,
+    seal: Option<Responder>,
+) -> Box<dyn DatagramReceiver> {
+    match seal {
+        Some(seal) => Box::new(SealedReceiver::new(receiver, seal, peer)),
+        None => Box::new(receiver),
+    }
+}
 
 /// The sending end.
 #[derive(Debug)]
@@ -132,8 +156,8 @@ impl<S: DatagramSender> DatagramSender for SealedSender<S> {
         self.inner.has_unsent()
     }
 
-    fn stream_figures(&self, now: Instant) -> Option<StreamFigures> {
-        self.inner.stream_figures(now)
+    fn report(&self, now: Instant) -> EndReport {
+        self.inner.report(now)
     }
 
     fn seal_counts(&self) -> Option<SealCounts> {
@@ -228,8 +252,8 @@ impl<R: DatagramReceiver> DatagramReceiver for SealedReceiver<R> {
         self.inner.attend(now);
     }
 
-    fn stream_figures(&self, now: Instant) -> Option<StreamFigures> {
-        self.inner.stream_figures(now)
+    fn report(&self, now: Instant) -> EndReport {
+        self.inner.report(now)
     }
 
     fn seal_counts(&self) -> Option<SealCounts> {

@@ -8,7 +8,8 @@ use hil_core::time::Instant;
 
 use super::conformance_tests::{udp_pair, within_bound};
 use super::probe::{Availability, ProbeSettings, Sentinel, arm_and_probe};
-use super::udp::{UdpReceiver, UdpSender, UdpSettings};
+use super::socket::SocketSettings;
+use super::udp::{UdpReceiver, UdpSender};
 use super::{DatagramReceiver, DatagramSender, SendRefusal};
 use hil_net::TxToken;
 use hil_net::clock_pair::{ClockPair, monotonic_now};
@@ -17,9 +18,9 @@ use hil_net::timestamping::{TimestampMode, arm_transmit};
 const UNDRAINED_SEND_COUNT: u32 = 2000;
 const ARRIVAL_COUNT: u32 = 50;
 
-pub(super) fn loopback_settings() -> UdpSettings {
+pub(super) fn loopback_settings() -> SocketSettings {
     let address = "127.0.0.1:0".parse().unwrap();
-    UdpSettings::new(address, address)
+    SocketSettings::new(address, address)
 }
 
 pub(super) fn sentinel() -> Sentinel {
@@ -171,7 +172,7 @@ fn check_dead_peer(address: &str) {
     assert_eq!(sender.receive(&mut [0; 8]).unwrap(), None);
     expect_report(&mut sender, 11);
 
-    let mut receiver = UdpReceiver::open(&UdpSettings::new(address, address)).unwrap();
+    let mut receiver = UdpReceiver::open(&SocketSettings::new(address, address)).unwrap();
     sender.send(b"welcome").unwrap();
     expect_arrivals(&mut receiver, 1);
 }

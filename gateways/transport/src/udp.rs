@@ -6,28 +6,108 @@ use std::io;
 use std::net::SocketAddr;
 use std::os::fd::{AsFd, BorrowedFd};
 
+use hil_core::time::Instant;
 use nix::sys::socket::{setsockopt, sockopt};
-use socket2::{SockAddr, Socket};
+use socket2::{Domain, Protocol, SockAddr, Socket, Type};
 
-pub use super::udp_receiver::UdpReceiver;
-pub use super::udp_socket::{GrantedOptions, UdpError, UdpSettings};
-use super::udp_socket::{bind, granted_options, local_address, open_socket, refuse};
-use super::{DatagramSender, Received, SendRefusal, SenderCounters};
+use super::registry::{OpenReceiver, OpenSender, Transport};
+use super::socket::{
+    GrantedOptions, SocketError, SocketSettings, bind, granted_options, local_address, mark,
+    refuse, set_buffers,
+};
+use super::{
+    DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
+    sealed,
+};
 use hil_net::control::{ControlData, QueueEntry, SCM_WIFI_STATUS};
 use hil_net::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
+use hil_net::reply_stamps::ReplyStamps;
 use hil_net::timestamping::{
-    MessageReader, Queue, TimestampMode, arm_transmit, int_option, restart_send_count,
+    MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, int_option, restart_send_count,
     set_int_option,
 };
 use hil_net::{TransmitStamp, TxToken};
+use hil_protocol::seal::{Initiator, Responder};
+use hil_protocol::transport::{Capabilities, Description, IpProtocol};
 
+/// Each datagram by itself.
+#[derive(Debug)]
+pub struct Udp;
+
+static DESCRIPTION: Description = Description {
+    name: "udp",
+    label: "UDP",
+    capabilities: Capabilities {
+        unstamped_because: None,
+        has_radio_reports: true,
+        cuts_to_path: false,
+        sender_port: Some(IpProtocol::Udp),
+        receiver_port: Some(IpProtocol::Udp),
+        ipv4_header_bytes: 20 + 8,
+        ipv6_header_bytes: 40 + 8,
+    },
+    options: &[],
+};
+
+impl Transport for Udp {
+    fn description(&self) -> &'static Description {
+        &DESCRIPTION
+    }
+
+    fn open_sender(
+        &self,
+        settings: &SocketSettings,
+        seal: Option<Initiator>,
+    ) -> Result<OpenSender, SocketError> {
+        let sender = UdpSender::open(settings)?;
+        let path = sender.path_mtu();
+        let mut facts = sender.granted().facts(settings);
+        if let Some(configured) = settings.path_mtu_bytes {
+            let text = format!("{} bytes, {configured} configured", path.packet_bytes);
+            facts.push(("path MTU".to_owned(), text));
+        }
+        Ok(OpenSender {
+            granted: sender.granted(),
+            datagram_bytes_max: datagram_bytes_max(settings, path),
+            facts,
+            connections: None,
+            sender: sealed::sender(sender, seal),
+        })
+    }
+
+    fn open_receiver(
+        &self,
+        settings: &SocketSettings,
+        seal: Option<Responder>,
+    ) -> Result<OpenReceiver, SocketError> {
+        let receiver = UdpReceiver::open(settings)?;
+        Ok(OpenReceiver {
+            facts: receiver.granted().facts(settings),
+            receiver: sealed::receiver(receiver, settings.peer, seal),
+        })
+    }
+}
+
+/// What a datagram may carry: as much as the settings say, but no more than the path takes.
+fn datagram_bytes_max(settings: &SocketSettings, path: PathMtu) -> usize {
+    let headers = DESCRIPTION.capabilities.header_bytes(settings.peer.ip());
+    let known = usize::try_from(path.datagram_bytes).unwrap_or(usize::MAX);
+    match settings.path_mtu_bytes {
+        None => known,
+        Some(configured) if path.is_assumed => configured.saturating_sub(headers),
+        Some(configured) => configured.saturating_sub(headers).min(known),
+    }
+}
+
+/// `IPV6_MTU_DISCOVER` of `linux/in6.h`.
+const IPV6_MTU_DISCOVER: i32 = 23;
 /// `IPV6_MTU` of `linux/in6.h`.
 const IPV6_MTU: i32 = 24;
 /// Entries of the error queue read in one call at most, so that a flood of reports cannot hold
 /// up the sending thread.
 const DRAIN_COUNT_MAX: u32 = 256;
 /// Pending reports that one receive call passes over at most; each costs one system call.
-pub(super) const RECEIVE_ATTEMPT_COUNT_MAX: u32 = 8;
+const RECEIVE_ATTEMPT_COUNT_MAX: u32 = 8;
 
 /// The largest packet the path to the peer is known to take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,17 +143,17 @@ impl UdpSender {
     ///
     /// # Errors
     /// When the settings contradict themselves or the kernel refuses a step.
-    pub fn open(settings: &UdpSettings) -> Result<Self, UdpError> {
+    pub fn open(settings: &SocketSettings) -> Result<Self, SocketError> {
         Self::open_towards(settings, Some(settings.peer))
     }
 
     /// As [`UdpSender::open`], connected to `peer`, or to nobody.
     pub(super) fn open_towards(
-        settings: &UdpSettings,
+        settings: &SocketSettings,
         peer: Option<SocketAddr>,
-    ) -> Result<Self, UdpError> {
+    ) -> Result<Self, SocketError> {
         if let Some(peer) = peer.filter(|peer| peer.is_ipv4() != settings.local.is_ipv4()) {
-            return Err(UdpError::Family {
+            return Err(SocketError::Family {
                 local: settings.local,
                 peer,
             });
@@ -345,6 +425,193 @@ impl DatagramSender for UdpSender {
     fn counters(&self) -> SenderCounters {
         self.counters
     }
+}
+
+/// The receiving socket, open to anyone.
+#[derive(Debug)]
+pub struct UdpReceiver {
+    socket: Socket,
+    reader: MessageReader,
+    counters: ReceiverCounters,
+    /// The kernel's drop count at the newest datagram, modulo 2^32.
+    kernel_drop_count: u32,
+    granted: GrantedOptions,
+    /// The code point arrivals should have.
+    dscp: Option<u8>,
+    stamps: ReplyStamps,
+}
+
+impl UdpReceiver {
+    /// Opens and binds the socket.
+    ///
+    /// # Errors
+    /// When the settings contradict themselves or the kernel refuses a step.
+    pub fn open(settings: &SocketSettings) -> Result<Self, SocketError> {
+        let socket = open_socket(settings)?;
+        // Before the socket can receive, so that no datagram comes without.
+        let armed = arm_receive(&socket, settings.timestamps);
+        refuse(
+            "SO_TIMESTAMPING",
+            format!("{:?}", settings.timestamps),
+            armed,
+        )?;
+        let drops = setsockopt(&socket, sockopt::RxqOvfl, &1);
+        refuse("SO_RXQ_OVFL", 1, drops.map_err(io::Error::from))?;
+        if settings.dscp.is_some() {
+            let (option, level, name) = if settings.local.is_ipv4() {
+                ("IP_RECVTOS", libc::SOL_IP, libc::IP_RECVTOS)
+            } else {
+                ("IPV6_RECVTCLASS", libc::SOL_IPV6, libc::IPV6_RECVTCLASS)
+            };
+            refuse(option, 1, set_int_option(&socket, level, name, 1))?;
+        }
+        bind(&socket, settings.local)?;
+        Ok(Self {
+            granted: granted_options(&socket, settings)?,
+            socket,
+            reader: MessageReader::new(),
+            counters: ReceiverCounters::default(),
+            kernel_drop_count: 0,
+            dscp: settings.dscp,
+            stamps: ReplyStamps::new(settings.timestamps),
+        })
+    }
+
+    /// What the kernel granted.
+    pub fn granted(&self) -> GrantedOptions {
+        self.granted
+    }
+
+    /// Where it listens, with the port the kernel chose.
+    ///
+    /// # Errors
+    /// When the kernel does not tell.
+    pub fn local_address(&self) -> io::Result<SocketAddr> {
+        local_address(&self.socket)
+    }
+
+    fn count_reply(&mut self, sent: io::Result<usize>, length: usize) -> Result<(), SendRefusal> {
+        match sent {
+            Ok(_) => {
+                self.counters.reply_count += 1;
+                Ok(())
+            }
+            Err(error) => {
+                self.counters.reply_refused_count += 1;
+                Err(SendRefusal::from_io(&error, length))
+            }
+        }
+    }
+}
+
+impl DatagramReceiver for UdpReceiver {
+    fn receive(&mut self, _now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>> {
+        for _ in 0..RECEIVE_ATTEMPT_COUNT_MAX {
+            let read = self
+                .reader
+                .read(self.socket.as_fd(), buffer, Queue::Arrivals)?;
+            let Some(message) = read else { return Ok(None) };
+            let data = ControlData::decode(self.reader.control());
+            if let Some(count) = data.drop_count {
+                let new_count = count.wrapping_sub(self.kernel_drop_count);
+                self.counters.kernel_drop_count += u64::from(new_count);
+                self.kernel_drop_count = count;
+            }
+            let Some(source) = message.source else {
+                self.counters.sourceless_count += 1;
+                continue;
+            };
+            let received = Received {
+                length_bytes: message.length_bytes,
+                is_truncated: message.is_truncated,
+                source,
+                stamps: data.stamps,
+                emulated: None,
+            };
+            let is_damaged = data.is_damaged || message.is_control_truncated;
+            self.counters.damaged_control_count += u64::from(is_damaged);
+            self.counters.count_mark(self.dscp, data.traffic_class);
+            self.counters.count_received(&received);
+            return Ok(Some(received));
+        }
+        Ok(None)
+    }
+
+    fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal> {
+        let address = SockAddr::from(to);
+        let flags = libc::MSG_DONTWAIT;
+        let sent = self.socket.send_to_with_flags(datagram, &address, flags);
+        self.count_reply(sent, datagram.len())
+    }
+
+    fn reply_stamped(
+        &mut self,
+        now: Instant,
+        datagram: &[u8],
+        to: SocketAddr,
+    ) -> Result<(), SendRefusal> {
+        if !self.stamps.are_asked_for() {
+            return self.reply(datagram, to);
+        }
+        // What is left of the reply before must not be taken for this one's, nor pile up.
+        self.take_reply_stamp(now);
+        let sent = self.stamps.send(&self.socket, now, datagram, to);
+        self.count_reply(sent, datagram.len())
+    }
+
+    fn take_reply_stamp(&mut self, now: Instant) -> Option<i64> {
+        if !self.stamps.is_look_due(now) {
+            return None;
+        }
+        let taken = self.stamps.take(&self.socket, &mut self.reader, now);
+        self.counters.reply_stamp_count = self.stamps.stamp_count;
+        self.counters.reply_stamp_missing_count = self.stamps.missing_count;
+        taken
+    }
+
+    fn next_due(&self) -> Option<Instant> {
+        None
+    }
+
+    fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
+        Some(self.socket.as_fd())
+    }
+
+    fn counters(&self) -> ReceiverCounters {
+        self.counters
+    }
+}
+
+/// A socket with everything set that both directions share.
+fn open_socket(settings: &SocketSettings) -> Result<Socket, SocketError> {
+    let domain = Domain::for_address(settings.local);
+    let opened = Socket::new(domain, Type::DGRAM, Some(Protocol::UDP));
+    let socket = refuse("socket", "UDP", opened)?;
+    refuse("O_NONBLOCK", true, socket.set_nonblocking(true))?;
+    if let Some(interface) = &settings.interface {
+        let bound = socket.bind_device(Some(interface.as_bytes()));
+        refuse("SO_BINDTODEVICE", interface, bound)?;
+    }
+    set_buffers(&socket, settings)?;
+    mark(&socket, settings)?;
+    // A datagram too long for the path is refused instead of sent in pieces, of which the loss
+    // of one would look like the loss of all.
+    let (option, level, name, discover) = if settings.local.is_ipv4() {
+        let name = libc::IP_MTU_DISCOVER;
+        ("IP_MTU_DISCOVER", libc::SOL_IP, name, libc::IP_PMTUDISC_DO)
+    } else {
+        // IPV6_PMTUDISC_DO has the value of its IPv4 twin.
+        let level = libc::SOL_IPV6;
+        (
+            "IPV6_MTU_DISCOVER",
+            level,
+            IPV6_MTU_DISCOVER,
+            libc::IP_PMTUDISC_DO,
+        )
+    };
+    let set = set_int_option(&socket, level, name, discover);
+    refuse(option, discover, set)?;
+    Ok(socket)
 }
 
 /// True for errors of the call itself; every other one is a report of the network.

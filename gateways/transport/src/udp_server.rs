@@ -11,7 +11,8 @@ use std::os::fd::BorrowedFd;
 
 use socket2::SockAddr;
 
-use super::udp::{GrantedOptions, UdpError, UdpSender, UdpSettings};
+use super::socket::{GrantedOptions, SocketError, SocketSettings};
+use super::udp::UdpSender;
 use super::{DatagramSender, Received, SendRefusal, SenderCounters};
 use hil_net::{TransmitStamp, TxToken};
 
@@ -27,7 +28,7 @@ impl UdpServer {
     ///
     /// # Errors
     /// When the settings contradict themselves or the kernel refuses a step.
-    pub fn open(settings: &UdpSettings) -> Result<Self, UdpError> {
+    pub fn open(settings: &SocketSettings) -> Result<Self, SocketError> {
         Ok(Self {
             line: UdpSender::open_towards(settings, None)?,
             peer: None,
@@ -91,7 +92,7 @@ mod tests {
 
     fn server() -> UdpServer {
         let local = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
-        UdpServer::open(&UdpSettings::new(local, local)).unwrap()
+        UdpServer::open(&SocketSettings::new(local, local)).unwrap()
     }
 
     /// Waits for what loopback delivers at once, unless the machine is busy.

@@ -150,9 +150,9 @@ fn cure(wanted: &[WantedPort]) -> String {
 mod tests {
     use super::*;
     use crate::finding::{Severity, settled};
-    use crate::plan::Protocol;
     use hil_nic::radio::netlink::encode_attributes;
     use hil_platform::host_facts::FakeHost;
+    use hil_protocol::transport::IpProtocol;
 
     fn chain(hook: u32, policy: u32, rules: u32) -> Option<Chain> {
         let hook = encode_attributes(&[(HOOK_NUMBER, &hook.to_be_bytes())]);
@@ -168,9 +168,9 @@ mod tests {
 
     fn wanted() -> Vec<WantedPort> {
         [
-            (Protocol::Udp, 7400),
-            (Protocol::Udp, 7403),
-            (Protocol::Tcp, 7399),
+            (IpProtocol::Udp, 7400),
+            (IpProtocol::Udp, 7403),
+            (IpProtocol::Tcp, 7399),
         ]
         .map(|(protocol, port)| WantedPort {
             protocol,

@@ -40,7 +40,7 @@ use self::finding::{Answer, settled};
 pub use self::finding::{Finding, Severity};
 use self::latency::LatencyReport;
 use self::network::StampQuery;
-pub use self::plan::{LinkLoad, Peer, Pin, Plan, Protocol, WantedPort};
+pub use self::plan::{LinkLoad, Peer, Pin, Plan, WantedPort};
 use hil_nic::card_clock::probing::probe_card;
 use hil_platform::clock_discipline::HostDiscipline;
 use hil_platform::domain_address::domain_base_candidates;

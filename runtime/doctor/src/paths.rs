@@ -163,10 +163,10 @@ fn addresses(present: &Interfaces, plan: &Plan) -> Checked {
 fn mtu(files: &HostFiles, present: &Interfaces, load: &LinkLoad) -> Checked {
     let id = "mtu";
     let message = format!("{} of {} bytes", load.channel, load.message_bytes);
-    if load.is_stream {
+    if let Some(label) = load.cut_by {
         return Ok(Finding::ok(
             id,
-            format!("{message}: TCP cuts its own segments"),
+            format!("{message}: {label} cuts its own segments"),
         ));
     }
     let interface = owner(present, load.own);
@@ -317,7 +317,8 @@ mod tests {
             message_bytes,
             path_mtu_bytes: 1500,
             own: "10.77.0.1".parse().unwrap(),
-            is_stream,
+            header_bytes: 28,
+            cut_by: is_stream.then_some("TCP"),
         };
         mtu_of(&host, &load)
     }

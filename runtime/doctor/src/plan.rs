@@ -5,13 +5,10 @@ use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 
 use hil_arm::egm::messages::Side;
+use hil_protocol::transport::IpProtocol;
 use hil_protocol::wire;
 
-use hil_topology::{ClockEnd, Crossing, Execution, FaceKind, Host, Program, Topology, Via, Wait};
-
-/// Bytes of the IP and UDP headers before a datagram.
-const IPV4_HEADERS: usize = 28;
-const IPV6_HEADERS: usize = 48;
+use hil_topology::{ClockEnd, Crossing, Execution, FaceKind, Host, Program, Topology, Wait};
 
 /// A CPU that something is pinned to.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -24,29 +21,11 @@ pub struct Pin {
     pub spins: bool,
 }
 
-/// TCP or UDP.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Protocol {
-    /// Datagrams.
-    Udp,
-    /// Connections.
-    Tcp,
-}
-
-impl Protocol {
-    pub(super) const fn word(self) -> &'static str {
-        match self {
-            Self::Udp => "udp",
-            Self::Tcp => "tcp",
-        }
-    }
-}
-
 /// A port that a run binds on this host.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct WantedPort {
     /// Its protocol.
-    pub protocol: Protocol,
+    pub protocol: IpProtocol,
     /// Where.
     pub address: SocketAddr,
     /// What for.
@@ -79,31 +58,23 @@ pub struct LinkLoad {
     pub path_mtu_bytes: usize,
     /// Where it leaves.
     pub own: IpAddr,
-    /// True over TCP, where segments are the kernel's business.
-    pub is_stream: bool,
+    /// Bytes of a packet before a datagram.
+    pub header_bytes: usize,
+    /// The transport, where it cuts what it carries to the path itself.
+    pub cut_by: Option<&'static str>,
 }
 
 impl LinkLoad {
     /// Bytes of the IP packet that the message would be in one piece.
     pub(super) fn packet_bytes(&self) -> usize {
-        self.headers_bytes() + self.message_bytes
+        self.header_bytes + wire::HEADER_BYTES + self.message_bytes
     }
 
     /// Datagrams of one message where a packet has at most `mtu` bytes; `None` when not even the
     /// headers fit.
     pub(super) fn datagram_count(&self, mtu: usize) -> Option<usize> {
-        let budget = mtu.checked_sub(self.headers_bytes())?;
+        let budget = mtu.checked_sub(self.header_bytes + wire::HEADER_BYTES)?;
         (budget > 0).then(|| self.message_bytes.div_ceil(budget).max(1))
-    }
-
-    /// Bytes of the headers of IP, UDP and the datagram.
-    fn headers_bytes(&self) -> usize {
-        let below = if self.own.is_ipv4() {
-            IPV4_HEADERS
-        } else {
-            IPV6_HEADERS
-        };
-        below + wire::HEADER_BYTES
     }
 }
 
@@ -152,7 +123,7 @@ impl Plan {
                 {
                     let sides = [Side::Right, Side::Left].into_iter();
                     for address in sides.filter_map(|side| face.address(side)) {
-                        plan.bind(Protocol::Udp, address, &process.name);
+                        plan.bind(IpProtocol::Udp, address, &process.name);
                     }
                 }
             }
@@ -163,12 +134,12 @@ impl Plan {
         // The supervisors meet at the first host; clock paths have ports of their own.
         let first = topology.hosts().first().filter(|host| is_here(host));
         if let Some(address) = first.and_then(Host::control_address) {
-            plan.bind(Protocol::Tcp, address, "control_port");
+            plan.bind(IpProtocol::Tcp, address, "control_port");
         }
         for path in topology.clock_paths() {
             for (host, address) in [(path.from, path.asking), (path.to, path.answering)] {
                 if is_here(host) {
-                    plan.bind(Protocol::Udp, address, &path.name());
+                    plan.bind(IpProtocol::Udp, address, &path.name());
                 }
             }
         }
@@ -206,16 +177,16 @@ impl Plan {
 
     fn cross(&mut self, crossing: &Crossing<'_>, is_here: &dyn Fn(&Host) -> bool) {
         let (from, to, channel) = (crossing.from_host, crossing.to_host, crossing.channel);
-        let is_stream = matches!(crossing.link.via, Via::Tcp(_));
+        let transport = crossing.hop.transport;
+        let capabilities = &transport.capabilities;
         if is_here(from) || is_here(to) {
             let name = format!("gateway of {}", crossing.link.name);
             self.pin(&name, &crossing.hop.gateway.execution);
         }
         let at = |host: &Host, port| SocketAddr::new(host.gateway_address(), port);
         if is_here(from) {
-            if !is_stream {
-                let address = at(from, crossing.ports.sender);
-                self.bind(Protocol::Udp, address, &channel.name);
+            if let Some(protocol) = capabilities.sender_port {
+                self.bind(protocol, at(from, crossing.ports.sender), &channel.name);
             }
             self.loads.push(LinkLoad {
                 link: crossing.link.name.clone(),
@@ -223,22 +194,20 @@ impl Plan {
                 message_bytes: channel.message.size_bytes,
                 path_mtu_bytes: crossing.hop.path_mtu_bytes,
                 own: from.gateway_address(),
-                is_stream,
+                header_bytes: capabilities.header_bytes(from.gateway_address()),
+                cut_by: capabilities.cuts_to_path.then_some(transport.label),
             });
             self.face(from, to);
         }
         if is_here(to) {
-            let protocol = if is_stream {
-                Protocol::Tcp
-            } else {
-                Protocol::Udp
-            };
-            self.bind(protocol, at(to, crossing.ports.receiver), &channel.name);
+            if let Some(protocol) = capabilities.receiver_port {
+                self.bind(protocol, at(to, crossing.ports.receiver), &channel.name);
+            }
             self.face(to, from);
         }
     }
 
-    fn bind(&mut self, protocol: Protocol, address: SocketAddr, of: &str) {
+    fn bind(&mut self, protocol: IpProtocol, address: SocketAddr, of: &str) {
         self.ports.push(WantedPort {
             protocol,
             address,
@@ -356,7 +325,8 @@ wait = "spin"
             message_bytes: 1400,
             path_mtu_bytes: 1500,
             own: IpAddr::from([10, 0, 0, 1]),
-            is_stream: false,
+            header_bytes: 28,
+            cut_by: None,
         };
         // 1500 - 28 - 72 leave exactly 1400.
         assert_eq!(load.packet_bytes(), 1500);

@@ -4,8 +4,10 @@
 use std::collections::BTreeSet;
 use std::net::{IpAddr, SocketAddr};
 
+use hil_protocol::transport::IpProtocol;
+
 use super::finding::{Answer, Checked, Finding, settled};
-use super::plan::{Protocol, WantedPort};
+use super::plan::WantedPort;
 use hil_platform::host_facts::{Fact, HostFiles, format_cpu_list};
 
 /// `TCP_LISTEN` in the socket tables.
@@ -48,12 +50,12 @@ fn check(files: &HostFiles, wanted: &[WantedPort]) -> Checked {
 }
 
 /// The ports of each protocol that has some, in ascending order.
-pub(super) fn by_protocol(wanted: &[WantedPort]) -> Vec<(Protocol, BTreeSet<u16>)> {
-    let ports = [Protocol::Udp, Protocol::Tcp].map(|protocol| {
+pub(super) fn by_protocol(wanted: &[WantedPort]) -> Vec<(IpProtocol, BTreeSet<u16>)> {
+    let ports = [IpProtocol::Udp, IpProtocol::Tcp].map(|protocol| {
         let own = wanted.iter().filter(|one| one.protocol == protocol);
         (protocol, own.map(|one| one.address.port()).collect())
     });
-    let has_some = |(_, ports): &(Protocol, BTreeSet<u16>)| !ports.is_empty();
+    let has_some = |(_, ports): &(IpProtocol, BTreeSet<u16>)| !ports.is_empty();
     ports.into_iter().filter(has_some).collect()
 }
 
@@ -63,7 +65,7 @@ fn collide(one: SocketAddr, other: SocketAddr) -> bool {
     one.port() == other.port() && (is_any || one.ip() == other.ip())
 }
 
-fn bound(files: &HostFiles, protocol: Protocol) -> Result<Vec<Bound>, String> {
+fn bound(files: &HostFiles, protocol: IpProtocol) -> Result<Vec<Bound>, String> {
     let first = format!("/proc/net/{}", protocol.word());
     let second = format!("{first}6");
     let mut found = parse(&files.read(&first).known()?, protocol);
@@ -74,10 +76,10 @@ fn bound(files: &HostFiles, protocol: Protocol) -> Result<Vec<Bound>, String> {
     Ok(found)
 }
 
-fn parse(text: &str, protocol: Protocol) -> Vec<Bound> {
+fn parse(text: &str, protocol: IpProtocol) -> Vec<Bound> {
     let lines = text.lines().skip(1).filter_map(|line| {
         let words: Vec<&str> = line.split_whitespace().collect();
-        if protocol == Protocol::Tcp && *words.get(3)? != LISTENING {
+        if protocol == IpProtocol::Tcp && *words.get(3)? != LISTENING {
             return None;
         }
         Some(Bound {
@@ -135,7 +137,7 @@ mod tests {
         format!("{HEADER}\n 0: {local} 00000000:0000 {state} 0:0 0:0 0 0 0 {inode} 2 0\n")
     }
 
-    fn wanted(protocol: Protocol) -> Vec<WantedPort> {
+    fn wanted(protocol: IpProtocol) -> Vec<WantedPort> {
         vec![WantedPort {
             protocol,
             address: "10.0.0.1:7400".parse().unwrap(),
@@ -170,7 +172,7 @@ mod tests {
         ];
         let host = FakeHost::with(&files);
         symlink("socket:[4711]", host.files().locate("/proc/77/fd/3")).unwrap();
-        let finding = examine(&host.files(), &wanted(Protocol::Udp)).unwrap();
+        let finding = examine(&host.files(), &wanted(IpProtocol::Udp)).unwrap();
         assert_eq!(finding.severity, Severity::Error);
         assert_eq!(
             finding.value,
@@ -184,9 +186,14 @@ mod tests {
         let connected = line(&local([10, 0, 0, 1]), "01", 1);
         let listening = line(&local([10, 0, 0, 1]), "0A", 1);
         for (path, table, protocol, expected) in [
-            ("/proc/net/udp", &elsewhere, Protocol::Udp, Severity::Ok),
-            ("/proc/net/tcp", &connected, Protocol::Tcp, Severity::Ok),
-            ("/proc/net/tcp", &listening, Protocol::Tcp, Severity::Error),
+            ("/proc/net/udp", &elsewhere, IpProtocol::Udp, Severity::Ok),
+            ("/proc/net/tcp", &connected, IpProtocol::Tcp, Severity::Ok),
+            (
+                "/proc/net/tcp",
+                &listening,
+                IpProtocol::Tcp,
+                Severity::Error,
+            ),
         ] {
             let host = FakeHost::with(&[(path, table.as_str())]);
             let finding = examine(&host.files(), &wanted(protocol)).unwrap();
@@ -197,11 +204,11 @@ mod tests {
     #[test]
     fn an_unreadable_table_is_no_pass_and_no_ports_no_finding() {
         let host = FakeHost::with(&[]);
-        let finding = examine(&host.files(), &wanted(Protocol::Udp)).unwrap();
+        let finding = examine(&host.files(), &wanted(IpProtocol::Udp)).unwrap();
         assert_eq!(finding.severity, Severity::CannotTell);
         assert_eq!(examine(&host.files(), &[]), None);
         let folder = FakeHost::with(&[("/proc/net/udp", HEADER), ("/proc/net/udp6/x", "")]);
-        let finding = examine(&folder.files(), &wanted(Protocol::Udp)).unwrap();
+        let finding = examine(&folder.files(), &wanted(IpProtocol::Udp)).unwrap();
         assert_eq!(finding.severity, Severity::CannotTell, "{finding:?}");
     }
 
@@ -209,7 +216,7 @@ mod tests {
     fn this_hosts_tables_show_a_socket_of_this_process() {
         let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
         let own = WantedPort {
-            protocol: Protocol::Udp,
+            protocol: IpProtocol::Udp,
             address: socket.local_addr().unwrap(),
             of: "test".to_owned(),
         };

@@ -159,7 +159,8 @@ impl CardTap {
         to_ns: u64,
         buffer: &mut Vec<u8>,
     ) -> CardResult {
-        let span = (on_card(from_ns, self.start), on_card(to_ns, self.end));
+        let from_ns = on_card(from_ns, self.start);
+        let to_ns = on_card(to_ns, self.end);
         let RingCounters {
             matched_count,
             dropped_count,
@@ -170,8 +171,15 @@ impl CardTap {
             self.result.stamped_count + self.result.unstamped_count,
             words(self.end)
         );
-        let counts = (matched_count, dropped_count);
-        writer::statistics(buffer, index, span, counts, Some(&comment));
+        writer::statistics(
+            buffer,
+            index,
+            from_ns,
+            to_ns,
+            matched_count,
+            dropped_count,
+            Some(&comment),
+        );
         self.result.restoring = self.card.restore_in_words();
         self.result
     }

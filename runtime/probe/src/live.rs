@@ -220,12 +220,20 @@ fn conclude(
             matched_count,
             dropped_count,
         } = tap.result.counters;
-        let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
-        let counts = (matched_count, dropped_count);
-        writer::statistics(file.buffer(), index, span, counts, None);
+        let to_ns = tap.gone_ns.unwrap_or(end_ns).max(start_ns);
+        let buffer = file.buffer();
+        writer::statistics(
+            buffer,
+            index,
+            start_ns,
+            to_ns,
+            matched_count,
+            dropped_count,
+            None,
+        );
         if let Some(card) = tap.card.take() {
             let index = tap_count + index;
-            tap.result.card = Some(card.finish(index, span.0, span.1, file.buffer()));
+            tap.result.card = Some(card.finish(index, start_ns, to_ns, buffer));
         }
     }
     Ok(())

@@ -152,7 +152,7 @@ mod tests {
         let mut buffer = Vec::new();
         writer::begin(&mut buffer, "test", "none");
         let head = buffer.len() as u64;
-        writer::statistics(&mut buffer, 0, (0, 1), (2, 3), None);
+        writer::statistics(&mut buffer, 0, 0, 1, 2, 3, None);
         let all = buffer.len() as u64;
         for (there, whole) in [
             (0, 0),

@@ -6,7 +6,7 @@ import { boundText } from "./strips.js";
 const STATES = { waiting: ["waiting for a run", "caution"], running: ["running", "good"], ended: ["ended", ""] };
 const MOST_WARNINGS = 4;
 const MOST_EVENTS = 80;
-const VIA = { "shared-memory": "shared memory", udp: "UDP", tcp: "TCP", emulated: "emulated", record: "record only" };
+const VIA = { "shared-memory": "shared memory", emulated: "emulated", record: "record only" };
 
 // Run, state and progress; `elapsed_s` is that of the moment shown.
 export function showRun(run, elapsed_s) {
@@ -128,7 +128,7 @@ export class ChannelTable {
 function figuresOf(channel, described) {
   const isKnown = described && (described.from !== null || described.to !== null);
   const way = isKnown ? `${described.from ?? "nobody"} → ${described.to ?? "record"}` : UNAVAILABLE;
-  const kind = described ? VIA[described.via] ?? described.via : "";
+  const kind = described ? VIA[described.via] ?? described.via.toUpperCase() : "";
   const link = described?.link ? `${described.link}, ${kind}` : kind;
   const silent = channel.link_state !== "silent" ? "" : channel.silent_s === null ? ", silent" : `, silent for ${seconds(channel.silent_s)}`;
   const crosses = described ? described.via !== "shared-memory" && described.via !== "record" : channel.lost_count !== null;

@@ -107,7 +107,9 @@ impl Assessment {
 }
 
 fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
-    let has = |link: LinkKind| summary.channels.iter().any(|channel| channel.link == link);
+    let links = || summary.channels.iter().map(|channel| channel.link);
+    let has_network = links().any(|link| matches!(link, LinkKind::Network(_)));
+    let has_emulation = links().any(|link| link == LinkKind::Emulated);
     let has_face = !summary.faces.is_empty();
     // A component that was killed took its count with it; other kinds have none to take.
     let is_silent =
@@ -117,11 +119,7 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::RunFailed
     } else if summary.run.is_virtual {
         NetworkVerdict::VirtualTime
-    } else if ![LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated]
-        .into_iter()
-        .any(has)
-        && !has_face
-    {
+    } else if !has_network && !has_emulation && !has_face {
         NetworkVerdict::NoNetwork
     } else if !overruns.is_empty() {
         NetworkVerdict::HostOverran {
@@ -137,9 +135,9 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         }
     } else if summary.processes.iter().any(is_silent) || !summary.processes.iter().any(has_ticks) {
         NetworkVerdict::TicksUnknown
-    } else if has(LinkKind::Emulated) {
+    } else if has_emulation {
         NetworkVerdict::EmulatedLink
-    } else if has(LinkKind::Udp) || has(LinkKind::Tcp) {
+    } else if has_network {
         NetworkVerdict::NetworkResult
     } else if summary.faces.iter().all(FaceSummary::is_unanswered) {
         NetworkVerdict::NoForeignProgram
@@ -279,8 +277,8 @@ fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
             "{name}: the account closes for {ratio} of messages, less than {least}"
         ));
     }
-    // A stream has no stamps, by design: nobody can do anything about it.
-    if channel.link != LinkKind::Tcp {
+    // What has no stamps by design, nobody can do anything about.
+    if channel.link.is_stamped() {
         warnings.extend(stamp_warnings(name, account));
     }
     warnings

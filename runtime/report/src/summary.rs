@@ -12,6 +12,7 @@ use std::{collections::BTreeMap, io};
 use hil_account::{ChannelAccount, MessageFate, OutageFigures};
 use hil_core::case_study::{Metric, Score};
 use hil_core::link_model::ReplayCounts;
+use hil_protocol::transport::Description;
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -421,16 +422,14 @@ impl RunEvent {
     }
 }
 
-/// How a channel is carried.
+/// How a channel is carried; in JSON its word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[serde(try_from = "String", into = "&'static str")]
 pub enum LinkKind {
     /// Shared memory of one host.
     SharedMemory,
-    /// A gateway pair over UDP.
-    Udp,
-    /// A gateway pair over TCP.
-    Tcp,
+    /// A gateway pair over a transport.
+    Network(&'static Description),
     /// A gateway pair over an emulated link.
     Emulated,
     /// Nothing: its messages go to the run's record only.
@@ -446,9 +445,28 @@ impl LinkKind {
         {
             None if channel.is_recorded_only() => Self::RecordOnly,
             None | Some(Via::SharedMemory) => Self::SharedMemory,
-            Some(Via::Udp(_)) => Self::Udp,
-            Some(Via::Tcp(_)) => Self::Tcp,
+            Some(Via::Network(hop)) => Self::Network(hop.transport),
             Some(Via::Emulated(..)) => Self::Emulated,
+        }
+    }
+
+    /// The kind that `word` stands for.
+    pub fn named(word: &str) -> Option<Self> {
+        Some(match word {
+            "shared_memory" => Self::SharedMemory,
+            "emulated" => Self::Emulated,
+            "record_only" => Self::RecordOnly,
+            name => Self::Network(hil_topology::transport(name)?),
+        })
+    }
+
+    /// Its word in JSON.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::SharedMemory => "shared_memory",
+            Self::Network(transport) => transport.name,
+            Self::Emulated => "emulated",
+            Self::RecordOnly => "record_only",
         }
     }
 
@@ -456,10 +474,17 @@ impl LinkKind {
     pub const fn label(self) -> &'static str {
         match self {
             Self::SharedMemory => "shared memory",
-            Self::Udp => "UDP",
-            Self::Tcp => "TCP",
+            Self::Network(transport) => transport.label,
             Self::Emulated => "emulated link",
             Self::RecordOnly => "recorded only",
+        }
+    }
+
+    /// True where the kernel can stamp the messages.
+    pub const fn is_stamped(self) -> bool {
+        match self {
+            Self::Network(transport) => transport.capabilities.unstamped_because.is_none(),
+            Self::SharedMemory | Self::Emulated | Self::RecordOnly => true,
         }
     }
 
@@ -469,6 +494,20 @@ impl LinkKind {
             (Self::Emulated, MessageFate::LostOnWire) => "lost by the emulated link",
             (_, fate) => fate.label(),
         }
+    }
+}
+
+impl From<LinkKind> for &'static str {
+    fn from(kind: LinkKind) -> Self {
+        kind.word()
+    }
+}
+
+impl TryFrom<String> for LinkKind {
+    type Error = String;
+
+    fn try_from(word: String) -> Result<Self, String> {
+        Self::named(&word).ok_or_else(|| format!("`{word}` carries no channel"))
     }
 }
 

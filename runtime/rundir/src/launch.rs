@@ -1,6 +1,7 @@
 //! What a supervisor tells a process it starts. A component learns its role and its channels and
 //! nothing of hosts, links or gateways: its card is byte-identical in a local and a split run.
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -123,22 +124,15 @@ impl Side {
     }
 }
 
-/// What carries the datagrams of a hop.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Transport {
-    /// Each by itself.
-    Udp,
-    /// One connection, from the sending gateway to the receiving one.
-    Tcp,
-}
-
 /// Socket options of a hop.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SocketLaunch {
-    /// What carries the datagrams.
-    pub transport: Transport,
+    /// Name of the transport that carries the datagrams.
+    pub transport: String,
+    /// The transport's own options, by their keys.
+    #[serde(default)]
+    pub options: BTreeMap<String, i64>,
     /// Interface to bind to.
     pub interface: Option<String>,
     /// Differentiated-services code point (RFC 2474), 0..=63.

@@ -113,8 +113,8 @@ pub enum CounterGroup {
     Refused,
     /// Its socket.
     Socket,
-    /// Its stream, where the transport is one.
-    Stream,
+    /// Its transport: what only that one counts.
+    Transport,
     /// Its seal, where its hop is sealed.
     Seal,
     /// The order of messages.
@@ -133,7 +133,7 @@ impl CounterGroup {
             Self::Own => "",
             Self::Refused => "refused: ",
             Self::Socket => "socket: ",
-            Self::Stream => "stream: ",
+            Self::Transport => "transport: ",
             Self::Seal => "seal: ",
             Self::Messages => "messages: ",
             Self::Pieces => "pieces: ",

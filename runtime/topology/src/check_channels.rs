@@ -7,6 +7,7 @@ use super::check_face::is_played_by_face;
 use super::errors::{Fault, Faults, Place};
 use super::file::{ChannelEntry, ProcessEntry};
 use super::file_links::LinkEntry;
+use super::file_links::crossing_words;
 use super::known::KnownCase;
 use super::model::{Channel, ChannelPorts, MessageLayout, Process, Program, Topology};
 use super::model_links::{Link, Via};
@@ -356,8 +357,8 @@ impl Routes<'_> {
             "`{}` on host `{from}` and `{consumer}` on host `{to}`",
             channel.from
         );
-        let hint =
-            format!("the channel joins {ends}: name a link via \"udp\", \"tcp\" or \"emulated\"");
+        let words = crossing_words(|_| true);
+        let hint = format!("the channel joins {ends}: name a link via {words}");
         let fault = match &channel.link {
             None => Fault::Missing(hint),
             Some(link) => {

@@ -1,5 +1,10 @@
 //! What a `[links.<name>]` table says by itself; see `file`.
 
+use std::collections::BTreeMap;
+
+use hil_protocol::transport::Description;
+use hil_transport::registry::{self, Transport};
+
 use super::errors::{Fault, Place};
 use super::file::{read_execution, read_on_exit};
 use super::file_impairments::{EMULATION_KEYS, read_emulation};
@@ -22,17 +27,30 @@ pub(super) struct LinkEntry {
 #[derive(Debug, Clone, Copy)]
 enum Kind {
     SharedMemory,
-    Udp,
-    Tcp,
+    Network(&'static Description),
     Emulated,
 }
 
-const KINDS: &[(&str, Kind)] = &[
-    ("shared-memory", Kind::SharedMemory),
-    ("udp", Kind::Udp),
-    ("tcp", Kind::Tcp),
-    ("emulated", Kind::Emulated),
-];
+/// Every transport.
+fn transports() -> impl Iterator<Item = &'static Description> {
+    registry::ALL.into_iter().map(Transport::description)
+}
+
+/// The words of `via`.
+fn kinds() -> Vec<(&'static str, Kind)> {
+    let network = transports().map(|one| (one.name, Kind::Network(one)));
+    core::iter::once(("shared-memory", Kind::SharedMemory))
+        .chain(network)
+        .chain([("emulated", Kind::Emulated)])
+        .collect()
+}
+
+/// The words of `via` that join two hosts, of the transports that `is_meant`, in a sentence.
+pub(super) fn crossing_words(is_meant: impl Fn(&Description) -> bool) -> String {
+    let words = transports().filter(|one| is_meant(one));
+    let words: Vec<_> = words.map(|one| format!("\"{}\"", one.name)).collect();
+    format!("{} or \"emulated\"", words.join(", "))
+}
 
 /// Keys that only a link with gateways has.
 const HOP_KEYS: &[&str] = &[
@@ -48,25 +66,23 @@ const HOP_KEYS: &[&str] = &[
 
 impl LinkEntry {
     pub(super) fn read(name: String, mut reader: Reader<'_>) -> Self {
-        let kind = reader.word("via", KINDS);
+        let kinds = kinds();
+        let kind = reader.word("via", &kinds);
         if !reader.has("via") {
-            let words: Vec<_> = KINDS
+            let words: Vec<_> = kinds
                 .iter()
                 .map(|(word, _)| format!("\"{word}\""))
                 .collect();
             let hint = format!("write one of {}", words.join(", "));
             reader.refuse("via", Fault::Missing(hint));
         }
-        let default = match kind {
-            Some(Kind::Tcp) => Timestamps::Off,
-            _ => Timestamps::Software,
-        };
-        let hop = read_hop(&mut reader, default);
-        if matches!(kind, Some(Kind::Tcp)) && hop.timestamps != Timestamps::Off {
-            let why = "needs via = \"udp\" or \"emulated\": a TCP stream has no messages that \
-                       the kernel could stamp; leave it out, or write \"off\"";
-            reader.refuse_present(&["timestamps"], why);
-        }
+        let hop = read_hop(
+            &mut reader,
+            match kind {
+                Some(Kind::Network(transport)) => transport,
+                _ => registry::PLAIN.description(),
+            },
+        );
         if matches!(kind, Some(Kind::Emulated)) {
             refuse_slack(&reader, &hop.gateway.execution);
         }
@@ -77,11 +93,10 @@ impl LinkEntry {
                 reader.refuse_present(HOP_KEYS, why);
                 Via::SharedMemory
             }
-            Kind::Udp => Via::Udp(hop),
-            Kind::Tcp => Via::Tcp(hop),
+            Kind::Network(_) => Via::Network(hop),
             Kind::Emulated => Via::Emulated(hop, Box::new(emulation)),
         });
-        if matches!(via, Some(Via::SharedMemory | Via::Udp(_) | Via::Tcp(_))) {
+        if matches!(via, Some(Via::SharedMemory | Via::Network(_))) {
             let why = "needs via = \"emulated\": no real link can be told what to do";
             reader.refuse_present(EMULATION_KEYS, why);
         }
@@ -134,19 +149,58 @@ where
     read.expect("the default of a limit fits the type of its key")
 }
 
-fn read_hop(reader: &mut Reader<'_>, timestamps: Timestamps) -> Hop {
+fn read_hop(reader: &mut Reader<'_>, transport: &'static Description) -> Hop {
     Hop {
+        transport,
+        options: read_options(reader, transport),
         port: integer(reader, "port", &limits::LINK_PORT),
         dscp: integer(reader, "dscp", &limits::LINK_DSCP),
         socket_priority: reader.integer("socket_priority", &limits::LINK_SOCKET_PRIORITY),
         send_buffer_bytes: integer(reader, "send_buffer_bytes", &limits::LINK_BUFFER_BYTES),
         receive_buffer_bytes: integer(reader, "receive_buffer_bytes", &limits::LINK_BUFFER_BYTES),
-        timestamps: reader
-            .word("timestamps", Timestamps::WORDS)
-            .unwrap_or(timestamps),
+        timestamps: read_timestamps(reader, transport),
         path_mtu_bytes: integer(reader, "path_mtu_bytes", &limits::LINK_PATH_MTU_BYTES),
         gateway: read_gateway(reader.table("gateway")),
     }
+}
+
+fn read_timestamps(reader: &mut Reader<'_>, transport: &Description) -> Timestamps {
+    let asked = reader.word("timestamps", Timestamps::WORDS);
+    let Some(why) = transport.capabilities.unstamped_because else {
+        return asked.unwrap_or(Timestamps::Software);
+    };
+    if asked.is_some_and(|asked| asked != Timestamps::Off) {
+        let words = crossing_words(|one| one.capabilities.unstamped_because.is_none());
+        let why = format!(
+            "needs via = {words}: over {} {why}; leave it out, or write \"off\"",
+            transport.label
+        );
+        reader.refuse_present(&["timestamps"], &why);
+    }
+    Timestamps::Off
+}
+
+/// The keys that only some transports have; a key of another one does not belong here.
+fn read_options(reader: &mut Reader<'_>, own: &Description) -> BTreeMap<String, i64> {
+    let mut options = BTreeMap::new();
+    for transport in transports() {
+        for option in transport.options {
+            let key = option.key;
+            let limit = limits::Limit {
+                default: option.default,
+                min: option.min,
+                max: option.max,
+            };
+            let value = integer(reader, key, &limit);
+            if transport.name == own.name {
+                options.insert(key.to_owned(), value);
+            } else if own.options.iter().all(|option| option.key != key) {
+                let why = format!("needs via = \"{}\"", transport.name);
+                reader.refuse_present(&[key], &why);
+            }
+        }
+    }
+    options
 }
 
 /// A gateway that ended is started again by default: it holds no state of the robot, its new

@@ -59,7 +59,7 @@ pub use model::{
     Case, Channel, ChannelPorts, Crossing, Direction, Execution, Host, MessageLayout, OnExit,
     Process, Program, Run, Scheduling, Topology, Wait,
 };
-pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
+pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via, transport};
 pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
 pub use schema::schema;
 pub use security::{Hops, Security};

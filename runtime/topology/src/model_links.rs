@@ -2,9 +2,12 @@
 //! no file and opens no socket.
 
 use core::fmt;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use hil_link::spec::LinkSpec;
+use hil_protocol::transport::Description;
+use hil_transport::registry;
 use serde::{Deserialize, Serialize};
 
 use super::model::{Execution, OnExit, Topology, words};
@@ -47,9 +50,14 @@ impl Link {
     pub fn emulation(&self) -> Option<&Emulation> {
         match &self.via {
             Via::Emulated(_, emulation) => Some(emulation),
-            Via::SharedMemory | Via::Udp(_) | Via::Tcp(_) => None,
+            Via::SharedMemory | Via::Network(_) => None,
         }
     }
+}
+
+/// The transport called `name`, as a topology or a summary names it.
+pub fn transport(name: &str) -> Option<&'static Description> {
+    registry::named(name).map(|transport| transport.description())
 }
 
 /// What carries a link's bytes.
@@ -57,11 +65,9 @@ impl Link {
 pub enum Via {
     /// One host, no gateway.
     SharedMemory,
-    /// UDP datagrams over the real network.
-    Udp(Hop),
-    /// One TCP connection per channel over the real network.
-    Tcp(Hop),
-    /// UDP datagrams behind a model of a network.
+    /// The real network.
+    Network(Hop),
+    /// Datagrams behind a model of a network.
     Emulated(Hop, Box<Emulation>),
 }
 
@@ -70,8 +76,7 @@ impl Via {
     pub const fn word(&self) -> &'static str {
         match self {
             Self::SharedMemory => "shared-memory",
-            Self::Udp(_) => "udp",
-            Self::Tcp(_) => "tcp",
+            Self::Network(hop) => hop.transport.name,
             Self::Emulated(..) => "emulated",
         }
     }
@@ -80,7 +85,7 @@ impl Via {
     pub fn hop(&self) -> Option<&Hop> {
         match self {
             Self::SharedMemory => None,
-            Self::Udp(hop) | Self::Tcp(hop) | Self::Emulated(hop, _) => Some(hop),
+            Self::Network(hop) | Self::Emulated(hop, _) => Some(hop),
         }
     }
 }
@@ -88,6 +93,10 @@ impl Via {
 /// Socket and gateway settings of a link.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Hop {
+    /// What carries the datagrams.
+    pub transport: &'static Description,
+    /// The transport's own options, by their keys.
+    pub options: BTreeMap<String, i64>,
     /// First port; see [`ChannelPorts::of`](super::ChannelPorts::of).
     pub port: u16,
     /// Differentiated-services code point (RFC 2474), 0..=63.

@@ -222,7 +222,7 @@ fn resolved_link(link: &Link) -> Table {
     put(&mut table, "via", link.via.word());
     match &link.via {
         Via::SharedMemory => {}
-        Via::Udp(hop) | Via::Tcp(hop) => put_hop(&mut table, hop),
+        Via::Network(hop) => put_hop(&mut table, hop),
         Via::Emulated(hop, emulation) => {
             put_hop(&mut table, hop);
             let (forward, backward) = (emulation.forward.clone(), emulation.backward.clone());
@@ -247,6 +247,9 @@ fn resolved_link(link: &Link) -> Table {
 
 fn put_hop(table: &mut Table, hop: &Hop) {
     put(table, "port", integer(hop.port));
+    for (key, value) in &hop.options {
+        put(table, key, *value);
+    }
     put(table, "dscp", integer(hop.dscp));
     if let Some(priority) = hop.socket_priority {
         put(table, "socket_priority", integer(priority));

@@ -71,7 +71,7 @@ fn check_alignment(pair: &HostPairClock) {
 /// The clocks are of one oscillator, so a delay measured across them is true within its bound; it
 /// was not negative.
 fn check_channels(summary: &RunSummary) {
-    for channel in carried(summary).filter(|one| one.link == LinkKind::Udp) {
+    for channel in carried(summary).filter(|one| one.link == LinkKind::named("udp").unwrap()) {
         let account = account(summary, &channel.name);
         let Some(delays) = account.end_to_end.distribution.measured() else {
             continue;

@@ -83,7 +83,10 @@ fn assert_accounted(summary: &RunSummary, link: LinkKind) {
     assert_accounts_close(summary);
     assert_eq!(channel(summary, "fleet/authority").link, link);
     assert_eq!(channel(summary, "fleet/mission").link, link);
-    assert_eq!(channel(summary, "fleet/state").link, LinkKind::Udp);
+    assert_eq!(
+        channel(summary, "fleet/state").link,
+        LinkKind::named("udp").unwrap()
+    );
     let truth = channel(summary, "fleet/truth");
     assert_eq!(truth.link, LinkKind::RecordOnly);
     let recorded = truth.recorded.unwrap();
@@ -106,7 +109,7 @@ fn four_fleets_over_a_plain_hop_do_not_collide_and_every_message_is_accounted_fo
     for mode_name in ["safe", "legacy"] {
         println!("mode {mode_name}");
         for summary in &split(&lab, &[&mode(mode_name)]) {
-            assert_accounted(summary, LinkKind::Udp);
+            assert_accounted(summary, LinkKind::named("udp").unwrap());
             assert_nobody_collided(summary);
             let states = account(summary, "fleet/state").published_count;
             // 28 robots report 33 times a second; a host that overran reports less often.

@@ -23,3 +23,4 @@ mod split_run;
 mod strangers;
 mod tcp_run;
 mod teleop_hop;
+mod transports;

@@ -135,7 +135,7 @@ fn check_account(summary: &RunSummary) {
     assert_eq!(channel(summary, "human/frame").link, LinkKind::SharedMemory);
     for name in CROSSING {
         let channel = channel(summary, name);
-        assert_eq!(channel.link, LinkKind::Udp);
+        assert_eq!(channel.link, LinkKind::named("udp").unwrap());
         assert_both_ends_are_stamped(name, account(summary, name));
         assert_eq!(channel.directions.len(), 2, "{:?}", channel.directions);
         for direction in &channel.directions {

@@ -70,7 +70,7 @@ impl Split {
             assert_eq!(summary.run.outcome, Outcome::Completed, "{:?}", summary.run);
             assert_every_message_is_accounted_for(summary);
             for name in CHANNELS {
-                assert_eq!(channel(summary, name).link, LinkKind::Tcp);
+                assert_eq!(channel(summary, name).link, LinkKind::named("tcp").unwrap());
                 let said = describe(name, account(summary, name));
                 println!("{}: {said}", summary.run.host);
             }
@@ -121,14 +121,14 @@ fn a_run_over_tcp_accounts_for_every_message_and_loses_none() {
                 assert!(ratio.is_none_or(|ratio| ratio < f64::EPSILON), "{stamps:?}");
             }
             let egress = direction(summary, name, "egress");
-            assert_eq!(count(egress, "stream: connection_count"), 1);
-            assert_eq!(count(egress, "stream: reconnect_count"), 0);
+            assert_eq!(count(egress, "transport: connection_count"), 1);
+            assert_eq!(count(egress, "transport: reconnect_count"), 0);
             assert!(fact(egress, "kernel stamps").starts_with("unavailable over TCP"));
             assert!(egress.stalls.unwrap().threshold_ns > 50_000_000);
             println!("{name}: {:?}", egress.facts);
             let ingress = direction(summary, name, "ingress");
-            assert_eq!(count(ingress, "stream: bad_frame_count"), 0);
-            assert_eq!(count(ingress, "stream: foreign_connection_count"), 0);
+            assert_eq!(count(ingress, "transport: bad_frame_count"), 0);
+            assert_eq!(count(ingress, "transport: foreign_connection_count"), 0);
             let round_trip = account.round_trip.measured();
             assert!(round_trip.is_some_and(|figures| figures.count > 10));
         }
@@ -166,17 +166,17 @@ fn a_link_that_stands_still_shows_as_a_stall_and_loses_nothing() {
             assert_eq!(account(summary, name).fates.lost_count(), 0);
             let egress = direction(summary, name, "egress");
             println!("{name}: {:?}", egress.facts);
-            assert_eq!(count(egress, "stream: reconnect_count"), 0);
+            assert_eq!(count(egress, "transport: reconnect_count"), 0);
             // The way out stands still, and so do the acknowledgements of what came in.
-            assert!(count(egress, "stream: stall_count") >= 1, "{egress:?}");
-            let longest_us = u128::from(count(egress, "stream: stall_longest_us"));
+            assert!(count(egress, "transport: stall_count") >= 1, "{egress:?}");
+            let longest_us = u128::from(count(egress, "transport: stall_longest_us"));
             assert!(
                 longest_us >= STANDSTILL.as_micros() * 9 / 10,
                 "{longest_us}"
             );
         }
         let egress = direction(summary, CHANNELS[0], "egress");
-        assert!(count(egress, "stream: waiting_bytes_max") > 1_000);
+        assert!(count(egress, "transport: waiting_bytes_max") > 1_000);
         let end_to_end = account(summary, CHANNELS[0])
             .end_to_end
             .distribution
@@ -214,7 +214,7 @@ fn a_killed_gateway_comes_back_and_what_was_under_way_is_counted_as_lost() {
         assert!(own.cause.contains("SIGKILL"));
         let egress = direction(summary, CHANNELS[0], "egress");
         println!("{}: {:?}", CHANNELS[0], egress.facts);
-        assert_eq!(count(egress, "stream: reconnect_count"), 1);
+        assert_eq!(count(egress, "transport: reconnect_count"), 1);
         let told = |words: &str| {
             summary
                 .events

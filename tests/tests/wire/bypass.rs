@@ -1,6 +1,7 @@
 //! A channel whose two ends share memory bypasses the network it is to measure. Whoever could be
 //! deceived notices: the bridges, the gateway processes; and supervisors never share a domain.
 
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
 use std::path::Path;
@@ -18,7 +19,7 @@ use hil_protocol::{
     IngressSettings, LocalRefusal, PeerState, Refusal,
 };
 use hil_rundir::launch::{
-    DirectionLaunch, GatewayWork, Side, SocketLaunch, Transport, Work, WorkerLaunch, write,
+    DirectionLaunch, GatewayWork, Side, SocketLaunch, Work, WorkerLaunch, write,
 };
 use hil_shm::{ChannelHolder, ChannelSettings, Domain};
 use hil_shuttle::ShuttleCommand;
@@ -142,7 +143,8 @@ fn direction(side: Side, [local, peer]: [SocketAddr; 2]) -> DirectionLaunch {
         local,
         peer,
         socket: SocketLaunch {
-            transport: Transport::Udp,
+            transport: "udp".to_owned(),
+            options: BTreeMap::new(),
             interface: None,
             dscp: 0,
             priority: None,

@@ -94,7 +94,7 @@ fn capture(folder: &RunFolder, frames: &[Vec<u8>]) -> PathBuf {
         };
         writer::packet(&mut bytes, &packet);
     }
-    writer::statistics(&mut bytes, 0, (STAMP_NS, STAMP_NS + 9000), (6, 3), None);
+    writer::statistics(&mut bytes, 0, STAMP_NS, STAMP_NS + 9000, 6, 3, None);
     fs::create_dir_all(folder.path()).unwrap();
     let path = folder.path().join("sample.pcapng");
     fs::write(&path, bytes).unwrap();

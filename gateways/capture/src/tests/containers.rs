@@ -332,13 +332,7 @@ fn what_the_writer_wrote_reads_the_same() {
         };
         writer::packet(&mut file, &packet);
     }
-    writer::statistics(
-        &mut file,
-        0,
-        (stamp_ns - 5, stamp_ns + 5),
-        (12, 2),
-        Some("why"),
-    );
+    writer::statistics(&mut file, 0, stamp_ns - 5, stamp_ns + 5, 12, 2, Some("why"));
     let (packets, faults, interfaces) = read(&file, 11);
     assert_eq!(faults, []);
     assert_eq!(packets[0].data, b"abcdefg");

@@ -8,7 +8,7 @@ use hil_net::link_type;
 
 #[test]
 fn the_same_datagram_is_found_behind_every_link_layer() {
-    let frame = udp_frame((40_000, 5004), b"payload");
+    let frame = udp_frame(40_000, 5004, b"payload");
     let bare = &frame[14..];
     let tagged = [&frame[..12], &[0x81, 0, 0xe0, 7], &frame[12..]].concat();
     let twice = [
@@ -41,7 +41,7 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
 
 #[test]
 fn options_fragments_and_extension_headers_are_followed_or_told() {
-    let frame = udp_frame((1, 2), b"payload");
+    let frame = udp_frame(1, 2, b"payload");
     let mut with_options = frame.clone();
     with_options[14] = 0x46;
     with_options[17] += 4;
@@ -73,7 +73,7 @@ fn options_fragments_and_extension_headers_are_followed_or_told() {
 
 #[test]
 fn the_et2000_header_is_found_at_either_end_with_port_and_stamp() {
-    let frame = udp_frame((1, 2), b"payload");
+    let frame = udp_frame(1, 2, b"payload");
     for (port, bit) in (0..esl::PORT_COUNT).zip(esl::FLAG_BITS) {
         let header = EslHeader {
             flags: bit | esl::STAMP_ENABLED,
@@ -132,7 +132,7 @@ fn flows_are_written_as_they_are_read_and_nonsense_is_refused_by_name() {
 fn a_datagram_is_known_by_what_its_flow_says() {
     let flow = |text: &str| text.parse::<FlowFilter>().unwrap();
     let identify = |text: &str, payload: &[u8]| {
-        let frame = udp_frame((7000, 2), payload);
+        let frame = udp_frame(7000, 2, payload);
         flow(text).identify(&udp_datagram(1, &frame).unwrap())
     };
     let own = identify("hil", &message(77)).unwrap();
@@ -162,7 +162,7 @@ fn a_datagram_is_known_by_what_its_flow_says() {
         Err(Unidentified::Foreign)
     );
 
-    let frame = udp_frame((7000, 2), &message(1));
+    let frame = udp_frame(7000, 2, &message(1));
     let cut = udp_datagram(1, &frame[..60]).unwrap();
     assert_eq!(flow("hil").identify(&cut), Err(Unidentified::CutShort));
     assert_eq!(

@@ -6,7 +6,7 @@ use hil_core::random::RandomStream;
 
 use super::super::flow::{DatagramIdentity, Numbered};
 use super::super::join::{Joined, OrderSource, WINDOW_NS, join};
-use super::super::observe::{Observation, Observer, Point, Seen, Stream};
+use super::super::observe::{Observation, Observer, Point, Seen, Span, Stream};
 use super::super::pairing::join_all;
 use super::super::point::{NumberFigures, single_point_figures};
 use super::super::{CaptureInterface, CapturedPacket};
@@ -46,14 +46,17 @@ fn point(file_index: usize, direction: Direction) -> Point {
     }
 }
 
-fn seen(list: Vec<Observation>, span_ns: (i64, i64)) -> Seen {
+fn seen(list: Vec<Observation>, span: Span) -> Seen {
     Seen {
-        span_ns: Some(span_ns),
+        span: Some(span),
         streams: BTreeMap::from([(STREAM(), list)]),
     }
 }
 
-const ALWAYS: (i64, i64) = (i64::MIN / 2, i64::MAX / 2);
+const ALWAYS: Span = Span {
+    first_ns: i64::MIN / 2,
+    last_ns: i64::MAX / 2,
+};
 
 fn joined(first: Vec<Observation>, second: Vec<Observation>) -> Joined {
     let (a, b) = (point(0, Direction::Outbound), point(1, Direction::Inbound));
@@ -138,11 +141,14 @@ fn what_leaves_at_the_edge_of_the_other_capture_is_not_lost() {
     let first: Vec<_> = (0..100)
         .map(|n| observation(i64::try_from(n).unwrap() * 1_000, n))
         .collect();
-    let watched = (20_000, 80_000);
+    let watched = Span {
+        first_ns: 20_000,
+        last_ns: 80_000,
+    };
     let second: Vec<_> = (0..100)
         .filter(|n| *n != 50)
         .map(|n| observation(i64::try_from(n).unwrap() * 1_000 + 500, n))
-        .filter(|one| (watched.0..=watched.1).contains(&one.stamp_ns))
+        .filter(|one| (watched.first_ns..=watched.last_ns).contains(&one.stamp_ns))
         .collect();
     let (a, b) = (point(0, Direction::Outbound), point(1, Direction::Inbound));
     let sides = (seen(first, ALWAYS), seen(second, watched));
@@ -257,7 +263,7 @@ fn observer_of(packets: &[(usize, Direction, i64, u16)], host: u8) -> Observer {
     let other_flow = "udp:src=10.77.0.1,dst=10.77.0.9".parse().unwrap();
     let mut observer = Observer::new(&[flow, other_flow]);
     for (file_index, direction, stamp_ns, port) in packets {
-        let mut data = udp_frame((9, *port), &(stamp_ns / 100).to_le_bytes());
+        let mut data = udp_frame(9, *port, &(stamp_ns / 100).to_le_bytes());
         if *file_index == 1 {
             data[33] = host;
         }

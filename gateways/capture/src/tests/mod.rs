@@ -55,15 +55,15 @@ fn read(
 }
 
 /// An Ethernet frame with a UDP datagram over IPv4 from 10.77.0.1 to 10.77.0.2.
-fn udp_frame(ports: (u16, u16), payload: &[u8]) -> Vec<u8> {
+fn udp_frame(source_port: u16, destination_port: u16, payload: &[u8]) -> Vec<u8> {
     let udp_bytes = u16::try_from(8 + payload.len()).unwrap();
     let mut frame = vec![2, 0, 0, 0, 0, 2, 2, 0, 0, 0, 0, 1, 0x08, 0x00];
     frame.extend([0x45, 0xb8]);
     frame.extend((20 + udp_bytes).to_be_bytes());
     frame.extend([0, 1, 0x40, 0, 64, 17, 0, 0]);
     frame.extend([10, 77, 0, 1, 10, 77, 0, 2]);
-    frame.extend(ports.0.to_be_bytes());
-    frame.extend(ports.1.to_be_bytes());
+    frame.extend(source_port.to_be_bytes());
+    frame.extend(destination_port.to_be_bytes());
     frame.extend(udp_bytes.to_be_bytes());
     frame.extend([0, 0]);
     frame.extend(payload);

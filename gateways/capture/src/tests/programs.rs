@@ -87,7 +87,7 @@ pub(super) fn made_up_frame(random: &mut RandomStream, case: u64, link: u16) -> 
     } else {
         message(case)
     };
-    let mut frame = udp_frame((pick(), pick()), &payload);
+    let mut frame = udp_frame(pick(), pick(), &payload);
     if random.chance(0.2) {
         frame[33] = 9;
     }

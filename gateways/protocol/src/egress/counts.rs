@@ -1,6 +1,6 @@
 //! What became of the messages offered to an egress bridge. It decides nothing.
 
-use crate::counters::named_counts;
+use crate::counts;
 
 /// Why a message of the local channel was not taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -33,77 +33,54 @@ pub enum LocalRefusal {
     Closed,
 }
 
-/// Counters of an egress bridge. At rest
-/// `offered = sent + message_failed + refused_count()`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct EgressCounts {
-    /// Messages offered by the local channel.
-    pub offered_count: u64,
-    /// Messages given to the owner completely, and not reported as failed.
-    pub sent_count: u64,
-    /// Messages given up because a datagram of theirs could not be sent or the peer went down.
-    pub message_failed_count: u64,
-    /// Refused: the peer had not greeted back.
-    pub refused_not_greeted_count: u64,
-    /// Refused: the peer was down.
-    pub refused_peer_down_count: u64,
-    /// Refused: the peer refuses the channel.
-    pub refused_channel_count: u64,
-    /// Refused: published by a gateway.
-    pub refused_forwarded_count: u64,
-    /// Refused: too big.
-    pub refused_too_big_count: u64,
-    /// Refused: the message before it was still being sent.
-    pub refused_pending_count: u64,
-    /// Refused: the session had ended.
-    pub refused_closed_count: u64,
-    /// Datagrams of any kind given to the owner.
-    pub datagram_count: u64,
-    /// Datagrams of any kind that the owner could not send.
-    pub transmit_failed_count: u64,
-    /// Transmit stamps that lay before handing over or 4 s after it.
-    pub transmit_stamp_implausible_count: u64,
-    /// Greetings given.
-    pub hello_sent_count: u64,
-    /// Clock exchanges asked for.
-    pub sync_sent_count: u64,
-    /// Clock exchanges that came back.
-    pub round_trip_count: u64,
-    /// Times the peer was reported unreachable after it was not.
-    pub peer_down_count: u64,
-    /// Times the peer came back with another session.
-    pub peer_restart_count: u64,
-    /// Times the peer asked for a greeting during a session.
-    pub greet_again_count: u64,
-    /// Datagrams received; accepted ones plus the total of the refusals.
-    pub reply_count: u64,
-    /// Datagrams received and accepted.
-    pub reply_accepted_count: u64,
+counts! {
+    /// Counters of an egress bridge. At rest
+    /// `offered = sent + message_failed + refused_count()`.
+    pub struct EgressCounts {
+        /// Messages offered by the local channel.
+        offered_count,
+        /// Messages given to the owner completely, and not reported as failed.
+        sent_count,
+        /// Messages given up because a datagram of theirs could not be sent or the peer went down.
+        message_failed_count,
+        /// Refused: the peer had not greeted back.
+        refused_not_greeted_count,
+        /// Refused: the peer was down.
+        refused_peer_down_count,
+        /// Refused: the peer refuses the channel.
+        refused_channel_count,
+        /// Refused: published by a gateway.
+        refused_forwarded_count,
+        /// Refused: too big.
+        refused_too_big_count,
+        /// Refused: the message before it was still being sent.
+        refused_pending_count,
+        /// Refused: the session had ended.
+        refused_closed_count,
+        /// Datagrams of any kind given to the owner.
+        datagram_count,
+        /// Datagrams of any kind that the owner could not send.
+        transmit_failed_count,
+        /// Transmit stamps that lay before handing over or 4 s after it.
+        transmit_stamp_implausible_count,
+        /// Greetings given.
+        hello_sent_count,
+        /// Clock exchanges asked for.
+        sync_sent_count,
+        /// Clock exchanges that came back.
+        round_trip_count,
+        /// Times the peer was reported unreachable after it was not.
+        peer_down_count,
+        /// Times the peer came back with another session.
+        peer_restart_count,
+        /// Times the peer asked for a greeting during a session.
+        greet_again_count,
+        /// Datagrams received; accepted ones plus the total of the refusals.
+        reply_count,
+        /// Datagrams received and accepted.
+        reply_accepted_count,
+    }
 }
-
-named_counts!(EgressCounts {
-    offered_count,
-    sent_count,
-    message_failed_count,
-    refused_not_greeted_count,
-    refused_peer_down_count,
-    refused_channel_count,
-    refused_forwarded_count,
-    refused_too_big_count,
-    refused_pending_count,
-    refused_closed_count,
-    datagram_count,
-    transmit_failed_count,
-    transmit_stamp_implausible_count,
-    hello_sent_count,
-    sync_sent_count,
-    round_trip_count,
-    peer_down_count,
-    peer_restart_count,
-    greet_again_count,
-    reply_count,
-    reply_accepted_count,
-});
 
 impl EgressCounts {
     /// Messages of the local channel refused for any reason.

@@ -37,7 +37,7 @@ impl EgressBridge {
         self.counts.hello_sent_count += 1;
         let hello = self.settings.hello();
         let body_bytes = hello.encode(&mut self.control[HEADER_BYTES..]);
-        self.transmit_control(now, Kind::Hello, (0, sequence), body_bytes)
+        self.transmit_control(now, Kind::Hello, 0, sequence, body_bytes)
     }
 
     pub(super) fn transmit_sync(&mut self, now: Instant) -> Transmit<'_> {
@@ -46,7 +46,7 @@ impl EgressBridge {
         self.counts.sync_sent_count += 1;
         self.exchanges.open(sequence, now.as_ns());
         self.control[HEADER_BYTES..][..SYNC_BODY_BYTES].fill(0);
-        self.transmit_control(now, Kind::SyncRequest, (0, sequence), SYNC_BODY_BYTES)
+        self.transmit_control(now, Kind::SyncRequest, 0, sequence, SYNC_BODY_BYTES)
     }
 
     pub(super) fn transmit_bye(&mut self, now: Instant) -> Transmit<'_> {
@@ -54,14 +54,15 @@ impl EgressBridge {
             Some((epoch, sequence)) => (epoch, sequence.saturating_add(1)),
             None => (0, 0),
         };
-        self.transmit_control(now, Kind::Bye, (epoch, next), 0)
+        self.transmit_control(now, Kind::Bye, epoch, next, 0)
     }
 
     fn transmit_control(
         &mut self,
         now: Instant,
         kind: Kind,
-        (epoch, sequence): (u32, u64),
+        epoch: u32,
+        sequence: u64,
         body_bytes: usize,
     ) -> Transmit<'_> {
         let mut header = Header::new(kind, self.settings.session, self.settings.channel.channel);

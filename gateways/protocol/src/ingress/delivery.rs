@@ -3,7 +3,7 @@
 use hil_core::message::Envelope;
 use hil_core::time::{Instant, RemoteInstant};
 
-use crate::counters::named_counts;
+use crate::counts;
 use crate::sequence::{Order, Stream};
 use crate::wire::{FollowUpField, Header};
 
@@ -84,43 +84,31 @@ pub enum Disposition {
     Farewell,
 }
 
-/// Counters of an ingress bridge, one per [`Disposition`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct IngressCounts {
-    /// Datagrams received.
-    pub datagram_count: u64,
-    /// Messages delivered.
-    pub delivered_count: u64,
-    /// Messages that gave way to a newer one.
-    pub superseded_count: u64,
-    /// Copies.
-    pub duplicate_count: u64,
-    /// Messages too old to judge.
-    pub late_count: u64,
-    /// Pieces stored.
-    pub fragment_count: u64,
-    /// Greetings accepted.
-    pub hello_count: u64,
-    /// Clock exchanges taken.
-    pub sync_count: u64,
-    /// Farewells.
-    pub bye_count: u64,
-    /// Sessions that replaced an earlier one; not a disposition of its own.
-    pub session_restart_count: u64,
+counts! {
+    /// Counters of an ingress bridge, one per [`Disposition`].
+    pub struct IngressCounts {
+        /// Datagrams received.
+        datagram_count,
+        /// Messages delivered.
+        delivered_count,
+        /// Messages that gave way to a newer one.
+        superseded_count,
+        /// Copies.
+        duplicate_count,
+        /// Messages too old to judge.
+        late_count,
+        /// Pieces stored.
+        fragment_count,
+        /// Greetings accepted.
+        hello_count,
+        /// Clock exchanges taken.
+        sync_count,
+        /// Farewells.
+        bye_count,
+        /// Sessions that replaced an earlier one; not a disposition of its own.
+        session_restart_count,
+    }
 }
-
-named_counts!(IngressCounts {
-    datagram_count,
-    delivered_count,
-    superseded_count,
-    duplicate_count,
-    late_count,
-    fragment_count,
-    hello_count,
-    sync_count,
-    bye_count,
-    session_restart_count,
-});
 
 impl IngressCounts {
     /// Datagrams accepted.

@@ -9,32 +9,26 @@ use super::{IngressSettings, REFUSAL_REPLY_PERIOD, Reply};
 use crate::body::{
     HELLO_ACK_BODY_BYTES, HelloAck, HelloStatus, ReceivedWindow, SYNC_BODY_BYTES, SyncResponse,
 };
-use crate::counters::named_counts;
+use crate::counts;
 use crate::stamps::StampSource;
 use crate::wire::{FollowUpField, HEADER_BYTES, Header, Kind};
 
 const BUFFER_BYTES: usize = HEADER_BYTES + SYNC_BODY_BYTES;
 const _: () = assert!(SYNC_BODY_BYTES >= HELLO_ACK_BODY_BYTES);
 
-/// What became of the replies.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct ReplyCounts {
-    /// Replies given to the owner.
-    pub sent_count: u64,
-    /// Replies that a later one of their kind replaced before they were polled.
-    pub replaced_count: u64,
-    /// Replies withheld because the last one of their kind was too recent.
-    pub rate_limited_count: u64,
-    /// Replies withheld because they would have been longer than their request.
-    pub amplifying_count: u64,
+counts! {
+    /// What became of the replies.
+    pub struct ReplyCounts {
+        /// Replies given to the owner.
+        sent_count,
+        /// Replies that a later one of their kind replaced before they were polled.
+        replaced_count,
+        /// Replies withheld because the last one of their kind was too recent.
+        rate_limited_count,
+        /// Replies withheld because they would have been longer than their request.
+        amplifying_count,
+    }
 }
-
-named_counts!(ReplyCounts {
-    sent_count,
-    replaced_count,
-    rate_limited_count,
-    amplifying_count,
-});
 
 #[derive(Debug, Clone, Copy)]
 pub(super) struct AckRequest {

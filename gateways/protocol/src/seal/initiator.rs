@@ -132,7 +132,7 @@ impl Initiator {
                 self.unanswered_count = 0;
             }
             Ok(_) => {}
-            Err(cause) => self.counts.refuse(cause),
+            Err(cause) => self.counts.refused.count(cause),
         }
         result
     }
@@ -204,7 +204,7 @@ impl Initiator {
 
     /// Notes a datagram that its owner refused before it came here.
     pub fn refuse(&mut self, cause: SealRefusal) {
-        self.counts.refuse(cause);
+        self.counts.refused.count(cause);
     }
 
     /// What was counted so far.

@@ -32,7 +32,7 @@ mod responder;
 mod traffic;
 pub mod window;
 
-pub use counts::{SealCounts, SealRefusal};
+pub use counts::{SealCounts, SealRefusal, SealRefusalCounts};
 pub use initiator::{Heard, Initiator};
 pub use keys::{Association, RunSecret, SALT_BYTES, Salt, Suite};
 pub use layout::KEY_EXCHANGE_BYTES;

@@ -74,7 +74,7 @@ impl Responder {
         match &result {
             Ok(Opened::Datagram(_)) => self.counts.opened_count += 1,
             Ok(Opened::Answer(_)) => self.counts.key_exchange_count += 1,
-            Err(cause) => self.counts.refuse(*cause),
+            Err(cause) => self.counts.refused.count(*cause),
         }
         result
     }
@@ -184,7 +184,7 @@ impl Responder {
 
     /// Notes a datagram that its owner refused before it came here.
     pub fn refuse(&mut self, cause: SealRefusal) {
-        self.counts.refuse(cause);
+        self.counts.refused.count(cause);
     }
 
     /// What was counted so far.

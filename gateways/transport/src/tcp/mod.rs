@@ -8,7 +8,7 @@
 //! - Nothing blocks. What the kernel does not take waits in a bounded buffer; a message that finds
 //!   no room there is refused and counted.
 //! - Every message leaves at once (`TCP_NODELAY`), and what it then waits for is measured: see
-//!   [`StreamFigures`].
+//!   `figures`.
 //! - There are no kernel stamps. The kernel stamps bytes of a stream, not messages: segments are
 //!   joined and cut on the way, and a joined one keeps only the newer of two stamps.
 
@@ -23,53 +23,86 @@ mod stream;
 #[cfg(test)]
 mod tests;
 
-use std::net::SocketAddr;
-
 use hil_core::time::Instant;
+use hil_net::clock_pair::monotonic_now;
+use hil_protocol::seal::{Initiator, Responder};
+use hil_protocol::transport::{Capabilities, Description, IpProtocol};
 
-pub use figures::{ConnectionTally, StreamFigures};
 pub use receiver::TcpReceiver;
 pub use sender::TcpSender;
-pub use socket::{KEEP_ALIVE_COUNT, KEEP_ALIVE_IDLE, KEEP_ALIVE_INTERVAL, USER_TIMEOUT};
 
-/// How to set up either end. Everything optional stays at the kernel's default when `None`.
-#[derive(Debug, Clone)]
-pub struct TcpSettings {
-    /// Where this end is: where a receiver listens, and the address, but not the port, that a
-    /// sender connects from.
-    pub local: SocketAddr,
-    /// The other end: where a sender connects to. A receiver takes connections from this address
-    /// alone, whatever their port, and names it as the source of every datagram.
-    pub peer: SocketAddr,
-    /// Interface to bind to (`SO_BINDTODEVICE`).
-    pub interface: Option<String>,
-    /// Differentiated services code point of outgoing packets, 0..=63 (RFC 2474).
-    pub dscp: Option<u8>,
-    /// Priority in the queueing discipline (`SO_PRIORITY`); above 6 needs `CAP_NET_ADMIN`.
-    pub priority: Option<u32>,
-    /// Send buffer in bytes (`SO_SNDBUF`): what may wait in the kernel.
-    pub send_buffer_bytes: Option<usize>,
-    /// Receive buffer in bytes (`SO_RCVBUF`).
-    pub receive_buffer_bytes: Option<usize>,
-    /// Largest IP packet the path takes; segments are cut to fit it (`TCP_MAXSEG`).
-    pub path_mtu_bytes: Option<usize>,
-    /// Reads the monotonic clock: how long a byte waits counts from when it was sent.
-    pub clock: fn() -> Instant,
+use crate::registry::{OpenReceiver, OpenSender, Transport};
+use crate::sealed;
+use crate::socket::{GrantedOptions, SocketError, SocketSettings};
+use socket::{KEEP_ALIVE_COUNT, KEEP_ALIVE_IDLE, KEEP_ALIVE_INTERVAL, USER_TIMEOUT};
+
+/// One connection per channel direction.
+#[derive(Debug)]
+pub struct Tcp;
+
+static DESCRIPTION: Description = Description {
+    name: "tcp",
+    label: "TCP",
+    capabilities: Capabilities {
+        unstamped_because: Some("the kernel stamps bytes of a stream, not messages"),
+        has_radio_reports: false,
+        cuts_to_path: true,
+        // The kernel chooses it.
+        sender_port: None,
+        receiver_port: Some(IpProtocol::Tcp),
+        ipv4_header_bytes: 20 + 20,
+        ipv6_header_bytes: 40 + 20,
+    },
+    options: &[],
+};
+
+impl Transport for Tcp {
+    fn description(&self) -> &'static Description {
+        &DESCRIPTION
+    }
+
+    fn open_sender(
+        &self,
+        settings: &SocketSettings,
+        seal: Option<Initiator>,
+    ) -> Result<OpenSender, SocketError> {
+        let sender = TcpSender::open(settings.clone())?;
+        Ok(OpenSender {
+            granted: sender.granted(),
+            datagram_bytes_max: frame::DATAGRAM_BYTES_MAX,
+            facts: facts(settings, sender.granted()),
+            connections: Some(sender.tally()),
+            sender: sealed::sender(sender, seal),
+        })
+    }
+
+    fn open_receiver(
+        &self,
+        settings: &SocketSettings,
+        seal: Option<Responder>,
+    ) -> Result<OpenReceiver, SocketError> {
+        let receiver = TcpReceiver::open(settings.clone())?;
+        Ok(OpenReceiver {
+            facts: facts(settings, receiver.granted()),
+            receiver: sealed::receiver(receiver, settings.peer, seal),
+        })
+    }
 }
 
-impl TcpSettings {
-    /// The kernel's defaults.
-    pub const fn new(local: SocketAddr, peer: SocketAddr, clock: fn() -> Instant) -> Self {
-        Self {
-            local,
-            peer,
-            interface: None,
-            dscp: None,
-            priority: None,
-            send_buffer_bytes: None,
-            receive_buffer_bytes: None,
-            path_mtu_bytes: None,
-            clock,
-        }
-    }
+fn facts(settings: &SocketSettings, granted: GrantedOptions) -> Vec<(String, String)> {
+    let mut facts = granted.facts(settings);
+    let options = format!(
+        "no delay; keep-alive after {} s, then {KEEP_ALIVE_COUNT} times every {} s; user time-out \
+         {} s",
+        KEEP_ALIVE_IDLE.as_secs(),
+        KEEP_ALIVE_INTERVAL.as_secs(),
+        USER_TIMEOUT.as_secs()
+    );
+    facts.push(("TCP".to_owned(), options));
+    facts
+}
+
+/// The monotonic clock: how long a byte waits counts from when it was sent.
+fn now() -> Instant {
+    monotonic_now().expect("every Linux has a monotonic clock")
 }

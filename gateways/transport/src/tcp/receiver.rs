@@ -3,18 +3,19 @@
 use core::time::Duration;
 use std::io;
 use std::net::SocketAddr;
-use std::os::fd::{AsFd, BorrowedFd};
+use std::os::fd::BorrowedFd;
 
 use hil_core::time::Instant;
-use nix::sys::epoll::{Epoll, EpollCreateFlags, EpollEvent, EpollFlags};
+use nix::sys::epoll::EpollFlags;
 use socket2::Socket;
 
-use super::TcpSettings;
 use super::figures::StreamFigures;
 use super::socket::{abort, listen, tune};
 use super::stream::{Ending, Stream};
-use crate::udp_socket::{GrantedOptions, UdpError, granted_options, local_address, refuse};
-use crate::{DatagramReceiver, Received, ReceiverCounters, SendRefusal};
+use crate::socket::{
+    GrantedOptions, SocketError, SocketSettings, granted_options, local_address, refuse,
+};
+use crate::{DatagramReceiver, EndReport, Received, ReceiverCounters, SendRefusal};
 use hil_net::KernelStamps;
 
 /// Waiting connections looked at in one call: a crowd at the door must not keep the channel
@@ -27,12 +28,9 @@ const ATTEND_PERIOD: Duration = Duration::from_micros(200);
 /// The receiving end.
 #[derive(Debug)]
 pub struct TcpReceiver {
-    settings: TcpSettings,
+    settings: SocketSettings,
     listener: Socket,
     stream: Stream,
-    epoll: Epoll,
-    /// What the connection is watched for.
-    interest: EpollFlags,
     counters: ReceiverCounters,
     granted: GrantedOptions,
     attended: Instant,
@@ -43,18 +41,14 @@ impl TcpReceiver {
     ///
     /// # Errors
     /// When the settings contradict themselves or the kernel refuses a step.
-    pub fn open(settings: TcpSettings) -> Result<Self, UdpError> {
+    pub fn open(settings: SocketSettings) -> Result<Self, SocketError> {
         let listener = listen(&settings)?;
-        let epoll = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC);
-        let epoll = refuse("epoll", "create", epoll.map_err(io::Error::from))?;
-        let added = epoll.add(&listener, EpollEvent::new(EpollFlags::EPOLLIN, 0));
-        refuse("epoll", "add", added.map_err(io::Error::from))?;
+        let mut stream = Stream::new()?;
+        refuse("epoll", "add", stream.watch(&listener, EpollFlags::EPOLLIN))?;
         Ok(Self {
-            granted: granted_options(&listener, &settings.common())?,
-            stream: Stream::new(settings.clock),
+            granted: granted_options(&listener, &settings)?,
+            stream,
             listener,
-            epoll,
-            interest: EpollFlags::empty(),
             counters: ReceiverCounters::default(),
             attended: Instant::from_ns(i64::MIN),
             settings,
@@ -72,6 +66,11 @@ impl TcpReceiver {
     /// When the kernel does not tell.
     pub fn local_address(&self) -> io::Result<SocketAddr> {
         local_address(&self.listener)
+    }
+
+    /// What it saw until `now`.
+    pub(super) fn figures(&self, now: Instant) -> StreamFigures {
+        self.stream.figures(now)
     }
 
     /// True while there is a connection.
@@ -94,29 +93,8 @@ impl TcpReceiver {
                 continue;
             }
             self.stream.end(Ending::Replaced, now);
-            self.interest = EpollFlags::EPOLLIN;
-            // Without it the wait ends by time alone.
-            let _slower = self
-                .epoll
-                .add(&socket, EpollEvent::new(self.interest, 0))
-                .is_err();
+            let _slower = self.stream.watch(&socket, EpollFlags::EPOLLIN).is_err();
             self.stream.adopt(socket, now);
-        }
-    }
-
-    /// Waits for room in the kernel's buffer only while a reply needs it.
-    fn update_interest(&mut self) {
-        let mut interest = EpollFlags::EPOLLIN;
-        if self.stream.has_backlog() {
-            interest |= EpollFlags::EPOLLOUT;
-        }
-        if interest == self.interest {
-            return;
-        }
-        if let Some(socket) = self.stream.socket() {
-            self.interest = interest;
-            let mut event = EpollEvent::new(interest, 0);
-            let _slower = self.epoll.modify(socket, &mut event).is_err();
         }
     }
 }
@@ -146,7 +124,7 @@ impl DatagramReceiver for TcpReceiver {
             Err(_) => self.counters.reply_refused_count += 1,
         }
         if self.stream.has_backlog() {
-            self.update_interest();
+            self.stream.update_interest();
         }
         sent
     }
@@ -156,7 +134,7 @@ impl DatagramReceiver for TcpReceiver {
     }
 
     fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
-        Some(self.epoll.0.as_fd())
+        Some(self.stream.poll_fd())
     }
 
     fn counters(&self) -> ReceiverCounters {
@@ -171,10 +149,10 @@ impl DatagramReceiver for TcpReceiver {
         self.attended = now;
         self.stream.look(now);
         self.accept(now);
-        self.update_interest();
+        self.stream.update_interest();
     }
 
-    fn stream_figures(&self, now: Instant) -> Option<StreamFigures> {
-        Some(self.stream.figures(now))
+    fn report(&self, now: Instant) -> EndReport {
+        self.figures(now).of_receiver()
     }
 }

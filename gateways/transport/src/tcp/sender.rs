@@ -1,21 +1,21 @@
 //! The end that connects: takes messages, hears replies, and comes back after every loss.
 
 use std::io;
-use std::os::fd::{AsFd, BorrowedFd};
+use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 
 use hil_core::time::Instant;
-use nix::sys::epoll::{Epoll, EpollCreateFlags, EpollEvent, EpollFlags};
+use nix::sys::epoll::EpollFlags;
 use socket2::Socket;
 
-use super::figures::{ConnectionTally, StreamFigures};
+use super::figures::StreamFigures;
+use super::now;
 use super::socket::{
     BackOff, CONNECT_PATIENCE, GOOD_CONNECTION, Progress, prepare, progress, start_connecting,
 };
 use super::stream::Stream;
-use super::{TcpSettings, frame};
-use crate::udp_socket::{GrantedOptions, UdpError, granted_options, refuse};
-use crate::{DatagramSender, Received, SendRefusal, SenderCounters};
+use crate::socket::{GrantedOptions, SocketError, SocketSettings, granted_options};
+use crate::{ConnectionTally, DatagramSender, EndReport, Received, SendRefusal, SenderCounters};
 use hil_net::{KernelStamps, TransmitStamp, TxToken};
 
 /// Where the connection stands.
@@ -32,13 +32,10 @@ enum Way {
 /// The sending end.
 #[derive(Debug)]
 pub struct TcpSender {
-    settings: TcpSettings,
+    settings: SocketSettings,
     way: Way,
     stream: Stream,
     back_off: BackOff,
-    epoll: Epoll,
-    /// What the newest socket is watched for.
-    interest: EpollFlags,
     counters: SenderCounters,
     granted: GrantedOptions,
 }
@@ -49,19 +46,17 @@ impl TcpSender {
     /// # Errors
     /// When the settings contradict themselves or the kernel refuses a step. A peer that is not
     /// there yet is no error.
-    pub fn open(settings: TcpSettings) -> Result<Self, UdpError> {
+    pub fn open(settings: SocketSettings) -> Result<Self, SocketError> {
         if settings.local.is_ipv4() != settings.peer.is_ipv4() {
-            return Err(UdpError::Family {
+            return Err(SocketError::Family {
                 local: settings.local,
                 peer: settings.peer,
             });
         }
-        let epoll = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC);
-        let epoll = refuse("epoll", "create", epoll.map_err(io::Error::from))?;
-        let now = (settings.clock)();
+        let now = now();
         let mut back_off = BackOff::new();
         let socket = prepare(&settings)?;
-        let granted = granted_options(&socket, &settings.common())?;
+        let granted = granted_options(&socket, &settings)?;
         let way = match start_connecting(&socket, &settings) {
             Ok(()) => Way::Connecting { socket, since: now },
             // No way there yet: the link may come up.
@@ -70,12 +65,10 @@ impl TcpSender {
             },
         };
         let mut sender = Self {
-            stream: Stream::new(settings.clock),
+            stream: Stream::new()?,
             settings,
             way,
             back_off,
-            epoll,
-            interest: EpollFlags::empty(),
             counters: SenderCounters::default(),
             granted,
         };
@@ -88,9 +81,9 @@ impl TcpSender {
         self.granted
     }
 
-    /// Longest datagram it takes.
-    pub const fn datagram_bytes_max(&self) -> usize {
-        frame::DATAGRAM_BYTES_MAX
+    /// What it saw until `now`.
+    pub(super) fn figures(&self, now: Instant) -> StreamFigures {
+        self.stream.figures(now)
     }
 
     /// How often connections come and go.
@@ -106,26 +99,7 @@ impl TcpSender {
     /// Waits for a socket that has just set out.
     fn watch_new_socket(&mut self) {
         if let Way::Connecting { socket, .. } = &self.way {
-            self.interest = EpollFlags::EPOLLOUT;
-            let event = EpollEvent::new(self.interest, 0);
-            // Without it the wait ends by time alone.
-            let _slower = self.epoll.add(socket, event).is_err();
-        }
-    }
-
-    /// Waits for room in the kernel's buffer only while something needs it.
-    fn update_interest(&mut self) {
-        let mut interest = EpollFlags::EPOLLIN;
-        if self.stream.has_backlog() {
-            interest |= EpollFlags::EPOLLOUT;
-        }
-        if interest == self.interest {
-            return;
-        }
-        if let Some(socket) = self.stream.socket() {
-            self.interest = interest;
-            let mut event = EpollEvent::new(interest, 0);
-            let _slower = self.epoll.modify(socket, &mut event).is_err();
+            let _slower = self.stream.watch(socket, EpollFlags::EPOLLOUT).is_err();
         }
     }
 
@@ -178,7 +152,7 @@ impl TcpSender {
             Progress::Connected => {
                 if let Way::Connecting { socket, .. } = core::mem::replace(&mut self.way, Way::Up) {
                     self.stream.adopt(socket, now);
-                    self.update_interest();
+                    self.stream.update_interest();
                 }
             }
         }
@@ -192,13 +166,13 @@ impl DatagramSender for TcpSender {
                 let low = self.counters.sent_count & u64::from(u32::MAX);
                 self.counters.sent_count += 1;
                 if self.stream.has_backlog() {
-                    self.update_interest();
+                    self.stream.update_interest();
                 }
                 Ok(TxToken(u32::try_from(low).expect("masked to 32 bits")))
             }
             Err(refusal) => {
                 self.counters.count_refusal(refusal);
-                self.notice_end((self.settings.clock)());
+                self.notice_end(now());
                 Err(refusal)
             }
         }
@@ -222,14 +196,14 @@ impl DatagramSender for TcpSender {
                 }))
             }
             Err(_ended) => {
-                self.notice_end((self.settings.clock)());
+                self.notice_end(now());
                 Ok(None)
             }
         }
     }
 
     fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
-        Some(self.epoll.0.as_fd())
+        Some(self.stream.poll_fd())
     }
 
     fn counters(&self) -> SenderCounters {
@@ -243,7 +217,7 @@ impl DatagramSender for TcpSender {
             Way::Connecting { .. } => self.conclude(now),
             Way::Up => {
                 self.stream.look(now);
-                self.update_interest();
+                self.stream.update_interest();
                 self.notice_end(now);
             }
         }
@@ -261,7 +235,7 @@ impl DatagramSender for TcpSender {
         self.stream.has_backlog()
     }
 
-    fn stream_figures(&self, now: Instant) -> Option<StreamFigures> {
-        Some(self.stream.figures(now))
+    fn report(&self, now: Instant) -> EndReport {
+        self.figures(now).of_sender()
     }
 }

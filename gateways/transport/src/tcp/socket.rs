@@ -8,18 +8,17 @@ use std::net::SocketAddr;
 use hil_core::time::Instant;
 use socket2::{Domain, Protocol, SockAddr, Socket, TcpKeepalive, Type};
 
-use super::TcpSettings;
-use crate::udp_socket::{UdpError, UdpSettings, bind, mark, refuse, set_buffers};
-use hil_net::timestamping::TimestampMode;
+use super::DESCRIPTION;
+use crate::socket::{SocketError, SocketSettings, bind, mark, refuse, set_buffers};
 
 /// Silence after which the kernel asks whether the peer is still there.
-pub const KEEP_ALIVE_IDLE: Duration = Duration::from_secs(5);
+pub(super) const KEEP_ALIVE_IDLE: Duration = Duration::from_secs(5);
 /// Between such questions.
-pub const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(1);
+pub(super) const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(1);
 /// Questions without an answer after which the peer is gone.
-pub const KEEP_ALIVE_COUNT: u32 = 5;
+pub(super) const KEEP_ALIVE_COUNT: u32 = 5;
 /// How long sent data may wait for an acknowledgement before the peer is gone.
-pub const USER_TIMEOUT: Duration = Duration::from_secs(10);
+pub(super) const USER_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a connection may take to come about, one repetition of its first packet included.
 pub(super) const CONNECT_PATIENCE: Duration = Duration::from_secs(3);
 /// Longest segment the kernel can be told of (`MAX_TCP_WINDOW`).
@@ -27,25 +26,8 @@ const SEGMENT_BYTES_MAX: u32 = 32_767;
 /// Connections that may wait to be accepted: the peer's, and a few of others to be turned away.
 const LISTEN_BACKLOG: i32 = 8;
 
-impl TcpSettings {
-    /// What a TCP socket has in common with a UDP one.
-    pub(super) fn common(&self) -> UdpSettings {
-        UdpSettings {
-            local: self.local,
-            peer: self.peer,
-            interface: self.interface.clone(),
-            dscp: self.dscp,
-            priority: self.priority,
-            send_buffer_bytes: self.send_buffer_bytes,
-            receive_buffer_bytes: self.receive_buffer_bytes,
-            timestamps: TimestampMode::Off,
-            wants_radio_reports: false,
-        }
-    }
-}
-
 /// A socket with everything set that has to be before it connects or listens.
-fn open(settings: &TcpSettings) -> Result<Socket, UdpError> {
+fn open(settings: &SocketSettings) -> Result<Socket, SocketError> {
     let domain = Domain::for_address(settings.local);
     let opened = Socket::new(domain, Type::STREAM, Some(Protocol::TCP));
     let socket = refuse("socket", "TCP", opened)?;
@@ -55,9 +37,8 @@ fn open(settings: &TcpSettings) -> Result<Socket, UdpError> {
         refuse("SO_BINDTODEVICE", interface, bound)?;
     }
     // The receive buffer decides the window scale, which the first packet settles.
-    let common = settings.common();
-    set_buffers(&socket, &common)?;
-    mark(&socket, &common)?;
+    set_buffers(&socket, settings)?;
+    mark(&socket, settings)?;
     if let Some(segment_bytes) = segment_bytes(settings) {
         let set = socket.set_tcp_mss(segment_bytes);
         refuse("TCP_MAXSEG", segment_bytes, set)?;
@@ -67,19 +48,15 @@ fn open(settings: &TcpSettings) -> Result<Socket, UdpError> {
 
 /// What a packet of the path has room for; `None` when it is more than the kernel can be told,
 /// which then finds out by itself.
-fn segment_bytes(settings: &TcpSettings) -> Option<u32> {
-    let headers = if settings.local.is_ipv4() {
-        20 + 20
-    } else {
-        40 + 20
-    };
+fn segment_bytes(settings: &SocketSettings) -> Option<u32> {
+    let headers = DESCRIPTION.capabilities.header_bytes(settings.local.ip());
     let segment_bytes = settings.path_mtu_bytes?.checked_sub(headers)?;
     let segment_bytes = u32::try_from(segment_bytes).ok()?;
     (segment_bytes <= SEGMENT_BYTES_MAX).then_some(segment_bytes)
 }
 
 /// A socket that listens where the settings say.
-pub(super) fn listen(settings: &TcpSettings) -> Result<Socket, UdpError> {
+pub(super) fn listen(settings: &SocketSettings) -> Result<Socket, SocketError> {
     let socket = open(settings)?;
     // Connections of an earlier gateway linger; the port is ours all the same.
     refuse("SO_REUSEADDR", true, socket.set_reuse_address(true))?;
@@ -90,7 +67,7 @@ pub(super) fn listen(settings: &TcpSettings) -> Result<Socket, UdpError> {
 
 /// A socket that may connect, from a port of the kernel's choice: a port of our own would be
 /// blocked for a minute after each connection that we ended.
-pub(super) fn prepare(settings: &TcpSettings) -> Result<Socket, UdpError> {
+pub(super) fn prepare(settings: &SocketSettings) -> Result<Socket, SocketError> {
     let socket = open(settings)?;
     tune(&socket, settings)?;
     bind(&socket, SocketAddr::new(settings.local.ip(), 0))?;
@@ -98,7 +75,7 @@ pub(super) fn prepare(settings: &TcpSettings) -> Result<Socket, UdpError> {
 }
 
 /// Sends it on its way to the peer.
-pub(super) fn start_connecting(socket: &Socket, settings: &TcpSettings) -> io::Result<()> {
+pub(super) fn start_connecting(socket: &Socket, settings: &SocketSettings) -> io::Result<()> {
     match socket.connect(&SockAddr::from(settings.peer)) {
         Err(error) if error.raw_os_error() != Some(libc::EINPROGRESS) => Err(error),
         _ => Ok(()),
@@ -136,7 +113,7 @@ pub(super) fn progress(socket: &Socket) -> Progress {
 }
 
 /// What every connection gets: each message leaves at once, and a peer that vanished is noticed.
-pub(super) fn tune(socket: &Socket, settings: &TcpSettings) -> Result<(), UdpError> {
+pub(super) fn tune(socket: &Socket, settings: &SocketSettings) -> Result<(), SocketError> {
     refuse("O_NONBLOCK", true, socket.set_nonblocking(true))?;
     refuse("TCP_NODELAY", true, socket.set_tcp_nodelay(true))?;
     let keep_alive = TcpKeepalive::new()
@@ -148,7 +125,7 @@ pub(super) fn tune(socket: &Socket, settings: &TcpSettings) -> Result<(), UdpErr
     let timeout_ms = USER_TIMEOUT.as_millis();
     refuse("TCP_USER_TIMEOUT", timeout_ms, timeout)?;
     // An accepted connection inherits buffers and code point, but not in every case the priority.
-    mark(socket, &settings.common())
+    mark(socket, settings)
 }
 
 /// Ends a connection at once, and leaves no trace of it that could get in a later one's way.

@@ -4,16 +4,20 @@
 
 use core::time::Duration;
 use std::io::{self, IoSlice, Read};
+use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::Arc;
 
 use hil_core::time::Instant;
+use nix::sys::epoll::{Epoll, EpollCreateFlags, EpollEvent, EpollFlags};
 use socket2::Socket;
 
-use super::figures::{ConnectionTally, StreamFigures};
+use super::figures::StreamFigures;
 use super::frame::{Backlog, FRAME_BYTES_MAX, FrameReader, prefix};
+use super::now;
 use super::socket::abort;
 use super::stall::StallWatch;
-use crate::SendRefusal;
+use crate::socket::{SocketError, refuse};
+use crate::{ConnectionTally, SendRefusal};
 use hil_net::tcp_info::{ConnectionInfo, unacknowledged_bytes};
 
 /// What the kernel has not taken waits here: two of the longest frames, so that one always fits
@@ -57,12 +61,17 @@ pub(super) struct Stream {
     /// Of connections that have ended, and counts of this side.
     figures: StreamFigures,
     tally: Arc<ConnectionTally>,
-    clock: fn() -> Instant,
+    epoll: Epoll,
+    /// What the newest socket is watched for.
+    interest: EpollFlags,
 }
 
 impl Stream {
-    pub(super) fn new(clock: fn() -> Instant) -> Self {
-        Self {
+    pub(super) fn new() -> Result<Self, SocketError> {
+        let epoll = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC);
+        Ok(Self {
+            epoll: refuse("epoll", "create", epoll.map_err(io::Error::from))?,
+            interest: EpollFlags::empty(),
             socket: None,
             connected: Instant::ZERO,
             reader: FrameReader::default(),
@@ -74,7 +83,30 @@ impl Stream {
             info: None,
             figures: StreamFigures::default(),
             tally: Arc::default(),
-            clock,
+        })
+    }
+
+    /// What to wait on for everything that is watched.
+    pub(super) fn poll_fd(&self) -> BorrowedFd<'_> {
+        self.epoll.0.as_fd()
+    }
+
+    /// Waits for `interest` of `socket` from now on. Where it fails, the wait ends by time alone.
+    pub(super) fn watch(&mut self, socket: &Socket, interest: EpollFlags) -> io::Result<()> {
+        self.interest = interest;
+        Ok(self.epoll.add(socket, EpollEvent::new(interest, 0))?)
+    }
+
+    /// Waits for room in the kernel's buffer only while something needs it.
+    pub(super) fn update_interest(&mut self) {
+        let mut interest = EpollFlags::EPOLLIN;
+        if self.has_backlog() {
+            interest |= EpollFlags::EPOLLOUT;
+        }
+        if let Some(socket) = self.socket.as_ref().filter(|_| interest != self.interest) {
+            self.interest = interest;
+            let mut event = EpollEvent::new(interest, 0);
+            let _slower = self.epoll.modify(socket, &mut event).is_err();
         }
     }
 
@@ -141,7 +173,7 @@ impl Stream {
         let length_bytes = datagram.len();
         let prefix = prefix(length_bytes).ok_or(SendRefusal::TooLong { length_bytes })?;
         if !self.backlog.is_empty() {
-            let now = (self.clock)();
+            let now = now();
             self.flush(now);
         }
         let Some(socket) = &self.socket else {
@@ -155,13 +187,13 @@ impl Stream {
                 Ok(count) => taken = count,
                 Err(error) if is_for_later(&error) => {}
                 Err(error) => {
-                    let now = (self.clock)();
+                    let now = now();
                     self.end(failed(&error), now);
                     return Err(SendRefusal::NotConnected);
                 }
             }
         }
-        let now = (self.clock)();
+        let now = now();
         if taken < whole {
             let rest = [
                 prefix.get(taken..).unwrap_or_default(),
@@ -220,7 +252,7 @@ impl Stream {
     }
 
     fn broken<T>(&mut self, ending: Ending) -> Result<T, Ending> {
-        let now = (self.clock)();
+        let now = now();
         self.end(ending, now);
         Err(ending)
     }

@@ -11,21 +11,16 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 
 use hil_core::random::RandomStream;
-use hil_core::time::Instant;
 
 use super::frame::{DATAGRAM_BYTES_MAX, FrameReader, PREFIX_BYTES, prefix};
-use super::{TcpReceiver, TcpSender, TcpSettings};
+use super::{TcpReceiver, TcpSender, now};
 use crate::conformance_tests::{tcp_pair, within_bound};
+use crate::socket::SocketSettings;
 use crate::{DatagramReceiver, DatagramSender, SendRefusal};
-use hil_net::clock_pair::monotonic_now;
 use hil_net::tcp_info::{ConnectionInfo, unacknowledged_bytes};
 
-fn now() -> Instant {
-    monotonic_now().unwrap()
-}
-
-fn settings(local: &str, peer: SocketAddr) -> TcpSettings {
-    TcpSettings::new(local.parse().unwrap(), peer, now)
+fn settings(local: &str, peer: SocketAddr) -> SocketSettings {
+    SocketSettings::new(local.parse().unwrap(), peer)
 }
 
 fn frame(datagram: &[u8]) -> Vec<u8> {
@@ -183,14 +178,14 @@ fn a_peer_that_vanished_is_a_state_and_comes_back() {
     assert_eq!(counters.newest_report, Some(SendRefusal::NotConnected));
     within_bound("failed attempt", || {
         sender.attend(now());
-        (sender.stream_figures(now()).unwrap().connect_failed_count >= 2).then_some(())
+        (sender.figures(now()).connect_failed_count >= 2).then_some(())
     });
     assert!(sender.next_due().is_some(), "another attempt is due");
 
     let mut receiver = TcpReceiver::open(settings(&place.to_string(), place)).unwrap();
     connect(&mut sender, &mut receiver);
     carry(&mut sender, &mut receiver, b"after");
-    let figures = sender.stream_figures(now()).unwrap();
+    let figures = sender.figures(now());
     assert_eq!(
         (figures.connection_count, figures.reconnect_count()),
         (2, 1)
@@ -207,17 +202,11 @@ fn a_restarted_sender_takes_the_place_of_the_one_that_vanished() {
     within_bound("second connection", || {
         second.attend(now());
         receiver.attend(now());
-        let figures = receiver.stream_figures(now()).unwrap();
+        let figures = receiver.figures(now());
         (second.is_connected() && figures.connection_count == 2).then_some(())
     });
     carry(&mut second, &mut receiver, b"second");
-    assert_eq!(
-        receiver
-            .stream_figures(now())
-            .unwrap()
-            .connection_ended_count,
-        1
-    );
+    assert_eq!(receiver.figures(now()).connection_ended_count, 1);
     // The first one hears of it.
     within_bound("end", || {
         assert_eq!(sender.receive(&mut [0; 64]).unwrap(), None);
@@ -243,7 +232,7 @@ fn a_bad_length_closes_the_connection_and_is_counted() {
         assert_eq!(receiver.receive(now(), &mut buffer).unwrap(), None);
         (!receiver.is_connected()).then_some(())
     });
-    let figures = receiver.stream_figures(now()).unwrap();
+    let figures = receiver.figures(now());
     assert_eq!(
         (figures.bad_frame_count, figures.connection_ended_count),
         (1, 1)
@@ -260,7 +249,7 @@ fn connections_of_another_host_are_turned_away() {
     let _stranger = TcpStream::connect(place).unwrap();
     within_bound("stranger", || {
         receiver.attend(now());
-        let figures = receiver.stream_figures(now()).unwrap();
+        let figures = receiver.figures(now());
         (figures.foreign_connection_count == 1).then_some(())
     });
     assert!(!receiver.is_connected());
@@ -293,7 +282,7 @@ fn a_peer_that_does_not_read_costs_messages_and_shows_as_a_stall() {
     assert!(sender.has_unsent());
     let stalled = within_bound("stall", || {
         sender.attend(now());
-        let figures = sender.stream_figures(now()).unwrap();
+        let figures = sender.figures(now());
         (figures.stall_count == 1 && figures.stall_longest > 2 * figures.stall_threshold)
             .then_some(figures)
     });
@@ -319,17 +308,10 @@ fn a_peer_that_does_not_read_costs_messages_and_shows_as_a_stall() {
     });
     let ended = within_bound("end of the stall", || {
         sender.attend(now());
-        sender
-            .next_due()
-            .is_none()
-            .then(|| sender.stream_figures(now()).unwrap())
+        sender.next_due().is_none().then(|| sender.figures(now()))
     });
     assert_eq!((ended.stall_count, ended.connection_ended_count), (1, 0));
-    assert_eq!(
-        sender.stream_figures(now()).unwrap().stalled,
-        ended.stalled,
-        "it is over"
-    );
+    assert_eq!(sender.figures(now()).stalled, ended.stalled, "it is over");
     assert!(
         ended
             .window_limited

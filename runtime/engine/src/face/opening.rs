@@ -9,7 +9,8 @@ use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::message::{Envelope, MessageType};
 use hil_core::record::{PublishedRecord, TakenRecord};
 use hil_net::timestamping::TimestampMode;
-use hil_transport::udp::{GrantedOptions, UdpSender, UdpSettings};
+use hil_transport::socket::{GrantedOptions, SocketSettings};
+use hil_transport::udp::UdpSender;
 use hil_transport::udp_server::UdpServer;
 
 use super::arm::{Arm, Attention, DATAGRAM_BYTES_MAX, Work};
@@ -211,7 +212,7 @@ impl JoinedArm {
     }
 }
 
-fn socket_settings(face: &FaceSettings, arm: &ArmLaunch) -> UdpSettings {
+fn socket_settings(face: &FaceSettings, arm: &ArmLaunch) -> SocketSettings {
     let any: IpAddr = if arm.address.is_ipv4() {
         Ipv4Addr::UNSPECIFIED.into()
     } else {
@@ -221,16 +222,20 @@ fn socket_settings(face: &FaceSettings, arm: &ArmLaunch) -> UdpSettings {
         FaceKind::Robot => SocketAddr::new(any, 0),
         FaceKind::Sensor => arm.address,
     };
-    UdpSettings {
+    SocketSettings {
         interface: face.interface.clone(),
         // 0 is the kernel's default; setting it would only reset the priority.
         dscp: (face.dscp > 0).then_some(face.dscp),
         timestamps: timestamp_mode(face.timestamps),
-        ..UdpSettings::new(local, arm.address)
+        ..SocketSettings::new(local, arm.address)
     }
 }
 
-fn facts(settings: &UdpSettings, granted: GrantedOptions, what: String) -> Vec<(String, String)> {
+fn facts(
+    settings: &SocketSettings,
+    granted: GrantedOptions,
+    what: String,
+) -> Vec<(String, String)> {
     let mut facts = vec![
         ("socket".to_owned(), what),
         (

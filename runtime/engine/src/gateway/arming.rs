@@ -8,16 +8,17 @@ use std::time::Duration;
 
 use hil_net::interface::interface_with_address;
 use hil_net::timestamping::TimestampMode;
+use hil_protocol::transport::Description;
 use hil_transport::probe::{
     Availability, DISCARD_PORT, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
 };
 
 use super::WorkerError;
-use super::socket::stamps_of;
+use super::socket::{timestamp_mode, transport_of};
 use super::stamp_plan::StampPlan;
 use hil_nic::radio::sampler::Sampler;
 use hil_nic::radio::socket::RadioSocket;
-use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side, Transport};
+use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side};
 use hil_rundir::radio_record::RadioRecord;
 use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder};
 use hil_topology::Timestamps;
@@ -51,10 +52,22 @@ pub(crate) struct RadioHop {
 }
 
 impl Arming {
+    /// `text` says why nothing was probed.
+    fn without_probe(text: String) -> Self {
+        Self {
+            _sentinel: None,
+            facts: vec![("kernel stamps".to_owned(), text)],
+            found: None,
+            is_wireless: false,
+            radio: None,
+        }
+    }
+
     /// What the sockets of `direction` are to ask for.
     pub(crate) fn plan(&self, direction: &DirectionLaunch) -> StampPlan {
-        let asked = stamps_of(&direction.socket);
-        let is_datagram = direction.socket.transport == Transport::Udp;
+        let asked = timestamp_mode(direction.socket.timestamps);
+        let has_reports = transport_of(&direction.socket)
+            .is_ok_and(|one| one.description().capabilities.has_radio_reports);
         let plan = match (&self.found, direction.side) {
             (Some((first, second)), Side::Egress) => {
                 StampPlan::found(asked, first, second.as_ref())
@@ -63,7 +76,7 @@ impl Arming {
             // departures; and nothing waits for their stamps.
             _ => StampPlan::asked(asked),
         };
-        plan.on_radio(self.is_wireless && is_datagram)
+        plan.on_radio(self.is_wireless && has_reports)
     }
 
     /// Starts the sampler of the hop's radio, if it has one, until `stop` is set; call it from a thread
@@ -108,34 +121,40 @@ fn open_sink(
 /// radio's.
 pub(super) fn arm(work: &GatewayWork) -> Arming {
     let (radio, mut facts) = find_radio(work);
-    let mut sockets = work.directions.iter().map(|one| one.socket.transport);
-    if sockets.any(|transport| transport == Transport::Tcp) {
-        let why = "unavailable over TCP: the kernel stamps bytes of a stream, not messages";
-        facts.insert(0, ("kernel stamps".to_owned(), why.to_owned()));
-        return Arming {
-            _sentinel: None,
-            facts,
-            found: None,
-            is_wireless: radio.is_some(),
-            radio,
-        };
-    }
-    let mut directions = work.directions.iter();
-    let stamped = directions.find(|one| one.socket.timestamps != Timestamps::Off);
-    let settings = stamped.map(|direction| ProbeSettings {
-        timestamps: stamps_of(&direction.socket),
-        interface: direction.socket.interface.clone(),
-        transmit_target: Some(SocketAddr::new(direction.peer.ip(), DISCARD_PORT)),
-        proof_count: 5,
-        bound: PROBE_BOUND,
+    let transports = work
+        .directions
+        .iter()
+        .filter_map(|one| transport_of(&one.socket).ok());
+    let mut unstamped = transports.filter_map(|transport| {
+        let Description {
+            label,
+            capabilities,
+            ..
+        } = transport.description();
+        let why = capabilities.unstamped_because?;
+        Some(format!("unavailable over {label}: {why}"))
     });
-    let mut armed = arm_and_describe(settings);
-    let asked = stamped.map(|direction| stamps_of(&direction.socket));
-    if let (Some((first, second)), Some(asked)) = (&armed.found, asked)
-        && let Some(text) = StampPlan::found(asked, first, second.as_ref()).fallback()
-    {
-        armed.facts.push(("stamp fallback".to_owned(), text));
-    }
+    let mut armed = if let Some(text) = unstamped.next() {
+        Arming::without_probe(text)
+    } else {
+        let mut directions = work.directions.iter();
+        let stamped = directions.find(|one| one.socket.timestamps != Timestamps::Off);
+        let mut armed = arm_and_describe(stamped.map(|direction| ProbeSettings {
+            timestamps: timestamp_mode(direction.socket.timestamps),
+            interface: direction.socket.interface.clone(),
+            transmit_target: Some(SocketAddr::new(direction.peer.ip(), DISCARD_PORT)),
+            proof_count: 5,
+            bound: PROBE_BOUND,
+        }));
+        if let (Some((first, second)), Some(stamped)) = (&armed.found, stamped) {
+            let asked = timestamp_mode(stamped.socket.timestamps);
+            let fallback = StampPlan::found(asked, first, second.as_ref()).fallback();
+            armed
+                .facts
+                .extend(fallback.map(|text| ("stamp fallback".to_owned(), text)));
+        }
+        armed
+    };
     armed.facts.append(&mut facts);
     armed.is_wireless = radio.is_some();
     armed.radio = radio;
@@ -179,15 +198,8 @@ fn interface_of(direction: &DirectionLaunch) -> Option<String> {
 
 /// Arms and probes what `settings` ask for; `None` where no stamps are wanted.
 pub(crate) fn arm_and_describe(settings: Option<ProbeSettings>) -> Arming {
-    let with = |sentinel, text: String, found| Arming {
-        _sentinel: sentinel,
-        facts: vec![("kernel stamps".to_owned(), text)],
-        found,
-        is_wireless: false,
-        radio: None,
-    };
     let Some(settings) = settings else {
-        return with(None, "switched off in the topology".to_owned(), None);
+        return Arming::without_probe("switched off in the topology".to_owned());
     };
     let asked_bound = settings.bound;
     let bound = if settings.timestamps == TimestampMode::Hardware {
@@ -200,9 +212,13 @@ pub(crate) fn arm_and_describe(settings: Option<ProbeSettings>) -> Arming {
         Ok((report, sentinel)) => {
             let second = probe_before_queue(settings, asked_bound, &report);
             let text = describe_probe(&report, second.as_ref());
-            with(Some(sentinel), text, Some((report, second)))
+            Arming {
+                _sentinel: Some(sentinel),
+                found: Some((report, second)),
+                ..Arming::without_probe(text)
+            }
         }
-        Err(error) => with(None, format!("unavailable: {error}"), None),
+        Err(error) => Arming::without_probe(format!("unavailable: {error}")),
     }
 }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use hil_core::time::Instant;
-use hil_transport::tcp::ConnectionTally;
+use hil_transport::ConnectionTally;
 
 use hil_rundir::launch::DirectionLaunch;
 use hil_rundir::pipe::{FromProcess, say};

@@ -92,6 +92,7 @@ pub(super) fn of_egress(egress: &Egress) -> Vec<CountByName> {
 /// Everything a receiving direction counted.
 pub(super) fn of_ingress(ingress: &Ingress) -> Vec<CountByName> {
     let bridge = &ingress.bridge;
+    let socket = ingress.receiver.counters();
     let steps = ("clock_step_count", ingress.clock.step_count());
     let foreign = ("foreign source", ingress.foreign_count);
     let stray = ("message on a clock path", ingress.stray_count);
@@ -111,7 +112,7 @@ pub(super) fn of_ingress(ingress: &Ingress) -> Vec<CountByName> {
         ))
         .chain(CountByName::all(
             CounterGroup::Socket,
-            ingress.receiver.counters().iter(),
+            socket.iter().chain(socket.loss_causes()),
         ))
         .chain(CountByName::all(CounterGroup::Own, [steps]))
         .chain(CountByName::all(
@@ -127,15 +128,11 @@ pub(super) fn of_ingress(ingress: &Ingress) -> Vec<CountByName> {
 
 /// What the seal of a direction counted.
 pub(super) fn of_seal(counts: &SealCounts) -> Vec<CountByName> {
-    let kept = [
-        ("sealed_count", counts.sealed_count),
-        ("opened_count", counts.opened_count),
-        ("key_exchange_count", counts.key_exchange_count),
-        ("agreement_count", counts.agreement_count),
-        ("rotation_count", counts.rotation_count),
-    ];
-    CountByName::all(CounterGroup::Seal, kept)
-        .chain(CountByName::all(CounterGroup::Refused, counts.refusals()))
+    CountByName::all(CounterGroup::Seal, counts.iter())
+        .chain(CountByName::all(
+            CounterGroup::Refused,
+            counts.refused.iter(),
+        ))
         .collect()
 }
 

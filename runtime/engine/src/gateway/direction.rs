@@ -7,8 +7,9 @@ use std::time::Duration;
 
 use hil_core::link_model::ReplayTally;
 use hil_core::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
+use hil_core::time::duration_ns;
 use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings, SettingsError};
-use hil_transport::tcp::ConnectionTally;
+use hil_transport::{ConnectionTally, Stalls};
 
 use super::egress::{Attention, Egress};
 use super::gathering::Gathering;
@@ -16,14 +17,14 @@ use super::ingress::{Ingress, Notes};
 use super::kernel_clock::KernelClock;
 use super::line::Line;
 use super::link_switch::SwitchHandle;
-use super::socket::{Ends, OpenSocket, stamps_of};
+use super::socket::{Ends, OpenSocket, timestamp_mode};
 use super::stamp_plan::StampPlan;
-use super::{Surroundings, WorkerError, counters, stream};
+use super::{Surroundings, WorkerError, counters};
 use crate::process::pulse::Pulse;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{WaitMode, WaitStrategy};
 use hil_rundir::launch::{DirectionLaunch, Side};
-use hil_rundir::pipe::{DirectionReport, RunStart};
+use hil_rundir::pipe::{CountByName, CounterGroup, DirectionReport, RunStart, StallFigures};
 use hil_rundir::record::{RecordKind, RecordSink, Recorder};
 use hil_shm::{RawInput, RawOutput, Waiter};
 
@@ -81,7 +82,7 @@ pub fn open(
     recorder: &mut Recorder,
     start: &RunStart,
 ) -> Result<OpenDirection, WorkerError> {
-    let plan = StampPlan::asked(stamps_of(&launch.socket));
+    let plan = StampPlan::asked(timestamp_mode(launch.socket.timestamps));
     let socket = OpenSocket::open(launch, plan, start, None)?;
     OpenDirection::new(launch, recorder, socket, plan)
 }
@@ -288,13 +289,13 @@ impl Direction {
     pub fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
         let now = MonotonicClock::now();
         let mut facts = self.facts.clone();
-        let (peer_state, mut counters, stream, seal) = match &self.way {
+        let (peer_state, mut counters, transport, seal) = match &self.way {
             Way::Egress(egress) => {
                 let sender = egress.line.sender();
                 (
                     counters::egress_state(egress),
                     counters::of_egress(egress),
-                    sender.stream_figures(now),
+                    sender.report(now),
                     sender.seal_counts(),
                 )
             }
@@ -306,25 +307,34 @@ impl Direction {
                 (
                     counters::ingress_state(ingress),
                     counters::of_ingress(ingress),
-                    ingress.receiver.stream_figures(now),
+                    ingress.receiver.report(now),
                     ingress.receiver.seal_counts(),
                 )
             }
         };
         counters.extend(seal.iter().flat_map(counters::of_seal));
-        if let Some(figures) = &stream {
-            counters.extend(stream::counters(figures));
-            facts.extend(stream::facts(figures, launch.side));
-        }
-        let stalls = stream.filter(|_| launch.side == Side::Egress);
+        let own = CountByName::all(CounterGroup::Transport, transport.counters);
+        counters.extend(own);
+        let own = transport.facts.into_iter();
+        facts.extend(own.map(|(label, text)| (label.to_owned(), text)));
         DirectionReport {
             channel: launch.channel.clone(),
             direction: launch.side,
             peer_state,
             counters,
             facts,
-            stalls: stalls.as_ref().map(stream::stalls),
+            stalls: transport.stalls.map(stall_figures),
             replay: self.replay.as_ref().map(ReplayTally::counts),
         }
+    }
+}
+
+fn stall_figures(stalls: Stalls) -> StallFigures {
+    let nanoseconds = |time| duration_ns(time).unsigned_abs();
+    StallFigures {
+        count: stalls.count,
+        total_ns: nanoseconds(stalls.total),
+        longest_ns: nanoseconds(stalls.longest),
+        threshold_ns: nanoseconds(stalls.threshold),
     }
 }

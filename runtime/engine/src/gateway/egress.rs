@@ -250,6 +250,6 @@ impl Egress {
     /// Replies refused so far, by the seal or the bridge.
     fn refused_count(&self) -> u64 {
         let sealed = self.line.sender().seal_counts();
-        sealed.map_or(0, |counts| counts.refused_total()) + self.bridge.refusals().total()
+        sealed.map_or(0, |counts| counts.refused.total()) + self.bridge.refusals().total()
     }
 }

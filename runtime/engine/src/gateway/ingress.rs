@@ -245,7 +245,7 @@ impl Ingress {
     /// Datagrams refused so far, whoever refused them.
     fn refused_count(&self) -> u64 {
         let sealed = self.receiver.seal_counts();
-        let by_seal = sealed.map_or(0, |counts| counts.refused_total());
+        let by_seal = sealed.map_or(0, |counts| counts.refused.total());
         by_seal + self.foreign_count + self.bridge.refusals().total()
     }
 }

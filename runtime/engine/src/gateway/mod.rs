@@ -22,7 +22,6 @@ pub(crate) mod process;
 pub(crate) mod socket;
 pub mod stamp_plan;
 pub(crate) mod stamp_tracker;
-mod stream;
 
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;

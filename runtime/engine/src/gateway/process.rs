@@ -13,7 +13,7 @@ use std::{io, thread};
 
 use hil_core::time::Instant;
 use hil_protocol::SettingsError;
-use hil_transport::udp::UdpError;
+use hil_transport::socket::SocketError;
 
 use super::arming::{self, Arming};
 use super::connection::Connection;
@@ -261,7 +261,7 @@ fn warn_of_shared_cpus(work: &GatewayWork) {
 /// path too narrow for now.
 fn is_away(error: &WorkerError) -> bool {
     match error {
-        WorkerError::Udp(UdpError::Refused { source, .. }) => matches!(
+        WorkerError::Open(SocketError::Refused { source, .. }) => matches!(
             source.kind(),
             io::ErrorKind::NetworkUnreachable
                 | io::ErrorKind::HostUnreachable
@@ -310,7 +310,7 @@ mod tests {
     #[test]
     fn a_path_that_is_away_is_waited_for_and_a_wrong_setting_is_not() {
         let refused = |errno: i32| {
-            WorkerError::Udp(UdpError::Refused {
+            WorkerError::Open(SocketError::Refused {
                 option: "connect",
                 value: String::new(),
                 source: io::Error::from_raw_os_error(errno),

@@ -1,7 +1,6 @@
 //! The socket of one channel direction: opened as its launch description says, behind a link model
 //! where it has one, with what the kernel granted. It moves no message.
 
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,13 +9,9 @@ use hil_core::time::{Instant, RemoteInstant};
 use hil_net::timestamping::TimestampMode;
 use hil_protocol::wire::{self, Kind};
 use hil_transport::emulated::{EmulatedReceiver, EmulatedSettings};
-use hil_transport::sealed::{SealedReceiver, SealedSender};
-use hil_transport::tcp::{
-    ConnectionTally, KEEP_ALIVE_COUNT, KEEP_ALIVE_IDLE, KEEP_ALIVE_INTERVAL, TcpReceiver,
-    TcpSender, TcpSettings, USER_TIMEOUT,
-};
-use hil_transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
-use hil_transport::{DatagramReceiver, DatagramSender};
+use hil_transport::registry::{self, Transport};
+use hil_transport::socket::{GrantedOptions, SocketSettings};
+use hil_transport::{ConnectionTally, DatagramReceiver, DatagramSender};
 
 use super::WorkerError;
 use super::link_switch::{SwitchHandle, switch};
@@ -24,14 +19,10 @@ use super::stamp_plan::StampPlan;
 use hil_nic::radio::category;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::host_facts::{HostFiles, kernel_release};
-use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch};
 use hil_rundir::pipe::RunStart;
 use hil_rundir::run_seal::RunSeal;
 use hil_topology::Timestamps;
-
-/// IP and UDP headers of a datagram.
-const IPV4_HEADERS: usize = 20 + 8;
-const IPV6_HEADERS: usize = 40 + 8;
 
 /// A direction's socket and what is known of it.
 #[derive(Debug)]
@@ -62,42 +53,28 @@ impl OpenSocket {
         start: &RunStart,
         seal: Option<&RunSeal>,
     ) -> Result<Self, WorkerError> {
-        let settings = udp_settings(launch, plan);
-        let mut opened = match launch.socket.transport {
-            Transport::Udp => Self::open_udp(&settings, launch, start, seal),
-            Transport::Tcp => Self::open_tcp(&settings, launch, seal),
-        }?;
-        opened.facts.push(security_fact(seal));
-        Ok(opened)
-    }
-
-    fn open_udp(
-        settings: &UdpSettings,
-        launch: &DirectionLaunch,
-        start: &RunStart,
-        seal: Option<&RunSeal>,
-    ) -> Result<Self, WorkerError> {
+        let transport = transport_of(&launch.socket)?;
+        let settings = socket_settings(launch, plan);
         let mut opened = match launch.side {
             Side::Egress => {
-                let sender = UdpSender::open(settings)?;
-                let mut facts = socket_facts(settings, sender.granted());
-                if settings.wants_radio_reports {
-                    facts.push(access_category(sender.granted()));
+                let seal = seal.map(|seal| seal.initiator(launch)).transpose();
+                let seal = seal.map_err(WorkerError::Session)?;
+                let mut end = transport.open_sender(&settings, seal)?;
+                if plan.asks_radio {
+                    end.facts.push(access_category(end.granted));
                 }
-                let mtu = sender.path_mtu();
-                let configured = launch.socket.path_mtu_bytes;
-                let text = format!("{} bytes, {configured} configured", mtu.packet_bytes);
-                facts.push(("path MTU".to_owned(), text));
-                let longest = datagram_bytes_max(launch, mtu);
-                let sender = sealed_sender(sender, launch, seal)?;
-                Self::new(Ends::Sender(sender, longest), facts)
+                let ends = Ends::Sender(end.sender, end.datagram_bytes_max);
+                Self {
+                    tally: end.connections,
+                    ..Self::new(ends, end.facts)
+                }
             }
             Side::Ingress => {
-                let receiver = UdpReceiver::open(settings)?;
-                let facts = socket_facts(settings, receiver.granted());
-                // Below the link model, which must not meet what a stranger sends.
-                let receiver = sealed_receiver(receiver, launch, seal)?;
-                emulate(receiver, facts, launch, start)?
+                let seal = seal.map(|seal| seal.responder(launch)).transpose();
+                let seal = seal.map_err(WorkerError::Session)?;
+                let end = transport.open_receiver(&settings, seal)?;
+                // Above the seal: the link model must not meet what a stranger sends.
+                emulate(end.receiver, end.facts, launch, start)?
             }
         };
         if let Some(emulation) = &launch.emulation {
@@ -111,6 +88,7 @@ impl OpenSocket {
                 opened.facts.push(fact);
             }
         }
+        opened.facts.push(security_fact(seal));
         Ok(opened)
     }
 
@@ -124,78 +102,12 @@ impl OpenSocket {
             switch: None,
         }
     }
-
-    fn open_tcp(
-        common: &UdpSettings,
-        launch: &DirectionLaunch,
-        seal: Option<&RunSeal>,
-    ) -> Result<Self, WorkerError> {
-        let settings = TcpSettings {
-            interface: common.interface.clone(),
-            dscp: common.dscp,
-            priority: common.priority,
-            send_buffer_bytes: common.send_buffer_bytes,
-            receive_buffer_bytes: common.receive_buffer_bytes,
-            path_mtu_bytes: Some(launch.socket.path_mtu_bytes),
-            ..TcpSettings::new(common.local, common.peer, MonotonicClock::now)
-        };
-        let (ends, granted, tally) = match launch.side {
-            Side::Egress => {
-                let sender = TcpSender::open(settings)?;
-                let (granted, longest) = (sender.granted(), sender.datagram_bytes_max());
-                let tally = Some(sender.tally());
-                let sender = sealed_sender(sender, launch, seal)?;
-                (Ends::Sender(sender, longest), granted, tally)
-            }
-            Side::Ingress => {
-                let receiver = TcpReceiver::open(settings)?;
-                let granted = receiver.granted();
-                let receiver = sealed_receiver(receiver, launch, seal)?;
-                (Ends::Receiver(receiver), granted, None)
-            }
-        };
-        let mut facts = socket_facts(common, granted);
-        let options = format!(
-            "no delay; keep-alive after {} s, then {KEEP_ALIVE_COUNT} times every {} s; user \
-             time-out {} s",
-            KEEP_ALIVE_IDLE.as_secs(),
-            KEEP_ALIVE_INTERVAL.as_secs(),
-            USER_TIMEOUT.as_secs()
-        );
-        facts.push(("TCP".to_owned(), options));
-        Ok(Self {
-            tally,
-            ..Self::new(ends, facts)
-        })
-    }
 }
 
-fn sealed_sender(
-    sender: impl DatagramSender + 'static,
-    launch: &DirectionLaunch,
-    seal: Option<&RunSeal>,
-) -> Result<Box<dyn DatagramSender>, WorkerError> {
-    let Some(seal) = seal else {
-        return Ok(Box::new(sender));
-    };
-    let initiator = seal.initiator(launch).map_err(WorkerError::Session)?;
-    Ok(Box::new(SealedSender::new(sender, initiator)))
-}
-
-fn sealed_receiver(
-    receiver: impl DatagramReceiver + 'static,
-    launch: &DirectionLaunch,
-    seal: Option<&RunSeal>,
-) -> Result<Box<dyn DatagramReceiver>, WorkerError> {
-    let Some(seal) = seal else {
-        return Ok(Box::new(receiver));
-    };
-    let responder = seal.responder(launch).map_err(WorkerError::Session)?;
-    Ok(Box::new(SealedReceiver::new(
-        receiver,
-        responder,
-        launch.peer,
-    )))
+/// The transport that a hop is carried by.
+pub(super) fn transport_of(socket: &SocketLaunch) -> Result<&'static dyn Transport, WorkerError> {
+    let name = &socket.transport;
+    registry::named(name).ok_or_else(|| WorkerError::UnknownTransport(name.clone()))
 }
 
 fn security_fact(seal: Option<&RunSeal>) -> (String, String) {
@@ -206,11 +118,9 @@ fn security_fact(seal: Option<&RunSeal>) -> (String, String) {
     ("security".to_owned(), text)
 }
 
-fn udp_settings(launch: &DirectionLaunch, plan: StampPlan) -> UdpSettings {
+fn socket_settings(launch: &DirectionLaunch, plan: StampPlan) -> SocketSettings {
     let socket = &launch.socket;
-    UdpSettings {
-        local: launch.local,
-        peer: launch.peer,
+    SocketSettings {
         interface: socket.interface.clone(),
         // 0 is the kernel's default; setting it would only reset the priority.
         dscp: (socket.dscp > 0).then_some(socket.dscp),
@@ -219,14 +129,9 @@ fn udp_settings(launch: &DirectionLaunch, plan: StampPlan) -> UdpSettings {
         receive_buffer_bytes: Some(socket.receive_buffer_bytes),
         timestamps: plan.mode,
         wants_radio_reports: plan.asks_radio,
-    }
-}
-
-/// The kernel stamps to ask for: none of a stream, whose bytes have no stamp of their own.
-pub(super) const fn stamps_of(socket: &SocketLaunch) -> TimestampMode {
-    match socket.transport {
-        Transport::Tcp => TimestampMode::Off,
-        Transport::Udp => timestamp_mode(socket.timestamps),
+        path_mtu_bytes: Some(socket.path_mtu_bytes),
+        options: socket.options.clone(),
+        ..SocketSettings::new(launch.local, launch.peer)
     }
 }
 
@@ -244,31 +149,6 @@ fn access_category(granted: GrantedOptions) -> (String, String) {
     let release = kernel_release(&HostFiles::of_this_host());
     let text = category::describe(granted.priority, granted.dscp, &release.to_text());
     ("access category".to_owned(), text)
-}
-
-fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String, String)> {
-    let fact = |label: &str, text: String| (label.to_owned(), text);
-    let mut facts = vec![
-        fact(
-            "socket",
-            format!("{} to or from {}", settings.local, settings.peer),
-        ),
-        fact(
-            "send buffer granted",
-            format!("{} bytes", granted.send_buffer_bytes),
-        ),
-        fact(
-            "receive buffer granted",
-            format!("{} bytes", granted.receive_buffer_bytes),
-        ),
-    ];
-    let shortfalls = granted.shortfalls(settings);
-    facts.extend(
-        shortfalls
-            .into_iter()
-            .map(|text| fact("socket option", text)),
-    );
-    facts
 }
 
 /// The longest datagram of the channel: as long as a message needs, with room for the greetings and
@@ -374,19 +254,6 @@ impl<L: LinkModel> LinkModel for SinceStart<L> {
             link.offer_numbered(at, length_bytes, message)
         })
     }
-}
-
-/// What a datagram may carry: as much as the topology says, but no more than the path takes.
-fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
-    let headers = match launch.peer.ip() {
-        IpAddr::V4(_) => IPV4_HEADERS,
-        IpAddr::V6(_) => IPV6_HEADERS,
-    };
-    let configured = launch.socket.path_mtu_bytes.saturating_sub(headers);
-    if path.is_assumed {
-        return configured;
-    }
-    configured.min(usize::try_from(path.datagram_bytes).unwrap_or(configured))
 }
 
 #[cfg(test)]

@@ -120,7 +120,8 @@ fn a_message_in_pieces_meets_one_record_whole() {
             number_of: Some(message_number),
             ..EmulatedSettings::default()
         };
-        let mut receiver = EmulatedReceiver::new(inner, Box::new(link), |_| false, settings);
+        let mut receiver =
+            EmulatedReceiver::new(Box::new(inner), Box::new(link), |_| false, settings);
         let mut arrived_count = [0; 60];
         for ms in 0..600_i64 {
             let now = Instant::from_ns(ms * 1_000_000);

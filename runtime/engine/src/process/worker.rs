@@ -14,7 +14,7 @@ use std::{io, thread};
 use hil_core::endpoint::PortCountError;
 use hil_protocol::SettingsError;
 use hil_protocol::body::HelloStatus;
-use hil_transport::udp::UdpError;
+use hil_transport::socket::SocketError;
 use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeValLike;
 
@@ -73,7 +73,10 @@ pub enum WorkerError {
     Record(#[from] RecordFileError),
     /// A socket could not be set up.
     #[error(transparent)]
-    Udp(#[from] UdpError),
+    Open(#[from] SocketError),
+    /// A transport that this program does not have.
+    #[error("there is no transport called `{0}`")]
+    UnknownTransport(String),
     /// The kernel does not tell a socket's address.
     #[error("cannot read the address of a socket: {0}")]
     Address(io::Error),

@@ -1,12 +1,15 @@
 //! What a host starts for its clock paths: gateways without messages, one for each other host. How
 //! clocks are exchanged is in the gateway, what comes of it in the analysis.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
+
+use hil_transport::registry;
 
 use super::plan::{ProcessPlan, ProcessTask};
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
-use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side, SocketLaunch, Transport};
+use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side, SocketLaunch};
 use hil_topology::{ClockPath, Host, OnExit, Timestamps, Topology, clock_process_name};
 
 /// Name of the message type that a clock path announces and never sends.
@@ -66,7 +69,8 @@ fn direction(path: &ClockPath<'_>, host: &Host, side: Side) -> DirectionLaunch {
         local,
         peer,
         socket: SocketLaunch {
-            transport: Transport::Udp,
+            transport: registry::PLAIN.description().name.to_owned(),
+            options: BTreeMap::new(),
             interface: host.clock.as_ref().and_then(|end| end.interface.clone()),
             dscp: 0,
             priority: None,

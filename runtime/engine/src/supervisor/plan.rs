@@ -19,13 +19,13 @@ use hil_platform::wait::WaitMode;
 use hil_rundir::announcement;
 use hil_rundir::event::ProcessKind;
 use hil_rundir::launch::{
-    ArmLaunch, DirectionLaunch, FaceSettings, GatewayWork, Side, SocketLaunch, Transport,
+    ArmLaunch, DirectionLaunch, FaceSettings, GatewayWork, Side, SocketLaunch,
 };
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{
     CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process,
-    ProcessCard, Program, Scheduling, Topology, Via, Wait, command_channel, feedback_channel,
+    ProcessCard, Program, Scheduling, Topology, Wait, command_channel, feedback_channel,
     gateway_name,
 };
 
@@ -351,10 +351,8 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
             priority: hop.socket_priority,
             send_buffer_bytes: hop.send_buffer_bytes,
             receive_buffer_bytes: hop.receive_buffer_bytes,
-            transport: match crossing.link.via {
-                Via::Tcp(_) => Transport::Tcp,
-                Via::SharedMemory | Via::Udp(_) | Via::Emulated(..) => Transport::Udp,
-            },
+            transport: hop.transport.name.to_owned(),
+            options: hop.options.clone(),
             path_mtu_bytes: hop.path_mtu_bytes,
             timestamps: hop.timestamps,
         },

@@ -23,7 +23,7 @@ use hil_net::timestamping::TimestampCapabilities;
 use self::guard::GuardedCard;
 use hil_rundir::card_story::CardStory;
 use hil_rundir::record::{RecordKind, RecordSink, Recorder};
-use hil_topology::{Host, Program, Timestamps, Topology, Via};
+use hil_topology::{Host, Program, Timestamps, Topology};
 
 /// How often the clocks are read: a crystal strays by nanoseconds in that time.
 const SAMPLE_PERIOD: Duration = Duration::from_millis(100);
@@ -181,7 +181,6 @@ impl Drop for CardWatch {
 fn wants_cards(topology: &Topology, host: &Host) -> bool {
     let of_hops = topology.crossings().any(|crossing| {
         crossing.hop.timestamps == Timestamps::Hardware
-            && !matches!(crossing.link.via, Via::Tcp(_))
             && [crossing.from_host, crossing.to_host]
                 .iter()
                 .any(|end| end.name == host.name)

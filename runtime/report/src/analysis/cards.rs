@@ -8,7 +8,7 @@ use super::records::RunRecords;
 use crate::card_figures::{CardSummary, HardwareStamps, Places, channel_stamps};
 use hil_rundir::card_story::CardStory;
 use hil_rundir::run_result::RunResult;
-use hil_topology::{Crossing, Timestamps, Via};
+use hil_topology::{Crossing, Timestamps};
 
 /// What the cards of the run say; `None` when hardware stamps were not asked for.
 pub(super) fn hardware_stamps(records: &RunRecords<'_>) -> Option<HardwareStamps> {
@@ -51,7 +51,7 @@ pub(super) fn hardware_stamps(records: &RunRecords<'_>) -> Option<HardwareStamps
 }
 
 fn passes_card(crossing: &Crossing<'_>) -> bool {
-    crossing.hop.timestamps == Timestamps::Hardware && !matches!(crossing.link.via, Via::Tcp(_))
+    crossing.hop.timestamps == Timestamps::Hardware
 }
 
 fn card_of<'a>(result: &'a RunResult, host: &str) -> Option<&'a CardStory> {

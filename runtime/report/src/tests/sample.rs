@@ -79,6 +79,11 @@ fn metric(label: &str, value: Option<f64>, unit: &str, method: &str) -> ScoreMet
     }
 }
 
+/// The kind called so in a summary.
+pub(super) fn link(word: &str) -> LinkKind {
+    LinkKind::named(word).unwrap()
+}
+
 fn channel(
     name: &str,
     roles: [&str; 2],
@@ -106,7 +111,7 @@ fn channels() -> Vec<ChannelSummary> {
     let files = Files::sample();
     let (there, back) = (["controller", "robot"], ["robot", "controller"]);
     let exact = files.account(Some(Alignment::SAME_CLOCK));
-    let mut command = channel("arm/command", there, LinkKind::Udp, exact);
+    let mut command = channel("arm/command", there, link("udp"), exact);
     command.refusals.push(CountByName {
         group: CounterGroup::Refused,
         name: "type hash differs".to_owned(),
@@ -121,7 +126,7 @@ fn channels() -> Vec<ChannelSummary> {
         stalls: None,
     });
     command.outages = Some(files.outages());
-    let status = channel("arm/status", back, LinkKind::Udp, files.account(None));
+    let status = channel("arm/status", back, link("udp"), files.account(None));
     let human = ["operator", "controller"];
     let motion = channel(
         "human/motion",
@@ -241,7 +246,7 @@ pub(crate) fn empty() -> RunSummary {
             name: name.to_owned(),
             from: "controller".to_owned(),
             to: Some("robot".to_owned()),
-            link: LinkKind::Udp,
+            link: link("udp"),
             account,
             outages: None,
             emulation: None,
@@ -509,7 +514,7 @@ fn a_stream_is_not_blamed_for_stamps_it_cannot_have() {
     }
     assert!(stamped(&summary));
     for channel in &mut summary.channels {
-        channel.link = LinkKind::Tcp;
+        channel.link = link("tcp");
     }
     assert!(!stamped(&summary));
     assert_eq!(

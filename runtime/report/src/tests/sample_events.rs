@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use hil_account::{MessageFate, Standing};
 use hil_core::case_study::Severity;
 
+use super::sample::link;
 use crate::assessment::{Assessment, NetworkVerdict};
 use crate::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::summary::{
@@ -184,7 +185,7 @@ fn a_recorded_channel_needs_no_account_but_every_message() {
 #[test]
 fn one_emulated_link_among_real_ones_makes_no_network_result() {
     let mut run = summary(recorded_channel());
-    for link in [LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated] {
+    for link in ["udp", "tcp", "emulated"].map(link) {
         run.channels.push(ChannelSummary {
             link,
             ..recorded_channel()

@@ -346,7 +346,11 @@ const FAULTY: &[Faulty] = &[
         "[channels.\"arm/status\"]\nlink = \"hop\"",
         "[channels.\"arm/status\"] #!",
         "channels.\"arm/status\".link",
-        &["`robot` on host `robot-pc`", "\"tcp\" or \"emulated\""],
+        &[
+            "`robot` on host `robot-pc`",
+            "\"udp\", \"tcp\"",
+            " or \"emulated\"",
+        ],
     ),
     Faulty(
         "[channels.\"arm/status\"]\nlink = \"hop\"",

@@ -172,7 +172,8 @@ fn a_link_over_tcp_has_ports_and_a_hop_and_no_model() {
     let image = crossings
         .find(|crossing| crossing.channel.name == "camera/image")
         .unwrap();
-    assert!(matches!(image.link.via, Via::Tcp(_)));
+    assert!(matches!(image.link.via, Via::Network(_)));
+    assert_eq!(image.hop.transport.name, "tcp");
     assert_eq!((image.ports.sender, image.ports.receiver), (9000, 9001));
     assert_eq!(image.spec, None);
     assert_eq!(image.hop.timestamps, Timestamps::Off);
@@ -182,7 +183,8 @@ fn a_link_over_tcp_has_ports_and_a_hop_and_no_model() {
     let stamped = text.replace("via = \"tcp\"", "via = \"tcp\"\ntimestamps = \"software\"");
     let refused = parse("tcp.toml", &stamped, &[], &known()).unwrap_err();
     let words = refused.to_string();
-    let expected = "links.wire.timestamps needs via = \"udp\" or \"emulated\": a TCP stream";
+    let expected =
+        "links.wire.timestamps needs via = \"udp\" or \"emulated\": over TCP the kernel stamps";
     assert!(words.contains(expected), "{words}");
 }
 

@@ -264,7 +264,7 @@ pub(crate) fn captures() -> Vec<Seed> {
         };
         writer::packet(&mut next, &packet);
     }
-    writer::statistics(&mut next, 1, (0, 9), (3, 0), Some("done"));
+    writer::statistics(&mut next, 1, 0, 9, 3, 0, Some("done"));
     let classic = |magic: [u8; 4], is_big: bool| {
         let word = |value: u32| {
             if is_big {

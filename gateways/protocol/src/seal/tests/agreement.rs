@@ -22,7 +22,7 @@ fn what_one_end_seals_the_other_opens_and_the_payload_is_not_to_be_seen() {
         assert_eq!(sealed[..reply.len()], reply);
         assert_eq!(pair.sender.counts().sealed_count, 4);
         assert_eq!(pair.receiver.counts().opened_count, 4);
-        assert_eq!(pair.receiver.counts().refused_total(), 0);
+        assert_eq!(pair.receiver.counts().refused.total(), 0);
     }
 }
 

@@ -36,7 +36,7 @@ fn under_loss_and_reordering_every_datagram_that_arrives_is_opened() {
         assert_eq!(pair.sender.counts().rotation_count, 199);
         assert_eq!(pair.receiver.counts().rotation_count, 199);
         assert_eq!(pair.receiver.counts().opened_count, arrived_count);
-        assert_eq!(pair.receiver.counts().refused_total(), 0);
+        assert_eq!(pair.receiver.counts().refused.total(), 0);
     }
 }
 

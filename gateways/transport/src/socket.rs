@@ -1,24 +1,23 @@
-//! Setting up a UDP socket: the settings, what the kernel granted of them and what it refused.
-//! It moves no datagram; [`super::udp`] does.
+//! Setting up the socket of a transport: the settings, what the kernel granted of them and what it
+//! refused. It moves no datagram.
 
 use core::fmt::Display;
+use std::collections::BTreeMap;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 
 use nix::sys::socket::{setsockopt, sockopt};
-use socket2::{Domain, Protocol, SockAddr, Socket, Type};
+use socket2::{SockAddr, Socket};
 use thiserror::Error;
 
-use hil_net::timestamping::{TimestampMode, set_int_option};
+use hil_net::timestamping::TimestampMode;
 
-/// `IPV6_MTU_DISCOVER` of `linux/in6.h`.
-const IPV6_MTU_DISCOVER: i32 = 23;
 /// Largest buffer to ask for: the kernel doubles the value in an `int`.
 const BUFFER_BYTES_MAX: usize = 0x3fff_ffff;
 
-/// How to set up both sockets. Everything optional stays at the kernel's default when `None`.
+/// How to set up either end of a transport. Everything optional stays at the kernel's default when `None`.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct UdpSettings {
+pub struct SocketSettings {
     /// Where this socket is: where a receiver listens, what a sender's datagrams come from. Port
     /// 0 lets the kernel choose. Sender and receiver of one channel need a port each.
     pub local: SocketAddr,
@@ -40,9 +39,13 @@ pub struct UdpSettings {
     /// Ask the radio which datagrams the peer radio acknowledged (`SO_WIFI_STATUS`). An interface
     /// that is not wireless reports nothing.
     pub wants_radio_reports: bool,
+    /// Largest IP packet that the path is said to take.
+    pub path_mtu_bytes: Option<usize>,
+    /// The transport's own options, by their keys in a topology.
+    pub options: BTreeMap<String, i64>,
 }
 
-impl UdpSettings {
+impl SocketSettings {
     /// The kernel's defaults and software stamps.
     pub const fn new(local: SocketAddr, peer: SocketAddr) -> Self {
         Self {
@@ -55,13 +58,15 @@ impl UdpSettings {
             receive_buffer_bytes: None,
             timestamps: TimestampMode::Software,
             wants_radio_reports: false,
+            path_mtu_bytes: None,
+            options: BTreeMap::new(),
         }
     }
 }
 
 /// Why a socket could not be set up.
 #[derive(Debug, Error)]
-pub enum UdpError {
+pub enum SocketError {
     /// A code point of more than six bits.
     #[error("dscp {dscp} is outside 0 to 63")]
     Dscp {
@@ -110,8 +115,27 @@ pub struct GrantedOptions {
 }
 
 impl GrantedOptions {
+    /// The socket and what it was granted, for the user to read.
+    pub fn facts(&self, settings: &SocketSettings) -> Vec<(String, String)> {
+        let ends = format!("{} to or from {}", settings.local, settings.peer);
+        let mut facts = vec![
+            ("socket".to_owned(), ends),
+            (
+                "send buffer granted".to_owned(),
+                format!("{} bytes", self.send_buffer_bytes),
+            ),
+            (
+                "receive buffer granted".to_owned(),
+                format!("{} bytes", self.receive_buffer_bytes),
+            ),
+        ];
+        let shortfalls = self.shortfalls(settings).into_iter();
+        facts.extend(shortfalls.map(|text| ("socket option".to_owned(), text)));
+        facts
+    }
+
     /// One line per setting that the kernel granted less of than asked, for the user to read.
-    pub fn shortfalls(&self, settings: &UdpSettings) -> Vec<String> {
+    pub fn shortfalls(&self, settings: &SocketSettings) -> Vec<String> {
         let buffer = |name: &str, requested: Option<usize>, granted: usize| {
             let doubled = requested?.saturating_mul(2);
             (granted < doubled).then(|| {
@@ -134,53 +158,21 @@ impl GrantedOptions {
 }
 
 /// Names the option and its value in a refusal.
-pub(super) fn refuse<T>(
+pub(crate) fn refuse<T>(
     option: &'static str,
     value: impl Display,
     result: io::Result<T>,
-) -> Result<T, UdpError> {
-    result.map_err(|source| UdpError::Refused {
+) -> Result<T, SocketError> {
+    result.map_err(|source| SocketError::Refused {
         option,
         value: value.to_string(),
         source,
     })
 }
 
-/// A socket with everything set that both directions share.
-pub(super) fn open_socket(settings: &UdpSettings) -> Result<Socket, UdpError> {
-    let domain = Domain::for_address(settings.local);
-    let opened = Socket::new(domain, Type::DGRAM, Some(Protocol::UDP));
-    let socket = refuse("socket", "UDP", opened)?;
-    refuse("O_NONBLOCK", true, socket.set_nonblocking(true))?;
-    if let Some(interface) = &settings.interface {
-        let bound = socket.bind_device(Some(interface.as_bytes()));
-        refuse("SO_BINDTODEVICE", interface, bound)?;
-    }
-    set_buffers(&socket, settings)?;
-    mark(&socket, settings)?;
-    // A datagram too long for the path is refused instead of sent in pieces, of which the loss
-    // of one would look like the loss of all.
-    let (option, level, name, discover) = if settings.local.is_ipv4() {
-        let name = libc::IP_MTU_DISCOVER;
-        ("IP_MTU_DISCOVER", libc::SOL_IP, name, libc::IP_PMTUDISC_DO)
-    } else {
-        // IPV6_PMTUDISC_DO has the value of its IPv4 twin.
-        let level = libc::SOL_IPV6;
-        (
-            "IPV6_MTU_DISCOVER",
-            level,
-            IPV6_MTU_DISCOVER,
-            libc::IP_PMTUDISC_DO,
-        )
-    };
-    let set = set_int_option(&socket, level, name, discover);
-    refuse(option, discover, set)?;
-    Ok(socket)
-}
-
 /// Sizes the buffers. Beyond `net.core.wmem_max` and `rmem_max` that takes `CAP_NET_ADMIN`; what
 /// remains short without it is reported by [`GrantedOptions`].
-pub(super) fn set_buffers(socket: &Socket, settings: &UdpSettings) -> Result<(), UdpError> {
+pub(crate) fn set_buffers(socket: &Socket, settings: &SocketSettings) -> Result<(), SocketError> {
     if let Some(bytes) = settings.send_buffer_bytes {
         let doubled = doubled_buffer("SO_SNDBUF", bytes)?;
         refuse("SO_SNDBUF", bytes, socket.set_send_buffer_size(bytes))?;
@@ -199,18 +191,18 @@ pub(super) fn set_buffers(socket: &Socket, settings: &UdpSettings) -> Result<(),
 }
 
 /// What the kernel accounts for a buffer of `bytes` when it grants all of it.
-fn doubled_buffer(option: &'static str, bytes: usize) -> Result<usize, UdpError> {
+fn doubled_buffer(option: &'static str, bytes: usize) -> Result<usize, SocketError> {
     if bytes > BUFFER_BYTES_MAX {
-        return Err(UdpError::Buffer { option, bytes });
+        return Err(SocketError::Buffer { option, bytes });
     }
     Ok(2 * bytes)
 }
 
 /// Code point first: `IP_TOS` resets `SO_PRIORITY`.
-pub(super) fn mark(socket: &Socket, settings: &UdpSettings) -> Result<(), UdpError> {
+pub(crate) fn mark(socket: &Socket, settings: &SocketSettings) -> Result<(), SocketError> {
     if let Some(dscp) = settings.dscp {
         if dscp > 63 {
-            return Err(UdpError::Dscp { dscp });
+            return Err(SocketError::Dscp { dscp });
         }
         let class = u32::from(dscp) << 2;
         if settings.local.is_ipv4() {
@@ -225,14 +217,14 @@ pub(super) fn mark(socket: &Socket, settings: &UdpSettings) -> Result<(), UdpErr
     Ok(())
 }
 
-pub(super) fn bind(socket: &Socket, address: SocketAddr) -> Result<(), UdpError> {
+pub(crate) fn bind(socket: &Socket, address: SocketAddr) -> Result<(), SocketError> {
     refuse("bind", address, socket.bind(&SockAddr::from(address)))
 }
 
-pub(super) fn granted_options(
+pub(crate) fn granted_options(
     socket: &Socket,
-    settings: &UdpSettings,
-) -> Result<GrantedOptions, UdpError> {
+    settings: &SocketSettings,
+) -> Result<GrantedOptions, SocketError> {
     let class = match settings.local.ip() {
         IpAddr::V4(_) => socket.tos_v4(),
         IpAddr::V6(_) => socket.tclass_v6(),
@@ -246,7 +238,7 @@ pub(super) fn granted_options(
     })
 }
 
-pub(super) fn local_address(socket: &Socket) -> io::Result<SocketAddr> {
+pub(crate) fn local_address(socket: &Socket) -> io::Result<SocketAddr> {
     let address = socket.local_addr()?.as_socket();
     address.ok_or_else(|| io::Error::from(io::ErrorKind::AddrNotAvailable))
 }

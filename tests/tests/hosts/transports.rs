@@ -1,0 +1,69 @@
+//! The real binary on two hosts over each transport of the registry: sealed, with a gateway that is killed in the
+//! middle. What one transport promises beyond the others is tested elsewhere.
+
+use std::time::Duration;
+
+use hil_report::summary::LinkKind;
+use hil_tests::account::channel;
+use hil_tests::binary::hil_runtime_binary;
+use hil_tests::child::ChildGuard;
+use hil_tests::lab::Lab;
+use hil_tests::run_folder::RunFolder;
+use hil_tests::shuttle::CHANNELS;
+use hil_tests::split::{HOSTS, Split, count, direction};
+use hil_tests::trial::{Trial, wait_until};
+use hil_transport::registry;
+use serde_json::Value;
+
+const LIMIT: Duration = Duration::from_mins(1);
+const KILLED: &str = "gateway-hop-robot-pc";
+
+/// Nothing that the doctor finds about the link of `trial` is an error.
+fn assert_doctor_is_content(lab: &Lab, trial: &Trial) {
+    for (index, host) in HOSTS.iter().enumerate() {
+        let mut command = lab.host(index).command(hil_runtime_binary());
+        command.args(["doctor", "--json", "--host", host]);
+        let mut doctor = ChildGuard::spawn(command.args(trial.arguments())).unwrap();
+        let finished = doctor.wait_within(LIMIT).unwrap();
+        finished.assert_success();
+        let report: Value = serde_json::from_str(&finished.stdout).unwrap();
+        for finding in report["findings"].as_array().unwrap() {
+            let is_of_link = ["mtu", "ports", "peer"].contains(&finding["id"].as_str().unwrap());
+            let is_error = finding["severity"] == "error";
+            assert!(!(is_of_link && is_error), "{host}: {finding}");
+        }
+    }
+}
+
+#[test]
+fn every_transport_carries_a_sealed_run_with_a_kill() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    for transport in registry::ALL {
+        let transport = transport.description();
+        let record = RunFolder::new(&format!("transport-{}", transport.name));
+        let trial = Trial::shipped("shuttle-split.toml", record.path())
+            .set(&format!("links.hop.via=\"{}\"", transport.name))
+            .set("run.duration=\"10 s\"");
+        assert_doctor_is_content(&lab, &trial);
+        let split = Split::start(&lab, &trial);
+        split.wait_for_messages();
+        split.files(1).kill_process(KILLED, 0, LIMIT);
+        wait_until(LIMIT, "the restart", || {
+            split.files(1).process(KILLED, 1).is_some()
+        });
+        let files = split.files(1).clone();
+        for summary in &split.finish() {
+            for name in CHANNELS {
+                let link = channel(summary, name).link;
+                assert_eq!(link, LinkKind::Network(transport));
+                let ingress = direction(summary, name, "ingress");
+                assert!(count(ingress, "seal: opened_count") > 100, "{ingress:?}");
+            }
+        }
+        let report = files.read("report.txt");
+        let words = format!("controller → robot · {}", transport.label);
+        assert!(report.contains(&words), "{words}: {report}");
+    }
+}
