@@ -230,7 +230,7 @@ fn print_segments(
     hosts: &Hosts,
     title: &str,
     plan: Plan,
-    woken: [Vec<u64>; 2],
+    woken: &[Vec<u64>; 2],
 ) -> Result<(), SetupError> {
     // In the two-thread cases the application is no party of its own, and the last message of a
     // round lies in its socket until the next round: medians tell, the tail does not.
@@ -241,7 +241,7 @@ fn print_segments(
         "p50, p99, p99.9, max"
     };
     println!("\n{title}: one way, microseconds ({columns})");
-    let found = segments(hosts, &plan, &woken)?;
+    let found = segments(hosts, &plan, woken)?;
     for (index, (name, quantiles)) in SEGMENTS.iter().zip(found).enumerate() {
         let Some(quantiles) = quantiles else {
             continue;
@@ -355,12 +355,12 @@ fn report(
                 &setup.hosts,
                 case.title,
                 before.plan,
-                [Vec::new(), Vec::new()],
+                &[Vec::new(), Vec::new()],
             )?;
         }
     }
     for (case, woken) in woken {
-        print_segments(&setup.hosts, case.title, case.plan, woken)?;
+        print_segments(&setup.hosts, case.title, case.plan, &woken)?;
     }
     println!();
     for verdict in &verdicts {

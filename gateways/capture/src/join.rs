@@ -280,7 +280,7 @@ fn figures(
     arrivals.sort_by_key(|departure| pairs[*departure].second.stamp_ns);
     let (reordered_count, reordering_extent_max) = reordering(&arrivals);
     let in_arrival = arrivals.iter().map(|departure| delays[*departure]);
-    let jitter = jitter_ns(&Vec::from_iter(in_arrival));
+    let jitter = jitter_ns(&in_arrival.collect::<Vec<_>>());
     let delay_interval = |quantile: f64, name: &str| {
         let mut random = RandomStream::new(0, name);
         block_bootstrap_quantile(&delays, quantile, CONFIDENCE, &mut random)

@@ -245,7 +245,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
         // What the folder cannot give back, because its disk is full, is still in memory.
         analysed.or_else(|error| {
             let concluded =
-                analysis::conclude(&topology, &result, registry, &path, &options.command_line)?;
+                analysis::conclude(&topology, &result, registry, path, &options.command_line)?;
             Ok::<_, AnalysisError>(Concluded {
                 unwritten: concluded.unwritten.or(Some(error)),
                 ..concluded

@@ -48,7 +48,7 @@ impl Severity {
     }
 
     /// Ok up to `ok_max`, a note up to `note_max`, a warning above.
-    pub(super) fn rising<T: PartialOrd>(value: T, ok_max: T, note_max: T) -> Self {
+    pub(super) fn rising<T: PartialOrd + Copy>(value: T, ok_max: T, note_max: T) -> Self {
         if value > note_max {
             Self::Warning
         } else {

@@ -84,12 +84,11 @@ fn interrupts_of(files: &HostFiles, interface: &str) -> Result<Vec<Interrupt>, S
     let folders = ["msi_irqs", "../msi_irqs"].map(|folder| format!("{device}/{folder}"));
     let list = |folder: &String| files.list(folder).known().ok();
     let listed = folders.iter().find_map(list);
-    let numbers: Vec<u32> = match listed {
-        Some(names) => names.iter().filter_map(|name| name.parse().ok()).collect(),
-        None => {
-            let own = lines.iter().filter(|(_, line)| line.names(interface));
-            own.map(|(number, _)| *number).collect()
-        }
+    let numbers: Vec<u32> = if let Some(names) = listed {
+        names.iter().filter_map(|name| name.parse().ok()).collect()
+    } else {
+        let own = lines.iter().filter(|(_, line)| line.names(interface));
+        own.map(|(number, _)| *number).collect()
     };
     let mut found = Vec::new();
     for number in numbers {

@@ -85,7 +85,7 @@ fn address_of(entry: &InterfaceAddress) -> Option<(IpAddr, u32)> {
 
 /// The names to look at: those of the plan, by name or address, else every one that is up.
 pub(super) fn wanted(present: &Interfaces, plan: &Plan) -> Vec<String> {
-    let mut names = BTreeSet::from_iter(plan.interfaces.iter().cloned());
+    let mut names = plan.interfaces.iter().cloned().collect::<BTreeSet<_>>();
     for (name, interface) in present {
         let mut own = interface.addresses.iter();
         if own.any(|(address, _)| plan.addresses.contains(address)) {

@@ -115,7 +115,7 @@ fn push_latency(text: &mut String, report: &LatencyReport, has_colour: bool) {
     };
     let head = format!("Wake-ups: absolute sleeps of {period_ms} ms for {duration_s} s{ended}");
     push(text, &head);
-    push_row(text, "", ["count", "skipped", "preempted"], QUANTILES);
+    push_row(text, "", &["count", "skipped", "preempted"], &QUANTILES);
     for one in &report.wakeups {
         let counts = [
             Some(one.count),
@@ -123,7 +123,7 @@ fn push_latency(text: &mut String, report: &LatencyReport, has_colour: bool) {
             one.preempted_count,
         ];
         let cells = counts.map(or_dash);
-        push_row(text, &place(one.cpu), cells, quantile_cells(one.lateness));
+        push_row(text, &place(one.cpu), &cells, &quantile_cells(one.lateness));
     }
     push_scheduling(text, report);
     if !report.gaps.is_empty() {
@@ -133,12 +133,17 @@ fn push_latency(text: &mut String, report: &LatencyReport, has_colour: bool) {
             format!("Gaps over 10 us of a busy poller, {s:.1} s per CPU, one after the other");
         push(text, "");
         push(text, &head);
-        push_row(text, "", ["gaps/s", "ms/s lost", "as throttle"], QUANTILES);
+        push_row(
+            text,
+            "",
+            &["gaps/s", "ms/s lost", "as throttle"],
+            &QUANTILES,
+        );
         for one in &report.gaps {
             let (rate, lost) = (one.per_second(), one.lost_ms_per_s());
             let throttled = or_dash(one.throttle_like_count);
             let cells = [format!("{rate:.0}"), format!("{lost:.1}"), throttled];
-            push_row(text, &place(one.cpu), cells, quantile_cells(one.length));
+            push_row(text, &place(one.cpu), &cells, &quantile_cells(one.length));
         }
     }
     push_surroundings(text, report);
@@ -231,8 +236,8 @@ fn place(cpu: Option<usize>) -> String {
 fn push_row<C: AsRef<str>, Q: AsRef<str>>(
     text: &mut String,
     name: &str,
-    cells: [C; 3],
-    quantiles: [Q; 4],
+    cells: &[C; 3],
+    quantiles: &[Q; 4],
 ) {
     let mut line = format!("  {name:18}");
     let cells = cells.iter().map(AsRef::as_ref);

@@ -94,6 +94,7 @@ struct HostClock {
 
 /// The offsets that the gateways of one host noted, nanoseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(clippy::struct_field_names, reason = "each in its unit")]
 struct Noted {
     first_ns: i64,
     lowest_ns: i64,

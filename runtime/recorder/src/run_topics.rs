@@ -77,10 +77,10 @@ impl ChannelTopics {
         let own = wanted.iter().map(|one| names.claim(topic_of(one.name)));
         let own: Vec<String> = own.collect();
         let both = wanted.into_iter().zip(own);
-        both.map(|(one, own)| Self::of(one, own, names)).collect()
+        both.map(|(one, own)| Self::of(&one, own, names)).collect()
     }
 
-    fn of(wanted: Wanted<'_>, own: String, names: &mut Names) -> Self {
+    fn of(wanted: &Wanted<'_>, own: String, names: &mut Names) -> Self {
         let (name, described) = (wanted.name, wanted.described);
         let mut untyped = None;
         let (codec, schema) = wanted.typed().unwrap_or_else(|why| {

@@ -57,7 +57,7 @@ impl Link {
 
 /// The transport called `name`, as a topology or a summary names it.
 pub fn transport(name: &str) -> Option<&'static Description> {
-    registry::named(name).map(|transport| transport.description())
+    registry::named(name).map(registry::Transport::description)
 }
 
 /// What carries a link's bytes.

@@ -32,6 +32,10 @@ pub(super) struct Shared {
 
 impl Shared {
     /// Not read yet. Its messages have `size_bytes`.
+    #[expect(
+        clippy::fn_params_excessive_bools,
+        reason = "two facts of one channel, named here and there"
+    )]
     pub(super) fn new(
         host: String,
         is_forwarded: bool,

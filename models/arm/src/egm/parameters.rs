@@ -315,6 +315,9 @@ impl EgmParameters {
     ///
     /// # Errors
     /// The first key outside its range, as `egm.<key>`.
+    ///
+    /// # Panics
+    /// Not with the presets of this file, each of which states every key.
     pub fn settings(&self) -> Result<ControllerSettings, ParameterError> {
         const STATED: &str = "a preset states every key";
         let all = self.spelled_out();

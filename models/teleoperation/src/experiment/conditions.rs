@@ -269,23 +269,23 @@ fn queue_rows(base: &Setup) -> [Condition; 5] {
 fn policy_rows(base: &Setup) -> [Condition; 6] {
     let policy = |name, note, change: fn(&mut ControllerSettings)| {
         outage_row(base, name, SHORT_RANGE, note, Expected::Open, |setup| {
-            change(&mut setup.settings)
+            change(&mut setup.settings);
         })
     };
     [
         policy("back-1s", "; back after 1 s", |s| back_after(s, 1.0)),
         policy("back-3s", "; back after 3 s", |s| back_after(s, 3.0)),
         policy("auto-retry", "; restart at once", |s| {
-            s.restart = RestartPolicy::AutoRetry
+            s.restart = RestartPolicy::AutoRetry;
         }),
         policy("external-trigger", "; restart when asked", |s| {
-            s.restart = RestartPolicy::ExternalTrigger
+            s.restart = RestartPolicy::ExternalTrigger;
         }),
         policy("go-home-first", "; home first", |s| {
-            s.restart = RestartPolicy::GoHomeFirst
+            s.restart = RestartPolicy::GoHomeFirst;
         }),
         policy("gain-5", "; position gain 5 per s", |s| {
-            s.position_gain_per_s = 5.0
+            s.position_gain_per_s = 5.0;
         }),
     ]
 }

@@ -136,7 +136,7 @@ fn toml(mut law: DelayLaw, option_count: usize) -> String {
             Slot::Numbers(values, _) => format!("{values:?}"),
             slot => unreachable!("no delay law has a {slot:?}"),
         };
-        lines.push_str(&format!("{} = {value}\n", field.key));
+        lines.extend([field.key, " = ", &value, "\n"]);
     }
     lines
 }

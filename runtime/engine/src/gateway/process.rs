@@ -130,11 +130,7 @@ fn open_sockets(
 }
 
 /// The job of one direction.
-fn job<'a>(
-    launch: &'a DirectionLaunch,
-    opened: OpenDirection,
-    around: Arc<Surroundings>,
-) -> Job<'a> {
+fn job(launch: &DirectionLaunch, opened: OpenDirection, around: Arc<Surroundings>) -> Job<'_> {
     let (way, what) = match launch.side {
         Side::Egress => ("out", "sent"),
         Side::Ingress => ("in", "received"),

@@ -99,7 +99,9 @@ impl Collisions {
         });
         let news: Vec<Collision> = news.collect();
         self.known_count = incidents.len();
-        news.into_iter().for_each(|one| self.list(one));
+        for one in news {
+            self.list(one);
+        }
     }
 
     /// Looks at reported poses instead: `robots` of one fleet, with the footprint of all.

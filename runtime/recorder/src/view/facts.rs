@@ -85,7 +85,7 @@ impl RunFacts {
         clocks: &Clocks,
     ) -> Self {
         let mut facts = manifest.map(Self::described).unwrap_or_default();
-        facts.name = name.to_owned();
+        name.clone_into(&mut facts.name);
         facts.has_one_clock = clocks.has_one_clock == Some(true);
         for name in recorded {
             if facts.channel(name).is_none() {

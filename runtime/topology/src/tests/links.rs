@@ -110,7 +110,7 @@ fn every_delay_law_of_the_list_is_read_with_its_required_keys_and_written_back()
                     continue;
                 }
             };
-            text.push_str(&format!("{} = {value}\n", field.key));
+            text.extend([field.key, " = ", &value, "\n"]);
         }
         if !has_list {
             assert_eq!(specs(&text).0.delay.name(), *name);
