@@ -1,6 +1,6 @@
-//! What the EGM faces add to the controller's cycle. A robot's application and a controller's
+//! What the EGM adapters add to the controller's cycle. A robot's application and a controller's
 //! exchange one feedback and one command every 4 ms: over shared memory alone, through our own
-//! gateways, and through robot face and sensor face in the maker's own datagrams; one-way times
+//! gateways, and through robot adapter and sensor adapter in the maker's own datagrams; one-way times
 //! from publication to being taken, all in one run. Not a test: it states its aim and whether it
 //! was met, and ends with code 0.
 //!
@@ -13,20 +13,20 @@ use std::process::ExitCode;
 use std::thread;
 use std::time::Duration;
 
-use hil_benches::face::{Exchange, Pair};
+use hil_benches::adapter::{Exchange, Pair};
 use hil_benches::gateway::hosts::SetupError;
 use hil_benches::gateway::notices::{announce, ended};
 use hil_benches::gateway::parties::{MachineTime, PRIORITY, claim, stolen_text};
 use hil_benches::gateway::verdict::Verdict;
 use hil_benches::{Case, Comparison, compare, json_line, table};
 use hil_platform::clock::MonotonicClock;
-use hil_report::face::FaceSegment;
+use hil_report::adapter::AdapterSegment;
 use serde_json::json;
 
 const BENCH: &str = "egm_face";
 /// The robot's cycle.
 const CYCLE: Duration = Duration::from_millis(4);
-/// A face may take this share of the cycle, at the 99th percentile, each way.
+/// An adapter may take this share of the cycle, at the 99th percentile, each way.
 const CYCLE_SHARE_MAX: f64 = 0.1;
 /// Exchanges of one case in one round.
 const EXCHANGES: usize = 50;
@@ -98,8 +98,8 @@ fn run(measured: &RefCell<Measured>, rounds: usize) -> Comparison {
     compare(rounds, &mut clock_batch, &mut cases)
 }
 
-/// What the faces noted themselves, with kernel stamps.
-fn print_segments(who: &str, segments: &[FaceSegment]) {
+/// What the adapters noted themselves, with kernel stamps.
+fn print_segments(who: &str, segments: &[AdapterSegment]) {
     let cycle_ns = i64::try_from(CYCLE.as_nanos()).ok();
     for segment in segments {
         let share = segment.p99_of_cycle(cycle_ns);
@@ -132,7 +132,7 @@ fn verdicts(outcome: &Comparison) -> Vec<Verdict> {
             let p99 = |row: usize| outcome.rows[row].quantiles.map(|one| one.p99_ns as f64);
             let added = p99(row)
                 .zip(p99(reference))
-                .map(|(face, direct)| face - direct);
+                .map(|(adapter, direct)| adapter - direct);
             Verdict {
                 name: format!("added p99 of {}, share of the cycle", TITLES[row]),
                 measured: added.map(|added_ns| added_ns / cycle_ns),

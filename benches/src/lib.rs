@@ -7,7 +7,7 @@
 //! are quantiles and paired ratios, never a bare mean.
 #![forbid(unsafe_code)]
 
-pub mod face;
+pub mod adapter;
 pub mod gateway;
 mod host;
 mod quantiles;

@@ -3,10 +3,8 @@
 //! declare the same name. What it writes: `page.html`, and the digests by which the page's policy
 //! knows its own style and script.
 
-use std::env;
-use std::fs;
-use std::io;
 use std::path::PathBuf;
+use std::{env, fs, io};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;

@@ -3,7 +3,7 @@
 
 use std::fmt::Write;
 
-use hil_account::{ChannelAccount, ClosingFigures, MessageFate, RESIDUAL_LIMIT_NS};
+use hil_account::{ChannelAccount, ClosingMetrics, MessageFate, RESIDUAL_LIMIT_NS};
 use hil_report::summary::{ChannelSummary, LinkKind, RunSummary};
 
 /// Share of messages whose account must close.
@@ -88,7 +88,7 @@ pub fn assert_account_closes(summary: &RunSummary, name: &str) {
 ///
 /// # Panics
 /// When it was not checked.
-pub fn closing<'a>(name: &str, account: &'a ChannelAccount) -> &'a ClosingFigures {
+pub fn closing<'a>(name: &str, account: &'a ChannelAccount) -> &'a ClosingMetrics {
     let checked = account.closing.checked();
     checked.unwrap_or_else(|| panic!("{name} was not checked: {:?}", account.closing))
 }

@@ -61,7 +61,7 @@ impl Arms {
     }
 
     /// The events of `side` as a log says them, for the output of a test.
-    pub fn story(&self, side: Side) -> String {
+    pub fn history(&self, side: Side) -> String {
         let events = self.events(side);
         let lines = events.iter().map(|event| {
             let at_s = event.at_ns as f64 * 1e-9;

@@ -5,14 +5,12 @@
 mod page;
 mod wire;
 
-use std::env;
 use std::ffi::OsString;
-use std::fs;
 use std::os::unix::process::CommandExt as _;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{env, fs, thread};
 
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::{Pid, Uid};

@@ -1,10 +1,9 @@
 //! How long messages took around the moments at which something was done beside a run, against all others of
 //! the same run.
 
-use std::fmt;
-use std::fs;
 use std::ops::Range;
 use std::path::Path;
+use std::{fmt, fs};
 
 use hil_core::record::TakenRecord;
 use hil_rundir::record::{RecordFile, RecordKind};

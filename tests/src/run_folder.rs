@@ -1,9 +1,8 @@
 //! A folder for one test's files, removed when the test ends, however it ends.
 
-use std::fs;
 use std::path::{Path, PathBuf};
-use std::process;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::{fs, process};
 
 /// A fresh folder below the system's temporary folder, removed on drop.
 #[derive(Debug)]

@@ -2,11 +2,10 @@
 //! anything is left where nothing should be. It judges no figure; see [`crate::account`].
 
 use std::ffi::OsString;
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{fs, thread};
 
 use hil_engine::security::PreSharedKey;
 use hil_platform::domain_address::DomainAddress;

@@ -31,7 +31,7 @@ const IMPURE_WORDS: [&str; 15] = [
 ];
 /// The only files that may hold `unsafe`, each for a kernel or shared-memory border.
 const UNSAFE_FILES: [&str; 7] = [
-    "gateways/net/src/card_clock.rs",
+    "gateways/net/src/nic_clock.rs",
     "gateways/net/src/packet_ring.rs",
     "gateways/net/src/packet_socket.rs",
     "gateways/net/src/tcp_info.rs",

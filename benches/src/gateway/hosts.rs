@@ -11,7 +11,7 @@ use std::{fs, process, thread};
 
 use hil_core::message::MessageType;
 use hil_core::record::{EgressRecord, IngressRecord};
-use hil_engine::gateway::Surroundings;
+use hil_engine::gateway::GatewayContext;
 use hil_engine::gateway::direction::{self, Direction, OpenDirection};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::realtime::RealtimeRequest;
@@ -75,7 +75,7 @@ pub struct Joint {
     pub address: DomainAddress,
     egress: (DirectionLaunch, OpenDirection),
     ingress: (DirectionLaunch, OpenDirection),
-    surroundings: Arc<Surroundings>,
+    surroundings: Arc<GatewayContext>,
 }
 
 /// A direction not yet connected; it may travel to its thread.
@@ -83,7 +83,7 @@ pub struct Joint {
 pub struct Loose {
     launch: DirectionLaunch,
     opened: OpenDirection,
-    surroundings: Arc<Surroundings>,
+    surroundings: Arc<GatewayContext>,
 }
 
 impl Loose {
@@ -156,7 +156,7 @@ pub struct Hosts {
     pub network: Network,
     domains: [Domain; 2],
     holders: Vec<ChannelHolder>,
-    surroundings: [Arc<Surroundings>; 2],
+    surroundings: [Arc<GatewayContext>; 2],
     recorders: [Option<Recorder>; 2],
     folder: PathBuf,
 }
@@ -173,7 +173,7 @@ impl Hosts {
         fs::create_dir_all(&folder)?;
         let domains = [Domain::create(&root(0))?, Domain::create(&root(1))?];
         let around = |domain: &Domain| -> Result<_, SetupError> {
-            Ok(Arc::new(Surroundings::new(Domain::open(
+            Ok(Arc::new(GatewayContext::new(Domain::open(
                 domain.address(),
             )?)?))
         };

@@ -36,7 +36,7 @@ pub enum OrderSource {
 
 /// Figures of a stream between two points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct JoinFigures {
+pub struct JoinMetrics {
     /// How first and second were told apart.
     pub order: OrderSource,
     /// Datagrams at the first point.
@@ -108,7 +108,7 @@ pub struct Joined {
     /// What was seen at both, in the order of departure.
     pub pairs: Vec<Pair>,
     /// The figures.
-    pub figures: JoinFigures,
+    pub figures: JoinMetrics,
 }
 
 /// What one of the two points saw of the stream, in time.
@@ -187,7 +187,7 @@ pub fn join(
     Some(Joined {
         first_point: *first.point,
         second_point: *second.point,
-        figures: figures(order, &first, &second, &pairs, &matches),
+        figures: metrics(order, &first, &second, &pairs, &matches),
         pairs,
     })
 }
@@ -245,13 +245,13 @@ impl Matches {
     }
 }
 
-fn figures(
+fn metrics(
     order: OrderSource,
     first: &Side<'_>,
     second: &Side<'_>,
     pairs: &[Pair],
     matches: &Matches,
-) -> JoinFigures {
+) -> JoinMetrics {
     let delays: Vec<i64> = pairs.iter().map(Pair::delay_ns).collect();
     let fastest = delays.iter().min().copied().unwrap_or(0);
     let slowest = delays.iter().max().copied().unwrap_or(0);
@@ -289,7 +289,7 @@ fn figures(
     let variation = delays.iter().map(|delay| delay.saturating_sub(fastest));
     let gaps = second.seen.windows(2);
     let gaps = gaps.map(|pair| pair[1].stamp_ns.saturating_sub(pair[0].stamp_ns));
-    JoinFigures {
+    JoinMetrics {
         order,
         first_count: first.seen.len() as u64,
         second_count: second.seen.len() as u64,

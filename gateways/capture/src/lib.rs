@@ -60,7 +60,7 @@ pub struct CaptureInterface {
 impl CaptureInterface {
     /// Its stamps are of the network card, on a clock of its own: no other interface's compare
     /// with them.
-    pub fn has_card_clock(&self) -> bool {
+    pub fn has_nic_clock(&self) -> bool {
         let description = self.description.as_deref();
         description.is_some_and(|text| text.starts_with(CARD_CLOCK))
     }
@@ -80,8 +80,8 @@ pub struct CapturedPacket<'a> {
     pub stamp_ns: Option<i64>,
     /// Length on the wire; more than `data` when the packet was cut short.
     pub original_bytes: u32,
-    /// Its stamp is of the network card; see [`CaptureInterface::has_card_clock`].
-    pub is_card_stamped: bool,
+    /// Its stamp is of the network card; see [`CaptureInterface::has_nic_clock`].
+    pub is_nic_stamped: bool,
     /// Which way it went.
     pub direction: Direction,
     /// What was kept of it, from the link layer on.

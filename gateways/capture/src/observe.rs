@@ -239,7 +239,7 @@ impl Observer {
                 continue;
             };
             // Its packets are those of another interface once more, on another clock.
-            if interface.has_card_clock() {
+            if interface.has_nic_clock() {
                 continue;
             }
             let has_other_points = self.seen.keys().any(|one| {

@@ -11,7 +11,7 @@ use super::observe::Observation;
 
 /// Figures of one stream at one point.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct PointFigures {
+pub struct PointMetrics {
     /// Datagrams seen, repetitions included.
     pub datagram_count: u64,
     /// Their payload, bytes.
@@ -23,14 +23,14 @@ pub struct PointFigures {
     /// Time from one to the next.
     pub interval: Distribution,
     /// Longest such time and when it began.
-    pub longest_gap: Option<GapFigures>,
+    pub longest_gap: Option<GapMetrics>,
     /// What the sequence numbers tell, where there are any.
-    pub numbers: Option<NumberFigures>,
+    pub numbers: Option<NumberMetrics>,
 }
 
 /// A time without datagrams.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct GapFigures {
+pub struct GapMetrics {
     /// Stamp of the datagram before it.
     pub from_ns: i64,
     /// How long.
@@ -39,7 +39,7 @@ pub struct GapFigures {
 
 /// Figures of sequence numbers, each series apart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct NumberFigures {
+pub struct NumberMetrics {
     /// Series met: a new one begins when a session or producer starts, or a number falls back too
     /// far to be late.
     pub series_count: u64,
@@ -55,28 +55,28 @@ pub struct NumberFigures {
 }
 
 /// Figures of a stream; `None` without observations. They are put in order of time first.
-pub fn single_point_figures(observations: &[Observation]) -> Option<PointFigures> {
+pub fn single_point_metrics(observations: &[Observation]) -> Option<PointMetrics> {
     let mut stamps: Vec<i64> = observations.iter().map(|one| one.stamp_ns).collect();
     stamps.sort_unstable();
     let (first_ns, last_ns) = (*stamps.first()?, *stamps.last()?);
     let mut interval = LatencyHistogram::default();
-    let mut longest: Option<GapFigures> = None;
+    let mut longest: Option<GapMetrics> = None;
     for pair in stamps.windows(2) {
         let (from_ns, length_ns) = (pair[0], pair[1].saturating_sub(pair[0]));
         interval.record(length_ns);
         if longest.is_none_or(|gap| length_ns > gap.length_ns) {
-            longest = Some(GapFigures { from_ns, length_ns });
+            longest = Some(GapMetrics { from_ns, length_ns });
         }
     }
     let payloads = observations.iter().map(|one| u64::from(one.payload_bytes));
-    Some(PointFigures {
+    Some(PointMetrics {
         datagram_count: observations.len() as u64,
         payload_bytes: payloads.sum(),
         first_ns,
         last_ns,
         interval: interval.distribution("fewer than two datagrams"),
         longest_gap: longest,
-        numbers: number_figures(observations),
+        numbers: number_metrics(observations),
     })
 }
 
@@ -131,12 +131,12 @@ impl Unwrapped {
     }
 }
 
-fn number_figures(observations: &[Observation]) -> Option<NumberFigures> {
+fn number_metrics(observations: &[Observation]) -> Option<NumberMetrics> {
     let mut in_time: Vec<&Observation> = observations.iter().collect();
     in_time.sort_by_key(|one| one.stamp_ns);
     // By what the datagrams say, and by how often the counting began anew unsaid.
     let mut series: BTreeMap<(u64, u64), Vec<u64>> = BTreeMap::new();
-    let mut figures = NumberFigures::default();
+    let mut figures = NumberMetrics::default();
     let mut counts: BTreeMap<u64, Unwrapped> = BTreeMap::new();
     let (mut has_pieces, mut repeated_count) = (false, 0);
     for one in in_time {

@@ -200,7 +200,7 @@ impl CaptureReader {
                         link_type: interface.link_type,
                         stamp_ns: found.stamp_ns,
                         original_bytes: found.original_bytes,
-                        is_card_stamped: interface.has_card_clock(),
+                        is_nic_stamped: interface.has_nic_clock(),
                         direction: found.direction,
                         data: &self.window.bytes()[found.data],
                     });

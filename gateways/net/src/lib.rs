@@ -4,19 +4,19 @@
 //!
 //! - [`timestamping`], [`control`] and [`reply_stamps`]: what the kernel and the card can stamp, and the
 //!   messages that bring the stamps.
-//! - [`card_arming`] and [`card_clock`]: setting a card up to stamp, and reading its clock.
+//! - [`nic_arming`] and [`nic_clock`]: setting a card up to stamp, and reading its clock.
 //! - [`clock_pair`]: from the real-time clock of the stamps to the monotonic clock of the run.
 //! - [`radio`]: whether the peer radio acknowledged each datagram.
 //! - [`packet_ring`], [`ring_frame`] and [`filter`]: a tap of an interface.
 //! - [`tcp_info`]: what the kernel tells of a TCP connection.
 //! - [`mod@interface`]: which interface has an address.
 
-pub mod card_arming;
-pub mod card_clock;
 pub mod clock_pair;
 pub mod control;
 pub mod filter;
 pub mod interface;
+pub mod nic_arming;
+pub mod nic_clock;
 pub mod packet_ring;
 mod packet_socket;
 pub mod radio;

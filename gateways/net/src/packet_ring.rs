@@ -190,7 +190,7 @@ impl PacketRing {
         setsockopt(&socket, sockopt::ReceiveTimestampns, &true)
             .map_err(|errno| refused("SO_TIMESTAMPNS")(errno.into()))?;
         if settings.stamps == RingStamps::Card {
-            prefer_card(&socket).map_err(refused("PACKET_TIMESTAMP"))?;
+            prefer_nic(&socket).map_err(refused("PACKET_TIMESTAMP"))?;
         }
         attach(&socket, &program).map_err(refused("SO_ATTACH_FILTER"))?;
         let frame_bytes = (FRAME_HEADER_BYTES + settings.snap_bytes as usize).next_power_of_two();
@@ -346,7 +346,7 @@ fn narrow(value: usize) -> c_uint {
 }
 
 /// Gives arriving packets the card's stamp where there is one, and leaves out what leaves.
-fn prefer_card(socket: &OwnedFd) -> io::Result<()> {
+fn prefer_nic(socket: &OwnedFd) -> io::Result<()> {
     let hardware = libc::SOF_TIMESTAMPING_RAW_HARDWARE;
     set_option(socket, libc::SOL_PACKET, libc::PACKET_TIMESTAMP, &hardware)?;
     let ignore: c_int = 1;

@@ -25,7 +25,7 @@ pub enum TimestampMode {
     /// driver gives none, as on Wi-Fi.
     Scheduled,
     /// Software and network card stamps. The card must be set up for it, see
-    /// [`super::card_arming`].
+    /// [`super::nic_arming`].
     Hardware,
 }
 
@@ -412,7 +412,7 @@ impl HardwareStamping {
     }
 
     /// Sets the card up (`SIOCSHWTSTAMP`) and says what it settled for. Needs `CAP_NET_ADMIN` and
-    /// changes the card for all its users; [`super::card_arming`] also puts it back.
+    /// changes the card for all its users; [`super::nic_arming`] also puts it back.
     ///
     /// # Errors
     /// `EOPNOTSUPP` when it cannot stamp, `ERANGE` when it does not have that filter, `EPERM`.

@@ -3,11 +3,9 @@
 //! can starve. It measures no network.
 
 use core::time::Duration;
-use std::fs;
-use std::io;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::os::fd::BorrowedFd;
-use std::thread;
+use std::{fs, io, thread};
 
 use hil_core::time::Instant;
 use nix::poll::{PollFd, PollFlags, ppoll};

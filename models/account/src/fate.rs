@@ -1,8 +1,8 @@
 //! Decides what became of each message. It concludes from records only: the absence of a record
 //! means something only in a file that is at hand.
 
-use super::figures::{Gap, InterruptionFigures};
 use super::join::{Join, Joined, Key};
+use super::metrics::{Gap, InterruptionMetrics};
 use super::stage::{MessageFate, Side};
 use super::{AccountContext, ChannelPath, ChannelRecords, Interruption, PathProcess, RunSpan};
 use hil_core::record::{EgressRecord, IngressRecord, stamp};
@@ -73,12 +73,12 @@ impl<'a> Judge<'a> {
     }
 
     /// What each interruption cost, with the silence it caused.
-    pub(super) fn interruptions(&self, gaps: &[Option<Gap>]) -> Vec<InterruptionFigures> {
+    pub(super) fn interruptions(&self, gaps: &[Option<Gap>]) -> Vec<InterruptionMetrics> {
         let costs = self.lost_counts.iter().zip(gaps);
         self.interruptions
             .iter()
             .zip(costs)
-            .map(|(interruption, (lost_count, gap))| InterruptionFigures {
+            .map(|(interruption, (lost_count, gap))| InterruptionMetrics {
                 process: interruption.process.clone(),
                 cause: interruption.cause.clone(),
                 length_ns: interruption.until.ns_since(interruption.from),

@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use super::figures::{BurstCount, Gap, Gaps};
 use super::join::Key;
+use super::metrics::{BurstCount, Gap, Gaps};
 use super::stage::{MessageFate, Side};
 use super::{AccountContext, ChannelRecords, Interruption, each};
 use hil_core::record::stamp;

@@ -16,13 +16,14 @@
 //! the alignment; the bound beside each figure that crosses hosts says how far that may be off.
 #![forbid(unsafe_code)]
 
-pub mod card_clock;
 mod fate;
-mod figures;
 mod follow_up;
 mod gaps;
+mod history;
 mod join;
+mod metrics;
 pub mod network;
+pub mod nic_clock;
 mod outage;
 mod passage;
 pub mod radio;
@@ -30,7 +31,6 @@ pub mod radio;
 mod random_fates;
 mod segments;
 mod stage;
-mod story;
 pub mod synthetic;
 #[cfg(test)]
 mod tests;
@@ -38,18 +38,18 @@ mod tests;
 use core::fmt::Debug;
 use core::time::Duration;
 
-pub use figures::{
-    BurstCount, ChannelAccount, Closing, ClosingFigures, Coverage, EndToEnd, FateCounts, Gap, Gaps,
-    InterruptionFigures, SegmentFigures, StampCoverage,
-};
+pub use history::{MessageHistory, stories};
 pub use join::{Joined, Key};
+pub use metrics::{
+    BurstCount, ChannelAccount, Closing, ClosingMetrics, Coverage, EndToEnd, FateCounts, Gap, Gaps,
+    InterruptionMetrics, SegmentMetrics, StampCoverage,
+};
 pub use outage::{
-    Foregoing, Happening, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFigures,
-    OutageFinder, Standing, foregoing, outages,
+    EventTime, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFinder, OutageMetrics,
+    Preceding, Standing, outages, preceding,
 };
 pub use passage::passages;
 pub use stage::{MessageFate, Side, Stage};
-pub use story::{MessageStory, stories};
 
 use hil_clock::{ClockMap, ClockSettings};
 use hil_core::random::RandomStream;
@@ -193,7 +193,7 @@ impl ChannelPath<'_> {
         match self {
             Self::SharedMemory => true,
             Self::Gateway { alignment } => alignment.is_some(),
-            Self::Mapped { map } => map.figures().bound.is_some(),
+            Self::Mapped { map } => map.metrics().bound.is_some(),
         }
     }
 

@@ -16,7 +16,7 @@ use hil_core::time::{Instant, duration_ns};
 /// takes seconds to come back.
 pub const OUTAGE_EFFECT_MAX: Duration = Duration::from_secs(5);
 
-/// Where the classes of [`OutageFigures::classes`] border on each other, milliseconds.
+/// Where the classes of [`OutageMetrics::classes`] border on each other, milliseconds.
 const BORDERS_MS: [i64; 6] = [20, 100, 500, 1_000, 2_000, 5_000];
 
 /// One outage: messages lost in a row, up to the next one that arrived.
@@ -170,7 +170,7 @@ pub fn outages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Ve
 
 /// The outages of a channel in figures.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct OutageFigures {
+pub struct OutageMetrics {
     /// How many.
     pub outage_count: u64,
     /// Messages lost in all of them.
@@ -214,7 +214,7 @@ pub struct LongestOutage {
     pub is_open: bool,
 }
 
-impl OutageFigures {
+impl OutageMetrics {
     /// The figures of `outages`; `end` of the run is on the producer's clock.
     pub fn of(outages: &[Outage], end: Option<Instant>) -> Self {
         let mut figures = Self {
@@ -268,7 +268,7 @@ fn empty_classes() -> Vec<OutageClass> {
 
 /// What a channel went through when something happened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Foregoing {
+pub struct Preceding {
     /// The outage that has most to do with it.
     pub outage: Outage,
     /// How the two stand to each other in time.
@@ -294,7 +294,7 @@ pub enum Standing {
 
 /// An event, as an outage may be held against it.
 #[derive(Debug, Clone, Copy)]
-pub struct Happening<'a> {
+pub struct EventTime<'a> {
     /// When it happened, on the clock of a host on this side of the channel; `None` when there is
     /// no such time.
     pub at: Option<(Instant, Side)>,
@@ -307,10 +307,10 @@ pub struct Happening<'a> {
 /// lost; else one that was under way, or over for at most [`OUTAGE_EFFECT_MAX`]. Among several it
 /// is the one that had lasted longest by then, for what came after an event cannot have led to
 /// it.
-pub fn foregoing(outages: &[Outage], happening: &Happening<'_>) -> Option<Foregoing> {
+pub fn preceding(outages: &[Outage], event: &EventTime<'_>) -> Option<Preceding> {
     let mut candidate_count = 0_u64;
-    let mut best: Option<((bool, i64), Foregoing)> = None;
-    let named = happening.lost_published_ns;
+    let mut best: Option<((bool, i64), Preceding)> = None;
+    let named = event.lost_published_ns;
     let first_ns = named.iter().min().copied();
     let last_ns = named.iter().max().copied();
     for outage in outages {
@@ -318,27 +318,25 @@ pub fn foregoing(outages: &[Outage], happening: &Happening<'_>) -> Option<Forego
         let is_far =
             outage.until_ns < first_ns && outage.until_ns.is_some() || outage.from_ns > last_ns;
         let names_one = !is_far && named.iter().any(|ns| outage.contains(*ns));
-        let timely = happening
-            .at
-            .and_then(|(at, side)| outage.standing(at, side));
+        let timely = event.at.and_then(|(at, side)| outage.standing(at, side));
         let (standing, passed_ns) = match timely {
             Some(timely) => timely,
-            None if names_one => outage.standing_anyway(happening.at),
+            None if names_one => outage.standing_anyway(event.at),
             None => continue,
         };
         candidate_count += 1;
         let rank = (names_one, passed_ns);
         if best.is_none_or(|(highest, _)| highest < rank) {
-            let foregoing = Foregoing {
+            let preceding = Preceding {
                 outage: *outage,
                 standing,
                 other_count: 0,
             };
-            best = Some((rank, foregoing));
+            best = Some((rank, preceding));
         }
     }
     let (_, found) = best?;
-    Some(Foregoing {
+    Some(Preceding {
         other_count: candidate_count - 1,
         ..found
     })

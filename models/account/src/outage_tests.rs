@@ -74,9 +74,9 @@ fn an_outage_at_the_end_lasts_as_long_as_the_run() {
     assert_eq!(found[0].silent_until_ns, None);
     assert_eq!(found[0].length_ns(end), Some(400 * PERIOD_NS));
     assert_eq!(found[0].length_ns(None), None);
-    let figures = OutageFigures::of(&found, end);
+    let figures = OutageMetrics::of(&found, end);
     assert!(figures.longest.unwrap().is_open);
-    assert_eq!(OutageFigures::of(&found, None).unknown_length_count, 1);
+    assert_eq!(OutageMetrics::of(&found, None).unknown_length_count, 1);
 }
 
 #[test]
@@ -94,7 +94,7 @@ fn outages_are_sorted_by_length_and_their_borders_belong_to_the_longer_class() {
         8, 19, 20, 99, 100, 499, 500, 999, 1_000, 1_999, 2_000, 5_000,
     ];
     let found: Vec<_> = lengths_ms.map(|ms| outage(10_000, ms)).to_vec();
-    let figures = OutageFigures::of(&found, None);
+    let figures = OutageMetrics::of(&found, None);
     let counts: Vec<_> = figures.classes.iter().map(|one| one.outage_count).collect();
     assert_eq!(counts, [2, 2, 2, 2, 2, 1, 1]);
     assert_eq!((figures.outage_count, figures.lost_count), (12, 24));
@@ -106,11 +106,11 @@ fn outages_are_sorted_by_length_and_their_borders_belong_to_the_longer_class() {
     let longest = figures.longest.unwrap();
     assert_eq!(longest.start_ns, 10_000 * PERIOD_NS);
     assert_eq!(longest.length_ns, 5_000 * PERIOD_NS);
-    assert_eq!(OutageFigures::of(&[], None).longest, None);
+    assert_eq!(OutageMetrics::of(&[], None).longest, None);
 }
 
-fn happening(at_ms: i64, side: Side) -> Happening<'static> {
-    Happening {
+fn event(at_ms: i64, side: Side) -> EventTime<'static> {
+    EventTime {
         at: Some((Instant::from_ns(at_ms * PERIOD_NS), side)),
         lost_published_ns: &[],
     }
@@ -132,7 +132,7 @@ fn some_outages() -> Vec<Outage> {
 fn an_event_finds_the_outage_that_had_lasted_longest_by_then() {
     let found = some_outages();
     let before = |ms: i64, side| {
-        let found = foregoing(&found, &happening(ms, side))?;
+        let found = preceding(&found, &event(ms, side))?;
         let Outage { first_sequence, .. } = found.outage;
         let is_under_way = found.standing == Standing::UnderWay;
         Some((first_sequence, found.other_count, is_under_way))
@@ -148,7 +148,7 @@ fn an_event_finds_the_outage_that_had_lasted_longest_by_then() {
         assert_eq!(before(8_900, side), None);
         assert_eq!(before(15_100, side), None);
     }
-    let ended = foregoing(&found, &happening(10_400, Side::Producer)).unwrap();
+    let ended = preceding(&found, &event(10_400, Side::Producer)).unwrap();
     assert_eq!(ended.standing, Standing::OverFor(400 * PERIOD_NS));
 }
 
@@ -157,18 +157,18 @@ fn a_lost_message_that_an_event_names_points_at_its_outage() {
     let found = some_outages();
     let named = |at, ms: i64| {
         let lost_published_ns = &[ms * PERIOD_NS];
-        let happening = Happening {
+        let event = EventTime {
             at,
             lost_published_ns,
         };
-        let found = foregoing(&found, &happening)?;
+        let found = preceding(&found, &event)?;
         Some((
             found.outage.first_sequence,
             found.standing,
             found.other_count,
         ))
     };
-    let at = |ms| happening(ms, Side::Consumer).at;
+    let at = |ms| event(ms, Side::Consumer).at;
     let short = named(at(3_100), 1_004).unwrap();
     assert_eq!((short.0, short.2), (1_000, 1), "a longer one is beside it");
     assert!(matches!(short.1, Standing::OverFor(_)));
@@ -187,7 +187,7 @@ fn a_lost_message_that_an_event_names_points_at_its_outage() {
 fn before_an_outage_a_consumer_that_is_sent_nothing_misses_nothing() {
     let ns = |ms: i64| ms * PERIOD_NS;
     let happened = |outages: &[Outage], ms| {
-        let found = foregoing(outages, &happening(ms, Side::Consumer));
+        let found = preceding(outages, &event(ms, Side::Consumer));
         found.map(|found| found.standing)
     };
     // One message a minute, each taken after 50 ms.
@@ -227,8 +227,8 @@ fn unaligned_clocks_leave_each_side_its_own_times() {
     let found = outages(&files.records(), &context);
     assert_eq!(burst(&found[0]), (100, 100, Some(100), Some(200)));
     let here_ms = 150 + ahead_ns / PERIOD_NS;
-    assert!(foregoing(&found, &happening(here_ms, Side::Consumer)).is_some());
-    assert!(foregoing(&found, &happening(here_ms, Side::Producer)).is_none());
+    assert!(preceding(&found, &event(here_ms, Side::Consumer)).is_some());
+    assert!(preceding(&found, &event(here_ms, Side::Producer)).is_none());
     let mut records = files.records();
     records.taken = None;
     let unseen = outages(&records, &context);

@@ -20,7 +20,7 @@ const CONFIDENCE: f64 = 0.95;
 /// What became of the messages a gateway sent, by the radio's report of their last datagram. Every
 /// message handed to the kernel is in exactly one row, and there in exactly one class.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct RadioFigures {
+pub struct RadioMetrics {
     /// Messages handed to the kernel.
     pub handed_count: u64,
     /// Acknowledged by the peer radio. What was lost was lost above it.
@@ -108,7 +108,7 @@ impl Share {
 
 /// Where the transmit stamps of a channel were taken.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct TransmitStampFigures {
+pub struct TransmitStampMetrics {
     /// Messages handed to the kernel.
     pub handed_count: u64,
     /// Stamped by the driver when they left.
@@ -120,8 +120,8 @@ pub struct TransmitStampFigures {
 }
 
 /// Where the transmit stamps of `egress` were taken.
-pub fn transmit_stamps(egress: &dyn RecordSource<EgressRecord>) -> TransmitStampFigures {
-    let mut figures = TransmitStampFigures::default();
+pub fn transmit_stamps(egress: &dyn RecordSource<EgressRecord>) -> TransmitStampMetrics {
+    let mut figures = TransmitStampMetrics::default();
     for record in handed(egress) {
         figures.handed_count += 1;
         let is_before_queue = record.flags & EgressRecord::STAMPED_BEFORE_QUEUE != 0;
@@ -138,10 +138,10 @@ pub fn transmit_stamps(egress: &dyn RecordSource<EgressRecord>) -> TransmitStamp
 /// Sets what the radio reported against what arrived; `None` when no radio reported anything or
 /// the sending gateway's records are not at hand. Fates are those of the account, so that what was
 /// under way at the end, or met a gateway that was down, counts as neither lost in the air nor above it.
-pub fn radio_figures(
+pub fn radio_metrics(
     records: &ChannelRecords<'_>,
     context: &AccountContext<'_>,
-) -> Option<RadioFigures> {
+) -> Option<RadioMetrics> {
     let reports = EgressRecord::RADIO_ACKNOWLEDGED | EgressRecord::RADIO_UNACKNOWLEDGED;
     if !records
         .egress?
@@ -162,10 +162,10 @@ pub fn radio_figures(
         };
         rows[row].add(fate);
     });
-    Some(figures(rows))
+    Some(metrics(rows))
 }
 
-fn figures(rows: [RadioRow; 3]) -> RadioFigures {
+fn metrics(rows: [RadioRow; 3]) -> RadioMetrics {
     let [acknowledged, unacknowledged, unreported] = rows;
     let sum = |of: fn(&RadioFates) -> u64| -> Option<u64> {
         rows.iter().map(|row| row.fates.as_ref().map(of)).sum()
@@ -176,7 +176,7 @@ fn figures(rows: [RadioRow; 3]) -> RadioFigures {
         Share::of(part, whole)
     };
     let judged_count = arrived_count.zip(lost_count).map(|(a, b)| a + b);
-    RadioFigures {
+    RadioMetrics {
         handed_count: rows.iter().map(|row| row.count).sum(),
         acknowledged,
         unacknowledged,
@@ -318,7 +318,7 @@ mod tests {
             ingress: Some(&ingress),
             ..ChannelRecords::default()
         };
-        let figures = radio_figures(&records, &context()).unwrap();
+        let figures = radio_metrics(&records, &context()).unwrap();
         assert_eq!(figures.handed_count, 7);
         assert_eq!(counts(figures.acknowledged), [1, 1, 0, 0]);
         assert_eq!(counts(figures.unacknowledged), [1, 2, 0, 0]);
@@ -367,7 +367,7 @@ mod tests {
                 alignment: Some(Alignment::SAME_CLOCK),
             })
         };
-        let figures = radio_figures(&records, &context).unwrap();
+        let figures = radio_metrics(&records, &context).unwrap();
         assert_eq!(counts(figures.unacknowledged), [7, 1, 1, 1]);
         let lost = figures.lost_ratio.unwrap();
         assert_eq!((lost.success_count, lost.trial_count), (1, 8));
@@ -381,7 +381,7 @@ mod tests {
             egress: Some(&egress),
             ..ChannelRecords::default()
         };
-        let figures = radio_figures(&records, &context()).unwrap();
+        let figures = radio_metrics(&records, &context()).unwrap();
         let rows = [
             figures.acknowledged,
             figures.unacknowledged,
@@ -393,15 +393,15 @@ mod tests {
     }
 
     #[test]
-    fn a_wired_channel_has_no_radio_figures() {
+    fn a_wired_channel_has_no_radio_metrics() {
         let egress = [sent(0, 0), sent(1, EgressRecord::STAMPED_BEFORE_QUEUE)];
         let records = ChannelRecords {
             egress: Some(&egress),
             ..ChannelRecords::default()
         };
-        assert_eq!(radio_figures(&records, &context()), None);
+        assert_eq!(radio_metrics(&records, &context()), None);
         let nothing = ChannelRecords::default();
-        assert_eq!(radio_figures(&nothing, &context()), None);
+        assert_eq!(radio_metrics(&nothing, &context()), None);
     }
 
     #[test]
@@ -410,7 +410,7 @@ mod tests {
         let mut bare = sent(2, 0);
         bare.tx_software_ns = UNAVAILABLE;
         egress.push(bare);
-        let expected = TransmitStampFigures {
+        let expected = TransmitStampMetrics {
             handed_count: 3,
             departure_count: 1,
             before_queue_count: 1,

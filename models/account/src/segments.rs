@@ -1,8 +1,8 @@
 //! Where the time of each message went, and whether the parts add up. It judges no fate: see
 //! [`super::fate`].
 
-use super::figures::{Closing, ClosingFigures, Coverage, EndToEnd, SegmentFigures, StampCoverage};
 use super::join::Joined;
+use super::metrics::{Closing, ClosingMetrics, Coverage, EndToEnd, SegmentMetrics, StampCoverage};
 use super::stage::{Side, Stage};
 use super::{AccountContext, ChannelPath, ChannelRecords, ORDER_TOLERANCE_NS, RESIDUAL_LIMIT_NS};
 use hil_core::random::RandomStream;
@@ -116,7 +116,7 @@ pub(super) struct SegmentBook<'a> {
     end_to_end_ns: Samples,
     end_to_end_bounds_ns: Bounds,
     residual: LatencyHistogram,
-    closing: ClosingFigures,
+    closing: ClosingMetrics,
     pub(super) coverage: StampCoverage,
 }
 
@@ -137,7 +137,7 @@ impl<'a> SegmentBook<'a> {
             end_to_end_ns: Samples::default(),
             end_to_end_bounds_ns: Bounds::default(),
             residual: LatencyHistogram::default(),
-            closing: ClosingFigures {
+            closing: ClosingMetrics {
                 checked_count: 0,
                 closed_count: 0,
                 closed_combined_count: 0,
@@ -306,7 +306,7 @@ impl<'a> SegmentBook<'a> {
     }
 
     /// Neighbouring stages first, measured or not, then combined segments that occurred.
-    pub(super) fn segments(&self) -> Vec<SegmentFigures> {
+    pub(super) fn segments(&self) -> Vec<SegmentMetrics> {
         let chain: &[Stage] = if self.is_gateway {
             &Stage::CHAIN
         } else {
@@ -328,13 +328,13 @@ impl<'a> SegmentBook<'a> {
                     |histogram| histogram.distribution(NOT_ALIGNED),
                 );
                 let cell = from.index() * Stage::COUNT + to.index();
-                SegmentFigures {
+                SegmentMetrics {
                     from,
                     to,
                     is_combined,
                     distribution,
                     bins: histogram(from, to).map_or_else(Vec::new, LatencyHistogram::bins),
-                    bound: self.bounds_ns[cell].figures(),
+                    bound: self.bounds_ns[cell].metrics(),
                 }
             })
             .collect()
@@ -385,7 +385,7 @@ impl<'a> SegmentBook<'a> {
             (_, false) => NO_CONSUMER,
             _ => "no message was taken",
         };
-        let bound = self.end_to_end_bounds_ns.figures();
+        let bound = self.end_to_end_bounds_ns.metrics();
         let exact = self.path.has_one_clock().then_some(0);
         let resampling = BlockResampling::of(&self.end_to_end_ns);
         let mut interval = |quantile| {
@@ -412,7 +412,7 @@ impl<'a> SegmentBook<'a> {
         match (self.path.is_aligned(), self.files.taken.is_some()) {
             (false, _) => unavailable(NOT_ALIGNED),
             (_, false) => unavailable(NO_CONSUMER),
-            _ => Closing::Checked(ClosingFigures {
+            _ => Closing::Checked(ClosingMetrics {
                 residual: self.residual.distribution("no message was taken"),
                 ..self.closing.clone()
             }),

@@ -338,7 +338,7 @@ fn unaligned_clocks_give_same_clock_segments_and_the_round_trip_only() {
 }
 
 #[test]
-fn hardware_stamps_give_a_segment_only_on_one_card_clock() {
+fn hardware_stamps_give_a_segment_only_on_one_nic_clock() {
     let mut files = Files::delivered(100);
     for (sent, arrived) in files.egress.iter_mut().zip(&mut files.ingress) {
         sent.tx_hardware_ns = sent.tx_software_ns + 37_000_000_400;

@@ -38,7 +38,7 @@ mod tests;
 
 pub use exchange::{Exchange, Requester, StampKind};
 
-pub use map::{ClockFigures, ClockMap, ClockStep, Localised, OffsetFigures};
+pub use map::{ClockMap, ClockMetrics, ClockStep, Localised, OffsetMetrics};
 
 use serde::{Deserialize, Serialize};
 

@@ -10,7 +10,7 @@ use crate::anchors::Anchors;
 use crate::band::{Band, Stretch, stretches};
 use crate::exchange::{Constraint, Exchange, StampKind};
 use hil_core::time::{Instant, RemoteInstant};
-use hil_stats::bounds::BoundFigures;
+use hil_stats::bounds::BoundMetrics;
 
 /// An instant of another host on this host's clock, with its bounds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,7 +37,7 @@ impl Localised {
 pub struct ClockMap {
     settings: ClockSettings,
     pieces: Vec<Piece>,
-    figures: ClockFigures,
+    figures: ClockMetrics,
 }
 
 #[derive(Debug, Clone)]
@@ -65,10 +65,10 @@ impl ClockMap {
         let mut map = Self {
             settings,
             pieces: pieces.collect(),
-            figures: no_figures(exchanges, &settings),
+            figures: no_metrics(exchanges, &settings),
         };
         map.figures.unused_count = (exchanges.len() - used_count) as u64;
-        map.add_figures(&constraints, &stretches);
+        map.add_metrics(&constraints, &stretches);
         map
     }
 
@@ -156,7 +156,7 @@ impl ClockMap {
     }
 
     /// What the map says of itself.
-    pub const fn figures(&self) -> &ClockFigures {
+    pub const fn metrics(&self) -> &ClockMetrics {
         &self.figures
     }
 
@@ -165,7 +165,7 @@ impl ClockMap {
         self.pieces.get(index).filter(|one| one.from_ns <= at_ns)
     }
 
-    fn add_figures(&mut self, constraints: &[Constraint], stretches: &[Stretch]) {
+    fn add_metrics(&mut self, constraints: &[Constraint], stretches: &[Stretch]) {
         let middle_of = |one: &Constraint| one.middle().at_ns;
         self.figures.rtt_min_ns = rtt_min_ns(constraints);
         let ends = constraints.first().zip(constraints.last());
@@ -200,7 +200,7 @@ impl ClockMap {
             let localised = self.localise(RemoteInstant::from_ns(at_ns))?;
             Some(localised.bound_ns())
         });
-        self.figures.bound = BoundFigures::of(bounds.collect());
+        self.figures.bound = BoundMetrics::of(bounds.collect());
         let longest = self
             .pieces
             .iter()
@@ -233,10 +233,10 @@ impl ClockMap {
 }
 
 impl Piece {
-    fn offset_at(&self, at_ns: i64, settings: &ClockSettings) -> Option<OffsetFigures> {
+    fn offset_at(&self, at_ns: i64, settings: &ClockSettings) -> Option<OffsetMetrics> {
         let (lowest_ns, highest_ns) = self.band.interval_at(at_ns, settings)?;
         let estimate_ns = self.anchors.offset_at(at_ns)?;
-        Some(OffsetFigures {
+        Some(OffsetMetrics {
             at_ns,
             // Noise may put the estimate where causality says that it cannot be.
             estimate_ns: estimate_ns.clamp(lowest_ns, highest_ns.max(lowest_ns)),
@@ -256,12 +256,12 @@ const fn half_way(first_ns: i64, last_ns: i64) -> i64 {
     first_ns.saturating_add(last_ns.saturating_sub(first_ns) / 2)
 }
 
-fn no_figures(exchanges: &[Exchange], settings: &ClockSettings) -> ClockFigures {
+fn no_metrics(exchanges: &[Exchange], settings: &ClockSettings) -> ClockMetrics {
     let mut stamp_counts = BTreeMap::new();
     for kind in exchanges.iter().flat_map(Exchange::kinds) {
         *stamp_counts.entry(kind).or_insert(0_u64) += 1;
     }
-    ClockFigures {
+    ClockMetrics {
         exchange_count: exchanges.len() as u64,
         unused_count: 0,
         stamp_counts,
@@ -279,7 +279,7 @@ fn no_figures(exchanges: &[Exchange], settings: &ClockSettings) -> ClockFigures 
 
 /// An alignment in figures.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ClockFigures {
+pub struct ClockMetrics {
     /// Exchanges given, in both directions.
     pub exchange_count: u64,
     /// Those not used: implausible, or under way while a clock was stepped.
@@ -290,10 +290,10 @@ pub struct ClockFigures {
     pub rtt_min_ns: Option<i64>,
     /// The offset in the middle of the exchanges or, when a clock was stepped just there, at the
     /// nearest instant that has one.
-    pub offset: Option<OffsetFigures>,
+    pub offset: Option<OffsetMetrics>,
     /// The offset in the middle of each stretch between noticed steps, in order of time: one
     /// offset cannot be held against a run with steps.
-    pub stretch_offsets: Vec<OffsetFigures>,
+    pub stretch_offsets: Vec<OffsetMetrics>,
     /// Standard deviation of the estimate's points about the line between their neighbours,
     /// nanoseconds; says nothing of a path that is always slower one way.
     pub spread_ns: Option<f64>,
@@ -303,7 +303,7 @@ pub struct ClockFigures {
     /// Its standard error: of the line, or of the mean of four parts' slopes, whichever is larger.
     pub skew_error_ppm: Option<f64>,
     /// Largest error of a converted instant, over the time of the exchanges.
-    pub bound: Option<BoundFigures>,
+    pub bound: Option<BoundMetrics>,
     /// Steps of either clock that were noticed.
     pub steps: Vec<ClockStep>,
     /// Drift allowance, parts per billion.
@@ -312,7 +312,7 @@ pub struct ClockFigures {
 
 /// The offset at one instant: `local = remote + offset`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct OffsetFigures {
+pub struct OffsetMetrics {
     /// The instant, on the other host's clock, nanoseconds.
     pub at_ns: i64,
     /// Assuming that the fastest exchanges took equally long both ways.

@@ -39,7 +39,7 @@ impl Tally {
         let exchanges = run.exchanges();
         let map = ClockMap::new(&exchanges, settings);
         self.run_count += 1;
-        self.step_count += map.figures().steps.len() as u64;
+        self.step_count += map.metrics().steps.len() as u64;
         let usable = exchanges.iter().filter_map(|one| one.constraint(&settings));
         let spans: Vec<Span> = usable
             .map(|one| (one.first_ns, one.last_ns, one.rtt_ns))
@@ -65,7 +65,7 @@ impl Tally {
     }
 
     fn compare_width(&mut self, at_ns: i64, one: Localised, map: &ClockMap, spans: &[Span]) {
-        let mut steps = map.figures().steps.iter();
+        let mut steps = map.metrics().steps.iter();
         let (from_ns, until_ns) = (at_ns - WINDOW_NS, at_ns + WINDOW_NS);
         if steps.any(|step| step.from_ns < until_ns && from_ns < step.until_ns) {
             return;
@@ -143,7 +143,7 @@ fn large_steps_are_noticed_each_once_with_their_sign_and_size() {
         let mut run = SimulatedRun::new(seed, DURATION_NS, Some((8.7, 9.5)));
         let exchanges = run.exchanges();
         let map = ClockMap::new(&exchanges, ClockSettings::default());
-        let steps = &map.figures().steps;
+        let steps = &map.metrics().steps;
         let true_steps_ns = run.offset_steps_ns();
         assert_eq!(steps.len(), true_steps_ns.len(), "seed {seed}: {steps:?}");
         for (step, true_ns) in steps.iter().zip(true_steps_ns) {
@@ -164,7 +164,7 @@ fn the_error_of_the_skew_covers_what_it_says() {
     for seed in 0..300 {
         let mut run = SimulatedRun::new(seed, DURATION_NS, None);
         let map = ClockMap::new(&run.exchanges(), ClockSettings::default());
-        let figures = map.figures();
+        let figures = map.metrics();
         let (skew, error) = figures.skew_ppm.zip(figures.skew_error_ppm).unwrap();
         let sigmas = (skew - run.skew_ppm()).abs() / error;
         compared_count += 1;
@@ -298,7 +298,7 @@ fn stepped() -> Vec<Exchange> {
 #[test]
 fn a_step_in_mid_run_leaves_the_offset_of_an_instant_that_has_one() {
     let map = ClockMap::new(&stepped(), ClockSettings::default());
-    let figures = map.figures();
+    let figures = map.metrics();
     let step = figures.steps[0];
     let middle_ns = 7_505_000_000;
     assert!(
@@ -365,7 +365,7 @@ fn asymmetry_shifts_the_estimate_and_stays_inside_the_interval() {
         let (back, bound_ns) = map.to_remote(localised.instant).unwrap();
         assert!(back.as_ns().abs_diff(remote.as_ns()) <= 2, "{back:?}");
         assert_eq!(bound_ns, localised.bound_ns());
-        assert_eq!(map.figures().rtt_min_ns, Some(400_000));
+        assert_eq!(map.metrics().rtt_min_ns, Some(400_000));
     }
 }
 
@@ -388,7 +388,7 @@ fn without_exchanges_nothing_is_converted() {
     let map = ClockMap::new(&[], ClockSettings::default());
     assert_eq!(map.localise(RemoteInstant::from_ns(0)), None);
     assert_eq!(map.to_remote(Instant::ZERO), None);
-    assert_eq!(map.figures().bound, None);
+    assert_eq!(map.metrics().bound, None);
 }
 
 #[test]
@@ -397,8 +397,8 @@ fn exchanges_that_no_clock_could_give_are_left_out_and_counted() {
     let arrives_before_it_left = record([0, 5_000_000_000, 5_000_000_000, -1]);
     exchanges.extend(Exchange::of(&arrives_before_it_left, Requester::Local));
     let map = ClockMap::new(&exchanges, ClockSettings::default());
-    assert_eq!(map.figures().unused_count, 1);
-    assert_eq!(map.figures().steps, []);
+    assert_eq!(map.metrics().unused_count, 1);
+    assert_eq!(map.metrics().steps, []);
     let missing = record([0, UNAVAILABLE, 1, 2]);
     assert_eq!(Exchange::of(&missing, Requester::Local), None);
     let mut card = record([0, 1, 2, 3]);

@@ -166,7 +166,7 @@ impl Iterator for LoggedMessages<'_> {
 
 /// A stamp brought to another clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct BroughtStamp {
+pub struct ConvertedStamp {
     /// The stamp there, nanoseconds.
     pub at_ns: i64,
     /// Its largest error, nanoseconds.
@@ -228,7 +228,7 @@ impl RunLog {
     pub fn bring_to_one_clock(
         &mut self,
         source_of: impl Fn(&str) -> Option<String>,
-        convert: impl Fn(&str, i64) -> Option<BroughtStamp>,
+        convert: impl Fn(&str, i64) -> Option<ConvertedStamp>,
     ) -> Result<(), String> {
         let mut all_shifts: Vec<Vec<u8>> = Vec::new();
         let mut by_source: BTreeMap<String, u64> = BTreeMap::new();

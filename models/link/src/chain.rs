@@ -7,7 +7,7 @@ use super::delay::DelaySampler;
 use super::loss::Losses;
 use super::outages::OutageLink;
 use super::rate::Bottleneck;
-use super::reordering::Strikes;
+use super::reordering::RandomHits;
 use super::spec::{LinkPlace, LinkSpec};
 use super::wifi::WifiLink;
 use hil_core::case_study::ParameterError;
@@ -24,8 +24,8 @@ pub(crate) struct LinkChain {
     bottleneck: Option<Bottleneck>,
     delay: (DelaySampler, RandomStream),
     reorders: bool,
-    reordering: Option<Strikes>,
-    duplication: Option<Strikes>,
+    reordering: Option<RandomHits>,
+    duplication: Option<RandomHits>,
     /// No later message arrives before, unless it was held back.
     floor: Instant,
     lost: LossCauses,
@@ -48,7 +48,7 @@ impl LinkChain {
             let link = WifiLink::new(wifi, place.way, own(".wifi"), shared(".wifi"));
             link.map(Box::new)
         });
-        let strikes = |ratio, later, part| Strikes::new(ratio, later, own(part));
+        let hits = |ratio, later, part| RandomHits::new(ratio, later, own(part));
         Ok(Self {
             outages,
             wifi: wifi.transpose()?,
@@ -58,10 +58,10 @@ impl LinkChain {
             reorders: spec.reorders,
             reordering: spec
                 .reordering
-                .map(|one| strikes(one.ratio, one.hold, ".reordering")),
+                .map(|one| hits(one.ratio, one.hold, ".reordering")),
             duplication: spec
                 .duplication
-                .map(|one| strikes(one.ratio, one.lag, ".duplication")),
+                .map(|one| hits(one.ratio, one.lag, ".duplication")),
             floor: Instant::from_ns(i64::MIN),
             lost: LossCauses::default(),
             behind_radio: Instant::from_ns(i64::MIN),
@@ -103,8 +103,8 @@ impl LinkModel for LinkChain {
         let sent = self.through_queue(now, length_bytes);
         // Drawn for a lost message as well, so that no draw depends on what was lost.
         let delay = self.delay.0.draw(&mut self.delay.1);
-        let held = self.reordering.as_mut().and_then(Strikes::next);
-        let copied = self.duplication.as_mut().and_then(Strikes::next);
+        let held = self.reordering.as_mut().and_then(RandomHits::next);
+        let copied = self.duplication.as_mut().and_then(RandomHits::next);
         let Some(sent) = sent else {
             return Fate::Lost;
         };

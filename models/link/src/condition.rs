@@ -10,7 +10,7 @@ use super::spec::{LinkSpec, Way};
 use hil_core::case_study::ParameterError;
 use hil_core::time::duration_ns;
 
-/// Version of the layout of [`LinkOrder`].
+/// Version of the layout of [`LinkChangeRequest`].
 pub const ORDER_VERSION: u32 = 1;
 /// Name of the message type of the channel that orders travel on.
 pub const ORDER_TYPE_NAME: &str = "hil.LinkOrder.v1";
@@ -108,7 +108,7 @@ impl fmt::Display for LinkCondition {
 /// An order to change the condition, as it lies in shared memory. Little-endian like every message.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-pub struct LinkOrder {
+pub struct LinkChangeRequest {
     /// [`ORDER_VERSION`].
     pub version: u32,
     /// 0 as the topology says, 1 fixed delay and loss, 2 cut.
@@ -121,7 +121,7 @@ pub struct LinkOrder {
     pub loss_ratio: f64,
 }
 
-impl LinkOrder {
+impl LinkChangeRequest {
     /// The order to set `condition`, known by `request`.
     pub fn new(condition: LinkCondition, request: u64) -> Self {
         let (kind, delay_ns, loss_ratio) = condition.numbers();
@@ -197,7 +197,7 @@ pub struct LinkConditionRecord {
     pub delay_ns: u64,
     /// Loss ratio, 0..=1.
     pub loss_ratio: f64,
-    /// As in [`LinkOrder`].
+    /// As in [`LinkChangeRequest`].
     pub kind: u32,
     /// An [`OrderOutcome`].
     pub outcome: u32,
@@ -243,9 +243,9 @@ mod tests {
             loss_ratio,
         };
         for condition in [LinkCondition::Topology, fixed(50, 0.1), LinkCondition::Cut] {
-            let order = LinkOrder::new(condition, 7);
+            let order = LinkChangeRequest::new(condition, 7);
             assert_eq!(order.condition(), Some(condition));
-            let newer = LinkOrder {
+            let newer = LinkChangeRequest {
                 version: ORDER_VERSION + 1,
                 ..order
             };
@@ -253,9 +253,9 @@ mod tests {
         }
         for strange in [fixed(60_001, 0.0), fixed(1, 1.5), fixed(1, f64::NAN)] {
             assert!(strange.check().is_err(), "{strange}");
-            assert_eq!(LinkOrder::new(strange, 1).condition(), None);
+            assert_eq!(LinkChangeRequest::new(strange, 1).condition(), None);
         }
-        let mut unknown = LinkOrder::new(LinkCondition::Cut, 1);
+        let mut unknown = LinkChangeRequest::new(LinkCondition::Cut, 1);
         unknown.kind = 9;
         assert_eq!(unknown.condition(), None);
         assert_eq!(fixed(50, 0.1).to_string(), "delay 50 ms, loss 0.1");

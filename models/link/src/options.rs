@@ -295,4 +295,6 @@ macro_rules! laws {
     };
 }
 
-pub(crate) use {laws, options, words};
+pub(crate) use laws;
+pub(crate) use options;
+pub(crate) use words;

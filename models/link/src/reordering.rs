@@ -34,13 +34,13 @@ options! {
 
 /// Something that strikes some messages and makes them later.
 #[derive(Debug, Clone)]
-pub(super) struct Strikes {
+pub(super) struct RandomHits {
     ratio: f64,
     later: Duration,
     random: RandomStream,
 }
 
-impl Strikes {
+impl RandomHits {
     /// With probability `ratio`, by `later`, both checked.
     pub(super) fn new(ratio: f64, later: Duration, random: RandomStream) -> Self {
         Self {

@@ -8,9 +8,9 @@ use hil_core::link_model::MessageNumber;
 
 /// Messages that the grid is sought in anew with each of them: the first of a run is the coldest, and
 /// later by itself than any after it.
-const YOUNG_COUNT: usize = 16;
+const WARM_UP_COUNT: usize = 16;
 /// Periods after which it is not sought any more: by then two clocks may be apart by a part of one.
-const YOUNG_PERIODS: f64 = 256.0;
+const WARM_UP_PERIODS: f64 = 256.0;
 /// Share of an offer's distance from the grid that moves the grid, and that changes its period: a
 /// quarter of the square of the first, so that it settles without swinging.
 const PHASE_GAIN: f64 = 1.0 / 128.0;
@@ -27,7 +27,7 @@ pub(super) struct OfferGrid {
     /// The latest tick given away: what went out too far ahead stays there, and the grid is none the
     /// worse for it.
     newest: u64,
-    young: Option<Young>,
+    warm_up: Option<WarmUp>,
 }
 
 impl OfferGrid {
@@ -38,7 +38,7 @@ impl OfferGrid {
             period_ns,
             tick,
             newest: tick,
-            young: Some(Young::new(at_ns, tick)),
+            warm_up: Some(WarmUp::new(at_ns, tick)),
         }
     }
 
@@ -57,12 +57,12 @@ impl OfferGrid {
 
     /// The tick of the next message, never before that of the last.
     pub(super) fn tick(&mut self, at_ns: i64) -> u64 {
-        let found = self.young.as_mut();
-        if let Some(found) = found.and_then(|young| young.found(at_ns, self.period_ns)) {
+        let found = self.warm_up.as_mut();
+        if let Some(found) = found.and_then(|warm_up| warm_up.found(at_ns, self.period_ns)) {
             self.expected_ns = found.expected_ns;
             self.tick = found.tick;
         } else {
-            self.young = None;
+            self.warm_up = None;
             let distance = (at_ns as f64 - self.expected_ns) / self.period_ns;
             let steps = distance.round().max(0.0);
             let error = (distance - steps).max(-0.5);
@@ -77,11 +77,11 @@ impl OfferGrid {
 
 /// The first messages of a producer.
 #[derive(Debug, Clone, Copy)]
-struct Young {
+struct WarmUp {
     first_ns: i64,
     first_tick: u64,
     /// Instants since the first, in periods.
-    places: [f64; YOUNG_COUNT],
+    places: [f64; WARM_UP_COUNT],
     count: usize,
 }
 
@@ -91,12 +91,12 @@ struct Found {
     tick: u64,
 }
 
-impl Young {
+impl WarmUp {
     const fn new(first_ns: i64, first_tick: u64) -> Self {
         Self {
             first_ns,
             first_tick,
-            places: [0.0; YOUNG_COUNT],
+            places: [0.0; WARM_UP_COUNT],
             count: 1,
         }
     }
@@ -104,7 +104,7 @@ impl Young {
     /// With one more at `at_ns`; `None` when they are too many, or it is too far off.
     fn found(&mut self, at_ns: i64, period_ns: f64) -> Option<Found> {
         let place = at_ns.saturating_sub(self.first_ns) as f64 / period_ns;
-        if self.count == YOUNG_COUNT || place > YOUNG_PERIODS {
+        if self.count == WARM_UP_COUNT || place > WARM_UP_PERIODS {
             return None;
         }
         self.places[self.count] = place;
@@ -130,8 +130,8 @@ impl Young {
 }
 
 /// The tick of each of `places` on the grid of period 1 at `phase`, and how late they are together.
-fn ticks_on(places: &[f64], phase: f64) -> ([i64; YOUNG_COUNT], f64) {
-    let mut ticks = [0; YOUNG_COUNT];
+fn ticks_on(places: &[f64], phase: f64) -> ([i64; WARM_UP_COUNT], f64) {
+    let mut ticks = [0; WARM_UP_COUNT];
     for (tick, place) in ticks.iter_mut().zip(places) {
         *tick = whole((place - phase + EARLY_RATIO).floor());
     }
@@ -278,7 +278,7 @@ mod tests {
 
     #[test]
     fn a_late_message_among_the_first_moves_none_after_it() {
-        for which in 1..YOUNG_COUNT {
+        for which in 1..WARM_UP_COUNT {
             for late in [0.3, 0.6, 0.9, 1.4] {
                 let of = |tick: usize| tick as f64 + if tick == which { late } else { 0.0 };
                 let mut places: Vec<f64> = (0..3_000).map(of).collect();

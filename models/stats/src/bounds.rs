@@ -6,14 +6,14 @@ use super::samples::Samples;
 
 /// The error bounds of a set of figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct BoundFigures {
+pub struct BoundMetrics {
     /// Half of them are no larger, nanoseconds.
     pub median_ns: u64,
     /// The largest, nanoseconds.
     pub largest_ns: u64,
 }
 
-impl BoundFigures {
+impl BoundMetrics {
     /// Of these bounds; `None` of none.
     pub fn of(mut bounds_ns: Vec<u64>) -> Option<Self> {
         let middle = bounds_ns.len().checked_sub(1)? / 2;
@@ -38,12 +38,12 @@ impl Bounds {
     }
 
     /// Median and largest; `None` of none.
-    pub fn figures(&self) -> Option<BoundFigures> {
+    pub fn metrics(&self) -> Option<BoundMetrics> {
         let last = self.0.len().checked_sub(1)?;
         let ascending = self.0.ascending();
         let [median_ns, largest_ns] =
             [last / 2, last].map(|place| (ascending.at(place) ^ i64::MIN).cast_unsigned());
-        Some(BoundFigures {
+        Some(BoundMetrics {
             median_ns,
             largest_ns,
         })
@@ -61,7 +61,7 @@ mod tests {
             for bound_ns in &bounds_ns {
                 bounds.push(*bound_ns);
             }
-            assert_eq!(bounds.figures(), BoundFigures::of(bounds_ns));
+            assert_eq!(bounds.metrics(), BoundMetrics::of(bounds_ns));
         }
     }
 }

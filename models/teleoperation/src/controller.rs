@@ -50,7 +50,7 @@ const CLOCK_RESTART_MS: i32 = 10_000;
 
 /// True when `feedback` takes the place of `newest`.
 pub(crate) fn is_newer(feedback: &EgmFeedback, newest: &EgmFeedback) -> bool {
-    // The cycles of a foreign robot never fall (the face counts them), though its clock does when
+    // The cycles of a foreign robot never fall (the adapter counts them), though its clock does when
     // it starts anew.
     if feedback.cycle_index > newest.cycle_index {
         return true;

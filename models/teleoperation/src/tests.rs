@@ -33,7 +33,7 @@ fn run(case: &Teleoperation, link: Option<Box<dyn Carrier>>, duration_s: f64) ->
         .unwrap()
 }
 
-fn figures(case: &Teleoperation, result: &SimulationResult) -> impl Fn(&str) -> f64 + use<> {
+fn metrics(case: &Teleoperation, result: &SimulationResult) -> impl Fn(&str) -> f64 + use<> {
     let score = case.score(&result.log);
     move |name| score.get(name).and_then(|metric| metric.value).unwrap()
 }
@@ -112,7 +112,7 @@ fn the_same_holds_at_250_hz() {
 fn at_the_default_gain_the_robot_lags_195_ms_and_executes_every_loop() {
     let case = case(|_| {});
     let result = run(&case, None, 2.0 + 6.0 * 4.033);
-    let figure = figures(&case, &result);
+    let figure = metrics(&case, &result);
     assert!((figure("tracking_lag_ms") - 195.0).abs() <= 8.0);
     assert!((figure("joint_error_ratio") - 0.299).abs() <= 0.015);
     assert!((figure("motion_loops_sent_count") - 6.0).abs() < 0.5);
@@ -126,7 +126,7 @@ fn at_the_default_gain_the_robot_lags_195_ms_and_executes_every_loop() {
 fn the_highest_gain_and_feed_forward_follow_as_the_control_law_says() {
     let duration_s = 2.0 + 5.0 * 4.033;
     let steep = case(|parameters| parameters.egm.position_gain_per_s = Some(20.0));
-    let figure = figures(&steep, &run(&steep, None, duration_s));
+    let figure = metrics(&steep, &run(&steep, None, duration_s));
     assert!((figure("tracking_lag_ms") - 50.0).abs() <= 8.0);
     // The law alone misses by 7.8 %. In virtual time every second command arrives on a grid point
     // exactly and so waits a whole cycle for the next: 4 ms more of a period of 4.033 s.
@@ -134,7 +134,7 @@ fn the_highest_gain_and_feed_forward_follow_as_the_control_law_says() {
     assert!((ratio - 0.084).abs() <= 0.005, "{ratio}");
 
     let fed = case(|parameters| parameters.feed_forward = true);
-    let figure = figures(&fed, &run(&fed, None, duration_s));
+    let figure = metrics(&fed, &run(&fed, None, duration_s));
     assert!(figure("tracking_lag_ms").abs() <= 8.0);
     // The law alone would stay below 1 %; what is left is the age of the newest command, 4 to 12
     // ms between frame and cycle.
@@ -152,7 +152,7 @@ fn bernoulli_loss_of_half_the_commands_loses_no_loop() {
     let link = LinkSpec::fixed(Duration::ZERO, 0.5)
         .build(&LinkPlace::alone(1, "link"))
         .unwrap();
-    let figure = figures(&case, &run(&case, Some(Box::new(link)), 2.0 + 8.0 * 4.033));
+    let figure = metrics(&case, &run(&case, Some(Box::new(link)), 2.0 + 8.0 * 4.033));
     assert!((figure("motion_loops_sent_count") - 8.0).abs() < 0.5);
     assert!(figure("motion_loss_ratio").abs() < 1e-12);
 }
@@ -182,7 +182,7 @@ fn an_outage_of_one_period_within_a_session_is_one_hold_and_one_lost_loop() {
         until: Instant::from_ns(18_033_000_000),
     };
     let duration_s = 2.0 + 8.0 * 4.033;
-    let figure = figures(&case, &run(&case, Some(Box::new(outage)), duration_s));
+    let figure = metrics(&case, &run(&case, Some(Box::new(outage)), duration_s));
     assert!((figure("hold_count") - 1.0).abs() < 0.1);
     assert!((figure("motion_loops_executed_count") - 7.0).abs() < 0.1);
     assert!((figure("motion_loss_ratio") - 0.125).abs() < 1e-12);
@@ -206,7 +206,7 @@ fn a_mirrored_left_arm_swings_opposite_without_failure() {
         right_max_m = right_max_m.max(right_m.abs());
     }
     assert!(right_max_m > 0.1, "{right_max_m}");
-    let figure = figures(&case, &result);
+    let figure = metrics(&case, &result);
     assert!(figure("ik_failure_count") + figure("ik_limited_count") < 0.5);
 }
 

@@ -8,9 +8,9 @@
 
 pub mod csv;
 pub mod fault;
-pub mod figures;
 pub mod fit;
 pub mod from_records;
+pub mod metrics;
 pub mod netem;
 pub mod opportunities;
 #[cfg(test)]

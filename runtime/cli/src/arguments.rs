@@ -6,7 +6,7 @@ use clap::{ArgGroup, Args, Parser, Subcommand};
 
 use hil_doctor::cli::DoctorArgs;
 use hil_engine::security::cli::KeyCommand;
-use hil_nic::card_clock::guard::CardGuardArgs;
+use hil_nic::nic_clock::guard::NicGuardArgs;
 use hil_probe::arguments::ProbeArgs;
 use hil_report::compare::cli as compare_cli;
 use hil_report::compare::cli::CompareArgs;
@@ -328,7 +328,7 @@ pub enum Command {
     Sweep,
     /// Wait for the end of the program that set a network card up; not for use by hand.
     #[command(hide = true)]
-    CardGuard(CardGuardArgs),
+    CardGuard(NicGuardArgs),
 }
 
 #[cfg(test)]

@@ -59,7 +59,7 @@ fn offers(entry: &CaseEntry) -> Vec<(&'static str, String)> {
     let offer = |is_there: bool, words: String| {
         if is_there { words } else { "none".to_owned() }
     };
-    let figures = entry.calibrated_figures.join(", ");
+    let figures = entry.calibrated_metrics.join(", ");
     let calibration = format!("{figures}; hil-runtime calibrate {name} --figure NAME=VALUE");
     let series = format!("{}; in the folder of each run", entry.series.join(", "));
     let tables = "hil-runtime tables --topology FILE".to_owned();
@@ -129,7 +129,7 @@ mod tests {
         assert_eq!(words("fleet")[0], "hil-runtime tables --topology FILE");
         assert!(list(&registry).contains("  calibration  none\n"));
         let mut calibrated = *registry.find("shuttle").unwrap();
-        calibrated.calibrated_figures = &["mlr", "lag"];
+        calibrated.calibrated_metrics = &["mlr", "lag"];
         calibrated.series = &["tool"];
         let words = offers(&calibrated);
         let expected = "mlr, lag; hil-runtime calibrate shuttle --figure NAME=VALUE";

@@ -22,7 +22,7 @@ use crate::cases;
 use hil_engine::process::{own_program, worker};
 use hil_engine::security::{KeyFileError, PreSharedKey};
 use hil_engine::supervisor::{self, PeerError, RunError, RunOptions};
-use hil_nic::card_clock::guard;
+use hil_nic::nic_clock::guard;
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};

@@ -184,7 +184,7 @@ impl Gaps {
 
 /// What else the host did meanwhile.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Surroundings {
+pub struct HostActivity {
     /// Load averages before.
     pub load_before: Fact<String>,
     /// And after.
@@ -213,7 +213,7 @@ pub struct LatencyReport {
     /// One per CPU, in turn; empty in a brief measurement.
     pub gaps: Vec<Gaps>,
     /// What else went on.
-    pub surroundings: Surroundings,
+    pub surroundings: HostActivity,
     /// What figures this host supports, each with its rule.
     pub claims: Vec<Claim>,
 }
@@ -305,7 +305,7 @@ pub fn measure(request: &LatencyRequest, files: &HostFiles, watch: &Watch<'_>) -
         is_interrupted: (watch.is_stopped)(),
         wakeups,
         gaps,
-        surroundings: Surroundings {
+        surroundings: HostActivity {
             load_before,
             load_after: load_average(files).map(|(_, words)| words),
             ticks: ticks_before.and_then(|before| ticks_after.map(|after| after.since(before))),
@@ -519,7 +519,7 @@ mod tests {
     }
 
     #[test]
-    fn no_time_means_no_figures() {
+    fn no_time_means_no_metrics() {
         let request = LatencyRequest {
             duration: Duration::ZERO,
             ..LatencyRequest::brief(None)

@@ -7,7 +7,6 @@
 //! `docs/doctor.md` is checked.
 #![forbid(unsafe_code)]
 
-mod card;
 mod catalogue;
 pub mod cli;
 mod clock_path;
@@ -19,6 +18,7 @@ mod interrupts;
 mod kernel;
 pub mod latency;
 mod network;
+mod nic;
 mod paths;
 mod plan;
 mod ports;
@@ -41,7 +41,7 @@ pub use self::finding::{Finding, Severity};
 use self::latency::LatencyReport;
 use self::network::StampQuery;
 pub use self::plan::{LinkLoad, Peer, Pin, Plan, WantedPort};
-use hil_nic::card_clock::probing::probe_card;
+use hil_nic::nic_clock::probing::probe_nic;
 use hil_platform::clock_discipline::HostDiscipline;
 use hil_platform::domain_address::domain_base_candidates;
 use hil_platform::host_facts::{HostFacts, HostFiles};
@@ -180,7 +180,7 @@ pub fn examine(request: &DoctorRequest) -> DoctorReport {
     };
     let names = network::wanted(&present, plan);
     findings.extend(network::examine(files, &present, &names, stamps));
-    findings.extend(card::examine(&present, &names, stamps, &probe_card));
+    findings.extend(nic::examine(&present, &names, stamps, &probe_nic));
     findings.extend(radio::examine(&names));
     findings.extend(interrupts::examine(files, &names, plan));
     let mut line = driver::open();

@@ -1,6 +1,7 @@
 //! The doctor as a whole, on the running host and on one that tells nothing.
 
-use std::{collections::BTreeSet, time::Duration};
+use std::collections::BTreeSet;
+use std::time::Duration;
 
 use super::latency::{LatencyRequest, Watch, measure};
 use super::*;

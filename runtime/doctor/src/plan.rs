@@ -8,7 +8,7 @@ use hil_arm::egm::messages::Side;
 use hil_protocol::transport::IpProtocol;
 use hil_protocol::wire;
 
-use hil_topology::{ClockEnd, Crossing, Execution, FaceKind, Host, Program, Topology, Wait};
+use hil_topology::{AdapterKind, ClockEnd, Crossing, Execution, Host, Program, Topology, Wait};
 
 /// A CPU that something is pinned to.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -117,12 +117,12 @@ impl Plan {
             }
             for process in topology.processes_on(&host.name) {
                 plan.pin(&process.name, &process.execution);
-                // A sensor face listens; a robot face sends from a port of the kernel's choice.
-                if let Program::Egm { face, .. } = &process.program
-                    && face.kind == FaceKind::Sensor
+                // A sensor adapter listens; a robot adapter sends from a port of the kernel's choice.
+                if let Program::Egm { adapter, .. } = &process.program
+                    && adapter.kind == AdapterKind::Sensor
                 {
                     let sides = [Side::Right, Side::Left].into_iter();
-                    for address in sides.filter_map(|side| face.address(side)) {
+                    for address in sides.filter_map(|side| adapter.address(side)) {
                         plan.bind(IpProtocol::Udp, address, &process.name);
                     }
                 }
@@ -197,13 +197,13 @@ impl Plan {
                 header_bytes: capabilities.header_bytes(from.gateway_address()),
                 cut_by: capabilities.cuts_to_path.then_some(transport.label),
             });
-            self.face(from, to);
+            self.adapter(from, to);
         }
         if is_here(to) {
             if let Some(protocol) = capabilities.receiver_port {
                 self.bind(protocol, at(to, crossing.ports.receiver), &channel.name);
             }
-            self.face(to, from);
+            self.adapter(to, from);
         }
     }
 
@@ -216,7 +216,7 @@ impl Plan {
     }
 
     /// `own` talks to `other`, as far as both have an address.
-    fn face(&mut self, own: &Host, other: &Host) {
+    fn adapter(&mut self, own: &Host, other: &Host) {
         if let (Some(here), Some(there)) = (own.address, other.address) {
             self.peers.push(Peer {
                 name: other.name.clone(),

@@ -2,7 +2,7 @@
 //! report and draws nothing.
 #![forbid(unsafe_code)]
 
-pub mod face;
+pub mod adapter;
 pub mod gateway;
 pub mod process;
 pub mod security;

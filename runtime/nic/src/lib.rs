@@ -2,5 +2,5 @@
 //! the messages. It carries no message itself.
 #![forbid(unsafe_code)]
 
-pub mod card_clock;
+pub mod nic_clock;
 pub mod radio;

@@ -5,10 +5,10 @@ use core::fmt::Write as _;
 use std::path::Path;
 
 use hil_capture::flow::FlowFilter;
-use hil_capture::join::{JoinFigures, Joined, OrderSource};
+use hil_capture::join::{JoinMetrics, Joined, OrderSource};
 use hil_capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_capture::pairing::join_all;
-use hil_capture::point::{PointFigures, single_point_figures};
+use hil_capture::point::{PointMetrics, single_point_metrics};
 use hil_stats::histogram::Distribution;
 use hil_stats::statistics::IntervalNs;
 use serde::Serialize;
@@ -70,7 +70,7 @@ impl Reading {
     }
 
     /// Every stream that a card stamped, with how many of its datagrams have the kernel's stamp.
-    fn card_streams(&self) -> impl Iterator<Item = (&Point, &Stream, &Vec<Observation>, u64)> {
+    fn nic_streams(&self) -> impl Iterator<Item = (&Point, &Stream, &Vec<Observation>, u64)> {
         let seen = self.of_cards.seen().iter();
         let streams = seen.flat_map(|(point, seen)| {
             let streams = seen.streams.iter();
@@ -155,7 +155,7 @@ struct PointReport {
     kernel_stamped_count: Option<u64>,
     #[serde(flatten)]
     stream: StreamReport,
-    figures: PointFigures,
+    figures: PointMetrics,
 }
 
 #[derive(Debug, Serialize)]
@@ -167,7 +167,7 @@ struct JoinReport {
     delay_bound_ns: Option<u64>,
     #[serde(flatten)]
     stream: StreamReport,
-    figures: JoinFigures,
+    figures: JoinMetrics,
 }
 
 /// Everything that is said of the captures.
@@ -194,7 +194,7 @@ impl Report {
         for (point, seen) in reading.observer.seen() {
             for (stream, observations) in &seen.streams {
                 points.extend(
-                    single_point_figures(observations).map(|figures| PointReport {
+                    single_point_metrics(observations).map(|figures| PointReport {
                         point: reading.name(point),
                         kernel_stamped_count: None,
                         stream: stream_report(stream),
@@ -203,14 +203,14 @@ impl Report {
                 );
             }
         }
-        for (point, stream, observations, all) in reading.card_streams() {
-            let figures = single_point_figures(observations);
+        for (point, stream, observations, all) in reading.nic_streams() {
+            let figures = single_point_metrics(observations);
             points.extend(figures.map(|figures| PointReport {
                 point: format!("{}, by the card's clock", reading.name(point)),
                 kernel_stamped_count: Some(all),
                 stream: stream_report(stream),
                 // A number that the card did not stamp was not skipped.
-                figures: PointFigures {
+                figures: PointMetrics {
                     numbers: figures.numbers.filter(|_| figures.datagram_count == all),
                     ..figures
                 },
@@ -315,8 +315,8 @@ fn file_report(file: &CaptureFile) -> FileReport {
         interfaces: names
             .map(|(index, one)| {
                 let name = one.name.clone().unwrap_or_else(|| index.to_string());
-                let of_card = if one.has_card_clock() { " (card)" } else { "" };
-                name + of_card
+                let of_nic = if one.has_nic_clock() { " (card)" } else { "" };
+                name + of_nic
             })
             .collect(),
         dropped_count: file.dropped_count(),
@@ -354,7 +354,7 @@ fn stream_line(stream: &StreamReport) -> String {
     )
 }
 
-fn point_lines(lines: &mut Vec<String>, figures: &PointFigures) {
+fn point_lines(lines: &mut Vec<String>, figures: &PointMetrics) {
     let seconds = figures.last_ns.saturating_sub(figures.first_ns) as f64 * 1e-9;
     lines.push(format!(
         "  {} datagrams, {} bytes in {seconds:.3} s",
@@ -376,7 +376,7 @@ fn point_lines(lines: &mut Vec<String>, figures: &PointFigures) {
     }
 }
 
-fn join_lines(lines: &mut Vec<String>, figures: &JoinFigures) {
+fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
     let order = match figures.order {
         OrderSource::PacketDirection => "by the packets' direction",
         OrderSource::Stamps => "by most stamps",

@@ -1,6 +1,7 @@
 //! The command line of the probe: definitions only.
 
-use std::{path::PathBuf, time::Duration};
+use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 use hil_capture::flow::FlowFilter;

@@ -68,7 +68,7 @@ pub(super) fn read(
     };
     loop {
         match reader.next_step() {
-            Step::Packet(packet) if packet.is_card_stamped => of_cards.take(file_index, &packet),
+            Step::Packet(packet) if packet.is_nic_stamped => of_cards.take(file_index, &packet),
             Step::Packet(packet) => {
                 file.packet_count += 1;
                 observer.take(file_index, &packet);

@@ -4,15 +4,17 @@
 
 mod analyse;
 pub mod arguments;
-mod card_tap;
 mod compare;
 mod files;
 mod live;
+mod nic_tap;
 mod output;
 mod point_clocks;
 
 use core::fmt::Write as _;
-use std::{fs, path::Path, time::Duration};
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
 
 use hil_capture::flow::FlowFilter;
 use hil_core::time::duration_ns;
@@ -267,9 +269,9 @@ fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8
     let mut dropped_count = 0;
     for one in &result.interfaces {
         tell(&mut text, one);
-        let of_card = one.card.as_ref();
+        let of_nic = one.card.as_ref();
         dropped_count += one.counters.dropped_count;
-        dropped_count += of_card.map_or(0, |card| card.counters.dropped_count);
+        dropped_count += of_nic.map_or(0, |card| card.counters.dropped_count);
     }
     let _infallible = writeln!(
         text,

@@ -1,18 +1,18 @@
 //! The live capture: rings looked into every few milliseconds, a pcapng file, a line of progress.
 //! It analyses nothing. Nothing waits for a packet, so that no sender pays for waking the probe.
 
+use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
-use std::{io, path::PathBuf, thread};
+use std::{io, thread};
 
-use hil_capture::CaptureInterface;
 use hil_capture::flow::FlowFilter;
-use hil_capture::writer;
+use hil_capture::{CaptureInterface, writer};
 use hil_net::Direction;
 use hil_net::filter::PacketFilter;
 use hil_net::packet_ring::{PacketRing, RingCounters, RingError, RingSettings, RingStamps};
 use hil_net::ring_frame::StampSource;
 
-use super::card_tap::{CardResult, CardTap};
+use super::nic_tap::{NicResult, NicTap};
 use super::output::{Output, append};
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
@@ -67,7 +67,7 @@ pub(super) struct InterfaceResult {
     /// The interface was taken down or has gone.
     pub(super) has_failed: bool,
     /// Of its card, if that was asked for stamps.
-    pub(super) card: Option<CardResult>,
+    pub(super) card: Option<NicResult>,
 }
 
 /// How a capture ended.
@@ -82,7 +82,7 @@ pub(super) struct LiveResult {
 
 struct Tap {
     ring: PacketRing,
-    card: Option<CardTap>,
+    card: Option<NicTap>,
     /// Number of the interface when it was opened: names are given anew.
     index: Option<u32>,
     /// When the interface had gone, nanoseconds since 1970.
@@ -159,7 +159,7 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
             RingStamps::Kernel => None,
             RingStamps::Card => {
                 let is_guarded = taps.iter().any(|tap| tap.result.name == *name);
-                let card = CardTap::open(name, is_guarded, &filters, &settings)?;
+                let card = NicTap::open(name, is_guarded, &filters, &settings)?;
                 let granted = format!("{name}: the card grants {}", card.granted());
                 if card.stamps_all_arrivals() {
                     console.say(&granted);

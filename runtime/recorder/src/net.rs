@@ -28,11 +28,11 @@ own_message! {
         /// Kernel transmit stamp.
         tx_realtime_ns: optional int64 = "6",
         /// The network card's transmit stamp, on the card's clock.
-        tx_card_ns: optional int64 = "7",
+        tx_nic_ns: optional int64 = "7",
         /// Real-time minus monotonic clock of the sending host.
         sender_realtime_offset_ns: optional int64 = "8",
         /// The network card's receive stamp, on the card's clock.
-        rx_card_ns: optional int64 = "9",
+        rx_nic_ns: optional int64 = "9",
         /// Kernel receive stamp.
         rx_realtime_ns: optional int64 = "10",
         /// The receive call had returned, on the receiving host.
@@ -240,13 +240,13 @@ impl MessageLatency {
                 self.gateway_taken_ns = stamp(one.taken_ns);
                 self.handed_ns = stamp(one.handed_ns);
                 self.tx_realtime_ns = stamp(one.tx_software_ns);
-                self.tx_card_ns = stamp(one.tx_hardware_ns);
+                self.tx_nic_ns = stamp(one.tx_hardware_ns);
                 self.sender_realtime_offset_ns = stamp(one.realtime_offset_ns);
             }
             Record::Ingress(one) => {
                 self.published_ns = self.published_ns.or(stamp(one.published_ns));
                 self.handed_ns = self.handed_ns.or(stamp(one.handed_ns));
-                self.rx_card_ns = stamp(one.rx_hardware_ns);
+                self.rx_nic_ns = stamp(one.rx_hardware_ns);
                 self.rx_realtime_ns = stamp(one.rx_software_ns);
                 self.received_ns = stamp(one.received_ns);
                 self.forwarded_ns = stamp(one.forwarded_ns);

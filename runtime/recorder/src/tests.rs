@@ -1,10 +1,9 @@
 //! Made-up run folders and damaged files: what a recording keeps of them, and what it says is gone.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
-use std::process;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::{fs, process};
 
 use bytemuck::Zeroable;
 use hil_core::message::Envelope;

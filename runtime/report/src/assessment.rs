@@ -1,12 +1,13 @@
 //! What follows from a summary's figures: whether the run may be called a network result at all,
 //! and what a reader must be warned of. It draws conclusions, it does not measure.
 
-use hil_account::{ChannelAccount, ClosingFigures, Coverage, MessageFate};
+use hil_account::{ChannelAccount, ClosingMetrics, Coverage, MessageFate};
 use serde::{Deserialize, Serialize};
 
+use super::adapter::AdapterSummary;
+use super::adapter_warnings;
 use super::summary::{ChannelSummary, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary};
 use super::terminal::{JOINT, percent};
-use super::{face::FaceSummary, face_warnings};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 
@@ -29,9 +30,9 @@ pub enum NetworkVerdict {
     VirtualTime,
     /// No channel went over a network.
     NoNetwork,
-    /// No link of ours was a network, but a foreign program took part through a face.
+    /// No link of ours was a network, but a foreign program took part through an adapter.
     ForeignProgram,
-    /// No link of ours was a network, and nothing came to any face from a foreign program.
+    /// No link of ours was a network, and nothing came to any adapter from a foreign program.
     NoForeignProgram,
     /// A channel went over an emulated link, whatever carried the others.
     EmulatedLink,
@@ -87,7 +88,12 @@ impl Assessment {
         warnings.extend(summary.channels.iter().filter_map(emulation_warning));
         warnings.extend(summary.channels.iter().filter_map(no_room_warning));
         warnings.extend(summary.warnings.iter().cloned());
-        warnings.extend(summary.faces.iter().flat_map(face_warnings::face_warnings));
+        warnings.extend(
+            summary
+                .faces
+                .iter()
+                .flat_map(adapter_warnings::adapter_warnings),
+        );
         warnings.extend(summary.processes.iter().flat_map(process_warnings));
         warnings.extend(summary.channels.iter().flat_map(channel_warnings));
         warnings.extend(
@@ -110,7 +116,7 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
     let links = || summary.channels.iter().map(|channel| channel.link);
     let has_network = links().any(|link| matches!(link, LinkKind::Network(_)));
     let has_emulation = links().any(|link| link == LinkKind::Emulated);
-    let has_face = !summary.faces.is_empty();
+    let has_adapter = !summary.faces.is_empty();
     // A component that was killed took its count with it; other kinds have none to take.
     let is_silent =
         |process: &ProcessSummary| process.kind.counts_ticks() && process.cpu_time_s.is_none();
@@ -119,7 +125,7 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::RunFailed
     } else if summary.run.is_virtual {
         NetworkVerdict::VirtualTime
-    } else if !has_network && !has_emulation && !has_face {
+    } else if !has_network && !has_emulation && !has_adapter {
         NetworkVerdict::NoNetwork
     } else if !overruns.is_empty() {
         NetworkVerdict::HostOverran {
@@ -139,7 +145,7 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::EmulatedLink
     } else if has_network {
         NetworkVerdict::NetworkResult
-    } else if summary.faces.iter().all(FaceSummary::is_unanswered) {
+    } else if summary.faces.iter().all(AdapterSummary::is_unanswered) {
         NetworkVerdict::NoForeignProgram
     } else {
         NetworkVerdict::ForeignProgram
@@ -269,7 +275,7 @@ fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
     if let Some((ratio, _)) = account
         .closing
         .checked()
-        .and_then(ClosingFigures::closed_ratio)
+        .and_then(ClosingMetrics::closed_ratio)
         && ratio < CLOSED_RATIO_MIN
     {
         let (ratio, least) = (percent(ratio), percent(CLOSED_RATIO_MIN));

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_clock::ClockFigures;
+use hil_clock::ClockMetrics;
 use serde::{Deserialize, Serialize};
 
 use hil_platform::clock_discipline::HostDiscipline;
@@ -68,7 +68,7 @@ pub struct HostPairClock {
     /// Why no rung above it was used, or what it rests on, in words.
     pub basis: String,
     /// What the gateways' exchanges say, whatever was used.
-    pub exchanges: Option<ClockFigures>,
+    pub exchanges: Option<ClockMetrics>,
     /// What the disciplined system clocks say, when they say something.
     #[serde(default)]
     pub disciplined: Option<DisciplinedOffset>,
@@ -99,9 +99,9 @@ pub struct ClockPathSummary {
     /// How the end that asks stood to the other at the end of the run, in words.
     pub state: String,
     /// What its exchanges say by themselves; `None` when there were none.
-    pub exchanges: Option<ClockFigures>,
+    pub exchanges: Option<ClockMetrics>,
     /// What the exchanges of the data path say by themselves; `None` when there were none.
-    pub data_path: Option<ClockFigures>,
+    pub data_path: Option<ClockMetrics>,
     /// The longest time of the run without an exchange over it, nanoseconds on the clock of the host
     /// that asks; `None` when there was none at all, or that host did not say when the run was.
     pub longest_gap_ns: Option<u64>,

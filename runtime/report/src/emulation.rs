@@ -14,7 +14,7 @@ const ERROR_SPREAD_RATIO: f64 = 0.1;
 
 /// What became of the datagrams that a link model took on one channel.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct EmulationFigures {
+pub struct EmulationMetrics {
     /// The model's delay: from when the gateway had the datagram to when it was due.
     pub requested: LatencySummary,
     /// The delay given: from when the gateway had the datagram to when it had it back.
@@ -28,7 +28,7 @@ pub struct EmulationFigures {
     pub overflow_count: Option<u64>,
 }
 
-impl EmulationFigures {
+impl EmulationMetrics {
     /// The figures of a channel's arrivals; `None` when no link model took any.
     pub fn of(
         records: impl IntoIterator<Item = impl Borrow<IngressRecord>>,
@@ -98,7 +98,7 @@ mod tests {
 
     #[test]
     fn requested_and_achieved_delay_differ_by_the_scheduling_error() {
-        let figures = EmulationFigures::of(records(|_| 40_000), Some(0)).unwrap();
+        let figures = EmulationMetrics::of(records(|_| 40_000), Some(0)).unwrap();
         assert_eq!(figures.scheduling_error.max_ns, 40_000);
         let close = |found: i64, expected: i64| (found - expected).abs() <= expected / 900;
         assert!(close(figures.requested.p50_ns, 15_000_000));
@@ -111,18 +111,18 @@ mod tests {
     fn a_late_host_and_a_full_one_did_not_keep_the_link() {
         // The delays span 10 ms, so a tenth of that is 1 ms: one in fifty is later.
         let late = |index: i64| if index % 50 == 0 { 1_200_000 } else { 0 };
-        let figures = EmulationFigures::of(records(late), Some(0)).unwrap();
+        let figures = EmulationMetrics::of(records(late), Some(0)).unwrap();
         assert_eq!(figures.error_max_ns, ERROR_FLOOR_NS);
         assert!(!figures.is_kept(), "{figures:?}");
         // One in two hundred does not reach the 99th percentile.
         let rarely = |index: i64| if index % 200 == 0 { 1_200_000 } else { 0 };
         assert!(
-            EmulationFigures::of(records(rarely), None)
+            EmulationMetrics::of(records(rarely), None)
                 .unwrap()
                 .is_kept()
         );
         assert!(
-            !EmulationFigures::of(records(|_| 0), Some(1))
+            !EmulationMetrics::of(records(|_| 0), Some(1))
                 .unwrap()
                 .is_kept()
         );
@@ -130,7 +130,7 @@ mod tests {
 
     #[test]
     fn a_run_whose_emulated_link_was_not_kept_blames_neither_network_nor_model() {
-        let late = EmulationFigures::of(records(|_| 3_000_000), Some(7));
+        let late = EmulationMetrics::of(records(|_| 3_000_000), Some(7));
         let mut run = summary(recorded_channel());
         run.channels.push(ChannelSummary {
             name: "arm/command".to_owned(),
@@ -159,7 +159,7 @@ mod tests {
         );
         let again = RunSummary::from_json(&run.to_json().unwrap()).unwrap();
         assert_eq!(again.channels[1].emulation, late);
-        run.channels[1].emulation = EmulationFigures::of(records(|_| 0), Some(0));
+        run.channels[1].emulation = EmulationMetrics::of(records(|_| 0), Some(0));
         assert_eq!(Assessment::of(&run).network, NetworkVerdict::EmulatedLink);
     }
 
@@ -172,7 +172,7 @@ mod tests {
             record
         };
         let records: Vec<_> = (0..101).map(wide).collect();
-        let figures = EmulationFigures::of(&records, Some(0)).unwrap();
+        let figures = EmulationMetrics::of(&records, Some(0)).unwrap();
         assert!(
             figures.error_max_ns > 9_000_000 && figures.is_kept(),
             "{figures:?}"
@@ -180,12 +180,12 @@ mod tests {
     }
 
     #[test]
-    fn a_real_link_has_no_such_figures() {
+    fn a_real_link_has_no_such_metrics() {
         let mut real = records(|_| 0);
         for record in &mut real {
             (record.emulated_ns, record.due_ns) = (UNAVAILABLE, UNAVAILABLE);
         }
-        assert_eq!(EmulationFigures::of(&real, Some(0)), None);
-        assert_eq!(EmulationFigures::of(&real[..0], None), None);
+        assert_eq!(EmulationMetrics::of(&real, Some(0)), None);
+        assert_eq!(EmulationMetrics::of(&real[..0], None), None);
     }
 }

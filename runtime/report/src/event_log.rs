@@ -3,8 +3,9 @@
 
 use core::fmt::Write;
 
+use super::link_change::LinkChange;
 use super::score_event::{ExplainedEvent, ScoreEvents};
-use super::{link_change::LinkChange, terminal::JOINT};
+use super::terminal::JOINT;
 
 /// The text of the file for the run called `name`.
 pub(crate) fn text(name: &str, all: &ScoreEvents, changes: &[LinkChange]) -> String {
@@ -84,7 +85,7 @@ mod tests {
 
     use super::*;
     use crate::link_change::ChangedTo;
-    use crate::network::ForegoingNetwork;
+    use crate::network::PrecedingNetwork;
     use crate::score_event::EventOutage;
     use hil_account::Standing;
     use hil_link::spec::Way;
@@ -136,7 +137,7 @@ mod tests {
         assert_eq!(text("run", &all), format!("# run\n{lines}"));
         all.clocks_differ = true;
         assert!(text("run", &all).contains("hold began (clock of robot-pc)\n"));
-        all.events[0].network = Some(ForegoingNetwork {
+        all.events[0].network = Some(PrecedingNetwork {
             foregoing_s: 5.0,
             events: Vec::new(),
             more_count: 0,

@@ -2,19 +2,19 @@
 //! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
 #![forbid(unsafe_code)]
 
+pub mod adapter;
+pub mod adapter_metrics;
+mod adapter_warnings;
 pub(crate) mod alike;
 pub mod analysis;
 pub mod assessment;
-pub mod card_figures;
 pub mod clock_summary;
 pub mod compare;
 pub mod emulation;
 pub(crate) mod event_log;
-pub mod face;
-pub mod face_figures;
-mod face_warnings;
 pub mod link_change;
 pub mod network;
+pub mod nic_metrics;
 pub mod page;
 pub mod radio;
 pub mod replay;

@@ -119,12 +119,12 @@ impl LinkChange {
 mod tests {
     use std::time::Duration;
 
-    use hil_link::condition::LinkOrder;
+    use hil_link::condition::LinkChangeRequest;
 
     use super::*;
 
     fn record(condition: LinkCondition, outcome: OrderOutcome) -> LinkConditionRecord {
-        let order = LinkOrder::new(condition, 9);
+        let order = LinkChangeRequest::new(condition, 9);
         LinkConditionRecord {
             number: 2,
             request: 9,

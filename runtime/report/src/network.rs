@@ -2,7 +2,7 @@
 //! time of the run beside what the robot did. Figures are computed elsewhere.
 
 use core::fmt;
-use hil_account::network::{NetworkEventKind, NetworkFigures};
+use hil_account::network::{NetworkEventKind, NetworkMetrics};
 use hil_stats::correlation::PairCorrelation;
 use serde::{Deserialize, Serialize};
 
@@ -12,7 +12,7 @@ use hil_platform::words::plural;
 
 /// How long before an event of the score the network is looked at, seconds. The longest effect
 /// that is known of: a session that an outage ended takes that long to come back.
-pub const FOREGOING_S: f64 = 5.0;
+pub const PRECEDING_S: f64 = 5.0;
 
 /// Everything a run has to say about its network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,7 +51,7 @@ pub struct ChannelNetwork {
     /// Host of the consumer.
     pub to_host: String,
     /// Its figures.
-    pub figures: NetworkFigures,
+    pub figures: NetworkMetrics,
 }
 
 /// Something that happened on a channel.
@@ -98,7 +98,7 @@ impl TimedEvent {
     }
 
     /// How long before `at_s` it was over, seconds; 0 when it was under way, `None` when it cannot have
-    /// been within [`FOREGOING_S`] before, as two hosts' times are known to `clock_bound_s` of each other.
+    /// been within [`PRECEDING_S`] before, as two hosts' times are known to `clock_bound_s` of each other.
     pub(crate) fn over_for_s(&self, at_s: f64, clock_bound_s: f64) -> Option<f64> {
         if self.from_s > at_s + clock_bound_s {
             return None;
@@ -106,7 +106,7 @@ impl TimedEvent {
         let over_s = self
             .until_s
             .map_or(0.0, |until_s| (at_s - until_s).max(0.0));
-        (over_s <= FOREGOING_S + clock_bound_s).then_some(over_s)
+        (over_s <= PRECEDING_S + clock_bound_s).then_some(over_s)
     }
 
     /// In words, without its time.
@@ -177,11 +177,11 @@ fn counted(count: u64, what: &str) -> String {
 
 /// What the network went through before one event of the score.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ForegoingNetwork {
+pub struct PrecedingNetwork {
     /// How long before the event was looked at, seconds.
     pub foregoing_s: f64,
     /// Network events of that time on any channel, nearest first.
-    pub events: Vec<ForegoingEvent>,
+    pub events: Vec<PrecedingEvent>,
     /// Further ones.
     pub more_count: u64,
     /// Messages lost by the network in that time on all channels, those of the events included.
@@ -190,7 +190,7 @@ pub struct ForegoingNetwork {
 
 /// A network event that came before an event of the score.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ForegoingEvent {
+pub struct PrecedingEvent {
     /// It.
     #[serde(flatten)]
     pub event: TimedEvent,
@@ -200,7 +200,7 @@ pub struct ForegoingEvent {
     pub words: String,
 }
 
-impl ForegoingEvent {
+impl PrecedingEvent {
     /// `event`, which was over for `over_for_s` at `at_s`.
     pub fn of(event: &TimedEvent, at_s: f64, over_for_s: f64) -> Self {
         let when = if event.until_s.is_none_or(|until_s| until_s >= at_s) {
@@ -219,7 +219,7 @@ impl ForegoingEvent {
     }
 }
 
-impl ForegoingNetwork {
+impl PrecedingNetwork {
     /// What is said when nothing happened, which is a finding too.
     pub(crate) fn nothing_words(&self) -> String {
         let window = duration_s(self.foregoing_s);
@@ -461,7 +461,7 @@ mod tests {
         let words = |from_s, until_s, at_s| {
             let event = outage(from_s, until_s);
             let over_for_s = event.over_for_s(at_s, 0.0).unwrap();
-            ForegoingEvent::of(&event, at_s, over_for_s)
+            PrecedingEvent::of(&event, at_s, over_for_s)
                 .words
                 .replace(JOINT, " ")
         };

@@ -2,7 +2,7 @@
 //! channel what the radio reported of its messages and where they were stamped. It draws no
 //! conclusion.
 
-use hil_account::radio::{RadioFigures, TransmitStampFigures};
+use hil_account::radio::{RadioMetrics, TransmitStampMetrics};
 use serde::{Deserialize, Serialize};
 
 /// Everything about radios. Empty on a wired run, but for where messages were stamped.
@@ -28,9 +28,9 @@ pub struct ChannelRadio {
     /// Its name.
     pub channel: String,
     /// Where its transmit stamps were taken; `None` without the sending gateway's records.
-    pub transmit_stamps: Option<TransmitStampFigures>,
+    pub transmit_stamps: Option<TransmitStampMetrics>,
     /// What the radio reported of its messages; `None` when none reported anything.
-    pub acknowledgements: Option<RadioFigures>,
+    pub acknowledgements: Option<RadioMetrics>,
 }
 
 /// The radio of one gateway.

@@ -2,14 +2,17 @@
 //! the robot's side again in virtual time. What is compared, and how, is the case's to say.
 
 use core::fmt::Write;
-use std::{fs, path::PathBuf};
+use std::fs;
+use std::path::PathBuf;
 
 use hil_core::replay::Replay;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
+use crate::analysis::AnalysisError;
 use crate::analysis::records::{MessageRecords, missing_count};
-use crate::{analysis::AnalysisError, summary::RunSummary, terminal::wrapped};
+use crate::summary::RunSummary;
+use crate::terminal::wrapped;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_rundir::run_folder::RunFolder;

@@ -6,7 +6,7 @@ use hil_account::{MessageFate, Standing};
 use hil_core::case_study::Severity;
 use serde::{Deserialize, Serialize};
 
-use super::network::{ForegoingEvent, ForegoingNetwork};
+use super::network::{PrecedingEvent, PrecedingNetwork};
 use super::terminal::duration_s;
 
 /// The events of a run's score.
@@ -40,7 +40,7 @@ pub struct ExplainedEvent {
     /// What happened on any network in the seconds before; `None` when the run crossed none, or
     /// the event has no time.
     #[serde(default)]
-    pub network: Option<ForegoingNetwork>,
+    pub network: Option<PrecedingNetwork>,
     /// The messages concerned.
     pub messages: Vec<ExplainedMessage>,
     /// Messages the event had no room for.
@@ -58,8 +58,8 @@ impl ExplainedEvent {
     }
 
     /// What came before it on any network, without outages that [`Self::outages`] tell of.
-    pub(crate) fn network_beside(&self) -> Vec<&ForegoingEvent> {
-        let is_told = |one: &&ForegoingEvent| {
+    pub(crate) fn network_beside(&self) -> Vec<&PrecedingEvent> {
+        let is_told = |one: &&PrecedingEvent| {
             let is_outage = matches!(one.event.kind, NetworkEventKind::Outage { .. });
             let mut outages = self.outages.iter();
             is_outage && outages.any(|outage| outage.channel == one.event.channel)

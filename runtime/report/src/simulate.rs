@@ -4,8 +4,10 @@
 mod events;
 mod watched;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::{collections::BTreeMap, fs, io, time::Duration};
+use std::time::Duration;
+use std::{fs, io};
 
 use hil_account::network::{Moment, NetworkContext};
 use hil_account::{
@@ -19,15 +21,18 @@ use hil_core::simulation::{Carrier, ChannelCounts, Simulation, SimulationError, 
 use hil_core::time::{Instant, duration_ns};
 use hil_stats::histogram::Distribution;
 
+use crate::analysis::metrics::shell_words;
 use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
-use crate::{analysis::figures::shell_words, analysis::outages::OutageStory};
+use crate::analysis::outages::OutageHistory;
 
+use crate::event_log;
+use crate::network::NetworkReport;
+use crate::score_event::ScoreEvents;
 use crate::summary::{
-    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures,
+    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedMetrics,
     RunFacts, RunSummary, ScoreMetric,
 };
 use crate::terminal::{self, Style, percent};
-use crate::{event_log, network::NetworkReport, score_event::ScoreEvents};
 use hil_rundir::launch::Side;
 use hil_rundir::pipe::CounterGroup;
 use hil_rundir::run_folder::RunFolder;
@@ -111,14 +116,14 @@ pub fn simulate(
     let mut summary = RunSummary::new(run_facts(topology, file));
     let outages: Vec<_> = links
         .iter()
-        .map(|(name, link)| events::story(name.clone(), link.watch.outages(), duration))
+        .map(|(name, link)| events::history(name.clone(), link.watch.outages(), duration))
         .collect();
     let channels = topology.channels().iter();
     summary.channels = channels
         .map(|channel| {
             let story = outages.iter().find(|story| story.channel == channel.name);
             ChannelSummary {
-                outages: story.and_then(OutageStory::figures),
+                outages: story.and_then(OutageHistory::metrics),
                 ..channel_summary(topology, channel, &result, links.get(&channel.name))
             }
         })
@@ -219,9 +224,9 @@ fn run_watched(
 
 fn refuse_faces(topology: &Topology) -> Result<(), String> {
     let mut processes = topology.processes().iter();
-    let face = processes.find(|one| matches!(one.program, Program::Egm { .. }));
-    face.map_or(Ok(()), |face| {
-        let name = &face.name;
+    let adapter = processes.find(|one| matches!(one.program, Program::Egm { .. }));
+    adapter.map_or(Ok(()), |adapter| {
+        let name = &adapter.name;
         Err(format!(
             "process `{name}` speaks with a foreign program, which knows no virtual time"
         ))
@@ -321,7 +326,7 @@ fn channel_summary(
         outages: None,
         emulation: None,
         trace_replay: link.and_then(|link| Some(link.replay.as_ref()?.counts())),
-        recorded: recorded.map(|count| RecordedFigures {
+        recorded: recorded.map(|count| RecordedMetrics {
             message_count: *count,
             missing_count: 0,
         }),

@@ -6,26 +6,30 @@
 //! not know. Units are part of the names.
 
 use core::fmt;
+use std::collections::BTreeMap;
+use std::io;
 use std::path::{Path, PathBuf};
-use std::{collections::BTreeMap, io};
 
-use hil_account::{ChannelAccount, MessageFate, OutageFigures};
+use hil_account::{ChannelAccount, MessageFate, OutageMetrics};
 use hil_core::case_study::{Metric, Score};
 use hil_core::link_model::ReplayCounts;
 use hil_protocol::transport::Description;
 use serde::{Deserialize, Serialize};
 
-use super::{
-    assessment::Assessment, clock_summary::ClockSection, emulation::EmulationFigures,
-    face::FaceSummary, link_change::LinkChange, network::NetworkReport, radio::RadioReport,
-    score_event::ScoreEvents,
-};
-use crate::card_figures::HardwareStamps;
+use super::adapter::AdapterSummary;
+use super::assessment::Assessment;
+use super::clock_summary::ClockSection;
+use super::emulation::EmulationMetrics;
+use super::link_change::LinkChange;
+use super::network::NetworkReport;
+use super::radio::RadioReport;
+use super::score_event::ScoreEvents;
+use crate::nic_metrics::HardwareStamps;
 use hil_platform::host_facts::HostFacts;
 use hil_platform::text::grouped;
 use hil_rundir::event::{EventKind, ProcessKind};
 use hil_rundir::launch::Side;
-use hil_rundir::pipe::StallFigures;
+use hil_rundir::pipe::StallMetrics;
 pub use hil_rundir::pipe::{CountByName, CounterGroup};
 use hil_rundir::protection::RunSecurity;
 use hil_topology::{Channel, Topology, Via};
@@ -56,9 +60,9 @@ pub struct RunSummary {
     pub link_changes: Vec<LinkChange>,
     /// The channels, in the order of the case study.
     pub channels: Vec<ChannelSummary>,
-    /// Arms that went through a face to a foreign program.
+    /// Arms that went through an adapter to a foreign program.
     #[serde(default)]
-    pub faces: Vec<FaceSummary>,
+    pub faces: Vec<AdapterSummary>,
     /// What the network cards stamped; `None` unless hardware stamps were asked for.
     #[serde(default)]
     pub hardware_stamps: Option<HardwareStamps>,
@@ -527,18 +531,18 @@ pub struct ChannelSummary {
     /// Its outages: messages lost in a row, by length; `None` when they are unknown or it is only
     /// recorded.
     #[serde(default)]
-    pub outages: Option<OutageFigures>,
+    pub outages: Option<OutageMetrics>,
     /// How well the hosts kept its emulated link; `None` on every other link, or when no message
     /// came through it.
     #[serde(default)]
-    pub emulation: Option<EmulationFigures>,
+    pub emulation: Option<EmulationMetrics>,
     /// What its emulated link met of the trace that it replays; `None` where it replays none, or
     /// its gateway left no word.
     #[serde(default)]
     pub trace_replay: Option<ReplayCounts>,
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
-    pub recorded: Option<RecordedFigures>,
+    pub recorded: Option<RecordedMetrics>,
     /// Datagrams the gateways refused, by cause; only causes that occurred.
     pub refusals: Vec<CountByName>,
     /// Datagrams that came while a socket's receive buffer was full: their receiver was late. They may have
@@ -551,7 +555,7 @@ pub struct ChannelSummary {
 
 /// What the record holds of a channel that goes nowhere else.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RecordedFigures {
+pub struct RecordedMetrics {
     /// Messages in the record.
     pub message_count: u64,
     /// Sequence numbers below the highest of each start that are not: the recorder was full, or
@@ -594,7 +598,7 @@ pub struct DirectionSummary {
     pub facts: Vec<Fact>,
     /// How often its stream stood still; `None` where it is none, or receives.
     #[serde(default)]
-    pub stalls: Option<StallFigures>,
+    pub stalls: Option<StallMetrics>,
 }
 
 impl DirectionSummary {

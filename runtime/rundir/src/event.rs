@@ -7,7 +7,7 @@ use std::fmt;
 use hil_core::time::Instant;
 use serde::{Deserialize, Serialize};
 
-use crate::card_story::CardStory;
+use crate::nic_history::NicHistory;
 use crate::pipe::ProcessReport;
 use hil_platform::clock_discipline::HostDiscipline;
 
@@ -150,7 +150,7 @@ impl ProcessKind {
 
 /// One process of the run, as its supervisor knows it at the end.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ProcessStory {
+pub struct ProcessHistory {
     /// Name in the topology, or of a gateway.
     pub name: String,
     /// The host it ran on.
@@ -169,7 +169,7 @@ pub struct ProcessStory {
 
 /// What one host tells of its share of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct HostStory {
+pub struct HostHistory {
     /// The hosts that ran under one supervisor, and so on one clock.
     pub hosts: Vec<String>,
     /// Start and end of the run on that clock.
@@ -180,14 +180,14 @@ pub struct HostStory {
     #[serde(default)]
     pub discipline: Option<HostDiscipline>,
     /// How the processes fared.
-    pub processes: Vec<ProcessStory>,
+    pub processes: Vec<ProcessHistory>,
     /// What became of the network cards it armed.
     #[serde(default)]
-    pub cards: Vec<CardStory>,
+    pub cards: Vec<NicHistory>,
 }
 
 /// Who steers the system clock, by host.
-pub fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
+pub fn disciplines(stories: &[HostHistory]) -> BTreeMap<String, HostDiscipline> {
     let told = stories.iter().flat_map(|story| {
         let discipline = story.discipline.as_ref();
         let hosts = story.hosts.iter();

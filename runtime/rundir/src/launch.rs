@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 use std::{fs, io};
 
-use hil_arm::egm::face::{Axes, RobotWare};
+use hil_arm::egm::adapter::{Axes, RobotWare};
 use hil_arm::egm::messages::Side as ArmSide;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
 use hil_topology::emulation::EmulationLaunch;
-use hil_topology::{CardChannel, FaceKind, FaceSend, Timestamps};
+use hil_topology::{AdapterKind, AdapterSend, NicChannel, Timestamps};
 
 /// How to start one process of the run that this binary plays.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -44,14 +44,14 @@ pub enum Work {
     /// Carries channels over a link, or is one end of a clock path.
     Gateway(GatewayWork),
     /// Speaks a robot maker's own protocol with a foreign program.
-    Adapter(FaceSettings),
+    Adapter(AdapterSettings),
 }
 
 /// What a component is told.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ComponentWork {
-    /// File with the [`ProcessCard`](hil_topology::ProcessCard).
+    /// File with the [`RoleSpec`](hil_topology::ProcessCard).
     pub card: PathBuf,
     /// What to ask of the kernel.
     pub realtime: RealtimeRequest,
@@ -152,11 +152,11 @@ pub struct SocketLaunch {
 /// What a process is told that speaks with a foreign program.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct FaceSettings {
+pub struct AdapterSettings {
     /// The role that the foreign program plays.
     pub role: String,
     /// Which side of the protocol we are.
-    pub kind: FaceKind,
+    pub kind: AdapterKind,
     /// Joints of an arm on the wire, 6 or 7.
     pub axes: u8,
     /// Generation of the robot's software, 6 or 7.
@@ -167,8 +167,8 @@ pub struct FaceSettings {
     pub planned_lead_ns: u64,
     /// How to wait.
     pub wait: WaitMode,
-    /// When a sensor face sends.
-    pub send: FaceSend,
+    /// When a sensor adapter sends.
+    pub send: AdapterSend,
     /// Kernel stamps to ask for.
     pub timestamps: Timestamps,
     /// Differentiated-services code point (RFC 2474), 0..=63.
@@ -178,11 +178,11 @@ pub struct FaceSettings {
     /// One thread and one socket each.
     pub arms: Vec<ArmLaunch>,
     /// Channels whose messages the protocol has no place for: taken, recorded and dropped.
-    pub spare: Vec<CardChannel>,
+    pub spare: Vec<NicChannel>,
 }
 
-impl FaceSettings {
-    /// [`FaceSettings::axes`] in the words of the protocol.
+impl AdapterSettings {
+    /// [`AdapterSettings::axes`] in the words of the protocol.
     pub const fn axes(&self) -> Axes {
         match self.axes {
             6 => Axes::Six,
@@ -190,7 +190,7 @@ impl FaceSettings {
         }
     }
 
-    /// [`FaceSettings::robotware`] in the words of the protocol.
+    /// [`AdapterSettings::robotware`] in the words of the protocol.
     pub const fn robotware(&self) -> RobotWare {
         match self.robotware {
             6 => RobotWare::Six,
@@ -199,18 +199,18 @@ impl FaceSettings {
     }
 }
 
-/// One arm of a face.
+/// One arm of an adapter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ArmLaunch {
     /// Which arm.
     pub arm: ArmSide,
-    /// Where the foreign program listens (robot face), or where we do (sensor face).
+    /// Where the foreign program listens (robot adapter), or where we do (sensor adapter).
     pub address: SocketAddr,
     /// The channel whose messages go out.
-    pub input: CardChannel,
+    pub input: NicChannel,
     /// The channel that what comes in is published on.
-    pub output: CardChannel,
+    pub output: NicChannel,
     /// What to ask of the kernel.
     pub realtime: RealtimeRequest,
 }

@@ -2,15 +2,15 @@
 //! files of its processes. It starts and computes nothing.
 #![forbid(unsafe_code)]
 
+pub mod adapter_record;
 pub mod announcement;
-pub mod card_story;
 pub mod event;
-pub mod face_record;
 pub mod launch;
 pub mod layout;
 pub mod link_orders;
 pub mod live_run;
 pub mod manifest;
+pub mod nic_history;
 pub mod pipe;
 pub mod protection;
 pub mod radio_record;

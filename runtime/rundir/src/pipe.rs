@@ -98,9 +98,9 @@ pub struct ProcessReport {
     pub involuntary_switches: u64,
     /// Named counters of each channel direction a gateway carries.
     pub directions: Vec<DirectionReport>,
-    /// The arms of a face that speaks with a foreign program.
+    /// The arms of an adapter that speaks with a foreign program.
     #[serde(default)]
-    pub faces: Vec<FaceReport>,
+    pub faces: Vec<AdapterReport>,
 }
 
 /// What of a direction or arm counted something.
@@ -173,17 +173,17 @@ impl CountByName {
     }
 }
 
-/// Why a face could not use a datagram.
+/// Why an adapter could not use a datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum FaceRefusal {
+pub enum AdapterRefusal {
     /// The protocol does not allow it.
     Protocol(Cause),
     /// It came from another address than the robot's.
     ForeignAddress,
 }
 
-impl FaceRefusal {
+impl AdapterRefusal {
     /// A few words for a report.
     pub const fn label(self) -> &'static str {
         match self {
@@ -193,18 +193,18 @@ impl FaceRefusal {
     }
 }
 
-/// How many datagrams a face could not use, and why.
+/// How many datagrams an adapter could not use, and why.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RefusalCount {
     /// Why.
-    pub cause: FaceRefusal,
+    pub cause: AdapterRefusal,
     /// How many.
     pub count: u64,
 }
 
-/// One arm of a face.
+/// One arm of an adapter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct FaceReport {
+pub struct AdapterReport {
     /// Which arm.
     pub arm: ArmSide,
     /// The channel whose messages went out.
@@ -236,7 +236,7 @@ pub struct DirectionReport {
     pub facts: Vec<(String, String)>,
     /// How often its stream stood still; `None` where it is none, or receives.
     #[serde(default)]
-    pub stalls: Option<StallFigures>,
+    pub stalls: Option<StallMetrics>,
     /// What its link model met of the trace that it replays; `None` where it replays none.
     #[serde(default)]
     pub replay: Option<ReplayCounts>,
@@ -244,7 +244,7 @@ pub struct DirectionReport {
 
 /// How often a stream stood still.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct StallFigures {
+pub struct StallMetrics {
     /// Times that a byte was not acknowledged within the limit.
     pub count: u64,
     /// All of them together, nanoseconds.

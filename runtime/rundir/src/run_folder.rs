@@ -102,7 +102,7 @@ impl RunFolder {
     }
 
     /// Card of a component.
-    pub fn card(&self, process: &str) -> PathBuf {
+    pub fn nic(&self, process: &str) -> PathBuf {
         self.root.join("cards").join(format!("{process}.json"))
     }
 

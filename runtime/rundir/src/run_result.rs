@@ -9,8 +9,8 @@ use std::{fs, io};
 use hil_core::time::Instant;
 use serde::{Deserialize, Serialize};
 
-use super::card_story::CardStory;
-use super::event::{Event, ProcessStory};
+use super::event::{Event, ProcessHistory};
+use super::nic_history::NicHistory;
 use super::run_folder::RunFolder;
 use crate::protection::RunSecurity;
 use hil_platform::clock_discipline::HostDiscipline;
@@ -77,10 +77,10 @@ pub struct RunResult {
     /// What happened, on all hosts.
     pub events: Vec<Event>,
     /// How the processes of all hosts fared.
-    pub processes: Vec<ProcessStory>,
+    pub processes: Vec<ProcessHistory>,
     /// What became of the network cards of all hosts; empty unless hardware stamps were asked
     /// for.
-    pub cards: Vec<CardStory>,
+    pub cards: Vec<NicHistory>,
     /// True when all hosts read one clock.
     pub has_one_clock: bool,
     /// How the hops between hosts are protected; `None` when there are none.

@@ -13,20 +13,20 @@ use super::status::{FILE_NAME, RunStatus};
 #[derive(Debug)]
 pub struct StatusFile {
     path: PathBuf,
-    desk: Arc<Desk>,
+    shared: Arc<SharedStatus>,
     /// `None` when it could not be started.
     writer: Option<JoinHandle<()>>,
 }
 
 /// What the supervisor and the writing thread hand each other.
 #[derive(Debug, Default)]
-struct Desk {
-    tray: Mutex<Tray>,
+struct SharedStatus {
+    pending: Mutex<PendingStatus>,
     bell: Condvar,
 }
 
 #[derive(Debug, Default)]
-struct Tray {
+struct PendingStatus {
     /// The newest status, until the writer takes it.
     next: Option<RunStatus>,
     /// What hindered the writer, until the supervisor takes it.
@@ -34,16 +34,16 @@ struct Tray {
     is_over: bool,
 }
 
-impl Desk {
+impl SharedStatus {
     /// Nothing that is held while this is can fail half way.
-    fn tray(&self) -> MutexGuard<'_, Tray> {
-        self.tray.lock().unwrap_or_else(PoisonError::into_inner)
+    fn pending(&self) -> MutexGuard<'_, PendingStatus> {
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The newest status, as soon as there is one; `None` when there will be no more.
     fn wait_for_next(&self) -> Option<RunStatus> {
-        let is_idle = |tray: &mut Tray| tray.next.is_none() && !tray.is_over;
-        let waited = self.bell.wait_while(self.tray(), is_idle);
+        let is_idle = |pending: &mut PendingStatus| pending.next.is_none() && !pending.is_over;
+        let waited = self.bell.wait_while(self.pending(), is_idle);
         waited.unwrap_or_else(PoisonError::into_inner).next.take()
     }
 }
@@ -52,33 +52,37 @@ impl StatusFile {
     /// That of the run in `folder`; writes nothing yet.
     pub fn of(folder: &Path) -> Self {
         let path = folder.join(FILE_NAME);
-        let desk = Arc::new(Desk::default());
-        let (theirs, file) = (Arc::clone(&desk), path.clone());
+        let shared = Arc::new(SharedStatus::default());
+        let (theirs, file) = (Arc::clone(&shared), path.clone());
         let started = Builder::new()
             .name("status".to_owned())
             .spawn(move || keep(&theirs, &file));
         let writer = started
-            .map_err(|error| desk.tray().complaint = Some(complaint(&path, &error)))
+            .map_err(|error| shared.pending().complaint = Some(complaint(&path, &error)))
             .ok();
-        Self { path, desk, writer }
+        Self {
+            path,
+            shared,
+            writer,
+        }
     }
 
     /// Has `status` written, so that a reader finds it whole, unless a newer one comes before the disk
     /// has time for it. Gives the complaint about an earlier one, once; what hindered it may be over.
     pub fn write(&self, status: RunStatus) -> Option<String> {
-        let mut tray = self.desk.tray();
-        tray.next = Some(status);
-        let complaint = tray.complaint.take();
-        drop(tray);
-        self.desk.bell.notify_one();
+        let mut pending = self.shared.pending();
+        pending.next = Some(status);
+        let complaint = pending.complaint.take();
+        drop(pending);
+        self.shared.bell.notify_one();
         complaint
     }
 }
 
 impl Drop for StatusFile {
     fn drop(&mut self) {
-        self.desk.tray().is_over = true;
-        self.desk.bell.notify_one();
+        self.shared.pending().is_over = true;
+        self.shared.bell.notify_one();
         if let Some(writer) = self.writer.take() {
             // It has nothing to tell any more, not even that it panicked.
             let _is_over = writer.join().is_ok();
@@ -89,15 +93,15 @@ impl Drop for StatusFile {
 }
 
 /// The writing thread.
-fn keep(desk: &Desk, path: &Path) {
+fn keep(shared: &SharedStatus, path: &Path) {
     let mut has_complained = false;
-    while let Some(status) = desk.wait_for_next() {
+    while let Some(status) = shared.wait_for_next() {
         let Err(error) = replace(path, &status) else {
             continue;
         };
         if !has_complained {
             has_complained = true;
-            desk.tray().complaint = Some(complaint(path, &error));
+            shared.pending().complaint = Some(complaint(path, &error));
         }
     }
 }

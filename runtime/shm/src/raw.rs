@@ -3,9 +3,8 @@
 //! (`CustomPayloadMarker`, `CustomHeaderMarker`, `__internal_*`, the same that its own network
 //! link and its C bindings use); the tests beside it say what an upgrade broke.
 
-use core::fmt;
 use core::mem::MaybeUninit;
-use core::slice;
+use core::{fmt, slice};
 use std::os::fd::BorrowedFd;
 
 use hil_core::message::Envelope;

@@ -1,17 +1,16 @@
 //! What the tables say about each other: hosts and processes. Channels and links follow in
 //! `check_channels`. Nothing is read here; the result is the checked topology.
 
-use super::check_channels;
-use super::check_face::{check_face, check_faces, is_dispensable};
+use super::adapter::EgmAdapter;
+use super::check_adapter::{check_adapter, check_faces, is_dispensable};
 use super::clock_path::{self, ClockEntry};
 use super::errors::{Fault, Faults, Place};
-use super::face::EgmFace;
 use super::file::{CaseEntry, File, HostEntry, ProcessEntry};
 use super::known::{KnownCase, KnownCases, ParameterFault};
-use super::limits;
 use super::model::{Case, Host, OnExit, Process, Program, Topology};
 use super::reader::At;
 use super::tree::{Node, Table, Value, join, to_plain_table};
+use super::{check_channels, limits};
 
 /// Name of the host of a file without `[hosts]`.
 const IMPLICIT_HOST: &str = "local";
@@ -225,12 +224,13 @@ fn check_processes(
             .role
             .as_ref()
             .and_then(|role| check_role(entry, role, roles, &processes, faults));
-        let face = entry.egm.as_ref().zip(roles.known).zip(role.as_ref());
-        let face = face.and_then(|((face, case), role)| check_face(face, role, case, faults));
+        let adapter = entry.egm.as_ref().zip(roles.known).zip(role.as_ref());
+        let adapter =
+            adapter.and_then(|((adapter, case), role)| check_adapter(adapter, role, case, faults));
         processes.push(Process {
             name: entry.name.clone(),
             host: check_host(entry, hosts, faults),
-            program: program(entry, role, face),
+            program: program(entry, role, adapter),
             execution: entry.execution.clone(),
             on_exit: entry.on_exit,
         });
@@ -238,14 +238,14 @@ fn check_processes(
     processes
 }
 
-fn program(entry: &ProcessEntry, role: Option<String>, face: Option<EgmFace>) -> Program {
-    match (&entry.command, role, face) {
+fn program(entry: &ProcessEntry, role: Option<String>, adapter: Option<EgmAdapter>) -> Program {
+    match (&entry.command, role, adapter) {
         (Some(command), role, _) => Program::Command {
             role,
             command: command.clone(),
             environment: entry.environment.clone(),
         },
-        (None, Some(role), Some(face)) => Program::Egm { role, face },
+        (None, Some(role), Some(adapter)) => Program::Egm { role, adapter },
         (None, role, _) => Program::BuiltIn {
             role: role.unwrap_or_default(),
         },
@@ -277,7 +277,7 @@ fn check_role(
         });
         return None;
     }
-    // A face knows nothing of the world that it could be wrong about.
+    // An adapter knows nothing of the world that it could be wrong about.
     let has_memory = entry.egm.is_none();
     if !case.may_restart && has_memory && entry.on_exit != OnExit::EndRun {
         let problem = format!(

@@ -3,11 +3,10 @@
 
 use hil_core::case_study::ChannelSpec;
 
-use super::check_face::is_played_by_face;
+use super::check_adapter::is_played_by_adapter;
 use super::errors::{Fault, Faults, Place};
 use super::file::{ChannelEntry, ProcessEntry};
-use super::file_links::LinkEntry;
-use super::file_links::crossing_words;
+use super::file_links::{LinkEntry, crossing_words};
 use super::known::KnownCase;
 use super::model::{Channel, ChannelPorts, MessageLayout, Process, Program, Topology};
 use super::model_links::{Link, Via};
@@ -95,7 +94,7 @@ fn case_channels(
         // An unplayed role is a fault already, or nobody misses it.
         let (from, to) = (player(spec.from), spec.to.and_then(player));
         // A foreign program leaves nothing in our record.
-        let is_recorded_here = spec.is_recorded_only() && !from.is_some_and(is_played_by_face);
+        let is_recorded_here = spec.is_recorded_only() && !from.is_some_and(is_played_by_adapter);
         let Some(from) = from.filter(|_| to.is_some() || is_recorded_here) else {
             refuse_unplayed(spec, entry, faults);
             continue;

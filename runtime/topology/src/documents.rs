@@ -2,9 +2,8 @@
 //! the shells. They are made from the same definitions that `--help` is, so they cannot differ from
 //! it. The schema of topology files and the description of the robot are laid beside them.
 
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
+use std::{fs, io};
 
 use clap::Command;
 use clap_complete::Shell;

@@ -7,7 +7,7 @@ use core::ops::Range;
 
 use annotate_snippets::{AnnotationKind, Group, Level, Renderer, Snippet};
 
-use super::schema::{Asked, Shape};
+use super::schema::{RequestedKeys, Shape};
 use super::suggest::{listed, nearest};
 
 /// Errors that are told at once: of a file that is no topology at all, every line would be one.
@@ -262,7 +262,7 @@ pub(super) struct Place {
 #[derive(Debug, Default)]
 pub(super) struct Faults {
     found: RefCell<Vec<(String, Fault, Option<Place>)>>,
-    asked: Option<RefCell<Asked>>,
+    asked: Option<RefCell<RequestedKeys>>,
 }
 
 impl Faults {
@@ -289,7 +289,7 @@ impl Faults {
     }
 
     /// What was noted.
-    pub(super) fn into_notes(self) -> Asked {
+    pub(super) fn into_notes(self) -> RequestedKeys {
         self.asked.map(RefCell::into_inner).unwrap_or_default()
     }
 

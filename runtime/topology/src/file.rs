@@ -6,9 +6,9 @@
 
 use std::collections::BTreeMap;
 
+use super::adapter::AdapterEntry;
 use super::clock_path::{self, ClockEntry};
 use super::errors::{Fault, Faults, Place};
-use super::face::FaceEntry;
 use super::file_links::LinkEntry;
 use super::limits;
 use super::model::{Execution, Host, MessageLayout, OnExit, Run, Scheduling, Wait};
@@ -55,7 +55,7 @@ pub(super) struct ProcessEntry {
     pub role: Option<At<String>>,
     pub command: Option<Vec<String>>,
     pub environment: BTreeMap<String, String>,
-    pub egm: Option<FaceEntry>,
+    pub egm: Option<AdapterEntry>,
     pub execution: Execution,
     pub on_exit: OnExit,
     pub path: String,
@@ -240,7 +240,7 @@ fn read_process(name: String, mut reader: Reader<'_>) -> ProcessEntry {
             "needs `run`: a built-in role reads no environment",
         );
     }
-    let egm = reader.table("egm").map(FaceEntry::read);
+    let egm = reader.table("egm").map(AdapterEntry::read);
     if egm.is_some() {
         let why =
             "does not go with `egm`: a foreign program that is not started here plays the role";

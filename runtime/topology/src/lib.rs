@@ -8,19 +8,18 @@
 //! collected with file, line and column into [`TopologyErrors`].
 //!
 //! A program registers its case studies in [`KnownCases`]; [`which_host`] says which host of the
-//! topology this machine is; [`ProcessCard`] is all that a process is told.
+//! topology this machine is; [`RoleSpec`] is all that a process is told.
 #![forbid(unsafe_code)]
 
-mod card;
+mod adapter;
 mod check;
+mod check_adapter;
 mod check_channels;
-mod check_face;
 mod clock_path;
 pub mod documents;
 pub mod emulation;
 pub mod emulation_room;
 mod errors;
-mod face;
 mod file;
 mod file_impairments;
 mod file_links;
@@ -36,6 +35,7 @@ mod parameter_reader;
 mod reader;
 pub mod registry;
 mod resolved;
+mod role_spec;
 mod schema;
 mod security;
 mod suggest;
@@ -45,12 +45,10 @@ mod units;
 
 use std::path::Path;
 
-pub use card::{CardChannel, ProcessCard};
-pub use check_face::{command_channel, feedback_channel};
-pub use clock_path::describe_end;
-pub use clock_path::{ClockEnd, ClockPath};
+pub use adapter::{AdapterKind, AdapterSend, EgmAdapter};
+pub use check_adapter::{command_channel, feedback_channel};
+pub use clock_path::{ClockEnd, ClockPath, describe_end};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
-pub use face::{EgmFace, FaceKind, FaceSend};
 pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};
 pub use known::{
     KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with, parameters_of,
@@ -61,6 +59,7 @@ pub use model::{
 };
 pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via, transport};
 pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
+pub use role_spec::{NicChannel, RoleSpec};
 pub use schema::schema;
 pub use security::{Hops, Security};
 

@@ -71,9 +71,9 @@ pub(super) const LINK_PATH_MTU_BYTES: Limit<i64> = limit(1_500, 576, 65_535);
 pub(super) const LINK_DELAY: Limit<Duration> = limit(ms(0), ms(0), ms(10_000));
 pub(super) const LINK_LOSS_RATIO: Limit<f64> = limit(0.0, 0.0, 1.0);
 
-/// Joints of an arm on the wire of an EGM face.
+/// Joints of an arm on the wire of an EGM adapter.
 pub(super) const EGM_AXES: Limit<i64> = limit(7, 6, 7);
-/// Generation of the robot's software whose fields an EGM face writes.
+/// Generation of the robot's software whose fields an EGM adapter writes.
 pub(super) const EGM_ROBOTWARE: Limit<i64> = limit(7, 6, 7);
 /// A robot takes one message per cycle of 4 ms; senders of up to four times that are seen.
 pub(super) const EGM_SEND_HZ: Limit<f64> = limit(250.0, 1.0, 1_000.0);

@@ -11,8 +11,8 @@ use hil_link::spec::LinkSpec;
 
 use super::model_links::{Hop, Link};
 
+use super::adapter::EgmAdapter;
 use super::clock_path::ClockEnd;
-use super::face::EgmFace;
 use super::security::Security;
 
 /// A topology file after every check. Only [`load`](super::load) and [`parse`](super::parse)
@@ -128,7 +128,7 @@ pub enum Program {
         /// Name of the role.
         role: String,
         /// How to speak with the program.
-        face: EgmFace,
+        adapter: EgmAdapter,
     },
 }
 

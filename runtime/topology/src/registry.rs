@@ -132,7 +132,7 @@ pub struct CaseEntry {
     /// The series it can give, by name.
     pub series: &'static [&'static str],
     /// The figures it can be calibrated for, by name.
-    pub calibrated_figures: &'static [&'static str],
+    pub calibrated_metrics: &'static [&'static str],
     make: fn(Value, u64) -> Result<Box<dyn Case>, CaseError>,
     defaults: fn() -> Value,
 }
@@ -180,7 +180,7 @@ impl Registry {
             channels: C::CHANNELS,
             score_clock: C::SCORE_CLOCK,
             series: C::SERIES,
-            calibrated_figures: C::CALIBRATED_FIGURES,
+            calibrated_metrics: C::CALIBRATED_FIGURES,
             make: make::<C>,
             defaults: || serde_json::to_value(C::Parameters::default()).unwrap_or(Value::Null),
         });

@@ -153,8 +153,8 @@ fn resolved_process(process: &Process) -> Table {
             .collect();
         put(&mut table, "env", variables);
     }
-    if let Program::Egm { face, .. } = &process.program {
-        put(&mut table, "egm", face.resolved());
+    if let Program::Egm { adapter, .. } = &process.program {
+        put(&mut table, "egm", adapter.resolved());
     }
     put_execution(&mut table, &process.execution);
     put_on_exit(&mut table, process.on_exit);

@@ -119,13 +119,13 @@ impl Shape {
 
 /// What readers asked for, by the path of the table.
 #[derive(Debug, Default)]
-pub(super) struct Asked {
+pub(super) struct RequestedKeys {
     tables: BTreeMap<String, BTreeMap<&'static str, Vec<Shape>>>,
     /// Tables that no reader looks into.
     unread: BTreeSet<String>,
 }
 
-impl Asked {
+impl RequestedKeys {
     /// Adds a key of the table at `path`.
     pub(super) fn add(&mut self, path: &str, key: &'static str, shape: Shape) {
         let table = self.tables.entry(path.to_owned()).or_default();
@@ -215,7 +215,7 @@ pub fn schema() -> Value {
 }
 
 /// What the readers ask for in all their branches.
-fn asked() -> Asked {
+fn asked() -> RequestedKeys {
     let faults = Faults::with_notes();
     for text in texts() {
         let sources = [Source {

@@ -1,8 +1,8 @@
 //! Good topologies: what they become, how they are written back, and what a process is told.
 //! Faulty ones are in `tests/faulty.rs`.
 
+mod adapter;
 mod clock_path;
-mod face;
 mod faulty;
 mod fitted;
 mod fleet;
@@ -381,7 +381,7 @@ fn the_hash_changes_with_every_meaning_and_with_no_spelling() {
 #[test]
 fn a_process_is_told_the_same_in_every_deployment() {
     let bytes = |file: &str, process: &str| {
-        let card = load_shipped(file, &[]).process_card(process).unwrap();
+        let card = load_shipped(file, &[]).role_spec(process).unwrap();
         serde_json::to_string_pretty(&card).unwrap()
     };
     for process in ["human", "controller", "robot"] {
@@ -405,9 +405,9 @@ fn a_process_is_told_the_same_in_every_deployment() {
 }
 
 #[test]
-fn a_card_lists_the_ports_of_its_role_in_order_and_survives_the_trip() {
+fn a_nic_lists_the_ports_of_its_role_in_order_and_survives_the_trip() {
     let topology = parse_good(EVERYTHING);
-    let card = topology.process_card("controller").unwrap();
+    let card = topology.role_spec("controller").unwrap();
     let inputs: Vec<_> = card
         .inputs
         .iter()
@@ -419,13 +419,13 @@ fn a_card_lists_the_ports_of_its_role_in_order_and_survives_the_trip() {
     let hash = hil_core::message::MessageType::of::<Frame>().hash();
     assert_eq!(card.outputs[0].message().hash(), hash);
     let json = serde_json::to_string(&card).unwrap();
-    assert_eq!(serde_json::from_str::<ProcessCard>(&json).unwrap(), card);
+    assert_eq!(serde_json::from_str::<RoleSpec>(&json).unwrap(), card);
 
-    let viewer = topology.process_card("viewer").unwrap();
+    let viewer = topology.role_spec("viewer").unwrap();
     assert_eq!((viewer.case, viewer.role), (None, None));
     assert!(viewer.parameters.is_empty());
     assert_eq!(viewer.inputs[0].message_name, "lab.Image.v1");
-    assert_eq!(topology.process_card("nobody"), None);
+    assert_eq!(topology.role_spec("nobody"), None);
 }
 
 #[test]

@@ -2,11 +2,10 @@
 //! files; what a message meets then is `hil_link::trace`.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
+use std::{fs, io};
 
 use hil_core::link_model::TraceMatch;
 use hil_link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};

@@ -1,15 +1,16 @@
 //! What an observer hears of a run, one thing at a time.
 
 use bytemuck::Pod;
-use hil_account::card_clock::CardClockRecord;
+use hil_account::nic_clock::NicClockRecord;
 use hil_core::message::Envelope;
 use hil_core::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_link::condition::LinkConditionRecord;
 
-use super::{feed::WatchedChannel, follow::Batch};
-use hil_rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
+use super::feed::WatchedChannel;
+use super::follow::Batch;
+use hil_rundir::adapter_record::{AdapterReceivedRecord, AdapterSentRecord};
 use hil_rundir::radio_record::RadioRecord;
 use hil_rundir::record::RecordKind;
 
@@ -78,12 +79,12 @@ pub enum Record {
     FollowUp(FollowUpRecord),
     /// A clock exchange.
     RoundTrip(RoundTripRecord),
-    /// A face sent.
-    FaceSent(FaceSentRecord),
-    /// A face received.
-    FaceReceived(FaceReceivedRecord),
+    /// An adapter sent.
+    AdapterSent(AdapterSentRecord),
+    /// An adapter received.
+    AdapterReceived(AdapterReceivedRecord),
     /// A network card's clock was read.
-    CardClock(CardClockRecord),
+    NicClock(NicClockRecord),
     /// A radio was asked, or said something.
     Radio(RadioRecord),
     /// An emulated link was given an order; the channel is `hil/link/<link>/<direction>`.
@@ -103,9 +104,9 @@ impl Record {
             RecordKind::Ingress => all(batch, Self::Ingress, take),
             RecordKind::FollowUp => all(batch, Self::FollowUp, take),
             RecordKind::RoundTrip => all(batch, Self::RoundTrip, take),
-            RecordKind::FaceSent => all(batch, Self::FaceSent, take),
-            RecordKind::FaceReceived => all(batch, Self::FaceReceived, take),
-            RecordKind::CardClock => all(batch, Self::CardClock, take),
+            RecordKind::AdapterSent => all(batch, Self::AdapterSent, take),
+            RecordKind::AdapterReceived => all(batch, Self::AdapterReceived, take),
+            RecordKind::NicClock => all(batch, Self::NicClock, take),
             RecordKind::Radio => all(batch, Self::Radio, take),
             RecordKind::LinkCondition => all(batch, Self::LinkCondition, take),
             RecordKind::Message => {}

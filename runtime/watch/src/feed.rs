@@ -1,15 +1,17 @@
 //! One run as one stream of events: for each channel the feed decides whether its messages are followed
 //! from the records or read from shared memory, and it knows when the run is over.
 
+use std::collections::BTreeMap;
+use std::io;
 use std::time::{Duration, Instant as WallInstant};
-use std::{collections::BTreeMap, io};
 
 use hil_core::message::Envelope;
 
 use super::event::{Event, Origin, Record};
 use super::follow::{Batch, RecordFollower};
 use super::passive::{PassiveCounters, PassiveReader};
-use super::{shared::Shared, since::Since};
+use super::shared::Shared;
+use super::since::Since;
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::live_run::{LiveRun, Source};
 use hil_rundir::manifest::{ChannelDescription, Manifest};

@@ -1,10 +1,13 @@
 //! The record files of a run while they grow: what came since the last look, in whole records. It
 //! knows no run; it follows a folder.
 
+use std::collections::BTreeSet;
+use std::ffi::OsString;
 use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant as WallInstant};
-use std::{collections::BTreeSet, ffi::OsString, io, os::unix::fs::FileExt};
 
 use bytemuck::Pod;
 use hil_core::message::Envelope;

@@ -1,8 +1,9 @@
 //! Watching a run that the tests make up: a domain and a folder, without any process of a run.
 
+use std::collections::BTreeMap;
 use std::fs::{self, OpenOptions};
+use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::{collections::BTreeMap, io::Write};
 
 use bytemuck::bytes_of;
 use hil_core::message::Envelope;

@@ -3,9 +3,8 @@
 use hil_capture::flow::FlowFilter;
 use hil_capture::observe::Observer;
 use hil_capture::reader::{CaptureReader, Step};
-use hil_capture::writer;
 use hil_capture::writer::PacketToWrite;
-use hil_capture::{CaptureFault, CaptureInterface, CapturedPacket, esl, link};
+use hil_capture::{CaptureFault, CaptureInterface, CapturedPacket, esl, link, writer};
 use hil_net::{Direction, link_type};
 
 use crate::Verdict;
@@ -184,7 +183,7 @@ pub(crate) fn frame(bytes: &[u8]) -> Verdict {
         link_type,
         stamp_ns: (original_bytes & 1 == 0).then_some(i64::from(original_bytes)),
         original_bytes,
-        is_card_stamped: false,
+        is_nic_stamped: false,
         direction: Direction::Unknown,
         data: frame,
     };

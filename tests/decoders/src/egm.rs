@@ -1,9 +1,10 @@
-//! The robot maker's datagrams, and sessions of them with our faces.
+//! The robot maker's datagrams, and sessions of them with our adapters.
 
 use std::time::Duration;
 
-use hil_arm::egm::face::{
-    Axes, RobotFace, RobotFaceSettings, RobotWare, SendPolicy, SensorFace, SensorFaceSettings,
+use hil_arm::egm::adapter::{
+    Axes, RobotAdapter, RobotAdapterSettings, RobotWare, SendPolicy, SensorAdapter,
+    SensorAdapterSettings,
 };
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
 use hil_arm::egm::wire::{
@@ -46,7 +47,7 @@ pub(crate) fn datagrams(bytes: &[u8]) -> Verdict {
     Verdict::of(accepted_count > 0)
 }
 
-/// Datagrams in a row, each with its length before it: the first byte says to which face. What is
+/// Datagrams in a row, each with its length before it: the first byte says to which adapter. What is
 /// taken is finite and within what the arm can be, and every datagram is counted once.
 pub(crate) fn session(bytes: &[u8]) -> Verdict {
     let mut input = Input::new(bytes);
@@ -64,7 +65,7 @@ pub(crate) fn session(bytes: &[u8]) -> Verdict {
 }
 
 fn to_the_robot(axes: Axes, mut input: Input<'_>) -> Verdict {
-    let mut face = RobotFace::new(RobotFaceSettings {
+    let mut adapter = RobotAdapter::new(RobotAdapterSettings {
         side: Side::Right,
         axes,
         robotware: RobotWare::Six,
@@ -79,12 +80,12 @@ fn to_the_robot(axes: Axes, mut input: Input<'_>) -> Verdict {
             cycle_index += 1;
             let session = u32::from(length & 0x4000 != 0) + 1;
             let _is_told =
-                face.encode(&feedback(cycle_index, session), Duration::ZERO, &mut buffer);
+                adapter.encode(&feedback(cycle_index, session), Duration::ZERO, &mut buffer);
             continue;
         }
         let datagram = input.take(length);
         count += 1;
-        if let Ok(command) = face.decode(datagram) {
+        if let Ok(command) = adapter.decode(datagram) {
             taken_count += 1;
             let EgmCommand {
                 position_rad,
@@ -104,9 +105,9 @@ fn to_the_robot(axes: Axes, mut input: Input<'_>) -> Verdict {
             );
         }
     }
-    assert_eq!(face.received().total(), count);
-    assert_eq!(face.received().accepted(), taken_count);
-    let refused: u64 = face.received().causes().map(|(_, count)| count).sum();
+    assert_eq!(adapter.received().total(), count);
+    assert_eq!(adapter.received().accepted(), taken_count);
+    let refused: u64 = adapter.received().causes().map(|(_, count)| count).sum();
     assert_eq!(refused + taken_count, count, "a refusal without a cause");
     Verdict::of(taken_count > 0)
 }
@@ -121,7 +122,7 @@ fn to_the_sensor(axes: Axes, is_free: bool, mut input: Input<'_>) -> Verdict {
             patience: Duration::from_millis(24),
         }
     };
-    let mut face = SensorFace::new(SensorFaceSettings {
+    let mut adapter = SensorAdapter::new(SensorAdapterSettings {
         axes,
         held_rad: 0.0,
         policy,
@@ -133,7 +134,7 @@ fn to_the_sensor(axes: Axes, is_free: bool, mut input: Input<'_>) -> Verdict {
         now = now + Duration::from_millis(4);
         let datagram = input.take(length);
         count += 1;
-        if let Ok(feedback) = face.decode(now, datagram) {
+        if let Ok(feedback) = adapter.decode(now, datagram) {
             taken_count += 1;
             let EgmFeedback {
                 measured_rad,
@@ -147,12 +148,12 @@ fn to_the_sensor(axes: Axes, is_free: bool, mut input: Input<'_>) -> Verdict {
             );
             assert!(feedback.session_state().is_some());
         }
-        while face.poll_transmit(now, &mut buffer) {
+        while adapter.poll_transmit(now, &mut buffer) {
             decode_sensor(&buffer).expect("our own datagram is one");
         }
     }
-    assert_eq!(face.received().total(), count);
-    assert_eq!(face.received().accepted(), taken_count);
+    assert_eq!(adapter.received().total(), count);
+    assert_eq!(adapter.received().accepted(), taken_count);
     Verdict::of(taken_count > 0)
 }
 

@@ -1,7 +1,7 @@
 //! Traces of what a link did: the binary form, the text, and delivery opportunities.
 
 use hil_trace::fault::{FaultKind, TraceFault};
-use hil_trace::figures::TraceFigures;
+use hil_trace::metrics::TraceMetrics;
 use hil_trace::wire::{Decoded, HEADER_BYTES, RECORD_BYTES, TraceDecoder};
 use hil_trace::{Trace, TraceHeader, csv, netem, opportunities as mahimahi, wire};
 
@@ -123,7 +123,7 @@ fn check_trace(trace: &Trace) {
     assert_eq!(again.trace.records.len(), trace.records.len());
     assert_eq!(csv::encode(&again.trace), text, "the text changes");
     if trace.records.len() <= FIGURED_RECORDS_MAX {
-        let figures = TraceFigures::of(trace, 1);
+        let figures = TraceMetrics::of(trace, 1);
         assert!(
             figures.rate_hz.is_none_or(|rate| rate >= 0.0),
             "{figures:?}"

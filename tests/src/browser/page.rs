@@ -1,9 +1,8 @@
 //! One page of a browser: where it goes, what a user does to it, what it shows, says and asks for.
 
-use std::fs;
 use std::path::Path;
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{fs, thread};
 
 use serde_json::{Value, json};
 

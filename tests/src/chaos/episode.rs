@@ -1,10 +1,9 @@
 //! One episode: two hosts, a run of two seconds between them, what was drawn for it, and the wait
 //! for its end.
 
-use std::fs;
 use std::path::{Path, PathBuf};
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{fs, thread};
 
 use nix::unistd::Pid;
 

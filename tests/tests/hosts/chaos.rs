@@ -4,11 +4,10 @@
 //! `HIL_CHAOS_EPISODES=200` plays as many episodes from `HIL_CHAOS_SEED` on (0 unless given), several
 //! at a time (`HIL_CHAOS_PARALLEL`, 2); one seed is one episode.
 
-use std::env;
 use std::fmt::Write as _;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::thread;
+use std::{env, thread};
 
 use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
 use hil_tests::chaos::episode::{Report, play};

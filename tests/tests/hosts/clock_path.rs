@@ -4,7 +4,7 @@
 use std::process::Command;
 use std::time::Duration;
 
-use hil_clock::{ClockFigures, StampKind};
+use hil_clock::{ClockMetrics, StampKind};
 use hil_report::clock_summary::{ClockPathSummary, ClockRung, HostPairClock};
 use hil_report::summary::{Outcome, RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
@@ -99,7 +99,7 @@ fn path(pair: &HostPairClock) -> &ClockPathSummary {
 }
 
 /// Holds `figures` against the truth; gives the width of what is guaranteed in mid-run, nanoseconds.
-fn width_ns(what: &str, figures: &ClockFigures) -> i64 {
+fn width_ns(what: &str, figures: &ClockMetrics) -> i64 {
     let (offset, bound) = (figures.offset.unwrap(), figures.bound.unwrap());
     println!(
         "{what}: {} exchanges, stamps {:?}, estimate off by {} ns, guaranteed {} to {} ns about the \

@@ -1,12 +1,12 @@
 //! Our controller drives our robot as two strangers would: each run knows the other only by the
-//! robot maker's datagrams, sensor face on one host, robot face on the other.
+//! robot maker's datagrams, sensor adapter on one host, robot adapter on the other.
 
 use std::time::Duration;
 
 use hil_arm::egm::messages::{EgmEventKind, Side};
 use hil_arm::yumi::Joints;
 use hil_arm::yumi::arm::Arm;
-use hil_report::face::FaceSummary;
+use hil_report::adapter::AdapterSummary;
 use hil_report::summary::{Outcome, RunSummary};
 use hil_tests::account::assert_account_closes;
 use hil_tests::arms::{Arms, of_kind};
@@ -41,22 +41,22 @@ fn loops(arm: &Arm, joints: impl Iterator<Item = Joints>) -> u32 {
     count
 }
 
-fn face<'a>(summary: &'a RunSummary, arm: &str) -> &'a FaceSummary {
+fn adapter<'a>(summary: &'a RunSummary, arm: &str) -> &'a AdapterSummary {
     let mut faces = summary.faces.iter();
-    let found = faces.find(|face| face.arm.word() == arm);
+    let found = faces.find(|adapter| adapter.arm.word() == arm);
     found.unwrap_or_else(|| panic!("no face of the {arm} arm"))
 }
 
-fn count(face: &FaceSummary, name: &str) -> u64 {
-    let mut counters = face.counters.iter();
+fn count(adapter: &AdapterSummary, name: &str) -> u64 {
+    let mut counters = adapter.counters.iter();
     let found = counters.find(|counter| counter.label() == name);
     found
         .unwrap_or_else(|| panic!("{name} is not counted"))
         .count
 }
 
-fn p99_us(face: &FaceSummary, name: &str) -> f64 {
-    let mut segments = face.segments.iter();
+fn p99_us(adapter: &AdapterSummary, name: &str) -> f64 {
+    let mut segments = adapter.segments.iter();
     let found = segments.find(|segment| segment.name == name);
     let figures = found.and_then(|segment| segment.distribution.measured());
     figures
@@ -67,7 +67,7 @@ fn p99_us(face: &FaceSummary, name: &str) -> f64 {
 
 /// What the controller's host and the robot's host must have recorded of one arm.
 fn assert_driven(here: &Arms, there: &Arms, side: Side, arm: &Arm) {
-    let story = there.story(side);
+    let story = there.history(side);
     println!("{story}");
     // The robot may time out before its sensor is there, and surely when it has gone.
     let arrivals = there.arrivals_ns(side);
@@ -151,34 +151,35 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     robot_files.assert_nothing_left_on(lab.host(1));
 }
 
-/// What both reports must say of their faces.
+/// What both reports must say of their adapters.
 fn judge([sensor, robot]: [&RunSummary; 2]) {
     for (summary, kind, way) in [
-        (sensor, "EGM sensor face", ["feedback", "command"]),
-        (robot, "EGM robot face", ["command", "feedback"]),
+        (sensor, "EGM sensor adapter", ["feedback", "command"]),
+        (robot, "EGM robot adapter", ["command", "feedback"]),
     ] {
         assert_eq!(summary.run.outcome, Outcome::Completed);
         for arm in ["right", "left"] {
             for what in ["command", "feedback"] {
                 assert_account_closes(summary, &format!("egm/{arm}/{what}"));
             }
-            let face = face(summary, arm);
-            assert_eq!(face.kind.to_string(), kind);
-            let ratio = face.answers.ratio().unwrap();
+            let adapter = adapter(summary, arm);
+            assert_eq!(adapter.kind.to_string(), kind);
+            let ratio = adapter.answers.ratio().unwrap();
             println!("{kind}, {arm} arm: {ratio} answered within the cycle");
             let [back, out] = way;
-            let inward = p99_us(face, &format!("{back} in all: RX stamp → published"));
-            let outward = p99_us(face, &format!("{out} in all: published → TX stamp"));
+            let inward = p99_us(adapter, &format!("{back} in all: RX stamp → published"));
+            let outward = p99_us(adapter, &format!("{out} in all: published → TX stamp"));
             println!("{kind}, {arm} arm: p99 {inward:.0} us in, {outward:.0} us out");
             assert!(
-                face.cycle_ns
+                adapter
+                    .cycle_ns
                     .is_some_and(|cycle_ns| (3_900_000..4_100_000).contains(&cycle_ns))
             );
-            assert_eq!(face.refusals, [], "{arm}");
-            assert_eq!(count(face, "socket: kernel_drop_count"), 0);
+            assert_eq!(adapter.refusals, [], "{arm}");
+            assert_eq!(count(adapter, "socket: kernel_drop_count"), 0);
         }
     }
-    let right = face(sensor, "right");
+    let right = adapter(sensor, "right");
     let sent = count(right, "datagrams encoded") as f64;
     let attended = right.answers.attended_count as f64;
     assert!(

@@ -20,7 +20,7 @@ const START_LIMIT: Duration = Duration::from_mins(1);
 const RUN_LIMIT: Duration = Duration::from_mins(2);
 
 #[test]
-fn on_a_veth_the_missing_card_is_said_and_software_stamps_carry_the_run() {
+fn on_a_veth_the_missing_nic_is_said_and_software_stamps_carry_the_run() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
@@ -115,7 +115,7 @@ fn a_guard_outlives_signals_and_acts_when_its_program_is_gone() {
 }
 
 #[test]
-fn a_guard_that_is_let_go_leaves_the_card_alone() {
+fn a_guard_that_is_let_go_leaves_the_nic_alone() {
     let mut guard = guard_of_loopback();
     guard.stdin.as_mut().unwrap().write_all(b"r").unwrap();
     assert_eq!(ended(guard), (Some(0), String::new()));

@@ -1,12 +1,11 @@
 //! `kill -9` during a split run: of each gateway and component in turn, of the robot when its end
 //! is to end the run, and of a whole supervisor.
 
-use std::fs;
 use std::process::Command;
-use std::thread;
 use std::time::Duration;
+use std::{fs, thread};
 
-use hil_account::{InterruptionFigures, MessageFate};
+use hil_account::{InterruptionMetrics, MessageFate};
 use hil_core::record::IngressRecord;
 use hil_report::assessment::{Assessment, NetworkVerdict};
 use hil_report::summary::{Outcome, RunEvent, RunSummary};
@@ -100,7 +99,7 @@ fn interruption<'a>(
     summary: &'a RunSummary,
     channel: &str,
     process: &str,
-) -> &'a InterruptionFigures {
+) -> &'a InterruptionMetrics {
     let all = &account(summary, channel).interruptions;
     let found = all.iter().find(|one| one.process == process);
     found.unwrap_or_else(|| panic!("{channel} knows no interruption of {process}: {all:?}"))

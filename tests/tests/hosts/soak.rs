@@ -3,11 +3,9 @@
 //! `HIL_SOAK_MINUTES=60 cargo test --package hil-tests --test hosts soak:: -- --ignored --nocapture`
 
 use std::collections::BTreeMap;
-use std::env;
-use std::fs;
 use std::path::Path;
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{env, fs, thread};
 
 use hil_account::MessageFate;
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
@@ -52,7 +50,7 @@ struct Soak {
 
 /// Everything seen of one process.
 #[derive(Default)]
-struct Story {
+struct History {
     samples: Vec<(f64, Held)>,
     peak_bytes: u64,
 }
@@ -145,10 +143,10 @@ fn eight_channels_at_a_kilohertz_leave_every_process_as_large_as_it_was() {
 type Shared = Vec<(f64, [(u64, u64); 2])>;
 
 /// Samples everything until the shortest run is about to end.
-fn watch(lab: &Lab, soaks: &[Soak], duration: Duration) -> (BTreeMap<String, Story>, Shared) {
+fn watch(lab: &Lab, soaks: &[Soak], duration: Duration) -> (BTreeMap<String, History>, Shared) {
     let period = SAMPLE_PERIOD_MAX.min(duration / 60);
     let began = Instant::now();
-    let mut stories: BTreeMap<String, Story> = BTreeMap::new();
+    let mut stories: BTreeMap<String, History> = BTreeMap::new();
     let mut shared = Vec::new();
     // The last moments belong to the end of the run.
     while began.elapsed() + period < duration {
@@ -206,7 +204,7 @@ fn mib(bytes: u64) -> f64 {
 }
 
 /// Prints what was seen and gives what is wrong with it.
-fn judge(stories: &BTreeMap<String, Story>, shared: &Shared, duration: Duration) -> Vec<String> {
+fn judge(stories: &BTreeMap<String, History>, shared: &Shared, duration: Duration) -> Vec<String> {
     let from_s = WARM_UP_S_MIN.max(WARM_UP_RATIO * duration.as_secs_f64());
     let allowed = if duration >= LONG {
         GROWTH_BYTES_PER_S

@@ -5,14 +5,12 @@
 //! `HIL_ATTACK_BUFFER_BYTES=4194304` gives the gateways' sockets that much room, and
 //! `HIL_ATTACK_FIFO=1` the run real-time priority on the second processor; `taskset -c 0` keeps the stranger off it.
 
-use std::env;
-use std::fs;
 use std::net::SocketAddrV4;
 use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{env, fs, thread};
 
 use hil_account::MessageFate;
 use hil_core::random::RandomStream;

@@ -2,10 +2,9 @@
 //! Python with `tests/mcap_reader/requirements.txt`. Every shipped topology fits; what the reader refuses as
 //! unknown, mistyped or out of range does not.
 
-use std::env;
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::{env, fs};
 
 use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::mcap_file::PYTHON_VARIABLE;

@@ -2,12 +2,11 @@
 //! may be anybody's, too many viewers, viewers that vanish and bytes that are no request. No run is needed for
 //! that.
 
-use std::fs;
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, Shutdown, TcpStream};
 use std::process::Command;
-use std::thread;
 use std::time::{Duration, Instant};
+use std::{fs, thread};
 
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::child::{ChildGuard, Finished, run};

@@ -1,10 +1,9 @@
 //! Recorders of a run that are killed: each takes a moment's messages with it, and harms nothing else.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
-use std::thread;
 use std::time::Duration;
+use std::{fs, thread};
 
 use hil_core::random::RandomStream;
 use hil_core::record::PublishedRecord;

@@ -6,8 +6,7 @@ use std::thread;
 use std::time::Duration;
 
 use hil_rundir::live_run::Source;
-use hil_rundir::select::running_runs;
-use hil_rundir::select::select;
+use hil_rundir::select::{running_runs, select};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
 use hil_watch::{Event, Feed, Origin, Poll};

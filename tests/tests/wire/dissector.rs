@@ -7,12 +7,10 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use hil_capture::CaptureInterface;
-use hil_capture::esl;
 use hil_capture::esl::EslHeader;
 use hil_capture::reader::{CaptureReader, Step};
-use hil_capture::writer;
 use hil_capture::writer::PacketToWrite;
+use hil_capture::{CaptureInterface, esl, writer};
 use hil_net::{Direction, link_type};
 use hil_protocol::StampSource;
 use hil_protocol::body::{Hello, HelloAck, HelloStatus, ReceivedWindow, SyncResponse};

@@ -1,14 +1,13 @@
-//! Programs nobody here wrote drive our robot through its EGM face: the packages `ABBRobotEGM` and
+//! Programs nobody here wrote drive our robot through its EGM adapter: the packages `ABBRobotEGM` and
 //! `abb_robot_client`, a process each, by the scripts in `tests/egm_clients`. Opt-in, because they
 //! come from the network: `HIL_EGM_CLIENTS` names a Python that has both (see
 //! `tests/egm_clients/requirements.txt`), `HIL_EGM_CLIENT_SECONDS` how long each drives (20;
 //! the acceptance asks for 60).
 
-use std::env;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::process::Command;
-use std::thread;
 use std::time::Duration;
+use std::{env, thread};
 
 use hil_account::MessageFate;
 use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EndCause, MotionKind, Side};
@@ -143,7 +142,7 @@ fn visits(arrivals_ns: &[i64]) -> Vec<(i64, i64)> {
 
 /// Checks what must hold while a client is there.
 fn assert_driven(arms: &Arms, first: i64, last: i64) {
-    let story = arms.story(Side::Right);
+    let story = arms.history(Side::Right);
     let events = arms.events(Side::Right);
     let ended = of_kind(&events, EgmEventKind::Ended);
     let during: Vec<_> = ended
@@ -205,7 +204,7 @@ fn assert_driven(arms: &Arms, first: i64, last: i64) {
 
 /// Checks that the session ended a second after `last`, and why; gives the event.
 fn assert_timed_out(arms: &Arms, last: i64) -> EgmEvent {
-    let story = arms.story(Side::Right);
+    let story = arms.history(Side::Right);
     let events = arms.events(Side::Right);
     let mut ended = of_kind(&events, EgmEventKind::Ended);
     let ended = *ended.find(|event| event.at_ns > last).unwrap();
@@ -246,7 +245,7 @@ fn driven_twice(script: &str, restart: &str, span: Duration) -> Option<(Arms, Eg
     robot.drive(Duration::from_secs(6));
     let (files, _folder) = robot.finish();
     let arms = Arms::of(&files);
-    println!("{script}, {restart}:\n{}", arms.story(Side::Right));
+    println!("{script}, {restart}:\n{}", arms.history(Side::Right));
     let visits = visits(&arms.arrivals_ns(Side::Right));
     let [first, second] = visits[..] else {
         panic!("two visits, not {visits:?}");
@@ -257,7 +256,7 @@ fn driven_twice(script: &str, restart: &str, span: Duration) -> Option<(Arms, Eg
     let events = arms.events(Side::Right);
     let ended_again = of_kind(&events, EgmEventKind::Ended);
     let mut during = ended_again.filter(|event| (second.0..second.1).contains(&event.at_ns));
-    assert_eq!(during.next(), None, "{}", arms.story(Side::Right));
+    assert_eq!(during.next(), None, "{}", arms.history(Side::Right));
 
     let summary = files.summary();
     for channel in ["egm/right/command", "egm/right/feedback"] {
@@ -266,8 +265,11 @@ fn driven_twice(script: &str, restart: &str, span: Duration) -> Option<(Arms, Eg
         assert_eq!(account.fates.of(MessageFate::Unexplained), 0, "{channel}");
     }
     let report = files.read("report.txt");
-    let face = report.split("EGM robot face").nth(1).unwrap();
-    println!("EGM robot face{}", face.split("Processes").next().unwrap());
+    let adapter = report.split("EGM robot adapter").nth(1).unwrap();
+    println!(
+        "EGM robot adapter{}",
+        adapter.split("Processes").next().unwrap()
+    );
     Some((arms, ended))
 }
 

@@ -2,11 +2,10 @@
 //! virtual time over those traces loses the same messages and comes to the same score. And what
 //! `hil-runtime trace` says of traces that are whole, damaged or none.
 
-use std::env;
-use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;
+use std::{env, fs};
 
 use hil_report::summary::{RunSummary, ScoreMetric};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};

@@ -342,8 +342,8 @@ fn what_the_writer_wrote_reads_the_same() {
         assert_eq!(packet.stamp_ns, Some(stamp_ns.cast_signed()));
         assert_eq!(packet.original_bytes, 1500);
     }
-    let of_card: Vec<bool> = packets.iter().map(|one| one.is_card_stamped).collect();
-    assert_eq!(of_card, [false, false, true]);
+    let of_nic: Vec<bool> = packets.iter().map(|one| one.is_nic_stamped).collect();
+    assert_eq!(of_nic, [false, false, true]);
     assert_eq!(interfaces[1].description, card.description);
     let read_back = &interfaces[0];
     assert_eq!(read_back.name, interface.name);

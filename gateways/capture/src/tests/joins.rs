@@ -8,7 +8,7 @@ use super::super::flow::{DatagramIdentity, Numbered};
 use super::super::join::{Joined, OrderSource, WINDOW_NS, join};
 use super::super::observe::{Observation, Observer, Point, Seen, Span, Stream};
 use super::super::pairing::join_all;
-use super::super::point::{NumberFigures, single_point_figures};
+use super::super::point::{NumberMetrics, single_point_metrics};
 use super::super::{CaptureInterface, CapturedPacket};
 use super::udp_frame;
 use hil_net::{Direction, link_type};
@@ -205,16 +205,16 @@ fn one_point_alone_tells_gaps_and_missing_numbers() {
         .iter()
         .map(|(at, number)| observation(*at, *number))
         .collect();
-    let figures = single_point_figures(&list).unwrap();
+    let figures = single_point_metrics(&list).unwrap();
     let found = figures.numbers.unwrap();
     assert_eq!((found.step, found.skipped_count), (2, 1));
     assert_eq!((found.repeated_count, found.reordered_count), (Some(1), 2));
     assert_eq!(figures.longest_gap.unwrap().length_ns, 510);
-    assert_eq!(single_point_figures(&[]), None);
+    assert_eq!(single_point_metrics(&[]), None);
 }
 
 /// Figures of these numbers of 16 bits, one every microsecond.
-fn counted(numbers: impl IntoIterator<Item = u64>) -> NumberFigures {
+fn counted(numbers: impl IntoIterator<Item = u64>) -> NumberMetrics {
     let mut list = Vec::new();
     for (at, number) in (0_i64..).zip(numbers) {
         let mut one = observation(at * 1000, number);
@@ -223,12 +223,12 @@ fn counted(numbers: impl IntoIterator<Item = u64>) -> NumberFigures {
         }
         list.push(one);
     }
-    single_point_figures(&list).unwrap().numbers.unwrap()
+    single_point_metrics(&list).unwrap().numbers.unwrap()
 }
 
 #[test]
 fn numbers_that_wrap_count_on_and_numbers_that_begin_anew_are_another_series() {
-    let expected = |series_count, skipped_count, repeated_count, reordered_count| NumberFigures {
+    let expected = |series_count, skipped_count, repeated_count, reordered_count| NumberMetrics {
         series_count,
         step: 1,
         skipped_count,
@@ -275,7 +275,7 @@ fn observer_of(packets: &[(usize, Direction, i64, u16)], host: u8) -> Observer {
                 link_type: link_type::ETHERNET,
                 stamp_ns: Some(*stamp_ns),
                 original_bytes: u32::try_from(data.len()).unwrap(),
-                is_card_stamped: false,
+                is_nic_stamped: false,
                 direction: *direction,
                 data: &data,
             },

@@ -18,7 +18,7 @@ struct Packet {
     interface_index: usize,
     stamp_ns: Option<i64>,
     original_bytes: u32,
-    is_card_stamped: bool,
+    is_nic_stamped: bool,
     direction: Direction,
     data: Vec<u8>,
 }
@@ -38,7 +38,7 @@ fn read(
                 interface_index: packet.interface_index,
                 stamp_ns: packet.stamp_ns,
                 original_bytes: packet.original_bytes,
-                is_card_stamped: packet.is_card_stamped,
+                is_nic_stamped: packet.is_nic_stamped,
                 direction: packet.direction,
                 data: packet.data.to_vec(),
             }),

@@ -4,7 +4,7 @@
 use super::counts::{SealCounts, SealRefusal};
 use super::keys::{Association, Root, Salt};
 use super::layout::{
-    KEY_EXCHANGE_BYTES, KeyExchange, Marks, about, code_place, covered, handed_ns_of, kind_of,
+    KEY_EXCHANGE_BYTES, KeyExchange, SealFields, about, code_place, covered, handed_ns_of, kind_of,
 };
 use super::traffic::{OpeningWay, Rotation, SealingWay};
 use crate::wire::{Kind, TAG_BYTES, u32_at};
@@ -138,8 +138,8 @@ impl Initiator {
     }
 
     fn accept(&mut self, datagram: &mut [u8]) -> Result<Heard, SealRefusal> {
-        let marks = Marks::read(datagram, self.root.channel)?;
-        match marks.kind {
+        let fields = SealFields::read(datagram, self.root.channel)?;
+        match fields.kind {
             Kind::KeyAnswer => return self.take_keys(datagram),
             Kind::HelloAck | Kind::SyncResponse => {}
             _ => return Err(SealRefusal::WrongWay),
@@ -147,9 +147,9 @@ impl Initiator {
         let traffic = self
             .traffic
             .as_mut()
-            .filter(|_| marks.session == self.session);
+            .filter(|_| fields.session == self.session);
         let traffic = traffic.ok_or(SealRefusal::ForeignSession)?;
-        traffic.backward.open(marks, datagram).map(Heard::Reply)
+        traffic.backward.open(fields, datagram).map(Heard::Reply)
     }
 
     fn take_keys(&mut self, datagram: &[u8]) -> Result<Heard, SealRefusal> {

@@ -20,7 +20,7 @@ pub const KEY_EXCHANGE_BYTES: usize = COVERED_BYTES + MAC_BYTES;
 
 /// What the seal reads of a header before it knows whether it is authentic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Marks {
+pub(super) struct SealFields {
     pub(super) kind: Kind,
     pub(super) session: u32,
     /// Low 8 bits of the key's generation.
@@ -29,7 +29,7 @@ pub(super) struct Marks {
     fragment: u16,
 }
 
-impl Marks {
+impl SealFields {
     /// Reads what must be right before a key is chosen.
     pub(super) fn read(datagram: &[u8], channel: u16) -> Result<Self, SealRefusal> {
         if datagram.len() >= 4 && u32_at(datagram, 0) != MAGIC {

@@ -3,7 +3,7 @@
 
 use super::counts::{SealCounts, SealRefusal};
 use super::keys::{Association, Root, SALT_BYTES, Salt};
-use super::layout::{KEY_EXCHANGE_BYTES, KeyExchange, Marks, about, code_place, covered};
+use super::layout::{KEY_EXCHANGE_BYTES, KeyExchange, SealFields, about, code_place, covered};
 use super::traffic::{OpeningWay, Rotation, SealingWay};
 use crate::wire::{Kind, TAG_BYTES, u32_at};
 
@@ -80,14 +80,14 @@ impl Responder {
     }
 
     fn accept(&mut self, datagram: &mut [u8]) -> Result<Opened, SealRefusal> {
-        let marks = Marks::read(datagram, self.root.channel)?;
-        match marks.kind {
+        let fields = SealFields::read(datagram, self.root.channel)?;
+        match fields.kind {
             Kind::KeyRequest => return self.answer(datagram).map(Opened::Answer),
             Kind::Data | Kind::SyncRequest | Kind::Hello | Kind::Bye => {}
             _ => return Err(SealRefusal::WrongWay),
         }
-        let place = find(&mut self.places, marks.session).ok_or(SealRefusal::ForeignSession)?;
-        let length = place.forward.open(marks, datagram)?;
+        let place = find(&mut self.places, fields.session).ok_or(SealRefusal::ForeignSession)?;
+        let length = place.forward.open(fields, datagram)?;
         self.clock += 1;
         place.used = self.clock;
         place.is_proven = true;

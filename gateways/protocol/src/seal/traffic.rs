@@ -3,7 +3,7 @@
 
 use super::counts::SealRefusal;
 use super::keys::{Generation, SealKey};
-use super::layout::{Marks, clear_marks, handed_ns_of};
+use super::layout::{SealFields, clear_marks, handed_ns_of};
 use super::window::ReplayWindow;
 use crate::wire::{HEADER_BYTES, TAG_BYTES};
 
@@ -76,10 +76,10 @@ impl SealingWay {
         {
             self.rotate(handed_ns);
         }
-        let marks = Marks::of_plain(datagram, low_byte(self.index), self.number);
+        let fields = SealFields::of_plain(datagram, low_byte(self.index), self.number);
         self.number += 1;
-        marks.write(datagram);
-        self.key.seal(marks.nonce(), datagram);
+        fields.write(datagram);
+        self.key.seal(fields.nonce(), datagram);
     }
 
     fn rotate(&mut self, handed_ns: i64) {
@@ -107,11 +107,11 @@ impl OpeningKey {
     }
 
     /// Authenticity first, then whether it is new.
-    fn open(&mut self, marks: Marks, datagram: &mut [u8]) -> Result<(), SealRefusal> {
-        if !self.key.open(marks.nonce(), datagram) {
+    fn open(&mut self, fields: SealFields, datagram: &mut [u8]) -> Result<(), SealRefusal> {
+        if !self.key.open(fields.nonce(), datagram) {
             return Err(SealRefusal::BadTag);
         }
-        self.window.take(marks.number)
+        self.window.take(fields.number)
     }
 }
 
@@ -146,15 +146,19 @@ impl OpeningWay {
     }
 
     /// Opens a datagram in place; what is left is the plain datagram, whose length it gives.
-    pub(super) fn open(&mut self, marks: Marks, datagram: &mut [u8]) -> Result<usize, SealRefusal> {
-        let ahead = marks.generation.wrapping_sub(low_byte(self.index));
+    pub(super) fn open(
+        &mut self,
+        fields: SealFields,
+        datagram: &mut [u8],
+    ) -> Result<usize, SealRefusal> {
+        let ahead = fields.generation.wrapping_sub(low_byte(self.index));
         match (ahead, &mut self.previous) {
-            (0, _) => self.current.open(marks, datagram)?,
+            (0, _) => self.current.open(fields, datagram)?,
             (1, _) => {
-                self.next.open(marks, datagram)?;
+                self.next.open(fields, datagram)?;
                 self.turn(handed_ns_of(datagram));
             }
-            (u8::MAX, Some(previous)) => previous.open(marks, datagram)?,
+            (u8::MAX, Some(previous)) => previous.open(fields, datagram)?,
             _ => return Err(SealRefusal::StaleEpoch),
         }
         let handed_ns = handed_ns_of(datagram);

@@ -12,8 +12,8 @@
 //! - There are no kernel stamps. The kernel stamps bytes of a stream, not messages: segments are
 //!   joined and cut on the way, and a joined one keeps only the newer of two stamps.
 
-mod figures;
 pub mod frame;
+mod metrics;
 mod receiver;
 mod sender;
 mod socket;

@@ -9,7 +9,7 @@ use hil_core::time::Instant;
 use nix::sys::epoll::EpollFlags;
 use socket2::Socket;
 
-use super::figures::StreamFigures;
+use super::metrics::StreamMetrics;
 use super::socket::{abort, listen, tune};
 use super::stream::{Ending, Stream};
 use crate::socket::{
@@ -69,8 +69,8 @@ impl TcpReceiver {
     }
 
     /// What it saw until `now`.
-    pub(super) fn figures(&self, now: Instant) -> StreamFigures {
-        self.stream.figures(now)
+    pub(super) fn metrics(&self, now: Instant) -> StreamMetrics {
+        self.stream.metrics(now)
     }
 
     /// True while there is a connection.
@@ -153,6 +153,6 @@ impl DatagramReceiver for TcpReceiver {
     }
 
     fn report(&self, now: Instant) -> EndReport {
-        self.figures(now).of_receiver()
+        self.metrics(now).of_receiver()
     }
 }

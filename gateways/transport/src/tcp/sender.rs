@@ -8,7 +8,7 @@ use hil_core::time::Instant;
 use nix::sys::epoll::EpollFlags;
 use socket2::Socket;
 
-use super::figures::StreamFigures;
+use super::metrics::StreamMetrics;
 use super::now;
 use super::socket::{
     BackOff, CONNECT_PATIENCE, GOOD_CONNECTION, Progress, prepare, progress, start_connecting,
@@ -82,8 +82,8 @@ impl TcpSender {
     }
 
     /// What it saw until `now`.
-    pub(super) fn figures(&self, now: Instant) -> StreamFigures {
-        self.stream.figures(now)
+    pub(super) fn metrics(&self, now: Instant) -> StreamMetrics {
+        self.stream.metrics(now)
     }
 
     /// How often connections come and go.
@@ -236,6 +236,6 @@ impl DatagramSender for TcpSender {
     }
 
     fn report(&self, now: Instant) -> EndReport {
-        self.figures(now).of_sender()
+        self.metrics(now).of_sender()
     }
 }

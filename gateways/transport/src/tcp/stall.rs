@@ -24,14 +24,14 @@ struct Mark {
 
 /// What was seen of stalls.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct StallFigures {
+pub(super) struct StallMetrics {
     pub(super) count: u64,
     pub(super) total: Duration,
     pub(super) longest: Duration,
     pub(super) waiting_bytes_max: u64,
 }
 
-impl StallFigures {
+impl StallMetrics {
     fn add(&mut self, length: Duration) {
         self.count += 1;
         self.total += length;
@@ -47,7 +47,7 @@ pub(super) struct StallWatch {
     accepted: u64,
     rtt_min: Duration,
     stalled_since: Option<Instant>,
-    figures: StallFigures,
+    figures: StallMetrics,
 }
 
 impl StallWatch {
@@ -57,7 +57,7 @@ impl StallWatch {
             accepted: 0,
             rtt_min: Duration::ZERO,
             stalled_since: None,
-            figures: StallFigures::default(),
+            figures: StallMetrics::default(),
         }
     }
 
@@ -133,7 +133,7 @@ impl StallWatch {
     }
 
     /// What was seen until `now`, a stall that still lasts included.
-    pub(super) fn figures(&self, now: Instant) -> StallFigures {
+    pub(super) fn metrics(&self, now: Instant) -> StallMetrics {
         let mut figures = self.figures;
         if let Some(since) = self.stalled_since {
             figures.add(now.saturating_duration_since(since));
@@ -163,14 +163,14 @@ mod tests {
         watch.on_accepted(100, at(0));
         watch.on_accepted(100, at(10));
         watch.on_look(200, at(60));
-        assert_eq!(watch.figures(at(60)).count, 0, "60 ms are no stall yet");
+        assert_eq!(watch.metrics(at(60)).count, 0, "60 ms are no stall yet");
         assert_eq!(watch.next_look(at(60)), Some(at(65)));
         watch.on_look(200, at(65));
-        assert_eq!(watch.figures(at(65)).longest, Duration::from_millis(65));
+        assert_eq!(watch.metrics(at(65)).longest, Duration::from_millis(65));
         // The first is acknowledged, the second is overdue as well: it is one stall.
         watch.on_look(100, at(80));
         watch.on_look(0, at(90));
-        let figures = watch.figures(at(1_000));
+        let figures = watch.metrics(at(1_000));
         assert_eq!(
             (figures.count, figures.longest),
             (1, Duration::from_millis(90))
@@ -187,7 +187,7 @@ mod tests {
             // Thirty messages are always under way.
             watch.on_look(3_000, at(ms));
         }
-        assert_eq!(watch.figures(at(1_000)).count, 0);
+        assert_eq!(watch.metrics(at(1_000)).count, 0);
         assert!(watch.is_waiting());
     }
 
@@ -197,10 +197,10 @@ mod tests {
         watch.on_accepted(100, at(0));
         watch.on_look(0, at(500));
         assert_eq!(
-            watch.figures(at(500)),
-            StallFigures {
+            watch.metrics(at(500)),
+            StallMetrics {
                 waiting_bytes_max: 0,
-                ..StallFigures::default()
+                ..StallMetrics::default()
             }
         );
     }
@@ -211,7 +211,7 @@ mod tests {
         watch.on_accepted(100, at(0));
         watch.on_look(100, at(100));
         watch.on_lost(at(200));
-        assert_eq!(watch.figures(at(900)).total, Duration::from_millis(200));
+        assert_eq!(watch.metrics(at(900)).total, Duration::from_millis(200));
         assert!(!watch.is_waiting());
     }
 
@@ -222,11 +222,11 @@ mod tests {
             watch.on_accepted(10, at(index / 100));
         }
         watch.on_look(30_000, at(100));
-        assert_eq!(watch.figures(at(100)).count, 1);
+        assert_eq!(watch.metrics(at(100)).count, 1);
         watch.on_look(10, at(110));
         assert!(watch.is_waiting(), "the last byte is still out");
         watch.on_look(0, at(120));
-        assert_eq!(watch.figures(at(120)).longest, Duration::from_millis(120));
+        assert_eq!(watch.metrics(at(120)).longest, Duration::from_millis(120));
         assert!(!watch.is_waiting());
     }
 }

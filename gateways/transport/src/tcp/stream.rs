@@ -11,8 +11,8 @@ use hil_core::time::Instant;
 use nix::sys::epoll::{Epoll, EpollCreateFlags, EpollEvent, EpollFlags};
 use socket2::Socket;
 
-use super::figures::StreamFigures;
 use super::frame::{Backlog, FRAME_BYTES_MAX, FrameReader, prefix};
+use super::metrics::StreamMetrics;
 use super::now;
 use super::socket::abort;
 use super::stall::StallWatch;
@@ -59,7 +59,7 @@ pub(super) struct Stream {
     informed: Instant,
     info: Option<ConnectionInfo>,
     /// Of connections that have ended, and counts of this side.
-    figures: StreamFigures,
+    figures: StreamMetrics,
     tally: Arc<ConnectionTally>,
     epoll: Epoll,
     /// What the newest socket is watched for.
@@ -81,7 +81,7 @@ impl Stream {
             looked: Instant::ZERO,
             informed: Instant::ZERO,
             info: None,
-            figures: StreamFigures::default(),
+            figures: StreamMetrics::default(),
             tally: Arc::default(),
         })
     }
@@ -118,7 +118,7 @@ impl Stream {
         self.socket.as_ref()
     }
 
-    pub(super) fn figures_mut(&mut self) -> &mut StreamFigures {
+    pub(super) fn figures_mut(&mut self) -> &mut StreamMetrics {
         &mut self.figures
     }
 
@@ -311,7 +311,7 @@ impl Stream {
     }
 
     /// Everything until `now`.
-    pub(super) fn figures(&self, now: Instant) -> StreamFigures {
+    pub(super) fn metrics(&self, now: Instant) -> StreamMetrics {
         let mut figures = self.figures;
         let info = self
             .socket
@@ -320,7 +320,7 @@ impl Stream {
         if let Some(info) = info.or(self.info) {
             figures.add(&info);
         }
-        let stalls = self.watch.figures(now);
+        let stalls = self.watch.metrics(now);
         figures.stall_threshold = self.watch.threshold();
         figures.stall_count = stalls.count;
         figures.stalled = stalls.total;

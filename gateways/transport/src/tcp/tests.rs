@@ -178,14 +178,14 @@ fn a_peer_that_vanished_is_a_state_and_comes_back() {
     assert_eq!(counters.newest_report, Some(SendRefusal::NotConnected));
     within_bound("failed attempt", || {
         sender.attend(now());
-        (sender.figures(now()).connect_failed_count >= 2).then_some(())
+        (sender.metrics(now()).connect_failed_count >= 2).then_some(())
     });
     assert!(sender.next_due().is_some(), "another attempt is due");
 
     let mut receiver = TcpReceiver::open(settings(&place.to_string(), place)).unwrap();
     connect(&mut sender, &mut receiver);
     carry(&mut sender, &mut receiver, b"after");
-    let figures = sender.figures(now());
+    let figures = sender.metrics(now());
     assert_eq!(
         (figures.connection_count, figures.reconnect_count()),
         (2, 1)
@@ -202,11 +202,11 @@ fn a_restarted_sender_takes_the_place_of_the_one_that_vanished() {
     within_bound("second connection", || {
         second.attend(now());
         receiver.attend(now());
-        let figures = receiver.figures(now());
+        let figures = receiver.metrics(now());
         (second.is_connected() && figures.connection_count == 2).then_some(())
     });
     carry(&mut second, &mut receiver, b"second");
-    assert_eq!(receiver.figures(now()).connection_ended_count, 1);
+    assert_eq!(receiver.metrics(now()).connection_ended_count, 1);
     // The first one hears of it.
     within_bound("end", || {
         assert_eq!(sender.receive(&mut [0; 64]).unwrap(), None);
@@ -232,7 +232,7 @@ fn a_bad_length_closes_the_connection_and_is_counted() {
         assert_eq!(receiver.receive(now(), &mut buffer).unwrap(), None);
         (!receiver.is_connected()).then_some(())
     });
-    let figures = receiver.figures(now());
+    let figures = receiver.metrics(now());
     assert_eq!(
         (figures.bad_frame_count, figures.connection_ended_count),
         (1, 1)
@@ -249,7 +249,7 @@ fn connections_of_another_host_are_turned_away() {
     let _stranger = TcpStream::connect(place).unwrap();
     within_bound("stranger", || {
         receiver.attend(now());
-        let figures = receiver.figures(now());
+        let figures = receiver.metrics(now());
         (figures.foreign_connection_count == 1).then_some(())
     });
     assert!(!receiver.is_connected());
@@ -282,7 +282,7 @@ fn a_peer_that_does_not_read_costs_messages_and_shows_as_a_stall() {
     assert!(sender.has_unsent());
     let stalled = within_bound("stall", || {
         sender.attend(now());
-        let figures = sender.figures(now());
+        let figures = sender.metrics(now());
         (figures.stall_count == 1 && figures.stall_longest > 2 * figures.stall_threshold)
             .then_some(figures)
     });
@@ -308,10 +308,10 @@ fn a_peer_that_does_not_read_costs_messages_and_shows_as_a_stall() {
     });
     let ended = within_bound("end of the stall", || {
         sender.attend(now());
-        sender.next_due().is_none().then(|| sender.figures(now()))
+        sender.next_due().is_none().then(|| sender.metrics(now()))
     });
     assert_eq!((ended.stall_count, ended.connection_ended_count), (1, 0));
-    assert_eq!(sender.figures(now()).stalled, ended.stalled, "it is over");
+    assert_eq!(sender.metrics(now()).stalled, ended.stalled, "it is over");
     assert!(
         ended
             .window_limited

@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Figure, Passage, Passages, is_arrived};
+use super::{Metric, Passage, Passages, is_arrived};
 use crate::ChannelPath;
 use hil_core::random::RandomStream;
 use hil_core::time::RemoteInstant;
@@ -28,7 +28,7 @@ pub struct DelayQuantile {
 /// One-way delay, handed to the kernel until received by the other gateway (RFC 7679), of the
 /// messages that arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct DelayFigures {
+pub struct DelayMetrics {
     /// Messages.
     pub count: u64,
     /// Smallest.
@@ -116,7 +116,7 @@ pub(super) fn delays<P: Passages + ?Sized>(
     passages: &P,
     path: ChannelPath<'_>,
     random: &mut RandomStream,
-) -> Figure<DelayFigures> {
+) -> Metric<DelayMetrics> {
     let arrived = || passages.each().filter(is_arrived);
     let delays_ns: Samples = arrived().filter_map(|one| one.delay_ns).collect();
     let Some(last) = delays_ns.len().checked_sub(1) else {
@@ -127,7 +127,7 @@ pub(super) fn delays<P: Passages + ?Sized>(
         } else {
             "clocks not aligned"
         };
-        return Figure::unavailable(reason);
+        return Metric::unavailable(reason);
     };
     let ascending = delays_ns.ascending();
     let (min_ns, max_ns) = (ascending.at(0), ascending.at(last));
@@ -143,7 +143,7 @@ pub(super) fn delays<P: Passages + ?Sized>(
     let alignment_bound_ns = arrived().map(|one| one.delay_bound_ns).max().unwrap_or(0);
     let above_min = |ns: i64| ns.saturating_sub(min_ns);
     let bound_ns = variation_bound_ns(arrived(), path, alignment_bound_ns);
-    Figure::Measured(DelayFigures {
+    Metric::Measured(DelayMetrics {
         count: ascending.len() as u64,
         min_ns,
         p50,
@@ -223,7 +223,7 @@ pub(super) fn at_share(ascending: &[i64], share: f64) -> i64 {
 pub(super) fn successive<P: Passages + ?Sized>(
     passages: &P,
     path: ChannelPath<'_>,
-) -> Figure<SuccessiveVariation> {
+) -> Metric<SuccessiveVariation> {
     let mut magnitudes = Samples::default();
     let mut bound_ns = 0;
     let mut last: Option<Passage> = None;
@@ -243,10 +243,10 @@ pub(super) fn successive<P: Passages + ?Sized>(
     }
     magnitudes.sort();
     let Some(last) = magnitudes.len().checked_sub(1) else {
-        return Figure::unavailable("no two successive messages arrived");
+        return Metric::unavailable("no two successive messages arrived");
     };
     let p50_ns = magnitudes.at_share(0.5);
-    Figure::Measured(SuccessiveVariation {
+    Metric::Measured(SuccessiveVariation {
         count: magnitudes.len() as u64,
         p50_ns,
         p99_ns: magnitudes.at_share(0.99),

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Crossing, Figure, Passages};
+use super::{Crossing, Metric, Passages};
 use crate::BurstCount;
 use hil_stats::statistics::{CONFIDENCE, Interval, wilson, wilson_of};
 
@@ -18,14 +18,14 @@ const RUN_COUNT_MIN: usize = 10;
 
 /// Losses of the network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct LossFigures {
+pub struct LossMetrics {
     /// Messages lost.
     pub lost_count: u64,
     /// Of so many handed to the network.
     pub of_count: u64,
     /// Their share.
     pub ratio: f64,
-    /// 95 % interval of the share: Wilson's on [`LossFigures::effective_count`].
+    /// 95 % interval of the share: Wilson's on [`LossMetrics::effective_count`].
     pub interval: Interval,
     /// How many independent messages would scatter as much as these did: all of them when losses
     /// are independent, far fewer when they come in bursts. The variance is the larger one of two
@@ -38,7 +38,7 @@ pub struct LossFigures {
     /// How often how many were lost in a row.
     pub runs: Vec<BurstCount>,
     /// Bursts of losses and the gaps between them; `None` without a burst.
-    pub bursts: Option<BurstFigures>,
+    pub bursts: Option<BurstMetrics>,
     /// The longest time without a message that got through.
     pub longest: Option<LongestLoss>,
 }
@@ -46,7 +46,7 @@ pub struct LossFigures {
 /// Bursts: from a lost message to a lost message with fewer than [`BURST_GAP_MIN`] received in a
 /// row between, at least two lost; all the rest is gaps (RFC 3611, section 4.7.2).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct BurstFigures {
+pub struct BurstMetrics {
     /// Bursts.
     pub count: u64,
     /// Mean length, messages.
@@ -131,13 +131,13 @@ pub(super) fn clusters(runs: &[LossRun]) -> impl Iterator<Item = &[LossRun]> {
 pub(super) fn losses<P: Passages + ?Sized>(
     passages: &P,
     run_ns: Option<(i64, i64)>,
-) -> Figure<LossFigures> {
+) -> Metric<LossMetrics> {
     let (runs, of_count) = loss_runs(passages);
     let lost_count = runs
         .iter()
         .fold(0_u64, |sum, run| sum.saturating_add(run.lost_count));
     let Some(independent_interval) = wilson(lost_count, of_count, CONFIDENCE) else {
-        return Figure::unavailable("no message is known to have been lost or to have arrived");
+        return Metric::unavailable("no message is known to have been lost or to have arrived");
     };
     let ratio = lost_count as f64 / of_count as f64;
     let effective_count = effective_count(&runs, of_count, ratio);
@@ -146,7 +146,7 @@ pub(super) fn losses<P: Passages + ?Sized>(
         *lengths.entry(run.lost_count).or_insert(0) += 1;
     }
     let lengths = lengths.into_iter();
-    Figure::Measured(LossFigures {
+    Metric::Measured(LossMetrics {
         lost_count,
         of_count,
         ratio,
@@ -168,7 +168,7 @@ pub(super) fn losses<P: Passages + ?Sized>(
     })
 }
 
-/// See [`LossFigures::effective_count`].
+/// See [`LossMetrics::effective_count`].
 fn effective_count(runs: &[LossRun], of_count: u64, ratio: f64) -> f64 {
     let n = of_count as f64;
     if runs.is_empty() {
@@ -229,7 +229,7 @@ fn variance_between_blocks(runs: &[LossRun], of_count: u64) -> f64 {
     scatter * of_count as f64 / length as f64
 }
 
-fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstFigures> {
+fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstMetrics> {
     let (mut count, mut length, mut lost_in_bursts) = (0_u64, 0_u64, 0_u64);
     for cluster in clusters(runs) {
         let lost_here: u64 = cluster.iter().map(|run| run.lost_count).sum();
@@ -242,7 +242,7 @@ fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstFigur
         length += last.place + last.lost_count - first.place;
     }
     let rest = of_count.saturating_sub(length) as f64;
-    (count > 0).then(|| BurstFigures {
+    (count > 0).then(|| BurstMetrics {
         count,
         length_mean: length as f64 / count as f64,
         loss_ratio: lost_in_bursts as f64 / length as f64,

@@ -24,15 +24,15 @@ use serde::{Deserialize, Serialize};
 
 pub use bins::{NetworkBin, NetworkBins, Place, bin_width_ns};
 pub use delay::{
-    DelayFigures, DelayQuantile, DelayVariation, InterarrivalJitter, SuccessiveVariation,
+    DelayMetrics, DelayQuantile, DelayVariation, InterarrivalJitter, SuccessiveVariation,
 };
 pub use events::{
     CLOCK_READING_AGE_NS_MAX, EVENT_OUTAGE_MIN_NS, NetworkEvent, NetworkEventKind, clock_steps,
     interruptions, network_events,
 };
 pub use list::{PackedPassages, Passages};
-pub use loss::{BURST_GAP_MIN, BurstFigures, LongestLoss, LossFigures};
-pub use order::OrderFigures;
+pub use loss::{BURST_GAP_MIN, BurstMetrics, LongestLoss, LossMetrics};
+pub use order::OrderMetrics;
 
 use crate::{ChannelPath, Side};
 use hil_core::random::RandomStream;
@@ -83,7 +83,7 @@ impl Passage {
 /// A figure, or why there is none.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "state", rename_all = "snake_case")]
-pub enum Figure<T> {
+pub enum Metric<T> {
     /// The figure.
     Measured(T),
     /// There is none.
@@ -93,7 +93,7 @@ pub enum Figure<T> {
     },
 }
 
-impl<T> Figure<T> {
+impl<T> Metric<T> {
     /// No figure, for this reason.
     pub fn unavailable(reason: &str) -> Self {
         Self::Unavailable {
@@ -129,7 +129,7 @@ pub struct NetworkContext<'a> {
 
 /// The network's figures of one channel, which is one direction.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct NetworkFigures {
+pub struct NetworkMetrics {
     /// Messages handed to the network whose outcome is known.
     pub offered_count: u64,
     /// Of these, received by the other gateway.
@@ -151,22 +151,22 @@ pub struct NetworkFigures {
     /// Payload bytes per second received over that time, without any header.
     pub arrived_bytes_per_s: Option<f64>,
     /// Handed to the kernel to received by the other gateway.
-    pub delay: Figure<DelayFigures>,
+    pub delay: Metric<DelayMetrics>,
     /// The same delays as a histogram; empty where none was measured.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub delay_bins: Vec<DurationBin>,
     /// Difference of the delays of successive messages; needs no alignment of clocks, only a bound
     /// of their rates.
-    pub successive: Figure<SuccessiveVariation>,
+    pub successive: Metric<SuccessiveVariation>,
     /// Losses of the network.
-    pub loss: Figure<LossFigures>,
+    pub loss: Metric<LossMetrics>,
     /// Reordering.
-    pub order: Figure<OrderFigures>,
+    pub order: Metric<OrderMetrics>,
     /// Round trips of the gateways' clock exchange.
     pub round_trip: Distribution,
 }
 
-impl NetworkFigures {
+impl NetworkMetrics {
     /// The figures of `passages`, which are in the order of epochs and sequence numbers.
     pub fn of<P: Passages + ?Sized>(passages: &P, context: &NetworkContext<'_>) -> Self {
         let counts = Counts::of(passages);

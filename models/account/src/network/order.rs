@@ -4,12 +4,12 @@
 use serde::{Deserialize, Serialize};
 
 use super::delay::at_share;
-use super::{Figure, Passages, is_arrived};
+use super::{Metric, Passages, is_arrived};
 use hil_stats::in_order::in_order;
 
 /// Reordering of the messages that arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct OrderFigures {
+pub struct OrderMetrics {
     /// Messages that arrived, copies left out.
     pub count: u64,
     /// Of these, those that came after one with a higher number (RFC 4737, section 3.3).
@@ -24,10 +24,10 @@ pub struct OrderFigures {
     pub extent_max: Option<u64>,
 }
 
-pub(super) fn order<P: Passages + ?Sized>(passages: &P) -> Figure<OrderFigures> {
+pub(super) fn order<P: Passages + ?Sized>(passages: &P) -> Metric<OrderMetrics> {
     let (found, count) = extents(arrivals(passages).map(|(_, number)| number));
     if count == 0 {
-        return Figure::unavailable("no message is known to have arrived");
+        return Metric::unavailable("no message is known to have arrived");
     }
     let mut extents: Vec<i64> = found
         .into_iter()
@@ -36,7 +36,7 @@ pub(super) fn order<P: Passages + ?Sized>(passages: &P) -> Figure<OrderFigures> 
     extents.sort_unstable();
     let largest = extents.last().copied();
     let median = largest.map(|_| at_share(&extents, 0.5));
-    Figure::Measured(OrderFigures {
+    Metric::Measured(OrderMetrics {
         count,
         reordered_count: extents.len() as u64,
         ratio: extents.len() as f64 / count as f64,

@@ -42,11 +42,11 @@ pub(super) fn passages(count: u64, is_lost: impl Fn(u64) -> bool) -> Vec<Passage
     (0..count).map(one).collect()
 }
 
-fn figures(passages: &[Passage]) -> NetworkFigures {
+fn metrics(passages: &[Passage]) -> NetworkMetrics {
     figures_on(ChannelPath::SharedMemory, passages)
 }
 
-pub(super) fn figures_on(path: ChannelPath<'_>, passages: &[Passage]) -> NetworkFigures {
+pub(super) fn figures_on(path: ChannelPath<'_>, passages: &[Passage]) -> NetworkMetrics {
     let context = NetworkContext {
         path,
         run_ns: Some((0, i64::try_from(passages.len()).unwrap() * PERIOD_NS)),
@@ -55,7 +55,7 @@ pub(super) fn figures_on(path: ChannelPath<'_>, passages: &[Passage]) -> Network
         round_trips_ns: &[4_000_000],
         seed: 1,
     };
-    NetworkFigures::of(passages, &context)
+    NetworkMetrics::of(passages, &context)
 }
 
 #[test]
@@ -63,7 +63,7 @@ fn delays_and_their_variation_are_those_that_were_put_in() {
     // 1 ms to 10 ms in steps of 1 µs, in an order that mixes them.
     let delay = |sequence: u64| 1_000_000 + 1_000 * i64::try_from(sequence * 7 % 9_001).unwrap();
     let all: Vec<_> = (0..9_001).map(|one| arrived(one, delay(one))).collect();
-    let found = figures(&all);
+    let found = metrics(&all);
     let delays = found.delay.measured().unwrap();
     assert_eq!((delays.min_ns, delays.max_ns), (1_000_000, 10_000_000));
     assert_eq!(delays.p50.value_ns, 5_500_000);
@@ -90,17 +90,17 @@ fn delays_and_their_variation_are_those_that_were_put_in() {
 #[test]
 fn what_arrived_is_counted_over_the_time_in_which_it_arrived() {
     // 100 per second for 10 s; only the first second gets through.
-    let found = figures(&passages(1_000, |one| one >= 101));
+    let found = metrics(&passages(1_000, |one| one >= 101));
     assert!((found.offered_per_s.unwrap() - 100.0).abs() < 1e-9);
     assert!((found.arrived_per_s.unwrap() - 100.0).abs() < 1e-9);
-    let alone = figures(&passages(1_000, |one| one > 0));
+    let alone = metrics(&passages(1_000, |one| one > 0));
     assert_eq!(alone.arrived_per_s, None, "one arrival has no rate");
     assert_eq!(alone.arrived_bytes_per_s, None);
     let mut unseen = passages(100, |_| false);
     for one in &mut unseen {
         one.received_ns = None;
     }
-    let unseen = figures(&unseen);
+    let unseen = metrics(&unseen);
     assert_eq!((unseen.arrived_count, unseen.arrived_per_s), (100, None));
 }
 
@@ -115,7 +115,7 @@ fn jitter_approaches_the_difference_that_every_message_has() {
             }
     };
     let all: Vec<_> = (0..2_000).map(|one| arrived(one, delay(one))).collect();
-    let jitter = figures(&all).successive.measured().unwrap().jitter;
+    let jitter = metrics(&all).successive.measured().unwrap().jitter;
     assert!((jitter.max_ns - 160_000.0).abs() < 1.0, "{jitter:?}");
     assert!(jitter.mean_ns > 158_000.0 && jitter.mean_ns < 160_000.0);
 }
@@ -126,14 +126,14 @@ fn a_bound_wider_than_the_delay_is_called_so_and_unaligned_clocks_leave_differen
     for one in &mut all {
         one.delay_bound_ns = 3_000_000;
     }
-    let found = figures(&all);
+    let found = metrics(&all);
     let delays = found.delay.measured().unwrap();
     assert!(delays.is_bound_wider && delays.alignment_bound_ns == 3_000_000);
     for one in &mut all {
         one.delay_ns = None;
     }
-    let found = figures(&all);
-    assert_eq!(found.delay, Figure::unavailable("clocks not aligned"));
+    let found = metrics(&all);
+    assert_eq!(found.delay, Metric::unavailable("clocks not aligned"));
     assert_eq!(found.successive.measured().unwrap().max_ns, 0);
     assert_eq!(found.round_trip.measured().unwrap().max_ns, 4_000_000);
 }
@@ -147,7 +147,7 @@ fn losses_runs_bursts_and_gaps_are_counted_as_rfc_3611_has_them() {
     let mut all = passages(1_000, is_lost);
     // What the host lost is in none of the figures, and interrupts nothing.
     all[302].crossing = Crossing::LostByHost;
-    let found = figures(&all);
+    let found = metrics(&all);
     assert_eq!((found.host_lost_count, found.offered_count), (1, 999));
     let loss = found.loss.measured().unwrap();
     assert_eq!((loss.lost_count, loss.of_count), (26, 999));
@@ -187,7 +187,7 @@ fn losses_runs_bursts_and_gaps_are_counted_as_rfc_3611_has_them() {
 #[test]
 fn an_outage_that_lasts_to_the_end_is_open() {
     let all = passages(500, |one| one >= 450);
-    let loss = figures(&all).loss;
+    let loss = metrics(&all).loss;
     let longest = loss.measured().unwrap().longest.unwrap();
     assert!(longest.is_open && longest.length_ns == 50 * PERIOD_NS);
     let events = network_events(&all);
@@ -244,7 +244,7 @@ fn the_interval_of_the_loss_covers_under_bursts_where_an_independent_one_does_no
     let (mut honest, mut independent) = (0, 0);
     for seed in 0..200 {
         let all = chain(6_000, &mut RandomStream::new(seed, "chain"));
-        let loss = figures(&all).loss;
+        let loss = metrics(&all).loss;
         let loss = loss.measured().unwrap();
         honest += i32::from(covers(loss.interval));
         independent += i32::from(covers(loss.independent_interval));
@@ -261,14 +261,14 @@ fn independent_losses_keep_about_all_of_their_sample() {
     let mut random = RandomStream::new(3, "independent");
     let fates: Vec<bool> = (0..20_000).map(|_| random.chance(0.1)).collect();
     let all = passages(20_000, |one| fates[usize::try_from(one).unwrap()]);
-    let loss = figures(&all).loss;
+    let loss = metrics(&all).loss;
     let loss = loss.measured().unwrap();
     assert!(loss.effective_count > 14_000.0, "{}", loss.effective_count);
     assert!(loss.interval.low < 0.1 && 0.1 < loss.interval.high);
-    let none = figures(&passages(100, |_| false)).loss;
+    let none = metrics(&passages(100, |_| false)).loss;
     let none = none.measured().unwrap();
     assert_eq!(none.interval, none.independent_interval);
-    let every = figures(&passages(100, |_| true)).loss;
+    let every = metrics(&passages(100, |_| true)).loss;
     assert!(
         every.measured().unwrap().interval.low < 0.5,
         "one run is one event"
@@ -287,7 +287,7 @@ fn reordering_has_the_ratio_and_extent_of_rfc_4737() {
         })
         .collect();
     all.sort_by_key(|one| one.sequence);
-    let found = figures(&all).order;
+    let found = metrics(&all).order;
     let found = found.measured().unwrap();
     assert_eq!((found.count, found.reordered_count), (11, 3));
     // 4 came four places after 7, 5 five, 6 six.
@@ -300,7 +300,7 @@ fn reordering_has_the_ratio_and_extent_of_rfc_4737() {
         extent_max: 6,
     };
     assert_eq!(event.unwrap().kind, expected);
-    let straight = figures(&passages(50, |_| false)).order;
+    let straight = metrics(&passages(50, |_| false)).order;
     let straight = straight.measured().unwrap();
     assert_eq!((straight.reordered_count, straight.extent_p50), (0, None));
 }
@@ -462,7 +462,7 @@ fn bins_widen_with_the_run() {
 
 #[test]
 fn nothing_is_concluded_from_nothing() {
-    let found = figures(&[]);
+    let found = metrics(&[]);
     assert!(found.delay.measured().is_none() && found.loss.measured().is_none());
     assert!(found.order.measured().is_none() && found.offered_per_s.is_none());
     assert!(network_events::<[Passage]>(&[]).is_empty());

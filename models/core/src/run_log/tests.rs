@@ -3,8 +3,8 @@
 use super::*;
 
 #[allow(clippy::unnecessary_wraps, reason = "as `bring_to_one_clock` takes it")]
-fn stamp(at_ns: i64, bound_ns: u64) -> Option<BroughtStamp> {
-    Some(BroughtStamp {
+fn stamp(at_ns: i64, bound_ns: u64) -> Option<ConvertedStamp> {
+    Some(ConvertedStamp {
         at_ns,
         bound_ns,
         is_early: false,
@@ -115,7 +115,7 @@ fn a_message_before_the_first_exchange_is_named_with_what_it_widens() {
     let brought = |widest_ns: u64| {
         let mut log = log();
         let convert = |channel: &str, ns: i64| match (channel, ns) {
-            ("status", 0) => Some(BroughtStamp {
+            ("status", 0) => Some(ConvertedStamp {
                 at_ns: ns,
                 bound_ns: widest_ns,
                 is_early: true,

@@ -106,7 +106,7 @@ fn a_repeat_that_had_to_be_waited_for_is_named_with_the_copies_before() {
     assert_eq!(diary.told(), []);
     // Aligned clocks may show a command as sent after it was taken, by as much as they are known.
     let stamp = |at_ns, bound_ns| {
-        Some(hil_core::run_log::BroughtStamp {
+        Some(hil_core::run_log::ConvertedStamp {
             at_ns,
             bound_ns,
             is_early: false,

@@ -48,7 +48,7 @@ struct Network {
     status_path: StatusPath,
     commands: Path,
     status: Path,
-    post: Post,
+    queue: MessageQueue,
     /// Per robot, the newest state that arrived; `None` where states may overtake each other.
     newest_status: Option<Vec<u32>>,
     superseded_count: u64,
@@ -99,7 +99,7 @@ impl Experiment {
                 status_path: links.status_path,
                 commands: Path::new(links, Way::Forward, seed)?,
                 status: Path::new(links, Way::Backward, seed)?,
-                post: Post::default(),
+                queue: MessageQueue::default(),
                 newest_status: status_count.map(|count| vec![0; count]),
                 superseded_count: 0,
             },
@@ -158,9 +158,9 @@ impl Experiment {
             .min((self.cycle.next, Rank::Cycle))
             .min((self.next_scan, Rank::Scan));
         self.network
-            .post
+            .queue
             .next()
-            .map_or(first, |post| first.min(post))
+            .map_or(first, |queue| first.min(queue))
     }
 
     /// One control cycle.
@@ -193,8 +193,10 @@ impl Experiment {
                 });
                 agenda.set(index, robot.next_event());
             }
-            ToRobot::Mission(mission) => network.command(now, Letter::Mission(mission)),
-            ToRobot::Authority(authority) => network.command(now, Letter::Authority(authority)),
+            ToRobot::Mission(mission) => network.command(now, QueuedMessage::Mission(mission)),
+            ToRobot::Authority(authority) => {
+                network.command(now, QueuedMessage::Authority(authority));
+            }
         });
         self.cycle.advance();
     }
@@ -213,21 +215,21 @@ impl Experiment {
             referee.on_truth(&truth);
             observe(&truth);
         };
-        let index = match network.post.take() {
-            Some(Letter::State(state)) => {
+        let index = match network.queue.take() {
+            Some(QueuedMessage::State(state)) => {
                 if network.is_news(&state) {
                     coordinator.on_state(now, &state);
                 }
                 return;
             }
-            Some(Letter::Authority(authority)) => {
+            Some(QueuedMessage::Authority(authority)) => {
                 let index = authority.header.robot_id as usize;
                 if let Some(robot) = robots.get_mut(index) {
                     robot.on_authority(now, &authority, &mut take);
                 }
                 index
             }
-            Some(Letter::Mission(mission)) => {
+            Some(QueuedMessage::Mission(mission)) => {
                 let index = mission.header.robot_id as usize;
                 if let Some(robot) = robots.get_mut(index) {
                     robot.on_mission(now, &mission, &mut take);
@@ -298,10 +300,12 @@ impl Experiment {
 
 impl Network {
     /// Sends a command to its robot.
-    fn command(&mut self, now: Instant, letter: Letter) {
-        let Self { commands, post, .. } = self;
-        let length_bytes = letter.length_bytes();
-        commands.offer(now, length_bytes, &mut |at| post.post(at, letter));
+    fn command(&mut self, now: Instant, queued: QueuedMessage) {
+        let Self {
+            commands, queue, ..
+        } = self;
+        let length_bytes = queued.length_bytes();
+        commands.offer(now, length_bytes, &mut |at| queue.queue(at, queued));
     }
 
     /// Sends a state to the coordinator, unless that reads the robots itself.
@@ -309,10 +313,10 @@ impl Network {
         if self.status_path == StatusPath::Bypass {
             return;
         }
-        let Self { status, post, .. } = self;
-        let letter = Letter::State(state);
-        let length_bytes = letter.length_bytes();
-        status.offer(now, length_bytes, &mut |at| post.post(at, letter));
+        let Self { status, queue, .. } = self;
+        let queued = QueuedMessage::State(state);
+        let length_bytes = queued.length_bytes();
+        status.offer(now, length_bytes, &mut |at| queue.queue(at, queued));
     }
 
     /// False for a state that a newer one has deleted from the queue on its way. Dropping it on
@@ -465,7 +469,7 @@ const HEADER_BYTES: usize = 72;
 
 /// A message under way.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Letter {
+pub(crate) enum QueuedMessage {
     /// To the coordinator.
     State(State),
     /// To a robot.
@@ -474,7 +478,7 @@ pub(crate) enum Letter {
     Mission(Mission),
 }
 
-impl Letter {
+impl QueuedMessage {
     /// Bytes of the message behind our datagram's header.
     pub(crate) const fn length_bytes(&self) -> usize {
         HEADER_BYTES
@@ -518,26 +522,26 @@ struct Flight {
 /// Letters under way, the earliest arrival first; of those at one instant and port, the one
 /// posted first.
 #[derive(Debug, Default)]
-pub(crate) struct Post {
+pub(crate) struct MessageQueue {
     flights: BinaryHeap<Reverse<Flight>>,
-    letters: Vec<Letter>,
+    queued_messages: Vec<QueuedMessage>,
     free: Vec<usize>,
     posted_count: u64,
 }
 
-impl Post {
+impl MessageQueue {
     /// Puts a letter under way.
-    pub(crate) fn post(&mut self, at: Instant, letter: Letter) {
+    pub(crate) fn queue(&mut self, at: Instant, queued: QueuedMessage) {
         let slot = if let Some(slot) = self.free.pop() {
-            self.letters[slot] = letter;
+            self.queued_messages[slot] = queued;
             slot
         } else {
-            self.letters.push(letter);
-            self.letters.len() - 1
+            self.queued_messages.push(queued);
+            self.queued_messages.len() - 1
         };
         self.flights.push(Reverse(Flight {
             at,
-            rank: letter.rank(),
+            rank: queued.rank(),
             order: self.posted_count,
             slot,
         }));
@@ -551,10 +555,10 @@ impl Post {
     }
 
     /// Takes the next letter, whenever it arrives.
-    pub(crate) fn take(&mut self) -> Option<Letter> {
+    pub(crate) fn take(&mut self) -> Option<QueuedMessage> {
         let Reverse(flight) = self.flights.pop()?;
         self.free.push(flight.slot);
-        Some(self.letters[flight.slot])
+        Some(self.queued_messages[flight.slot])
     }
 }
 
@@ -648,8 +652,8 @@ mod post_tests {
     use super::*;
     use crate::messages::Header;
 
-    fn authority(sequence: u32) -> Letter {
-        Letter::Authority(Authority {
+    fn authority(sequence: u32) -> QueuedMessage {
+        QueuedMessage::Authority(Authority {
             sequence,
             ..Authority::default()
         })
@@ -658,21 +662,21 @@ mod post_tests {
     #[test]
     fn letters_arrive_by_time_then_port_then_order() {
         let (early, late) = (Instant::from_ns(1), Instant::from_ns(2));
-        let mut post = Post::default();
-        let mission = Letter::Mission(Mission::default());
-        let state = Letter::State(State {
+        let mut queue = MessageQueue::default();
+        let mission = QueuedMessage::Mission(Mission::default());
+        let state = QueuedMessage::State(State {
             header: Header::default(),
             ..State::default()
         });
-        post.post(late, authority(1));
-        for letter in [mission, authority(2), authority(3), state] {
-            post.post(early, letter);
+        queue.queue(late, authority(1));
+        for queued in [mission, authority(2), authority(3), state] {
+            queue.queue(early, queued);
         }
-        assert_eq!(post.next(), Some((early, Rank::State)));
-        let taken: Vec<_> = core::iter::from_fn(|| post.take()).collect();
+        assert_eq!(queue.next(), Some((early, Rank::State)));
+        let taken: Vec<_> = core::iter::from_fn(|| queue.take()).collect();
         let expected = [state, authority(2), authority(3), mission, authority(1)];
         assert_eq!(taken, expected);
-        post.post(late, mission);
-        assert_eq!(post.letters.len(), 5, "a slot is used again");
+        queue.queue(late, mission);
+        assert_eq!(queue.queued_messages.len(), 5, "a slot is used again");
     }
 }

@@ -179,7 +179,7 @@ fn published_row(
         Some(Place::Published { copies, .. }) => Cell::Count(u64::from(*copies)),
         _ => Cell::Absent,
     });
-    row.extend(figures(ours.and_then(|(_, tally)| tally)));
+    row.extend(metrics(ours.and_then(|(_, tally)| tally)));
     let (sections, collisions) = (published.sections, published.collisions);
     row.extend([
         Cell::Count(sections),
@@ -201,14 +201,14 @@ fn variant_row(cell: &Experiment, tally: Option<&FleetTally>) -> Vec<Cell> {
         Cell::number(Some(100.0), 0),
         Cell::Count(1),
     ];
-    row.extend(figures(tally));
+    row.extend(metrics(tally));
     row.extend([Cell::Absent, Cell::Absent, Cell::Absent, Cell::Absent]);
     row.push(judged(cell, tally));
     row
 }
 
 /// Sections, collisions, probability and its interval.
-fn figures(tally: Option<&FleetTally>) -> [Cell; 4] {
+fn metrics(tally: Option<&FleetTally>) -> [Cell; 4] {
     let Some(tally) = tally else {
         return [Cell::Absent, Cell::Absent, Cell::Absent, Cell::Absent];
     };
@@ -330,14 +330,14 @@ fn mechanism_table(scenario: Scenario, results: &Results<'_>) -> Table {
         let of = |mode| results.mechanism(scenario, mechanism, mode);
         let mut cells = vec![Cell::text(mechanism.label())];
         cells.extend(of(CoordinatorMode::Legacy).map_or_else(absent, |tally| {
-            let mut cells = figures(Some(tally)).to_vec();
+            let mut cells = metrics(Some(tally)).to_vec();
             cells.push(Cell::Count(tally.coordinator.resets));
             cells.push(Cell::number(tally.missions_per_hour(), 0));
             cells
         }));
         let safe = of(CoordinatorMode::Safe).map_or_else(absent, |tally| {
             let high = tally.collision_interval().map(|(_, high)| 1e3 * high);
-            let [sections, collisions, ..] = figures(Some(tally));
+            let [sections, collisions, ..] = metrics(Some(tally));
             vec![
                 sections,
                 collisions,

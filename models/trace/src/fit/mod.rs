@@ -9,7 +9,7 @@ mod loss;
 
 use serde::{Deserialize, Serialize};
 
-use super::figures::{TraceFigures, known_losses};
+use super::metrics::{TraceMetrics, known_losses};
 use super::{Trace, TraceDirection};
 use hil_stats::goodness::ChiSquare;
 use hil_stats::histogram::Distribution;
@@ -143,7 +143,7 @@ pub struct TraceFit {
 impl TraceFit {
     /// Fits every law to `trace`; `seed` is that of the bootstrap.
     pub fn of(trace: &Trace, seed: u64) -> Self {
-        let figures = TraceFigures::of(trace, seed);
+        let figures = TraceMetrics::of(trace, seed);
         let losses = known_losses(trace);
         let measured = trace.delays_ns();
         let delays_s = measured.iter().map(|ns| (*ns).max(0) as f64 * 1e-9);
@@ -252,7 +252,7 @@ impl TraceFit {
 }
 
 /// How far the clocks may have led the delays astray, where that is more than nothing.
-fn bound_remark(figures: &TraceFigures) -> Option<String> {
+fn bound_remark(figures: &TraceMetrics) -> Option<String> {
     let delay = figures.delay.measured()?;
     let Some(bound_ns) = figures.bound_max_ns else {
         return Some(

@@ -55,7 +55,7 @@ fn to_files(args: &ReportArgs, console: &mut Console) -> Result<(), Refusal> {
     });
     let materials = materials.map_err(usage)?;
     if format == Format::Svg && template.is_none() {
-        return figures(args, &materials, console);
+        return metrics(args, &materials, console);
     }
     let own = template
         .as_ref()
@@ -108,7 +108,7 @@ fn template(path: &Path) -> Result<(String, String), Refusal> {
 }
 
 /// One figure to a file or standard output, or all of them to a folder.
-fn figures(
+fn metrics(
     args: &ReportArgs,
     materials: &[Material],
     console: &mut Console,

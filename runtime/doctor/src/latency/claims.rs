@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Gaps, LatencyReport, Quantiles, Surroundings, Wakeups};
+use super::{Gaps, HostActivity, LatencyReport, Quantiles, Wakeups};
 use crate::finding::{Answer, Checked, Finding};
 use hil_platform::host_facts::Fact;
 use hil_platform::words::counted_plainly;
@@ -64,7 +64,7 @@ impl Claim {
     }
 }
 
-impl Surroundings {
+impl HostActivity {
     /// A hypervisor runs below, as far as is known.
     fn is_virtual_machine(&self) -> bool {
         matches!(&self.virtual_machine, Fact::Available(answer) if answer != "no")
@@ -79,8 +79,8 @@ fn period_ns(report: &LatencyReport) -> i64 {
 pub(crate) fn judge(measured: &LatencyReport) -> Checked {
     let id = "wakeup_latency";
     let figures = |one: &Wakeups| Some((one.count, one.is_as_asked, one.lateness?));
-    let with_figures = measured.wakeups.iter().filter_map(figures);
-    let worst = with_figures.max_by_key(|(.., lateness)| lateness.p99_ns);
+    let with_metrics = measured.wakeups.iter().filter_map(figures);
+    let worst = with_metrics.max_by_key(|(.., lateness)| lateness.p99_ns);
     let worst = worst.ok_or("no wake-up fell into the measuring time");
     let (count, is_as_asked, lateness) = worst.told(id)?;
     let [p50, p99, max] =
@@ -319,7 +319,7 @@ mod tests {
                 }),
             }],
             gaps: Vec::new(),
-            surroundings: Surroundings {
+            surroundings: HostActivity {
                 load_before: unknown(),
                 load_after: unknown(),
                 ticks: Fact::Unavailable("not in this test".to_owned()),

@@ -12,19 +12,19 @@ use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings,
 use hil_transport::{ConnectionTally, Stalls};
 
 use super::egress::{Attention, Egress};
-use super::gathering::Gathering;
 use super::ingress::{Ingress, Notes};
 use super::kernel_clock::KernelClock;
 use super::line::Line;
 use super::link_switch::SwitchHandle;
-use super::socket::{Ends, OpenSocket, timestamp_mode};
+use super::refusal_backoff::RefusalBackoff;
+use super::socket::{OpenSocket, SocketEnd, timestamp_mode};
 use super::stamp_plan::StampPlan;
-use super::{Surroundings, WorkerError, counters};
-use crate::process::pulse::Pulse;
+use super::{GatewayContext, WorkerError, counters};
+use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{WaitMode, WaitStrategy};
 use hil_rundir::launch::{DirectionLaunch, Side};
-use hil_rundir::pipe::{CountByName, CounterGroup, DirectionReport, RunStart, StallFigures};
+use hil_rundir::pipe::{CountByName, CounterGroup, DirectionReport, RunStart, StallMetrics};
 use hil_rundir::record::{RecordKind, RecordSink, Recorder};
 use hil_shm::{RawInput, RawOutput, Waiter};
 
@@ -44,7 +44,7 @@ pub struct OpenDirection {
     sinks: Sinks,
     count: Arc<AtomicU64>,
     is_established: Arc<AtomicBool>,
-    pulse: Pulse,
+    heartbeat: Heartbeat,
     plan: StampPlan,
 }
 
@@ -60,14 +60,14 @@ struct Sinks {
 /// A direction at work.
 #[derive(Debug)]
 pub struct Direction {
-    way: Way,
-    pulse: Pulse,
+    way: BridgeLoop,
+    heartbeat: Heartbeat,
     facts: Vec<(String, String)>,
     replay: Option<ReplayTally>,
 }
 
 #[derive(Debug)]
-enum Way {
+enum BridgeLoop {
     Egress(Box<Egress>),
     Ingress(Box<Ingress>),
 }
@@ -124,7 +124,7 @@ impl OpenDirection {
             sinks: open_sinks(launch, recorder)?,
             plan,
             count: Arc::default(),
-            pulse: Pulse::default(),
+            heartbeat: Heartbeat::default(),
             // A receiver has nobody to wait for: it takes what comes.
             is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
         })
@@ -146,8 +146,8 @@ impl OpenDirection {
     }
 
     /// The turns of the thread that will carry the messages.
-    pub(crate) fn pulse(&self) -> Pulse {
-        self.pulse.clone()
+    pub(crate) fn heartbeat(&self) -> Heartbeat {
+        self.heartbeat.clone()
     }
 
     /// True while the peer takes this direction's messages.
@@ -162,10 +162,10 @@ impl OpenDirection {
     pub fn connect(
         self,
         launch: &DirectionLaunch,
-        around: &Surroundings,
+        around: &GatewayContext,
     ) -> Result<Direction, WorkerError> {
         let way = match self.socket.ends {
-            Ends::Sender(sender, datagram_max_bytes) => {
+            SocketEnd::Sender(sender, datagram_max_bytes) => {
                 let bridge = egress_bridge(datagram_max_bytes, launch, around)?;
                 let input = (!launch.is_clock_path)
                     .then(|| RawInput::open(&around.domain, &launch.channel, launch.depth))
@@ -177,7 +177,7 @@ impl OpenDirection {
                     messages,
                     exchanges,
                 } = self.sinks;
-                Way::Egress(Box::new(Egress {
+                BridgeLoop::Egress(Box::new(Egress {
                     input,
                     waiter,
                     bridge,
@@ -186,13 +186,13 @@ impl OpenDirection {
                     sent: self.count,
                     stop: Arc::clone(&around.stop),
                     attention: Attention::default(),
-                    gathering: Gathering::of_replies(),
+                    refusal_backoff: RefusalBackoff::of_replies(),
                     is_established: self.is_established,
                 }))
             }
-            Ends::Receiver(receiver) => {
+            SocketEnd::Receiver(receiver) => {
                 let settings = IngressSettings::new(
-                    Surroundings::identity(launch),
+                    GatewayContext::identity(launch),
                     around.session,
                     around.fingerprint,
                     around.clock_id,
@@ -200,7 +200,7 @@ impl OpenDirection {
                 let output = (!launch.is_clock_path)
                     .then(|| RawOutput::open(&around.domain, &launch.channel, true))
                     .transpose()?;
-                Way::Ingress(Box::new(Ingress {
+                BridgeLoop::Ingress(Box::new(Ingress {
                     receiver,
                     is_emulated: launch.emulation.is_some(),
                     bridge: IngressBridge::new(settings)?,
@@ -215,7 +215,7 @@ impl OpenDirection {
                     stop: Arc::clone(&around.stop),
                     foreign_count: 0,
                     stray_count: 0,
-                    gathering: Gathering::of_messages(),
+                    refusal_backoff: RefusalBackoff::of_messages(),
                     clock: KernelClock::read()?,
                     response: None,
                     buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
@@ -224,7 +224,7 @@ impl OpenDirection {
         };
         Ok(Direction {
             way,
-            pulse: self.pulse,
+            heartbeat: self.heartbeat,
             facts: self.socket.facts,
             replay: self.socket.replay,
         })
@@ -235,10 +235,10 @@ impl OpenDirection {
 pub(super) fn egress_bridge(
     datagram_max_bytes: usize,
     launch: &DirectionLaunch,
-    around: &Surroundings,
+    around: &GatewayContext,
 ) -> Result<EgressBridge, SettingsError> {
     EgressBridge::new(EgressSettings {
-        channel: Surroundings::identity(launch),
+        channel: GatewayContext::identity(launch),
         session: around.session,
         domain: around.fingerprint,
         clock_id: around.clock_id,
@@ -258,8 +258,8 @@ impl Direction {
     /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
     pub fn run(&mut self) -> Result<(), WorkerError> {
         match &mut self.way {
-            Way::Egress(egress) => egress.run(&self.pulse),
-            Way::Ingress(ingress) => ingress.run(&self.pulse),
+            BridgeLoop::Egress(egress) => egress.run(&self.heartbeat),
+            BridgeLoop::Ingress(ingress) => ingress.run(&self.heartbeat),
         }
     }
 
@@ -269,8 +269,8 @@ impl Direction {
     /// As [`Direction::run`].
     pub fn step(&mut self) -> Result<bool, WorkerError> {
         match &mut self.way {
-            Way::Egress(egress) => egress.step(),
-            Way::Ingress(ingress) => ingress.step(),
+            BridgeLoop::Egress(egress) => egress.step(),
+            BridgeLoop::Ingress(ingress) => ingress.step(),
         }
     }
 
@@ -280,8 +280,8 @@ impl Direction {
     /// When waiting itself fails.
     pub fn rest(&mut self) -> Result<(), WorkerError> {
         match &mut self.way {
-            Way::Egress(egress) => egress.rest(),
-            Way::Ingress(ingress) => ingress.rest(),
+            BridgeLoop::Egress(egress) => egress.rest(),
+            BridgeLoop::Ingress(ingress) => ingress.rest(),
         }
     }
 
@@ -290,7 +290,7 @@ impl Direction {
         let now = MonotonicClock::now();
         let mut facts = self.facts.clone();
         let (peer_state, mut counters, transport, seal) = match &self.way {
-            Way::Egress(egress) => {
+            BridgeLoop::Egress(egress) => {
                 let sender = egress.line.sender();
                 (
                     counters::egress_state(egress),
@@ -299,7 +299,7 @@ impl Direction {
                     sender.seal_counts(),
                 )
             }
-            Way::Ingress(ingress) => {
+            BridgeLoop::Ingress(ingress) => {
                 if launch.socket.dscp > 0 {
                     let counters = ingress.receiver.counters();
                     facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
@@ -323,15 +323,15 @@ impl Direction {
             peer_state,
             counters,
             facts,
-            stalls: transport.stalls.map(stall_figures),
+            stalls: transport.stalls.map(stall_metrics),
             replay: self.replay.as_ref().map(ReplayTally::counts),
         }
     }
 }
 
-fn stall_figures(stalls: Stalls) -> StallFigures {
+fn stall_metrics(stalls: Stalls) -> StallMetrics {
     let nanoseconds = |time| duration_ns(time).unsigned_abs();
-    StallFigures {
+    StallMetrics {
         count: stalls.count,
         total_ns: nanoseconds(stalls.total),
         longest_ns: nanoseconds(stalls.longest),

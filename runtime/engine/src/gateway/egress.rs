@@ -10,11 +10,11 @@ use hil_core::time::Instant;
 use hil_protocol::egress::RoundTrip;
 use hil_protocol::{EgressBridge, EgressEvent, LocalRefusal, PeerState};
 
-use super::gathering::Gathering;
 use super::line::Line;
+use super::refusal_backoff::RefusalBackoff;
 use super::stamp_tracker::STAMP_PATIENCE_NS;
 use super::{WorkerError, poll_descriptors};
-use crate::process::pulse::Pulse;
+use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy};
 use hil_shm::{RawInput, Waiter};
@@ -34,7 +34,7 @@ pub(crate) struct Egress {
     pub(crate) sent: Arc<AtomicU64>,
     pub(crate) stop: Arc<AtomicBool>,
     pub(crate) attention: Attention,
-    pub(super) gathering: Gathering,
+    pub(super) refusal_backoff: RefusalBackoff,
     /// Set while the peer takes messages.
     pub(crate) is_established: Arc<AtomicBool>,
 }
@@ -59,12 +59,12 @@ impl Egress {
     ///
     /// # Errors
     /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
-    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), WorkerError> {
+    pub(crate) fn run(&mut self, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
         while !self.stop.load(Ordering::Acquire) {
             if !self.step()? {
                 self.rest()?;
             }
-            pulse.beat();
+            heartbeat.beat();
         }
         self.bridge.bye();
         self.line.transmit(&mut self.bridge);
@@ -228,7 +228,7 @@ impl Egress {
             Pause::Spin => core::hint::spin_loop(),
             Pause::Sleep(until) => {
                 // Messages are never kept waiting for refused replies.
-                let away = self.gathering.until(now, self.refused_count());
+                let away = self.refusal_backoff.until(now, self.refused_count());
                 let until = away.unwrap_or(until).min(until);
                 let listeners = self.waiter.iter().flat_map(Waiter::descriptors);
                 let socket = self.line.sender.poll_fd().filter(|_| away.is_none());

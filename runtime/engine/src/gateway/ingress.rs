@@ -14,10 +14,10 @@ use hil_protocol::wire::Kind;
 use hil_protocol::{Delivery, Disposition, IngressBridge};
 use hil_transport::{DatagramReceiver, Received};
 
-use super::gathering::Gathering;
 use super::kernel_clock::KernelClock;
+use super::refusal_backoff::RefusalBackoff;
 use super::{WorkerError, poll_descriptors};
-use crate::process::pulse::Pulse;
+use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy, release};
 use hil_rundir::record::RecordSink;
@@ -41,7 +41,7 @@ pub(crate) struct Ingress {
     pub(crate) foreign_count: u64,
     /// Messages that came over a clock path, dropped.
     pub(crate) stray_count: u64,
-    pub(super) gathering: Gathering,
+    pub(super) refusal_backoff: RefusalBackoff,
     pub(crate) clock: KernelClock,
     /// The clock response whose departure the kernel is to stamp.
     pub(crate) response: Option<Response>,
@@ -97,12 +97,12 @@ impl Ingress {
     ///
     /// # Errors
     /// When the channel or the socket itself breaks.
-    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), WorkerError> {
+    pub(crate) fn run(&mut self, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
         while !self.stop.load(Ordering::Acquire) {
             if !self.step()? {
                 self.rest()?;
             }
-            pulse.beat();
+            heartbeat.beat();
         }
         self.bridge.finish();
         Ok(())
@@ -234,7 +234,7 @@ impl Ingress {
         match pause {
             Pause::Spin => core::hint::spin_loop(),
             Pause::Sleep(until) => {
-                let away = self.gathering.until(now, self.refused_count());
+                let away = self.refusal_backoff.until(now, self.refused_count());
                 let socket = self.receiver.poll_fd().filter(|_| away.is_none());
                 poll_descriptors(socket.into_iter(), away.unwrap_or(until).min(until))?;
             }

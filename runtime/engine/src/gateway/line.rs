@@ -48,7 +48,7 @@ struct Pending {
     /// Of a message's last piece.
     record: Option<EgressRecord>,
     is_stamped: bool,
-    is_card_stamped: bool,
+    is_nic_stamped: bool,
     is_reported: bool,
 }
 
@@ -144,7 +144,7 @@ impl Line {
             handed,
             record,
             is_stamped: false,
-            is_card_stamped: false,
+            is_nic_stamped: false,
             is_reported: false,
         };
         let displaced = self.pending.expect(token, handed, pending);
@@ -207,7 +207,7 @@ impl Line {
             }
         }
         if let Some(hardware_ns) = stamp.stamps.hardware_ns {
-            pending.is_card_stamped = true;
+            pending.is_nic_stamped = true;
             if let Some(record) = &mut pending.record {
                 record.tx_hardware_ns = hardware_ns;
             }
@@ -234,7 +234,7 @@ impl Line {
         let awaited = self.awaited;
         let is_complete = self.pending.find(token).is_some_and(|one| {
             (one.is_stamped || !awaited.awaits_software())
-                && (one.is_card_stamped || !awaited.awaits_hardware())
+                && (one.is_nic_stamped || !awaited.awaits_hardware())
                 && (one.is_reported || !awaited.asks_radio)
         });
         if is_complete {

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use hil_link::condition::{
-    LinkCondition, LinkConditionRecord, LinkOrder, OrderOutcome, order_channel,
+    LinkChangeRequest, LinkCondition, LinkConditionRecord, OrderOutcome, order_channel,
 };
 
 use super::WorkerError;
@@ -91,7 +91,7 @@ impl ControlLine {
         for _ in 0..ORDERS_MAX {
             let mut order = None;
             let taken = self.orders.receive(&mut |_, bytes| {
-                order = bytemuck::try_pod_read_unaligned::<LinkOrder>(bytes).ok();
+                order = bytemuck::try_pod_read_unaligned::<LinkChangeRequest>(bytes).ok();
             });
             match taken {
                 Ok(true) => waiting.extend(order),
@@ -135,11 +135,11 @@ impl ControlLine {
             .condition()
             .filter(|one| *one != LinkCondition::Topology)
         {
-            self.obey(&LinkOrder::new(condition, last.request));
+            self.obey(&LinkChangeRequest::new(condition, last.request));
         }
     }
 
-    fn obey(&mut self, order: &LinkOrder) {
+    fn obey(&mut self, order: &LinkChangeRequest) {
         self.number += 1;
         let outcome = self.book.open().map(|()| self.try_obey(order));
         let said = match outcome {
@@ -153,7 +153,7 @@ impl ControlLine {
     }
 
     /// Changes all channels at one instant, or none.
-    fn try_obey(&mut self, order: &LinkOrder) -> LinkConditionRecord {
+    fn try_obey(&mut self, order: &LinkChangeRequest) -> LinkConditionRecord {
         let ready = self.prepare(order);
         let from = MonotonicClock::now() + LEAD;
         let outcome = match ready {
@@ -180,7 +180,7 @@ impl ControlLine {
 
     fn prepare(
         &mut self,
-        order: &LinkOrder,
+        order: &LinkChangeRequest,
     ) -> Result<Vec<super::link_switch::Replacement>, OrderOutcome> {
         let condition = order.condition().ok_or(OrderOutcome::Malformed)?;
         if !self.switches.iter().all(|one| one.can_hold(condition)) {

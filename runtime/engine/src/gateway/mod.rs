@@ -5,23 +5,23 @@
 //! - `process`: what the process opens, one thread per channel direction.
 //! - [`direction`]: one direction from its launch description to its final counters.
 //! - `egress`: shared memory to network; `ingress`: network to shared memory.
-//! - `gathering`: what both do about a flood of datagrams that they refuse.
+//! - `refusal_backoff`: what both do about a flood of datagrams that they refuse.
 
-pub(crate) mod arming;
 mod connection;
 mod counters;
 pub mod direction;
 pub(crate) mod egress;
-mod gathering;
 pub(crate) mod ingress;
 pub(crate) mod kernel_clock;
 mod line;
 pub(crate) mod link_control;
 mod link_switch;
 pub(crate) mod process;
+mod refusal_backoff;
 pub(crate) mod socket;
 pub mod stamp_plan;
 pub(crate) mod stamp_tracker;
+pub(crate) mod timestamping;
 
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;
@@ -41,7 +41,7 @@ use hil_shm::{Domain, clock_id};
 
 /// What a direction's thread needs from the process around it.
 #[derive(Debug)]
-pub struct Surroundings {
+pub struct GatewayContext {
     /// The host's shared memory.
     pub domain: Domain,
     /// Number of this start.
@@ -54,7 +54,7 @@ pub struct Surroundings {
     pub stop: Arc<AtomicBool>,
 }
 
-impl Surroundings {
+impl GatewayContext {
     /// A gateway's start in `domain`, with a session number nobody can guess from the last one.
     ///
     /// # Errors

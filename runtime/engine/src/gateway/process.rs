@@ -15,12 +15,12 @@ use hil_core::time::Instant;
 use hil_protocol::SettingsError;
 use hil_transport::socket::SocketError;
 
-use super::arming::{self, Arming};
 use super::connection::Connection;
 use super::direction::{Direction, OpenDirection, egress_bridge};
 use super::link_control::LinkControl;
-use super::socket::{Ends, OpenSocket};
-use super::{Surroundings, WorkerError};
+use super::socket::{OpenSocket, SocketEnd};
+use super::timestamping::{self, TimestampingSetup};
+use super::{GatewayContext, WorkerError};
 use crate::process::worker::{Counter, Job, JobWork, Opened, open_domain, warn_of_spinning};
 use hil_nic::radio::sampler::Sampler;
 use hil_platform::clock::MonotonicClock;
@@ -54,14 +54,14 @@ pub(crate) fn open<'a>(
     }
     let seal = seal.flatten();
     let stop = Arc::clone(orders.stop_flag());
-    let surroundings = Arc::new(Surroundings {
+    let surroundings = Arc::new(GatewayContext {
         stop: Arc::clone(&stop),
-        ..Surroundings::new(open_domain(launch)?)?
+        ..GatewayContext::new(open_domain(launch)?)?
     });
     warn_of_shared_cpus(work);
     let mut away = Away::default();
     let (mut armed, sockets) = loop {
-        let armed = arming::arm(work);
+        let armed = timestamping::arm(work);
         match open_sockets(work, &armed, orders, seal.as_ref(), &surroundings) {
             Ok(sockets) => break (armed, sockets),
             Err(error) if launch.instance > 0 && is_away(&error) => away.note(&error),
@@ -112,15 +112,15 @@ pub(crate) fn open<'a>(
 /// The socket of every direction, in their order.
 fn open_sockets(
     work: &GatewayWork,
-    armed: &Arming,
+    armed: &TimestampingSetup,
     orders: &Orders,
     seal: Option<&RunSeal>,
-    around: &Surroundings,
+    around: &GatewayContext,
 ) -> Result<Vec<OpenSocket>, WorkerError> {
     let open = |direction: &DirectionLaunch| {
         let plan = armed.plan(direction);
         let socket = OpenSocket::open(direction, plan, &orders.run_start(), seal)?;
-        if let Ends::Sender(_, longest) = &socket.ends {
+        if let SocketEnd::Sender(_, longest) = &socket.ends {
             // A path may be too narrow for the gateways' own exchanges; the thread would only end.
             egress_bridge(*longest, direction, around)?;
         }
@@ -130,7 +130,7 @@ fn open_sockets(
 }
 
 /// The job of one direction.
-fn job(launch: &DirectionLaunch, opened: OpenDirection, around: Arc<Surroundings>) -> Job<'_> {
+fn job(launch: &DirectionLaunch, opened: OpenDirection, around: Arc<GatewayContext>) -> Job<'_> {
     let (way, what) = match launch.side {
         Side::Egress => ("out", "sent"),
         Side::Ingress => ("in", "received"),
@@ -142,7 +142,7 @@ fn job(launch: &DirectionLaunch, opened: OpenDirection, around: Arc<Surroundings
             what,
             count: opened.count(),
         }],
-        pulse: Some(opened.pulse()),
+        heartbeat: Some(opened.heartbeat()),
         connect: Box::new(move |thread| {
             thread.claim(&launch.realtime);
             let direction = opened.connect(launch, &around)?;

@@ -27,7 +27,7 @@ use hil_topology::Timestamps;
 /// A direction's socket and what is known of it.
 #[derive(Debug)]
 pub(super) struct OpenSocket {
-    pub(super) ends: Ends,
+    pub(super) ends: SocketEnd,
     pub(super) facts: Vec<(String, String)>,
     /// How often its connections come and go, where this end tells of it.
     pub(super) tally: Option<Arc<ConnectionTally>>,
@@ -39,7 +39,7 @@ pub(super) struct OpenSocket {
 
 /// Which end of the hop it is.
 #[derive(Debug)]
-pub(super) enum Ends {
+pub(super) enum SocketEnd {
     /// The sending one, and the longest datagram it takes.
     Sender(Box<dyn DatagramSender>, usize),
     Receiver(Box<dyn DatagramReceiver>),
@@ -63,7 +63,7 @@ impl OpenSocket {
                 if plan.asks_radio {
                     end.facts.push(access_category(end.granted));
                 }
-                let ends = Ends::Sender(end.sender, end.datagram_bytes_max);
+                let ends = SocketEnd::Sender(end.sender, end.datagram_bytes_max);
                 Self {
                     tally: end.connections,
                     ..Self::new(ends, end.facts)
@@ -93,7 +93,7 @@ impl OpenSocket {
     }
 
     /// A socket without a connection to tell of or a link model behind it.
-    const fn new(ends: Ends, facts: Vec<(String, String)>) -> Self {
+    const fn new(ends: SocketEnd, facts: Vec<(String, String)>) -> Self {
         Self {
             ends,
             facts,
@@ -167,7 +167,7 @@ fn emulate(
     start: &RunStart,
 ) -> Result<OpenSocket, WorkerError> {
     let Some(emulation) = &launch.emulation else {
-        return Ok(OpenSocket::new(Ends::Receiver(receiver), facts));
+        return Ok(OpenSocket::new(SocketEnd::Receiver(receiver), facts));
     };
     let link = SinceStart {
         link: emulation.model(&launch.channel)?,
@@ -188,7 +188,7 @@ fn emulate(
     Ok(OpenSocket {
         replay,
         switch: Some(switch),
-        ..OpenSocket::new(Ends::Receiver(Box::new(receiver)), facts)
+        ..OpenSocket::new(SocketEnd::Receiver(Box::new(receiver)), facts)
     })
 }
 

@@ -6,7 +6,7 @@ use hil_transport::probe::{Availability, ProbeReport};
 
 /// Whether a card's stamps of what is sent are to come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum CardStamps {
+pub enum NicStamps {
     /// Nobody asked for them.
     NotAsked,
     /// They come, or nothing is known yet.
@@ -30,7 +30,7 @@ pub struct StampPlan {
     /// The hop is wireless: ask the radio which datagrams were acknowledged.
     pub asks_radio: bool,
     /// What the card is known to do.
-    pub card: CardStamps,
+    pub card: NicStamps,
 }
 
 impl StampPlan {
@@ -42,8 +42,8 @@ impl StampPlan {
             is_queueing_stamped: false,
             asks_radio: false,
             card: match mode {
-                TimestampMode::Hardware => CardStamps::Expected,
-                _ => CardStamps::NotAsked,
+                TimestampMode::Hardware => NicStamps::Expected,
+                _ => NicStamps::NotAsked,
             },
         }
     }
@@ -53,43 +53,43 @@ impl StampPlan {
     pub fn found(asked: TimestampMode, first: &ProbeReport, second: Option<&ProbeReport>) -> Self {
         match asked {
             TimestampMode::Off | TimestampMode::Scheduled => Self::asked(asked),
-            TimestampMode::Software => Self::without_card(first, second),
-            TimestampMode::Hardware => Self::with_card(first, second),
+            TimestampMode::Software => Self::without_nic(first, second),
+            TimestampMode::Hardware => Self::with_nic(first, second),
         }
     }
 
     /// True where a second probe has to find out what the first left open.
     pub(super) fn needs_second_probe(asked: TimestampMode, first: &ProbeReport) -> bool {
-        let is_card_silent = first.tx_hardware != Availability::Seen;
+        let is_nic_silent = first.tx_hardware != Availability::Seen;
         let is_missed = first.tx_software != Availability::Seen;
         match asked {
             TimestampMode::Off | TimestampMode::Scheduled => false,
             TimestampMode::Software => is_missed,
-            TimestampMode::Hardware => is_missed && is_card_silent,
+            TimestampMode::Hardware => is_missed && is_nic_silent,
         }
     }
 
-    fn with_card(first: &ProbeReport, second: Option<&ProbeReport>) -> Self {
+    fn with_nic(first: &ProbeReport, second: Option<&ProbeReport>) -> Self {
         let asked = Self::asked(TimestampMode::Hardware);
-        match card_stamps(first, second) {
-            CardStamps::Missing => Self {
-                card: CardStamps::Missing,
-                ..Self::without_card(first, second)
+        match nic_stamps(first, second) {
+            NicStamps::Missing => Self {
+                card: NicStamps::Missing,
+                ..Self::without_nic(first, second)
             },
-            CardStamps::Unproved => Self {
-                card: CardStamps::Unproved,
+            NicStamps::Unproved => Self {
+                card: NicStamps::Unproved,
                 ..asked
             },
             // The card's stamps prove that the datagrams left: a driver that does not claim to
             // stamp departures itself and did not will not.
-            CardStamps::NotAsked | CardStamps::Expected => Self {
+            NicStamps::NotAsked | NicStamps::Expected => Self {
                 is_departure_stamped: first.tx_software != Availability::NotOffered,
                 ..asked
             },
         }
     }
 
-    fn without_card(first: &ProbeReport, second: Option<&ProbeReport>) -> Self {
+    fn without_nic(first: &ProbeReport, second: Option<&ProbeReport>) -> Self {
         let plan = Self::asked(TimestampMode::Software);
         if first.tx_software == Availability::Seen {
             return plan;
@@ -139,14 +139,14 @@ impl StampPlan {
     pub fn fallback(self) -> Option<String> {
         let kernel = self.kernel_fallback();
         match self.card {
-            CardStamps::NotAsked | CardStamps::Expected => kernel.map(str::to_owned),
-            CardStamps::Unproved => Some(
+            NicStamps::NotAsked | NicStamps::Expected => kernel.map(str::to_owned),
+            NicStamps::Unproved => Some(
                 "hardware stamps: claimed by the driver, none seen, and nothing shows that a probe \
                  left, perhaps because the peer was not there yet: each record waits for its \
                  stamps for up to 200 ms"
                     .to_owned(),
             ),
-            CardStamps::Missing => {
+            NicStamps::Missing => {
                 let instead = kernel.unwrap_or("TX stamp of the departure by the kernel instead");
                 Some(format!(
                     "hardware stamps were asked for and do not come, so no record waits for them; \
@@ -181,20 +181,20 @@ impl StampPlan {
 
 /// What two probes say of the card. A driver that claims its stamps and gave none within the whole
 /// bound of the probe, though datagrams left, gives none: often its card is not armed.
-fn card_stamps(first: &ProbeReport, second: Option<&ProbeReport>) -> CardStamps {
+fn nic_stamps(first: &ProbeReport, second: Option<&ProbeReport>) -> NicStamps {
     let is_departure_seen = |report: &ProbeReport| report.tx_software == Availability::Seen;
     // Where only the second probe saw departures, the first came before the peer did.
     let passed_second = |second: &ProbeReport| {
         second.tx_scheduled == Availability::Seen && !is_departure_seen(second)
     };
     match first.tx_hardware {
-        Availability::Seen => CardStamps::Expected,
-        Availability::NotOffered => CardStamps::Missing,
+        Availability::Seen => NicStamps::Expected,
+        Availability::NotOffered => NicStamps::Missing,
         Availability::ClaimedButNotSeen => {
             if is_departure_seen(first) || second.is_some_and(passed_second) {
-                CardStamps::Missing
+                NicStamps::Missing
             } else {
-                CardStamps::Unproved
+                NicStamps::Unproved
             }
         }
     }
@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn a_card_that_stamps_is_recorded_beside_the_kernel() {
+    fn a_nic_that_stamps_is_recorded_beside_the_kernel() {
         use Availability::{NotOffered, Seen};
         let hardware = TimestampMode::Hardware;
         let first = with_hardware(Seen, Seen);
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn a_card_that_offers_no_stamps_is_planned_for_as_in_software() {
+    fn a_nic_that_offers_no_stamps_is_planned_for_as_in_software() {
         use Availability::{NotOffered, Seen};
         let hardware = TimestampMode::Hardware;
         let wired = with_hardware(NotOffered, Seen);
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn a_claim_of_the_card_counts_only_while_nothing_is_known_to_have_left() {
+    fn a_claim_of_the_nic_counts_only_while_nothing_is_known_to_have_left() {
         use Availability::{ClaimedButNotSeen, NotOffered, Seen};
         let hardware = TimestampMode::Hardware;
         let found = |software, second: Option<&ProbeReport>| {
@@ -323,13 +323,13 @@ mod tests {
         let plan = found(Seen, None);
         assert_eq!(
             (plan.mode, plan.card),
-            (TimestampMode::Software, CardStamps::Missing)
+            (TimestampMode::Software, NicStamps::Missing)
         );
         // Datagrams passed the queue, and nobody stamped a departure.
         let plan = found(NotOffered, Some(&report(NotOffered, Seen)));
         assert_eq!(
             (plan.mode, plan.card),
-            (TimestampMode::Scheduled, CardStamps::Missing)
+            (TimestampMode::Scheduled, NicStamps::Missing)
         );
         assert!(!plan.awaits_hardware());
         // No peer at all, or only when the second probe began: the card may be good.
@@ -340,7 +340,7 @@ mod tests {
             Some(&late),
         ] {
             let plan = found(ClaimedButNotSeen, second);
-            assert_eq!((plan.mode, plan.card), (hardware, CardStamps::Unproved));
+            assert_eq!((plan.mode, plan.card), (hardware, NicStamps::Unproved));
             assert!(plan.awaits_hardware() && plan.awaits_software());
             assert!(plan.fallback().unwrap().contains("none seen"));
         }

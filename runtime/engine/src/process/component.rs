@@ -9,7 +9,7 @@ use hil_core::endpoint::Endpoint;
 use hil_core::message::{Envelope, MessageType};
 use hil_core::record::{PublishedRecord, TakenRecord};
 
-use super::pulse::Pulse;
+use super::heartbeat::Heartbeat;
 use super::recording::{Destination, RecordedInput, RecordedOutput, output_settings};
 use super::worker::{
     Counter, Job, JobWork, NO_TIMER, Opened, WorkerError, open_domain, warn_of_spinning,
@@ -21,7 +21,7 @@ use hil_rundir::pipe::{Orders, ProcessReport};
 use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder};
 use hil_shm::{ChannelError, Domain, Sequencer, ShmInput, ShmOutput, Waiter};
 use hil_topology::registry::Registry;
-use hil_topology::{CardChannel, ProcessCard};
+use hil_topology::{NicChannel, RoleSpec};
 
 /// Records a ring holds: 4 s at 4 kHz, far more than the writer's period needs.
 const RING_RECORDS: usize = 16_384;
@@ -39,14 +39,14 @@ pub(super) fn open<'a>(
     registry: &'a Registry,
     recorder: &mut Recorder,
 ) -> Result<Opened<'a>, WorkerError> {
-    let card: ProcessCard = read(&work.card)?;
+    let card: RoleSpec = read(&work.card)?;
     let counts = Counts::of(&card);
     let sinks = Sinks::open(&card, recorder)?;
     let skipped_ticks = Some(Arc::clone(&counts.skipped));
     let job = Job {
         name: "main".to_owned(),
         counters: counts.taken.iter().chain(&counts.given).cloned().collect(),
-        pulse: Some(counts.pulse.clone()),
+        heartbeat: Some(counts.heartbeat.clone()),
         connect: Box::new(move |thread| {
             let asked = MonotonicClock::now();
             let role = make_role(&card, registry)?;
@@ -87,7 +87,7 @@ struct Component {
     _domain: Domain,
 }
 
-fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, WorkerError> {
+fn make_role(card: &RoleSpec, registry: &Registry) -> Result<Box<dyn Role>, WorkerError> {
     let name = card.case.clone().unwrap_or_default();
     let entry = registry.find(&name).ok_or(WorkerError::UnknownCase(name))?;
     let parameters = serde_json::to_value(&card.parameters).unwrap_or_default();
@@ -105,17 +105,17 @@ struct Counts {
     given: Vec<Counter>,
     /// Ticks that passed without the role; [`NO_TIMER`] for one that has none.
     skipped: Arc<AtomicU64>,
-    pulse: Pulse,
+    heartbeat: Heartbeat,
 }
 
 impl Counts {
-    fn of(card: &ProcessCard) -> Self {
-        let counter = |channel: &CardChannel, what| Counter {
+    fn of(card: &RoleSpec) -> Self {
+        let counter = |channel: &NicChannel, what| Counter {
             channel: channel.name.clone(),
             what,
             count: Arc::default(),
         };
-        let given = |channel: &CardChannel| {
+        let given = |channel: &NicChannel| {
             let what = if channel.is_recorded_only {
                 "recorded"
             } else {
@@ -131,7 +131,7 @@ impl Counts {
                 .collect(),
             given: card.outputs.iter().map(given).collect(),
             skipped: Arc::new(AtomicU64::new(NO_TIMER)),
-            pulse: Pulse::default(),
+            heartbeat: Heartbeat::default(),
         }
     }
 }
@@ -150,7 +150,7 @@ struct GivenSinks {
 }
 
 impl Sinks {
-    fn open(card: &ProcessCard, recorder: &mut Recorder) -> Result<Self, RecordFileError> {
+    fn open(card: &RoleSpec, recorder: &mut Recorder) -> Result<Self, RecordFileError> {
         let mut taken = Vec::new();
         for channel in &card.inputs {
             let size = size_of::<TakenRecord>();
@@ -175,7 +175,7 @@ impl Sinks {
 fn connect(
     role: Box<dyn Role>,
     domain: &Domain,
-    card: &ProcessCard,
+    card: &RoleSpec,
     wait: WaitMode,
     sinks: Sinks,
     counts: &Counts,
@@ -226,7 +226,7 @@ fn connect(
 /// A component without inputs, or one that spins, listens for no wake-ups.
 fn open_waiter(
     domain: &Domain,
-    card: &ProcessCard,
+    card: &RoleSpec,
     mode: WaitMode,
 ) -> Result<Option<Waiter>, ChannelError> {
     if card.inputs.is_empty() || mode == WaitMode::Spin {
@@ -249,7 +249,7 @@ impl JobWork for Component {
         while !orders.is_stopping() {
             let ticks = self.report.ticks;
             self.turn()?;
-            self.counts.pulse.beat();
+            self.counts.heartbeat.beat();
             if self.report.ticks != ticks {
                 let skipped = self.endpoint.role().skipped_ticks();
                 self.counts.skipped.store(skipped, Ordering::Relaxed);
@@ -304,8 +304,8 @@ mod tests {
     use super::*;
     use hil_shuttle::Shuttle;
 
-    fn card(case: &str, role: &str) -> ProcessCard {
-        ProcessCard {
+    fn nic(case: &str, role: &str) -> RoleSpec {
+        RoleSpec {
             process: "test".to_owned(),
             case: Some(case.to_owned()),
             role: Some(role.to_owned()),
@@ -317,13 +317,13 @@ mod tests {
     }
 
     #[test]
-    fn a_card_that_fits_no_case_or_role_is_refused_by_name() {
+    fn a_nic_that_fits_no_case_or_role_is_refused_by_name() {
         let mut registry = Registry::default();
         registry.add::<Shuttle>();
-        let error = make_role(&card("fleet", "robot"), &registry).unwrap_err();
+        let error = make_role(&nic("fleet", "robot"), &registry).unwrap_err();
         assert!(error.to_string().contains("no case fleet"), "{error}");
-        let error = make_role(&card("shuttle", "pilot"), &registry).unwrap_err();
+        let error = make_role(&nic("shuttle", "pilot"), &registry).unwrap_err();
         assert_eq!(error.to_string(), "case shuttle has no role pilot");
-        assert!(make_role(&card("shuttle", "robot"), &registry).is_ok());
+        assert!(make_role(&nic("shuttle", "robot"), &registry).is_ok());
     }
 }

@@ -19,10 +19,10 @@ use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeValLike;
 
 use super::component;
-use super::pulse::{Pulse, Pulses};
-use crate::gateway::arming::Arming;
+use super::heartbeat::{Heartbeat, Heartbeats};
 use crate::gateway::process::GatewayWatch;
-use crate::{face, gateway};
+use crate::gateway::timestamping::TimestampingSetup;
+use crate::{adapter, gateway};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::realtime::{self, RealtimeGrant, RealtimeRequest, SpinAdvice};
 use hil_platform::wait::WaitMode;
@@ -119,7 +119,7 @@ pub(crate) struct Job<'a> {
     /// What it counts for whoever watches the run.
     pub(crate) counters: Vec<Counter>,
     /// The turns of its loop; `None` where nobody looks whether it turns.
-    pub(crate) pulse: Option<Pulse>,
+    pub(crate) heartbeat: Option<Heartbeat>,
     /// Joins the channels, in the thread.
     pub(crate) connect: Connect<'a>,
 }
@@ -166,7 +166,7 @@ pub(crate) struct Counter {
 pub(crate) struct Opened<'a> {
     pub(crate) jobs: Vec<Job<'a>>,
     /// Held until the end, so that the kernel never switches receive stamps off in between.
-    pub(crate) armed: Option<Arming>,
+    pub(crate) armed: Option<TimestampingSetup>,
     /// What a gateway looks after beside its jobs.
     pub(crate) gateway: Option<GatewayWatch<'a>>,
     /// Ticks that passed without the role of a component; [`NO_TIMER`] for one that has none.
@@ -209,7 +209,7 @@ fn open_and_run(path: &Path, registry: &Registry) -> Result<(), WorkerError> {
     let opened = match &launch.work {
         Work::Component(work) => component::open(&launch, work, registry, &mut recorder),
         Work::Gateway(work) => gateway::process::open(&launch, work, &orders, &mut recorder),
-        Work::Adapter(work) => face::process::open(&launch, work, &mut recorder),
+        Work::Adapter(work) => adapter::process::open(&launch, work, &mut recorder),
     }?;
     let stop = Arc::clone(orders.stop_flag());
     recorder
@@ -251,7 +251,7 @@ fn run_jobs(
         skipped_ticks,
     } = opened;
     let counters: Vec<Counter> = jobs.iter().flat_map(|job| job.counters.clone()).collect();
-    let mut pulses = Pulses::of(jobs.iter().filter_map(|job| job.pulse.clone()));
+    let mut heartbeats = Heartbeats::of(jobs.iter().filter_map(|job| job.heartbeat.clone()));
     let job_count = jobs.len();
     let stop = || orders.stop_flag().store(true, Ordering::Release);
     // This end is kept: without a job the process still waits for its orders.
@@ -290,7 +290,7 @@ fn run_jobs(
                 }
                 if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
                     told = now;
-                    say_progress(&counters, &mut pulses, skipped_ticks.as_deref());
+                    say_progress(&counters, &mut heartbeats, skipped_ticks.as_deref());
                 }
             }
             match words.recv_timeout(period) {
@@ -323,12 +323,12 @@ struct Ended {
 }
 
 fn run_job(job: Job<'_>, orders: &Orders, sender: Sender<Word>) -> Ended {
-    let teller = EndTeller(sender);
+    let status_publisher = EndTeller(sender);
     let mut thread = JobThread::default();
     let mut report = ProcessReport::default();
     let outcome = (job.connect)(&mut thread).and_then(|mut work| {
         // The process waits for this word; it cannot have left.
-        let _left = teller.0.send(Word::Connected).is_err();
+        let _left = status_publisher.0.send(Word::Connected).is_err();
         let outcome = work.run(orders);
         report = work.report();
         outcome
@@ -362,14 +362,18 @@ fn add(report: &mut ProcessReport, other: ProcessReport, facts: &[(String, Strin
 
 /// Says how many messages passed, that the threads turn, if they do, and what ticks passed without the
 /// role.
-fn say_progress(counters: &[Counter], pulses: &mut Pulses, skipped_ticks: Option<&AtomicU64>) {
+fn say_progress(
+    counters: &[Counter],
+    heartbeats: &mut Heartbeats,
+    skipped_ticks: Option<&AtomicU64>,
+) {
     let progress = counters.iter().map(|counter| ChannelProgress {
         channel: counter.channel.clone(),
         what: counter.what.to_owned(),
         count: counter.count.load(Ordering::Relaxed),
     });
     say(&FromProcess::Progress(progress.collect()));
-    if pulses.have_all_beaten() {
+    if heartbeats.have_all_turned() {
         say(&FromProcess::Alive);
     }
     let skipped = skipped_ticks.map_or(NO_TIMER, |count| count.load(Ordering::Relaxed));

@@ -1,5 +1,5 @@
 //! One process the supervisor started: its pipes, its log, its death. When to start, restart or
-//! stop it is decided in `crew.rs`.
+//! stop it is decided in `process_group.rs`.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read as _, Seek as _, SeekFrom, Write};

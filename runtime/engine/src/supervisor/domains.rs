@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant as WallInstant};
 use std::{fs, thread};
 
-use hil_link::condition::{LinkOrder, ORDER_TYPE_NAME};
+use hil_link::condition::{LinkChangeRequest, ORDER_TYPE_NAME};
 
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::gateway::link_control::ORDERS_MAX;
@@ -230,8 +230,8 @@ fn order_settings(name: &str) -> ChannelSettings {
         name: name.to_owned(),
         message: TypeInfo {
             name: ORDER_TYPE_NAME.to_owned(),
-            size_bytes: size_of::<LinkOrder>(),
-            alignment_bytes: align_of::<LinkOrder>(),
+            size_bytes: size_of::<LinkChangeRequest>(),
+            alignment_bytes: align_of::<LinkChangeRequest>(),
         },
         depth_max: ORDERS_MAX,
         writers_max: WRITERS_MAX,

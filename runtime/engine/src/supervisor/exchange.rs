@@ -14,7 +14,7 @@ use super::frame::{
     CHUNK_BYTES, Frame, PeerMessage, is_plain_record_name, write_chunk, write_message,
 };
 use super::peer::{Peer, PeerEvent};
-use hil_rundir::event::HostStory;
+use hil_rundir::event::HostHistory;
 
 /// A peer that says nothing for this long while records are due has failed to deliver them.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -24,7 +24,7 @@ const ALIVE_PERIOD: Duration = Duration::from_secs(1);
 /// What came from one peer, or from all of them.
 #[derive(Debug, Default)]
 pub(crate) struct Received {
-    pub(crate) stories: Vec<HostStory>,
+    pub(crate) stories: Vec<HostHistory>,
     /// Why records of a host are missing or incomplete.
     pub(crate) problems: Vec<String>,
     names: BTreeSet<String>,
@@ -35,7 +35,7 @@ pub(crate) fn exchange(
     peers: &mut [Peer],
     is_first_host: bool,
     records: &Path,
-    story: &HostStory,
+    story: &HostHistory,
 ) -> Received {
     let mut all = Received::default();
     let own = record_files(records).unwrap_or_else(|error| {
@@ -94,7 +94,7 @@ fn collect(peers: &mut [Peer], records: &Path) -> Vec<Received> {
 fn distribute(
     peers: &mut [Peer],
     own: &[PathBuf],
-    own_story: &HostStory,
+    own_history: &HostHistory,
     received: &[Received],
     records: &Path,
     all: &mut Received,
@@ -107,7 +107,7 @@ fn distribute(
                 .enumerate()
                 .filter(|(other, _)| *other != index);
             let mut files = own.to_vec();
-            let mut stories = vec![own_story.clone()];
+            let mut stories = vec![own_history.clone()];
             for (_, other) in others {
                 files.extend(other.names.iter().map(|name| records.join(name)));
                 stories.extend(other.stories.iter().cloned());
@@ -131,14 +131,14 @@ fn distribute(
 fn give_and_take(
     peer: &mut Peer,
     own: &[PathBuf],
-    own_story: &HostStory,
+    own_history: &HostHistory,
     records: &Path,
     all: &mut Received,
 ) {
     let host = peer.hello.host.clone();
     let (writer, inbox) = peer.halves();
     let (received, sent) = thread::scope(|scope| {
-        let sending = scope.spawn(|| give_all(writer, own, std::slice::from_ref(own_story)));
+        let sending = scope.spawn(|| give_all(writer, own, std::slice::from_ref(own_history)));
         let received = take_from(&host, inbox, records);
         (received, join_sending(sending))
     });
@@ -174,7 +174,7 @@ fn record_files(records: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-fn give_all(out: &mut impl Write, files: &[PathBuf], stories: &[HostStory]) -> io::Result<()> {
+fn give_all(out: &mut impl Write, files: &[PathBuf], stories: &[HostHistory]) -> io::Result<()> {
     for story in stories {
         write_message(out, &PeerMessage::Report(story.clone()))?;
     }

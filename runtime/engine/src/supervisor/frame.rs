@@ -6,8 +6,8 @@ use std::io::{self, Read, Write};
 use serde::{Deserialize, Serialize};
 use zeroize::Zeroizing;
 
-use super::elsewhere::HostTicks;
-use hil_rundir::event::HostStory;
+use super::peer_status::HostTicks;
+use hil_rundir::event::HostHistory;
 use hil_rundir::run_seal::RunSeal;
 
 /// Largest frame either side accepts; a longer length field is an error, not an allocation.
@@ -71,7 +71,7 @@ pub enum PeerMessage {
         size_bytes: u64,
     },
     /// What happened on a host and how its processes fared.
-    Report(HostStory),
+    Report(HostHistory),
     /// Everything has been sent.
     Done,
 }

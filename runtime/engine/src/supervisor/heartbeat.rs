@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use hil_core::time::Instant;
 
-use super::crew::{Crew, Member};
 use super::plan::ProcessTask;
+use super::process_group::{ManagedProcess, ProcessGroup};
 use hil_rundir::event::EventKind;
 
 /// A process that gets a processor now and then speaks within this time.
@@ -21,14 +21,14 @@ pub(super) struct Heartbeats {
 }
 
 impl Heartbeats {
-    /// Looks at all processes at `now`; what changed is noted in the crew's events and given back in
+    /// Looks at all processes at `now`; what changed is noted in the process group's events and given back in
     /// words.
-    pub(super) fn look(&mut self, crew: &mut Crew, now: Instant) -> Vec<String> {
+    pub(super) fn look(&mut self, process_group: &mut ProcessGroup, now: Instant) -> Vec<String> {
         let mut words = Vec::new();
-        for index in 0..crew.members().len() {
-            let member = &crew.members()[index];
+        for index in 0..process_group.members().len() {
+            let member = &process_group.members()[index];
             let name = member.plan.name.clone();
-            let silence = silence(member, now).filter(|_| crew.started.is_some());
+            let silence = silence(member, now).filter(|_| process_group.started.is_some());
             let is_silent = silence.is_some_and(|silence| silence > SILENCE_MAX);
             let kind = match (is_silent, self.silent.contains(&index)) {
                 (true, false) => {
@@ -46,7 +46,7 @@ impl Heartbeats {
                 _ => continue,
             };
             words.push(format!("{name}: {kind}"));
-            crew.note(now, index, kind, None);
+            process_group.note(now, index, kind, None);
         }
         words
     }
@@ -58,7 +58,7 @@ impl Heartbeats {
 }
 
 /// How long `member` has been silent; `None` of one that owes no sign of life.
-fn silence(member: &Member, now: Instant) -> Option<Duration> {
+fn silence(member: &ManagedProcess, now: Instant) -> Option<Duration> {
     let is_foreign = matches!(member.plan.task, ProcessTask::Foreign { .. });
     let owes = member.child.is_some() && member.is_ready && !is_foreign;
     owes.then(|| now.saturating_duration_since(member.heard))

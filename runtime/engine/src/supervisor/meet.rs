@@ -7,9 +7,11 @@ use std::{io, thread};
 
 use socket2::{Domain, Socket, Type};
 
-use super::door::{Admission, Arrived, Door, KEY_NEEDED, knock, read_hello, say};
+use super::control_listener::{
+    Admission, Arrived, ControlListener, KEY_NEEDED, knock, read_hello, say,
+};
 use super::frame::{PeerHello, PeerMessage};
-use super::peer::{ControlEnds, Peer};
+use super::peer::{ControlHalves, Peer};
 use crate::security::PreSharedKey;
 use crate::security::greeting::GreetingError;
 
@@ -213,11 +215,11 @@ fn host(
         expected: meeting.expected.clone(),
         key: meeting.key.clone(),
     };
-    let mut door = Door::open(address, admission).map_err(listen)?;
+    let mut control_listener = ControlListener::open(address, admission).map_err(listen)?;
     let mut peers: Vec<Peer> = Vec::new();
     loop {
-        door.admit_waiting().map_err(listen)?;
-        while let Some(arrived) = door.look() {
+        control_listener.admit_waiting().map_err(listen)?;
+        while let Some(arrived) = control_listener.look() {
             match arrived {
                 Arrived::Peer {
                     ip,
@@ -243,7 +245,7 @@ fn host(
             }
         }
         if peers.len() == meeting.expected.len() {
-            let strangers = door.counts().words();
+            let strangers = control_listener.counts().words();
             return Ok(Met { peers, strangers });
         }
         // Whatever came: strangers must not keep this host from its deadline and its signals.
@@ -259,7 +261,7 @@ fn host(
 
 /// Greets one that said who it is; `None` when it is nobody of this run, or not at its own address.
 fn welcome(
-    mut ends: ControlEnds,
+    mut ends: ControlHalves,
     ip: IpAddr,
     theirs: PeerHello,
     meeting: &Meeting,
@@ -344,7 +346,7 @@ fn greet(
     hello: &PeerHello,
     other: &str,
     key: Option<&PreSharedKey>,
-) -> Result<(ControlEnds, PeerMessage), GreetingError> {
+) -> Result<(ControlHalves, PeerMessage), GreetingError> {
     let mut ends = knock(stream, &hello.host, other, key)?;
     say(&mut ends, &PeerMessage::Hello(hello.clone()))?;
     let answer = read_hello(&mut ends)?;

@@ -3,21 +3,21 @@
 
 pub(crate) mod child;
 pub(crate) mod clock_path;
-pub(crate) mod crew;
+mod control_listener;
 pub(crate) mod domains;
-mod door;
-pub mod elsewhere;
 pub(crate) mod exchange;
 pub mod frame;
-mod gathering;
 mod heartbeat;
 pub(crate) mod meet;
 mod outcome;
 pub(crate) mod peer;
+pub mod peer_status;
 pub(crate) mod plan;
+pub(crate) mod process_group;
 mod progress_line;
+mod rendezvous;
 mod session;
-mod teller;
+mod status_publisher;
 
 pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;

@@ -7,10 +7,10 @@ use std::path::PathBuf;
 
 use hil_core::layout::Field;
 
-use super::crew::CrewError;
 use super::domains::DomainsError;
 use super::frame::{EndMeaning, PeerMessage};
 use super::meet::PeerError;
+use super::process_group::ProcessGroupError;
 use crate::security::KeyFileError;
 use hil_rundir::run_result::Outcome;
 use hil_shm::DomainError;
@@ -71,8 +71,8 @@ pub enum RunError {
     Emulation(EmulationError),
 }
 
-impl From<CrewError> for RunError {
-    fn from(error: CrewError) -> Self {
+impl From<ProcessGroupError> for RunError {
+    fn from(error: ProcessGroupError) -> Self {
         Self::Start(error.to_string())
     }
 }

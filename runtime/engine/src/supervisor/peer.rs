@@ -83,12 +83,12 @@ impl Write for ControlWriter {
 
 /// Both halves.
 #[derive(Debug)]
-pub(super) struct ControlEnds {
+pub(super) struct ControlHalves {
     pub(super) reader: ControlReader,
     pub(super) writer: ControlWriter,
 }
 
-impl ControlEnds {
+impl ControlHalves {
     /// Of a connection that is not secured.
     pub(super) fn plain(stream: TimedStream) -> io::Result<Self> {
         let writer = BufWriter::new(stream.try_clone()?);
@@ -99,7 +99,7 @@ impl ControlEnds {
     }
 }
 
-impl From<Secured> for ControlEnds {
+impl From<Secured> for ControlHalves {
     fn from(secured: Secured) -> Self {
         Self {
             reader: ControlReader::Secured(Box::new(secured.reader)),
@@ -124,8 +124,8 @@ pub(crate) struct Peer {
 
 impl Peer {
     /// Listens to the connection in a thread of its own.
-    pub(super) fn new(ends: ControlEnds, hello: PeerHello) -> io::Result<Self> {
-        let ControlEnds {
+    pub(super) fn new(ends: ControlHalves, hello: PeerHello) -> io::Result<Self> {
+        let ControlHalves {
             reader: mut input,
             writer,
         } = ends;

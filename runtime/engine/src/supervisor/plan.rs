@@ -19,14 +19,13 @@ use hil_platform::wait::WaitMode;
 use hil_rundir::announcement;
 use hil_rundir::event::ProcessKind;
 use hil_rundir::launch::{
-    ArmLaunch, DirectionLaunch, FaceSettings, GatewayWork, Side, SocketLaunch,
+    AdapterSettings, ArmLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch,
 };
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{
-    CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process,
-    ProcessCard, Program, Scheduling, Topology, Wait, command_channel, feedback_channel,
-    gateway_name,
+    AdapterKind, Channel, Crossing, EgmAdapter, Execution, Host, NicChannel, OnExit, Process,
+    Program, RoleSpec, Scheduling, Topology, Wait, command_channel, feedback_channel, gateway_name,
 };
 
 /// Everything one supervisor is responsible for.
@@ -35,7 +34,7 @@ pub(crate) struct Plan {
     /// One per host that runs here.
     pub(crate) hosts: Vec<HostPlan>,
     /// Clock paths first, whose exchanges are to lie on both sides of every message; then gateways
-    /// and faces, which must be ready before components publish.
+    /// and adapters, which must be ready before components publish.
     pub(crate) processes: Vec<ProcessPlan>,
 }
 
@@ -66,7 +65,7 @@ pub(crate) struct ProcessPlan {
 pub(crate) enum ProcessTask {
     /// A role of the case, in this binary.
     Component {
-        card: ProcessCard,
+        card: RoleSpec,
         realtime: RealtimeRequest,
         wait: WaitMode,
     },
@@ -75,10 +74,10 @@ pub(crate) enum ProcessTask {
     /// One end of a clock path: a gateway that carries no messages.
     ClockPath(GatewayWork),
     /// What speaks with a foreign program, in this binary.
-    Adapter(FaceSettings),
+    Adapter(AdapterSettings),
     /// The user's own program.
     Foreign {
-        card: ProcessCard,
+        card: RoleSpec,
         command: Vec<String>,
         environment: BTreeMap<String, String>,
     },
@@ -100,7 +99,7 @@ impl ProcessPlan {
         matches!(self.task, ProcessTask::Gateway(_)) || self.is_clock_path()
     }
 
-    /// True for what carries messages instead of making them: a gateway, or a face.
+    /// True for what carries messages instead of making them: a gateway, or an adapter.
     pub(crate) fn is_carrier(&self) -> bool {
         matches!(self.task, ProcessTask::Gateway(_) | ProcessTask::Adapter(_))
     }
@@ -122,7 +121,7 @@ impl ProcessPlan {
             ProcessTask::Component { card, .. } | ProcessTask::Foreign { card, .. } => {
                 card.role.clone()
             }
-            ProcessTask::Adapter(face) => Some(face.role.clone()),
+            ProcessTask::Adapter(adapter) => Some(adapter.role.clone()),
             ProcessTask::Gateway(_) | ProcessTask::ClockPath(_) => None,
         }
     }
@@ -180,7 +179,7 @@ fn order_channels(topology: &Topology, host: &Host) -> BTreeSet<String> {
 
 fn component(topology: &Topology, process: &Process) -> ProcessPlan {
     let card = topology
-        .process_card(&process.name)
+        .role_spec(&process.name)
         .expect("the process is of this topology");
     let task = match &process.program {
         Program::BuiltIn { .. } => ProcessTask::Component {
@@ -197,10 +196,10 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
             command: command.clone(),
             environment: environment.clone(),
         },
-        Program::Egm { role, face } => {
+        Program::Egm { role, adapter } => {
             let host = topology.host(&process.host);
             let interface = host.and_then(|host| host.interface.clone());
-            ProcessTask::Adapter(face_settings(role, face, &card, process, interface))
+            ProcessTask::Adapter(adapter_settings(role, adapter, &card, process, interface))
         }
     };
     ProcessPlan {
@@ -211,23 +210,23 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
     }
 }
 
-fn face_settings(
+fn adapter_settings(
     role: &str,
-    face: &EgmFace,
-    card: &ProcessCard,
+    adapter: &EgmAdapter,
+    card: &RoleSpec,
     process: &Process,
     interface: Option<String>,
-) -> FaceSettings {
+) -> AdapterSettings {
     let mut arms = Vec::new();
     for side in ArmSide::BOTH {
-        let Some(address) = face.address(side) else {
+        let Some(address) = adapter.address(side) else {
             continue;
         };
-        let (input, output) = match face.kind {
-            FaceKind::Robot => (feedback_channel(side), command_channel(side)),
-            FaceKind::Sensor => (command_channel(side), feedback_channel(side)),
+        let (input, output) = match adapter.kind {
+            AdapterKind::Robot => (feedback_channel(side), command_channel(side)),
+            AdapterKind::Sensor => (command_channel(side), feedback_channel(side)),
         };
-        let named = |channels: &[CardChannel], name: &str| {
+        let named = |channels: &[NicChannel], name: &str| {
             channels
                 .iter()
                 .find(|channel| channel.name == name)
@@ -248,18 +247,18 @@ fn face_settings(
         });
     }
     let (cycle, delay_cycles) = robot_cycle(card);
-    let is_used = |channel: &&CardChannel| arms.iter().any(|arm| arm.input == **channel);
-    FaceSettings {
+    let is_used = |channel: &&NicChannel| arms.iter().any(|arm| arm.input == **channel);
+    AdapterSettings {
         role: role.to_owned(),
-        kind: face.kind,
-        axes: face.axes,
-        robotware: face.robotware,
+        kind: adapter.kind,
+        axes: adapter.axes,
+        robotware: adapter.robotware,
         cycle_ns: nanoseconds(cycle),
         planned_lead_ns: nanoseconds(cycle) * delay_cycles,
         wait: wait_mode(process.execution.wait),
-        send: face.send,
-        timestamps: face.timestamps,
-        dscp: face.dscp,
+        send: adapter.send,
+        timestamps: adapter.timestamps,
+        dscp: adapter.dscp,
         interface,
         spare: card
             .inputs
@@ -273,7 +272,7 @@ fn face_settings(
 
 /// The robot's cycle, and by how many of them its measured joints lag the planned ones: what the
 /// case's `egm` table says, or its default.
-fn robot_cycle(card: &ProcessCard) -> (Duration, u64) {
+fn robot_cycle(card: &RoleSpec) -> (Duration, u64) {
     let table = card.parameters.get("egm").cloned();
     let parameters: EgmParameters = table
         .and_then(|egm| egm.try_into().ok())

@@ -8,24 +8,24 @@ use std::time::{Duration, Instant as WallInstant, SystemTime};
 use hil_core::time::Instant;
 use hil_net::clock_pair::ClockPair;
 
-use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
-use super::elsewhere::{Elsewhere, greeting, own_ticks};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
-use super::gathering::{gather, read_key};
 use super::outcome::{Heard, RunError, RunOptions, meaning};
 use super::peer::{Peer, PeerEvent};
+use super::peer_status::{PeerStatus, greeting, own_ticks};
 use super::plan::{ProcessPlan, plan};
-use super::teller::Teller;
-use hil_nic::card_clock::CardWatch;
+use super::process_group::{self, ProcessGroup, Verdict};
+use super::rendezvous::{gather, read_key};
+use super::status_publisher::StatusPublisher;
+use hil_nic::nic_clock::NicWatch;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::clock_discipline::HostDiscipline;
 use hil_platform::console::Console;
 use hil_platform::host_facts::HostFacts;
 use hil_platform::signals::Signals;
 use hil_rundir::announcement::Announcement;
-use hil_rundir::event::{Event, HostStory, ProcessStory, disciplines};
+use hil_rundir::event::{Event, HostHistory, ProcessHistory, disciplines};
 use hil_rundir::manifest::{self, ManifestContent};
 use hil_rundir::protection::RunSecurity;
 use hil_rundir::run_folder::{RunFolder, utc_text};
@@ -68,7 +68,7 @@ pub fn run(
         .collect();
     let key = read_key(topology, &hosts)?;
     let plan = plan(topology, &hosts);
-    crew::find_programs(&plan.processes)?;
+    process_group::find_programs(&plan.processes)?;
     check_emulation(topology).map_err(RunError::Emulation)?;
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
@@ -93,25 +93,26 @@ pub fn run(
     let gathered = gather(topology, key.as_ref(), &hosts, &domains, signals, console)?;
     let peers = gathered.peers;
     let here = clock_id()?;
-    let crew = Crew::new(plan.processes, domains.addresses(), &folder, gathered.seal)?;
+    let process_group =
+        ProcessGroup::new(plan.processes, domains.addresses(), &folder, gathered.seal)?;
     let announcement = Announcement::make(
         topology,
         &folder,
         domains.addresses(),
-        crew.names(),
+        process_group.names(),
         clocks_known(topology, &hosts, &peers, here),
     );
     let announcement = announcement.map_err(unwritable)?;
     // Before the gateways: they find out by sending what the cards deliver.
-    let cards = CardWatch::start(topology, &hosts, &folder.records());
-    let teller = Teller::new(folder.root());
+    let cards = NicWatch::start(topology, &hosts, &folder.records());
+    let status_publisher = StatusPublisher::new(folder.root());
     let mut session = Session {
         topology,
         announcement,
         cards,
         is_first_host: is_here(&topology.hosts()[0], &hosts),
         has_one_clock: peers.iter().all(|peer| peer.hello.clock_id == here),
-        crew,
+        process_group,
         domains,
         peers,
         signals,
@@ -120,8 +121,8 @@ pub fn run(
         security: gathered.security,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
-        teller,
-        elsewhere: Elsewhere::new(topology, &hosts),
+        status_publisher,
+        elsewhere: PeerStatus::new(topology, &hosts),
     };
     let begun = session.begin(topology.run().start_timeout);
     let start = MonotonicClock::now();
@@ -169,12 +170,12 @@ struct Session<'a> {
     topology: &'a Topology,
     // Before the domains: its files lie beside theirs.
     announcement: Announcement,
-    cards: CardWatch,
+    cards: NicWatch,
     is_first_host: bool,
     /// All hosts of the run read one clock.
     has_one_clock: bool,
     // Before the domains: no process may be left when its shared memory goes.
-    crew: Crew,
+    process_group: ProcessGroup,
     domains: Domains,
     peers: Vec<Peer>,
     signals: &'a Signals,
@@ -185,8 +186,8 @@ struct Session<'a> {
     security: Option<RunSecurity>,
     cleaned: WallInstant,
     greeted: WallInstant,
-    teller: Teller,
-    elsewhere: Elsewhere,
+    status_publisher: StatusPublisher,
+    elsewhere: PeerStatus,
 }
 
 impl Session<'_> {
@@ -196,7 +197,7 @@ impl Session<'_> {
     /// # Errors
     /// Why the run ended before it began.
     fn begin(&mut self, timeout: Duration) -> Result<(), Outcome> {
-        self.crew
+        self.process_group
             .start()
             .map_err(|error| Outcome::Failed(error.to_string()))?;
         let deadline = WallInstant::now() + timeout;
@@ -210,7 +211,7 @@ impl Session<'_> {
                 Some(outcome) => return Err(outcome),
             }
             self.tell(Phase::Starting);
-            let is_ready = self.crew.is_ready();
+            let is_ready = self.process_group.is_ready();
             if is_ready && !has_told && !self.is_first_host {
                 self.say_to_all(&PeerMessage::Ready);
                 has_told = true;
@@ -238,11 +239,11 @@ impl Session<'_> {
                 self.say_to_all(&PeerMessage::Start { has_one_clock });
                 // Only observers read it; they do without.
                 let _is_said = self.announcement.say_clock(has_one_clock).is_ok();
-                self.crew.begin();
+                self.process_group.begin();
                 return Ok(());
             }
             if WallInstant::now() > deadline {
-                let missing = self.crew.missing();
+                let missing = self.process_group.missing();
                 let text = if missing.is_empty() {
                     "the other host".to_owned()
                 } else {
@@ -296,14 +297,14 @@ impl Session<'_> {
             ));
             return Some(Outcome::Interrupted(signal.to_owned()));
         }
-        let known = self.crew.events().len();
-        let verdict = self.crew.watch();
-        for event in &self.crew.events()[known..] {
+        let known = self.process_group.events().len();
+        let verdict = self.process_group.watch();
+        for event in &self.process_group.events()[known..] {
             self.console
                 .warn(&format!("{}: {}", event.process, event.kind));
         }
         match verdict {
-            Verdict::GoesOn => None,
+            Verdict::Running => None,
             Verdict::Finished(text) => Some(Outcome::EndedEarly(text)),
             Verdict::Failed(text) => Some(Outcome::Failed(text)),
         }
@@ -311,7 +312,7 @@ impl Session<'_> {
 
     /// Tells each peer that this host lives, and what is known of ticks.
     fn greet(&mut self) {
-        let ticks = own_ticks(&self.own_hosts(), self.crew.members());
+        let ticks = own_ticks(&self.own_hosts(), self.process_group.members());
         let told = self.elsewhere.told(ticks, MonotonicClock::now());
         for peer in &mut self.peers {
             let is_heard = peer.silence() <= 2 * ALIVE_PERIOD;
@@ -365,9 +366,10 @@ impl Session<'_> {
     }
 
     fn tell(&mut self, phase: Phase) {
-        let (topology, crew, elsewhere) = (self.topology, &mut self.crew, &self.elsewhere);
-        self.teller
-            .tell(phase, topology, crew, elsewhere, self.console);
+        let (topology, process_group, elsewhere) =
+            (self.topology, &mut self.process_group, &self.elsewhere);
+        self.status_publisher
+            .tell(phase, topology, process_group, elsewhere, self.console);
     }
 
     /// Ends components everywhere first, then gateways, so that what is under way arrives, and last
@@ -377,14 +379,17 @@ impl Session<'_> {
         let reason = outcome.text();
         let meaning = meaning(outcome);
         self.say_to_all(&PeerMessage::Stop { reason, meaning });
-        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_component);
+        self.process_group
+            .stop(STOP_PATIENCE, ProcessPlan::is_component);
         self.say_to_all(&PeerMessage::Quiet);
         if !matches!(outcome, Outcome::PeerLost(_)) {
             self.wait_for_quiet();
         }
         thread::sleep(DRAIN);
-        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_carrier);
-        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_clock_path);
+        self.process_group
+            .stop(STOP_PATIENCE, ProcessPlan::is_carrier);
+        self.process_group
+            .stop(STOP_PATIENCE, ProcessPlan::is_clock_path);
     }
 
     fn wait_for_quiet(&mut self) {
@@ -414,10 +419,10 @@ impl Session<'_> {
         let own_hosts = self.own_hosts();
         let watch = core::mem::take(&mut self.cards);
         let (cards, mut problems) = watch.finish();
-        let own = HostStory {
+        let own = HostHistory {
             hosts: own_hosts.clone(),
             span: (start, end),
-            events: self.crew.events().to_vec(),
+            events: self.process_group.events().to_vec(),
             discipline: self.discipline(),
             processes: self.stories(),
             cards,
@@ -435,8 +440,8 @@ impl Session<'_> {
             stories.extend(received.stories);
         }
         let has_one_clock = self.has_one_clock;
-        drop(self.crew);
-        drop(self.teller);
+        drop(self.process_group);
+        drop(self.status_publisher);
         self.announcement.withdraw();
         self.domains.let_observers_leave();
         let left = self.domains.remove();
@@ -481,10 +486,10 @@ impl Session<'_> {
         Some(before.worse(HostDiscipline::gather().ok()?))
     }
 
-    fn stories(&self) -> Vec<ProcessStory> {
-        let members = self.crew.members().iter();
+    fn stories(&self) -> Vec<ProcessHistory> {
+        let members = self.process_group.members().iter();
         members
-            .map(|member| ProcessStory {
+            .map(|member| ProcessHistory {
                 name: member.plan.name.clone(),
                 host: member.plan.host.clone(),
                 kind: member.plan.kind(),

@@ -41,7 +41,7 @@ pub fn heard(bytes: &[u8]) -> Heard {
             ..
         } = answer
         {
-            let event = nl80211::Happening::decode(command, attributes);
+            let event = nl80211::AssociationEvent::decode(command, attributes);
             let family = nl80211::family(attributes, b"mlme\0");
             heard.station_count += usize::from(nl80211::Station::decode(attributes).is_some());
             heard.interface_count += usize::from(nl80211::Wireless::decode(attributes).is_some());

@@ -204,7 +204,7 @@ impl Station {
 
 /// Something that happened to an association.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Happening {
+pub(crate) struct AssociationEvent {
     /// The command that tells of it.
     pub(crate) command: u8,
     /// The interface.
@@ -215,7 +215,7 @@ pub(crate) struct Happening {
     pub(crate) code: Option<u16>,
 }
 
-impl Happening {
+impl AssociationEvent {
     /// The happening a message of the `mlme` group tells of; `None` for one of no concern here.
     pub(crate) fn decode(command: u8, attributes: Attributes<'_>) -> Option<Self> {
         use command::{

@@ -109,9 +109,12 @@ fn interfaces_say_what_they_are() {
 #[test]
 fn a_disconnection_names_its_interface_and_reason() {
     let (command, attributes) = message(DISCONNECT);
-    let happening = Happening::decode(command, attributes).unwrap();
+    let happening = AssociationEvent::decode(command, attributes).unwrap();
     assert_eq!(happening.command, command::DISCONNECT);
     assert_eq!((happening.ifindex, happening.code), (3, Some(3)));
     assert_eq!(happening.mac, None);
-    assert_eq!(Happening::decode(command::GET_STATION, attributes), None);
+    assert_eq!(
+        AssociationEvent::decode(command::GET_STATION, attributes),
+        None
+    );
 }

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use super::nl80211::{Happening, Rate, Station};
+use super::nl80211::{AssociationEvent, Rate, Station};
 use super::socket::RadioSocket;
 use hil_core::record::UNAVAILABLE;
 use hil_platform::clock::MonotonicClock;
@@ -164,7 +164,7 @@ fn sample_record(at_ns: i64, station: &Station) -> RadioRecord {
 }
 
 /// An event.
-fn happening_record(at_ns: i64, happening: &Happening) -> RadioRecord {
+fn happening_record(at_ns: i64, happening: &AssociationEvent) -> RadioRecord {
     RadioRecord {
         mac: happening.mac.unwrap_or_default(),
         event: happening.command,

@@ -11,7 +11,7 @@ use nix::sys::socket::{MsgFlags, SockProtocol, recv};
 use super::conversation::{Conversation, netlink_socket};
 use super::netlink::{Answer, Answers, Attributes};
 use super::nl80211;
-use super::nl80211::{Happening, Station, Wireless, attribute};
+use super::nl80211::{AssociationEvent, Station, Wireless, attribute};
 use hil_rundir::radio_record::command;
 
 /// The longest event of the kernel: it fills pages of 32 KiB at most.
@@ -122,7 +122,7 @@ impl RadioSocket {
     ///
     /// # Errors
     /// When the socket breaks; what was there before has been given.
-    pub(crate) fn happenings(&mut self, mut note: impl FnMut(Happening)) -> io::Result<u64> {
+    pub(crate) fn happenings(&mut self, mut note: impl FnMut(AssociationEvent)) -> io::Result<u64> {
         let Some(events) = &self.events else {
             return Ok(0);
         };
@@ -135,7 +135,7 @@ impl RadioSocket {
                     attributes,
                 } = answer
                     && of == family
-                    && let Some(happening) = Happening::decode(command, attributes)
+                    && let Some(happening) = AssociationEvent::decode(command, attributes)
                     && happening.ifindex == ifindex
                 {
                     note(happening);

@@ -110,12 +110,12 @@ pub(super) fn listen(
 
 /// The port that viewers connect to, before anybody is let in.
 #[derive(Debug)]
-pub(super) struct Door {
+pub(super) struct ViewerListener {
     listener: TcpListener,
     port: u16,
 }
 
-impl Door {
+impl ViewerListener {
     /// Takes `address`; connections wait. Viewers that take nothing for `gone_after` lose their place.
     ///
     /// # Errors
@@ -144,14 +144,14 @@ impl Door {
         access: Arc<Access>,
         page_port: u16,
     ) -> Front {
-        let house = Arc::new(House {
+        let context = Arc::new(ServerContext {
             access,
             page_port,
             server,
             seats: Arc::new(Semaphore::new(SEATS)),
         });
         let (close, closed) = oneshot::channel();
-        let task = runtime.spawn(attend(self.listener, house, closed));
+        let task = runtime.spawn(attend(self.listener, context, closed));
         Front { close, task }
     }
 }
@@ -179,7 +179,7 @@ impl Front {
 
 /// What all connections need.
 #[derive(Debug)]
-struct House {
+struct ServerContext {
     access: Arc<Access>,
     page_port: u16,
     server: SocketAddr,
@@ -187,7 +187,11 @@ struct House {
 }
 
 /// Takes connections until it is told to end, then waits for those that are there.
-async fn attend(listener: TcpListener, house: Arc<House>, mut closed: oneshot::Receiver<()>) {
+async fn attend(
+    listener: TcpListener,
+    context: Arc<ServerContext>,
+    mut closed: oneshot::Receiver<()>,
+) {
     // Dropped with this, and all connections with it.
     let mut connections = JoinSet::new();
     let entering = Arc::new(Semaphore::new(ENTERING_MAX));
@@ -201,10 +205,10 @@ async fn attend(listener: TcpListener, house: Arc<House>, mut closed: oneshot::R
             Some(_) = connections.join_next() => {}
             (place, accepted) = next => match accepted {
                 Ok((viewer, _)) => {
-                    let house = Arc::clone(&house);
+                    let context = Arc::clone(&context);
                     connections.spawn(async move {
                         // Whoever goes away in the middle is nobody's fault.
-                        let _is_served = serve(viewer, &house, place).await.is_ok();
+                        let _is_served = serve(viewer, &context, place).await.is_ok();
                     });
                 }
                 Err(_) => sleep(PAUSE).await,
@@ -216,7 +220,7 @@ async fn attend(listener: TcpListener, house: Arc<House>, mut closed: oneshot::R
 }
 
 /// One connection; `place` is its place among those that enter.
-async fn serve<P>(mut viewer: TcpStream, house: &House, place: P) -> io::Result<()> {
+async fn serve<P>(mut viewer: TcpStream, context: &ServerContext, place: P) -> io::Result<()> {
     viewer.set_nodelay(true)?;
     let mut bytes = Vec::new();
     let head = match timeout(HEAD_WITHIN, read_head(&mut viewer, &mut bytes)).await {
@@ -228,13 +232,13 @@ async fn serve<P>(mut viewer: TcpStream, house: &House, place: P) -> io::Result<
             None => return Ok(()),
         },
     };
-    let judged = head.and_then(|head| house.access.judge(&head, house.page_port));
+    let judged = head.and_then(|head| context.access.judge(&head, context.page_port));
     let seat = judged.and_then(|()| {
-        let seat = Arc::clone(&house.seats).try_acquire_owned();
+        let seat = Arc::clone(&context.seats).try_acquire_owned();
         seat.map_err(|_none| Refusal::Full(SEATS))
     });
     let server = match seat {
-        Ok(seat) => connect(house.server).await.map(|server| (server, seat)),
+        Ok(seat) => connect(context.server).await.map(|server| (server, seat)),
         Err(refusal) => Err(refusal),
     };
     match server {
@@ -245,7 +249,7 @@ async fn serve<P>(mut viewer: TcpStream, house: &House, place: P) -> io::Result<
             hand_on(&mut viewer, &mut server).await
         }
         Err(refusal) => {
-            house.access.count(&refusal);
+            context.access.count(&refusal);
             refuse(&mut viewer, &refusal).await
         }
     }
@@ -354,7 +358,7 @@ mod tests {
     const LIMIT: Duration = Duration::from_mins(1);
 
     /// A door before what listens at `server`: its address, and what keeps it open.
-    fn door(server: SocketAddr) -> (SocketAddr, Front, Runtime) {
+    fn viewer_listener(server: SocketAddr) -> (SocketAddr, Front, Runtime) {
         door_for(server, GONE_AFTER)
     }
 
@@ -362,10 +366,10 @@ mod tests {
         let mut builder = Builder::new_multi_thread();
         let runtime = builder.worker_threads(2).enable_all().build().unwrap();
         let loopback = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
-        let door = Door::take(runtime.handle(), loopback, gone_after).unwrap();
-        let address = SocketAddr::new(loopback.ip(), door.port());
+        let viewer_listener = ViewerListener::take(runtime.handle(), loopback, gone_after).unwrap();
+        let address = SocketAddr::new(loopback.ip(), viewer_listener.port());
         let access = Arc::new(Access::new(&[], &[], None));
-        let front = door.open(runtime.handle(), server, access, 80);
+        let front = viewer_listener.open(runtime.handle(), server, access, 80);
         (address, front, runtime)
     }
 
@@ -418,7 +422,7 @@ mod tests {
             // Only now, when the other way is closed already.
             stream.write_all(&bytes).unwrap();
         });
-        let (address, front, runtime) = door(server);
+        let (address, front, runtime) = viewer_listener(server);
         let mut stream = viewer(address);
         let body: Vec<u8> = (0..=250).cycle().take(BYTES).collect();
         stream.write_all(&body).unwrap();
@@ -440,7 +444,7 @@ mod tests {
     fn a_viewer_hears_that_there_is_nothing_to_see() {
         let (listener, server) = listener();
         drop(listener);
-        let (address, front, runtime) = door(server);
+        let (address, front, runtime) = viewer_listener(server);
         let mut stream = viewer(address);
         let mut answer = String::new();
         stream.read_to_string(&mut answer).unwrap();
@@ -456,7 +460,7 @@ mod tests {
     #[test]
     fn one_that_neither_reads_nor_goes_does_not_keep_the_door_open() {
         let (listener, server) = listener();
-        let (address, front, runtime) = door(server);
+        let (address, front, runtime) = viewer_listener(server);
         let mut stream = viewer(address);
         let writing = writing_on(&listener);
         let mut first = [0; 1];

@@ -229,13 +229,13 @@ impl Account {
     }
 
     /// The channel's entry in `/live/channels`.
-    pub(crate) fn figures(&mut self, name: &str, now_ns: i64) -> Value {
+    pub(crate) fn metrics(&mut self, name: &str, now_ns: i64) -> Value {
         let named = self.way.segments().iter().zip(&mut self.segments);
         let segments: Vec<Value> = named
-            .map(|(name, samples)| samples.figures(name, now_ns))
+            .map(|(name, samples)| samples.metrics(name, now_ns))
             .collect();
         let one_way = self.whole.is_available;
-        let one_way = one_way.then(|| self.whole.figures("published-taken", now_ns));
+        let one_way = one_way.then(|| self.whole.metrics("published-taken", now_ns));
         let can_tell = self.way.has_link && self.counts.received.is_some();
         let window_lost = self.window_lost.count(now_ns);
         let arrived_ns = self.arrived_ns.filter(|_| self.way.has_link);
@@ -472,7 +472,7 @@ impl Samples {
     }
 
     /// `p50_us`, `p99_us`, `max_us`, `count` and `is_available` of the window before `now_ns`, as `name`.
-    fn figures(&mut self, name: &str, now_ns: i64) -> Value {
+    fn metrics(&mut self, name: &str, now_ns: i64) -> Value {
         let oldest_ns = now_ns - WINDOW_NS;
         while self.values.front().is_some_and(|(at, _)| *at <= oldest_ns) {
             self.values.pop_front();

@@ -101,7 +101,7 @@ fn what_was_sent_and_did_not_arrive_is_lost_after_a_second() {
         (&json!([3, 8]), &json!(2))
     );
     assert_eq!(losses["first_at_s"], 0.3);
-    let figures = account.figures("x", 1900 * MS);
+    let figures = account.metrics("x", 1900 * MS);
     assert_eq!(
         (&figures["lost_count"], &figures["published_count"]),
         (&json!(2), &json!(10))
@@ -112,7 +112,7 @@ fn what_was_sent_and_did_not_arrive_is_lost_after_a_second() {
     );
     // One of them comes after all.
     account.take(&received(8, 1950 * MS));
-    assert_eq!(account.figures("x", 1950 * MS)["lost_count"], 1);
+    assert_eq!(account.metrics("x", 1950 * MS)["lost_count"], 1);
 }
 
 #[test]
@@ -121,7 +121,7 @@ fn what_was_taken_or_received_was_published() {
     account.take(&taken(0, 2 * MS));
     account.take(&taken(1, 3 * MS));
     let published_count =
-        |account: &mut Account| account.figures("x", 4 * MS)["published_count"].clone();
+        |account: &mut Account| account.metrics("x", 4 * MS)["published_count"].clone();
     // Nobody here notes what is published, as far as is known.
     assert_eq!(published_count(&mut account), Value::Null);
     account.take(&published(0, 0));
@@ -147,7 +147,7 @@ fn a_receiver_alone_knows_the_lost_by_the_numbers_passed_over() {
     assert_eq!(losses["sequences"], json!([7, 10, 11]));
     assert_eq!(losses["first_at_s"], Value::Null);
     assert_eq!(
-        account.figures("x", 3000 * MS)["published_count"],
+        account.metrics("x", 3000 * MS)["published_count"],
         Value::Null
     );
 }
@@ -157,7 +157,7 @@ fn a_sender_alone_knows_of_no_loss() {
     let mut account = account(true);
     account.take(&sent(0, 0));
     account.settle(5000 * MS);
-    let figures = account.figures("x", 5000 * MS);
+    let figures = account.metrics("x", 5000 * MS);
     assert_eq!(figures["lost_count"], Value::Null);
     assert_eq!(figures["link_state"], "none");
     assert_eq!(account.take_losses("x", 5.0, Some(0)), None);
@@ -174,7 +174,7 @@ fn each_segment_is_counted_once_as_soon_as_its_ends_are_known() {
     ] {
         account.take(&one);
     }
-    let figures = account.figures("x", 3 * MS);
+    let figures = account.metrics("x", 3 * MS);
     let counts: Vec<_> = (0..7)
         .map(|index| &figures["segments"][index]["count"])
         .collect();
@@ -192,26 +192,26 @@ fn a_cut_link_is_silent_and_an_idle_one_is_not() {
         account.take(&received(sequence, sequence.cast_signed() * 10 * MS + MS));
     }
     let state =
-        |account: &mut Account, ms: i64| account.figures("x", ms * MS)["link_state"].clone();
+        |account: &mut Account, ms: i64| account.metrics("x", ms * MS)["link_state"].clone();
     assert_eq!(state(&mut account, 100), "up");
     assert_eq!(state(&mut account, 5000), "up");
     for sequence in 10..200 {
         account.take(&sent(sequence, sequence.cast_signed() * 10 * MS));
     }
     assert_eq!(state(&mut account, 2000), "silent");
-    assert_eq!(account.figures("x", 2091 * MS)["silent_s"], 2.0);
+    assert_eq!(account.metrics("x", 2091 * MS)["silent_s"], 2.0);
 }
 
 #[test]
 fn of_a_producer_elsewhere_only_what_had_a_rhythm_can_be_silent() {
     let mut unseen = account(true);
-    assert_eq!(unseen.figures("x", 9000 * MS)["rate_hz"], Value::Null);
+    assert_eq!(unseen.metrics("x", 9000 * MS)["rate_hz"], Value::Null);
     for (count, state) in [(2, "up"), (100, "silent")] {
         let mut account = account(true);
         for sequence in 0..count {
             account.take(&received(sequence, sequence.cast_signed() * 10 * MS));
         }
-        let figures = account.figures("x", 9000 * MS);
+        let figures = account.metrics("x", 9000 * MS);
         assert_eq!(figures["link_state"], state, "{count} messages");
         assert_eq!(figures["rate_hz"], 0.0);
     }
@@ -224,7 +224,7 @@ fn shared_memory_has_one_segment_and_loses_nothing_that_we_know_of() {
     account.take(&taken(0, 2 * MS));
     account.take(&published(1, 0));
     account.settle(5000 * MS);
-    let figures = account.figures("x", 10 * MS);
+    let figures = account.metrics("x", 10 * MS);
     assert_eq!(figures["segments"].as_array().map(Vec::len), Some(1));
     assert_eq!(figures["segments"][0]["p50_us"], 2000.0);
     assert_eq!(
@@ -248,18 +248,18 @@ fn what_is_older_than_a_second_does_not_count() {
 #[test]
 fn percentiles_are_those_of_the_window() {
     let mut samples = Samples::default();
-    assert_eq!(samples.figures("x", 0)["is_available"], false);
-    assert_eq!(samples.figures("x", 0)["p50_us"], Value::Null);
+    assert_eq!(samples.metrics("x", 0)["is_available"], false);
+    assert_eq!(samples.metrics("x", 0)["p50_us"], Value::Null);
     samples.add(0, 900_000);
     for index in 1..=100 {
         samples.add(WINDOW_NS + index, index * 1000);
     }
-    let figures = samples.figures("x", WINDOW_NS + 200);
+    let figures = samples.metrics("x", WINDOW_NS + 200);
     assert_eq!(figures["count"], 100);
     assert_eq!(figures["p50_us"], 50.0);
     assert_eq!(figures["p99_us"], 99.0);
     assert_eq!(figures["max_us"], 100.0);
-    let later = samples.figures("x", 3 * WINDOW_NS);
+    let later = samples.metrics("x", 3 * WINDOW_NS);
     assert_eq!(
         (&later["count"], &later["max_us"]),
         (&json!(0), &Value::Null)

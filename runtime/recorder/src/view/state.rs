@@ -126,7 +126,7 @@ impl RunState {
         let (mut channels, mut losses) = (Vec::new(), Vec::new());
         for (account, facts) in self.accounts.iter_mut().zip(&self.facts.channels) {
             account.settle(now_ns);
-            channels.push(account.figures(&facts.name, now_ns));
+            channels.push(account.metrics(&facts.name, now_ns));
             // Another host's clock may be anything.
             let from_host = facts.hosts[0].as_ref();
             let is_here = from_host.is_some_and(|host| self.facts.hosts_here.contains(host));

@@ -2,7 +2,8 @@
 //! time is brought to one host's clock before the start is taken from it: two clocks drift apart by
 //! milliseconds in minutes, so a start alone, converted once, would not do.
 
-use std::{cell::RefCell, collections::BTreeMap};
+use std::cell::RefCell;
+use std::collections::BTreeMap;
 
 use hil_core::time::{Instant, RemoteInstant};
 

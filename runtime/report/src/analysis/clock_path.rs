@@ -1,10 +1,11 @@
 //! The clock path of two hosts held against their data path: both are causally true of the same
 //! two clocks, so what they allow together is used, and if they exclude each other nothing is.
 
-use hil_clock::{ClockFigures, ClockMap, ClockSettings, Exchange, Localised, Requester};
+use hil_clock::{ClockMap, ClockMetrics, ClockSettings, Exchange, Localised, Requester};
 use hil_core::time::{Instant, RemoteInstant};
 
-use super::{clocks, records::RunRecords};
+use super::clocks;
+use super::records::RunRecords;
 use crate::clock_summary::{ClockPathEnd, ClockPathSummary, ClockRung, HostPairClock};
 use hil_rundir::run_result::RunResult;
 use hil_topology::{ClockPath, Host, clock_process_name};
@@ -42,8 +43,8 @@ pub(super) fn compare(pair: &mut HostPairClock, records: &RunRecords<'_>) {
     let over_data = clocks::exchanges(records, from, to);
     let [path_map, data_map] =
         [&over_path, &over_data].map(|some| ClockMap::new(some, ClockSettings::default()));
-    let figures = |map: &ClockMap| -> Option<ClockFigures> {
-        let figures = map.figures();
+    let figures = |map: &ClockMap| -> Option<ClockMetrics> {
+        let figures = map.metrics();
         (figures.exchange_count > 0).then(|| figures.clone())
     };
     // Of the host that asks, whichever of the two is converted from.

@@ -4,10 +4,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use hil_account::ChannelPath;
-use hil_clock::{ClockFigures, ClockMap, ClockSettings, Exchange, Requester};
+use hil_clock::{ClockMap, ClockMetrics, ClockSettings, Exchange, Requester};
 use hil_core::time::{Alignment, Instant, RemoteInstant};
 
-use super::{clock_path, records::RunRecords};
+use super::clock_path;
+use super::records::RunRecords;
 use crate::clock_summary::{ClockRung, ClockSection, DisciplinedOffset, HostPairClock};
 use hil_platform::clock_discipline::{self, HostDiscipline};
 use hil_topology::{Channel, Topology};
@@ -136,7 +137,7 @@ impl HostClocks {
             to: to.clone(),
             rung: ClockRung::None,
             basis: String::new(),
-            exchanges: (there.figures().exchange_count > 0).then(|| there.figures().clone()),
+            exchanges: (there.metrics().exchange_count > 0).then(|| there.metrics().clone()),
             disciplined: disciplined.as_ref().ok().copied(),
             contradiction: None,
             clock_path: None,
@@ -178,7 +179,7 @@ fn choose(
         "same boot, same time namespace: stamps compare as they are".clone_into(&mut pair.basis);
         return;
     }
-    let figures = map.figures();
+    let figures = map.metrics();
     match disciplined {
         Ok(offset) => {
             pair.contradiction = contradiction(offset, figures);
@@ -210,7 +211,7 @@ fn choose(
 
 /// Why the system clocks and the exchanges cannot both be right: what the former claim holds for the
 /// whole run, so it must be possible in each stretch between steps.
-fn contradiction(claimed: DisciplinedOffset, exchanges: &ClockFigures) -> Option<String> {
+fn contradiction(claimed: DisciplinedOffset, exchanges: &ClockMetrics) -> Option<String> {
     let lowest_ns = claimed.offset_ns.saturating_sub_unsigned(claimed.bound_ns);
     let highest_ns = claimed.offset_ns.saturating_add_unsigned(claimed.bound_ns);
     let stretches = &exchanges.stretch_offsets;
@@ -330,7 +331,7 @@ mod tests {
         // The other clock gains 20 ms in mid-run, which the claim knows nothing of.
         let step = |index: i64| if index < 200 { 0 } else { 20_000_000 };
         let map = ClockMap::new(&exchanges(0, step), ClockSettings::default());
-        assert_eq!(map.figures().stretch_offsets.len(), 2);
+        assert_eq!(map.metrics().stretch_offsets.len(), 2);
         for offset_ns in [0, -20_000_000] {
             let bound_ns = 50_000;
             let pair = chosen(

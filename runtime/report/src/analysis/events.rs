@@ -3,14 +3,17 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_account::{Happening, MessageFate, MessageStory, Side, stories};
+use hil_account::{EventTime, MessageFate, MessageHistory, Side, stories};
 use hil_core::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
 use hil_core::time::{Instant, RemoteInstant};
 
-use super::{axis::RunAxis, outages::OutageStory, records::RunRecords};
+use super::axis::RunAxis;
+use super::outages::OutageHistory;
+use super::records::RunRecords;
+use crate::network::within;
 use crate::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::summary::{ChannelSummary, CounterGroup, LinkKind};
-use crate::{network::within, terminal::duration_s};
+use crate::terminal::duration_s;
 use hil_topology::{Channel, Topology};
 
 /// The events of `score` with the fates of their messages and the outages before them.
@@ -20,7 +23,7 @@ pub(super) fn explained(
     axis: &RunAxis<'_>,
     channels: &[ChannelSummary],
     specs: &[ChannelSpec],
-    outages: &[OutageStory],
+    outages: &[OutageHistory],
 ) -> ScoreEvents {
     let mut wanted: BTreeMap<&str, BTreeSet<(u32, u64)>> = BTreeMap::new();
     for message in score.events.iter().flat_map(|event| &event.messages) {
@@ -88,7 +91,7 @@ fn outages_before(
     event: &ScoreEvent,
     records: &RunRecords<'_>,
     specs: &[ChannelSpec],
-    stories: &[OutageStory],
+    stories: &[OutageHistory],
     ways: &BTreeMap<&str, Way<'_>>,
 ) -> Vec<EventOutage> {
     let topology = records.topology;
@@ -117,7 +120,7 @@ fn outages_before(
         ];
         let mut sides = sides.into_iter().flatten().map(Some).chain([None]);
         sides.find_map(|side| {
-            let mut found = story.before(&Happening {
+            let mut found = story.before(&EventTime {
                 at: side.map(|(at, side, _)| (at, side)),
                 lost_published_ns: &lost_published_ns,
             })?;
@@ -148,7 +151,7 @@ fn unavailable(message: &MessageRef, why: &str) -> ExplainedMessage {
 struct Way<'a> {
     channel: &'a Channel,
     summary: &'a ChannelSummary,
-    stories: BTreeMap<(u32, u64), MessageStory>,
+    stories: BTreeMap<(u32, u64), MessageHistory>,
     axis: &'a RunAxis<'a>,
     /// Of its producer.
     host: Option<&'a str>,
@@ -185,7 +188,7 @@ impl Way<'_> {
         lost.filter_map(|story| story.published_ns).collect()
     }
 
-    fn words(&self, story: &MessageStory) -> String {
+    fn words(&self, story: &MessageHistory) -> String {
         let link = self.channel.link.as_deref().unwrap_or_default();
         match story.fate {
             MessageFate::Taken => {
@@ -217,7 +220,7 @@ impl Way<'_> {
         }
     }
 
-    fn words_of_interruption(&self, story: &MessageStory) -> String {
+    fn words_of_interruption(&self, story: &MessageHistory) -> String {
         let account = self.summary.account.as_ref();
         let interruption = account
             .zip(story.interruption_index)

@@ -1,13 +1,15 @@
 //! Orders to emulated links, from the gateways' records to the report: put on the axis of the run. The
 //! fates of messages are not touched: each is on record by itself.
 
-use std::{collections::BTreeMap, time::Duration};
+use std::collections::BTreeMap;
+use std::time::Duration;
 
 use hil_core::time::Instant;
 use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome, order_channel};
 use hil_link::spec::Way;
 
-use super::{axis::RunAxis, records::RunRecords};
+use super::axis::RunAxis;
+use super::records::RunRecords;
 use crate::link_change::LinkChange;
 use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{Crossing, Topology};

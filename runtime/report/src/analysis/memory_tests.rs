@@ -1,9 +1,12 @@
 //! What drawing up the account of a run costs in memory, and that it does not grow with the run as its
 //! records do: runs of two lengths are concluded, each in a process of its own, and their peaks compared.
 
+use std::collections::BTreeMap;
+use std::env;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
-use std::{collections::BTreeMap, env, path::Path, process::Command};
+use std::path::Path;
+use std::process::Command;
 
 use bytemuck::Pod;
 use hil_account::MessageFate;
@@ -23,9 +26,8 @@ use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::run_result::{Outcome, RunResult};
-use hil_topology;
-use hil_topology::Topology;
 use hil_topology::registry::Registry;
+use hil_topology::{self, Topology};
 
 /// Says to a process of this test which run to conclude.
 const FOLDER_VARIABLE: &str = "HIL_TEST_CONCLUDE_FOLDER";

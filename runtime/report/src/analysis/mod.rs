@@ -1,18 +1,18 @@
 //! From the records of a finished run to its summary: reads the record files, draws up the
 //! account of each channel, and lets the case score what the robot did.
 
+mod adapters;
 mod axis;
-mod cards;
 mod clock_path;
 mod clocks;
 mod events;
-mod faces;
-pub(crate) mod figures;
 mod interruptions;
 pub(crate) mod link_changes;
 #[cfg(test)]
 mod memory_tests;
+pub(crate) mod metrics;
 pub(crate) mod network;
+mod nics;
 pub(crate) mod outages;
 mod radio;
 pub(crate) mod records;
@@ -28,13 +28,14 @@ use hil_core::plot::PlotSeries;
 
 use axis::RunAxis;
 use clocks::HostClocks;
-use figures::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
-use outages::OutageStory;
+use metrics::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
+use outages::OutageHistory;
 use records::RunRecords;
 
+use crate::event_log;
 use crate::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
 use crate::terminal::{self, Style};
-use crate::{event_log, trace::capture};
+use crate::trace::capture;
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::run_result::{RunResult, RunResultError};
@@ -153,8 +154,8 @@ pub fn conclude(
         .map(|channel| channel_summary(&records, channel))
         .collect();
     capture::write(&mut summary, &records);
-    summary.faces = faces::face_summaries(&records);
-    summary.hardware_stamps = cards::hardware_stamps(&records);
+    summary.faces = adapters::adapter_summaries(&records);
+    summary.hardware_stamps = nics::hardware_stamps(&records);
     let outages = add_outages(&mut summary, &records, &axis);
     let (specs, score) = match &case {
         Some((entry, case)) => (entry.channels, case.score(&records.log)),
@@ -203,14 +204,14 @@ fn add_outages(
     summary: &mut RunSummary,
     records: &RunRecords<'_>,
     axis: &RunAxis<'_>,
-) -> Vec<OutageStory> {
+) -> Vec<OutageHistory> {
     let mut stories = Vec::new();
     for (summary, channel) in summary.channels.iter_mut().zip(records.topology.channels()) {
         let unknown = MessageFate::UnknownPeerRecordsUnavailable;
         let fates = summary.account.as_ref().map(|account| &account.fates);
         let is_partial = fates.is_some_and(|fates| fates.of(unknown) > 0);
-        if let Some(story) = OutageStory::of(records, axis, channel, is_partial) {
-            summary.outages = story.figures();
+        if let Some(story) = OutageHistory::of(records, axis, channel, is_partial) {
+            summary.outages = story.metrics();
             stories.push(story);
         }
     }

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use hil_account::network::{
     Moment, NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind,
-    NetworkFigures, PackedPassages, Place, bin_width_ns, clock_steps, interruptions,
+    NetworkMetrics, PackedPassages, Place, bin_width_ns, clock_steps, interruptions,
     network_events,
 };
 use hil_account::{Side, passages};
@@ -17,12 +17,15 @@ use hil_core::record::IngressRecord;
 use hil_core::time::Instant;
 use hil_stats::correlation::{self, LagWindow};
 
+use super::axis::RunAxis;
+use super::clocks::HostClocks;
+use super::records::RunRecords;
 pub(crate) use super::robot_series::RobotSeries;
 use super::robot_series::{index_of, without_holes};
-use super::{axis::RunAxis, clocks::HostClocks, records::RunRecords};
 use crate::network::{
-    ChannelNetwork, Correlation, CorrelationTests, FOREGOING_S, ForegoingEvent, ForegoingNetwork,
-    NetworkQuantity, NetworkReport, TestedPair, TimedEvent, Timeline, TimelineRow, TimelineSubject,
+    ChannelNetwork, Correlation, CorrelationTests, NetworkQuantity, NetworkReport, PRECEDING_S,
+    PrecedingEvent, PrecedingNetwork, TestedPair, TimedEvent, Timeline, TimelineRow,
+    TimelineSubject,
 };
 use crate::score_event::ScoreEvents;
 use hil_rundir::run_result::RunResult;
@@ -30,14 +33,14 @@ use hil_topology::Channel;
 
 /// Network events a summary keeps, and of those before one event of the score.
 const EVENTS_MAX: usize = 2_000;
-const FOREGOING_MAX: usize = 8;
+const PRECEDING_MAX: usize = 8;
 
 /// Steps of the timeline in a summary.
 const STEPS_MAX: usize = 120;
 
 /// Lags searched, seconds: bins and stamps are not exact, so the robot may seem to come first.
 const LEAD_MAX_S: f64 = 1.0;
-const LAG_MAX_S: f64 = FOREGOING_S;
+const LAG_MAX_S: f64 = PRECEDING_S;
 
 /// One channel over a network, ready to be put on the run's axis.
 pub(crate) struct ChannelPassages<'a> {
@@ -85,7 +88,7 @@ impl NetworkBuilder {
             channel: one.channel.to_owned(),
             from_host: one.hosts[0].to_owned(),
             to_host: one.hosts[1].to_owned(),
-            figures: NetworkFigures::of(one.passages, &one.context),
+            figures: NetworkMetrics::of(one.passages, &one.context),
         });
         let mut events = network_events(one.passages);
         events.extend(one.other_events);
@@ -184,7 +187,7 @@ impl NetworkBuilder {
         let run_s = count as f64 * width_s;
         let dropped = self.events.len().saturating_sub(EVENTS_MAX);
         let report = NetworkReport {
-            foregoing_s: FOREGOING_S,
+            foregoing_s: PRECEDING_S,
             foregoing_chance_ratio: covered_s(&self.events, run_s, bound_s) / run_s,
             clocks_differ: axis.bound_s.is_none(),
             clock_bound_s: axis.bound_s,
@@ -207,7 +210,7 @@ impl NetworkBuilder {
     }
 
     /// What the network went through before `at_s`, nearest first.
-    fn before(&self, at_s: f64, clock_bound_s: f64) -> ForegoingNetwork {
+    fn before(&self, at_s: f64, clock_bound_s: f64) -> PrecedingNetwork {
         let mut found: Vec<(f64, &TimedEvent)> = self
             .events
             .iter()
@@ -217,19 +220,19 @@ impl NetworkBuilder {
         found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.from_s.total_cmp(&b.1.from_s)));
         let lost = |bins: &NetworkBins| {
             let width_s = bins.width_ns as f64 * 1e-9;
-            let from_s = at_s - FOREGOING_S - clock_bound_s;
+            let from_s = at_s - PRECEDING_S - clock_bound_s;
             let first = index_of(from_s.max(0.0) / width_s).unwrap_or(0);
             let last = index_of((at_s + clock_bound_s) / width_s).map_or(0, |last| last + 1);
             let within = bins.bins.iter().take(last).skip(first);
             within.map(|bin| bin.lost_count).sum::<u64>()
         };
-        ForegoingNetwork {
-            foregoing_s: FOREGOING_S,
-            more_count: found.len().saturating_sub(FOREGOING_MAX) as u64,
+        PrecedingNetwork {
+            foregoing_s: PRECEDING_S,
+            more_count: found.len().saturating_sub(PRECEDING_MAX) as u64,
             events: found
                 .iter()
-                .take(FOREGOING_MAX)
-                .map(|(over_for_s, event)| ForegoingEvent::of(event, at_s, *over_for_s))
+                .take(PRECEDING_MAX)
+                .map(|(over_for_s, event)| PrecedingEvent::of(event, at_s, *over_for_s))
                 .collect(),
             lost_count: self.bins.iter().map(|(_, bins)| lost(bins)).sum(),
         }
@@ -241,7 +244,7 @@ fn covered_s(events: &[TimedEvent], run_s: f64, clock_bound_s: f64) -> f64 {
     let (mut covered_s, mut until_s) = (0.0, 0.0_f64);
     for event in events {
         let from_s = (event.from_s - clock_bound_s).clamp(until_s, run_s);
-        let after_s = FOREGOING_S + clock_bound_s;
+        let after_s = PRECEDING_S + clock_bound_s;
         let end_s = event.until_s.map_or(run_s, |end_s| end_s + after_s);
         let end_s = end_s.clamp(from_s, run_s);
         covered_s += end_s - from_s;

@@ -3,10 +3,11 @@
 
 use std::collections::BTreeMap;
 
-use hil_account::{Happening, Outage, OutageFigures, Side, Standing, foregoing, outages};
+use hil_account::{EventTime, Outage, OutageMetrics, Side, Standing, outages, preceding};
 use hil_core::time::Instant;
 
-use super::{axis::RunAxis, records::RunRecords};
+use super::axis::RunAxis;
+use super::records::RunRecords;
 use crate::score_event::EventOutage;
 use crate::terminal::{duration_s, seconds};
 use hil_platform::words::counted;
@@ -14,7 +15,7 @@ use hil_topology::Channel;
 
 /// The outages of one channel, with what gives their times a meaning.
 #[derive(Debug)]
-pub(crate) struct OutageStory {
+pub(crate) struct OutageHistory {
     /// The channel.
     pub(crate) channel: String,
     /// In the order of its messages.
@@ -30,7 +31,7 @@ pub(crate) struct OutageStory {
     pub(crate) is_partial: bool,
 }
 
-impl OutageStory {
+impl OutageHistory {
     /// The outages of `channel` as its records have them; `None` when it leaves none.
     pub(super) fn of(
         records: &RunRecords<'_>,
@@ -57,10 +58,10 @@ impl OutageStory {
     }
 
     /// In figures; `None` when none was found and some may be missing.
-    pub(crate) fn figures(&self) -> Option<OutageFigures> {
+    pub(crate) fn metrics(&self) -> Option<OutageMetrics> {
         let is_unknown = self.is_partial && self.outages.is_empty();
         (!is_unknown).then(|| {
-            let mut figures = OutageFigures::of(&self.outages, self.end);
+            let mut figures = OutageMetrics::of(&self.outages, self.end);
             if let Some(longest) = &mut figures.longest {
                 let placed_ns = self.placed_ns.get(&longest.start_ns);
                 longest.start_ns = placed_ns.copied().unwrap_or(longest.start_ns);
@@ -70,8 +71,8 @@ impl OutageStory {
     }
 
     /// What has most to do with something that happened.
-    pub(crate) fn before(&self, happening: &Happening<'_>) -> Option<EventOutage> {
-        let found = foregoing(&self.outages, happening)?;
+    pub(crate) fn before(&self, event: &EventTime<'_>) -> Option<EventOutage> {
+        let found = preceding(&self.outages, event)?;
         let outage = found.outage;
         let since_start_s = |ns: i64| Some(*self.placed_ns.get(&ns)? as f64 * 1e-9);
         let mut event_outage = EventOutage {
@@ -88,7 +89,7 @@ impl OutageStory {
         let interrupted = outage
             .interruption_index
             .and_then(|index| self.interrupted.get(index));
-        let later_ns = happening.at.and_then(|(at, side)| {
+        let later_ns = event.at.and_then(|(at, side)| {
             let from_ns = match side {
                 Side::Producer => outage.from_ns,
                 Side::Consumer => outage.silent_from_ns,
@@ -163,8 +164,8 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    fn story(outages: Vec<Outage>) -> OutageStory {
-        OutageStory {
+    fn history(outages: Vec<Outage>) -> OutageHistory {
+        OutageHistory {
             channel: "egm/right/command".to_owned(),
             placed_ns: placed(&outages, |ns| Some(ns - 1_000 * MS)),
             outages,
@@ -186,8 +187,8 @@ mod tests {
         }
     }
 
-    fn words_at(story: &OutageStory, at_ms: i64) -> Option<String> {
-        let found = story.before(&Happening {
+    fn words_at(story: &OutageHistory, at_ms: i64) -> Option<String> {
+        let found = story.before(&EventTime {
             at: Some((Instant::from_ns(at_ms * MS), Side::Producer)),
             lost_published_ns: &[],
         })?;
@@ -198,7 +199,7 @@ mod tests {
     fn an_outage_beside_an_event_is_told_with_its_time_and_its_losses() {
         let mut broken = outage(50_000, Some(50_008), 1);
         broken.interruption_index = Some(0);
-        let story = story(vec![
+        let story = history(vec![
             outage(42_200, Some(44_040), 230),
             outage(44_100, Some(44_108), 1),
             broken,
@@ -246,8 +247,8 @@ mod tests {
 
     #[test]
     fn an_outage_that_begins_after_the_event_says_so() {
-        let story = story(vec![outage(42_500, Some(43_000), 62)]);
-        let found = story.before(&Happening {
+        let story = history(vec![outage(42_500, Some(43_000), 62)]);
+        let found = story.before(&EventTime {
             at: Some((Instant::from_ns(42_000 * MS), Side::Producer)),
             lost_published_ns: &[42_600 * MS],
         });
@@ -260,13 +261,13 @@ mod tests {
 
     #[test]
     fn no_outage_found_among_unknown_fates_is_no_figure() {
-        let mut story = story(Vec::new());
-        assert_eq!(story.figures().unwrap().outage_count, 0);
+        let mut story = history(Vec::new());
+        assert_eq!(story.metrics().unwrap().outage_count, 0);
         story.is_partial = true;
-        assert_eq!(story.figures(), None);
+        assert_eq!(story.metrics(), None);
         story.outages.push(outage(2_000, Some(2_100), 12));
         story.placed_ns = placed(&story.outages, |ns| Some(ns - 1_000 * MS));
-        let figures = story.figures().unwrap();
+        let figures = story.metrics().unwrap();
         assert_eq!(figures.outage_count, 1);
         assert_eq!(figures.longest.unwrap().start_ns, 1_000 * MS);
     }

@@ -1,14 +1,17 @@
 //! From the records of radios to what a report says of them: summaries, events of the association,
 //! and a table of the samples.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::{collections::BTreeMap, fs, path::Path};
+use std::fs;
+use std::path::Path;
 
-use hil_account::radio::{radio_figures, transmit_stamps};
+use hil_account::radio::{radio_metrics, transmit_stamps};
 use hil_core::record::UNAVAILABLE;
 use hil_core::time::Instant;
 
-use super::{axis::RunAxis, records::RunRecords};
+use super::axis::RunAxis;
+use super::records::RunRecords;
 use crate::radio::{ChannelRadio, RadioHopSummary, RadioReport, Spread, StationSummary};
 use crate::summary::{CounterGroup, Fact, RadioChange, RunEvent, RunEventKind, RunSummary};
 use hil_rundir::radio_record::{
@@ -26,7 +29,7 @@ pub(super) fn add(summary: &mut RunSummary, records: &RunRecords<'_>, axis: &Run
                 .push(records.consult(channel, |files, context| ChannelRadio {
                     channel: channel.name.clone(),
                     transmit_stamps: files.egress.map(transmit_stamps),
-                    acknowledgements: radio_figures(files, context),
+                    acknowledgements: radio_metrics(files, context),
                 }));
         }
     }

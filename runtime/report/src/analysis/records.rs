@@ -1,12 +1,15 @@
 //! The record files of a finished run, joined by channel, and the account drawn up from them. What
 //! the account means for a reader is decided elsewhere.
 
+use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
 use std::path::{Path, PathBuf};
-use std::{cell::RefCell, fs, sync::Arc, time::Duration};
+use std::sync::Arc;
+use std::time::Duration;
 
 use bytemuck::Pod;
-use hil_account::card_clock::{CardClockRecord, CardTimeline};
+use hil_account::nic_clock::{NicClockRecord, NicTimeline};
 use hil_account::{
     AccountContext, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption, ORDER_TOLERANCE_NS,
     RunSpan,
@@ -17,9 +20,9 @@ use hil_core::record::{
 use hil_core::run_log::{Logged, RunLog};
 use hil_link::condition::LinkConditionRecord;
 
-use super::{AnalysisError, clocks::HostClocks};
-use super::{interruptions, link_changes};
-use crate::summary::RecordedFigures;
+use super::clocks::HostClocks;
+use super::{AnalysisError, interruptions, link_changes};
+use crate::summary::RecordedMetrics;
 use hil_rundir::radio_record::RadioRecord;
 use hil_rundir::record::stored::{
     ReadFaults, StoredFile, StoredRecords, file_bytes, sort_by_start,
@@ -39,7 +42,7 @@ pub(crate) struct RunRecords<'a> {
     pub(crate) topology: &'a Topology,
     pub(crate) result: &'a RunResult,
     pub(super) channels: BTreeMap<String, ChannelFiles>,
-    cards: BTreeMap<String, Vec<CardClockRecord>>,
+    cards: BTreeMap<String, Vec<NicClockRecord>>,
     /// Every message of the run.
     pub(super) log: RunLog,
     /// How the hosts' clocks relate; none are aligned before they are related.
@@ -100,9 +103,9 @@ impl<'a> RunRecords<'a> {
             records
         };
         match kind {
-            RecordKind::CardClock => {
+            RecordKind::NicClock => {
                 let card = self.cards.entry(name).or_default();
-                card.extend(alone(file).records::<CardClockRecord>());
+                card.extend(alone(file).records::<NicClockRecord>());
                 return;
             }
             RecordKind::Radio => {
@@ -124,8 +127,8 @@ impl<'a> RunRecords<'a> {
             RecordKind::Egress => &mut channel.egress,
             RecordKind::Ingress => &mut channel.ingress,
             RecordKind::FollowUp => &mut channel.follow_up,
-            RecordKind::FaceSent => &mut channel.face_sent,
-            RecordKind::FaceReceived => &mut channel.face_received,
+            RecordKind::AdapterSent => &mut channel.adapter_sent,
+            RecordKind::AdapterReceived => &mut channel.adapter_received,
             RecordKind::Message => &mut channel.message,
             RecordKind::RoundTrip => {
                 let records = alone(file);
@@ -135,7 +138,7 @@ impl<'a> RunRecords<'a> {
                 return;
             }
             // They belong to no channel, see above.
-            RecordKind::CardClock | RecordKind::Radio | RecordKind::LinkCondition => return,
+            RecordKind::NicClock | RecordKind::Radio | RecordKind::LinkCondition => return,
         };
         files
             .get_or_insert_with(|| StoredRecords::new(&self.faults))
@@ -154,9 +157,9 @@ impl<'a> RunRecords<'a> {
     }
 
     /// The clock of a card, by the name that a
-    /// [`CardStory`](hil_rundir::card_story::CardStory) gives it; `None` when it was not read.
-    pub(super) fn card_timeline(&self, card: &str) -> Option<CardTimeline> {
-        self.cards.get(card).map(|pairs| CardTimeline::new(pairs))
+    /// [`NicHistory`](hil_rundir::card_story::CardStory) gives it; `None` when it was not read.
+    pub(super) fn nic_timeline(&self, card: &str) -> Option<NicTimeline> {
+        self.cards.get(card).map(|pairs| NicTimeline::new(pairs))
     }
 
     /// The records that `channel` has of one kind; none when nobody left any.
@@ -210,9 +213,9 @@ impl<'a> RunRecords<'a> {
     }
 
     /// What there is of a channel that is only recorded; `None` when nothing is.
-    pub(super) fn recorded(&self, channel: &str) -> Option<RecordedFigures> {
+    pub(super) fn recorded(&self, channel: &str) -> Option<RecordedMetrics> {
         let messages = self.log.raw(channel);
-        self.has(channel).then(|| RecordedFigures {
+        self.has(channel).then(|| RecordedMetrics {
             message_count: messages.len() as u64,
             missing_count: missing_count(messages),
         })
@@ -235,7 +238,7 @@ impl<'a> RunRecords<'a> {
         let crossing = topology.crossing(channel);
         let cards_share_clock = crossing
             .as_ref()
-            .is_some_and(|crossing| super::cards::share_a_clock(result, crossing));
+            .is_some_and(|crossing| super::nics::share_a_clock(result, crossing));
         let path = if crossing.is_some() {
             let host_of = |process: Option<&str>| Some(&topology.process(process?)?.host);
             let hosts = host_of(Some(&channel.from)).zip(host_of(channel.to.as_deref()));
@@ -341,8 +344,8 @@ pub(super) struct ChannelFiles {
     pub(super) follow_up: Option<StoredRecords>,
     pub(super) taken: Option<StoredRecords>,
     pub(super) round_trips: BTreeMap<(u32, u64), RoundTripRecord>,
-    pub(super) face_sent: Option<StoredRecords>,
-    pub(super) face_received: Option<StoredRecords>,
+    pub(super) adapter_sent: Option<StoredRecords>,
+    pub(super) adapter_received: Option<StoredRecords>,
     pub(super) message: Option<StoredRecords>,
     pub(super) signs: Signs,
 }

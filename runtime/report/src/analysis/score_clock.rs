@@ -1,10 +1,11 @@
 //! Brings the messages of a run to the clock that its score is kept on, where the clocks of the hosts
 //! are aligned. The score then compares what two hosts did, within the bound of the alignment.
 
-use hil_core::run_log::{BroughtStamp, RunLog};
+use hil_core::run_log::{ConvertedStamp, RunLog};
 use hil_core::time::RemoteInstant;
 
-use super::{clocks::HostClocks, records::RunRecords};
+use super::clocks::HostClocks;
+use super::records::RunRecords;
 use hil_topology::Topology;
 use hil_topology::registry::MadeCase;
 
@@ -51,7 +52,7 @@ fn bring(
         // A message that was published long before the gateways met is one of the score all the same.
         let path = clocks.path(&host_of(channel)?, &here);
         let (at, bound_ns, is_early) = path.localise_early(RemoteInstant::from_ns(ns))?;
-        Some(BroughtStamp {
+        Some(ConvertedStamp {
             at_ns: at.as_ns(),
             bound_ns,
             is_early,

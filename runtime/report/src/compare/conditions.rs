@@ -8,7 +8,7 @@ use core::fmt;
 use hil_stats::statistics::Interval;
 use serde::Serialize;
 
-use super::{ComparedFigure, Comparison, FigureKind, Part};
+use super::{ChartKind, ComparedMetric, Comparison, Part};
 
 /// Why a condition cannot be judged.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -192,10 +192,10 @@ impl Condition {
         verdicts: &mut Verdicts,
     ) -> Result<(), ConditionError> {
         let figures = &comparison.figures;
-        let is_whole = |one: &&ComparedFigure| {
-            one.kind != FigureKind::Delay || one.part == Some(Part::EndToEnd)
+        let is_whole = |one: &&ComparedMetric| {
+            one.kind != ChartKind::Delay || one.part == Some(Part::EndToEnd)
         };
-        let named: Vec<&ComparedFigure> = figures
+        let named: Vec<&ComparedMetric> = figures
             .iter()
             .filter(is_whole)
             .filter(|one| one.metric == self.metric)
@@ -207,10 +207,10 @@ impl Condition {
                 allowed: words(figures.iter().map(|one| one.metric.as_str())),
             });
         }
-        let is_meant = |one: &&&ComparedFigure| {
+        let is_meant = |one: &&&ComparedMetric| {
             self.channel.is_none() || one.channel.as_ref() == self.channel.as_ref()
         };
-        let meant: Vec<&&ComparedFigure> = named.iter().filter(is_meant).collect();
+        let meant: Vec<&&ComparedMetric> = named.iter().filter(is_meant).collect();
         if meant.is_empty() {
             return Err(ConditionError::UnknownChannel {
                 text: self.text.clone(),
@@ -238,7 +238,7 @@ impl Condition {
 
     fn judge_one(
         &self,
-        figure: &ComparedFigure,
+        figure: &ComparedMetric,
         is_strict: bool,
     ) -> Result<Judged, ConditionError> {
         let name = name_of(figure);
@@ -277,7 +277,7 @@ impl Condition {
     /// The figure and its interval in the condition's unit.
     fn quantity(
         &self,
-        figure: &ComparedFigure,
+        figure: &ComparedMetric,
     ) -> Result<(Option<f64>, Option<Interval>), ConditionError> {
         let scaled = |(value, interval): (Option<f64>, Option<Interval>), by: f64| {
             let interval = interval.map(|one| Interval {
@@ -293,13 +293,13 @@ impl Condition {
         let quotient = (figure.ratio, figure.ratio_interval);
         let more = (figure.difference, figure.difference_interval);
         Ok(match (figure.kind, self.unit.as_str()) {
-            (FigureKind::Delay | FigureKind::Score, "x") => quotient,
-            (FigureKind::Delay, "ns") | (FigureKind::Score, "") => new,
-            (FigureKind::Delay, "us" | "µs") => scaled(new, 1e-3),
-            (FigureKind::Delay, "ms") => scaled(new, 1e-6),
-            (FigureKind::Delay, "s") => scaled(new, 1e-9),
-            (FigureKind::Loss, "%") => scaled(new, 100.0),
-            (FigureKind::Loss, "pp") => scaled(more, 100.0),
+            (ChartKind::Delay | ChartKind::Score, "x") => quotient,
+            (ChartKind::Delay, "ns") | (ChartKind::Score, "") => new,
+            (ChartKind::Delay, "us" | "µs") => scaled(new, 1e-3),
+            (ChartKind::Delay, "ms") => scaled(new, 1e-6),
+            (ChartKind::Delay, "s") => scaled(new, 1e-9),
+            (ChartKind::Loss, "%") => scaled(new, 100.0),
+            (ChartKind::Loss, "pp") => scaled(more, 100.0),
             (kind, unit) => {
                 return Err(ConditionError::Unit {
                     text: self.text.clone(),
@@ -309,11 +309,11 @@ impl Condition {
                         unit => format!("takes no `{unit}`"),
                     },
                     allowed: match kind {
-                        FigureKind::Delay => "x (new by base); s, ms, us, ns (of the new runs)",
-                        FigureKind::Loss => {
+                        ChartKind::Delay => "x (new by base); s, ms, us, ns (of the new runs)",
+                        ChartKind::Loss => {
                             "% (of the new runs), pp (new less base, percentage points)"
                         }
-                        FigureKind::Score => "x (new by base), or no unit (of the new runs)",
+                        ChartKind::Score => "x (new by base), or no unit (of the new runs)",
                     },
                 });
             }
@@ -322,7 +322,7 @@ impl Condition {
 }
 
 /// Channel and metric.
-pub(super) fn name_of(figure: &ComparedFigure) -> String {
+pub(super) fn name_of(figure: &ComparedMetric) -> String {
     let metric = &figure.metric;
     figure
         .channel

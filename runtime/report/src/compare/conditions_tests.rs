@@ -5,14 +5,14 @@ use hil_stats::comparison::Estimate;
 use super::*;
 use crate::compare::Verdict;
 
-fn figure(metric: &str, kind: FigureKind, [low, value, high]: [f64; 3]) -> ComparedFigure {
+fn figure(metric: &str, kind: ChartKind, [low, value, high]: [f64; 3]) -> ComparedMetric {
     let interval = Some(Interval { low, high });
     let estimate = |value: f64| Some(Estimate { value, interval });
-    ComparedFigure {
-        channel: (kind != FigureKind::Score).then(|| "a/b".to_owned()),
+    ComparedMetric {
+        channel: (kind != ChartKind::Score).then(|| "a/b".to_owned()),
         part: match kind {
-            FigureKind::Delay => Some(Part::EndToEnd),
-            FigureKind::Loss | FigureKind::Score => None,
+            ChartKind::Delay => Some(Part::EndToEnd),
+            ChartKind::Loss | ChartKind::Score => None,
         },
         metric: metric.to_owned(),
         kind,
@@ -31,7 +31,7 @@ fn figure(metric: &str, kind: FigureKind, [low, value, high]: [f64; 3]) -> Compa
 }
 
 fn comparison() -> Comparison {
-    let mut maximum = figure("max", FigureKind::Delay, [1.0, 3.0, 4.0]);
+    let mut maximum = figure("max", ChartKind::Delay, [1.0, 3.0, 4.0]);
     maximum.ratio_interval = None;
     Comparison {
         base: Vec::new(),
@@ -40,10 +40,10 @@ fn comparison() -> Comparison {
         differences: Vec::new(),
         cautions: Vec::new(),
         figures: vec![
-            figure("p99", FigureKind::Delay, [1.1, 1.3, 1.5]),
+            figure("p99", ChartKind::Delay, [1.1, 1.3, 1.5]),
             maximum,
-            figure("loss", FigureKind::Loss, [0.001, 0.002, 0.004]),
-            figure("score_ratio", FigureKind::Score, [0.5, 0.7, 0.9]),
+            figure("loss", ChartKind::Loss, [0.001, 0.002, 0.004]),
+            figure("score_ratio", ChartKind::Score, [0.5, 0.7, 0.9]),
         ],
     }
 }
@@ -66,7 +66,7 @@ fn verdicts(
 #[test]
 fn a_channel_that_cannot_be_judged_is_named_beside_those_that_can() {
     let mut both = comparison();
-    let mut sparse = figure("p99", FigureKind::Delay, [1.0, 3.0, 4.0]);
+    let mut sparse = figure("p99", ChartKind::Delay, [1.0, 3.0, 4.0]);
     sparse.channel = Some("c/d".to_owned());
     sparse.ratio_interval = None;
     both.figures.push(sparse);

@@ -4,7 +4,7 @@
 
 pub mod cli;
 mod conditions;
-mod figures;
+mod metrics;
 mod origin;
 mod render;
 pub mod work;
@@ -102,7 +102,7 @@ impl Verdict {
 /// What kind of figure it is: it says how it is compared and printed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum FigureKind {
+pub(crate) enum ChartKind {
     /// Nanoseconds, compared by their ratio.
     Delay,
     /// A share, compared by its difference.
@@ -137,14 +137,14 @@ impl fmt::Display for Part {
 
 /// One figure of both sides.
 #[derive(Debug, Clone, Serialize)]
-pub(crate) struct ComparedFigure {
+pub(crate) struct ComparedMetric {
     /// The channel; `None` for a score.
     pub(crate) channel: Option<String>,
     /// Which part of the channel's way a delay is of; `None` for losses and scores.
     pub(crate) part: Option<Part>,
     /// `p50`, `p99`, `p99.9`, `max`, `loss`, or the score's name.
     pub(crate) metric: String,
-    pub(crate) kind: FigureKind,
+    pub(crate) kind: ChartKind,
     /// The unit of both: `ns`, `1`, or the score's.
     pub(crate) unit: String,
     /// Of the base: one run's figure, or the mean of repetitions (of delays, the geometric one), with
@@ -182,7 +182,7 @@ pub(crate) struct Comparison {
     pub(crate) differences: Vec<String>,
     /// Why figures must be read with care.
     pub(crate) cautions: Vec<String>,
-    pub(crate) figures: Vec<ComparedFigure>,
+    pub(crate) figures: Vec<ComparedMetric>,
 }
 
 impl Comparison {
@@ -190,9 +190,9 @@ impl Comparison {
     pub(crate) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Self {
         let folders = |runs: &[ComparedRun]| runs.iter().map(|run| run.folder.clone()).collect();
         let (same, differences) = origin::of(base, new);
-        let figures = figures::of(base, new);
+        let figures = metrics::of(base, new);
         let mut cautions = origin::cautions(base, new);
-        cautions.extend(figures::cautions(&figures, [base.len(), new.len()]));
+        cautions.extend(metrics::cautions(&figures, [base.len(), new.len()]));
         Self {
             base: folders(base),
             new: folders(new),

@@ -4,7 +4,7 @@ use hil_stats::comparison::Estimate;
 use hil_stats::statistics::Interval;
 
 use super::conditions::Verdicts;
-use super::{ComparedFigure, Comparison, FigureKind, Part};
+use super::{ChartKind, ComparedMetric, Comparison, Part};
 use crate::terminal::{duration, figure, percent};
 
 const UNAVAILABLE: &str = "unavailable";
@@ -28,23 +28,23 @@ fn rows(comparison: &Comparison) -> Vec<Row> {
     .collect()
 }
 
-fn cells(one: &ComparedFigure) -> [String; 6] {
+fn cells(one: &ComparedMetric) -> [String; 6] {
     let name = match one.part {
         None => one.metric.clone(),
         Some(part) => format!("{part} {}", one.metric),
     };
     let (change, interval) = match one.kind {
-        FigureKind::Delay => (
+        ChartKind::Delay => (
             one.ratio.map(|ratio| format!("{ratio:.3}x")),
             one.ratio_interval
                 .map(|Interval { low, high }| format!("{low:.3}x to {high:.3}x")),
         ),
-        FigureKind::Loss => (
+        ChartKind::Loss => (
             one.difference.map(points),
             one.difference_interval
                 .map(|Interval { low, high }| format!("{} to {}", points(low), points(high))),
         ),
-        FigureKind::Score => (
+        ChartKind::Score => (
             one.difference.map(signed),
             one.difference_interval
                 .map(|Interval { low, high }| format!("{} to {}", signed(low), signed(high))),
@@ -75,15 +75,15 @@ fn signed(value: f64) -> String {
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "nanoseconds of a delay")]
-fn value(one: &ComparedFigure, estimate: Option<Estimate>) -> String {
+fn value(one: &ComparedMetric, estimate: Option<Estimate>) -> String {
     let Some(Estimate { value, .. }) = estimate else {
         return UNAVAILABLE.to_owned();
     };
     match (one.kind, one.unit.as_str()) {
-        (FigureKind::Delay, _) => duration(value as i64),
-        (FigureKind::Loss, _) => percent(value),
-        (FigureKind::Score, "1") => figure(value),
-        (FigureKind::Score, unit) => format!("{} {unit}", figure(value)),
+        (ChartKind::Delay, _) => duration(value as i64),
+        (ChartKind::Loss, _) => percent(value),
+        (ChartKind::Score, "1") => figure(value),
+        (ChartKind::Score, unit) => format!("{} {unit}", figure(value)),
     }
 }
 
@@ -158,10 +158,10 @@ fn methods(comparison: &Comparison) -> Vec<String> {
     let mut found: Vec<(&str, Vec<&str>)> = Vec::new();
     for one in &comparison.figures {
         let whom = match one.kind {
-            FigureKind::Delay if one.part == Some(Part::EndToEnd) => one.metric.as_str(),
-            FigureKind::Delay => "segments",
-            FigureKind::Loss => "loss",
-            FigureKind::Score => "scores",
+            ChartKind::Delay if one.part == Some(Part::EndToEnd) => one.metric.as_str(),
+            ChartKind::Delay => "segments",
+            ChartKind::Loss => "loss",
+            ChartKind::Score => "scores",
         };
         match found.iter_mut().find(|known| known.0 == one.method) {
             Some((_, known)) if known.contains(&whom) => {}

@@ -1,13 +1,13 @@
 //! One channel of a page: its figures, tables and drawings, from the account and the network's figures
 //! of a summary. Nothing is computed anew but shares of counts.
 
-use hil_account::network::{DelayQuantile, Figure as Measured, NetworkFigures};
-use hil_account::{ChannelAccount, Coverage, MessageFate, OutageFigures, SegmentFigures};
+use hil_account::network::{DelayQuantile, Metric as Measured, NetworkMetrics};
+use hil_account::{ChannelAccount, Coverage, MessageFate, OutageMetrics, SegmentMetrics};
 use hil_stats::histogram::Distribution;
 use hil_stats::statistics::{CONFIDENCE, IntervalNs, wilson};
 
-use super::data::{Channel, Figure, Table};
-use super::figures::waterfall::Bar;
+use super::charts::waterfall::Bar;
+use super::data::{Channel, Metric, Table};
 use super::words::{UNAVAILABLE, count, ns_s, number};
 use crate::summary::LinkKind;
 use crate::terminal::{JOINT, duration, percent, unsigned_duration};
@@ -22,8 +22,8 @@ pub(super) struct Sources<'a> {
     pub(super) account: Option<&'a ChannelAccount>,
     /// How a live run carried it.
     pub(super) link: Option<LinkKind>,
-    pub(super) network: Option<&'a NetworkFigures>,
-    pub(super) outages: Option<&'a OutageFigures>,
+    pub(super) network: Option<&'a NetworkMetrics>,
+    pub(super) outages: Option<&'a OutageMetrics>,
 }
 
 const BOOTSTRAP: &str = "95 % by block bootstrap, as successive delays are correlated";
@@ -45,10 +45,10 @@ pub(super) fn fill(channel: &mut Channel, sources: &Sources<'_>) {
         channel.figures.extend(network(sources));
     }
     if let Some(outages) = sources.outages {
-        channel.figures.extend(outage_figures(outages));
+        channel.figures.extend(outage_metrics(outages));
         channel.tables.extend(outage_table(outages));
     } else {
-        let unknown = Figure::unavailable("outage_count", "outages", "1", "unknown: no records");
+        let unknown = Metric::unavailable("outage_count", "outages", "1", "unknown: no records");
         channel.figures.push(unknown);
     }
     if let Some(account) = sources.account {
@@ -58,9 +58,9 @@ pub(super) fn fill(channel: &mut Channel, sources: &Sources<'_>) {
     }
 }
 
-fn counts(sources: &Sources<'_>) -> Vec<Figure> {
+fn counts(sources: &Sources<'_>) -> Vec<Metric> {
     let figure = |name, label, count: Option<u64>, reason: &str| {
-        Figure::maybe(name, label, "1", count.map(|count| count as f64), reason)
+        Metric::maybe(name, label, "1", count.map(|count| count as f64), reason)
     };
     let account = sources.account;
     let live = |of: fn(&ChannelAccount) -> u64| account.map(of);
@@ -82,9 +82,9 @@ fn counts(sources: &Sources<'_>) -> Vec<Figure> {
     ]
 }
 
-fn loss_ratio(network: Option<&NetworkFigures>) -> Figure {
+fn loss_ratio(network: Option<&NetworkMetrics>) -> Metric {
     let unavailable =
-        |reason: &str| Figure::unavailable("loss_ratio", "lost by the network", "share", reason);
+        |reason: &str| Metric::unavailable("loss_ratio", "lost by the network", "share", reason);
     let Some(network) = network else {
         return unavailable(NO_NETWORK);
     };
@@ -92,7 +92,7 @@ fn loss_ratio(network: Option<&NetworkFigures>) -> Figure {
         Measured::Measured(loss) => {
             let interval = (loss.interval.low, loss.interval.high);
             let independent = loss.independent_interval;
-            Figure::new("loss_ratio", "lost by the network", "share", loss.ratio)
+            Metric::new("loss_ratio", "lost by the network", "share", loss.ratio)
                 .within(Some(interval))
                 .by(&format!(
                     "95 %, Wilson on {} independent messages' worth of {}, as losses come in \
@@ -108,7 +108,7 @@ fn loss_ratio(network: Option<&NetworkFigures>) -> Figure {
 }
 
 /// Late, duplicated, reordered: counts, each with its share of what arrived.
-fn order(sources: &Sources<'_>) -> Vec<Figure> {
+fn order(sources: &Sources<'_>) -> Vec<Metric> {
     let account = sources.account;
     let reason = match (account, sources.network) {
         (None, None) => NO_ACCOUNT,
@@ -129,7 +129,7 @@ fn order(sources: &Sources<'_>) -> Vec<Figure> {
         ("duplicated", "duplicated", duplicated),
         ("reordered", "reordered", reordered),
     ] {
-        let figure = Figure::maybe(name, label, "1", found.map(|found| found as f64), reason);
+        let figure = Metric::maybe(name, label, "1", found.map(|found| found as f64), reason);
         let shares = found.zip(arrived).and_then(|(found, arrived)| {
             let interval = wilson(found.min(arrived), arrived, CONFIDENCE)?;
             let share = percent(found as f64 / arrived as f64);
@@ -161,11 +161,11 @@ const ONE_WAY: DelayKind = DelayKind {
 };
 
 impl DelayKind {
-    fn figure(self, name: &str, label: &str, ns: i64, interval: Option<IntervalNs>) -> Figure {
+    fn figure(self, name: &str, label: &str, ns: i64, interval: Option<IntervalNs>) -> Metric {
         let (name, label) = self.names(name, label);
         let method = if interval.is_some() { BOOTSTRAP } else { "" };
         let interval = interval.map(|one| (ns_s(one.low_ns), ns_s(one.high_ns)));
-        Figure::new(&name, &label, "s", ns_s(ns))
+        Metric::new(&name, &label, "s", ns_s(ns))
             .within(interval)
             .by(method)
     }
@@ -177,7 +177,7 @@ impl DelayKind {
         )
     }
 
-    fn unavailable(self, reason: &str) -> Vec<Figure> {
+    fn unavailable(self, reason: &str) -> Vec<Metric> {
         let names = [
             ("p50", "p50"),
             ("p99", "p99"),
@@ -186,13 +186,13 @@ impl DelayKind {
         ];
         let figure = |(name, label): (&str, &str)| {
             let (name, label) = self.names(name, label);
-            Figure::unavailable(&name, &label, "s", reason)
+            Metric::unavailable(&name, &label, "s", reason)
         };
         names.map(figure).to_vec()
     }
 }
 
-fn end_to_end(sources: &Sources<'_>) -> Vec<Figure> {
+fn end_to_end(sources: &Sources<'_>) -> Vec<Metric> {
     let Some(account) = sources.account else {
         return END_TO_END.unavailable(NO_ACCOUNT);
     };
@@ -210,7 +210,7 @@ fn end_to_end(sources: &Sources<'_>) -> Vec<Figure> {
                 figure("max", "largest", summary.max_ns, None),
             ];
             if let Some(bound_ns) = whole.alignment_bound_ns.filter(|bound_ns| *bound_ns > 0) {
-                let bound = Figure::new(
+                let bound = Metric::new(
                     "clock_bound",
                     "off by the clocks, at most",
                     "s",
@@ -224,7 +224,7 @@ fn end_to_end(sources: &Sources<'_>) -> Vec<Figure> {
     }
 }
 
-fn network(sources: &Sources<'_>) -> Vec<Figure> {
+fn network(sources: &Sources<'_>) -> Vec<Metric> {
     let Some(network) = sources.network else {
         return ONE_WAY.unavailable(NO_NETWORK);
     };
@@ -242,7 +242,7 @@ fn network(sources: &Sources<'_>) -> Vec<Figure> {
                 of("p99", "p99", delay.p99),
                 of("p999", "p99.9", delay.p999),
                 ONE_WAY.figure("max", "largest", delay.max_ns, None),
-                Figure::new("variation_p99", "delay variation, p99", "s", variation)
+                Metric::new("variation_p99", "delay variation, p99", "s", variation)
                     .by("above the smallest delay of the run (RFC 5481, PDV)"),
             ]
         }
@@ -251,14 +251,14 @@ fn network(sources: &Sources<'_>) -> Vec<Figure> {
         Measured::Measured(successive) => (Some(successive.jitter.mean_ns * 1e-9), ""),
         Measured::Unavailable { reason } => (None, reason.as_str()),
     };
-    let jitter = Figure::maybe("jitter_mean", "jitter, mean", "s", jitter_s, reason);
+    let jitter = Metric::maybe("jitter_mean", "jitter, mean", "s", jitter_s, reason);
     figures.push(jitter.by("RFC 3550; needs no aligned clocks"));
     let (round_trip_s, reason) = match &network.round_trip {
         Distribution::Measured(one) => (Some(ns_s(one.p50_ns)), ""),
         Distribution::Unavailable { reason } => (None, reason.as_str()),
     };
     let label = "round trip of the gateways, p50";
-    figures.push(Figure::maybe(
+    figures.push(Metric::maybe(
         "round_trip_p50",
         label,
         "s",
@@ -268,7 +268,7 @@ fn network(sources: &Sources<'_>) -> Vec<Figure> {
     figures
 }
 
-fn outage_figures(outages: &OutageFigures) -> Vec<Figure> {
+fn outage_metrics(outages: &OutageMetrics) -> Vec<Metric> {
     let longest = outages.longest.as_ref();
     let where_from = longest.map_or_else(String::new, |one| {
         let open = if one.is_open {
@@ -281,9 +281,9 @@ fn outage_figures(outages: &OutageFigures) -> Vec<Figure> {
     });
     let longest = longest.map(|one| ns_s(one.length_ns));
     vec![
-        Figure::new("outage_count", "outages", "1", outages.outage_count as f64)
+        Metric::new("outage_count", "outages", "1", outages.outage_count as f64)
             .by("runs of lost messages"),
-        Figure::maybe(
+        Metric::maybe(
             "outage_longest",
             "longest outage",
             "s",
@@ -294,7 +294,7 @@ fn outage_figures(outages: &OutageFigures) -> Vec<Figure> {
     ]
 }
 
-fn outage_table(outages: &OutageFigures) -> Option<Table> {
+fn outage_table(outages: &OutageMetrics) -> Option<Table> {
     if outages.outage_count == 0 {
         return None;
     }
@@ -371,7 +371,7 @@ fn segment_table(account: &ChannelAccount) -> Table {
 }
 
 /// Both ends, and whether stages between were missing.
-fn segment_name(segment: &SegmentFigures) -> String {
+fn segment_name(segment: &SegmentMetrics) -> String {
     let combined = if segment.is_combined {
         " (combined: a stamp between is missing)"
     } else {

@@ -1,6 +1,6 @@
 //! Figures as rows of RFC 4180: one per channel and figure, and one per figure of the score.
 
-use super::data::{Figure, Page, Run};
+use super::data::{Metric, Page, Run};
 use crate::terminal::JOINT;
 
 const HEADER: &str = "run,channel,figure,value,unit,low,high,method\r\n";
@@ -35,7 +35,7 @@ pub(super) fn text(page: &Page) -> String {
 }
 
 /// Every figure of a run with its channel; the score's have none.
-pub(crate) fn rows(run: &Run) -> impl Iterator<Item = (&str, &Figure)> {
+pub(crate) fn rows(run: &Run) -> impl Iterator<Item = (&str, &Metric)> {
     let score = run.score.iter().map(|figure| ("", figure));
     let channels = run.channels.iter().flat_map(|channel| {
         let figures = channel.figures.iter();

@@ -48,12 +48,12 @@ pub(crate) struct Run {
     /// Whether it says anything about a network.
     pub(crate) network_verdict: Verdict,
     /// The few figures to see first.
-    pub(crate) headline: Vec<Figure>,
+    pub(crate) headline: Vec<Metric>,
     pub(crate) warnings: Vec<String>,
     /// What this report lacks, and why.
     pub(crate) missing: Vec<String>,
     pub(crate) facts: Vec<FactGroup>,
-    pub(crate) score: Vec<Figure>,
+    pub(crate) score: Vec<Metric>,
     /// The run as a row of the seed paper's tables.
     pub(crate) paper: Option<Table>,
     pub(crate) channels: Vec<Channel>,
@@ -89,7 +89,7 @@ pub(crate) struct FactGroup {
 
 /// One figure with its interval and how it came about.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub(crate) struct Figure {
+pub(crate) struct Metric {
     /// Snake-case; what `--format csv` and `compare` call it.
     pub(crate) name: String,
     pub(crate) label: String,
@@ -113,7 +113,7 @@ pub(crate) struct Channel {
     pub(crate) from: String,
     pub(crate) to: Option<String>,
     pub(crate) link: String,
-    pub(crate) figures: Vec<Figure>,
+    pub(crate) figures: Vec<Metric>,
     /// Fates, segments, stamps, outages; those that there are.
     pub(crate) tables: Vec<Table>,
     /// What else is to be known of it.
@@ -166,7 +166,7 @@ pub(crate) struct Drawing {
     pub(crate) plot: Option<super::series::Plot>,
 }
 
-impl Figure {
+impl Metric {
     /// A figure with its text.
     pub(crate) fn new(name: &str, label: &str, unit: &str, value: f64) -> Self {
         Self {

@@ -1,9 +1,11 @@
 //! Which figures a run and its channels get, with the words below them.
 
 use super::channel::{Sources, bar};
-use super::figures::cdf::{Curve, delay_cdf};
-use super::figures::waterfall::{Bar, waterfall};
-use super::{data::Drawing, figures::bursts::loss_bursts, figures::histogram::delay_histogram};
+use super::charts::bursts::loss_bursts;
+use super::charts::cdf::{Curve, delay_cdf};
+use super::charts::histogram::delay_histogram;
+use super::charts::waterfall::{Bar, waterfall};
+use super::data::Drawing;
 use hil_account::ChannelAccount;
 use hil_platform::text::grouped;
 

@@ -4,11 +4,11 @@
 
 mod axis;
 mod channel;
+mod charts;
 pub(crate) mod csv;
 pub(crate) mod data;
 mod drawings;
 mod events;
-mod figures;
 mod paper;
 pub mod read;
 mod run;
@@ -21,7 +21,8 @@ mod timeline;
 mod words;
 pub mod write;
 
-use std::{collections::BTreeSet, path::Path};
+use std::collections::BTreeSet;
+use std::path::Path;
 
 use clap::ValueEnum;
 
@@ -152,7 +153,7 @@ pub fn render(
             (None, Format::Tex) => template::tex(&page)?,
             (None, Format::Csv) => csv::text(&page),
             (None, Format::Json) => json(&page),
-            (None, Format::Svg) => figures(&page).iter().map(|one| one.svg.as_str()).collect(),
+            (None, Format::Svg) => charts(&page).iter().map(|one| one.svg.as_str()).collect(),
         };
         let is_page = template.is_none() && format == Format::Html;
         if !is_page || text.len() <= PAGE_BYTES_MAX || steps <= STEPS_MIN {
@@ -169,7 +170,7 @@ fn json(page: &Page) -> String {
 }
 
 /// Every figure of a page.
-pub(crate) fn figures(page: &Page) -> Vec<&Drawing> {
+pub(crate) fn charts(page: &Page) -> Vec<&Drawing> {
     let runs = page.runs.iter();
     runs.flat_map(|run| {
         let channels = run.channels.iter().flat_map(|channel| &channel.drawings);
@@ -187,7 +188,7 @@ pub fn figure_files(
     wanted: Option<&str>,
 ) -> Result<Vec<(String, String)>, String> {
     let page = page_of(materials, STEPS_MAX);
-    let all = figures(&page);
+    let all = charts(&page);
     let is_wanted = |one: &&&Drawing| {
         wanted.is_none_or(|wanted| {
             one.name == wanted || one.name.strip_prefix("run-1-") == Some(wanted)

@@ -3,8 +3,9 @@
 
 use super::data::Table;
 use super::words::{UNAVAILABLE, ns_s};
+use crate::network::NetworkReport;
+use crate::summary::ScoreMetric;
 use crate::terminal::{JOINT, duration_s, figure};
-use crate::{network::NetworkReport, summary::ScoreMetric};
 
 /// The table; `None` for a case that the paper has no table of. The case is known by its figures.
 pub(super) fn table(

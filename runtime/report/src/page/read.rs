@@ -1,6 +1,7 @@
 //! Reads a run's folder for a page. What cannot be read is said, and the rest is read all the same.
 
-use std::{fs, io, path::Path};
+use std::path::Path;
+use std::{fs, io};
 
 use serde::Deserialize;
 use serde_json::Value;

@@ -2,14 +2,16 @@
 //! nothing is measured here.
 
 use super::channel::{self, Sources};
-use super::data::{Channel, FactGroup, Figure, Run, RunKind, Table, Verdict};
+use super::data::{Channel, FactGroup, Metric, Run, RunKind, Table, Verdict};
 use super::events::{correlation, network_events, score_events};
 use super::read::{Found, Manifest, Material};
 use super::words::{UNAVAILABLE, count};
 use super::{drawings, paper, timeline};
+use crate::assessment::Assessment;
+use crate::clock_summary::ClockSection;
+use crate::score_event::ScoreEvents;
 use crate::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric, host_words};
 use crate::terminal::{self, duration, seconds, unsigned_duration};
-use crate::{assessment::Assessment, clock_summary::ClockSection, score_event::ScoreEvents};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 
@@ -332,9 +334,9 @@ fn notes(one: &ChannelSummary) -> Vec<String> {
 }
 
 /// The figures of a score.
-pub(super) fn score(metrics: &[ScoreMetric]) -> Vec<Figure> {
+pub(super) fn score(metrics: &[ScoreMetric]) -> Vec<Metric> {
     let figure = |one: &ScoreMetric| {
-        Figure::maybe(&one.name, &one.label, &one.unit, one.value, &one.method)
+        Metric::maybe(&one.name, &one.label, &one.unit, one.value, &one.method)
             .within(one.interval)
             .by(&one.method)
     };
@@ -425,13 +427,13 @@ pub(super) const WORST: [(&str, &str); 3] = [
 
 /// The figures to see first: what the case is about, the worst of the network, and how often the
 /// robot came to harm.
-fn headline(run: &Run) -> Vec<Figure> {
+fn headline(run: &Run) -> Vec<Metric> {
     let wanted = ["collision_ratio", "motion_loss_ratio"];
     let named = run
         .score
         .iter()
         .find(|one| wanted.contains(&one.name.as_str()));
-    let mut figures: Vec<Figure> = named
+    let mut figures: Vec<Metric> = named
         .or_else(|| run.score.first())
         .cloned()
         .into_iter()
@@ -454,7 +456,7 @@ fn headline(run: &Run) -> Vec<Figure> {
         });
         if let Some((channel, figure)) = worst {
             let label = format!("{words}: {channel}");
-            figures.push(Figure {
+            figures.push(Metric {
                 label,
                 ..figure.clone()
             });
@@ -472,8 +474,8 @@ mod tests {
         let channel = |name: &str, delivered, p99| Channel {
             name: name.to_owned(),
             figures: vec![
-                Figure::new("delivered", "delivered", "1", delivered),
-                Figure::new("p99", "p99", "s", p99),
+                Metric::new("delivered", "delivered", "1", delivered),
+                Metric::new("p99", "p99", "s", p99),
             ],
             ..Channel::default()
         };

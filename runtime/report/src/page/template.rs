@@ -6,7 +6,8 @@ use serde_json::json;
 
 use super::data::Page;
 use super::svg::{STYLE, escaped};
-use crate::{alike::joined_labels, terminal::JOINT};
+use crate::alike::joined_labels;
+use crate::terminal::JOINT;
 
 /// Why a template gave no text.
 #[derive(Debug, thiserror::Error)]

@@ -5,9 +5,10 @@ use std::collections::BTreeMap;
 use super::read::{Found, Manifest, Material};
 use super::series::{Series, parse};
 use super::{Format, PAGE_BYTES_MAX, figure_files, page_of, render};
+use crate::network::TimelineSubject;
+use crate::summary::RunSummary;
 use crate::terminal::{JOINT, Style};
 use crate::tests::sample::{awkward, empty, full};
-use crate::{network::TimelineSubject, summary::RunSummary};
 
 const HOSTILE: &str = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>&amp;]]>";
 
@@ -288,7 +289,7 @@ fn markdown_says_the_name_of_its_only_run_once() {
 }
 
 #[test]
-fn the_other_formats_have_the_same_figures() {
+fn the_other_formats_have_the_same_metrics() {
     let one = [material(full())];
     let csv = render(&one, Format::Csv, None).unwrap();
     assert!(csv.starts_with("run,channel,figure,value,unit,low,high,method\r\n"));

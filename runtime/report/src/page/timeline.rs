@@ -5,12 +5,14 @@ use core::ops::Range;
 
 use hil_core::case_study::Severity;
 
-use super::figures::time::{Mark, MarkClass, over_time};
+use super::charts::time::{Mark, MarkClass, over_time};
+use super::data::Drawing;
+use super::drawings::name_of;
 use super::series::{Plot, PlotPanel, Series, Thinned, thinned};
-use super::{data::Drawing, drawings::name_of};
+use crate::link_change::LinkChange;
 use crate::network::{NetworkQuantity, NetworkReport, TimelineRow, TimelineSubject};
 use crate::score_event::{ExplainedEvent, ScoreEvents};
-use crate::{link_change::LinkChange, terminal::duration_s};
+use crate::terminal::duration_s;
 
 /// Lines of one panel; a series with more columns gets more panels.
 const LINES_MAX: usize = 7;

@@ -3,17 +3,17 @@
 
 use core::time::Duration;
 
-use hil_account::{Happening, MessageFate, Outage, Side};
+use hil_account::{EventTime, MessageFate, Outage, Side};
 use hil_core::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
 use hil_core::run_log::{LoggedMessage, RunLog};
 use hil_core::time::Instant;
 
-use crate::analysis::outages::{OutageStory, placed};
+use crate::analysis::outages::{OutageHistory, placed};
 use crate::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 
 /// The outages of `channel` in a run of `duration`, which begins at instant zero.
-pub(super) fn story(channel: String, outages: Vec<Outage>, duration: Duration) -> OutageStory {
-    OutageStory {
+pub(super) fn history(channel: String, outages: Vec<Outage>, duration: Duration) -> OutageHistory {
+    OutageHistory {
         channel,
         // Virtual time begins with the run.
         placed_ns: placed(&outages, Some),
@@ -28,7 +28,7 @@ pub(super) fn story(channel: String, outages: Vec<Outage>, duration: Duration) -
 pub(super) fn explained(
     score: &Score,
     channels: &[ChannelSpec],
-    stories: &[OutageStory],
+    stories: &[OutageHistory],
     log: &RunLog,
 ) -> ScoreEvents {
     let events = score.events.iter().map(|event| {
@@ -55,7 +55,7 @@ pub(super) fn explained(
 fn outages_before(
     event: &ScoreEvent,
     channels: &[ChannelSpec],
-    stories: &[OutageStory],
+    stories: &[OutageHistory],
     log: &RunLog,
 ) -> Vec<EventOutage> {
     let before = |spec: &ChannelSpec| {
@@ -69,7 +69,7 @@ fn outages_before(
         // A channel that never delivered anything has no consumer's view of its outage.
         let mut sides = [Side::Consumer, Side::Producer].into_iter();
         sides.find_map(|side| {
-            story.before(&Happening {
+            story.before(&EventTime {
                 at: Some((event.at, side)),
                 lost_published_ns: &lost_published_ns,
             })
@@ -82,7 +82,7 @@ fn outages_before(
 }
 
 /// What the link's model did to `message`.
-fn explain(message: &MessageRef, stories: &[OutageStory], log: &RunLog) -> ExplainedMessage {
+fn explain(message: &MessageRef, stories: &[OutageHistory], log: &RunLog) -> ExplainedMessage {
     let published_ns = published_ns(message, log);
     let story = stories.iter().find(|one| one.channel == message.channel);
     let is_lost = published_ns
@@ -169,7 +169,7 @@ mod tests {
             interruption_index: None,
         };
         let name = "shuttle/command".to_owned();
-        let stories = [story(name, vec![outage], Duration::from_secs(20))];
+        let stories = [history(name, vec![outage], Duration::from_secs(20))];
         let events = explained(&score, Shuttle::CHANNELS, &stories, &log).events;
         assert!(events[0].outages.is_empty());
         let found = &events[1].outages[0];

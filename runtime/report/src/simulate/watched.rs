@@ -1,7 +1,8 @@
 //! A link model in virtual time under watch: what it does is counted, what becomes of each message is
 //! noted, and what it loses as outages. It changes nothing of what the model does.
 
-use std::{cell::RefCell, rc::Rc};
+use std::cell::RefCell;
+use std::rc::Rc;
 
 use hil_account::network::{Crossing, Passage};
 use hil_account::{Outage, OutageFinder};

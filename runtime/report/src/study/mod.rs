@@ -5,8 +5,10 @@
 mod pool;
 mod render;
 
+use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
-use std::{fs, num::NonZeroUsize, thread, time::Duration};
+use std::time::Duration;
+use std::{fs, thread};
 
 use hil_core::study::{Batch, StudyReport};
 
@@ -133,7 +135,7 @@ pub fn batch_of(
             .ok_or_else(|| StudyError::NoCalibration {
                 case: name(),
                 figure: figure.to_owned(),
-                known: match entry.calibrated_figures {
+                known: match entry.calibrated_metrics {
                     [] => "it has no calibration".to_owned(),
                     figures => format!("there is {}", figures.join(", ")),
                 },

@@ -4,7 +4,7 @@
 use core::ops::Range;
 
 use hil_account::{
-    BurstCount, ChannelAccount, Closing, ClosingFigures, Coverage, Gap, MessageFate, SegmentFigures,
+    BurstCount, ChannelAccount, Closing, ClosingMetrics, Coverage, Gap, MessageFate, SegmentMetrics,
 };
 use hil_stats::histogram::{Distribution, LatencySummary};
 use hil_stats::statistics::IntervalNs;
@@ -12,10 +12,10 @@ use hil_stats::statistics::IntervalNs;
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
 use super::clocks;
 use super::units::{duration, percent, unsigned_duration};
-use crate::summary::{ChannelSummary, LinkKind, RecordedFigures};
+use crate::summary::{ChannelSummary, LinkKind, RecordedMetrics};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
-use hil_rundir::pipe::StallFigures;
+use hil_rundir::pipe::StallMetrics;
 
 /// Columns of a stage's name, of each of the four figures, and between figures and bar.
 const NAME_WIDTH: usize = 22;
@@ -72,7 +72,7 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
 }
 
 /// How often a stream stood still, and what counts as that.
-pub(crate) fn stall_words(stalls: &StallFigures) -> String {
+pub(crate) fn stall_words(stalls: &StallMetrics) -> String {
     let threshold = unsigned_duration(stalls.threshold_ns);
     let rule = format!(
         "a byte unacknowledged for over {threshold}: twice the smallest round trip and 50 ms"
@@ -88,7 +88,7 @@ pub(crate) fn stall_words(stalls: &StallFigures) -> String {
     )
 }
 
-fn recorded(canvas: &mut Canvas, figures: Option<RecordedFigures>) {
+fn recorded(canvas: &mut Canvas, figures: Option<RecordedMetrics>) {
     let Some(figures) = figures else {
         canvas.paragraph(
             INDENT,
@@ -174,7 +174,7 @@ fn waterfall(canvas: &mut Canvas, account: &ChannelAccount) {
         .segments
         .iter()
         .partition(|segment| !segment.is_combined);
-    let median = |segment: &&SegmentFigures| {
+    let median = |segment: &&SegmentMetrics| {
         let summary = segment.distribution.measured();
         summary.map_or(0.0, |summary| summary.p50_ns.max(0) as f64)
     };
@@ -300,7 +300,7 @@ pub(crate) fn closing_text(closing: &Closing) -> Option<String> {
     }
 }
 
-fn closing_words(figures: &ClosingFigures) -> Option<(Tone, String)> {
+fn closing_words(figures: &ClosingMetrics) -> Option<(Tone, String)> {
     let (ratio, interval) = figures.closed_ratio()?;
     let mut text = format!(
         "closes for {} of {} messages: {} [{}, {}]",

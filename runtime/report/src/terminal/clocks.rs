@@ -2,8 +2,8 @@
 //! other. It computes no alignment.
 
 use hil_account::ChannelAccount;
-use hil_clock::{ClockFigures, StampKind};
-use hil_stats::bounds::BoundFigures;
+use hil_clock::{ClockMetrics, StampKind};
+use hil_stats::bounds::BoundMetrics;
 use hil_stats::histogram::Distribution;
 
 use super::canvas::{Canvas, INDENT, Tone};
@@ -78,7 +78,7 @@ fn pair_lines(canvas: &mut Canvas, pair: &HostPairClock) {
 
 /// The clock path, and what each of the two paths bounds by itself.
 fn path_words(path: &ClockPathSummary) -> Vec<(&'static str, Tone, String)> {
-    let alone = |figures: &Option<ClockFigures>| {
+    let alone = |figures: &Option<ClockMetrics>| {
         let bound = figures.as_ref().and_then(|figures| figures.bound);
         bound.map_or_else(|| "no bound".to_owned(), bound_words)
     };
@@ -104,11 +104,11 @@ fn path_words(path: &ClockPathSummary) -> Vec<(&'static str, Tone, String)> {
 }
 
 fn exchange_words(
-    figures: &ClockFigures,
+    figures: &ClockMetrics,
     path: Option<&ClockPathSummary>,
 ) -> Vec<(&'static str, String)> {
     let mut lines = Vec::new();
-    let of = |figures: &Option<ClockFigures>| {
+    let of = |figures: &Option<ClockMetrics>| {
         let count = figures.as_ref().map_or(0, |figures| figures.exchange_count);
         grouped(count)
     };
@@ -171,7 +171,7 @@ fn exchange_words(
     lines
 }
 
-fn bound_words(bound: BoundFigures) -> String {
+fn bound_words(bound: BoundMetrics) -> String {
     format!(
         "median ±{}, largest ±{}",
         unsigned_duration(bound.median_ns),
@@ -232,7 +232,7 @@ mod tests {
     use hil_clock::{ClockMap, ClockSettings, Exchange, Requester};
     use hil_core::record::RoundTripRecord;
 
-    fn figures() -> ClockFigures {
+    fn metrics() -> ClockMetrics {
         let exchange = |index: i64| {
             let sent_ns = index * 100_000_000;
             let record = RoundTripRecord {
@@ -248,7 +248,7 @@ mod tests {
         };
         let exchanges: Vec<Exchange> = (0..100).filter_map(exchange).collect();
         ClockMap::new(&exchanges, ClockSettings::default())
-            .figures()
+            .metrics()
             .clone()
     }
 
@@ -262,7 +262,7 @@ mod tests {
                 to: "robot-pc".to_owned(),
                 rung: ClockRung::Exchanges,
                 basis: "system clocks give no bound: nobody steers them".to_owned(),
-                exchanges: Some(figures()),
+                exchanges: Some(metrics()),
                 disciplined: None,
                 contradiction: Some("the rungs disagree".to_owned()),
                 clock_path: Some(ClockPathSummary {
@@ -275,7 +275,7 @@ mod tests {
                         },
                     ),
                     state: "established".to_owned(),
-                    exchanges: Some(figures()),
+                    exchanges: Some(metrics()),
                     data_path: None,
                     longest_gap_ns: Some(31_000_000),
                 }),

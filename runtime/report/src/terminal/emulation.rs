@@ -6,14 +6,15 @@ use hil_stats::histogram::LatencySummary;
 
 use super::canvas::{Canvas, Tone};
 use super::units::duration;
-use crate::{emulation::EmulationFigures, trace_counts::replay_words};
+use crate::emulation::EmulationMetrics;
+use crate::trace_counts::replay_words;
 use hil_platform::text::grouped;
 
 /// Columns of a label.
 const LABEL_WIDTH: usize = 18;
 
 /// The section of one channel.
-pub(super) fn emulation(canvas: &mut Canvas, figures: &EmulationFigures) {
+pub(super) fn emulation(canvas: &mut Canvas, figures: &EmulationMetrics) {
     let line = |summary: &LatencySummary| {
         format!(
             "p50 {} · p99 {} · p99.9 {} · max {}",
@@ -79,7 +80,7 @@ mod tests {
             ..IngressRecord::zeroed()
         };
         let page = |overflow_count| {
-            let figures = EmulationFigures::of([record; 10], overflow_count).unwrap();
+            let figures = EmulationMetrics::of([record; 10], overflow_count).unwrap();
             let mut canvas = Canvas::new(120, Style::Plain);
             emulation(&mut canvas, &figures);
             let text = canvas.finish().replace('\u{a0}', " ");

@@ -1,14 +1,14 @@
 //! Renders a summary for a terminal of 80 to 120 columns. It returns text; the caller prints it.
 
+mod adapter;
 mod canvas;
-mod cards;
 mod changes;
 mod channel;
 mod clocks;
 mod emulation;
 mod events;
-mod face;
 mod network;
+mod nics;
 mod outages;
 mod radio;
 mod tables;
@@ -48,11 +48,11 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
         channel::channel(&mut canvas, channel);
         radio::channel(&mut canvas, summary.radio.channel(&channel.name));
     }
-    for face in &summary.faces {
-        face::face(&mut canvas, face);
+    for adapter in &summary.faces {
+        adapter::adapter(&mut canvas, adapter);
     }
     if let Some(stamps) = &summary.hardware_stamps {
-        cards::hardware_stamps(&mut canvas, stamps);
+        nics::hardware_stamps(&mut canvas, stamps);
     }
     if let Some(section) = &summary.clocks {
         clocks::clocks(&mut canvas, section);

@@ -1,10 +1,11 @@
 //! The network of a run: a table of all channels, then the figures of each with their intervals;
 //! and what preceded what. Figures are not computed here.
 
-use core::{cmp::Ordering, fmt::Write};
+use core::cmp::Ordering;
+use core::fmt::Write;
 
 use hil_account::network::{
-    DelayFigures, DelayQuantile, Figure, InterarrivalJitter, LossFigures, NetworkFigures,
+    DelayMetrics, DelayQuantile, InterarrivalJitter, LossMetrics, Metric, NetworkMetrics,
     SuccessiveVariation,
 };
 
@@ -59,10 +60,10 @@ pub(super) fn network(canvas: &mut Canvas, report: &NetworkReport) {
     }
 }
 
-fn row(figures: &NetworkFigures) -> [String; 8] {
+fn row(figures: &NetworkMetrics) -> [String; 8] {
     const NONE: &str = "–";
     let delay = figures.delay.measured();
-    let of_delay = |ns: fn(&DelayFigures) -> i64| {
+    let of_delay = |ns: fn(&DelayMetrics) -> i64| {
         delay.map_or_else(|| NONE.to_owned(), |delay| duration(ns(delay)))
     };
     let loss = figures.loss.measured();
@@ -91,28 +92,28 @@ fn channel(canvas: &mut Canvas, one: &ChannelNetwork) {
         canvas.field_at(LINE_MARGIN, LABEL_WIDTH, label, Tone::Plain, text);
     };
     match &figures.delay {
-        Figure::Measured(delay) => {
+        Metric::Measured(delay) => {
             line("delay", &delay_words(delay));
             line("", &bound_words(delay, figures));
             line("variation", &variation_words(delay));
         }
-        Figure::Unavailable { reason } => {
+        Metric::Unavailable { reason } => {
             let text = format!("unavailable: {reason}; {}", round_trip_words(figures));
             line("delay", &text);
         }
     }
     match &figures.successive {
-        Figure::Measured(successive) => line("successive", &successive_words(successive)),
-        Figure::Unavailable { reason } => line("successive", &format!("unavailable: {reason}")),
+        Metric::Measured(successive) => line("successive", &successive_words(successive)),
+        Metric::Unavailable { reason } => line("successive", &format!("unavailable: {reason}")),
     }
     match &figures.loss {
-        Figure::Measured(loss) => {
+        Metric::Measured(loss) => {
             line("loss", &loss_words(loss));
             if loss.lost_count > 0 {
                 line("in a row", &runs_words(loss));
             }
         }
-        Figure::Unavailable { reason } => line("loss", &format!("unavailable: {reason}")),
+        Metric::Unavailable { reason } => line("loss", &format!("unavailable: {reason}")),
     }
     line("order", &order_words(figures));
     line("rate", &rate_words(figures));
@@ -142,7 +143,7 @@ fn quantile(label: &str, one: &DelayQuantile) -> String {
     }
 }
 
-fn delay_words(delay: &DelayFigures) -> String {
+fn delay_words(delay: &DelayMetrics) -> String {
     let min = format!("min{JOINT}{}", duration(delay.min_ns));
     let max = format!("max{JOINT}{}", duration(delay.max_ns));
     [
@@ -156,7 +157,7 @@ fn delay_words(delay: &DelayFigures) -> String {
     .join(" · ")
 }
 
-fn bound_words(delay: &DelayFigures, figures: &NetworkFigures) -> String {
+fn bound_words(delay: &DelayMetrics, figures: &NetworkMetrics) -> String {
     let bound = delay.alignment_bound_ns;
     match (bound, delay.is_bound_wider) {
         (0, _) => format!(
@@ -176,7 +177,7 @@ fn bound_words(delay: &DelayFigures, figures: &NetworkFigures) -> String {
     }
 }
 
-fn round_trip_words(figures: &NetworkFigures) -> String {
+fn round_trip_words(figures: &NetworkMetrics) -> String {
     figures.round_trip.measured().map_or_else(
         || "no round trip was measured".to_owned(),
         |round_trip| {
@@ -191,7 +192,7 @@ fn round_trip_words(figures: &NetworkFigures) -> String {
     )
 }
 
-fn variation_words(delay: &DelayFigures) -> String {
+fn variation_words(delay: &DelayMetrics) -> String {
     let variation = &delay.variation;
     let [p50, p95, p99, p999, max] = [
         variation.p50_ns,
@@ -248,7 +249,7 @@ fn jitter_bound_words(jitter: InterarrivalJitter) -> String {
     format!(" ±{}{wide}", duration_s(jitter.bound_ns * 1e-9))
 }
 
-fn loss_words(loss: &LossFigures) -> String {
+fn loss_words(loss: &LossMetrics) -> String {
     let bounds = |interval: hil_stats::statistics::Interval| {
         format!("[{}, {}]", percent(interval.low), percent(interval.high))
     };
@@ -267,7 +268,7 @@ fn loss_words(loss: &LossFigures) -> String {
     )
 }
 
-fn runs_words(loss: &LossFigures) -> String {
+fn runs_words(loss: &LossMetrics) -> String {
     let times = |count: u64| match count {
         1 => "once".to_owned(),
         2 => "twice".to_owned(),
@@ -305,14 +306,14 @@ fn runs_words(loss: &LossFigures) -> String {
     text
 }
 
-fn order_words(figures: &NetworkFigures) -> String {
+fn order_words(figures: &NetworkMetrics) -> String {
     let copies = figures.duplicated_count.map_or_else(
         || "copies unavailable".to_owned(),
         |count| format!("{} copies", grouped(count)),
     );
     match &figures.order {
-        Figure::Unavailable { reason } => format!("unavailable: {reason}; {copies}"),
-        Figure::Measured(order) => {
+        Metric::Unavailable { reason } => format!("unavailable: {reason}; {copies}"),
+        Metric::Measured(order) => {
             let Some((p50, max)) = order.extent_p50.zip(order.extent_max) else {
                 return format!("none of {} reordered; {copies}", grouped(order.count));
             };
@@ -328,7 +329,7 @@ fn order_words(figures: &NetworkFigures) -> String {
     }
 }
 
-fn rate_words(figures: &NetworkFigures) -> String {
+fn rate_words(figures: &NetworkMetrics) -> String {
     let rate = |per_s: Option<f64>, unit: &str, what: &str| {
         per_s.map_or_else(
             || format!("{what} unavailable: fewer than two messages"),
@@ -353,7 +354,7 @@ pub(super) fn what_preceded_what(
     events: &ScoreEvents,
 ) {
     canvas.heading("What preceded what", "correlation is not cause");
-    canvas.paragraph(INDENT, Tone::Plain, &foregoing_words(report, events));
+    canvas.paragraph(INDENT, Tone::Plain, &preceding_words(report, events));
     if report.clocks_differ {
         let text = "Clocks are not aligned: each host's times count from its own start of the run, \
                     and hosts start within a message of their supervisors of each other; lags are \
@@ -369,7 +370,7 @@ pub(super) fn what_preceded_what(
     }
 }
 
-fn foregoing_words(report: &NetworkReport, events: &ScoreEvents) -> String {
+fn preceding_words(report: &NetworkReport, events: &ScoreEvents) -> String {
     let bound_s = report.clock_bound_s.filter(|bound_s| *bound_s > 0.0);
     let slack = bound_s.map_or_else(String::new, |bound_s| {
         format!(" (±{} by the clocks)", duration_s(bound_s))

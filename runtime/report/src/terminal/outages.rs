@@ -1,6 +1,6 @@
 //! The outages of one channel: how many of which length, and the longest.
 
-use hil_account::{LongestOutage, OutageClass, OutageFigures};
+use hil_account::{LongestOutage, OutageClass, OutageMetrics};
 
 use super::canvas::{Canvas, INDENT, Tone, bar, right};
 use super::units::{duration, seconds};
@@ -13,7 +13,7 @@ const CLASS_WIDTH: usize = 16;
 const COUNT_WIDTH: usize = 10;
 const GAP: usize = 2;
 
-pub(super) fn outages(canvas: &mut Canvas, figures: &OutageFigures) {
+pub(super) fn outages(canvas: &mut Canvas, figures: &OutageMetrics) {
     if figures.outage_count == 0 {
         return;
     }
@@ -33,7 +33,7 @@ pub(super) fn outages(canvas: &mut Canvas, figures: &OutageFigures) {
     }
 }
 
-fn total(figures: &OutageFigures) -> String {
+fn total(figures: &OutageMetrics) -> String {
     let count = figures.outage_count;
     let mut text = format!(
         "{} with {} lost, {} in all, from the first lost publication to the next one that arrived",
@@ -102,7 +102,7 @@ fn border(ns: i64) -> String {
 mod tests {
     use super::*;
     use crate::terminal::Style;
-    use hil_account::{Outage, OutageFigures};
+    use hil_account::{Outage, OutageMetrics};
 
     const MS: i64 = 1_000_000;
 
@@ -121,7 +121,7 @@ mod tests {
                 interruption_index: None,
             })
             .collect();
-        let figures = OutageFigures::of(&found, None);
+        let figures = OutageMetrics::of(&found, None);
         let mut canvas = Canvas::new(100, Style::Plain);
         outages(&mut canvas, &figures);
         let page = canvas.finish();
@@ -136,7 +136,7 @@ mod tests {
 ";
         assert_eq!(page, expected, "{page}");
         let mut canvas = Canvas::new(100, Style::Plain);
-        outages(&mut canvas, &OutageFigures::of(&[], None));
+        outages(&mut canvas, &OutageMetrics::of(&[], None));
         assert_eq!(canvas.finish(), "");
     }
 }

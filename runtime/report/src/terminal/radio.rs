@@ -1,6 +1,6 @@
 //! What a report says of radios. It returns nothing on a wired run whose drivers stamp departures.
 
-use hil_account::radio::{RadioFigures, Share, TransmitStampFigures};
+use hil_account::radio::{RadioMetrics, Share, TransmitStampMetrics};
 
 use super::canvas::{Canvas, Tone};
 use super::units::percent;
@@ -19,7 +19,7 @@ pub(super) fn channel(canvas: &mut Canvas, radio: Option<&ChannelRadio>) {
 }
 
 /// Where stamps were taken, unless all are departures.
-fn stamp_words(figures: &TransmitStampFigures) -> Option<String> {
+fn stamp_words(figures: &TransmitStampMetrics) -> Option<String> {
     let of = |count: u64| format!("{} of {}", grouped(count), grouped(figures.handed_count));
     let mut words = Vec::new();
     if figures.before_queue_count > 0 {
@@ -38,7 +38,7 @@ fn stamp_words(figures: &TransmitStampFigures) -> Option<String> {
     (!words.is_empty()).then(|| words.join("; "))
 }
 
-fn acknowledgements(canvas: &mut Canvas, figures: &RadioFigures) {
+fn acknowledgements(canvas: &mut Canvas, figures: &RadioMetrics) {
     let text = acknowledgement_words(figures);
     canvas.field("radio", Tone::Plain, &text);
     let mut words = Vec::new();
@@ -57,7 +57,7 @@ fn acknowledgements(canvas: &mut Canvas, figures: &RadioFigures) {
 }
 
 /// What the radio said, and what became of the messages of which it said so.
-fn acknowledgement_words(figures: &RadioFigures) -> String {
+fn acknowledgement_words(figures: &RadioMetrics) -> String {
     let n = grouped;
     let rows = [
         figures.acknowledged,
@@ -183,17 +183,17 @@ mod tests {
 
     #[test]
     fn a_wired_channel_stamped_at_departure_needs_no_line() {
-        let figures = TransmitStampFigures {
+        let figures = TransmitStampMetrics {
             handed_count: 9,
             departure_count: 9,
-            ..TransmitStampFigures::default()
+            ..TransmitStampMetrics::default()
         };
         assert_eq!(stamp_words(&figures), None);
-        let fallback = TransmitStampFigures {
+        let fallback = TransmitStampMetrics {
             handed_count: 9,
             before_queue_count: 8,
             application_count: 1,
-            ..TransmitStampFigures::default()
+            ..TransmitStampMetrics::default()
         };
         let words = stamp_words(&fallback).unwrap();
         assert!(words.contains("before the queue for 8 of 9"), "{words}");
@@ -211,7 +211,7 @@ mod tests {
                 in_flight_count,
             }),
         };
-        let mut figures = RadioFigures {
+        let mut figures = RadioMetrics {
             handed_count: 17,
             acknowledged: row(10, 0, 0),
             unacknowledged: row(7, 4, 2),

@@ -4,8 +4,8 @@
 use core::fmt::Write as _;
 
 use hil_stats::histogram::Distribution;
-use hil_trace::figures::{Memory, RunCount, TraceFigures};
 use hil_trace::fit::{Fit, Ranking, TraceFit};
+use hil_trace::metrics::{Memory, RunCount, TraceMetrics};
 use hil_trace::{Trace, TraceHeader};
 
 use super::Style;
@@ -21,7 +21,7 @@ const PLOT_ROWS: usize = 20;
 /// The figures of a trace.
 pub(crate) fn render_trace(
     trace: &Trace,
-    figures: &TraceFigures,
+    figures: &TraceMetrics,
     width_columns: usize,
     style: Style,
 ) -> String {
@@ -112,7 +112,7 @@ fn heading(canvas: &mut Canvas, header: &TraceHeader) {
     canvas.heading(&of(&header.channel, "a trace"), &aside);
 }
 
-fn outage_words(figures: &TraceFigures) -> String {
+fn outage_words(figures: &TraceMetrics) -> String {
     let Some(outage) = figures.longest_outage else {
         return "none".to_owned();
     };
@@ -125,14 +125,14 @@ fn outage_words(figures: &TraceFigures) -> String {
     )
 }
 
-fn rate_words(figures: &TraceFigures) -> String {
+fn rate_words(figures: &TraceMetrics) -> String {
     match (figures.rate_hz, figures.rate_bytes_per_s) {
         (Some(rate), Some(bytes)) => format!("{rate:.2} per second, {bytes:.0} bytes per second"),
         _ => "rate unavailable: fewer than two instants".to_owned(),
     }
 }
 
-fn loss_words(figures: &TraceFigures) -> String {
+fn loss_words(figures: &TraceMetrics) -> String {
     let counts = &figures.counts;
     let Some((ratio, interval)) = figures.loss_ratio.zip(figures.loss_ratio_interval) else {
         return "unavailable: no message has a known fate".to_owned();
@@ -186,7 +186,7 @@ fn memory_words(memory: Option<&Memory>) -> String {
     )
 }
 
-fn delay_words(figures: &TraceFigures) -> String {
+fn delay_words(figures: &TraceMetrics) -> String {
     match &figures.delay {
         Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
         Distribution::Measured(delay) => {
@@ -214,7 +214,7 @@ fn delay_words(figures: &TraceFigures) -> String {
 }
 
 /// Of messages that arrived and were not published.
-fn late_words(figures: &TraceFigures) -> String {
+fn late_words(figures: &TraceMetrics) -> String {
     match &figures.late_delay {
         Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
         Distribution::Measured(late) => format!(
@@ -317,7 +317,7 @@ fn fit_line(fit: &Fit) -> String {
 /// Delay distribution, burst lengths and memory as bars.
 pub(crate) fn render_trace_plots(
     trace: &Trace,
-    figures: &TraceFigures,
+    figures: &TraceMetrics,
     width_columns: usize,
     style: Style,
 ) -> String {
@@ -433,7 +433,7 @@ mod tests {
     #[test]
     fn a_page_says_what_was_measured_and_never_grows_too_wide() {
         let trace = sample();
-        let figures = TraceFigures::of(&trace, 1);
+        let figures = TraceMetrics::of(&trace, 1);
         let fit = TraceFit::of(&trace, 1);
         let pages = [
             render_trace(&trace, &figures, 90, Style::Plain),

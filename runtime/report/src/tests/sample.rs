@@ -9,9 +9,10 @@ use hil_arm::egm::messages::Side as ArmSide;
 use hil_core::time::Alignment;
 
 use super::sample_events::{few_events, many_events, recorded_channel};
-use super::{sample_network::network, sample_records::Files};
+use super::sample_network::network;
+use super::sample_records::Files;
+use crate::adapter::{AdapterSummary, Answers};
 use crate::assessment::{Assessment, NetworkVerdict};
-use crate::face::{Answers, FaceSummary};
 use crate::summary::{
     Absence, ChannelSummary, CountByName, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
     ProcessSummary, RadioChange, RealtimeFacts, RunEvent, RunEventKind, RunFacts, RunSummary,
@@ -21,7 +22,7 @@ use crate::terminal::{Style, render};
 use hil_platform::host_facts::{self, HostFact, HostFacts};
 use hil_rundir::event::{EventKind, ProcessKind};
 use hil_rundir::launch::Side;
-use hil_topology::FaceKind;
+use hil_topology::AdapterKind;
 
 fn run_facts() -> RunFacts {
     RunFacts {
@@ -469,13 +470,13 @@ fn what_had_no_room_in_a_receive_buffer_is_not_put_down_to_the_network() {
 }
 
 #[test]
-fn a_run_whose_face_nobody_answered_does_not_claim_a_foreign_program() {
+fn a_run_whose_adapter_nobody_answered_does_not_claim_a_foreign_program() {
     let mut summary = full();
     summary.channels.truncate(0);
-    summary.faces.push(FaceSummary {
+    summary.faces.push(AdapterSummary {
         process: "client".to_owned(),
         host: "local".to_owned(),
-        kind: FaceKind::Robot,
+        kind: AdapterKind::Robot,
         arm: ArmSide::Right,
         address: "127.0.0.1:6510".to_owned(),
         peer_state: "never answered".to_owned(),

@@ -10,7 +10,7 @@ use super::sample::link;
 use crate::assessment::{Assessment, NetworkVerdict};
 use crate::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::summary::{
-    ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RecordedFigures, RunFacts, RunSummary,
+    ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RecordedMetrics, RunFacts, RunSummary,
 };
 use crate::terminal::{Style, render};
 use hil_rundir::event::ProcessKind;
@@ -122,7 +122,7 @@ pub(crate) fn recorded_channel() -> ChannelSummary {
         outages: None,
         emulation: None,
         trace_replay: None,
-        recorded: Some(RecordedFigures {
+        recorded: Some(RecordedMetrics {
             message_count: 12_345,
             missing_count: 0,
         }),

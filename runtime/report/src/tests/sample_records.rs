@@ -1,7 +1,7 @@
 //! The records of a run that never was, for the reports that are checked in.
 
 use hil_account::{
-    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Interruption, OutageFigures,
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Interruption, OutageMetrics,
     PathProcess, RunSpan, account, outages,
 };
 use hil_core::random::RandomStream;
@@ -106,10 +106,10 @@ impl Files {
     }
 
     /// The outages of the same channel on one clock.
-    pub(crate) fn outages(&self) -> OutageFigures {
+    pub(crate) fn outages(&self) -> OutageMetrics {
         let found = self.consult(Some(Alignment::SAME_CLOCK), outages);
         let end = Instant::from_ns(5_000 * PERIOD_NS);
-        OutageFigures::of(&found, Some(end))
+        OutageMetrics::of(&found, Some(end))
     }
 
     fn consult<T>(

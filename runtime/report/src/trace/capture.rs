@@ -9,8 +9,9 @@ use hil_trace::from_records::{TraceChannel, each_traced, link_trace};
 use hil_trace::wire::TraceEncoder;
 use hil_trace::{TraceArrival, TraceDirection, TraceHeader, TraceRecord, UNAVAILABLE_NS};
 
+use crate::analysis::link_changes;
+use crate::analysis::records::RunRecords;
 use crate::summary::{Fact, RunSummary};
-use crate::{analysis::link_changes, analysis::records::RunRecords};
 use hil_rundir::run_result::RunResult;
 use hil_topology::trace_source::file_name;
 use hil_topology::{Crossing, Direction, Via};

@@ -1,7 +1,7 @@
 //! The series of a trace, ready for any plotting program.
 
 use hil_core::plot::{PlotColumn, PlotSeries};
-use hil_trace::figures::{RunCount, TraceFigures};
+use hil_trace::metrics::{RunCount, TraceMetrics};
 use hil_trace::{Trace, UNBOUNDED_NS};
 
 const fn column(name: &'static str, label: &'static str, unit: &'static str) -> PlotColumn {
@@ -12,7 +12,7 @@ const fn column(name: &'static str, label: &'static str, unit: &'static str) -> 
 const CDF_STEPS: usize = 400;
 
 /// Every series of `trace`.
-pub(super) fn series(trace: &Trace, figures: &TraceFigures) -> Vec<PlotSeries> {
+pub(super) fn series(trace: &Trace, figures: &TraceMetrics) -> Vec<PlotSeries> {
     vec![
         cdf(trace),
         runs("bursts", "losses in a row", &figures.loss_bursts),
@@ -81,8 +81,8 @@ fn runs(name: &str, title: &str, runs: &[RunCount]) -> PlotSeries {
     made(name, title, columns, values)
 }
 
-fn memory(figures: &TraceFigures) -> PlotSeries {
-    let of = |which: &Option<hil_trace::figures::Memory>| {
+fn memory(figures: &TraceMetrics) -> PlotSeries {
+    let of = |which: &Option<hil_trace::metrics::Memory>| {
         which
             .as_ref()
             .map_or(Vec::new(), |memory| memory.coefficients.clone())

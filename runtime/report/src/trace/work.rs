@@ -2,11 +2,13 @@
 //! `hil_trace`'s, the page is `report::terminal`'s.
 
 use core::fmt::Write as _;
-use std::{collections::BTreeSet, fs, path::Path};
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
 
 use hil_core::plot::PlotSeries;
-use hil_trace::figures::TraceFigures;
 use hil_trace::fit::TraceFit;
+use hil_trace::metrics::TraceMetrics;
 use hil_trace::netem::NetemTable;
 use hil_trace::{Trace, TraceDirection, csv, netem, opportunities, wire};
 use serde_json::{Value, json};
@@ -164,7 +166,7 @@ fn key(name: &str) -> String {
 fn each(
     asked: &TraceFiles,
     console: &mut Console,
-    show: &mut dyn FnMut(&Opened, bool, &mut Talk<'_>) -> Result<Value, String>,
+    show: &mut dyn FnMut(&Opened, bool, &mut ProgressReporter<'_>) -> Result<Value, String>,
 ) -> End {
     let paths = match files(&asked.files) {
         Ok(paths) => paths,
@@ -174,7 +176,7 @@ fn each(
         }
     };
     let (mut end, mut documents) = (End::Done, Vec::new());
-    let mut talk = Talk::begin(console);
+    let mut talk = ProgressReporter::begin(console);
     for (index, path) in paths.iter().enumerate() {
         // Of the first, nothing says yet how long one takes.
         talk.share = (index > 0).then(|| index as f64 / paths.len() as f64);
@@ -212,14 +214,14 @@ fn each(
 }
 
 /// Says how far the work on all files is while there is nothing else to say.
-struct Talk<'a> {
+struct ProgressReporter<'a> {
     console: &'a mut Console,
     progress: Progress,
     /// Files that are done.
     share: Option<f64>,
 }
 
-impl<'a> Talk<'a> {
+impl<'a> ProgressReporter<'a> {
     fn begin(console: &'a mut Console) -> Self {
         Self {
             console,
@@ -240,13 +242,13 @@ impl<'a> Talk<'a> {
         self.during(&format!("reading {}", path.display()), || open(path))
     }
 
-    fn figures_of(&mut self, opened: &Opened) -> TraceFigures {
+    fn figures_of(&mut self, opened: &Opened) -> TraceMetrics {
         let words = format!("computing the figures of {}", opened.path.display());
-        self.during(&words, || TraceFigures::of(&opened.trace, SEED))
+        self.during(&words, || TraceMetrics::of(&opened.trace, SEED))
     }
 }
 
-fn info_json(opened: &Opened, figures: &TraceFigures) -> Value {
+fn info_json(opened: &Opened, figures: &TraceMetrics) -> Value {
     let header = &opened.trace.header;
     json!({
         "file": opened.path,
@@ -267,7 +269,7 @@ fn plot(
     is_json: bool,
     output: Option<&Path>,
     columns: usize,
-    talk: &mut Talk<'_>,
+    talk: &mut ProgressReporter<'_>,
 ) -> Result<Value, String> {
     let figures = talk.figures_of(opened);
     let made = plots::series(&opened.trace, &figures);
@@ -322,7 +324,7 @@ fn convert(
         console.error(&format!("{}: exists; say --force", into.display()));
         return End::Refused;
     }
-    let mut talk = Talk::begin(console);
+    let mut talk = ProgressReporter::begin(console);
     let opened = match talk.open(from) {
         Ok(opened) => opened,
         Err(error) => {

@@ -15,7 +15,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use bytemuck::{CheckedBitPattern, Pod};
-use hil_account::card_clock::CardClockRecord;
+use hil_account::nic_clock::NicClockRecord;
 use hil_core::message::Envelope;
 use hil_core::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
@@ -23,7 +23,7 @@ use hil_core::record::{
 use hil_core::run_log::RunLog;
 use hil_link::condition::LinkConditionRecord;
 
-use crate::face_record::{FaceReceivedRecord, FaceSentRecord};
+use crate::adapter_record::{AdapterReceivedRecord, AdapterSentRecord};
 use crate::radio_record::RadioRecord;
 use hil_topology::CHANNEL_NAME_BYTES_MAX;
 
@@ -49,12 +49,12 @@ pub enum RecordKind {
     Message = 6,
     /// [`RoundTripRecord`]s of a sending gateway.
     RoundTrip = 7,
-    /// [`FaceSentRecord`]s of a face: datagrams to a foreign program.
-    FaceSent = 8,
-    /// [`FaceReceivedRecord`]s of a face: datagrams of a foreign program.
-    FaceReceived = 9,
-    /// [`CardClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
-    CardClock = 10,
+    /// [`AdapterSentRecord`]s of an adapter: datagrams to a foreign program.
+    AdapterSent = 8,
+    /// [`AdapterReceivedRecord`]s of an adapter: datagrams of a foreign program.
+    AdapterReceived = 9,
+    /// [`NicClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
+    NicClock = 10,
     /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
     Radio = 15,
     /// [`LinkConditionRecord`]s of a gateway that emulates a link; the channel is that of the orders,
@@ -73,9 +73,9 @@ impl RecordKind {
             Self::FollowUp => "follow-up",
             Self::Message => "message",
             Self::RoundTrip => "round-trip",
-            Self::FaceSent => "face-sent",
-            Self::FaceReceived => "face-received",
-            Self::CardClock => "card-clock",
+            Self::AdapterSent => "face-sent",
+            Self::AdapterReceived => "face-received",
+            Self::NicClock => "card-clock",
             Self::Radio => "radio",
             Self::LinkCondition => "link-condition",
         }
@@ -90,9 +90,9 @@ impl RecordKind {
             Self::Ingress => Some(size_of::<IngressRecord>()),
             Self::FollowUp => Some(size_of::<FollowUpRecord>()),
             Self::RoundTrip => Some(size_of::<RoundTripRecord>()),
-            Self::FaceSent => Some(size_of::<FaceSentRecord>()),
-            Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
-            Self::CardClock => Some(size_of::<CardClockRecord>()),
+            Self::AdapterSent => Some(size_of::<AdapterSentRecord>()),
+            Self::AdapterReceived => Some(size_of::<AdapterReceivedRecord>()),
+            Self::NicClock => Some(size_of::<NicClockRecord>()),
             Self::Radio => Some(size_of::<RadioRecord>()),
             Self::LinkCondition => Some(size_of::<LinkConditionRecord>()),
             Self::Message => None,

@@ -133,7 +133,7 @@ fn the_shipped_fleets_mean_the_same_written_out_and_differ_in_their_hosts_alone(
         assert!(state.depth >= 128, "{}", state.depth);
     }
     for process in ["controller", "robots"] {
-        let card = |topology: &Topology| topology.process_card(process);
+        let card = |topology: &Topology| topology.role_spec(process);
         assert_eq!(card(&split), card(&emulated));
         assert_eq!(card(&local), card(&harbor));
     }

@@ -68,14 +68,14 @@ fn a_recorded_channel_has_its_number_and_neither_queue_nor_port() {
 #[test]
 fn its_producer_is_told_in_port_order_and_nobody_reads_it() {
     let topology = parse_diary(SPLIT).unwrap();
-    let card = topology.process_card("robot").unwrap();
+    let card = topology.role_spec("robot").unwrap();
     let outputs: Vec<_> = card
         .outputs
         .iter()
         .map(|output| (output.name.as_str(), output.is_recorded_only))
         .collect();
     assert_eq!(outputs, [("arm/truth", true), ("arm/status", false)]);
-    let card = topology.process_card("controller").unwrap();
+    let card = topology.role_spec("controller").unwrap();
     let inputs: Vec<_> = card.inputs.iter().map(|input| &input.name).collect();
     assert_eq!(inputs, ["arm/status"]);
 }

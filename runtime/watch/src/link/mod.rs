@@ -5,14 +5,16 @@
 pub mod cli;
 pub mod work;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::{collections::BTreeMap, fs, io, thread, time::Duration};
+use std::time::Duration;
+use std::{fs, io, thread};
 
 use hil_core::case_study::ParameterError;
 use hil_core::message::Envelope;
 use hil_core::time::Instant;
 use hil_link::condition::{
-    LinkCondition, LinkConditionRecord, LinkOrder, OrderOutcome, order_channel,
+    LinkChangeRequest, LinkCondition, LinkConditionRecord, OrderOutcome, order_channel,
 };
 use hil_link::spec::Way;
 use serde_json::Value;
@@ -341,7 +343,7 @@ impl RunLinks {
             published_ns: now.as_ns(),
             ..bytemuck::Zeroable::zeroed()
         };
-        let order = LinkOrder::new(condition, request);
+        let order = LinkChangeRequest::new(condition, request);
         output.publish(&envelope, bytemuck::bytes_of(&order))?;
         self.wait_for(direction, request)
     }

@@ -1,6 +1,7 @@
 //! What `hil-runtime link` does: finds the run, asks or orders, prints. The orders are [`super`]'s.
 
-use std::{path::PathBuf, time::Duration};
+use std::path::PathBuf;
+use std::time::Duration;
 
 use hil_link::condition::LinkCondition;
 use serde_json::{Value, json};

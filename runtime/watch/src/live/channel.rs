@@ -7,8 +7,9 @@ use serde::Serialize;
 
 use super::cli::{ChannelArgs, ChannelCommand};
 use super::observer::{ObserveError, Observer};
+use super::pace::Pace;
+use super::top::via;
 use super::{delay, echo, hz};
-use super::{pace::Pace, top::via};
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
 use hil_rundir::layout::PathFault;
@@ -92,9 +93,9 @@ pub(super) enum Scope {
 
 /// How many of an observer's problems the user was told.
 #[derive(Debug, Default)]
-pub(super) struct Told(usize);
+pub(super) struct ReportedProblems(usize);
 
-impl Told {
+impl ReportedProblems {
     /// Tells those that are new.
     pub(super) fn tell(&mut self, observer: &Observer, console: &mut Console) {
         let problems = observer.problems();

@@ -2,7 +2,9 @@
 //! the orders that were given to them while it goes. Only gateways of this host tell of orders here.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::{io, path::Path, time::Duration};
+use std::io;
+use std::path::Path;
+use std::time::Duration;
 
 use hil_core::time::duration_ns;
 use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome, order_channel};
@@ -138,12 +140,12 @@ fn longest_delay(orders: &[LinkConditionRecord], now_ns: i64) -> Duration {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_link::condition::LinkOrder;
+    use hil_link::condition::LinkChangeRequest;
 
     const MS: i64 = 1_000_000;
 
     fn record(number: u64, from_ns: i64, condition: LinkCondition) -> LinkConditionRecord {
-        let order = LinkOrder::new(condition, number);
+        let order = LinkChangeRequest::new(condition, number);
         LinkConditionRecord {
             number,
             request: number,

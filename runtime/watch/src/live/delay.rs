@@ -11,8 +11,9 @@ use hil_stats::histogram::{Distribution, LatencySummary};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::channel::{ChannelError, End, Scope, Told};
-use super::{cli::WindowArgs, observer::Observer};
+use super::channel::{ChannelError, End, ReportedProblems, Scope};
+use super::cli::WindowArgs;
+use super::observer::Observer;
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
 use hil_platform::text::grouped;
@@ -31,12 +32,12 @@ pub(super) fn run(
     console: &mut Console,
 ) -> Result<End, ChannelError> {
     let name = observer.channel(&args.which.channel)?.name.clone();
-    let mut told = Told::default();
-    told.tell(&observer, console);
+    let mut reported = ReportedProblems::default();
+    reported.tell(&observer, console);
     observer.settle(signals);
     loop {
         let is_whole = observer.poll_for(args.window, signals);
-        told.tell(&observer, console);
+        reported.tell(&observer, console);
         let is_last = !is_whole || observer.is_over();
         if is_whole {
             let account = observer.account(&name, args.window);
@@ -108,7 +109,7 @@ fn clock(observer: &Observer, channel: &str) -> Clock {
         return one;
     }
     let map = observer.clock_map(&from, &to);
-    let figures = map.as_ref().map(ClockMap::figures);
+    let figures = map.as_ref().map(ClockMap::metrics);
     Clock {
         relation: if figures.is_some() {
             ClockRelation::Exchanges
@@ -129,7 +130,7 @@ fn answer(
     is_json: bool,
 ) -> Result<String, ChannelError> {
     if is_json {
-        let figures = account.map(|account| figures(account, clock));
+        let figures = account.map(|account| metrics(account, clock));
         let all = json!({
             "channel": channel,
             "of": of,
@@ -148,7 +149,7 @@ fn answer(
     Ok(text(&format!("{channel}, {of}"), account, clock))
 }
 
-fn figures(account: &ChannelAccount, clock: &Clock) -> Value {
+fn metrics(account: &ChannelAccount, clock: &Clock) -> Value {
     let each = account.segments.iter();
     let segments: Vec<Value> = each
         .map(|segment| {

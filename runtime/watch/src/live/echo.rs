@@ -1,12 +1,14 @@
 //! `channel echo`: the messages of a channel as their run's manifest lays them out, or as bytes.
 
-use std::{thread, time::Duration};
+use std::thread;
+use std::time::Duration;
 
 use hil_core::message::Envelope;
 use serde::Serialize;
 
 use super::channel::{ChannelError, End};
-use super::{cli::EchoArgs, observer::Observer};
+use super::cli::EchoArgs;
+use super::observer::Observer;
 use crate::{PassiveReader, RecordFollower};
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;

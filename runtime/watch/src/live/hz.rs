@@ -2,9 +2,10 @@
 
 use serde::Serialize;
 
-use super::channel::{ChannelError, End, Scope, Told};
-use super::pace::{Pace, PaceFigures};
-use super::{cli::WindowArgs, observer::Observer};
+use super::channel::{ChannelError, End, ReportedProblems, Scope};
+use super::cli::WindowArgs;
+use super::observer::Observer;
+use super::pace::{Pace, PaceMetrics};
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
 use hil_platform::words::counted;
@@ -20,7 +21,7 @@ struct Answer<'a> {
     of: Scope,
     window_s: f64,
     #[serde(flatten)]
-    figures: &'a PaceFigures,
+    figures: &'a PaceMetrics,
 }
 
 pub(super) fn run(
@@ -37,10 +38,10 @@ pub(super) fn run(
         _ => "publication",
     };
     observer.count_unrecorded(&name);
-    let mut told = Told::default();
-    told.tell(&observer, console);
+    let mut reported = ReportedProblems::default();
+    reported.tell(&observer, console);
     let mut pace = Pace::default();
-    let answer = |console: &mut Console, of, figures: &PaceFigures| {
+    let answer = |console: &mut Console, of, figures: &PaceMetrics| {
         let answer = Answer {
             channel: &name,
             seen_at,
@@ -58,7 +59,7 @@ pub(super) fn run(
     };
     loop {
         let is_whole = observer.poll_for(args.window, signals);
-        told.tell(&observer, console);
+        reported.tell(&observer, console);
         let arrivals = observer.take_arrivals(&name);
         for arrival in &arrivals {
             pace.take(arrival);
@@ -93,7 +94,7 @@ pub(super) fn run(
 }
 
 /// The figures on one line.
-fn words(channel: &str, figures: &PaceFigures) -> String {
+fn words(channel: &str, figures: &PaceMetrics) -> String {
     let count = counted(figures.message_count, "message");
     let mut parts = vec![channel.to_owned(), count];
     if let (Some(rate_hz), Some(gap)) = (figures.rate_hz, &figures.gap) {
@@ -126,14 +127,14 @@ fn rounded(ns: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::live::pace::GapFigures;
+    use crate::live::pace::GapMetrics;
 
     #[test]
     fn a_line_says_what_is_known_and_no_more() {
-        let mut figures = PaceFigures {
+        let mut figures = PaceMetrics {
             message_count: 1_250,
             rate_hz: Some(250.0),
-            gap: Some(GapFigures {
+            gap: Some(GapMetrics {
                 min_ns: 3_900_000,
                 mean_ns: 4e6,
                 p99_ns: 4_100_000,

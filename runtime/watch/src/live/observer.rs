@@ -1,8 +1,9 @@
 //! One running run as the commands of a terminal need it: its topology, the newest records of each
 //! channel, and how the clocks of its hosts stand to each other. It draws nothing.
 
+use std::collections::BTreeMap;
+use std::thread;
 use std::time::{Duration, Instant as WallInstant};
-use std::{collections::BTreeMap, thread};
 
 use hil_account::{AccountContext, ChannelAccount, ChannelPath, FLIGHT_TIME_MAX, RunSpan};
 use hil_clock::{ClockMap, ClockSettings, Exchange, Requester};
@@ -12,7 +13,8 @@ use hil_core::time::{Alignment, Instant, duration_ns};
 use hil_link::condition::{LinkCondition, LinkConditionRecord};
 use hil_link::spec::Way;
 
-use super::{conditions::LinkConditions, tail::ChannelTail};
+use super::conditions::LinkConditions;
+use super::tail::ChannelTail;
 use crate::{PassiveReader, RecordFollower};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::signals::Signals;
@@ -466,7 +468,7 @@ impl Observer {
     pub(crate) fn clock_map(&self, from: &str, to: &str) -> Option<ClockMap> {
         let exchanges = self.exchanges(from, to);
         let map = ClockMap::new(&exchanges, ClockSettings::default());
-        map.figures().offset.is_some().then_some(map)
+        map.metrics().offset.is_some().then_some(map)
     }
 
     /// What figures between the two hosts rest on while the run goes on, in the words of a report. What

@@ -39,13 +39,13 @@ struct Counted {
 
 /// Figures of a window or of all time; what needs two messages is `None` before.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct PaceFigures {
+pub(crate) struct PaceMetrics {
     /// Messages that came.
     pub(crate) message_count: u64,
     /// Messages per second: one over the mean gap.
     pub(crate) rate_hz: Option<f64>,
     /// Times between successive messages.
-    pub(crate) gap: Option<GapFigures>,
+    pub(crate) gap: Option<GapMetrics>,
     /// Numbers below the highest that did not come.
     pub(crate) missed_count: u64,
     /// Messages that came after one with a higher number.
@@ -57,7 +57,7 @@ pub(crate) struct PaceFigures {
 /// Times between successive messages, nanoseconds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[allow(clippy::struct_field_names, reason = "the unit belongs to the name")]
-pub(crate) struct GapFigures {
+pub(crate) struct GapMetrics {
     /// Smallest.
     pub(crate) min_ns: i64,
     /// Arithmetic mean.
@@ -93,17 +93,17 @@ impl Pace {
     }
 
     /// The figures since the last call, or since the first message.
-    pub(crate) fn turn(&mut self) -> PaceFigures {
+    pub(crate) fn turn(&mut self) -> PaceMetrics {
         let now = self.counted();
-        let figures = self.window.figures(now.since(self.before));
+        let figures = self.window.metrics(now.since(self.before));
         self.window = Gaps::default();
         self.before = now;
         figures
     }
 
     /// The figures of all time.
-    pub(crate) fn total(&self) -> PaceFigures {
-        self.total.figures(self.counted())
+    pub(crate) fn total(&self) -> PaceMetrics {
+        self.total.metrics(self.counted())
     }
 
     fn counted(&self) -> Counted {
@@ -137,12 +137,12 @@ impl Gaps {
         }
     }
 
-    fn figures(&self, counted: Counted) -> PaceFigures {
+    fn metrics(&self, counted: Counted) -> PaceMetrics {
         let summary = self.histogram.summary();
         let count = self.histogram.count() as f64;
         let gap = summary.map(|summary| {
             let mean_ns = self.sum_ns / count;
-            GapFigures {
+            GapMetrics {
                 min_ns: summary.min_ns,
                 mean_ns,
                 p99_ns: summary.p99_ns,
@@ -151,7 +151,7 @@ impl Gaps {
             }
         });
         let mean_ns = gap.as_ref().map(|gap| gap.mean_ns);
-        PaceFigures {
+        PaceMetrics {
             message_count: self.message_count,
             rate_hz: mean_ns.filter(|mean| *mean > 0.0).map(|mean| 1e9 / mean),
             gap,

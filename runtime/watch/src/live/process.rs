@@ -1,7 +1,8 @@
 //! What the kernel says of a running process: processor time, processors it may use, how it is
 //! scheduled. It reads `/proc` and changes nothing.
 
-use std::{collections::BTreeSet, fs};
+use std::collections::BTreeSet;
+use std::fs;
 
 /// One look at a process.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]

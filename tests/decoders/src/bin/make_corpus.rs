@@ -5,8 +5,7 @@
 //! cargo run --package hil-decoders --bin make_corpus
 //! ```
 
-use std::fs;
-use std::io;
+use std::{fs, io};
 
 use hil_decoders::TARGETS;
 

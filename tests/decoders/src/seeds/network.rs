@@ -2,14 +2,14 @@
 
 use std::time::Duration;
 
-use hil_arm::egm::face::{
-    Axes, RobotFace, RobotFaceSettings, RobotWare, SendPolicy, SensorFace, SensorFaceSettings,
+use hil_arm::egm::adapter::{
+    Axes, RobotAdapter, RobotAdapterSettings, RobotWare, SendPolicy, SensorAdapter,
+    SensorAdapterSettings,
 };
 use hil_arm::egm::messages::{EgmCommand, Side};
 use hil_arm::yumi::arm::RIGHT_START_RAD;
-use hil_capture::writer;
 use hil_capture::writer::PacketToWrite;
-use hil_capture::{CaptureInterface, esl};
+use hil_capture::{CaptureInterface, esl, writer};
 use hil_core::message::Envelope;
 use hil_core::time::Instant;
 use hil_net::{Direction, link_type};
@@ -304,14 +304,14 @@ fn egm_messages() -> Vec<Vec<u8>> {
     let mut made = Vec::new();
     let axes = [Axes::Six, Axes::Seven];
     for (axes, robotware) in axes.into_iter().zip([RobotWare::Six, RobotWare::Seven]) {
-        let mut robot = RobotFace::new(RobotFaceSettings {
+        let mut robot = RobotAdapter::new(RobotAdapterSettings {
             side: Side::Right,
             axes,
             robotware,
             cycle: Duration::from_millis(4),
             planned_lead: Duration::from_millis(16),
         });
-        let mut sensor = SensorFace::new(SensorFaceSettings {
+        let mut sensor = SensorAdapter::new(SensorAdapterSettings {
             axes,
             held_rad: 0.0,
             policy: SendPolicy::Coupled {

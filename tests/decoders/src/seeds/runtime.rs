@@ -7,12 +7,12 @@ use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::layout::Field;
 use hil_core::message::Message;
 use hil_core::time::Instant;
-use hil_engine::supervisor::elsewhere::HostTicks;
 use hil_engine::supervisor::frame::{
     EndMeaning, PeerHello, PeerMessage, write_chunk, write_message,
 };
+use hil_engine::supervisor::peer_status::HostTicks;
 use hil_report::summary::{Fact, Outcome, RunFacts, RunSummary};
-use hil_rundir::event::{Event, EventKind, HostStory, Interruption, ProcessKind, ProcessStory};
+use hil_rundir::event::{Event, EventKind, HostHistory, Interruption, ProcessHistory, ProcessKind};
 use hil_rundir::manifest::describe_fields;
 use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
@@ -89,7 +89,7 @@ pub(crate) fn record_files() -> Vec<Seed> {
 
 pub(crate) fn peer_frames() -> Vec<Seed> {
     let at = Instant::from_ns;
-    let story = HostStory {
+    let story = HostHistory {
         hosts: vec!["robot-pc".to_owned()],
         span: (at(5), at(9)),
         events: vec![Event {
@@ -105,7 +105,7 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
             }),
         }],
         discipline: None,
-        processes: vec![ProcessStory {
+        processes: vec![ProcessHistory {
             name: "robot".to_owned(),
             host: "robot-pc".to_owned(),
             kind: ProcessKind::Component,

@@ -78,7 +78,7 @@ impl Controller {
     ///
     /// `CommTimeout` counts from the last command that could have moved the arm: one that was
     /// queued, or found the queue full. A refused one does not postpone it, as it does not where a
-    /// face refuses it before it comes here.
+    /// adapter refuses it before it comes here.
     pub(super) fn settle_arrivals(&mut self, tell: &mut dyn FnMut(EgmEvent)) {
         let is_running = self.session.phase == Phase::Running;
         while let Some((arrived_at, fate)) = self.inbox.settle(self.at, is_running) {

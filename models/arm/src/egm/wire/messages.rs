@@ -1,5 +1,5 @@
 //! The messages of the protocol, field for field, and the body both directions share. Layout only:
-//! whether a message makes sense is judged by [`crate::egm::face`].
+//! whether a message makes sense is judged by [`crate::egm::adapter`].
 //!
 //! proto2, package `abb.egm`. Message names are the maker's; field names are its names in snake
 //! case. Angles are in degrees, lengths in millimetres, and stay so here.

@@ -1,5 +1,5 @@
 //! The maker's datagrams: messages of externally guided motion, encoded and decoded. A library by
-//! itself: it opens no socket, knows no session and judges no value; [`crate::egm::face`] does.
+//! itself: it opens no socket, knows no session and judges no value; [`crate::egm::adapter`] does.
 //!
 //! 1. [`messages`] and [`robot`]: every message of the protocol, for `RobotWare` 6 and 7.
 //! 2. [`WireJoints`]: which joint is where.
@@ -11,7 +11,7 @@
 //! came packed (they go out unpacked, as the maker's own definition has it).
 //!
 //! **Allocation.** A message owns one `Vec` per list of joints, so decoding allocates unless the
-//! caller gives a message to decode into, as the faces do. A refused datagram allocates its error.
+//! caller gives a message to decode into, as the adapters do. A refused datagram allocates its error.
 //!
 //! Decoding a robot's datagram and answering it:
 //!

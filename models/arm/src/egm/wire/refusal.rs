@@ -1,5 +1,5 @@
 //! Why a datagram, or a command to be sent, is not taken: the causes and their counts. It decides
-//! nothing: the faces do.
+//! nothing: the adapters do.
 
 use serde::{Deserialize, Serialize};
 

@@ -267,7 +267,7 @@ fn two_clocks_withdraw_error_and_lag_but_not_the_loops() {
     let bound_ns = 15_000;
     let source_of = |channel: &str| Some(channel.to_owned());
     let stamp = |at_ns, bound_ns| {
-        Some(hil_core::run_log::BroughtStamp {
+        Some(hil_core::run_log::ConvertedStamp {
             at_ns,
             bound_ns,
             is_early: false,

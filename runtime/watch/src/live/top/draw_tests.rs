@@ -7,7 +7,7 @@ use ratatui::backend::TestBackend;
 
 use super::*;
 use crate::live::top::view::{
-    ClockRow, ElsewhereRow, LinkRow, LinkState, RunState, RunView, SegmentRow,
+    ClockRow, LinkRow, LinkState, PeerStatusRow, RunState, RunView, SegmentRow,
 };
 use hil_rundir::event::ProcessKind;
 use hil_rundir::status::{HostHearing, ProcessState};
@@ -33,9 +33,9 @@ fn process(name: &str, state: ProcessState, restart_count: u32) -> ProcessRow {
     }
 }
 
-fn heard(host: &str, silent_s: Option<f64>, overruns: &[(&str, u64)]) -> ElsewhereRow {
+fn heard(host: &str, silent_s: Option<f64>, overruns: &[(&str, u64)]) -> PeerStatusRow {
     let overruns = overruns.iter();
-    ElsewhereRow {
+    PeerStatusRow {
         hearing: HostHearing {
             host: host.to_owned(),
             is_heard: silent_s.is_some_and(|silent_s| silent_s < 3.0),
@@ -48,7 +48,7 @@ fn heard(host: &str, silent_s: Option<f64>, overruns: &[(&str, u64)]) -> Elsewhe
     }
 }
 
-fn elsewhere_rows() -> Vec<ElsewhereRow> {
+fn peer_status_rows() -> Vec<PeerStatusRow> {
     vec![
         heard("robot-pc", Some(0.4), &[]),
         heard("camera-pc", Some(0.4), &[("tracker", 12), ("writer", 3)]),
@@ -80,7 +80,7 @@ fn view() -> View {
                 0,
             ),
         ],
-        elsewhere: elsewhere_rows(),
+        elsewhere: peer_status_rows(),
         channels: vec![
             ChannelRow {
                 name: "egm/right/command".to_owned(),

@@ -1,7 +1,9 @@
 //! A [`View`] of a run, from what its processes recorded in the last window, from what its
 //! supervisor says of them and from what the kernel does.
 
-use std::{collections::BTreeMap, io, time::Duration};
+use std::collections::BTreeMap;
+use std::io;
+use std::time::Duration;
 
 use hil_account::{ChannelAccount, MessageFate};
 use hil_clock::ClockMap;
@@ -12,10 +14,12 @@ use hil_stats::histogram::Distribution;
 
 use super::draw::HISTORY_COLUMNS;
 use super::view::{
-    ChannelRow, ClockRow, ElsewhereRow, LinkRow, LinkState, ProcessRow, Quantiles, RunState,
+    ChannelRow, ClockRow, LinkRow, LinkState, PeerStatusRow, ProcessRow, Quantiles, RunState,
     RunView, SegmentRow, View,
 };
-use crate::{live::observer::Observer, live::pace::Pace, live::process};
+use crate::live::observer::Observer;
+use crate::live::pace::Pace;
+use crate::live::process;
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::status::{self, Phase, ProcessStatus, RunStatus};
 use hil_topology::{Channel, Direction, Link, Topology};
@@ -138,7 +142,7 @@ impl Gatherer {
 }
 
 /// The other hosts; once the run is being ended, as they were heard before.
-fn elsewhere(status: &RunStatus) -> Vec<ElsewhereRow> {
+fn elsewhere(status: &RunStatus) -> Vec<PeerStatusRow> {
     let now = match status.phase {
         Phase::Ending => Instant::from_ns(status.written_ns),
         Phase::Starting | Phase::Running => MonotonicClock::now(),
@@ -149,7 +153,7 @@ fn elsewhere(status: &RunStatus) -> Vec<ElsewhereRow> {
             let count = one.skipped_tick_count.filter(|count| *count > 0)?;
             Some((one.name.clone(), count))
         });
-        ElsewhereRow {
+        PeerStatusRow {
             hearing: status::hearing(&host.name, host.heard_ns, now, host.left_out_count),
             overruns: skipped.collect(),
         }
@@ -410,7 +414,7 @@ fn clock_row(observer: &Observer, from: String, to: String) -> ClockRow {
         };
     }
     let map = observer.clock_map(&from, &to);
-    let figures = map.as_ref().map(ClockMap::figures);
+    let figures = map.as_ref().map(ClockMap::metrics);
     ClockRow {
         rung,
         exchange_count: figures.map(|figures| figures.exchange_count),

@@ -7,8 +7,10 @@ use std::time::{Duration, Instant as WallInstant};
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
+use super::TopEnd;
 use super::draw::{Detail, Frame, draw};
-use super::{TopEnd, gather::Gatherer, view::View};
+use super::gather::Gatherer;
+use super::view::View;
 use crate::live::observer::{Observer, POLL_PERIOD};
 use hil_platform::signals::Signals;
 

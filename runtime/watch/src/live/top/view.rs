@@ -1,7 +1,9 @@
 //! What `top` shows: plain figures of one look, ready to be drawn or printed as JSON. What is not
 //! known is `None`. Nothing here gathers or draws.
 
-use std::{collections::BTreeMap, fmt, path::PathBuf};
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::PathBuf;
 
 use serde::Serialize;
 
@@ -16,7 +18,7 @@ pub(crate) struct View {
     /// What runs on this host.
     pub(crate) processes: Vec<ProcessRow>,
     /// The other hosts of the run.
-    pub(crate) elsewhere: Vec<ElsewhereRow>,
+    pub(crate) elsewhere: Vec<PeerStatusRow>,
     /// The channels with an end on this host, and those that are only recorded here.
     pub(crate) channels: Vec<ChannelRow>,
     /// What carries them.
@@ -116,7 +118,7 @@ pub(crate) struct ProcessRow {
 
 /// Another host, as far as it is heard here.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct ElsewhereRow {
+pub(crate) struct PeerStatusRow {
     /// How well it is heard.
     #[serde(flatten)]
     pub(crate) hearing: HostHearing,

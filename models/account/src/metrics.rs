@@ -1,0 +1,285 @@
+//! What an account says: plain figures, ready to be written and read back. Nothing here
+//! computes an account.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::stage::{MessageFate, Stage};
+use hil_stats::bounds::BoundMetrics;
+use hil_stats::histogram::{Distribution, DurationBin};
+use hil_stats::statistics::{CONFIDENCE, Interval, IntervalNs, wilson};
+
+/// The latency account of one channel.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ChannelAccount {
+    /// Messages the producer published: every sequence number up to the highest seen, of each
+    /// of its starts.
+    pub published_count: u64,
+    /// Those without a record of the producer's; `None` when its records are not at hand.
+    pub published_unrecorded_count: Option<u64>,
+    /// Starts of the producer after the first: restarts, not losses.
+    pub producer_restart_count: u64,
+    /// What became of each message; the sum is [`ChannelAccount::published_count`].
+    pub fates: FateCounts,
+    /// Received after a message with a higher sequence number; `None` without the receiving
+    /// gateway's records or on a direct channel.
+    pub reordered_count: Option<u64>,
+    /// Datagrams received again.
+    pub duplicated_count: Option<u64>,
+    /// Messages older than the sequence window.
+    pub late_count: Option<u64>,
+    /// The way of a message in order: first each pair of neighbouring stages, available or not,
+    /// then pairs that some message had to combine because a stage between was missing.
+    pub segments: Vec<SegmentMetrics>,
+    /// Card to card, beside the chain because a card's clock is its own.
+    pub hardware_wire: Option<Distribution>,
+    /// Published to taken, as the consumer's own record has it.
+    pub end_to_end: EndToEnd,
+    /// Whether the segments of each message add up.
+    pub closing: Closing,
+    /// Share of messages with each kernel stamp.
+    pub coverage: StampCoverage,
+    /// Round trips of the gateways' clock exchange, separate from the chain.
+    pub round_trip: Distribution,
+    /// How many losses came in a row.
+    pub loss_bursts: Vec<BurstCount>,
+    /// Silence at the consumer.
+    pub gaps: Gaps,
+    /// What each interruption cost this channel.
+    pub interruptions: Vec<InterruptionMetrics>,
+}
+
+/// Messages by fate.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct FateCounts {
+    counts: BTreeMap<MessageFate, u64>,
+}
+
+impl FateCounts {
+    /// Messages with this fate.
+    pub fn of(&self, fate: MessageFate) -> u64 {
+        self.counts.get(&fate).copied().unwrap_or(0)
+    }
+
+    /// All messages.
+    pub fn total(&self) -> u64 {
+        let counts = self.counts.values();
+        counts.fold(0, |sum, count| sum.saturating_add(*count))
+    }
+
+    /// Messages that vanished; see [`MessageFate::is_loss`].
+    pub fn lost_count(&self) -> u64 {
+        let losses = self.iter().filter(|(fate, _)| fate.is_loss());
+        losses.fold(0, |sum, (_, count)| sum.saturating_add(count))
+    }
+
+    /// The fates that occurred, in the order of a message's way.
+    pub fn iter(&self) -> impl Iterator<Item = (MessageFate, u64)> + '_ {
+        self.counts.iter().map(|(fate, count)| (*fate, *count))
+    }
+
+    /// Counts `count` messages of one fate.
+    pub fn add(&mut self, fate: MessageFate, count: u64) {
+        let entry = self.counts.entry(fate).or_insert(0);
+        *entry = entry.saturating_add(count);
+    }
+}
+
+/// The durations between two stages.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SegmentMetrics {
+    /// Where it starts.
+    pub from: Stage,
+    /// Where it ends.
+    pub to: Stage,
+    /// True when a stage between the two was missing for the messages counted here.
+    pub is_combined: bool,
+    /// Its durations.
+    pub distribution: Distribution,
+    /// The same durations as a histogram; empty where none was measured.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub bins: Vec<DurationBin>,
+    /// How far its durations may be off because it ends on another host's clock than it began on;
+    /// `None` within one host.
+    #[serde(default)]
+    pub bound: Option<BoundMetrics>,
+}
+
+impl SegmentMetrics {
+    /// Both ends in words.
+    pub fn name(&self) -> String {
+        format!("{} → {}", self.from, self.to)
+    }
+}
+
+/// Published to taken.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EndToEnd {
+    /// The durations, on the consumer's clock.
+    pub distribution: Distribution,
+    /// The same durations as a histogram; empty where none was measured.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub bins: Vec<DurationBin>,
+    /// 95 % interval of the median by block bootstrap; `None` below 100 messages.
+    pub p50_interval: Option<IntervalNs>,
+    /// 95 % interval of the 99th percentile by block bootstrap.
+    pub p99_interval: Option<IntervalNs>,
+    /// Largest error from clock alignment, nanoseconds; 0 on one clock.
+    pub alignment_bound_ns: Option<u64>,
+    /// Errors from clock alignment over all messages; zero on one clock.
+    #[serde(default)]
+    pub bound: Option<BoundMetrics>,
+}
+
+/// Whether published-to-taken equals the sum of the segments, message by message.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "state", rename_all = "snake_case")]
+pub enum Closing {
+    /// Checked on every taken message.
+    Checked(ClosingMetrics),
+    /// Not checkable.
+    Unavailable {
+        /// Why, in words for a report.
+        reason: String,
+    },
+}
+
+impl Closing {
+    /// The figures, if it was checked.
+    pub const fn checked(&self) -> Option<&ClosingMetrics> {
+        match self {
+            Self::Checked(figures) => Some(figures),
+            Self::Unavailable { .. } => None,
+        }
+    }
+}
+
+/// The outcome of the closing check.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ClosingMetrics {
+    /// Messages checked: all that were taken.
+    pub checked_count: u64,
+    /// Messages whose stages are complete and in order and whose residual is within the limit.
+    pub closed_count: u64,
+    /// Closed messages with a combined segment: a kernel stamp was missing, so the two clocks
+    /// of a host were not tested against each other.
+    pub closed_combined_count: u64,
+    /// Not closed because a process left no record of a stage it must have passed.
+    pub missing_stage_count: u64,
+    /// Not closed because a stage lies before its predecessor by more than the tolerance.
+    pub negative_segment_count: u64,
+    /// Not closed because of the residual alone.
+    pub residual_count: u64,
+    /// Not checked because a clock was stepped about when the message was published.
+    #[serde(default)]
+    pub unaligned_count: u64,
+    /// True when stamps of one host were converted to the other's clock first: then an error of
+    /// either host's real-time offset cancels out, and the check proves that much less.
+    #[serde(default)]
+    pub is_converted: bool,
+    /// Largest residual that closes, nanoseconds.
+    pub residual_limit_ns: i64,
+    /// End-to-end minus sum of segments, magnitude.
+    pub residual: Distribution,
+}
+
+impl ClosingMetrics {
+    /// Share of checked messages that closed, with its 95 % Wilson interval.
+    pub fn closed_ratio(&self) -> Option<(f64, Interval)> {
+        let interval = wilson(self.closed_count, self.checked_count, CONFIDENCE)?;
+        Some((
+            self.closed_count as f64 / self.checked_count as f64,
+            interval,
+        ))
+    }
+}
+
+/// How many messages carried each stamp.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct StampCoverage {
+    /// Kernel transmit stamps, of the messages handed to the kernel. On a host without the
+    /// sender's records: of the messages received, by follow-up.
+    pub tx_software: Option<Coverage>,
+    /// Card transmit stamps.
+    pub tx_hardware: Option<Coverage>,
+    /// Kernel receive stamps, of the messages received.
+    pub rx_software: Option<Coverage>,
+    /// Card receive stamps.
+    pub rx_hardware: Option<Coverage>,
+}
+
+/// Stamped messages among those that could have been.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Coverage {
+    /// With a stamp.
+    pub stamped_count: u64,
+    /// With or without.
+    pub eligible_count: u64,
+}
+
+impl Coverage {
+    /// Share in 0..=1; `None` when there was nothing to stamp.
+    pub fn ratio(&self) -> Option<f64> {
+        let stamped = self.stamped_count as f64;
+        (self.eligible_count > 0).then(|| stamped / self.eligible_count as f64)
+    }
+
+    pub(super) fn count(&mut self, is_stamped: bool) {
+        self.eligible_count += 1;
+        self.stamped_count += u64::from(is_stamped);
+    }
+}
+
+/// So many runs of exactly so many successive losses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BurstCount {
+    /// Losses in a row.
+    pub length_messages: u64,
+    /// How often.
+    pub count: u64,
+}
+
+/// The time between successive messages at the consumer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Gaps {
+    /// All of them.
+    pub between_taken: Distribution,
+    /// The longest; `None` below two taken messages.
+    pub longest: Option<Gap>,
+    /// The longest that overlaps no interruption.
+    pub longest_unattributed: Option<Gap>,
+    /// From the last taken message to the end of the run, nanoseconds; `None` when either is
+    /// unknown.
+    pub last_taken_to_run_end_ns: Option<i64>,
+}
+
+/// One silence at the consumer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Gap {
+    /// Start, nanoseconds after the start of the run, or on the consumer's clock when that is
+    /// unknown.
+    pub start_ns: i64,
+    /// Length, nanoseconds.
+    pub length_ns: i64,
+    /// Sequence number of the last message before.
+    pub after_sequence: u64,
+    /// Index of the interruption it overlaps, if any.
+    pub interruption_index: Option<usize>,
+}
+
+/// What one interruption cost.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct InterruptionMetrics {
+    /// The process that was down.
+    pub process: String,
+    /// Why, e.g. `killed by signal 9`.
+    pub cause: String,
+    /// Length, nanoseconds.
+    pub length_ns: i64,
+    /// Messages lost to it.
+    pub lost_count: u64,
+    /// The longest silence at the consumer that overlaps it.
+    pub gap: Option<Gap>,
+}

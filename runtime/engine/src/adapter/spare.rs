@@ -1,0 +1,95 @@
+//! Takes the messages that the foreign protocol has no place for, such as requests to the motion
+//! server or an arm the topology gives no address: recorded as taken, counted and dropped, so that
+//! their channels' accounts close. It is not measured and has a thread of normal priority.
+
+use hil_core::message::Envelope;
+use hil_core::record::TakenRecord;
+
+use crate::process::recording::forwarded_ns;
+use crate::process::worker::{JobWork, WorkerError};
+use hil_platform::clock::MonotonicClock;
+use hil_platform::wait::WAIT_MAX;
+use hil_rundir::pipe::{Orders, ProcessReport};
+use hil_rundir::record::{RecordKind, RecordSink, Recorder};
+use hil_shm::{Domain, RawInput, Waiter};
+use hil_topology::NicChannel;
+
+/// Records a ring holds.
+const RING_RECORDS: usize = 16_384;
+
+/// The channels nobody speaks for.
+#[derive(Debug)]
+pub(super) struct Spare {
+    channels: Vec<(NicChannel, RecordSink)>,
+}
+
+impl Spare {
+    /// Opens the record files of `channels`.
+    ///
+    /// # Errors
+    /// When a file cannot be made.
+    pub(super) fn open(
+        channels: &[NicChannel],
+        recorder: &mut Recorder,
+    ) -> Result<Self, WorkerError> {
+        let mut opened = Vec::new();
+        for channel in channels {
+            let size = size_of::<TakenRecord>();
+            let sink = recorder.sink(RecordKind::Taken, &channel.name, size, RING_RECORDS)?;
+            opened.push((channel.clone(), sink));
+        }
+        Ok(Self { channels: opened })
+    }
+
+    /// Joins the channels.
+    ///
+    /// # Errors
+    /// When a channel does not appear.
+    pub(super) fn connect(self, domain: &Domain) -> Result<JoinedSpare, WorkerError> {
+        let names = self.channels.iter().map(|(one, _)| one.name.as_str());
+        let waiter = Waiter::open(domain, &names.collect::<Vec<_>>())?;
+        let mut channels = Vec::new();
+        for (channel, sink) in self.channels {
+            let input = RawInput::open(domain, &channel.name, channel.depth)?;
+            channels.push((input, sink));
+        }
+        Ok(JoinedSpare { channels, waiter })
+    }
+}
+
+/// The channels nobody speaks for, joined.
+pub(super) struct JoinedSpare {
+    channels: Vec<(RawInput, RecordSink)>,
+    waiter: Waiter,
+}
+
+impl JobWork for JoinedSpare {
+    fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
+        loop {
+            let is_last = orders.is_stopping();
+            for (input, sink) in &mut self.channels {
+                while input.receive(&mut |envelope, _| sink.push(&taken(envelope)))? {}
+            }
+            if is_last {
+                return Ok(());
+            }
+            self.waiter.wait(WAIT_MAX)?;
+        }
+    }
+
+    /// What it took is in its records.
+    fn report(&mut self) -> ProcessReport {
+        ProcessReport::default()
+    }
+}
+
+fn taken(envelope: &Envelope) -> TakenRecord {
+    TakenRecord {
+        sequence: envelope.sequence,
+        published_ns: envelope.published_ns,
+        forwarded_ns: forwarded_ns(envelope),
+        taken_ns: MonotonicClock::now().as_ns(),
+        epoch: envelope.epoch,
+        reserved: 0,
+    }
+}

@@ -1,0 +1,478 @@
+//! The processes of this supervisor as a whole: started in order, watched, restarted or given up
+//! by policy, stopped in order. Each single one is a [`Child`].
+
+use std::collections::BTreeMap;
+use std::os::unix::process::ExitStatusExt;
+use std::path::PathBuf;
+use std::process::{Command, ExitStatus};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::time::Duration;
+use std::{env, io};
+
+use hil_core::time::{Instant, duration_ns};
+
+use super::child::{Child, Word, describe_exit, last_line};
+use super::plan::{ProcessPlan, ProcessTask};
+use crate::process::own_program;
+use hil_platform::clock::MonotonicClock;
+use hil_rundir::event::{Event, EventKind, Interruption};
+use hil_rundir::launch::{ComponentWork, LaunchError, Work, WorkerLaunch, write};
+use hil_rundir::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
+use hil_rundir::run_folder::RunFolder;
+use hil_rundir::run_seal::RunSeal;
+use hil_topology::OnExit;
+
+/// Words that may wait for the supervisor.
+const WORDS_MAX: usize = 4096;
+/// Messages a dead process may have held in its queues were published at most this long before
+/// it was last seen alive.
+const QUEUE_SPAN: Duration = Duration::from_millis(50);
+
+/// The last words of a process that has ended are in its pipe; reading them takes no longer.
+const LAST_WORDS_PATIENCE: Duration = Duration::from_secs(1);
+
+/// Why the processes could not be started.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ProcessGroupError {
+    #[error(transparent)]
+    Launch(#[from] LaunchError),
+    #[error("process {process}: cannot start {program}: {source}")]
+    Spawn {
+        process: String,
+        program: String,
+        source: io::Error,
+    },
+    #[error("cannot find this program's own file: {0}")]
+    OwnPath(io::Error),
+}
+
+/// What ended the run, if a process did.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// Everything goes on.
+    Running,
+    /// A process ended by itself without a fault.
+    Finished(String),
+    /// A process failed.
+    Failed(String),
+}
+
+/// One process with its history.
+#[derive(Debug)]
+pub(crate) struct ManagedProcess {
+    pub(crate) plan: ProcessPlan,
+    pub(crate) restart_count: u32,
+    pub(crate) report: Option<ProcessReport>,
+    pub(crate) end: Option<String>,
+    pub(crate) progress: Vec<ChannelProgress>,
+    /// Ticks of its timer that passed without it, as it last said.
+    pub(crate) skipped_tick_count: Option<u64>,
+    pub(super) child: Option<Child>,
+    pub(super) is_ready: bool,
+    /// When it last said that its loops turn, or was asked to begin.
+    pub(super) heard: Instant,
+    seen_alive: Instant,
+    complaint: Option<String>,
+}
+
+/// The processes of one supervisor.
+#[derive(Debug)]
+pub(crate) struct ProcessGroup {
+    members: Vec<ManagedProcess>,
+    places: BTreeMap<String, String>,
+    folder: RunFolder,
+    own_program: PathBuf,
+    /// The run's secret, for its gateways; `None` when its hops are plain.
+    seal: Option<RunSeal>,
+    sender: SyncSender<Word>,
+    words: Receiver<Word>,
+    /// When the run began.
+    pub(super) started: Option<Instant>,
+    events: Vec<Event>,
+}
+
+impl ProcessGroup {
+    /// A process group for `plans`; `places` gives the address of each host's shared memory. Starts nothing.
+    pub(crate) fn new(
+        plans: Vec<ProcessPlan>,
+        places: BTreeMap<String, String>,
+        folder: &RunFolder,
+        seal: Option<RunSeal>,
+    ) -> Result<Self, ProcessGroupError> {
+        let (sender, words) = sync_channel(WORDS_MAX);
+        let members = plans.into_iter().map(|plan| ManagedProcess {
+            plan,
+            restart_count: 0,
+            report: None,
+            end: None,
+            progress: Vec::new(),
+            skipped_tick_count: None,
+            child: None,
+            is_ready: false,
+            heard: Instant::ZERO,
+            seen_alive: Instant::ZERO,
+            complaint: None,
+        });
+        Ok(Self {
+            members: members.collect(),
+            places,
+            folder: folder.clone(),
+            seal,
+            own_program: env::current_exe().map_err(ProcessGroupError::OwnPath)?,
+            sender,
+            words,
+            started: None,
+            events: Vec::new(),
+        })
+    }
+
+    /// Starts every process; they wait for [`ProcessGroup::begin`].
+    pub(crate) fn start(&mut self) -> Result<(), ProcessGroupError> {
+        (0..self.members.len()).try_for_each(|index| self.spawn(index))
+    }
+
+    fn spawn(&mut self, index: usize) -> Result<(), ProcessGroupError> {
+        let member = &mut self.members[index];
+        let (name, instance) = (member.plan.name.clone(), member.restart_count);
+        let log = self.folder.log(&name);
+        let domain = self.places[&member.plan.host].clone();
+        let mut program = Command::new(&self.own_program);
+        let work = match &member.plan.task {
+            ProcessTask::Component {
+                card,
+                realtime,
+                wait,
+            } => {
+                let nic_path = self.folder.nic(&name);
+                write(&nic_path, card)?;
+                Some(Work::Component(ComponentWork {
+                    card: nic_path,
+                    realtime: realtime.clone(),
+                    wait: *wait,
+                }))
+            }
+            ProcessTask::Gateway(work) | ProcessTask::ClockPath(work) => {
+                Some(Work::Gateway(work.clone()))
+            }
+            ProcessTask::Adapter(adapter) => Some(Work::Adapter(adapter.clone())),
+            ProcessTask::Foreign {
+                card,
+                command,
+                environment,
+            } => {
+                let nic_path = self.folder.nic(&name);
+                write(&nic_path, card)?;
+                let supervisor = std::process::id().to_string();
+                program
+                    .args(["become", "--supervisor", &supervisor, "--"])
+                    .args(command)
+                    .envs(environment)
+                    .env("HIL_DOMAIN", &domain)
+                    .env("HIL_CARD", &nic_path);
+                None
+            }
+        };
+        // A user's own program says nothing: being started is all that is known of it.
+        member.is_ready = work.is_none();
+        let spawned = match work {
+            None => Child::spawn_foreign(program, &log),
+            Some(work) => {
+                let launch = WorkerLaunch {
+                    process: name.clone(),
+                    instance,
+                    domain,
+                    records: self.folder.records(),
+                    is_sealed: self.seal.is_some() && member.plan.is_gateway(),
+                    work,
+                };
+                let path = self.folder.launch(&name, instance);
+                write(&path, &launch)?;
+                program.arg("worker").arg("--launch").arg(&path);
+                Child::spawn_speaking(program, &log, index, instance, self.sender.clone())
+            }
+        };
+        let mut child = spawned.map_err(|source| ProcessGroupError::Spawn {
+            process: name,
+            program: match &member.plan.task {
+                ProcessTask::Foreign { command, .. } => command[0].clone(),
+                _ => self.own_program.display().to_string(),
+            },
+            source,
+        })?;
+        if let Some(seal) = self.seal.as_ref().filter(|_| member.plan.is_gateway()) {
+            child.order(&ToProcess::Seal(seal.clone()));
+        }
+        let now = MonotonicClock::now();
+        member.child = Some(child);
+        member.seen_alive = now;
+        if member.is_ready && self.started.is_some() {
+            self.close_interruptions(index, now);
+        }
+        Ok(())
+    }
+
+    /// True once every process is ready.
+    pub(crate) fn is_ready(&self) -> bool {
+        self.members.iter().all(|member| member.is_ready)
+    }
+
+    /// Names of the processes that are not ready yet.
+    pub(crate) fn missing(&self) -> String {
+        let missing = self.members.iter().filter(|member| !member.is_ready);
+        missing
+            .map(|member| member.plan.name.as_str())
+            .collect::<Vec<_>>()
+            .join(", ")
+    }
+
+    /// Lets every process begin.
+    pub(crate) fn begin(&mut self) {
+        let started = MonotonicClock::now();
+        self.started = Some(started);
+        let at_ns = started.as_ns();
+        for member in &mut self.members {
+            member.heard = started;
+            if let Some(child) = &mut member.child {
+                child.order(&ToProcess::Start { at_ns });
+            }
+        }
+    }
+
+    /// Hears what the processes said, sees who died, and applies the policies.
+    pub(crate) fn watch(&mut self) -> Verdict {
+        self.listen();
+        let now = MonotonicClock::now();
+        let mut verdict = Verdict::Running;
+        for index in 0..self.members.len() {
+            let member = &mut self.members[index];
+            let Some(child) = &mut member.child else {
+                continue;
+            };
+            let Some(status) = child.poll_exit() else {
+                member.seen_alive = now;
+                continue;
+            };
+            // Its last words decide what its end means; they come within moments.
+            if !child.has_said_all() {
+                continue;
+            }
+            member.child = None;
+            self.listen();
+            let judged = self.judge(index, status, now);
+            // A failure is not overridden by an orderly end seen in the same turn.
+            if !matches!(verdict, Verdict::Failed(_)) && judged != Verdict::Running {
+                verdict = judged;
+            }
+        }
+        verdict
+    }
+
+    /// What the end of a process means: it is started again, or the run ends.
+    fn judge(&mut self, index: usize, status: ExitStatus, now: Instant) -> Verdict {
+        let member = &mut self.members[index];
+        let mut what = describe_exit(status);
+        let log = self.folder.log(&member.plan.name);
+        if let Some(complaint) = &member.complaint {
+            what = format!("{what}: {complaint}");
+        } else if status.code().is_some_and(|code| code != 0)
+            && let Some(last) = last_line(&log)
+        {
+            what = format!("{what}, after it said \"{last}\"");
+        }
+        member.end = Some(what.clone());
+        let limit = match member.plan.on_exit {
+            OnExit::EndRun => 0,
+            OnExit::Restart { limit } => limit,
+        };
+        let name = member.plan.name.clone();
+        let is_orderly = status.success() && member.complaint.is_none();
+        let from = member.seen_alive.as_ns() - duration_ns(QUEUE_SPAN);
+        let interruption = Interruption {
+            from: Instant::from_ns(from),
+            until: None,
+        };
+        if self.started.is_some() && member.restart_count < limit && member.complaint.is_none() {
+            member.restart_count += 1;
+            let kind = EventKind::Restarted {
+                end: what,
+                restart: member.restart_count,
+                limit,
+            };
+            self.note(now, index, kind, Some(interruption));
+            return match self.spawn(index) {
+                Ok(()) => Verdict::Running,
+                Err(error) if self.members[index].plan.is_clock_path() => {
+                    self.go_on_without(now, index, error.to_string())
+                }
+                Err(error) => {
+                    let error = error.to_string();
+                    let kind = EventKind::StartFailed {
+                        error: error.clone(),
+                    };
+                    self.note(now, index, kind, None);
+                    Verdict::Failed(error)
+                }
+            };
+        }
+        if self.members[index].plan.is_clock_path() {
+            return self.go_on_without(now, index, what);
+        }
+        // What it had in its queues, or came for it until the end, is lost with it.
+        let interruption = Some(interruption).filter(|_| !is_orderly);
+        let text = format!("process {name} {what}");
+        self.note(now, index, EventKind::EndedRun { end: what }, interruption);
+        if is_orderly {
+            Verdict::Finished(text)
+        } else {
+            Verdict::Failed(text)
+        }
+    }
+
+    /// A clock path that is gone for good: nothing waits for it, and no message depends on it.
+    fn go_on_without(&mut self, now: Instant, index: usize, end: String) -> Verdict {
+        self.members[index].is_ready = true;
+        self.note(now, index, EventKind::GivenUp { end }, None);
+        Verdict::Running
+    }
+
+    fn listen(&mut self) {
+        while let Ok(Word {
+            index,
+            instance,
+            said,
+        }) = self.words.try_recv()
+        {
+            let now = MonotonicClock::now();
+            if self.members[index].restart_count != instance {
+                continue;
+            }
+            let member = &mut self.members[index];
+            match said {
+                FromProcess::Alive => member.heard = now,
+                FromProcess::Ready => {
+                    member.is_ready = true;
+                    member.heard = now;
+                    if let Some(started) = self.started
+                        && instance > 0
+                    {
+                        let at_ns = started.as_ns();
+                        if let Some(child) = &mut member.child {
+                            child.order(&ToProcess::Start { at_ns });
+                        }
+                        self.close_interruptions(index, now);
+                    }
+                }
+                FromProcess::Progress(progress) => member.progress = progress,
+                FromProcess::SkippedTicks(count) => member.skipped_tick_count = Some(count),
+                FromProcess::Warning(text) => {
+                    self.note(now, index, EventKind::Warning { text }, None);
+                }
+                FromProcess::Finished(report) => member.report = Some(*report),
+                FromProcess::Failed(text) => member.complaint = Some(text),
+            }
+        }
+    }
+
+    /// The process is back: whatever interruption of it is still open ends here.
+    fn close_interruptions(&mut self, index: usize, now: Instant) {
+        let name = &self.members[index].plan.name;
+        for event in self
+            .events
+            .iter_mut()
+            .filter(|event| event.process == *name)
+        {
+            if let Some(gap) = &mut event.interruption {
+                gap.until.get_or_insert(now);
+            }
+        }
+    }
+
+    pub(super) fn note(
+        &mut self,
+        at: Instant,
+        index: usize,
+        kind: EventKind,
+        interruption: Option<Interruption>,
+    ) {
+        let plan = &self.members[index].plan;
+        self.events.push(Event {
+            at,
+            host: plan.host.clone(),
+            process: plan.name.clone(),
+            kind,
+            interruption,
+        });
+    }
+
+    /// Stops the processes that `choose` picks and waits for them up to `patience`; who does not
+    /// end by then is killed, which is noted.
+    pub(crate) fn stop(&mut self, patience: Duration, choose: impl Fn(&ProcessPlan) -> bool) {
+        let chosen: Vec<usize> = (0..self.members.len())
+            .filter(|index| choose(&self.members[*index].plan))
+            .collect();
+        for index in &chosen {
+            let member = &mut self.members[*index];
+            if let Some(child) = &mut member.child {
+                child.order(&ToProcess::Stop);
+            }
+        }
+        let deadline = std::time::Instant::now() + patience;
+        for index in chosen {
+            let Some(mut child) = self.members[index].child.take() else {
+                continue;
+            };
+            let ended_by_itself = child.end(deadline);
+            let said_all_by = std::time::Instant::now() + LAST_WORDS_PATIENCE;
+            while !child.has_said_all() && std::time::Instant::now() < said_all_by {
+                self.listen();
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            let end = match child.poll_exit() {
+                // What a program of the user's does when it is told to stop.
+                Some(status) if status.signal() == Some(libc::SIGTERM) => "stopped".to_owned(),
+                Some(status) => describe_exit(status),
+                None => "ended".to_owned(),
+            };
+            if !ended_by_itself {
+                let patience_s = patience.as_secs();
+                let kind = EventKind::Killed { patience_s };
+                self.note(MonotonicClock::now(), index, kind, None);
+            }
+            self.members[index].end = Some(end);
+        }
+        self.listen();
+    }
+
+    /// Names of the processes.
+    pub(crate) fn names(&self) -> Vec<String> {
+        let members = self.members.iter();
+        members.map(|member| member.plan.name.clone()).collect()
+    }
+
+    /// The processes with their history.
+    pub(crate) fn members(&self) -> &[ManagedProcess] {
+        &self.members
+    }
+
+    /// What happened, in order.
+    pub(crate) fn events(&self) -> &[Event] {
+        &self.events
+    }
+}
+
+/// Looks for every user's own program before the run begins.
+///
+/// # Errors
+/// Names the process and the program that is not there.
+pub(crate) fn find_programs(plans: &[ProcessPlan]) -> Result<(), ProcessGroupError> {
+    for plan in plans {
+        if let ProcessTask::Foreign { command, .. } = &plan.task {
+            own_program::find(&command[0]).map_err(|source| ProcessGroupError::Spawn {
+                process: plan.name.clone(),
+                program: command[0].clone(),
+                source,
+            })?;
+        }
+    }
+    Ok(())
+}

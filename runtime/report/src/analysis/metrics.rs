@@ -1,0 +1,231 @@
+//! The parts of a summary: from what the supervisor and the processes said to what a report shows.
+//! It draws up no account itself.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use hil_account::account;
+use hil_core::record::IngressRecord;
+
+use super::axis::RunAxis;
+use super::records::RunRecords;
+use crate::emulation::EmulationMetrics;
+use crate::summary::{
+    Absence, ChannelSummary, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
+    ProcessSummary, RealtimeFacts, RunEvent, RunEventKind, RunFacts,
+};
+use hil_platform::realtime::GrantOutcome;
+use hil_rundir::event::{Event, ProcessHistory};
+use hil_rundir::run_result::{self, RunResult};
+use hil_topology::{Channel, Topology};
+
+pub(super) fn run_facts(
+    topology: &Topology,
+    result: &RunResult,
+    topology_file: &Path,
+    command_line: &[String],
+) -> RunFacts {
+    let outcome = match &result.outcome {
+        run_result::Outcome::Completed | run_result::Outcome::EndedEarly(_) => Outcome::Completed,
+        run_result::Outcome::Interrupted(_) | run_result::Outcome::EndedByPeer(_) => {
+            Outcome::Stopped
+        }
+        run_result::Outcome::Failed(_) | run_result::Outcome::PeerLost(_) => Outcome::Failed,
+    };
+    let files = [
+        ("summary.json", "every figure of this report"),
+        (
+            "manifest.json",
+            "topology as resolved, versions, host, seed",
+        ),
+        (
+            "records/",
+            "one record per message and stage; layout in docs/run-folder.md",
+        ),
+        ("logs/", "what each process said on standard error"),
+        (
+            "events.log",
+            "what happened to the robot, one line each, with the outage before it",
+        ),
+    ];
+    // The run on the clock of this supervisor.
+    let own_host = result.own_hosts.first();
+    let own_span = own_host.and_then(|host| result.spans.get(host));
+    RunFacts {
+        name: result.folder.name(),
+        case: topology
+            .case()
+            .map(|case| case.name.clone())
+            .unwrap_or_default(),
+        topology_file: topology_file.display().to_string(),
+        topology_hash: format!("{:016x}", topology.hash()),
+        seed: topology.run().seed,
+        security: result.security.clone(),
+        is_virtual: false,
+        host: result.own_hosts.join(", "),
+        started: result.started.clone(),
+        starts_ns: result
+            .spans
+            .iter()
+            .map(|(host, (start, _))| (host.clone(), start.as_ns()))
+            .collect(),
+        duration_s: own_span.map_or(0.0, |(start, end)| end.seconds_since(*start)),
+        outcome,
+        exit_reason: result.outcome.reason(),
+        folder: result.folder.root().display().to_string(),
+        files: files.map(|(name, what)| Fact::new(name, what)).to_vec(),
+        repeat_command: shell_words(command_line),
+    }
+}
+
+/// What the kernel granted and refused, each item once with the threads it concerns.
+pub(super) fn realtime_facts(processes: &[ProcessHistory]) -> RealtimeFacts {
+    let mut items: BTreeMap<(bool, String), Vec<String>> = BTreeMap::new();
+    let mut thread_count = 0;
+    for process in processes {
+        for (thread, grant) in process.report.iter().flat_map(|report| &report.realtime) {
+            thread_count += 1;
+            let who = if thread == "main" {
+                process.name.clone()
+            } else {
+                format!("{} ({thread})", process.name)
+            };
+            for item in &grant.items {
+                let is_refused = item.outcome != GrantOutcome::Granted;
+                items
+                    .entry((is_refused, item.to_string()))
+                    .or_default()
+                    .push(who.clone());
+            }
+        }
+    }
+    let mut facts = RealtimeFacts::default();
+    for ((is_refused, what), who) in items {
+        let who = if who.len() == thread_count {
+            format!("all {thread_count} measured threads")
+        } else {
+            who.join(", ")
+        };
+        let side = if is_refused {
+            &mut facts.refused
+        } else {
+            &mut facts.granted
+        };
+        side.push(Fact::new(what, who));
+    }
+    facts
+}
+
+/// A command line that a shell reads back as it was.
+pub(crate) fn shell_words(words: &[String]) -> String {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/._-=:@,+".contains(&byte);
+    let quoted = words.iter().map(|word| {
+        if !word.is_empty() && word.bytes().all(is_plain) {
+            word.clone()
+        } else {
+            format!("'{}'", word.replace('\'', r"'\''"))
+        }
+    });
+    quoted.collect::<Vec<_>>().join(" ")
+}
+
+pub(super) fn process_summary(process: &ProcessHistory) -> ProcessSummary {
+    let report = process.report.as_ref();
+    // A gateway has no period of its own, and a component that messages drive has none either.
+    let ticking = report.filter(|report| report.ticks + report.skipped_ticks > 0);
+    ProcessSummary {
+        name: process.name.clone(),
+        host: process.host.clone(),
+        kind: process.kind,
+        role: process.role.clone(),
+        exit: process.end.clone(),
+        restart_count: u64::from(process.restart_count),
+        preparation_s: report.and_then(|report| report.preparation_s),
+        tick_count: ticking.map(|report| report.ticks),
+        skipped_tick_count: ticking.map(|report| report.skipped_ticks),
+        cpu_time_s: report.map(|report| report.cpu_s),
+        voluntary_switch_count: report.map(|report| report.voluntary_switches),
+        involuntary_switch_count: report.map(|report| report.involuntary_switches),
+        malformed_count: report.map(|report| report.malformed_count),
+        outbox_drop_count: report.map(|report| report.outbox_dropped),
+        recorder_drop_count: report.map(|report| report.recorder_dropped),
+    }
+}
+
+pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
+    let absence = event.interruption.map(|gap| Absence {
+        length_s: gap.until.map(|until| until.seconds_since(gap.from)),
+    });
+    RunEvent {
+        at_s: axis.shown_s(&event.host, event.at),
+        process: event.process.clone(),
+        kind: RunEventKind::Process(event.kind.clone()),
+        absence,
+    }
+}
+
+pub(super) fn channel_summary(records: &RunRecords<'_>, channel: &Channel) -> ChannelSummary {
+    let result = records.result;
+    let directions = directions(result, &channel.name);
+    let reports = result.processes.iter().flat_map(|one| &one.report);
+    let trace_replay = reports
+        .flat_map(|report| &report.directions)
+        .filter(|direction| direction.channel == channel.name)
+        .find_map(|direction| direction.replay);
+    let refusals = directions
+        .iter()
+        .flat_map(|direction| &direction.counters)
+        .filter(|counter| counter.group == CounterGroup::Refused && counter.count > 0)
+        .cloned()
+        .collect();
+    let of_socket = |name: &'static str| {
+        directions
+            .iter()
+            .filter_map(move |direction| direction.count(CounterGroup::Socket, name))
+    };
+    let overflow_count = of_socket("link_overflow_count").next();
+    let no_room_count = of_socket("kernel_drop_count").sum();
+    ChannelSummary {
+        name: channel.name.clone(),
+        from: channel.from.clone(),
+        to: channel.to.clone(),
+        link: LinkKind::of(records.topology, channel),
+        account: (records.has(&channel.name) && !channel.is_recorded_only())
+            .then(|| records.consult(channel, account)),
+        outages: None,
+        emulation: EmulationMetrics::of(
+            records.of_kind::<IngressRecord>(&channel.name, |files| files.ingress.as_ref()),
+            overflow_count,
+        ),
+        trace_replay,
+        recorded: channel
+            .is_recorded_only()
+            .then(|| records.recorded(&channel.name))
+            .flatten(),
+        refusals,
+        no_room_count,
+        directions,
+    }
+}
+
+fn directions(result: &RunResult, channel: &str) -> Vec<DirectionSummary> {
+    let mut found = Vec::new();
+    for process in &result.processes {
+        let directions = process.report.iter().flat_map(|report| &report.directions);
+        for direction in directions.filter(|one| one.channel == channel) {
+            found.push(DirectionSummary {
+                process: process.name.clone(),
+                direction: direction.direction,
+                peer_state: direction.peer_state.clone(),
+                counters: direction.counters.clone(),
+                facts: direction
+                    .facts
+                    .iter()
+                    .map(|(label, value)| Fact::new(label.clone(), value.clone()))
+                    .collect(),
+                stalls: direction.stalls,
+            });
+        }
+    }
+    found
+}

@@ -1,0 +1,487 @@
+//! The figures of two sides with ratio, difference and intervals. Which interval a figure gets depends
+//! on what the runs left: see `docs/compare.md`.
+
+use std::collections::BTreeMap;
+
+use hil_account::{ChannelAccount, FateCounts, MessageFate};
+use hil_stats::comparison::{
+    Estimate, Share, binned_quantile_interval, difference, mean_interval, ratio, welch,
+};
+use hil_stats::histogram::{Distribution, DurationBin, LatencySummary};
+use hil_stats::statistics::{CONFIDENCE, Interval, IntervalNs};
+
+use super::{ChartKind, ComparedMetric, ComparedRun, Part, Verdict};
+use crate::summary::ScoreMetric;
+
+const BOOTSTRAP: &str = "block bootstrap of each run, ratio by MOVER of the logarithms";
+const ORDER: &str = "order statistics of each run's histogram, which take messages as independent, ratio \
+                     by MOVER of the logarithms";
+const REPETITIONS: &str = "Welch's interval over the repetitions";
+const MIXED: &str = "one run's own interval and Student's over the repetitions of the other side, by \
+                     MOVER";
+const NO_SPREAD: &str = "no interval: no repetition differs from another, or delays reach zero";
+const PARTIAL: &str = "not every repetition has it";
+const NO_INTERVAL: &str = "no interval: too few messages, or delays that reach zero";
+const NO_MAXIMUM: &str = "no interval: one run's maximum has none; repeat the runs";
+const NEWCOMBE: &str = "Newcombe's interval (method 10), which takes messages as independent";
+const OWN: &str = "MOVER of the scores' own intervals";
+const NO_OWN: &str = "no interval: the score has none of its own; repeat the runs";
+const ABSENT: &str = "unavailable on one side";
+
+/// What a delay is of.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct DelayKey {
+    channel: String,
+    part: Part,
+    /// Place in [`METRICS`].
+    metric: usize,
+}
+
+/// A delay of one run, nanoseconds, and how its interval came about.
+#[derive(Debug, Clone, Copy)]
+struct RunDelay {
+    estimate: Estimate,
+    method: &'static str,
+}
+
+const METRICS: [&str; 4] = ["p50", "p99", "p99.9", "max"];
+
+/// So many runs of the base, and so many new ones.
+type Counts = [usize; 2];
+
+/// Some runs of a side have a figure and others do not. What those would have shown is unknown, so that
+/// nothing may be told by the ones that are left.
+fn is_partial(have: Counts, of: Counts) -> bool {
+    have.iter().zip(of).any(|(have, of)| (1..of).contains(have))
+}
+
+/// What only some of the repetitions have.
+pub(super) fn cautions(figures: &[ComparedMetric], of: Counts) -> Vec<String> {
+    let mut found: Vec<String> = Vec::new();
+    for one in figures {
+        let have = [one.base_count, one.new_count];
+        if !is_partial(have, of) {
+            continue;
+        }
+        let name = match (&one.channel, one.part) {
+            (None, _) => one.metric.clone(),
+            (Some(channel), None) => format!("{channel} {}", one.metric),
+            // Its quantiles are there together or not at all.
+            (Some(channel), Some(part)) => format!("{channel} {part}"),
+        };
+        let text = format!(
+            "{name}: only {} of {} base and {} of {} new runs have it",
+            have[0], of[0], have[1], of[1]
+        );
+        if !found.contains(&text) {
+            found.push(text);
+        }
+    }
+    found
+}
+
+/// A side's figure, without an interval if only some of its runs have it.
+fn of_all(found: Option<Estimate>, have: usize, of: usize) -> Option<Estimate> {
+    found.map(|one| Estimate {
+        value: one.value,
+        interval: one.interval.filter(|_| have == of),
+    })
+}
+
+/// Every figure that either side has.
+pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
+    let mut figures = delays(base, new);
+    figures.extend(losses(base, new));
+    // A channel's losses stand before its delays, in the order of the channels.
+    let order = channel_order(base, new);
+    let place = |one: &ComparedMetric| {
+        let channel = one.channel.as_ref();
+        let index = channel.and_then(|name| order.iter().position(|known| known == name));
+        (index, one.kind != ChartKind::Loss)
+    };
+    figures.sort_by_key(place);
+    figures.extend(scores(base, new));
+    figures
+}
+
+fn channel_order(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<String> {
+    let mut order: Vec<String> = Vec::new();
+    for run in base.iter().chain(new) {
+        for channel in &run.summary.channels {
+            if !order.contains(&channel.name) {
+                order.push(channel.name.clone());
+            }
+        }
+    }
+    order
+}
+
+fn accounts(run: &ComparedRun) -> impl Iterator<Item = (&str, &ChannelAccount)> {
+    let channels = run.summary.channels.iter();
+    channels.filter_map(|one| Some((one.name.as_str(), one.account.as_ref()?)))
+}
+
+/// Every delay of a run, in nanoseconds, and how its interval came about.
+fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, RunDelay> {
+    let mut found = BTreeMap::new();
+    for (channel, account) in accounts(run) {
+        let mut add = |part, distribution: &Distribution, bins: &[DurationBin], own| {
+            let delays = distribution
+                .measured()
+                .map(|one| run_delays(one, bins, own));
+            for (metric, delay) in delays.into_iter().flatten().enumerate() {
+                let channel = channel.to_owned();
+                let key = DelayKey {
+                    channel,
+                    part,
+                    metric,
+                };
+                found.insert(key, delay);
+            }
+        };
+        let whole = &account.end_to_end;
+        let own = [whole.p50_interval, whole.p99_interval, None, None];
+        add(Part::EndToEnd, &whole.distribution, &whole.bins, own);
+        for segment in &account.segments {
+            let (from, to) = (segment.from, segment.to);
+            let part = Part::Segment { from, to };
+            add(part, &segment.distribution, &segment.bins, [None; 4]);
+        }
+    }
+    found
+}
+
+/// The delays of [`METRICS`], each with its `own` interval, or that of the `bins` where it has none.
+fn run_delays(
+    figures: &LatencySummary,
+    bins: &[DurationBin],
+    own: [Option<IntervalNs>; 4],
+) -> [RunDelay; 4] {
+    let binned = |quantile| binned_quantile_interval(bins, quantile, CONFIDENCE);
+    let delay = |value_ns: i64, own: Option<IntervalNs>, quantile: Option<f64>| RunDelay {
+        estimate: Estimate {
+            value: value_ns as f64,
+            interval: own.or_else(|| binned(quantile?)).map(|one| Interval {
+                low: one.low_ns as f64,
+                high: one.high_ns as f64,
+            }),
+        },
+        method: if own.is_some() { BOOTSTRAP } else { ORDER },
+    };
+    [
+        delay(figures.p50_ns, own[0], Some(0.5)),
+        delay(figures.p99_ns, own[1], Some(0.99)),
+        delay(figures.p999_ns, own[2], Some(0.999)),
+        delay(figures.max_ns, own[3], None),
+    ]
+}
+
+fn delays(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
+    let collect = |runs: &[ComparedRun]| {
+        let mut all: BTreeMap<DelayKey, Vec<RunDelay>> = BTreeMap::new();
+        for (key, one) in runs.iter().flat_map(delays_of) {
+            all.entry(key).or_default().push(one);
+        }
+        all
+    };
+    let (b, n) = (collect(base), collect(new));
+    let mut keys: Vec<&DelayKey> = b.keys().chain(n.keys()).collect();
+    keys.sort();
+    keys.dedup();
+    keys.into_iter()
+        .map(|key| {
+            let [b, n] = [&b, &n].map(|all| all.get(key).map_or(&[][..], Vec::as_slice));
+            delay_figure(key, b, n, [base.len(), new.len()])
+        })
+        .collect()
+}
+
+fn delay_figure(key: &DelayKey, base: &[RunDelay], new: &[RunDelay], of: Counts) -> ComparedMetric {
+    let b = of_all(geometric(base), base.len(), of[0]);
+    let n = of_all(geometric(new), new.len(), of[1]);
+    let both = b.zip(n);
+    let (interval, method) = match both {
+        None => (None, ABSENT),
+        Some(_) if is_partial([base.len(), new.len()], of) => (None, PARTIAL),
+        Some((b, n)) => delay_interval(base, new, b, n, METRICS[key.metric]),
+    };
+    let is_repeated = base.len() > 1 && new.len() > 1;
+    ComparedMetric {
+        channel: Some(key.channel.clone()),
+        part: Some(key.part),
+        unit: "ns".to_owned(),
+        ratio_interval: interval,
+        difference_interval: both
+            .filter(|_| !is_repeated)
+            .and_then(|(b, n)| difference(b, n)),
+        verdict: verdict(interval, 1.0, [Verdict::Faster, Verdict::Slower]),
+        method: method.to_owned(),
+        ..figure(
+            ChartKind::Delay,
+            METRICS[key.metric],
+            b,
+            n,
+            [base.len(), new.len()],
+        )
+    }
+}
+
+/// What two sides come to in every figure, of which `have` runs have it.
+fn figure(
+    kind: ChartKind,
+    metric: &str,
+    base: Option<Estimate>,
+    new: Option<Estimate>,
+    have: Counts,
+) -> ComparedMetric {
+    let both = base.zip(new);
+    ComparedMetric {
+        channel: None,
+        part: None,
+        metric: metric.to_owned(),
+        kind,
+        unit: "1".to_owned(),
+        base,
+        new,
+        base_count: have[0],
+        new_count: have[1],
+        ratio: both.and_then(|(b, n)| (b.value > 0.0).then(|| n.value / b.value)),
+        ratio_interval: None,
+        difference: both.map(|(b, n)| n.value - b.value),
+        difference_interval: None,
+        verdict: Verdict::NotTested,
+        method: String::new(),
+    }
+}
+
+/// The interval of the ratio, and how it came about or why there is none.
+fn delay_interval(
+    base: &[RunDelay],
+    new: &[RunDelay],
+    b: Estimate,
+    n: Estimate,
+    metric: &str,
+) -> (Option<Interval>, &'static str) {
+    let repeated_count = [base, new].iter().filter(|side| side.len() > 1).count();
+    let (found, method) = match repeated_count {
+        2 => {
+            let spread = welch(&logarithms(base), &logarithms(new), CONFIDENCE);
+            (spread.and_then(exponential), REPETITIONS)
+        }
+        1 => (ratio(b, n), MIXED),
+        // A histogram's bins are wider than what it was made of, so say which.
+        _ => {
+            let methods = base.iter().chain(new).map(|one| one.method);
+            (ratio(b, n), methods.max().unwrap_or(ABSENT))
+        }
+    };
+    match (found, repeated_count) {
+        (Some(_), _) => (found, method),
+        (None, 2) => (None, NO_SPREAD),
+        (None, _) if metric == "max" => (None, NO_MAXIMUM),
+        (None, _) => (None, NO_INTERVAL),
+    }
+}
+
+fn logarithms(side: &[RunDelay]) -> Vec<f64> {
+    side.iter().map(|one| one.estimate.value.ln()).collect()
+}
+
+/// Back from an interval of logarithms; `None` where that cannot be written as a number.
+fn exponential(one: Interval) -> Option<Interval> {
+    let (low, high) = (one.low.exp(), one.high.exp());
+    let is_known = one.low.is_finite() && high.is_finite();
+    is_known.then_some(Interval { low, high })
+}
+
+/// One run's figure as it is; of several the geometric mean, with Student's interval of the logarithms.
+fn geometric(side: &[RunDelay]) -> Option<Estimate> {
+    match side {
+        [] => None,
+        [only] => Some(only.estimate),
+        several => {
+            let logs = logarithms(several);
+            let value = (logs.iter().sum::<f64>() / logs.len() as f64).exp();
+            value.is_finite().then(|| Estimate {
+                value,
+                interval: mean_interval(&logs, CONFIDENCE).and_then(exponential),
+            })
+        }
+    }
+}
+
+fn verdict(interval: Option<Interval>, none: f64, [below, above]: [Verdict; 2]) -> Verdict {
+    match interval {
+        None => Verdict::NotTested,
+        Some(one) if one.high < none => below,
+        Some(one) if one.low > none => above,
+        Some(_) => Verdict::NoDifferenceShown,
+    }
+}
+
+/// Lost among those whose fate is known and final.
+fn share(fates: &FateCounts) -> Share {
+    let open =
+        fates.of(MessageFate::InFlight) + fates.of(MessageFate::UnknownPeerRecordsUnavailable);
+    Share {
+        count: fates.lost_count(),
+        of: fates.total().saturating_sub(open),
+    }
+}
+
+fn losses(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
+    let collect = |runs: &[ComparedRun]| {
+        let mut all: BTreeMap<String, Vec<Share>> = BTreeMap::new();
+        for run in runs {
+            for (channel, account) in accounts(run) {
+                let one = share(&account.fates);
+                if one.of > 0 {
+                    all.entry(channel.to_owned()).or_default().push(one);
+                }
+            }
+        }
+        all
+    };
+    let (b, n) = (collect(base), collect(new));
+    channel_order(base, new)
+        .into_iter()
+        .filter(|channel| b.contains_key(channel) || n.contains_key(channel))
+        .map(|channel| {
+            let [b, n] = [&b, &n].map(|all| all.get(&channel).map_or(&[][..], Vec::as_slice));
+            loss_figure(&channel, b, n, [base.len(), new.len()])
+        })
+        .collect()
+}
+
+fn pooled(shares: &[Share]) -> Share {
+    Share {
+        count: shares.iter().map(|one| one.count).sum(),
+        of: shares.iter().map(|one| one.of).sum(),
+    }
+}
+
+/// One run's share with Wilson's interval; of several their mean with Student's, and then true. Where no
+/// run differs from another it is Wilson's of all messages together.
+fn mean_share(side: &[Share]) -> (Option<Estimate>, bool) {
+    let values = values_of(side);
+    match mean_interval(&values, CONFIDENCE) {
+        None => (pooled(side).estimate(CONFIDENCE), false),
+        Some(found) => {
+            let estimate = Estimate {
+                value: values.iter().sum::<f64>() / values.len() as f64,
+                // A share has no less than none and no more than all.
+                interval: Some(Interval {
+                    low: found.low.max(0.0),
+                    high: found.high.min(1.0),
+                }),
+            };
+            (Some(estimate), true)
+        }
+    }
+}
+
+fn values_of(side: &[Share]) -> Vec<f64> {
+    let shares = side.iter();
+    shares.map(|one| one.count as f64 / one.of as f64).collect()
+}
+
+fn loss_figure(channel: &str, base: &[Share], new: &[Share], of: Counts) -> ComparedMetric {
+    let ((be, is_base_spread), (ne, is_new_spread)) = (mean_share(base), mean_share(new));
+    let be = of_all(be, base.len(), of[0]);
+    let ne = of_all(ne, new.len(), of[1]);
+    let both = be.zip(ne);
+    let repeated = welch(&values_of(base), &values_of(new), CONFIDENCE);
+    let (interval, method) = match (both, repeated) {
+        (None, _) => (None, ABSENT),
+        (Some(_), _) if is_partial([base.len(), new.len()], of) => (None, PARTIAL),
+        (Some(_), Some(interval)) => (Some(interval), REPETITIONS),
+        (Some((b, n)), None) if is_base_spread || is_new_spread => (difference(b, n), MIXED),
+        // Of Wilson's intervals on both sides: that is Newcombe's.
+        (Some((b, n)), None) => (difference(b, n), NEWCOMBE),
+    };
+    ComparedMetric {
+        channel: Some(channel.to_owned()),
+        difference_interval: interval,
+        verdict: verdict(interval, 0.0, [Verdict::LosesLess, Verdict::LosesMore]),
+        method: method.to_owned(),
+        ..figure(ChartKind::Loss, "loss", be, ne, [base.len(), new.len()])
+    }
+}
+
+fn scores(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
+    let mut names: Vec<&ScoreMetric> = Vec::new();
+    for metric in base.iter().chain(new).flat_map(|run| &run.summary.score) {
+        if names.iter().all(|known| known.name != metric.name) {
+            names.push(metric);
+        }
+    }
+    names
+        .into_iter()
+        .map(|metric| score_figure(metric, base, new))
+        .collect()
+}
+
+fn score_figure(metric: &ScoreMetric, base: &[ComparedRun], new: &[ComparedRun]) -> ComparedMetric {
+    let (bs, ns) = (scores_of(metric, base), scores_of(metric, new));
+    let (have, of) = ([bs.len(), ns.len()], [base.len(), new.len()]);
+    let b = of_all(mean_score(&bs), have[0], of[0]);
+    let n = of_all(mean_score(&ns), have[1], of[1]);
+    let both = b.zip(n);
+    let repeated = welch(&plain(&bs), &plain(&ns), CONFIDENCE);
+    let own = both.and_then(|(b, n)| difference(b, n));
+    let repeated_count = have.iter().filter(|count| **count > 1).count();
+    let (interval, method) = match (both, repeated, own) {
+        (None, ..) => (None, ABSENT),
+        (Some(_), ..) if is_partial(have, of) => (None, PARTIAL),
+        (_, Some(found), _) => (Some(found), REPETITIONS),
+        (_, None, Some(found)) if repeated_count > 0 => (Some(found), MIXED),
+        (_, None, Some(found)) => (Some(found), OWN),
+        (_, None, None) if repeated_count == 2 => (None, NO_SPREAD),
+        (_, None, None) => (None, NO_OWN),
+    };
+    ComparedMetric {
+        unit: metric.unit.clone(),
+        ratio_interval: both
+            .filter(|_| repeated.is_none())
+            .and_then(|(b, n)| ratio(b, n)),
+        difference_interval: interval,
+        verdict: verdict(interval, 0.0, [Verdict::Lower, Verdict::Higher]),
+        method: method.to_owned(),
+        ..figure(ChartKind::Score, &metric.name, b, n, have)
+    }
+}
+
+/// The score of that name of every run that has it.
+fn scores_of(metric: &ScoreMetric, runs: &[ComparedRun]) -> Vec<Estimate> {
+    let found = runs.iter().filter_map(|run| {
+        let mut all = run.summary.score.iter();
+        let one = all.find(|one| one.name == metric.name)?;
+        Some(Estimate {
+            value: one.value?,
+            interval: one.interval.map(|(low, high)| Interval { low, high }),
+        })
+    });
+    found.collect()
+}
+
+fn plain(side: &[Estimate]) -> Vec<f64> {
+    side.iter().map(|one| one.value).collect()
+}
+
+/// One run's score as it is; of several the mean with Student's interval.
+fn mean_score(side: &[Estimate]) -> Option<Estimate> {
+    match side {
+        [] => None,
+        [only] => Some(*only),
+        several => {
+            let values = plain(several);
+            Some(Estimate {
+                value: values.iter().sum::<f64>() / values.len() as f64,
+                interval: mean_interval(&values, CONFIDENCE),
+            })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,121 @@
+//! What repetitions say together, and what they do not when some of them lack a figure.
+
+use super::*;
+use crate::compare::Comparison;
+use crate::compare::conditions::{Condition, Verdicts};
+
+fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedMetric {
+    let side = |all: &[f64]| -> Vec<RunDelay> {
+        let estimate = |ms: &f64| Estimate {
+            value: ms * 1e6,
+            interval: Some(Interval {
+                low: ms * 0.99e6,
+                high: ms * 1.01e6,
+            }),
+        };
+        let delay = |ms: &f64| RunDelay {
+            estimate: estimate(ms),
+            method: BOOTSTRAP,
+        };
+        all.iter().map(delay).collect()
+    };
+    let key = DelayKey {
+        channel: "a/b".to_owned(),
+        part: Part::EndToEnd,
+        metric: 1,
+    };
+    delay_figure(&key, &side(base_ms), &side(new_ms), of)
+}
+
+fn loss(base: &[u64], new: &[u64], of: Counts) -> ComparedMetric {
+    let side = |all: &[u64]| -> Vec<Share> {
+        let share = |count: &u64| Share {
+            count: *count,
+            of: 1000,
+        };
+        all.iter().map(share).collect()
+    };
+    loss_figure("a/b", &side(base), &side(new), of)
+}
+
+/// Whether a condition holds, or why it cannot be judged.
+fn judged(condition: &str, figure: &ComparedMetric) -> Result<bool, String> {
+    let comparison = Comparison {
+        base: Vec::new(),
+        new: Vec::new(),
+        same: Vec::new(),
+        differences: Vec::new(),
+        cautions: Vec::new(),
+        figures: vec![figure.clone()],
+    };
+    let condition = Condition::parse(condition).unwrap();
+    let mut verdicts = Verdicts::default();
+    let found = condition.judge(&comparison, false, &mut verdicts);
+    found.map_err(|error| error.to_string())?;
+    Ok(verdicts.judged.iter().any(|one| one.holds))
+}
+
+#[test]
+fn conditions_on_the_new_runs_are_judged_by_how_repetitions_differ() {
+    // The mean of the logarithms reaches from 5.36 to 7.86 ms.
+    let delay = p99(&[3.0, 3.1, 3.2], &[6.0, 6.5, 7.0], [3, 3]);
+    assert_eq!(
+        (delay.verdict, delay.method.as_str()),
+        (Verdict::Slower, REPETITIONS)
+    );
+    assert_eq!(judged("p99 > 5ms", &delay), Ok(true));
+    assert_eq!(judged("p99 > 6ms", &delay), Ok(false));
+    assert_eq!(judged("p99 > 1.5x", &delay), Ok(true));
+    // The mean of the shares from 0.70 to 1.70 %; by all 3000 messages alone from 0.87 %.
+    let lost = loss(&[1, 2, 3], &[10, 12, 14], [3, 3]);
+    assert_eq!(judged("loss > 0.5%", &lost), Ok(true));
+    assert_eq!(judged("loss > 0.8%", &lost), Ok(false));
+    // Where no run differs from another, all messages together.
+    let none = loss(&[0, 0], &[0, 0], [2, 2]);
+    assert_eq!(none.method, NEWCOMBE);
+    assert_eq!(judged("loss > 0.5%", &none), Ok(false));
+    let alike = p99(&[3.0, 3.0], &[6.0, 6.0], [2, 2]);
+    let why = judged("p99 > 5ms", &alike).unwrap_err();
+    assert!(why.contains(NO_SPREAD), "{why}");
+}
+
+#[test]
+fn a_figure_that_some_repetitions_lack_is_not_tested_and_told() {
+    let whole = p99(&[3.0, 3.1, 3.2], &[6.0, 6.5, 7.0], [3, 3]);
+    let delay = p99(&[3.0, 3.1], &[6.0, 6.5, 7.0], [3, 3]);
+    let lost = loss(&[1, 2, 3], &[10], [3, 3]);
+    for one in [&delay, &lost] {
+        assert_eq!(
+            (one.verdict, one.method.as_str()),
+            (Verdict::NotTested, PARTIAL)
+        );
+        assert_eq!((one.ratio_interval, one.difference_interval), (None, None));
+    }
+    // All new runs have the delay; of the loss the one that is left has nothing to say.
+    assert_eq!(judged("p99 > 5ms", &delay), Ok(true));
+    let why = judged("loss > 0.5%", &lost).unwrap_err();
+    assert!(why.contains(PARTIAL), "{why}");
+    assert_eq!(
+        cautions(&[whole, delay.clone(), delay, lost], [3, 3]),
+        [
+            "a/b end to end: only 2 of 3 base and 3 of 3 new runs have it",
+            "a/b loss: only 3 of 3 base and 1 of 3 new runs have it",
+        ]
+    );
+    let absent = p99(&[], &[6.0, 6.5, 7.0], [3, 3]);
+    assert_eq!(absent.method, ABSENT);
+    assert!(cautions(&[absent], [3, 3]).is_empty(), "it says so itself");
+}
+
+#[test]
+fn one_run_against_repetitions_has_an_interval_of_both_kinds() {
+    let delay = p99(&[3.0], &[6.0, 6.5, 7.0], [1, 3]);
+    assert_eq!(
+        (delay.verdict, delay.method.as_str()),
+        (Verdict::Slower, MIXED)
+    );
+    let lost = loss(&[1], &[10, 12, 14], [1, 3]);
+    assert_eq!(lost.method, MIXED);
+    assert_eq!(loss(&[1], &[10], [1, 1]).method, NEWCOMBE);
+    assert_eq!(p99(&[3.0], &[6.0], [1, 1]).method, BOOTSTRAP);
+}
