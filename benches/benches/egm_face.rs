@@ -38,8 +38,8 @@ const TITLES: [&str; 6] = [
     "command, shared memory alone",
     "feedback, our gateways",
     "command, our gateways",
-    "feedback, both EGM faces",
-    "command, both EGM faces",
+    "feedback, both EGM adapters",
+    "command, both EGM adapters",
 ];
 /// Row of each row's reference.
 const REFERENCES: [usize; 6] = [0, 1, 0, 1, 0, 1];
@@ -155,7 +155,7 @@ fn measure_all() -> Result<(), SetupError> {
     announce(
         BENCH,
         &format!(
-            "robot and its face on cpu 0, controller and its face on cpu 1, waiting in the kernel, \
+            "robot and its adapter on cpu 0, controller and its adapter on cpu 1, waiting in the kernel, \
          SCHED_FIFO {PRIORITY} asked for"
         ),
         pair.network_note(),
@@ -180,7 +180,10 @@ fn measure_all() -> Result<(), SetupError> {
     );
     let Measured { pair, .. } = measured.into_inner();
     let finished = pair.finish()?;
-    for (who, figures) in ["robot face", "sensor face"].iter().zip(&finished.figures) {
+    for (who, figures) in ["robot adapter", "sensor adapter"]
+        .iter()
+        .zip(&finished.figures)
+    {
         print_segments(who, &figures.segments);
     }
     for verdict in verdicts(&outcome) {

@@ -11,7 +11,7 @@ use std::process::ExitCode;
 use std::thread::Thread;
 use std::time::Duration;
 
-use hil_benches::gateway::applications::{Crew, PARTY_COUNT};
+use hil_benches::gateway::applications::{PARTY_COUNT, PartyGroup};
 use hil_benches::gateway::cases::{CasePlan, Kind, PERIOD, case_plans, only};
 use hil_benches::gateway::ends::{NearEnd, Setup};
 use hil_benches::gateway::hosts::{Hosts, Plan, SetupError};
@@ -92,9 +92,9 @@ fn measure(
             usage.add(before, after);
             samples
         }
-        NearEnd::Applications(crew) => match case.kind {
-            Kind::Applications { is_paced: true } => crew.round(extent.paced_slice, Some(PERIOD)),
-            _ => crew.round(extent.slice, None),
+        NearEnd::Applications(group) => match case.kind {
+            Kind::Applications { is_paced: true } => group.round(extent.paced_slice, Some(PERIOD)),
+            _ => group.round(extent.slice, None),
         },
     }
 }
@@ -168,8 +168,8 @@ fn hybrid_verdicts(setup: &Setup, cases: &[CasePlan], cpu_count: usize) -> Vec<V
             NearEnd::Hop { usage, .. } if case.plan.wait == WaitMode::Hybrid => {
                 verdicts.push(share_verdict(case.title, usage));
             }
-            NearEnd::Applications(crew) if case.plan.wait == WaitMode::Hybrid => {
-                let (parties, _) = crew.usage();
+            NearEnd::Applications(group) if case.plan.wait == WaitMode::Hybrid => {
+                let (parties, _) = group.usage();
                 let dearest = parties.iter().max_by_key(|(_, usage)| usage.processor_ns);
                 if let Some((party, usage)) = dearest {
                     let title = format!("{}, dearest party ({})", case.title, party.name);
@@ -211,8 +211,8 @@ fn print_usage(setup: &Setup, cases: &[CasePlan]) {
                 let messages = usage.elapsed_ns / u64::try_from(PERIOD.as_nanos()).unwrap_or(1);
                 line(case.title, "far gateway", usage, messages);
             }
-            NearEnd::Applications(crew) => {
-                let (parties, trips) = crew.usage();
+            NearEnd::Applications(group) => {
+                let (parties, trips) = group.usage();
                 for (party, usage) in parties {
                     line(case.title, party.name, usage, trips);
                 }
@@ -330,15 +330,15 @@ fn report(
     let mut verdicts = ratio_verdicts(outcome, cases);
     verdicts.extend(hybrid_verdicts(&setup, cases, cpu_count));
     setup.turns.give(STOP, &[setup.far.thread().clone()]);
-    let mut crews: Vec<(&CasePlan, Crew)> = Vec::new();
+    let mut groups: Vec<(&CasePlan, PartyGroup)> = Vec::new();
     for (end, case) in setup.near.drain(..).zip(cases) {
-        if let NearEnd::Applications(crew) = end {
-            crews.push((case, *crew));
+        if let NearEnd::Applications(group) = end {
+            groups.push((case, *group));
         }
     }
-    let woken: Vec<_> = crews
+    let woken: Vec<_> = groups
         .into_iter()
-        .map(|(case, crew)| (case, crew.finish()))
+        .map(|(case, group)| (case, group.finish()))
         .collect();
     let refused_far = setup.far.join().unwrap_or_default();
     println!("\nrecords dropped: {}", setup.hosts.finish_recording());

@@ -27,7 +27,7 @@ use hil_rundir::record::{RecordFile, Recorder};
 use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, Waiter,
 };
-use hil_topology::{AdapterKind, AdapterSend, NicChannel, Timestamps};
+use hil_topology::{AdapterKind, AdapterSend, RoleChannel, Timestamps};
 
 use crate::gateway::hosts::{Hosts, Joint, Plan, SetupError};
 use crate::gateway::network::Network;
@@ -282,8 +282,8 @@ impl Pair {
         if let Err(error) = fs::remove_dir_all(&self.folder) {
             left.push(format!("{}: {error}", self.folder.display()));
         }
-        let figures =
-            <[AdapterMetrics; 2]>::try_from(each).map_err(|_other_count| "two faces were noted")?;
+        let figures = <[AdapterMetrics; 2]>::try_from(each)
+            .map_err(|_other_count| "two adapters were noted")?;
         Ok(Finished {
             figures,
             refusals,
@@ -333,7 +333,7 @@ fn feedback(cycle: u64) -> EgmFeedback {
 }
 
 fn settings(host: usize, listens_at: std::net::SocketAddr) -> AdapterSettings {
-    let channel = |(name, message): (&str, MessageType)| NicChannel {
+    let channel = |(name, message): (&str, MessageType)| RoleChannel {
         name: name.to_owned(),
         message_name: message.name.to_owned(),
         message_size_bytes: message.size_bytes,

@@ -74,7 +74,7 @@ impl Application {
 
 /// The threads of one case, asleep while it is not their turn.
 #[derive(Debug)]
-pub struct Crew {
+pub struct PartyGroup {
     plan: Plan,
     case: usize,
     turns: Arc<Turns>,
@@ -125,7 +125,7 @@ impl Berth {
     }
 }
 
-impl Crew {
+impl PartyGroup {
     /// Starts the threads of `joints` and waits until the gateways have greeted each other. With
     /// fewer than [`PARTY_COUNT`] processors each host has one.
     ///

@@ -55,7 +55,7 @@ fn word(wait: WaitMode) -> &'static str {
     }
 }
 
-/// All cases for a machine with `cpu_count` processors; crews come last.
+/// All cases for a machine with `cpu_count` processors; groups come last.
 pub fn case_plans(cpu_count: usize) -> Vec<CasePlan> {
     let mut list = List::default();
     let mut blocking_echo = BTreeMap::new();

@@ -10,7 +10,7 @@ use std::thread::{self, JoinHandle};
 
 use hil_platform::clock::MonotonicClock;
 
-use super::applications::Crew;
+use super::applications::PartyGroup;
 use super::cases::{CasePlan, Kind};
 use super::hosts::{Hosts, Joint, SetupError, greet};
 use super::network::Network;
@@ -61,7 +61,7 @@ pub enum NearEnd {
         usage: Usage,
     },
     /// A thread per party.
-    Applications(Box<Crew>),
+    Applications(Box<PartyGroup>),
 }
 
 /// Which of the two ways.
@@ -251,9 +251,9 @@ fn connect(
             noted,
             usage: Usage::default(),
         },
-        Loose::Applications(joints) => {
-            NearEnd::Applications(Box::new(Crew::start(*joints, case, turns, cpu_count)?))
-        }
+        Loose::Applications(joints) => NearEnd::Applications(Box::new(PartyGroup::start(
+            *joints, case, turns, cpu_count,
+        )?)),
         Loose::Elsewhere => return Err("every case has a near end".into()),
     })
 }
@@ -265,7 +265,7 @@ impl NearEnd {
         match self {
             Self::PingPong(side) => side.stamp_coverage(),
             Self::Gateway(shared, Column::Whole) => shared.0.borrow().side.stamp_coverage(),
-            // The traffic of a hop goes the other way; a crew's is in its records.
+            // The traffic of a hop goes the other way; a group's is in its records.
             Self::Gateway(..) | Self::Hop { .. } | Self::Applications(_) => None,
         }
     }

@@ -22,7 +22,7 @@ pub struct SocketSettings {
     /// 0 lets the kernel choose. Sender and receiver of one channel need a port each.
     pub local: SocketAddr,
     /// Where the peer's receiver listens: the sender is connected to it and hears replies of it
-    /// alone. The receiver does not use it.
+    /// alone. A receiver uses it for the seal.
     pub peer: SocketAddr,
     /// Interface to bind both sockets to (`SO_BINDTODEVICE`).
     pub interface: Option<String>,

@@ -3,7 +3,7 @@
 //! opens no file; layouts are in `docs/traces.md`.
 //!
 //! [`wire`] is the binary form, [`csv`] the textual one, [`opportunities`] that of Mahimahi,
-//! [`netem`] an export; [`figures`] describes a trace, [`fit`] sets link models beside it.
+//! [`netem`] an export; [`metrics`] describes a trace, [`fit`] sets link models beside it.
 #![forbid(unsafe_code)]
 
 pub mod csv;

@@ -1,5 +1,5 @@
 //! What an adapter notes of each datagram, in records of fixed size: pushed into a ring on the measured
-//! path, joined after the run by `figures`. It computes nothing.
+//! path, joined after the run by the report. It computes nothing.
 
 use bytemuck::{Pod, Zeroable};
 use hil_core::record::UNAVAILABLE;

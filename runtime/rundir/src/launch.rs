@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
 use hil_topology::emulation::EmulationLaunch;
-use hil_topology::{AdapterKind, AdapterSend, NicChannel, Timestamps};
+use hil_topology::{AdapterKind, AdapterSend, RoleChannel, Timestamps};
 
 /// How to start one process of the run that this binary plays.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,7 +51,7 @@ pub enum Work {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ComponentWork {
-    /// File with the [`RoleSpec`](hil_topology::ProcessCard).
+    /// File with the [`RoleSpec`](hil_topology::RoleSpec).
     pub card: PathBuf,
     /// What to ask of the kernel.
     pub realtime: RealtimeRequest,
@@ -178,7 +178,7 @@ pub struct AdapterSettings {
     /// One thread and one socket each.
     pub arms: Vec<ArmLaunch>,
     /// Channels whose messages the protocol has no place for: taken, recorded and dropped.
-    pub spare: Vec<NicChannel>,
+    pub spare: Vec<RoleChannel>,
 }
 
 impl AdapterSettings {
@@ -208,9 +208,9 @@ pub struct ArmLaunch {
     /// Where the foreign program listens (robot adapter), or where we do (sensor adapter).
     pub address: SocketAddr,
     /// The channel whose messages go out.
-    pub input: NicChannel,
+    pub input: RoleChannel,
     /// The channel that what comes in is published on.
-    pub output: NicChannel,
+    pub output: RoleChannel,
     /// What to ask of the kernel.
     pub realtime: RealtimeRequest,
 }

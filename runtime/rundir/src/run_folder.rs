@@ -102,7 +102,7 @@ impl RunFolder {
     }
 
     /// Card of a component.
-    pub fn nic(&self, process: &str) -> PathBuf {
+    pub fn role_spec(&self, process: &str) -> PathBuf {
         self.root.join("cards").join(format!("{process}.json"))
     }
 

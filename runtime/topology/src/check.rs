@@ -2,7 +2,7 @@
 //! `check_channels`. Nothing is read here; the result is the checked topology.
 
 use super::adapter::EgmAdapter;
-use super::check_adapter::{check_adapter, check_faces, is_dispensable};
+use super::check_adapter::{check_adapter, check_adapters, is_dispensable};
 use super::clock_path::{self, ClockEntry};
 use super::errors::{Fault, Faults, Place};
 use super::file::{CaseEntry, File, HostEntry, ProcessEntry};
@@ -48,7 +48,7 @@ pub(super) fn check(file: File<'_>, known: &KnownCases, needs: Needs, faults: &F
     }
     let processes = check_processes(&file.processes, &hosts, &roles, faults);
     let written = case_entry.and_then(|entry| entry.parameters);
-    check_faces(&file.processes, &processes, case.as_ref(), written, faults);
+    check_adapters(&file.processes, &processes, case.as_ref(), written, faults);
     if let (Some(entry), Some(known), false) = (case_entry, known_case, runs_nothing) {
         check_every_role_is_played(known, &processes, entry.place, faults);
     }

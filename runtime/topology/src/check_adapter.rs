@@ -65,7 +65,7 @@ pub(super) fn check_adapter(
     }
     if kind == AdapterKind::Sensor && entry.axes == 6 {
         let fault = "is 6, but our controller moves seven joints: a robot of six axes would not \
-                     follow J7 and does not measure it; allowed in a sensor face: 7";
+                     follow J7 and does not measure it; allowed in a sensor adapter: 7";
         let key = join(&entry.path, "axes");
         faults.add(
             key,
@@ -149,7 +149,7 @@ pub(super) fn is_played_by_adapter(process: &Process) -> bool {
 
 /// Checks the adapters of all processes against each other and against the case's parameters: all of
 /// them, and those that the file writes, with their places.
-pub(super) fn check_faces(
+pub(super) fn check_adapters(
     entries: &[ProcessEntry],
     processes: &[Process],
     case: Option<&Case>,

@@ -59,7 +59,7 @@ pub use model::{
 };
 pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via, transport};
 pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
-pub use role_spec::{NicChannel, RoleSpec};
+pub use role_spec::{RoleChannel, RoleSpec};
 pub use schema::schema;
 pub use security::{Hops, Security};
 

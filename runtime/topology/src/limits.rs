@@ -1,5 +1,5 @@
-//! Default, minimum and maximum of every number a topology file can hold: this table and no
-//! other place.
+//! Default, minimum and maximum of the numbers that the topology itself defines. Parts of a link,
+//! transports and cases state their own.
 
 use core::fmt;
 use core::ops::RangeInclusive;

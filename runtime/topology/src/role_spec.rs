@@ -19,17 +19,17 @@ pub struct RoleSpec {
     /// Seed of the run.
     pub seed: u64,
     /// Channels it reads; those of its role in port order.
-    pub inputs: Vec<NicChannel>,
+    pub inputs: Vec<RoleChannel>,
     /// Channels it writes; those of its role in port order.
-    pub outputs: Vec<NicChannel>,
+    pub outputs: Vec<RoleChannel>,
     /// Every parameter of the case; empty without a role.
     pub parameters: toml::Table,
 }
 
-/// One channel of a card.
+/// One channel of a role.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct NicChannel {
+pub struct RoleChannel {
     /// Name, also of the shared-memory service.
     pub name: String,
     /// Name and version of its messages.
@@ -44,7 +44,7 @@ pub struct NicChannel {
     pub is_recorded_only: bool,
 }
 
-impl NicChannel {
+impl RoleChannel {
     fn of(channel: &Channel) -> Self {
         Self {
             name: channel.name.clone(),
@@ -75,7 +75,7 @@ impl Topology {
         let ends = |is_end: fn(&Channel, &Process) -> bool| {
             let channels = self.channels.iter();
             let channels = channels.filter(|channel| is_end(channel, process));
-            channels.map(NicChannel::of).collect()
+            channels.map(RoleChannel::of).collect()
         };
         Some(RoleSpec {
             process: process.name.clone(),

@@ -405,7 +405,7 @@ fn a_process_is_told_the_same_in_every_deployment() {
 }
 
 #[test]
-fn a_nic_lists_the_ports_of_its_role_in_order_and_survives_the_trip() {
+fn a_role_spec_lists_the_ports_of_its_role_in_order_and_survives_the_trip() {
     let topology = parse_good(EVERYTHING);
     let card = topology.role_spec("controller").unwrap();
     let inputs: Vec<_> = card

@@ -150,7 +150,7 @@ targets! {
     opportunities: "a trace of delivery opportunities", trace::opportunities,
         seeds::opportunities, (64 * KIB, 4 * KIB);
     egm: "the maker's datagrams", egm::datagrams, seeds::egm_datagrams, (16 * KIB, 256);
-    egm_session: "a session of them with either face", egm::session, seeds::egm_sessions,
+    egm_session: "a session of them with either adapter", egm::session, seeds::egm_sessions,
         (256 * KIB, 256);
     motion: "a motion file", motion::bvh, seeds::motions, (64 * KIB, KIB);
     #[cfg(feature = "runtime")]

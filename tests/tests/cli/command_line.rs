@@ -393,7 +393,7 @@ fn a_written_motion_is_one_that_can_be_read_and_played() {
 }
 
 #[test]
-fn an_own_program_is_told_its_nic_and_its_channels_and_is_asked_to_stop() {
+fn an_own_program_is_told_its_role_spec_and_its_channels_and_is_asked_to_stop() {
     let record = RunFolder::new("own");
     let mark = record.path().display().to_string();
     let script = "cat $HIL_CARD > $0/card; echo $HIL_DOMAIN $MOOD > $0/told; \

@@ -44,7 +44,7 @@ fn loops(arm: &Arm, joints: impl Iterator<Item = Joints>) -> u32 {
 fn adapter<'a>(summary: &'a RunSummary, arm: &str) -> &'a AdapterSummary {
     let mut faces = summary.faces.iter();
     let found = faces.find(|adapter| adapter.arm.word() == arm);
-    found.unwrap_or_else(|| panic!("no face of the {arm} arm"))
+    found.unwrap_or_else(|| panic!("no adapter of the {arm} arm"))
 }
 
 fn count(adapter: &AdapterSummary, name: &str) -> u64 {

@@ -8,7 +8,7 @@
 //! - Nothing blocks. What the kernel does not take waits in a bounded buffer; a message that finds
 //!   no room there is refused and counted.
 //! - Every message leaves at once (`TCP_NODELAY`), and what it then waits for is measured: see
-//!   `figures`.
+//!   `metrics`.
 //! - There are no kernel stamps. The kernel stamps bytes of a stream, not messages: segments are
 //!   joined and cut on the way, and a joined one keeps only the newer of two stamps.
 

@@ -34,7 +34,7 @@ pub struct CoordinatorParameters {
     pub known_delay_ms: f64,
     /// Tracking period of the robots it reckons with, 1..=10000 ms.
     pub tracking_period_ms: f64,
-    /// Copies sent of every authority, 1..=10; see [`replica_count`].
+    /// Copies sent of every authority, 1..=10.
     pub replicas: u32,
     /// How states that overtook each other are taken.
     pub message_order: MessageOrder,

@@ -55,7 +55,7 @@ fn to_files(args: &ReportArgs, console: &mut Console) -> Result<(), Refusal> {
     });
     let materials = materials.map_err(usage)?;
     if format == Format::Svg && template.is_none() {
-        return metrics(args, &materials, console);
+        return charts(args, &materials, console);
     }
     let own = template
         .as_ref()
@@ -108,11 +108,7 @@ fn template(path: &Path) -> Result<(String, String), Refusal> {
 }
 
 /// One figure to a file or standard output, or all of them to a folder.
-fn metrics(
-    args: &ReportArgs,
-    materials: &[Material],
-    console: &mut Console,
-) -> Result<(), Refusal> {
+fn charts(args: &ReportArgs, materials: &[Material], console: &mut Console) -> Result<(), Refusal> {
     let files = Progress::begin().during(console, "drawing", |_| {
         page::figure_files(materials, args.figure.as_deref())
     });

@@ -7,8 +7,8 @@
 //! - *Sensor adapter*: we are the sensor. Each `EgmRobot` that comes becomes a feedback, and commands
 //!   go out as `EgmSensor` to where it came from.
 //!
-//! Read in this order: [`hil_rundir::launch`], `process`, `arm`, then `robot` or `sensor`; [`hil_rundir::adapter_record`] is what
-//! they note, `figures` what that comes to.
+//! Read in this order: [`hil_rundir::launch`], `process`, `arm`, then `robot` or `sensor`;
+//! [`hil_rundir::adapter_record`] is what they note.
 //!
 //! On the measured path nothing allocates once the protocol's lists have grown, but for what a joint
 //! session does not use (a tool speed, signals of a program, forces) and for the error of a datagram

@@ -12,7 +12,7 @@ use hil_platform::wait::WAIT_MAX;
 use hil_rundir::pipe::{Orders, ProcessReport};
 use hil_rundir::record::{RecordKind, RecordSink, Recorder};
 use hil_shm::{Domain, RawInput, Waiter};
-use hil_topology::NicChannel;
+use hil_topology::RoleChannel;
 
 /// Records a ring holds.
 const RING_RECORDS: usize = 16_384;
@@ -20,7 +20,7 @@ const RING_RECORDS: usize = 16_384;
 /// The channels nobody speaks for.
 #[derive(Debug)]
 pub(super) struct Spare {
-    channels: Vec<(NicChannel, RecordSink)>,
+    channels: Vec<(RoleChannel, RecordSink)>,
 }
 
 impl Spare {
@@ -29,7 +29,7 @@ impl Spare {
     /// # Errors
     /// When a file cannot be made.
     pub(super) fn open(
-        channels: &[NicChannel],
+        channels: &[RoleChannel],
         recorder: &mut Recorder,
     ) -> Result<Self, WorkerError> {
         let mut opened = Vec::new();

@@ -26,7 +26,7 @@ use hil_rundir::launch::{AdapterSettings, ArmLaunch};
 use hil_rundir::pipe::AdapterRefusal;
 use hil_rundir::record::Recorder;
 use hil_shm::{ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput};
-use hil_topology::{AdapterKind, AdapterSend, NicChannel, Timestamps};
+use hil_topology::{AdapterKind, AdapterSend, RoleChannel, Timestamps};
 
 const FEEDBACK: &str = "egm/right/feedback";
 const COMMAND: &str = "egm/right/command";
@@ -150,7 +150,7 @@ impl Bench {
 }
 
 fn settings(kind: AdapterKind, address: SocketAddr) -> AdapterSettings {
-    let channel = |name: &str, message: MessageType| NicChannel {
+    let channel = |name: &str, message: MessageType| RoleChannel {
         name: name.to_owned(),
         message_name: message.name.to_owned(),
         message_size_bytes: message.size_bytes,

@@ -21,7 +21,7 @@ use hil_rundir::pipe::{Orders, ProcessReport};
 use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder};
 use hil_shm::{ChannelError, Domain, Sequencer, ShmInput, ShmOutput, Waiter};
 use hil_topology::registry::Registry;
-use hil_topology::{NicChannel, RoleSpec};
+use hil_topology::{RoleChannel, RoleSpec};
 
 /// Records a ring holds: 4 s at 4 kHz, far more than the writer's period needs.
 const RING_RECORDS: usize = 16_384;
@@ -110,12 +110,12 @@ struct Counts {
 
 impl Counts {
     fn of(card: &RoleSpec) -> Self {
-        let counter = |channel: &NicChannel, what| Counter {
+        let counter = |channel: &RoleChannel, what| Counter {
             channel: channel.name.clone(),
             what,
             count: Arc::default(),
         };
-        let given = |channel: &NicChannel| {
+        let given = |channel: &RoleChannel| {
             let what = if channel.is_recorded_only {
                 "recorded"
             } else {
@@ -304,7 +304,7 @@ mod tests {
     use super::*;
     use hil_shuttle::Shuttle;
 
-    fn nic(case: &str, role: &str) -> RoleSpec {
+    fn role_spec(case: &str, role: &str) -> RoleSpec {
         RoleSpec {
             process: "test".to_owned(),
             case: Some(case.to_owned()),
@@ -317,13 +317,13 @@ mod tests {
     }
 
     #[test]
-    fn a_nic_that_fits_no_case_or_role_is_refused_by_name() {
+    fn a_role_spec_that_fits_no_case_or_role_is_refused_by_name() {
         let mut registry = Registry::default();
         registry.add::<Shuttle>();
-        let error = make_role(&nic("fleet", "robot"), &registry).unwrap_err();
+        let error = make_role(&role_spec("fleet", "robot"), &registry).unwrap_err();
         assert!(error.to_string().contains("no case fleet"), "{error}");
-        let error = make_role(&nic("shuttle", "pilot"), &registry).unwrap_err();
+        let error = make_role(&role_spec("shuttle", "pilot"), &registry).unwrap_err();
         assert_eq!(error.to_string(), "case shuttle has no role pilot");
-        assert!(make_role(&nic("shuttle", "robot"), &registry).is_ok());
+        assert!(make_role(&role_spec("shuttle", "robot"), &registry).is_ok());
     }
 }

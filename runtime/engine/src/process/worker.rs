@@ -42,6 +42,9 @@ pub(crate) const NO_TIMER: u64 = u64::MAX;
 /// Why a process of the run cannot go on.
 #[derive(Debug, thiserror::Error)]
 pub enum WorkerError {
+    /// A thread of a gateway or an adapter panicked.
+    #[error("a thread panicked")]
+    Panicked,
     /// The launch file.
     #[error(transparent)]
     Launch(#[from] LaunchError),
@@ -223,10 +226,13 @@ fn open_and_run(path: &Path, registry: &Registry) -> Result<(), WorkerError> {
     report.recorder_dropped = written.dropped_count;
     report.recorder_failures = written.failures;
     add_usage(&mut report);
-    if let Some(panic) = panic {
-        resume_unwind(panic);
-    }
     say(&FromProcess::Finished(Box::new(report)));
+    match (panic, &launch.work) {
+        // A role is the user's code, and its process may be started again; a panic of ours is a fault.
+        (Some(panic), Work::Component(_)) => resume_unwind(panic),
+        (Some(_), _) => return Err(WorkerError::Panicked),
+        (None, _) => {}
+    }
     outcome.and(problem.map_or(Ok(()), |text| Err(WorkerError::Unrecorded(text))))
 }
 
@@ -323,12 +329,12 @@ struct Ended {
 }
 
 fn run_job(job: Job<'_>, orders: &Orders, sender: Sender<Word>) -> Ended {
-    let status_publisher = EndTeller(sender);
+    let end = EndTeller(sender);
     let mut thread = JobThread::default();
     let mut report = ProcessReport::default();
     let outcome = (job.connect)(&mut thread).and_then(|mut work| {
         // The process waits for this word; it cannot have left.
-        let _left = status_publisher.0.send(Word::Connected).is_err();
+        let _left = end.0.send(Word::Connected).is_err();
         let outcome = work.run(orders);
         report = work.report();
         outcome

@@ -88,7 +88,7 @@ impl ConnectionCounts {
     }
 }
 
-/// Whom the door opens for.
+/// Whom the listener lets in.
 #[derive(Debug, Clone)]
 pub(super) struct Admission {
     /// Name of this host.
@@ -247,7 +247,10 @@ impl ControlListener {
             drop(alive);
         };
         // Without a thread the connection is dropped, and its end tries again.
-        match thread::Builder::new().name("door".to_owned()).spawn(greet) {
+        match thread::Builder::new()
+            .name("listener".to_owned())
+            .spawn(greet)
+        {
             Ok(thread) => self.half_open.push(HalfOpen {
                 ip,
                 stream: handle,

@@ -123,7 +123,7 @@ impl Meeting {
 pub(crate) struct Met {
     /// All that were awaited.
     pub(crate) peers: Vec<Peer>,
-    /// What else came to the door and got no further, in words.
+    /// Connections that were refused, in words.
     pub(crate) strangers: Option<String>,
 }
 

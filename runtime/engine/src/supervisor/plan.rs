@@ -24,8 +24,9 @@ use hil_rundir::launch::{
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{
-    AdapterKind, Channel, Crossing, EgmAdapter, Execution, Host, NicChannel, OnExit, Process,
-    Program, RoleSpec, Scheduling, Topology, Wait, command_channel, feedback_channel, gateway_name,
+    AdapterKind, Channel, Crossing, EgmAdapter, Execution, Host, OnExit, Process, Program,
+    RoleChannel, RoleSpec, Scheduling, Topology, Wait, command_channel, feedback_channel,
+    gateway_name,
 };
 
 /// Everything one supervisor is responsible for.
@@ -226,7 +227,7 @@ fn adapter_settings(
             AdapterKind::Robot => (feedback_channel(side), command_channel(side)),
             AdapterKind::Sensor => (command_channel(side), feedback_channel(side)),
         };
-        let named = |channels: &[NicChannel], name: &str| {
+        let named = |channels: &[RoleChannel], name: &str| {
             channels
                 .iter()
                 .find(|channel| channel.name == name)
@@ -247,7 +248,7 @@ fn adapter_settings(
         });
     }
     let (cycle, delay_cycles) = robot_cycle(card);
-    let is_used = |channel: &&NicChannel| arms.iter().any(|arm| arm.input == **channel);
+    let is_used = |channel: &&RoleChannel| arms.iter().any(|arm| arm.input == **channel);
     AdapterSettings {
         role: role.to_owned(),
         kind: adapter.kind,

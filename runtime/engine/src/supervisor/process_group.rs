@@ -143,10 +143,10 @@ impl ProcessGroup {
                 realtime,
                 wait,
             } => {
-                let nic_path = self.folder.nic(&name);
-                write(&nic_path, card)?;
+                let role_spec_path = self.folder.role_spec(&name);
+                write(&role_spec_path, card)?;
                 Some(Work::Component(ComponentWork {
-                    card: nic_path,
+                    card: role_spec_path,
                     realtime: realtime.clone(),
                     wait: *wait,
                 }))
@@ -160,15 +160,15 @@ impl ProcessGroup {
                 command,
                 environment,
             } => {
-                let nic_path = self.folder.nic(&name);
-                write(&nic_path, card)?;
+                let role_spec_path = self.folder.role_spec(&name);
+                write(&role_spec_path, card)?;
                 let supervisor = std::process::id().to_string();
                 program
                     .args(["become", "--supervisor", &supervisor, "--"])
                     .args(command)
                     .envs(environment)
                     .env("HIL_DOMAIN", &domain)
-                    .env("HIL_CARD", &nic_path);
+                    .env("HIL_CARD", &role_spec_path);
                 None
             }
         };

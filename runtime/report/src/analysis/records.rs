@@ -157,7 +157,7 @@ impl<'a> RunRecords<'a> {
     }
 
     /// The clock of a card, by the name that a
-    /// [`NicHistory`](hil_rundir::card_story::CardStory) gives it; `None` when it was not read.
+    /// [`NicHistory`](hil_rundir::nic_history::NicHistory) gives it; `None` when it was not read.
     pub(super) fn nic_timeline(&self, card: &str) -> Option<NicTimeline> {
         self.cards.get(card).map(|pairs| NicTimeline::new(pairs))
     }

@@ -130,7 +130,7 @@ fn who_stands_in_for_the_robot_sees_a_sensor_and_leaves_no_record() {
 }
 
 #[test]
-fn a_adapter_survives_being_written_back() {
+fn an_adapter_survives_being_written_back() {
     for text in [CLIENT, ROBOT] {
         let topology = good(text);
         let written = topology.to_toml();
@@ -141,7 +141,7 @@ fn a_adapter_survives_being_written_back() {
 }
 
 #[test]
-fn a_adapter_may_be_started_again_although_the_case_remembers() {
+fn an_adapter_may_be_started_again_although_the_case_remembers() {
     let text = CLIENT.replace(
         "role = \"controller\"",
         "role = \"controller\"\non_exit = \"restart\"",
@@ -305,7 +305,7 @@ const FAULTY: &[Faulty] = &[
 ];
 
 #[test]
-fn what_a_adapter_may_not_say_is_named_with_what_it_may() {
+fn what_an_adapter_may_not_say_is_named_with_what_it_may() {
     for Faulty(text, from, to, key, words) in FAULTY {
         let faulty = text.replace(from, to);
         assert_ne!(faulty, *text, "{from} is not there");

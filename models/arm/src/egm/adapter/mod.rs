@@ -25,14 +25,14 @@
 //! #     ..Zeroable::zeroed()
 //! # };
 //! # let command = EgmCommand { position_rad: RIGHT_START_RAD, ..Zeroable::zeroed() };
-//! let mut robot = RobotFace::new(RobotFaceSettings {
+//! let mut robot = RobotAdapter::new(RobotAdapterSettings {
 //!     side: Side::Right,
 //!     axes: Axes::Seven,
 //!     robotware: RobotWare::Six,
 //!     cycle: Duration::from_millis(4),
 //!     planned_lead: Duration::from_millis(16),
 //! });
-//! let mut sensor = SensorFace::new(SensorFaceSettings {
+//! let mut sensor = SensorAdapter::new(SensorAdapterSettings {
 //!     axes: Axes::Seven,
 //!     held_rad: 0.0,
 //!     policy: SendPolicy::Coupled { patience: Duration::from_millis(2) },

@@ -132,7 +132,7 @@ pub struct EgmCartesianSpeed {
 /// `EgmExternalJoints`, laid out alike, and uses it nowhere.
 #[derive(Clone, PartialEq, prost::Message)]
 pub struct EgmJoints {
-    /// One value per joint; see [`crate::egm::wire::joints`] for which is which.
+    /// One value per joint; see the constants of [`crate::egm::wire`] for which is which.
     #[prost(double, repeated, packed = "false", tag = "1")]
     pub joints: Vec<f64>,
 }
