@@ -203,7 +203,7 @@ impl Observer {
                     });
                     return;
                 }
-                // Following our own means looking at everything: what is not ours is nobody's.
+                // Following our own means looking at everything: what is not ours belongs to no flow.
                 Err(Unidentified::Foreign) if flow.kind == FlowKind::Hil => {}
                 Err(reason) => why = Some(reason),
             }

@@ -96,7 +96,7 @@ pub struct RadioLedger {
     reports: VecDeque<RadioReport>,
     /// Sends forgotten because a later one needed their place; each would have a report unmatched.
     pub forgotten_count: u64,
-    /// Reports dropped because nobody took them.
+    /// Reports dropped because they were not taken.
     pub overflow_count: u64,
 }
 

@@ -82,7 +82,7 @@ counts! {
         stamp_count,
         /// Transmit stamps that named no datagram of this sender, dropped.
         unmatched_stamp_count,
-        /// Transmit stamps dropped because nobody fetched them in time; known for a queue only, the
+        /// Transmit stamps dropped because they were not fetched in time; known for a queue only, the
         /// kernel does not tell.
         stamp_overflow_count,
         /// Reports of the network (ICMP) about earlier datagrams, swallowed.
@@ -103,7 +103,7 @@ counts! {
         radio_unacknowledged_count,
         /// Reports of the radio that name no send of ours or came too late to be matched, dropped.
         radio_unmatched_count,
-        /// Reports of the radio dropped because nobody took them in time.
+        /// Reports of the radio dropped because they were not taken in time.
         radio_overflow_count,
     }
     beside {
@@ -181,7 +181,7 @@ counts! {
 }
 
 impl ReceiverCounters {
-    /// What the link model lost its datagrams to, with names; empty where nobody can tell.
+    /// What the link model lost its datagrams to, with names; empty where it is unknown.
     pub fn loss_causes(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
         self.link_loss_causes.into_iter().flat_map(|causes| {
             [

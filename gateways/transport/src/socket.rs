@@ -7,7 +7,7 @@ use std::io;
 use std::net::{IpAddr, SocketAddr};
 
 use nix::sys::socket::{setsockopt, sockopt};
-use socket2::{SockAddr, Socket};
+use socket2::{Domain, Protocol, SockAddr, Socket, Type};
 use thiserror::Error;
 
 use hil_net::timestamping::TimestampMode;
@@ -170,9 +170,29 @@ pub(crate) fn refuse<T>(
     })
 }
 
+/// A non-blocking IP socket with what every transport sets before it binds, connects or listens. The
+/// receive buffer is among it: it decides the window scale of TCP, which the first packet settles.
+pub(crate) fn open(
+    settings: &SocketSettings,
+    kind: Type,
+    protocol: Protocol,
+    label: &'static str,
+) -> Result<Socket, SocketError> {
+    let domain = Domain::for_address(settings.local);
+    let socket = refuse("socket", label, Socket::new(domain, kind, Some(protocol)))?;
+    refuse("O_NONBLOCK", true, socket.set_nonblocking(true))?;
+    if let Some(interface) = &settings.interface {
+        let bound = socket.bind_device(Some(interface.as_bytes()));
+        refuse("SO_BINDTODEVICE", interface, bound)?;
+    }
+    set_buffers(&socket, settings)?;
+    mark(&socket, settings)?;
+    Ok(socket)
+}
+
 /// Sizes the buffers. Beyond `net.core.wmem_max` and `rmem_max` that takes `CAP_NET_ADMIN`; what
 /// remains short without it is reported by [`GrantedOptions`].
-pub(crate) fn set_buffers(socket: &Socket, settings: &SocketSettings) -> Result<(), SocketError> {
+fn set_buffers(socket: &Socket, settings: &SocketSettings) -> Result<(), SocketError> {
     if let Some(bytes) = settings.send_buffer_bytes {
         let doubled = doubled_buffer("SO_SNDBUF", bytes)?;
         refuse("SO_SNDBUF", bytes, socket.set_send_buffer_size(bytes))?;

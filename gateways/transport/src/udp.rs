@@ -8,12 +8,11 @@ use std::os::fd::{AsFd, BorrowedFd};
 
 use hil_core::time::Instant;
 use nix::sys::socket::{setsockopt, sockopt};
-use socket2::{Domain, Protocol, SockAddr, Socket, Type};
+use socket2::{Protocol, SockAddr, Socket, Type};
 
 use super::registry::{OpenReceiver, OpenSender, Transport};
 use super::socket::{
-    GrantedOptions, SocketError, SocketSettings, bind, granted_options, local_address, mark,
-    refuse, set_buffers,
+    self, GrantedOptions, SocketError, SocketSettings, bind, granted_options, local_address, refuse,
 };
 use super::{
     DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
@@ -584,16 +583,7 @@ impl DatagramReceiver for UdpReceiver {
 
 /// A socket with everything set that both directions share.
 fn open_socket(settings: &SocketSettings) -> Result<Socket, SocketError> {
-    let domain = Domain::for_address(settings.local);
-    let opened = Socket::new(domain, Type::DGRAM, Some(Protocol::UDP));
-    let socket = refuse("socket", "UDP", opened)?;
-    refuse("O_NONBLOCK", true, socket.set_nonblocking(true))?;
-    if let Some(interface) = &settings.interface {
-        let bound = socket.bind_device(Some(interface.as_bytes()));
-        refuse("SO_BINDTODEVICE", interface, bound)?;
-    }
-    set_buffers(&socket, settings)?;
-    mark(&socket, settings)?;
+    let socket = socket::open(settings, Type::DGRAM, Protocol::UDP, DESCRIPTION.label)?;
     // A datagram too long for the path is refused instead of sent in pieces, of which the loss
     // of one would look like the loss of all.
     let (option, level, name, discover) = if settings.local.is_ipv4() {

@@ -321,7 +321,7 @@ fn ns(duration: Duration) -> u64 {
     u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// Pins this thread, locks memory, takes the priority; says what became of each.
+/// Pins this thread, locks memory, takes the priority; reports the result of each.
 fn prepare(cpu: Option<usize>, priority: Option<u8>) -> RealtimeGrant {
     apply(&RealtimeRequest {
         cpu,

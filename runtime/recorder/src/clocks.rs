@@ -105,7 +105,7 @@ struct Noted {
 #[derive(Debug, Default)]
 pub(crate) struct Clocks {
     hosts: BTreeMap<String, HostClock>,
-    /// True when every host reads one clock; `None` when nobody said.
+    /// True when every host reads one clock; `None` when unknown.
     pub(crate) has_one_clock: Option<bool>,
 }
 
@@ -239,7 +239,7 @@ impl LiveClocks {
         };
         for channel in feed.channels() {
             let host = channel.description.from_host.as_deref().unwrap_or_default();
-            // Where nobody knows yet how a clock stands, the first message decides.
+            // Where the offset of a clock is not known yet, the first message decides.
             if clocks.has_one_clock.is_some() || clocks.is_here(host) {
                 clocks.basis(host);
             }
@@ -283,7 +283,7 @@ impl LiveClocks {
     }
 
     /// The time of an instant on the clock of `host`; `None` when that clock is another one and
-    /// nobody noted how it stands.
+    /// its offset was not recorded.
     pub(crate) fn time_ns(&mut self, host: &str, monotonic_ns: i64) -> Option<u64> {
         match self.basis(host) {
             Basis::Arrival => at(*self.noted_ns.get(host)?, monotonic_ns),

@@ -1,4 +1,4 @@
-//! Programs nobody here wrote drive our robot through its EGM adapter: the packages `ABBRobotEGM` and
+//! Foreign programs drive our robot through its EGM adapter: the packages `ABBRobotEGM` and
 //! `abb_robot_client`, a process each, by the scripts in `tests/egm_clients`. Opt-in, because they
 //! come from the network: `HIL_EGM_CLIENTS` names a Python that has both (see
 //! `tests/egm_clients/requirements.txt`), `HIL_EGM_CLIENT_SECONDS` how long each drives (20;

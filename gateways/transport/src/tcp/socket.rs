@@ -6,10 +6,10 @@ use std::io;
 use std::net::SocketAddr;
 
 use hil_core::time::Instant;
-use socket2::{Domain, Protocol, SockAddr, Socket, TcpKeepalive, Type};
+use socket2::{Protocol, SockAddr, Socket, TcpKeepalive, Type};
 
 use super::DESCRIPTION;
-use crate::socket::{SocketError, SocketSettings, bind, mark, refuse, set_buffers};
+use crate::socket::{self, SocketError, SocketSettings, bind, mark, refuse};
 
 /// Silence after which the kernel asks whether the peer is still there.
 pub(super) const KEEP_ALIVE_IDLE: Duration = Duration::from_secs(5);
@@ -28,17 +28,7 @@ const LISTEN_BACKLOG: i32 = 8;
 
 /// A socket with everything set that has to be before it connects or listens.
 fn open(settings: &SocketSettings) -> Result<Socket, SocketError> {
-    let domain = Domain::for_address(settings.local);
-    let opened = Socket::new(domain, Type::STREAM, Some(Protocol::TCP));
-    let socket = refuse("socket", "TCP", opened)?;
-    refuse("O_NONBLOCK", true, socket.set_nonblocking(true))?;
-    if let Some(interface) = &settings.interface {
-        let bound = socket.bind_device(Some(interface.as_bytes()));
-        refuse("SO_BINDTODEVICE", interface, bound)?;
-    }
-    // The receive buffer decides the window scale, which the first packet settles.
-    set_buffers(&socket, settings)?;
-    mark(&socket, settings)?;
+    let socket = socket::open(settings, Type::STREAM, Protocol::TCP, DESCRIPTION.label)?;
     if let Some(segment_bytes) = segment_bytes(settings) {
         let set = socket.set_tcp_mss(segment_bytes);
         refuse("TCP_MAXSEG", segment_bytes, set)?;

@@ -534,7 +534,7 @@ pub struct Incident {
     pub is_under_way: [bool; 2],
     /// Half way between the two, map frame, metres.
     pub position_m: [f64; 2],
-    /// Per robot, what became of its last authority.
+    /// Per robot, the fate of its last authority.
     pub causes: [Cause; 2],
 }
 

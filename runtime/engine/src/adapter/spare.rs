@@ -17,7 +17,7 @@ use hil_topology::RoleChannel;
 /// Records a ring holds.
 const RING_RECORDS: usize = 16_384;
 
-/// The channels nobody speaks for.
+/// The channels that no arm serves.
 #[derive(Debug)]
 pub(super) struct Spare {
     channels: Vec<(RoleChannel, RecordSink)>,
@@ -57,7 +57,7 @@ impl Spare {
     }
 }
 
-/// The channels nobody speaks for, joined.
+/// The channels that no arm serves, joined.
 pub(super) struct JoinedSpare {
     channels: Vec<(RawInput, RecordSink)>,
     waiter: Waiter,

@@ -2,7 +2,7 @@
 //! channel direction. The process's own thread opens and arms the sockets, because kernel stamps are
 //! switched on by a worker that a spinning real-time thread would starve; then it only looks after
 //! connections and orders. A gateway that starts with the run says at once what is wrong with its
-//! path; one that comes back while the run goes on waits for a path that is away, as one that never
+//! path; one that comes back during the run waits for a path that is away, as one that never
 //! left would.
 
 use std::collections::BTreeMap;

@@ -80,7 +80,7 @@ impl TimestampingSetup {
     }
 
     /// Starts the sampler of the hop's radio, if it has one, until `stop` is set; call it from a thread
-    /// of normal priority. Where its record file cannot be opened the run goes on without samples, and
+    /// of normal priority. Where its record file cannot be opened the run continues without samples, and
     /// a fact says so.
     ///
     /// # Errors

@@ -1,6 +1,6 @@
 //! The shell of every process of a run that this binary plays: component, gateway, clock path and
 //! adapter. It hears the supervisor's orders, starts one thread for each job, tells what they count
-//! and that they turn, and reports what became of them. What a job does is its own business.
+//! and that they turn, and reports their outcome. What a job does is its own business.
 
 use std::any::Any;
 use std::panic::resume_unwind;
@@ -121,7 +121,7 @@ pub(crate) struct Job<'a> {
     pub(crate) name: String,
     /// What it counts for whoever watches the run.
     pub(crate) counters: Vec<Counter>,
-    /// The turns of its loop; `None` where nobody looks whether it turns.
+    /// The turns of its loop; `None` where its turns are not watched.
     pub(crate) heartbeat: Option<Heartbeat>,
     /// Joins the channels, in the thread.
     pub(crate) connect: Connect<'a>,

@@ -124,7 +124,7 @@ impl HostDiscipline {
         }
     }
 
-    /// Takes the bound of a synchronised NTP daemon, unless its clock is nobody's.
+    /// Takes the bound of a synchronised NTP daemon, unless its clock has no source.
     fn follow(&mut self, reference: &str, bound_ns: u64) {
         if is_local_reference(reference) {
             self.basis.push_str(LOCAL_CLOCK);

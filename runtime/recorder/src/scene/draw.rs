@@ -33,7 +33,7 @@ const SERIES: [Paint; 7] = [
 ];
 /// What went wrong (`--bad`).
 const BAD: Paint = [0xb3, 0x26, 0x1e];
-/// What is old, or belongs to nobody (`--faint`).
+/// What is old, or has no owner (`--faint`).
 const FAINT: Paint = [0x5b, 0x64, 0x72];
 /// What stands on the ground (`--rule`, darker).
 const STONE: Paint = [0xa6, 0xad, 0xb8];

@@ -1,5 +1,5 @@
 //! Where the records of a served run come from: a finished run's folder, each record when it happened, or a
-//! run that goes on, as its feed tells of it.
+//! running run, as its feed tells of it.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom};
@@ -292,7 +292,7 @@ const LINES_MAX: usize = 3;
 /// As much of the end of a log is read: it is looked at every second, and may become long.
 const LOG_END_BYTES: u64 = 64 * 1024;
 
-/// A run that goes on.
+/// A run that has not ended.
 #[derive(Debug)]
 pub(crate) struct Running {
     feed: Feed,

@@ -162,7 +162,7 @@ impl<'a> RunRecords<'a> {
         self.cards.get(card).map(|pairs| NicTimeline::new(pairs))
     }
 
-    /// The records that `channel` has of one kind; none when nobody left any.
+    /// The records that `channel` has of one kind; empty when there are none.
     pub(super) fn of_kind<R: Pod>(
         &self,
         channel: &str,

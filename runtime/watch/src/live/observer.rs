@@ -471,7 +471,7 @@ impl Observer {
         map.metrics().offset.is_some().then_some(map)
     }
 
-    /// What figures between the two hosts rest on while the run goes on, in the words of a report. What
+    /// What figures between the two hosts rest on during the run, in the words of a report. What
     /// daemons say of system clocks is asked at its end only, so that rung is none of these.
     pub(crate) fn clock_rung(&self, from: &str, to: &str) -> &'static str {
         if self.has_one_clock() {
