@@ -124,7 +124,7 @@ impl HostDiscipline {
         }
     }
 
-    /// Takes the bound of a synchronised NTP daemon, unless its clock has no source.
+    /// Takes the bound of a synchronised NTP daemon, unless its reference is a local clock.
     fn follow(&mut self, reference: &str, bound_ns: u64) {
         if is_local_reference(reference) {
             self.basis.push_str(LOCAL_CLOCK);

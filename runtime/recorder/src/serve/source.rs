@@ -1,5 +1,5 @@
 //! Where the records of a served run come from: a finished run's folder, each record when it happened, or a
-//! running run, as its feed tells of it.
+//! live run, as its feed tells of it.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom};
