@@ -2,8 +2,8 @@
 //! second, and how that grows with the fleet at constant density: every 7 robots bring a yard or
 //! hall of their own. Not a test: it asserts nothing about time.
 //!
-//! `cargo bench -p hil-benches --bench fleet_throughput [-- --rounds 5]`, one thread on processor
-//! 0, a few minutes. Processor time of the thread is measured, not time on the wall, and sizes take
+//! `cargo bench -p hil-benches --bench fleet_throughput [-- --rounds 5 --robot-seconds 20000]`, one
+//! thread on processor 0, a few minutes. Processor time of the thread is measured, not time on the wall, and sizes take
 //! turns round by round, because neighbours on the machine change by the minute. Before the first
 //! round each world is driven until the sections of its paths are known; that time is printed
 //! apart.
@@ -24,7 +24,7 @@ use nix::time::{ClockId, clock_gettime};
 
 const ROBOTS: [u32; 6] = [7, 14, 28, 56, 112, 224];
 const SCENARIOS: [Scenario; 2] = [Scenario::Harbor, Scenario::Warehouse];
-/// Robot-seconds of one case in one round, whatever the number of robots.
+/// Robot-seconds of one case in one round, whatever the number of robots, unless the command line says.
 const ROBOT_SECONDS: i64 = 200_000;
 const ROUNDS: usize = 3;
 
@@ -159,7 +159,7 @@ fn name_of(scenario: Scenario) -> &'static str {
 }
 
 /// Builds the worlds and drives each once, so that no round pays for planning or sections.
-fn cases() -> Vec<Case> {
+fn cases(robot_seconds: i64) -> Vec<Case> {
     let mut cases = Vec::new();
     for scenario in SCENARIOS {
         for robots in ROBOTS {
@@ -181,7 +181,7 @@ fn cases() -> Vec<Case> {
             }));
             let warm_up: f64 = cases[start..]
                 .iter()
-                .map(|case| case.measure(1_000, ROBOT_SECONDS).processor_s)
+                .map(|case| case.measure(1_000, robot_seconds).processor_s)
                 .sum();
             println!(
                 "{} with {robots} robots: planned in {built_s:.2} s, first drives {warm_up:.2} s",
@@ -193,10 +193,12 @@ fn cases() -> Vec<Case> {
 }
 
 fn main() {
-    let mut arguments = std::env::args().skip_while(|argument| argument != "--rounds");
-    let rounds = arguments
-        .nth(1)
-        .map_or(ROUNDS, |text| text.parse().unwrap());
+    let given = |name: &str| {
+        let mut arguments = std::env::args().skip_while(|argument| argument != name);
+        arguments.nth(1).map(|text| text.parse::<i64>().unwrap())
+    };
+    let rounds = given("--rounds").map_or(ROUNDS, |rounds| usize::try_from(rounds).unwrap());
+    let robot_seconds = given("--robot-seconds").unwrap_or(ROBOT_SECONDS);
     // Read first: a pinned process may use one processor only.
     let mut host = HostFacts::read("");
     host.pinning = match pin_to_cpu(0) {
@@ -207,10 +209,10 @@ fn main() {
         "{}",
         serde_json::json!({"bench": "fleet_throughput", "host": host.to_json()})
     );
-    let mut cases = cases();
+    let mut cases = cases(robot_seconds);
     for round in 0..rounds {
         for case in &mut cases {
-            let measured = case.measure(round as u64, ROBOT_SECONDS);
+            let measured = case.measure(round as u64, robot_seconds);
             case.rounds.push(measured);
         }
     }

@@ -99,6 +99,27 @@ impl ShmInput {
         })
     }
 
+    /// What `take` makes of the oldest waiting message; `None` when none waits. Never blocks.
+    ///
+    /// # Errors
+    /// When the channel is broken.
+    pub fn take<T>(
+        &mut self,
+        mut take: impl FnMut(&Envelope, &[u8]) -> T,
+    ) -> Result<Option<T>, ChannelError> {
+        let Self { reader, tracker } = self;
+        loop {
+            let taken = reader.receive(|_, envelope, payload| {
+                tracker.accept(envelope).then(|| take(envelope, payload))
+            })?;
+            match taken {
+                Some(None) => {}
+                Some(taken) => return Ok(taken),
+                None => return Ok(None),
+            }
+        }
+    }
+
     /// What came and what did not.
     pub fn counters(&self) -> InputCounters {
         InputCounters {
@@ -116,21 +137,7 @@ impl InputPort for ShmInput {
         _now: Instant,
         take: &mut dyn FnMut(&Envelope, &[u8]),
     ) -> Result<bool, ChannelError> {
-        let Self { reader, tracker } = self;
-        loop {
-            let taken = reader.receive(|_, envelope, payload| {
-                let is_current = tracker.accept(envelope);
-                if is_current {
-                    take(envelope, payload);
-                }
-                is_current
-            })?;
-            match taken {
-                Some(true) => return Ok(true),
-                Some(false) => {}
-                None => return Ok(false),
-            }
-        }
+        Ok(self.take(take)?.is_some())
     }
 
     fn next_arrival(&self) -> Option<Instant> {
@@ -199,13 +206,11 @@ impl<M: Message> TypedInput<M> {
     /// # Errors
     /// When the channel is broken.
     pub fn receive(&mut self) -> Result<Option<(Envelope, M)>, ChannelError> {
-        let mut taken = None;
-        self.input
-            .receive(Instant::ZERO, &mut |envelope, payload| {
-                // The channel carries messages of this type and no others.
-                taken = M::from_bytes(0, payload).map(|message| (*envelope, message));
-            })?;
-        Ok(taken)
+        // The channel carries messages of this type and no others.
+        let taken = self.input.take(|envelope, payload| {
+            M::from_bytes(0, payload).map(|message| (*envelope, message))
+        })?;
+        Ok(taken.flatten())
     }
 
     /// What came and what did not.
