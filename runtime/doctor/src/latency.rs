@@ -23,7 +23,9 @@ use hil_platform::host_facts::{
     virtual_machine,
 };
 use hil_platform::progress::Stage;
-use hil_platform::realtime::{RealtimeGrant, RealtimeRequest, SchedulingPolicy, apply};
+use hil_platform::realtime::{
+    RealtimeGrant, RealtimeGrantItem, RealtimeItem, RealtimeRequest, SchedulingPolicy, apply,
+};
 
 /// A busy poller holds its CPU at real-time priority; the kernel's own threads there wait this long at
 /// most.
@@ -124,10 +126,8 @@ impl Quantiles {
 pub struct Wakeups {
     /// The CPU it was pinned to; `None` when it was left to run anywhere.
     pub cpu: Option<usize>,
-    /// What was asked of the kernel and what became of it, in words.
-    pub scheduling: Vec<String>,
-    /// The kernel gave everything that was asked.
-    pub is_as_asked: bool,
+    /// What was asked of the kernel and what became of it.
+    pub scheduling: RealtimeGrant,
     /// How long it measured, nanoseconds.
     pub measured_ns: u64,
     /// Instants to wake at that fell into this time. Each has a lateness: one that passed while the
@@ -147,7 +147,7 @@ pub struct Gaps {
     /// The CPU it was pinned to; `None` when it was left to run anywhere.
     pub cpu: Option<usize>,
     /// As for [`Wakeups::scheduling`].
-    pub scheduling: Vec<String>,
+    pub scheduling: RealtimeGrant,
     /// How long it measured, nanoseconds.
     pub measured_ns: u64,
     /// Looks at the clock.
@@ -334,8 +334,15 @@ fn prepare(cpu: Option<usize>, priority: Option<u8>) -> RealtimeGrant {
     })
 }
 
-fn in_words(grant: &RealtimeGrant) -> Vec<String> {
-    grant.items.iter().map(ToString::to_string).collect()
+/// How long to measure: not at all where the thread is not on the CPU that the figures would be called
+/// after, such as one outside the cpuset.
+fn duration_of(asked: Duration, grant: &RealtimeGrant) -> Duration {
+    let is_elsewhere = |one: &RealtimeGrantItem| one.item == RealtimeItem::CpuPinning;
+    if grant.refusals().any(is_elsewhere) {
+        Duration::ZERO
+    } else {
+        asked
+    }
 }
 
 /// Times that the kernel took the CPU away from this thread so far.
@@ -353,7 +360,7 @@ fn wake(request: &LatencyRequest, cpu: Option<usize>, stop: &AtomicBool) -> Wake
     let mut timer = PeriodicTimer::new(request.period);
     let preempted_before = preempted_count();
     let start = MonotonicClock::now();
-    let end = start + request.duration;
+    let end = start + duration_of(request.duration, &grant);
     timer.start(start + request.period);
     let mut skipped_count = 0;
     while let Some(due) = timer.next()
@@ -380,8 +387,7 @@ fn wake(request: &LatencyRequest, cpu: Option<usize>, stop: &AtomicBool) -> Wake
     let preempted = preempted_before.zip(preempted_count());
     Wakeups {
         cpu,
-        is_as_asked: grant.is_complete(),
-        scheduling: in_words(&grant),
+        scheduling: grant,
         measured_ns: u64::try_from(measured).unwrap_or(0),
         count: histogram.count(),
         skipped_count,
@@ -405,7 +411,7 @@ fn spin(
     let kept_back_ns = throttle_ns.unwrap_or(0);
     let (mut look_count, mut lost_ns, mut throttle_like_count) = (0, 0, 0);
     let start = MonotonicClock::now();
-    let end = start + duration;
+    let end = start + duration_of(duration, &grant);
     let mut last = start;
     while last < end && !stop.load(Ordering::Relaxed) {
         let now = MonotonicClock::now();
@@ -421,7 +427,7 @@ fn spin(
     }
     Gaps {
         cpu,
-        scheduling: in_words(&grant),
+        scheduling: grant,
         measured_ns: u64::try_from(last.ns_since(start)).unwrap_or(0),
         look_count,
         count: histogram.count(),
@@ -433,6 +439,8 @@ fn spin(
 
 #[cfg(test)]
 mod tests {
+    use hil_platform::realtime::GrantOutcome;
+
     use super::*;
 
     fn brief_of(milliseconds: u64) -> LatencyRequest {
@@ -535,9 +543,19 @@ mod tests {
             ..LatencyRequest::brief(None)
         };
         let wakeups = wake(&request, Some(1000), &AtomicBool::new(false));
-        assert!(!wakeups.is_as_asked);
+        assert!(!wakeups.scheduling.is_complete());
+        assert_eq!((wakeups.count, wakeups.lateness), (0, None), "of no CPU");
+        let gaps = spin(
+            Some(1000),
+            None,
+            request.duration,
+            None,
+            &AtomicBool::new(false),
+        );
+        assert_eq!((gaps.look_count, gaps.count, gaps.length), (0, 0, None));
+        let pin = &wakeups.scheduling.items[0];
         assert!(
-            wakeups.scheduling[0].starts_with("cpu 1000 refused"),
+            pin.asked == "cpu 1000" && matches!(pin.outcome, GrantOutcome::Refused { .. }),
             "{wakeups:?}"
         );
     }

@@ -6,6 +6,7 @@ use core::fmt::Write as _;
 
 use anstyle::{AnsiColor, Style};
 use hil_platform::host_facts::Fact;
+use hil_platform::realtime::{GrantOutcome, RealtimeGrantItem};
 use hil_platform::words::plural;
 
 use super::latency::{LatencyReport, Quantiles, Standing, us_up};
@@ -152,17 +153,18 @@ fn push_latency(text: &mut String, report: &LatencyReport, has_colour: bool) {
 
 /// How the threads ran, said once where they agree.
 fn push_scheduling(text: &mut String, report: &LatencyReport) {
-    let mut lines: Vec<&str> = Vec::new();
-    for words in report.wakeups.iter().flat_map(|one| &one.scheduling) {
-        if !lines.contains(&words.as_str()) {
-            lines.push(words);
+    let mut seen: Vec<&RealtimeGrantItem> = Vec::new();
+    for item in report.wakeups.iter().flat_map(|one| &one.scheduling.items) {
+        if !seen.contains(&item) {
+            seen.push(item);
         }
     }
-    let is_refused = |line: &&str| line.contains(" refused");
-    let (refused, granted): (Vec<&str>, Vec<&str>) = lines.into_iter().partition(is_refused);
+    let is_granted = |item: &&RealtimeGrantItem| item.outcome == GrantOutcome::Granted;
+    let (granted, refused): (Vec<_>, Vec<_>) = seen.into_iter().partition(is_granted);
+    let granted: Vec<String> = granted.into_iter().map(ToString::to_string).collect();
     push_behind(text, "  ", 2, &granted.join(", "));
-    for words in refused {
-        push_behind(text, "  ", 2, words);
+    for item in refused {
+        push_behind(text, "  ", 2, &item.to_string());
     }
 }
 

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Gaps, HostActivity, LatencyReport, Quantiles, Wakeups};
+use super::{Gaps, HostActivity, LatencyReport, Quantiles};
 use crate::finding::{Answer, Checked, Finding};
 use hil_platform::host_facts::Fact;
 use hil_platform::words::counted_plainly;
@@ -78,18 +78,19 @@ fn period_ns(report: &LatencyReport) -> i64 {
 /// The finding that a measurement of wake-ups comes to: that of the CPU that was latest at p99.
 pub(crate) fn judge(measured: &LatencyReport) -> Checked {
     let id = "wakeup_latency";
-    let figures = |one: &Wakeups| Some((one.count, one.is_as_asked, one.lateness?));
-    let with_metrics = measured.wakeups.iter().filter_map(figures);
-    let worst = with_metrics.max_by_key(|(.., lateness)| lateness.p99_ns);
+    let wakeups = measured.wakeups.iter();
+    let with_metrics = wakeups.filter_map(|one| Some((one, one.lateness?)));
+    let worst = with_metrics.max_by_key(|(_, lateness)| lateness.p99_ns);
     let worst = worst.ok_or("no wake-up fell into the measuring time");
-    let (count, is_as_asked, lateness) = worst.told(id)?;
+    let (wakeups, lateness) = worst.told(id)?;
     let [p50, p99, max] =
         [lateness.p50_ns, lateness.p99_ns, lateness.max_ns].map(|ns| ns as f64 / 1000.0);
-    let how = if is_as_asked {
+    let how = if wakeups.scheduling.is_complete() {
         format!("SCHED_FIFO {}", measured.priority)
     } else {
         "not at the priority asked for".to_owned()
     };
+    let count = wakeups.count;
     let value = format!("p50 {p50:.0} us, p99 {p99:.0} us, max {max:.0} us of {count} ({how})");
     let below = if measured.surroundings.is_virtual_machine() {
         "; this is a virtual machine, whose tail comes from below and stays when it is idle"
@@ -291,8 +292,11 @@ pub(crate) fn us_up(ns: i64) -> i64 {
 
 #[cfg(test)]
 mod tests {
+    use hil_platform::realtime::RealtimeGrant;
+
     use super::*;
     use crate::finding::{Severity, settled};
+    use crate::latency::Wakeups;
 
     fn report(count: u64, lateness_us: [i64; 4]) -> LatencyReport {
         let [p50, p99, p999, max] = lateness_us.map(|us| us * 1000);
@@ -305,8 +309,7 @@ mod tests {
             is_interrupted: false,
             wakeups: vec![Wakeups {
                 cpu: Some(1),
-                scheduling: Vec::new(),
-                is_as_asked: true,
+                scheduling: RealtimeGrant::default(),
                 measured_ns: 30_000_000_000,
                 count,
                 skipped_count: 0,
@@ -397,7 +400,7 @@ mod tests {
         let mut report = report(30_000, [3, 8, 12, 40]);
         report.gaps = vec![Gaps {
             cpu: Some(1),
-            scheduling: Vec::new(),
+            scheduling: RealtimeGrant::default(),
             measured_ns: 10_000_000_000,
             look_count: 100_000_000,
             count: 3_500,
