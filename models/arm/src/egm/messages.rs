@@ -5,20 +5,6 @@ use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
 use crate::yumi::{Joints, Pose};
-use hil_core::layout::Field;
-use hil_core::message::Message;
-
-/// Makes a message of a structure whose layout is stated: its name, its size in bytes.
-macro_rules! message {
-    ($structure:ident, $name:literal, $bytes:literal) => {
-        impl Message for $structure {
-            const NAME: &'static str = $name;
-            const FIELDS: &'static [Field] = Self::LAYOUT;
-        }
-
-        const _: () = assert!(size_of::<$structure>() == $bytes);
-    };
-}
 
 /// One of the robot's two arms, each a motion task of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -53,25 +39,27 @@ impl Side {
     }
 }
 
-/// To the robot: where one arm shall be.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct EgmCommand {
-    /// The human frame this command answers; a foreign client's counts its datagrams instead.
-    pub frame_index: u64,
-    /// Time of that frame on the motion's own time axis; of a foreign client, zero.
-    pub source_time_ns: i64,
-    /// [`EgmFeedback::cycle_index`] of the newest feedback the sender had seen; meaningless
-    /// without [`EgmCommand::ANSWERS`].
-    pub answered_cycle: u64,
-    /// Desired joint positions.
-    pub position_rad: Joints,
-    /// Desired joint speeds; meaningless without [`EgmCommand::HAS_SPEED`].
-    pub speed_rad_per_s: Joints,
-    /// Sender's number of this message; foreign clients do not always count by one.
-    pub seqno: u32,
-    /// Bits below; all others are zero.
-    pub flags: u32,
+hil_core::message! {
+    /// To the robot: where one arm shall be.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct EgmCommand = "hil.EgmCommand.v1" {
+        /// The human frame this command answers; a foreign client's counts its datagrams instead.
+        pub frame_index: u64,
+        /// Time of that frame on the motion's own time axis; of a foreign client, zero.
+        pub source_time_ns: i64,
+        /// [`EgmFeedback::cycle_index`] of the newest feedback the sender had seen; meaningless
+        /// without [`EgmCommand::ANSWERS`].
+        pub answered_cycle: u64,
+        /// Desired joint positions.
+        pub position_rad: Joints,
+        /// Desired joint speeds; meaningless without [`EgmCommand::HAS_SPEED`].
+        pub speed_rad_per_s: Joints,
+        /// Sender's number of this message; foreign clients do not always count by one.
+        pub seqno: u32,
+        /// Bits below; all others are zero.
+        pub flags: u32,
+    }
 }
 
 impl EgmCommand {
@@ -89,50 +77,42 @@ impl EgmCommand {
     pub const PARKED: u32 = 1 << 5;
 }
 
-hil_core::layout!(EgmCommand {
-    frame_index,
-    source_time_ns,
-    answered_cycle,
-    position_rad,
-    speed_rad_per_s,
-    seqno,
-    flags
-});
+const _: () = assert!(size_of::<EgmCommand>() == 144);
 
-message!(EgmCommand, "hil.EgmCommand.v1", 144);
-
-/// From the robot, every cycle: where one arm is.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct EgmFeedback {
-    /// Controller cycle, counted from the robot's start; a skipped cycle leaves a gap.
-    pub cycle_index: u64,
-    /// [`EgmCommand::frame_index`] of the reference in use; meaningless without
-    /// [`EgmFeedback::HAS_REFERENCE`].
-    pub reference_frame_index: u64,
-    /// Time since the reference in use arrived at the robot, queueing included; without
-    /// [`EgmFeedback::HAS_REFERENCE`], since its session began to be set up or to run.
-    pub reference_age_ns: i64,
-    /// Joint positions as measured.
-    pub measured_rad: Joints,
-    /// Joint positions as the controller plans them, ahead of the measured by its own delay.
-    pub planned_rad: Joints,
-    /// Tool centre point (the flange frame `tool0`) in the robot's body frame: x forward, y to
-    /// the robot's left, z up.
-    pub tool: Pose,
-    /// The controller's clock in milliseconds, wrapping; the protocol's `tm`.
-    pub clock_ms: u32,
-    /// Counts the cycles since guided motion last began to run, from 0; the protocol's `seqno`. A
-    /// skipped cycle leaves a gap.
-    pub seqno: u32,
-    /// Counts the sessions (activations) since the robot's start, from 1; 0 before the first.
-    pub session: u32,
-    /// [`SessionState`] as a number.
-    pub state: u32,
-    /// Commands waiting after this cycle took its own.
-    pub queue_count: u32,
-    /// Bits below; all others are zero.
-    pub flags: u32,
+hil_core::message! {
+    /// From the robot, every cycle: where one arm is.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct EgmFeedback = "hil.EgmFeedback.v1" {
+        /// Controller cycle, counted from the robot's start; a skipped cycle leaves a gap.
+        pub cycle_index: u64,
+        /// [`EgmCommand::frame_index`] of the reference in use; meaningless without
+        /// [`EgmFeedback::HAS_REFERENCE`].
+        pub reference_frame_index: u64,
+        /// Time since the reference in use arrived at the robot, queueing included; without
+        /// [`EgmFeedback::HAS_REFERENCE`], since its session began to be set up or to run.
+        pub reference_age_ns: i64,
+        /// Joint positions as measured.
+        pub measured_rad: Joints,
+        /// Joint positions as the controller plans them, ahead of the measured by its own delay.
+        pub planned_rad: Joints,
+        /// Tool centre point (the flange frame `tool0`) in the robot's body frame: x forward, y to
+        /// the robot's left, z up.
+        pub tool: Pose,
+        /// The controller's clock in milliseconds, wrapping; the protocol's `tm`.
+        pub clock_ms: u32,
+        /// Counts the cycles since guided motion last began to run, from 0; the protocol's `seqno`. A
+        /// skipped cycle leaves a gap.
+        pub seqno: u32,
+        /// Counts the sessions (activations) since the robot's start, from 1; 0 before the first.
+        pub session: u32,
+        /// [`SessionState`] as a number.
+        pub state: u32,
+        /// Commands waiting after this cycle took its own.
+        pub queue_count: u32,
+        /// Bits below; all others are zero.
+        pub flags: u32,
+    }
 }
 
 impl EgmFeedback {
@@ -162,22 +142,7 @@ impl EgmFeedback {
     }
 }
 
-hil_core::layout!(EgmFeedback {
-    cycle_index,
-    reference_frame_index,
-    reference_age_ns,
-    measured_rad,
-    planned_rad,
-    tool,
-    clock_ms,
-    seqno,
-    session,
-    state,
-    queue_count,
-    flags
-});
-
-message!(EgmFeedback, "hil.EgmFeedback.v1", 216);
+const _: () = assert!(size_of::<EgmFeedback>() == 216);
 
 /// What an arm's motion task is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -211,44 +176,34 @@ impl SessionState {
     }
 }
 
-/// To the record: something happened to an arm's session. What `value`, `limit` and `count` mean,
-/// `kind` says.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct EgmEvent {
-    /// Grid time of the cycle in which it happened, the robot's clock.
-    pub at_ns: i64,
-    /// That cycle.
-    pub cycle_index: u64,
-    /// What was seen, in the unit of the kind.
-    pub value: f64,
-    /// What it was held against, in the same unit.
-    pub limit: f64,
-    /// A count that belongs to it.
-    pub count: u64,
-    /// [`EgmEventKind`] as a number.
-    pub kind: u32,
-    /// [`Side::index`].
-    pub side: u32,
-    /// The session it belongs to.
-    pub session: u32,
-    /// [`EndCause`] or refusal as a number, where the kind has one.
-    pub cause: u32,
+hil_core::message! {
+    /// To the record: something happened to an arm's session. What `value`, `limit` and `count` mean,
+    /// `kind` says.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct EgmEvent = "hil.EgmEvent.v1" {
+        /// Grid time of the cycle in which it happened, the robot's clock.
+        pub at_ns: i64,
+        /// That cycle.
+        pub cycle_index: u64,
+        /// What was seen, in the unit of the kind.
+        pub value: f64,
+        /// What it was held against, in the same unit.
+        pub limit: f64,
+        /// A count that belongs to it.
+        pub count: u64,
+        /// [`EgmEventKind`] as a number.
+        pub kind: u32,
+        /// [`Side::index`].
+        pub side: u32,
+        /// The session it belongs to.
+        pub session: u32,
+        /// [`EndCause`] or refusal as a number, where the kind has one.
+        pub cause: u32,
+    }
 }
 
-hil_core::layout!(EgmEvent {
-    at_ns,
-    cycle_index,
-    value,
-    limit,
-    count,
-    kind,
-    side,
-    session,
-    cause
-});
-
-message!(EgmEvent, "hil.EgmEvent.v1", 56);
+const _: () = assert!(size_of::<EgmEvent>() == 56);
 
 /// What an [`EgmEvent`] tells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -311,49 +266,46 @@ pub enum CommandRefusal {
     NoSession = 3,
 }
 
-/// To the record: a command as it arrived at the controller, before anything was made of it. With
-/// [`MotionArrival`] and [`EgmEventKind::Started`] it is all that a replay needs.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct EgmArrival {
-    /// When, on the robot's clock.
-    pub at_ns: i64,
-    /// [`Side::index`].
-    pub side: u32,
-    /// Zero.
-    pub reserved: u32,
-    /// The command.
-    pub command: EgmCommand,
+hil_core::message! {
+    /// To the record: a command as it arrived at the controller, before anything was made of it. With
+    /// [`MotionArrival`] and [`EgmEventKind::Started`] it is all that a replay needs.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct EgmArrival = "hil.EgmArrival.v1" {
+        /// When, on the robot's clock.
+        pub at_ns: i64,
+        /// [`Side::index`].
+        pub side: u32,
+        /// Zero.
+        pub reserved: u32,
+        /// The command.
+        pub command: EgmCommand,
+    }
 }
 
-hil_core::layout!(EgmArrival {
-    at_ns,
-    side,
-    reserved,
-    command
-});
+const _: () = assert!(size_of::<EgmArrival>() == 160);
 
-message!(EgmArrival, "hil.EgmArrival.v1", 160);
-
-/// To the motion server: do something that guided motion is not, or start and stop that.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct MotionRequest {
-    /// The sender's number; the responses carry it.
-    pub request_id: u64,
-    /// [`MotionKind`] as a number.
-    pub kind: u32,
-    /// Bit 0: right arm, bit 1: left arm; several at once are done together.
-    pub arms: u32,
-    /// Target of a joint motion, right then left.
-    pub joints_rad: [Joints; 2],
-    /// Target of a linear motion in the body frame, right then left.
-    pub poses: [Pose; 2],
-    /// Speed of a motion: share of the joints' own limits (joint motion, home), or m/s of the
-    /// tool (linear); 0 takes the controller's default.
-    pub speed: f64,
-    /// Parameters of [`MotionKind::EgmStart`].
-    pub egm: EgmStartParameters,
+hil_core::message! {
+    /// To the motion server: do something that guided motion is not, or start and stop that.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct MotionRequest = "hil.MotionRequest.v1" {
+        /// The sender's number; the responses carry it.
+        pub request_id: u64,
+        /// [`MotionKind`] as a number.
+        pub kind: u32,
+        /// Bit 0: right arm, bit 1: left arm; several at once are done together.
+        pub arms: u32,
+        /// Target of a joint motion, right then left.
+        pub joints_rad: [Joints; 2],
+        /// Target of a linear motion in the body frame, right then left.
+        pub poses: [Pose; 2],
+        /// Speed of a motion: share of the joints' own limits (joint motion, home), or m/s of the
+        /// tool (linear); 0 takes the controller's default.
+        pub speed: f64,
+        /// Parameters of [`MotionKind::EgmStart`].
+        pub egm: EgmStartParameters,
+    }
 }
 
 impl MotionRequest {
@@ -363,17 +315,7 @@ impl MotionRequest {
     }
 }
 
-hil_core::layout!(MotionRequest {
-    request_id,
-    kind,
-    arms,
-    joints_rad,
-    poses,
-    speed,
-    egm
-});
-
-message!(MotionRequest, "hil.MotionRequest.v1", 312);
+const _: () = assert!(size_of::<MotionRequest>() == 312);
 
 /// What a session shall differ in from the controller's own settings; NaN keeps the setting.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
@@ -440,38 +382,30 @@ pub enum MotionKind {
     Home = 5,
 }
 
-/// From the motion server: at once when a request is taken or refused, and once more when what
-/// it began has ended.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct MotionResponse {
-    /// [`MotionRequest::request_id`].
-    pub request_id: u64,
-    /// [`MotionRequest::kind`].
-    pub kind: u32,
-    /// [`MotionOutcome`] as a number.
-    pub outcome: u32,
-    /// [`MotionRefusal`] as a number when refused, otherwise 0.
-    pub refusal: u32,
-    /// [`Side::index`] of the arm at fault when refused.
-    pub refused_side: u32,
-    /// [`SessionState`] of right and left arm.
-    pub states: [u32; 2],
-    /// Measured joints of right and left arm.
-    pub measured_rad: [Joints; 2],
+hil_core::message! {
+    /// From the motion server: at once when a request is taken or refused, and once more when what
+    /// it began has ended.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct MotionResponse = "hil.MotionResponse.v1" {
+        /// [`MotionRequest::request_id`].
+        pub request_id: u64,
+        /// [`MotionRequest::kind`].
+        pub kind: u32,
+        /// [`MotionOutcome`] as a number.
+        pub outcome: u32,
+        /// [`MotionRefusal`] as a number when refused, otherwise 0.
+        pub refusal: u32,
+        /// [`Side::index`] of the arm at fault when refused.
+        pub refused_side: u32,
+        /// [`SessionState`] of right and left arm.
+        pub states: [u32; 2],
+        /// Measured joints of right and left arm.
+        pub measured_rad: [Joints; 2],
+    }
 }
 
-hil_core::layout!(MotionResponse {
-    request_id,
-    kind,
-    outcome,
-    refusal,
-    refused_side,
-    states,
-    measured_rad
-});
-
-message!(MotionResponse, "hil.MotionResponse.v1", 144);
+const _: () = assert!(size_of::<MotionResponse>() == 144);
 
 /// How a request stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -508,19 +442,19 @@ pub enum MotionRefusal {
     GuidedMotionRuns = 7,
 }
 
-/// To the record: a request as it arrived at the motion server.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct MotionArrival {
-    /// When, on the robot's clock.
-    pub at_ns: i64,
-    /// The request.
-    pub request: MotionRequest,
+hil_core::message! {
+    /// To the record: a request as it arrived at the motion server.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct MotionArrival = "hil.MotionArrival.v1" {
+        /// When, on the robot's clock.
+        pub at_ns: i64,
+        /// The request.
+        pub request: MotionRequest,
+    }
 }
 
-hil_core::layout!(MotionArrival { at_ns, request });
-
-message!(MotionArrival, "hil.MotionArrival.v1", 320);
+const _: () = assert!(size_of::<MotionArrival>() == 320);
 
 impl Side {
     /// The side with this number, see [`Side::index`].
