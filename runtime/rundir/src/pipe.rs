@@ -1,7 +1,7 @@
 //! What a supervisor and the process it started say to each other, one JSON line at a time over
 //! the child's standard input and output. Messages of channels never go this way.
 
-use std::io::{self, BufRead, Write};
+use std::io::{self, BufRead, BufReader, Write};
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -291,12 +291,20 @@ impl RunStart {
 }
 
 impl Orders {
-    /// Listens on standard input in a thread of its own. An end of input means that the
-    /// supervisor is gone, and counts as [`ToProcess::Stop`].
+    /// Listens on standard input, as [`Orders::from_input`].
     ///
     /// # Errors
     /// When the system gives no thread.
     pub fn listen() -> io::Result<Self> {
+        Self::from_input(BufReader::new(io::stdin()))
+    }
+
+    /// Listens in a thread of its own. An end of input means that the supervisor is gone, and counts
+    /// as [`ToProcess::Stop`].
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn from_input(input: impl BufRead + Send + 'static) -> io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let start = RunStart::default();
         let (sealed, seal) = channel();
@@ -304,7 +312,7 @@ impl Orders {
         thread::Builder::new()
             .name("orders".to_owned())
             .spawn(move || {
-                for line in io::stdin().lock().lines() {
+                for line in input.lines() {
                     let line = line.ok().map(Zeroizing::new);
                     match line.and_then(|line| serde_json::from_str(&line).ok()) {
                         Some(ToProcess::Seal(seal)) => {

@@ -52,6 +52,15 @@ struct Pending {
     is_reported: bool,
 }
 
+impl Pending {
+    /// Everything that `awaited` says will come has come.
+    const fn is_complete(&self, awaited: StampPlan) -> bool {
+        (self.is_stamped || !awaited.awaits_software())
+            && (self.is_nic_stamped || !awaited.awaits_hardware())
+            && (self.is_reported || !awaited.asks_radio)
+    }
+}
+
 impl Line {
     pub(crate) fn new(
         sender: Box<dyn DatagramSender>,
@@ -231,13 +240,8 @@ impl Line {
     }
 
     fn retire_if_complete(&mut self, token: TxToken) {
-        let awaited = self.awaited;
-        let is_complete = self.pending.find(token).is_some_and(|one| {
-            (one.is_stamped || !awaited.awaits_software())
-                && (one.is_nic_stamped || !awaited.awaits_hardware())
-                && (one.is_reported || !awaited.asks_radio)
-        });
-        if is_complete {
+        let pending = self.pending.find(token);
+        if pending.is_some_and(|one| one.is_complete(self.awaited)) {
             let pending = self.pending.take(token);
             self.retire(pending);
         }
@@ -346,7 +350,48 @@ fn failure(refusal: SendRefusal, is_established: bool) -> TransmitFailure {
 
 #[cfg(test)]
 mod tests {
+    use hil_net::timestamping::TimestampMode;
+
     use super::*;
+
+    #[test]
+    fn a_record_is_complete_when_all_that_the_plan_awaits_has_come() {
+        let [off, software, hardware] = [
+            TimestampMode::Off,
+            TimestampMode::Software,
+            TimestampMode::Hardware,
+        ]
+        .map(StampPlan::asked);
+        for (plan, wanted) in [
+            (off, [false, false, false]),
+            (off.on_radio(true), [false, false, true]),
+            (software, [true, false, false]),
+            (software.on_radio(true), [true, false, true]),
+            (hardware, [true, true, false]),
+            (hardware.on_radio(true), [true, true, true]),
+        ] {
+            for come in 0..8_u8 {
+                let [is_stamped, is_nic_stamped, is_reported] =
+                    [1, 2, 4].map(|bit| come & bit != 0);
+                let pending = Pending {
+                    kind: Kind::Data,
+                    sequence: 0,
+                    handed: Instant::ZERO,
+                    record: None,
+                    is_stamped,
+                    is_nic_stamped,
+                    is_reported,
+                };
+                let has = [is_stamped, is_nic_stamped, is_reported];
+                let lacks_none = wanted.iter().zip(has).all(|(wanted, has)| has || !wanted);
+                assert_eq!(
+                    pending.is_complete(plan),
+                    lacks_none,
+                    "{plan:?} {pending:?}"
+                );
+            }
+        }
+    }
 
     #[test]
     fn a_departure_replaces_a_stamp_before_the_queue_in_either_order() {

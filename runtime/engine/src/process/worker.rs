@@ -2,7 +2,6 @@
 //! adapter. It hears the supervisor's orders, starts one thread for each job, tells what they count
 //! and that they turn, and reports their outcome. What a job does is its own business.
 
-use std::any::Any;
 use std::panic::resume_unwind;
 use std::path::Path;
 use std::sync::Arc;
@@ -42,7 +41,7 @@ pub(crate) const NO_TIMER: u64 = u64::MAX;
 /// Why a process of the run cannot go on.
 #[derive(Debug, thiserror::Error)]
 pub enum WorkerError {
-    /// A thread of a gateway or an adapter panicked.
+    /// One of its threads panicked.
     #[error("a thread panicked")]
     Panicked,
     /// The launch file.
@@ -219,21 +218,19 @@ fn open_and_run(path: &Path, registry: &Registry) -> Result<(), WorkerError> {
         .start_and_tell(move || stop.store(true, Ordering::Release))
         .map_err(WorkerError::Thread)?;
     let mut report = ProcessReport::default();
-    let mut panic = None;
-    let outcome = run_jobs(opened, &orders, &mut report, &mut panic);
+    let outcome = run_jobs(opened, &orders, &mut report);
     let written = recorder.finish();
     let problem = written.problem();
     report.recorder_dropped = written.dropped_count;
     report.recorder_failures = written.failures;
     add_usage(&mut report);
     say(&FromProcess::Finished(Box::new(report)));
-    match (panic, &launch.work) {
+    match (outcome, &launch.work) {
         // A role is the user's code, and its process may be started again; a panic of ours is a fault.
-        (Some(panic), Work::Component(_)) => resume_unwind(panic),
-        (Some(_), _) => return Err(WorkerError::Panicked),
-        (None, _) => {}
+        (Err(WorkerError::Panicked), Work::Component(_)) => resume_unwind(Box::new(())),
+        (outcome, _) => outcome,
     }
-    outcome.and(problem.map_or(Ok(()), |text| Err(WorkerError::Unrecorded(text))))
+    .and(problem.map_or(Ok(()), |text| Err(WorkerError::Unrecorded(text))))
 }
 
 /// The shared memory that `launch` names.
@@ -243,12 +240,14 @@ pub(crate) fn open_domain(launch: &WorkerLaunch) -> Result<Domain, WorkerError> 
 }
 
 /// Starts a thread for each job, watches them until one ends or the process is told to stop, and adds
-/// to `report` what they report. A panic of a job is left in `panic`.
+/// to `report` what they report.
+///
+/// # Errors
+/// The first of the jobs' errors, or the panic of one.
 fn run_jobs(
     opened: Opened<'_>,
     orders: &Orders,
     report: &mut ProcessReport,
-    panic: &mut Option<Box<dyn Any + Send>>,
 ) -> Result<(), WorkerError> {
     let Opened {
         jobs,
@@ -314,7 +313,8 @@ fn run_jobs(
                     add(report, ended.report, &facts);
                     outcome = outcome.and(ended.outcome);
                 }
-                Err(payload) => *panic = Some(payload),
+                // The thread's own message is on standard error.
+                Err(_payload) => outcome = Err(WorkerError::Panicked),
             }
         }
         outcome
@@ -409,5 +409,62 @@ fn add_usage(report: &mut ProcessReport) {
         report.cpu_s = cpu_us as f64 * 1e-6;
         report.voluntary_switches = usage.voluntary_context_switches().unsigned_abs();
         report.involuntary_switches = usage.involuntary_context_switches().unsigned_abs();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{BufReader, pipe};
+    use std::panic::panic_any;
+
+    use super::*;
+
+    /// Works until told to stop, or panics at once.
+    struct Counting {
+        panics: bool,
+    }
+
+    impl JobWork for Counting {
+        fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
+            if self.panics {
+                panic_any("planted");
+            }
+            while !orders.is_stopping() {
+                thread::yield_now();
+            }
+            Ok(())
+        }
+
+        fn report(&mut self) -> ProcessReport {
+            ProcessReport {
+                malformed_count: 7,
+                ..ProcessReport::default()
+            }
+        }
+    }
+
+    fn job(panics: bool) -> Job<'static> {
+        Job {
+            name: "counting".to_owned(),
+            counters: Vec::new(),
+            heartbeat: None,
+            connect: Box::new(move |_| Ok(Box::new(Counting { panics }))),
+        }
+    }
+
+    #[test]
+    fn a_panic_of_a_thread_is_an_error_and_the_others_report_what_they_counted() {
+        // The supervisor stays, so it is the panic that ends the process.
+        let (orders_in, _supervisor) = pipe().unwrap();
+        let orders = Orders::from_input(BufReader::new(orders_in)).unwrap();
+        let opened = Opened {
+            jobs: vec![job(false), job(true), job(false)],
+            ..Opened::default()
+        };
+        let mut report = ProcessReport::default();
+        let outcome = run_jobs(opened, &orders, &mut report);
+        assert!(orders.is_stopping());
+        assert!(matches!(outcome, Err(WorkerError::Panicked)), "{outcome:?}");
+        assert_eq!(report.malformed_count, 14);
     }
 }
