@@ -12,6 +12,7 @@ use hil_nic::radio;
 use hil_platform::clock_discipline::{ChronyTracking, NtpVariables, PtpStatus};
 use hil_platform::domain_address::DomainAddress;
 use hil_report::summary::RunSummary;
+use hil_rundir::event::HostHistory;
 use hil_rundir::layout::{Decoder, Value};
 use hil_rundir::manifest::FieldDescription;
 use hil_rundir::record::RecordFile;
@@ -85,7 +86,15 @@ pub(crate) fn peer_frames(bytes: &[u8]) -> Verdict {
             Frame::Message(message) => {
                 write_message(&mut wire, message).expect("no longer than it was");
             }
-            Frame::Chunk(chunk) => write_chunk(&mut wire, chunk).expect("no longer than it was"),
+            Frame::Chunk(chunk) => {
+                write_chunk(&mut wire, chunk).expect("no longer than it was");
+                if let Ok(history) = serde_json::from_slice::<HostHistory>(chunk) {
+                    let written =
+                        serde_json::to_vec(&history).expect("what was read can be written");
+                    let again = serde_json::from_slice(&written).ok();
+                    assert_eq!(again, Some(history));
+                }
+            }
         }
         assert_eq!(read_frame(&mut wire.as_slice()).ok(), Some(frame));
     }

@@ -11,7 +11,8 @@ use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
 use super::frame::{
-    CHUNK_BYTES, Frame, PeerMessage, is_plain_record_name, write_chunk, write_message,
+    CHUNK_BYTES, Frame, PeerMessage, REPORT_BYTES_MAX, is_plain_record_name, write_chunk,
+    write_message,
 };
 use super::peer::{Peer, PeerEvent};
 use hil_rundir::event::HostHistory;
@@ -174,9 +175,30 @@ fn record_files(records: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
+fn give_report(out: &mut impl Write, story: &HostHistory) -> io::Result<()> {
+    let body = serde_json::to_vec(story)?;
+    let size_bytes = body.len() as u64;
+    check_report(size_bytes)?;
+    write_message(out, &PeerMessage::Report { size_bytes })?;
+    body.chunks(CHUNK_BYTES)
+        .try_for_each(|chunk| write_chunk(out, chunk))
+}
+
+fn check_report(size_bytes: u64) -> io::Result<()> {
+    if size_bytes <= REPORT_BYTES_MAX {
+        return Ok(());
+    }
+    let text = format!("a report of {size_bytes} bytes, {REPORT_BYTES_MAX} is most");
+    Err(invalid(text))
+}
+
+fn invalid(text: String) -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidData, text)
+}
+
 fn give_all(out: &mut impl Write, files: &[PathBuf], stories: &[HostHistory]) -> io::Result<()> {
     for story in stories {
-        write_message(out, &PeerMessage::Report(story.clone()))?;
+        give_report(out, story)?;
     }
     for path in files {
         let Some(name) = path.file_name().and_then(|name| name.to_str()) else {
@@ -203,16 +225,32 @@ fn give_all(out: &mut impl Write, files: &[PathBuf], stories: &[HostHistory]) ->
     write_message(out, &PeerMessage::Done)
 }
 
-/// A file on its way in.
+/// What is on its way in, and how many bytes of it are still to come.
 struct Incoming {
-    file: Option<File>,
+    body: Body,
     left: u64,
+}
+
+enum Body {
+    Nothing,
+    File(File),
+    Report(Vec<u8>),
+}
+
+impl Incoming {
+    /// What was announced before came in full.
+    fn check_whole(&self) -> io::Result<()> {
+        if self.left == 0 {
+            return Ok(());
+        }
+        Err(invalid(format!("{} bytes did not come", self.left)))
+    }
 }
 
 fn take_from(host: &str, inbox: &mut Receiver<PeerEvent>, records: &Path) -> Received {
     let mut received = Received::default();
     let mut incoming = Incoming {
-        file: None,
+        body: Body::Nothing,
         left: 0,
     };
     let problem = loop {
@@ -242,17 +280,25 @@ fn take_frame(
     incoming: &mut Incoming,
     received: &mut Received,
 ) -> io::Result<bool> {
-    let invalid = |text: String| io::Error::new(io::ErrorKind::InvalidData, text);
     match frame {
-        Frame::Message(PeerMessage::Done) => return Ok(true),
-        Frame::Message(PeerMessage::Report(story)) => received.stories.push(story),
+        Frame::Message(PeerMessage::Done) => {
+            incoming.check_whole()?;
+            return Ok(true);
+        }
+        Frame::Message(PeerMessage::Report { size_bytes }) => {
+            incoming.check_whole()?;
+            check_report(size_bytes)?;
+            incoming.body = Body::Report(Vec::new());
+            incoming.left = size_bytes;
+        }
         Frame::Message(PeerMessage::File { name, size_bytes }) => {
+            incoming.check_whole()?;
             if !is_plain_record_name(&name) {
                 return Err(invalid(format!(
                     "file name {name:?} is not a record file's"
                 )));
             }
-            incoming.file = Some(File::create_new(records.join(&name))?);
+            incoming.body = Body::File(File::create_new(records.join(&name))?);
             incoming.left = size_bytes;
             received.names.insert(name);
         }
@@ -265,12 +311,89 @@ fn take_frame(
                 )));
             }
             incoming.left -= length;
-            if let Some(file) = &mut incoming.file {
-                file.write_all(&bytes)?;
+            match &mut incoming.body {
+                Body::Nothing => {}
+                Body::File(file) => file.write_all(&bytes)?,
+                Body::Report(body) => {
+                    body.extend_from_slice(&bytes);
+                    if incoming.left == 0 {
+                        received.stories.push(serde_json::from_slice(body)?);
+                        incoming.body = Body::Nothing;
+                    }
+                }
             }
         }
         // Left over from the run itself.
         Frame::Message(_) => {}
     }
     Ok(false)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::supervisor::frame::read_frame;
+    use hil_core::time::Instant as At;
+    use hil_rundir::event::{Event, EventKind};
+
+    fn story(event_count: usize) -> HostHistory {
+        let event = |index| Event {
+            at: At::ZERO,
+            host: "robot-pc".to_owned(),
+            process: "p".repeat(96),
+            kind: EventKind::Warning {
+                text: format!("said: line {index}"),
+            },
+            interruption: None,
+        };
+        HostHistory {
+            hosts: vec!["robot-pc".to_owned()],
+            span: (At::ZERO, At::from_ns(1)),
+            events: (0..event_count).map(event).collect(),
+            discipline: None,
+            processes: Vec::new(),
+            cards: Vec::new(),
+        }
+    }
+
+    fn taken(wire: &[u8]) -> io::Result<Received> {
+        let (mut input, mut received) = (wire, Received::default());
+        let mut incoming = Incoming {
+            body: Body::Nothing,
+            left: 0,
+        };
+        let nowhere = Path::new("/nonexistent");
+        while !take_frame(
+            read_frame(&mut input)?,
+            nowhere,
+            &mut incoming,
+            &mut received,
+        )? {}
+        Ok(received)
+    }
+
+    #[test]
+    fn a_report_of_any_length_arrives_whole() {
+        for event_count in [0, 1, 100_000] {
+            let mut wire = Vec::new();
+            give_all(&mut wire, &[], &[story(event_count), story(1)]).unwrap();
+            let received = taken(&wire).unwrap();
+            assert_eq!(received.stories, [story(event_count), story(1)]);
+        }
+    }
+
+    #[test]
+    fn a_report_that_is_too_long_or_cut_short_is_refused() {
+        let mut wire = Vec::new();
+        let size_bytes = REPORT_BYTES_MAX + 1;
+        write_message(&mut wire, &PeerMessage::Report { size_bytes }).unwrap();
+        let said = taken(&wire).unwrap_err().to_string();
+        assert!(said.contains("268435457 bytes"), "{said}");
+        let mut wire = Vec::new();
+        write_message(&mut wire, &PeerMessage::Report { size_bytes: 9 }).unwrap();
+        write_chunk(&mut wire, b"{}").unwrap();
+        write_message(&mut wire, &PeerMessage::Done).unwrap();
+        let said = taken(&wire).unwrap_err().to_string();
+        assert_eq!(said, "7 bytes did not come");
+    }
 }

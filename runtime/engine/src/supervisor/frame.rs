@@ -7,13 +7,14 @@ use serde::{Deserialize, Serialize};
 use zeroize::Zeroizing;
 
 use super::peer_status::HostTicks;
-use hil_rundir::event::HostHistory;
 use hil_rundir::run_seal::RunSeal;
 
 /// Largest frame either side accepts; a longer length field is an error, not an allocation.
 pub const FRAME_BYTES_MAX: usize = 1 << 20;
-/// Piece in which record files travel.
+/// Piece in which record files and reports travel.
 pub const CHUNK_BYTES: usize = 1 << 18;
+/// Longest report of a host: a million events, or the counters of tens of thousands of channels.
+pub const REPORT_BYTES_MAX: u64 = 1 << 28;
 
 /// Who a supervisor is; the first frame each way.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -70,8 +71,12 @@ pub enum PeerMessage {
         /// Its size.
         size_bytes: u64,
     },
-    /// What happened on a host and how its processes fared.
-    Report(HostHistory),
+    /// What happened on a host and how its processes fared follows in chunks: a
+    /// [`HostHistory`](hil_rundir::event::HostHistory) in JSON.
+    Report {
+        /// Its length.
+        size_bytes: u64,
+    },
     /// Everything has been sent.
     Done,
 }
@@ -93,7 +98,7 @@ pub enum EndMeaning {
 pub enum Frame {
     /// A message.
     Message(PeerMessage),
-    /// The next piece of the file announced last.
+    /// The next piece of the file or report announced last.
     Chunk(Vec<u8>),
 }
 
@@ -110,7 +115,7 @@ pub fn write_message(out: &mut impl Write, message: &PeerMessage) -> io::Result<
     write_frame(out, KIND_MESSAGE, &body)
 }
 
-/// Writes one piece of a file.
+/// Writes one piece of a file or report.
 ///
 /// # Errors
 /// When the connection fails.

@@ -137,7 +137,6 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
             meaning: EndMeaning::Broken,
         },
         PeerMessage::Quiet,
-        PeerMessage::Report(story),
     ];
     let mut inputs: Vec<Vec<u8>> = messages
         .iter()
@@ -153,6 +152,12 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
     write_chunk(&mut file, &[1, 2, 3, 4, 5]).expect("memory takes it");
     write_message(&mut file, &PeerMessage::Done).expect("memory takes it");
     inputs.push(file);
+    let mut report = Vec::new();
+    let body = serde_json::to_vec(&story).expect("a history always serialises");
+    let size_bytes = body.len() as u64;
+    write_message(&mut report, &PeerMessage::Report { size_bytes }).expect("memory takes it");
+    write_chunk(&mut report, &body).expect("memory takes it");
+    inputs.push(report);
     inputs.push(b"arm.command.taken.robot.0.rec".to_vec());
     inputs.push(ticks());
     numbered("frames", inputs)
