@@ -66,6 +66,11 @@ pub enum EventKind {
     },
     /// It was silent and gives signs of life again.
     Responsive,
+    /// It printed more than its log keeps.
+    OutputCut {
+        /// What was left out of the middle, bytes.
+        left_out_bytes: u64,
+    },
     /// It complained.
     Warning {
         /// What it said.
@@ -98,6 +103,10 @@ impl fmt::Display for EventKind {
                 "gave no sign of life for {limit_s} s: it hangs, or gets no processor"
             ),
             Self::Responsive => formatter.write_str("gives signs of life again"),
+            Self::OutputCut { left_out_bytes } => write!(
+                formatter,
+                "printed more than its log keeps: {left_out_bytes} bytes in the middle were left out"
+            ),
             Self::Warning { text } => formatter.write_str(text),
         }
     }

@@ -10,6 +10,7 @@ pub mod frame;
 mod heartbeat;
 pub(crate) mod meet;
 mod outcome;
+mod output_log;
 pub(crate) mod peer;
 pub mod peer_status;
 pub(crate) mod plan;

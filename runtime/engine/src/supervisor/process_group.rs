@@ -12,6 +12,7 @@ use std::{env, io};
 use hil_core::time::{Instant, duration_ns};
 
 use super::child::{Child, Word, describe_exit, last_line};
+use super::output_log::{cut_middle, release_middle};
 use super::plan::{ProcessPlan, ProcessTask};
 use crate::process::own_program;
 use hil_platform::clock::MonotonicClock;
@@ -441,6 +442,30 @@ impl ProcessGroup {
             self.members[index].end = Some(end);
         }
         self.listen();
+    }
+
+    /// Gives back the disk space that the middle of each long log takes.
+    pub(crate) fn release_logs(&self) {
+        for member in &self.members {
+            // A log that cannot be opened now is looked at again, and at the end.
+            let _unopened = release_middle(&self.folder.log(&member.plan.name)).is_err();
+        }
+    }
+
+    /// Takes the middle out of each long log, once nothing is written to it any more.
+    pub(crate) fn cut_logs(&mut self) {
+        for index in 0..self.members.len() {
+            let kind = match cut_middle(&self.folder.log(&self.members[index].plan.name)) {
+                Ok(0) => continue,
+                Ok(left_out_bytes) => EventKind::OutputCut { left_out_bytes },
+                // It was never started.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+                Err(error) => EventKind::Warning {
+                    text: format!("its log cannot be shortened: {error}"),
+                },
+            };
+            self.note(MonotonicClock::now(), index, kind, None);
+        }
     }
 
     /// Names of the processes.

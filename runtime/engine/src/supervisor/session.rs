@@ -285,6 +285,7 @@ impl Session<'_> {
     fn look_after(&mut self) -> Option<Outcome> {
         if self.cleaned.elapsed() >= CLEANUP_PERIOD {
             self.domains.free_what_the_dead_held();
+            self.process_group.release_logs();
             self.cleaned = WallInstant::now();
         }
         if self.greeted.elapsed() >= ALIVE_PERIOD {
@@ -390,6 +391,7 @@ impl Session<'_> {
             .stop(STOP_PATIENCE, ProcessPlan::is_carrier);
         self.process_group
             .stop(STOP_PATIENCE, ProcessPlan::is_clock_path);
+        self.process_group.cut_logs();
     }
 
     fn wait_for_quiet(&mut self) {
