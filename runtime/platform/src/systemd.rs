@@ -9,13 +9,21 @@ use std::ffi::OsStr;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
-use std::{env, io};
+use std::time::{Duration, Instant};
+use std::{env, io, thread};
 
 /// Variables by which systemd speaks to a service: for its main process, not for those it starts.
 pub const VARIABLES: [&str; 3] = ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"];
 
 /// Longest status; systemd shows one line.
 const STATUS_CHARS_MAX: usize = 400;
+
+/// How much longer a service that ends asks for at a time.
+const EXTENSION: Duration = Duration::from_secs(30);
+/// How often it asks: a manager that misses two hears the third in time.
+const EXTENSION_PERIOD: Duration = Duration::from_secs(8);
+/// How long it goes on asking. What takes longer than to exchange and write the records of a day hangs.
+const ENDING_MAX: Duration = Duration::from_mins(30);
 
 /// The system's service manager, as far as it listens.
 #[derive(Debug)]
@@ -83,13 +91,37 @@ impl ServiceManager {
         }
     }
 
-    /// It is ending: said once. The unit's time to stop counts from here, and no tick is due.
+    /// It is ending: said once, and no tick is due any more. The unit's time to stop counts from here;
+    /// it is extended by a thread of its own until the process is gone, so that neither a slow peer nor
+    /// a slow disk keeps an extension back.
     pub fn stopping(&mut self) {
-        self.is_stopping = self.is_stopping || self.say("STOPPING=1");
+        if self.is_stopping || !self.say("STOPPING=1") {
+            return;
+        }
+        self.is_stopping = true;
+        let Ok(socket) = self.socket.try_clone() else {
+            return;
+        };
+        // Without the thread the unit's own time to stop is what there is.
+        let _extended = thread::Builder::new()
+            .name("extend".to_owned())
+            .spawn(move || extend(&socket, EXTENSION_PERIOD, ENDING_MAX))
+            .is_ok();
     }
 
     fn say(&self, word: &str) -> bool {
         self.socket.send(word.as_bytes()).is_ok()
+    }
+}
+
+/// Asks for more time to stop every `period`, for at most `whole`.
+fn extend(socket: &UnixDatagram, period: Duration, whole: Duration) {
+    let word = format!("EXTEND_TIMEOUT_USEC={}", EXTENSION.as_micros());
+    let begun = Instant::now();
+    while begun.elapsed() < whole {
+        // One that finds no room is followed by the next.
+        let _is_said = socket.send(word.as_bytes()).is_ok();
+        thread::sleep(period);
     }
 }
 
@@ -153,7 +185,26 @@ mod tests {
             "WATCHDOG=1",
             "STOPPING=1",
         ];
-        assert_eq!(listener.heard(), expected);
+        let mut heard = listener.heard();
+        // The extensions come from a thread of their own.
+        heard.retain(|word| !word.starts_with("EXTEND_TIMEOUT_USEC="));
+        assert_eq!(heard, expected);
+    }
+
+    #[test]
+    fn a_service_that_ends_asks_for_time_until_it_is_gone() {
+        let listener = Listener::new("extend");
+        let mut manager = ServiceManager::at(listener.path.as_os_str(), true).unwrap();
+        manager.stopping();
+        let word = "EXTEND_TIMEOUT_USEC=30000000";
+        while !listener.heard().iter().any(|heard| heard == word) {
+            thread::yield_now();
+        }
+        let (period, whole) = (Duration::from_millis(1), Duration::from_millis(20));
+        extend(&manager.socket, period, whole);
+        let asked = listener.heard();
+        assert!(asked.len() > 1 && asked.iter().all(|heard| heard == word));
+        assert!(2 * EXTENSION_PERIOD < EXTENSION);
     }
 
     #[test]
