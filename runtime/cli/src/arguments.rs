@@ -40,11 +40,11 @@ Examples:
 Exit codes:
   0  the run ended as planned         75  an address or a port is not
   1  the run failed, its report has       there yet: try again
-     gaps, or a replay differs        77  a folder is not this user's,
-  2  wrong arguments or topology          or the key cannot be used
-  69 a peer host was not reachable    78  doctor --strict: host not fit
-  70 internal error                   130 interrupted; report complete
-                                      131 interrupted twice: no report";
+     gaps, a result cannot be         77  a folder is not this user's,
+     written, or a replay differs         or the key cannot be used
+  2  wrong arguments or topology      78  doctor --strict: host not fit
+  69 a peer host was not reachable    130 interrupted; report complete
+  70 internal error                   131 interrupted twice: no report";
 
 const CALIBRATE_EXAMPLES: &str = "\
 Examples:

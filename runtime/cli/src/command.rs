@@ -23,7 +23,7 @@ use hil_engine::process::{own_program, worker};
 use hil_engine::security::{KeyFileError, PreSharedKey};
 use hil_engine::supervisor::{self, PeerError, RunError, RunOptions};
 use hil_nic::nic_clock::guard;
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_report::analysis::{self, AnalysisError, Concluded};
@@ -33,8 +33,8 @@ use hil_rundir::run_result::{Outcome, RunResult};
 use hil_topology::emulation_room::check_emulation;
 use hil_topology::registry::Registry;
 use hil_topology::{
-    HOST_VARIABLE, HostChoice, MachineIdentity, Topology, TopologyErrors, documents, trace_source,
-    which_host,
+    HOST_VARIABLE, HostChoice, MachineIdentity, Process, Program, Topology, TopologyErrors,
+    documents, trace_source, which_host,
 };
 use hil_watch::link;
 
@@ -52,7 +52,16 @@ mod exit {
 
 /// Does what the command line says.
 pub(crate) fn run(registry: &Registry) -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        // Help and version are results; what is said of a wrong use is not.
+        Err(text) if !text.use_stderr() => {
+            let mut console = Console::new(false);
+            console.result(&text.render().ansi().to_string());
+            return ExitCode::from(console.exit_code(exit::RAN));
+        }
+        Err(fault) => fault.exit(),
+    };
     let mut console = Console::new(cli.run.quiet);
     let outcome = match cli.command {
         None => run_topology(&cli.run, registry, &mut console),
@@ -64,7 +73,7 @@ pub(crate) fn run(registry: &Registry) -> ExitCode {
         }
         refusal.code
     });
-    ExitCode::from(code)
+    ExitCode::from(console.exit_code(code))
 }
 
 /// What stops a command.
@@ -91,6 +100,14 @@ fn usage(why: impl Display) -> Refusal {
 /// It was tried and did not come about.
 fn failed(why: impl Display) -> Refusal {
     Refusal::new(exit::FAILED, why)
+}
+
+const fn code_of(end: CommandEnd) -> u8 {
+    match end {
+        CommandEnd::Done => exit::RAN,
+        CommandEnd::Failed => exit::FAILED,
+        CommandEnd::Refused => exit::USAGE,
+    }
 }
 
 fn run_command(
@@ -126,21 +143,9 @@ fn run_command(
         Command::Calibrate(args) => case_work::calibrate(args, registry, console),
         Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
         Command::Report(args) => report_work::report(&args, registry, console),
-        Command::Compare(args) => Ok(match compare::work::work(&args, console) {
-            compare::work::End::Passed => exit::RAN,
-            compare::work::End::Failed => exit::FAILED,
-            compare::work::End::Refused => exit::USAGE,
-        }),
-        Command::Trace { command } => Ok(match trace::work::work(command, columns(), console) {
-            trace::work::End::Done => exit::RAN,
-            trace::work::End::Failed => exit::FAILED,
-            trace::work::End::Refused => exit::USAGE,
-        }),
-        Command::Link { command } => Ok(match link::work::work(&command, console) {
-            link::work::End::Done => exit::RAN,
-            link::work::End::Failed => exit::FAILED,
-            link::work::End::Refused => exit::USAGE,
-        }),
+        Command::Compare(args) => Ok(code_of(compare::work::work(&args, console))),
+        Command::Trace { command } => Ok(code_of(trace::work::work(command, columns(), console))),
+        Command::Link { command } => Ok(code_of(link::work::work(&command, console))),
         Command::Doctor(args) => doctor_work::doctor(&args, registry, console),
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
@@ -214,6 +219,20 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
         let hint = "no topology given; try --topology deploy/topologies/local.toml or --help";
         return Err(usage(hint));
     };
+    // A file of a study names no processes: no run can be what it says, and other commands take it.
+    if args.check
+        && let Ok(case) = hil_topology::load_case(path, &args.overrides, registry.known())
+        && case.processes().is_empty()
+        && case.links().is_empty()
+    {
+        console.result(&format!(
+            "# {}: the file is valid; it names no processes, so it is for `simulate`, `tables` and\n\
+             # `calibrate`; it comes to\n\n{}",
+            path.display(),
+            case.to_toml()
+        ));
+        return Ok(exit::RAN);
+    }
     let topology = load(path, &args.overrides, registry, console)?;
     trace_source::check(&topology).map_err(usage)?;
     // A file is checked anywhere, also where none of its hosts is.
@@ -290,6 +309,22 @@ fn key_here(
         .transpose()
 }
 
+/// Looks for the programs that a run would start on `hosts`, which are this machine.
+fn find_programs(topology: &Topology, hosts: &[String]) -> Result<(), Refusal> {
+    let is_here = |process: &&Process| hosts.contains(&process.host);
+    for process in topology.processes().iter().filter(is_here) {
+        if let Program::Command { command, .. } = &process.program {
+            own_program::find(&command[0]).map_err(|error| {
+                let (name, program) = (&process.name, &command[0]);
+                usage(format!(
+                    "processes.{name}.run: cannot start {program}: {error}"
+                ))
+            })?;
+        }
+    }
+    Ok(())
+}
+
 /// What the file comes to, or why no run of it can be what it says; with `hosts`, which are this
 /// machine, also which key is here.
 fn show_check(
@@ -308,6 +343,7 @@ fn show_check(
     if let Some(text) = topology.unsaid_security() {
         return Err(usage(format!("{}: {text}", path.display())));
     }
+    find_programs(topology, hosts.unwrap_or_default())?;
     // As comments, so that what is printed is a topology as a whole.
     let clock_paths = topology.clock_paths().map(|clock| {
         let (asking, answering) = (clock.asking.port(), clock.answering.port());
@@ -354,6 +390,7 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         {
             exit::TRY_AGAIN
         }
+        RunError::Domains(error) if error.is_of_path() => exit::USAGE,
         RunError::Folder { .. }
         | RunError::SecurityUnsaid(_)
         | RunError::Emulation(_)

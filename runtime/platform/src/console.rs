@@ -21,6 +21,17 @@ const JOURNAL_PERIOD: Duration = Duration::from_mins(1);
 /// Columns of a terminal that does not say how many it has.
 const COLUMNS_UNKNOWN: usize = 80;
 
+/// How a command ended; the program knows the exit codes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CommandEnd {
+    /// All is well.
+    Done,
+    /// Something was damaged, could not be read or written, or a condition holds that was to be told.
+    Failed,
+    /// Nothing could be done with what was asked.
+    Refused,
+}
+
 /// How a line weighs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Weight {
@@ -94,6 +105,8 @@ pub struct Console {
     /// The progress line that was said last, where it cannot be redrawn.
     last_plain: Option<(Instant, String)>,
     service: Option<ServiceManager>,
+    /// A result could not be written, and not because its reader left.
+    has_lost_result: bool,
 }
 
 impl Console {
@@ -105,6 +118,7 @@ impl Console {
             has_open_line: false,
             last_plain: None,
             service: None,
+            has_lost_result: false,
         }
     }
 
@@ -174,7 +188,7 @@ impl Console {
         if self.listener == Listener::Terminal {
             let text = one_row(text, terminal_columns().unwrap_or(COLUMNS_UNKNOWN));
             // Carriage return, text, erase to the end of the line.
-            write_to(&mut io::stderr(), &format!("\r{text}\x1b[K"));
+            say_to(&mut io::stderr(), &format!("\r{text}\x1b[K"));
             self.has_open_line = true;
         } else if is_worth_saying(self.last_plain.as_ref(), text, period) {
             self.last_plain = Some((Instant::now(), text.to_owned()));
@@ -185,16 +199,36 @@ impl Console {
     /// Takes the progress line away: the work is done.
     pub(crate) fn end_progress(&mut self) {
         if self.has_open_line {
-            write_to(&mut io::stderr(), "\r\x1b[K");
+            say_to(&mut io::stderr(), "\r\x1b[K");
             self.has_open_line = false;
         }
     }
 
-    /// Gives a result; colours are dropped where the output cannot show them. False when nobody
-    /// reads it any more, which ends what would go on for ever.
+    /// Gives a result; colours are dropped where the output cannot show them. False when it was not
+    /// taken, which ends what would go on for ever. A reader that left (a closed pipe) is no failure;
+    /// any other is told at once and counts in [`Console::exit_code`].
     pub fn result(&mut self, text: &str) -> bool {
         self.close_line();
-        write_to(&mut anstream::stdout(), text)
+        let Err(error) = write_to(&mut anstream::stdout(), text) else {
+            return true;
+        };
+        if error.kind() != io::ErrorKind::BrokenPipe && !self.has_lost_result {
+            self.has_lost_result = true;
+            self.error(&format!(
+                "cannot write the result to standard output: {error}"
+            ));
+        }
+        false
+    }
+
+    /// What a program exits with that ended with `code`: 1 in place of 0 when a result could not be
+    /// written.
+    pub const fn exit_code(&self, code: u8) -> u8 {
+        if code == 0 && self.has_lost_result {
+            1
+        } else {
+            code
+        }
     }
 
     /// Says text that is already laid out, such as an annotated piece of a file.
@@ -214,11 +248,11 @@ impl Console {
     fn line(&mut self, weight: Weight, text: &str) {
         self.close_line();
         if self.listener == Listener::Journal {
-            write_to(&mut anstream::stderr(), &for_journal(weight, text));
+            say_to(&mut anstream::stderr(), &for_journal(weight, text));
             return;
         }
         let style = weight.style();
-        write_to(
+        say_to(
             &mut anstream::stderr(),
             &format!("{style}{text}{style:#}\n"),
         );
@@ -226,7 +260,7 @@ impl Console {
 
     fn close_line(&mut self) {
         if self.has_open_line {
-            write_to(&mut io::stderr(), "\n");
+            say_to(&mut io::stderr(), "\n");
             self.has_open_line = false;
         }
     }
@@ -256,11 +290,14 @@ fn terminal_columns() -> Option<usize> {
     (width.0 > 0).then(|| usize::from(width.0))
 }
 
-/// False when the reader left (a closed pipe), which is no reason to fail a run.
-fn write_to(out: &mut impl Write, text: &str) -> bool {
-    out.write_all(text.as_bytes())
-        .and_then(|()| out.flush())
-        .is_ok()
+fn write_to(out: &mut impl Write, text: &str) -> io::Result<()> {
+    out.write_all(text.as_bytes())?;
+    out.flush()
+}
+
+/// Says `text` on the way; that nobody hears it is no reason to fail a run.
+fn say_to(out: &mut impl Write, text: &str) {
+    let _unheard = write_to(out, text).is_err();
 }
 
 #[cfg(test)]

@@ -41,7 +41,10 @@ mod exit {
 /// Does what the command line says and gives the exit code.
 pub fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
     match &args.work {
-        None => capture(&args.live),
+        None => {
+            *console = Console::new(args.live.quiet);
+            capture(&args.live, console)
+        }
         Some(ProbeWork::Analyse {
             file,
             second,
@@ -163,8 +166,7 @@ fn analyse(
     }
 }
 
-fn capture(args: &LiveArgs) -> u8 {
-    let mut console = Console::new(args.quiet);
+fn capture(args: &LiveArgs, console: &mut Console) -> u8 {
     let Some(output) = &args.output else {
         console.error("no --output FILE given for the capture; try --help");
         return exit::USAGE;
@@ -214,8 +216,8 @@ fn capture(args: &LiveArgs) -> u8 {
             return exit::INTERNAL;
         }
     };
-    match live::capture(&request, &signals, &mut console) {
-        Ok(result) => conclude(&request, &result, &mut console),
+    match live::capture(&request, &signals, console) {
+        Ok(result) => conclude(&request, &result, console),
         Err(error) => {
             console.error(&error.to_string());
             match error {

@@ -26,7 +26,16 @@ const END_WITHIN: Duration = Duration::from_millis(400);
 
 /// Does what the command line of this process says, and tells the exit code.
 pub fn run() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        // Help and version are results; what is said of a wrong use is not.
+        Err(text) if !text.use_stderr() => {
+            let mut console = Console::new(false);
+            console.result(&text.render().ansi().to_string());
+            return ExitCode::from(console.exit_code(Exit::Done as u8));
+        }
+        Err(fault) => fault.exit(),
+    };
     let mut console = Console::new(cli.quiet);
     let exit = match Signals::install() {
         Ok(signals) => work(cli.command, &signals, &mut console).unwrap_or_else(|failure| {
@@ -38,7 +47,7 @@ pub fn run() -> ExitCode {
             Exit::Internal
         }
     };
-    ExitCode::from(exit as u8)
+    ExitCode::from(console.exit_code(exit as u8))
 }
 
 fn work(command: Command, signals: &Signals, console: &mut Console) -> Result<Exit, Failure> {

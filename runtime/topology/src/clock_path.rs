@@ -195,8 +195,19 @@ pub(super) fn read_address(reader: &Reader<'_>, key: &str, text: &str) -> Option
     if address.is_none() {
         let fault = Fault::Inconsistent(format!("\"{text}\" is no address of one host"));
         reader.refuse(key, fault);
+    } else if address.is_some_and(is_link_local_v6) {
+        let fault = format!(
+            "\"{text}\" is link-local: it says nothing without an interface, and its scope differs \
+             from host to host; give the host a unique local address (fd00::/8) or use IPv4"
+        );
+        reader.refuse(key, Fault::Inconsistent(fault));
     }
     address
+}
+
+/// Of `fe80::/10` (RFC 4291, 2.5.6): the kernel refuses it without a scope.
+const fn is_link_local_v6(address: IpAddr) -> bool {
+    matches!(address, IpAddr::V6(address) if address.is_unicast_link_local())
 }
 
 /// The name of an interface.

@@ -60,7 +60,7 @@ pub fn become_program(supervisor: u32, program: &[String]) -> Result<(), OwnProg
 ///
 /// # Errors
 /// When no executable file of that name is on the search path.
-pub(crate) fn find(program: &str) -> Result<PathBuf, io::Error> {
+pub fn find(program: &str) -> Result<PathBuf, io::Error> {
     let is_executable = |path: &Path| path.is_file() && access(path, AccessFlags::X_OK).is_ok();
     let not_found = || io::Error::new(io::ErrorKind::NotFound, "no such executable file");
     if program.contains('/') {

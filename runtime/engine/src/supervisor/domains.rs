@@ -46,6 +46,19 @@ pub enum DomainsError {
     },
 }
 
+impl DomainsError {
+    /// The path of the domain itself is at fault, as whoever named it can mend.
+    pub const fn is_of_path(&self) -> bool {
+        matches!(
+            self,
+            Self::Domain {
+                source: DomainError::Address(_),
+                ..
+            }
+        )
+    }
+}
+
 #[derive(Debug)]
 struct HostDomain {
     host: String,

@@ -7,35 +7,24 @@ use serde::Serialize;
 use super::cli::{CompareArgs, CompareFormat};
 use super::conditions::{Condition, Judged, Unjudged, Verdicts};
 use super::{ComparedRun, Comparison, render};
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::{Progress, Stage};
 
-/// How it ended; the caller knows the exit codes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum End {
-    /// No condition holds.
-    Passed,
-    /// One does.
-    Failed,
-    /// Nothing could be compared or judged.
-    Refused,
-}
-
 /// Does what the command line says.
-pub fn work(args: &CompareArgs, console: &mut Console) -> End {
+pub fn work(args: &CompareArgs, console: &mut Console) -> CommandEnd {
     let compared = Progress::begin().during(console, "reading runs", |stage| compared(args, stage));
     match compared {
         Ok((text, has_failed)) => {
             console.result(&format!("{text}\n"));
             if has_failed {
                 console.error("a condition of --fail-if holds");
-                return End::Failed;
+                return CommandEnd::Failed;
             }
-            End::Passed
+            CommandEnd::Done
         }
         Err(text) => {
             console.error(&text);
-            End::Refused
+            CommandEnd::Refused
         }
     }
 }

@@ -17,7 +17,7 @@ use super::cli::{TraceCommand, TraceFiles, TraceForm};
 use super::open::{Opened, files, open};
 use super::plots;
 use crate::terminal::{self, Style};
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::Progress;
 use hil_rundir::series;
 use hil_topology::trace_source::TraceFileError;
@@ -25,19 +25,8 @@ use hil_topology::trace_source::TraceFileError;
 /// Seed of the intervals where the user gives none.
 const SEED: u64 = 1;
 
-/// How it ended; the caller knows the exit codes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum End {
-    /// All is well.
-    Done,
-    /// Something was damaged or could not be written.
-    Failed,
-    /// Nothing could be done with what was asked.
-    Refused,
-}
-
 /// Does what the command line says, on a page of `columns`.
-pub fn work(command: TraceCommand, columns: usize, console: &mut Console) -> End {
+pub fn work(command: TraceCommand, columns: usize, console: &mut Console) -> CommandEnd {
     match command {
         TraceCommand::Info(asked) => each(&asked, console, &mut |opened, is_json, talk| {
             let figures = talk.figures_of(opened);
@@ -167,15 +156,15 @@ fn each(
     asked: &TraceFiles,
     console: &mut Console,
     show: &mut dyn FnMut(&Opened, bool, &mut ProgressReporter<'_>) -> Result<Value, String>,
-) -> End {
+) -> CommandEnd {
     let paths = match files(&asked.files) {
         Ok(paths) => paths,
         Err(text) => {
             console.error(&text);
-            return End::Refused;
+            return CommandEnd::Refused;
         }
     };
-    let (mut end, mut documents) = (End::Done, Vec::new());
+    let (mut end, mut documents) = (CommandEnd::Done, Vec::new());
     let mut talk = ProgressReporter::begin(console);
     for (index, path) in paths.iter().enumerate() {
         // Of the first, nothing says yet how long one takes.
@@ -184,7 +173,7 @@ fn each(
             Ok(opened) => opened,
             Err(error) => {
                 talk.console.error(&error.to_string());
-                end = End::Refused;
+                end = CommandEnd::Refused;
                 continue;
             }
         };
@@ -192,7 +181,11 @@ fn each(
             let kept = opened.trace.records.len();
             talk.console
                 .error(&format!("{fault}; the {kept} records before it are shown"));
-            end = if end == End::Done { End::Failed } else { end };
+            end = if end == CommandEnd::Done {
+                CommandEnd::Failed
+            } else {
+                end
+            };
         }
         if let Some(remark) = opened.remark {
             let name = path.display();
@@ -202,7 +195,7 @@ fn each(
             Ok(document) => documents.push(document),
             Err(text) => {
                 talk.console.error(&text);
-                end = End::Failed;
+                end = CommandEnd::Failed;
             }
         }
     }
@@ -312,24 +305,24 @@ fn convert(
     to: Option<TraceForm>,
     force: bool,
     console: &mut Console,
-) -> End {
+) -> CommandEnd {
     let Some(form) = to.or_else(|| form_of(into)) else {
         let name = into.display();
         console.error(&format!(
             "{name}: no form by that ending; end it in .trace, .csv, .mahimahi or .netem, or say --to"
         ));
-        return End::Refused;
+        return CommandEnd::Refused;
     };
     if into.exists() && !force {
         console.error(&format!("{}: exists; say --force", into.display()));
-        return End::Refused;
+        return CommandEnd::Refused;
     }
     let mut talk = ProgressReporter::begin(console);
     let opened = match talk.open(from) {
         Ok(opened) => opened,
         Err(error) => {
             talk.console.error(&error.to_string());
-            return End::Refused;
+            return CommandEnd::Refused;
         }
     };
     if let Some(remark) = opened.remark {
@@ -341,12 +334,12 @@ fn convert(
         Ok(converted) => converted,
         Err(text) => {
             talk.console.error(&format!("{}: {text}", from.display()));
-            return End::Failed;
+            return CommandEnd::Failed;
         }
     };
     if let Err(error) = fs::write(into, bytes) {
         talk.console.error(&format!("{}: {error}", into.display()));
-        return End::Failed;
+        return CommandEnd::Failed;
     }
     let count = opened.trace.records.len();
     talk.console.say(&format!(
@@ -356,9 +349,9 @@ fn convert(
     if let Some(fault) = &opened.fault {
         talk.console
             .error(&format!("{fault}; what stands before it was converted"));
-        return End::Failed;
+        return CommandEnd::Failed;
     }
-    End::Done
+    CommandEnd::Done
 }
 
 /// The bytes, and what there is to say about them.

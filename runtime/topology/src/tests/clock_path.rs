@@ -157,6 +157,7 @@ fn an_address_belongs_to_one_host_and_names_one_interface_of_it() {
         ("0.0.0.0", "is no address of one host"),
         ("224.0.0.1", "is no address of one host"),
         ("ff02::1", "is no address of one host"),
+        ("fe80::1", "is link-local"),
         ("eth1", "is no address of one host"),
         ("fd00::2", "are of different IP versions"),
     ] {

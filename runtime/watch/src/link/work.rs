@@ -9,22 +9,11 @@ use serde_json::{Value, json};
 use super::cli::{LinkCommand, RunChoice, SetArgs};
 use super::{Carrier, Confirmed, LinkDirection, LinkError, RunLinks};
 use hil_platform::clock::MonotonicClock;
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_rundir::select;
 
-/// How it ended; the caller knows the exit codes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum End {
-    /// All is well.
-    Done,
-    /// The gateway refused, or something could not be read.
-    Failed,
-    /// Nothing could be done with what was asked.
-    Refused,
-}
-
 /// Does what the command line says.
-pub fn work(command: &LinkCommand, console: &mut Console) -> End {
+pub fn work(command: &LinkCommand, console: &mut Console) -> CommandEnd {
     let outcome = match command {
         LinkCommand::Show(choice) => show(choice),
         LinkCommand::Set(args) => {
@@ -35,7 +24,7 @@ pub fn work(command: &LinkCommand, console: &mut Console) -> End {
     match outcome {
         Ok(text) => {
             console.result(&format!("{text}\n"));
-            End::Done
+            CommandEnd::Done
         }
         Err((end, text)) => {
             console.error(&text);
@@ -44,25 +33,25 @@ pub fn work(command: &LinkCommand, console: &mut Console) -> End {
     }
 }
 
-type Outcome<T> = Result<T, (End, String)>;
+type Outcome<T> = Result<T, (CommandEnd, String)>;
 
-fn refused(text: impl core::fmt::Display) -> (End, String) {
-    (End::Refused, text.to_string())
+fn refused(text: impl core::fmt::Display) -> (CommandEnd, String) {
+    (CommandEnd::Refused, text.to_string())
 }
 
-fn end_of(error: &LinkError) -> (End, String) {
+fn end_of(error: &LinkError) -> (CommandEnd, String) {
     let end = match error {
         LinkError::Folder { .. }
         | LinkError::UnknownLink { .. }
         | LinkError::NotEmulated { .. }
         | LinkError::Elsewhere { .. }
         | LinkError::Range(_)
-        | LinkError::NoRoom { .. } => End::Refused,
+        | LinkError::NoRoom { .. } => CommandEnd::Refused,
         LinkError::Over(_)
         | LinkError::Channel(_)
         | LinkError::Record(_)
         | LinkError::Refused { .. }
-        | LinkError::Silent { .. } => End::Failed,
+        | LinkError::Silent { .. } => CommandEnd::Failed,
     };
     (end, error.to_string())
 }
@@ -210,5 +199,5 @@ fn condition_json(condition: LinkCondition) -> Value {
 }
 
 fn pretty(value: &Value) -> Outcome<String> {
-    serde_json::to_string_pretty(value).map_err(|error| (End::Failed, error.to_string()))
+    serde_json::to_string_pretty(value).map_err(|error| (CommandEnd::Failed, error.to_string()))
 }
