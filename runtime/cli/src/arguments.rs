@@ -125,7 +125,7 @@ pub struct RunArgs {
     pub overrides: Vec<String>,
 
     /// Check the file, print what would run, start nothing; with --host also this machine's copy of
-    /// the key.
+    /// the key, and its own programs by this shell's PATH and folder.
     #[arg(long)]
     pub check: bool,
 

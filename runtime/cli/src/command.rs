@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::{env, fs};
 
-use clap::{CommandFactory as _, Parser};
+use clap::CommandFactory as _;
 use hil_core::case_study::ParameterError;
 use hil_core::layout::Field;
 use hil_teleoperation::swing::swing_bvh;
@@ -33,8 +33,8 @@ use hil_rundir::run_result::{Outcome, RunResult};
 use hil_topology::emulation_room::check_emulation;
 use hil_topology::registry::Registry;
 use hil_topology::{
-    HOST_VARIABLE, HostChoice, MachineIdentity, Process, Program, Topology, TopologyErrors,
-    documents, trace_source, which_host,
+    HOST_VARIABLE, HostChoice, MachineIdentity, Topology, TopologyErrors, documents, trace_source,
+    which_host,
 };
 use hil_watch::link;
 
@@ -52,15 +52,13 @@ mod exit {
 
 /// Does what the command line says.
 pub(crate) fn run(registry: &Registry) -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let cli: Cli = match documents::command_line() {
         Ok(cli) => cli,
-        // Help and version are results; what is said of a wrong use is not.
-        Err(text) if !text.use_stderr() => {
+        Err(help) => {
             let mut console = Console::new(false);
-            console.result(&text.render().ansi().to_string());
+            console.result(&help);
             return ExitCode::from(console.exit_code(exit::RAN));
         }
-        Err(fault) => fault.exit(),
     };
     let mut console = Console::new(cli.run.quiet);
     let outcome = match cli.command {
@@ -219,21 +217,15 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
         let hint = "no topology given; try --topology deploy/topologies/local.toml or --help";
         return Err(usage(hint));
     };
-    // A file of a study names no processes: no run can be what it says, and other commands take it.
-    if args.check
-        && let Ok(case) = hil_topology::load_case(path, &args.overrides, registry.known())
-        && case.processes().is_empty()
-        && case.links().is_empty()
-    {
-        console.result(&format!(
-            "# {}: the file is valid; it names no processes, so it is for `simulate`, `tables` and\n\
-             # `calibrate`; it comes to\n\n{}",
-            path.display(),
-            case.to_toml()
-        ));
-        return Ok(exit::RAN);
+    let topology = if args.check {
+        let topology = hil_topology::load_case(path, &args.overrides, registry.known());
+        loaded(topology, console)?
+    } else {
+        load(path, &args.overrides, registry, console)?
+    };
+    if args.check && topology.processes().is_empty() {
+        return show_study(path, &topology, args, registry, console);
     }
-    let topology = load(path, &args.overrides, registry, console)?;
     trace_source::check(&topology).map_err(usage)?;
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
@@ -309,20 +301,25 @@ fn key_here(
         .transpose()
 }
 
-/// Looks for the programs that a run would start on `hosts`, which are this machine.
-fn find_programs(topology: &Topology, hosts: &[String]) -> Result<(), Refusal> {
-    let is_here = |process: &&Process| hosts.contains(&process.host);
-    for process in topology.processes().iter().filter(is_here) {
-        if let Program::Command { command, .. } = &process.program {
-            own_program::find(&command[0]).map_err(|error| {
-                let (name, program) = (&process.name, &command[0]);
-                usage(format!(
-                    "processes.{name}.run: cannot start {program}: {error}"
-                ))
-            })?;
-        }
+/// What a file without processes comes to: no run can be what it says, and other commands take it.
+fn show_study(
+    path: &Path,
+    topology: &Topology,
+    args: &RunArgs,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    // What links hosts, or is asked for one, was meant for a run: its fault is that nothing runs.
+    if !topology.links().is_empty() || args.host.is_some() {
+        load(path, &args.overrides, registry, console)?;
     }
-    Ok(())
+    console.result(&format!(
+        "# {}: the file is valid; it names no processes, so it is for `simulate`, `tables` and\n\
+         # `calibrate`; it comes to\n\n{}",
+        path.display(),
+        topology.to_toml()
+    ));
+    Ok(exit::RAN)
 }
 
 /// What the file comes to, or why no run of it can be what it says; with `hosts`, which are this
@@ -343,7 +340,7 @@ fn show_check(
     if let Some(text) = topology.unsaid_security() {
         return Err(usage(format!("{}: {text}", path.display())));
     }
-    find_programs(topology, hosts.unwrap_or_default())?;
+    own_program::find_all(topology, hosts.unwrap_or_default()).map_err(usage)?;
     // As comments, so that what is printed is a topology as a whole.
     let clock_paths = topology.clock_paths().map(|clock| {
         let (asking, answering) = (clock.asking.port(), clock.answering.port());
@@ -392,6 +389,7 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         }
         RunError::Domains(error) if error.is_of_path() => exit::USAGE,
         RunError::Folder { .. }
+        | RunError::Programs(_)
         | RunError::SecurityUnsaid(_)
         | RunError::Emulation(_)
         | RunError::Peer(

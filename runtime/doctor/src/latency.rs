@@ -24,7 +24,7 @@ use hil_platform::host_facts::{
 };
 use hil_platform::progress::Stage;
 use hil_platform::realtime::{
-    RealtimeGrant, RealtimeGrantItem, RealtimeItem, RealtimeRequest, SchedulingPolicy, apply,
+    RealtimeGrant, RealtimeItem, RealtimeRequest, SchedulingPolicy, apply,
 };
 
 /// A busy poller holds its CPU at real-time priority; the kernel's own threads there wait this long at
@@ -195,6 +195,20 @@ pub struct HostActivity {
     pub virtual_machine: Fact<String>,
 }
 
+impl LatencyReport {
+    /// The wake-ups of threads that were where they were to be: a CPU outside the cpuset has none.
+    pub(crate) fn measured_wakeups(&self) -> impl Iterator<Item = &Wakeups> {
+        let is_there = |one: &&Wakeups| one.scheduling.has(RealtimeItem::CpuPinning);
+        self.wakeups.iter().filter(is_there)
+    }
+
+    /// As [`LatencyReport::measured_wakeups`], of pollers.
+    pub(crate) fn measured_gaps(&self) -> impl Iterator<Item = &Gaps> {
+        let is_there = |one: &&Gaps| one.scheduling.has(RealtimeItem::CpuPinning);
+        self.gaps.iter().filter(is_there)
+    }
+}
+
 /// What was measured and what it allows.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LatencyReport {
@@ -337,11 +351,10 @@ fn prepare(cpu: Option<usize>, priority: Option<u8>) -> RealtimeGrant {
 /// How long to measure: not at all where the thread is not on the CPU that the figures would be called
 /// after, such as one outside the cpuset.
 fn duration_of(asked: Duration, grant: &RealtimeGrant) -> Duration {
-    let is_elsewhere = |one: &RealtimeGrantItem| one.item == RealtimeItem::CpuPinning;
-    if grant.refusals().any(is_elsewhere) {
-        Duration::ZERO
-    } else {
+    if grant.has(RealtimeItem::CpuPinning) {
         asked
+    } else {
+        Duration::ZERO
     }
 }
 

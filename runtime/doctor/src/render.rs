@@ -117,7 +117,7 @@ fn push_latency(text: &mut String, report: &LatencyReport, has_colour: bool) {
     let head = format!("Wake-ups: absolute sleeps of {period_ms} ms for {duration_s} s{ended}");
     push(text, &head);
     push_row(text, "", &["count", "skipped", "preempted"], &QUANTILES);
-    for one in &report.wakeups {
+    for one in report.measured_wakeups() {
         let counts = [
             Some(one.count),
             Some(one.skipped_count),
@@ -140,7 +140,7 @@ fn push_latency(text: &mut String, report: &LatencyReport, has_colour: bool) {
             &["gaps/s", "ms/s lost", "as throttle"],
             &QUANTILES,
         );
-        for one in &report.gaps {
+        for one in report.measured_gaps() {
             let (rate, lost) = (one.per_second(), one.lost_ms_per_s());
             let throttled = or_dash(one.throttle_like_count);
             let cells = [format!("{rate:.0}"), format!("{lost:.1}"), throttled];

@@ -26,7 +26,7 @@ const COLUMNS_UNKNOWN: usize = 80;
 pub enum CommandEnd {
     /// All is well.
     Done,
-    /// Something was damaged, could not be read or written, or a condition holds that was to be told.
+    /// Something was damaged, could not be read or written, or a `--fail-if` condition holds.
     Failed,
     /// Nothing could be done with what was asked.
     Refused,
@@ -122,6 +122,11 @@ impl Console {
         }
     }
 
+    /// From now on only warnings and errors are said, or everything.
+    pub const fn set_quiet(&mut self, is_quiet: bool) {
+        self.is_quiet = is_quiet;
+    }
+
     /// From now on the service manager that started this process hears how it stands, if there is one
     /// that wants to. For the main process of a service only.
     pub fn serve(&mut self) {
@@ -150,9 +155,15 @@ impl Console {
 
     /// Tells the service manager that the service is ending.
     pub fn announce_ending(&mut self) {
-        if let Some(service) = &mut self.service {
-            service.stopping();
-            service.status("ending the run");
+        let Some(service) = &mut self.service else {
+            return;
+        };
+        let asked = service.stopping();
+        service.status("ending the run");
+        if let Err(error) = asked {
+            self.warn(&format!(
+                "systemd cannot be asked for time to end the run: {error}"
+            ));
         }
     }
 
@@ -295,9 +306,9 @@ fn write_to(out: &mut impl Write, text: &str) -> io::Result<()> {
     out.flush()
 }
 
-/// Says `text` on the way; that nobody hears it is no reason to fail a run.
+/// Says `text` on the way. Errors are ignored: it is no result.
 fn say_to(out: &mut impl Write, text: &str) {
-    let _unheard = write_to(out, text).is_err();
+    let _unwritten = write_to(out, text).is_err();
 }
 
 #[cfg(test)]

@@ -82,8 +82,7 @@ pub enum DomainAddressError {
     },
     /// The sockets below the root path would not fit into a Unix socket address.
     #[error(
-        "root path {} has {} characters, at most {ROOT_PATH_LENGTH_MAX} fit; name a shorter one with \
-         --domain-root",
+        "root path {} has {} characters, at most {ROOT_PATH_LENGTH_MAX} fit",
         .root_path.display(), .root_path.as_os_str().len()
     )]
     RootPathTooLong {

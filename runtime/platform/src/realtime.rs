@@ -138,6 +138,11 @@ impl RealtimeGrant {
         self.refusals().next().is_none()
     }
 
+    /// Nothing that was asked of `item` was refused.
+    pub fn has(&self, item: RealtimeItem) -> bool {
+        self.refusals().all(|one| one.item != item)
+    }
+
     /// The items the kernel refused.
     pub fn refusals(&self) -> impl Iterator<Item = &RealtimeGrantItem> {
         self.items

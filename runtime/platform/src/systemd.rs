@@ -9,7 +9,7 @@ use std::ffi::OsStr;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use std::{env, io, thread};
 
 /// Variables by which systemd speaks to a service: for its main process, not for those it starts.
@@ -18,12 +18,14 @@ pub const VARIABLES: [&str; 3] = ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PI
 /// Longest status; systemd shows one line.
 const STATUS_CHARS_MAX: usize = 400;
 
-/// How much longer a service that ends asks for at a time.
+/// How much more time a service that ends asks for.
 const EXTENSION: Duration = Duration::from_secs(30);
-/// How often it asks: a manager that misses two hears the third in time.
+/// How often it asks.
 const EXTENSION_PERIOD: Duration = Duration::from_secs(8);
-/// How long it goes on asking. What takes longer than to exchange and write the records of a day hangs.
-const ENDING_MAX: Duration = Duration::from_mins(30);
+/// How often in all: for ten minutes. An end that takes longer hangs, and is ended by the manager.
+const EXTENSION_COUNT: u32 = 75;
+// A manager that misses two hears the third in time.
+const _: () = assert!(3 * EXTENSION_PERIOD.as_secs() < EXTENSION.as_secs());
 
 /// The system's service manager, as far as it listens.
 #[derive(Debug)]
@@ -91,22 +93,23 @@ impl ServiceManager {
         }
     }
 
-    /// It is ending: said once, and no tick is due any more. The unit's time to stop counts from here;
-    /// it is extended by a thread of its own until the process is gone, so that neither a slow peer nor
+    /// It is ending; no tick is due any more. A thread of its own says so until it is heard, and asks
+    /// for more time to stop until the process is gone, for ten minutes at most: neither a slow peer nor
     /// a slow disk keeps an extension back.
-    pub fn stopping(&mut self) {
-        if self.is_stopping || !self.say("STOPPING=1") {
-            return;
+    ///
+    /// # Errors
+    /// When there is no thread: then the unit's own time to stop is all there is.
+    pub fn stopping(&mut self) -> io::Result<()> {
+        if self.is_stopping {
+            return Ok(());
         }
         self.is_stopping = true;
-        let Ok(socket) = self.socket.try_clone() else {
-            return;
-        };
-        // Without the thread the unit's own time to stop is what there is.
-        let _extended = thread::Builder::new()
-            .name("extend".to_owned())
-            .spawn(move || extend(&socket, EXTENSION_PERIOD, ENDING_MAX))
-            .is_ok();
+        let is_said = self.say("STOPPING=1");
+        let socket = self.socket.try_clone()?;
+        thread::Builder::new()
+            .name("ending".to_owned())
+            .spawn(move || extend(&socket, is_said, EXTENSION_PERIOD, EXTENSION_COUNT))?;
+        Ok(())
     }
 
     fn say(&self, word: &str) -> bool {
@@ -114,13 +117,14 @@ impl ServiceManager {
     }
 }
 
-/// Asks for more time to stop every `period`, for at most `whole`.
-fn extend(socket: &UnixDatagram, period: Duration, whole: Duration) {
+/// Says that the service ends, where that has not been heard, and asks for more time to stop: every
+/// `period`, `count` times.
+fn extend(socket: &UnixDatagram, mut is_said: bool, period: Duration, count: u32) {
     let word = format!("EXTEND_TIMEOUT_USEC={}", EXTENSION.as_micros());
-    let begun = Instant::now();
-    while begun.elapsed() < whole {
+    for _ in 0..count {
+        is_said = is_said || socket.send(b"STOPPING=1").is_ok();
         // One that finds no room is followed by the next.
-        let _is_said = socket.send(word.as_bytes()).is_ok();
+        let _is_heard = socket.send(word.as_bytes()).is_ok();
         thread::sleep(period);
     }
 }
@@ -176,8 +180,8 @@ mod tests {
             manager.status("1.0 / 20 s\n  a 3→2");
             manager.alive();
         }
-        manager.stopping();
-        manager.stopping();
+        manager.stopping().unwrap();
+        manager.stopping().unwrap();
         let expected = [
             "READY=1",
             "STATUS=1.0 / 20 s a 3→2",
@@ -195,16 +199,16 @@ mod tests {
     fn a_service_that_ends_asks_for_time_until_it_is_gone() {
         let listener = Listener::new("extend");
         let mut manager = ServiceManager::at(listener.path.as_os_str(), true).unwrap();
-        manager.stopping();
+        manager.stopping().unwrap();
         let word = "EXTEND_TIMEOUT_USEC=30000000";
         while !listener.heard().iter().any(|heard| heard == word) {
             thread::yield_now();
         }
-        let (period, whole) = (Duration::from_millis(1), Duration::from_millis(20));
-        extend(&manager.socket, period, whole);
-        let asked = listener.heard();
-        assert!(asked.len() > 1 && asked.iter().all(|heard| heard == word));
-        assert!(2 * EXTENSION_PERIOD < EXTENSION);
+        // The thread asks again in 8 s.
+        extend(&manager.socket, true, Duration::from_millis(1), 3);
+        assert_eq!(listener.heard(), [word; 3]);
+        extend(&manager.socket, false, Duration::from_millis(1), 2);
+        assert_eq!(listener.heard(), ["STOPPING=1", word, word]);
     }
 
     #[test]

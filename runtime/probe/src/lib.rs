@@ -42,7 +42,7 @@ mod exit {
 pub fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
     match &args.work {
         None => {
-            *console = Console::new(args.live.quiet);
+            console.set_quiet(args.live.quiet);
             capture(&args.live, console)
         }
         Some(ProbeWork::Analyse {

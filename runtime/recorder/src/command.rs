@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use clap::{CommandFactory as _, Parser};
+use clap::CommandFactory as _;
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
@@ -26,15 +26,13 @@ const END_WITHIN: Duration = Duration::from_millis(400);
 
 /// Does what the command line of this process says, and tells the exit code.
 pub fn run() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let cli: Cli = match documents::command_line() {
         Ok(cli) => cli,
-        // Help and version are results; what is said of a wrong use is not.
-        Err(text) if !text.use_stderr() => {
+        Err(help) => {
             let mut console = Console::new(false);
-            console.result(&text.render().ansi().to_string());
+            console.result(&help);
             return ExitCode::from(console.exit_code(Exit::Done as u8));
         }
-        Err(fault) => fault.exit(),
     };
     let mut console = Console::new(cli.quiet);
     let exit = match Signals::install() {

@@ -19,7 +19,7 @@ use std::{fs, io};
 /// | `records/*.rec` | one fixed-size record per message and stage |
 /// | `cards/*.json` | what each component was told it is |
 /// | `launch/*.json` | how each process was started here |
-/// | `logs/*.log` | standard error of each process |
+/// | `logs/*.log` | what each process printed, of much the first and last MiB |
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RunFolder {
     root: PathBuf,

@@ -9,6 +9,7 @@ use hil_arm::egm::messages::Side;
 use serde::{Deserialize, Serialize};
 use toml::Table;
 
+use super::clock_path::link_local_fault;
 use super::errors::{Fault, Place};
 use super::limits;
 use super::model_links::Timestamps;
@@ -190,6 +191,13 @@ fn read_address(reader: &mut Reader<'_>, key: &'static str) -> Option<SocketAddr
              {EGM_PORT_MIN} to 65535"
         );
         reader.refuse(key, Fault::Inconsistent(fault));
+        return None;
+    }
+    if let Some(SocketAddr::V6(address)) = parsed
+        && address.ip().is_unicast_link_local()
+        && address.scope_id() == 0
+    {
+        reader.refuse(key, Fault::Inconsistent(link_local_fault(&text.value)));
         return None;
     }
     parsed

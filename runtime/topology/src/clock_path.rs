@@ -196,13 +196,17 @@ pub(super) fn read_address(reader: &Reader<'_>, key: &str, text: &str) -> Option
         let fault = Fault::Inconsistent(format!("\"{text}\" is no address of one host"));
         reader.refuse(key, fault);
     } else if address.is_some_and(is_link_local_v6) {
-        let fault = format!(
-            "\"{text}\" is link-local: it says nothing without an interface, and its scope differs \
-             from host to host; give the host a unique local address (fd00::/8) or use IPv4"
-        );
-        reader.refuse(key, Fault::Inconsistent(fault));
+        reader.refuse(key, Fault::Inconsistent(link_local_fault(text)));
     }
     address
+}
+
+/// Why a link-local address without a scope is refused.
+pub(super) fn link_local_fault(text: &str) -> String {
+    format!(
+        "\"{text}\" is link-local: it says nothing without an interface, and its scope differs from \
+         host to host; give the host a unique local address (fd00::/8) or use IPv4"
+    )
 }
 
 /// Of `fe80::/10` (RFC 4291, 2.5.6): the kernel refuses it without a scope.

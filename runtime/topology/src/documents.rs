@@ -5,7 +5,7 @@
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
-use clap::Command;
+use clap::{Command, Parser};
 use clap_complete::Shell;
 use clap_mangen::Man;
 use clap_mangen::roff::Roff;
@@ -21,6 +21,19 @@ const SHELLS: [(Shell, &str); 3] = [
     (Shell::Zsh, "zsh"),
     (Shell::Fish, "fish"),
 ];
+
+/// The command line of this process. What is wrong with it is told, and ends the process.
+///
+/// # Errors
+/// The help or the version, where that is what was asked for: a result like any other.
+pub fn command_line<C: Parser>() -> Result<C, String> {
+    C::try_parse().map_err(|asked| {
+        if asked.use_stderr() {
+            asked.exit();
+        }
+        asked.render().ansi().to_string()
+    })
+}
 
 /// Writes the documents of `command` below `folder`: `man1/*.1`, and a folder of completions per
 /// shell. Gives back what it wrote.

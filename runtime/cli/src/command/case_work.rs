@@ -53,7 +53,7 @@ pub(super) fn tables(
     registry: &Registry,
     console: &mut Console,
 ) -> Result<u8, Refusal> {
-    *console = Console::new(batch.quiet);
+    console.set_quiet(batch.quiet);
     // Before the preparation, which takes its time and must not end without a word.
     let signals = signals()?;
     let topology = hil_topology::load_case(path, overrides, registry.known());
@@ -68,7 +68,7 @@ pub(super) fn calibrate(
     registry: &Registry,
     console: &mut Console,
 ) -> Result<u8, Refusal> {
-    *console = Console::new(args.batch.quiet);
+    console.set_quiet(args.batch.quiet);
     let signals = signals()?;
     let (figure, value) = wanted_figure(args.mlr, args.figure.as_deref()).map_err(usage)?;
     let entry = registry.find_by_prefix(&args.case).map_err(usage)?;

@@ -75,13 +75,22 @@ fn period_ns(report: &LatencyReport) -> i64 {
     i64::try_from(report.period_ns).unwrap_or(i64::MAX)
 }
 
+/// Why there are no figures.
+fn nothing_measured(report: &LatencyReport) -> &'static str {
+    if report.measured_wakeups().next().is_none() {
+        "no thread could be put on the CPU to be measured"
+    } else {
+        "no wake-up fell into the measuring time"
+    }
+}
+
 /// The finding that a measurement of wake-ups comes to: that of the CPU that was latest at p99.
 pub(crate) fn judge(measured: &LatencyReport) -> Checked {
     let id = "wakeup_latency";
-    let wakeups = measured.wakeups.iter();
+    let wakeups = measured.measured_wakeups();
     let with_metrics = wakeups.filter_map(|one| Some((one, one.lateness?)));
     let worst = with_metrics.max_by_key(|(_, lateness)| lateness.p99_ns);
-    let worst = worst.ok_or("no wake-up fell into the measuring time");
+    let worst = worst.ok_or_else(|| nothing_measured(measured));
     let (wakeups, lateness) = worst.told(id)?;
     let [p50, p99, max] =
         [lateness.p50_ns, lateness.p99_ns, lateness.max_ns].map(|ns| ns as f64 / 1000.0);
@@ -123,7 +132,7 @@ struct Worst {
 impl Worst {
     fn of(report: &LatencyReport) -> Option<Self> {
         let (mut count, mut lateness) = (u64::MAX, None::<Quantiles>);
-        for one in &report.wakeups {
+        for one in report.measured_wakeups() {
             // A CPU without figures leaves nothing to claim of all.
             let (own, worst) = (one.lateness?, lateness.get_or_insert_default());
             count = count.min(one.count);
@@ -212,7 +221,7 @@ pub(super) fn derive(report: &LatencyReport) -> Vec<Claim> {
             "medians of delays",
             QUANTILE_RULE,
             Standing::NotMeasured,
-            "no wake-up fell into the time",
+            nothing_measured(report),
         )];
     };
     let of = worst.lateness;
@@ -231,7 +240,7 @@ pub(super) fn derive(report: &LatencyReport) -> Vec<Claim> {
         ),
     ];
     claims.extend(DEADLINES.map(|(rate_hz, rate)| worst.deadline(rate_hz, rate)));
-    let gaps = report.gaps.iter();
+    let gaps = report.measured_gaps();
     claims.extend(gaps.map(|gaps| busy_polling(gaps, worst.period_ns)));
     if report.surroundings.is_virtual_machine() {
         claims.push(Claim::new(
@@ -292,7 +301,7 @@ pub(crate) fn us_up(ns: i64) -> i64 {
 
 #[cfg(test)]
 mod tests {
-    use hil_platform::realtime::RealtimeGrant;
+    use hil_platform::realtime::{GrantOutcome, RealtimeGrant, RealtimeGrantItem, RealtimeItem};
 
     use super::*;
     use crate::finding::{Severity, settled};
@@ -393,6 +402,34 @@ mod tests {
         let mut silent = report(0, [0; 4]);
         silent.wakeups[0].lateness = None;
         assert_eq!(found(&silent, "median").standing, Standing::NotMeasured);
+    }
+
+    #[test]
+    fn a_cpu_that_could_not_be_used_has_no_part_in_what_is_claimed() {
+        let refused = |report: &mut LatencyReport, index: usize| {
+            report.wakeups[index].scheduling.items = vec![RealtimeGrantItem {
+                item: RealtimeItem::CpuPinning,
+                asked: "cpu 1".to_owned(),
+                outcome: GrantOutcome::Refused {
+                    error: "EINVAL: Invalid argument".to_owned(),
+                    reason: String::new(),
+                    fix: String::new(),
+                },
+            }];
+            report.wakeups[index].lateness = None;
+            report.wakeups[index].count = 0;
+        };
+        let whole = report(30_000, [3, 8, 12, 40]);
+        let mut partial = whole.clone();
+        partial.wakeups.push(whole.wakeups[0].clone());
+        refused(&mut partial, 1);
+        assert_eq!(derive(&partial), derive(&whole));
+        refused(&mut partial, 0);
+        let claims = derive(&partial);
+        assert_eq!(
+            claims[0].why,
+            "no thread could be put on the CPU to be measured"
+        );
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, io};
 
+use hil_topology::{Program, Topology};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
 use nix::unistd::{AccessFlags, access};
@@ -56,19 +57,51 @@ pub fn become_program(supervisor: u32, program: &[String]) -> Result<(), OwnProg
     })
 }
 
-/// Where `program` is, as the shell would find it.
+/// Programs of the user's that a run would start and cannot.
+#[derive(Debug, thiserror::Error)]
+#[error("{}", .0.join("\n"))]
+pub struct ProgramsMissing(Vec<String>);
+
+/// Looks for the own programs of `topology` that would run on `hosts`, which are this machine, before a
+/// run begins: by this process's search path and from its working folder.
 ///
 /// # Errors
-/// When no executable file of that name is on the search path.
-pub fn find(program: &str) -> Result<PathBuf, io::Error> {
+/// Names the key of each process whose program is not there, and the program.
+pub fn find_all(topology: &Topology, hosts: &[String]) -> Result<(), ProgramsMissing> {
+    let here = topology.processes().iter();
+    let here = here.filter(|process| hosts.contains(&process.host));
+    let missing: Vec<String> = here
+        .filter_map(|process| match &process.program {
+            Program::Command { command, .. } => {
+                let (name, program) = (&process.name, &command[0]);
+                let error = find(program).err()?;
+                Some(format!(
+                    "processes.{name}.run: cannot start {program}: {error}"
+                ))
+            }
+            Program::BuiltIn { .. } | Program::Egm { .. } => None,
+        })
+        .collect();
+    if missing.is_empty() {
+        Ok(())
+    } else {
+        Err(ProgramsMissing(missing))
+    }
+}
+
+/// Where `program` is, as the shell would find it.
+fn find(program: &str) -> io::Result<PathBuf> {
     let is_executable = |path: &Path| path.is_file() && access(path, AccessFlags::X_OK).is_ok();
-    let not_found = || io::Error::new(io::ErrorKind::NotFound, "no such executable file");
+    let not_found = |place: String| {
+        let text = format!("no executable file of that name {place}");
+        io::Error::new(io::ErrorKind::NotFound, text)
+    };
     if program.contains('/') {
-        let path = PathBuf::from(program);
+        let path = env::current_dir()?.join(program);
         return if is_executable(&path) {
             Ok(path)
         } else {
-            Err(not_found())
+            Err(not_found(format!("at {}", path.display())))
         };
     }
     let search_path = env::var_os("PATH").unwrap_or_default();
@@ -76,7 +109,7 @@ pub fn find(program: &str) -> Result<PathBuf, io::Error> {
     found
         .into_iter()
         .find(|path| is_executable(path))
-        .ok_or_else(not_found)
+        .ok_or_else(|| not_found(format!("in {}", search_path.to_string_lossy())))
 }
 
 #[cfg(test)]

@@ -10,6 +10,7 @@ use hil_link::condition::{LinkChangeRequest, ORDER_TYPE_NAME};
 
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::gateway::link_control::ORDERS_MAX;
+use hil_platform::domain_address::checked_root_path;
 use hil_rundir::announcement::withdraw_abandoned;
 use hil_shm::{
     ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo, observer_depth,
@@ -47,7 +48,7 @@ pub enum DomainsError {
 }
 
 impl DomainsError {
-    /// The path of the domain itself is at fault, as whoever named it can mend.
+    /// The given path is invalid.
     pub const fn is_of_path(&self) -> bool {
         matches!(
             self,
@@ -71,6 +72,19 @@ struct HostDomain {
 #[derive(Debug)]
 pub(crate) struct Domains {
     hosts: Vec<HostDomain>,
+}
+
+/// Checks that the domain of `host` can lie below `base` or the default folder; the length of its path does
+/// not depend on the run.
+///
+/// # Errors
+/// When the path is too long or unusable.
+pub(crate) fn check_path(base: Option<&PathBuf>, host: &str) -> Result<(), DomainsError> {
+    let checked = checked_root_path(&domain_root(base, "", host));
+    checked.map(drop).map_err(|error| DomainsError::Domain {
+        host: host.to_owned(),
+        source: error.into(),
+    })
 }
 
 impl Domains {

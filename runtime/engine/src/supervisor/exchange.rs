@@ -175,20 +175,24 @@ fn record_files(records: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-fn give_report(out: &mut impl Write, story: &HostHistory) -> io::Result<()> {
+/// Gives one report, and how long all so far are.
+fn give_report(out: &mut impl Write, story: &HostHistory, before_bytes: u64) -> io::Result<u64> {
     let body = serde_json::to_vec(story)?;
     let size_bytes = body.len() as u64;
-    check_report(size_bytes)?;
+    let whole_bytes = before_bytes.saturating_add(size_bytes);
+    check_reports(whole_bytes)?;
     write_message(out, &PeerMessage::Report { size_bytes })?;
-    body.chunks(CHUNK_BYTES)
-        .try_for_each(|chunk| write_chunk(out, chunk))
+    for chunk in body.chunks(CHUNK_BYTES) {
+        write_chunk(out, chunk)?;
+    }
+    Ok(whole_bytes)
 }
 
-fn check_report(size_bytes: u64) -> io::Result<()> {
-    if size_bytes <= REPORT_BYTES_MAX {
+fn check_reports(whole_bytes: u64) -> io::Result<()> {
+    if whole_bytes <= REPORT_BYTES_MAX {
         return Ok(());
     }
-    let text = format!("a report of {size_bytes} bytes, {REPORT_BYTES_MAX} is most");
+    let text = format!("reports of {whole_bytes} bytes, {REPORT_BYTES_MAX} is most");
     Err(invalid(text))
 }
 
@@ -197,8 +201,9 @@ fn invalid(text: String) -> io::Error {
 }
 
 fn give_all(out: &mut impl Write, files: &[PathBuf], stories: &[HostHistory]) -> io::Result<()> {
+    let mut report_bytes = 0;
     for story in stories {
-        give_report(out, story)?;
+        report_bytes = give_report(out, story, report_bytes)?;
     }
     for path in files {
         let Some(name) = path.file_name().and_then(|name| name.to_str()) else {
@@ -229,6 +234,8 @@ fn give_all(out: &mut impl Write, files: &[PathBuf], stories: &[HostHistory]) ->
 struct Incoming {
     body: Body,
     left: u64,
+    /// Of all reports so far.
+    report_bytes: u64,
 }
 
 enum Body {
@@ -252,6 +259,7 @@ fn take_from(host: &str, inbox: &mut Receiver<PeerEvent>, records: &Path) -> Rec
     let mut incoming = Incoming {
         body: Body::Nothing,
         left: 0,
+        report_bytes: 0,
     };
     let problem = loop {
         let frame = match inbox.recv_timeout(PATIENCE) {
@@ -283,11 +291,18 @@ fn take_frame(
     match frame {
         Frame::Message(PeerMessage::Done) => {
             incoming.check_whole()?;
+            if received.stories.is_empty() {
+                return Err(invalid("no report came".to_owned()));
+            }
             return Ok(true);
         }
         Frame::Message(PeerMessage::Report { size_bytes }) => {
             incoming.check_whole()?;
-            check_report(size_bytes)?;
+            incoming.report_bytes = incoming.report_bytes.saturating_add(size_bytes);
+            check_reports(incoming.report_bytes)?;
+            if size_bytes == 0 {
+                return Err(invalid("an empty report".to_owned()));
+            }
             incoming.body = Body::Report(Vec::new());
             incoming.left = size_bytes;
         }
@@ -361,6 +376,7 @@ mod tests {
         let mut incoming = Incoming {
             body: Body::Nothing,
             left: 0,
+            report_bytes: 0,
         };
         let nowhere = Path::new("/nonexistent");
         while !take_frame(
@@ -373,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn a_report_of_any_length_arrives_whole() {
+    fn reports_longer_than_a_frame_arrive_whole() {
         for event_count in [0, 1, 100_000] {
             let mut wire = Vec::new();
             give_all(&mut wire, &[], &[story(event_count), story(1)]).unwrap();
@@ -383,17 +399,46 @@ mod tests {
     }
 
     #[test]
-    fn a_report_that_is_too_long_or_cut_short_is_refused() {
-        let mut wire = Vec::new();
-        let size_bytes = REPORT_BYTES_MAX + 1;
-        write_message(&mut wire, &PeerMessage::Report { size_bytes }).unwrap();
-        let said = taken(&wire).unwrap_err().to_string();
-        assert!(said.contains("268435457 bytes"), "{said}");
-        let mut wire = Vec::new();
-        write_message(&mut wire, &PeerMessage::Report { size_bytes: 9 }).unwrap();
-        write_chunk(&mut wire, b"{}").unwrap();
-        write_message(&mut wire, &PeerMessage::Done).unwrap();
-        let said = taken(&wire).unwrap_err().to_string();
-        assert_eq!(said, "7 bytes did not come");
+    fn what_is_too_long_cut_short_or_missing_is_refused() {
+        let report = |size_bytes| PeerMessage::Report { size_bytes };
+        let file = || PeerMessage::File {
+            name: "a.rec".to_owned(),
+            size_bytes: 1,
+        };
+        let cases: [(&[PeerMessage], &[u8], PeerMessage, &str); 6] = [
+            (
+                &[report(REPORT_BYTES_MAX + 1)],
+                b"",
+                PeerMessage::Done,
+                "reports of 268435457 bytes",
+            ),
+            (&[report(0)], b"", PeerMessage::Done, "an empty report"),
+            (&[], b"", PeerMessage::Done, "no report came"),
+            (
+                &[report(9)],
+                b"{}",
+                PeerMessage::Done,
+                "7 bytes did not come",
+            ),
+            (&[report(9)], b"{}", file(), "7 bytes did not come"),
+            (
+                &[report(1)],
+                b"{}",
+                PeerMessage::Done,
+                "2 bytes came, 1 were due",
+            ),
+        ];
+        for (before, chunk, after, expected) in cases {
+            let mut wire = Vec::new();
+            for message in before {
+                write_message(&mut wire, message).unwrap();
+            }
+            if !chunk.is_empty() {
+                write_chunk(&mut wire, chunk).unwrap();
+            }
+            write_message(&mut wire, &after).unwrap();
+            let said = taken(&wire).unwrap_err().to_string();
+            assert!(said.contains(expected), "{said}");
+        }
     }
 }

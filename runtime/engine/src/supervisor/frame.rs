@@ -13,7 +13,8 @@ use hil_rundir::run_seal::RunSeal;
 pub const FRAME_BYTES_MAX: usize = 1 << 20;
 /// Piece in which record files and reports travel.
 pub const CHUNK_BYTES: usize = 1 << 18;
-/// Longest report of a host: a million events, or the counters of tens of thousands of channels.
+/// Most that a peer may send of reports: a million events, or the counters of tens of thousands of
+/// channels.
 pub const REPORT_BYTES_MAX: u64 = 1 << 28;
 
 /// Who a supervisor is; the first frame each way.

@@ -11,6 +11,7 @@ use super::domains::DomainsError;
 use super::frame::{EndMeaning, PeerMessage};
 use super::meet::PeerError;
 use super::process_group::ProcessGroupError;
+use crate::process::own_program::ProgramsMissing;
 use crate::security::KeyFileError;
 use hil_rundir::run_result::Outcome;
 use hil_shm::DomainError;
@@ -51,6 +52,9 @@ pub enum RunError {
     /// The other hosts did not come.
     #[error(transparent)]
     Peer(#[from] PeerError),
+    /// A program of the user's is not there.
+    #[error(transparent)]
+    Programs(#[from] ProgramsMissing),
     /// A process cannot be started.
     #[error("{0}")]
     Start(String),

@@ -12,9 +12,8 @@ use std::{env, io};
 use hil_core::time::{Instant, duration_ns};
 
 use super::child::{Child, Word, describe_exit, last_line};
-use super::output_log::{cut_middle, release_middle};
+use super::output_log::{LogKeeper, cut_middle};
 use super::plan::{ProcessPlan, ProcessTask};
-use crate::process::own_program;
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::event::{Event, EventKind, Interruption};
 use hil_rundir::launch::{ComponentWork, LaunchError, Work, WorkerLaunch, write};
@@ -45,6 +44,8 @@ pub(crate) enum ProcessGroupError {
     },
     #[error("cannot find this program's own file: {0}")]
     OwnPath(io::Error),
+    #[error("cannot start a thread: {0}")]
+    Thread(io::Error),
 }
 
 /// What ended the run, if a process did.
@@ -90,6 +91,7 @@ pub(crate) struct ProcessGroup {
     /// When the run began.
     pub(super) started: Option<Instant>,
     events: Vec<Event>,
+    log_keeper: Option<LogKeeper>,
 }
 
 impl ProcessGroup {
@@ -124,11 +126,15 @@ impl ProcessGroup {
             words,
             started: None,
             events: Vec::new(),
+            log_keeper: None,
         })
     }
 
     /// Starts every process; they wait for [`ProcessGroup::begin`].
     pub(crate) fn start(&mut self) -> Result<(), ProcessGroupError> {
+        let names = self.members.iter().map(|member| &member.plan.name);
+        let logs = names.map(|name| self.folder.log(name)).collect();
+        self.log_keeper = Some(LogKeeper::start(logs).map_err(ProcessGroupError::Thread)?);
         (0..self.members.len()).try_for_each(|index| self.spawn(index))
     }
 
@@ -444,16 +450,11 @@ impl ProcessGroup {
         self.listen();
     }
 
-    /// Gives back the disk space that the middle of each long log takes.
-    pub(crate) fn release_logs(&self) {
-        for member in &self.members {
-            // A log that cannot be opened now is looked at again, and at the end.
-            let _unopened = release_middle(&self.folder.log(&member.plan.name)).is_err();
-        }
-    }
-
     /// Takes the middle out of each long log, once nothing is written to it any more.
     pub(crate) fn cut_logs(&mut self) {
+        if let Some(keeper) = self.log_keeper.take() {
+            keeper.finish();
+        }
         for index in 0..self.members.len() {
             let kind = match cut_middle(&self.folder.log(&self.members[index].plan.name)) {
                 Ok(0) => continue,
@@ -483,21 +484,4 @@ impl ProcessGroup {
     pub(crate) fn events(&self) -> &[Event] {
         &self.events
     }
-}
-
-/// Looks for every user's own program before the run begins.
-///
-/// # Errors
-/// Names the process and the program that is not there.
-pub(crate) fn find_programs(plans: &[ProcessPlan]) -> Result<(), ProcessGroupError> {
-    for plan in plans {
-        if let ProcessTask::Foreign { command, .. } = &plan.task {
-            own_program::find(&command[0]).map_err(|source| ProcessGroupError::Spawn {
-                process: plan.name.clone(),
-                program: command[0].clone(),
-                source,
-            })?;
-        }
-    }
-    Ok(())
 }

@@ -8,16 +8,17 @@ use std::time::{Duration, Instant as WallInstant, SystemTime};
 use hil_core::time::Instant;
 use hil_net::clock_pair::ClockPair;
 
-use super::domains::Domains;
+use super::domains::{self, Domains};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
 use super::outcome::{Heard, RunError, RunOptions, meaning};
 use super::peer::{Peer, PeerEvent};
 use super::peer_status::{PeerStatus, greeting, own_ticks};
 use super::plan::{ProcessPlan, plan};
-use super::process_group::{self, ProcessGroup, Verdict};
+use super::process_group::{ProcessGroup, Verdict};
 use super::rendezvous::{gather, read_key};
 use super::status_publisher::StatusPublisher;
+use crate::process::own_program;
 use hil_nic::nic_clock::NicWatch;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::clock_discipline::HostDiscipline;
@@ -66,10 +67,11 @@ pub fn run(
         .iter()
         .filter(|host| options.hosts.contains(&host.name))
         .collect();
+    own_program::find_all(topology, &options.hosts)?;
     let key = read_key(topology, &hosts)?;
     let plan = plan(topology, &hosts);
-    process_group::find_programs(&plan.processes)?;
     check_emulation(topology).map_err(RunError::Emulation)?;
+    domains::check_path(options.domain_root.as_ref(), &hosts[0].name)?;
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
     let discipline = HostDiscipline::gather().ok();
@@ -285,7 +287,6 @@ impl Session<'_> {
     fn look_after(&mut self) -> Option<Outcome> {
         if self.cleaned.elapsed() >= CLEANUP_PERIOD {
             self.domains.free_what_the_dead_held();
-            self.process_group.release_logs();
             self.cleaned = WallInstant::now();
         }
         if self.greeted.elapsed() >= ALIVE_PERIOD {
