@@ -28,7 +28,7 @@ mod outage;
 mod passage;
 pub mod radio;
 #[cfg(test)]
-mod random_fates;
+mod random_fates_tests;
 mod segments;
 mod stage;
 pub mod synthetic;

@@ -5,9 +5,13 @@
 //! checked by the compiler, and that the fields cover every byte in order is an assertion at build
 //! time, so a layout cannot fall behind its type.
 
-/// Of what kind a field's elements are; all little-endian as on the machines we support.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum FieldKind {
+use serde::{Deserialize, Serialize};
+
+/// Of what kind a field's elements are; all little-endian as on the machines we support. `Name` and
+/// `Fields` are how a structure's own are kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FieldKind<Name = &'static str, Fields = &'static [Field]> {
     /// Unsigned.
     U8,
     /// Unsigned.
@@ -31,10 +35,32 @@ pub enum FieldKind {
     /// A structure: its name and fields, offsets from its own start.
     Record {
         /// Name of the type.
-        name: &'static str,
+        name: Name,
         /// Its fields.
-        fields: &'static [Field],
+        fields: Fields,
     },
+}
+
+impl<Name, Fields> FieldKind<Name, Fields> {
+    /// The same kind with a structure's name and fields as `keep` keeps them.
+    pub fn kept<N, F>(&self, keep: impl FnOnce(&Name, &Fields) -> (N, F)) -> FieldKind<N, F> {
+        match self {
+            Self::U8 => FieldKind::U8,
+            Self::U16 => FieldKind::U16,
+            Self::U32 => FieldKind::U32,
+            Self::U64 => FieldKind::U64,
+            Self::I8 => FieldKind::I8,
+            Self::I16 => FieldKind::I16,
+            Self::I32 => FieldKind::I32,
+            Self::I64 => FieldKind::I64,
+            Self::F32 => FieldKind::F32,
+            Self::F64 => FieldKind::F64,
+            Self::Record { name, fields } => {
+                let (name, fields) = keep(name, fields);
+                FieldKind::Record { name, fields }
+            }
+        }
+    }
 }
 
 impl FieldKind {

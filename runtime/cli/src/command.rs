@@ -100,11 +100,12 @@ fn failed(why: impl Display) -> Refusal {
     Refusal::new(exit::FAILED, why)
 }
 
-const fn code_of(end: CommandEnd) -> u8 {
+fn code_of(end: CommandEnd) -> u8 {
     match end {
         CommandEnd::Done => exit::RAN,
         CommandEnd::Failed => exit::FAILED,
         CommandEnd::Refused => exit::USAGE,
+        CommandEnd::Interrupted => interrupted(),
     }
 }
 

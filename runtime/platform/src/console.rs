@@ -30,6 +30,8 @@ pub enum CommandEnd {
     Failed,
     /// Nothing could be done with what was asked.
     Refused,
+    /// A signal ended it; what was complete by then is shown.
+    Interrupted,
 }
 
 /// How a line weighs.

@@ -127,7 +127,7 @@ const fn is_real(kind: &KindDescription) -> bool {
 }
 
 const fn is_signed(kind: &KindDescription) -> bool {
-    use KindDescription::{I8, I16, I32, I64};
+    use hil_core::layout::FieldKind::{I8, I16, I32, I64};
     matches!(kind, I8 | I16 | I32 | I64)
 }
 

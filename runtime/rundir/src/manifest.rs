@@ -192,38 +192,8 @@ pub struct FieldDescription {
     pub offset_bytes: usize,
 }
 
-/// Of what kind the elements of a field are, all little-endian; see [`FieldKind`].
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum KindDescription {
-    /// Unsigned.
-    U8,
-    /// Unsigned.
-    U16,
-    /// Unsigned.
-    U32,
-    /// Unsigned.
-    U64,
-    /// Signed.
-    I8,
-    /// Signed.
-    I16,
-    /// Signed.
-    I32,
-    /// Signed.
-    I64,
-    /// IEEE 754.
-    F32,
-    /// IEEE 754.
-    F64,
-    /// A structure; offsets from its own start.
-    Record {
-        /// Name of the type.
-        name: String,
-        /// Its fields.
-        fields: Vec<FieldDescription>,
-    },
-}
+/// Of what kind the elements of a field are, as a file keeps it.
+pub type KindDescription = FieldKind<String, Vec<FieldDescription>>;
 
 impl FieldDescription {
     /// True for filler that means nothing.
@@ -236,30 +206,11 @@ impl From<&Field> for FieldDescription {
     fn from(field: &Field) -> Self {
         Self {
             name: field.name.to_owned(),
-            kind: (&field.kind).into(),
+            kind: field
+                .kind
+                .kept(|name, fields| ((*name).to_owned(), describe_fields(fields))),
             count: field.count,
             offset_bytes: field.offset_bytes,
-        }
-    }
-}
-
-impl From<&FieldKind> for KindDescription {
-    fn from(kind: &FieldKind) -> Self {
-        match kind {
-            FieldKind::U8 => Self::U8,
-            FieldKind::U16 => Self::U16,
-            FieldKind::U32 => Self::U32,
-            FieldKind::U64 => Self::U64,
-            FieldKind::I8 => Self::I8,
-            FieldKind::I16 => Self::I16,
-            FieldKind::I32 => Self::I32,
-            FieldKind::I64 => Self::I64,
-            FieldKind::F32 => Self::F32,
-            FieldKind::F64 => Self::F64,
-            FieldKind::Record { name, fields } => Self::Record {
-                name: (*name).to_owned(),
-                fields: describe_fields(fields),
-            },
         }
     }
 }

@@ -317,38 +317,29 @@ impl MotionRequest {
 
 const _: () = assert!(size_of::<MotionRequest>() == 312);
 
-/// What a session shall differ in from the controller's own settings; NaN keeps the setting.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct EgmStartParameters {
-    /// `CommTimeout`, s.
-    pub comm_timeout_s: f64,
-    /// `CondTime`, s.
-    pub condition_time_s: f64,
-    /// `MaxSpeedDeviation`, rad/s.
-    pub max_speed_deviation_rad_per_s: f64,
-    /// `MaxPosDeviation`, rad.
-    pub max_position_deviation_rad: f64,
-    /// `RampInTime`, s.
-    pub ramp_in_s: f64,
-    /// `PosCorrGain`, 0..=1.
-    pub position_correction_ratio: f64,
-    /// Proportional position gain, 1/s.
-    pub position_gain_per_s: f64,
-    /// Low-pass corner, Hz; 0 switches it off.
-    pub low_pass_hz: f64,
+hil_core::message! {
+    /// What a session shall differ in from the controller's own settings; NaN keeps the setting.
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    pub struct EgmStartParameters {
+        /// `CommTimeout`, s.
+        pub comm_timeout_s: f64,
+        /// `CondTime`, s.
+        pub condition_time_s: f64,
+        /// `MaxSpeedDeviation`, rad/s.
+        pub max_speed_deviation_rad_per_s: f64,
+        /// `MaxPosDeviation`, rad.
+        pub max_position_deviation_rad: f64,
+        /// `RampInTime`, s.
+        pub ramp_in_s: f64,
+        /// `PosCorrGain`, 0..=1.
+        pub position_correction_ratio: f64,
+        /// Proportional position gain, 1/s.
+        pub position_gain_per_s: f64,
+        /// Low-pass corner, Hz; 0 switches it off.
+        pub low_pass_hz: f64,
+    }
 }
-
-hil_core::layout!(EgmStartParameters {
-    comm_timeout_s,
-    condition_time_s,
-    max_speed_deviation_rad_per_s,
-    max_position_deviation_rad,
-    ramp_in_s,
-    position_correction_ratio,
-    position_gain_per_s,
-    low_pass_hz
-});
 
 impl EgmStartParameters {
     /// Keeps every setting.

@@ -2,7 +2,7 @@
 //! period. A pure state machine; what carries the messages, and how badly, it does not know.
 
 #[cfg(test)]
-mod closed_loop;
+mod closed_loop_tests;
 pub mod counters;
 mod legacy;
 pub mod parameters;

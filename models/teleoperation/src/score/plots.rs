@@ -262,35 +262,24 @@ impl RobotSeries<'_> {
     }
 }
 
-const DESIRED: [PlotColumn; JOINT_COUNT] = [
-    column("desired_j1_rad", "joint 1 desired", "rad"),
-    column("desired_j2_rad", "joint 2 desired", "rad"),
-    column("desired_j7_rad", "joint 7 desired", "rad"),
-    column("desired_j3_rad", "joint 3 desired", "rad"),
-    column("desired_j4_rad", "joint 4 desired", "rad"),
-    column("desired_j5_rad", "joint 5 desired", "rad"),
-    column("desired_j6_rad", "joint 6 desired", "rad"),
-];
+/// Columns of all joints in chain order, by the maker's numbers: `<key>_j1_rad` and so on, titled
+/// `joint 1<title>`.
+macro_rules! of_joints {
+    ($key:literal, $title:literal) => {
+        of_joints!($key, $title, 1, 2, 7, 3, 4, 5, 6)
+    };
+    ($key:literal, $title:literal, $($joint:literal),+) => {
+        [$(column(
+            concat!($key, "_j", $joint, "_rad"),
+            concat!("joint ", $joint, $title),
+            "rad",
+        )),+]
+    };
+}
 
-const MEASURED: [PlotColumn; JOINT_COUNT] = [
-    column("measured_j1_rad", "joint 1 measured", "rad"),
-    column("measured_j2_rad", "joint 2 measured", "rad"),
-    column("measured_j7_rad", "joint 7 measured", "rad"),
-    column("measured_j3_rad", "joint 3 measured", "rad"),
-    column("measured_j4_rad", "joint 4 measured", "rad"),
-    column("measured_j5_rad", "joint 5 measured", "rad"),
-    column("measured_j6_rad", "joint 6 measured", "rad"),
-];
-
-const ERROR: [PlotColumn; JOINT_COUNT] = [
-    column("error_j1_rad", "joint 1, desired minus measured", "rad"),
-    column("error_j2_rad", "joint 2, desired minus measured", "rad"),
-    column("error_j7_rad", "joint 7, desired minus measured", "rad"),
-    column("error_j3_rad", "joint 3, desired minus measured", "rad"),
-    column("error_j4_rad", "joint 4, desired minus measured", "rad"),
-    column("error_j5_rad", "joint 5, desired minus measured", "rad"),
-    column("error_j6_rad", "joint 6, desired minus measured", "rad"),
-];
+const DESIRED: [PlotColumn; JOINT_COUNT] = of_joints!("desired", " desired");
+const MEASURED: [PlotColumn; JOINT_COUNT] = of_joints!("measured", " measured");
+const ERROR: [PlotColumn; JOINT_COUNT] = of_joints!("error", ", desired minus measured");
 
 const JOINT_NOTE: &str = "right arm, joints in chain order, the maker's numbers; desired: newest \
                           command sent by then";

@@ -5,16 +5,16 @@ use std::path::Path;
 
 use crate::arguments::CalibrateArgs;
 use hil_core::study::Batch;
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
-use hil_report::study::{self, BatchArgs, StudyEnd, StudyError, Wanted};
+use hil_report::study::{self, BatchArgs, StudyError, Wanted};
 use hil_report::terminal::{self, Style};
 use hil_report::{replay, simulate};
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::Registry;
 
-use super::{Refusal, columns, exit, failed, interrupted, load, loaded, signals, usage};
+use super::{Refusal, code_of, columns, exit, failed, load, loaded, signals, usage};
 
 /// `simulate`, with its report and the run's folder.
 pub(super) fn simulate(
@@ -127,11 +127,10 @@ fn compute(
 ) -> Result<u8, Refusal> {
     let study = study.map_err(usage)?;
     match study::run(study.as_ref(), args, signals, console).map_err(failed)? {
-        StudyEnd::Passed => Ok(exit::RAN),
-        StudyEnd::Missed => Err(failed(
+        CommandEnd::Failed => Err(failed(
             "a criterion is missed: the lines marked MISSED at the end of the tables",
         )),
-        StudyEnd::Interrupted => Ok(interrupted()),
+        end => Ok(code_of(end)),
     }
 }
 

@@ -1,11 +1,11 @@
 //! The commands that look at a run while it goes: `channel` and `top`.
 
-use super::{Refusal, columns_or, exit, failed, interrupted, signals, usage};
+use super::{Refusal, code_of, columns_or, exit, failed, signals, usage};
 use hil_platform::console::Console;
 use hil_topology::registry::Registry;
-use hil_watch::live::channel::{self, End};
+use hil_watch::live::channel;
 use hil_watch::live::cli::{ChannelArgs, TopArgs};
-use hil_watch::live::top::{self, TopEnd, TopError};
+use hil_watch::live::top::{self, TopError};
 
 /// `channel`.
 pub(super) fn channel(
@@ -14,8 +14,7 @@ pub(super) fn channel(
     console: &mut Console,
 ) -> Result<u8, Refusal> {
     match channel::run(args, registry, &signals()?, console) {
-        Ok(End::Done) => Ok(exit::RAN),
-        Ok(End::Interrupted) => Ok(interrupted()),
+        Ok(end) => Ok(code_of(end)),
         Err(error) if error.is_usage() => Err(usage(error)),
         Err(error) => Err(failed(error)),
     }
@@ -33,8 +32,7 @@ pub(super) fn top(
     let signals = signals()?;
     let columns = columns_or(PLAIN_COLUMNS);
     match top::run(args, columns, registry, &signals, console) {
-        Ok(TopEnd::Done) => Ok(exit::RAN),
-        Ok(TopEnd::Interrupted) => Ok(interrupted()),
+        Ok(end) => Ok(code_of(end)),
         Err(error) => {
             let code = match error {
                 TopError::Observe(_) => exit::USAGE,

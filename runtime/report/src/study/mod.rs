@@ -13,7 +13,7 @@ use std::{fs, thread};
 use hil_core::study::{Batch, StudyReport};
 
 use clap::Args;
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_topology::Topology;
 use hil_topology::registry::Registry;
@@ -35,17 +35,6 @@ pub struct BatchArgs {
     /// Print no progress, only the tables.
     #[arg(long, short)]
     pub quiet: bool,
-}
-
-/// How a study ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum StudyEnd {
-    /// Every criterion that could be judged is met.
-    Passed,
-    /// A criterion is missed.
-    Missed,
-    /// It was interrupted; what was complete is shown.
-    Interrupted,
 }
 
 /// What a study cost this machine.
@@ -152,7 +141,7 @@ pub fn run(
     args: &BatchArgs,
     signals: &Signals,
     console: &mut Console,
-) -> Result<StudyEnd, StudyError> {
+) -> Result<CommandEnd, StudyError> {
     let jobs = args
         .jobs
         .or_else(|| thread::available_parallelism().ok())
@@ -176,12 +165,12 @@ pub fn run(
             "ended by {signal}: {} of {} tasks are in the tables",
             cost.ended_count, cost.task_count
         ));
-        return Ok(StudyEnd::Interrupted);
+        return Ok(CommandEnd::Interrupted);
     }
     Ok(if report.is_passed() {
-        StudyEnd::Passed
+        CommandEnd::Done
     } else {
-        StudyEnd::Missed
+        CommandEnd::Failed
     })
 }
 

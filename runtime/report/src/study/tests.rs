@@ -117,7 +117,7 @@ fn a_calibration_is_computed_and_written_like_tables() {
     };
     let signals = Signals::install().unwrap();
     let end = run(batch.as_ref(), &args, &signals, &mut Console::new(true)).unwrap();
-    assert_eq!(end, StudyEnd::Passed);
+    assert_eq!(end, CommandEnd::Done);
     let curve = fs::read_to_string(folder.join("curve.csv")).unwrap();
     assert_eq!(curve, "outages_per_h\r\n0\r\n1\r\n2\r\n3\r\n");
     assert!(folder.join("report.json").is_file() && folder.join("report.txt").is_file());

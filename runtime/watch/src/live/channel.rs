@@ -10,7 +10,7 @@ use super::observer::{ObserveError, Observer};
 use super::pace::Pace;
 use super::top::via;
 use super::{delay, echo, hz};
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_rundir::layout::PathFault;
 use hil_rundir::manifest::ChannelDescription;
@@ -72,15 +72,6 @@ impl ChannelError {
     }
 }
 
-/// How it ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum End {
-    /// As asked, or with the run.
-    Done,
-    /// By a signal; the totals so far were printed.
-    Interrupted,
-}
-
 /// The messages that an answer is of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -115,7 +106,7 @@ pub fn run(
     registry: &Registry,
     signals: &Signals,
     console: &mut Console,
-) -> Result<End, ChannelError> {
+) -> Result<CommandEnd, ChannelError> {
     let open = |run: Option<&str>| Observer::open(run, registry);
     match args.command {
         ChannelCommand::List { run, json, window } => {
@@ -162,7 +153,7 @@ fn list(
     is_json: bool,
     signals: &Signals,
     console: &mut Console,
-) -> End {
+) -> CommandEnd {
     let channels = observer.manifest().channels.clone();
     // Before this program becomes a reader of some.
     let ends: Vec<Vec<HostEnds>> = channels
@@ -205,9 +196,9 @@ fn list(
         console.warn(problem);
     }
     if is_whole {
-        End::Done
+        CommandEnd::Done
     } else {
-        End::Interrupted
+        CommandEnd::Interrupted
     }
 }
 

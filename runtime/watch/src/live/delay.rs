@@ -11,10 +11,10 @@ use hil_stats::histogram::{Distribution, LatencySummary};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::channel::{ChannelError, End, ReportedProblems, Scope};
+use super::channel::{ChannelError, ReportedProblems, Scope};
 use super::cli::WindowArgs;
 use super::observer::Observer;
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
@@ -30,7 +30,7 @@ pub(super) fn run(
     args: &WindowArgs,
     signals: &Signals,
     console: &mut Console,
-) -> Result<End, ChannelError> {
+) -> Result<CommandEnd, ChannelError> {
     let name = observer.channel(&args.which.channel)?.name.clone();
     let mut reported = ReportedProblems::default();
     reported.tell(&observer, console);
@@ -45,7 +45,7 @@ pub(super) fn run(
             let (of, account) = (Scope::Window, account.as_ref());
             let text = answer(&name, of, args.window, account, &clock, args.json)?;
             if !console.result(&text) {
-                return Ok(End::Done);
+                return Ok(CommandEnd::Done);
             }
             if args.once {
                 let is_empty = account.is_none_or(|account| account.published_count == 0);
@@ -56,7 +56,7 @@ pub(super) fn run(
                         window_s: args.window.as_secs_f64(),
                     })
                 } else {
-                    Ok(End::Done)
+                    Ok(CommandEnd::Done)
                 };
             }
         }
@@ -66,9 +66,9 @@ pub(super) fn run(
             let (of, account) = (Scope::Total, account.as_ref());
             console.result(&answer(&name, of, TOTAL_MAX, account, &clock, args.json)?);
             return Ok(if is_whole {
-                End::Done
+                CommandEnd::Done
             } else {
-                End::Interrupted
+                CommandEnd::Interrupted
             });
         }
         observer.trim(TOTAL_MAX);

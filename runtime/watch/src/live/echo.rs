@@ -6,11 +6,11 @@ use std::time::Duration;
 use hil_core::message::Envelope;
 use serde::Serialize;
 
-use super::channel::{ChannelError, End};
+use super::channel::ChannelError;
 use super::cli::EchoArgs;
 use super::observer::Observer;
 use crate::{PassiveReader, RecordFollower};
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_platform::words::counted_plainly;
 use hil_rundir::layout::{Decoder, Selection, Value, hex};
@@ -59,7 +59,7 @@ pub(super) fn run(
     args: &EchoArgs,
     signals: &Signals,
     console: &mut Console,
-) -> Result<End, ChannelError> {
+) -> Result<CommandEnd, ChannelError> {
     let channel = observer.channel(&args.which.channel)?.clone();
     let form = form(&channel, args)?;
     if matches!(form, Form::Bytes) && !args.raw {
@@ -85,22 +85,22 @@ pub(super) fn run(
             is_heard &= console.result(&text?);
         }
         if !is_heard {
-            return Ok(End::Done);
+            return Ok(CommandEnd::Done);
         }
         if wanted.is_some_and(|wanted| shown_count >= wanted) {
-            break End::Done;
+            break CommandEnd::Done;
         }
         for problem in place.take_problems() {
             console.warn(&problem);
         }
         if signals.received().is_some() {
-            break End::Interrupted;
+            break CommandEnd::Interrupted;
         }
         match looked {
             // Channels break when their run ends.
             Err(error) if !observer.is_over() => return Err(ChannelError::Broken(error)),
-            Err(_) => break End::Done,
-            Ok(()) if is_over => break End::Done,
+            Err(_) => break CommandEnd::Done,
+            Ok(()) if is_over => break CommandEnd::Done,
             Ok(()) => thread::sleep(LOOK_PERIOD),
         }
     };
@@ -112,11 +112,13 @@ pub(super) fn run(
         ));
     }
     match wanted {
-        Some(wanted) if shown_count < wanted && end == End::Done => Err(ChannelError::Ended {
-            channel: channel.name,
-            shown_count,
-            wanted_count: wanted,
-        }),
+        Some(wanted) if shown_count < wanted && end == CommandEnd::Done => {
+            Err(ChannelError::Ended {
+                channel: channel.name,
+                shown_count,
+                wanted_count: wanted,
+            })
+        }
         _ => Ok(end),
     }
 }

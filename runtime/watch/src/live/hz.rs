@@ -2,11 +2,11 @@
 
 use serde::Serialize;
 
-use super::channel::{ChannelError, End, ReportedProblems, Scope};
+use super::channel::{ChannelError, ReportedProblems, Scope};
 use super::cli::WindowArgs;
 use super::observer::Observer;
 use super::pace::{Pace, PaceMetrics};
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_platform::words::counted;
 use hil_report::terminal::{JOINT, duration};
@@ -29,7 +29,7 @@ pub(super) fn run(
     args: &WindowArgs,
     signals: &Signals,
     console: &mut Console,
-) -> Result<End, ChannelError> {
+) -> Result<CommandEnd, ChannelError> {
     let name = observer.channel(&args.which.channel)?.name.clone();
     let seen_at = match observer.source(&name) {
         Some(Source::SharedMemory {
@@ -68,7 +68,7 @@ pub(super) fn run(
         if is_whole {
             let figures = pace.turn();
             if !answer(console, Scope::Window, &figures)? {
-                return Ok(End::Done);
+                return Ok(CommandEnd::Done);
             }
             if args.once {
                 return if figures.message_count == 0 {
@@ -78,16 +78,16 @@ pub(super) fn run(
                         window_s: args.window.as_secs_f64(),
                     })
                 } else {
-                    Ok(End::Done)
+                    Ok(CommandEnd::Done)
                 };
             }
         }
         if !is_whole || observer.is_over() {
             answer(console, Scope::Total, &pace.total())?;
             return Ok(if is_whole {
-                End::Done
+                CommandEnd::Done
             } else {
-                End::Interrupted
+                CommandEnd::Interrupted
             });
         }
     }

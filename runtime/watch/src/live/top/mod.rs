@@ -9,7 +9,7 @@ use std::io::{self, IsTerminal};
 
 use super::cli::TopArgs;
 use super::observer::{ObserveError, Observer};
-use hil_platform::console::Console;
+use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_topology::registry::Registry;
 
@@ -29,15 +29,6 @@ pub enum TopError {
     Json(#[from] serde_json::Error),
 }
 
-/// How it ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum TopEnd {
-    /// All was shown, or the user left.
-    Done,
-    /// By a signal.
-    Interrupted,
-}
-
 /// Shows the run until the user leaves or it ends; once where nobody looks at a terminal.
 ///
 /// # Errors
@@ -48,7 +39,7 @@ pub fn run(
     registry: &Registry,
     signals: &Signals,
     console: &mut Console,
-) -> Result<TopEnd, TopError> {
+) -> Result<CommandEnd, TopError> {
     let mut observer = Observer::open(args.run.as_deref(), registry)?;
     let names: Vec<String> = observer
         .manifest()
@@ -77,10 +68,10 @@ pub fn run(
         };
         let is_heard = console.result(&text);
         if !is_whole {
-            return Ok(TopEnd::Interrupted);
+            return Ok(CommandEnd::Interrupted);
         }
         if args.once || !args.json || !is_heard || observer.is_over() {
-            return Ok(TopEnd::Done);
+            return Ok(CommandEnd::Done);
         }
     }
 }

@@ -7,11 +7,11 @@ use std::time::{Duration, Instant as WallInstant};
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
-use super::TopEnd;
 use super::draw::{Detail, Frame, draw};
 use super::gather::Gatherer;
 use super::view::View;
 use crate::live::observer::{Observer, POLL_PERIOD};
+use hil_platform::console::CommandEnd;
 use hil_platform::signals::Signals;
 
 /// Shows the run until the user leaves.
@@ -20,7 +20,7 @@ pub(super) fn run(
     gatherer: Gatherer,
     window: Duration,
     signals: &Signals,
-) -> io::Result<TopEnd> {
+) -> io::Result<CommandEnd> {
     // Also sets a hook that restores the terminal before a panic is printed.
     let mut terminal = match ratatui::try_init() {
         Ok(terminal) => terminal,
@@ -83,12 +83,16 @@ fn wish_of(key: KeyEvent) -> Option<Wish> {
 }
 
 impl Screen {
-    fn live(&mut self, terminal: &mut DefaultTerminal, signals: &Signals) -> io::Result<TopEnd> {
+    fn live(
+        &mut self,
+        terminal: &mut DefaultTerminal,
+        signals: &Signals,
+    ) -> io::Result<CommandEnd> {
         let mut looked = WallInstant::now();
         let mut is_stale = true;
         loop {
             if signals.received().is_some() {
-                return Ok(TopEnd::Interrupted);
+                return Ok(CommandEnd::Interrupted);
             }
             self.observer.poll();
             let is_due = looked.elapsed() >= self.window || self.view.is_none();
@@ -112,7 +116,7 @@ impl Screen {
             if let Event::Key(key) = event::read()?
                 && self.does(wish_of(key))
             {
-                return Ok(TopEnd::Done);
+                return Ok(CommandEnd::Done);
             }
         }
     }
