@@ -84,12 +84,11 @@ impl Estimate {
         let n = blocks.len() as f64;
         let mean = blocks.iter().sum::<f64>() / n;
         let squares: f64 = blocks.iter().map(|block| (block - mean).powi(2)).sum();
-        let half_width = student_quantile(0.975, n - 1.0) * (squares / (n - 1.0) / n).sqrt();
-        Self {
-            value,
-            interval: (blocks.len() >= BLOCKS_MIN)
-                .then_some((value - half_width, value + half_width)),
-        }
+        let interval = (blocks.len() >= BLOCKS_MIN).then(|| {
+            let half_width = student_quantile(0.975, n - 1.0) * (squares / (n - 1.0) / n).sqrt();
+            (value - half_width, value + half_width)
+        });
+        Self { value, interval }
     }
 }
 

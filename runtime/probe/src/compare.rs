@@ -12,6 +12,7 @@ use hil_capture::join::Joined;
 use hil_capture::observe::{Observation, Stream};
 use hil_core::record::{EgressRecord, IngressRecord, UNAVAILABLE};
 use hil_net::Direction;
+use hil_protocol::transport::IpProtocol;
 use hil_protocol::wire::Kind;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
 use serde::Serialize;
@@ -19,7 +20,7 @@ use serde::Serialize;
 use super::analyse::{Reading, quantiles};
 use super::point_clocks::WireClocks;
 use hil_platform::progress::Stage;
-use hil_report::summary::{CounterGroup, RunSummary, SummaryError};
+use hil_report::summary::{CounterGroup, LinkKind, RunSummary, SummaryError};
 use hil_rundir::launch::Side;
 use hil_rundir::record::{RecordFile, RecordFileError, RecordKind};
 use hil_rundir::run_folder::RunFolder;
@@ -100,6 +101,8 @@ pub(super) struct Comparison {
     run: String,
     clocks: WireClocks,
     channels: Vec<ChannelComparison>,
+    /// Channels whose transport has no datagrams of its own that a probe could read.
+    left_out: Vec<String>,
 }
 
 impl Comparison {
@@ -151,6 +154,13 @@ impl Comparison {
             };
             text.push_str(&verdict);
         }
+        if !self.left_out.is_empty() {
+            let names = self.left_out.join(", ");
+            let _infallible = write!(
+                text,
+                "\nnot compared, as they go over TCP, which cuts datagrams as it likes: {names}\n"
+            );
+        }
         text
     }
 }
@@ -185,7 +195,13 @@ pub(super) fn compare(
     let summary = summary(&folder)?;
     let joined = captures.joined(window_ns);
     let numbers = channel_numbers(&sides, captures);
-    let channels = sides.iter().map(|(name, side)| {
+    let is_read = |name: &str| {
+        summary
+            .as_ref()
+            .is_none_or(|summary| has_datagrams(summary, name))
+    };
+    let (compared, left_out): (Vec<_>, Vec<_>) = sides.iter().partition(|(name, _)| is_read(name));
+    let channels = compared.into_iter().map(|(name, side)| {
         let sockets = summary.as_ref().map(|summary| socket_counts(summary, name));
         let probe = Probe {
             captures,
@@ -199,7 +215,18 @@ pub(super) fn compare(
         run: folder.name(),
         clocks: WireClocks::of(summary.as_ref()),
         channels: channels.collect(),
+        left_out: left_out.into_iter().map(|(name, _)| name.clone()).collect(),
     })
+}
+
+/// Whether a channel's gateways send datagrams that stand on the wire as they made them.
+fn has_datagrams(summary: &RunSummary, channel: &str) -> bool {
+    let found = summary.channels.iter().find(|one| one.name == channel);
+    !matches!(
+        found.map(|one| one.link),
+        Some(LinkKind::Network(transport))
+            if transport.capabilities.receiver_port == Some(IpProtocol::Tcp)
+    )
 }
 
 /// A capture in which no message of the run was seen.
@@ -365,6 +392,7 @@ impl Probe<'_> {
             let answer = match own.kind {
                 Kind::Hello => Kind::HelloAck,
                 Kind::SyncRequest => Kind::SyncResponse,
+                Kind::KeyRequest => Kind::KeyAnswer,
                 _ => return false,
             };
             answers.contains(&(answer as u8, own.session, own.sequence))
@@ -398,7 +426,10 @@ fn own(observation: &Observation) -> Option<OwnHeader> {
 
 /// What the sender of a channel sends; the rest are replies of the receiver.
 fn is_forward(own: &OwnHeader) -> bool {
-    !matches!(own.kind, Kind::SyncResponse | Kind::HelloAck)
+    !matches!(
+        own.kind,
+        Kind::SyncResponse | Kind::HelloAck | Kind::KeyAnswer
+    )
 }
 
 fn is_data(own: &OwnHeader) -> bool {

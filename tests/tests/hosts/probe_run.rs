@@ -2,7 +2,7 @@
 //! two say of the wire must agree, though neither knows of the other.
 
 use std::net::{Ipv4Addr, UdpSocket};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
@@ -14,7 +14,7 @@ use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::{INTERFACE, Lab, LabHost};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::Trial;
+use hil_tests::trial::{RunFiles, Trial};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
@@ -48,23 +48,12 @@ fn json(arguments: &[&Path]) -> (Value, Option<i32>) {
     (value, finished.status.code())
 }
 
-#[test]
-fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
-    let Some(lab) = Lab::two_hosts_or_skip() else {
-        return;
-    };
-    let record = RunFolder::new("probe-run");
+/// A run of the shuttle over the wire, and what probes at both ends saw of it.
+fn run_with_probes(lab: &Lab, record: &RunFolder, trial: &Trial) -> ([RunFiles; 2], [PathBuf; 2]) {
     std::fs::create_dir_all(record.path()).unwrap();
     let captures = HOSTS.map(|host| record.path().join(format!("{host}.pcapng")));
     let mut probes =
         [0, 1].map(|index| start_probe(lab.host(index), INTERFACE, &captures[index], ""));
-
-    let trial = Trial::shipped("shuttle-split.toml", record.path())
-        // What is on the wire is looked at byte by byte.
-        .plain()
-        .set("run.duration=\"8 s\"")
-        // Often enough that neither tap nor driver runs from cold caches each time.
-        .set("case.parameters.rate_hz=1000.0");
     let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
     let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), START_LIMIT));
     for host in &mut hosts {
@@ -77,6 +66,40 @@ fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
         print!("{}", finished.stdout);
     }
     assert_eq!(files[0].summary().run.outcome, Outcome::Completed);
+    (files, captures)
+}
+
+#[test]
+fn of_a_sealed_run_every_datagram_is_accounted_for_as_well() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("probe-sealed");
+    let trial = Trial::shipped("shuttle-split.toml", record.path()).set("run.duration=\"3 s\"");
+    let (files, captures) = run_with_probes(&lab, &record, &trial);
+    let run = files[0].root();
+    let (comparison, _) = json(&[Path::new("compare"), run, &captures[0], &captures[1]]);
+    for channel in comparison["channels"].as_array().unwrap() {
+        for counts in ["sent", "received", "data_sent", "data_received"] {
+            let counts = &channel[counts];
+            assert_eq!(counts["gateway"], counts["probe"], "{channel:#}");
+        }
+    }
+}
+
+#[test]
+fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("probe-run");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        // What is on the wire is looked at byte by byte.
+        .plain()
+        .set("run.duration=\"8 s\"")
+        // Often enough that neither tap nor driver runs from cold caches each time.
+        .set("case.parameters.rate_hz=1000.0");
+    let (files, captures) = run_with_probes(&lab, &record, &trial);
 
     let arguments = [
         Path::new("compare"),
@@ -122,7 +145,7 @@ fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
 }
 
 /// A capture with a fault, and one of another time, beside the run.
-fn check_comparisons_with_faults(run: &Path, captures: &[std::path::PathBuf; 2]) {
+fn check_comparisons_with_faults(run: &Path, captures: &[PathBuf; 2]) {
     let bytes = std::fs::read(&captures[0]).unwrap();
     let cut = captures[0].with_extension("tail.pcapng");
     std::fs::write(&cut, &bytes[..bytes.len() - 1]).unwrap();
@@ -209,7 +232,7 @@ fn an_interface_that_goes_ends_the_capture_with_a_whole_file_and_its_own_exit_co
 }
 
 /// What the captures say on their own.
-fn check_analysis(captures: &[std::path::PathBuf; 2]) {
+fn check_analysis(captures: &[PathBuf; 2]) {
     let (report, code) = json(&[Path::new("analyse"), &captures[0], &captures[1]]);
     assert_eq!(code, Some(0), "{:#}", report["files"]);
     for file in report["files"].as_array().unwrap() {
@@ -243,7 +266,7 @@ fn check_analysis(captures: &[std::path::PathBuf; 2]) {
 }
 
 /// A capture cut off in the middle keeps what was there and is told apart by exit code and offset.
-fn check_cut(captures: &[std::path::PathBuf; 2]) {
+fn check_cut(captures: &[PathBuf; 2]) {
     let bytes = std::fs::read(&captures[0]).unwrap();
     let cut = captures[0].with_extension("cut.pcapng");
     std::fs::write(&cut, &bytes[..=bytes.len() / 2]).unwrap();
