@@ -126,7 +126,7 @@ impl Quantiles {
 pub struct Wakeups {
     /// The CPU it was pinned to; `None` when it was left to run anywhere.
     pub cpu: Option<usize>,
-    /// What was asked of the kernel and what became of it.
+    /// What was asked of the kernel, granted or refused.
     pub scheduling: RealtimeGrant,
     /// How long it measured, nanoseconds.
     pub measured_ns: u64,

@@ -22,7 +22,7 @@ const STATUS_CHARS_MAX: usize = 400;
 const EXTENSION: Duration = Duration::from_secs(30);
 /// How often it asks.
 const EXTENSION_PERIOD: Duration = Duration::from_secs(8);
-/// How often in all: for ten minutes. An end that takes longer hangs, and is ended by the manager.
+/// How often in all: for ten minutes. After that the manager ends the service.
 const EXTENSION_COUNT: u32 = 75;
 // A manager that misses two hears the third in time.
 const _: () = assert!(3 * EXTENSION_PERIOD.as_secs() < EXTENSION.as_secs());

@@ -158,7 +158,7 @@ impl Comparison {
             let names = self.left_out.join(", ");
             let _infallible = write!(
                 text,
-                "\nnot compared, as they go over TCP, which cuts datagrams as it likes: {names}\n"
+                "\nnot compared, as they go over TCP, which does not keep datagrams: {names}\n"
             );
         }
         text

@@ -61,7 +61,7 @@ impl LogKeeper {
     }
 }
 
-/// Gives back the disk space of the middle of `log`, to which its process goes on appending.
+/// Gives back the disk space of the middle of `log`, to which its process still appends.
 ///
 /// # Errors
 /// When there is no such file, or its file system makes no holes.
