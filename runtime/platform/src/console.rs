@@ -218,7 +218,7 @@ impl Console {
     }
 
     /// Gives a result; colours are dropped where the output cannot show them. False when it was not
-    /// taken, which ends what would go on for ever. A reader that left (a closed pipe) is no failure;
+    /// taken, so that endless output can stop. A reader that left (a closed pipe) is no failure;
     /// any other is told at once and counts in [`Console::exit_code`].
     pub fn result(&mut self, text: &str) -> bool {
         self.close_line();
