@@ -45,8 +45,8 @@ fn association(suite: Suite) -> Association {
     Association {
         secret: RunSecret::new(&mut [7; 32]),
         suite,
-        channel: 0,
-        channel_name: "bench/hop".to_owned(),
+        flow: 0,
+        flow_name: "bench/hop".to_owned(),
     }
 }
 

@@ -1,4 +1,4 @@
--- Wireshark dissector of hil-runtime's datagrams, version 1 of the wire format
+-- Wireshark dissector of hil-runtime's datagrams, version 2 of the wire format
 -- (gateways/protocol/src/wire.rs and body.rs). It recognises them by their magic number on any UDP
 -- port and judges nothing that the gateways would judge from state.
 --
@@ -15,9 +15,8 @@ local kinds = {
     [7] = "KEY_REQ", [8] = "KEY_ANS",
 }
 local statuses = {
-    [0] = "accepted", [1] = "message types differ", [2] = "size or alignment differ",
-    [3] = "one shared-memory domain", [4] = "unknown channel", [5] = "versions differ",
-    [6] = "greet again",
+    [0] = "accepted", [1] = "channels differ", [2] = "one shared-memory domain",
+    [3] = "unknown flow", [4] = "versions differ", [5] = "greet again",
 }
 local sources = { [0] = "application", [1] = "kernel software", [2] = "hardware" }
 
@@ -28,10 +27,10 @@ local f = {
     flags = ProtoField.uint16("hil.flags", "Flags", base.HEX),
     authenticated = ProtoField.bool("hil.flags.authenticated", "Sealed", 16, nil, 0x0001),
     session = ProtoField.uint32("hil.session", "Session", base.HEX),
-    channel = ProtoField.uint16("hil.channel", "Channel"),
+    channel = ProtoField.uint16("hil.channel", "Channel or flow"),
     header_len = ProtoField.uint16("hil.header_len", "Header length"),
     sequence = ProtoField.uint64("hil.sequence", "Sequence"),
-    type_hash = ProtoField.uint64("hil.type_hash", "Message type hash", base.HEX),
+    type_hash = ProtoField.uint64("hil.type_hash", "Hash of the message type, or digest of the flow", base.HEX),
     published = ProtoField.int64("hil.published_ns", "Published (sender's monotonic, ns)"),
     handed = ProtoField.int64("hil.handed_ns", "Handed to kernel (sender's monotonic, ns)"),
     follow_up_sequence = ProtoField.uint32("hil.follow_up.sequence", "Follow-up for sequence, low half"),
@@ -51,10 +50,8 @@ local f = {
 
     hello_domain = ProtoField.bytes("hil.hello.domain", "Shared-memory domain"),
     hello_clock = ProtoField.uint64("hil.hello.clock_id", "Clock", base.HEX),
-    hello_size = ProtoField.uint32("hil.hello.size_max_bytes", "Largest payload"),
-    hello_alignment = ProtoField.uint32("hil.hello.alignment_bytes", "Alignment"),
-    hello_channel = ProtoField.string("hil.hello.channel_name", "Channel name"),
-    hello_type = ProtoField.string("hil.hello.type_name", "Type name"),
+    hello_channels = ProtoField.uint16("hil.hello.channel_count", "Channels of the flow"),
+    hello_flow = ProtoField.string("hil.hello.flow_name", "Flow name"),
 
     ack_status = ProtoField.uint8("hil.ack.status", "Status", base.DEC, statuses),
     ack_session = ProtoField.uint32("hil.ack.session", "Answering session", base.HEX),
@@ -65,17 +62,12 @@ local f = {
     t1 = ProtoField.int64("hil.sync.t1_ns", "t1: request handed (requester's monotonic, ns)"),
     t2 = ProtoField.int64("hil.sync.t2_ns", "t2: request arrived (responder's monotonic, ns)"),
     t3 = ProtoField.int64("hil.sync.t3_ns", "t3: response handed (responder's monotonic, ns)"),
-    newest = ProtoField.uint64("hil.sync.newest", "Newest sequence received"),
-    bitmap = ProtoField.bytes("hil.sync.bitmap", "Received, newest - i at bit i"),
-    window_epoch = ProtoField.uint32("hil.sync.epoch", "Epoch of the window", base.HEX),
-    sync_count = ProtoField.uint32("hil.sync.received_count", "Requests received"),
     t2_source = ProtoField.uint8("hil.sync.t2_source", "Source of t2", base.DEC, sources),
-    window_valid = ProtoField.uint8("hil.sync.window_valid", "Window valid"),
 }
 hil.fields = f
 
 local e = {
-    version = ProtoExpert.new("hil.expert.version", "Version is not 1: only the first 16 bytes are known",
+    version = ProtoExpert.new("hil.expert.version", "Version is not 2: only the first 16 bytes are known",
         expert.group.UNDECODED, expert.severity.WARN),
     malformed = ProtoExpert.new("hil.expert.malformed", "Lengths or reserved bytes are not as they must be",
         expert.group.MALFORMED, expert.severity.ERROR),
@@ -86,18 +78,12 @@ local function dissect_hello(body, tree)
     if body:len() < 42 then return false end
     tree:add(f.hello_domain, body(0, 16))
     tree:add_le(f.hello_clock, body(16, 8))
-    tree:add_le(f.hello_size, body(24, 4))
-    tree:add_le(f.hello_alignment, body(28, 4))
-    tree:add(f.reserved, body(32, 8))
-    local at = 40
-    for _, field in ipairs({ f.hello_channel, f.hello_type }) do
-        if at >= body:len() then return false end
-        local length = body(at, 1):uint()
-        if length == 0 or at + 1 + length > body:len() then return false end
-        tree:add(field, body(at + 1, length))
-        at = at + 1 + length
-    end
-    return at == body:len()
+    tree:add_le(f.hello_channels, body(24, 2))
+    tree:add(f.reserved, body(26, 14))
+    local length = body(40, 1):uint()
+    if length == 0 or 41 + length ~= body:len() then return false end
+    tree:add(f.hello_flow, body(41, length))
+    return true
 end
 
 local function dissect_hello_ack(body, tree)
@@ -112,17 +98,12 @@ local function dissect_hello_ack(body, tree)
 end
 
 local function dissect_sync_response(body, tree)
-    if body:len() ~= 80 then return false end
+    if body:len() ~= 40 then return false end
     tree:add_le(f.t1, body(0, 8))
     tree:add_le(f.t2, body(8, 8))
     tree:add_le(f.t3, body(16, 8))
-    tree:add_le(f.newest, body(24, 8))
-    tree:add(f.bitmap, body(32, 32))
-    tree:add_le(f.window_epoch, body(64, 4))
-    tree:add_le(f.sync_count, body(68, 4))
-    tree:add(f.t2_source, body(72, 1))
-    tree:add(f.window_valid, body(73, 1))
-    tree:add(f.reserved, body(74, 6))
+    tree:add(f.t2_source, body(24, 1))
+    tree:add(f.reserved, body(25, 15))
     return true
 end
 
@@ -132,7 +113,7 @@ local function dissect_body(kind, body, tree)
         return true
     elseif kind == 2 then
         tree:add(f.reserved, body)
-        return body:len() == 80
+        return body:len() == 40
     elseif kind == 3 then
         return dissect_sync_response(body, tree)
     elseif kind == 4 then
@@ -157,9 +138,10 @@ function hil.dissector(buffer, pinfo, root)
     tree:add_le(f.channel, buffer(12, 2))
     tree:add_le(f.header_len, buffer(14, 2))
     local channel = buffer(12, 2):le_uint()
-    if buffer(4, 1):uint() ~= 1 then
+    local about = (kind == 1 or kind == 6) and "channel" or "flow"
+    if buffer(4, 1):uint() ~= 2 then
         tree:add_proto_expert_info(e.version)
-        pinfo.cols.info = name .. " channel " .. channel .. " of another version"
+        pinfo.cols.info = name .. " " .. about .. " " .. channel .. " of another version"
         return buffer:len()
     end
     if buffer:len() < HEADER_BYTES then
@@ -216,7 +198,7 @@ function hil.dissector(buffer, pinfo, root)
     if not is_sealed and buffer(68, 4):le_uint() ~= 0 then is_sound = false end
     if not is_sound and not is_cut then tree:add_proto_expert_info(e.malformed) end
 
-    local info = name .. " channel " .. channel .. " seq " .. tostring(sequence)
+    local info = name .. " " .. about .. " " .. channel .. " seq " .. tostring(sequence)
     local count = buffer(62, 2):le_uint()
     if count > 1 then info = info .. " piece " .. (buffer(60, 2):le_uint() + 1) .. "/" .. count end
     if is_sealed then info = info .. ", sealed" end

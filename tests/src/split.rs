@@ -101,14 +101,24 @@ impl<'a> Split<'a> {
     }
 }
 
-/// One way of the channel `name`: `egress` or `ingress`.
+/// The gateway thread that carried the channel `name` with others of its way: `egress` or `ingress`.
 ///
 /// # Panics
 /// When the summary has none.
 pub fn direction<'a>(summary: &'a RunSummary, name: &str, which: &str) -> &'a DirectionSummary {
-    let mut all = channel(summary, name).directions.iter();
-    let found = all.find(|one| one.direction.word() == which);
+    let mut all = summary.directions.iter();
+    let found = all.find(|one| {
+        one.direction.word() == which && one.channels.iter().any(|channel| channel == name)
+    });
     found.unwrap_or_else(|| panic!("{name} has no {which}"))
+}
+
+/// What the gateways counted of the channel `name` alone; 0 when there is no such counter.
+pub fn count_of_channel(summary: &RunSummary, name: &str, counter: &str) -> u64 {
+    let ends = channel(summary, name).ends.iter();
+    let counters = ends.flat_map(|one| &one.counters);
+    let named = counters.filter(|one| one.label() == counter);
+    named.map(|one| one.count).sum()
 }
 
 /// The counter `name` of a direction; 0 when there is none.

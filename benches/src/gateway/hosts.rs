@@ -16,7 +16,7 @@ use hil_engine::gateway::direction::{self, Direction, OpenDirection};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
-use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch};
+use hil_rundir::launch::{ChannelLaunch, DirectionLaunch, Side, SocketLaunch};
 use hil_rundir::pipe::RunStart;
 use hil_rundir::record::{RecordFile, RecordKind, RecordSink, Recorder};
 use hil_shm::{
@@ -345,12 +345,8 @@ impl Hosts {
 fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
     let unset = "0.0.0.0:0".parse().expect("an address");
     DirectionLaunch {
-        channel: plan.channel_of(way),
-        channel_id: 1 + u16::try_from(way).expect("0 or 1"),
-        message: plan.message().name.to_owned(),
-        size_bytes: plan.size_bytes,
-        alignment_bytes: plan.message().alignment_bytes,
-        depth: plan.depth,
+        flow: plan.channel_of(way),
+        flow_number: u16::MAX - u16::try_from(way).expect("0 or 1"),
         side,
         local: unset,
         peer: unset,
@@ -371,8 +367,15 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
         },
         wait: plan.wait,
         realtime: RealtimeRequest::default(),
-        emulation: None,
-        is_clock_path: false,
+        channels: vec![ChannelLaunch {
+            channel: plan.channel_of(way),
+            channel_id: 1 + u16::try_from(way).expect("0 or 1"),
+            message: plan.message().name.to_owned(),
+            size_bytes: plan.size_bytes,
+            alignment_bytes: plan.message().alignment_bytes,
+            depth: plan.depth,
+            emulation: None,
+        }],
     }
 }
 

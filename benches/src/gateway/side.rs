@@ -269,7 +269,7 @@ impl Side for GatewaySide {
         // A failure shows as a message that does not come.
         self.ports.output.publish(started, &self.message).ok();
         self.put_ns = since(started);
-        if self.ingress.0.channel.ends_with("out") {
+        if self.ingress.0.flow.ends_with("out") {
             self.far_application_ns
                 .store(self.take_ns + self.put_ns, Ordering::Relaxed);
         }

@@ -10,7 +10,8 @@ use hil_core::record::{EgressRecord, IngressRecord};
 use hil_core::time::Instant;
 use hil_platform::clock::MonotonicClock;
 use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, IngressBridge, IngressSettings,
+    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, IngressBridge,
+    IngressSettings,
 };
 use hil_rundir::record::RecordSink;
 use hil_shm::{Domain, RawInput, RawOutput};
@@ -190,7 +191,7 @@ impl Workbench {
             let Some(((envelope, payload), datagram)) = slots.next() else {
                 return false;
             };
-            if egress.on_local(now, envelope, payload).is_err() {
+            if egress.on_local(now, 0, envelope, payload).is_err() {
                 return false;
             }
             let Some(transmit) = egress.poll_transmit(now) else {
@@ -290,10 +291,15 @@ fn bridges(
 ) -> Result<(EgressBridge, IngressBridge), SetupError> {
     let size = u32::try_from(plan.size_bytes)?;
     let channel = ChannelIdentity::new(1, &plan.channel_of(0), plan.message().name, size, 8);
+    let flow = FlowIdentity {
+        flow: u16::MAX,
+        name: "hil/link/bench/forward".to_owned(),
+        channels: vec![channel],
+    };
     let clock_id = hil_shm::clock_id()?;
     let now = MonotonicClock::now();
     let mut egress = EgressBridge::new(EgressSettings {
-        channel: channel.clone(),
+        flow: flow.clone(),
         session: 1,
         domain: domains[0].fingerprint()?,
         clock_id,
@@ -302,7 +308,7 @@ fn bridges(
         sync_period: core::time::Duration::from_hours(1),
     })?;
     let fingerprint = domains[1].fingerprint()?;
-    let mut ingress = IngressBridge::new(IngressSettings::new(channel, 2, fingerprint, clock_id))?;
+    let mut ingress = IngressBridge::new(IngressSettings::new(flow, 2, fingerprint, clock_id))?;
     let arrival = ArrivalStamps::application(now.as_ns());
     let hello = egress
         .poll_transmit(now)

@@ -1,7 +1,6 @@
-//! What both gateways of a channel must agree on, and why settings are refused. It carries no
-//! message.
+//! What both gateways of a flow must agree on, and why settings are refused. It carries no message.
 
-use hil_core::message::type_hash;
+use hil_core::message::{FNV_OFFSET, fnv1a, type_hash};
 
 use super::body::NAME_BYTES_MAX;
 
@@ -42,18 +41,96 @@ impl ChannelIdentity {
     }
 
     pub(crate) fn check(&self) -> Result<(), SettingsError> {
-        for (key, name) in [
-            ("channel_name", &self.channel_name),
-            ("type_name", &self.type_name),
-        ] {
-            if name.is_empty() || name.len() > NAME_BYTES_MAX {
-                return Err(SettingsError::NameLength {
-                    key,
-                    bytes: name.len(),
-                });
+        check_name("channel_name", &self.channel_name)?;
+        check_name("type_name", &self.type_name)
+    }
+}
+
+/// What one link carries one way, as both hosts must see it. A channel is known by its index in
+/// [`FlowIdentity::channels`] to whoever owns a bridge, and by its number on the wire.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FlowIdentity {
+    /// Number in datagrams that are about no channel; no channel has it.
+    pub flow: u16,
+    /// Its name.
+    pub name: String,
+    /// Its channels; none on a clock path.
+    pub channels: Vec<ChannelIdentity>,
+}
+
+impl FlowIdentity {
+    /// Digest over everything of the channels that both hosts must agree on, in their order.
+    pub fn digest(&self) -> u64 {
+        let mut digest = FNV_OFFSET;
+        for one in &self.channels {
+            for bytes in [
+                &one.channel.to_le_bytes()[..],
+                one.channel_name.as_bytes(),
+                &[0],
+                one.type_name.as_bytes(),
+                &[0],
+                &one.type_hash.to_le_bytes(),
+                &one.size_max_bytes.to_le_bytes(),
+                &one.alignment_bytes.to_le_bytes(),
+            ] {
+                digest = fnv1a(digest, bytes);
             }
         }
+        digest
+    }
+
+    /// Size of the largest payload of any channel.
+    pub fn size_max_bytes(&self) -> u32 {
+        let sizes = self.channels.iter().map(|one| one.size_max_bytes);
+        sizes.max().unwrap_or(0)
+    }
+
+    pub(crate) fn check(&self) -> Result<(), SettingsError> {
+        check_name("flow_name", &self.name)?;
+        let mut numbers = vec![self.flow];
+        for channel in &self.channels {
+            channel.check()?;
+            if numbers.contains(&channel.channel) {
+                return Err(SettingsError::NumberTwice {
+                    number: channel.channel,
+                });
+            }
+            numbers.push(channel.channel);
+        }
         Ok(())
+    }
+}
+
+fn check_name(key: &'static str, name: &str) -> Result<(), SettingsError> {
+    if name.is_empty() || name.len() > NAME_BYTES_MAX {
+        return Err(SettingsError::NameLength {
+            key,
+            bytes: name.len(),
+        });
+    }
+    Ok(())
+}
+
+/// The channels of a flow by their numbers on the wire.
+#[derive(Debug)]
+pub(crate) struct ChannelNumbers {
+    /// Index of each number up to the highest; the largest integer where there is none.
+    indices: Box<[u16]>,
+}
+
+impl ChannelNumbers {
+    pub(crate) fn new(channels: &[ChannelIdentity]) -> Self {
+        let length = channels.iter().map(|one| usize::from(one.channel) + 1);
+        let mut indices = vec![u16::MAX; length.max().unwrap_or(0)].into_boxed_slice();
+        for (index, one) in (0..u16::MAX).zip(channels) {
+            indices[usize::from(one.channel)] = index;
+        }
+        Self { indices }
+    }
+
+    pub(crate) fn index_of(&self, number: u16) -> Option<usize> {
+        let index = *self.indices.get(usize::from(number))?;
+        (index != u16::MAX).then_some(usize::from(index))
     }
 }
 
@@ -63,7 +140,7 @@ pub enum SettingsError {
     /// A name is empty or does not fit its length byte.
     #[error("{key} has {bytes} bytes, allowed are 1 to 255")]
     NameLength {
-        /// `channel_name` or `type_name`.
+        /// `flow_name`, `channel_name` or `type_name`.
         key: &'static str,
         /// Its length.
         bytes: usize,
@@ -73,7 +150,7 @@ pub enum SettingsError {
     DatagramTooSmall {
         /// What was given.
         value: usize,
-        /// The least that works for this channel.
+        /// The least that works for this flow.
         bound: usize,
     },
     /// The largest payload would need too many datagrams.
@@ -85,6 +162,12 @@ pub enum SettingsError {
         fragments: usize,
         /// Most that are allowed.
         bound: usize,
+    },
+    /// Two channels, or a channel and its flow, have one number.
+    #[error("channel number {number} is given twice")]
+    NumberTwice {
+        /// Which one.
+        number: u16,
     },
     /// A period or count that must be above zero is zero.
     #[error("{key} 0 is outside 1..")]

@@ -16,8 +16,7 @@ use super::sequence::Stream;
 use crate::counts;
 
 /// Most datagrams of one message.
-pub const FRAGMENT_COUNT_MAX: usize = 1024;
-const WORDS: usize = FRAGMENT_COUNT_MAX / 64;
+pub const FRAGMENT_COUNT_MAX: usize = 1 << 15;
 
 /// How one message is cut.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,7 +60,7 @@ impl FragmentPlan {
         })
     }
 
-    /// Datagrams the message takes, 1..=1024.
+    /// Datagrams the message takes, 1..=32768.
     pub const fn count(&self) -> u16 {
         self.count
     }
@@ -137,13 +136,13 @@ pub struct Reassembler {
     counts: ReassemblyCounts,
 }
 
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct Slot {
     message: Option<(Stream, u64)>,
     total_len: u32,
     count: u16,
     missing: u16,
-    received: [u64; WORDS],
+    received: Box<[u64]>,
     /// Of piece 0.
     handed_ns: i64,
     started_at: Instant,
@@ -162,7 +161,9 @@ impl Reassembler {
             total_len: 0,
             count: 0,
             missing: 0,
-            received: [0; WORDS],
+            // No message has more pieces than bytes.
+            received: vec![0; size_max_bytes.clamp(1, FRAGMENT_COUNT_MAX).div_ceil(64)]
+                .into_boxed_slice(),
             handed_ns: 0,
             started_at: Instant::ZERO,
         };
@@ -274,15 +275,13 @@ impl Reassembler {
             .expect("there is at least one slot");
         self.counts.started_count += 1;
         self.counts.evicted_count += u64::from(slot.message.is_some());
-        *slot = Slot {
-            message: Some((fragment.stream, fragment.sequence)),
-            total_len: fragment.total_len,
-            count: fragment.count,
-            missing: fragment.count,
-            received: [0; WORDS],
-            handed_ns: fragment.handed_ns,
-            started_at: now,
-        };
+        slot.message = Some((fragment.stream, fragment.sequence));
+        slot.total_len = fragment.total_len;
+        slot.count = fragment.count;
+        slot.missing = fragment.count;
+        slot.received[..usize::from(fragment.count).div_ceil(64)].fill(0);
+        slot.handed_ns = fragment.handed_ns;
+        slot.started_at = now;
         index
     }
 }

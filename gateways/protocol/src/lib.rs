@@ -6,29 +6,32 @@
 //!
 //! 1. [`wire`] and [`body`]: the datagram, byte by byte; [`refusal`]: every way to refuse one.
 //! 2. [`sequence`]: lost, reordered, duplicate, late; [`fragment`]: messages above the path MTU.
-//! 3. [`egress`]: the sending host's half of a channel.
+//! 3. [`egress`]: the sending host's half of a flow.
 //! 4. [`ingress`]: the receiving host's half.
 //! 5. [`seal`]: encryption and authentication, between a bridge and its transport.
 //! 6. [`transport`]: what is known of a transport before it is opened.
 //!
-//! One channel carries messages one way. Replies (acknowledged greetings, clock exchanges) travel
-//! the other way on the same pair of addresses.
+//! A flow carries the messages of any number of channels one way. Replies (acknowledged greetings, clock
+//! exchanges) travel the other way on the same pair of addresses. What is agreed and exchanged once is the
+//! flow's: session, seal, clock exchanges; sequences, pieces and what became of messages are a channel's.
 //!
 //! A message from one host to the other, without a network:
 //!
 //! ```
 //! use std::time::Duration;
 //! use hil_protocol::{
-//!     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, IngressBridge, IngressSettings,
+//!     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, IngressBridge,
+//!     IngressSettings,
 //! };
 //! use hil_core::message::Envelope;
 //! use hil_core::time::Instant;
 //!
 //! let channel = ChannelIdentity::new(0, "arm/command", "example.Command.v1", 8, 8);
-//! let mut ingress =
-//!     IngressBridge::new(IngressSettings::new(channel.clone(), 7, [2; 16], 22))?;
+//! let name = "link/hop/forward".to_owned();
+//! let flow = FlowIdentity { flow: 65_535, name, channels: vec![channel] };
+//! let mut ingress = IngressBridge::new(IngressSettings::new(flow.clone(), 7, [2; 16], 22))?;
 //! let mut egress = EgressBridge::new(EgressSettings {
-//!     channel,
+//!     flow,
 //!     session: 5,
 //!     domain: [1; 16],
 //!     clock_id: 11,
@@ -44,7 +47,7 @@
 //! egress.on_datagram(now, arrival, answer)?;
 //!
 //! let envelope = Envelope { published_ns: 900, ..Envelope::default() };
-//! egress.on_local(now, &envelope, &[42; 8])?;
+//! egress.on_local(now, 0, &envelope, &[42; 8])?;
 //! let data = egress.poll_transmit(now).expect("the message was staged").datagram;
 //! let mut received = Vec::new();
 //! ingress.on_datagram(now, arrival, data, &mut |delivery| {
@@ -68,7 +71,7 @@ pub mod stamps;
 pub mod transport;
 pub mod wire;
 
-pub use channel::{ChannelIdentity, SettingsError};
+pub use channel::{ChannelIdentity, FlowIdentity, SettingsError};
 pub use egress::{
     EgressBridge, EgressEvent, EgressSettings, LocalRefusal, PeerState, Transmit, TransmitFailure,
 };

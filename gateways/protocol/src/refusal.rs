@@ -14,7 +14,7 @@ causes! {
     /// Not a datagram of this protocol.
     BadMagic => "bad magic", "datagram does not start with the magic number";
     /// Another version of the protocol.
-    UnsupportedVersion => "unsupported version", "protocol version is not 1";
+    UnsupportedVersion => "unsupported version", "protocol version is not 2";
     /// A kind this version does not know.
     UnknownKind => "unknown kind", "kind is outside 1 to 8";
     /// The header claims another length than this version's.
@@ -34,8 +34,8 @@ causes! {
     MalformedBody => "malformed body", "body does not parse";
     /// A kind that only the other direction carries.
     UnexpectedKind => "unexpected kind", "kind belongs to the other direction";
-    /// The channel is not this bridge's.
-    UnknownChannel => "unknown channel", "channel is not carried here";
+    /// The channel or flow is not this bridge's.
+    UnknownChannel => "unknown channel", "channel or flow is not carried here";
     /// It comes from another address than the one that greeted.
     ForeignSource => "source that did not greet", "source address is not the one that greeted";
     /// Its session has not greeted.
@@ -44,9 +44,9 @@ causes! {
     Stale => "stale", "datagram belongs to something that is over";
     /// The two hosts disagree on the message type.
     TypeMismatch => "type mismatch", "message type differs from this host's";
-    /// The two hosts disagree on the message's size or alignment.
-    SizeMismatch => "size mismatch", "message size or alignment differs from this host's";
-    /// Both ends of the channel lie in one shared-memory domain, so messages bypass the hop.
+    /// The two hosts disagree on the channels of the flow.
+    ChannelsDiffer => "channels differ", "the channels of the flow differ from this host's";
+    /// Both ends of the flow lie in one shared-memory domain, so messages bypass the hop.
     SharedDomain => "shared domain", "both ends lie in one shared-memory domain";
     /// The message is larger than the channel's largest.
     Oversize => "oversize", "message is larger than the channel allows";

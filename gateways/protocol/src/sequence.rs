@@ -11,7 +11,6 @@
 //! the sending gateway's own clock, so that neither a datagram that was long under way nor a single
 //! corrupted one can make the window follow a stream that is over.
 
-use super::body::ReceivedWindow;
 use crate::counts;
 
 /// Sequence numbers the window remembers.
@@ -219,25 +218,6 @@ impl SequenceWindow {
         (oldest..=self.highest)
             .filter(|&sequence| !self.is_seen(sequence))
             .count() as u64
-    }
-
-    /// The newest 256 numbers for the sender; `None` before the first message of a stream.
-    pub fn received_window(&self) -> Option<ReceivedWindow> {
-        let stream = self.stream?;
-        let mut bitmap = [0_u64; 4];
-        for (word, ages) in bitmap.iter_mut().zip((0_u64..).step_by(64)) {
-            for bit in 0..64 {
-                let sequence = self.highest.checked_sub(ages + bit);
-                if sequence.is_some_and(|sequence| self.is_seen(sequence)) {
-                    *word |= 1 << bit;
-                }
-            }
-        }
-        Some(ReceivedWindow {
-            epoch: stream.epoch,
-            newest: self.highest,
-            bitmap,
-        })
     }
 
     /// Where counting starts in a stream that opens with `sequence`: at 0 when the producer

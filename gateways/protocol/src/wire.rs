@@ -1,27 +1,28 @@
 //! The datagram: 72 bytes of header, then payload or body, then a 16-byte tag or room for it. Bodies
 //! are in [`super::body`]; nothing here knows sessions, windows, keys or state.
 //!
-//! All numbers are little-endian and unaligned. Version 1:
+//! All numbers are little-endian and unaligned. A **flow** is what one link carries one way: its channels share
+//! addresses, sessions, seal and clock exchanges, and DATA and BYE name the channel they are about. Version 2:
 //!
 //! | offset | bytes | field | meaning |
 //! |-------:|------:|-------|---------|
 //! | 0 | 4 | magic | `48 49 4c 47`, the letters `HILG` |
-//! | 4 | 1 | version | 1 |
+//! | 4 | 1 | version | 2 |
 //! | 5 | 1 | kind | 1 DATA, 2 `SYNC_REQ`, 3 `SYNC_RSP`, 4 HELLO, 5 `HELLO_ACK`, 6 BYE; 7 `KEY_REQ`, 8 `KEY_ANS` of the seal |
 //! | 6 | 2 | flags | bit 0: sealed, what follows the header is encrypted and ends in a tag; then bits 8..16: low 8 bits of the key's generation; others 0 |
 //! | 8 | 4 | session | start of the *sending-side* gateway; replies repeat the request's |
-//! | 12 | 2 | channel | number of the channel between the two hosts |
+//! | 12 | 2 | channel | DATA: number of the channel between the two hosts; BYE: of the channel, or of the flow; otherwise of the flow |
 //! | 14 | 2 | `header_len` | 72 |
-//! | 16 | 8 | sequence | DATA: the producer's; `SYNC_REQ`, HELLO: own count; replies repeat the request's; BYE: one past the last message taken for sending |
-//! | 24 | 8 | `type_hash` | hash over message type name, size and alignment |
+//! | 16 | 8 | sequence | DATA: the producer's; `SYNC_REQ`, HELLO: own count; replies repeat the request's; BYE: one past the channel's last message taken for sending, 0 for the flow |
+//! | 24 | 8 | `type_hash` | DATA, BYE of a channel: hash over message type name, size and alignment; otherwise digest over all channels of the flow |
 //! | 32 | 8 | `published_ns` | DATA: producer's stamp, sender's monotonic clock, `i64::MIN` when it has none; otherwise 0 |
 //! | 40 | 8 | `handed_ns` | just before the send call, sender's monotonic clock |
 //! | 48 | 4 | `follow_up_sequence` | low 32 bits of an *earlier* sequence of this kind |
 //! | 52 | 4 | `follow_up_delta_ns` | that datagram's kernel transmit stamp minus its `handed_ns`; `ff ff ff ff` none |
 //! | 56 | 4 | `total_len` | DATA: bytes of the whole message; otherwise bytes of the body |
 //! | 60 | 2 | `fragment_index` | 0-based; 0 unless DATA |
-//! | 62 | 2 | `fragment_count` | 1..=1024; 1 unless DATA |
-//! | 64 | 4 | epoch | DATA, BYE: producer's start; otherwise 0 |
+//! | 62 | 2 | `fragment_count` | 1..=32768; 1 unless DATA |
+//! | 64 | 4 | epoch | DATA, BYE of a channel: producer's start; otherwise 0 |
 //! | 68 | 4 | number | sealed: of the datagram under its key; otherwise 0 |
 //! | 72 | n | payload or body | |
 //! | 72 + n | 0 or 16 | tag | only with flag bit 0 |
@@ -31,9 +32,9 @@
 //! after its datagram has left, so it rides on a later one. A fragment's length follows from
 //! `total_len` and `fragment_count` alone ([`super::fragment`]), so overlaps cannot be expressed.
 //!
-//! A **clock path** is a channel without messages over addresses of its own: it sends every kind but
-//! DATA, its number is counted down from 65535, its type is `hil.ClockPath.v1` of 0 bytes, aligned to 1,
-//! and its name `clock/` with the names of both hosts. Nothing in a datagram tells it from another channel.
+//! Numbers of flows are counted down from 65535, where no channel's is. A **clock path** is a flow
+//! without channels over addresses of its own, called `clock/` with the names of both hosts. Nothing in
+//! a datagram tells it from another flow.
 //!
 //! Sealing a hop is the business of [`super::seal`], which lies between bridges and transport: a bridge
 //! refuses a set bit 0. The room for the tag is kept free on a plain hop too, so that both fragment
@@ -48,7 +49,7 @@ use super::refusal::Refusal;
 /// First four bytes of every datagram, as a little-endian number.
 pub const MAGIC: u32 = u32::from_le_bytes(*b"HILG");
 /// Version of the layout in the module documentation.
-pub const VERSION: u8 = 1;
+pub const VERSION: u8 = 2;
 /// Bytes before the payload.
 pub const HEADER_BYTES: usize = 72;
 /// Bytes kept free after the payload for an authentication tag.
@@ -131,11 +132,11 @@ pub struct Header {
     pub kind: Kind,
     /// Start of the sending-side gateway.
     pub session: u32,
-    /// Channel number.
+    /// Number of the channel or of the flow.
     pub channel: u16,
     /// See the table: message, request or reply number.
     pub sequence: u64,
-    /// Message type.
+    /// Message type, or digest of the flow.
     pub type_hash: u64,
     /// Producer's stamp, nanoseconds on the sender's monotonic clock.
     pub published_ns: i64,
@@ -325,7 +326,7 @@ pub enum Body<'a> {
     Data(&'a [u8]),
     /// Padding only, as long as the response.
     SyncRequest,
-    /// The responder's stamps and received window.
+    /// The responder's stamps.
     SyncResponse(SyncResponse),
     /// Who greets and what it wants to send.
     Hello(Hello<'a>),

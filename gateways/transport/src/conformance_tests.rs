@@ -13,7 +13,7 @@ use std::time::Duration;
 use hil_core::link_model::PerfectLink;
 use hil_core::time::Instant;
 
-use super::emulated::{EmulatedReceiver, EmulatedSettings};
+use super::emulated::{EmulatedReceiver, EmulatedSettings, Offer};
 use super::queue::{QueueSettings, queue_pair};
 use super::registry::{self, OpenReceiver, OpenSender, Transport};
 use super::socket::{SocketError, SocketSettings};
@@ -281,7 +281,13 @@ fn every_transport_keeps_the_promises() {
 
 fn perfect(inner: Box<dyn DatagramReceiver>) -> EmulatedReceiver {
     let settings = EmulatedSettings::default();
-    EmulatedReceiver::new(inner, Box::new(PerfectLink), |_| false, settings)
+    let any = |_: &[u8]| {
+        Some(Offer {
+            channel: 0,
+            message: None,
+        })
+    };
+    EmulatedReceiver::new(inner, Box::new(PerfectLink), any, 0, settings)
 }
 
 #[test]

@@ -162,10 +162,6 @@ counts! {
         reply_stamp_count,
         /// Transmit stamps of replies that were asked for and did not come in time.
         reply_stamp_missing_count,
-        /// Datagrams the link model lost.
-        link_lost_count,
-        /// Datagrams dropped because the emulation already held as many as it may.
-        link_overflow_count,
         /// Datagrams that arrived with the code point this end marks with; counted where it marks.
         mark_kept_count,
         /// Datagrams that arrived with another code point: something on the way changed it, or the
@@ -173,25 +169,41 @@ counts! {
         mark_changed_count,
     }
     beside {
-        /// What the lost ones were lost to; `None` without a link model, or for one that does not tell.
-        link_loss_causes: Option<LossCauses>,
         /// The code point of the newest datagram that arrived with another one.
         newest_other_dscp: Option<u8>,
     }
 }
 
-impl ReceiverCounters {
-    /// What the link model lost its datagrams to, with names; empty where it is unknown.
-    pub fn loss_causes(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
-        self.link_loss_causes.into_iter().flat_map(|causes| {
+/// What a link model did to the datagrams of one channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LinkCounts {
+    /// Datagrams it lost.
+    pub lost_count: u64,
+    /// Datagrams dropped because the emulation already held as many as it may.
+    pub overflow_count: u64,
+    /// What the lost ones were lost to; `None` for a model that does not tell.
+    pub causes: Option<LossCauses>,
+}
+
+impl LinkCounts {
+    /// Every counter with its name, zeros included; causes where they are known.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
+        let causes = self.causes.into_iter().flat_map(|causes| {
             [
                 ("link_lost_to_outages_count", causes.outage_count),
                 ("link_lost_by_chance_count", causes.chance_count),
                 ("link_lost_to_full_queue_count", causes.queue_count),
             ]
-        })
+        });
+        let own = [
+            ("link_lost_count", self.lost_count),
+            ("link_overflow_count", self.overflow_count),
+        ];
+        own.into_iter().chain(causes)
     }
+}
 
+impl ReceiverCounters {
     /// Compares the mark of an arrival with the one it should have; neither is known without
     /// marking.
     pub(crate) fn count_mark(&mut self, expected_dscp: Option<u8>, class: Option<u8>) {

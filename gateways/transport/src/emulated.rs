@@ -1,5 +1,5 @@
-//! Any receiver behind a link model: it loses and delays real datagrams as the model says, so a
-//! run over an emulated link differs from one over the real link in one object. It reads no
+//! Any receiver behind link models, one for each channel of its flow: they lose and delay real datagrams,
+//! so a run over an emulated link differs from one over the real link in one object. It reads no
 //! clock, delays no replies (they go the other way) and wakes nobody; the caller waits until
 //! [`DatagramReceiver::next_due`].
 
@@ -10,10 +10,12 @@ use std::io;
 use std::net::SocketAddr;
 use std::os::fd::BorrowedFd;
 
-use hil_core::link_model::{LinkModel, MessageNumber};
+use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_core::time::Instant;
 
-use super::{DatagramReceiver, EmulatedDelay, EndReport, Received, ReceiverCounters, SendRefusal};
+use super::{
+    DatagramReceiver, EmulatedDelay, EndReport, LinkCounts, Received, ReceiverCounters, SendRefusal,
+};
 use hil_protocol::seal::SealCounts;
 
 /// How much an emulated link may hold.
@@ -27,9 +29,6 @@ pub struct EmulatedSettings {
     /// milliseconds if the thread was held up in between, and a datagram would be early by as
     /// much. `None` trusts `now`, as virtual time does.
     pub clock: Option<fn() -> Instant>,
-    /// Which message of its channel a datagram belongs to; `None` where nobody can tell. Only a
-    /// recorded trace asks: to it all pieces of a message are one.
-    pub number_of: Option<NumberOf>,
 }
 
 impl Default for EmulatedSettings {
@@ -39,13 +38,66 @@ impl Default for EmulatedSettings {
             capacity_count: 1024,
             datagram_bytes_max: 1472,
             clock: None,
-            number_of: None,
         }
     }
 }
 
-/// Reads which message of its channel a datagram belongs to.
-pub type NumberOf = fn(&[u8]) -> Option<MessageNumber>;
+/// What a datagram is to the link models.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Offer {
+    /// Which model it meets.
+    pub channel: u16,
+    /// Which message of its channel it belongs to; `None` where nobody can tell. Only a recorded
+    /// trace asks: to it all pieces of a message are one.
+    pub message: Option<MessageNumber>,
+}
+
+impl Offer {
+    /// The fate that `link` gives it.
+    pub fn meet(
+        self,
+        link: &mut (impl LinkModel + ?Sized),
+        now: Instant,
+        length_bytes: usize,
+    ) -> Fate {
+        match self.message {
+            Some(message) => link.offer_numbered(now, length_bytes, message),
+            None => link.offer(now, length_bytes),
+        }
+    }
+}
+
+/// Reads what a datagram is to the link models; `None` for one that meets none, such as a greeting: it
+/// passes undelayed and changes the fate of no other.
+pub type OfferOf = fn(&[u8]) -> Option<Offer>;
+
+/// The link models of a flow.
+pub trait FlowLinks: fmt::Debug + Send {
+    /// Offers a datagram of `length_bytes` to the model of its channel and gives its fate; `None` where
+    /// the channel has no model. Calls come in non-decreasing `now`.
+    fn offer(&mut self, now: Instant, length_bytes: usize, offer: Offer) -> Option<Fate>;
+
+    /// Tells what time it is while nothing is offered, for links that change by themselves.
+    fn attend(&mut self, now: Instant);
+
+    /// What the datagrams of `channel` were lost to so far; `None` where nobody tells.
+    fn loss_causes(&self, channel: u16) -> Option<LossCauses>;
+}
+
+/// One link model for whatever is offered.
+impl<L: LinkModel> FlowLinks for L {
+    fn offer(&mut self, now: Instant, length_bytes: usize, offer: Offer) -> Option<Fate> {
+        Some(offer.meet(self, now, length_bytes))
+    }
+
+    fn attend(&mut self, now: Instant) {
+        LinkModel::attend(self, now);
+    }
+
+    fn loss_causes(&self, _channel: u16) -> Option<LossCauses> {
+        LinkModel::loss_causes(self)
+    }
+}
 
 /// Position in the order of delivery: due first, then arrival, and the buffer that holds it.
 type Position = Reverse<(Instant, u64, usize)>;
@@ -53,58 +105,55 @@ type Position = Reverse<(Instant, u64, usize)>;
 /// A receiver whose arrivals pass a link model first.
 pub struct EmulatedReceiver {
     inner: Box<dyn DatagramReceiver>,
-    link: Box<dyn LinkModel>,
-    is_exempt: fn(&[u8]) -> bool,
-    datagram_bytes_max: usize,
-    clock: Option<fn() -> Instant>,
-    number_of: Option<NumberOf>,
+    links: Box<dyn FlowLinks>,
+    offer_of: OfferOf,
+    settings: EmulatedSettings,
     /// One buffer per place and a last one for arrivals that find no place.
     storage: Box<[u8]>,
-    held: Box<[Option<Received>]>,
+    /// The places that were ever used: memory for the others is never touched.
+    held: Vec<Option<Received>>,
+    /// Those of them that are free now.
     free: Vec<usize>,
     order: BinaryHeap<Position>,
     arrival_count: u64,
     newest_arrival: Instant,
     counters: ReceiverCounters,
+    /// By channel number.
+    lost: Vec<LinkCounts>,
 }
 
 impl EmulatedReceiver {
-    /// Puts `inner` behind `link`. Datagrams that `is_exempt` accepts, such as handshakes, pass
-    /// undelayed and without being offered, so that they do not change the fate of the others.
+    /// Puts `inner` behind `links`, which meet what `offer_of` says; no channel's number is above
+    /// `channel_max`.
     ///
     /// # Panics
     /// When `settings` leaves no room for a datagram.
     pub fn new(
         inner: Box<dyn DatagramReceiver>,
-        link: Box<dyn LinkModel>,
-        is_exempt: fn(&[u8]) -> bool,
+        links: Box<dyn FlowLinks>,
+        offer_of: OfferOf,
+        channel_max: u16,
         settings: EmulatedSettings,
     ) -> Self {
-        let EmulatedSettings {
-            capacity_count,
-            datagram_bytes_max,
-            clock,
-            number_of,
-        } = settings;
+        let capacity_count = settings.capacity_count;
         assert!(
-            capacity_count > 0 && datagram_bytes_max > 0,
+            capacity_count > 0 && settings.datagram_bytes_max > 0,
             "an emulated link needs room for one datagram"
         );
-        let storage = vec![0; (capacity_count + 1) * datagram_bytes_max];
+        let storage = vec![0; (capacity_count + 1) * settings.datagram_bytes_max];
         Self {
             inner,
-            link,
-            is_exempt,
-            datagram_bytes_max,
-            clock,
-            number_of,
+            links,
+            offer_of,
+            settings,
             storage: storage.into_boxed_slice(),
-            held: vec![None; capacity_count].into_boxed_slice(),
-            free: (0..capacity_count).rev().collect(),
+            held: Vec::with_capacity(capacity_count),
+            free: Vec::with_capacity(capacity_count),
             order: BinaryHeap::with_capacity(capacity_count),
             arrival_count: 0,
             newest_arrival: Instant::from_ns(i64::MIN),
             counters: ReceiverCounters::default(),
+            lost: vec![LinkCounts::default(); usize::from(channel_max) + 1],
         }
     }
 
@@ -113,18 +162,23 @@ impl EmulatedReceiver {
         self.order.len()
     }
 
+    /// Where the next arrival is kept; the place beyond the last when there is none.
+    fn next_place(&self) -> usize {
+        let unused = self.held.len();
+        self.free.last().copied().unwrap_or(unused)
+    }
+
     /// Takes everything that has arrived below, at most as many as may be held.
     fn pull(&mut self, now: Instant) -> io::Result<()> {
         self.newest_arrival = self.newest_arrival.max(now);
-        for _ in 0..self.held.len() {
-            let overflow = self.held.len();
-            let place = self.free.last().copied().unwrap_or(overflow);
-            let start = place * self.datagram_bytes_max;
-            let buffer = &mut self.storage[start..start + self.datagram_bytes_max];
+        let longest = self.settings.datagram_bytes_max;
+        for _ in 0..self.settings.capacity_count {
+            let place = self.next_place();
+            let buffer = &mut self.storage[place * longest..][..longest];
             let Some(received) = self.inner.receive(now, buffer)? else {
                 break;
             };
-            let arrived = self.clock.map_or(now, |clock| clock());
+            let arrived = self.settings.clock.map_or(now, |clock| clock());
             self.newest_arrival = self.newest_arrival.max(arrived);
             self.admit(received, place);
         }
@@ -134,48 +188,55 @@ impl EmulatedReceiver {
     /// Decides the fate of the datagram in `place`.
     fn admit(&mut self, mut received: Received, place: usize) {
         let arrived = self.newest_arrival;
-        let start = place * self.datagram_bytes_max;
-        let datagram = &self.storage[start..start + received.length_bytes];
-        if (self.is_exempt)(datagram) {
-            self.hold(received, place, arrived);
-            return;
-        }
+        let start = place * self.settings.datagram_bytes_max;
+        let length_bytes = received.length_bytes;
+        let offer = (self.offer_of)(&self.storage[start..start + length_bytes]);
         // The model is asked even when there is no room, so that the fate of the n-th datagram
         // does not depend on how full we were.
-        let number = self.number_of.and_then(|number_of| number_of(datagram));
-        let fate = match number {
-            Some(number) => self
-                .link
-                .offer_numbered(arrived, received.length_bytes, number),
-            None => self.link.offer(arrived, received.length_bytes),
+        let fate = offer.and_then(|offer| self.links.offer(arrived, length_bytes, offer));
+        let Some((offer, fate)) = offer.zip(fate) else {
+            self.hold(received, place, arrived, None);
+            return;
         };
+        let channel = Some(offer.channel);
         let Some(due) = fate.arrival() else {
-            self.counters.link_lost_count += 1;
+            if let Some(counts) = self.counts_of(channel) {
+                counts.lost_count += 1;
+            }
             return;
         };
         received.emulated = Some(EmulatedDelay { arrived, due });
-        self.hold(received, place, due);
+        self.hold(received, place, due, channel);
         if let Some(due) = fate.second_arrival() {
-            let copy = self.free.last().copied().unwrap_or(self.held.len());
+            let copy = self.next_place();
             self.storage.copy_within(
-                start..start + received.length_bytes,
-                copy * self.datagram_bytes_max,
+                start..start + length_bytes,
+                copy * self.settings.datagram_bytes_max,
             );
             received.emulated = Some(EmulatedDelay { arrived, due });
-            self.hold(received, copy, due);
+            self.hold(received, copy, due, channel);
         }
     }
 
     /// Keeps the datagram in `place` until `due`, if that is a place.
-    fn hold(&mut self, received: Received, place: usize, due: Instant) {
-        let Some(slot) = self.held.get_mut(place) else {
-            self.counters.link_overflow_count += 1;
+    fn hold(&mut self, received: Received, place: usize, due: Instant, channel: Option<u16>) {
+        if place < self.held.len() {
+            self.free.pop();
+            self.held[place] = Some(received);
+        } else if place < self.settings.capacity_count {
+            self.held.push(Some(received));
+        } else {
+            if let Some(counts) = self.counts_of(channel) {
+                counts.overflow_count += 1;
+            }
             return;
-        };
-        *slot = Some(received);
-        self.free.pop();
+        }
         self.order.push(Reverse((due, self.arrival_count, place)));
         self.arrival_count += 1;
+    }
+
+    fn counts_of(&mut self, channel: Option<u16>) -> Option<&mut LinkCounts> {
+        self.lost.get_mut(usize::from(channel?))
     }
 }
 
@@ -192,7 +253,7 @@ impl DatagramReceiver for EmulatedReceiver {
         self.free.push(place);
         let held = self.held[place].take();
         let mut received = held.expect("a place in the order holds a datagram");
-        let start = place * self.datagram_bytes_max;
+        let start = place * self.settings.datagram_bytes_max;
         let length_bytes = received.length_bytes.min(buffer.len());
         buffer[..length_bytes].copy_from_slice(&self.storage[start..start + length_bytes]);
         received.is_truncated |= length_bytes < received.length_bytes;
@@ -231,7 +292,7 @@ impl DatagramReceiver for EmulatedReceiver {
     }
 
     fn attend(&mut self, now: Instant) {
-        self.link.attend(now);
+        self.links.attend(now);
         self.inner.attend(now);
     }
 
@@ -243,7 +304,13 @@ impl DatagramReceiver for EmulatedReceiver {
         self.inner.seal_counts()
     }
 
-    /// Own counts of what was handed out, lost and dropped; the rest from below.
+    fn link_counts(&self, channel: u16) -> Option<LinkCounts> {
+        let counts = *self.lost.get(usize::from(channel))?;
+        let causes = self.links.loss_causes(channel);
+        Some(LinkCounts { causes, ..counts })
+    }
+
+    /// Own counts of what was handed out; the rest from below.
     fn counters(&self) -> ReceiverCounters {
         let inner = self.inner.counters();
         let own = &self.counters;
@@ -252,9 +319,6 @@ impl DatagramReceiver for EmulatedReceiver {
             software_stamp_count: own.software_stamp_count,
             hardware_stamp_count: own.hardware_stamp_count,
             truncated_count: own.truncated_count,
-            link_lost_count: inner.link_lost_count + own.link_lost_count,
-            link_overflow_count: inner.link_overflow_count + own.link_overflow_count,
-            link_loss_causes: self.link.loss_causes().or(inner.link_loss_causes),
             ..inner
         }
     }
@@ -265,7 +329,7 @@ impl fmt::Debug for EmulatedReceiver {
         // Without the buffers, which are long and say nothing.
         f.debug_struct("EmulatedReceiver")
             .field("inner", &self.inner)
-            .field("link", &self.link)
+            .field("links", &self.links)
             .field("held_count", &self.order.len())
             .field("counters", &self.counters)
             .finish_non_exhaustive()

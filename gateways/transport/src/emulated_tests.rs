@@ -35,11 +35,25 @@ fn emulated(
         capacity_count,
         datagram_bytes_max: 16,
         clock: None,
-        number_of: None,
     };
-    let is_handshake = |datagram: &[u8]| datagram.first() == Some(&b'h');
-    let receiver = EmulatedReceiver::new(Box::new(inner), Box::new(link), is_handshake, settings);
+    let offer_of = |datagram: &[u8]| (datagram.first() != Some(&b'h')).then_some(ANY);
+    let receiver = EmulatedReceiver::new(Box::new(inner), Box::new(link), offer_of, 0, settings);
     (sender, receiver)
+}
+
+const ANY: Offer = Offer {
+    channel: 0,
+    message: None,
+};
+
+impl EmulatedReceiver {
+    fn free_count(&self) -> usize {
+        self.settings.capacity_count - self.held.len() + self.free.len()
+    }
+
+    fn counts(&self) -> LinkCounts {
+        self.link_counts(0).unwrap()
+    }
 }
 
 fn take(receiver: &mut impl DatagramReceiver, now: Instant) -> Option<(u8, Received)> {
@@ -58,7 +72,8 @@ fn a_caller_that_was_held_up_does_not_make_a_datagram_early() {
         clock: Some(|| Instant::from_ns(8_000_000)),
         ..EmulatedSettings::default()
     };
-    let mut receiver = EmulatedReceiver::new(Box::new(inner), Box::new(link), |_| false, settings);
+    let mut receiver =
+        EmulatedReceiver::new(Box::new(inner), Box::new(link), |_| Some(ANY), 0, settings);
     sender.send(b"x").unwrap();
     let mut buffer = [0; 8];
     assert!(
@@ -91,7 +106,7 @@ fn datagrams_come_when_due_in_due_order_and_say_how_long_they_were_held() {
         (delay.arrived, delay.due),
         (start, Instant::from_ns(35 * MS))
     );
-    assert_eq!(receiver.counters().link_lost_count, 1);
+    assert_eq!(receiver.counts().lost_count, 1);
     assert_eq!((receiver.next_due(), receiver.held_count()), (None, 0));
 }
 
@@ -102,7 +117,7 @@ fn a_full_link_drops_and_counts_and_recovers() {
         sender.send(&[byte]).unwrap();
         assert_eq!(take(&mut receiver, Instant::ZERO), None);
     }
-    assert_eq!(receiver.counters().link_overflow_count, 3);
+    assert_eq!(receiver.counts().overflow_count, 3);
     let due = Instant::from_ns(10 * MS);
     assert_eq!(take(&mut receiver, due).unwrap().0, 0);
     assert_eq!(take(&mut receiver, due).unwrap().0, 1);
@@ -144,8 +159,8 @@ fn a_copy_comes_when_it_is_due_with_the_bytes_and_the_arrival_of_the_original() 
     let expected = [("ab", 0, 10), ("cd", 1, 11), ("ab", 0, 25), ("cd", 1, 26)];
     let expected = expected.map(|(text, arrived, due)| (text.into(), arrived, due));
     assert_eq!(seen, expected);
-    assert_eq!((receiver.held_count(), receiver.free.len()), (0, 8));
-    assert_eq!(receiver.counters().link_overflow_count, 0);
+    assert_eq!((receiver.held_count(), receiver.free_count()), (0, 8));
+    assert_eq!(receiver.counts().overflow_count, 0);
 }
 
 #[test]
@@ -157,13 +172,13 @@ fn copies_that_find_no_room_are_counted_and_the_receiver_stays_bounded() {
         assert!(receiver.held_count() <= 3);
     }
     // Two places for the first, one for the second: its copy, and both of the others, drop.
-    assert_eq!(receiver.counters().link_overflow_count, 5);
+    assert_eq!(receiver.counts().overflow_count, 5);
     let at = |ms| Instant::from_ns(ms * MS);
     assert_eq!(take(&mut receiver, at(10)).unwrap().0, 0);
     assert_eq!(take(&mut receiver, at(10)).unwrap().0, 1);
     assert_eq!(take(&mut receiver, at(24)), None);
     assert_eq!(take(&mut receiver, at(25)).unwrap().0, 0);
-    assert_eq!((receiver.held_count(), receiver.free.len()), (0, 3));
+    assert_eq!((receiver.held_count(), receiver.free_count()), (0, 3));
     // And it is as good as new.
     sender.send(b"9").unwrap();
     assert_eq!(take(&mut receiver, at(30)), None);
@@ -200,15 +215,15 @@ fn a_hundred_thousand_random_fates_leave_nothing_behind() {
             newest_due = newest_due.max(delay.due);
             taken_count += 1;
         }
-        assert_eq!(receiver.held_count() + receiver.free.len(), 5);
+        assert_eq!(receiver.held_count() + receiver.free_count(), 5);
         assert!(receiver.next_due().is_none_or(|due| due > now));
     }
     let end = Instant::from_ns(i64::MAX);
     taken_count += core::iter::from_fn(|| take(&mut receiver, end)).count() as u64;
     let counters = receiver.counters();
-    assert_eq!((receiver.held_count(), receiver.free.len()), (0, 5));
+    assert_eq!((receiver.held_count(), receiver.free_count()), (0, 5));
     assert_eq!(counters.received_count, taken_count);
-    assert!(counters.link_overflow_count > 1_000, "{counters:?}");
+    assert!(receiver.counts().overflow_count > 1_000);
 }
 
 #[test]
@@ -223,7 +238,7 @@ fn exempt_datagrams_pass_at_once_and_change_no_fate() {
         take(&mut receiver, Instant::from_ns(10 * MS)).unwrap().0,
         b'1'
     );
-    assert_eq!(receiver.counters().link_lost_count, 1);
+    assert_eq!(receiver.counts().lost_count, 1);
 }
 
 #[test]
@@ -265,4 +280,49 @@ fn a_clock_that_goes_back_does_not_reach_the_model() {
     // The second came in at 7, so at 3 it was not due yet.
     assert_eq!(receiver.counters().received_count, 2);
     assert_eq!(receiver.held_count(), 1);
+}
+
+#[test]
+fn each_channel_meets_its_own_model_and_has_its_own_counts() {
+    #[derive(Debug)]
+    struct ByChannel(Vec<Listed>);
+    impl FlowLinks for ByChannel {
+        fn offer(&mut self, now: Instant, length_bytes: usize, offer: Offer) -> Option<Fate> {
+            let link = self.0.get_mut(usize::from(offer.channel))?;
+            Some(LinkModel::offer(link, now, length_bytes))
+        }
+        fn attend(&mut self, _now: Instant) {}
+        fn loss_causes(&self, channel: u16) -> Option<LossCauses> {
+            let chance_count = u64::from(channel);
+            Some(LossCauses {
+                chance_count,
+                ..LossCauses::default()
+            })
+        }
+    }
+    let links = ByChannel(vec![Listed(vec![-1, 30, -1]), Listed(vec![10, -1])]);
+    let (mut sender, inner) = queue_pair(&QueueSettings::default());
+    let offer_of = |datagram: &[u8]| {
+        let channel = u16::from(datagram[0]);
+        Some(Offer {
+            channel,
+            message: None,
+        })
+    };
+    let settings = EmulatedSettings::default();
+    let mut receiver =
+        EmulatedReceiver::new(Box::new(inner), Box::new(links), offer_of, 2, settings);
+    for channel in [0, 1, 0, 2, 1, 0] {
+        sender.send(&[channel]).unwrap();
+    }
+    // A channel without a model passes at once.
+    let (byte, arrival) = take(&mut receiver, Instant::ZERO).unwrap();
+    assert_eq!((byte, arrival.emulated), (2, None));
+    assert_eq!(take(&mut receiver, Instant::from_ns(10 * MS)).unwrap().0, 1);
+    assert_eq!(take(&mut receiver, Instant::from_ns(30 * MS)).unwrap().0, 0);
+    let counts = [0, 1, 2].map(|channel| receiver.link_counts(channel).unwrap());
+    assert_eq!(counts.map(|one| one.lost_count), [2, 1, 0]);
+    let causes = counts.map(|one| one.causes.unwrap().chance_count);
+    assert_eq!(causes, [0, 1, 2]);
+    assert_eq!(receiver.link_counts(3), None);
 }

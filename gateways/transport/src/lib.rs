@@ -42,7 +42,9 @@ use std::os::fd::BorrowedFd;
 use hil_core::time::Instant;
 use thiserror::Error;
 
-pub use counters::{ConnectionTally, EndReport, ReceiverCounters, SenderCounters, Stalls};
+pub use counters::{
+    ConnectionTally, EndReport, LinkCounts, ReceiverCounters, SenderCounters, Stalls,
+};
 
 use hil_net::radio::RadioReport;
 use hil_net::{KernelStamps, TransmitStamp, TxToken};
@@ -257,6 +259,11 @@ pub trait DatagramReceiver: Debug + Send {
     /// Does what is due beside receiving, such as taking connections: call it whenever the
     /// descriptor has something and [`DatagramReceiver::receive`] gave nothing.
     fn attend(&mut self, _now: Instant) {}
+
+    /// What a link model in front of it did to the datagrams of `channel`; `None` without one.
+    fn link_counts(&self, _channel: u16) -> Option<LinkCounts> {
+        None
+    }
 
     /// What only this transport counts and has to tell, until `now`.
     fn report(&self, _now: Instant) -> EndReport {

@@ -15,26 +15,31 @@ use hil_net::timestamping::TimestampMode;
 use hil_protocol::seal::{Association, Rotation, RunSecret, Suite};
 use hil_protocol::wire::{HEADER_BYTES, Header};
 use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, IngressBridge, IngressSettings,
-    PeerState,
+    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, IngressBridge,
+    IngressSettings, PeerState,
 };
 
 fn association() -> Association {
     Association {
         secret: RunSecret::new(&mut [9; 32]),
         suite: Suite::Aes256Gcm,
-        channel: 3,
-        channel_name: "arm/command".to_owned(),
+        flow: 65_535,
+        flow_name: "link/hop/forward".to_owned(),
     }
 }
 
-fn channel() -> ChannelIdentity {
-    ChannelIdentity::new(3, "arm/command", "test.Command.v1", 3_000, 8)
+fn flow() -> FlowIdentity {
+    let channel = ChannelIdentity::new(3, "arm/command", "test.Command.v1", 3_000, 8);
+    FlowIdentity {
+        flow: 65_535,
+        name: "link/hop/forward".to_owned(),
+        channels: vec![channel],
+    }
 }
 
 fn egress_settings() -> EgressSettings {
     EgressSettings {
-        channel: channel(),
+        flow: flow(),
         session: 100,
         domain: [1; 16],
         clock_id: 11,
@@ -63,7 +68,7 @@ impl Hop {
         Self {
             egress: EgressBridge::new(egress_settings()).unwrap(),
             sender,
-            ingress: IngressBridge::new(IngressSettings::new(channel(), 200, [2; 16], 22)).unwrap(),
+            ingress: IngressBridge::new(IngressSettings::new(flow(), 200, [2; 16], 22)).unwrap(),
             receiver,
             is_real,
             now: Instant::from_ns(1_000_000_000),
@@ -132,13 +137,15 @@ fn check_conversation(mut hop: Hop) {
             ..Envelope::default()
         };
         let payload = vec![sequence.to_le_bytes()[0]; if sequence % 3 == 0 { 3_000 } else { 64 }];
-        hop.egress.on_local(hop.now, &envelope, &payload).unwrap();
+        hop.egress
+            .on_local(hop.now, 0, &envelope, &payload)
+            .unwrap();
         hop.step_until(|hop| !hop.delivered.is_empty());
         assert_eq!(hop.delivered.pop(), Some(payload));
     }
     hop.egress.bye();
     hop.step_until(|hop| hop.ingress.has_left());
-    let sequences = hop.ingress.sequence_counts();
+    let sequences = hop.ingress.sequence_counts(0);
     assert_eq!((sequences.received_count, sequences.lost_count), (200, 0));
     assert!(hop.egress.counts().round_trip_count > 5);
     assert_eq!(

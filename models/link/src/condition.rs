@@ -226,10 +226,18 @@ impl Way {
     }
 }
 
-/// The channel on which orders for one direction of a link travel, and the name under which they are
-/// recorded. Names that begin with `hil/` are reserved.
-pub fn order_channel(link: &str, way: Way) -> String {
-    format!("hil/link/{link}/{}", way.word())
+const FLOW_PREFIX: &str = "hil/link/";
+
+/// What one link carries one way: the name under which its gateways' clock exchanges and the orders to
+/// change it are recorded, and of the channel on which those orders travel. Names that begin with `hil/`
+/// are reserved.
+pub fn flow_name(link: &str, way: Way) -> String {
+    format!("{FLOW_PREFIX}{link}/{}", way.word())
+}
+
+/// What a reader is shown of such a name: `hop/forward`; another name as it is.
+pub fn flow_label(name: &str) -> &str {
+    name.strip_prefix(FLOW_PREFIX).unwrap_or(name)
 }
 
 #[cfg(test)]
@@ -259,7 +267,10 @@ mod tests {
         unknown.kind = 9;
         assert_eq!(unknown.condition(), None);
         assert_eq!(fixed(50, 0.1).to_string(), "delay 50 ms, loss 0.1");
-        assert_eq!(order_channel("hop", Way::Backward), "hil/link/hop/backward");
+        let name = flow_name("hop", Way::Backward);
+        assert_eq!(name, "hil/link/hop/backward");
+        assert_eq!(flow_label(&name), "hop/backward");
+        assert_eq!(flow_label("clock/a-b"), "clock/a-b");
     }
 
     #[test]

@@ -94,7 +94,7 @@ pub fn encode(trace: &Trace) -> String {
 }
 
 /// A name as a remark can hold it: on one line, without blanks around it.
-fn one_line(text: &str) -> String {
+pub(crate) fn one_line(text: &str) -> String {
     let line: String = text
         .chars()
         .map(|c| if c.is_control() { ' ' } else { c })

@@ -2,6 +2,7 @@
 //! deviates of a distribution with mean 0 and standard deviation 1, ascending, times 8192
 //! (iproute2, `netem/maketable.c`). It is an export only, and keeps no order and no loss.
 
+use crate::csv::one_line;
 use core::fmt::Write;
 
 use super::Trace;
@@ -43,7 +44,7 @@ pub fn table(trace: &Trace) -> Option<NetemTable> {
     }
     let mut text = format!(
         "# delay distribution of {}: tc ... netem delay {:.0}us {:.0}us distribution FILE\n",
-        trace.header.channel,
+        one_line(&trace.header.channel),
         mean_ns / 1e3,
         deviation_ns / 1e3
     );

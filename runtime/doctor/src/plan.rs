@@ -183,10 +183,11 @@ impl Plan {
             let name = format!("gateway of {}", crossing.link.name);
             self.pin(&name, &crossing.hop.gateway.execution);
         }
+        let flow = format!("link {}", crossing.flow_label());
         let at = |host: &Host, port| SocketAddr::new(host.gateway_address(), port);
         if is_here(from) {
             if let Some(protocol) = capabilities.sender_port {
-                self.bind(protocol, at(from, crossing.ports.sender), &channel.name);
+                self.bind(protocol, at(from, crossing.ports.sender), &flow);
             }
             self.loads.push(LinkLoad {
                 link: crossing.link.name.clone(),
@@ -201,7 +202,7 @@ impl Plan {
         }
         if is_here(to) {
             if let Some(protocol) = capabilities.receiver_port {
-                self.bind(protocol, at(to, crossing.ports.receiver), &channel.name);
+                self.bind(protocol, at(to, crossing.ports.receiver), &flow);
             }
             self.adapter(to, from);
         }
@@ -295,8 +296,8 @@ wait = "spin"
         assert_eq!(
             ports,
             [
-                "udp 10.0.0.1:7400 shuttle/command",
-                "udp 10.0.0.1:7403 shuttle/status",
+                "udp 10.0.0.1:7400 link hop/forward",
+                "udp 10.0.0.1:7401 link hop/backward",
                 "udp 10.1.0.1:7390 clock/a-b",
                 "tcp 10.0.0.1:7399 control_port",
             ]

@@ -297,30 +297,26 @@ fn summary(folder: &RunFolder) -> Result<Option<RunSummary>, CompareError> {
         .map_err(|source| CompareError::Summary { path, source })
 }
 
-/// Datagrams of a channel's sockets, where the run's summary has them.
+/// Datagrams with messages of a channel, where the run's summary has them.
 #[derive(Debug, Clone, Copy, Default)]
 struct SocketCounts {
     sent: Option<u64>,
-    /// Without farewells: whether one is received depends on which gateway ends first.
     received: Option<u64>,
 }
 
 fn socket_counts(summary: &RunSummary, channel: &str) -> SocketCounts {
-    let of = |side: Side, group: CounterGroup, name: &str| {
+    let of = |side: Side| {
         let channel = summary.channels.iter().find(|one| one.name == channel)?;
-        let ways = channel.directions.iter();
-        let counts = ways
-            .filter(|one| one.direction == side)
-            .filter_map(|one| one.count(group, name));
-        counts.reduce(|a, b| a + b)
+        let ends = channel.ends.iter().filter(|one| one.direction == side);
+        let counters = ends.flat_map(|one| &one.counters);
+        let named = counters
+            .filter(|one| one.group == CounterGroup::Own && one.name == "datagram_count")
+            .map(|one| one.count);
+        named.reduce(|a, b| a + b)
     };
-    let all = of(Side::Ingress, CounterGroup::Socket, "received_count");
-    let farewells = of(Side::Ingress, CounterGroup::Own, "bye_count");
     SocketCounts {
-        sent: of(Side::Egress, CounterGroup::Socket, "sent_count"),
-        received: all
-            .zip(farewells)
-            .and_then(|(all, byes)| all.checked_sub(byes)),
+        sent: of(Side::Egress),
+        received: of(Side::Ingress),
     }
 }
 

@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use super::adapter::AdapterSummary;
 use super::adapter_warnings;
-use super::summary::{ChannelSummary, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary};
+use super::summary::{
+    ChannelSummary, DirectionSummary, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary,
+};
 use super::terminal::{JOINT, percent};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
@@ -86,7 +88,12 @@ impl Assessment {
         let overruns: Vec<Overrun> = summary.processes.iter().filter_map(overrun).collect();
         let mut warnings: Vec<String> = overruns.iter().map(overrun_warning).collect();
         warnings.extend(summary.channels.iter().filter_map(emulation_warning));
-        warnings.extend(summary.channels.iter().filter_map(no_room_warning));
+        warnings.extend(
+            summary
+                .directions
+                .iter()
+                .filter_map(|one| no_room_warning(summary, one)),
+        );
         warnings.extend(summary.warnings.iter().cloned());
         warnings.extend(
             summary
@@ -162,22 +169,33 @@ fn unkept(summary: &RunSummary) -> Vec<String> {
     channels.map(|channel| channel.name.clone()).collect()
 }
 
-/// The channels of which more than [`SKIPPED_TICK_RATIO_MAX`] of the messages may have been lost to the
-/// receiver's host: a gateway keeps no ticks that would tell that it was late.
-fn received_late(summary: &RunSummary) -> Vec<String> {
-    let is_late = |channel: &&ChannelSummary| {
-        let account = channel.account.as_ref();
-        let published_count = account.map_or(0, |account| account.published_count);
-        channel.no_room_count as f64 > SKIPPED_TICK_RATIO_MAX * published_count as f64
-    };
-    let channels = summary.channels.iter().filter(is_late);
-    channels.map(|channel| channel.name.clone()).collect()
+/// The channels that a direction carried.
+fn carried<'a>(
+    summary: &'a RunSummary,
+    direction: &'a DirectionSummary,
+) -> impl Iterator<Item = &'a ChannelSummary> {
+    let channels = summary.channels.iter();
+    channels.filter(|one| direction.channels.contains(&one.name))
 }
 
-fn no_room_warning(channel: &ChannelSummary) -> Option<String> {
-    let count = Some(channel.no_room_count).filter(|count| *count > 0)?;
-    let account = channel.account.as_ref();
-    let lost = account.map_or(0, |account| account.fates.of(MessageFate::LostOnWire));
+/// The ways of links on which more than [`SKIPPED_TICK_RATIO_MAX`] of the messages may have been lost to the
+/// receiver's host: a gateway keeps no ticks that would tell that it was late.
+fn received_late(summary: &RunSummary) -> Vec<String> {
+    let is_late = |direction: &&DirectionSummary| {
+        let accounts = carried(summary, direction).filter_map(|one| one.account.as_ref());
+        let published_count: u64 = accounts.map(|account| account.published_count).sum();
+        direction.no_room_count() as f64 > SKIPPED_TICK_RATIO_MAX * published_count as f64
+    };
+    let directions = summary.directions.iter().filter(is_late);
+    directions.map(|one| one.label().to_owned()).collect()
+}
+
+fn no_room_warning(summary: &RunSummary, direction: &DirectionSummary) -> Option<String> {
+    let count = Some(direction.no_room_count()).filter(|count| *count > 0)?;
+    let accounts = carried(summary, direction).filter_map(|one| one.account.as_ref());
+    let lost: u64 = accounts
+        .map(|account| account.fates.of(MessageFate::LostOnWire))
+        .sum();
     let lost = match lost.min(count) {
         0 => String::new(),
         most => format!(
@@ -187,7 +205,7 @@ fn no_room_warning(channel: &ChannelSummary) -> Option<String> {
     };
     Some(format!(
         "{}: {} had {NO_ROOM}, because the receiving gateway was late or more came than it could take{lost}",
-        channel.name,
+        direction.label(),
         counted(count, "datagram"),
     ))
 }

@@ -29,8 +29,8 @@ use crate::event_log;
 use crate::network::NetworkReport;
 use crate::score_event::ScoreEvents;
 use crate::summary::{
-    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedMetrics,
-    RunFacts, RunSummary, ScoreMetric,
+    ChannelEnd, ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome,
+    RecordedMetrics, RunFacts, RunSummary, ScoreMetric,
 };
 use crate::terminal::{self, Style, percent};
 use hil_rundir::launch::Side;
@@ -128,6 +128,8 @@ pub fn simulate(
             }
         })
         .collect();
+    let directions = links.iter().map(|(name, link)| link.direction(name));
+    summary.directions = directions.collect();
     summary.score = ScoreMetric::all_of(&score);
     summary.score_events = events::explained(&score, entry.channels, &outages, &result.log);
     let watches = links.into_iter().map(|(name, link)| (name, link.watch));
@@ -330,9 +332,7 @@ fn channel_summary(
             message_count: *count,
             missing_count: 0,
         }),
-        refusals: Vec::new(),
-        no_room_count: 0,
-        directions: link.map(WatchedLink::direction).into_iter().collect(),
+        ends: link.map(WatchedLink::end).into_iter().collect(),
     }
 }
 
@@ -396,11 +396,8 @@ struct WatchedLink {
 }
 
 impl WatchedLink {
-    /// The model and its own counts, where a real run has its gateways.
-    fn direction(&self) -> DirectionSummary {
-        let mut facts = vec![Fact::new("model", self.emulation.describe())];
-        let ratio = self.emulation.loss_ratio();
-        facts.extend(ratio.map(|ratio| Fact::new("loss asked for", percent(ratio))));
+    /// Its own counts, where a real run has its gateways.
+    fn end(&self) -> ChannelEnd {
         let causes = self.watch.loss_causes();
         let causes = causes.into_iter().flat_map(|causes| {
             [
@@ -411,23 +408,35 @@ impl WatchedLink {
         });
         let all = [("link_lost_count", self.watch.lost_count())];
         let counters = all.into_iter().chain(causes);
+        ChannelEnd {
+            process: VIRTUAL_GATEWAY.to_owned(),
+            direction: VIRTUAL_SIDE,
+            counters: CountByName::all(CounterGroup::Own, counters).collect(),
+        }
+    }
+
+    /// The model of `channel`.
+    fn direction(&self, channel: &str) -> DirectionSummary {
+        let mut facts = vec![Fact::new("model", self.emulation.describe())];
+        let ratio = self.emulation.loss_ratio();
+        facts.extend(ratio.map(|ratio| Fact::new("loss asked for", percent(ratio))));
         DirectionSummary {
-            process: "simulate".to_owned(),
-            // Where a real run has its link model: behind the receiving socket.
-            direction: Side::Ingress,
+            flow: channel.to_owned(),
+            process: VIRTUAL_GATEWAY.to_owned(),
+            direction: VIRTUAL_SIDE,
+            channels: vec![channel.to_owned()],
             peer_state: "none, in virtual time".to_owned(),
-            counters: counters
-                .map(|(name, count)| CountByName {
-                    group: CounterGroup::Own,
-                    name: name.to_owned(),
-                    count,
-                })
-                .collect(),
+            counters: Vec::new(),
             facts,
             stalls: None,
         }
     }
 }
+
+/// What stands for the gateway of a channel.
+const VIRTUAL_GATEWAY: &str = "simulate";
+/// Where a real run has its link model: behind the receiving socket.
+const VIRTUAL_SIDE: Side = Side::Ingress;
 
 /// Width of `report.txt`.
 const REPORT_FILE_WIDTH: usize = 100;

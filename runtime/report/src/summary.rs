@@ -1,4 +1,4 @@
-//! The serialisable summary of a run, schema version 1. It holds figures, not judgements: those
+//! The serialisable summary of a run, schema version 2. It holds figures, not judgements: those
 //! are drawn from them in [`super::assessment`] whenever a summary is written.
 //!
 //! `summary.json` is one object with the fields of [`RunSummary`] under their own names plus
@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use hil_account::{ChannelAccount, MessageFate, OutageMetrics};
 use hil_core::case_study::{Metric, Score};
 use hil_core::link_model::ReplayCounts;
+use hil_link::condition::flow_label;
 use hil_protocol::transport::Description;
 use serde::{Deserialize, Serialize};
 
@@ -35,7 +36,7 @@ use hil_rundir::protection::RunSecurity;
 use hil_topology::{Channel, Topology, Via};
 
 /// Version of the `summary.json` layout.
-pub const SCHEMA_VERSION: u32 = 1;
+pub const SCHEMA_VERSION: u32 = 2;
 
 /// Everything a finished run has to say.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -60,6 +61,9 @@ pub struct RunSummary {
     pub link_changes: Vec<LinkChange>,
     /// The channels, in the order of the case study.
     pub channels: Vec<ChannelSummary>,
+    /// The gateway threads that carried them; empty where none crossed a link.
+    #[serde(default)]
+    pub directions: Vec<DirectionSummary>,
     /// Arms that went through an adapter to a foreign program.
     #[serde(default)]
     pub faces: Vec<AdapterSummary>,
@@ -95,6 +99,7 @@ impl RunSummary {
             events: Vec::new(),
             link_changes: Vec::new(),
             channels: Vec::new(),
+            directions: Vec::new(),
             faces: Vec::new(),
             hardware_stamps: None,
             radio: RadioReport::default(),
@@ -543,14 +548,20 @@ pub struct ChannelSummary {
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedMetrics>,
-    /// Datagrams the gateways refused, by cause; only causes that occurred.
-    pub refusals: Vec<CountByName>,
-    /// Datagrams that came while a socket's receive buffer was full: their receiver was late. They may have
-    /// been anything, also messages.
+    /// What each gateway that carried it counted of it alone; empty on a direct channel.
     #[serde(default)]
-    pub no_room_count: u64,
-    /// The gateway threads that carried it; empty on a direct channel.
-    pub directions: Vec<DirectionSummary>,
+    pub ends: Vec<ChannelEnd>,
+}
+
+/// One channel in one gateway.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ChannelEnd {
+    /// The gateway process.
+    pub process: String,
+    /// Which way it carried it.
+    pub direction: Side,
+    /// Everything it counted of it.
+    pub counters: Vec<CountByName>,
 }
 
 /// What the record holds of a channel that goes nowhere else.
@@ -564,35 +575,31 @@ pub struct RecordedMetrics {
 }
 
 impl ChannelSummary {
-    /// What its gateways counted by this name, together.
+    /// What its gateways counted of it by this name, together.
     pub fn count(&self, group: CounterGroup, name: &str) -> u64 {
-        let counts = self.directions.iter();
-        counts.filter_map(|one| one.count(group, name)).sum()
-    }
-
-    /// What became of datagrams that are no messages of it, in words, each cause with its count.
-    pub(crate) fn refusal_words(&self) -> Vec<String> {
-        let refused = self.refusals.iter();
-        let refused = refused.map(|one| format!("{} {}", one.name, grouped(one.count)));
-        let no_room = Some(self.no_room_count).filter(|count| *count > 0);
-        let no_room = no_room.map(|count| format!("{NO_ROOM} {}", grouped(count)));
-        refused.chain(no_room).collect()
+        let counters = self.ends.iter().flat_map(|one| &one.counters);
+        let named = counters.filter(|one| one.group == group && one.name == name);
+        named.map(|one| one.count).sum()
     }
 }
 
-/// What reports say of [`ChannelSummary::no_room_count`].
+/// What reports say of [`DirectionSummary::no_room_count`].
 pub(super) const NO_ROOM: &str = "no room in the receive buffer";
 
-/// One gateway thread of a channel.
+/// One way of a link in one gateway: its thread and its socket.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DirectionSummary {
+    /// What goes that way: the link and the way, or a channel in virtual time.
+    pub flow: String,
     /// The gateway process.
     pub process: String,
     /// Which way it carried it.
     pub direction: Side,
+    /// Names of the channels.
+    pub channels: Vec<String>,
     /// The peer's state at the end, in words.
     pub peer_state: String,
-    /// Everything it counted.
+    /// Everything it counted that is of no one channel.
     pub counters: Vec<CountByName>,
     /// What was granted and found: buffers, stamp probe, path MTU.
     pub facts: Vec<Fact>,
@@ -602,6 +609,11 @@ pub struct DirectionSummary {
 }
 
 impl DirectionSummary {
+    /// What goes that way, for a reader.
+    pub fn label(&self) -> &str {
+        flow_label(&self.flow)
+    }
+
     /// How it stood to its peer, and what was granted and found, for a reader.
     pub(crate) fn words(&self) -> Vec<String> {
         let peer = core::iter::once(format!("peer {}", self.peer_state));
@@ -613,6 +625,23 @@ impl DirectionSummary {
         let mut counters = self.counters.iter();
         let found = counters.find(|one| one.group == group && one.name == name);
         found.map(|one| one.count)
+    }
+
+    /// Datagrams that came while the socket's receive buffer was full: their receiver was late. They may
+    /// have been anything, also messages.
+    pub fn no_room_count(&self) -> u64 {
+        let count = self.count(CounterGroup::Socket, "kernel_drop_count");
+        count.unwrap_or(0)
+    }
+
+    /// What became of datagrams that are no messages, in words, each cause with its count.
+    pub(crate) fn refusal_words(&self) -> Vec<String> {
+        let counters = self.counters.iter();
+        let refused = counters.filter(|one| one.group == CounterGroup::Refused && one.count > 0);
+        let refused = refused.map(|one| format!("{} {}", one.name, grouped(one.count)));
+        let no_room = Some(self.no_room_count()).filter(|count| *count > 0);
+        let no_room = no_room.map(|count| format!("{NO_ROOM} {}", grouped(count)));
+        refused.chain(no_room).collect()
     }
 }
 

@@ -63,28 +63,20 @@ pub struct ComponentWork {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GatewayWork {
-    /// One thread each.
+    /// One thread each: what goes out on the link and what comes in.
     pub directions: Vec<DirectionLaunch>,
     /// How long it waits for the peer's answer before it is ready without; `None` waits on.
     pub ready_within: Option<Duration>,
 }
 
-/// One channel direction through a gateway.
+/// One way of a link through a gateway: a flow with all its channels.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DirectionLaunch {
-    /// Name of the channel.
-    pub channel: String,
+    /// Name of the flow.
+    pub flow: String,
     /// Its number in datagrams.
-    pub channel_id: u16,
-    /// Name and version of its message type.
-    pub message: String,
-    /// Size of one message.
-    pub size_bytes: usize,
-    /// Alignment of one message.
-    pub alignment_bytes: usize,
-    /// Messages that wait at most in shared memory.
-    pub depth: usize,
+    pub flow_number: u16,
     /// Which way.
     pub side: Side,
     /// This end of the hop.
@@ -97,14 +89,38 @@ pub struct DirectionLaunch {
     pub wait: WaitMode,
     /// What to ask of the kernel.
     pub realtime: RealtimeRequest,
-    /// A link model in front of this direction's receiver.
-    pub emulation: Option<EmulationLaunch>,
-    /// It exchanges clocks only: no channel of shared memory is behind it.
-    #[serde(default)]
-    pub is_clock_path: bool,
+    /// Its channels; none on a clock path, which exchanges clocks only.
+    pub channels: Vec<ChannelLaunch>,
 }
 
-/// Which way a gateway thread carries its channel.
+impl DirectionLaunch {
+    /// True for one that exchanges clocks only.
+    pub fn is_clock_path(&self) -> bool {
+        self.channels.is_empty()
+    }
+}
+
+/// One channel of a flow.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ChannelLaunch {
+    /// Name of the channel.
+    pub channel: String,
+    /// Its number in datagrams.
+    pub channel_id: u16,
+    /// Name and version of its message type.
+    pub message: String,
+    /// Size of one message.
+    pub size_bytes: usize,
+    /// Alignment of one message.
+    pub alignment_bytes: usize,
+    /// Messages that wait at most in shared memory.
+    pub depth: usize,
+    /// A link model that its messages meet behind the receiving socket.
+    pub emulation: Option<EmulationLaunch>,
+}
+
+/// Which way a gateway thread carries its channels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Side {

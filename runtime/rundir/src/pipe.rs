@@ -96,7 +96,7 @@ pub struct ProcessReport {
     pub voluntary_switches: u64,
     /// Context switches forced on it.
     pub involuntary_switches: u64,
-    /// Named counters of each channel direction a gateway carries.
+    /// Named counters of each way of its link that a gateway carries.
     pub directions: Vec<DirectionReport>,
     /// The arms of an adapter that speaks with a foreign program.
     #[serde(default)]
@@ -221,22 +221,33 @@ pub struct AdapterReport {
     pub facts: Vec<(String, String)>,
 }
 
-/// One direction of one channel through a gateway.
+/// One way of a link through a gateway: its thread and its socket, and each of its channels.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DirectionReport {
-    /// The channel.
-    pub channel: String,
+    /// Name of the flow.
+    pub flow: String,
     /// Which way.
     pub direction: Side,
     /// The peer's state in words at the end.
     pub peer_state: String,
-    /// Everything it counted; zeros are left out by whoever prints.
+    /// Everything it counted that is of no one channel; zeros are left out by whoever prints.
     pub counters: Vec<CountByName>,
     /// Facts in words: granted buffers, stamp probe, path MTU.
     pub facts: Vec<(String, String)>,
     /// How often its stream stood still; `None` where it is none, or receives.
     #[serde(default)]
     pub stalls: Option<StallMetrics>,
+    /// Its channels.
+    pub channels: Vec<ChannelReport>,
+}
+
+/// One channel of one way of a link through a gateway.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ChannelReport {
+    /// The channel.
+    pub channel: String,
+    /// Everything counted of it alone.
+    pub counters: Vec<CountByName>,
     /// What its link model met of the trace that it replays; `None` where it replays none.
     #[serde(default)]
     pub replay: Option<ReplayCounts>,

@@ -69,12 +69,12 @@ impl RunSeal {
         Association {
             secret: self.secret.clone(),
             suite: self.suite(),
-            channel: launch.channel_id,
-            channel_name: launch.channel.clone(),
+            flow: launch.flow_number,
+            flow_name: launch.flow.clone(),
         }
     }
 
-    /// The sending end of the channel of `launch`, with a salt of its own.
+    /// The sending end of the flow of `launch`, with a salt of its own.
     ///
     /// # Errors
     /// As [`RunSeal::fresh`].
@@ -87,7 +87,7 @@ impl RunSeal {
         ))
     }
 
-    /// The receiving end of the channel of `launch`, with salts of its own.
+    /// The receiving end of the flow of `launch`, with salts of its own.
     ///
     /// # Errors
     /// As [`RunSeal::fresh`].

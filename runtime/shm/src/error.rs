@@ -109,14 +109,9 @@ pub enum ChannelError {
         /// Bytes of one message.
         expected: usize,
     },
-    /// More channels than one waiter can wait for.
-    #[error("a waiter takes 1 to {max} channels, {given} were given")]
-    WaiterChannelCount {
-        /// Channels given.
-        given: usize,
-        /// The bound.
-        max: usize,
-    },
+    /// A waiter without a channel.
+    #[error("a waiter takes at least one channel")]
+    NoChannel,
     /// The wait itself failed.
     #[error("cannot wait for channel {channel}")]
     Wait {

@@ -47,4 +47,4 @@ pub use ports::{ShmInput, ShmOutput, TypedInput, TypedOutput};
 pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
 pub use sequence::{InputCounters, OutputSettings, SequenceTracker, Sequencer, Stamp};
 pub use type_info::TypeInfo;
-pub use wake::{WAITER_CHANNELS_MAX, Waiter, Wake};
+pub use wake::{Waiter, Wake};

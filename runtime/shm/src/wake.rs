@@ -2,7 +2,6 @@
 //! Spinning readers need none of this.
 
 use core::time::Duration;
-use std::array;
 use std::os::fd::{AsFd, BorrowedFd};
 
 use hil_core::time::Instant;
@@ -12,6 +11,7 @@ use iceoryx2::prelude::ipc;
 use iceoryx2::service::port_factory::event;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, ppoll};
+use nix::sys::epoll::{Epoll, EpollCreateFlags, EpollEvent, EpollFlags, EpollTimeout};
 use nix::sys::time::TimeSpec;
 
 use super::domain::Domain;
@@ -19,8 +19,8 @@ use super::error::{ChannelError, retry};
 use super::raw;
 use hil_platform::clock::MonotonicClock;
 
-/// Most channels one waiter waits for.
-pub const WAITER_CHANNELS_MAX: usize = 16;
+/// Announced channels that one look finds; more are found by the next.
+const ANNOUNCED_PER_LOOK: usize = 32;
 /// Looks at one channel's announcements before its writer is taken for faster than they are.
 const DRAIN_LOOKS_MAX: usize = 8;
 
@@ -42,25 +42,35 @@ pub enum Wake {
 #[derive(Debug)]
 pub struct Waiter {
     listeners: Vec<(String, Listener<ipc::Service>)>,
+    /// Of several channels: tells which of them are announced, at a cost that does not grow with those
+    /// that are not.
+    group: Option<Epoll>,
+    /// The channel that is looked at after the next quiet wait.
+    swept: usize,
 }
 
 impl Waiter {
-    /// Listens to `channels`, 1..=[`WAITER_CHANNELS_MAX`] of them.
+    /// Listens to `channels`, at least one.
     ///
     /// # Errors
-    /// When there are too many, or one does not appear in time or has all its readers.
+    /// When there is none, or one does not appear in time or has all its readers.
     pub fn open(domain: &Domain, channels: &[&str]) -> Result<Self, ChannelError> {
-        if channels.is_empty() || channels.len() > WAITER_CHANNELS_MAX {
-            return Err(ChannelError::WaiterChannelCount {
-                given: channels.len(),
-                max: WAITER_CHANNELS_MAX,
-            });
-        }
+        let Some(first) = channels.first() else {
+            return Err(ChannelError::NoChannel);
+        };
         let listeners = channels
             .iter()
             .map(|channel| Ok(((*channel).to_owned(), open_listener(domain, channel)?)))
-            .collect::<Result<_, ChannelError>>()?;
-        Ok(Self { listeners })
+            .collect::<Result<Vec<_>, ChannelError>>()?;
+        let group = (channels.len() > 1)
+            .then(|| group_of(&listeners))
+            .transpose();
+        let group = group.map_err(|errno| wait_error(first, errno))?;
+        Ok(Self {
+            listeners,
+            group,
+            swept: 0,
+        })
     }
 
     /// Sleeps until a channel is announced or `timeout` has passed.
@@ -82,59 +92,102 @@ impl Waiter {
         self.poll(left)
     }
 
-    /// The descriptors that become readable on an announcement, in the order of the channels, for
-    /// a loop that also waits for a socket; call [`Waiter::drain`] after.
-    pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
-        self.listeners
-            .iter()
-            .map(|(_, listener)| raw::descriptor(listener))
+    /// The descriptor that is readable while a channel is announced, for a loop that also waits for a
+    /// socket; [`Waiter::announced`] says which.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        match &self.group {
+            Some(group) => group.0.as_fd(),
+            None => raw::descriptor(&self.listeners[0].1),
+        }
     }
 
-    /// Takes back all announcements, so that the descriptors are quiet until the next. False when
-    /// there was none.
+    /// Tells `take` which channels are announced, by their index; not all of them at once where they are
+    /// many: [`Waiter::descriptor`] stays readable for the rest. A single channel is always told.
     ///
     /// # Errors
-    /// When a listener is broken.
-    pub fn drain(&mut self) -> Result<bool, ChannelError> {
-        let mut found = false;
-        for (channel, listener) in &self.listeners {
-            found |= drain(channel, listener)?;
+    /// When the look itself fails.
+    pub fn announced(&mut self, mut take: impl FnMut(usize)) -> Result<(), ChannelError> {
+        let Some(group) = &self.group else {
+            take(0);
+            return Ok(());
+        };
+        // On the stack: waiting is part of the measured path, which does not allocate.
+        let mut events = [EpollEvent::empty(); ANNOUNCED_PER_LOOK];
+        let found = match group.wait(&mut events, EpollTimeout::ZERO) {
+            Ok(count) => count,
+            Err(Errno::EINTR) => 0,
+            Err(errno) => return Err(wait_error(&self.listeners[0].0, errno)),
+        };
+        for event in &events[..found] {
+            if let Ok(index) = usize::try_from(event.data()) {
+                take(index);
+            }
         }
-        Ok(found)
+        Ok(())
+    }
+
+    /// Takes back the announcements of the channel with `index`, so that it is quiet until the next. False
+    /// when there was none.
+    ///
+    /// # Errors
+    /// When the listener is broken.
+    pub fn drain(&mut self, index: usize) -> Result<bool, ChannelError> {
+        let (channel, listener) = &self.listeners[index];
+        drain(channel, listener)
+    }
+
+    /// The channel to look at after a quiet wait, each in its turn: whatever became of its descriptor, what
+    /// was announced is found then.
+    pub fn next_swept(&mut self) -> usize {
+        let next = self.swept;
+        self.swept = (next + 1) % self.listeners.len();
+        next
     }
 
     fn poll(&mut self, timeout: Option<Duration>) -> Result<Wake, ChannelError> {
         let timeout = timeout.map(TimeSpec::from_duration);
-        // On the stack: waiting is part of the measured path, which does not allocate.
-        let mut entries: [PollFd<'_>; WAITER_CHANNELS_MAX] = array::from_fn(|index| {
-            let (_, listener) = &self.listeners[index.min(self.listeners.len() - 1)];
-            PollFd::new(raw::descriptor(listener), PollFlags::POLLIN)
-        });
-        let entries = &mut entries[..self.listeners.len()];
-        match ppoll(entries, timeout, None) {
-            // Whatever became of the descriptor, what was announced is found here.
+        let mut entries = [PollFd::new(self.descriptor(), PollFlags::POLLIN)];
+        match ppoll(&mut entries, timeout, None) {
             Ok(0) => {
-                return Ok(if self.drain()? {
+                let quiet = self.next_swept();
+                let is_woken = self.drain(quiet)?;
+                Ok(if is_woken {
                     Wake::Woken
                 } else {
                     Wake::TimedOut
-                });
+                })
             }
-            Ok(_) => {}
-            Err(Errno::EINTR) => return Ok(Wake::Interrupted),
-            Err(errno) => {
-                return Err(ChannelError::Wait {
-                    channel: self.listeners[0].0.clone(),
-                    source: errno.into(),
-                });
+            Ok(_) => {
+                let mut announced = [0; ANNOUNCED_PER_LOOK];
+                let mut count = 0;
+                self.announced(|index| {
+                    announced[count] = index;
+                    count += 1;
+                })?;
+                for &index in &announced[..count] {
+                    self.drain(index)?;
+                }
+                Ok(Wake::Woken)
             }
+            Err(Errno::EINTR) => Ok(Wake::Interrupted),
+            Err(errno) => Err(wait_error(&self.listeners[0].0, errno)),
         }
-        for (entry, (channel, listener)) in entries.iter().zip(&self.listeners) {
-            if entry.any().unwrap_or(true) {
-                drain(channel, listener)?;
-            }
-        }
-        Ok(Wake::Woken)
+    }
+}
+
+fn group_of(listeners: &[(String, Listener<ipc::Service>)]) -> nix::Result<Epoll> {
+    let group = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC)?;
+    for (index, (_, listener)) in (0..).zip(listeners) {
+        let event = EpollEvent::new(EpollFlags::EPOLLIN, index);
+        group.add(raw::descriptor(listener), event)?;
+    }
+    Ok(group)
+}
+
+fn wait_error(channel: &str, errno: Errno) -> ChannelError {
+    ChannelError::Wait {
+        channel: channel.to_owned(),
+        source: errno.into(),
     }
 }
 
@@ -189,11 +242,4 @@ fn drain(channel: &str, listener: &Listener<ipc::Service>) -> Result<bool, Chann
         }
     }
     Ok(found)
-}
-
-impl AsFd for Waiter {
-    /// The first channel's descriptor, for the common case of one channel.
-    fn as_fd(&self) -> BorrowedFd<'_> {
-        raw::descriptor(&self.listeners[0].1)
-    }
 }

@@ -1,5 +1,5 @@
 //! What channels and links say about processes and hosts: which process ends a channel, which
-//! link carries it, and on which ports. See `check`.
+//! link carries it, and which ports links take. See `check`.
 
 use hil_core::case_study::ChannelSpec;
 
@@ -8,7 +8,7 @@ use super::errors::{Fault, Faults, Place};
 use super::file::{ChannelEntry, ProcessEntry};
 use super::file_links::{LinkEntry, crossing_words};
 use super::known::KnownCase;
-use super::model::{Channel, ChannelPorts, MessageLayout, Process, Program, Topology};
+use super::model::{Channel, Host, LinkPorts, MessageLayout, Process, Program, Topology};
 use super::model_links::{Link, Via};
 use super::reader::At;
 use super::tree::join;
@@ -48,7 +48,6 @@ pub(super) fn check(
         links: &links,
         tables,
         between: vec![None; links.len()],
-        carried_counts: vec![0; links.len()],
         faults,
     };
     for channel in &mut channels {
@@ -56,7 +55,7 @@ pub(super) fn check(
     }
     let mut between = core::mem::take(&mut routes.between);
     routes.check_named_hosts();
-    check_port_ranges(&links, &routes.carried_counts, faults);
+    check_port_ranges(topology, &links, &between, faults);
     topology.channels = channels;
     topology.links = links
         .into_iter()
@@ -115,7 +114,7 @@ fn case_channels(
                 (false, None) => ChannelEntry::default_depth(),
             },
             link: entry.and_then(ChannelEntry::link_name),
-            ports: None,
+            is_carried: false,
             is_foreign: false,
         });
     }
@@ -207,7 +206,7 @@ fn foreign_channel(
         to: Some(to),
         depth: entry.depth,
         link: entry.link_name(),
-        ports: None,
+        is_carried: false,
         is_foreign: true,
     })
 }
@@ -253,12 +252,11 @@ struct Routes<'a> {
     tables: Tables<'a>,
     /// Hosts of each link, in alphabetical order, from the first channel that uses it.
     between: Vec<Option<[String; 2]>>,
-    carried_counts: Vec<usize>,
     faults: &'a Faults,
 }
 
 impl Routes<'_> {
-    /// Checks the link of `channel` against the hosts of its ends; gives it its ports.
+    /// Checks the link of `channel` against the hosts of its ends.
     fn assign(&mut self, channel: &mut Channel) {
         let host_of = |name: &str| self.topology.process(name).map(|process| &process.host);
         // A link given to a channel without consumer is a fault already.
@@ -316,21 +314,7 @@ impl Routes<'_> {
             return;
         }
         self.between[index] = Some(hosts);
-        let Some(hop) = link.via.as_ref().and_then(Via::hop) else {
-            return;
-        };
-        channel.ports = ChannelPorts::of(hop.port, self.carried_counts[index]);
-        self.carried_counts[index] += 1;
-        if channel.ports.is_none() {
-            let count = self.carried_counts[index];
-            let fault = format!(
-                "{} leaves no ports below 65536 for {count} channels",
-                hop.port
-            );
-            let key = join(&link.path, "port");
-            self.faults
-                .add(key, Some(link.place), Fault::Inconsistent(fault));
-        }
+        channel.is_carried = true;
     }
 
     /// The link the channel names, if any; `Err` when there is none of that name.
@@ -405,22 +389,44 @@ fn place_of(value: Option<&At<String>>, table: Place) -> Place {
 }
 
 /// Ports of different links must differ even between different hosts: on one PC they meet.
-fn check_port_ranges(links: &[LinkEntry], carried_counts: &[usize], faults: &Faults) {
-    let mut taken: Vec<(&str, core::ops::Range<usize>)> = Vec::new();
-    for (link, count) in links.iter().zip(carried_counts) {
-        let Some(hop) = link.via.as_ref().and_then(Via::hop) else {
+fn check_port_ranges(
+    topology: &Topology,
+    links: &[LinkEntry],
+    between: &[Option<[String; 2]>],
+    faults: &Faults,
+) {
+    let mut taken: Vec<(&str, core::ops::Range<u32>)> = Vec::new();
+    for (link, hosts) in links.iter().zip(between) {
+        let hop = link.via.as_ref().and_then(Via::hop);
+        // A link that carries nothing takes no ports.
+        let Some((hop, hosts)) = hop.zip(hosts.as_ref()) else {
             continue;
         };
-        let base = usize::from(hop.port);
-        let range = base..base + 2 * count;
-        let overlaps = |(_, other): &&(&str, core::ops::Range<usize>)| {
+        let [one, other] = hosts.each_ref().map(|name| {
+            let host = topology.host(name);
+            host.map(Host::gateway_address)
+        });
+        let count = LinkPorts::count(one == other);
+        let range = u32::from(hop.port)..u32::from(hop.port) + u32::from(count);
+        let last = range.end - 1;
+        let add = |fault: String| {
+            let key = join(&link.path, "port");
+            faults.add(key, Some(link.place), Fault::Inconsistent(fault));
+        };
+        if last > u32::from(u16::MAX) {
+            let port = hop.port;
+            add(format!(
+                "{port} leaves no ports below 65536: a link takes {count}"
+            ));
+        }
+        let overlaps = |(_, other): &&(&str, core::ops::Range<u32>)| {
             range.start < other.end && other.start < range.end
         };
         if let Some((other, _)) = taken.iter().find(overlaps) {
-            let last = range.end.saturating_sub(1);
-            let fault = format!("{base} to {last} overlaps with the ports of link `{other}`");
-            let key = join(&link.path, "port");
-            faults.add(key, Some(link.place), Fault::Inconsistent(fault));
+            let base = hop.port;
+            add(format!(
+                "{base} to {last} overlaps with the ports of link `{other}`"
+            ));
         }
         taken.push((&link.name, range));
     }

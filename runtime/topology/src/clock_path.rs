@@ -44,7 +44,7 @@ impl ClockPath<'_> {
     }
 
     /// Number in datagrams: counted down from the top, where no channel's is.
-    pub const fn channel_id(&self) -> u16 {
+    pub const fn flow_number(&self) -> u16 {
         u16::MAX - self.index
     }
 

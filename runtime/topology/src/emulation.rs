@@ -9,7 +9,7 @@ use hil_link::spec::{LinkPlace, LinkSpec, Way};
 use serde::{Deserialize, Serialize};
 
 use super::emulation_room::EmulationRoom;
-use super::model::{Crossing, Direction};
+use super::model::Crossing;
 use super::trace_source::{TraceError, TraceLaunch};
 
 /// A link model in front of a receiver: what makes it the same model live and in virtual time.
@@ -45,10 +45,7 @@ impl EmulationLaunch {
         Some(Self {
             spec: crossing.spec?.clone(),
             link: crossing.link.name.clone(),
-            way: match crossing.direction {
-                Direction::Forward => Way::Forward,
-                Direction::Backward => Way::Backward,
-            },
+            way: crossing.direction.way(),
             seed,
             trace: crossing.link.emulation().and_then(|emulation| {
                 let trace = emulation.trace.as_ref()?;

@@ -15,6 +15,8 @@ use crate::emulation::{EmulationError, EmulationLaunch};
 const BURST_COUNT: usize = 1024;
 /// Most datagrams a gateway holds on one channel.
 const CAPACITY_MAX: usize = 65_536;
+/// Most datagrams a gateway holds on all channels of one way of a link.
+const FLOW_CAPACITY_MAX: usize = 1 << 20;
 /// Datagrams per second that room is made for, while they are under way.
 const SIZED_RATE_HZ: f64 = 4_000.0;
 /// And while an outage holds them.
@@ -97,6 +99,18 @@ impl EmulationRoom {
 }
 
 impl EmulationRoom {
+    /// Room for this and for what another channel holds beside it, as far as one gateway can have it.
+    #[must_use]
+    pub fn and(self, other: Self) -> Self {
+        let wanted = self.capacity_count + other.capacity_count;
+        let largest = self.capacity_count.max(other.capacity_count);
+        Self {
+            capacity_count: wanted.min(FLOW_CAPACITY_MAX.max(largest)),
+            held_max: self.held_max.max(other.held_max),
+            rate_max_hz: self.rate_max_hz + other.rate_max_hz,
+        }
+    }
+
     /// The longest fixed delay that this much room holds at 100 messages per second.
     pub fn longest_delay(&self) -> Duration {
         Duration::from_secs_f64(self.capacity_count as f64 / LEAST_RATE_HZ)

@@ -54,8 +54,8 @@ pub use known::{
     KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with, parameters_of,
 };
 pub use model::{
-    Case, Channel, ChannelPorts, Crossing, Direction, Execution, Host, MessageLayout, OnExit,
-    Process, Program, Run, Scheduling, Topology, Wait,
+    Case, Channel, Crossing, Direction, Execution, Host, LinkPorts, MessageLayout, OnExit, Process,
+    Program, Run, Scheduling, Topology, Wait,
 };
 pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via, transport};
 pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};

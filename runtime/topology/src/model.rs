@@ -7,7 +7,8 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use hil_core::message::type_hash;
-use hil_link::spec::LinkSpec;
+use hil_link::condition::{flow_label, flow_name};
+use hil_link::spec::{LinkSpec, Way};
 
 use super::model_links::{Hop, Link};
 
@@ -217,8 +218,8 @@ pub struct Channel {
     pub depth: usize,
     /// Name of its link, if the file gives one.
     pub link: Option<String>,
-    /// Ports of its gateways; `None` when it stays in shared memory.
-    pub ports: Option<ChannelPorts>,
+    /// True when gateways carry it over its link, false when it stays in shared memory.
+    pub is_carried: bool,
     /// True when the file declares it, false when the case does.
     pub is_foreign: bool,
 }
@@ -230,22 +231,30 @@ impl Channel {
     }
 }
 
-/// The two ports of a channel on a hop. Over TCP only the receiver's is used.
+/// The two ports of one way of a link. Over TCP only the receiver's is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ChannelPorts {
-    /// Bound on the producer's host.
+pub struct LinkPorts {
+    /// Bound on the host that sends.
     pub sender: u16,
-    /// Bound on the consumer's host.
+    /// Bound on the host that receives.
     pub receiver: u16,
 }
 
-impl ChannelPorts {
-    /// The ports of the channel with `index` among those of a link with base port `base`:
-    /// `base + 2 index` and the next; `None` beyond 65535.
-    pub fn of(base: u16, index: usize) -> Option<Self> {
-        let offset = u16::try_from(index).ok()?.checked_mul(2)?;
-        let sender = base.checked_add(offset)?;
-        let receiver = sender.checked_add(1)?;
+impl LinkPorts {
+    /// Ports that a link takes from its `port` on: one for each way, of one number at both ends; between
+    /// hosts at one address as many again for the ends that send.
+    pub const fn count(is_one_address: bool) -> u16 {
+        if is_one_address { 4 } else { 2 }
+    }
+
+    /// The ports of one way of a link with first port `base`; `None` beyond 65535.
+    pub fn of(base: u16, direction: Direction, is_one_address: bool) -> Option<Self> {
+        let offset = match direction {
+            Direction::Forward => 0,
+            Direction::Backward => 1,
+        };
+        let receiver = base.checked_add(offset)?;
+        let sender = receiver.checked_add(if is_one_address { 2 } else { 0 })?;
         Some(Self { sender, receiver })
     }
 }
@@ -268,8 +277,8 @@ pub struct Crossing<'a> {
     pub link: &'a Link,
     /// Settings of that link.
     pub hop: &'a Hop,
-    /// Its ports.
-    pub ports: ChannelPorts,
+    /// Ports of that way of the link.
+    pub ports: LinkPorts,
     /// Host of the producer.
     pub from_host: &'a Host,
     /// Host of the consumer.
@@ -356,8 +365,7 @@ impl Topology {
 
     /// How `channel` leaves its host; `None` when it stays.
     pub fn crossing<'a>(&'a self, channel: &'a Channel) -> Option<Crossing<'a>> {
-        let ports = channel.ports?;
-        let link = self.link(channel.link.as_deref()?)?;
+        let link = self.link(channel.link.as_deref().filter(|_| channel.is_carried)?)?;
         let hop = link.hop()?;
         let from_host = self.host(&self.process(&channel.from)?.host)?;
         let to_host = self.host(&self.process(channel.to.as_deref()?)?.host)?;
@@ -367,6 +375,8 @@ impl Topology {
         } else {
             Direction::Backward
         };
+        let is_one_address = from_host.gateway_address() == to_host.gateway_address();
+        let ports = LinkPorts::of(hop.port, direction, is_one_address)?;
         let emulation = link.emulation();
         let spec = emulation.map(|emulation| match direction {
             Direction::Forward => &emulation.forward,
@@ -382,6 +392,40 @@ impl Topology {
             direction,
             spec,
         })
+    }
+}
+
+impl Direction {
+    /// The same way as the link models call it.
+    pub const fn way(self) -> Way {
+        match self {
+            Self::Forward => Way::Forward,
+            Self::Backward => Way::Backward,
+        }
+    }
+}
+
+impl Crossing<'_> {
+    /// Name of all that goes this way on the link: the flow.
+    pub fn flow_name(&self) -> String {
+        flow_name(&self.link.name, self.direction.way())
+    }
+
+    /// The same for a reader: `hop/forward`.
+    pub fn flow_label(&self) -> String {
+        flow_label(&self.flow_name()).to_owned()
+    }
+}
+
+impl Topology {
+    /// Number in datagrams of what goes the way of `crossing` on its link: counted down from the numbers of
+    /// the clock paths, where no channel's is.
+    pub fn flow_number(&self, crossing: &Crossing<'_>) -> u16 {
+        let links = self.links.iter();
+        let before = links.take_while(|link| link.name != crossing.link.name);
+        let ways = 2 * before.count() + usize::from(crossing.direction == Direction::Backward);
+        let number = u16::try_from(self.clock_paths().count() + ways).unwrap_or(u16::MAX);
+        u16::MAX - number
     }
 }
 

@@ -97,7 +97,7 @@ pub struct Hop {
     pub transport: &'static Description,
     /// The transport's own options, by their keys.
     pub options: BTreeMap<String, i64>,
-    /// First port; see [`ChannelPorts::of`](super::ChannelPorts::of).
+    /// First port; see [`LinkPorts::of`](super::LinkPorts::of).
     pub port: u16,
     /// Differentiated-services code point (RFC 2474), 0..=63.
     pub dscp: u8,

@@ -14,7 +14,8 @@ use hil_core::message::Envelope;
 use hil_core::time::Instant;
 use hil_protocol::wire::decode;
 use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, IngressBridge, IngressSettings,
+    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, IngressBridge,
+    IngressSettings,
 };
 
 use crate::Verdict;
@@ -23,19 +24,28 @@ use crate::input::Input;
 const SENDER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::new(10, 0, 0, 1)), 9);
 const RECEIVER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::new(10, 0, 0, 2)), 9);
 const SIZE_MAX_BYTES: u32 = 3000;
+const SIZE_SHORT_BYTES: u32 = 400;
 /// Datagrams under way one way; more are lost.
 const PATH_LENGTH: usize = 32;
 /// More steps than any interesting input has.
 const STEPS_MAX: usize = 512;
 
-/// Makes bridges as a gateway would for the same channel.
-fn channel() -> ChannelIdentity {
-    ChannelIdentity::new(3, "arm/command", "test.Command.v1", SIZE_MAX_BYTES, 8)
+/// Makes bridges as a gateway would for the same flow: a channel whose messages may come in pieces, and one
+/// whose never do.
+fn flow() -> FlowIdentity {
+    FlowIdentity {
+        flow: 65_535,
+        name: "hil/link/hop/forward".to_owned(),
+        channels: vec![
+            ChannelIdentity::new(3, "arm/command", "test.Command.v1", SIZE_MAX_BYTES, 8),
+            ChannelIdentity::new(5, "arm/mode", "test.Mode.v1", SIZE_SHORT_BYTES, 8),
+        ],
+    }
 }
 
 pub(crate) fn egress(session: u32) -> EgressBridge {
     let settings = EgressSettings {
-        channel: channel(),
+        flow: flow(),
         session,
         domain: [1; 16],
         clock_id: 11,
@@ -46,7 +56,7 @@ pub(crate) fn egress(session: u32) -> EgressBridge {
 }
 
 pub(crate) fn ingress() -> IngressBridge {
-    let settings = IngressSettings::new(channel(), 200, [2; 16], 22);
+    let settings = IngressSettings::new(flow(), 200, [2; 16], 22);
     IngressBridge::new(settings).expect("the settings are fixed")
 }
 
@@ -59,9 +69,9 @@ struct Conversation {
     session: u32,
     epoch: u32,
     sequence: u64,
-    /// What was published, by start of the producer and number.
-    published: BTreeMap<(u32, u64), Vec<u8>>,
-    delivered: BTreeSet<(u32, u64)>,
+    /// What was published, by channel, start of the producer and number.
+    published: BTreeMap<(usize, u32, u64), Vec<u8>>,
+    delivered: BTreeSet<(usize, u32, u64)>,
     /// Bytes came that no gateway made.
     is_forged: bool,
     handed_to_ingress: u64,
@@ -107,7 +117,9 @@ impl Conversation {
     }
 
     fn publish(&mut self, argument: usize) {
-        // Most fit into a datagram, some take two or three.
+        // Most fit into a datagram, some take two or three; every third goes to the other channel, which
+        // refuses what is too long for it.
+        let channel = usize::from(argument.is_multiple_of(3));
         let length = if argument < 200 {
             argument
         } else {
@@ -122,10 +134,11 @@ impl Conversation {
             epoch: self.epoch,
             ..Envelope::default()
         };
-        let key = (self.epoch, self.sequence);
+        let key = (channel, self.epoch, self.sequence);
         self.sequence += 1;
         // A refusal is counted by the bridge; then nothing leaves.
-        if self.egress.on_local(self.now, &envelope, &payload).is_ok() {
+        let staged = self.egress.on_local(self.now, channel, &envelope, &payload);
+        if staged.is_ok() {
             self.published.insert(key, payload);
         }
     }
@@ -136,10 +149,10 @@ impl Conversation {
             let Some(transmit) = self.egress.poll_transmit(self.now) else {
                 break;
             };
-            let (kind, sequence) = (transmit.kind, transmit.sequence);
+            let (kind, channel, sequence) = (transmit.kind, transmit.channel, transmit.sequence);
             let bytes = transmit.datagram.to_vec();
             assert!(decode(&bytes).is_ok(), "a gateway sends what is refused");
-            self.egress.on_transmit_stamp(kind, sequence, 700);
+            self.egress.on_transmit_stamp(kind, channel, sequence, 700);
             if self.forward.len() < PATH_LENGTH {
                 self.forward.push_back(bytes);
             }
@@ -182,7 +195,8 @@ impl Conversation {
             .ingress
             .on_datagram(self.now, arrival, bytes, &mut |delivery| {
                 assert!(delivery.payload.len() <= SIZE_MAX_BYTES as usize);
-                let key = (delivery.message.epoch, delivery.message.sequence);
+                let message = delivery.message;
+                let key = (message.channel, message.epoch, message.sequence);
                 if is_forged {
                     return;
                 }
@@ -262,14 +276,20 @@ impl Conversation {
         let refused = self.ingress.refusals().total();
         assert_eq!(counts.datagram_count, counts.accepted_count() + refused);
         self.ingress.finish();
-        let sequences = *self.ingress.sequence_counts();
-        if !self.is_forged {
-            let seen = sequences.received_count;
-            let delivered = counts.delivered_count + counts.superseded_count;
-            assert_eq!(seen, delivered, "received and not delivered");
-            assert_eq!(counts.delivered_count, self.delivered.len() as u64);
+        let mut delivered_count = 0;
+        for channel in 0..flow().channels.len() {
+            let counts = *self.ingress.channel_counts(channel);
+            delivered_count += counts.delivered_count;
+            if !self.is_forged {
+                let seen = self.ingress.sequence_counts(channel).received_count;
+                let delivered = counts.delivered_count + counts.superseded_count;
+                assert_eq!(seen, delivered, "received and not delivered");
+            }
         }
-        Verdict::of(counts.delivered_count > 0)
+        if !self.is_forged {
+            assert_eq!(delivered_count, self.delivered.len() as u64);
+        }
+        Verdict::of(delivered_count > 0)
     }
 }
 

@@ -13,7 +13,7 @@ use socket2::{Domain, Protocol, Socket, Type};
 use crate::lab::LabHost;
 
 /// UDP ports of the gateways, and the TCP port of the supervisors.
-const GATEWAY_PORTS: std::ops::Range<u16> = 7400..7404;
+const GATEWAY_PORTS: std::ops::Range<u16> = 7400..7402;
 const CONTROL_PORT: u16 = 7399;
 const IPV4_BYTES: usize = 20;
 const UDP_BYTES: usize = 8;

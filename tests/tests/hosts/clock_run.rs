@@ -60,12 +60,12 @@ fn check_alignment(pair: &HostPairClock) {
     assert!(error_ns.unsigned_abs() <= bound.largest_ns, "{offset:?}");
     assert_eq!(figures.steps, [], "no clock was stepped");
     assert!(figures.exchange_count >= 100, "{figures:?}");
-    // Four of the six channels are UDP, whose stamps are the kernel's at all four places; those of
-    // TCP never are. With one place missing it would be a half.
+    // Two of the four ways are UDP, whose stamps are the kernel's at all four places; those of TCP never
+    // are. With one place missing it would be three eighths.
     let count = |kind| figures.stamp_counts.get(&kind).copied().unwrap_or(0);
     let kernel_count = count(StampKind::KernelSoftware);
     let all_count: u64 = figures.stamp_counts.values().sum();
-    assert!(kernel_count * 100 >= all_count * 58, "{figures:?}");
+    assert!(kernel_count * 100 >= all_count * 47, "{figures:?}");
 }
 
 /// The clocks are of one oscillator, so a delay measured across them is true within its bound; it

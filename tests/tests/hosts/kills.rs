@@ -14,6 +14,7 @@ use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
+use hil_tests::split::direction;
 use hil_tests::trial::{RunFiles, Trial, load_average, wait_until};
 use nix::sys::signal::{Signal, kill};
 
@@ -241,8 +242,7 @@ fn a_receiver_that_stood_still_is_no_network_result() {
         assert_every_message_is_accounted_for(&summary);
         let channel = "shuttle/command";
         let said = describe(channel, account(&summary, channel));
-        let of_channel = summary.channels.iter().find(|one| one.name == channel);
-        let no_room = of_channel.unwrap().no_room_count;
+        let no_room = direction(&summary, channel, "ingress").no_room_count();
         let lost = account(&summary, channel).fates.of(MessageFate::LostOnWire);
         println!("{said}; {no_room} datagrams without room");
         assert!(lost > 0 && lost <= no_room, "{lost} of {no_room}: {said}");

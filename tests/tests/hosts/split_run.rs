@@ -15,6 +15,7 @@ use hil_tests::account::{
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
+use hil_tests::split::direction;
 use hil_tests::trial::{RunFiles, Trial, wait_until};
 
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
@@ -137,8 +138,9 @@ fn check_account(summary: &RunSummary) {
         let channel = channel(summary, name);
         assert_eq!(channel.link, LinkKind::named("udp").unwrap());
         assert_both_ends_are_stamped(name, account(summary, name));
-        assert_eq!(channel.directions.len(), 2, "{:?}", channel.directions);
-        for direction in &channel.directions {
+        assert_eq!(channel.ends.len(), 2, "{:?}", channel.ends);
+        for side in ["egress", "ingress"] {
+            let direction = direction(summary, name, side);
             let states = [
                 "established",
                 "said farewell",

@@ -25,7 +25,7 @@ use hil_tests::latency::Latencies;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::soak::held::Held;
-use hil_tests::split::{Split, count, delays, direction, refused};
+use hil_tests::split::{Split, count, count_of_channel, delays, direction, refused};
 use hil_tests::trial::Trial;
 use nix::unistd::Pid;
 
@@ -87,9 +87,13 @@ fn made_up(recorded: &[Vec<u8>], random: &mut RandomStream, number: u64) -> Vec<
             out[68..72].fill(0);
             out.truncate(out.len() - 16);
         }
-        5 => out[12] = !out[12],
+        // A request for keys of another flow.
+        5 => {
+            out[5] = 7;
+            out[12] = !out[12];
+        }
         6 => out[8..12].copy_from_slice(&byte[..4]),
-        7 => out[4] = 2,
+        7 => out[4] = 1,
         _ => {
             out.clear();
             out.extend((0..100).map(|_| random.next_u64().to_le_bytes()[0]));
@@ -110,7 +114,7 @@ fn ingress_ns(gateway: Pid) -> u64 {
     let tasks = fs::read_dir(format!("/proc/{gateway}/task")).unwrap();
     let times = tasks.flatten().filter_map(|task| {
         let name = fs::read_to_string(task.path().join("comm")).ok()?;
-        let is_it = name.trim() == "in shuttle/comm";
+        let is_it = name.trim() == "in hop/forward";
         let times = fs::read_to_string(task.path().join("schedstat")).ok()?;
         is_it.then(|| times.split(' ').next()?.parse::<u64>().ok())?
     });
@@ -160,7 +164,7 @@ fn play(record: &Path, lab: &Lab, stranger: &Attacker, span: Duration, attacks: 
     };
     let split = Split::start(lab, &trial);
     split.wait_for_messages();
-    let recorded = stranger.overhear(PORT + 1, 200, LIMIT);
+    let recorded = stranger.overhear(PORT, 200, LIMIT);
     assert!(recorded.len() >= 200, "the stranger hears the wire");
     let mut random = RandomStream::new(9, "attack");
     let datagrams = (0..MADE_UP).map(|number| made_up(&recorded, &mut random, number));
@@ -172,7 +176,7 @@ fn play(record: &Path, lab: &Lab, stranger: &Attacker, span: Duration, attacks: 
         let watching = scope.spawn(|| watch_memory(gateway, span));
         let flood = if attacks {
             let from = SocketAddrV4::new(ADDRESSES[0], PORT);
-            let to = SocketAddrV4::new(ADDRESSES[1], PORT + 1);
+            let to = SocketAddrV4::new(ADDRESSES[1], PORT);
             stranger.flood(from, to, span, RATE, &datagrams)
         } else {
             thread::sleep(span);
@@ -239,7 +243,7 @@ fn assert_refused_by_cause(ingress: &DirectionSummary) {
         "forged or damaged",
         "too short",
         "not sealed",
-        "foreign channel",
+        "foreign flow",
         "foreign session",
         "wrong version",
         "foreign protocol",
@@ -269,7 +273,10 @@ fn assert_reconciled(phase: &Phase) {
     let sealed = count(sender, "seal: sealed_count");
     assert!(opened <= sealed, "{opened} opened, {sealed} sealed");
     assert_eq!(opened, count(ingress, "datagram_count"));
-    assert_eq!(count(ingress, "messages: duplicate_count"), 0);
+    assert_eq!(
+        count_of_channel(robot, CHANNELS[0], "messages: duplicate_count"),
+        0
+    );
     let (stranger, peer) = (phase.flood.sent_count, count(sender, "socket: sent_count"));
     let missing = (stranger + peer).checked_sub(received + no_room);
     println!(

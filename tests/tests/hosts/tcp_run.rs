@@ -13,6 +13,7 @@ use hil_tests::account::{
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::{INTERFACE, Lab, LabHost};
 use hil_tests::run_folder::RunFolder;
+use hil_tests::split::direction;
 use hil_tests::trial::{RunFiles, Trial, wait_until};
 
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
@@ -77,12 +78,6 @@ impl Split {
         }
         summaries
     }
-}
-
-fn direction<'a>(summary: &'a RunSummary, name: &str, which: &str) -> &'a DirectionSummary {
-    let mut all = channel(summary, name).directions.iter();
-    let found = all.find(|one| one.direction.word() == which);
-    found.unwrap_or_else(|| panic!("{name} has no {which}"))
 }
 
 fn count(direction: &DirectionSummary, name: &str) -> u64 {

@@ -15,8 +15,8 @@ use hil_core::time::{Instant, duration_ns};
 use hil_link::spec::{LinkPlace, LinkSpec};
 use hil_protocol::wire::Kind;
 use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, Delivery, EgressBridge, EgressSettings, IngressBridge,
-    IngressSettings, PeerState,
+    ArrivalStamps, ChannelIdentity, Delivery, EgressBridge, EgressSettings, FlowIdentity,
+    IngressBridge, IngressSettings, PeerState,
 };
 use hil_shuttle::{Shuttle, ShuttleParameters};
 use hil_teleoperation::{Teleoperation, TeleoperationParameters};
@@ -66,9 +66,14 @@ impl Hop {
             u32::try_from(message.size_bytes).unwrap(),
             u32::try_from(message.alignment_bytes).unwrap(),
         );
-        let ingress = IngressSettings::new(channel.clone(), 7, [2; 16], 22);
+        let flow = FlowIdentity {
+            flow: 65_535,
+            name: "hil/link/hop/forward".to_owned(),
+            channels: vec![channel],
+        };
+        let ingress = IngressSettings::new(flow.clone(), 7, [2; 16], 22);
         let egress = EgressSettings {
-            channel,
+            flow,
             session: 5,
             domain: [1; 16],
             clock_id: 11,
@@ -150,7 +155,7 @@ impl Carrier for Hop {
         self.exchange(gateway_now, Fate::Lost, &mut |_, _, _| {});
         let fate = LinkModel::offer(&mut self.link, now, payload.len());
         self.counts.borrow_mut().messages += 1;
-        let staged = self.egress.on_local(gateway_now, envelope, payload);
+        let staged = self.egress.on_local(gateway_now, 0, envelope, payload);
         assert_eq!(staged, Ok(()), "message {} at {now}", envelope.sequence);
         self.exchange(gateway_now, fate, deliver);
     }

@@ -81,7 +81,7 @@ fn check(
     let channel = summary.channels.iter().find(|one| one.name == name);
     let channel = channel.unwrap();
     let account = channel.account.as_ref().unwrap();
-    let counters = channel.directions.iter().flat_map(|one| &one.counters);
+    let counters = channel.ends.iter().flat_map(|one| &one.counters);
     let by_chance: Vec<u64> = counters
         .filter(|counter| counter.name == "link_chance_lost_count")
         .map(|counter| counter.count)

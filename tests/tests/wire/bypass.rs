@@ -15,11 +15,11 @@ use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
 use hil_protocol::body::HelloStatus;
 use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, EgressBridge, EgressEvent, EgressSettings, IngressBridge,
-    IngressSettings, LocalRefusal, PeerState, Refusal,
+    ArrivalStamps, ChannelIdentity, EgressBridge, EgressEvent, EgressSettings, FlowIdentity,
+    IngressBridge, IngressSettings, LocalRefusal, PeerState, Refusal,
 };
 use hil_rundir::launch::{
-    DirectionLaunch, GatewayWork, Side, SocketLaunch, Work, WorkerLaunch, write,
+    ChannelLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch, Work, WorkerLaunch, write,
 };
 use hil_shm::{ChannelHolder, ChannelSettings, Domain};
 use hil_shuttle::ShuttleCommand;
@@ -30,15 +30,21 @@ use hil_tests::trial::{Trial, wait_until};
 use hil_topology::Timestamps;
 
 const CHANNEL: &str = "shuttle/command";
+const FLOW: &str = "hil/link/hop/forward";
 const LIMIT: Duration = Duration::from_mins(1);
 const REASON: &str = "one shared-memory domain, so messages would bypass the network";
 
 /// Lets an egress with `domain` greet an ingress with domain 2; gives the answer.
 fn greet(domain: u8) -> (EgressBridge, IngressBridge, EgressEvent) {
     let channel = ChannelIdentity::new(1, CHANNEL, "hil.ShuttleCommand.v1", 16, 8);
-    let ingress = IngressSettings::new(channel.clone(), 7, [2; 16], 22);
+    let flow = FlowIdentity {
+        flow: 65_535,
+        name: FLOW.to_owned(),
+        channels: vec![channel],
+    };
+    let ingress = IngressSettings::new(flow.clone(), 7, [2; 16], 22);
     let egress = EgressSettings {
-        channel,
+        flow,
         session: 5,
         domain: [domain; 16],
         clock_id: 11,
@@ -65,7 +71,7 @@ fn two_bridges_of_one_domain_refuse_each_other() {
     assert_eq!(ingress.refusals().get(Refusal::SharedDomain), 1);
     assert_eq!(ingress.session(), None);
     let envelope = Envelope::default();
-    let staged = egress.on_local(Instant::from_ns(2_000), &envelope, &[0; 16]);
+    let staged = egress.on_local(Instant::from_ns(2_000), 0, &envelope, &[0; 16]);
     assert_eq!(staged, Err(LocalRefusal::ChannelRefused));
     assert!(HelloStatus::SharedDomain.label().contains(REASON));
 
@@ -133,12 +139,8 @@ fn free_ports() -> [SocketAddr; 2] {
 fn direction(side: Side, [local, peer]: [SocketAddr; 2]) -> DirectionLaunch {
     let message = MessageType::of::<ShuttleCommand>();
     DirectionLaunch {
-        channel: CHANNEL.to_owned(),
-        channel_id: 1,
-        message: message.name.to_owned(),
-        size_bytes: message.size_bytes,
-        alignment_bytes: message.alignment_bytes,
-        depth: 1,
+        flow: FLOW.to_owned(),
+        flow_number: 65_535,
         side,
         local,
         peer,
@@ -155,8 +157,15 @@ fn direction(side: Side, [local, peer]: [SocketAddr; 2]) -> DirectionLaunch {
         },
         wait: WaitMode::Block,
         realtime: RealtimeRequest::default(),
-        emulation: None,
-        is_clock_path: false,
+        channels: vec![ChannelLaunch {
+            channel: CHANNEL.to_owned(),
+            channel_id: 1,
+            message: message.name.to_owned(),
+            size_bytes: message.size_bytes,
+            alignment_bytes: message.alignment_bytes,
+            depth: 1,
+            emulation: None,
+        }],
     }
 }
 

@@ -13,7 +13,7 @@ use hil_capture::writer::PacketToWrite;
 use hil_capture::{CaptureInterface, esl, writer};
 use hil_net::{Direction, link_type};
 use hil_protocol::StampSource;
-use hil_protocol::body::{Hello, HelloAck, HelloStatus, ReceivedWindow, SyncResponse};
+use hil_protocol::body::{Hello, HelloAck, HelloStatus, SyncResponse};
 use hil_protocol::wire::{FollowUpField, HEADER_BYTES, Header, Kind};
 use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::child::run;
@@ -135,10 +135,8 @@ fn sample_frames() -> Vec<Vec<u8>> {
     let hello = Hello {
         domain: [0xd0; 16],
         clock_id: 0x99,
-        size_max_bytes: 640,
-        alignment_bytes: 8,
-        channel_name: "arm/command",
-        type_name: "ArmCommand",
+        channel_count: 400,
+        flow_name: "hil/link/hop/forward",
     };
     let ack = HelloAck {
         status: HelloStatus::SharedDomain,
@@ -152,12 +150,6 @@ fn sample_frames() -> Vec<Vec<u8>> {
         t2_ns: -12,
         t3_ns: 13,
         t2_source: StampSource::KernelSoftware,
-        window: Some(ReceivedWindow {
-            epoch: 0xe,
-            newest: 900,
-            bitmap: [3, 0, 0, 1 << 63],
-        }),
-        sync_received_count: 42,
     };
     let mut bodies = [vec![0; 200], vec![0; 200], vec![0; 200]];
     let lengths = [
@@ -167,7 +159,7 @@ fn sample_frames() -> Vec<Vec<u8>> {
     ];
     [
         datagram(&data, b"0123456789"),
-        datagram(&sample_header(Kind::SyncRequest), &[0; 80]),
+        datagram(&sample_header(Kind::SyncRequest), &[0; 40]),
         datagram(&sample_header(Kind::SyncResponse), &bodies[2][..lengths[2]]),
         datagram(&sample_header(Kind::Hello), &bodies[0][..lengths[0]]),
         datagram(&sample_header(Kind::HelloAck), &bodies[1][..lengths[1]]),
@@ -184,7 +176,7 @@ type Fields = Vec<(&'static str, String)>;
 fn common_fields() -> Fields {
     [
         ("hil.magic", "HILG"),
-        ("hil.version", "1"),
+        ("hil.version", "2"),
         ("hil.flags", "0x0000"),
         ("hil.session", "0x11223344"),
         ("hil.channel", "513"),
@@ -202,7 +194,6 @@ fn common_fields() -> Fields {
 fn own_fields() -> [Fields; 6] {
     let dd = "d0".repeat(16);
     let d1 = "d1".repeat(16);
-    let bitmap = format!("03{}{}80", "00".repeat(23), "00".repeat(7));
     let own: [&[(&'static str, &str)]; 6] = [
         &[
             ("hil.kind", "1"),
@@ -217,7 +208,7 @@ fn own_fields() -> [Fields; 6] {
         ],
         &[
             ("hil.kind", "2"),
-            ("hil.total_len", "80"),
+            ("hil.total_len", "40"),
             ("hil.follow_up.delta_ns", ""),
         ],
         &[
@@ -225,25 +216,18 @@ fn own_fields() -> [Fields; 6] {
             ("hil.sync.t1_ns", "11"),
             ("hil.sync.t2_ns", "-12"),
             ("hil.sync.t3_ns", "13"),
-            ("hil.sync.newest", "900"),
-            ("hil.sync.bitmap", &bitmap),
-            ("hil.sync.epoch", "0x0000000e"),
-            ("hil.sync.received_count", "42"),
             ("hil.sync.t2_source", "1"),
-            ("hil.sync.window_valid", "1"),
         ],
         &[
             ("hil.kind", "4"),
             ("hil.hello.domain", &dd),
             ("hil.hello.clock_id", "0x0000000000000099"),
-            ("hil.hello.size_max_bytes", "640"),
-            ("hil.hello.alignment_bytes", "8"),
-            ("hil.hello.channel_name", "arm/command"),
-            ("hil.hello.type_name", "ArmCommand"),
+            ("hil.hello.channel_count", "400"),
+            ("hil.hello.flow_name", "hil/link/hop/forward"),
         ],
         &[
             ("hil.kind", "5"),
-            ("hil.ack.status", "3"),
+            ("hil.ack.status", "2"),
             ("hil.ack.session", "0x00000055"),
             ("hil.ack.clock_id", "0x0000000000000066"),
             ("hil.ack.domain", &d1),
@@ -318,7 +302,7 @@ fn the_dissector_marks_what_is_not_as_it_must_be_and_leaves_others_alone() {
     let folder = RunFolder::new("dissector-broken");
     let hello = datagram(&sample_header(Kind::Hello), &[1; 41]);
     let mut newer = datagram(&sample_header(Kind::Bye), &[]);
-    newer[4] = 2;
+    newer[4] = 3;
     let frames = [
         hello,
         newer,

@@ -56,7 +56,7 @@ fn an_emulated_link_loses_and_delays_what_it_was_told_to() {
 
 /// Losses are those of the link model, and as many as its ratio allows.
 fn check_loss(channel: &ChannelSummary, account: &ChannelAccount) {
-    let counters = channel.directions.iter().flat_map(|one| &one.counters);
+    let counters = channel.ends.iter().flat_map(|one| &one.counters);
     let count_of = |name: &str| -> u64 {
         let chosen = counters.clone().filter(|counter| counter.label() == name);
         chosen.map(|counter| counter.count).sum()

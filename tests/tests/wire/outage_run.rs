@@ -101,7 +101,7 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
         let lost_count = messages.iter().filter(|(_, has_come)| !has_come).count() as u64;
         let virtually = hil_tests::account::account(&virtual_time, name);
         let lost_virtually = virtually.fates.lost_count();
-        let counters = channel(&summary, name).directions.iter();
+        let counters = channel(&summary, name).ends.iter();
         let emulated_count: u64 = counters
             .flat_map(|one| &one.counters)
             .filter(|one| one.label() == "socket: link_lost_count")
@@ -120,9 +120,9 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
         let tolerance = 2 * outages.len() as u64 + 2;
         assert!(lost_count.abs_diff(lost_virtually) <= tolerance);
         assert!(account.fates.of(MessageFate::LostOnWire) <= emulated_count);
-        let facts = channel(&summary, name)
-            .directions
-            .iter()
+        let carriers = summary.directions.iter();
+        let facts = carriers
+            .filter(|one| one.channels.iter().any(|channel| channel == name))
             .flat_map(|one| &one.facts);
         let told = facts.filter(|fact| fact.value.contains("2400 outages per hour of 300 ms"));
         assert_eq!(told.count(), 1);

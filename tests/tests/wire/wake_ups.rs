@@ -1,7 +1,7 @@
 //! A channel whose reader lost an announcement: it must be woken by the next ones all the same.
 //! Before, it never was again, and every message waited for the reader's own patience.
 
-use std::os::fd::{AsFd, AsRawFd};
+use std::os::fd::AsRawFd;
 use std::time::Duration;
 
 use hil_core::message::MessageType;
@@ -24,7 +24,7 @@ const NEVER: Duration = Duration::from_secs(20);
 /// emptying the socket.
 fn rob(waiter: &Waiter) {
     let mut byte = [0];
-    let socket = waiter.as_fd().as_raw_fd();
+    let socket = waiter.descriptor().as_raw_fd();
     assert_eq!(recv(socket, &mut byte, MsgFlags::MSG_DONTWAIT), Ok(1));
     let rest = recv(socket, &mut byte, MsgFlags::MSG_DONTWAIT);
     assert_eq!(rest, Err(Errno::EAGAIN));
@@ -45,7 +45,7 @@ fn a_reader_that_lost_an_announcement_is_woken_by_the_next() {
     // Whether it waits for a while, or takes announcements back for whatever reason.
     let recoveries: [fn(&mut Waiter); 2] = [
         |waiter| assert_eq!(waiter.wait(SHORT).unwrap(), Wake::Woken),
-        |waiter| assert!(waiter.drain().unwrap()),
+        |waiter| assert!(waiter.drain(0).unwrap()),
     ];
     for recover in recoveries {
         announce();

@@ -11,8 +11,8 @@ pub enum LocalRefusal {
     /// The network reported the peer unreachable, and it has not greeted back since.
     #[error("peer is down")]
     PeerDown,
-    /// The peer refused the channel.
-    #[error("peer refused the channel")]
+    /// The peer refused the flow.
+    #[error("peer refused the flow")]
     ChannelRefused,
     /// A gateway published it: its stamps are of another clock, and sending it on could loop.
     #[error("message was published by a gateway")]
@@ -34,9 +34,9 @@ pub enum LocalRefusal {
 }
 
 counts! {
-    /// Counters of an egress bridge. At rest
+    /// Counters of one channel of an egress bridge. At rest
     /// `offered = sent + message_failed + refused_count()`.
-    pub struct EgressCounts {
+    pub struct EgressChannelCounts {
         /// Messages offered by the local channel.
         offered_count,
         /// Messages given to the owner completely, and not reported as failed.
@@ -57,6 +57,14 @@ counts! {
         refused_pending_count,
         /// Refused: the session had ended.
         refused_closed_count,
+        /// Datagrams about it given to the owner, its farewell among them.
+        datagram_count,
+    }
+}
+
+counts! {
+    /// Counters of an egress bridge that are of no one channel.
+    pub struct EgressCounts {
         /// Datagrams of any kind given to the owner.
         datagram_count,
         /// Datagrams of any kind that the owner could not send.
@@ -82,7 +90,7 @@ counts! {
     }
 }
 
-impl EgressCounts {
+impl EgressChannelCounts {
     /// Messages of the local channel refused for any reason.
     pub const fn refused_count(&self) -> u64 {
         self.refused_not_greeted_count

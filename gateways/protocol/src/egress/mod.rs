@@ -1,5 +1,6 @@
-//! The sending host's half of a channel: takes messages from the local channel, gives datagrams,
-//! and takes replies. It owns no socket and no clock.
+//! The sending host's half of a flow: takes messages from the local channels, gives datagrams, and takes
+//! replies. It owns no socket and no clock. A channel without messages costs it nothing: greetings, clock
+//! exchanges and the state of the peer are the flow's.
 //!
 //! The loop that owns it does, in this order: [`EgressBridge::on_local`] for a waiting message,
 //! [`EgressBridge::poll_transmit`] until it gives nothing, [`EgressBridge::on_transmit_stamp`] for
@@ -22,18 +23,17 @@ use hil_core::message::Envelope;
 use hil_core::time::{Instant, PeriodicTimer};
 
 use crate::body::{
-    HELLO_ACK_BODY_BYTES, Hello, HelloAck, HelloStatus, ReceivedWindow, SYNC_BODY_BYTES,
-    SyncResponse,
+    HELLO_ACK_BODY_BYTES, Hello, HelloAck, HelloStatus, SYNC_BODY_BYTES, SyncResponse,
 };
-use crate::channel::{ChannelIdentity, SettingsError};
+use crate::channel::{FlowIdentity, SettingsError};
 use crate::fragment::FRAGMENT_COUNT_MAX;
 use crate::refusal::{Refusal, RefusalCounts};
 use crate::stamps::ArrivalStamps;
 use crate::wire::{
-    self, Body, HEADER_BYTES, Header, Kind, Prefix, TAG_BYTES, payload_budget_bytes,
+    self, Body, FollowUpField, HEADER_BYTES, Header, Kind, Prefix, TAG_BYTES, payload_budget_bytes,
 };
 
-pub use counts::{EgressCounts, LocalRefusal};
+pub use counts::{EgressChannelCounts, EgressCounts, LocalRefusal};
 pub use exchange::RoundTrip;
 
 use exchange::Exchanges;
@@ -41,15 +41,15 @@ use staging::Staging;
 
 /// Time between greetings while the peer has not answered or is down.
 pub const HELLO_PERIOD: Duration = Duration::from_millis(50);
-/// Time between greetings after the peer refused the channel: it may be restarted with other
+/// Time between greetings after the peer refused the flow: it may be restarted with other
 /// settings, but soon is unlikely.
 pub const HELLO_PERIOD_REFUSED: Duration = Duration::from_secs(1);
 
 /// Settings of an [`EgressBridge`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EgressSettings {
-    /// The channel, as both hosts must see it.
-    pub channel: ChannelIdentity,
+    /// The flow, as both hosts must see it.
+    pub flow: FlowIdentity,
     /// This gateway's start; must differ from its earlier ones.
     pub session: u32,
     /// Fingerprint of this host's shared-memory domain.
@@ -68,24 +68,21 @@ impl EgressSettings {
         payload_budget_bytes(self.datagram_max_bytes)
     }
 
-    /// Datagrams that the channel's largest message takes.
-    pub const fn fragment_count_max(&self) -> usize {
-        let budget = self.payload_budget_bytes();
-        if budget == 0 {
-            return usize::MAX;
+    /// Datagrams that the largest message of any channel takes.
+    pub fn fragment_count_max(&self) -> usize {
+        let size_bytes = self.flow.size_max_bytes() as usize;
+        match self.payload_budget_bytes() {
+            0 => usize::MAX,
+            budget => size_bytes.div_ceil(budget).max(1),
         }
-        let count = (self.channel.size_max_bytes as usize).div_ceil(budget);
-        if count == 0 { 1 } else { count }
     }
 
     fn hello(&self) -> Hello<'_> {
         Hello {
             domain: self.domain,
             clock_id: self.clock_id,
-            size_max_bytes: self.channel.size_max_bytes,
-            alignment_bytes: self.channel.alignment_bytes,
-            channel_name: &self.channel.channel_name,
-            type_name: &self.channel.type_name,
+            channel_count: u16::try_from(self.flow.channels.len()).unwrap_or(u16::MAX),
+            flow_name: &self.flow.name,
         }
     }
 
@@ -96,7 +93,7 @@ impl EgressSettings {
     }
 
     fn check(&self) -> Result<(), SettingsError> {
-        self.channel.check()?;
+        self.flow.check()?;
         if self.sync_period.is_zero() {
             return Err(SettingsError::Zero { key: "sync_period" });
         }
@@ -110,7 +107,7 @@ impl EgressSettings {
         let fragments = self.fragment_count_max();
         if fragments > FRAGMENT_COUNT_MAX {
             return Err(SettingsError::TooManyFragments {
-                size_bytes: self.channel.size_max_bytes,
+                size_bytes: self.flow.size_max_bytes(),
                 fragments,
                 bound: FRAGMENT_COUNT_MAX,
             });
@@ -128,7 +125,7 @@ pub enum PeerState {
     Established,
     /// The network reported the peer unreachable.
     Down,
-    /// The peer refused the channel; greetings go on slowly.
+    /// The peer refused the flow; greetings go on slowly.
     Refused(HelloStatus),
 }
 
@@ -148,7 +145,10 @@ pub struct Transmit<'a> {
     pub datagram: &'a [u8],
     /// What it is.
     pub kind: Kind,
-    /// The header's sequence number; with `kind` the key for [`EgressBridge::on_transmit_stamp`].
+    /// Index of the channel whose message it carries.
+    pub channel: Option<usize>,
+    /// The header's sequence number; with `kind` and `channel` the key for
+    /// [`EgressBridge::on_transmit_stamp`].
     pub sequence: u64,
     /// Epoch and sequence of the message it carries.
     pub message: Option<(u32, u64)>,
@@ -168,7 +168,7 @@ pub enum EgressEvent {
         /// The peer answered before with another session.
         is_peer_restart: bool,
     },
-    /// The peer refused the channel.
+    /// The peer refused the flow.
     Refused(HelloStatus),
     /// The peer does not know this session; greeting starts again.
     GreetAgain,
@@ -178,11 +178,6 @@ pub enum EgressEvent {
         round_trip: RoundTrip,
         /// An earlier exchange, now with the responder's kernel transmit stamp as t3.
         earlier: Option<RoundTrip>,
-        /// What the peer received of the messages.
-        window: Option<ReceivedWindow>,
-        /// Requests the peer received in this session; wraps. Against
-        /// [`EgressCounts::sync_sent_count`] it tells lost requests from lost responses.
-        sync_received_count: u32,
     },
 }
 
@@ -190,6 +185,8 @@ pub enum EgressEvent {
 #[derive(Debug)]
 pub struct EgressBridge {
     settings: EgressSettings,
+    digest: u64,
+    channels: Box<[EgressChannel]>,
     state: PeerState,
     peer: Option<SocketAddr>,
     peer_session: Option<u32>,
@@ -206,22 +203,35 @@ pub struct EgressBridge {
     staging: Staging,
     control: Box<[u8]>,
     last_transmit: Option<LastTransmit>,
-    last_message: Option<(u32, u64)>,
     farewell: Farewell,
     counts: EgressCounts,
     refusals: RefusalCounts,
 }
 
+/// What the bridge knows of one channel.
+#[derive(Debug, Clone, Copy, Default)]
+struct EgressChannel {
+    /// Epoch and sequence of the last message taken.
+    last_message: Option<(u32, u64)>,
+    /// A stamp that rides on its next message.
+    follow_up: Option<FollowUpField>,
+    counts: EgressChannelCounts,
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct LastTransmit {
     kind: Kind,
+    channel: Option<usize>,
     is_last_fragment: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Farewell {
     Open,
-    Due,
+    /// Of the channels from this index on, then of the flow.
+    Due {
+        from: usize,
+    },
     Said,
 }
 
@@ -244,13 +254,15 @@ impl EgressBridge {
             sync_timer: PeriodicTimer::new(settings.sync_period),
             sync_sequence: 0,
             exchanges: Exchanges::new(),
+            digest: settings.flow.digest(),
+            channels: vec![EgressChannel::default(); settings.flow.channels.len()]
+                .into_boxed_slice(),
             staging: Staging::new(
-                settings.channel.size_max_bytes as usize,
+                settings.flow.size_max_bytes() as usize,
                 settings.payload_budget_bytes(),
             ),
             control: vec![0; settings.control_bytes()].into_boxed_slice(),
             last_transmit: None,
-            last_message: None,
             farewell: Farewell::Open,
             counts: EgressCounts::default(),
             refusals: RefusalCounts::default(),
@@ -258,41 +270,42 @@ impl EgressBridge {
         })
     }
 
-    /// Stages one message of the local channel; send it with [`EgressBridge::poll_transmit`]
-    /// before staging the next.
+    /// Stages one message of the local channel with index `channel`; send it with
+    /// [`EgressBridge::poll_transmit`] before staging the next of any channel.
     ///
     /// # Errors
     /// The message is refused and counted; it will not be sent.
+    ///
+    /// # Panics
+    /// When the flow has no such channel.
     pub fn on_local(
         &mut self,
         now: Instant,
+        channel: usize,
         envelope: &Envelope,
         payload: &[u8],
     ) -> Result<(), LocalRefusal> {
-        self.counts.offered_count += 1;
-        let result = self.check_local(envelope, payload);
+        let result = self.check_local(channel, envelope, payload);
+        let own = &mut self.channels[channel];
+        own.counts.offered_count += 1;
         match result {
             Ok(()) => {
-                if self
+                let before = own
                     .last_message
-                    .is_some_and(|(epoch, _)| epoch != envelope.epoch)
-                {
-                    // A follow-up names its message by sequence alone.
-                    self.staging.forget_follow_up();
-                }
-                self.last_message = Some((envelope.epoch, envelope.sequence));
-                let mut header = Header::new(
-                    Kind::Data,
-                    self.settings.session,
-                    self.settings.channel.channel,
-                );
-                header.type_hash = self.settings.channel.type_hash;
+                    .replace((envelope.epoch, envelope.sequence));
+                let identity = &self.settings.flow.channels[channel];
+                let mut header = Header::new(Kind::Data, self.settings.session, identity.channel);
+                header.type_hash = identity.type_hash;
                 header.sequence = envelope.sequence;
                 header.published_ns = envelope.published_ns;
                 header.epoch = envelope.epoch;
-                self.staging.stage(now, header, payload);
+                // A follow-up names its message by sequence alone.
+                let follow_up = own.follow_up.take();
+                header.follow_up =
+                    follow_up.filter(|_| before.is_none_or(|(epoch, _)| epoch == envelope.epoch));
+                self.staging.stage(now, channel, header, payload);
             }
-            Err(refusal) => self.counts.refuse(refusal),
+            Err(refusal) => own.counts.refuse(refusal),
         }
         result
     }
@@ -303,9 +316,8 @@ impl EgressBridge {
         if self.staging.is_pending() {
             return Some(self.transmit_data(now));
         }
-        if self.farewell == Farewell::Due {
-            self.farewell = Farewell::Said;
-            return Some(self.transmit_bye(now));
+        if let Farewell::Due { from } = self.farewell {
+            return Some(self.transmit_bye(now, from));
         }
         if self.farewell == Farewell::Said {
             return None;
@@ -322,12 +334,14 @@ impl EgressBridge {
         self.counts.transmit_failed_count += 1;
         match self.last_transmit.take() {
             Some(LastTransmit {
-                kind: Kind::Data,
+                channel: Some(channel),
                 is_last_fragment,
+                ..
             }) => {
-                self.counts.message_failed_count += 1;
+                let counts = &mut self.channels[channel].counts;
+                counts.message_failed_count += 1;
                 if is_last_fragment {
-                    self.counts.sent_count -= 1;
+                    counts.sent_count -= 1;
                 } else {
                     self.staging.abandon();
                 }
@@ -346,9 +360,7 @@ impl EgressBridge {
     /// The network reported the peer unreachable outside a send call (a receive call returned
     /// ECONNREFUSED). Messages are refused until the peer greets back.
     pub fn on_peer_unreachable(&mut self, now: Instant) {
-        if self.staging.abandon() {
-            self.counts.message_failed_count += 1;
-        }
+        self.abandon_staged();
         if self.state != PeerState::Down {
             self.counts.peer_down_count += 1;
             self.greet_from(PeerState::Down, now + HELLO_PERIOD);
@@ -358,18 +370,29 @@ impl EgressBridge {
     /// The kernel's transmit stamp of a datagram given earlier: `handed_to_tx_ns` is that stamp
     /// minus the `now` it was polled with; for a fragmented message, the stamp of the last
     /// fragment minus the `now` of the first. It rides on the next message, or refines t1.
-    pub fn on_transmit_stamp(&mut self, kind: Kind, sequence: u64, handed_to_tx_ns: i64) {
+    pub fn on_transmit_stamp(
+        &mut self,
+        kind: Kind,
+        channel: Option<usize>,
+        sequence: u64,
+        handed_to_tx_ns: i64,
+    ) {
         let delta = u32::try_from(handed_to_tx_ns).unwrap_or(u32::MAX);
         if delta == u32::MAX {
             self.counts.transmit_stamp_implausible_count += 1;
             return;
         }
-        match kind {
-            Kind::Data if self.last_message.is_some_and(|(_, last)| sequence <= last) => {
-                self.staging.set_follow_up(sequence, delta);
+        match (channel, kind) {
+            (Some(channel), _) => {
+                let own = &mut self.channels[channel];
+                if own.last_message.is_some_and(|(_, last)| sequence <= last) {
+                    own.follow_up = Some(FollowUpField::new(sequence, delta));
+                }
             }
-            Kind::SyncRequest => self.exchanges.set_transmit_stamp(sequence, handed_to_tx_ns),
-            _ => {}
+            (None, Kind::SyncRequest) => {
+                self.exchanges.set_transmit_stamp(sequence, handed_to_tx_ns);
+            }
+            (None, _) => {}
         }
     }
 
@@ -399,7 +422,7 @@ impl EgressBridge {
     pub fn bye(&mut self) {
         if self.farewell == Farewell::Open {
             self.farewell = if self.state == PeerState::Established {
-                Farewell::Due
+                Farewell::Due { from: 0 }
             } else {
                 Farewell::Said
             };
@@ -414,7 +437,7 @@ impl EgressBridge {
         }
         match (self.farewell, self.state) {
             (Farewell::Said, _) => None,
-            (Farewell::Due, _) => Some(Instant::from_ns(i64::MIN)),
+            (Farewell::Due { .. }, _) => Some(Instant::from_ns(i64::MIN)),
             (Farewell::Open, PeerState::Established) => self.sync_timer.next(),
             (Farewell::Open, _) => Some(self.hello_due),
         }
@@ -435,9 +458,17 @@ impl EgressBridge {
         self.peer_clock_id.map(|id| id == self.settings.clock_id)
     }
 
-    /// What became of messages, exchanges and replies.
+    /// What became of datagrams, exchanges and replies.
     pub const fn counts(&self) -> &EgressCounts {
         &self.counts
+    }
+
+    /// What became of the messages of the channel with index `channel`.
+    ///
+    /// # Panics
+    /// When the flow has no such channel.
+    pub fn channel_counts(&self, channel: usize) -> &EgressChannelCounts {
+        &self.channels[channel].counts
     }
 
     /// Replies refused, by reason.
@@ -445,7 +476,12 @@ impl EgressBridge {
         &self.refusals
     }
 
-    fn check_local(&self, envelope: &Envelope, payload: &[u8]) -> Result<(), LocalRefusal> {
+    fn check_local(
+        &self,
+        channel: usize,
+        envelope: &Envelope,
+        payload: &[u8],
+    ) -> Result<(), LocalRefusal> {
         if self.farewell != Farewell::Open {
             return Err(LocalRefusal::Closed);
         }
@@ -458,7 +494,7 @@ impl EgressBridge {
         if envelope.is_forwarded() {
             return Err(LocalRefusal::Forwarded);
         }
-        let size_max_bytes = self.settings.channel.size_max_bytes as usize;
+        let size_max_bytes = self.settings.flow.channels[channel].size_max_bytes as usize;
         if payload.len() > size_max_bytes {
             return Err(LocalRefusal::TooBig {
                 size_bytes: payload.len(),
@@ -483,7 +519,7 @@ impl EgressBridge {
             }
         })?;
         let header = &datagram.header;
-        if header.channel != self.settings.channel.channel {
+        if header.channel != self.settings.flow.flow {
             return Err(Refusal::UnknownChannel);
         }
         if let (Some(bound), Some(from)) = (self.peer, arrival.peer)
@@ -507,7 +543,7 @@ impl EgressBridge {
         let is_answer = Prefix::decode(bytes).is_some_and(|prefix| {
             prefix.kind == Some(Kind::HelloAck)
                 && prefix.session == self.settings.session
-                && prefix.channel == self.settings.channel.channel
+                && prefix.channel == self.settings.flow.flow
         });
         if is_answer && self.state != PeerState::Established {
             let refused = PeerState::Refused(HelloStatus::VersionMismatch);
@@ -564,11 +600,15 @@ impl EgressBridge {
         }
     }
 
+    fn abandon_staged(&mut self) {
+        if let Some(channel) = self.staging.abandon() {
+            self.channels[channel].counts.message_failed_count += 1;
+        }
+    }
+
     /// Leaves for a state in which the peer is greeted, first at `due`.
     fn greet_from(&mut self, state: PeerState, due: Instant) {
-        if self.staging.abandon() {
-            self.counts.message_failed_count += 1;
-        }
+        self.abandon_staged();
         // Refused and Down keep listening to answers of greetings that are still under way.
         if self.state == PeerState::Established {
             self.round_started_ns = None;
@@ -592,8 +632,6 @@ impl EgressBridge {
         Ok(EgressEvent::RoundTrip {
             round_trip,
             earlier,
-            window: response.window,
-            sync_received_count: response.sync_received_count,
         })
     }
 }

@@ -1,10 +1,10 @@
-//! The one message an egress bridge holds, laid out as its datagrams, so that its payload is
-//! copied once. It is not a queue.
+//! The one message an egress bridge holds, of whichever channel, laid out as its datagrams, so that its
+//! payload is copied once. It is not a queue.
 
 use hil_core::time::Instant;
 
 use crate::fragment::FragmentPlan;
-use crate::wire::{FollowUpField, HEADER_BYTES, Header};
+use crate::wire::{HEADER_BYTES, Header};
 
 #[derive(Debug)]
 pub(super) struct Staging {
@@ -12,11 +12,20 @@ pub(super) struct Staging {
     /// Header and piece of each fragment, back to back.
     buffer: Box<[u8]>,
     staged: Option<Staged>,
-    follow_up: Option<FollowUpField>,
+}
+
+/// One datagram of the staged message.
+#[derive(Debug)]
+pub(super) struct Piece<'a> {
+    pub(super) channel: usize,
+    pub(super) header: Header,
+    pub(super) is_last: bool,
+    pub(super) datagram: &'a [u8],
 }
 
 #[derive(Debug, Clone, Copy)]
 struct Staged {
+    channel: usize,
     header: Header,
     plan: FragmentPlan,
     since: Instant,
@@ -29,31 +38,36 @@ impl Staging {
             budget_bytes,
             buffer: vec![0; count * HEADER_BYTES + size_max_bytes].into_boxed_slice(),
             staged: None,
-            follow_up: None,
         }
     }
 
     /// `header` needs no length, fragment or hand-over fields yet.
-    pub(super) fn stage(&mut self, now: Instant, mut header: Header, payload: &[u8]) {
+    pub(super) fn stage(
+        &mut self,
+        now: Instant,
+        channel: usize,
+        mut header: Header,
+        payload: &[u8],
+    ) {
         let plan = FragmentPlan::new(payload.len(), self.budget_bytes)
             .expect("settings bound the fragments of the largest message");
         header.total_len = u32::try_from(payload.len()).expect("size_max_bytes is a u32");
         header.fragment_count = plan.count();
-        header.follow_up = self.follow_up.take();
         for index in 0..plan.count() {
             let range = plan.range(index).expect("index is below the count");
             let start = place(&plan, index) + HEADER_BYTES;
             self.buffer[start..start + range.len()].copy_from_slice(&payload[range]);
         }
         self.staged = Some(Staged {
+            channel,
             header,
             plan,
             since: now,
         });
     }
 
-    /// Header of the next datagram, whether it is the last, and its bytes.
-    pub(super) fn next(&mut self, now: Instant) -> (Header, bool, &[u8]) {
+    /// The next datagram.
+    pub(super) fn next(&mut self, now: Instant) -> Piece<'_> {
         let staged = self.staged.as_mut().expect("called only while pending");
         let mut header = staged.header;
         header.handed_ns = now.as_ns();
@@ -61,13 +75,19 @@ impl Staging {
         let range = staged.plan.range(index).expect("index is below the count");
         let is_last = index + 1 == staged.plan.count();
         let start = place(&staged.plan, index);
+        let channel = staged.channel;
         staged.header.fragment_index = index + 1;
         if is_last {
             self.staged = None;
         }
         let datagram = &mut self.buffer[start..start + HEADER_BYTES + range.len()];
         header.encode(datagram);
-        (header, is_last, datagram)
+        Piece {
+            channel,
+            header,
+            is_last,
+            datagram,
+        }
     }
 
     pub(super) const fn is_pending(&self) -> bool {
@@ -78,17 +98,9 @@ impl Staging {
         self.staged.as_ref().map(|staged| staged.since)
     }
 
-    /// Forgets the staged message; true when there was one.
-    pub(super) fn abandon(&mut self) -> bool {
-        self.staged.take().is_some()
-    }
-
-    pub(super) fn set_follow_up(&mut self, sequence: u64, handed_to_tx_ns: u32) {
-        self.follow_up = Some(FollowUpField::new(sequence, handed_to_tx_ns));
-    }
-
-    pub(super) fn forget_follow_up(&mut self) {
-        self.follow_up = None;
+    /// Forgets the staged message; the channel whose it was.
+    pub(super) fn abandon(&mut self) -> Option<usize> {
+        self.staged.take().map(|staged| staged.channel)
     }
 }
 

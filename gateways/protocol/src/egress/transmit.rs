@@ -3,22 +3,34 @@
 
 use hil_core::time::Instant;
 
-use super::{EgressBridge, HELLO_PERIOD, HELLO_PERIOD_REFUSED, LastTransmit, PeerState, Transmit};
+use super::{
+    EgressBridge, Farewell, HELLO_PERIOD, HELLO_PERIOD_REFUSED, LastTransmit, PeerState, Transmit,
+};
 use crate::body::SYNC_BODY_BYTES;
+use crate::egress::staging::Piece;
 use crate::wire::{HEADER_BYTES, Header, Kind};
 
 impl EgressBridge {
     pub(super) fn transmit_data(&mut self, now: Instant) -> Transmit<'_> {
-        let (header, is_last_fragment, datagram) = self.staging.next(now);
+        let Piece {
+            channel,
+            header,
+            is_last: is_last_fragment,
+            datagram,
+        } = self.staging.next(now);
         self.counts.datagram_count += 1;
-        self.counts.sent_count += u64::from(is_last_fragment);
+        let counts = &mut self.channels[channel].counts;
+        counts.datagram_count += 1;
+        counts.sent_count += u64::from(is_last_fragment);
         self.last_transmit = Some(LastTransmit {
             kind: Kind::Data,
+            channel: Some(channel),
             is_last_fragment,
         });
         Transmit {
             datagram,
             kind: Kind::Data,
+            channel: Some(channel),
             sequence: header.sequence,
             message: Some((header.epoch, header.sequence)),
             is_last_fragment,
@@ -37,7 +49,9 @@ impl EgressBridge {
         self.counts.hello_sent_count += 1;
         let hello = self.settings.hello();
         let body_bytes = hello.encode(&mut self.control[HEADER_BYTES..]);
-        self.transmit_control(now, Kind::Hello, 0, sequence, body_bytes)
+        let mut header = self.flow_header(Kind::Hello);
+        header.sequence = sequence;
+        self.transmit_control(now, header, body_bytes)
     }
 
     pub(super) fn transmit_sync(&mut self, now: Instant) -> Transmit<'_> {
@@ -46,41 +60,58 @@ impl EgressBridge {
         self.counts.sync_sent_count += 1;
         self.exchanges.open(sequence, now.as_ns());
         self.control[HEADER_BYTES..][..SYNC_BODY_BYTES].fill(0);
-        self.transmit_control(now, Kind::SyncRequest, 0, sequence, SYNC_BODY_BYTES)
+        let mut header = self.flow_header(Kind::SyncRequest);
+        header.sequence = sequence;
+        self.transmit_control(now, header, SYNC_BODY_BYTES)
     }
 
-    pub(super) fn transmit_bye(&mut self, now: Instant) -> Transmit<'_> {
-        let (epoch, next) = match self.last_message {
-            Some((epoch, sequence)) => (epoch, sequence.saturating_add(1)),
-            None => (0, 0),
+    /// The farewell of the next channel from `from` on that carried a message; once there is none, that
+    /// of the flow.
+    pub(super) fn transmit_bye(&mut self, now: Instant, from: usize) -> Transmit<'_> {
+        let mut rest = self.channels.iter().enumerate().skip(from);
+        let next = rest.find_map(|(index, channel)| Some((index, channel.last_message?)));
+        let Some((index, (epoch, sequence))) = next else {
+            self.farewell = Farewell::Said;
+            let header = self.flow_header(Kind::Bye);
+            return self.transmit_control(now, header, 0);
         };
-        self.transmit_control(now, Kind::Bye, epoch, next, 0)
+        self.farewell = Farewell::Due { from: index + 1 };
+        self.channels[index].counts.datagram_count += 1;
+        let identity = &self.settings.flow.channels[index];
+        let mut header = Header::new(Kind::Bye, self.settings.session, identity.channel);
+        header.type_hash = identity.type_hash;
+        header.epoch = epoch;
+        header.sequence = sequence.saturating_add(1);
+        self.transmit_control(now, header, 0)
+    }
+
+    /// Of a datagram that is about no channel.
+    const fn flow_header(&self, kind: Kind) -> Header {
+        let mut header = Header::new(kind, self.settings.session, self.settings.flow.flow);
+        header.type_hash = self.digest;
+        header
     }
 
     fn transmit_control(
         &mut self,
         now: Instant,
-        kind: Kind,
-        epoch: u32,
-        sequence: u64,
+        mut header: Header,
         body_bytes: usize,
     ) -> Transmit<'_> {
-        let mut header = Header::new(kind, self.settings.session, self.settings.channel.channel);
-        header.type_hash = self.settings.channel.type_hash;
-        header.epoch = epoch;
-        header.sequence = sequence;
         header.handed_ns = now.as_ns();
         header.total_len = u32::try_from(body_bytes).expect("a body is below 1 KiB");
         header.encode(&mut self.control);
         self.counts.datagram_count += 1;
         self.last_transmit = Some(LastTransmit {
-            kind,
+            kind: header.kind,
+            channel: None,
             is_last_fragment: true,
         });
         Transmit {
             datagram: &self.control[..HEADER_BYTES + body_bytes],
-            kind,
-            sequence,
+            kind: header.kind,
+            channel: None,
+            sequence: header.sequence,
             message: None,
             is_last_fragment: true,
         }

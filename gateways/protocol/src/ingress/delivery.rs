@@ -10,6 +10,8 @@ use crate::wire::{FollowUpField, Header};
 /// Who a message is and when it was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MessageInfo {
+    /// Index of its channel in the flow.
+    pub channel: usize,
     /// The sending gateway's start.
     pub session: u32,
     /// The producer's start.
@@ -80,25 +82,17 @@ pub enum Disposition {
     },
     /// A clock exchange will be answered.
     SyncRequested,
-    /// The sender says that the session ends.
+    /// The sender says that the session, or one of its channels, ends.
     Farewell,
 }
 
 counts! {
-    /// Counters of an ingress bridge, one per [`Disposition`].
+    /// Counters of an ingress bridge that are of no one channel.
     pub struct IngressCounts {
         /// Datagrams received.
         datagram_count,
-        /// Messages delivered.
-        delivered_count,
-        /// Messages that gave way to a newer one.
-        superseded_count,
-        /// Copies.
-        duplicate_count,
-        /// Messages too old to judge.
-        late_count,
-        /// Pieces stored.
-        fragment_count,
+        /// Datagrams accepted that carried a message or a piece of one.
+        message_datagram_count,
         /// Greetings accepted.
         hello_count,
         /// Clock exchanges taken.
@@ -110,19 +104,46 @@ counts! {
     }
 }
 
+counts! {
+    /// Counters of one channel of an ingress bridge, one per [`Disposition`] of a message.
+    pub struct IngressChannelCounts {
+        /// Messages delivered.
+        delivered_count,
+        /// Messages that gave way to a newer one.
+        superseded_count,
+        /// Copies.
+        duplicate_count,
+        /// Messages too old to judge.
+        late_count,
+        /// Pieces stored.
+        fragment_count,
+        /// Datagrams that named the channel in a known session; those above and what was refused.
+        datagram_count,
+    }
+}
+
 impl IngressCounts {
     /// Datagrams accepted.
     pub const fn accepted_count(&self) -> u64 {
-        self.delivered_count
-            + self.superseded_count
-            + self.duplicate_count
-            + self.late_count
-            + self.fragment_count
-            + self.hello_count
-            + self.sync_count
-            + self.bye_count
+        self.message_datagram_count + self.hello_count + self.sync_count + self.bye_count
     }
 
+    pub(super) fn count(&mut self, disposition: &Disposition) {
+        let counter = match disposition {
+            Disposition::Delivered(_)
+            | Disposition::Superseded(_)
+            | Disposition::Duplicate(_)
+            | Disposition::Late(_)
+            | Disposition::FragmentStored => &mut self.message_datagram_count,
+            Disposition::Greeted { .. } => &mut self.hello_count,
+            Disposition::SyncRequested => &mut self.sync_count,
+            Disposition::Farewell => &mut self.bye_count,
+        };
+        *counter += 1;
+    }
+}
+
+impl IngressChannelCounts {
     pub(super) fn count(&mut self, disposition: &Disposition) {
         let counter = match disposition {
             Disposition::Delivered(_) => &mut self.delivered_count,
@@ -130,9 +151,9 @@ impl IngressCounts {
             Disposition::Duplicate(_) => &mut self.duplicate_count,
             Disposition::Late(_) => &mut self.late_count,
             Disposition::FragmentStored => &mut self.fragment_count,
-            Disposition::Greeted { .. } => &mut self.hello_count,
-            Disposition::SyncRequested => &mut self.sync_count,
-            Disposition::Farewell => &mut self.bye_count,
+            Disposition::Greeted { .. } | Disposition::SyncRequested | Disposition::Farewell => {
+                return;
+            }
         };
         *counter += 1;
     }
@@ -165,8 +186,9 @@ pub(super) fn stream_of(header: &Header) -> Stream {
     }
 }
 
-pub(super) fn message_of(header: &Header, handed_ns: i64) -> MessageInfo {
+pub(super) fn message_of(channel: usize, header: &Header, handed_ns: i64) -> MessageInfo {
     MessageInfo {
+        channel,
         session: header.session,
         epoch: header.epoch,
         sequence: header.sequence,

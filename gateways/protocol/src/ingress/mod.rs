@@ -1,4 +1,4 @@
-//! The receiving host's half of a channel: takes datagrams, delivers messages, and gives replies.
+//! The receiving host's half of a flow: takes datagrams, delivers messages, and gives replies.
 //! It owns no socket and no clock, and it never replays a message: silence stays silence.
 //!
 //! The loop that owns it does: [`IngressBridge::on_datagram`] for each arrival, then
@@ -19,14 +19,16 @@ use core::time::Duration;
 use hil_core::time::Instant;
 
 use super::body::{Hello, HelloStatus};
-use super::channel::{ChannelIdentity, SettingsError};
+use super::channel::{ChannelIdentity, ChannelNumbers, FlowIdentity, SettingsError};
 use super::fragment::{Fragment, Reassembler, ReassemblyCounts};
 use super::refusal::{Refusal, RefusalCounts};
 use super::sequence::{Order, SequenceCounts, SequenceWindow};
 use super::stamps::ArrivalStamps;
 use super::wire::{self, Body, Header, Kind, Prefix};
 
-pub use delivery::{Delivery, Disposition, FollowUp, IngressCounts, MessageInfo};
+pub use delivery::{
+    Delivery, Disposition, FollowUp, IngressChannelCounts, IngressCounts, MessageInfo,
+};
 pub use replies::ReplyCounts;
 
 use delivery::{delivery_of, message_of, stream_of};
@@ -42,15 +44,15 @@ pub const SEQUENCE_JUMP_MAX: u64 = 1 << 20;
 /// Settings of an [`IngressBridge`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct IngressSettings {
-    /// The channel, as both hosts must see it.
-    pub channel: ChannelIdentity,
+    /// The flow, as both hosts must see it.
+    pub flow: FlowIdentity,
     /// This gateway's start; must differ from its earlier ones.
     pub session: u32,
     /// Fingerprint of this host's shared-memory domain.
     pub domain: [u8; 16],
     /// Names this host's monotonic clock; equal ids on both hosts mean one clock.
     pub clock_id: u64,
-    /// Incomplete messages held at a time; the oldest gives way.
+    /// Incomplete messages held at a time for each channel; the oldest gives way.
     pub reassembly_slots: usize,
     /// An incomplete message older than this is given up; one period of the channel is a good
     /// value.
@@ -62,9 +64,9 @@ pub struct IngressSettings {
 
 impl IngressSettings {
     /// Four reassembly slots, 100 ms each, reordered messages delivered.
-    pub fn new(channel: ChannelIdentity, session: u32, domain: [u8; 16], clock_id: u64) -> Self {
+    pub fn new(flow: FlowIdentity, session: u32, domain: [u8; 16], clock_id: u64) -> Self {
         Self {
-            channel,
+            flow,
             session,
             domain,
             clock_id,
@@ -75,7 +77,7 @@ impl IngressSettings {
     }
 
     fn check(&self) -> Result<(), SettingsError> {
-        self.channel.check()?;
+        self.flow.check()?;
         if self.reassembly_slots == 0 {
             return Err(SettingsError::Zero {
                 key: "reassembly_slots",
@@ -108,15 +110,45 @@ pub struct Reply<'a> {
 #[derive(Debug)]
 pub struct IngressBridge {
     settings: IngressSettings,
+    digest: u64,
+    numbers: ChannelNumbers,
+    channels: Box<[IngressChannel]>,
+    /// Indices of the channels with incomplete messages.
+    split: Vec<usize>,
     sessions: Sessions,
-    window: SequenceWindow,
-    reassembler: Reassembler,
     replies: Replies,
-    /// The next message may skip any number: its session has just greeted.
-    is_jump_allowed: bool,
-    sync_received_count: u32,
     counts: IngressCounts,
     refusals: RefusalCounts,
+}
+
+/// What the bridge knows of one channel.
+#[derive(Debug)]
+struct IngressChannel {
+    window: SequenceWindow,
+    reassembler: Reassembler,
+    /// The next message may skip any number: its session has just greeted.
+    is_jump_allowed: bool,
+    counts: IngressChannelCounts,
+}
+
+impl IngressChannel {
+    fn new(identity: &ChannelIdentity, settings: &IngressSettings) -> Self {
+        Self {
+            window: SequenceWindow::new(),
+            reassembler: Reassembler::new(
+                settings.reassembly_slots,
+                identity.size_max_bytes as usize,
+                settings.reassembly_timeout,
+            ),
+            is_jump_allowed: true,
+            counts: IngressChannelCounts::default(),
+        }
+    }
+
+    fn clear(&mut self) {
+        self.reassembler.clear();
+        self.window.finish();
+    }
 }
 
 /// A datagram on its way through the checks.
@@ -136,16 +168,17 @@ impl IngressBridge {
     pub fn new(settings: IngressSettings) -> Result<Self, SettingsError> {
         settings.check()?;
         Ok(Self {
+            digest: settings.flow.digest(),
+            numbers: ChannelNumbers::new(&settings.flow.channels),
+            channels: settings
+                .flow
+                .channels
+                .iter()
+                .map(|identity| IngressChannel::new(identity, &settings))
+                .collect(),
+            split: Vec::with_capacity(settings.flow.channels.len()),
             sessions: Sessions::new(),
-            window: SequenceWindow::new(),
-            reassembler: Reassembler::new(
-                settings.reassembly_slots,
-                settings.channel.size_max_bytes as usize,
-                settings.reassembly_timeout,
-            ),
             replies: Replies::new(&settings),
-            is_jump_allowed: true,
-            sync_received_count: 0,
             counts: IngressCounts::default(),
             refusals: RefusalCounts::default(),
             settings,
@@ -164,7 +197,7 @@ impl IngressBridge {
         deliver: &mut dyn FnMut(Delivery<'_>),
     ) -> Result<Disposition, Refusal> {
         self.counts.datagram_count += 1;
-        self.reassembler.expire(now);
+        self.expire(now);
         let result = self.accept(now, arrival, bytes, deliver);
         match &result {
             Ok(disposition) => self.counts.count(disposition),
@@ -194,19 +227,24 @@ impl IngressBridge {
     /// When something changes without a datagram: a reply waits, or an incomplete message is to
     /// be given up.
     pub fn next_wakeup(&self) -> Option<Instant> {
-        let expiry = self.reassembler.next_expiry();
-        self.replies.waiting_since().into_iter().chain(expiry).min()
+        let split = self.split.iter();
+        let expiries =
+            split.filter_map(|&channel| self.channels[channel].reassembler.next_expiry());
+        self.replies
+            .waiting_since()
+            .into_iter()
+            .chain(expiries)
+            .min()
     }
 
     /// Gives up incomplete messages whose time is up; call at [`IngressBridge::next_wakeup`].
     pub fn on_wakeup(&mut self, now: Instant) {
-        self.reassembler.expire(now);
+        self.expire(now);
     }
 
     /// Ends the accounting: outstanding gaps become losses and incomplete messages are given up.
     pub fn finish(&mut self) {
-        self.reassembler.clear();
-        self.window.finish();
+        self.clear_channels();
     }
 
     /// Session that greeted last, if one has.
@@ -237,19 +275,27 @@ impl IngressBridge {
         &self.counts
     }
 
-    /// What became of the messages.
-    pub const fn sequence_counts(&self) -> &SequenceCounts {
-        self.window.counts()
+    /// What became of the datagrams of the channel with index `channel`.
+    ///
+    /// # Panics
+    /// When the flow has no such channel; so the three below.
+    pub fn channel_counts(&self, channel: usize) -> &IngressChannelCounts {
+        &self.channels[channel].counts
     }
 
-    /// Messages missing now that may still come.
-    pub fn outstanding_count(&self) -> u64 {
-        self.window.outstanding_count()
+    /// What became of its messages.
+    pub fn sequence_counts(&self, channel: usize) -> &SequenceCounts {
+        self.channels[channel].window.counts()
     }
 
-    /// What became of messages that came in pieces.
-    pub const fn reassembly_counts(&self) -> &ReassemblyCounts {
-        self.reassembler.counts()
+    /// Its messages that are missing now and may still come.
+    pub fn outstanding_count(&self, channel: usize) -> u64 {
+        self.channels[channel].window.outstanding_count()
+    }
+
+    /// What became of its messages that came in pieces.
+    pub fn reassembly_counts(&self, channel: usize) -> &ReassemblyCounts {
+        self.channels[channel].reassembler.counts()
     }
 
     /// What became of the replies.
@@ -285,11 +331,18 @@ impl IngressBridge {
             Body::SyncResponse(_) | Body::HelloAck(_) => return Err(Refusal::UnexpectedKind),
             Body::Data(_) | Body::SyncRequest | Body::Bye => {}
         }
-        self.check_session(request)?;
-        let disposition = match datagram.body {
-            Body::Data(payload) => self.on_data(request, payload, deliver)?,
-            Body::Bye => self.on_bye(request.header),
-            _ => self.on_sync_request(request),
+        let channel = self.check_session(request)?;
+        let disposition = match (datagram.body, channel) {
+            (Body::Data(payload), Some(channel)) => {
+                let result = self.on_data(request, channel, payload, deliver);
+                let counts = &mut self.channels[channel].counts;
+                counts.datagram_count += 1;
+                result.inspect(|disposition| counts.count(disposition))?
+            }
+            (Body::Bye, Some(channel)) => self.on_bye(request.header, channel),
+            (Body::Bye, None) => Disposition::Farewell,
+            (_, None) if request.header.kind == Kind::SyncRequest => self.on_sync_request(request),
+            _ => return Err(Refusal::UnknownChannel),
         };
         let handed_ns = datagram.header.handed_ns;
         let has_left = disposition == Disposition::Farewell;
@@ -302,7 +355,7 @@ impl IngressBridge {
         let Some(prefix) = Prefix::decode(bytes) else {
             return;
         };
-        if prefix.kind == Some(Kind::Hello) && prefix.channel == self.settings.channel.channel {
+        if prefix.kind == Some(Kind::Hello) && prefix.channel == self.settings.flow.flow {
             let header = Header::new(Kind::Hello, prefix.session, prefix.channel);
             let request = Request {
                 now,
@@ -321,10 +374,9 @@ impl IngressBridge {
     ) -> Result<Disposition, Refusal> {
         if let Err(refusal) = self.check_hello(request.header, hello) {
             let status = match refusal {
-                Refusal::UnknownChannel => HelloStatus::UnknownChannel,
+                Refusal::UnknownChannel => HelloStatus::UnknownFlow,
                 Refusal::SharedDomain => HelloStatus::SharedDomain,
-                Refusal::SizeMismatch => HelloStatus::SizeMismatch,
-                _ => HelloStatus::TypeMismatch,
+                _ => HelloStatus::ChannelsDiffer,
             };
             self.acknowledge(request, status);
             return Err(refusal);
@@ -335,12 +387,12 @@ impl IngressBridge {
         let greeting =
             self.sessions
                 .greet(request.now, request.arrival, request.header, hello.clock_id)?;
-        self.is_jump_allowed = true;
+        for channel in &mut self.channels {
+            channel.is_jump_allowed = true;
+        }
         if greeting.is_new {
-            self.window.finish();
-            self.reassembler.clear();
+            self.clear_channels();
             self.replies.forget_transmit_stamp();
-            self.sync_received_count = 0;
         }
         self.counts.session_restart_count += u64::from(greeting.is_restart);
         self.acknowledge(request, HelloStatus::Accepted);
@@ -350,24 +402,33 @@ impl IngressBridge {
     }
 
     fn check_hello(&self, header: &Header, hello: &Hello<'_>) -> Result<(), Refusal> {
-        let own = &self.settings.channel;
-        if header.channel != own.channel || hello.channel_name != own.channel_name {
+        let own = &self.settings.flow;
+        if header.channel != own.flow || hello.flow_name != own.name {
             return Err(Refusal::UnknownChannel);
         }
         if hello.domain == self.settings.domain {
             return Err(Refusal::SharedDomain);
         }
-        if hello.type_name != own.type_name {
-            return Err(Refusal::TypeMismatch);
-        }
-        let size = (hello.size_max_bytes, hello.alignment_bytes);
-        if size != (own.size_max_bytes, own.alignment_bytes) {
-            return Err(Refusal::SizeMismatch);
-        }
-        if header.type_hash != own.type_hash {
-            return Err(Refusal::TypeMismatch);
+        let is_count_equal = usize::from(hello.channel_count) == own.channels.len();
+        if !is_count_equal || header.type_hash != self.digest {
+            return Err(Refusal::ChannelsDiffer);
         }
         Ok(())
+    }
+
+    /// Gives up incomplete messages whose time is up.
+    fn expire(&mut self, now: Instant) {
+        let channels = &mut self.channels;
+        self.split.retain(|&channel| {
+            let reassembler = &mut channels[channel].reassembler;
+            reassembler.expire(now);
+            reassembler.open_count() > 0
+        });
+    }
+
+    fn clear_channels(&mut self) {
+        self.channels.iter_mut().for_each(IngressChannel::clear);
+        self.split.clear();
     }
 
     fn acknowledge(&mut self, request: Request<'_>, status: HelloStatus) {
@@ -375,7 +436,7 @@ impl IngressBridge {
             now: request.now,
             status,
             session: request.header.session,
-            channel: request.header.channel,
+            flow: self.settings.flow.flow,
             sequence: request.header.sequence,
             answers_handed_ns: request.header.handed_ns,
             request_bytes: request.length_bytes,
@@ -383,9 +444,11 @@ impl IngressBridge {
         });
     }
 
-    fn check_session(&mut self, request: Request<'_>) -> Result<(), Refusal> {
+    /// The index of the channel that the datagram is about; `None` when it is about the flow.
+    fn check_session(&mut self, request: Request<'_>) -> Result<Option<usize>, Refusal> {
         let header = request.header;
-        if header.channel != self.settings.channel.channel {
+        let channel = self.numbers.index_of(header.channel);
+        if channel.is_none() && header.channel != self.settings.flow.flow {
             return Err(Refusal::UnknownChannel);
         }
         let result = self.sessions.check(request.arrival, header);
@@ -393,8 +456,12 @@ impl IngressBridge {
             self.acknowledge(request, HelloStatus::GreetAgain);
         }
         result?;
-        if header.type_hash == self.settings.channel.type_hash {
-            Ok(())
+        let type_hash = match channel {
+            Some(index) => self.settings.flow.channels[index].type_hash,
+            None => self.digest,
+        };
+        if header.type_hash == type_hash {
+            Ok(channel)
         } else {
             Err(Refusal::TypeMismatch)
         }
@@ -403,30 +470,33 @@ impl IngressBridge {
     fn on_data(
         &mut self,
         request: Request<'_>,
+        channel: usize,
         payload: &[u8],
         deliver: &mut dyn FnMut(Delivery<'_>),
     ) -> Result<Disposition, Refusal> {
         let header = request.header;
-        if header.total_len > self.settings.channel.size_max_bytes {
+        if header.total_len > self.settings.flow.channels[channel].size_max_bytes {
             return Err(Refusal::Oversize);
         }
         self.sessions.check_stamps(request.arrival, header)?;
         let stream = stream_of(header);
-        let order = self.window.peek(stream, header.sequence, header.handed_ns);
+        let own = &mut self.channels[channel];
+        let order = own.window.peek(stream, header.sequence, header.handed_ns);
         if let Order::InOrder { gap } = order
             && gap > SEQUENCE_JUMP_MAX
-            && !self.is_jump_allowed
+            && !own.is_jump_allowed
         {
             self.acknowledge(request, HelloStatus::GreetAgain);
             return Err(Refusal::ImplausibleSequence);
         }
+        let deliver_reordered = self.settings.deliver_reordered;
         if header.fragment_count == 1 {
-            let window = &mut self.window;
-            self.is_jump_allowed = false;
-            let message = message_of(header, header.handed_ns);
+            own.is_jump_allowed = false;
+            let message = message_of(channel, header, header.handed_ns);
+            let window = &mut own.window;
             let order = window.record(stream, header.sequence, header.handed_ns);
             let delivery = delivery_of(header, message, payload, order);
-            return Ok(delivery.dispose(self.settings.deliver_reordered, deliver));
+            return Ok(delivery.dispose(deliver_reordered, deliver));
         }
         match order {
             Order::Duplicate => return Err(Refusal::DuplicateFragment),
@@ -442,20 +512,21 @@ impl IngressBridge {
             handed_ns: header.handed_ns,
             payload,
         };
-        let Some(assembled) = self.reassembler.insert(request.now, &fragment)? else {
+        let Some(assembled) = own.reassembler.insert(request.now, &fragment)? else {
+            if !self.split.contains(&channel) {
+                self.split.push(channel);
+            }
             return Ok(Disposition::FragmentStored);
         };
-        self.is_jump_allowed = false;
-        let message = message_of(header, assembled.handed_ns);
-        let order = self
-            .window
-            .record(stream, header.sequence, header.handed_ns);
+        own.is_jump_allowed = false;
+        let message = message_of(channel, header, assembled.handed_ns);
+        let window = &mut own.window;
+        let order = window.record(stream, header.sequence, header.handed_ns);
         let delivery = delivery_of(header, message, assembled.payload, order);
-        Ok(delivery.dispose(self.settings.deliver_reordered, deliver))
+        Ok(delivery.dispose(deliver_reordered, deliver))
     }
 
     fn on_sync_request(&mut self, request: Request<'_>) -> Disposition {
-        self.sync_received_count = self.sync_received_count.wrapping_add(1);
         self.sessions.anchor(request.arrival, request.header);
         self.replies.answer(&SyncRequest {
             now: request.now,
@@ -464,21 +535,20 @@ impl IngressBridge {
             t1_ns: request.header.handed_ns,
             t2_ns: request.arrival.received_ns,
             t2_source: request.arrival.received_source,
-            window: self.window.received_window(),
-            sync_received_count: self.sync_received_count,
             destination: request.arrival.peer,
         });
         Disposition::SyncRequested
     }
 
-    fn on_bye(&mut self, header: &Header) -> Disposition {
+    fn on_bye(&mut self, header: &Header, channel: usize) -> Disposition {
         let stream = stream_of(header);
         let Some(last) = header.sequence.checked_sub(1) else {
             return Disposition::Farewell;
         };
-        let order = self.window.peek(stream, last, header.handed_ns);
+        let window = &mut self.channels[channel].window;
+        let order = window.peek(stream, last, header.handed_ns);
         if !matches!(order, Order::InOrder { gap } if gap > SEQUENCE_JUMP_MAX) {
-            self.window.announce_end(stream, header.sequence);
+            window.announce_end(stream, header.sequence);
         }
         Disposition::Farewell
     }

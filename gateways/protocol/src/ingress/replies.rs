@@ -6,15 +6,13 @@ use core::net::SocketAddr;
 use hil_core::time::Instant;
 
 use super::{IngressSettings, REFUSAL_REPLY_PERIOD, Reply};
-use crate::body::{
-    HELLO_ACK_BODY_BYTES, HelloAck, HelloStatus, ReceivedWindow, SYNC_BODY_BYTES, SyncResponse,
-};
+use crate::body::{HELLO_ACK_BODY_BYTES, HelloAck, HelloStatus, SYNC_BODY_BYTES, SyncResponse};
 use crate::counts;
 use crate::stamps::StampSource;
 use crate::wire::{FollowUpField, HEADER_BYTES, Header, Kind};
 
-const BUFFER_BYTES: usize = HEADER_BYTES + SYNC_BODY_BYTES;
-const _: () = assert!(SYNC_BODY_BYTES >= HELLO_ACK_BODY_BYTES);
+const BUFFER_BYTES: usize = HEADER_BYTES + HELLO_ACK_BODY_BYTES;
+const _: () = assert!(SYNC_BODY_BYTES == HELLO_ACK_BODY_BYTES);
 
 counts! {
     /// What became of the replies.
@@ -35,7 +33,7 @@ pub(super) struct AckRequest {
     pub(super) now: Instant,
     pub(super) status: HelloStatus,
     pub(super) session: u32,
-    pub(super) channel: u16,
+    pub(super) flow: u16,
     pub(super) sequence: u64,
     pub(super) answers_handed_ns: i64,
     pub(super) request_bytes: usize,
@@ -50,8 +48,6 @@ pub(super) struct SyncRequest {
     pub(super) t1_ns: i64,
     pub(super) t2_ns: i64,
     pub(super) t2_source: StampSource,
-    pub(super) window: Option<ReceivedWindow>,
-    pub(super) sync_received_count: u32,
     pub(super) destination: Option<SocketAddr>,
 }
 
@@ -60,8 +56,8 @@ pub(super) struct Replies {
     session: u32,
     domain: [u8; 16],
     clock_id: u64,
-    channel: u16,
-    type_hash: u64,
+    flow: u16,
+    digest: u64,
     buffer: [u8; BUFFER_BYTES],
     ack: Option<AckRequest>,
     sync: Option<SyncRequest>,
@@ -76,8 +72,8 @@ impl Replies {
             session: settings.session,
             domain: settings.domain,
             clock_id: settings.clock_id,
-            channel: settings.channel.channel,
-            type_hash: settings.channel.type_hash,
+            flow: settings.flow.flow,
+            digest: settings.flow.digest(),
             buffer: [0; BUFFER_BYTES],
             ack: None,
             sync: None,
@@ -144,7 +140,7 @@ impl Replies {
             answers_handed_ns: request.answers_handed_ns,
         };
         let length = body.encode(&mut self.buffer[HEADER_BYTES..]);
-        let mut header = Header::new(Kind::HelloAck, request.session, request.channel);
+        let mut header = Header::new(Kind::HelloAck, request.session, request.flow);
         header.sequence = request.sequence;
         header.handed_ns = now.as_ns();
         self.reply(header, length, request.destination)
@@ -156,11 +152,9 @@ impl Replies {
             t2_ns: request.t2_ns,
             t3_ns: now.as_ns(),
             t2_source: request.t2_source,
-            window: request.window,
-            sync_received_count: request.sync_received_count,
         };
         let length = body.encode(&mut self.buffer[HEADER_BYTES..]);
-        let mut header = Header::new(Kind::SyncResponse, request.session, self.channel);
+        let mut header = Header::new(Kind::SyncResponse, request.session, self.flow);
         header.sequence = request.sequence;
         header.handed_ns = now.as_ns();
         header.follow_up = self.follow_up.take();
@@ -173,7 +167,7 @@ impl Replies {
         body_bytes: usize,
         destination: Option<SocketAddr>,
     ) -> Reply<'_> {
-        header.type_hash = self.type_hash;
+        header.type_hash = self.digest;
         header.total_len = u32::try_from(body_bytes).expect("a body is below 1 KiB");
         header.encode(&mut self.buffer);
         self.counts.sent_count += 1;

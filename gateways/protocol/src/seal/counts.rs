@@ -21,8 +21,8 @@ causes! {
     NotSealed => "not sealed", "datagram is not sealed";
     /// Kind, flags or header length are none of this version.
     BadHeader => "malformed header", "kind, flags or header length are unknown";
-    /// The channel is not this one.
-    ForeignChannel => "foreign channel", "channel is not carried here";
+    /// The flow is not this one.
+    ForeignFlow => "foreign flow", "flow is not carried here";
     /// A kind that only the other end sends.
     WrongWay => "wrong way", "kind belongs to the other direction";
     /// No key was agreed with its session.

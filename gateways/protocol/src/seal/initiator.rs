@@ -90,7 +90,7 @@ impl Initiator {
         let request = KeyExchange {
             kind: Kind::KeyRequest,
             session: self.session,
-            channel: self.root.channel,
+            flow: self.root.flow,
             request: self.request,
             generation: self.traffic.as_ref().map_or(0, |one| one.forward.index()),
             handed_ns: handed_ns_of(datagram),
@@ -138,7 +138,7 @@ impl Initiator {
     }
 
     fn accept(&mut self, datagram: &mut [u8]) -> Result<Heard, SealRefusal> {
-        let fields = SealFields::read(datagram, self.root.channel)?;
+        let fields = SealFields::read(datagram, self.root.flow)?;
         match fields.kind {
             Kind::KeyAnswer => return self.take_keys(datagram),
             Kind::HelloAck | Kind::SyncResponse => {}

@@ -1,4 +1,4 @@
-//! From a run's secret to the keys of one way of one channel. It draws no random number and keeps no
+//! From a run's secret to the keys of one way of one flow. It draws no random number and keeps no
 //! state beyond the secrets. Secrets and ciphers are overwritten when they go; the HMAC and HKDF states
 //! of an association last as long as its gateway, and `ring` offers no way to overwrite them.
 //!
@@ -6,10 +6,10 @@
 //!
 //! ```text
 //! root     = extract(salt "hil-runtime seal v1", secret of the run)
-//! request  = expand(root, "request"  | channel number | channel name)            HMAC key
-//! answer   = expand(root, "answer"   | channel number | channel name)            HMAC key
-//! forward  = expand(root, "forward"  | channel | both salts)   generation 0, messages
-//! backward = expand(root, "backward" | channel | both salts)   generation 0, replies
+//! request  = expand(root, "request"  | flow number | flow name)            HMAC key
+//! answer   = expand(root, "answer"   | flow number | flow name)            HMAC key
+//! forward  = expand(root, "forward"  | flow | both salts)   generation 0, messages
+//! backward = expand(root, "backward" | flow | both salts)   generation 0, replies
 //! key      = expand(generation, "key")
 //! next     = expand(generation, "next")                        the generation after it
 //! ```
@@ -74,17 +74,17 @@ impl Suite {
     }
 }
 
-/// What both ends of a channel know of each other before they exchange salts.
+/// What both ends of a flow know of each other before they exchange salts.
 #[derive(Debug, Clone)]
 pub struct Association {
     /// The run's secret.
     pub secret: RunSecret,
     /// The run's cipher.
     pub suite: Suite,
-    /// Number of the channel in datagrams.
-    pub channel: u16,
-    /// Name of the channel.
-    pub channel_name: String,
+    /// Number of the flow in datagrams.
+    pub flow: u16,
+    /// Name of the flow.
+    pub flow_name: String,
 }
 
 /// The keys that an association has before salts are exchanged.
@@ -92,8 +92,8 @@ pub struct Association {
 pub(super) struct Root {
     secret: hkdf::Prk,
     suite: Suite,
-    pub(super) channel: u16,
-    channel_name: String,
+    pub(super) flow: u16,
+    flow_name: String,
     pub(super) request: hmac::Key,
     pub(super) answer: hmac::Key,
 }
@@ -106,8 +106,8 @@ impl Root {
             let key = expand(
                 &secret,
                 label,
-                association.channel,
-                &association.channel_name,
+                association.flow,
+                &association.flow_name,
                 [&[], &[]],
             );
             hmac::Key::new(hmac::HMAC_SHA256, &*key)
@@ -117,8 +117,8 @@ impl Root {
             answer: mac("answer"),
             secret,
             suite: association.suite,
-            channel: association.channel,
-            channel_name: association.channel_name.clone(),
+            flow: association.flow,
+            flow_name: association.flow_name.clone(),
         }
     }
 
@@ -134,7 +134,7 @@ impl Root {
 
     fn generation(&self, label: &str, asking: &Salt, answering: &Salt) -> Generation {
         let salts: [&[u8]; 2] = [asking, answering];
-        let secret = expand(&self.secret, label, self.channel, &self.channel_name, salts);
+        let secret = expand(&self.secret, label, self.flow, &self.flow_name, salts);
         Generation {
             secret,
             suite: self.suite,
@@ -181,15 +181,15 @@ impl hkdf::KeyType for Length {
 fn expand(
     root: &hkdf::Prk,
     label: &str,
-    channel: u16,
+    flow: u16,
     name: &str,
     [asking, answering]: [&[u8]; 2],
 ) -> Secret {
-    let channel = channel.to_le_bytes();
+    let flow = flow.to_le_bytes();
     let name_bytes = u16::try_from(name.len()).unwrap_or(u16::MAX).to_le_bytes();
     let info = [
         label.as_bytes(),
-        &channel[..],
+        &flow[..],
         &name_bytes,
         name.as_bytes(),
         asking,
@@ -269,17 +269,17 @@ impl fmt::Debug for SealKey {
 mod tests {
     use super::*;
 
-    fn root(secret: u8, channel: u16, name: &str) -> Root {
+    fn root(secret: u8, flow: u16, name: &str) -> Root {
         Root::new(&Association {
             secret: RunSecret::new(&mut [secret; 32]),
             suite: Suite::Aes256Gcm,
-            channel,
-            channel_name: name.to_owned(),
+            flow,
+            flow_name: name.to_owned(),
         })
     }
 
     #[test]
-    fn secret_channel_way_salts_and_generation_each_give_another_key() {
+    fn secret_flow_way_salts_and_generation_each_give_another_key() {
         let base = root(1, 0, "arm/command");
         let (one, two) = ([1; 16], [2; 16]);
         let mut secrets = vec![
@@ -308,8 +308,8 @@ mod tests {
         let association = Association {
             secret: RunSecret::new(&mut [0xab; 32]),
             suite: Suite::Aes256Gcm,
-            channel: 0,
-            channel_name: "x".to_owned(),
+            flow: 0,
+            flow_name: "x".to_owned(),
         };
         let text = format!(
             "{association:?} {:?}",

@@ -31,7 +31,7 @@ pub(super) struct SealFields {
 
 impl SealFields {
     /// Reads what must be right before a key is chosen.
-    pub(super) fn read(datagram: &[u8], channel: u16) -> Result<Self, SealRefusal> {
+    pub(super) fn read(datagram: &[u8], flow: u16) -> Result<Self, SealRefusal> {
         if datagram.len() >= 4 && u32_at(datagram, 0) != MAGIC {
             return Err(SealRefusal::BadMagic);
         }
@@ -55,8 +55,10 @@ impl SealFields {
         {
             return Err(SealRefusal::BadHeader);
         }
-        if u16_at(datagram, 12) != channel {
-            return Err(SealRefusal::ForeignChannel);
+        // What is about a channel of the flow is under the flow's keys.
+        let is_key_exchange = matches!(kind, Kind::KeyRequest | Kind::KeyAnswer);
+        if is_key_exchange && u16_at(datagram, 12) != flow {
+            return Err(SealRefusal::ForeignFlow);
         }
         Ok(Self {
             kind,
@@ -122,7 +124,7 @@ pub(super) fn handed_ns_of(datagram: &[u8]) -> i64 {
 pub(super) struct KeyExchange {
     pub(super) kind: Kind,
     pub(super) session: u32,
-    pub(super) channel: u16,
+    pub(super) flow: u16,
     /// Number of the request, which the answer repeats.
     pub(super) request: u64,
     /// Generation of the key under which this end seals.
@@ -142,7 +144,7 @@ impl KeyExchange {
         Ok(Self {
             kind: kind_of(datagram),
             session: u32_at(datagram, 8),
-            channel: u16_at(datagram, 12),
+            flow: u16_at(datagram, 12),
             request: u64_at(datagram, 16),
             generation: u32_at(datagram, 64),
             handed_ns: handed_ns_of(datagram),
@@ -153,7 +155,7 @@ impl KeyExchange {
 
     /// Header and salt; the code over [`covered`] is still to come.
     pub(super) fn write(&self, datagram: &mut [u8; KEY_EXCHANGE_BYTES]) {
-        let mut header = Header::new(self.kind, self.session, self.channel);
+        let mut header = Header::new(self.kind, self.session, self.flow);
         header.sequence = self.request;
         header.handed_ns = self.handed_ns;
         header.epoch = self.generation;

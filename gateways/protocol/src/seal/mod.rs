@@ -8,8 +8,8 @@
 //! gateway whose key goes on.
 //!
 //! **Keys.** All of it follows from a secret of the run ([`RunSecret`]), which the supervisors agree on
-//! and which is never used twice. The two ends of a channel exchange random salts, `KEY_REQ` from the
-//! sender and `KEY_ANS` from the receiver, both under HMAC of the run's secret. From secret, channel and
+//! and which is never used twice. The two ends of a flow exchange random salts, `KEY_REQ` from the
+//! sender and `KEY_ANS` from the receiver, both under HMAC of the run's secret. From secret, flow and
 //! both salts come one key per way ([`keys`]). A gateway that starts again draws another salt, so no
 //! key is ever used with a nonce again, and a request that is played back opens nothing: whoever cannot
 //! seal under the fresh keys has proven nothing, and the bridge hears of nobody before.

@@ -80,7 +80,7 @@ impl Responder {
     }
 
     fn accept(&mut self, datagram: &mut [u8]) -> Result<Opened, SealRefusal> {
-        let fields = SealFields::read(datagram, self.root.channel)?;
+        let fields = SealFields::read(datagram, self.root.flow)?;
         match fields.kind {
             Kind::KeyRequest => return self.answer(datagram).map(Opened::Answer),
             Kind::Data | Kind::SyncRequest | Kind::Hello | Kind::Bye => {}

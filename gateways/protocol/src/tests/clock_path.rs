@@ -1,13 +1,12 @@
-//! A channel without messages, which is what a clock path is to the protocol: nothing but greetings,
+//! A flow without channels, which is what a clock path is to the protocol: nothing but greetings,
 //! clock exchanges and a farewell, in the datagrams there are.
 
 use core::time::Duration;
 
-use hil_core::message::type_hash;
 use hil_core::time::Instant;
 
 use super::golden::bytes;
-use crate::channel::ChannelIdentity;
+use crate::channel::FlowIdentity;
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings, PeerState};
 use crate::ingress::{Disposition, IngressBridge, IngressSettings};
 use crate::refusal::Refusal;
@@ -20,20 +19,24 @@ const OFFSET_NS: i64 = 5_000_000_000;
 const DELAY_NS: i64 = 20_000;
 const DEPARTURE_NS: i64 = 300;
 
-fn channel() -> ChannelIdentity {
-    ChannelIdentity::new(65_535, "clock/a-b", "hil.ClockPath.v1", 0, 1)
+fn flow() -> FlowIdentity {
+    FlowIdentity {
+        flow: 65_535,
+        name: "clock/a-b".to_owned(),
+        channels: Vec::new(),
+    }
 }
 
 fn pair() -> (EgressBridge, IngressBridge) {
     let egress = EgressBridge::new(EgressSettings {
-        channel: channel(),
+        flow: flow(),
         session: 0x0403_0201,
         domain: [1; 16],
         clock_id: 11,
         datagram_max_bytes: 576 - 28,
         sync_period: PERIOD,
     });
-    let ingress = IngressBridge::new(IngressSettings::new(channel(), 7, [2; 16], 22));
+    let ingress = IngressBridge::new(IngressSettings::new(flow(), 7, [2; 16], 22));
     (egress.unwrap(), ingress.unwrap())
 }
 
@@ -49,15 +52,15 @@ fn arrival(received_ns: i64) -> ArrivalStamps {
 fn its_greeting_has_these_bytes() {
     let (mut egress, _) = pair();
     let hello = egress.poll_transmit(Instant::from_ns(0x0d)).unwrap();
-    let hash = type_hash("hil.ClockPath.v1", 0, 1);
-    let hash = format!("{:016x}", hash.swap_bytes());
+    // What the digest of no channels is: the offset basis of FNV-1a.
+    let hash = "25232284e49cf2cb";
     let ones = "01".repeat(16);
     let expected = format!(
-        "48494c47 01 04 0000 01020304 ffff 4800 0000000000000000
+        "48494c47 02 04 0000 01020304 ffff 4800 0000000000000000
          {hash} 0000000000000000 0d00000000000000
-         00000000 ffffffff 43000000 0000 0100 00000000 00000000
-         {ones} 0b00000000000000 00000000 01000000
-         0000000000000000 09 636c6f636b2f612d62 10 68696c2e436c6f636b506174682e7631"
+         00000000 ffffffff 32000000 0000 0100 00000000 00000000
+         {ones} 0b00000000000000 0000
+         0000000000000000000000000000 09 636c6f636b2f612d62"
     );
     assert_eq!(hello.datagram, bytes(&expected));
 }
@@ -80,7 +83,7 @@ fn it_exchanges_clocks_every_period_with_all_four_stamps_of_the_kernel() {
                 &mut |_| panic!("no message"),
             );
             taken.unwrap();
-            egress.on_transmit_stamp(kind, sequence, DEPARTURE_NS);
+            egress.on_transmit_stamp(kind, None, sequence, DEPARTURE_NS);
             let reply = ingress.poll_transmit(Instant::from_ns(there_ns)).unwrap();
             let (kind, sequence) = (reply.kind, reply.sequence);
             let back_ns = there_ns + DEPARTURE_NS + DELAY_NS + OFFSET_NS;
@@ -114,11 +117,11 @@ fn a_message_has_no_room_on_it() {
     let greeted = ingress.on_datagram(now, arrival(1_000_000), hello, &mut |_| {});
     assert!(matches!(greeted, Ok(Disposition::Greeted { .. })));
     let mut header = Header::new(Kind::Data, 0x0403_0201, 65_535);
-    header.type_hash = channel().type_hash;
+    header.type_hash = flow().digest();
     header.handed_ns = 1_000_000;
     header.total_len = 1;
     let mut datagram = vec![0; HEADER_BYTES + 1];
     header.encode(&mut datagram);
     let refused = ingress.on_datagram(now, arrival(1_000_000), &datagram, &mut |_| panic!());
-    assert_eq!(refused, Err(Refusal::Oversize));
+    assert_eq!(refused, Err(Refusal::UnknownChannel));
 }

@@ -2,6 +2,7 @@
 
 mod bridges;
 mod clock_path;
+mod flow;
 mod fragments;
 mod golden;
 pub(super) mod network;

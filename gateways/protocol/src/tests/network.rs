@@ -8,7 +8,7 @@ use hil_core::message::Envelope;
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
-use crate::channel::ChannelIdentity;
+use crate::channel::{ChannelIdentity, FlowIdentity};
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings, LocalRefusal, TransmitFailure};
 use crate::ingress::{Disposition, IngressBridge, IngressSettings, MessageInfo};
 use crate::refusal::Refusal;
@@ -25,9 +25,18 @@ pub(super) fn channel(size_max_bytes: u32) -> ChannelIdentity {
     ChannelIdentity::new(3, "arm/command", "test.Command.v1", size_max_bytes, 8)
 }
 
+/// A flow of that one channel.
+pub(super) fn flow(size_max_bytes: u32) -> FlowIdentity {
+    FlowIdentity {
+        flow: 65_535,
+        name: "link/hop/forward".to_owned(),
+        channels: vec![channel(size_max_bytes)],
+    }
+}
+
 pub(super) fn egress_settings(session: u32, size_max_bytes: u32) -> EgressSettings {
     EgressSettings {
-        channel: channel(size_max_bytes),
+        flow: flow(size_max_bytes),
         session,
         domain: [1; 16],
         clock_id: 11,
@@ -37,7 +46,7 @@ pub(super) fn egress_settings(session: u32, size_max_bytes: u32) -> EgressSettin
 }
 
 pub(super) fn ingress_settings(session: u32, size_max_bytes: u32) -> IngressSettings {
-    IngressSettings::new(channel(size_max_bytes), session, [2; 16], 22)
+    IngressSettings::new(flow(size_max_bytes), session, [2; 16], 22)
 }
 
 #[derive(Debug, Clone, Copy, Default)]
@@ -165,7 +174,9 @@ impl Lab {
         };
         let payload = Self::payload(self.next_sequence, self.payload_bytes);
         self.next_sequence += 1;
-        let result = self.egress.on_local(self.egress_now(), &envelope, &payload);
+        let result = self
+            .egress
+            .on_local(self.egress_now(), 0, &envelope, &payload);
         self.drain_egress();
         result
     }
@@ -173,7 +184,7 @@ impl Lab {
     pub(super) fn drain_egress(&mut self) {
         let now = self.egress_now();
         while let Some(transmit) = self.egress.poll_transmit(now) {
-            let (kind, sequence) = (transmit.kind, transmit.sequence);
+            let (kind, channel, sequence) = (transmit.kind, transmit.channel, transmit.sequence);
             assert!(transmit.datagram.len() + 16 <= 1472);
             let is_last = transmit.is_last_fragment;
             if self.ingress.is_none() {
@@ -185,7 +196,8 @@ impl Lab {
             let bytes = transmit.datagram;
             self.there.offer(self.now_ns, self.egress_address, bytes);
             if is_last {
-                self.egress.on_transmit_stamp(kind, sequence, TX_NS);
+                self.egress
+                    .on_transmit_stamp(kind, channel, sequence, TX_NS);
             }
         }
     }
@@ -248,6 +260,7 @@ impl Lab {
         let counts = self.egress.counts();
         let refused = self.egress.refusals().total();
         assert_eq!(counts.reply_count, counts.reply_accepted_count + refused);
+        let counts = self.egress.channel_counts(0);
         assert_eq!(
             counts.offered_count,
             counts.sent_count + counts.message_failed_count + counts.refused_count()

@@ -29,7 +29,7 @@ fn a_restarted_producer_is_a_restart_and_not_a_loss() {
     lab.next_sequence = 0;
     lab.publish_for_ms(200);
     finish(&mut lab);
-    let counts = lab.ingress().sequence_counts();
+    let counts = lab.ingress().sequence_counts(0);
     assert_eq!((counts.received_count, counts.lost_count), (500, 0));
     assert_eq!(counts.restart_count, 1);
     // The stamp of the old producer's last message does not ride on the new one's first.
@@ -48,7 +48,7 @@ fn a_restarted_sending_gateway_is_a_restart_and_not_a_loss() {
     lab.run_ms(2);
     lab.publish_for_ms(200);
     finish(&mut lab);
-    let counts = lab.ingress().sequence_counts();
+    let counts = lab.ingress().sequence_counts(0);
     assert_eq!((counts.received_count, counts.lost_count), (500, 0));
     assert_eq!(counts.restart_count, 1);
     assert_eq!(lab.ingress().counts().session_restart_count, 1);
@@ -75,9 +75,9 @@ fn a_restarted_receiving_gateway_asks_for_a_greeting_and_goes_on() {
         assert!((1..=21).contains(&refused), "{refused} refused");
         let replies = lab.ingress().reply_counts();
         assert_eq!(replies.amplifying_count > 0, payload_bytes == 8);
-        let received = lab.ingress().sequence_counts().received_count;
+        let received = lab.ingress().sequence_counts(0).received_count;
         assert!(received >= 75, "{received} received");
-        assert_eq!(lab.ingress().sequence_counts().lost_count, 0);
+        assert_eq!(lab.ingress().sequence_counts(0).lost_count, 0);
     }
 }
 
@@ -91,8 +91,9 @@ fn a_vanished_peer_is_down_until_it_greets_back() {
     assert_eq!(lab.egress.peer_state(), PeerState::Down);
     let counts = *lab.egress.counts();
     assert_eq!(counts.peer_down_count, 1);
-    assert_eq!(counts.message_failed_count, 1);
-    assert_eq!(counts.refused_peer_down_count, 499);
+    let messages = lab.egress.channel_counts(0);
+    assert_eq!(messages.message_failed_count, 1);
+    assert_eq!(messages.refused_peer_down_count, 499);
     // Greetings go on every 50 ms.
     assert!((8..=11).contains(&(counts.hello_sent_count)), "{counts:?}");
     lab.ingress = gone;
@@ -100,7 +101,7 @@ fn a_vanished_peer_is_down_until_it_greets_back() {
     assert_eq!(lab.egress.peer_state(), PeerState::Established);
     lab.publish_for_ms(100);
     finish(&mut lab);
-    let counts = *lab.ingress().sequence_counts();
+    let counts = *lab.ingress().sequence_counts(0);
     assert_eq!((counts.received_count, counts.lost_count), (200, 500));
     assert_eq!(counts.loss_burst_length_max, 500);
     assert_eq!(
@@ -125,7 +126,7 @@ fn a_silent_network_does_not_stop_messages() {
     lab.back.impairment = back;
     lab.publish_for_ms(100);
     finish(&mut lab);
-    let counts = *lab.ingress().sequence_counts();
+    let counts = *lab.ingress().sequence_counts(0);
     assert_eq!((counts.received_count, counts.lost_count), (200, 5000));
     assert_eq!(counts.loss_burst_length_max, 5000);
 }
@@ -181,7 +182,7 @@ fn a_session_replaced_by_mistake_comes_back() {
     assert_eq!(taken, Ok(Disposition::Greeted { is_restart: true }));
     lab.publish_for_ms(50);
     assert_eq!(lab.ingress().session(), Some(100));
-    let received = lab.ingress().sequence_counts().received_count;
+    let received = lab.ingress().sequence_counts(0).received_count;
     assert!(received >= 95, "{received} received");
 }
 
@@ -221,8 +222,11 @@ fn a_leap_of_the_sequence_asks_for_a_greeting_first() {
     lab.publish_for_ms(20);
     let refused = lab.ingress().refusals().get(Refusal::ImplausibleSequence);
     assert!(refused >= 1);
-    let received = lab.ingress().sequence_counts().received_count;
-    assert_eq!(received + refused + lab.egress.counts().refused_count(), 30);
+    let received = lab.ingress().sequence_counts(0).received_count;
+    assert_eq!(
+        received + refused + lab.egress.channel_counts(0).refused_count(),
+        30
+    );
     assert!(received > 20);
 }
 
@@ -243,7 +247,7 @@ fn stamps_that_contradict_the_clock_are_refused_until_the_next_exchange() {
             ..Default::default()
         };
         lab.next_sequence += 1;
-        lab.egress.on_local(now, &envelope, &[0; 64]).unwrap();
+        lab.egress.on_local(now, 0, &envelope, &[0; 64]).unwrap();
         let bytes = lab.egress.poll_transmit(now).unwrap().datagram.to_vec();
         let arrival = ArrivalStamps::application(lab.now_ns);
         let now = Instant::from_ns(lab.now_ns);

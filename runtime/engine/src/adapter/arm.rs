@@ -118,7 +118,7 @@ impl Arm {
         // was published before they were is seen by the look that follows.
         let was_announced = core::mem::take(&mut self.attention.is_announced);
         if was_announced && let Some(waiter) = &mut self.waiter {
-            waiter.drain()?;
+            waiter.drain(0)?;
         }
         Ok(has_moved || was_announced)
     }
@@ -135,7 +135,7 @@ impl Arm {
         match own.sooner(self.input.wait.pause(now, None)) {
             Pause::Spin => core::hint::spin_loop(),
             Pause::Sleep(until) => {
-                let listeners = self.waiter.iter().flat_map(Waiter::descriptors);
+                let listeners = self.waiter.iter().map(Waiter::descriptor);
                 let socket: Option<BorrowedFd<'_>> = self.line.poll_fd();
                 let [first, second] = poll_descriptors(listeners.chain(socket), until)?;
                 let (is_announced, has_news) = match self.waiter {

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use hil_core::time::Instant;
+use hil_link::condition::flow_label;
 use hil_transport::ConnectionTally;
 
 use hil_rundir::launch::DirectionLaunch;
@@ -17,7 +18,7 @@ const PATIENCE: Duration = Duration::from_secs(1);
 /// One direction's connection, as told so far.
 #[derive(Debug)]
 pub(super) struct Connection {
-    channel: String,
+    link: String,
     peer: SocketAddr,
     tally: Arc<ConnectionTally>,
     /// Connections that came about, as of the last look.
@@ -30,7 +31,7 @@ pub(super) struct Connection {
 impl Connection {
     pub(super) fn new(launch: &DirectionLaunch, tally: Arc<ConnectionTally>) -> Self {
         Self {
-            channel: launch.channel.clone(),
+            link: flow_label(&launch.flow).to_owned(),
             peer: launch.peer,
             begun_count: tally.begun_count(),
             tally,
@@ -50,7 +51,7 @@ impl Connection {
         let (ended_count, begun_count) = (self.tally.ended_count(), self.tally.begun_count());
         let is_new = begun_count > self.begun_count.max(1);
         self.begun_count = begun_count;
-        let (channel, peer) = (&self.channel, self.peer);
+        let (link, peer) = (&self.link, self.peer);
         if begun_count > ended_count {
             let away = self.away_since.take();
             self.is_told = false;
@@ -58,7 +59,7 @@ impl Connection {
                 let away_ms =
                     away.map_or(0, |since| now.saturating_duration_since(since).as_millis());
                 format!(
-                    "{channel}: the connection to {peer} was lost for about {away_ms} ms and is \
+                    "{link}: the connection to {peer} was lost for about {away_ms} ms and is \
                      back (reconnect {})",
                     begun_count - 1
                 )
@@ -67,7 +68,7 @@ impl Connection {
         let since = *self.away_since.get_or_insert(now);
         let is_long = now.saturating_duration_since(since) >= PATIENCE;
         (is_long && !core::mem::replace(&mut self.is_told, is_long)).then(|| {
-            format!("{channel}: no connection to {peer} for a second; trying again and again")
+            format!("{link}: no connection to {peer} for a second; trying again and again")
         })
     }
 }

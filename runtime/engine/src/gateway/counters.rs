@@ -1,8 +1,9 @@
-//! The counters of one channel direction under the names a report prints. It counts nothing itself.
+//! The counters of one way of a link, and of each of its channels, under the names a report prints. It
+//! counts nothing itself.
 
 use hil_protocol::PeerState;
 use hil_protocol::seal::SealCounts;
-use hil_transport::ReceiverCounters;
+use hil_transport::{LinkCounts, ReceiverCounters};
 
 use super::egress::Egress;
 use super::ingress::Ingress;
@@ -17,7 +18,7 @@ pub(super) fn egress_state(egress: &Egress) -> String {
     match egress.bridge.peer_state() {
         PeerState::Greeting => "never answered".to_owned(),
         // No message tells whether it mattered: how long it lasted does.
-        PeerState::Down if egress.input.is_none() => match silence_ns(egress) {
+        PeerState::Down if egress.inputs.is_empty() => match silence_ns(egress) {
             Some(silence_ns) => {
                 format!("unreachable for the last {:.3} s", silence_ns as f64 * 1e-9)
             }
@@ -27,7 +28,7 @@ pub(super) fn egress_state(egress: &Egress) -> String {
         // earlier one for the time, with no message concerned.
         PeerState::Down if !has_lost_messages(egress) => "left after the last message".to_owned(),
         PeerState::Down => "unreachable".to_owned(),
-        PeerState::Refused(status) => format!("refused the channel: {}", status.label()),
+        PeerState::Refused(status) => format!("refused the link: {}", status.label()),
         PeerState::Established => {
             match silence_ns(egress).filter(|silence_ns| *silence_ns > SILENCE_NS) {
                 Some(silence_ns) => format!("silent for {:.1} s", silence_ns as f64 * 1e-9),
@@ -45,8 +46,10 @@ fn silence_ns(egress: &Egress) -> Option<i64> {
 
 /// True when a message could not go because the peer was unreachable.
 fn has_lost_messages(egress: &Egress) -> bool {
-    let counts = egress.bridge.counts();
-    counts.refused_peer_down_count + counts.message_failed_count > 0
+    let channels = 0..egress.sent.len();
+    channels
+        .map(|channel| egress.bridge.channel_counts(channel))
+        .any(|counts| counts.refused_peer_down_count + counts.message_failed_count > 0)
 }
 
 /// How the sending gateway stood to this one, in words.
@@ -73,7 +76,7 @@ pub(super) fn mark_fact(dscp: u8, counters: &ReceiverCounters) -> Option<(String
     Some(("mark".to_owned(), text))
 }
 
-/// Everything a sending direction counted.
+/// Everything a sending direction counted that is of no one channel.
 pub(super) fn of_egress(egress: &Egress) -> Vec<CountByName> {
     let steps = ("clock_step_count", egress.line.clock_step_count());
     CountByName::all(CounterGroup::Own, egress.bridge.counts().iter())
@@ -89,36 +92,44 @@ pub(super) fn of_egress(egress: &Egress) -> Vec<CountByName> {
         .collect()
 }
 
-/// Everything a receiving direction counted.
+/// Everything a sending direction counted of one channel.
+pub(super) fn of_sent(egress: &Egress, channel: usize) -> Vec<CountByName> {
+    let counts = egress.bridge.channel_counts(channel);
+    CountByName::all(CounterGroup::Own, counts.iter()).collect()
+}
+
+/// Everything a receiving direction counted of one channel, whose number in datagrams is `number`.
+pub(super) fn of_received(ingress: &Ingress, channel: usize, number: u16) -> Vec<CountByName> {
+    let bridge = &ingress.bridge;
+    let pieces = bridge.reassembly_counts(channel);
+    let link = ingress.receiver.link_counts(number);
+    CountByName::all(CounterGroup::Own, bridge.channel_counts(channel).iter())
+        .chain(CountByName::all(
+            CounterGroup::Messages,
+            bridge.sequence_counts(channel).iter(),
+        ))
+        .chain(CountByName::all(CounterGroup::Pieces, pieces.iter()))
+        .chain(CountByName::all(
+            CounterGroup::Socket,
+            link.iter().flat_map(LinkCounts::iter),
+        ))
+        .collect()
+}
+
+/// Everything a receiving direction counted that is of no one channel.
 pub(super) fn of_ingress(ingress: &Ingress) -> Vec<CountByName> {
     let bridge = &ingress.bridge;
     let socket = ingress.receiver.counters();
     let steps = ("clock_step_count", ingress.clock.step_count());
     let foreign = ("foreign source", ingress.foreign_count);
-    let stray = ("message on a clock path", ingress.stray_count);
-    let stray = ingress.output.is_none().then_some(stray);
     CountByName::all(CounterGroup::Own, bridge.counts().iter())
-        .chain(CountByName::all(
-            CounterGroup::Messages,
-            bridge.sequence_counts().iter(),
-        ))
-        .chain(CountByName::all(
-            CounterGroup::Pieces,
-            bridge.reassembly_counts().iter(),
-        ))
         .chain(CountByName::all(
             CounterGroup::Replies,
             bridge.reply_counts().iter(),
         ))
-        .chain(CountByName::all(
-            CounterGroup::Socket,
-            socket.iter().chain(socket.loss_causes()),
-        ))
+        .chain(CountByName::all(CounterGroup::Socket, socket.iter()))
         .chain(CountByName::all(CounterGroup::Own, [steps]))
-        .chain(CountByName::all(
-            CounterGroup::Refused,
-            [foreign].into_iter().chain(stray),
-        ))
+        .chain(CountByName::all(CounterGroup::Refused, [foreign]))
         .chain(CountByName::all(
             CounterGroup::Refused,
             bridge.refusals().iter(),

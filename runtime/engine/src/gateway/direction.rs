@@ -1,5 +1,5 @@
-//! One channel direction of a gateway from its launch description to its final counters: opens
-//! the socket in the normal thread, the shared-memory port in the pinned one.
+//! One way of a link through a gateway, from its launch description to its final counters: opens the socket
+//! in the normal thread, the shared-memory ports in the pinned one.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64};
@@ -12,7 +12,8 @@ use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings,
 use hil_transport::{ConnectionTally, Stalls};
 
 use super::egress::{Attention, Egress};
-use super::ingress::{Ingress, Notes};
+use super::ingress::{Ingress, Output};
+use super::inputs::Inputs;
 use super::kernel_clock::KernelClock;
 use super::line::Line;
 use super::link_switch::SwitchHandle;
@@ -22,14 +23,18 @@ use super::stamp_plan::StampPlan;
 use super::{GatewayContext, WorkerError, counters};
 use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
-use hil_platform::wait::{WaitMode, WaitStrategy};
+use hil_platform::wait::WaitStrategy;
 use hil_rundir::launch::{DirectionLaunch, Side};
-use hil_rundir::pipe::{CountByName, CounterGroup, DirectionReport, RunStart, StallMetrics};
+use hil_rundir::pipe::{
+    ChannelReport, CountByName, CounterGroup, DirectionReport, RunStart, StallMetrics,
+};
 use hil_rundir::record::{RecordKind, RecordSink, Recorder};
-use hil_shm::{RawInput, RawOutput, Waiter};
+use hil_shm::RawOutput;
 
-/// Records a ring holds.
+/// Records that the rings of one kind hold together, shared out among the channels.
 const RING_RECORDS: usize = 16_384;
+/// Each channel's ring holds as many at least: what it may bring in one period of the writer.
+const RING_RECORDS_MIN: usize = 512;
 /// Time between clock exchanges: frequent enough for a round-trip distribution, rare enough to
 /// be a fraction of any control channel's traffic.
 const SYNC_PERIOD: Duration = Duration::from_millis(100);
@@ -37,12 +42,12 @@ const SYNC_PERIOD: Duration = Duration::from_millis(100);
 /// which is less than the fastest exchange leaves open.
 const CLOCK_PATH_PERIOD: Duration = Duration::from_millis(10);
 
-/// A direction whose socket and files are open and whose port is not.
+/// A direction whose socket and files are open and whose ports are not.
 #[derive(Debug)]
 pub struct OpenDirection {
     socket: OpenSocket,
     sinks: Sinks,
-    count: Arc<AtomicU64>,
+    counts: Vec<Arc<AtomicU64>>,
     is_established: Arc<AtomicBool>,
     heartbeat: Heartbeat,
     plan: StampPlan,
@@ -50,11 +55,18 @@ pub struct OpenDirection {
 
 /// The record rings of a direction.
 #[derive(Debug)]
-struct Sinks {
-    /// One record for each message.
-    messages: RecordSink,
-    /// Round trips of a sender, follow-ups of a receiver.
-    exchanges: RecordSink,
+enum Sinks {
+    Egress {
+        /// One record for each message, by channel.
+        messages: Box<[RecordSink]>,
+        round_trips: RecordSink,
+    },
+    Ingress {
+        /// By channel.
+        messages: Vec<RecordSink>,
+        /// By channel.
+        follow_ups: Vec<RecordSink>,
+    },
 }
 
 /// A direction at work.
@@ -63,7 +75,8 @@ pub struct Direction {
     way: BridgeLoop,
     heartbeat: Heartbeat,
     facts: Vec<(String, String)>,
-    replay: Option<ReplayTally>,
+    /// By channel.
+    replays: Vec<Option<ReplayTally>>,
 }
 
 #[derive(Debug)]
@@ -88,22 +101,27 @@ pub fn open(
 }
 
 fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, WorkerError> {
-    let channel = &launch.channel;
-    let mut sink = |kind, size| {
-        // Files of messages would say that a channel carried none.
-        if launch.is_clock_path && kind != RecordKind::RoundTrip {
-            return Ok(recorder.closed_sink());
-        }
-        recorder.sink(kind, channel, size, RING_RECORDS)
+    let share = RING_RECORDS / launch.channels.len().max(1);
+    let capacity = share.max(RING_RECORDS_MIN);
+    let mut of_channels = |kind, size| -> Result<Vec<RecordSink>, WorkerError> {
+        let channels = launch.channels.iter();
+        let sinks = channels.map(|one| recorder.sink(kind, &one.channel, size, capacity));
+        Ok(sinks.collect::<Result<_, _>>()?)
     };
     Ok(match launch.side {
-        Side::Egress => Sinks {
-            messages: sink(RecordKind::Egress, size_of::<EgressRecord>())?,
-            exchanges: sink(RecordKind::RoundTrip, size_of::<RoundTripRecord>())?,
+        Side::Egress => Sinks::Egress {
+            messages: of_channels(RecordKind::Egress, size_of::<EgressRecord>())?
+                .into_boxed_slice(),
+            round_trips: recorder.sink(
+                RecordKind::RoundTrip,
+                &launch.flow,
+                size_of::<RoundTripRecord>(),
+                RING_RECORDS,
+            )?,
         },
-        Side::Ingress => Sinks {
-            messages: sink(RecordKind::Ingress, size_of::<IngressRecord>())?,
-            exchanges: sink(RecordKind::FollowUp, size_of::<FollowUpRecord>())?,
+        Side::Ingress => Sinks::Ingress {
+            messages: of_channels(RecordKind::Ingress, size_of::<IngressRecord>())?,
+            follow_ups: of_channels(RecordKind::FollowUp, size_of::<FollowUpRecord>())?,
         },
     })
 }
@@ -123,16 +141,16 @@ impl OpenDirection {
             socket,
             sinks: open_sinks(launch, recorder)?,
             plan,
-            count: Arc::default(),
+            counts: launch.channels.iter().map(|_| Arc::default()).collect(),
             heartbeat: Heartbeat::default(),
             // A receiver has nobody to wait for: it takes what comes.
             is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
         })
     }
 
-    /// Messages carried so far.
-    pub fn count(&self) -> Arc<AtomicU64> {
-        Arc::clone(&self.count)
+    /// Messages carried so far, by channel.
+    pub fn counts(&self) -> &[Arc<AtomicU64>] {
+        &self.counts
     }
 
     /// Where the emulated link of this direction is changed, if it has one; once.
@@ -155,78 +173,79 @@ impl OpenDirection {
         Arc::clone(&self.is_established)
     }
 
-    /// Joins the local channel; call it in the thread that will carry the messages.
+    /// Joins the local channels; call it in the thread that will carry the messages.
     ///
     /// # Errors
-    /// When the channel does not appear or is of another type.
+    /// When a channel does not appear or is of another type.
     pub fn connect(
         self,
         launch: &DirectionLaunch,
         around: &GatewayContext,
     ) -> Result<Direction, WorkerError> {
-        let way = match self.socket.ends {
-            SocketEnd::Sender(sender, datagram_max_bytes) => {
-                let bridge = egress_bridge(datagram_max_bytes, launch, around)?;
-                let input = (!launch.is_clock_path)
-                    .then(|| RawInput::open(&around.domain, &launch.channel, launch.depth))
-                    .transpose()?;
-                let waiter = (launch.wait != WaitMode::Spin && input.is_some())
-                    .then(|| Waiter::open(&around.domain, &[launch.channel.as_str()]))
-                    .transpose()?;
-                let Sinks {
+        let way = match (self.socket.ends, self.sinks) {
+            (
+                SocketEnd::Sender(sender, datagram_max_bytes),
+                Sinks::Egress {
                     messages,
-                    exchanges,
-                } = self.sinks;
-                BridgeLoop::Egress(Box::new(Egress {
-                    input,
-                    waiter,
-                    bridge,
-                    line: Line::new(sender, messages, exchanges, around.session, self.plan)?,
-                    wait: WaitStrategy::new(launch.wait),
-                    sent: self.count,
-                    stop: Arc::clone(&around.stop),
-                    attention: Attention::default(),
-                    refusal_backoff: RefusalBackoff::of_replies(),
-                    is_established: self.is_established,
-                }))
-            }
-            SocketEnd::Receiver(receiver) => {
+                    round_trips,
+                },
+            ) => BridgeLoop::Egress(Box::new(Egress {
+                inputs: Inputs::open(&around.domain, &launch.channels, launch.wait)?,
+                bridge: egress_bridge(datagram_max_bytes, launch, around)?,
+                line: Line::new(sender, messages, round_trips, around.session, self.plan)?,
+                wait: WaitStrategy::new(launch.wait),
+                sent: self.counts.into_boxed_slice(),
+                stop: Arc::clone(&around.stop),
+                attention: Attention::default(),
+                refusal_backoff: RefusalBackoff::of_replies(),
+                is_established: self.is_established,
+            })),
+            (
+                SocketEnd::Receiver(receiver),
+                Sinks::Ingress {
+                    messages,
+                    follow_ups,
+                },
+            ) => {
                 let settings = IngressSettings::new(
                     GatewayContext::identity(launch),
                     around.session,
                     around.fingerprint,
                     around.clock_id,
                 );
-                let output = (!launch.is_clock_path)
-                    .then(|| RawOutput::open(&around.domain, &launch.channel, true))
-                    .transpose()?;
+                let channels = launch.channels.iter().zip(self.counts);
+                let sinks = messages.into_iter().zip(follow_ups);
+                let outputs = channels.zip(sinks).map(|((one, received), sinks)| {
+                    let (messages, follow_ups) = sinks;
+                    Ok(Output {
+                        port: RawOutput::open(&around.domain, &one.channel, true)?,
+                        messages,
+                        follow_ups,
+                        received,
+                    })
+                });
                 BridgeLoop::Ingress(Box::new(Ingress {
                     receiver,
-                    is_emulated: launch.emulation.is_some(),
+                    is_emulated: launch.channels.iter().any(|one| one.emulation.is_some()),
                     bridge: IngressBridge::new(settings)?,
-                    output,
+                    outputs: outputs.collect::<Result<_, WorkerError>>()?,
                     wait: WaitStrategy::new(launch.wait),
                     peer: launch.peer,
-                    notes: Notes {
-                        messages: self.sinks.messages,
-                        follow_ups: self.sinks.exchanges,
-                    },
-                    received: self.count,
                     stop: Arc::clone(&around.stop),
                     foreign_count: 0,
-                    stray_count: 0,
                     refusal_backoff: RefusalBackoff::of_messages(),
                     clock: KernelClock::read()?,
                     response: None,
                     buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
                 }))
             }
+            _ => unreachable!("sinks and socket are opened for one side"),
         };
         Ok(Direction {
             way,
             heartbeat: self.heartbeat,
             facts: self.socket.facts,
-            replay: self.socket.replay,
+            replays: self.socket.replays,
         })
     }
 }
@@ -238,12 +257,12 @@ pub(super) fn egress_bridge(
     around: &GatewayContext,
 ) -> Result<EgressBridge, SettingsError> {
     EgressBridge::new(EgressSettings {
-        channel: GatewayContext::identity(launch),
+        flow: GatewayContext::identity(launch),
         session: around.session,
         domain: around.fingerprint,
         clock_id: around.clock_id,
         datagram_max_bytes,
-        sync_period: if launch.is_clock_path {
+        sync_period: if launch.is_clock_path() {
             CLOCK_PATH_PERIOD
         } else {
             SYNC_PERIOD
@@ -255,7 +274,7 @@ impl Direction {
     /// Carries messages until told to stop.
     ///
     /// # Errors
-    /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
+    /// When a channel or the socket itself breaks, or the peer refuses the flow for good.
     pub fn run(&mut self) -> Result<(), WorkerError> {
         match &mut self.way {
             BridgeLoop::Egress(egress) => egress.run(&self.heartbeat),
@@ -317,14 +336,27 @@ impl Direction {
         counters.extend(own);
         let own = transport.facts.into_iter();
         facts.extend(own.map(|(label, text)| (label.to_owned(), text)));
+        let channels = launch.channels.iter().enumerate().map(|(index, one)| {
+            let replay = self.replays.get(index).and_then(Option::as_ref);
+            ChannelReport {
+                channel: one.channel.clone(),
+                counters: match &self.way {
+                    BridgeLoop::Egress(egress) => counters::of_sent(egress, index),
+                    BridgeLoop::Ingress(ingress) => {
+                        counters::of_received(ingress, index, one.channel_id)
+                    }
+                },
+                replay: replay.map(ReplayTally::counts),
+            }
+        });
         DirectionReport {
-            channel: launch.channel.clone(),
+            flow: launch.flow.clone(),
             direction: launch.side,
             peer_state,
             counters,
             facts,
             stalls: transport.stalls.map(stall_metrics),
-            replay: self.replay.as_ref().map(ReplayTally::counts),
+            channels: channels.collect(),
         }
     }
 }

@@ -1,5 +1,5 @@
-//! The sending thread of a gateway: from one local channel to the network. It owns the clock, the
-//! port and the socket; what to send and what replies mean is the bridge's business.
+//! The sending thread of a gateway: from the local channels of one flow to the network. It owns the clock,
+//! the ports and the socket; what to send and what replies mean is the bridge's business.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -10,6 +10,7 @@ use hil_core::time::Instant;
 use hil_protocol::egress::RoundTrip;
 use hil_protocol::{EgressBridge, EgressEvent, LocalRefusal, PeerState};
 
+use super::inputs::Inputs;
 use super::line::Line;
 use super::refusal_backoff::RefusalBackoff;
 use super::stamp_tracker::STAMP_PATIENCE_NS;
@@ -17,7 +18,6 @@ use super::{WorkerError, poll_descriptors};
 use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy};
-use hil_shm::{RawInput, Waiter};
 
 /// Longer than any reply; what is longer is no reply and is cut.
 const REPLY_BYTES_MAX: usize = 1024;
@@ -25,13 +25,13 @@ const REPLY_BYTES_MAX: usize = 1024;
 /// Everything the thread works with.
 #[derive(Debug)]
 pub(crate) struct Egress {
-    /// Where messages come from; `None` on a clock path, which carries none.
-    pub(crate) input: Option<RawInput>,
-    pub(crate) waiter: Option<Waiter>,
+    /// Where messages come from; empty on a clock path, which carries none.
+    pub(super) inputs: Inputs,
     pub(crate) bridge: EgressBridge,
     pub(crate) line: Line,
     pub(crate) wait: WaitStrategy,
-    pub(crate) sent: Arc<AtomicU64>,
+    /// Messages sent, by channel.
+    pub(crate) sent: Box<[Arc<AtomicU64>]>,
     pub(crate) stop: Arc<AtomicBool>,
     pub(crate) attention: Attention,
     pub(super) refusal_backoff: RefusalBackoff,
@@ -44,7 +44,6 @@ pub(crate) struct Egress {
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Attention {
     has_news: bool,
-    is_announced: bool,
     is_overdue: bool,
     looked: Instant,
 }
@@ -55,10 +54,10 @@ const LOOK_PERIOD_BUSY_NS: i64 = 5_000_000;
 const LOOK_PERIOD_NS: i64 = 500_000;
 
 impl Egress {
-    /// Carries the channel until told to stop, then says goodbye to the peer.
+    /// Carries the channels until told to stop, then says goodbye to the peer.
     ///
     /// # Errors
-    /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
+    /// When the channel or the socket itself breaks, or the peer refuses the flow for good.
     pub(crate) fn run(&mut self, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
         while !self.stop.load(Ordering::Acquire) {
             if !self.step()? {
@@ -73,7 +72,7 @@ impl Egress {
     }
 
     /// Sends one waiting message, or else looks after stamps, replies and appointments; false when
-    /// no message waited and none was announced.
+    /// no message waited and no channel is to be looked at.
     pub(crate) fn step(&mut self) -> Result<bool, WorkerError> {
         let moved = self.forward()?;
         if moved && !self.attention.is_overdue {
@@ -101,35 +100,29 @@ impl Egress {
             self.line.transmit(&mut self.bridge);
         }
         // Announcements are taken back only now, for the message waited for its datagram, not
-        // for this. A message published before they were is seen by the look that follows.
-        let was_announced = core::mem::take(&mut self.attention.is_announced);
-        if was_announced && let Some(waiter) = &mut self.waiter {
-            waiter.drain()?;
-        }
-        Ok(moved || was_announced)
+        // for this.
+        let was_announced = self.inputs.settle()?;
+        Ok(moved || was_announced || self.inputs.is_any_due())
     }
 
     /// True while the peer takes messages. On a clock path the run may begin after an exchange
     /// whose four stamps are known: that of the response's departure rides on the next.
     fn is_ready(&self) -> bool {
         let is_established = self.bridge.peer_state() == PeerState::Established;
-        is_established && (self.input.is_some() || self.bridge.counts().round_trip_count > 1)
+        is_established && (!self.inputs.is_empty() || self.bridge.counts().round_trip_count > 1)
     }
 
-    /// Sends the oldest waiting message; false when none waited.
+    /// Sends the oldest message of the channel whose turn it is; false when it had none.
     fn forward(&mut self) -> Result<bool, WorkerError> {
         let Self {
-            input,
+            inputs,
             bridge,
             line,
             wait,
             sent,
             ..
         } = self;
-        let Some(input) = input else {
-            return Ok(false);
-        };
-        let mut take = |envelope: &Envelope, payload: &[u8]| {
+        let take = |channel: usize, envelope: &Envelope, payload: &[u8]| {
             let taken = MonotonicClock::now();
             wait.on_arrival(taken);
             let record = EgressRecord {
@@ -145,21 +138,25 @@ impl Egress {
                 flags: 0,
                 fragment_count: 0,
             };
-            match bridge.on_local(taken, envelope, payload) {
+            match bridge.on_local(taken, channel, envelope, payload) {
                 Ok(()) => {
                     line.message = Some(record);
                     line.transmit(bridge);
-                    sent.store(bridge.counts().sent_count, Ordering::Relaxed);
+                    let sent_count = bridge.channel_counts(channel).sent_count;
+                    sent[channel].store(sent_count, Ordering::Relaxed);
                 }
                 // Another gateway's message: not this gateway's to account for.
                 Err(LocalRefusal::Forwarded) => {}
-                Err(_counted) => line.finish(EgressRecord {
-                    flags: EgressRecord::REFUSED_BY_KERNEL,
-                    ..record
-                }),
+                Err(_counted) => line.finish(
+                    channel,
+                    EgressRecord {
+                        flags: EgressRecord::REFUSED_BY_KERNEL,
+                        ..record
+                    },
+                ),
             }
         };
-        Ok(input.receive(&mut take)?)
+        Ok(inputs.receive(take)?)
     }
 
     /// Takes the peer's replies.
@@ -178,7 +175,6 @@ impl Egress {
                 Ok(EgressEvent::RoundTrip {
                     round_trip,
                     earlier,
-                    ..
                 }) => {
                     if let Some(earlier) = earlier {
                         self.note_round_trip(&earlier);
@@ -230,18 +226,22 @@ impl Egress {
                 // Messages are never kept waiting for refused replies.
                 let away = self.refusal_backoff.until(now, self.refused_count());
                 let until = away.unwrap_or(until).min(until);
-                let listeners = self.waiter.iter().flat_map(Waiter::descriptors);
+                let listener = self.inputs.descriptor();
+                let is_listening = listener.is_some();
                 let socket = self.line.sender.poll_fd().filter(|_| away.is_none());
-                let [is_announced, has_socket_news] =
-                    poll_descriptors(listeners.chain(socket), until)?;
-                // Without a waiter the socket comes first.
-                let (is_announced, has_socket_news) = match self.waiter {
-                    Some(_) => (is_announced, has_socket_news || away.is_some()),
-                    None => (false, is_announced || away.is_some()),
+                let [first, second] = poll_descriptors(listener.into_iter().chain(socket), until)?;
+                // Without a listener the socket comes first.
+                let (is_announced, has_socket_news) = if is_listening {
+                    (first, second)
+                } else {
+                    (false, first)
                 };
-                self.attention.has_news |= has_socket_news;
-                // After a quiet wait it is looked at as well: see `Waiter::drain`.
-                self.attention.is_announced |= is_announced || !has_socket_news;
+                self.attention.has_news |= has_socket_news || away.is_some();
+                if is_announced {
+                    self.inputs.note_announced()?;
+                } else if !has_socket_news {
+                    self.inputs.note_quiet();
+                }
             }
         }
         Ok(())

@@ -1,5 +1,5 @@
-//! The receiving thread of a gateway: from the network to one local channel. It owns the clock,
-//! the socket and the port; what a datagram means is the bridge's business.
+//! The receiving thread of a gateway: from the network to the local channels of one flow. It owns the clock,
+//! the socket and the ports; what a datagram means is the bridge's business.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -30,17 +30,13 @@ pub(crate) struct Ingress {
     /// The receiver holds datagrams back, so it must be told the time.
     pub(crate) is_emulated: bool,
     pub(crate) bridge: IngressBridge,
-    /// Where messages go; `None` on a clock path, which carries none.
-    pub(crate) output: Option<RawOutput>,
+    /// Where messages go, by channel; empty on a clock path, which carries none.
+    pub(crate) outputs: Box<[Output]>,
     pub(crate) wait: WaitStrategy,
     pub(crate) peer: SocketAddr,
-    pub(crate) notes: Notes,
-    pub(crate) received: Arc<AtomicU64>,
     pub(crate) stop: Arc<AtomicBool>,
     /// Datagrams from an address that is not the peer's, dropped unread.
     pub(crate) foreign_count: u64,
-    /// Messages that came over a clock path, dropped.
-    pub(crate) stray_count: u64,
     pub(super) refusal_backoff: RefusalBackoff,
     pub(crate) clock: KernelClock,
     /// The clock response whose departure the kernel is to stamp.
@@ -55,11 +51,14 @@ pub(crate) struct Response {
     handed: Instant,
 }
 
-/// Where the thread's records go.
+/// One local channel, and where the records of its messages go.
 #[derive(Debug)]
-pub(crate) struct Notes {
+pub(crate) struct Output {
+    pub(crate) port: RawOutput,
     pub(crate) messages: RecordSink,
     pub(crate) follow_ups: RecordSink,
+    /// Messages delivered.
+    pub(crate) received: Arc<AtomicU64>,
 }
 
 /// What is known of a datagram before the bridge reads it.
@@ -93,10 +92,10 @@ impl Arrival {
 }
 
 impl Ingress {
-    /// Carries the channel until told to stop.
+    /// Carries the channels until told to stop.
     ///
     /// # Errors
-    /// When the channel or the socket itself breaks.
+    /// When a channel or the socket itself breaks.
     pub(crate) fn run(&mut self, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
         while !self.stop.load(Ordering::Acquire) {
             if !self.step()? {
@@ -157,28 +156,22 @@ impl Ingress {
         let stamps = self.clock.arrival(&received, at);
         let Self {
             bridge,
-            output,
-            notes,
-            received: count,
-            stray_count,
+            outputs,
             buffer,
             ..
         } = self;
         let bytes = &buffer[..received.length_bytes];
         let mut failed = None;
         let mut deliver = |delivery: Delivery<'_>| {
-            let Some(output) = output else {
-                *stray_count += 1;
-                return;
-            };
-            count.fetch_add(1, Ordering::Relaxed);
-            if let Err(error) = publish(output, notes, &arrival, &delivery) {
+            let output = &mut outputs[delivery.message.channel];
+            output.received.fetch_add(1, Ordering::Relaxed);
+            if let Err(error) = output.publish(&arrival, &delivery) {
                 failed = Some(error);
             }
         };
         // A refused datagram is a counter of the bridge.
         if let Ok(disposition) = bridge.on_datagram(at, stamps, bytes, &mut deliver) {
-            note_undelivered(notes, &arrival, disposition);
+            note_undelivered(outputs, &arrival, disposition);
         }
         failed.map_or(Ok(Some(at)), |error| Err(error.into()))
     }
@@ -250,50 +243,46 @@ impl Ingress {
     }
 }
 
-fn publish(
-    output: &mut RawOutput,
-    notes: &mut Notes,
-    arrival: &Arrival,
-    delivery: &Delivery<'_>,
-) -> Result<(), ChannelError> {
-    let message = &delivery.message;
-    let mut forwarded_ns = UNAVAILABLE;
-    output.publish_with(delivery.payload, || {
-        forwarded_ns = MonotonicClock::now().as_ns();
-        Envelope {
-            sequence: message.sequence,
-            published_ns: message.published.as_ns(),
-            forwarded_ns,
-            epoch: message.epoch,
-            flags: Envelope::FORWARDED,
-            reserved: [0; 4],
-        }
-    })?;
-    let flags = if delivery.order == Order::Reordered {
-        IngressRecord::REORDERED
-    } else {
-        0
-    };
-    notes
-        .messages
-        .push(&arrival.record(message, forwarded_ns, flags));
-    if let Some(FollowUp {
-        sequence,
-        handed_to_tx_ns,
-    }) = delivery.follow_up
-    {
-        let session = message.session;
-        notes.follow_ups.push(&FollowUpRecord {
+impl Output {
+    fn publish(&mut self, arrival: &Arrival, delivery: &Delivery<'_>) -> Result<(), ChannelError> {
+        let message = &delivery.message;
+        let mut forwarded_ns = UNAVAILABLE;
+        self.port.publish_with(delivery.payload, || {
+            forwarded_ns = MonotonicClock::now().as_ns();
+            Envelope {
+                sequence: message.sequence,
+                published_ns: message.published.as_ns(),
+                forwarded_ns,
+                epoch: message.epoch,
+                flags: Envelope::FORWARDED,
+                reserved: [0; 4],
+            }
+        })?;
+        let flags = if delivery.order == Order::Reordered {
+            IngressRecord::REORDERED
+        } else {
+            0
+        };
+        self.messages
+            .push(&arrival.record(message, forwarded_ns, flags));
+        if let Some(FollowUp {
             sequence,
             handed_to_tx_ns,
-            session,
-            reserved: 0,
-        });
+        }) = delivery.follow_up
+        {
+            let session = message.session;
+            self.follow_ups.push(&FollowUpRecord {
+                sequence,
+                handed_to_tx_ns,
+                session,
+                reserved: 0,
+            });
+        }
+        Ok(())
     }
-    Ok(())
 }
 
-fn note_undelivered(notes: &mut Notes, arrival: &Arrival, disposition: Disposition) {
+fn note_undelivered(outputs: &mut [Output], arrival: &Arrival, disposition: Disposition) {
     let (message, flags) = match disposition {
         Disposition::Duplicate(message) => (message, IngressRecord::DUPLICATE),
         Disposition::Late(message) => (message, IngressRecord::LATE),
@@ -304,7 +293,7 @@ fn note_undelivered(notes: &mut Notes, arrival: &Arrival, disposition: Dispositi
         | Disposition::SyncRequested
         | Disposition::Farewell => return,
     };
-    notes
+    outputs[message.channel]
         .messages
         .push(&arrival.record(&message, UNAVAILABLE, flags));
 }

@@ -30,7 +30,8 @@ const HAND_OVER_MAX: Duration = Duration::from_millis(200);
 pub(crate) struct Line {
     pub(super) sender: Box<dyn DatagramSender>,
     pending: StampTracker<Pending>,
-    records: RecordSink,
+    /// By channel.
+    records: Box<[RecordSink]>,
     pub(super) round_trips: RecordSink,
     pub(super) session: u32,
     pub(super) clock: KernelClock,
@@ -43,6 +44,8 @@ pub(crate) struct Line {
 #[derive(Debug, Clone, Copy)]
 struct Pending {
     kind: Kind,
+    /// Whose message it carries.
+    channel: Option<usize>,
     sequence: u64,
     handed: Instant,
     /// Of a message's last piece.
@@ -64,7 +67,7 @@ impl Pending {
 impl Line {
     pub(crate) fn new(
         sender: Box<dyn DatagramSender>,
-        records: RecordSink,
+        records: Box<[RecordSink]>,
         round_trips: RecordSink,
         session: u32,
         awaited: StampPlan,
@@ -95,7 +98,7 @@ impl Line {
                 break;
             };
             self.newest_handed = handed;
-            let (kind, sequence) = (transmit.kind, transmit.sequence);
+            let (kind, channel, sequence) = (transmit.kind, transmit.channel, transmit.sequence);
             let is_last = transmit.is_last_fragment;
             if kind == Kind::Data
                 && let Some(record) = &mut self.message
@@ -113,15 +116,25 @@ impl Line {
                 None
             };
             match sent {
-                Ok(token) => self.expect_stamp(token, kind, sequence, handed, record),
+                Ok(token) => {
+                    let pending = Pending {
+                        kind,
+                        channel,
+                        sequence,
+                        handed,
+                        record,
+                        is_stamped: false,
+                        is_nic_stamped: false,
+                        is_reported: false,
+                    };
+                    self.expect_stamp(token, pending);
+                }
                 Err(refusal) => {
                     let is_established = bridge.peer_state() == PeerState::Established;
                     bridge.on_transmit_failed(handed, failure(refusal, is_established));
-                    if let Some(record) = record {
-                        self.finish(EgressRecord {
-                            flags: EgressRecord::REFUSED_BY_KERNEL,
-                            ..record
-                        });
+                    if let Some((channel, record)) = channel.zip(record) {
+                        let flags = EgressRecord::REFUSED_BY_KERNEL;
+                        self.finish(channel, EgressRecord { flags, ..record });
                     }
                 }
             }
@@ -133,30 +146,12 @@ impl Line {
         self.take_due_stamps(bridge);
     }
 
-    fn expect_stamp(
-        &mut self,
-        token: TxToken,
-        kind: Kind,
-        sequence: u64,
-        handed: Instant,
-        record: Option<EgressRecord>,
-    ) {
+    fn expect_stamp(&mut self, token: TxToken, pending: Pending) {
         if !self.awaited.is_anything_awaited() {
-            if let Some(record) = record {
-                self.finish(record);
-            }
+            self.retire(Some(pending));
             return;
         }
-        let pending = Pending {
-            kind,
-            sequence,
-            handed,
-            record,
-            is_stamped: false,
-            is_nic_stamped: false,
-            is_reported: false,
-        };
-        let displaced = self.pending.expect(token, handed, pending);
+        let displaced = self.pending.expect(token, pending.handed, pending);
         self.retire(displaced);
     }
 
@@ -206,6 +201,7 @@ impl Line {
                     .map_or(pending.handed.as_ns(), |record| record.handed_ns);
                 bridge.on_transmit_stamp(
                     pending.kind,
+                    pending.channel,
                     pending.sequence,
                     software_ns - offset - first_handed,
                 );
@@ -262,13 +258,13 @@ impl Line {
     }
 
     fn retire(&mut self, pending: Option<Pending>) {
-        if let Some(record) = pending.and_then(|one| one.record) {
-            self.finish(record);
+        if let Some((channel, record)) = pending.and_then(|one| one.channel.zip(one.record)) {
+            self.finish(channel, record);
         }
     }
 
-    pub(super) fn finish(&mut self, record: EgressRecord) {
-        self.records.push(&record);
+    pub(super) fn finish(&mut self, channel: usize, record: EgressRecord) {
+        self.records[channel].push(&record);
     }
 
     /// How long a datagram may wait for what is still to come of it.
@@ -375,6 +371,7 @@ mod tests {
                     [1, 2, 4].map(|bit| come & bit != 0);
                 let pending = Pending {
                     kind: Kind::Data,
+                    channel: Some(0),
                     sequence: 0,
                     handed: Instant::ZERO,
                     record: None,

@@ -8,11 +8,11 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use hil_link::condition::{
-    LinkChangeRequest, LinkCondition, LinkConditionRecord, OrderOutcome, order_channel,
+    LinkChangeRequest, LinkCondition, LinkConditionRecord, OrderOutcome, flow_name,
 };
 
 use super::WorkerError;
-use super::link_switch::SwitchHandle;
+use super::link_switch::{Replacements, SwitchHandle};
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::launch::WorkerLaunch;
 use hil_rundir::link_orders::condition_header;
@@ -27,7 +27,7 @@ pub(crate) const ORDERS_MAX: usize = 8;
 /// channels of the direction change at one instant.
 const LEAD: Duration = Duration::from_millis(5);
 
-/// Every emulated direction of one gateway process.
+/// Every emulated way of the link of one gateway process.
 #[derive(Debug, Default)]
 pub(super) struct LinkControl {
     lines: Vec<ControlLine>,
@@ -37,7 +37,7 @@ pub(super) struct LinkControl {
 #[derive(Debug)]
 struct ControlLine {
     orders: RawInput,
-    switches: Vec<SwitchHandle>,
+    switch: SwitchHandle,
     book: ConditionBook,
     number: u64,
     /// One complaint about its channel is enough.
@@ -58,14 +58,10 @@ impl LinkControl {
         let mut lines: Vec<ControlLine> = Vec::new();
         for switch in switches {
             let emulation = switch.emulation();
-            let name = order_channel(&emulation.link, emulation.way);
-            if let Some(line) = lines.iter_mut().find(|line| line.book.channel == name) {
-                line.switches.push(switch);
-                continue;
-            }
+            let name = flow_name(&emulation.link, emulation.way);
             lines.push(ControlLine {
                 orders: RawInput::open(domain, &name, ORDERS_MAX)?,
-                switches: vec![switch],
+                switch,
                 book: ConditionBook::new(launch, name),
                 number: 0,
                 has_complained: false,
@@ -158,9 +154,7 @@ impl ControlLine {
         let from = MonotonicClock::now() + LEAD;
         let outcome = match ready {
             Ok(replacements) => {
-                for (switch, replacement) in self.switches.iter_mut().zip(replacements) {
-                    switch.send(from, replacement);
-                }
+                self.switch.send(from, replacements);
                 OrderOutcome::InForce
             }
             Err(refused) => refused,
@@ -178,22 +172,16 @@ impl ControlLine {
         }
     }
 
-    fn prepare(
-        &mut self,
-        order: &LinkChangeRequest,
-    ) -> Result<Vec<super::link_switch::Replacement>, OrderOutcome> {
+    fn prepare(&mut self, order: &LinkChangeRequest) -> Result<Replacements, OrderOutcome> {
         let condition = order.condition().ok_or(OrderOutcome::Malformed)?;
-        if !self.switches.iter().all(|one| one.can_hold(condition)) {
+        if !self.switch.can_hold(condition) {
             return Err(OrderOutcome::NoRoom);
         }
-        if !self.switches.iter_mut().all(SwitchHandle::is_free) {
+        if !self.switch.is_free() {
             return Err(OrderOutcome::Busy);
         }
-        let number = self.number;
-        let built = self.switches.iter().map(|one| one.build(condition, number));
-        built
-            .collect::<Result<_, _>>()
-            .map_err(|_range| OrderOutcome::Malformed)
+        let built = self.switch.build(condition, self.number);
+        built.map_err(|_range| OrderOutcome::Malformed)
     }
 }
 

@@ -1,10 +1,11 @@
 //! The gateway of a link on one host: carries channels between shared memory and the network. What
 //! bytes mean is the business of `hil_protocol`; here are the loops that own clock,
-//! socket, port and records.
+//! socket, ports and records.
 //!
-//! - `process`: what the process opens, one thread per channel direction.
-//! - [`direction`]: one direction from its launch description to its final counters.
+//! - `process`: what the process opens: one thread and one socket each way, however many channels.
+//! - [`direction`]: one of them from its launch description to its final counters.
 //! - `egress`: shared memory to network; `ingress`: network to shared memory.
+//! - `inputs`: which channel's message goes next.
 //! - `refusal_backoff`: what both do about a flood of datagrams that they refuse.
 
 mod connection;
@@ -12,6 +13,7 @@ mod counters;
 pub mod direction;
 pub(crate) mod egress;
 pub(crate) mod ingress;
+mod inputs;
 pub(crate) mod kernel_clock;
 mod line;
 pub(crate) mod link_control;
@@ -28,7 +30,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use hil_core::time::Instant;
-use hil_protocol::ChannelIdentity;
+use hil_protocol::{ChannelIdentity, FlowIdentity};
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::TimeSpec;
@@ -70,15 +72,22 @@ impl GatewayContext {
         })
     }
 
-    /// What the other end of the channel of `launch` must agree on.
-    pub fn identity(launch: &DirectionLaunch) -> ChannelIdentity {
-        ChannelIdentity::new(
-            launch.channel_id,
-            &launch.channel,
-            &launch.message,
-            u32::try_from(launch.size_bytes).unwrap_or(u32::MAX),
-            u32::try_from(launch.alignment_bytes).unwrap_or(u32::MAX),
-        )
+    /// What the other end of the flow of `launch` must agree on.
+    pub fn identity(launch: &DirectionLaunch) -> FlowIdentity {
+        let channels = launch.channels.iter().map(|one| {
+            ChannelIdentity::new(
+                one.channel_id,
+                &one.channel,
+                &one.message,
+                u32::try_from(one.size_bytes).unwrap_or(u32::MAX),
+                u32::try_from(one.alignment_bytes).unwrap_or(u32::MAX),
+            )
+        });
+        FlowIdentity {
+            flow: launch.flow_number,
+            name: launch.flow.clone(),
+            channels: channels.collect(),
+        }
     }
 }
 

@@ -1,5 +1,5 @@
-//! The process of one link's gateway on one host, or of one end of a clock path: one thread per
-//! channel direction. The process's own thread opens and arms the sockets, because kernel stamps are
+//! The process of one link's gateway on one host, or of one end of a clock path: one thread for what goes out
+//! and one for what comes in. The process's own thread opens and arms the sockets, because kernel stamps are
 //! switched on by a worker that a spinning real-time thread would starve; then it only looks after
 //! connections and orders. A gateway that starts with the run says at once what is wrong with its
 //! path; one that comes back during the run waits for a path that is away, as one that never
@@ -12,6 +12,7 @@ use std::time::Duration;
 use std::{io, thread};
 
 use hil_core::time::Instant;
+use hil_link::condition::flow_label;
 use hil_protocol::SettingsError;
 use hil_transport::socket::SocketError;
 
@@ -80,7 +81,7 @@ pub(crate) fn open<'a>(
         directions.push((direction, opened));
     }
     let switches = directions.iter_mut();
-    let switches = switches.filter_map(|(_, one)| one.take_switch()).collect();
+    let switches: Vec<_> = switches.filter_map(|(_, one)| one.take_switch()).collect();
     let gateway = GatewayWatch {
         work,
         instance: launch.instance,
@@ -97,7 +98,7 @@ pub(crate) fn open<'a>(
         sampler: armed.start_sampler(&launch.process, recorder, stop)?,
     };
     let jobs = directions.into_iter().map(|(direction, opened)| {
-        let spinner = format!("{}: ", direction.channel);
+        let spinner = format!("{}: ", flow_label(&direction.flow));
         warn_of_spinning(&spinner, direction.wait, direction.realtime.cpu);
         job(direction, opened, Arc::clone(&surroundings))
     });
@@ -135,13 +136,15 @@ fn job(launch: &DirectionLaunch, opened: OpenDirection, around: Arc<GatewayConte
         Side::Egress => ("out", "sent"),
         Side::Ingress => ("in", "received"),
     };
+    let counters = launch.channels.iter().zip(opened.counts());
+    let counters = counters.map(|(one, count)| Counter {
+        channel: one.channel.clone(),
+        what,
+        count: Arc::clone(count),
+    });
     Job {
-        name: format!("{way} {}", launch.channel),
-        counters: vec![Counter {
-            channel: launch.channel.clone(),
-            what,
-            count: opened.count(),
-        }],
+        name: format!("{way} {}", flow_label(&launch.flow)),
+        counters: counters.collect(),
         heartbeat: Some(opened.heartbeat()),
         connect: Box::new(move |thread| {
             thread.claim(&launch.realtime);
@@ -237,17 +240,17 @@ fn warn_of_shared_cpus(work: &GatewayWork) {
         .filter(|one| one.wait == WaitMode::Spin)
     {
         if let Some(cpu) = direction.realtime.cpu {
-            spinning.entry(cpu).or_default().push(&direction.channel);
+            spinning
+                .entry(cpu)
+                .or_default()
+                .push(flow_label(&direction.flow));
         }
     }
-    for (cpu, channels) in spinning
-        .into_iter()
-        .filter(|(_, channels)| channels.len() > 1)
-    {
+    for (cpu, flows) in spinning.into_iter().filter(|(_, flows)| flows.len() > 1) {
         let text = format!(
             "wait = spin: the threads of {} share CPU {cpu}; list one CPU for each in \
              gateway.cpu",
-            channels.join(" and ")
+            flows.join(" and ")
         );
         say(&FromProcess::Warning(text));
     }

@@ -1,20 +1,21 @@
-//! The socket of one channel direction: opened as its launch description says, behind a link model
-//! where it has one, with what the kernel granted. It moves no message.
+//! The socket of one way of a link: opened as its launch description says, behind the link models of its
+//! channels where they have any, with what the kernel granted. It moves no message.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber, ReplayTally};
 use hil_core::time::{Instant, RemoteInstant};
 use hil_net::timestamping::TimestampMode;
-use hil_protocol::wire::{self, Kind};
-use hil_transport::emulated::{EmulatedReceiver, EmulatedSettings};
+use hil_protocol::wire::{self, Header, Kind};
+use hil_transport::emulated::{EmulatedReceiver, EmulatedSettings, Offer};
 use hil_transport::registry::{self, Transport};
 use hil_transport::socket::{GrantedOptions, SocketSettings};
 use hil_transport::{ConnectionTally, DatagramReceiver, DatagramSender};
 
 use super::WorkerError;
-use super::link_switch::{SwitchHandle, switch};
+use super::link_switch::{OwnLink, SwitchHandle, switch};
 use super::stamp_plan::StampPlan;
 use hil_nic::radio::category;
 use hil_platform::clock::MonotonicClock;
@@ -23,6 +24,7 @@ use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch};
 use hil_rundir::pipe::RunStart;
 use hil_rundir::run_seal::RunSeal;
 use hil_topology::Timestamps;
+use hil_topology::emulation_room::EmulationRoom;
 
 /// A direction's socket and what is known of it.
 #[derive(Debug)]
@@ -31,9 +33,9 @@ pub(super) struct OpenSocket {
     pub(super) facts: Vec<(String, String)>,
     /// How often its connections come and go, where this end tells of it.
     pub(super) tally: Option<Arc<ConnectionTally>>,
-    /// What its link model met of the trace that it replays, where it replays one.
-    pub(super) replay: Option<ReplayTally>,
-    /// Where its link model can be changed, where it has one.
+    /// What the link model of each channel met of the trace that it replays, where it replays one.
+    pub(super) replays: Vec<Option<ReplayTally>>,
+    /// Where its link models can be changed, where it has any.
     pub(super) switch: Option<SwitchHandle>,
 }
 
@@ -77,16 +79,12 @@ impl OpenSocket {
                 emulate(end.receiver, end.facts, launch, start)?
             }
         };
-        if let Some(emulation) = &launch.emulation {
-            opened.facts.push((
-                "link model behind the socket, part of RX stamp → received by gateway".to_owned(),
-                emulation.describe(),
-            ));
-            if launch.side == Side::Ingress {
-                let room = emulation.room(launch.size_bytes)?;
-                let fact = ("room of the link model".to_owned(), room.to_string());
-                opened.facts.push(fact);
-            }
+        opened.facts.extend(model_facts(launch));
+        if launch.side == Side::Ingress
+            && let Some(room) = room_of(launch)?
+        {
+            let fact = ("room of the link model".to_owned(), room.to_string());
+            opened.facts.push(fact);
         }
         opened.facts.push(security_fact(seal));
         Ok(opened)
@@ -98,7 +96,7 @@ impl OpenSocket {
             ends,
             facts,
             tally: None,
-            replay: None,
+            replays: Vec::new(),
             switch: None,
         }
     }
@@ -151,56 +149,115 @@ fn access_category(granted: GrantedOptions) -> (String, String) {
     ("access category".to_owned(), text)
 }
 
-/// The longest datagram of the channel: as long as a message needs, with room for the greetings and
+/// The longest datagram of any channel: as long as a message needs, with room for the greetings and
 /// clock exchanges that share its socket, and no longer than the path takes.
 fn held_bytes_max(launch: &DirectionLaunch) -> usize {
-    let message = launch.size_bytes + wire::HEADER_BYTES + wire::TAG_BYTES;
-    message.max(512).min(launch.socket.path_mtu_bytes)
+    let messages = launch.channels.iter().map(|one| one.size_bytes);
+    let longest = messages.max().unwrap_or(0) + wire::HEADER_BYTES + wire::TAG_BYTES;
+    longest.max(512).min(launch.socket.path_mtu_bytes)
 }
 
-/// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
-/// pass freely: the model stands for what happens to the robot's messages.
+/// What the channels meet, once where all of them meet the same.
+fn model_facts(launch: &DirectionLaunch) -> Vec<(String, String)> {
+    const LABEL: &str = "link model behind the socket, part of RX stamp → received by gateway";
+    let mut channels_of: BTreeMap<String, Vec<&str>> = BTreeMap::new();
+    for one in &launch.channels {
+        if let Some(emulation) = &one.emulation {
+            let channels = channels_of.entry(emulation.describe()).or_default();
+            channels.push(&one.channel);
+        }
+    }
+    let is_one = channels_of.len() == 1;
+    let facts = channels_of.into_iter().map(|(model, channels)| {
+        let label = if is_one {
+            LABEL.to_owned()
+        } else {
+            format!("{LABEL}, of {}", channels.join(", "))
+        };
+        (label, model)
+    });
+    facts.collect()
+}
+
+/// Room for what the link models of all channels hold together; `None` without a model.
+fn room_of(launch: &DirectionLaunch) -> Result<Option<EmulationRoom>, WorkerError> {
+    let mut whole: Option<EmulationRoom> = None;
+    for one in &launch.channels {
+        if let Some(emulation) = &one.emulation {
+            let room = emulation.room(one.size_bytes)?;
+            whole = Some(whole.map_or(room, |before| before.and(room)));
+        }
+    }
+    Ok(whole)
+}
+
+/// Puts the receiver behind the link models of its channels, if they have any. Greetings and clock
+/// exchanges pass freely: the models stand for what happens to the robot's messages.
 fn emulate(
     receiver: Box<dyn DatagramReceiver>,
     facts: Vec<(String, String)>,
     launch: &DirectionLaunch,
     start: &RunStart,
 ) -> Result<OpenSocket, WorkerError> {
-    let Some(emulation) = &launch.emulation else {
+    let Some(room) = room_of(launch)? else {
         return Ok(OpenSocket::new(SocketEnd::Receiver(receiver), facts));
     };
-    let link = SinceStart {
-        link: emulation.model(&launch.channel)?,
-        start: start.clone(),
-    };
-    let room = emulation.room(launch.size_bytes)?;
-    let replay = link.replay_tally();
-    let (link, switch) = switch(link, &launch.channel, emulation, room);
+    let mut links = Vec::new();
+    let mut replays = Vec::new();
+    for one in &launch.channels {
+        let Some(emulation) = &one.emulation else {
+            replays.push(None);
+            continue;
+        };
+        let link = SinceStart {
+            link: emulation.model(&one.channel)?,
+            start: start.clone(),
+        };
+        replays.push(link.replay_tally());
+        links.push(OwnLink {
+            number: one.channel_id,
+            channel: one.channel.clone(),
+            room: emulation.room(one.size_bytes)?,
+            emulation: emulation.clone(),
+            link: Box::new(link),
+        });
+    }
+    let channel_max = links.iter().map(|one| one.number).max().unwrap_or(0);
+    let (links, switch) = switch(links);
     let settings = EmulatedSettings {
         capacity_count: room.capacity_count,
         datagram_bytes_max: held_bytes_max(launch),
         clock: Some(MonotonicClock::now),
-        number_of: Some(message_number),
     };
-    let is_exempt =
-        |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
-    let receiver = EmulatedReceiver::new(receiver, Box::new(link), is_exempt, settings);
+    let receiver =
+        EmulatedReceiver::new(receiver, Box::new(links), offer_of, channel_max, settings);
     Ok(OpenSocket {
-        replay,
-        switch: Some(switch),
+        replays,
+        switch,
         ..OpenSocket::new(SocketEnd::Receiver(Box::new(receiver)), facts)
     })
 }
 
-/// Which message of its channel a datagram carries, or a part of.
-fn message_number(bytes: &[u8]) -> Option<MessageNumber> {
-    let header = wire::decode(bytes).ok()?.header;
-    (header.kind == Kind::Data).then_some(MessageNumber {
-        start: header.epoch,
-        sequence: header.sequence,
-        // The smallest integer stands for a message without a stamp.
-        published: (header.published_ns != i64::MIN)
-            .then(|| RemoteInstant::from_ns(header.published_ns)),
+/// Which message of which channel a datagram carries, or a part of; `None` for one that carries none.
+fn offer_of(bytes: &[u8]) -> Option<Offer> {
+    let decoded = wire::decode(bytes);
+    let Ok(datagram) = decoded else {
+        // A bridge refuses it; until then it is a datagram like another.
+        return Header::read(bytes).ok().map(|(header, _)| Offer {
+            channel: header.channel,
+            message: None,
+        });
+    };
+    let header = datagram.header;
+    (header.kind == Kind::Data).then_some(Offer {
+        channel: header.channel,
+        message: Some(MessageNumber {
+            start: header.epoch,
+            sequence: header.sequence,
+            // The smallest integer stands for a message without a stamp.
+            published: (header.published_ns != i64::MIN)
+                .then(|| RemoteInstant::from_ns(header.published_ns)),
+        }),
     })
 }
 

@@ -116,12 +116,9 @@ fn a_message_in_pieces_meets_one_record_whole() {
         let (mut sender, inner) = queue_pair(&QueueSettings::default());
         let link = traced(matching);
         let tally = link.tally();
-        let settings = EmulatedSettings {
-            number_of: Some(message_number),
-            ..EmulatedSettings::default()
-        };
+        let settings = EmulatedSettings::default();
         let mut receiver =
-            EmulatedReceiver::new(Box::new(inner), Box::new(link), |_| false, settings);
+            EmulatedReceiver::new(Box::new(inner), Box::new(link), offer_of, 1, settings);
         let mut arrived_count = [0; 60];
         for ms in 0..600_i64 {
             let now = Instant::from_ns(ms * 1_000_000);

@@ -12,8 +12,6 @@ use hil_platform::wait::WaitMode;
 use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side, SocketLaunch};
 use hil_topology::{ClockPath, Host, OnExit, Timestamps, Topology, clock_process_name};
 
-/// Name of the message type that a clock path announces and never sends.
-const MESSAGE: &str = "hil.ClockPath.v1";
 /// Buffer asked of the kernel in each direction: a second of exchanges, with room.
 const BUFFER_BYTES: usize = 212_992;
 /// What every host must accept (RFC 791) holds a greeting with names of any length there may be.
@@ -51,20 +49,16 @@ pub(super) fn on<'a>(
     })
 }
 
-/// One end, as a channel of empty messages that nobody sends: what it takes from a channel is the
-/// greeting, the clock exchanges and the farewell.
+/// One end, as a flow without channels: what it has of a flow is the greeting, the clock exchanges and the
+/// farewell.
 fn direction(path: &ClockPath<'_>, host: &Host, side: Side) -> DirectionLaunch {
     let (local, peer) = match side {
         Side::Egress => (path.asking, path.answering),
         Side::Ingress => (path.answering, path.asking),
     };
     DirectionLaunch {
-        channel: path.name(),
-        channel_id: path.channel_id(),
-        message: MESSAGE.to_owned(),
-        size_bytes: 0,
-        alignment_bytes: 1,
-        depth: 0,
+        flow: path.name(),
+        flow_number: path.flow_number(),
         side,
         local,
         peer,
@@ -81,9 +75,7 @@ fn direction(path: &ClockPath<'_>, host: &Host, side: Side) -> DirectionLaunch {
         },
         wait: WaitMode::Block,
         realtime: RealtimeRequest::default(),
-        // The path is not part of what is emulated.
-        emulation: None,
-        is_clock_path: true,
+        channels: Vec::new(),
     }
 }
 
@@ -144,11 +136,11 @@ mod tests {
         assert_eq!(asking.local.to_string(), "10.78.0.1:7390");
         assert_eq!(asking.socket.interface.as_deref(), Some("eth1"));
         assert_eq!(answering.socket.interface, None);
-        assert_eq!(asking.channel, "clock/control-pc-robot-pc");
+        assert_eq!(asking.flow, "clock/control-pc-robot-pc");
         assert_eq!(*patience, Duration::from_millis(1_500));
         for end in [asking, answering] {
-            assert!(end.is_clock_path && end.emulation.is_none());
-            assert_eq!(end.channel_id, u16::MAX);
+            assert!(end.is_clock_path());
+            assert_eq!(end.flow_number, u16::MAX);
             assert_eq!(end.socket.timestamps, Timestamps::Software);
             assert_eq!(end.wait, WaitMode::Block);
         }

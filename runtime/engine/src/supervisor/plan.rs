@@ -9,7 +9,7 @@ use std::time::Duration;
 use hil_arm::egm::messages::Side as ArmSide;
 use hil_arm::egm::parameters::{ControllerSettings, EgmParameters};
 use hil_core::message::{FNV_OFFSET, fnv1a};
-use hil_link::condition::order_channel;
+use hil_link::condition::flow_name;
 use nix::unistd::{AccessFlags, access};
 
 use super::clock_path;
@@ -19,7 +19,7 @@ use hil_platform::wait::WaitMode;
 use hil_rundir::announcement;
 use hil_rundir::event::ProcessKind;
 use hil_rundir::launch::{
-    AdapterSettings, ArmLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch,
+    AdapterSettings, ArmLaunch, ChannelLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch,
 };
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
@@ -174,7 +174,7 @@ fn order_channels(topology: &Topology, host: &Host) -> BTreeSet<String> {
         .crossings()
         .filter(|crossing| crossing.to_host.name == host.name)
         .filter_map(|crossing| EmulationLaunch::of(&crossing, seed))
-        .map(|emulation| order_channel(&emulation.link, emulation.way))
+        .map(|emulation| flow_name(&emulation.link, emulation.way))
         .collect()
 }
 
@@ -291,21 +291,22 @@ fn gateways_on(topology: &Topology, host: &Host) -> Vec<ProcessPlan> {
     let mut plans = Vec::new();
     for link in topology.links() {
         let Some(hop) = link.hop() else { continue };
-        let mut directions = Vec::new();
-        for crossing in topology
+        let crossings: Vec<Crossing<'_>> = topology
             .crossings()
             .filter(|crossing| crossing.link.name == link.name)
-        {
-            for side in [Side::Egress, Side::Ingress] {
-                let here = match side {
+            .collect();
+        let mut directions = Vec::new();
+        for side in [Side::Egress, Side::Ingress] {
+            let is_here = |crossing: &&Crossing<'_>| {
+                let end = match side {
                     Side::Egress => crossing.from_host,
                     Side::Ingress => crossing.to_host,
                 };
-                if here.name == host.name {
-                    let index = directions.len();
-                    directions.push(direction(&crossing, side, index, topology.run().seed));
-                }
-            }
+                end.name == host.name
+            };
+            let here: Vec<&Crossing<'_>> = crossings.iter().filter(is_here).collect();
+            let index = directions.len();
+            directions.extend(direction(topology, &here, side, index));
         }
         if !directions.is_empty() {
             plans.push(ProcessPlan {
@@ -322,26 +323,37 @@ fn gateways_on(topology: &Topology, host: &Host) -> Vec<ProcessPlan> {
     plans
 }
 
-fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> DirectionLaunch {
-    let Crossing {
-        channel,
-        hop,
-        ports,
-        ..
-    } = crossing;
-    let sender = SocketAddr::new(crossing.from_host.gateway_address(), ports.sender);
-    let receiver = SocketAddr::new(crossing.to_host.gateway_address(), ports.receiver);
+/// One way of a link, which `crossings` go; `None` when nothing goes it.
+fn direction(
+    topology: &Topology,
+    crossings: &[&Crossing<'_>],
+    side: Side,
+    index: usize,
+) -> Option<DirectionLaunch> {
+    let first = crossings.first()?;
+    let (hop, ports) = (first.hop, first.ports);
+    let sender = SocketAddr::new(first.from_host.gateway_address(), ports.sender);
+    let receiver = SocketAddr::new(first.to_host.gateway_address(), ports.receiver);
     let (local, peer, here) = match side {
-        Side::Egress => (sender, receiver, crossing.from_host),
-        Side::Ingress => (receiver, sender, crossing.to_host),
+        Side::Egress => (sender, receiver, first.from_host),
+        Side::Ingress => (receiver, sender, first.to_host),
     };
-    DirectionLaunch {
-        channel: channel.name.clone(),
-        channel_id: channel.channel_id,
-        message: channel.message.name.clone(),
-        size_bytes: channel.message.size_bytes,
-        alignment_bytes: channel.message.alignment_bytes,
-        depth: channel.depth,
+    let seed = topology.run().seed;
+    let channels = crossings.iter().map(|crossing| {
+        let channel = crossing.channel;
+        ChannelLaunch {
+            channel: channel.name.clone(),
+            channel_id: channel.channel_id,
+            message: channel.message.name.clone(),
+            size_bytes: channel.message.size_bytes,
+            alignment_bytes: channel.message.alignment_bytes,
+            depth: channel.depth,
+            emulation: EmulationLaunch::of(crossing, seed).filter(|_| side == Side::Ingress),
+        }
+    });
+    Some(DirectionLaunch {
+        flow: first.flow_name(),
+        flow_number: topology.flow_number(first),
         side,
         local,
         peer,
@@ -358,9 +370,8 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
         },
         wait: wait_mode(hop.gateway.execution.wait),
         realtime: realtime(&hop.gateway.execution, index),
-        emulation: EmulationLaunch::of(crossing, seed).filter(|_| side == Side::Ingress),
-        is_clock_path: false,
-    }
+        channels: channels.collect(),
+    })
 }
 
 /// The request for thread number `index` of something that runs as `execution` says: its CPUs

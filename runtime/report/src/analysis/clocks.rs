@@ -256,23 +256,24 @@ fn disciplined(
     })
 }
 
-/// The exchanges of all channels between two hosts, for instants of the first on the clock of the
-/// second.
+/// The exchanges of all links between two hosts, for instants of the first on the clock of the second.
 pub(super) fn exchanges(records: &RunRecords<'_>, from: &str, to: &str) -> Vec<Exchange> {
-    let mut found = Vec::new();
-    for channel in records.topology.channels() {
-        let Some((sender, receiver)) = hosts_of(records.topology, channel) else {
-            continue;
-        };
+    let mut flows: BTreeMap<String, Requester> = BTreeMap::new();
+    for crossing in records.topology.crossings() {
         // The sending gateway asks.
-        let requester = if (sender.as_str(), receiver.as_str()) == (to, from) {
-            Requester::Local
-        } else if (sender.as_str(), receiver.as_str()) == (from, to) {
-            Requester::Remote
-        } else {
-            continue;
-        };
-        let round_trips = records.round_trips(&channel.name);
+        let ends = (
+            crossing.from_host.name.as_str(),
+            crossing.to_host.name.as_str(),
+        );
+        if ends == (to, from) {
+            flows.insert(crossing.flow_name(), Requester::Local);
+        } else if ends == (from, to) {
+            flows.insert(crossing.flow_name(), Requester::Remote);
+        }
+    }
+    let mut found = Vec::new();
+    for (flow, requester) in flows {
+        let round_trips = records.round_trips(&flow);
         found.extend(round_trips.filter_map(|one| Exchange::of(one, requester)));
     }
     found
@@ -280,9 +281,8 @@ pub(super) fn exchanges(records: &RunRecords<'_>, from: &str, to: &str) -> Vec<E
 
 /// Both ends of a channel that a link carries between two hosts.
 fn hosts_of(topology: &Topology, channel: &Channel) -> Option<(String, String)> {
-    topology.crossing(channel)?;
-    let from = &topology.process(&channel.from)?.host;
-    let to = &topology.process(channel.to.as_deref()?)?.host;
+    let crossing = topology.crossing(channel)?;
+    let (from, to) = (&crossing.from_host.name, &crossing.to_host.name);
     (from != to).then(|| (from.clone(), to.clone()))
 }
 

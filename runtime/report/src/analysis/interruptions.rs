@@ -7,7 +7,7 @@
 use std::time::Duration;
 
 use hil_account::{FLIGHT_TIME_MAX, Interruption, PathProcess};
-use hil_core::record::{IngressRecord, PublishedRecord, UNAVAILABLE};
+use hil_core::record::{IngressRecord, PublishedRecord, RoundTripRecord, UNAVAILABLE};
 use hil_core::time::{Instant, duration_ns};
 
 use super::records::{ChannelFiles, RunRecords, all};
@@ -63,7 +63,10 @@ pub(super) fn noted(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interrup
                     let end = end_of(&event.host);
                     let latest = next.map_or(end, |next| next.min(end));
                     let files = records.channels.get(&channel.name);
-                    files.map_or(back, |files| reached(files, event.at, back, latest))
+                    let exchanges = records.exchanges_of(channel);
+                    files.map_or(back, |files| {
+                        reached(files, exchanges, event.at, back, latest)
+                    })
                 }
                 Some(back) => back,
                 None => end_of(&event.host),
@@ -81,7 +84,13 @@ pub(super) fn noted(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interrup
 }
 
 /// See [`works_again`]; without the gateway's records, nobody knows what reached it.
-fn reached(files: &ChannelFiles, dead: Instant, back: Instant, end: Instant) -> Instant {
+fn reached<'a>(
+    files: &ChannelFiles,
+    exchanges: impl Iterator<Item = &'a RoundTripRecord>,
+    dead: Instant,
+    back: Instant,
+    end: Instant,
+) -> Instant {
     if files.ingress.is_none() {
         return back;
     }
@@ -92,7 +101,7 @@ fn reached(files: &ChannelFiles, dead: Instant, back: Instant, end: Instant) -> 
         taken_ns => taken_ns,
     });
     // So does a clock exchange that it answered reach it, on a channel that speaks seldom.
-    let exchanges_ns = files.round_trips.values().map(|one| one.t2_ns);
+    let exchanges_ns = exchanges.map(|one| one.t2_ns);
     works_again(dead, back, end, messages_ns.chain(exchanges_ns))
 }
 
@@ -265,6 +274,15 @@ mod tests {
     fn without_the_gateways_records_it_is_back_when_its_supervisor_says_so() {
         let times = [100, 160, 9_000].map(|ms| Instant::from_ns(ms * MS));
         let [dead, back, end] = times;
-        assert_eq!(reached(&ChannelFiles::default(), dead, back, end), back);
+        assert_eq!(
+            reached(
+                &ChannelFiles::default(),
+                core::iter::empty(),
+                dead,
+                back,
+                end
+            ),
+            back
+        );
     }
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use hil_core::time::Instant;
-use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome, order_channel};
+use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome, flow_name};
 use hil_link::spec::Way;
 
 use super::axis::RunAxis;
@@ -38,7 +38,7 @@ pub(super) fn of_run(records: &RunRecords<'_>, axis: &RunAxis<'_>) -> Vec<LinkCh
 
 fn channel_of(topology: &Topology, crossing: &Crossing<'_>) -> Option<(String, Way)> {
     let emulation = EmulationLaunch::of(crossing, topology.run().seed)?;
-    Some((order_channel(&emulation.link, emulation.way), emulation.way))
+    Some((flow_name(&emulation.link, emulation.way), emulation.way))
 }
 
 /// Orders to the direction that `crossing` goes, which took effect.

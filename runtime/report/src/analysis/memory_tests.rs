@@ -17,6 +17,8 @@ use hil_core::record::{
     UNAVAILABLE,
 };
 use hil_core::time::Instant;
+use hil_link::condition::flow_name;
+use hil_link::spec::Way;
 use hil_shuttle::{Shuttle, ShuttleCommand, ShuttleStatus};
 
 use super::{analyse, conclude};
@@ -133,6 +135,11 @@ struct Written<'a> {
 impl<'a> Written<'a> {
     fn new(folder: &Path, channel: &'a str, is_robot: bool, payload: usize) -> Self {
         let sink = |kind, bytes| Sink::new(folder, kind, channel, bytes);
+        let way = if is_robot {
+            Way::Backward
+        } else {
+            Way::Forward
+        };
         Self {
             is_robot,
             channel,
@@ -142,7 +149,12 @@ impl<'a> Written<'a> {
             ingress: sink(RecordKind::Ingress, size_of::<IngressRecord>()),
             follow_up: sink(RecordKind::FollowUp, size_of::<FollowUpRecord>()),
             taken: sink(RecordKind::Taken, size_of::<TakenRecord>()),
-            round_trip: sink(RecordKind::RoundTrip, size_of::<RoundTripRecord>()),
+            round_trip: Sink::new(
+                folder,
+                RecordKind::RoundTrip,
+                &flow_name("hop", way),
+                size_of::<RoundTripRecord>(),
+            ),
             message: sink(RecordKind::Message, size_of::<Envelope>() + payload),
             late: Vec::new(),
         }

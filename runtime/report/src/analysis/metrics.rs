@@ -11,7 +11,7 @@ use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::emulation::EmulationMetrics;
 use crate::summary::{
-    Absence, ChannelSummary, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
+    Absence, ChannelEnd, ChannelSummary, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
     ProcessSummary, RealtimeFacts, RunEvent, RunEventKind, RunFacts,
 };
 use hil_platform::realtime::GrantOutcome;
@@ -166,25 +166,28 @@ pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
 
 pub(super) fn channel_summary(records: &RunRecords<'_>, channel: &Channel) -> ChannelSummary {
     let result = records.result;
-    let directions = directions(result, &channel.name);
-    let reports = result.processes.iter().flat_map(|one| &one.report);
-    let trace_replay = reports
-        .flat_map(|report| &report.directions)
-        .filter(|direction| direction.channel == channel.name)
-        .find_map(|direction| direction.replay);
-    let refusals = directions
+    let mut trace_replay = None;
+    let mut ends = Vec::new();
+    for process in &result.processes {
+        let directions = process.report.iter().flat_map(|report| &report.directions);
+        for direction in directions {
+            let mut channels = direction.channels.iter();
+            let Some(one) = channels.find(|one| one.channel == channel.name) else {
+                continue;
+            };
+            trace_replay = trace_replay.or(one.replay);
+            ends.push(ChannelEnd {
+                process: process.name.clone(),
+                direction: direction.direction,
+                counters: one.counters.clone(),
+            });
+        }
+    }
+    let overflow_count = ends
         .iter()
-        .flat_map(|direction| &direction.counters)
-        .filter(|counter| counter.group == CounterGroup::Refused && counter.count > 0)
-        .cloned()
-        .collect();
-    let of_socket = |name: &'static str| {
-        directions
-            .iter()
-            .filter_map(move |direction| direction.count(CounterGroup::Socket, name))
-    };
-    let overflow_count = of_socket("link_overflow_count").next();
-    let no_room_count = of_socket("kernel_drop_count").sum();
+        .flat_map(|end: &ChannelEnd| &end.counters)
+        .find(|one| one.group == CounterGroup::Socket && one.name == "link_overflow_count")
+        .map(|one| one.count);
     ChannelSummary {
         name: channel.name.clone(),
         from: channel.from.clone(),
@@ -202,20 +205,25 @@ pub(super) fn channel_summary(records: &RunRecords<'_>, channel: &Channel) -> Ch
             .is_recorded_only()
             .then(|| records.recorded(&channel.name))
             .flatten(),
-        refusals,
-        no_room_count,
-        directions,
+        ends,
     }
 }
 
-fn directions(result: &RunResult, channel: &str) -> Vec<DirectionSummary> {
+/// Every way of every link that a gateway carried.
+pub(super) fn directions(result: &RunResult) -> Vec<DirectionSummary> {
     let mut found = Vec::new();
     for process in &result.processes {
-        let directions = process.report.iter().flat_map(|report| &report.directions);
-        for direction in directions.filter(|one| one.channel == channel) {
+        for direction in process.report.iter().flat_map(|report| &report.directions) {
+            // A clock path carries no channel; what it found is told with the clocks.
+            if direction.channels.is_empty() {
+                continue;
+            }
+            let channels = direction.channels.iter();
             found.push(DirectionSummary {
+                flow: direction.flow.clone(),
                 process: process.name.clone(),
                 direction: direction.direction,
+                channels: channels.map(|one| one.channel.clone()).collect(),
                 peer_state: direction.peer_state.clone(),
                 counters: direction.counters.clone(),
                 facts: direction

@@ -153,6 +153,7 @@ pub fn conclude(
         .iter()
         .map(|channel| channel_summary(&records, channel))
         .collect();
+    summary.directions = metrics::directions(result);
     capture::write(&mut summary, &records);
     summary.faces = adapters::adapter_summaries(&records);
     summary.hardware_stamps = nics::hardware_stamps(&records);

@@ -69,16 +69,14 @@ pub(super) fn add(summary: &mut RunSummary, records: &RunRecords<'_>, axis: &Run
 
 /// Marks that did not survive the way: the access category at the far end is not the one meant.
 fn add_mark_warnings(summary: &mut RunSummary) {
-    for channel in &summary.channels {
-        for direction in &channel.directions {
-            let changed = direction.count(CounterGroup::Socket, "mark_changed_count");
-            if let Some(changed) = changed.filter(|count| *count > 0) {
-                summary.warnings.push(format!(
-                    "{}: {changed} datagrams arrived with another code point than they should: \
-                     something on the way changes marks, or the other host sets another dscp",
-                    channel.name
-                ));
-            }
+    for direction in &summary.directions {
+        let changed = direction.count(CounterGroup::Socket, "mark_changed_count");
+        if let Some(changed) = changed.filter(|count| *count > 0) {
+            summary.warnings.push(format!(
+                "{}: {changed} datagrams arrived with another code point than they should: \
+                 something on the way changes marks, or the other host sets another dscp",
+                direction.label()
+            ));
         }
     }
 }

@@ -51,6 +51,8 @@ pub(crate) struct RunRecords<'a> {
     pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Orders to emulated links, by the channel on which they were given.
     link_orders: BTreeMap<String, Vec<LinkConditionRecord>>,
+    /// Clock exchanges, by flow.
+    round_trips: BTreeMap<String, BTreeMap<(u32, u64), RoundTripRecord>>,
     /// Files that could not be opened, with the reason.
     problems: Vec<String>,
     /// What went wrong later.
@@ -74,6 +76,7 @@ impl<'a> RunRecords<'a> {
             clocks: HostClocks::default(),
             radios: BTreeMap::new(),
             link_orders: BTreeMap::new(),
+            round_trips: BTreeMap::new(),
             problems: Vec::new(),
             faults: ReadFaults::default(),
             interruptions: RefCell::default(),
@@ -118,6 +121,14 @@ impl<'a> RunRecords<'a> {
                 orders.extend(alone(file).records::<LinkConditionRecord>());
                 return;
             }
+            RecordKind::RoundTrip => {
+                let known = self.round_trips.entry(name).or_default();
+                let records = alone(file);
+                // An exchange whose stamps were bettered later is there twice.
+                let of = |one: RoundTripRecord| ((one.session, one.sequence), one);
+                known.extend(records.records().map(of));
+                return;
+            }
             _ => {}
         }
         let channel = self.channels.entry(name).or_default();
@@ -130,15 +141,11 @@ impl<'a> RunRecords<'a> {
             RecordKind::AdapterSent => &mut channel.adapter_sent,
             RecordKind::AdapterReceived => &mut channel.adapter_received,
             RecordKind::Message => &mut channel.message,
-            RecordKind::RoundTrip => {
-                let records = alone(file);
-                // An exchange whose stamps were bettered later is there twice.
-                let of = |one: RoundTripRecord| ((one.session, one.sequence), one);
-                channel.round_trips.extend(records.records().map(of));
-                return;
-            }
             // They belong to no channel, see above.
-            RecordKind::NicClock | RecordKind::Radio | RecordKind::LinkCondition => return,
+            RecordKind::RoundTrip
+            | RecordKind::NicClock
+            | RecordKind::Radio
+            | RecordKind::LinkCondition => return,
         };
         files
             .get_or_insert_with(|| StoredRecords::new(&self.faults))
@@ -172,12 +179,17 @@ impl<'a> RunRecords<'a> {
         files.into_iter().flat_map(StoredRecords::records)
     }
 
-    /// The clock exchanges of the gateways of `channel`.
-    pub(super) fn round_trips(&self, channel: &str) -> impl Iterator<Item = &RoundTripRecord> {
-        let files = self.channels.get(channel);
-        files
-            .into_iter()
-            .flat_map(|files| files.round_trips.values())
+    /// The clock exchanges of the gateways of `flow`: one way of a link, or a clock path.
+    pub(super) fn round_trips(&self, flow: &str) -> impl Iterator<Item = &RoundTripRecord> {
+        let known = self.round_trips.get(flow);
+        known.into_iter().flat_map(BTreeMap::values)
+    }
+
+    /// The clock exchanges of the gateways that carry `channel`; none of one that stays on its host.
+    pub(super) fn exchanges_of(&self, channel: &Channel) -> impl Iterator<Item = &RoundTripRecord> {
+        let crossing = self.topology.crossing(channel);
+        let known = crossing.and_then(|one| self.round_trips.get(&one.flow_name()));
+        known.into_iter().flat_map(BTreeMap::values)
     }
 
     /// Real-time minus monotonic clock of `host` as its gateways noted it; `None` when none did, or
@@ -262,7 +274,7 @@ impl<'a> RunRecords<'a> {
                 }
                 None => emulation.spec.flight_time(FLIGHT_QUANTILE),
             });
-        let round_trips = files.round_trips.values();
+        let round_trips = self.exchanges_of(channel);
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {
             interruptions: &interruptions,
@@ -343,7 +355,6 @@ pub(super) struct ChannelFiles {
     pub(super) ingress: Option<StoredRecords>,
     pub(super) follow_up: Option<StoredRecords>,
     pub(super) taken: Option<StoredRecords>,
-    pub(super) round_trips: BTreeMap<(u32, u64), RoundTripRecord>,
     pub(super) adapter_sent: Option<StoredRecords>,
     pub(super) adapter_received: Option<StoredRecords>,
     pub(super) message: Option<StoredRecords>,

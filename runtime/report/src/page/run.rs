@@ -10,7 +10,9 @@ use super::{drawings, paper, timeline};
 use crate::assessment::Assessment;
 use crate::clock_summary::ClockSection;
 use crate::score_event::ScoreEvents;
-use crate::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric, host_words};
+use crate::summary::{
+    ChannelSummary, DirectionSummary, Fact, LinkKind, RunSummary, ScoreMetric, host_words,
+};
 use crate::terminal::{self, duration, seconds, unsigned_duration};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
@@ -261,7 +263,8 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
             or_none(&host_words(&summary.host_facts), UNAVAILABLE),
         ),
     ];
-    groups.into_iter().chain(by_hand).collect()
+    let gateways = gateways(&summary.directions);
+    groups.into_iter().chain(gateways).chain(by_hand).collect()
 }
 
 fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channel {
@@ -319,18 +322,27 @@ fn notes(one: &ChannelSummary) -> Vec<String> {
              p99, limit {limit}"
         ));
     }
-    let refusals = one.refusal_words();
-    if !refusals.is_empty() {
-        notes.push(format!("datagrams refused: {}", refusals.join(", ")));
-    }
-    for direction in &one.directions {
-        let mut words = direction.words();
-        let stalls = direction.stalls.iter();
-        words.extend(stalls.map(|one| format!("stalls: {}", terminal::stall_words(one))));
-        let way = direction.direction.word();
-        notes.push(format!("{way}: {}", words.join(", ")));
-    }
     notes
+}
+
+/// The gateways at both ends of each way of each link.
+fn gateways(directions: &[DirectionSummary]) -> Option<FactGroup> {
+    let rows = directions.iter().map(|one| {
+        let mut words = one.words();
+        let refused = one.refusal_words();
+        if !refused.is_empty() {
+            words.push(format!("datagrams refused: {}", refused.join(", ")));
+        }
+        let stalls = one.stalls.iter();
+        words.extend(stalls.map(|one| format!("stalls: {}", terminal::stall_words(one))));
+        let label = format!("{}, {}", one.label(), one.direction.word());
+        Fact::new(label, words.join(", "))
+    });
+    let facts: Vec<Fact> = rows.collect();
+    (!facts.is_empty()).then(|| FactGroup {
+        title: "Gateways".to_owned(),
+        facts,
+    })
 }
 
 /// The figures of a score.

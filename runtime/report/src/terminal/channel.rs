@@ -56,19 +56,6 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
     if let Some(figures) = &channel.outages {
         super::outages::outages(canvas, figures);
     }
-    let refused = channel.refusal_words();
-    if !refused.is_empty() {
-        let text = format!("datagrams: {}", refused.join(" · "));
-        canvas.field("refused", Tone::Caution, &text);
-    }
-    for direction in &channel.directions {
-        let words = direction.words().join(" · ");
-        canvas.field(direction.direction.word(), Tone::Faint, &words);
-        // Whether a stream stood still is a result, and not one to be looked for among options.
-        if let Some(stalls) = &direction.stalls {
-            canvas.field("stalls", Tone::Plain, &stall_words(stalls));
-        }
-    }
 }
 
 /// How often a stream stood still, and what counts as that.

@@ -7,6 +7,7 @@ mod channel;
 mod clocks;
 mod emulation;
 mod events;
+mod link;
 mod network;
 mod nics;
 mod outages;
@@ -48,6 +49,7 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
         channel::channel(&mut canvas, channel);
         radio::channel(&mut canvas, summary.radio.channel(&channel.name));
     }
+    link::links(&mut canvas, &summary.directions);
     for adapter in &summary.faces {
         adapter::adapter(&mut canvas, adapter);
     }

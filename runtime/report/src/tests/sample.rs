@@ -19,6 +19,8 @@ use crate::summary::{
     ScoreMetric, SummaryError,
 };
 use crate::terminal::{Style, render};
+use hil_link::condition::flow_name;
+use hil_link::spec::Way;
 use hil_platform::host_facts::{self, HostFact, HostFacts};
 use hil_rundir::event::{EventKind, ProcessKind};
 use hil_rundir::launch::Side;
@@ -101,9 +103,7 @@ fn channel(
         emulation: None,
         trace_replay: None,
         recorded: None,
-        refusals: Vec::new(),
-        no_room_count: 0,
-        directions: Vec::new(),
+        ends: Vec::new(),
     }
 }
 
@@ -113,19 +113,6 @@ fn channels() -> Vec<ChannelSummary> {
     let (there, back) = (["controller", "robot"], ["robot", "controller"]);
     let exact = files.account(Some(Alignment::SAME_CLOCK));
     let mut command = channel("arm/command", there, link("udp"), exact);
-    command.refusals.push(CountByName {
-        group: CounterGroup::Refused,
-        name: "type hash differs".to_owned(),
-        count: 3,
-    });
-    command.directions.push(DirectionSummary {
-        process: "robot gateway".to_owned(),
-        direction: Side::Ingress,
-        peer_state: "said farewell".to_owned(),
-        counters: Vec::new(),
-        facts: vec![Fact::new("receive buffer granted", "425984 bytes")],
-        stalls: None,
-    });
     command.outages = Some(files.outages());
     let status = channel("arm/status", back, link("udp"), files.account(None));
     let human = ["operator", "controller"];
@@ -136,6 +123,24 @@ fn channels() -> Vec<ChannelSummary> {
         files.direct(),
     );
     vec![command, status, motion, recorded_channel()]
+}
+
+/// The gateway that receives what goes over the network one way.
+fn directions() -> Vec<DirectionSummary> {
+    vec![DirectionSummary {
+        flow: flow_name("hop", Way::Forward),
+        process: "robot gateway".to_owned(),
+        direction: Side::Ingress,
+        channels: vec!["arm/command".to_owned()],
+        peer_state: "said farewell".to_owned(),
+        counters: vec![CountByName {
+            group: CounterGroup::Refused,
+            name: "type hash differs".to_owned(),
+            count: 3,
+        }],
+        facts: vec![Fact::new("receive buffer granted", "425984 bytes")],
+        stalls: None,
+    }]
 }
 
 /// A whole report.
@@ -180,6 +185,7 @@ pub(crate) fn full() -> RunSummary {
             }),
         }],
         channels: channels(),
+        directions: directions(),
         score: vec![
             metric(
                 "joint error, root mean square",
@@ -253,9 +259,7 @@ pub(crate) fn empty() -> RunSummary {
             emulation: None,
             trace_replay: None,
             recorded: None,
-            refusals: Vec::new(),
-            no_room_count: 0,
-            directions: Vec::new(),
+            ends: Vec::new(),
         });
     }
     summary
@@ -364,7 +368,7 @@ fn a_summary_survives_its_json() {
 fn a_newer_schema_is_refused_by_its_number() {
     let error = RunSummary::from_json("{\"schema_version\": 7, \"runs\": []}").unwrap_err();
     assert!(matches!(error, SummaryError::NewerSchema { found: 7 }));
-    assert_eq!(error.to_string(), "schema version 7 is newer than 1");
+    assert_eq!(error.to_string(), "schema version 7 is newer than 2");
     assert!(matches!(
         RunSummary::from_json("{}"),
         Err(SummaryError::Decode(_))
@@ -451,21 +455,24 @@ fn what_had_no_room_in_a_receive_buffer_is_not_put_down_to_the_network() {
     account.unwrap().published_count = 5_000;
     // 0.1 % of 5 000 messages is 5: at the limit it still counts, and is told.
     for (count, is_result) in [(0, true), (5, true), (6, false)] {
-        let channel = &mut summary.channels[0];
-        channel.no_room_count = count;
-        let name = channel.name.clone();
+        summary.directions[0].counters.push(CountByName {
+            group: CounterGroup::Socket,
+            name: "kernel_drop_count".to_owned(),
+            count,
+        });
         let assessment = Assessment::of(&summary);
         let expected = if is_result {
             NetworkVerdict::NetworkResult
         } else {
             NetworkVerdict::ReceiverLate {
-                channels: vec![name],
+                channels: vec!["hop/forward".to_owned()],
             }
         };
         assert_eq!(assessment.network, expected, "{count}");
         let text = render(&summary, 120, Style::Plain);
         assert_eq!(text.contains("NOT a network result"), !is_result);
         assert_eq!(text.contains("because the receiving gateway"), count > 0);
+        summary.directions[0].counters.pop();
     }
 }
 

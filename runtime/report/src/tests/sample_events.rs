@@ -126,9 +126,7 @@ pub(crate) fn recorded_channel() -> ChannelSummary {
             message_count: 12_345,
             missing_count: 0,
         }),
-        refusals: Vec::new(),
-        no_room_count: 0,
-        directions: Vec::new(),
+        ends: Vec::new(),
     }
 }
 

@@ -313,8 +313,7 @@ fn a_waiter_wakes_on_either_channel_and_drains() {
     }
     let past = Instant::from_ns(MonotonicClock::now().as_ns() - 1);
     assert_eq!(waiter.wait_until(Some(past)).unwrap(), Wake::TimedOut);
-    assert_eq!(waiter.descriptors().count(), 2);
-    assert!(!waiter.drain().unwrap());
+    assert!(!waiter.drain(0).unwrap() && !waiter.drain(1).unwrap());
     drop((waiter, other, holder));
     assert_nothing_left(domain);
 }
@@ -364,16 +363,58 @@ fn no_announcement_means_no_wake() {
 }
 
 #[test]
-fn a_waiter_takes_a_bounded_number_of_channels() {
-    let (domain, holder) = launch("bound", 1);
-    for channels in [&[][..], &["arm/pose"; 17][..]] {
-        let refused = Waiter::open(&domain, channels);
-        assert!(matches!(
-            refused,
-            Err(ChannelError::WaiterChannelCount { .. })
-        ));
+fn a_waiter_of_many_channels_says_which_are_announced() {
+    const COUNT: usize = 70;
+    let (domain, holder) = launch("many", 1);
+    let names: Vec<String> = (0..COUNT).map(|index| format!("arm/{index}")).collect();
+    let holders: Vec<_> = names
+        .iter()
+        .map(|name| ChannelHolder::create(&domain, &ChannelSettings::of(name, &POSE)).unwrap())
+        .collect();
+    assert!(matches!(
+        Waiter::open(&domain, &[]),
+        Err(ChannelError::NoChannel)
+    ));
+    let listed: Vec<&str> = names.iter().map(String::as_str).collect();
+    let mut waiter = Waiter::open(&domain, &listed).unwrap();
+    let mut outputs: Vec<_> = names
+        .iter()
+        .map(|name| {
+            let settings = OutputSettings::default();
+            TypedOutput::<Pose>::open(&domain, name, settings).unwrap()
+        })
+        .collect();
+    assert_eq!(waiter.wait(Duration::ZERO).unwrap(), Wake::TimedOut);
+    let announced = |waiter: &mut Waiter| {
+        let mut found = Vec::new();
+        waiter.announced(|index| found.push(index)).unwrap();
+        found
+    };
+    for index in [3, 69] {
+        let now = MonotonicClock::now();
+        outputs[index].send(now, pose(0)).unwrap();
     }
-    drop(holder);
+    let mut found = announced(&mut waiter);
+    found.sort_unstable();
+    assert_eq!(found, [3, 69]);
+    assert!(waiter.drain(3).unwrap());
+    assert_eq!(announced(&mut waiter), [69]);
+    assert_eq!(waiter.wait(Duration::ZERO).unwrap(), Wake::Woken);
+    assert_eq!(announced(&mut waiter), Vec::<usize>::new());
+    // All of them at once are found by looking again.
+    for output in &mut outputs {
+        output.send(MonotonicClock::now(), pose(0)).unwrap();
+    }
+    let mut seen = [false; COUNT];
+    while seen.contains(&false) {
+        let found = announced(&mut waiter);
+        assert!(!found.is_empty());
+        for index in found {
+            assert!(waiter.drain(index).unwrap() && !seen[index]);
+            seen[index] = true;
+        }
+    }
+    drop((waiter, outputs, holders, holder));
     assert_nothing_left(domain);
 }
 

@@ -46,7 +46,7 @@ fn two_linked_hosts_with_a_clock_address_have_a_clock_path() {
     assert_eq!(path.describe(), "clock path 10.78.0.1 (eth1) <-> 10.78.0.2");
     assert_eq!(path.asking.to_string(), "10.78.0.1:7390");
     assert_eq!(path.answering.to_string(), "10.78.0.2:7390");
-    assert_eq!(path.channel_id(), u16::MAX);
+    assert_eq!(path.flow_number(), u16::MAX);
     assert_eq!(path.from.name, "control-pc");
     let found = |one, other| topology.clock_path_between(one, other).is_some();
     assert!(found("robot-pc", "control-pc") && found("control-pc", "robot-pc"));
@@ -87,7 +87,7 @@ fn each_further_path_of_a_host_takes_the_next_port() {
                 path.name(),
                 path.asking.port(),
                 path.answering.port(),
-                path.channel_id(),
+                path.flow_number(),
             )
         })
         .collect();
@@ -186,7 +186,7 @@ fn no_port_of_a_clock_path_is_one_of_a_link() {
         )
     };
     let key = "hosts.control-pc.clock_port";
-    for port in [7400, 7403] {
+    for port in [7400, 7401] {
         let text = fault_of(&with_port(port), key);
         let words = format!("{port} to {port} overlaps with the ports of link `hop`");
         assert!(text.contains(&words), "{text}");
@@ -196,14 +196,14 @@ fn no_port_of_a_clock_path_is_one_of_a_link() {
         let place = format!("clock.toml:{}:", line.unwrap() + 1);
         assert!(text.contains(&place), "{text}");
     }
-    for port in [7399, 7404, 65_535] {
+    for port in [7399, 7402, 65_535] {
         assert_eq!(parse_good(&with_port(port)).clock_paths().count(), 1);
     }
     let text = fault_of(&with_port(1_000), key);
     assert!(text.contains("1000 is outside 1024 to 65535"), "{text}");
     let text = good().replace(
         "[links.hop]\nvia = \"udp\"",
-        "[links.hop]\nvia = \"udp\"\nport = 7388",
+        "[links.hop]\nvia = \"udp\"\nport = 7389",
     );
     let errors = parse("clock.toml", &text, &[], &known()).unwrap_err();
     assert!(

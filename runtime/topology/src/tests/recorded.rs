@@ -58,7 +58,10 @@ fn a_recorded_channel_has_its_number_and_neither_queue_nor_port() {
     let topology = parse_diary(SPLIT).unwrap_or_else(|errors| panic!("{errors}"));
     let truth = topology.channel("arm/truth").unwrap();
     assert!(truth.is_recorded_only());
-    assert_eq!((truth.channel_id, truth.depth, truth.ports), (1, 0, None));
+    assert_eq!(
+        (truth.channel_id, truth.depth, truth.is_carried),
+        (1, 0, false)
+    );
     assert_eq!(topology.crossings().count(), 2);
     // Written out, it is not mentioned, and the file means the same.
     assert!(!topology.to_toml().contains("arm/truth"));

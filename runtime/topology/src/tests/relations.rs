@@ -132,15 +132,20 @@ fn foreign_channels_are_checked_like_those_of_a_case() {
 
 #[test]
 fn ports_of_two_links_may_not_meet() {
-    let text = EVERYTHING.replace("port = 9000", "port = 8003");
+    let text = EVERYTHING.replace("port = 9000", "port = 8001");
     let errors = parse("ports.toml", &text, &[], &known()).unwrap_err();
     assert_eq!(errors.errors()[0].key, "links.wire.port");
     assert!(
         errors
             .to_string()
-            .contains("8003 to 8004 overlaps with the ports of link `hop`")
+            .contains("8001 to 8002 overlaps with the ports of link `hop`")
     );
     let text = EVERYTHING.replace("port = 8000", "port = 65534");
+    assert!(parse("ports.toml", &text, &[], &known()).is_ok());
+    // At one address what sends needs ports of its own.
+    let there = "address = \"10.77.0.2\"";
+    let here = "address = \"10.77.0.1\", control_port = 7500";
+    let text = text.replace(there, here);
     let errors = parse("ports.toml", &text, &[], &known()).unwrap_err();
     assert!(
         errors.to_string().contains("leaves no ports below 65536"),
@@ -174,7 +179,7 @@ fn a_link_over_tcp_has_ports_and_a_hop_and_no_model() {
         .unwrap();
     assert!(matches!(image.link.via, Via::Network(_)));
     assert_eq!(image.hop.transport.name, "tcp");
-    assert_eq!((image.ports.sender, image.ports.receiver), (9000, 9001));
+    assert_eq!((image.ports.sender, image.ports.receiver), (9001, 9001));
     assert_eq!(image.spec, None);
     assert_eq!(image.hop.timestamps, Timestamps::Off);
     let written = topology.to_toml();

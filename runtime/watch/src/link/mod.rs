@@ -14,7 +14,7 @@ use hil_core::case_study::ParameterError;
 use hil_core::message::Envelope;
 use hil_core::time::Instant;
 use hil_link::condition::{
-    LinkChangeRequest, LinkCondition, LinkConditionRecord, OrderOutcome, order_channel,
+    LinkChangeRequest, LinkCondition, LinkConditionRecord, OrderOutcome, flow_name,
 };
 use hil_link::spec::Way;
 use serde_json::Value;
@@ -148,7 +148,7 @@ impl LinkDirection {
 
     /// The channel on which orders for it travel.
     pub fn order_channel(&self) -> String {
-        order_channel(&self.link, self.way)
+        flow_name(&self.link, self.way)
     }
 }
 
@@ -414,26 +414,24 @@ fn newest_launches(folder: &Path) -> io::Result<Vec<WorkerLaunch>> {
 
 fn add_directions(directions: &mut Vec<LinkDirection>, launch: &WorkerLaunch, work: &GatewayWork) {
     for one in &work.directions {
-        let Some(emulation) = &one.emulation else {
+        let emulated = || {
+            let channels = one.channels.iter();
+            channels.filter_map(|channel| Some((channel, channel.emulation.as_ref()?)))
+        };
+        let Some((_, first)) = emulated().next() else {
             continue;
         };
-        let room = emulation.room(one.size_bytes).ok();
-        let longest = room.map(|room| room.longest_delay());
-        let found = directions
-            .iter_mut()
-            .find(|known| known.link == emulation.link && known.way == emulation.way);
-        if let Some(known) = found {
-            known.channels.push(one.channel.clone());
-            known.delay_max = known.delay_max.zip(longest).map(|(a, b)| a.min(b));
-            continue;
-        }
+        let longest = emulated().map(|(channel, emulation)| {
+            let room = emulation.room(channel.size_bytes).ok()?;
+            Some(room.longest_delay())
+        });
         directions.push(LinkDirection {
-            link: emulation.link.clone(),
-            way: emulation.way,
+            link: first.link.clone(),
+            way: first.way,
             gateway: launch.process.clone(),
-            channels: vec![one.channel.clone()],
-            described: emulation.describe(),
-            delay_max: longest,
+            channels: emulated().map(|(one, _)| one.channel.clone()).collect(),
+            described: first.describe(),
+            delay_max: longest.min().flatten(),
             domain: launch.domain.clone(),
         });
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use hil_core::time::duration_ns;
-use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome, order_channel};
+use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome, flow_name};
 use hil_link::spec::Way;
 
 use hil_platform::clock::MonotonicClock;
@@ -47,7 +47,7 @@ impl LinkConditions {
             let flight = Flight {
                 // Of a trace that cannot be read here nothing is known.
                 by_topology: emulation.flight_time(FLIGHT_QUANTILE).unwrap_or_default(),
-                orders: order_channel(&emulation.link, emulation.way),
+                orders: flow_name(&emulation.link, emulation.way),
             };
             Some((crossing.channel.name.clone(), flight))
         });
@@ -96,7 +96,7 @@ impl LinkConditions {
 
     /// What the direction `way` of `link` was ordered to do, as far as this host knows.
     pub(crate) fn now(&self, link: &str, way: Way) -> LinkCondition {
-        let orders = self.orders.get(&order_channel(link, way));
+        let orders = self.orders.get(&flow_name(link, way));
         orders.map_or(LinkCondition::Topology, |orders| in_force(orders).0)
     }
 
@@ -179,7 +179,7 @@ mod tests {
 
     #[test]
     fn an_order_that_is_read_twice_counts_once_and_the_last_one_holds() {
-        let channel = order_channel("hop", Way::Forward);
+        let channel = flow_name("hop", Way::Forward);
         let mut conditions = LinkConditions::default();
         conditions.add(&channel, [record(2, 2 * MS, LinkCondition::Cut)]);
         conditions.add(

@@ -520,16 +520,20 @@ impl Observer {
         found
     }
 
-    /// The host that asks and the host that answers in the exchanges recorded as `name`: of a
-    /// channel, whose sending gateway asks, or of a clock path.
+    /// The host that asks and the host that answers in the exchanges recorded as `name`: of one way of a
+    /// link, whose sending gateway asks, or of a clock path.
     fn exchanging_hosts(&self, name: &str) -> Option<(String, String)> {
         if let Some(topology) = &self.topology {
             let clock_path = topology.clock_paths().find(|path| path.name() == name);
             if let Some(path) = clock_path {
                 return Some((path.from.name.clone(), path.to.name.clone()));
             }
+            let mut crossings = topology.crossings();
+            let crossing = crossings.find(|one| one.flow_name() == name)?;
+            let (from, to) = (crossing.from_host, crossing.to_host);
+            return Some((from.name.clone(), to.name.clone()));
         }
-        self.hosts_of(name)
+        None
     }
 }
 

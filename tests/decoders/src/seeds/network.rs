@@ -36,12 +36,14 @@ fn all_datagrams() -> Vec<Vec<u8>> {
         };
         let now = Instant::from_ns(NOW_NS) + Duration::from_millis(25 * sequence as u64);
         // Not greeted at first: then the message is refused, and counted.
-        let _counted = sender.on_local(now, &envelope, &vec![7; length]);
+        let _counted = sender.on_local(now, 0, &envelope, &vec![7; length]);
         converse(&mut sender, &mut receiver, now, &mut made);
     }
     sender.bye();
-    let farewell = sender.poll_transmit(Instant::from_ns(NOW_NS));
-    made.extend(farewell.map(|transmit| transmit.datagram.to_vec()));
+    // Of the channel, and of the flow.
+    while let Some(farewell) = sender.poll_transmit(Instant::from_ns(NOW_NS)) {
+        made.push(farewell.datagram.to_vec());
+    }
     made
 }
 
@@ -53,9 +55,9 @@ fn converse(
 ) {
     let arrival = ArrivalStamps::application(now.as_ns());
     while let Some(transmit) = sender.poll_transmit(now) {
-        let (kind, sequence) = (transmit.kind, transmit.sequence);
+        let (kind, channel, sequence) = (transmit.kind, transmit.channel, transmit.sequence);
         let datagram = transmit.datagram.to_vec();
-        sender.on_transmit_stamp(kind, sequence, 900);
+        sender.on_transmit_stamp(kind, channel, sequence, 900);
         let _counted = receiver.on_datagram(now, arrival, &datagram, &mut |_| {});
         made.push(datagram);
         while let Some(reply) = receiver.poll_transmit(now) {

@@ -40,7 +40,7 @@ fn nothing_is_sealed_before_there_are_keys_and_a_greeting_asks_for_them() {
 }
 
 #[test]
-fn another_secret_or_channel_gets_no_answer_and_no_keys() {
+fn another_secret_or_flow_gets_no_answer_and_no_keys() {
     let base = association(Suite::Aes256Gcm);
     let others = [
         Association {
@@ -48,7 +48,7 @@ fn another_secret_or_channel_gets_no_answer_and_no_keys() {
             ..base.clone()
         },
         Association {
-            channel_name: "arm/commanD".to_owned(),
+            flow_name: "link/hop/forwarD".to_owned(),
             ..base.clone()
         },
     ];
@@ -59,11 +59,11 @@ fn another_secret_or_channel_gets_no_answer_and_no_keys() {
         assert_eq!(pair.receiver.open(&mut request), Err(SealRefusal::BadTag));
     }
     let mut pair = Pair::strangers(Suite::Aes256Gcm, Rotation::default());
-    let elsewhere = Association { channel: 4, ..base };
+    let elsewhere = Association { flow: 4, ..base };
     pair.sender = Initiator::new(&elsewhere, [1; 16], Rotation::default());
     let mut request = pair.sender.request_before(&hello()).unwrap();
     let refused = pair.receiver.open(&mut request);
-    assert_eq!(refused, Err(SealRefusal::ForeignChannel));
+    assert_eq!(refused, Err(SealRefusal::ForeignFlow));
 }
 
 #[test]

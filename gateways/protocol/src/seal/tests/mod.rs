@@ -14,8 +14,8 @@ pub(super) fn association(suite: Suite) -> Association {
     Association {
         secret: RunSecret::new(&mut [9; 32]),
         suite,
-        channel: 3,
-        channel_name: "arm/command".to_owned(),
+        flow: 3,
+        flow_name: "link/hop/forward".to_owned(),
     }
 }
 
@@ -35,7 +35,7 @@ pub(super) fn hello() -> Vec<u8> {
     plain(Kind::Hello, 0, 1_000, &[5; 60])
 }
 
-/// Both ends of a channel.
+/// Both ends of a flow.
 pub(super) struct Pair {
     pub(super) sender: Initiator,
     pub(super) receiver: Responder,

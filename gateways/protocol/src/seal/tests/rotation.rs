@@ -41,7 +41,7 @@ fn under_loss_and_reordering_every_datagram_that_arrives_is_opened() {
 }
 
 #[test]
-fn a_slow_channel_rotates_by_time() {
+fn a_slow_flow_rotates_by_time() {
     let mut pair = Pair::agreed(Suite::Aes256Gcm, OFTEN);
     for sequence in 0..50_u64 {
         let handed_ns = i64::try_from(sequence).unwrap() * 250_000_000;

@@ -1,0 +1,503 @@
+//! What a channel costs on a link: the two gateway processes of the product between two hosts, with 1 to 400
+//! channels of 64 bytes, idle and at one total rate of messages. Not a test: it asserts nothing about time.
+//!
+//! `cargo bench -p hil-benches --bench channels_per_link [-- --seconds 8 --rate 2000 --rounds 3 --channels
+//! 1,10,100,400]`, about 4 minutes. Processor time, wake-ups and memory are those of the gateways, of both
+//! hosts together; a delay is from the publication of a message to its publication on the other host.
+#![allow(clippy::print_stdout, reason = "a bench prints its result")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a bench that cannot start may stop with a backtrace"
+)]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::net::SocketAddr;
+use std::os::fd::BorrowedFd;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::channel;
+use std::thread;
+use std::time::Duration;
+
+use hil_benches::gateway::network::Network;
+use hil_benches::{HostFacts, Quantiles};
+use hil_core::message::MessageType;
+use hil_platform::clock::MonotonicClock;
+use hil_platform::realtime::RealtimeRequest;
+use hil_platform::wait::WaitMode;
+use hil_rundir::launch::{
+    ChannelLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch, Work, WorkerLaunch, write,
+};
+use hil_shm::{
+    ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, ShmOutput, Waiter,
+};
+use hil_tests::binary::hil_runtime_binary;
+use hil_topology::Timestamps;
+use nix::poll::{PollFd, PollFlags, ppoll};
+use nix::sys::time::{TimeSpec, TimeValLike};
+use serde_json::json;
+
+const MESSAGE: MessageType = MessageType {
+    name: "bench.Bytes.v1",
+    size_bytes: 64,
+    alignment_bytes: 8,
+    fields: &[],
+};
+const DEPTH: usize = 16;
+/// After a change of load, before figures are taken.
+const SETTLING: Duration = Duration::from_secs(1);
+
+struct Options {
+    seconds: u64,
+    rate_hz: u64,
+    rounds: usize,
+    channels: Vec<usize>,
+}
+
+impl Options {
+    fn of_arguments() -> Self {
+        let mut options = Self {
+            seconds: 8,
+            rate_hz: 2_000,
+            rounds: 3,
+            channels: vec![1, 10, 100, 400],
+        };
+        let mut arguments = std::env::args().skip(1).filter(|one| one != "--bench");
+        while let Some(key) = arguments.next() {
+            let value = arguments.next().unwrap_or_default();
+            match key.as_str() {
+                "--seconds" => options.seconds = value.parse().unwrap(),
+                "--rate" => options.rate_hz = value.parse().unwrap(),
+                "--rounds" => options.rounds = value.parse().unwrap(),
+                "--channels" => {
+                    options.channels = value.split(',').map(|one| one.parse().unwrap()).collect();
+                }
+                other => panic!("unknown option {other}"),
+            }
+        }
+        options
+    }
+}
+
+/// What the kernel counted of one process.
+#[derive(Clone, Copy, Default)]
+struct Usage {
+    cpu_ns: u64,
+    wake_up_count: u64,
+}
+
+impl Usage {
+    fn of(process: u32) -> Self {
+        let mut usage = Self::default();
+        for task in fs::read_dir(format!("/proc/{process}/task"))
+            .unwrap()
+            .flatten()
+        {
+            let of = |file: &str| fs::read_to_string(task.path().join(file)).unwrap_or_default();
+            let first = of("schedstat");
+            let first = first
+                .split(' ')
+                .next()
+                .and_then(|one| one.parse::<u64>().ok());
+            usage.cpu_ns += first.unwrap_or(0);
+            usage.wake_up_count += field(&of("status"), "voluntary_ctxt_switches:");
+        }
+        usage
+    }
+
+    fn since(self, before: Self) -> Self {
+        Self {
+            cpu_ns: self.cpu_ns - before.cpu_ns,
+            wake_up_count: self.wake_up_count - before.wake_up_count,
+        }
+    }
+
+    fn and(self, other: Self) -> Self {
+        Self {
+            cpu_ns: self.cpu_ns + other.cpu_ns,
+            wake_up_count: self.wake_up_count + other.wake_up_count,
+        }
+    }
+}
+
+fn field(status: &str, key: &str) -> u64 {
+    let mut lines = status.lines();
+    let line = lines.find_map(|line| line.strip_prefix(key));
+    let word = line.and_then(|rest| rest.split_whitespace().next());
+    word.and_then(|word| word.parse().ok()).unwrap_or(0)
+}
+
+/// UDP ports that a process has bound to the address of its host.
+fn ports(process: u32) -> BTreeSet<String> {
+    let links = fs::read_dir(format!("/proc/{process}/fd"))
+        .unwrap()
+        .flatten();
+    let sockets: BTreeSet<String> = links
+        .filter_map(|link| fs::read_link(link.path()).ok())
+        .filter_map(|link| {
+            let name = link.to_string_lossy().into_owned();
+            let inode = name.strip_prefix("socket:[")?.strip_suffix(']')?;
+            Some(inode.to_owned())
+        })
+        .collect();
+    let table = fs::read_to_string(format!("/proc/{process}/net/udp")).unwrap();
+    let of_line = |line: &str| {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let (local, inode) = (words.get(1)?, words.get(9)?);
+        let is_own = sockets.contains(*inode) && !local.starts_with("0100007F");
+        is_own.then(|| (*local).to_owned())
+    };
+    table.lines().filter_map(of_line).collect()
+}
+
+/// The gateway of one host.
+struct Gateway {
+    process: Child,
+}
+
+impl Gateway {
+    fn start(network: &Network, host: usize, launch: &Path) -> Self {
+        let mut command = Command::new(hil_runtime_binary());
+        command.arg("worker").arg("--launch").arg(launch);
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        let process = network.on(host, move || command.spawn()).unwrap();
+        Self { process }
+    }
+
+    /// Waits for its word that the peer takes messages, and reads on.
+    fn wait_until_ready(&mut self) {
+        let (ready, is_ready) = channel();
+        let out = BufReader::new(self.process.stdout.take().unwrap());
+        thread::spawn(move || {
+            for line in out.lines().map_while(Result::ok) {
+                if line == "\"ready\"" {
+                    // Who waits for it may have given up.
+                    let _gone = ready.send(()).is_err();
+                } else if line.contains("\"failed\"") {
+                    println!("{line}");
+                }
+            }
+        });
+        let waited = is_ready.recv_timeout(Duration::from_mins(1));
+        waited.expect("a gateway is ready within a minute");
+    }
+
+    fn end(mut self) {
+        let mut orders = self.process.stdin.take().unwrap();
+        orders.write_all(b"\"stop\"\n").unwrap();
+        self.process.wait().unwrap();
+    }
+}
+
+/// Figures of one number of channels in one round.
+struct Figures {
+    idle: Usage,
+    loaded: Usage,
+    resident_bytes: u64,
+    threads: u64,
+    ports: usize,
+    sent_count: u64,
+    delays_ns: Vec<u64>,
+}
+
+fn names(count: usize) -> Vec<String> {
+    (0..count)
+        .map(|index| format!("bench/robot-{index}"))
+        .collect()
+}
+
+fn direction(side: Side, names: &[String], addresses: [SocketAddr; 2]) -> DirectionLaunch {
+    let channel = |(index, name): (usize, &String)| ChannelLaunch {
+        channel: name.clone(),
+        channel_id: u16::try_from(index).unwrap(),
+        message: MESSAGE.name.to_owned(),
+        size_bytes: MESSAGE.size_bytes,
+        alignment_bytes: MESSAGE.alignment_bytes,
+        depth: DEPTH,
+        emulation: None,
+    };
+    let [local, peer] = match side {
+        Side::Egress => addresses,
+        Side::Ingress => [addresses[1], addresses[0]],
+    };
+    DirectionLaunch {
+        flow: "hil/link/bench/forward".to_owned(),
+        flow_number: u16::MAX,
+        side,
+        local,
+        peer,
+        socket: SocketLaunch {
+            transport: "udp".to_owned(),
+            options: BTreeMap::new(),
+            interface: None,
+            dscp: 0,
+            priority: None,
+            send_buffer_bytes: 212_992,
+            receive_buffer_bytes: 212_992,
+            path_mtu_bytes: 1500,
+            timestamps: Timestamps::Software,
+        },
+        wait: WaitMode::Block,
+        realtime: RealtimeRequest::default(),
+        channels: names.iter().enumerate().map(channel).collect(),
+    }
+}
+
+fn measure(network: &Network, folder: &Path, count: usize, options: &Options) -> Figures {
+    let names = names(count);
+    let domains = [0, 1].map(|host| Domain::create(&folder.join(format!("d{host}"))).unwrap());
+    let mut holders = Vec::new();
+    for domain in &domains {
+        for name in &names {
+            let settings = ChannelSettings {
+                depth_max: DEPTH,
+                ..ChannelSettings::of(name, &MESSAGE)
+            };
+            holders.push(ChannelHolder::create(domain, &settings).unwrap());
+        }
+    }
+    let addresses = [0, 1].map(|host| network.free_address(host).unwrap());
+    let mut gateways = [(0, Side::Egress), (1, Side::Ingress)].map(|(host, side)| {
+        let records = folder.join(format!("records-{host}"));
+        fs::create_dir_all(&records).unwrap();
+        let launch = WorkerLaunch {
+            process: format!("gateway-bench-{host}"),
+            instance: 0,
+            domain: domains[host].address().to_string(),
+            records,
+            is_sealed: false,
+            work: Work::Gateway(GatewayWork {
+                directions: vec![direction(side, &names, addresses)],
+                ready_within: None,
+            }),
+        };
+        let path = folder.join(format!("launch-{host}.json"));
+        write(&path, &launch).unwrap();
+        Gateway::start(network, host, &path)
+    });
+    let mut outputs: Vec<ShmOutput> = names
+        .iter()
+        .map(|name| {
+            ShmOutput::open(&domains[0], name, &MESSAGE, OutputSettings::default()).unwrap()
+        })
+        .collect();
+    gateways.iter_mut().for_each(Gateway::wait_until_ready);
+    let processes = gateways.each_ref().map(|one| one.process.id());
+    let usage = || {
+        let [one, other] = processes.map(Usage::of);
+        one.and(other)
+    };
+    let span = Duration::from_secs(options.seconds);
+    thread::sleep(SETTLING);
+    let before = usage();
+    thread::sleep(span);
+    let idle = usage().since(before);
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let receiving = {
+        let (stop, names) = (Arc::clone(&stop), names.clone());
+        let domain = Domain::open(domains[1].address()).unwrap();
+        thread::spawn(move || take(&domain, &names, &stop))
+    };
+    let period = Duration::from_nanos(1_000_000_000 / options.rate_hz);
+    let payload = [7; 64];
+    let mut send_for = |span: Duration| {
+        let started = MonotonicClock::now();
+        let mut sent_count = 0;
+        let mut due = started;
+        while due < started + span {
+            let left = due.saturating_duration_since(MonotonicClock::now());
+            thread::sleep(left);
+            let index = usize::try_from(sent_count).unwrap() % count;
+            outputs[index]
+                .publish(MonotonicClock::now(), &payload)
+                .unwrap();
+            sent_count += 1;
+            due = due + period;
+        }
+        sent_count
+    };
+    send_for(SETTLING);
+    let began = MonotonicClock::now();
+    let before = usage();
+    let sent_count = send_for(span);
+    let loaded = usage().since(before);
+    let status = |process: u32| fs::read_to_string(format!("/proc/{process}/status")).unwrap();
+    let of_both = |key: &str| {
+        processes
+            .map(|one| field(&status(one), key))
+            .iter()
+            .sum::<u64>()
+    };
+    let (resident_bytes, threads) = (of_both("VmRSS:") * 1024, of_both("Threads:"));
+    let ports = processes
+        .map(ports)
+        .iter()
+        .map(BTreeSet::len)
+        .max()
+        .unwrap();
+    thread::sleep(Duration::from_millis(200));
+    stop.store(true, Ordering::Release);
+    let arrivals = receiving.join().unwrap();
+    let delays_ns = arrivals
+        .into_iter()
+        .filter(|(published_ns, _)| *published_ns >= began.as_ns())
+        .map(|(_, delay_ns)| delay_ns)
+        .collect();
+    gateways.into_iter().for_each(Gateway::end);
+    drop((outputs, holders));
+    for domain in domains {
+        domain.remove();
+    }
+    fs::remove_dir_all(folder).unwrap();
+    Figures {
+        idle,
+        loaded,
+        resident_bytes,
+        threads,
+        ports,
+        sent_count,
+        delays_ns,
+    }
+}
+
+/// Takes every message; when each was published, and how long it took to the other host.
+fn take(domain: &Domain, names: &[String], stop: &AtomicBool) -> Vec<(i64, u64)> {
+    let listed: Vec<&str> = names.iter().map(String::as_str).collect();
+    let mut waiter = Waiter::open(domain, &listed).unwrap();
+    let mut inputs: Vec<RawInput> = names
+        .iter()
+        .map(|name| RawInput::open(domain, name, DEPTH).unwrap())
+        .collect();
+    let mut arrivals = Vec::new();
+    let mut announced = Vec::new();
+    while !stop.load(Ordering::Acquire) {
+        sleep_for(waiter.descriptor());
+        waiter.announced(|index| announced.push(index)).unwrap();
+        for index in announced.drain(..) {
+            waiter.drain(index).unwrap();
+            while inputs[index]
+                .receive(&mut |envelope, _| {
+                    let delay_ns = envelope.forwarded_ns - envelope.published_ns;
+                    arrivals.push((envelope.published_ns, delay_ns.unsigned_abs()));
+                })
+                .unwrap()
+            {}
+        }
+    }
+    arrivals
+}
+
+fn sleep_for(descriptor: BorrowedFd<'_>) {
+    let mut entries = [PollFd::new(descriptor, PollFlags::POLLIN)];
+    let patience = TimeSpec::milliseconds(50);
+    ppoll(&mut entries, Some(patience), None).unwrap();
+}
+
+/// The middle one of three, or of whatever number there is.
+fn median(mut figures: Vec<f64>) -> f64 {
+    figures.sort_unstable_by(f64::total_cmp);
+    figures[figures.len() / 2]
+}
+
+fn main() {
+    let options = Options::of_arguments();
+    let network = Network::open();
+    println!("{}", HostFacts::read("none").to_json());
+    println!(
+        "{}; {} messages per second in all, 64 bytes",
+        network.note(),
+        options.rate_hz
+    );
+    let folder = |name: String| -> PathBuf { std::env::temp_dir().join(name) };
+    let mut of_count: BTreeMap<usize, Vec<Figures>> = BTreeMap::new();
+    for round in 0..options.rounds {
+        let mut order = options.channels.clone();
+        if round % 2 == 1 {
+            order.reverse();
+        }
+        for count in order {
+            let name = format!("hil-cpl-{}-{round}-{count}", std::process::id());
+            let figures = measure(&network, &folder(name), count, &options);
+            of_count.entry(count).or_default().push(figures);
+        }
+    }
+    let seconds = options.seconds as f64;
+    let mut rows = Vec::new();
+    let mut first: Option<[f64; 4]> = None;
+    for (count, rounds) in of_count {
+        let of = |pick: &dyn Fn(&Figures) -> f64| median(rounds.iter().map(pick).collect());
+        let idle_cpu = of(&|one| one.idle.cpu_ns as f64 * 1e-9 / seconds);
+        let idle_wake_ups = of(&|one| one.idle.wake_up_count as f64 / seconds);
+        let cpu_us = of(&|one| one.loaded.cpu_ns as f64 * 1e-3 / one.sent_count as f64);
+        let resident_mb = of(&|one| one.resident_bytes as f64 * 1e-6);
+        let threads = of(&|one| one.threads as f64);
+        let ports = of(&|one| one.ports as f64);
+        let sent: u64 = rounds.iter().map(|one| one.sent_count).sum();
+        let mut delays: Vec<u64> = rounds
+            .iter()
+            .flat_map(|one| one.delays_ns.clone())
+            .collect();
+        let come = delays.len() as u64;
+        let delay = Quantiles::of(&mut delays).expect("messages arrive");
+        let own = [idle_cpu, idle_wake_ups, cpu_us, delay.p99_ns as f64];
+        let base = *first.get_or_insert(own);
+        let ratio = |index: usize| format!("{:.2}", own[index] / base[index]);
+        rows.push(vec![
+            count.to_string(),
+            format!("{:.2} %", idle_cpu * 100.0),
+            ratio(0),
+            format!("{idle_wake_ups:.0}"),
+            ratio(1),
+            format!("{cpu_us:.1}"),
+            ratio(2),
+            format!("{:.0}", delay.p50_ns as f64 * 1e-3),
+            format!("{:.0}", delay.p99_ns as f64 * 1e-3),
+            ratio(3),
+            format!("{:.0}", delay.p99_9_ns as f64 * 1e-3),
+            format!("{resident_mb:.1}"),
+            format!("{threads:.0}"),
+            format!("{ports:.0}"),
+            (sent - come.min(sent)).to_string(),
+        ]);
+        println!(
+            "{}",
+            json!({
+                "bench": "channels_per_link",
+                "channels": count,
+                "idle_cpu_ratio": idle_cpu,
+                "idle_wake_ups_hz": idle_wake_ups,
+                "cpu_us_per_message": cpu_us,
+                "delay": delay.to_json(),
+                "resident_bytes": resident_mb * 1e6,
+                "threads": threads,
+                "ports": ports,
+            })
+        );
+    }
+    let columns = [
+        "channels",
+        "idle CPU",
+        "x",
+        "wake-ups/s",
+        "x",
+        "CPU us/msg",
+        "x",
+        "p50 us",
+        "p99 us",
+        "x",
+        "p99.9 us",
+        "RSS MB",
+        "threads",
+        "ports",
+        "lost",
+    ];
+    for row in core::iter::once(columns.map(str::to_owned).to_vec()).chain(rows) {
+        let cells: Vec<String> = row.iter().map(|cell| format!("{cell:>10}")).collect();
+        println!("{}", cells.join(" "));
+    }
+}
