@@ -44,7 +44,8 @@ pub enum FromProcess {
     Ready,
     /// Every loop of the process has turned since it last said so: a few times a second.
     Alive,
-    /// Counts so far, a few times a second.
+    /// Counts so far of the channels whose changed since they were told last, in an order that is always the
+    /// same; a few times a second.
     Progress(Vec<ChannelProgress>),
     /// Grid points of the role's timer that passed without a tick so far; not of a role without one.
     SkippedTicks(u64),

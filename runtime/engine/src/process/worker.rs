@@ -255,7 +255,8 @@ fn run_jobs(
         mut gateway,
         skipped_ticks,
     } = opened;
-    let counters: Vec<Counter> = jobs.iter().flat_map(|job| job.counters.clone()).collect();
+    let counters = jobs.iter().flat_map(|job| job.counters.clone());
+    let mut counters: Vec<(Counter, Option<u64>)> = counters.map(|one| (one, None)).collect();
     let mut heartbeats = Heartbeats::of(jobs.iter().filter_map(|job| job.heartbeat.clone()));
     let job_count = jobs.len();
     let stop = || orders.stop_flag().store(true, Ordering::Release);
@@ -295,7 +296,7 @@ fn run_jobs(
                 }
                 if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
                     told = now;
-                    say_progress(&counters, &mut heartbeats, skipped_ticks.as_deref());
+                    say_progress(&mut counters, &mut heartbeats, skipped_ticks.as_deref());
                 }
             }
             match words.recv_timeout(period) {
@@ -366,19 +367,27 @@ fn add(report: &mut ProcessReport, other: ProcessReport, facts: &[(String, Strin
     report.faces.extend(arms);
 }
 
-/// Says how many messages passed, that the threads turn, if they do, and what ticks passed without the
-/// role.
+/// Says how many messages passed on the channels on which any did since it was said last, that the threads
+/// turn, if they do, and what ticks passed without the role.
 fn say_progress(
-    counters: &[Counter],
+    counters: &mut [(Counter, Option<u64>)],
     heartbeats: &mut Heartbeats,
     skipped_ticks: Option<&AtomicU64>,
 ) {
-    let progress = counters.iter().map(|counter| ChannelProgress {
-        channel: counter.channel.clone(),
-        what: counter.what.to_owned(),
-        count: counter.count.load(Ordering::Relaxed),
-    });
-    say(&FromProcess::Progress(progress.collect()));
+    let mut progress = Vec::new();
+    for (counter, said) in counters {
+        let count = counter.count.load(Ordering::Relaxed);
+        if said.replace(count) != Some(count) {
+            progress.push(ChannelProgress {
+                channel: counter.channel.clone(),
+                what: counter.what.to_owned(),
+                count,
+            });
+        }
+    }
+    if !progress.is_empty() {
+        say(&FromProcess::Progress(progress));
+    }
     if heartbeats.have_all_turned() {
         say(&FromProcess::Alive);
     }

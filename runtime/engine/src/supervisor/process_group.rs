@@ -77,6 +77,22 @@ pub(crate) struct ManagedProcess {
     complaint: Option<String>,
 }
 
+/// Puts the counts that a process tells of now in the place of those it told of before, both in its order.
+fn merge(known: &mut Vec<ChannelProgress>, told: Vec<ChannelProgress>) {
+    let mut next = 0;
+    for one in told {
+        let is_it =
+            |known: &ChannelProgress| (&known.channel, &known.what) == (&one.channel, &one.what);
+        match known[next..].iter().position(is_it) {
+            Some(place) => {
+                next += place;
+                known[next] = one;
+            }
+            None => known.push(one),
+        }
+    }
+}
+
 /// The processes of one supervisor.
 #[derive(Debug)]
 pub(crate) struct ProcessGroup {
@@ -369,7 +385,7 @@ impl ProcessGroup {
                         self.close_interruptions(index, now);
                     }
                 }
-                FromProcess::Progress(progress) => member.progress = progress,
+                FromProcess::Progress(progress) => merge(&mut member.progress, progress),
                 FromProcess::SkippedTicks(count) => member.skipped_tick_count = Some(count),
                 FromProcess::Warning(text) => {
                     self.note(now, index, EventKind::Warning { text }, None);
@@ -483,5 +499,30 @@ impl ProcessGroup {
     /// What happened, in order.
     pub(crate) fn events(&self) -> &[Event] {
         &self.events
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_that_are_not_told_again_stay_as_they_were() {
+        let told = |counts: &[(&str, u64)]| -> Vec<ChannelProgress> {
+            let one = |&(channel, count): &(&str, u64)| ChannelProgress {
+                channel: channel.to_owned(),
+                what: "sent".to_owned(),
+                count,
+            };
+            counts.iter().map(one).collect()
+        };
+        let mut known = Vec::new();
+        merge(&mut known, told(&[("a", 1), ("b", 2), ("c", 3)]));
+        merge(&mut known, told(&[("b", 5)]));
+        merge(&mut known, told(&[("a", 4), ("c", 6)]));
+        assert_eq!(known, told(&[("a", 4), ("b", 5), ("c", 6)]));
+        // Started again, it counts from the beginning.
+        merge(&mut known, told(&[("a", 0), ("b", 0), ("c", 0), ("d", 1)]));
+        assert_eq!(known, told(&[("a", 0), ("b", 0), ("c", 0), ("d", 1)]));
     }
 }
