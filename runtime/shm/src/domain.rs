@@ -17,6 +17,7 @@ use iceoryx2::prelude::{
 use nix::errno::Errno;
 use nix::fcntl::{Flock, FlockArg};
 
+use super::capacity::reserve;
 use super::error::{DomainError, explain};
 use super::identity::{Fnv128, SHARED_MEMORY_DIRECTORY, fingerprint};
 use super::members;
@@ -356,7 +357,7 @@ fn fresh_prefix(root_path: &Path) -> Result<String, DomainError> {
     }
 }
 
-fn shared_memory_files(prefix: &str) -> Vec<PathBuf> {
+pub(super) fn shared_memory_files(prefix: &str) -> Vec<PathBuf> {
     let Ok(entries) = fs::read_dir(SHARED_MEMORY_DIRECTORY) else {
         return Vec::new();
     };
@@ -371,15 +372,20 @@ fn shared_memory_files(prefix: &str) -> Vec<PathBuf> {
 const LENGTHLESS_MAX: Duration = Duration::from_millis(500);
 
 /// Deletes files that a process was killed over before it could give them a length; false while
-/// one is young enough that its maker may live.
+/// one is young enough that its maker may live. Takes the memory of files that another program than
+/// ours made, which does not do so itself.
 fn is_clear_of_lengthless_files(prefix: &str) -> bool {
     shared_memory_files(prefix).iter().all(|file| {
         let Ok(metadata) = fs::metadata(file) else {
             return true;
         };
+        if metadata.len() > 0 {
+            // Where there is too little nothing can be done about it here.
+            let _is_taken = reserve(file, &metadata).is_ok();
+            return true;
+        }
         let age = metadata.modified().ok().and_then(|at| at.elapsed().ok());
-        metadata.len() > 0
-            || (age.is_some_and(|age| age > LENGTHLESS_MAX) && fs::remove_file(file).is_ok())
+        age.is_some_and(|age| age > LENGTHLESS_MAX) && fs::remove_file(file).is_ok()
     })
 }
 

@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use std::{io, thread};
 
+use super::capacity::Room;
+use super::identity::SHARED_MEMORY_DIRECTORY;
 use hil_platform::domain_address::DomainAddressError;
 
 /// A domain could not be created, opened or removed.
@@ -33,7 +35,7 @@ pub enum DomainError {
         root_path: PathBuf,
     },
     /// The operating system refused.
-    #[error("cannot {operation} {}", .path.display())]
+    #[error("cannot {operation} {}: {source}", .path.display())]
     Io {
         /// What was attempted.
         operation: &'static str,
@@ -98,6 +100,27 @@ pub enum ChannelError {
         found: String,
         /// What this side uses.
         wanted: String,
+    },
+    /// There is too little memory for it.
+    #[error(
+        "channel {channel}: {SHARED_MEMORY_DIRECTORY} has {free} free, this side takes {need}; \
+         mount -o remount,size=SIZE {SHARED_MEMORY_DIRECTORY}, or end what fills it"
+    )]
+    NoRoom {
+        /// The channel's name.
+        channel: String,
+        /// What it takes.
+        need: Room,
+        /// What is free.
+        free: Room,
+    },
+    /// Its memory cannot be taken before it is used.
+    #[error("channel {channel}: cannot take its memory: {source}")]
+    Reserve {
+        /// The channel's name.
+        channel: String,
+        /// Why the kernel refused.
+        source: io::Error,
     },
     /// A payload of another length than the channel's message.
     #[error("channel {channel}: payload has {given} bytes, its messages have {expected}")]

@@ -39,7 +39,7 @@ impl ChannelSettings {
 
     /// Processes that may have the channel open: each writer and reader in its own, as many again
     /// that died and are not cleaned up yet, the launcher and a few observers.
-    const fn nodes_max(&self) -> usize {
+    pub(crate) const fn nodes_max(&self) -> usize {
         2 * (self.writers_max + self.readers_max) + 4
     }
 }

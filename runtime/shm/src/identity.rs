@@ -7,7 +7,7 @@ use std::path::Path;
 use super::error::DomainError;
 
 /// Where iceoryx2's shared memory lives on Linux.
-pub(crate) const SHARED_MEMORY_DIRECTORY: &str = "/dev/shm";
+pub const SHARED_MEMORY_DIRECTORY: &str = "/dev/shm";
 
 /// Sixteen bytes that two processes have in common exactly when their channels of this domain
 /// share memory: same boot of the same kernel, same root directory, same `/dev/shm`, same prefix.

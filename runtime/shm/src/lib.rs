@@ -19,6 +19,7 @@
 //!
 //! Ports are not [`Send`]: open each in the thread that uses it. A [`Domain`] can be shared.
 
+mod capacity;
 mod census;
 mod degradation;
 mod domain;
@@ -36,11 +37,12 @@ mod wake;
 #[cfg(test)]
 mod tests;
 
+pub use capacity::Room;
 pub use census::Census;
 pub use domain::{Cleanup, Domain, Removal};
 pub use error::{ChannelError, DomainError};
 pub use holder::{ChannelHolder, ChannelSettings};
-pub use identity::clock_id;
+pub use identity::{SHARED_MEMORY_DIRECTORY, clock_id};
 pub use members::ForeignNodes;
 pub use observer::observer_depth;
 pub use ports::{ShmInput, ShmOutput, TypedInput, TypedOutput};

@@ -21,9 +21,11 @@ use iceoryx2::prelude::{
 use iceoryx2::sample_mut_uninit::SampleMutUninit;
 use iceoryx2::service::builder::publish_subscribe::{Builder, PublishSubscribeOpenError};
 use iceoryx2::service::marker::{CustomHeaderMarker, CustomPayloadMarker};
-use iceoryx2::service::port_factory::publish_subscribe;
+use iceoryx2::service::port_factory::{PortFactory as _, publish_subscribe};
 use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
+use iceoryx2::service::static_config::publish_subscribe::StaticConfig;
 
+use super::capacity::{BORROWED_MAX, LOANED_MAX, check_room, take_room};
 use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
@@ -132,7 +134,7 @@ pub(crate) fn create_samples(
         .enable_safe_overflow(true)
         .history_size(0)
         .subscriber_max_buffer_size(settings.depth_max)
-        .subscriber_max_borrowed_samples(2)
+        .subscriber_max_borrowed_samples(BORROWED_MAX)
         .max_publishers(settings.writers_max)
         .max_subscribers(settings.readers_max)
         .max_nodes(nodes_max)
@@ -159,6 +161,17 @@ pub(super) fn open_for_reading(
         .user_header::<SharedEnvelope>()
         .open()
         .map_err(|error| open_error(domain, channel, message, error))
+}
+
+/// What the launcher created the channel with.
+fn settings_of(config: &StaticConfig, channel: &str, message: &TypeInfo) -> ChannelSettings {
+    ChannelSettings {
+        name: channel.to_owned(),
+        message: message.clone(),
+        depth_max: config.subscriber_max_buffer_size(),
+        writers_max: config.max_publishers(),
+        readers_max: config.max_subscribers(),
+    }
 }
 
 /// Says which types differ, where that is why the channel did not open.
@@ -281,15 +294,23 @@ impl RawOutput {
     ) -> Result<Self, ChannelError> {
         let within = domain.open_within();
         let service = retry(within, || open_for_writing(domain, channel, &message))?;
+        let settings = settings_of(service.static_config(), channel, &message);
+        check_room(channel, settings.writer_room())?;
         let failures = ConnectionFailures::default();
         let publisher = retry(within, || {
             service
                 .publisher_builder()
-                .max_loaned_samples(1)
+                .max_loaned_samples(LOANED_MAX)
                 .set_degradation_handler(failures.handler())
                 .create()
                 .map_err(|error| ChannelError::refused(channel, "become a writer", &error))
         })?;
+        take_room(
+            domain,
+            channel,
+            publisher.id().value(),
+            settings.writer_room(),
+        )?;
         let notifier = notifies_readers
             .then(|| retry(within, || wake::open_notifier(domain, channel)))
             .transpose()?;
@@ -395,6 +416,8 @@ impl ByteReader {
     ) -> Result<Self, ChannelError> {
         let within = domain.open_within();
         let service = retry(within, || open_for_reading(domain, channel, message))?;
+        let settings = settings_of(service.static_config(), channel, message);
+        check_room(channel, settings.reader_room())?;
         let failures = ConnectionFailures::default();
         let subscriber = retry(within, || {
             service
@@ -407,6 +430,8 @@ impl ByteReader {
         subscriber
             .update_connections()
             .map_err(|error| ChannelError::refused(channel, "connect to its writers", &error))?;
+        let room = settings.reader_room();
+        take_room(domain, channel, subscriber.id().value(), room)?;
         Ok(Self {
             channel: channel.to_owned(),
             subscriber,

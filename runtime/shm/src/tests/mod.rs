@@ -1,5 +1,6 @@
 //! Tests of the channels as a whole: real shared memory, several members, killed processes.
 
+mod capacity;
 mod domain;
 mod exchange;
 mod kill;
