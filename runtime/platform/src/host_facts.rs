@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::fake::FakeHost;
 pub use self::files::{CAP_IPC_LOCK, CAP_SYS_NICE, HostFiles, format_cpu_list};
+pub(crate) use self::files::{CAP_SYS_ADMIN, CAP_SYS_RESOURCE};
 pub use self::kernel::{
     KernelOptions, PreemptionMode, RealtimeThrottle, boot_parameter, clocksource, has_fair_server,
     kernel_release, preemption, virtual_machine,

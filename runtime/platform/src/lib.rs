@@ -7,6 +7,8 @@ pub mod clock_discipline;
 pub mod console;
 pub mod domain_address;
 pub mod host_facts;
+pub mod host_limits;
+pub mod open_files;
 pub mod progress;
 pub mod random;
 pub mod realtime;

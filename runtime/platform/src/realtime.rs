@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use core_affinity::CoreId;
 use nix::errno::Errno;
-use nix::sched::sched_getaffinity;
+use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
 use nix::sys::mman::{MlockAllFlags, mlockall};
 use nix::sys::prctl;
 use nix::sys::resource::Resource;
@@ -232,13 +232,35 @@ fn pin_to(cpu: usize) -> Result<(), Refusal> {
         return Err(refused(Errno::last()));
     }
     let mask = sched_getaffinity(Pid::from_raw(0)).map_err(refused)?;
-    let is_exact = (0..nix::sched::CpuSet::count())
-        .all(|index| mask.is_set(index).unwrap_or(false) == (index == cpu));
+    let is_exact =
+        (0..CpuSet::count()).all(|index| mask.is_set(index).unwrap_or(false) == (index == cpu));
     if is_exact {
         Ok(())
     } else {
         Err(refused(Errno::EAGAIN))
     }
+}
+
+/// The CPUs that threads of this process may be pinned to: those of its cpuset that are online.
+///
+/// # Errors
+/// When the kernel does not tell.
+pub fn allowed_cpus() -> Result<Vec<usize>, Errno> {
+    // In a thread of its own, whose mask nobody inherits. The kernel takes of a mask what is allowed.
+    let asked = std::thread::Builder::new().spawn(|| {
+        let mut mask = CpuSet::new();
+        for cpu in 0..CpuSet::count() {
+            mask.set(cpu)?;
+        }
+        sched_setaffinity(Pid::from_raw(0), &mask)?;
+        let granted = sched_getaffinity(Pid::from_raw(0))?;
+        let cpus = (0..CpuSet::count()).filter(|cpu| granted.is_set(*cpu).unwrap_or(false));
+        Ok(cpus.collect())
+    });
+    asked
+        .map_err(|_no_thread| Errno::EAGAIN)?
+        .join()
+        .unwrap_or(Err(Errno::EAGAIN))
 }
 
 fn lock_memory() -> Result<(), Refusal> {

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clap::CommandFactory as _;
 use hil_platform::console::Console;
+use hil_platform::open_files;
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
 use hil_platform::words::counted_plainly;
@@ -35,6 +36,8 @@ pub fn run() -> ExitCode {
         }
     };
     let mut console = Console::new(cli.quiet);
+    // A run and each viewer have files open; where the kernel refuses, the limit stays.
+    let _is_raised = open_files::raise_limit().is_ok();
     let exit = match Signals::install() {
         Ok(signals) => work(cli.command, &signals, &mut console).unwrap_or_else(|failure| {
             console.error(&failure.words);

@@ -136,6 +136,10 @@ impl HostFiles {
 
 /// `CAP_IPC_LOCK`: memory may be locked beyond `RLIMIT_MEMLOCK`.
 pub const CAP_IPC_LOCK: u32 = 14;
+/// `CAP_SYS_ADMIN`.
+pub(crate) const CAP_SYS_ADMIN: u32 = 21;
+/// `CAP_SYS_RESOURCE`: limits of a user do not bind.
+pub(crate) const CAP_SYS_RESOURCE: u32 = 24;
 /// `CAP_SYS_NICE`: real-time priorities may be taken beyond `RLIMIT_RTPRIO`.
 pub const CAP_SYS_NICE: u32 = 23;
 
