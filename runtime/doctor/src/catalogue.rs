@@ -123,6 +123,13 @@ const KERNEL: &[Entry] = &[
 
 const PROCESSORS: &[Entry] = &[
     Entry {
+        id: "pinned_cpus",
+        title: "CPUs to be had for pinned threads",
+        source: "sched_setaffinity(2), tried: the cpuset of this process, and what is online of it",
+        why: "a thread whose CPU is refused runs on any: it is moved about, 10 to 1000 us each time",
+        fix: "cpu = of the key named, or AllowedCPUs= in the unit (--cpuset-cpus for a container)",
+    },
+    Entry {
         id: "isolated_cpus",
         title: "Isolated CPUs",
         source: "/sys/devices/system/cpu/isolated; pins: cpu = in the topology",
@@ -329,6 +336,14 @@ const MEMORY: &[Entry] = &[
         source: "statvfs of /dev/shm",
         why: "channels live there: one that outgrows the space ends its process with SIGBUS",
         fix: "mount -o remount,size=1G,mode=1777 /dev/shm (--shm-size=1g for a container)",
+    },
+    Entry {
+        id: "run_limits",
+        title: "Limits of this host for the run",
+        source: "what the topology takes, against statvfs, RLIMIT_NOFILE, RLIMIT_NPROC, RLIMIT_MEMLOCK, pids.max, \
+                 MemAvailable and the memory limits of control groups",
+        why: "a run that takes more is refused before it begins (exit 78)",
+        fix: "what is named with each",
     },
     Entry {
         id: "shared_memory_leftovers",

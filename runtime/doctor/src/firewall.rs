@@ -176,6 +176,10 @@ mod tests {
             protocol,
             address: ([10, 0, 0, 1], port).into(),
             of: "x".to_owned(),
+            key: "links.hop.port".to_owned(),
+            address_key: "hosts.a.address".to_owned(),
+            interface: None,
+            is_dispensable: false,
         })
         .to_vec()
     }

@@ -175,6 +175,7 @@ mod tests {
         Plan {
             pins: vec![Pin {
                 cpu,
+                key: "processes.robot.cpu".to_owned(),
                 of: "robot".to_owned(),
                 spins: false,
             }],

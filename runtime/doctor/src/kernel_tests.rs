@@ -15,6 +15,7 @@ fn spinning() -> Plan {
     Plan {
         pins: vec![Pin {
             cpu: 3,
+            key: "links.hop.gateway.cpu".to_owned(),
             of: "gateway".to_owned(),
             spins: true,
         }],

@@ -19,6 +19,7 @@ mod kernel;
 pub mod latency;
 mod network;
 mod nic;
+mod obstacles;
 mod paths;
 mod plan;
 mod ports;
@@ -40,11 +41,13 @@ use self::finding::{Answer, settled};
 pub use self::finding::{Finding, Severity};
 use self::latency::LatencyReport;
 use self::network::StampQuery;
-pub use self::plan::{LinkLoad, Peer, Pin, Plan, WantedPort};
+pub use self::obstacles::{Effect, Obstacle, Trouble, obstacles};
+pub use self::plan::{LinkLoad, Peer, Pin, Plan, WantedInterface, WantedPort};
 use hil_nic::nic_clock::probing::probe_nic;
 use hil_platform::clock_discipline::HostDiscipline;
 use hil_platform::domain_address::domain_base_candidates;
 use hil_platform::host_facts::{HostFacts, HostFiles};
+use hil_platform::realtime::allowed_cpus;
 use hil_shm::ForeignNodes;
 
 /// What to examine.
@@ -52,6 +55,8 @@ use hil_shm::ForeignNodes;
 pub struct DoctorRequest {
     /// What a topology has this host do; `None` when none was given.
     pub plan: Option<Plan>,
+    /// What this host gives too little of for the plan, in words; `None` when no plan was given.
+    pub shortfalls: Option<Vec<String>>,
     /// Another host's report, with its name, to compare clocks with.
     pub other: Option<(String, Box<DoctorReport>)>,
     /// Folders for sockets and service files, in the order the runtime tries them.
@@ -64,6 +69,7 @@ impl Default for DoctorRequest {
     fn default() -> Self {
         Self {
             plan: None,
+            shortfalls: None,
             other: None,
             runtime_folders: domain_base_candidates(),
             files: HostFiles::of_this_host(),
@@ -166,9 +172,11 @@ pub fn examine(request: &DoctorRequest) -> DoctorReport {
     let stamps: StampQuery<'_> =
         &|interface| TimestampCapabilities::query(interface).map_err(|error| error.to_string());
     let files = &request.files;
-    let plan = &request.plan.clone().unwrap_or_default();
+    let plan = &request.plan.clone().unwrap_or_default().with_own_names();
     let fifo = privileges::try_fifo();
     let mut findings = kernel::examine(files, plan, fifo.as_ref());
+    let allowed = allowed_cpus().map_err(|errno| format!("sched_setaffinity: {}", errno.desc()));
+    findings.push(settled(processors::pinned(plan, allowed)));
     findings.extend(processors::examine(files, plan));
     findings.extend(privileges::examine(files, fifo.as_ref()));
     let present = match network::interfaces().told("interface") {
@@ -180,6 +188,7 @@ pub fn examine(request: &DoctorRequest) -> DoctorReport {
     };
     let names = network::wanted(&present, plan);
     findings.extend(network::examine(files, &present, &names, stamps));
+    findings.extend(obstacles::without_carrier(&present, plan));
     findings.extend(nic::examine(&present, &names, stamps, &probe_nic));
     findings.extend(radio::examine(&names));
     findings.extend(interrupts::examine(files, &names, plan));
@@ -212,6 +221,8 @@ pub fn examine(request: &DoctorRequest) -> DoctorReport {
     } else {
         &plan.record_folder
     };
+    let shortfalls = request.shortfalls.as_deref();
+    findings.extend(shortfalls.map(shared_memory::run_limits));
     findings.extend(storage::examine(files, record_folder, runtime_folder));
     DoctorReport {
         host: HostFacts::gather_from(files),

@@ -5,6 +5,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 
 use hil_arm::egm::messages::Side;
+use hil_net::interface::own_name;
 use hil_protocol::transport::IpProtocol;
 use hil_protocol::wire;
 
@@ -15,6 +16,8 @@ use hil_topology::{AdapterKind, ClockEnd, Crossing, Execution, Host, Program, To
 pub struct Pin {
     /// The CPU.
     pub cpu: usize,
+    /// The key that says so.
+    pub key: String,
     /// The process or gateway, for people.
     pub of: String,
     /// It polls without pause (`wait = "spin"`).
@@ -30,6 +33,29 @@ pub struct WantedPort {
     pub address: SocketAddr,
     /// What for.
     pub of: String,
+    /// The key that says so.
+    pub key: String,
+    /// The key of its address.
+    pub address_key: String,
+    /// The interface that it is bound to.
+    pub interface: Option<String>,
+    /// A run does without it.
+    pub is_dispensable: bool,
+}
+
+impl WantedPort {
+    /// For `of`, at the address of `host`.
+    fn new(protocol: IpProtocol, host: &Host, address: SocketAddr, of: &str, key: String) -> Self {
+        Self {
+            protocol,
+            address,
+            of: of.to_owned(),
+            key,
+            address_key: format!("hosts.{}.address", host.name),
+            interface: None,
+            is_dispensable: false,
+        }
+    }
 }
 
 /// A host that this one talks to.
@@ -78,6 +104,17 @@ impl LinkLoad {
     }
 }
 
+/// An interface, or an address, that a run of the topology needs here.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct WantedInterface {
+    /// The key that names it, or the address that it has.
+    pub key: String,
+    /// Its name; `None` where only the address says which it is.
+    pub name: Option<String>,
+    /// The address that it has.
+    pub address: IpAddr,
+}
+
 /// What a topology has this host do.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Plan {
@@ -87,6 +124,8 @@ pub struct Plan {
     pub interfaces: Vec<String>,
     /// Its own addresses.
     pub addresses: Vec<IpAddr>,
+    /// The interfaces that messages of a run pass.
+    pub ways: Vec<WantedInterface>,
     /// Ports.
     pub ports: Vec<WantedPort>,
     /// Hosts to talk to.
@@ -109,6 +148,16 @@ impl Plan {
         };
         for host in topology.hosts().iter().filter(|host| is_here(host)) {
             plan.addresses.extend(host.address);
+            plan.ways
+                .extend(host.address.map(|address| WantedInterface {
+                    key: format!(
+                        "hosts.{}.{}",
+                        host.name,
+                        host.interface.as_ref().map_or("address", |_| "interface")
+                    ),
+                    name: host.interface.clone(),
+                    address,
+                }));
             plan.interfaces.extend(host.interface.clone());
             if let Some(end) = &host.clock {
                 plan.addresses.push(end.address);
@@ -116,14 +165,21 @@ impl Plan {
                 plan.clock_end.get_or_insert_with(|| end.clone());
             }
             for process in topology.processes_on(&host.name) {
-                plan.pin(&process.name, &process.execution);
+                let key = format!("processes.{}", process.name);
+                plan.pin(&process.name, &key, &process.execution);
                 // A sensor adapter listens; a robot adapter sends from a port of the kernel's choice.
                 if let Program::Egm { adapter, .. } = &process.program
                     && adapter.kind == AdapterKind::Sensor
                 {
                     let sides = [Side::Right, Side::Left].into_iter();
-                    for address in sides.filter_map(|side| adapter.address(side)) {
-                        plan.bind(IpProtocol::Udp, address, &process.name);
+                    let addresses = sides.filter_map(|side| Some((side, adapter.address(side)?)));
+                    for (side, address) in addresses {
+                        let key = format!("{key}.egm.{}", side.word());
+                        plan.ports.push(WantedPort {
+                            interface: host.interface.clone(),
+                            address_key: key.clone(),
+                            ..WantedPort::new(IpProtocol::Udp, host, address, &process.name, key)
+                        });
                     }
                 }
             }
@@ -133,13 +189,23 @@ impl Plan {
         }
         // The supervisors meet at the first host; clock paths have ports of their own.
         let first = topology.hosts().first().filter(|host| is_here(host));
-        if let Some(address) = first.and_then(Host::control_address) {
-            plan.bind(IpProtocol::Tcp, address, "control_port");
+        if let Some((host, address)) = first.and_then(|host| Some((host, host.control_address()?)))
+        {
+            let key = format!("hosts.{}.control_port", host.name);
+            let port = WantedPort::new(IpProtocol::Tcp, host, address, "control_port", key);
+            plan.ports.push(port);
         }
         for path in topology.clock_paths() {
             for (host, address) in [(path.from, path.asking), (path.to, path.answering)] {
                 if is_here(host) {
-                    plan.bind(IpProtocol::Udp, address, &path.name());
+                    let key = format!("hosts.{}.clock_port", host.name);
+                    let end = host.clock.as_ref();
+                    plan.ports.push(WantedPort {
+                        interface: end.and_then(|end| end.interface.clone()),
+                        is_dispensable: true,
+                        address_key: format!("hosts.{}.clock_address", host.name),
+                        ..WantedPort::new(IpProtocol::Udp, host, address, &path.name(), key)
+                    });
                 }
             }
         }
@@ -155,6 +221,23 @@ impl Plan {
         plan
     }
 
+    /// The same with the kernel's own names of the interfaces that it calls otherwise.
+    #[must_use]
+    pub(super) fn with_own_names(mut self) -> Self {
+        let named = self.interfaces.iter_mut();
+        let named = named.chain(self.ways.iter_mut().filter_map(|way| way.name.as_mut()));
+        let of_peers = self.peers.iter_mut();
+        let named = named.chain(of_peers.filter_map(|peer| peer.interface.as_mut()));
+        let end = self.clock_end.as_mut();
+        for name in named.chain(end.and_then(|end| end.interface.as_mut())) {
+            if let Some(own) = own_name(name) {
+                *name = own;
+            }
+        }
+        sort_unique(&mut self.interfaces);
+        self
+    }
+
     /// The CPUs of the pins, each once.
     pub fn cpus(&self) -> Vec<usize> {
         let mut cpus: Vec<usize> = self.pins.iter().map(|pin| pin.cpu).collect();
@@ -167,9 +250,10 @@ impl Plan {
         self.pins.iter().any(|pin| pin.spins)
     }
 
-    fn pin(&mut self, of: &str, execution: &Execution) {
+    fn pin(&mut self, of: &str, table: &str, execution: &Execution) {
         self.pins.extend(execution.cpus.iter().map(|cpu| Pin {
             cpu: usize::from(*cpu),
+            key: format!("{table}.cpu"),
             of: of.to_owned(),
             spins: execution.wait == Wait::Spin,
         }));
@@ -181,13 +265,22 @@ impl Plan {
         let capabilities = &transport.capabilities;
         if is_here(from) || is_here(to) {
             let name = format!("gateway of {}", crossing.link.name);
-            self.pin(&name, &crossing.hop.gateway.execution);
+            let table = format!("links.{}.gateway", crossing.link.name);
+            self.pin(&name, &table, &crossing.hop.gateway.execution);
         }
         let flow = format!("link {}", crossing.flow_label());
-        let at = |host: &Host, port| SocketAddr::new(host.gateway_address(), port);
+        let port_of = |protocol, host: &Host, port| {
+            let address = SocketAddr::new(host.gateway_address(), port);
+            let key = format!("links.{}.port", crossing.link.name);
+            WantedPort {
+                interface: host.interface.clone(),
+                ..WantedPort::new(protocol, host, address, &flow, key)
+            }
+        };
         if is_here(from) {
             if let Some(protocol) = capabilities.sender_port {
-                self.bind(protocol, at(from, crossing.ports.sender), &flow);
+                let port = port_of(protocol, from, crossing.ports.sender);
+                self.ports.push(port);
             }
             self.loads.push(LinkLoad {
                 link: crossing.link.name.clone(),
@@ -202,18 +295,11 @@ impl Plan {
         }
         if is_here(to) {
             if let Some(protocol) = capabilities.receiver_port {
-                self.bind(protocol, at(to, crossing.ports.receiver), &flow);
+                let port = port_of(protocol, to, crossing.ports.receiver);
+                self.ports.push(port);
             }
             self.adapter(to, from);
         }
-    }
-
-    fn bind(&mut self, protocol: IpProtocol, address: SocketAddr, of: &str) {
-        self.ports.push(WantedPort {
-            protocol,
-            address,
-            of: of.to_owned(),
-        });
     }
 
     /// `own` talks to `other`, as far as both have an address.

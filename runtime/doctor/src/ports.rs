@@ -32,10 +32,12 @@ fn check(files: &HostFiles, wanted: &[WantedPort]) -> Checked {
         let word = protocol.word();
         let bound = bound(files, protocol).told(id)?;
         for one in wanted.iter().filter(|one| one.protocol == protocol) {
-            let (address, of) = (one.address, &one.of);
+            let (address, of, key) = (one.address, &one.of, &one.key);
             if let Some(other) = bound.iter().find(|bound| collide(bound.address, address)) {
                 let holder = holder(files, other.inode);
-                taken.push(format!("{word} {address} of {of} is held by {holder}"));
+                taken.push(format!(
+                    "{word} {address} of {of} ({key}) is held by {holder}"
+                ));
             }
         }
         // `udp 7400-7403, tcp 7399`.
@@ -107,6 +109,18 @@ fn address(text: &str) -> Option<SocketAddr> {
     Some(SocketAddr::new(ip, port))
 }
 
+/// Who holds a port that a run wants, as far as this user may see.
+pub(super) fn holder_of(files: &HostFiles, wanted: &WantedPort) -> String {
+    let bound = bound(files, wanted.protocol).unwrap_or_default();
+    let mut colliding = bound
+        .iter()
+        .filter(|one| collide(one.address, wanted.address));
+    colliding.next().map_or_else(
+        || "a process this user cannot see".to_owned(),
+        |one| holder(files, one.inode),
+    )
+}
+
 /// Who has the socket open, as far as this user may see.
 fn holder(files: &HostFiles, inode: u64) -> String {
     let wanted = Fact::Available(format!("socket:[{inode}]"));
@@ -142,6 +156,10 @@ mod tests {
             protocol,
             address: "10.0.0.1:7400".parse().unwrap(),
             of: "shuttle/command".to_owned(),
+            key: "links.hop.port".to_owned(),
+            address_key: "hosts.a.address".to_owned(),
+            interface: None,
+            is_dispensable: false,
         }]
     }
 
@@ -176,7 +194,7 @@ mod tests {
         assert_eq!(finding.severity, Severity::Error);
         assert_eq!(
             finding.value,
-            "udp 10.0.0.1:7400 of shuttle/command is held by iperf3 (process 77)"
+            "udp 10.0.0.1:7400 of shuttle/command (links.hop.port) is held by iperf3 (process 77)"
         );
     }
 
@@ -219,6 +237,10 @@ mod tests {
             protocol: IpProtocol::Udp,
             address: socket.local_addr().unwrap(),
             of: "test".to_owned(),
+            key: "links.hop.port".to_owned(),
+            address_key: "hosts.a.address".to_owned(),
+            interface: None,
+            is_dispensable: false,
         };
         let finding = examine(&HostFiles::of_this_host(), &[own]).unwrap();
         assert_eq!(finding.severity, Severity::Error);

@@ -37,6 +37,22 @@ pub(super) fn examine(files: &HostFiles, plan: &Plan) -> Vec<Finding> {
     checks.map(settled).into()
 }
 
+/// Whether the pinned CPUs may be had; `allowed` are those of the cpuset that are online.
+pub(super) fn pinned(plan: &Plan, allowed: Result<Vec<usize>, String>) -> Checked {
+    let id = "pinned_cpus";
+    let allowed = allowed.told(id)?;
+    let value = format_cpu_list(&allowed);
+    let outside = plan.pins.iter().filter(|pin| !allowed.contains(&pin.cpu));
+    let outside: Vec<String> = outside
+        .map(|pin| format!("{} by {} ({})", pin.cpu, pin.of, pin.key))
+        .collect();
+    if outside.is_empty() {
+        return Ok(Finding::ok(id, value));
+    }
+    let value = format!("{value}; not {}", outside.join(", "));
+    Ok(Finding::warning(id, value))
+}
+
 /// Whether the pinned CPUs are among those that were set apart.
 fn covered(id: &str, apart: Fact<Vec<usize>>, plan: &Plan) -> Checked {
     let apart = apart.told(id)?;
@@ -179,6 +195,7 @@ mod tests {
     fn pinned(cpus: &[usize], spins: bool) -> Plan {
         let pins = cpus.iter().map(|cpu| Pin {
             cpu: *cpu,
+            key: "links.hop.gateway.cpu".to_owned(),
             of: "gateway of hop".to_owned(),
             spins,
         });
@@ -260,6 +277,20 @@ mod tests {
         // What only blocks feels it less.
         let findings = with(&files, &pinned(&[1], false));
         assert_eq!(found(&findings, "nohz_full").severity, Severity::Note);
+    }
+
+    #[test]
+    fn a_pin_outside_the_cpuset_is_told_with_its_key() {
+        let found = |cpus: &[usize]| settled(super::pinned(&pinned(cpus, false), Ok(vec![0, 1])));
+        assert_eq!(found(&[1]).severity, Severity::Ok);
+        let outside = found(&[1, 5]);
+        assert_eq!(outside.severity, Severity::Warning);
+        assert_eq!(
+            outside.value,
+            "0-1; not 5 by gateway of hop (links.hop.gateway.cpu)"
+        );
+        let unknown = settled(super::pinned(&pinned(&[1], false), Err("no".to_owned())));
+        assert_eq!(unknown.severity, Severity::CannotTell);
     }
 
     #[test]

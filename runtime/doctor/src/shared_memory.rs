@@ -32,6 +32,15 @@ pub(super) fn examine(
     ]
 }
 
+/// What a run of the topology would be refused for.
+pub(super) fn run_limits(shortfalls: &[String]) -> Finding {
+    let id = "run_limits";
+    if shortfalls.is_empty() {
+        return Finding::ok(id, "enough for the run");
+    }
+    Finding::error(id, shortfalls.join("; "))
+}
+
 fn space(shm: &Path) -> Finding {
     let id = "shared_memory";
     let absent = |error: &str| {
@@ -235,6 +244,14 @@ mod tests {
             finding.fix.starts_with("if no other user's run"),
             "{finding:?}"
         );
+    }
+
+    #[test]
+    fn what_a_run_would_be_refused_for_is_an_error_in_its_words() {
+        assert_eq!(run_limits(&[]).severity, Severity::Ok);
+        let short = run_limits(&["too few files".to_owned(), "too few threads".to_owned()]);
+        assert_eq!(short.severity, Severity::Error);
+        assert_eq!(short.value, "too few files; too few threads");
     }
 
     #[test]
