@@ -42,9 +42,10 @@ Exit codes:
   1  the run failed, its report has       there yet: try again
      gaps, a result cannot be         77  a folder is not this user's,
      written, or a replay differs         or the key cannot be used
-  2  wrong arguments or topology      78  doctor --strict: host not fit
-  69 a peer host was not reachable    130 interrupted; report complete
-  70 internal error                   131 interrupted twice: no report";
+  2  wrong arguments or topology      78  this host gives too little, or
+  69 a peer host was not reachable        doctor --strict: it is not fit
+  70 internal error                   130 interrupted; report complete
+                                      131 interrupted twice: no report";
 
 const CALIBRATE_EXAMPLES: &str = "\
 Examples:
@@ -124,8 +125,9 @@ pub struct RunArgs {
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub overrides: Vec<String>,
 
-    /// Check the file, print what would run, start nothing; with --host also this machine's copy of
-    /// the key, and its own programs by this shell's PATH and folder.
+    /// Check the file, print what would run, start nothing; with --host also whether this machine can
+    /// run its share: key, own programs by this shell's PATH and folder, memory, files, threads,
+    /// interfaces, ports.
     #[arg(long)]
     pub check: bool,
 
@@ -313,6 +315,9 @@ pub enum Command {
         /// Process id of the supervisor.
         #[arg(long)]
         supervisor: u32,
+        /// Files that the program may have open, if not as many as the supervisor.
+        #[arg(long)]
+        open_files: Option<u64>,
         /// Program and arguments.
         #[arg(last = true, required = true)]
         program: Vec<String>,

@@ -19,16 +19,19 @@ use hil_teleoperation::swing::swing_bvh;
 
 use crate::arguments::{Cli, Command, RunArgs};
 use crate::cases;
+use hil_doctor::{Effect, Plan, obstacles};
 use hil_engine::process::{own_program, worker};
 use hil_engine::security::{KeyFileError, PreSharedKey};
 use hil_engine::supervisor::{self, PeerError, RunError, RunOptions};
 use hil_nic::nic_clock::guard;
 use hil_platform::console::{CommandEnd, Console};
+use hil_platform::open_files;
 use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_report::analysis::{self, AnalysisError, Concluded};
 use hil_report::terminal::{self, Style};
 use hil_report::{compare, trace};
+use hil_rundir::pipe::FailureKind;
 use hil_rundir::run_result::{Outcome, RunResult};
 use hil_topology::emulation_room::check_emulation;
 use hil_topology::registry::Registry;
@@ -61,6 +64,9 @@ pub(crate) fn run(registry: &Registry) -> ExitCode {
         }
     };
     let mut console = Console::new(cli.run.quiet);
+    // A run has files open for each channel, and so has whoever watches one. Where the kernel refuses,
+    // the limit stays, which a run compares with what it needs.
+    let _is_raised = open_files::raise_limit().is_ok();
     let outcome = match cli.command {
         None => run_topology(&cli.run, registry, &mut console),
         Some(command) => run_command(command, registry, &mut console),
@@ -119,8 +125,9 @@ fn run_command(
         Command::Worker { launch } => worker::run(&launch, registry).map(done).map_err(failed),
         Command::Become {
             supervisor,
+            open_files,
             program,
-        } => own_program::become_program(supervisor, &program)
+        } => own_program::become_program(supervisor, open_files, &program)
             .map(done)
             .map_err(failed),
         Command::CardGuard(args) => guard::run(&args).map(done).map_err(failed),
@@ -227,14 +234,19 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
     if args.check && topology.processes().is_empty() {
         return show_study(path, &topology, args, registry, console);
     }
-    trace_source::check(&topology).map_err(usage)?;
+    check_traces(path, &args.overrides, &topology, console)?;
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
-        return show_check(path, &topology, None, console);
+        check_file(path, &topology)?;
+        return Ok(show_check(path, &topology, None, console));
     }
     let hosts = hosts_here(&topology, args.host.as_deref()).map_err(usage)?;
     if args.check {
-        return show_check(path, &topology, Some(&hosts), console);
+        check_file(path, &topology)?;
+    }
+    let key = check_here(path, args, &topology, &hosts, console)?;
+    if args.check {
+        return Ok(show_check(path, &topology, key, console));
     }
     let signals = signals()?;
     let options = RunOptions {
@@ -247,7 +259,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
     console.serve();
     let result = supervisor::run(&topology, &options, &signals, console)
         .map_err(|error| Refusal::new(exit_code_of_error(&error), error))?;
-    let code = match exit_code(&result.outcome) {
+    let code = match exit_code(&result) {
         exit::RAN if result.has_gaps() => exit::FAILED,
         code => code,
     };
@@ -277,6 +289,33 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
         return Ok(code.max(exit::FAILED));
     }
     Ok(code)
+}
+
+/// Refuses a file whose traces cannot be replayed.
+fn check_traces(
+    path: &Path,
+    overrides: &[String],
+    topology: &Topology,
+    console: &mut Console,
+) -> Result<(), Refusal> {
+    trace_source::check(topology).map_err(|faulty| {
+        let faulty = faulty.into_iter();
+        let faulty = faulty.map(|error| (error.key, error.source.to_string()));
+        unusable(path, overrides, faulty, exit::USAGE, console)
+    })
+}
+
+/// Says what of the file cannot be used, each key where it stands.
+fn unusable(
+    path: &Path,
+    overrides: &[String],
+    found: impl IntoIterator<Item = (String, String)>,
+    code: u8,
+    console: &mut Console,
+) -> Refusal {
+    let errors = hil_topology::unusable(path, overrides, found);
+    console.faults(&errors.render(io::stderr().is_terminal()));
+    Refusal { code, text: None }
 }
 
 /// The fields of the messages of the topology's case, by channel.
@@ -323,14 +362,8 @@ fn show_study(
     Ok(exit::RAN)
 }
 
-/// What the file comes to, or why no run of it can be what it says; with `hosts`, which are this
-/// machine, also which key is here.
-fn show_check(
-    path: &Path,
-    topology: &Topology,
-    hosts: Option<&[String]>,
-    console: &mut Console,
-) -> Result<u8, Refusal> {
+/// Refuses a file of which no run can be what it says, on whatever hosts.
+fn check_file(path: &Path, topology: &Topology) -> Result<(), Refusal> {
     check_emulation(topology).map_err(|error| {
         usage(format!(
             "{}: the file is valid and can be simulated, but no gateway can keep its emulated \
@@ -338,18 +371,69 @@ fn show_check(
             path.display()
         ))
     })?;
-    if let Some(text) = topology.unsaid_security() {
-        return Err(usage(format!("{}: {text}", path.display())));
+    match topology.unsaid_security() {
+        Some(text) => Err(usage(format!("{}: {text}", path.display()))),
+        None => Ok(()),
     }
-    own_program::find_all(topology, hosts.unwrap_or_default()).map_err(usage)?;
+}
+
+/// Refuses what cannot run on these hosts, which are this machine, and warns of what it would run without;
+/// gives the key that it would hold in a run with others. A check also refuses what a run would wait for.
+fn check_here(
+    path: &Path,
+    args: &RunArgs,
+    topology: &Topology,
+    hosts: &[String],
+    console: &mut Console,
+) -> Result<Option<(PathBuf, PreSharedKey)>, Refusal> {
+    own_program::find_all(topology, hosts)
+        .map_err(|missing| unusable(path, &args.overrides, missing.0, exit::USAGE, console))?;
+    let key = key_here(topology, hosts);
+    let key = key.map_err(|error| Refusal::new(exit::FORBIDDEN, error))?;
+    // A run looks once it has removed what dead ones left.
+    if args.check {
+        supervisor::check_host(topology, hosts)
+            .map_err(|error| Refusal::new(exit::HOST_UNFIT, error))?;
+    }
+    let (mut refused, mut told) = (Vec::new(), Vec::new());
+    for obstacle in obstacles(&Plan::of(topology, hosts)) {
+        let is_refused = match obstacle.effect {
+            Effect::Prevents => true,
+            Effect::HoldsUp => args.check,
+            Effect::DoneWithout => false,
+        };
+        let list = if is_refused { &mut refused } else { &mut told };
+        list.push((obstacle.key, obstacle.trouble.to_string()));
+    }
+    for (key, words) in told {
+        console.warn(&format!("{key}: {words}"));
+    }
+    if refused.is_empty() {
+        Ok(key)
+    } else {
+        Err(unusable(
+            path,
+            &args.overrides,
+            refused,
+            exit::TRY_AGAIN,
+            console,
+        ))
+    }
+}
+
+/// What the file comes to; with the key of this machine, also which it is.
+fn show_check(
+    path: &Path,
+    topology: &Topology,
+    key: Option<(PathBuf, PreSharedKey)>,
+    console: &mut Console,
+) -> u8 {
     // As comments, so that what is printed is a topology as a whole.
     let clock_paths = topology.clock_paths().map(|clock| {
         let (asking, answering) = (clock.asking.port(), clock.answering.port());
         let words = clock.describe();
         format!("\n# {words}, UDP ports {asking} and {answering}\n")
     });
-    let key = hosts.map_or(Ok(None), |hosts| key_here(topology, hosts));
-    let key = key.map_err(|error| Refusal::new(exit::FORBIDDEN, error))?;
     let key = key.map(|(file, key)| {
         let (file, fingerprint) = (file.display(), key.fingerprint());
         format!("\n# {file}: the key {fingerprint}, which the other hosts must have as well\n")
@@ -361,12 +445,12 @@ fn show_check(
         clock_paths.collect::<Vec<_>>().concat(),
         key.unwrap_or_default()
     ));
-    Ok(exit::RAN)
+    exit::RAN
 }
 
 /// Why a run does not end with exit code 0, for those who do not read its report.
 fn complaint(result: &RunResult) -> String {
-    let is_incomplete = result.has_gaps() && exit_code(&result.outcome) == exit::RAN;
+    let is_incomplete = result.has_gaps() && exit_code(result) == exit::RAN;
     if is_incomplete {
         "the report is incomplete; see its warnings".to_owned()
     } else {
@@ -388,6 +472,7 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         {
             exit::TRY_AGAIN
         }
+        RunError::HostTooSmall(_) => exit::HOST_UNFIT,
         RunError::Domains(error) if error.is_of_path() => exit::USAGE,
         RunError::Folder { .. }
         | RunError::Programs(_)
@@ -414,11 +499,16 @@ fn interrupted() -> u8 {
     u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::INTERNAL)
 }
 
-fn exit_code(outcome: &Outcome) -> u8 {
-    match outcome {
+fn exit_code(result: &RunResult) -> u8 {
+    match result.outcome {
         Outcome::Completed | Outcome::EndedEarly(_) => exit::RAN,
         Outcome::Interrupted(_) => interrupted(),
-        Outcome::Failed(_) | Outcome::EndedByPeer(_) => exit::FAILED,
+        Outcome::Failed(_) => match result.failure {
+            FailureKind::Fault => exit::FAILED,
+            FailureKind::NotThereYet => exit::TRY_AGAIN,
+            FailureKind::HostTooSmall => exit::HOST_UNFIT,
+        },
+        Outcome::EndedByPeer(_) => exit::FAILED,
         Outcome::PeerLost(_) => exit::PEER_ABSENT,
     }
 }

@@ -12,6 +12,7 @@ use hil_arm::egm::messages::Side as ArmSide;
 use hil_arm::egm::wire::Cause;
 use hil_core::link_model::ReplayCounts;
 use hil_core::time::Instant;
+use nix::errno::Errno;
 use serde::{Deserialize, Serialize};
 use zeroize::Zeroizing;
 
@@ -54,7 +55,50 @@ pub enum FromProcess {
     /// The last word of an orderly end.
     Finished(Box<ProcessReport>),
     /// The process cannot go on.
-    Failed(String),
+    Failed {
+        /// What it means for whoever would try again.
+        kind: FailureKind,
+        /// Why, in words.
+        text: String,
+    },
+}
+
+/// What a failure means for whoever would try again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FailureKind {
+    /// It stays until something is changed.
+    #[default]
+    Fault,
+    /// An address, an interface or a port is not there yet, or in use: it may pass by itself.
+    NotThereYet,
+    /// This host gives too little: descriptors, threads or memory.
+    HostTooSmall,
+}
+
+impl FailureKind {
+    /// Of what the system answered.
+    pub fn of(error: &io::Error) -> Self {
+        match error.raw_os_error().map(Errno::from_raw) {
+            Some(
+                Errno::EADDRINUSE
+                | Errno::EADDRNOTAVAIL
+                | Errno::ENODEV
+                | Errno::ENETDOWN
+                | Errno::ENETUNREACH
+                | Errno::EHOSTUNREACH,
+            ) => Self::NotThereYet,
+            Some(
+                Errno::EMFILE
+                | Errno::ENFILE
+                | Errno::EAGAIN
+                | Errno::ENOMEM
+                | Errno::ENOBUFS
+                | Errno::ENOSPC,
+            ) => Self::HostTooSmall,
+            _ => Self::Fault,
+        }
+    }
 }
 
 /// Counts of one channel as one process sees it.
@@ -395,6 +439,20 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_failure_is_of_the_kind_that_its_cause_may_pass_by_itself() {
+        let of = |errno: Errno| FailureKind::of(&errno.into());
+        for errno in [Errno::EADDRINUSE, Errno::EADDRNOTAVAIL, Errno::ENODEV] {
+            assert_eq!(of(errno), FailureKind::NotThereYet, "{errno}");
+        }
+        for errno in [Errno::EMFILE, Errno::ENFILE, Errno::EAGAIN, Errno::ENOSPC] {
+            assert_eq!(of(errno), FailureKind::HostTooSmall, "{errno}");
+        }
+        for errno in [Errno::EPERM, Errno::EINVAL, Errno::ECONNREFUSED] {
+            assert_eq!(of(errno), FailureKind::Fault, "{errno}");
+        }
+    }
+
+    #[test]
     fn every_message_survives_the_pipe() {
         let report = ProcessReport {
             skipped_ticks: 3,
@@ -404,6 +462,10 @@ mod tests {
             FromProcess::Ready,
             FromProcess::Alive,
             FromProcess::Warning("spin on a shared CPU".to_owned()),
+            FromProcess::Failed {
+                kind: FailureKind::NotThereYet,
+                text: "the port is taken".to_owned(),
+            },
             FromProcess::Finished(Box::new(report)),
         ] {
             let line = serde_json::to_string(&message).unwrap();

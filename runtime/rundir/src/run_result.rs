@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::event::{Event, ProcessHistory};
 use super::nic_history::NicHistory;
+use super::pipe::FailureKind;
 use super::run_folder::RunFolder;
 use crate::protection::RunSecurity;
 use hil_platform::clock_discipline::HostDiscipline;
@@ -70,6 +71,9 @@ pub struct RunResult {
     pub folder: RunFolder,
     /// How it ended.
     pub outcome: Outcome,
+    /// What it means for whoever would try again, where a process failed.
+    #[serde(default)]
+    pub failure: FailureKind,
     /// Start and end of the run on each host, on that host's own monotonic clock.
     pub spans: BTreeMap<String, (Instant, Instant)>,
     /// When it started, as people write it.

@@ -123,6 +123,9 @@ pub enum Fault {
     /// The case study refuses a parameter.
     #[error("{0}")]
     Parameter(String),
+    /// What the key names or asks for is not there.
+    #[error("cannot be used: {0}")]
+    Unusable(String),
 }
 
 impl Fault {

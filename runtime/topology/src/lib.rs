@@ -147,6 +147,25 @@ pub fn parse(
     read_and_check(Path::new(name), text, overrides, known, Needs::Processes)
 }
 
+/// What is wrong with values that a topology of `path` and `overrides` has and that only their use
+/// could show: each key, and why it cannot be used, with the place where the files say it.
+pub fn unusable(
+    path: &Path,
+    overrides: &[String],
+    found: impl IntoIterator<Item = (String, String)>,
+) -> TopologyErrors {
+    let mut layers = Layers::default();
+    let mut table = layers.read(path, None).unwrap_or_default();
+    for text in overrides {
+        layers.lay_override(&mut table, text);
+    }
+    for (key, why) in found {
+        let place = tree::place_of(&table, &key);
+        layers.faults.add(key, place, Fault::Unusable(why));
+    }
+    layers.faults.into_errors(layers.sources)
+}
+
 fn read_and_check(
     path: &Path,
     text: Option<String>,

@@ -176,8 +176,9 @@ impl TraceSource {
 /// Reads every trace that the links of `topology` replay, so that a run without one does not begin.
 ///
 /// # Errors
-/// The first that cannot be used.
-pub fn check(topology: &Topology) -> Result<(), TraceError> {
+/// All that cannot be used.
+pub fn check(topology: &Topology) -> Result<(), Vec<TraceError>> {
+    let mut faulty = Vec::new();
     for crossing in topology.crossings() {
         let source = crossing
             .link
@@ -185,10 +186,14 @@ pub fn check(topology: &Topology) -> Result<(), TraceError> {
             .and_then(|emulation| emulation.trace.as_ref());
         let (link, channel) = (&crossing.link.name, &crossing.channel.name);
         if let Some(launch) = source.and_then(|source| source.launch(link, channel)) {
-            launch.model()?;
+            faulty.extend(launch.model().err());
         }
     }
-    Ok(())
+    if faulty.is_empty() {
+        Ok(())
+    } else {
+        Err(faulty)
+    }
 }
 
 impl TraceLaunch {

@@ -178,6 +178,42 @@ pub(super) fn merge(base: &mut Table, overlay: Table) {
     }
 }
 
+/// Where `path` stands in `table`, or as much of it as the files say; `None` where they say nothing of it.
+pub(super) fn place_of(table: &Table, path: &str) -> Option<Place> {
+    let (mut table, mut found) = (table, None);
+    for key in segments(path) {
+        let Some(node) = table.get(&key) else { break };
+        match &node.value {
+            Value::Table(below) => {
+                found = Some(node.key_place);
+                table = below;
+            }
+            _ => return Some(node.place),
+        }
+    }
+    found
+}
+
+/// The keys of a path that [`join`] made.
+fn segments(path: &str) -> Vec<String> {
+    let (mut keys, mut key) = (Vec::new(), String::new());
+    let (mut is_quoted, mut is_escaped) = (false, false);
+    for letter in path.chars() {
+        match letter {
+            _ if is_escaped => {
+                key.push(letter);
+                is_escaped = false;
+            }
+            '\\' if is_quoted => is_escaped = true,
+            '"' => is_quoted = !is_quoted,
+            '.' if !is_quoted => keys.push(core::mem::take(&mut key)),
+            _ => key.push(letter),
+        }
+    }
+    keys.push(key);
+    keys
+}
+
 /// `path.key`, the key quoted when TOML needs it.
 pub(super) fn join(path: &str, key: &str) -> String {
     let is_bare = |letter: char| letter.is_ascii_alphanumeric() || letter == '_' || letter == '-';

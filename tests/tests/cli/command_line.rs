@@ -155,13 +155,12 @@ fn a_host_whose_address_is_elsewhere_says_so() {
     let trial = split_here(&record)
         .set("hosts.control-pc.address=\"203.0.113.1\"")
         .set("hosts.robot-pc.address=\"203.0.113.2\"");
-    for (host, words) in [
-        ("control-pc", "cannot listen on 203.0.113.1"),
-        ("robot-pc", "cannot connect from 203.0.113.2"),
-    ] {
+    for (host, address) in [("control-pc", "203.0.113.1"), ("robot-pc", "203.0.113.2")] {
         let finished = start_as(&trial, host).wait_within(LIMIT).unwrap();
         assert_code(&finished, 75);
-        assert_says(&finished, &[words, "is it this host's address"]);
+        let key = format!("hosts.{host}.address cannot be used");
+        let words = format!("no interface has {address}");
+        assert_says(&finished, &[&key, &words, "--set"]);
     }
 }
 
@@ -551,7 +550,10 @@ fn a_program_that_does_not_exist_is_named_before_the_run_begins() {
     assert_code(&finished, 2);
     assert_says(
         &finished,
-        &["processes.robot.run: cannot start no-such-robot", "in /"],
+        &[
+            "processes.robot.run cannot be used: cannot start no-such-robot",
+            "in /",
+        ],
     );
     let entry_count = fs::read_dir(record.path()).unwrap().count();
     assert_eq!(entry_count, 0, "a run folder of no run");
@@ -563,7 +565,7 @@ fn a_program_that_does_not_exist_is_named_before_the_run_begins() {
     assert_code(&checked, 2);
     assert_says(
         &checked,
-        &["processes.robot.run: cannot start no-such-robot"],
+        &["processes.robot.run cannot be used: cannot start no-such-robot"],
     );
     let checked = ChildGuard::spawn(trial.command_here().arg("--check")).unwrap();
     assert_code(&{ checked }.wait_within(LIMIT).unwrap(), 0);

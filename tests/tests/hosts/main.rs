@@ -16,6 +16,7 @@ mod egm_faces;
 mod fleet;
 mod hardware_stamps;
 mod kills;
+mod limits;
 mod probe_run;
 mod secured_run;
 mod soak;

@@ -14,7 +14,7 @@ use hil_report::{replay, simulate};
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::Registry;
 
-use super::{Refusal, code_of, columns, exit, failed, load, loaded, signals, usage};
+use super::{Refusal, check_traces, code_of, columns, exit, failed, load, loaded, signals, usage};
 
 /// `simulate`, with its report and the run's folder.
 pub(super) fn simulate(
@@ -29,6 +29,7 @@ pub(super) fn simulate(
     let watch =
         signals.end_program_unless_over("a run in virtual time is shown whole or not at all");
     let topology = load(file, overrides, registry, console)?;
+    check_traces(file, overrides, &topology, console)?;
     let progress = Progress::begin();
     let outcome = output
         .map_or(Ok(()), simulate::check_output)

@@ -8,6 +8,7 @@ use super::{Refusal, exit, hosts_here, interrupted, load, signals, usage};
 use hil_doctor::cli::DoctorArgs;
 use hil_doctor::latency::{LatencyReport, LatencyRequest, Watch, measure};
 use hil_doctor::{DoctorReport, DoctorRequest, Plan, Severity};
+use hil_engine::supervisor;
 use hil_platform::console::Console;
 use hil_platform::host_facts::{HostFiles, isolated_or_online};
 use hil_platform::progress::Progress;
@@ -72,6 +73,9 @@ fn request(
         let topology = load(path, &args.overrides, registry, console)?;
         let here = hosts_here(&topology, args.host.as_deref()).map_err(usage)?;
         request.plan = Some(Plan::of(&topology, &here));
+        let short = supervisor::check_host(&topology, &here).err();
+        let short = short.map_or_else(Vec::new, |error| error.0);
+        request.shortfalls = Some(short.iter().map(ToString::to_string).collect());
     }
     Ok(request)
 }

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, io};
 
+use hil_platform::open_files;
 use hil_topology::{Program, Topology};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
@@ -25,6 +26,14 @@ pub enum OwnProgramError {
         /// What the kernel answered.
         source: io::Error,
     },
+    /// Its descriptors cannot be as the supervisor found them.
+    #[error("cannot restore the descriptors of {program}: {source}")]
+    Descriptors {
+        /// The program.
+        program: String,
+        /// What the kernel answered.
+        source: io::Error,
+    },
     /// The program cannot be executed.
     #[error("cannot execute {program}: {source}")]
     Execute {
@@ -36,11 +45,16 @@ pub enum OwnProgramError {
 }
 
 /// Replaces this process by `program`, which the kernel will kill when the supervisor ends.
-/// Returns only when it fails.
+/// Returns only when it fails. The program inherits nothing that the supervisor has open, and may open
+/// as many files as `open_files` says: what the supervisor was started with, where it raised that.
 ///
 /// # Errors
 /// When the supervisor is gone or the program cannot be executed.
-pub fn become_program(supervisor: u32, program: &[String]) -> Result<(), OwnProgramError> {
+pub fn become_program(
+    supervisor: u32,
+    open_files: Option<u64>,
+    program: &[String],
+) -> Result<(), OwnProgramError> {
     let name = program.first().cloned().unwrap_or_default();
     set_pdeathsig(Signal::SIGKILL).map_err(|errno| OwnProgramError::Bind {
         program: name.clone(),
@@ -50,6 +64,12 @@ pub fn become_program(supervisor: u32, program: &[String]) -> Result<(), OwnProg
     if parent_id() != supervisor {
         return Err(OwnProgramError::Orphaned(name));
     }
+    let restored = open_files::close_inherited()
+        .and_then(|()| open_files.map_or(Ok(()), open_files::set_limit));
+    restored.map_err(|source| OwnProgramError::Descriptors {
+        program: name.clone(),
+        source,
+    })?;
     let source = Command::new(&name).args(&program[1..]).exec();
     Err(OwnProgramError::Execute {
         program: name,
@@ -59,8 +79,16 @@ pub fn become_program(supervisor: u32, program: &[String]) -> Result<(), OwnProg
 
 /// Programs of the user's that a run would start and cannot.
 #[derive(Debug, thiserror::Error)]
-#[error("{}", .0.join("\n"))]
-pub struct ProgramsMissing(Vec<String>);
+#[error("{}", lines(.0))]
+pub struct ProgramsMissing(
+    /// The key of each process, and why its program cannot be started.
+    pub Vec<(String, String)>,
+);
+
+fn lines(missing: &[(String, String)]) -> String {
+    let lines = missing.iter().map(|(key, why)| format!("{key}: {why}"));
+    lines.collect::<Vec<_>>().join("\n")
+}
 
 /// Looks for the own programs of `topology` that would run on `hosts`, which are this machine, before a
 /// run begins: by this process's search path and from its working folder.
@@ -70,14 +98,13 @@ pub struct ProgramsMissing(Vec<String>);
 pub fn find_all(topology: &Topology, hosts: &[String]) -> Result<(), ProgramsMissing> {
     let here = topology.processes().iter();
     let here = here.filter(|process| hosts.contains(&process.host));
-    let missing: Vec<String> = here
+    let missing: Vec<(String, String)> = here
         .filter_map(|process| match &process.program {
             Program::Command { command, .. } => {
                 let (name, program) = (&process.name, &command[0]);
                 let error = find(program).err()?;
-                Some(format!(
-                    "processes.{name}.run: cannot start {program}: {error}"
-                ))
+                let key = format!("processes.{name}.run");
+                Some((key, format!("cannot start {program}: {error}")))
             }
             Program::BuiltIn { .. } | Program::Egm { .. } => None,
         })
@@ -126,7 +153,7 @@ mod tests {
 
     #[test]
     fn an_orphan_does_not_start() {
-        let error = become_program(u32::MAX, &["true".to_owned()]).unwrap_err();
+        let error = become_program(u32::MAX, None, &["true".to_owned()]).unwrap_err();
         assert!(matches!(error, OwnProgramError::Orphaned(_)));
     }
 }

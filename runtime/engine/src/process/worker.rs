@@ -23,10 +23,11 @@ use crate::gateway::process::GatewayWatch;
 use crate::gateway::timestamping::TimestampingSetup;
 use crate::{adapter, gateway};
 use hil_platform::clock::MonotonicClock;
+use hil_platform::open_files;
 use hil_platform::realtime::{self, RealtimeGrant, RealtimeRequest, SpinAdvice};
 use hil_platform::wait::WaitMode;
 use hil_rundir::launch::{LaunchError, Work, WorkerLaunch, read};
-use hil_rundir::pipe::{ChannelProgress, FromProcess, Orders, ProcessReport, say};
+use hil_rundir::pipe::{ChannelProgress, FailureKind, FromProcess, Orders, ProcessReport, say};
 use hil_rundir::record::{RecordFileError, Recorder};
 use hil_shm::{ChannelError, Domain, DomainError};
 use hil_topology::emulation::EmulationError;
@@ -100,6 +101,9 @@ pub enum WorkerError {
     /// No thread.
     #[error("cannot start a thread: {0}")]
     Thread(io::Error),
+    /// What the supervisor left open.
+    #[error("cannot close what the supervisor has open: {0}")]
+    Inherited(io::Error),
     /// The run's secret, without which its hops are not opened.
     #[error("the supervisor did not give the run's secret")]
     SecretMissing,
@@ -112,6 +116,23 @@ pub enum WorkerError {
     /// A record file could not be written any more.
     #[error("{0}")]
     Unrecorded(String),
+}
+
+impl WorkerError {
+    /// What it means for whoever would try again.
+    fn kind(&self) -> FailureKind {
+        match self {
+            Self::Open(SocketError::Refused { source, .. })
+            | Self::Address(source)
+            | Self::Clock(source)
+            | Self::Socket(source)
+            | Self::Wait(source)
+            | Self::Thread(source)
+            | Self::Session(source) => FailureKind::of(source),
+            Self::Channel(ChannelError::NoRoom { .. }) => FailureKind::HostTooSmall,
+            _ => FailureKind::Fault,
+        }
+    }
 }
 
 /// One thread of a worker, opened and not yet connected.
@@ -197,9 +218,15 @@ impl Drop for EndTeller {
 /// # Errors
 /// When something cannot be opened or breaks; the supervisor is told as well.
 pub fn run(launch: &Path, registry: &Registry) -> Result<(), WorkerError> {
-    let outcome = open_and_run(launch, registry);
+    // What the supervisor has open is not this process's.
+    let outcome = open_files::close_inherited()
+        .map_err(WorkerError::Inherited)
+        .and_then(|()| open_and_run(launch, registry));
     if let Err(error) = &outcome {
-        say(&FromProcess::Failed(error.to_string()));
+        say(&FromProcess::Failed {
+            kind: error.kind(),
+            text: error.to_string(),
+        });
     }
     outcome
 }

@@ -14,6 +14,7 @@ use super::frame::{Frame, PeerHello, PeerMessage, read_frame_within, write_messa
 use super::peer::{ControlHalves, ControlReader};
 use crate::security::PreSharedKey;
 use crate::security::greeting::{self, GreetingError, MAGIC, TimedStream, Why};
+use hil_rundir::pipe::FailureKind;
 
 /// How long a greeting may take altogether.
 pub(super) const GREETING_TIMEOUT: Duration = Duration::from_secs(3);
@@ -165,8 +166,13 @@ impl ControlListener {
         self.counts
     }
 
-    /// Takes waiting connections, a bounded number of them.
-    pub(super) fn admit_waiting(&mut self) -> io::Result<()> {
+    /// Takes waiting connections, a bounded number of them; says what this host is short of where that
+    /// leaves one waiting. A connection that waits is taken once there is enough again.
+    ///
+    /// # Errors
+    /// When the listener itself is broken.
+    pub(super) fn admit_waiting(&mut self) -> io::Result<Option<io::Error>> {
+        let mut shortage = None;
         for _ in 0..ADMITTED_MAX {
             if Arc::strong_count(&self.alive) > THREADS_MAX {
                 break;
@@ -176,11 +182,15 @@ impl ControlListener {
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
                 // Connections that ended before they were taken.
                 Err(error) if error.kind() == io::ErrorKind::ConnectionAborted => {}
+                Err(error) if FailureKind::of(&error) == FailureKind::HostTooSmall => {
+                    shortage = Some(error);
+                    break;
+                }
                 Err(error) => return Err(error),
             }
         }
         self.half_open.retain(HalfOpen::is_unknown);
-        Ok(())
+        Ok(shortage)
     }
 
     /// The next connection that turned out to be something; `None` when there is none now. No more come

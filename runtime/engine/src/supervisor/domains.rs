@@ -94,7 +94,6 @@ impl Domains {
         base: Option<&PathBuf>,
         run: &str,
     ) -> Result<Self, DomainsError> {
-        sweep_below(&domain_base(base));
         let hosts = plans.iter().map(|plan| create_host(plan, base, run));
         Ok(Self {
             hosts: hosts.collect::<Result<_, _>>()?,
@@ -179,7 +178,7 @@ pub fn sweep() {
 
 /// Removes the domains of supervisors that were killed: nobody holds their lock any more. A run
 /// that is just starting has taken the lock before its folder can be told for a domain's.
-fn sweep_below(base: &Path) {
+pub(super) fn sweep_below(base: &Path) {
     let Ok(entries) = fs::read_dir(base) else {
         return;
     };
@@ -224,19 +223,7 @@ fn create_host(
         source,
     })?;
     let mut holders = Vec::new();
-    let of_messages = plan.channels.iter().map(|channel| ChannelSettings {
-        name: channel.name.clone(),
-        message: TypeInfo {
-            name: channel.message.name.clone(),
-            size_bytes: channel.message.size_bytes,
-            alignment_bytes: channel.message.alignment_bytes,
-        },
-        depth_max: depth_max(channel, &plan.observed),
-        writers_max: WRITERS_MAX,
-        readers_max: READERS_MAX,
-    });
-    let of_orders = plan.orders.iter().map(|name| order_settings(name));
-    for settings in of_messages.chain(of_orders) {
+    for settings in channel_settings(plan) {
         let holder =
             ChannelHolder::create(&domain, &settings).map_err(|source| DomainsError::Channel {
                 host: host.clone(),
@@ -249,6 +236,23 @@ fn create_host(
         holders,
         domain,
     })
+}
+
+/// The channels that a host's domain has.
+pub(super) fn channel_settings(plan: &HostPlan) -> impl Iterator<Item = ChannelSettings> {
+    let of_messages = plan.channels.iter().map(|channel| ChannelSettings {
+        name: channel.name.clone(),
+        message: TypeInfo {
+            name: channel.message.name.clone(),
+            size_bytes: channel.message.size_bytes,
+            alignment_bytes: channel.message.alignment_bytes,
+        },
+        depth_max: depth_max(channel, &plan.observed),
+        writers_max: WRITERS_MAX,
+        readers_max: READERS_MAX,
+    });
+    let of_orders = plan.orders.iter().map(|name| order_settings(name));
+    of_messages.chain(of_orders)
 }
 
 /// A channel for orders to an emulated link: one gives them at a time, the gateway takes them.

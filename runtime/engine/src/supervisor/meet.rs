@@ -14,6 +14,7 @@ use super::frame::{PeerHello, PeerMessage};
 use super::peer::{ControlHalves, Peer};
 use crate::security::PreSharedKey;
 use crate::security::greeting::GreetingError;
+use hil_rundir::pipe::FailureKind;
 
 /// How often a host that cannot connect yet tries again.
 const RETRY_PERIOD: Duration = Duration::from_millis(200);
@@ -127,15 +128,24 @@ pub(crate) struct Met {
     pub(crate) strangers: Option<String>,
 }
 
-/// Brings the hosts of a run together. `waiting` is told whom it waits for, a few times a second;
-/// it returns false to give up.
+/// What a host that waits for the others has to say.
+#[derive(Debug)]
+pub(crate) enum Waiting<'a> {
+    /// Whom it waits for, and for how long already: a few times a second.
+    For { missing: &'a str, waited: Duration },
+    /// That it cannot take or make a connection for want of descriptors, threads or memory, and goes on
+    /// trying: once.
+    ShortOf(&'a io::Error),
+}
+
+/// Brings the hosts of a run together. What `waiting` returns after [`Waiting::For`] says whether to go on.
 ///
 /// # Errors
 /// See [`PeerError`].
 pub(crate) fn meet(
     meeting: &Meeting,
     hello: &PeerHello,
-    waiting: &mut dyn FnMut(&str, Duration) -> bool,
+    waiting: &mut dyn FnMut(&Waiting<'_>) -> bool,
 ) -> Result<Met, PeerError> {
     let mut patience = Patience {
         meeting,
@@ -143,6 +153,7 @@ pub(crate) fn meet(
         began: Instant::now(),
         told: None,
         turned_away: None,
+        is_short: false,
     };
     if meeting.is_here {
         host(meeting, hello, &mut patience)
@@ -157,11 +168,13 @@ pub(crate) fn meet(
 
 struct Patience<'a> {
     meeting: &'a Meeting,
-    waiting: &'a mut dyn FnMut(&str, Duration) -> bool,
+    waiting: &'a mut dyn FnMut(&Waiting<'_>) -> bool,
     began: Instant,
     told: Option<Instant>,
     /// Whoever came last without this run's key, and what it did.
     turned_away: Option<(String, &'static str)>,
+    /// It was said that this host is short of something.
+    is_short: bool,
 }
 
 impl Patience<'_> {
@@ -169,6 +182,14 @@ impl Patience<'_> {
     /// end a run with it, and the right one may still come.
     fn note(&mut self, meeting: &Meeting, ip: IpAddr, why: &'static str) {
         self.turned_away = Some((meeting.name_of(ip), why));
+    }
+
+    /// Says once what this host is short of. It ends no waiting: others may give it back.
+    fn note_shortage(&mut self, error: &io::Error) {
+        if !self.is_short {
+            self.is_short = true;
+            let _goes_on = (self.waiting)(&Waiting::ShortOf(error));
+        }
     }
 
     /// Waits a moment for `missing`, or says why not. True a few times a second.
@@ -192,7 +213,11 @@ impl Patience<'_> {
                 Some((host, why)) => format!("{missing}; {host} {why}"),
                 None => missing.to_owned(),
             };
-            if !(self.waiting)(&who, waited) {
+            let missing_now = Waiting::For {
+                missing: &who,
+                waited,
+            };
+            if !(self.waiting)(&missing_now) {
                 return Err(PeerError::Interrupted {
                     missing: missing.to_owned(),
                 });
@@ -218,7 +243,9 @@ fn host(
     let mut control_listener = ControlListener::open(address, admission).map_err(listen)?;
     let mut peers: Vec<Peer> = Vec::new();
     loop {
-        control_listener.admit_waiting().map_err(listen)?;
+        if let Some(shortage) = control_listener.admit_waiting().map_err(listen)? {
+            patience.note_shortage(&shortage);
+        }
         while let Some(arrived) = control_listener.look() {
             match arrived {
                 Arrived::Peer {
@@ -226,7 +253,7 @@ fn host(
                     ends,
                     hello: theirs,
                 } => {
-                    if let Some(peer) = welcome(*ends, ip, theirs, meeting, hello)? {
+                    if let Some(peer) = welcome(*ends, ip, theirs, hello, patience)? {
                         // One that gave up and came again: its first connection is a dead one.
                         peers.retain(|known| known.hello.host != peer.hello.host);
                         peers.push(peer);
@@ -264,9 +291,10 @@ fn welcome(
     mut ends: ControlHalves,
     ip: IpAddr,
     theirs: PeerHello,
-    meeting: &Meeting,
     hello: &PeerHello,
+    patience: &mut Patience<'_>,
 ) -> Result<Option<Peer>, PeerError> {
+    let meeting = patience.meeting;
     let mut expected = meeting.expected.iter();
     if !expected.any(|(name, from)| *name == theirs.host && *from == ip) {
         let text = format!("host {} is not awaited here at {ip}", theirs.host);
@@ -285,13 +313,18 @@ fn welcome(
             reason,
         });
     }
+    let mut peer = match Peer::new(ends, theirs.clone()) {
+        Ok(peer) => peer,
+        // It was not answered, so it comes again.
+        Err(error) if FailureKind::of(&error) == FailureKind::HostTooSmall => {
+            patience.note_shortage(&error);
+            return Ok(None);
+        }
+        Err(error) => return Err(connection(error)),
+    };
     // One that is gone again by now comes back.
-    if say(&mut ends, &PeerMessage::Hello(hello.clone())).is_err() {
-        return Ok(None);
-    }
-    Peer::new(ends, theirs.clone())
-        .map(Some)
-        .map_err(connection)
+    peer.say(&PeerMessage::Hello(hello.clone()));
+    Ok(peer.is_open().then_some(peer))
 }
 
 fn join(
@@ -302,9 +335,20 @@ fn join(
     let first = meeting.expected.first();
     let name = first.map_or("the first host", |(name, _)| name).to_owned();
     loop {
-        let Ok(stream) = connect(meeting)? else {
-            patience.wait(&name)?;
-            continue;
+        let stream = match connect(meeting) {
+            Ok(Ok(stream)) => stream,
+            Ok(Err(_nobody_there)) => {
+                patience.wait(&name)?;
+                continue;
+            }
+            Err(PeerError::Own { source, .. })
+                if FailureKind::of(&source) == FailureKind::HostTooSmall =>
+            {
+                patience.note_shortage(&source);
+                patience.wait(&name)?;
+                continue;
+            }
+            Err(error) => return Err(error),
         };
         match greet(stream, hello, &name, meeting.key.as_ref()) {
             Ok((ends, PeerMessage::Hello(theirs))) => {

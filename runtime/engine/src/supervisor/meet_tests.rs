@@ -40,8 +40,8 @@ fn pair_with(
     let there = meeting(false, left, right_key);
     let here = meeting(true, right, left_key);
     let right = right.clone();
-    let joining = thread::spawn(move || meet(&there, &right, &mut |_, _| true));
-    let hosting = meet(&here, left, &mut |_, _| true);
+    let joining = thread::spawn(move || meet(&there, &right, &mut |_| true));
+    let hosting = meet(&here, left, &mut |_| true);
     [hosting, joining.join().unwrap()].map(|end| end.map(|met| met.peers))
 }
 
@@ -137,7 +137,7 @@ fn nobody_there_is_said_with_the_name_and_the_address() {
         timeout: Duration::from_millis(1),
         key: None,
     };
-    let error = meet(&meeting, &hello("a", 1, 1), &mut |_, _| true)
+    let error = meet(&meeting, &hello("a", 1, 1), &mut |_| true)
         .map(|_| ())
         .unwrap_err();
     assert!(
@@ -172,7 +172,7 @@ fn connections_that_say_nothing_keep_a_host_neither_from_its_deadline_nor_from_i
                 }
             }
         });
-        let outcome = meet(&meeting, &hello("a", 1, 1), &mut |_, _| {
+        let outcome = meet(&meeting, &hello("a", 1, 1), &mut |_| {
             told_count += 1;
             true
         });

@@ -9,6 +9,7 @@ pub(crate) mod exchange;
 pub mod frame;
 mod heartbeat;
 pub(crate) mod meet;
+pub(crate) mod needs;
 mod outcome;
 mod output_log;
 pub(crate) mod peer;
@@ -22,5 +23,6 @@ mod status_publisher;
 
 pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;
+pub use needs::{HostTooSmall, Shortfall, check_host};
 pub use outcome::{RunError, RunOptions};
 pub use session::run;

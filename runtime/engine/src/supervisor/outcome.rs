@@ -10,6 +10,7 @@ use hil_core::layout::Field;
 use super::domains::DomainsError;
 use super::frame::{EndMeaning, PeerMessage};
 use super::meet::PeerError;
+use super::needs::HostTooSmall;
 use super::process_group::ProcessGroupError;
 use crate::process::own_program::ProgramsMissing;
 use crate::security::KeyFileError;
@@ -43,6 +44,9 @@ pub enum RunError {
         /// What the system said.
         source: io::Error,
     },
+    /// This host gives less than the run takes.
+    #[error(transparent)]
+    HostTooSmall(#[from] HostTooSmall),
     /// Shared memory cannot be set up.
     #[error(transparent)]
     Domains(#[from] DomainsError),

@@ -149,6 +149,11 @@ impl Peer {
         self.is_open = self.is_open && write_message(&mut self.writer, message).is_ok();
     }
 
+    /// False once something could not be said to it.
+    pub(super) fn is_open(&self) -> bool {
+        self.is_open
+    }
+
     /// The next thing the peer said, waiting up to `timeout`.
     pub(crate) fn receive(&mut self, timeout: Duration) -> Option<PeerEvent> {
         match self.inbox.recv_timeout(timeout) {

@@ -15,11 +15,13 @@ use super::child::{Child, Word, describe_exit, last_line};
 use super::output_log::{LogKeeper, cut_middle};
 use super::plan::{ProcessPlan, ProcessTask};
 use hil_platform::clock::MonotonicClock;
+use hil_platform::open_files;
 use hil_rundir::event::{Event, EventKind, Interruption};
 use hil_rundir::launch::{ComponentWork, LaunchError, Work, WorkerLaunch, write};
-use hil_rundir::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
+use hil_rundir::pipe::{ChannelProgress, FailureKind, FromProcess, ProcessReport, ToProcess};
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::run_seal::RunSeal;
+use hil_shm::{Room, SHARED_MEMORY_DIRECTORY};
 use hil_topology::OnExit;
 
 /// Words that may wait for the supervisor.
@@ -48,6 +50,18 @@ pub(crate) enum ProcessGroupError {
     Thread(io::Error),
 }
 
+impl ProcessGroupError {
+    /// What it means for whoever would try again.
+    pub(crate) fn kind(&self) -> FailureKind {
+        match self {
+            Self::Spawn { source, .. } | Self::OwnPath(source) | Self::Thread(source) => {
+                FailureKind::of(source)
+            }
+            Self::Launch(_) => FailureKind::Fault,
+        }
+    }
+}
+
 /// What ended the run, if a process did.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Verdict {
@@ -74,7 +88,7 @@ pub(crate) struct ManagedProcess {
     /// When it last said that its loops turn, or was asked to begin.
     pub(super) heard: Instant,
     seen_alive: Instant,
-    complaint: Option<String>,
+    complaint: Option<(FailureKind, String)>,
 }
 
 /// Puts the counts that a process tells of now in the place of those it told of before, both in its order.
@@ -107,6 +121,8 @@ pub(crate) struct ProcessGroup {
     /// When the run began.
     pub(super) started: Option<Instant>,
     events: Vec<Event>,
+    /// What the failure that ended the run means for whoever would try again.
+    failure: Option<FailureKind>,
     log_keeper: Option<LogKeeper>,
 }
 
@@ -142,6 +158,7 @@ impl ProcessGroup {
             words,
             started: None,
             events: Vec::new(),
+            failure: None,
             log_keeper: None,
         })
     }
@@ -186,8 +203,12 @@ impl ProcessGroup {
                 let role_spec_path = self.folder.role_spec(&name);
                 write(&role_spec_path, card)?;
                 let supervisor = std::process::id().to_string();
+                program.args(["become", "--supervisor", &supervisor]);
+                if let Some(limit) = open_files::inherited_limit() {
+                    program.args(["--open-files", &limit.to_string()]);
+                }
                 program
-                    .args(["become", "--supervisor", &supervisor, "--"])
+                    .arg("--")
                     .args(command)
                     .envs(environment)
                     .env("HIL_DOMAIN", &domain)
@@ -295,8 +316,13 @@ impl ProcessGroup {
         let member = &mut self.members[index];
         let mut what = describe_exit(status);
         let log = self.folder.log(&member.plan.name);
-        if let Some(complaint) = &member.complaint {
+        let kind = member.complaint.as_ref().map(|(kind, _)| *kind);
+        if let Some((_, complaint)) = &member.complaint {
             what = format!("{what}: {complaint}");
+        } else if status.signal() == Some(libc::SIGBUS)
+            && let Ok(free) = Room::free()
+        {
+            what = format!("{what}; {SHARED_MEMORY_DIRECTORY} has {free} free");
         } else if status.code().is_some_and(|code| code != 0)
             && let Some(last) = last_line(&log)
         {
@@ -347,6 +373,7 @@ impl ProcessGroup {
         if is_orderly {
             Verdict::Finished(text)
         } else {
+            self.failure.get_or_insert(kind.unwrap_or_default());
             Verdict::Failed(text)
         }
     }
@@ -391,7 +418,7 @@ impl ProcessGroup {
                     self.note(now, index, EventKind::Warning { text }, None);
                 }
                 FromProcess::Finished(report) => member.report = Some(*report),
-                FromProcess::Failed(text) => member.complaint = Some(text),
+                FromProcess::Failed { kind, text } => member.complaint = Some((kind, text)),
             }
         }
     }
@@ -494,6 +521,11 @@ impl ProcessGroup {
     /// The processes with their history.
     pub(crate) fn members(&self) -> &[ManagedProcess] {
         &self.members
+    }
+
+    /// What the failure that ended the run means for whoever would try again; `None` where none did.
+    pub(crate) fn failure(&self) -> Option<FailureKind> {
+        self.failure
     }
 
     /// What happened, in order.

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::domains::Domains;
 use super::frame::{Frame, PeerHello, PeerMessage};
-use super::meet::{Meeting, Met, PeerError, meet};
+use super::meet::{Meeting, Met, PeerError, Waiting, meet};
 use super::outcome::RunError;
 use super::peer::{Peer, PeerEvent};
 use super::session::is_here;
@@ -87,7 +87,17 @@ pub(super) fn gather(
     let Met {
         mut peers,
         strangers,
-    } = meet(&meeting, &hello, &mut |missing, waited| {
+    } = meet(&meeting, &hello, &mut |waiting| {
+        let (missing, waited) = match waiting {
+            Waiting::For { missing, waited } => (missing, waited),
+            Waiting::ShortOf(error) => {
+                console.warn(&format!(
+                    "cannot take a connection of another host for now: {error}; going on as soon as there \
+                     is room"
+                ));
+                return true;
+            }
+        };
         let waited_s = waited.as_secs();
         let role = if is_first {
             "to connect to"

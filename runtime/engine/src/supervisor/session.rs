@@ -11,10 +11,11 @@ use hil_net::clock_pair::ClockPair;
 use super::domains::{self, Domains};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
+use super::needs;
 use super::outcome::{Heard, RunError, RunOptions, meaning};
 use super::peer::{Peer, PeerEvent};
 use super::peer_status::{PeerStatus, greeting, own_ticks};
-use super::plan::{ProcessPlan, plan};
+use super::plan::{ProcessPlan, domain_base, plan};
 use super::process_group::{ProcessGroup, Verdict};
 use super::rendezvous::{gather, read_key};
 use super::status_publisher::StatusPublisher;
@@ -28,6 +29,7 @@ use hil_platform::signals::Signals;
 use hil_rundir::announcement::Announcement;
 use hil_rundir::event::{Event, HostHistory, ProcessHistory, disciplines};
 use hil_rundir::manifest::{self, ManifestContent};
+use hil_rundir::pipe::FailureKind;
 use hil_rundir::protection::RunSecurity;
 use hil_rundir::run_folder::{RunFolder, utc_text};
 use hil_rundir::run_result::{Outcome, RunResult};
@@ -71,7 +73,11 @@ pub fn run(
     let key = read_key(topology, &hosts)?;
     let plan = plan(topology, &hosts);
     check_emulation(topology).map_err(RunError::Emulation)?;
-    domains::check_path(options.domain_root.as_ref(), &hosts[0].name)?;
+    let base = options.domain_root.as_ref();
+    domains::check_path(base, &hosts[0].name)?;
+    // What dead runs left is no reason to refuse this one.
+    domains::sweep_below(&domain_base(base));
+    needs::check(&plan, base)?;
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
     let discipline = HostDiscipline::gather().ok();
@@ -90,7 +96,7 @@ pub fn run(
     };
     manifest::write(&content, &folder).map_err(unwritable)?;
     let run = folder.root().to_string_lossy();
-    let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
+    let domains = Domains::create(&plan.hosts, base, &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
     let gathered = gather(topology, key.as_ref(), &hosts, &domains, signals, console)?;
     let peers = gathered.peers;
@@ -123,6 +129,7 @@ pub fn run(
         security: gathered.security,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
+        failure: FailureKind::default(),
         status_publisher,
         elsewhere: PeerStatus::new(topology, &hosts),
     };
@@ -188,6 +195,8 @@ struct Session<'a> {
     security: Option<RunSecurity>,
     cleaned: WallInstant,
     greeted: WallInstant,
+    /// What a failure of this supervisor's own means.
+    failure: FailureKind,
     status_publisher: StatusPublisher,
     elsewhere: PeerStatus,
 }
@@ -199,9 +208,10 @@ impl Session<'_> {
     /// # Errors
     /// Why the run ended before it began.
     fn begin(&mut self, timeout: Duration) -> Result<(), Outcome> {
-        self.process_group
-            .start()
-            .map_err(|error| Outcome::Failed(error.to_string()))?;
+        self.process_group.start().map_err(|error| {
+            self.failure = error.kind();
+            Outcome::Failed(error.to_string())
+        })?;
         let deadline = WallInstant::now() + timeout;
         let mut ready_peers = 0;
         let mut has_told = false;
@@ -443,6 +453,7 @@ impl Session<'_> {
             stories.extend(received.stories);
         }
         let has_one_clock = self.has_one_clock;
+        let failure = self.process_group.failure().unwrap_or(self.failure);
         drop(self.process_group);
         drop(self.status_publisher);
         self.announcement.withdraw();
@@ -468,6 +479,7 @@ impl Session<'_> {
         RunResult {
             folder,
             outcome,
+            failure,
             spans,
             started,
             events,

@@ -436,3 +436,27 @@ fn every_fault_names_its_key_file_and_line() {
         }
     }
 }
+
+#[test]
+fn what_only_use_shows_is_told_where_its_key_stands_or_would_stand() {
+    let folder = std::env::temp_dir().join(format!("hil-unusable-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let path = folder.join("t.toml");
+    let text = "version = 1\n[links.hop.trace.files]\n\"arm/command\" = \"x.trace\"\n";
+    std::fs::write(&path, text).unwrap();
+    let found = [
+        ("links.hop.trace.files.\"arm/command\"", "3:17"),
+        ("links.hop.port", "2:8"),
+        ("run.duration", "1:1"),
+        ("hosts.a.address", ""),
+    ];
+    let overrides = ["run.duration=\"5 s\"".to_owned()];
+    let keys = found.map(|(key, _)| (key.to_owned(), "it is not there".to_owned()));
+    let told = unusable(&path, &overrides, keys).to_string();
+    for (key, place) in found {
+        let line = told.lines().find(|line| line.contains(key)).unwrap();
+        assert!(line.contains(place), "{line}");
+        assert!(line.ends_with("cannot be used: it is not there"), "{line}");
+    }
+    std::fs::remove_dir_all(folder).unwrap();
+}
