@@ -398,7 +398,8 @@ fn a_topology_with_a_missing_or_damaged_trace_starts_nothing() {
     assert_eq!(check.status.code(), Some(2));
     let complaint = text(&check.stderr);
     assert!(
-        complaint.contains("links.hop.trace.folder: trace ")
+        complaint.contains("links.hop.trace.folder cannot be used: trace ")
+            && complaint.contains("replay.toml:25:10")
             && complaint.contains("traces/shuttle.command.trace"),
         "{complaint}"
     );
