@@ -18,6 +18,18 @@ pub fn plural(count: u64, what: &str) -> String {
     format!("{what}{ending}")
 }
 
+/// `512 B`, `44.0 KiB`, `3.2 MiB`: bytes in the largest unit of which there is one.
+pub fn bytes(count: u64) -> String {
+    const KIBIBYTE: u64 = 1 << 10;
+    const MEBIBYTE: u64 = 1 << 20;
+    let scaled = |unit: u64| count as f64 / unit as f64;
+    match count {
+        0..KIBIBYTE => format!("{count} B"),
+        KIBIBYTE..MEBIBYTE => format!("{:.1} KiB", scaled(KIBIBYTE)),
+        _ => format!("{:.1} MiB", scaled(MEBIBYTE)),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -28,5 +40,13 @@ mod tests {
         assert_eq!(counted(0, "message"), "0 messages");
         assert_eq!(counted(12_345, "message"), "12,345 messages");
         assert_eq!(counted_plainly(12_345, "message"), "12345 messages");
+    }
+
+    #[test]
+    fn bytes_are_told_in_the_largest_unit_of_which_there_is_one() {
+        assert_eq!(bytes(0), "0 B");
+        assert_eq!(bytes(1023), "1023 B");
+        assert_eq!(bytes(45_056), "44.0 KiB");
+        assert_eq!(bytes(3_355_443), "3.2 MiB");
     }
 }

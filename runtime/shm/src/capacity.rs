@@ -16,6 +16,7 @@ use super::domain::{Domain, shared_memory_files};
 use super::error::ChannelError;
 use super::holder::ChannelSettings;
 use super::identity::SHARED_MEMORY_DIRECTORY;
+use hil_platform::words;
 
 /// Messages a reader may hold at a time.
 pub(crate) const BORROWED_MAX: usize = 2;
@@ -119,14 +120,8 @@ impl Room {
 impl fmt::Display for Room {
     /// `3.2 MiB in 15 files`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} in {} files", mebibytes(self.bytes), self.files)
+        write!(f, "{} in {} files", words::bytes(self.bytes), self.files)
     }
-}
-
-/// Bytes as people write them.
-fn mebibytes(bytes: u64) -> String {
-    const MEBIBYTE: f64 = 1_048_576.0;
-    format!("{:.1} MiB", bytes as f64 / MEBIBYTE)
 }
 
 impl ChannelSettings {

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use hil_platform::host_facts::HostFiles;
 use hil_platform::host_limits::{Headroom, locked_memory_bound, memory_headroom, thread_headroom};
-use hil_platform::open_files;
+use hil_platform::{open_files, words};
 use hil_rundir::launch::{AdapterSettings, GatewayWork};
 use hil_shm::{ChannelSettings, Room, SHARED_MEMORY_DIRECTORY};
 use hil_topology::{Host, RoleSpec, Topology};
@@ -136,11 +136,6 @@ fn listed(shortfalls: &[Shortfall]) -> String {
     lines.join("\n  ")
 }
 
-fn mebibytes(bytes: u64) -> String {
-    const MEBIBYTE: f64 = 1_048_576.0;
-    format!("{:.1} MiB", bytes as f64 / MEBIBYTE)
-}
-
 impl fmt::Display for Shortfall {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -166,9 +161,9 @@ impl fmt::Display for Shortfall {
             Self::Memory { need, have } => write!(
                 f,
                 "the channels take {} of memory, and {} leaves {}; {}",
-                mebibytes(*need),
+                words::bytes(*need),
                 have.bound,
-                mebibytes(have.left),
+                words::bytes(have.left),
                 have.bound.cure()
             ),
             Self::OpenFiles {
@@ -195,9 +190,9 @@ impl fmt::Display for Shortfall {
             } => write!(
                 f,
                 "{process} has lock_memory and locks {} at least, and {} is {}; {}",
-                mebibytes(*need),
+                words::bytes(*need),
                 have.bound,
-                mebibytes(have.left),
+                words::bytes(have.left),
                 have.bound.cure()
             ),
         }
