@@ -12,7 +12,7 @@ use hil_core::message::Envelope;
 use nix::fcntl::posix_fallocate;
 use nix::sys::statvfs::statvfs;
 
-use super::domain::{Domain, shared_memory_files};
+use super::domain::{Domain, shared_memory_files_with};
 use super::error::ChannelError;
 use super::holder::ChannelSettings;
 use super::identity::SHARED_MEMORY_DIRECTORY;
@@ -196,11 +196,7 @@ pub(crate) fn take_room(
 ) -> Result<(), ChannelError> {
     // iceoryx2 0.10 names a writer's memory by its number, and a connection by those of both ends.
     let port = port.to_string();
-    for path in shared_memory_files(domain.address().prefix()) {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        if !name.split(['_', '.']).any(|part| part == port) {
-            continue;
-        }
+    for path in shared_memory_files_with(domain.address().prefix(), &port) {
         match fs::metadata(&path).and_then(|file| reserve(&path, &file)) {
             Ok(()) => {}
             // Of another port that has just been closed.

@@ -357,13 +357,20 @@ fn fresh_prefix(root_path: &Path) -> Result<String, DomainError> {
     }
 }
 
-pub(super) fn shared_memory_files(prefix: &str) -> Vec<PathBuf> {
+fn shared_memory_files(prefix: &str) -> Vec<PathBuf> {
+    shared_memory_files_with(prefix, "")
+}
+
+/// Those whose names have `part` behind the prefix. A gateway asks for each of its ports, so a name that
+/// has not costs a look at its bytes.
+pub(super) fn shared_memory_files_with(prefix: &str, part: &str) -> Vec<PathBuf> {
     let Ok(entries) = fs::read_dir(SHARED_MEMORY_DIRECTORY) else {
         return Vec::new();
     };
     let names = entries.flatten().filter(|entry| {
         let name = entry.file_name();
-        name.as_encoded_bytes().starts_with(prefix.as_bytes())
+        let behind = name.to_str().and_then(|name| name.strip_prefix(prefix));
+        behind.is_some_and(|name| name.contains(part))
     });
     names.map(|entry| entry.path()).collect()
 }
