@@ -24,8 +24,10 @@ const SUPERVISOR_FILES: u64 = 160;
 /// Of the supervisor for each channel it holds, and for each process.
 const HELD_CHANNEL_FILES: u64 = 4;
 const CHILD_FILES: u64 = 4;
-/// Of a gateway or an adapter for one direction of a channel: port, records, socket, four observers.
-const DIRECTION_FILES: u64 = 18;
+/// Of a gateway for one way of its link, or of an adapter for one of its channels: socket, clock exchanges.
+const DIRECTION_FILES: u64 = 8;
+/// Of a gateway or an adapter for each of its channels: port, records, four observers.
+const CARRIED_CHANNEL_FILES: u64 = 16;
 /// Of a component for each of its channels: port, records, four observers.
 const COMPONENT_CHANNEL_FILES: u64 = 16;
 
@@ -344,19 +346,33 @@ fn narrowest(bounds: &[Headroom], need: u64) -> Option<Headroom> {
 }
 
 fn process_need(process: &ProcessPlan, room_of: &dyn Fn(&str) -> u64) -> ProcessNeed {
-    let (open_files, threads, locks, channels) = match &process.task {
+    let opened = match &process.task {
         ProcessTask::Component { card, realtime, .. } => {
             let channels = channels_of(card);
-            let files = OWN_FILES + COMPONENT_CHANNEL_FILES * channels.len() as u64;
-            (files, OWN_THREADS + 1, realtime.lock_memory, channels)
+            ProcessContent {
+                open_files: OWN_FILES + COMPONENT_CHANNEL_FILES * channels.len() as u64,
+                threads: OWN_THREADS + 1,
+                locks_memory: realtime.lock_memory,
+                channels,
+            }
         }
-        ProcessTask::Gateway(work) | ProcessTask::ClockPath(work) => gateway_need(work),
-        ProcessTask::Adapter(adapter) => adapter_need(adapter),
+        ProcessTask::Gateway(work) | ProcessTask::ClockPath(work) => gateway_content(work),
+        ProcessTask::Adapter(adapter) => adapter_content(adapter),
         // What it opens is its own, under its own limit.
-        ProcessTask::Foreign { .. } => (0, 1, false, Vec::new()),
+        ProcessTask::Foreign { .. } => ProcessContent {
+            open_files: 0,
+            threads: 1,
+            locks_memory: false,
+            channels: Vec::new(),
+        },
     };
-    let locked_bytes = locks.then(|| {
-        let memory: u64 = channels.iter().map(|channel| room_of(channel)).sum();
+    let ProcessContent {
+        open_files,
+        threads,
+        ..
+    } = opened;
+    let locked_bytes = opened.locks_memory.then(|| {
+        let memory: u64 = opened.channels.iter().map(|one| room_of(one)).sum();
         LOCKED_PROGRAM_BYTES + LOCKED_THREAD_BYTES * threads + memory
     });
     ProcessNeed {
@@ -367,36 +383,46 @@ fn process_need(process: &ProcessPlan, room_of: &dyn Fn(&str) -> u64) -> Process
     }
 }
 
+/// What a process of ours opens and starts.
+struct ProcessContent {
+    open_files: u64,
+    threads: u64,
+    locks_memory: bool,
+    /// Names of the channels it joins.
+    channels: Vec<String>,
+}
+
 fn channels_of(card: &RoleSpec) -> Vec<String> {
     let channels = card.inputs.iter().chain(&card.outputs);
     channels.map(|channel| channel.name.clone()).collect()
 }
 
-fn gateway_need(work: &GatewayWork) -> (u64, u64, bool, Vec<String>) {
+fn gateway_content(work: &GatewayWork) -> ProcessContent {
     let count = work.directions.len() as u64;
     let mut directions = work.directions.iter();
-    let locks = directions.any(|one| one.realtime.lock_memory);
-    let channels = work.directions.iter().map(|one| one.channel.clone());
-    (
-        OWN_FILES + DIRECTION_FILES * count,
+    let channels = work.directions.iter().flat_map(|one| &one.channels);
+    let channels: Vec<String> = channels.map(|one| one.channel.clone()).collect();
+    ProcessContent {
+        open_files: OWN_FILES
+            + DIRECTION_FILES * count
+            + CARRIED_CHANNEL_FILES * channels.len() as u64,
         // One more samples a radio.
-        OWN_THREADS + 1 + count,
-        locks,
-        channels.collect(),
-    )
+        threads: OWN_THREADS + 1 + count,
+        locks_memory: directions.any(|one| one.realtime.lock_memory),
+        channels,
+    }
 }
 
-fn adapter_need(adapter: &AdapterSettings) -> (u64, u64, bool, Vec<String>) {
+fn adapter_content(adapter: &AdapterSettings) -> ProcessContent {
     let count = adapter.arms.len() as u64;
-    let locks = adapter.arms.iter().any(|arm| arm.realtime.lock_memory);
     let channels = adapter.arms.iter();
     let channels = channels.flat_map(|arm| [arm.input.name.clone(), arm.output.name.clone()]);
-    (
-        OWN_FILES + 2 * DIRECTION_FILES * count,
-        OWN_THREADS + 1 + count,
-        locks,
-        channels.collect(),
-    )
+    ProcessContent {
+        open_files: OWN_FILES + 2 * (DIRECTION_FILES + CARRIED_CHANNEL_FILES) * count,
+        threads: OWN_THREADS + 1 + count,
+        locks_memory: adapter.arms.iter().any(|arm| arm.realtime.lock_memory),
+        channels: channels.collect(),
+    }
 }
 
 #[cfg(test)]
