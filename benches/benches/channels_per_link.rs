@@ -12,14 +12,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::channel;
 use std::thread;
 use std::time::Duration;
 
@@ -35,7 +32,7 @@ use hil_rundir::launch::{
 use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, ShmOutput, Waiter,
 };
-use hil_tests::binary::hil_runtime_binary;
+use hil_tests::worker::Worker;
 use hil_topology::Timestamps;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::{TimeSpec, TimeValLike};
@@ -154,45 +151,6 @@ fn ports(process: u32) -> BTreeSet<String> {
     table.lines().filter_map(of_line).collect()
 }
 
-/// The gateway of one host.
-struct Gateway {
-    process: Child,
-}
-
-impl Gateway {
-    fn start(network: &Network, host: usize, launch: &Path) -> Self {
-        let mut command = Command::new(hil_runtime_binary());
-        command.arg("worker").arg("--launch").arg(launch);
-        command.stdin(Stdio::piped()).stdout(Stdio::piped());
-        let process = network.on(host, move || command.spawn()).unwrap();
-        Self { process }
-    }
-
-    /// Waits for its word that the peer takes messages, and reads on.
-    fn wait_until_ready(&mut self) {
-        let (ready, is_ready) = channel();
-        let out = BufReader::new(self.process.stdout.take().unwrap());
-        thread::spawn(move || {
-            for line in out.lines().map_while(Result::ok) {
-                if line == "\"ready\"" {
-                    // Who waits for it may have given up.
-                    let _gone = ready.send(()).is_err();
-                } else if line.contains("\"failed\"") {
-                    println!("{line}");
-                }
-            }
-        });
-        let waited = is_ready.recv_timeout(Duration::from_mins(1));
-        waited.expect("a gateway is ready within a minute");
-    }
-
-    fn end(mut self) {
-        let mut orders = self.process.stdin.take().unwrap();
-        orders.write_all(b"\"stop\"\n").unwrap();
-        self.process.wait().unwrap();
-    }
-}
-
 /// Figures of one number of channels in one round.
 struct Figures {
     idle: Usage,
@@ -277,7 +235,8 @@ fn measure(network: &Network, folder: &Path, count: usize, options: &Options) ->
         };
         let path = folder.join(format!("launch-{host}.json"));
         write(&path, &launch).unwrap();
-        Gateway::start(network, host, &path)
+        let mut command = Worker::command(&path);
+        Worker::adopt(network.on(host, move || command.spawn()).unwrap())
     });
     let mut outputs: Vec<ShmOutput> = names
         .iter()
@@ -285,8 +244,10 @@ fn measure(network: &Network, folder: &Path, count: usize, options: &Options) ->
             ShmOutput::open(&domains[0], name, &MESSAGE, OutputSettings::default()).unwrap()
         })
         .collect();
-    gateways.iter_mut().for_each(Gateway::wait_until_ready);
-    let processes = gateways.each_ref().map(|one| one.process.id());
+    for gateway in &mut gateways {
+        gateway.wait_until_ready(Duration::from_mins(1));
+    }
+    let processes = gateways.each_ref().map(Worker::id);
     let usage = || {
         let [one, other] = processes.map(Usage::of);
         one.and(other)
@@ -321,7 +282,7 @@ fn measure(network: &Network, folder: &Path, count: usize, options: &Options) ->
         }
         sent_count
     };
-    send_for(SETTLING);
+    let settled_count = send_for(SETTLING);
     let began = MonotonicClock::now();
     let before = usage();
     let sent_count = send_for(span);
@@ -343,12 +304,24 @@ fn measure(network: &Network, folder: &Path, count: usize, options: &Options) ->
     thread::sleep(Duration::from_millis(200));
     stop.store(true, Ordering::Release);
     let arrivals = receiving.join().unwrap();
+    let arrivals_count = arrivals.len() as u64;
+    let sent_all = sent_count + settled_count;
     let delays_ns = arrivals
         .into_iter()
         .filter(|(published_ns, _)| *published_ns >= began.as_ns())
         .map(|(_, delay_ns)| delay_ns)
         .collect();
-    gateways.into_iter().for_each(Gateway::end);
+    for gateway in gateways {
+        let (_, words) = gateway.end(Duration::from_mins(1));
+        let mut warnings = words.lines().filter(|line| line.contains("warning"));
+        if let Some(warning) = warnings.next() {
+            println!("{warning}");
+        }
+        if arrivals_count < sent_all {
+            // What became of those that did not come.
+            println!("{}", counts_of(&words));
+        }
+    }
     drop((outputs, holders));
     for domain in domains {
         domain.remove();
@@ -396,6 +369,27 @@ fn sleep_for(descriptor: BorrowedFd<'_>) {
     let mut entries = [PollFd::new(descriptor, PollFlags::POLLIN)];
     let patience = TimeSpec::milliseconds(50);
     ppoll(&mut entries, Some(patience), None).unwrap();
+}
+
+/// The counters of the sockets in a worker's last words, as far as they are not zero.
+fn counts_of(words: &str) -> String {
+    let last = words.lines().find(|line| line.contains("\"finished\""));
+    let report: serde_json::Value = last
+        .and_then(|line| serde_json::from_str(line).ok())
+        .unwrap_or_default();
+    let counters = &report["finished"]["directions"][0]["counters"];
+    let counted = counters.as_array().into_iter().flatten();
+    let counted = counted.filter(|one| one["count"] != 0);
+    let words: Vec<String> = counted
+        .map(|one| {
+            format!(
+                "{} {}",
+                one["name"].as_str().unwrap_or_default(),
+                one["count"]
+            )
+        })
+        .collect();
+    words.join(", ")
 }
 
 /// The middle one of three, or of whatever number there is.

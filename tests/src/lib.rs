@@ -22,3 +22,4 @@ pub mod soak;
 pub mod source_tree;
 pub mod split;
 pub mod trial;
+pub mod worker;

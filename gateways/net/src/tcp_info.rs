@@ -88,7 +88,8 @@ impl ConnectionInfo {
     }
 }
 
-/// Bytes given to the kernel that the peer has not acknowledged (`SIOCOUTQ`).
+/// Bytes given to the kernel that the peer has not acknowledged, or of a UDP socket that have not left this
+/// host (`SIOCOUTQ`).
 ///
 /// # Errors
 /// What the kernel answered.

@@ -95,6 +95,8 @@ pub struct Fragment<'a> {
     pub index: u16,
     /// Of how many.
     pub count: u16,
+    /// The producer's stamp, the sender's monotonic clock.
+    pub published_ns: i64,
     /// When this piece was handed to the sender's kernel, the sender's monotonic clock.
     pub handed_ns: i64,
     /// Its bytes.
@@ -108,6 +110,23 @@ pub struct Assembled<'a> {
     pub payload: &'a [u8],
     /// When its first piece was handed to the sender's kernel, the sender's monotonic clock.
     pub handed_ns: i64,
+}
+
+/// A message that was given up: of some of its pieces nothing was seen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GivenUp {
+    /// Its stream.
+    pub stream: Stream,
+    /// Its number.
+    pub sequence: u64,
+    /// The producer's stamp, the sender's monotonic clock.
+    pub published_ns: i64,
+    /// When the first piece that came was handed to the sender's kernel, the sender's monotonic clock.
+    pub handed_ns: i64,
+    /// When the last piece came.
+    pub heard_at: Instant,
+    /// How many pieces came.
+    pub received_count: u16,
 }
 
 counts! {
@@ -133,6 +152,8 @@ pub struct Reassembler {
     storage: Box<[u8]>,
     size_max_bytes: usize,
     timeout: Duration,
+    /// Taken by the owner after every call.
+    given_up: Vec<GivenUp>,
     counts: ReassemblyCounts,
 }
 
@@ -142,15 +163,18 @@ struct Slot {
     total_len: u32,
     count: u16,
     missing: u16,
+    published_ns: i64,
     received: Box<[u64]>,
     /// Of piece 0.
     handed_ns: i64,
     started_at: Instant,
+    /// When its last piece came.
+    heard_at: Instant,
 }
 
 impl Reassembler {
-    /// Sets aside `slot_count` messages of `size_max_bytes`; an incomplete one is given up after
-    /// `timeout`.
+    /// Sets aside `slot_count` messages of `size_max_bytes`; an incomplete one is given up `timeout` after
+    /// its last piece.
     ///
     /// # Panics
     /// When `slot_count` is zero.
@@ -161,17 +185,20 @@ impl Reassembler {
             total_len: 0,
             count: 0,
             missing: 0,
+            published_ns: 0,
             // No message has more pieces than bytes.
             received: vec![0; size_max_bytes.clamp(1, FRAGMENT_COUNT_MAX).div_ceil(64)]
                 .into_boxed_slice(),
             handed_ns: 0,
             started_at: Instant::ZERO,
+            heard_at: Instant::ZERO,
         };
         Self {
             slots: vec![empty; slot_count].into_boxed_slice(),
             storage: vec![0; slot_count * size_max_bytes].into_boxed_slice(),
             size_max_bytes,
             timeout,
+            given_up: Vec::with_capacity(slot_count + 1),
             counts: ReassemblyCounts::default(),
         }
     }
@@ -201,6 +228,7 @@ impl Reassembler {
         let base = index * self.size_max_bytes;
         self.storage[base + range.start..base + range.end].copy_from_slice(fragment.payload);
         let slot = &mut self.slots[index];
+        slot.heard_at = now;
         slot.receive(fragment);
         if slot.missing > 0 {
             return Ok(None);
@@ -216,8 +244,8 @@ impl Reassembler {
     /// Gives up incomplete messages whose time is up.
     pub fn expire(&mut self, now: Instant) {
         for slot in &mut self.slots {
-            if slot.message.is_some() && slot.started_at + self.timeout <= now {
-                slot.message = None;
+            if slot.message.is_some() && slot.heard_at + self.timeout <= now {
+                self.given_up.extend(slot.give_up());
                 self.counts.timed_out_count += 1;
             }
         }
@@ -226,7 +254,8 @@ impl Reassembler {
     /// Gives up every incomplete message.
     pub fn clear(&mut self) {
         for slot in &mut self.slots {
-            if slot.message.take().is_some() {
+            if let Some(given_up) = slot.give_up() {
+                self.given_up.push(given_up);
                 self.counts.abandoned_count += 1;
             }
         }
@@ -235,13 +264,18 @@ impl Reassembler {
     /// When the next incomplete message is given up.
     pub fn next_expiry(&self) -> Option<Instant> {
         let open = self.slots.iter().filter(|slot| slot.message.is_some());
-        open.map(|slot| slot.started_at + self.timeout).min()
+        open.map(|slot| slot.heard_at + self.timeout).min()
     }
 
     /// Incomplete messages.
     pub fn open_count(&self) -> usize {
         let open = self.slots.iter().filter(|slot| slot.message.is_some());
         open.count()
+    }
+
+    /// A message that was given up since this was asked last. Ask until `None` after every other call.
+    pub fn next_given_up(&mut self) -> Option<GivenUp> {
+        self.given_up.pop()
     }
 
     /// What became of the messages so far.
@@ -274,11 +308,15 @@ impl Reassembler {
             .min_by_key(|(_, slot)| order(slot))
             .expect("there is at least one slot");
         self.counts.started_count += 1;
-        self.counts.evicted_count += u64::from(slot.message.is_some());
+        if let Some(given_up) = slot.give_up() {
+            self.given_up.push(given_up);
+            self.counts.evicted_count += 1;
+        }
         slot.message = Some((fragment.stream, fragment.sequence));
         slot.total_len = fragment.total_len;
         slot.count = fragment.count;
         slot.missing = fragment.count;
+        slot.published_ns = fragment.published_ns;
         slot.received[..usize::from(fragment.count).div_ceil(64)].fill(0);
         slot.handed_ns = fragment.handed_ns;
         slot.started_at = now;
@@ -287,6 +325,19 @@ impl Reassembler {
 }
 
 impl Slot {
+    /// Empties it; what is known of its message, if it held one.
+    fn give_up(&mut self) -> Option<GivenUp> {
+        let (stream, sequence) = self.message.take()?;
+        Some(GivenUp {
+            stream,
+            sequence,
+            published_ns: self.published_ns,
+            handed_ns: self.handed_ns,
+            heard_at: self.heard_at,
+            received_count: self.count - self.missing,
+        })
+    }
+
     fn has(&self, index: u16) -> bool {
         self.received[usize::from(index) / 64] >> (index % 64) & 1 == 1
     }

@@ -73,9 +73,12 @@ pub mod wire;
 
 pub use channel::{ChannelIdentity, FlowIdentity, SettingsError};
 pub use egress::{
-    EgressBridge, EgressEvent, EgressSettings, LocalRefusal, PeerState, Transmit, TransmitFailure,
+    EgressBridge, EgressEvent, EgressSettings, LocalRefusal, LongPiece, PeerState, Transmit,
+    TransmitFailure,
 };
-pub use ingress::{Delivery, Disposition, IngressBridge, IngressSettings, MessageInfo, Reply};
+pub use ingress::{
+    Delivery, Disposition, Incomplete, IngressBridge, IngressSettings, MessageInfo, Reply,
+};
 pub use refusal::{Refusal, RefusalCounts};
 pub use stamps::{ArrivalStamps, StampSource};
 

@@ -161,6 +161,13 @@ pub trait DatagramSender: Debug + Send {
     /// The state that kept it from leaving; it is counted.
     fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal>;
 
+    /// As [`DatagramSender::send`], of a datagram that lies in two places: a long message's piece is not
+    /// copied behind its header first.
+    ///
+    /// # Errors
+    /// As [`DatagramSender::send`].
+    fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal>;
+
     /// The next transmit stamp that has arrived. Call it until `None` after every send: the
     /// kernel charges unfetched stamps to the receive buffer, so a sender that is never drained
     /// hears no replies. Reports of the network are swallowed and counted on the way.
@@ -192,6 +199,12 @@ pub trait DatagramSender: Debug + Send {
     /// When [`DatagramSender::attend`] is due without a word from the descriptor.
     fn next_due(&self) -> Option<Instant> {
         None
+    }
+
+    /// Bytes that this host has not got rid of yet, as far as the kernel tells: what a datagram sent now
+    /// waits for.
+    fn queued_bytes(&self) -> usize {
+        0
     }
 
     /// True while bytes of a datagram it took have not been given to the kernel.

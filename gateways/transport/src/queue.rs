@@ -120,8 +120,8 @@ fn lane(settings: &QueueSettings) -> (LaneIn, LaneOut) {
 }
 
 impl LaneIn {
-    fn push(&mut self, datagram: &[u8], token: TxToken) -> Result<(), SendRefusal> {
-        let length_bytes = datagram.len();
+    fn push(&mut self, head: &[u8], tail: &[u8], token: TxToken) -> Result<(), SendRefusal> {
+        let length_bytes = head.len() + tail.len();
         if length_bytes > self.datagram_bytes_max {
             return Err(SendRefusal::TooLong { length_bytes });
         }
@@ -131,7 +131,8 @@ impl LaneIn {
             },
             TryRecvError::Disconnected => SendRefusal::PeerRefused,
         })?;
-        slot.bytes[..length_bytes].copy_from_slice(datagram);
+        slot.bytes[..head.len()].copy_from_slice(head);
+        slot.bytes[head.len()..length_bytes].copy_from_slice(tail);
         slot.length_bytes = length_bytes;
         slot.token = token;
         self.filled.try_send(slot).map_err(|error| match error {
@@ -176,9 +177,13 @@ pub struct QueueSender {
 
 impl DatagramSender for QueueSender {
     fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
+        self.send_parts(datagram, &[])
+    }
+
+    fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal> {
         let low_bits = self.counters.sent_count & u64::from(u32::MAX);
         let token = TxToken(u32::try_from(low_bits).expect("masked to 32 bits"));
-        if let Err(refusal) = self.lane.push(datagram, token) {
+        if let Err(refusal) = self.lane.push(head, tail, token) {
             self.counters.count_refusal(refusal);
             return Err(refusal);
         }
@@ -244,7 +249,7 @@ impl DatagramReceiver for QueueReceiver {
 
     fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal> {
         let refusal = if to == self.peer {
-            self.lane.push(datagram, TxToken(0)).err()
+            self.lane.push(datagram, &[], TxToken(0)).err()
         } else {
             let errno = libc::ENETUNREACH;
             Some(SendRefusal::Unreachable { errno })

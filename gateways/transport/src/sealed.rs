@@ -94,6 +94,13 @@ impl<S: DatagramSender> SealedSender<S> {
 }
 
 impl<S: DatagramSender> DatagramSender for SealedSender<S> {
+    fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal> {
+        let Some(length) = self.seal.seal_parts(head, tail, &mut self.buffer) else {
+            return Err(SendRefusal::NotConnected);
+        };
+        self.inner.send(&self.buffer[..length])
+    }
+
     fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
         if let Some(request) = self.seal.request_before(datagram) {
             let sent = self.inner.send(&request);
@@ -107,6 +114,10 @@ impl<S: DatagramSender> DatagramSender for SealedSender<S> {
             return Err(SendRefusal::NotConnected);
         };
         self.inner.send(&self.buffer[..length])
+    }
+
+    fn queued_bytes(&self) -> usize {
+        self.inner.queued_bytes()
     }
 
     fn next_stamp(&mut self) -> Option<TransmitStamp> {

@@ -2,7 +2,7 @@
 //! fetched are charged to the *receive* buffer of their socket, so one socket for both goes deaf.
 //! It frames, encrypts and retries nothing.
 
-use std::io;
+use std::io::{self, IoSlice};
 use std::net::SocketAddr;
 use std::os::fd::{AsFd, BorrowedFd};
 
@@ -21,6 +21,7 @@ use super::{
 use hil_net::control::{ControlData, QueueEntry, SCM_WIFI_STATUS};
 use hil_net::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
 use hil_net::reply_stamps::ReplyStamps;
+use hil_net::tcp_info::unacknowledged_bytes;
 use hil_net::timestamping::{
     MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, int_option, restart_send_count,
     set_int_option,
@@ -314,17 +315,27 @@ impl UdpSender {
             None => self.socket.send_with_flags(datagram, flags),
             Some(to) => self.socket.send_to_with_flags(datagram, to, flags),
         };
+        self.note_sent(sent, datagram, datagram.len())
+    }
+
+    /// What became of a send of `length_bytes`, which begin with `head`.
+    fn note_sent(
+        &mut self,
+        sent: io::Result<usize>,
+        head: &[u8],
+        length_bytes: usize,
+    ) -> Result<TxToken, SendRefusal> {
         match sent {
             Ok(_) => {
                 let token = TxToken(sent_modulo(self.counters.sent_count));
                 self.counters.sent_count += 1;
                 if let Some(radio) = &mut self.radio {
-                    radio.note(datagram, token);
+                    radio.note(head, token);
                 }
                 Ok(token)
             }
             Err(error) => {
-                let refusal = SendRefusal::from_io(&error, datagram.len());
+                let refusal = SendRefusal::from_io(&error, length_bytes);
                 self.counters.count_refusal(refusal);
                 match refusal {
                     SendRefusal::QueueFull {
@@ -350,6 +361,19 @@ impl UdpSender {
 impl DatagramSender for UdpSender {
     fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
         self.send_towards(datagram, None)
+    }
+
+    fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal> {
+        let parts = [IoSlice::new(head), IoSlice::new(tail)];
+        let sent = self
+            .socket
+            .send_vectored_with_flags(&parts, libc::MSG_DONTWAIT);
+        self.note_sent(sent, head, head.len() + tail.len())
+    }
+
+    fn queued_bytes(&self) -> usize {
+        let queued = unacknowledged_bytes(&self.socket).unwrap_or(0);
+        usize::try_from(queued).unwrap_or(usize::MAX)
     }
 
     fn next_stamp(&mut self) -> Option<TransmitStamp> {

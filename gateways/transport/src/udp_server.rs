@@ -65,6 +65,15 @@ impl DatagramSender for UdpServer {
         self.line.send_towards(datagram, Some(peer))
     }
 
+    /// A foreign protocol has no message that lies in two places.
+    fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal> {
+        if tail.is_empty() {
+            return self.send(head);
+        }
+        let length_bytes = head.len() + tail.len();
+        Err(SendRefusal::TooLong { length_bytes })
+    }
+
     fn next_stamp(&mut self) -> Option<TransmitStamp> {
         self.line.next_stamp()
     }

@@ -144,7 +144,9 @@ impl<'a> Judge<'a> {
         if let Some(forwarded_ns) = stamp(ingress.forwarded_ns) {
             return self.fate_at_consumer(joined, Some(forwarded_ns), self.consumer_end_ns);
         }
-        if ingress.flags & IngressRecord::LATE != 0 {
+        if ingress.flags & IngressRecord::INCOMPLETE != 0 {
+            MessageFate::Incomplete
+        } else if ingress.flags & IngressRecord::LATE != 0 {
             MessageFate::Late
         } else if ingress.flags & IngressRecord::DUPLICATE != 0 {
             MessageFate::Duplicate
@@ -217,6 +219,7 @@ impl<'a> Judge<'a> {
         }
         let may_have_been_inside = match fate {
             MessageFate::LostOnWire
+            | MessageFate::Incomplete
             | MessageFate::Unexplained
             | MessageFate::InFlight
             | MessageFate::UnknownPeerRecordsUnavailable => true,

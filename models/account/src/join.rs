@@ -40,6 +40,12 @@ pub struct Joined {
 }
 
 impl Joined {
+    /// What the receiving gateway noted of the whole message; `None` also where only pieces of it came.
+    pub fn arrived(&self) -> Option<IngressRecord> {
+        let is_whole = |one: &IngressRecord| one.flags & IngressRecord::INCOMPLETE == 0;
+        self.ingress.filter(is_whole)
+    }
+
     /// The producer's stamp, from whichever record carries it.
     pub fn published_ns(&self) -> Option<i64> {
         let stamps = [

@@ -21,9 +21,9 @@ pub fn passages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> P
 fn passage(joined: &Joined, fate: MessageFate, context: &AccountContext<'_>) -> Passage {
     let crossing = match fate {
         // What happened behind the receiving gateway is not the network's.
-        _ if joined.ingress.is_some() => Crossing::Arrived,
+        _ if joined.arrived().is_some() => Crossing::Arrived,
         MessageFate::Taken | MessageFate::SupersededAtConsumer => Crossing::Arrived,
-        MessageFate::LostOnWire => Crossing::LostByNetwork,
+        MessageFate::LostOnWire | MessageFate::Incomplete => Crossing::LostByNetwork,
         MessageFate::InFlight
         | MessageFate::Unexplained
         | MessageFate::UnknownPeerRecordsUnavailable => Crossing::Unknown,
@@ -38,7 +38,9 @@ fn passage(joined: &Joined, fate: MessageFate, context: &AccountContext<'_>) -> 
         .egress
         .and_then(|record| stamp(record.handed_ns))
         .or_else(|| stamp(joined.ingress?.handed_ns));
-    let received_ns = joined.ingress.and_then(|record| stamp(record.received_ns));
+    let received_ns = joined
+        .arrived()
+        .and_then(|record| stamp(record.received_ns));
     let sent =
         handed_ns.and_then(|handed_ns| context.path.localise(RemoteInstant::from_ns(handed_ns)));
     let delay = sent.zip(received_ns);

@@ -223,7 +223,7 @@ pub(super) fn each_handed(
         let handed = joined.egress.filter(is_handed);
         let Some(egress) = handed else { return };
         let fate = match fate {
-            _ if joined.ingress.is_some() => HandedFate::Arrived,
+            _ if joined.arrived().is_some() => HandedFate::Arrived,
             MessageFate::Taken | MessageFate::SupersededAtConsumer => HandedFate::Arrived,
             MessageFate::LostInInterruption => HandedFate::Interrupted,
             MessageFate::InFlight => HandedFate::InFlight,
@@ -233,6 +233,7 @@ pub(super) fn each_handed(
             MessageFate::LostOnWire
             | MessageFate::SupersededAtInput
             | MessageFate::RefusedByKernel
+            | MessageFate::Incomplete
             | MessageFate::RefusedAtIngress
             | MessageFate::Late
             | MessageFate::Duplicate => HandedFate::Lost,

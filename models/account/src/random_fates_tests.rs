@@ -9,11 +9,12 @@ use super::*;
 const MS: i64 = 1_000_000;
 
 /// The fates a message can be written with in the middle of a run.
-const WRITABLE: [MessageFate; 9] = [
+const WRITABLE: [MessageFate; 10] = [
     MessageFate::Taken,
     MessageFate::SupersededAtInput,
     MessageFate::RefusedByKernel,
     MessageFate::LostOnWire,
+    MessageFate::Incomplete,
     MessageFate::RefusedAtIngress,
     MessageFate::Late,
     MessageFate::Duplicate,

@@ -35,7 +35,7 @@ struct Timeline {
 impl Timeline {
     /// A direct channel has no stages between its ends, whatever a record claims.
     fn of(joined: &Joined, is_gateway: bool) -> Self {
-        let (egress, ingress, taken) = (joined.egress, joined.ingress, joined.taken);
+        let (egress, ingress, taken) = (joined.egress, joined.arrived(), joined.taken);
         let published_ns = joined
             .published
             .and_then(|record| stamp(record.published_ns))
@@ -281,7 +281,7 @@ impl<'a> SegmentBook<'a> {
         {
             coverage.count(joined.handed_to_tx_ns.is_some_and(has));
         }
-        if let Some(ingress) = joined.ingress {
+        if let Some(ingress) = joined.arrived() {
             for (coverage, ns) in [
                 (&mut coverage.rx_software, ingress.rx_software_ns),
                 (&mut coverage.rx_hardware, ingress.rx_hardware_ns),

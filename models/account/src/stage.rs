@@ -110,6 +110,8 @@ pub enum MessageFate {
     RefusedByKernel,
     /// Handed to the kernel, never received.
     LostOnWire,
+    /// Handed to the kernel in pieces, of which only some were received.
+    Incomplete,
     /// Received and not forwarded, for no recorded reason.
     RefusedAtIngress,
     /// Received after the sequence window had moved on.
@@ -130,11 +132,12 @@ pub enum MessageFate {
 
 impl MessageFate {
     /// Every fate, in the order of a message's way.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::Taken,
         Self::SupersededAtInput,
         Self::RefusedByKernel,
         Self::LostOnWire,
+        Self::Incomplete,
         Self::RefusedAtIngress,
         Self::Late,
         Self::Duplicate,
@@ -152,6 +155,7 @@ impl MessageFate {
             Self::SupersededAtInput => "superseded at the gateway's input",
             Self::RefusedByKernel => "refused by the kernel or peer absent",
             Self::LostOnWire => "lost on the wire",
+            Self::Incomplete => "incomplete: pieces of it lost on the wire",
             Self::RefusedAtIngress => "refused by the receiving gateway",
             Self::Late => "too late for the receiving gateway",
             Self::Duplicate => "received only as a duplicate",
@@ -170,6 +174,7 @@ impl MessageFate {
             self,
             Self::RefusedByKernel
                 | Self::LostOnWire
+                | Self::Incomplete
                 | Self::RefusedAtIngress
                 | Self::Late
                 | Self::Duplicate

@@ -97,6 +97,7 @@ impl Files {
         }
         let mut ingress = arrived(message);
         ingress.flags = match fate {
+            Fate::Incomplete => IngressRecord::INCOMPLETE,
             Fate::Late => IngressRecord::LATE,
             Fate::Duplicate => IngressRecord::DUPLICATE,
             _ => 0,
@@ -107,7 +108,10 @@ impl Files {
             session: ingress.session,
             reserved: 0,
         });
-        if matches!(fate, Fate::Late | Fate::Duplicate | Fate::RefusedAtIngress) {
+        if matches!(
+            fate,
+            Fate::Incomplete | Fate::Late | Fate::Duplicate | Fate::RefusedAtIngress
+        ) {
             ingress.forwarded_ns = UNAVAILABLE;
         }
         self.ingress.push(ingress);

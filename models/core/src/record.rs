@@ -118,7 +118,7 @@ pub struct IngressRecord {
     pub session: u32,
     /// Bits below.
     pub flags: u32,
-    /// Datagrams this message took.
+    /// Datagrams this message took, or those of them that came.
     pub fragment_count: u32,
 }
 
@@ -129,6 +129,8 @@ impl IngressRecord {
     pub const DUPLICATE: u32 = 2;
     /// Older than the sequence window; not published.
     pub const LATE: u32 = 4;
+    /// Of its pieces only so many as `fragment_count` came; not published.
+    pub const INCOMPLETE: u32 = 8;
 }
 
 /// A clock exchange of a sending gateway with its peer (four stamps, as in NTP, RFC 5905 section

@@ -181,7 +181,7 @@ fn departure_ns(joined: &Joined) -> Option<i64> {
 
 /// Whether the link delivered it; what the consumer made of it is not the link's business.
 fn trace_fate(joined: &Joined, fate: MessageFate) -> TraceFate {
-    if let Some(ingress) = joined.ingress {
+    if let Some(ingress) = joined.arrived() {
         return match stamp(ingress.forwarded_ns) {
             Some(_) => TraceFate::Delivered,
             None => TraceFate::LostAfterLink,
@@ -190,7 +190,7 @@ fn trace_fate(joined: &Joined, fate: MessageFate) -> TraceFate {
     match fate {
         MessageFate::Taken | MessageFate::SupersededAtConsumer => TraceFate::Delivered,
         MessageFate::SupersededAtInput | MessageFate::RefusedByKernel => TraceFate::LostBeforeLink,
-        MessageFate::LostOnWire => TraceFate::LostInNetwork,
+        MessageFate::LostOnWire | MessageFate::Incomplete => TraceFate::LostInNetwork,
         MessageFate::RefusedAtIngress | MessageFate::Late | MessageFate::Duplicate => {
             TraceFate::LostAfterLink
         }

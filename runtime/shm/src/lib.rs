@@ -46,7 +46,7 @@ pub use identity::{SHARED_MEMORY_DIRECTORY, clock_id};
 pub use members::ForeignNodes;
 pub use observer::observer_depth;
 pub use ports::{ShmInput, ShmOutput, TypedInput, TypedOutput};
-pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
+pub use raw::{ENVELOPE_TYPE_NAME, HeldMessage, RawInput, RawOutput};
 pub use sequence::{InputCounters, OutputSettings, SequenceTracker, Sequencer, Stamp};
 pub use type_info::TypeInfo;
 pub use wake::{Waiter, Wake};

@@ -18,6 +18,7 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{
     FileDescriptorBased, MessagingPattern, PayloadHeader, Service, ServiceName, ZeroCopySend, ipc,
 };
+use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut_uninit::SampleMutUninit;
 use iceoryx2::service::builder::publish_subscribe::{Builder, PublishSubscribeOpenError};
 use iceoryx2::service::marker::{CustomHeaderMarker, CustomPayloadMarker};
@@ -443,6 +444,14 @@ impl ByteReader {
         self.failures.count()
     }
 
+    fn sample(
+        &self,
+    ) -> Result<Option<Sample<ipc::Service, [CustomPayloadMarker], SharedEnvelope>>, ChannelError>
+    {
+        let received = self.subscriber.receive();
+        received.map_err(|error| ChannelError::refused(&self.channel, "receive", &error))
+    }
+
     /// Hands the oldest waiting sample to `take`; `None` when none waits.
     #[allow(
         unsafe_code,
@@ -452,10 +461,7 @@ impl ByteReader {
         &mut self,
         take: impl FnOnce(UniqueNodeId, &Envelope, &[u8]) -> T,
     ) -> Result<Option<T>, ChannelError> {
-        let sample = self
-            .subscriber
-            .receive()
-            .map_err(|error| ChannelError::refused(&self.channel, "receive", &error))?;
+        let sample = self.sample()?;
         Ok(sample.map(|sample| {
             let payload = sample.payload();
             // SAFETY: the marker is one byte of plain data, so the slice is that many bytes; the
@@ -463,6 +469,35 @@ impl ByteReader {
             let payload = unsafe { slice::from_raw_parts(payload.as_ptr().cast(), payload.len()) };
             take(sample.header().node_id(), &sample.user_header().0, payload)
         }))
+    }
+}
+
+/// A message that its reader keeps for a while: its memory is not given to its writer again meanwhile.
+pub struct HeldMessage(Sample<ipc::Service, [CustomPayloadMarker], SharedEnvelope>);
+
+impl HeldMessage {
+    /// Its envelope.
+    pub fn envelope(&self) -> Envelope {
+        self.0.user_header().0
+    }
+
+    /// Its bytes.
+    #[allow(
+        unsafe_code,
+        reason = "reads a message whose type is known only at run time"
+    )]
+    pub fn payload(&self) -> &[u8] {
+        let payload = self.0.payload();
+        // SAFETY: as in `ByteReader::receive`; the sample is held as long as this lives.
+        unsafe { slice::from_raw_parts(payload.as_ptr().cast(), payload.len()) }
+    }
+}
+
+impl fmt::Debug for HeldMessage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("HeldMessage")
+            .field(&self.envelope())
+            .finish()
     }
 }
 
@@ -497,6 +532,22 @@ impl RawInput {
     /// Attempts to connect to a writer that failed. While it grows, a writer is not heard.
     pub fn connection_failure_count(&self) -> u64 {
         self.reader.connection_failure_count()
+    }
+
+    /// The oldest waiting message, to be kept; `None` when none waits. One may be kept while others are
+    /// received. As [`RawInput::receive`] otherwise.
+    ///
+    /// # Errors
+    /// When the channel is broken.
+    pub fn hold(&mut self) -> Result<Option<HeldMessage>, ChannelError> {
+        loop {
+            let Some(sample) = self.reader.sample()? else {
+                return Ok(None);
+            };
+            if sample.header().node_id() != self.own_node {
+                return Ok(Some(HeldMessage(sample)));
+            }
+        }
     }
 
     /// Hands the oldest waiting sample to `take`; false when none waits. Never blocks.

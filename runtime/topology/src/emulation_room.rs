@@ -21,6 +21,10 @@ const FLOW_CAPACITY_MAX: usize = 1 << 20;
 const SIZED_RATE_HZ: f64 = 4_000.0;
 /// And while an outage holds them.
 const OUTAGE_RATE_HZ: f64 = 1_000.0;
+/// Long messages per second that room is made for, while their pieces are under way.
+const LONG_RATE_HZ: f64 = 30.0;
+/// What one of them carries on Ethernet.
+const PIECE_BYTES: usize = wire::payload_budget_bytes(1_472);
 /// A link that cannot be kept at this rate is refused: no control channel is slower.
 const LEAST_RATE_HZ: f64 = 100.0;
 /// All but one in a million are under way for less than what is reckoned with.
@@ -79,7 +83,11 @@ impl EmulationRoom {
                 problem,
             ));
         }
-        let wanted = BURST_COUNT as f64 + held(SIZED_RATE_HZ, OUTAGE_RATE_HZ);
+        // A long message brings many datagrams at once, and is not sent as often.
+        let more_pieces = message_bytes.div_ceil(PIECE_BYTES).max(1) - 1;
+        let long =
+            more_pieces as f64 * copies * (2.0 + LONG_RATE_HZ * (way_s + queue_s + outage_s));
+        let wanted = BURST_COUNT as f64 + held(SIZED_RATE_HZ, OUTAGE_RATE_HZ) + long;
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,

@@ -54,7 +54,7 @@ pub(super) const RESTART_LIMIT: Limit<i64> = limit(3, 1, 100);
 
 pub(super) const CHANNEL_DEPTH: Limit<i64> = limit(16, 1, 1_024);
 /// Without default: a foreign channel must say how large its messages are.
-pub(super) const MESSAGE_SIZE_BYTES: Limit<i64> = limit(1, 1, 65_536);
+pub(super) const MESSAGE_SIZE_BYTES: Limit<i64> = limit(1, 1, 16_777_216);
 /// A power of two.
 pub(super) const MESSAGE_ALIGNMENT_BYTES: Limit<i64> = limit(8, 1, 64);
 

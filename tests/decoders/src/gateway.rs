@@ -92,6 +92,7 @@ pub(crate) fn reassembly(bytes: &[u8]) -> Verdict {
             index,
             count,
             handed_ns: i64::from(index),
+            published_ns: 0,
             payload: &storage,
         };
         if let Ok(Some(whole)) = reassembler.insert(now, &fragment) {

@@ -2,10 +2,7 @@
 //! deceived notices: the bridges, the gateway processes; and supervisors never share a domain.
 
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use hil_account::MessageFate;
@@ -24,9 +21,9 @@ use hil_rundir::launch::{
 use hil_shm::{ChannelHolder, ChannelSettings, Domain};
 use hil_shuttle::ShuttleCommand;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
-use hil_tests::binary::hil_runtime_binary;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
+use hil_tests::worker::Worker;
 use hil_topology::Timestamps;
 
 const CHANNEL: &str = "shuttle/command";
@@ -80,56 +77,6 @@ fn two_bridges_of_one_domain_refuse_each_other() {
     assert_eq!(egress.peer_state(), PeerState::Established);
 }
 
-/// A gateway process with its order pipe; killed when dropped.
-struct Gateway {
-    process: Child,
-}
-
-impl Gateway {
-    fn start(launch: &Path) -> Self {
-        let mut command = Command::new(hil_runtime_binary());
-        command.arg("worker").arg("--launch").arg(launch);
-        command.stdin(Stdio::piped()).stdout(Stdio::piped());
-        let process = command.stderr(Stdio::piped()).spawn().unwrap();
-        Self { process }
-    }
-
-    fn is_running(&mut self) -> bool {
-        matches!(self.process.try_wait(), Ok(None))
-    }
-
-    /// Tells it to stop, waits for its end and gives its words.
-    fn end(mut self) -> (Option<i32>, String) {
-        if let Some(mut orders) = self.process.stdin.take() {
-            // One that has refused is gone already.
-            drop(orders.write_all(b"\"stop\"\n"));
-        }
-        wait_until(LIMIT, "the end of a gateway", || !self.is_running());
-        let mut words = String::new();
-        for pipe in [
-            self.process
-                .stdout
-                .take()
-                .map(|pipe| Box::new(pipe) as Box<dyn std::io::Read>),
-            self.process
-                .stderr
-                .take()
-                .map(|pipe| Box::new(pipe) as Box<dyn std::io::Read>),
-        ] {
-            pipe.unwrap().read_to_string(&mut words).unwrap();
-        }
-        (self.process.wait().unwrap().code(), words)
-    }
-}
-
-impl Drop for Gateway {
-    fn drop(&mut self) {
-        // Both fail only if it has ended.
-        drop(self.process.kill());
-        drop(self.process.wait());
-    }
-}
-
 /// Two free ports of the loopback interface.
 fn free_ports() -> [SocketAddr; 2] {
     let sockets = [(); 2].map(|()| UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap());
@@ -177,7 +124,7 @@ fn domain(folder: &RunFolder, name: &str) -> (ChannelHolder, Domain) {
     (holder, domain)
 }
 
-fn launch(folder: &RunFolder, name: &str, domain: &Domain, direction: DirectionLaunch) -> Gateway {
+fn launch(folder: &RunFolder, name: &str, domain: &Domain, direction: DirectionLaunch) -> Worker {
     let records = folder.join(format!("records-{name}"));
     std::fs::create_dir(&records).unwrap();
     let launch = WorkerLaunch {
@@ -193,7 +140,7 @@ fn launch(folder: &RunFolder, name: &str, domain: &Domain, direction: DirectionL
     };
     let path = folder.join(format!("{name}.json"));
     write(&path, &launch).unwrap();
-    Gateway::start(&path)
+    Worker::start(&path)
 }
 
 #[test]
@@ -215,10 +162,10 @@ fn a_gateway_process_refuses_a_peer_that_shares_its_memory_and_says_why() {
     );
     wait_until(LIMIT, "the refusal", || !egress.is_running());
     assert!(ingress.is_running(), "the refused one ends, not the other");
-    let (code, words) = egress.end();
+    let (code, words) = egress.end(LIMIT);
     assert_eq!(code, Some(1), "{words}");
     assert!(words.contains(REASON), "{words}");
-    let (code, words) = ingress.end();
+    let (code, words) = ingress.end(LIMIT);
     assert_eq!(code, Some(0), "{words}");
     assert!(words.contains("shared domain"), "{words}");
 }
@@ -252,7 +199,7 @@ fn gateway_processes_with_memory_of_their_own_accept_each_other() {
         exchange_file.is_some_and(|data| data.len() > 256)
     });
     for gateway in [egress, ingress] {
-        let (code, words) = gateway.end();
+        let (code, words) = gateway.end(LIMIT);
         assert_eq!(code, Some(0), "{words}");
     }
 }

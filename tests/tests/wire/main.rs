@@ -15,6 +15,7 @@ mod dissector;
 mod egm_clients;
 mod emulated_run;
 mod live_links;
+mod long_messages;
 mod outage_run;
 mod trace_live;
 mod trace_replay;

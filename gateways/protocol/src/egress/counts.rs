@@ -35,7 +35,7 @@ pub enum LocalRefusal {
 
 counts! {
     /// Counters of one channel of an egress bridge. At rest
-    /// `offered = sent + message_failed + refused_count()`.
+    /// `offered = sent + message_failed + refused_count()`, and one more while a long message is under way.
     pub struct EgressChannelCounts {
         /// Messages offered by the local channel.
         offered_count,

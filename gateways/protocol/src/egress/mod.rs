@@ -26,7 +26,7 @@ use crate::body::{
     HELLO_ACK_BODY_BYTES, Hello, HelloAck, HelloStatus, SYNC_BODY_BYTES, SyncResponse,
 };
 use crate::channel::{FlowIdentity, SettingsError};
-use crate::fragment::FRAGMENT_COUNT_MAX;
+use crate::fragment::{FRAGMENT_COUNT_MAX, FragmentPlan};
 use crate::refusal::{Refusal, RefusalCounts};
 use crate::stamps::ArrivalStamps;
 use crate::wire::{
@@ -39,6 +39,9 @@ pub use exchange::RoundTrip;
 use exchange::Exchanges;
 use staging::Staging;
 
+/// A message up to this size is sent in one go. The pieces of a longer one leave between other messages, as
+/// the owner paces them, and its bytes stay with the owner meanwhile.
+pub const STAGED_BYTES_MAX: usize = 65_536;
 /// Time between greetings while the peer has not answered or is down.
 pub const HELLO_PERIOD: Duration = Duration::from_millis(50);
 /// Time between greetings after the peer refused the flow: it may be restarted with other
@@ -201,11 +204,38 @@ pub struct EgressBridge {
     sync_sequence: u64,
     exchanges: Exchanges,
     staging: Staging,
+    long: Option<Long>,
     control: Box<[u8]>,
     last_transmit: Option<LastTransmit>,
     farewell: Farewell,
     counts: EgressCounts,
     refusals: RefusalCounts,
+}
+
+/// A long message under way.
+#[derive(Debug, Clone, Copy)]
+struct Long {
+    channel: usize,
+    /// Of its next piece.
+    header: Header,
+    plan: FragmentPlan,
+    /// Of the piece given last.
+    head: [u8; HEADER_BYTES],
+}
+
+/// One piece of a long message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LongPiece<'a> {
+    /// The bytes before it.
+    pub head: &'a [u8],
+    /// Its own, of the message.
+    pub tail: &'a [u8],
+    /// Index of the channel.
+    pub channel: usize,
+    /// The message's number.
+    pub sequence: u64,
+    /// No further piece follows.
+    pub is_last: bool,
 }
 
 /// What the bridge knows of one channel.
@@ -257,8 +287,9 @@ impl EgressBridge {
             digest: settings.flow.digest(),
             channels: vec![EgressChannel::default(); settings.flow.channels.len()]
                 .into_boxed_slice(),
+            long: None,
             staging: Staging::new(
-                settings.flow.size_max_bytes() as usize,
+                (settings.flow.size_max_bytes() as usize).min(STAGED_BYTES_MAX),
                 settings.payload_budget_bytes(),
             ),
             control: vec![0; settings.control_bytes()].into_boxed_slice(),
@@ -285,29 +316,129 @@ impl EgressBridge {
         envelope: &Envelope,
         payload: &[u8],
     ) -> Result<(), LocalRefusal> {
-        let result = self.check_local(channel, envelope, payload);
-        let own = &mut self.channels[channel];
-        own.counts.offered_count += 1;
-        match result {
-            Ok(()) => {
-                let before = own
-                    .last_message
-                    .replace((envelope.epoch, envelope.sequence));
-                let identity = &self.settings.flow.channels[channel];
-                let mut header = Header::new(Kind::Data, self.settings.session, identity.channel);
-                header.type_hash = identity.type_hash;
-                header.sequence = envelope.sequence;
-                header.published_ns = envelope.published_ns;
-                header.epoch = envelope.epoch;
-                // A follow-up names its message by sequence alone.
-                let follow_up = own.follow_up.take();
-                header.follow_up =
-                    follow_up.filter(|_| before.is_none_or(|(epoch, _)| epoch == envelope.epoch));
-                self.staging.stage(now, channel, header, payload);
-            }
-            Err(refusal) => own.counts.refuse(refusal),
+        let mut result = self.check_local(channel, envelope, payload.len());
+        if result.is_ok() && payload.len() > STAGED_BYTES_MAX {
+            result = Err(LocalRefusal::TooBig {
+                size_bytes: payload.len(),
+                size_max_bytes: STAGED_BYTES_MAX,
+            });
+        }
+        self.count_offered(channel, result);
+        if result.is_ok() {
+            let header = self.message_header(channel, envelope);
+            self.staging.stage(now, channel, header, payload);
         }
         result
+    }
+
+    /// Begins a message of `length_bytes`, which may be above [`STAGED_BYTES_MAX`]; its pieces are then given
+    /// by [`EgressBridge::long_piece`], and other messages may be sent between them.
+    ///
+    /// # Errors
+    /// The message is refused and counted; it will not be sent. One at a time.
+    ///
+    /// # Panics
+    /// When the flow has no such channel.
+    pub fn begin_long(
+        &mut self,
+        channel: usize,
+        envelope: &Envelope,
+        length_bytes: usize,
+    ) -> Result<(), LocalRefusal> {
+        let mut result = self.check_local(channel, envelope, length_bytes);
+        if result.is_ok() && self.long.is_some() {
+            result = Err(LocalRefusal::TransmissionPending);
+        }
+        self.count_offered(channel, result);
+        result?;
+        let plan = FragmentPlan::new(length_bytes, self.settings.payload_budget_bytes())
+            .expect("settings bound the fragments of the largest message");
+        let mut header = self.message_header(channel, envelope);
+        header.total_len = u32::try_from(length_bytes).expect("size_max_bytes is a u32");
+        header.fragment_count = plan.count();
+        self.long = Some(Long {
+            channel,
+            header,
+            plan,
+            head: [0; HEADER_BYTES],
+        });
+        Ok(())
+    }
+
+    /// True while a long message is under way; it ends with its last piece, or with the peer.
+    pub const fn has_long(&self) -> bool {
+        self.long.is_some()
+    }
+
+    /// The next piece of the long message under way, whose bytes are `payload`; the same again until
+    /// [`EgressBridge::on_long_sent`] or [`EgressBridge::on_long_failed`]. `now` becomes its `handed_ns`.
+    pub fn long_piece<'a>(&'a mut self, now: Instant, payload: &'a [u8]) -> Option<LongPiece<'a>> {
+        let long = self.long.as_mut()?;
+        let index = long.header.fragment_index;
+        let range = long.plan.range(index).expect("index is below the count");
+        let mut header = long.header;
+        header.handed_ns = now.as_ns();
+        header.encode(&mut long.head);
+        Some(LongPiece {
+            tail: payload.get(range)?,
+            channel: long.channel,
+            sequence: header.sequence,
+            is_last: index + 1 == long.plan.count(),
+            head: &long.head,
+        })
+    }
+
+    /// The piece given last has left.
+    pub fn on_long_sent(&mut self) {
+        let Some(long) = &mut self.long else {
+            return;
+        };
+        self.counts.datagram_count += 1;
+        let counts = &mut self.channels[long.channel].counts;
+        counts.datagram_count += 1;
+        // A follow-up rides on the first piece.
+        long.header.follow_up = None;
+        long.header.fragment_index += 1;
+        if long.header.fragment_index == long.plan.count() {
+            counts.sent_count += 1;
+            self.long = None;
+        }
+    }
+
+    /// The piece given last could not be sent; the rest of its message is given up.
+    pub fn on_long_failed(&mut self, now: Instant, failure: TransmitFailure) {
+        self.counts.transmit_failed_count += 1;
+        self.abandon_long();
+        if failure == TransmitFailure::PeerUnreachable {
+            self.on_peer_unreachable(now);
+        }
+    }
+
+    fn count_offered(&mut self, channel: usize, result: Result<(), LocalRefusal>) {
+        let counts = &mut self.channels[channel].counts;
+        counts.offered_count += 1;
+        if let Err(refusal) = result {
+            counts.refuse(refusal);
+        }
+    }
+
+    /// Of a message that is taken now.
+    fn message_header(&mut self, channel: usize, envelope: &Envelope) -> Header {
+        let own = &mut self.channels[channel];
+        let before = own
+            .last_message
+            .replace((envelope.epoch, envelope.sequence));
+        let identity = &self.settings.flow.channels[channel];
+        let mut header = Header::new(Kind::Data, self.settings.session, identity.channel);
+        header.type_hash = identity.type_hash;
+        header.sequence = envelope.sequence;
+        header.published_ns = envelope.published_ns;
+        header.epoch = envelope.epoch;
+        // A follow-up names its message by sequence alone.
+        let follow_up = own.follow_up.take();
+        header.follow_up =
+            follow_up.filter(|_| before.is_none_or(|(epoch, _)| epoch == envelope.epoch));
+        header
     }
 
     /// The next datagram to send: fragments of the staged message first, then what is due.
@@ -480,7 +611,7 @@ impl EgressBridge {
         &self,
         channel: usize,
         envelope: &Envelope,
-        payload: &[u8],
+        size_bytes: usize,
     ) -> Result<(), LocalRefusal> {
         if self.farewell != Farewell::Open {
             return Err(LocalRefusal::Closed);
@@ -495,9 +626,9 @@ impl EgressBridge {
             return Err(LocalRefusal::Forwarded);
         }
         let size_max_bytes = self.settings.flow.channels[channel].size_max_bytes as usize;
-        if payload.len() > size_max_bytes {
+        if size_bytes > size_max_bytes {
             return Err(LocalRefusal::TooBig {
-                size_bytes: payload.len(),
+                size_bytes,
                 size_max_bytes,
             });
         }
@@ -603,6 +734,13 @@ impl EgressBridge {
     fn abandon_staged(&mut self) {
         if let Some(channel) = self.staging.abandon() {
             self.channels[channel].counts.message_failed_count += 1;
+        }
+        self.abandon_long();
+    }
+
+    fn abandon_long(&mut self) {
+        if let Some(long) = self.long.take() {
+            self.channels[long.channel].counts.message_failed_count += 1;
         }
     }
 

@@ -4,6 +4,7 @@ use hil_core::message::Envelope;
 use hil_core::time::{Instant, RemoteInstant};
 
 use crate::counts;
+use crate::fragment::GivenUp;
 use crate::sequence::{Order, Stream};
 use crate::wire::{FollowUpField, Header};
 
@@ -36,6 +37,32 @@ impl MessageInfo {
             epoch: self.epoch,
             flags: Envelope::FORWARDED,
             ..Envelope::default()
+        }
+    }
+}
+
+/// A message of which some pieces did not come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Incomplete {
+    /// Who it is; `fragment_count` is of the pieces that came.
+    pub message: MessageInfo,
+    /// When the last of them came.
+    pub heard_at: Instant,
+}
+
+impl Incomplete {
+    pub(super) const fn of(channel: usize, given_up: &GivenUp) -> Self {
+        Self {
+            message: MessageInfo {
+                channel,
+                session: given_up.stream.session,
+                epoch: given_up.stream.epoch,
+                sequence: given_up.sequence,
+                published: RemoteInstant::from_ns(given_up.published_ns),
+                handed: RemoteInstant::from_ns(given_up.handed_ns),
+                fragment_count: given_up.received_count,
+            },
+            heard_at: given_up.heard_at,
         }
     }
 }

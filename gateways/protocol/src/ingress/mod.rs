@@ -15,6 +15,7 @@ mod session;
 
 use core::net::SocketAddr;
 use core::time::Duration;
+use std::collections::VecDeque;
 
 use hil_core::time::Instant;
 
@@ -27,7 +28,7 @@ use super::stamps::ArrivalStamps;
 use super::wire::{self, Body, Header, Kind, Prefix};
 
 pub use delivery::{
-    Delivery, Disposition, FollowUp, IngressChannelCounts, IngressCounts, MessageInfo,
+    Delivery, Disposition, FollowUp, Incomplete, IngressChannelCounts, IngressCounts, MessageInfo,
 };
 pub use replies::ReplyCounts;
 
@@ -54,8 +55,7 @@ pub struct IngressSettings {
     pub clock_id: u64,
     /// Incomplete messages held at a time for each channel; the oldest gives way.
     pub reassembly_slots: usize,
-    /// An incomplete message older than this is given up; one period of the channel is a good
-    /// value.
+    /// An incomplete message of which no piece came for so long is given up.
     pub reassembly_timeout: Duration,
     /// True to deliver a message that is new but older than one already delivered; false for
     /// newest-wins.
@@ -115,6 +115,8 @@ pub struct IngressBridge {
     channels: Box<[IngressChannel]>,
     /// Indices of the channels with incomplete messages.
     split: Vec<usize>,
+    /// Messages given up, until the owner takes them.
+    incomplete: VecDeque<Incomplete>,
     sessions: Sessions,
     replies: Replies,
     counts: IngressCounts,
@@ -151,6 +153,19 @@ impl IngressChannel {
     }
 }
 
+/// Messages given up that may wait for the owner; older ones give way.
+const INCOMPLETE_MAX: usize = 64;
+
+/// Puts what `reassembler` gave up of `channel` where the owner finds it.
+fn collect(incomplete: &mut VecDeque<Incomplete>, reassembler: &mut Reassembler, channel: usize) {
+    while let Some(given_up) = reassembler.next_given_up() {
+        if incomplete.len() == INCOMPLETE_MAX {
+            incomplete.pop_front();
+        }
+        incomplete.push_back(Incomplete::of(channel, &given_up));
+    }
+}
+
 /// A datagram on its way through the checks.
 #[derive(Clone, Copy)]
 struct Request<'a> {
@@ -177,6 +192,7 @@ impl IngressBridge {
                 .map(|identity| IngressChannel::new(identity, &settings))
                 .collect(),
             split: Vec::with_capacity(settings.flow.channels.len()),
+            incomplete: VecDeque::with_capacity(INCOMPLETE_MAX),
             sessions: Sessions::new(),
             replies: Replies::new(&settings),
             counts: IngressCounts::default(),
@@ -245,6 +261,12 @@ impl IngressBridge {
     /// Ends the accounting: outstanding gaps become losses and incomplete messages are given up.
     pub fn finish(&mut self) {
         self.clear_channels();
+    }
+
+    /// A message that was given up because some of its pieces did not come. Ask until `None` after every
+    /// datagram and wake-up, and at the end.
+    pub fn next_incomplete(&mut self) -> Option<Incomplete> {
+        self.incomplete.pop_front()
     }
 
     /// Session that greeted last, if one has.
@@ -418,16 +440,20 @@ impl IngressBridge {
 
     /// Gives up incomplete messages whose time is up.
     fn expire(&mut self, now: Instant) {
-        let channels = &mut self.channels;
+        let (channels, incomplete) = (&mut self.channels, &mut self.incomplete);
         self.split.retain(|&channel| {
             let reassembler = &mut channels[channel].reassembler;
             reassembler.expire(now);
+            collect(incomplete, reassembler, channel);
             reassembler.open_count() > 0
         });
     }
 
     fn clear_channels(&mut self) {
-        self.channels.iter_mut().for_each(IngressChannel::clear);
+        for (index, channel) in self.channels.iter_mut().enumerate() {
+            channel.clear();
+            collect(&mut self.incomplete, &mut channel.reassembler, index);
+        }
         self.split.clear();
     }
 
@@ -509,10 +535,12 @@ impl IngressBridge {
             total_len: header.total_len,
             index: header.fragment_index,
             count: header.fragment_count,
+            published_ns: header.published_ns,
             handed_ns: header.handed_ns,
             payload,
         };
         let Some(assembled) = own.reassembler.insert(request.now, &fragment)? else {
+            collect(&mut self.incomplete, &mut own.reassembler, channel);
             if !self.split.contains(&channel) {
                 self.split.push(channel);
             }

@@ -112,9 +112,18 @@ impl Initiator {
     /// # Panics
     /// When `out` is not 16 bytes longer than `datagram`.
     pub fn seal(&mut self, datagram: &[u8], out: &mut [u8]) -> Option<usize> {
+        self.seal_parts(datagram, &[], out)
+    }
+
+    /// As [`Initiator::seal`], of a datagram that lies in two places.
+    ///
+    /// # Panics
+    /// When `out` is not 16 bytes longer than both.
+    pub fn seal_parts(&mut self, head: &[u8], tail: &[u8], out: &mut [u8]) -> Option<usize> {
         let traffic = self.traffic.as_mut()?;
-        let length = datagram.len() + TAG_BYTES;
-        out[..datagram.len()].copy_from_slice(datagram);
+        let length = head.len() + tail.len() + TAG_BYTES;
+        out[..head.len()].copy_from_slice(head);
+        out[head.len()..][..tail.len()].copy_from_slice(tail);
         traffic.forward.seal(&mut out[..length]);
         self.counts.sealed_count += 1;
         Some(length)

@@ -256,3 +256,141 @@ fn the_answer_to_a_greeting_of_other_channels_is_no_acceptance() {
     let event = pair.egress.on_datagram(now, arrival, &reply);
     assert!(matches!(event, Ok(EgressEvent::Refused(_))), "{event:?}");
 }
+
+/// A flow of a long channel and a short one, both established.
+fn long_pair() -> (EgressBridge, IngressBridge) {
+    let flow = FlowIdentity {
+        flow: 65_535,
+        name: "link/hop/forward".to_owned(),
+        channels: vec![
+            ChannelIdentity::new(0, "camera/image", "test.Image.v1", 4 << 20, 8),
+            ChannelIdentity::new(1, "arm/command", "test.Command.v1", 16, 8),
+        ],
+    };
+    let mut egress = EgressBridge::new(EgressSettings {
+        flow: flow.clone(),
+        ..egress_settings(100, 0)
+    })
+    .unwrap();
+    let mut ingress = IngressBridge::new(IngressSettings {
+        flow,
+        ..ingress_settings(200, 0)
+    })
+    .unwrap();
+    let now = Instant::from_ns(1_000_000);
+    let arrival = ArrivalStamps::application(now.as_ns());
+    let hello = egress.poll_transmit(now).unwrap().datagram.to_vec();
+    ingress
+        .on_datagram(now, arrival, &hello, &mut |_| {})
+        .unwrap();
+    let answer = ingress.poll_transmit(now).unwrap().datagram.to_vec();
+    egress.on_datagram(now, arrival, &answer).unwrap();
+    (egress, ingress)
+}
+
+/// Sends a long message with a short one after every hundredth piece, and loses the pieces that `is_lost`.
+/// What was delivered: its channel and its bytes.
+fn send_long(
+    egress: &mut EgressBridge,
+    ingress: &mut IngressBridge,
+    image: &[u8],
+    is_lost: impl Fn(usize) -> bool,
+) -> Vec<(usize, Vec<u8>)> {
+    let now = Instant::from_ns(2_000_000);
+    let arrival = ArrivalStamps::application(now.as_ns());
+    let mut delivered = Vec::new();
+    let mut deliver = |one: crate::Delivery<'_>| {
+        delivered.push((one.message.channel, one.payload.to_vec()));
+    };
+    let envelope = Envelope::default();
+    egress.begin_long(0, &envelope, image.len()).unwrap();
+    let again = egress.begin_long(0, &envelope, image.len());
+    assert_eq!(again, Err(crate::LocalRefusal::TransmissionPending));
+    let mut piece_count = 0;
+    let mut short_count = 0;
+    while let Some(piece) = egress.long_piece(now, image) {
+        let mut datagram = piece.head.to_vec();
+        datagram.extend_from_slice(piece.tail);
+        assert!(datagram.len() <= 1472 - 16);
+        assert_eq!(
+            egress.long_piece(now, image).unwrap().tail.len(),
+            datagram.len() - HEADER_BYTES
+        );
+        if !is_lost(piece_count) {
+            ingress
+                .on_datagram(now, arrival, &datagram, &mut deliver)
+                .unwrap();
+        }
+        egress.on_long_sent();
+        piece_count += 1;
+        if piece_count % 100 == 0 {
+            let envelope = Envelope {
+                sequence: short_count,
+                ..Envelope::default()
+            };
+            short_count += 1;
+            egress.on_local(now, 1, &envelope, &[5; 16]).unwrap();
+            let short = egress.poll_transmit(now).unwrap().datagram.to_vec();
+            ingress
+                .on_datagram(now, arrival, &short, &mut deliver)
+                .unwrap();
+        }
+    }
+    assert!(!egress.has_long());
+    assert_eq!(piece_count, image.len().div_ceil(1384));
+    delivered
+}
+
+#[test]
+fn a_long_message_leaves_between_short_ones_and_arrives_whole() {
+    let (mut egress, mut ingress) = long_pair();
+    let image: Vec<u8> = (0..4_u32 << 20)
+        .map(|at| (at % 251).to_le_bytes()[0])
+        .collect();
+    let delivered = send_long(&mut egress, &mut ingress, &image, |_| false);
+    let (last, short) = delivered.split_last().unwrap();
+    assert_eq!(short.len(), 30, "they came before it was whole");
+    assert!(short.iter().all(|one| *one == (1, vec![5; 16])));
+    assert_eq!(last.0, 0);
+    assert!(last.1 == image);
+    assert_eq!(egress.channel_counts(0).sent_count, 1);
+    assert_eq!(ingress.next_incomplete(), None);
+    // It is too long to be staged as others are.
+    let now = Instant::from_ns(3_000_000);
+    let envelope = Envelope::default();
+    let refused = egress.on_local(now, 0, &envelope, &image).unwrap_err();
+    assert!(matches!(refused, crate::LocalRefusal::TooBig { .. }));
+}
+
+#[test]
+fn a_long_message_of_which_a_piece_is_missing_is_given_up_with_what_came() {
+    let (mut egress, mut ingress) = long_pair();
+    let image = vec![9; 1 << 20];
+    let delivered = send_long(&mut egress, &mut ingress, &image, |piece| piece == 500);
+    assert!(delivered.iter().all(|(channel, _)| *channel == 1));
+    let due = ingress.next_wakeup().unwrap();
+    assert_eq!(due, Instant::from_ns(2_000_000 + 100_000_000));
+    assert_eq!(ingress.next_incomplete(), None);
+    ingress.on_wakeup(due);
+    let incomplete = ingress.next_incomplete().unwrap();
+    assert_eq!(incomplete.message.channel, 0);
+    assert_eq!(
+        usize::from(incomplete.message.fragment_count),
+        image.len().div_ceil(1384) - 1
+    );
+    assert_eq!(incomplete.heard_at, Instant::from_ns(2_000_000));
+    assert_eq!(ingress.next_incomplete(), None);
+    assert_eq!(ingress.reassembly_counts(0).timed_out_count, 1);
+}
+
+#[test]
+fn a_peer_that_goes_takes_the_long_message_with_it() {
+    let (mut egress, _ingress) = long_pair();
+    let now = Instant::from_ns(2_000_000);
+    egress.begin_long(0, &Envelope::default(), 1 << 20).unwrap();
+    egress.on_peer_unreachable(now);
+    assert!(!egress.has_long());
+    assert_eq!(egress.long_piece(now, &[0; 1 << 20]), None);
+    let counts = egress.channel_counts(0);
+    assert_eq!((counts.offered_count, counts.message_failed_count), (1, 1));
+}

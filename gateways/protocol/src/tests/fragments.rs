@@ -25,6 +25,7 @@ fn pieces(sequence: u64, message: &[u8], budget: usize) -> Vec<Fragment<'_>> {
             index,
             count: plan.count(),
             handed_ns: 100 + i64::from(index),
+            published_ns: 0,
             payload: &message[plan.range(index).unwrap()],
         })
         .collect()

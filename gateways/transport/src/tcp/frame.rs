@@ -148,9 +148,9 @@ impl Backlog {
         &self.buffer[self.start..self.end]
     }
 
-    /// Adds both parts, or nothing when there is no room for both; says whether there was.
-    pub(super) fn push(&mut self, parts: [&[u8]; 2]) -> bool {
-        let added = parts[0].len() + parts[1].len();
+    /// Adds all parts, or nothing when there is no room for all; says whether there was.
+    pub(super) fn push(&mut self, parts: [&[u8]; 3]) -> bool {
+        let added = parts.iter().map(|part| part.len()).sum::<usize>();
         if self.len_bytes() + added > self.buffer.len() {
             return false;
         }

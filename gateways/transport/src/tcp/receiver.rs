@@ -118,7 +118,7 @@ impl DatagramReceiver for TcpReceiver {
 
     /// There is one way back, so `to` is not looked at.
     fn reply(&mut self, datagram: &[u8], _to: SocketAddr) -> Result<(), SendRefusal> {
-        let sent = self.stream.send(datagram);
+        let sent = self.stream.send(datagram, &[]);
         match sent {
             Ok(()) => self.counters.reply_count += 1,
             Err(_) => self.counters.reply_refused_count += 1,

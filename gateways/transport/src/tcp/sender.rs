@@ -161,7 +161,11 @@ impl TcpSender {
 
 impl DatagramSender for TcpSender {
     fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
-        match self.stream.send(datagram) {
+        self.send_parts(datagram, &[])
+    }
+
+    fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal> {
+        match self.stream.send(head, tail) {
             Ok(()) => {
                 let low = self.counters.sent_count & u64::from(u32::MAX);
                 self.counters.sent_count += 1;
@@ -228,6 +232,15 @@ impl DatagramSender for TcpSender {
             Way::Waiting { due } => Some(*due),
             Way::Connecting { since, .. } => Some(*since + CONNECT_PATIENCE),
             Way::Up => self.stream.next_look(),
+        }
+    }
+
+    /// What the kernel does not take waits here, and everything else behind it.
+    fn queued_bytes(&self) -> usize {
+        if self.stream.has_backlog() {
+            usize::MAX
+        } else {
+            0
         }
     }
 

@@ -165,12 +165,12 @@ impl Stream {
         self.watch.on_lost(now);
     }
 
-    /// Gives one datagram to the kernel, or keeps what the kernel does not take.
+    /// Gives one datagram, which lies in two places, to the kernel, or keeps what the kernel does not take.
     ///
     /// # Errors
     /// When it is too long, there is no connection or no room; it was not sent then, in no part.
-    pub(super) fn send(&mut self, datagram: &[u8]) -> Result<(), SendRefusal> {
-        let length_bytes = datagram.len();
+    pub(super) fn send(&mut self, head: &[u8], tail: &[u8]) -> Result<(), SendRefusal> {
+        let length_bytes = head.len() + tail.len();
         let prefix = prefix(length_bytes).ok_or(SendRefusal::TooLong { length_bytes })?;
         if !self.backlog.is_empty() {
             let now = now();
@@ -182,7 +182,7 @@ impl Stream {
         let whole = prefix.len() + length_bytes;
         let mut taken = 0;
         if self.backlog.is_empty() {
-            let parts = [IoSlice::new(&prefix), IoSlice::new(datagram)];
+            let parts = [&prefix, head, tail].map(IoSlice::new);
             match socket.send_vectored_with_flags(&parts, libc::MSG_DONTWAIT | libc::MSG_NOSIGNAL) {
                 Ok(count) => taken = count,
                 Err(error) if is_for_later(&error) => {}
@@ -195,10 +195,12 @@ impl Stream {
         }
         let now = now();
         if taken < whole {
-            let rest = [
-                prefix.get(taken..).unwrap_or_default(),
-                &datagram[taken.saturating_sub(prefix.len())..],
-            ];
+            let mut left = taken;
+            let rest = [&prefix, head, tail].map(|part| {
+                let skipped = left.min(part.len());
+                left -= skipped;
+                &part[skipped..]
+            });
             if !self.backlog.push(rest) {
                 // Nothing of it was taken: the rest of a frame always fits, as nothing else waits.
                 let errno = libc::ENOBUFS;

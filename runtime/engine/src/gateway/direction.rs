@@ -191,6 +191,7 @@ impl OpenDirection {
                 },
             ) => BridgeLoop::Egress(Box::new(Egress {
                 inputs: Inputs::open(&around.domain, &launch.channels, launch.wait)?,
+                long: None,
                 bridge: egress_bridge(datagram_max_bytes, launch, around)?,
                 line: Line::new(sender, messages, round_trips, around.session, self.plan)?,
                 wait: WaitStrategy::new(launch.wait),

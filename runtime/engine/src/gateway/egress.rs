@@ -5,19 +5,21 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use hil_core::message::Envelope;
-use hil_core::record::{EgressRecord, RoundTripRecord, UNAVAILABLE};
+use hil_core::record::RoundTripRecord;
 use hil_core::time::Instant;
 use hil_protocol::egress::RoundTrip;
 use hil_protocol::{EgressBridge, EgressEvent, LocalRefusal, PeerState};
 
-use super::inputs::Inputs;
+use super::inputs::{Inputs, Look};
 use super::line::Line;
+use super::long_message::LongMessage;
 use super::refusal_backoff::RefusalBackoff;
 use super::stamp_tracker::STAMP_PATIENCE_NS;
 use super::{WorkerError, poll_descriptors};
 use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy};
+use hil_shm::HeldMessage;
 
 /// Longer than any reply; what is longer is no reply and is cut.
 const REPLY_BYTES_MAX: usize = 1024;
@@ -27,6 +29,8 @@ const REPLY_BYTES_MAX: usize = 1024;
 pub(crate) struct Egress {
     /// Where messages come from; empty on a clock path, which carries none.
     pub(super) inputs: Inputs,
+    /// A message that is too long to be sent in one go, while its pieces leave.
+    pub(super) long: Option<LongMessage>,
     pub(crate) bridge: EgressBridge,
     pub(crate) line: Line,
     pub(crate) wait: WaitStrategy,
@@ -65,6 +69,9 @@ impl Egress {
             }
             heartbeat.beat();
         }
+        if let Some(mut long) = self.long.take() {
+            long.end(&mut self.line);
+        }
         self.bridge.bye();
         self.line.transmit(&mut self.bridge);
         self.line.settle(&mut self.bridge)?;
@@ -74,7 +81,7 @@ impl Egress {
     /// Sends one waiting message, or else looks after stamps, replies and appointments; false when
     /// no message waited and no channel is to be looked at.
     pub(crate) fn step(&mut self) -> Result<bool, WorkerError> {
-        let moved = self.forward()?;
+        let moved = self.forward()? | self.push_long();
         if moved && !self.attention.is_overdue {
             // A producer faster than the socket must not keep replies and orders waiting for ever.
             let now = self.line.newest_handed;
@@ -112,6 +119,38 @@ impl Egress {
         is_established && (!self.inputs.is_empty() || self.bridge.counts().round_trip_count > 1)
     }
 
+    /// Sends some pieces of the long message under way; false when there is none, or enough of it is on its
+    /// way.
+    fn push_long(&mut self) -> bool {
+        let Some(long) = &mut self.long else {
+            return false;
+        };
+        let has_moved = long.push(&mut self.bridge, &mut self.line);
+        if !self.bridge.has_long() {
+            let channel = long.end(&mut self.line);
+            let sent_count = self.bridge.channel_counts(channel).sent_count;
+            self.sent[channel].store(sent_count, Ordering::Relaxed);
+            self.long = None;
+            self.inputs.resume_long();
+        }
+        has_moved
+    }
+
+    /// Begins to send the message of `channel` that was taken at `taken`.
+    fn begin_long(&mut self, taken: Instant, channel: usize, held: HeldMessage) {
+        let envelope = held.envelope();
+        let record = self.line.record_of(taken, &envelope);
+        let begun = self
+            .bridge
+            .begin_long(channel, &envelope, held.payload().len());
+        match begun {
+            Ok(()) => self.long = Some(LongMessage::new(channel, held, record)),
+            // Another gateway's message: not this gateway's to account for.
+            Err(LocalRefusal::Forwarded) => {}
+            Err(_counted) => self.line.finish_refused(channel, record),
+        }
+    }
+
     /// Sends the oldest message of the channel whose turn it is; false when it had none.
     fn forward(&mut self) -> Result<bool, WorkerError> {
         let Self {
@@ -125,19 +164,7 @@ impl Egress {
         let take = |channel: usize, envelope: &Envelope, payload: &[u8]| {
             let taken = MonotonicClock::now();
             wait.on_arrival(taken);
-            let record = EgressRecord {
-                sequence: envelope.sequence,
-                published_ns: envelope.published_ns,
-                taken_ns: taken.as_ns(),
-                handed_ns: UNAVAILABLE,
-                tx_software_ns: UNAVAILABLE,
-                tx_hardware_ns: UNAVAILABLE,
-                realtime_offset_ns: line.clock.offset_ns(),
-                epoch: envelope.epoch,
-                session: line.session,
-                flags: 0,
-                fragment_count: 0,
-            };
+            let record = line.record_of(taken, envelope);
             match bridge.on_local(taken, channel, envelope, payload) {
                 Ok(()) => {
                     line.message = Some(record);
@@ -147,16 +174,19 @@ impl Egress {
                 }
                 // Another gateway's message: not this gateway's to account for.
                 Err(LocalRefusal::Forwarded) => {}
-                Err(_counted) => line.finish(
-                    channel,
-                    EgressRecord {
-                        flags: EgressRecord::REFUSED_BY_KERNEL,
-                        ..record
-                    },
-                ),
+                Err(_counted) => line.finish_refused(channel, record),
             }
         };
-        Ok(inputs.receive(take)?)
+        match inputs.receive(self.long.is_none(), take)? {
+            Look::Empty => Ok(false),
+            Look::Message => Ok(true),
+            Look::Long(channel, held) => {
+                let taken = MonotonicClock::now();
+                self.wait.on_arrival(taken);
+                self.begin_long(taken, channel, held);
+                Ok(true)
+            }
+        }
     }
 
     /// Takes the peer's replies.
@@ -213,7 +243,11 @@ impl Egress {
     /// Waits for a message, a stamp, a reply or an appointment.
     pub(crate) fn rest(&mut self) -> Result<(), WorkerError> {
         let now = MonotonicClock::now();
-        let dues = [self.bridge.next_wakeup(), self.line.sender.next_due()];
+        let dues = [
+            self.bridge.next_wakeup(),
+            self.line.sender.next_due(),
+            self.long.as_ref().map(LongMessage::due),
+        ];
         let mut due = dues.into_iter().flatten().min();
         if self.line.awaits_stamps() {
             // A stamp makes the socket readable, but an overdue one must be given up in time.

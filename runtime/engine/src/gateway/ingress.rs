@@ -11,7 +11,7 @@ use hil_core::time::Instant;
 use hil_protocol::ingress::{FollowUp, MessageInfo};
 use hil_protocol::sequence::Order;
 use hil_protocol::wire::Kind;
-use hil_protocol::{Delivery, Disposition, IngressBridge};
+use hil_protocol::{Delivery, Disposition, Incomplete, IngressBridge};
 use hil_transport::{DatagramReceiver, Received};
 
 use super::kernel_clock::KernelClock;
@@ -104,7 +104,31 @@ impl Ingress {
             heartbeat.beat();
         }
         self.bridge.finish();
+        self.note_incomplete();
         Ok(())
+    }
+
+    /// Records the messages of which some pieces did not come.
+    fn note_incomplete(&mut self) {
+        while let Some(Incomplete { message, heard_at }) = self.bridge.next_incomplete() {
+            let record = IngressRecord {
+                sequence: message.sequence,
+                published_ns: message.published.as_ns(),
+                handed_ns: message.handed.as_ns(),
+                rx_hardware_ns: UNAVAILABLE,
+                rx_software_ns: UNAVAILABLE,
+                received_ns: heard_at.as_ns(),
+                forwarded_ns: UNAVAILABLE,
+                realtime_offset_ns: self.clock.offset_ns(),
+                emulated_ns: UNAVAILABLE,
+                due_ns: UNAVAILABLE,
+                epoch: message.epoch,
+                session: message.session,
+                flags: IngressRecord::INCOMPLETE,
+                fragment_count: u32::from(message.fragment_count),
+            };
+            self.outputs[message.channel].messages.push(&record);
+        }
     }
 
     /// Delivers one waiting datagram, or else does what is due; false when none waited. Asking
@@ -121,6 +145,7 @@ impl Ingress {
         }
         let now = MonotonicClock::now();
         self.bridge.on_wakeup(now);
+        self.note_incomplete();
         self.take_response_stamp(now);
         self.receiver.attend(now);
         self.clock.refresh(now);
@@ -173,6 +198,7 @@ impl Ingress {
         if let Ok(disposition) = bridge.on_datagram(at, stamps, bytes, &mut deliver) {
             note_undelivered(outputs, &arrival, disposition);
         }
+        self.note_incomplete();
         failed.map_or(Ok(Some(at)), |error| Err(error.into()))
     }
 

@@ -6,8 +6,9 @@ use std::os::fd::BorrowedFd;
 
 use hil_core::message::Envelope;
 use hil_platform::wait::WaitMode;
+use hil_protocol::egress::STAGED_BYTES_MAX;
 use hil_rundir::launch::ChannelLaunch;
-use hil_shm::{ChannelError, Domain, RawInput, Waiter};
+use hil_shm::{ChannelError, Domain, HeldMessage, RawInput, Waiter};
 
 /// The channels of one sending thread, by their index in its flow.
 #[derive(Debug)]
@@ -17,11 +18,26 @@ pub(super) struct Inputs {
     waiter: Option<Waiter>,
     /// Those that may have a message, each once, the next one first.
     due: VecDeque<usize>,
+    /// Channels with long messages that wait for the one under way.
+    waiting: Vec<usize>,
+}
+
+/// What a look at the next channel found.
+#[derive(Debug)]
+pub(super) enum Look {
+    /// Nothing.
+    Empty,
+    /// A message, which was handed over.
+    Message,
+    /// A long message of the channel with this index.
+    Long(usize, HeldMessage),
 }
 
 #[derive(Debug)]
 struct Input {
     port: RawInput,
+    /// Its messages are too long to be sent in one go.
+    is_long: bool,
     is_due: bool,
     /// Its announcements are to be taken back.
     is_announced: bool,
@@ -40,6 +56,7 @@ impl Inputs {
         let open = |one: &ChannelLaunch| {
             Ok(Input {
                 port: RawInput::open(domain, &one.channel, one.depth)?,
+                is_long: one.size_bytes > STAGED_BYTES_MAX,
                 is_due: true,
                 is_announced: false,
             })
@@ -54,6 +71,7 @@ impl Inputs {
                 .then(|| Waiter::open(domain, &names))
                 .transpose()?,
             due: (0..channels.len()).collect(),
+            waiting: Vec::with_capacity(channels.len()),
         })
     }
 
@@ -72,28 +90,50 @@ impl Inputs {
         self.waiter.is_none() || self.channels.len() == 1
     }
 
-    /// Hands the oldest message of the next channel to `take`; false when it had none.
+    /// Looks at the next channel and hands its oldest message to `take`, or gives it where it is long and
+    /// `takes_long`; without that, the channel waits for [`Inputs::resume_long`].
     ///
     /// # Errors
     /// When the channel is broken.
     pub(super) fn receive(
         &mut self,
+        takes_long: bool,
         mut take: impl FnMut(usize, &Envelope, &[u8]),
-    ) -> Result<bool, ChannelError> {
+    ) -> Result<Look, ChannelError> {
         let Some(index) = self.due.pop_front() else {
-            return Ok(false);
+            return Ok(Look::Empty);
         };
         let is_always_looked_at = self.is_always_looked_at();
         let input = &mut self.channels[index];
-        let has_moved = input
-            .port
-            .receive(&mut |envelope, payload| take(index, envelope, payload))?;
+        if input.is_long && !takes_long {
+            self.waiting.push(index);
+            return Ok(Look::Empty);
+        }
+        let look = if input.is_long {
+            let held = input.port.hold()?;
+            held.map_or(Look::Empty, |held| Look::Long(index, held))
+        } else {
+            let has_moved = input
+                .port
+                .receive(&mut |envelope, payload| take(index, envelope, payload))?;
+            if has_moved {
+                Look::Message
+            } else {
+                Look::Empty
+            }
+        };
         // A message may follow, or come before its announcement is taken back.
+        let has_moved = !matches!(look, Look::Empty);
         input.is_due = has_moved || input.is_announced || is_always_looked_at;
         if input.is_due {
             self.due.push_back(index);
         }
-        Ok(has_moved)
+        Ok(look)
+    }
+
+    /// The long message is no longer under way: those that waited for it are looked at again.
+    pub(super) fn resume_long(&mut self) {
+        self.due.extend(self.waiting.drain(..));
     }
 
     /// Takes back the announcements of the channel that was found empty last; false when it had none. A
@@ -127,6 +167,7 @@ impl Inputs {
             channels,
             waiter,
             due,
+            ..
         } = self;
         let Some(waiter) = waiter else {
             return Ok(());

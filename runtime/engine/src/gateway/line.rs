@@ -3,13 +3,14 @@
 
 use std::time::Duration;
 
+use hil_core::message::Envelope;
 use hil_core::record::{EgressRecord, UNAVAILABLE};
 use hil_core::time::Instant;
 use hil_net::radio::RadioReport;
 use hil_net::{TransmitStage, TransmitStamp, TxToken};
 use hil_protocol::egress::TransmitFailure;
 use hil_protocol::wire::Kind;
-use hil_protocol::{EgressBridge, PeerState};
+use hil_protocol::{EgressBridge, LongPiece, PeerState};
 use hil_transport::{DatagramSender, SendRefusal};
 
 use super::kernel_clock::KernelClock;
@@ -133,8 +134,7 @@ impl Line {
                     let is_established = bridge.peer_state() == PeerState::Established;
                     bridge.on_transmit_failed(handed, failure(refusal, is_established));
                     if let Some((channel, record)) = channel.zip(record) {
-                        let flags = EgressRecord::REFUSED_BY_KERNEL;
-                        self.finish(channel, EgressRecord { flags, ..record });
+                        self.finish_refused(channel, record);
                     }
                 }
             }
@@ -162,7 +162,7 @@ impl Line {
 
     /// Takes the stamps that are still to come, as far as they have come; asks no further, as
     /// each look is a system call.
-    fn take_due_stamps(&mut self, bridge: &mut EgressBridge) {
+    pub(super) fn take_due_stamps(&mut self, bridge: &mut EgressBridge) {
         while self.awaits_stamps() && self.take_stamp(bridge) {}
     }
 
@@ -263,8 +263,54 @@ impl Line {
         }
     }
 
+    /// Of a message taken at `taken`, nothing of which has left yet.
+    pub(super) fn record_of(&self, taken: Instant, envelope: &Envelope) -> EgressRecord {
+        EgressRecord {
+            sequence: envelope.sequence,
+            published_ns: envelope.published_ns,
+            taken_ns: taken.as_ns(),
+            handed_ns: UNAVAILABLE,
+            tx_software_ns: UNAVAILABLE,
+            tx_hardware_ns: UNAVAILABLE,
+            realtime_offset_ns: self.clock.offset_ns(),
+            epoch: envelope.epoch,
+            session: self.session,
+            flags: 0,
+            fragment_count: 0,
+        }
+    }
+
     pub(super) fn finish(&mut self, channel: usize, record: EgressRecord) {
         self.records[channel].push(&record);
+    }
+
+    /// Of a message that did not leave, or not as a whole.
+    pub(super) fn finish_refused(&mut self, channel: usize, record: EgressRecord) {
+        let flags = EgressRecord::REFUSED_BY_KERNEL;
+        self.finish(channel, EgressRecord { flags, ..record });
+    }
+
+    /// Hands a piece of a long message over; `record` is the message's with its last piece.
+    pub(super) fn send_piece(
+        &mut self,
+        piece: &LongPiece<'_>,
+        handed: Instant,
+        record: Option<EgressRecord>,
+    ) -> Result<(), SendRefusal> {
+        self.newest_handed = handed;
+        let token = self.sender.send_parts(piece.head, piece.tail)?;
+        let pending = Pending {
+            kind: Kind::Data,
+            channel: Some(piece.channel),
+            sequence: piece.sequence,
+            handed,
+            record,
+            is_stamped: false,
+            is_nic_stamped: false,
+            is_reported: false,
+        };
+        self.expect_stamp(token, pending);
+        Ok(())
     }
 
     /// How long a datagram may wait for what is still to come of it.
@@ -331,7 +377,7 @@ fn note_software(record: &mut EgressRecord, software_ns: i64, is_departure: bool
 
 /// What a refusal means for the conversation. That there is no connection yet says nothing of a
 /// peer that has not been heard of; that there is none any more says that it is gone.
-fn failure(refusal: SendRefusal, is_established: bool) -> TransmitFailure {
+pub(super) fn failure(refusal: SendRefusal, is_established: bool) -> TransmitFailure {
     match refusal {
         SendRefusal::PeerRefused | SendRefusal::Unreachable { .. } => {
             TransmitFailure::PeerUnreachable

@@ -5,7 +5,7 @@
 //! - `process`: what the process opens: one thread and one socket each way, however many channels.
 //! - [`direction`]: one of them from its launch description to its final counters.
 //! - `egress`: shared memory to network; `ingress`: network to shared memory.
-//! - `inputs`: which channel's message goes next.
+//! - `inputs`: which channel's message goes next; `long_message`: one that leaves in many turns.
 //! - `refusal_backoff`: what both do about a flood of datagrams that they refuse.
 
 mod connection;
@@ -18,6 +18,7 @@ pub(crate) mod kernel_clock;
 mod line;
 pub(crate) mod link_control;
 mod link_switch;
+mod long_message;
 pub(crate) mod process;
 mod refusal_backoff;
 pub(crate) mod socket;
