@@ -22,8 +22,10 @@ const STATUS_CHARS_MAX: usize = 400;
 const EXTENSION: Duration = Duration::from_secs(30);
 /// How often it asks.
 const EXTENSION_PERIOD: Duration = Duration::from_secs(8);
-/// How often in all: for ten minutes. After that the manager ends the service.
-const EXTENSION_COUNT: u32 = 75;
+/// How often in a row without progress: for ten minutes. After that the manager ends the service.
+const IDLE_COUNT_MAX: u32 = 75;
+/// A process that reads and writes less between two looks makes no progress: about what the console takes.
+const PROGRESS_BYTES: u64 = 4096;
 // A manager that misses two hears the third in time.
 const _: () = assert!(3 * EXTENSION_PERIOD.as_secs() < EXTENSION.as_secs());
 
@@ -94,8 +96,8 @@ impl ServiceManager {
     }
 
     /// It is ending; no tick is due any more. A thread of its own says so until it is heard, and asks
-    /// for more time to stop until the process is gone, for ten minutes at most: neither a slow peer nor
-    /// a slow disk keeps an extension back.
+    /// for more time to stop until the process is gone, or has read and written nothing for ten minutes:
+    /// neither a slow peer nor a slow disk keeps an extension back, and a process that hangs is ended.
     ///
     /// # Errors
     /// When there is no thread: then the unit's own time to stop is all there is.
@@ -108,7 +110,11 @@ impl ServiceManager {
         let socket = self.socket.try_clone()?;
         thread::Builder::new()
             .name("ending".to_owned())
-            .spawn(move || extend(&socket, is_said, EXTENSION_PERIOD, EXTENSION_COUNT))?;
+            .spawn(move || {
+                let mut moved = MovedBytes::default();
+                let look = || moved.look();
+                extend(&socket, is_said, EXTENSION_PERIOD, IDLE_COUNT_MAX, look);
+            })?;
         Ok(())
     }
 
@@ -118,14 +124,50 @@ impl ServiceManager {
 }
 
 /// Says that the service ends, where that has not been heard, and asks for more time to stop: every
-/// `period`, `count` times.
-fn extend(socket: &UnixDatagram, mut is_said: bool, period: Duration, count: u32) {
+/// `period`, until `moved_bytes` has hardly grown for `idle_count_max` periods in a row.
+fn extend(
+    socket: &UnixDatagram,
+    mut is_said: bool,
+    period: Duration,
+    idle_count_max: u32,
+    mut moved_bytes: impl FnMut() -> u64,
+) {
     let word = format!("EXTEND_TIMEOUT_USEC={}", EXTENSION.as_micros());
-    for _ in 0..count {
+    let mut idle_count = 0;
+    let mut known_bytes = moved_bytes();
+    while idle_count < idle_count_max {
         is_said = is_said || socket.send(b"STOPPING=1").is_ok();
         // One that finds no room is followed by the next.
         let _is_heard = socket.send(word.as_bytes()).is_ok();
         thread::sleep(period);
+        let now_bytes = moved_bytes();
+        if now_bytes.saturating_sub(known_bytes) < PROGRESS_BYTES {
+            idle_count += 1;
+        } else {
+            (idle_count, known_bytes) = (0, now_bytes);
+        }
+    }
+}
+
+/// What this process has read from files and written to them.
+#[derive(Debug, Default)]
+struct MovedBytes {
+    /// By looking.
+    own: u64,
+}
+
+impl MovedBytes {
+    /// So far, bytes; 0 where the kernel does not count.
+    fn look(&mut self) -> u64 {
+        let text = std::fs::read_to_string("/proc/self/io").unwrap_or_default();
+        let counts = text.lines().filter_map(|line| {
+            let (name, count) = line.split_once(": ")?;
+            let count: u64 = count.parse().ok()?;
+            matches!(name, "rchar" | "wchar").then_some(count)
+        });
+        let moved = counts.sum::<u64>().saturating_sub(self.own);
+        self.own += text.len() as u64;
+        moved
     }
 }
 
@@ -205,10 +247,30 @@ mod tests {
             thread::yield_now();
         }
         // The thread asks again in 8 s.
-        extend(&manager.socket, true, Duration::from_millis(1), 3);
+        let at_once = Duration::from_millis(1);
+        extend(&manager.socket, true, at_once, 3, || 0);
         assert_eq!(listener.heard(), [word; 3]);
-        extend(&manager.socket, false, Duration::from_millis(1), 2);
+        extend(&manager.socket, false, at_once, 2, || 0);
         assert_eq!(listener.heard(), ["STOPPING=1", word, word]);
+        // It moves something at every third look: no more than two periods in a row are idle.
+        let mut looks = 0;
+        let moved = || {
+            looks += 1;
+            (looks.min(6) / 3) * PROGRESS_BYTES
+        };
+        extend(&manager.socket, true, at_once, 4, moved);
+        assert_eq!(listener.heard(), [word; 9]);
+    }
+
+    #[test]
+    fn what_a_process_reads_and_writes_is_progress_and_looking_is_none() {
+        let mut moved = MovedBytes::default();
+        let path = env::temp_dir().join(format!("hil-moved-{}", std::process::id()));
+        let before = moved.look();
+        assert!(moved.look() - before < PROGRESS_BYTES);
+        std::fs::write(&path, vec![0; 100_000]).unwrap();
+        assert!(moved.look() - before >= 100_000);
+        std::fs::remove_file(path).unwrap();
     }
 
     #[test]
