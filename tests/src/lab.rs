@@ -24,6 +24,7 @@ use std::time::Duration;
 use nix::sched::{CloneFlags, setns};
 
 pub use self::privilege::require_privileges;
+use crate::child;
 
 /// The interface that joins the two hosts, in each of them.
 pub const INTERFACE: &str = "eth0";
@@ -321,6 +322,18 @@ impl LabHost {
             .join(self.holder.id().to_string())
             .join("root")
             .join(inside)
+    }
+
+    /// Puts a disk of `size`, in the words of mount(8) for a tmpfs, at `folder` of this host alone.
+    ///
+    /// # Panics
+    /// When it cannot be done.
+    pub fn mount_disk(&self, folder: &Path, size: &str) {
+        let script = r#"mkdir -p "$0" && mount -t tmpfs -o "size=$1" tmpfs "$0""#;
+        let mut command = self.command("sh");
+        command.args(["-c", script]).arg(folder).arg(size);
+        let mounted = child::run(&mut command, SETUP_LIMIT);
+        assert!(mounted.is_ok(), "{mounted:?}");
     }
 
     /// The names in this host's `/dev/shm`, sorted.

@@ -31,6 +31,7 @@ use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_report::analysis::{self, AnalysisError, Concluded};
 use hil_report::terminal::{self, Style};
 use hil_report::{compare, trace};
+use hil_rundir::file_fault::is_of_full_disk;
 use hil_rundir::pipe::FailureKind;
 use hil_rundir::run_result::{Outcome, RunResult};
 use hil_topology::emulation_room::check_emulation;
@@ -259,7 +260,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
     console.serve();
     let result = supervisor::run(&topology, &options, &signals, console)
         .map_err(|error| Refusal::new(exit_code_of_error(&error), error))?;
-    let code = match exit_code(&result) {
+    let code = match exit_code(&result.outcome) {
         exit::RAN if result.has_gaps() => exit::FAILED,
         code => code,
     };
@@ -450,7 +451,7 @@ fn show_check(
 
 /// Why a run does not end with exit code 0, for those who do not read its report.
 fn complaint(result: &RunResult) -> String {
-    let is_incomplete = result.has_gaps() && exit_code(result) == exit::RAN;
+    let is_incomplete = result.has_gaps() && exit_code(&result.outcome) == exit::RAN;
     if is_incomplete {
         "the report is incomplete; see its warnings".to_owned()
     } else {
@@ -474,6 +475,7 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         }
         RunError::HostTooSmall(_) => exit::HOST_UNFIT,
         RunError::Domains(error) if error.is_of_path() => exit::USAGE,
+        RunError::Folder { source, .. } if is_of_full_disk(source) => exit::FAILED,
         RunError::Folder { .. }
         | RunError::Programs(_)
         | RunError::SecurityUnsaid(_)
@@ -499,16 +501,18 @@ fn interrupted() -> u8 {
     u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::INTERNAL)
 }
 
-fn exit_code(result: &RunResult) -> u8 {
-    match result.outcome {
+fn exit_code(outcome: &Outcome) -> u8 {
+    match outcome {
         Outcome::Completed | Outcome::EndedEarly(_) => exit::RAN,
         Outcome::Interrupted(_) => interrupted(),
-        Outcome::Failed(_) => match result.failure {
+        Outcome::Failed(failure) => match failure.kind {
             FailureKind::Fault => exit::FAILED,
             FailureKind::NotThereYet => exit::TRY_AGAIN,
             FailureKind::HostTooSmall => exit::HOST_UNFIT,
         },
-        Outcome::EndedByPeer(_) => exit::FAILED,
+        Outcome::Unwritable { .. } | Outcome::PeerFailed { .. } | Outcome::EndedByPeer(_) => {
+            exit::FAILED
+        }
         Outcome::PeerLost(_) => exit::PEER_ABSENT,
     }
 }

@@ -30,6 +30,16 @@ pub fn bytes(count: u64) -> String {
     }
 }
 
+/// As many of `names` as `shown_count`, and the number of the others: `a, b and 1,000 more`.
+pub fn named(names: &[impl AsRef<str>], shown_count: usize) -> String {
+    let shown = names.iter().take(shown_count).map(AsRef::as_ref);
+    let shown = shown.collect::<Vec<_>>().join(", ");
+    match names.len().saturating_sub(shown_count) {
+        0 => shown,
+        more => format!("{shown} and {} more", grouped(more as u64)),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -48,5 +58,12 @@ mod tests {
         assert_eq!(bytes(1023), "1023 B");
         assert_eq!(bytes(45_056), "44.0 KiB");
         assert_eq!(bytes(3_355_443), "3.2 MiB");
+    }
+
+    #[test]
+    fn a_few_of_many_are_named() {
+        assert_eq!(named(&["a", "b"], 2), "a, b");
+        assert_eq!(named(&["a", "b", "c"], 2), "a, b and 1 more");
+        assert_eq!(named(&[""; 1003], 3), ", ,  and 1,000 more");
     }
 }

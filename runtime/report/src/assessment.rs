@@ -1,6 +1,8 @@
 //! What follows from a summary's figures: whether the run may be called a network result at all,
 //! and what a reader must be warned of. It draws conclusions, it does not measure.
 
+use std::collections::BTreeSet;
+
 use hil_account::{ChannelAccount, ClosingMetrics, Coverage, MessageFate};
 use serde::{Deserialize, Serialize};
 
@@ -11,10 +13,13 @@ use super::summary::{
 };
 use super::terminal::{JOINT, percent};
 use hil_platform::text::grouped;
-use hil_platform::words::counted;
+use hil_platform::words::{counted, named};
 
 /// Share of skipped ticks above which the host, not the network, shaped the run.
 pub const SKIPPED_TICK_RATIO_MAX: f64 = 0.001;
+
+/// Channels that are named where many have the same fault.
+const NAMED_COUNT: usize = 3;
 
 /// Share of messages whose account must close.
 const CLOSED_RATIO_MIN: f64 = 0.999;
@@ -58,6 +63,11 @@ pub enum NetworkVerdict {
     },
     /// A component left no report, so nobody can tell whether it kept its ticks.
     TicksUnknown,
+    /// Hosts lack records of others: what was lost cannot be told from what is not known.
+    RecordsMissing {
+        /// The hosts that lack some.
+        hosts: Vec<String>,
+    },
 }
 
 /// A process that skipped more than [`SKIPPED_TICK_RATIO_MAX`] of its ticks.
@@ -102,6 +112,7 @@ impl Assessment {
                 .flat_map(adapter_warnings::adapter_warnings),
         );
         warnings.extend(summary.processes.iter().flat_map(process_warnings));
+        warnings.extend(unrecorded_warning(&summary.channels));
         warnings.extend(summary.channels.iter().flat_map(channel_warnings));
         warnings.extend(
             summary
@@ -134,6 +145,11 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::VirtualTime
     } else if !has_network && !has_emulation && !has_adapter {
         NetworkVerdict::NoNetwork
+    } else if !summary.record_gaps.is_empty() {
+        let hosts: BTreeSet<_> = summary.record_gaps.iter().map(|gap| &gap.host).collect();
+        NetworkVerdict::RecordsMissing {
+            hosts: hosts.into_iter().cloned().collect(),
+        }
     } else if !overruns.is_empty() {
         NetworkVerdict::HostOverran {
             processes: overruns,
@@ -276,13 +292,31 @@ fn process_warnings(process: &ProcessSummary) -> Vec<String> {
     warnings
 }
 
+/// One warning for all channels without records: those between programs of the user's may be many.
+fn unrecorded_warning(channels: &[ChannelSummary]) -> Option<String> {
+    let has_none =
+        |one: &&ChannelSummary| one.account.is_none() && one.link != LinkKind::RecordOnly;
+    let names = channels
+        .iter()
+        .filter(has_none)
+        .map(|one| one.name.as_str());
+    match names.collect::<Vec<_>>()[..] {
+        [] => None,
+        [name] => Some(format!("{name} left no records: it has no account")),
+        ref names => {
+            let names = named(names, NAMED_COUNT);
+            Some(format!("{names} left no records: they have no account"))
+        }
+    }
+}
+
 fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
     let name = &channel.name;
     if channel.link == LinkKind::RecordOnly {
         return recorded_warnings(channel);
     }
     let Some(account) = &channel.account else {
-        return vec![format!("{name} left no records: it has no account")];
+        return Vec::new();
     };
     let mut warnings = Vec::new();
     let unexplained = account.fates.of(MessageFate::Unexplained);

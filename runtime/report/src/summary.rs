@@ -25,10 +25,12 @@ use super::link_change::LinkChange;
 use super::network::NetworkReport;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
+use crate::analysis::write_whole;
 use crate::nic_metrics::HardwareStamps;
 use hil_platform::host_facts::HostFacts;
 use hil_platform::text::grouped;
 use hil_rundir::event::{EventKind, ProcessKind};
+use hil_rundir::file_fault::RecordGap;
 use hil_rundir::launch::Side;
 use hil_rundir::pipe::StallMetrics;
 pub use hil_rundir::pipe::{CountByName, CounterGroup};
@@ -82,6 +84,9 @@ pub struct RunSummary {
     /// crossed one.
     #[serde(default)]
     pub network: Option<NetworkReport>,
+    /// Records that hosts lack: what is lost cannot be told from what is not known.
+    #[serde(default)]
+    pub record_gaps: Vec<RecordGap>,
     /// Anything else a reader must know; [`Assessment::warnings`] come on top.
     pub warnings: Vec<String>,
 }
@@ -106,6 +111,7 @@ impl RunSummary {
             score: Vec::new(),
             score_events: ScoreEvents::default(),
             network: None,
+            record_gaps: Vec::new(),
             warnings: Vec::new(),
         }
     }
@@ -154,7 +160,7 @@ impl RunSummary {
     pub fn write(&self, path: &Path) -> Result<(), SummaryError> {
         let text = self.to_json()?;
         let partial = path.with_extension("json.partial");
-        std::fs::write(&partial, text)
+        write_whole(&partial, &text)
             .and_then(|()| std::fs::rename(&partial, path))
             .map_err(|source| SummaryError::Write {
                 path: path.to_owned(),
@@ -179,7 +185,7 @@ pub enum SummaryError {
         found: u32,
     },
     /// The file cannot be written.
-    #[error("cannot write {}", path.display())]
+    #[error("cannot write {}: {source}", path.display())]
     Write {
         /// Which file.
         path: PathBuf,

@@ -7,6 +7,7 @@ use std::fmt;
 use hil_core::time::Instant;
 use serde::{Deserialize, Serialize};
 
+use crate::file_fault::FileFault;
 use crate::nic_history::NicHistory;
 use crate::pipe::ProcessReport;
 use hil_platform::clock_discipline::HostDiscipline;
@@ -54,6 +55,11 @@ pub enum EventKind {
         /// How it ended.
         end: String,
     },
+    /// It cannot record any more, and with that the run ends. How the run ended tells why.
+    Unrecorded {
+        /// The first of its files that was not written.
+        fault: FileFault,
+    },
     /// It did not end when it was told to.
     Killed {
         /// How long it was waited for, seconds.
@@ -70,6 +76,11 @@ pub enum EventKind {
     OutputCut {
         /// What was left out of the middle, bytes.
         left_out_bytes: u64,
+    },
+    /// It complained more often than is kept.
+    WarningsLeftOut {
+        /// How many of its warnings are not told.
+        count: u64,
     },
     /// It complained.
     Warning {
@@ -92,6 +103,11 @@ impl fmt::Display for EventKind {
                 "{end}; policy: the run goes on, with the clock exchanges of the data path"
             ),
             Self::EndedRun { end } => write!(formatter, "{end}; policy: end the run"),
+            Self::Unrecorded { fault } => write!(
+                formatter,
+                "cannot record any more, first in {}; policy: end the run",
+                fault.file_name()
+            ),
             Self::Killed { patience_s } => {
                 write!(
                     formatter,
@@ -106,6 +122,10 @@ impl fmt::Display for EventKind {
             Self::OutputCut { left_out_bytes } => write!(
                 formatter,
                 "printed more than its log keeps: {left_out_bytes} bytes in the middle were left out"
+            ),
+            Self::WarningsLeftOut { count } => write!(
+                formatter,
+                "{count} more warnings of it found no room among the events"
             ),
             Self::Warning { text } => formatter.write_str(text),
         }

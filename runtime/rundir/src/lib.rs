@@ -5,6 +5,7 @@
 pub mod adapter_record;
 pub mod announcement;
 pub mod event;
+pub mod file_fault;
 pub mod launch;
 pub mod layout;
 pub mod link_orders;

@@ -17,6 +17,7 @@ use serde::{Deserialize, Serialize};
 use zeroize::Zeroizing;
 
 use super::launch::Side;
+use crate::file_fault::FileFault;
 use crate::run_seal::RunSeal;
 use hil_platform::realtime::RealtimeGrant;
 
@@ -52,23 +53,36 @@ pub enum FromProcess {
     SkippedTicks(u64),
     /// A condition the user should hear about now.
     Warning(String),
+    /// A file of the run cannot be written: what the process records from now on is lost, and it ends.
+    Unwritable(FileFault),
     /// The last word of an orderly end.
     Finished(Box<ProcessReport>),
     /// The process cannot go on.
-    Failed {
-        /// What it means for whoever would try again.
-        kind: FailureKind,
-        /// Why, in words.
-        text: String,
-    },
+    Failed(Failure),
+}
+
+/// Why a process or a run cannot go on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failure {
+    /// What it means for whoever would try again.
+    pub kind: FailureKind,
+    /// Why, in words.
+    pub text: String,
+}
+
+impl Failure {
+    /// One that stays until something is changed.
+    pub const fn fault(text: String) -> Self {
+        let kind = FailureKind::Fault;
+        Self { kind, text }
+    }
 }
 
 /// What a failure means for whoever would try again.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FailureKind {
     /// It stays until something is changed.
-    #[default]
     Fault,
     /// An address, an interface or a port is not there yet, or in use: it may pass by itself.
     NotThereYet,
@@ -133,8 +147,8 @@ pub struct ProcessReport {
     pub connection_failures: u64,
     /// Records dropped by a full ring.
     pub recorder_dropped: u64,
-    /// Files that could not be written.
-    pub recorder_failures: Vec<String>,
+    /// Record files that could not be written any more.
+    pub recorder_failures: Vec<FileFault>,
     /// Processor time of the whole process, seconds.
     pub cpu_s: f64,
     /// Context switches the process asked for (it waited).
@@ -462,10 +476,10 @@ mod tests {
             FromProcess::Ready,
             FromProcess::Alive,
             FromProcess::Warning("spin on a shared CPU".to_owned()),
-            FromProcess::Failed {
+            FromProcess::Failed(Failure {
                 kind: FailureKind::NotThereYet,
                 text: "the port is taken".to_owned(),
-            },
+            }),
             FromProcess::Finished(Box::new(report)),
         ] {
             let line = serde_json::to_string(&message).unwrap();

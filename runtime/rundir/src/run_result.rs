@@ -2,16 +2,20 @@
 //! folder. With the manifest and the records beside it, every figure can be computed again.
 
 use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, Write as _};
 use std::path::PathBuf;
 use std::time::Duration;
-use std::{fs, io};
 
 use hil_core::time::Instant;
+use nix::errno::Errno;
+use nix::fcntl::{FallocateFlags, fallocate};
 use serde::{Deserialize, Serialize};
 
 use super::event::{Event, ProcessHistory};
+use super::file_fault::{FileFault, RecordGap};
 use super::nic_history::NicHistory;
-use super::pipe::FailureKind;
+use super::pipe::Failure;
 use super::run_folder::RunFolder;
 use crate::protection::RunSecurity;
 use hil_platform::clock_discipline::HostDiscipline;
@@ -33,8 +37,22 @@ pub enum Outcome {
     /// The user ended it.
     Interrupted(String),
     /// A process failed and its policy ended the run.
-    Failed(String),
-    /// Another host ended it.
+    Failed(Failure),
+    /// A host could not write what the run needs or records. All hosts have the same.
+    Unwritable {
+        /// The host.
+        host: String,
+        /// The file that was refused first.
+        fault: FileFault,
+    },
+    /// It failed on another host.
+    PeerFailed {
+        /// The host.
+        host: String,
+        /// Why it failed there.
+        reason: String,
+    },
+    /// It was ended on another host.
     EndedByPeer(String),
     /// Another host vanished.
     PeerLost(String),
@@ -47,7 +65,8 @@ impl Outcome {
             Self::Completed => "completed as planned".to_owned(),
             Self::EndedEarly(text) => format!("ended early: {text}"),
             Self::Interrupted(by) => format!("interrupted by {by}"),
-            Self::Failed(text) => format!("failed: {text}"),
+            Self::Failed(_) | Self::Unwritable { .. } => format!("failed: {}", self.reason()),
+            Self::PeerFailed { .. } => format!("failed {}", self.reason()),
             Self::EndedByPeer(text) => format!("ended by another host: {text}"),
             Self::PeerLost(text) => format!("another host vanished: {text}"),
         }
@@ -57,7 +76,9 @@ impl Outcome {
     pub fn reason(&self) -> String {
         match self {
             Self::Completed => "as planned".to_owned(),
-            Self::Failed(text) => text.clone(),
+            Self::Failed(failure) => failure.text.clone(),
+            Self::Unwritable { host, fault } => format!("{host} cannot write {fault}"),
+            Self::PeerFailed { host, reason } => format!("on {host}: {reason}"),
             other => other.text(),
         }
     }
@@ -71,9 +92,6 @@ pub struct RunResult {
     pub folder: RunFolder,
     /// How it ended.
     pub outcome: Outcome,
-    /// What it means for whoever would try again, where a process failed.
-    #[serde(default)]
-    pub failure: FailureKind,
     /// Start and end of the run on each host, on that host's own monotonic clock.
     pub spans: BTreeMap<String, (Instant, Instant)>,
     /// When it started, as people write it.
@@ -93,7 +111,10 @@ pub struct RunResult {
     pub disciplines: BTreeMap<String, HostDiscipline>,
     /// Hosts that ran here.
     pub own_hosts: Vec<String>,
-    /// What spoils the completeness of the report.
+    /// Records that hosts lack after the exchange: of all hosts, as far as they could tell each other.
+    #[serde(default)]
+    pub gaps: Vec<RecordGap>,
+    /// What else spoils the completeness of the report.
     pub problems: Vec<String>,
     /// Facts of this host.
     pub facts: HostFacts,
@@ -151,8 +172,28 @@ struct Head {
     version: u32,
 }
 
+/// Has the disk hold room for the `result.json` of the run in `folder`, so that a run that fills the disk
+/// can be read afterwards. Where the file system cannot do that, nothing is held.
+///
+/// # Errors
+/// When there is no room.
+pub fn hold_room(folder: &RunFolder, bytes: u64) -> io::Result<()> {
+    let file = File::create(new_file(folder))?;
+    let bytes = i64::try_from(bytes).map_err(io::Error::other)?;
+    match fallocate(&file, FallocateFlags::empty(), 0, bytes) {
+        Err(Errno::EOPNOTSUPP | Errno::ENOSYS) => Ok(()),
+        other => other.map_err(io::Error::from),
+    }
+}
+
+/// Where `result.json` is written before it gets its name.
+fn new_file(folder: &RunFolder) -> PathBuf {
+    folder.result().with_extension("json.new")
+}
+
 impl RunResult {
-    /// Writes it into the run's folder, so that a reader finds it whole or not at all.
+    /// Writes it into the run's folder, so that a reader finds it whole or not at all: into the room that
+    /// was held for it, if there is some.
     ///
     /// # Errors
     /// When the file cannot be written.
@@ -167,8 +208,21 @@ impl RunResult {
             Ok(text) => text,
             Err(source) => return Err(RunResultError::Content { path, source }),
         };
-        let new = path.with_extension("json.new");
-        let done = fs::write(&new, text).and_then(|()| fs::rename(&new, &path));
+        let new = new_file(&self.folder);
+        let options = File::options()
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .open(&new);
+        let written = options.and_then(|mut file| {
+            file.write_all(text.as_bytes())?;
+            file.set_len(text.len() as u64)
+        });
+        let done = written.and_then(|()| fs::rename(&new, &path));
+        if done.is_err() {
+            // The error that is told is the first one.
+            let _left = fs::remove_file(&new).is_err();
+        }
         done.map_err(|source| RunResultError::Io { path, source })
     }
 
@@ -211,6 +265,6 @@ impl RunResult {
             .iter()
             .filter_map(|process| process.report.as_ref());
         let mut failures = reports.flat_map(|report| &report.recorder_failures);
-        !self.problems.is_empty() || failures.next().is_some()
+        !self.problems.is_empty() || !self.gaps.is_empty() || failures.next().is_some()
     }
 }

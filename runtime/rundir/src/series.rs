@@ -113,7 +113,11 @@ pub fn write(folder: &Path, series: Vec<PlotSeries>) -> Result<Vec<String>, Seri
     for one in series {
         entries.push(SeriesEntry::of(&one));
         let file = folder.join(format!("{}.csv", one.name));
-        write_table(&file, &one).map_err(at(&file))?;
+        if let Err(error) = write_table(&file, &one) {
+            // Half a table would pass for a short one; the error that is told is the first one.
+            let _left = fs::remove_file(&file).is_err();
+            return Err(at(&file)(error));
+        }
     }
     let path = folder.join(LIST);
     let text = serde_json::to_string_pretty(&entries).map_err(|error| at(&path)(error.into()))?;

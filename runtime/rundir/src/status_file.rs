@@ -109,8 +109,12 @@ fn keep(shared: &SharedStatus, path: &Path) {
 fn replace(path: &Path, status: &RunStatus) -> io::Result<()> {
     let new = path.with_extension("json.new");
     let text = serde_json::to_string(status).map_err(io::Error::other)?;
-    fs::write(&new, text)?;
-    fs::rename(&new, path)
+    let written = fs::write(&new, text).and_then(|()| fs::rename(&new, path));
+    if written.is_err() {
+        // A part of it would stay on a full disk; the error that is told is the first one.
+        let _left = fs::remove_file(&new).is_err();
+    }
+    written
 }
 
 fn complaint(path: &Path, error: &io::Error) -> String {

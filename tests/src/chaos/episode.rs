@@ -135,7 +135,7 @@ pub fn play(plan: &Plan) -> Report {
     let number = lab.host(0).namespace().replace("hil-lab-", "");
     let record = PathBuf::from(format!("/run/chaos-{number}"));
     for host in 0..2 {
-        mount_disk(lab.host(host), &record);
+        lab.host(host).mount_disk(&record, &format!("{DISK_MIB}m"));
     }
     // Outside of what the hosts have for themselves.
     let keys = RunFolder::new("chaos-key");
@@ -197,18 +197,6 @@ pub fn play(plan: &Plan) -> Report {
         took: began.elapsed(),
         messages: judged.messages,
     }
-}
-
-fn mount_disk(host: &LabHost, folder: &Path) {
-    let mut mkdir = host.command("mkdir");
-    let made = child::run(mkdir.arg(folder), COMMAND_LIMIT);
-    let mut mount = host.command("mount");
-    let size = format!("size={DISK_MIB}m");
-    mount
-        .args(["-t", "tmpfs", "-o", &size, "tmpfs"])
-        .arg(folder);
-    let mounted = made.and_then(|_| child::run(&mut mount, COMMAND_LIMIT));
-    assert!(mounted.is_ok(), "{mounted:?}");
 }
 
 fn start(host: &LabHost, plan: &Plan, record: &Path, key: Option<&Path>) -> ChildGuard {

@@ -279,7 +279,7 @@ fn a_killed_robot_ends_the_run_on_both_hosts_with_a_complete_report() {
     split.assert_nothing_left();
     let [control, robot] = split.summaries();
     assert_eq!(robot.run.outcome, Outcome::Failed);
-    assert_eq!(control.run.outcome, Outcome::Stopped);
+    assert_eq!(control.run.outcome, Outcome::Failed);
     for summary in [control, robot] {
         let reason = &summary.run.exit_reason;
         assert!(

@@ -14,6 +14,7 @@ mod clock_run;
 mod disturbances;
 mod egm_faces;
 mod fleet;
+mod full_disk;
 mod hardware_stamps;
 mod kills;
 mod limits;

@@ -26,8 +26,11 @@ use hil_platform::clock::MonotonicClock;
 use hil_platform::open_files;
 use hil_platform::realtime::{self, RealtimeGrant, RealtimeRequest, SpinAdvice};
 use hil_platform::wait::WaitMode;
+use hil_rundir::file_fault::FileFault;
 use hil_rundir::launch::{LaunchError, Work, WorkerLaunch, read};
-use hil_rundir::pipe::{ChannelProgress, FailureKind, FromProcess, Orders, ProcessReport, say};
+use hil_rundir::pipe::{
+    ChannelProgress, Failure, FailureKind, FromProcess, Orders, ProcessReport, say,
+};
 use hil_rundir::record::{RecordFileError, Recorder};
 use hil_shm::{ChannelError, Domain, DomainError};
 use hil_topology::emulation::EmulationError;
@@ -114,8 +117,8 @@ pub enum WorkerError {
     #[error("the gateway at the other end refused the channel: {}", .0.label())]
     Refused(HelloStatus),
     /// A record file could not be written any more.
-    #[error("{0}")]
-    Unrecorded(String),
+    #[error("cannot record: {0}; messages after that would be in no account")]
+    Unrecorded(FileFault),
 }
 
 impl WorkerError {
@@ -223,10 +226,13 @@ pub fn run(launch: &Path, registry: &Registry) -> Result<(), WorkerError> {
         .map_err(WorkerError::Inherited)
         .and_then(|()| open_and_run(launch, registry));
     if let Err(error) = &outcome {
-        say(&FromProcess::Failed {
+        if let WorkerError::Record(RecordFileError::Io { path, source }) = error {
+            say(&FromProcess::Unwritable(FileFault::new(path, source)));
+        }
+        say(&FromProcess::Failed(Failure {
             kind: error.kind(),
             text: error.to_string(),
-        });
+        }));
     }
     outcome
 }
@@ -242,12 +248,15 @@ fn open_and_run(path: &Path, registry: &Registry) -> Result<(), WorkerError> {
     }?;
     let stop = Arc::clone(orders.stop_flag());
     recorder
-        .start_and_tell(move || stop.store(true, Ordering::Release))
+        .start_and_tell(move |fault| {
+            stop.store(true, Ordering::Release);
+            say(&FromProcess::Unwritable(fault.clone()));
+        })
         .map_err(WorkerError::Thread)?;
     let mut report = ProcessReport::default();
     let outcome = run_jobs(opened, &orders, &mut report);
     let written = recorder.finish();
-    let problem = written.problem();
+    let unrecorded = written.failures.first().cloned();
     report.recorder_dropped = written.dropped_count;
     report.recorder_failures = written.failures;
     add_usage(&mut report);
@@ -257,7 +266,12 @@ fn open_and_run(path: &Path, registry: &Registry) -> Result<(), WorkerError> {
         (Err(WorkerError::Panicked), Work::Component(_)) => resume_unwind(Box::new(())),
         (outcome, _) => outcome,
     }
-    .and(problem.map_or(Ok(()), |text| Err(WorkerError::Unrecorded(text))))
+    .and(if written.has_panicked {
+        Err(WorkerError::Panicked)
+    } else {
+        Ok(())
+    })
+    .and(unrecorded.map_or(Ok(()), |fault| Err(WorkerError::Unrecorded(fault))))
 }
 
 /// The shared memory that `launch` names.

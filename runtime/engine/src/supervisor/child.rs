@@ -18,6 +18,9 @@ use zeroize::Zeroizing;
 use hil_platform::systemd;
 use hil_rundir::pipe::{FromProcess, ToProcess};
 
+/// Longest line of a process that is kept: the report of a gateway with tens of thousands of channels.
+const LINE_BYTES_MAX: usize = 1 << 28;
+
 /// A word from a process.
 #[derive(Debug)]
 pub(crate) struct Word {
@@ -68,10 +71,12 @@ impl Child {
         let words = thread::Builder::new()
             .name(format!("words {index}"))
             .spawn(move || {
-                for line in BufReader::new(output).lines() {
-                    let Ok(line) = line else { return };
-                    let said = serde_json::from_str(&line)
-                        .unwrap_or_else(|_not_ours| FromProcess::Warning(format!("said: {line}")));
+                let mut output = BufReader::new(output);
+                while let Ok(Some(line)) = next_line(&mut output, LINE_BYTES_MAX) {
+                    let said = serde_json::from_slice(&line).unwrap_or_else(|_not_ours| {
+                        let text = String::from_utf8_lossy(&line);
+                        FromProcess::Warning(format!("said: {text}"))
+                    });
                     let word = Word {
                         index,
                         instance,
@@ -199,6 +204,34 @@ fn prepared(mut command: Command, log: &Path) -> io::Result<Command> {
     Ok(command)
 }
 
+/// The next line without its end, at most `bytes_max` of it: the rest of a longer one is left out. `None` at
+/// the end.
+///
+/// # Errors
+/// When reading fails.
+fn next_line(input: &mut impl BufRead, bytes_max: usize) -> io::Result<Option<Vec<u8>>> {
+    let mut line = Vec::new();
+    let mut has_begun = false;
+    loop {
+        let bytes = match input.fill_buf() {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            other => other?,
+        };
+        if bytes.is_empty() {
+            return Ok(has_begun.then_some(line));
+        }
+        has_begun = true;
+        let end = bytes.iter().position(|byte| *byte == b'\n');
+        let length = end.unwrap_or(bytes.len());
+        let room = bytes_max - line.len();
+        line.extend_from_slice(&bytes[..length.min(room)]);
+        input.consume(end.map_or(length, |end| end + 1));
+        if end.is_some() {
+            return Ok(Some(line));
+        }
+    }
+}
+
 /// How a process ended, in words.
 pub(crate) fn describe_exit(status: ExitStatus) -> String {
     match (status.code(), status.signal()) {
@@ -256,6 +289,16 @@ mod tests {
         let said = words.recv().unwrap().said;
         assert_eq!(said, FromProcess::Warning("said: hello".to_owned()));
         fs::remove_file(log).unwrap();
+    }
+
+    #[test]
+    fn of_a_line_that_is_too_long_the_beginning_is_kept() {
+        let mut input = BufReader::with_capacity(3, &b"0123456789\n\nabcd\nend"[..]);
+        let mut lines = Vec::new();
+        while let Some(line) = next_line(&mut input, 4).unwrap() {
+            lines.push(String::from_utf8(line).unwrap());
+        }
+        assert_eq!(lines, ["0123", "", "abcd", "end"]);
     }
 
     #[test]

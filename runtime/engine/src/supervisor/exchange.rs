@@ -5,7 +5,9 @@
 use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
+use std::net::Shutdown;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
@@ -16,6 +18,7 @@ use super::frame::{
 };
 use super::peer::{Peer, PeerEvent};
 use hil_rundir::event::HostHistory;
+use hil_rundir::file_fault::{FileFault, GapCause, RecordGap};
 
 /// A peer that says nothing for this long while records are due has failed to deliver them.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -26,12 +29,47 @@ const ALIVE_PERIOD: Duration = Duration::from_secs(1);
 #[derive(Debug, Default)]
 pub(crate) struct Received {
     pub(crate) stories: Vec<HostHistory>,
-    /// Why records of a host are missing or incomplete.
+    /// Records that hosts lack.
+    pub(crate) gaps: Vec<RecordGap>,
+    /// What else a reader of the records must know.
     pub(crate) problems: Vec<String>,
     names: BTreeSet<String>,
 }
 
-/// Sends this host's records and story, and receives those of the others into `records`.
+impl Received {
+    /// Takes back the record files that came: a part of them is worse than none.
+    fn drop_files(&mut self, records: &Path) {
+        for name in core::mem::take(&mut self.names) {
+            let path = records.join(name);
+            if let Err(error) = fs::remove_file(&path) {
+                let path = path.display();
+                let text = format!("{path}: {error}; it may be a part of a file only");
+                self.problems.push(text);
+            }
+        }
+    }
+
+    /// Whether the connection failed.
+    fn is_broken(&self) -> bool {
+        let causes = self.gaps.iter().map(|gap| &gap.cause);
+        causes
+            .into_iter()
+            .any(|cause| matches!(cause, GapCause::Connection(_)))
+    }
+
+    /// Notes that `host` lacks the records of those whose reports came, or of `peer` if none did.
+    fn note_gap(&mut self, host: &str, peer: &str, cause: GapCause) {
+        let mut of = hosts_of(&self.stories);
+        if of.is_empty() {
+            of.push(peer.to_owned());
+        }
+        let host = host.to_owned();
+        self.gaps.push(RecordGap { host, of, cause });
+    }
+}
+
+/// Sends this host's records and story, and receives those of the others into `records`. In the end the
+/// hosts tell each other which records they lack, so that all reports say the same of the run.
 pub(crate) fn exchange(
     peers: &mut [Peer],
     is_first_host: bool,
@@ -50,22 +88,57 @@ pub(crate) fn exchange(
         }
     }
     if is_first_host {
-        let received = collect(peers, records);
-        distribute(peers, &own, story, &received, records, &mut all);
-        for one in received {
-            all.stories.extend(one.stories);
-            all.problems.extend(one.problems);
+        let here = &story.hosts[0];
+        let take = |host: &str, inbox: &mut _| take_from(here, host, inbox, records);
+        let mut received = receive_from_all(peers, take, |host| {
+            let mut received = Received::default();
+            let cause = "the receiving thread panicked".to_owned();
+            received.note_gap(here, host, GapCause::Connection(cause));
+            received
+        });
+        for (peer, one) in peers.iter_mut().zip(&mut received) {
+            // Nothing more is expected of it, and it is not waited for again.
+            if one.is_broken() {
+                peer.hang_up();
+            }
+            all.gaps.append(&mut one.gaps);
+            all.problems.append(&mut one.problems);
         }
+        distribute(peers, &own, story, &received, records, &mut all);
+        let panicked = |_host: &str| Err("the receiving thread panicked".to_owned());
+        let words = receive_from_all(peers, |_host, inbox| take_word(inbox), panicked);
+        for (peer, word) in peers.iter().zip(words) {
+            note_word(&peer.hello.host, word, &mut all);
+        }
+        for peer in peers.iter_mut() {
+            peer.say(&PeerMessage::Taken(all.gaps.clone()));
+        }
+        all.stories
+            .extend(received.into_iter().flat_map(|one| one.stories));
     } else {
         for peer in peers.iter_mut() {
             give_and_take(peer, &own, story, records, &mut all);
+            peer.say(&PeerMessage::Taken(all.gaps.clone()));
+            let (_, inbox) = peer.halves();
+            let word = take_word(inbox);
+            if word.is_ok() {
+                // It has what was said just now.
+                all.gaps.clear();
+            }
+            note_word(&peer.hello.host, word, &mut all);
         }
     }
     all
 }
 
-/// Receives from all peers at once, and says meanwhile that this host is still there.
-fn collect(peers: &mut [Peer], records: &Path) -> Vec<Received> {
+/// Receives from all peers at once, and says meanwhile that this host is still there; `panicked` stands for
+/// what a thread did not give.
+fn receive_from_all<T: Send>(
+    peers: &mut [Peer],
+    receive: impl Fn(&str, &mut Receiver<PeerEvent>) -> T + Sync,
+    panicked: impl Fn(&str) -> T,
+) -> Vec<T> {
+    let receive = &receive;
     thread::scope(|scope| {
         let mut writers = Vec::new();
         let mut receiving = Vec::new();
@@ -73,11 +146,14 @@ fn collect(peers: &mut [Peer], records: &Path) -> Vec<Received> {
             let host = peer.hello.host.clone();
             let (writer, inbox) = peer.halves();
             writers.push(writer);
-            let take = move || take_from(&host, inbox, records);
-            receiving.push(scope.spawn(take));
+            let thread = {
+                let host = host.clone();
+                scope.spawn(move || receive(&host, inbox))
+            };
+            receiving.push((host, thread));
         }
         let mut said = Instant::now();
-        while !receiving.iter().all(ScopedJoinHandle::is_finished) {
+        while !receiving.iter().all(|(_, thread)| thread.is_finished()) {
             if said.elapsed() >= ALIVE_PERIOD {
                 said = Instant::now();
                 for writer in &mut writers {
@@ -87,7 +163,10 @@ fn collect(peers: &mut [Peer], records: &Path) -> Vec<Received> {
             }
             thread::sleep(Duration::from_millis(2));
         }
-        receiving.into_iter().map(join_receiving).collect()
+        let joined = receiving.into_iter();
+        joined
+            .map(|(host, thread)| thread.join().unwrap_or_else(|_panic| panicked(&host)))
+            .collect()
     })
 }
 
@@ -115,16 +194,20 @@ fn distribute(
             }
             let host = peer.hello.host.clone();
             let (writer, _) = peer.halves();
+            let of = hosts_of(&stories);
             let give = move || give_all(writer, &files, &stories);
-            sending.push((host, scope.spawn(give)));
+            sending.push((host, of, scope.spawn(give)));
         }
         sending
             .into_iter()
-            .map(|(host, one)| (host, join_sending(one)))
+            .map(|(host, of, one)| (host, of, join_sending(one)))
             .collect::<Vec<_>>()
     });
-    for (host, outcome) in sent {
-        note_unsent(&host, outcome, all);
+    for (peer, (host, of, sent)) in peers.iter_mut().zip(sent) {
+        if sent.is_err() {
+            peer.hang_up();
+        }
+        note_unsent(&host, of, sent, all);
     }
 }
 
@@ -137,22 +220,39 @@ fn give_and_take(
     all: &mut Received,
 ) {
     let host = peer.hello.host.clone();
+    let own_history = std::slice::from_ref(own_history);
+    let handle = peer.handle().ok();
     let (writer, inbox) = peer.halves();
+    let is_taken = AtomicBool::new(false);
     let (received, sent) = thread::scope(|scope| {
-        let sending = scope.spawn(|| give_all(writer, own, std::slice::from_ref(own_history)));
-        let received = take_from(&host, inbox, records);
+        let sending = scope.spawn(|| {
+            give_all(writer, own, own_history)?;
+            // A disk that is slow to take what comes looks like a host that is gone otherwise.
+            let mut said = Instant::now();
+            while !is_taken.load(Ordering::Acquire) {
+                if said.elapsed() >= ALIVE_PERIOD {
+                    said = Instant::now();
+                    write_message(writer, &PeerMessage::Alive)?;
+                }
+                thread::sleep(Duration::from_millis(2));
+            }
+            Ok(())
+        });
+        let received = take_from(&own_history[0].hosts[0], &host, inbox, records);
+        is_taken.store(true, Ordering::Release);
+        if let Some(stream) = handle.filter(|_| received.is_broken()) {
+            // What is being sent would wait for as long again.
+            let _already_closed = stream.shutdown(Shutdown::Both).is_err();
+        }
         (received, join_sending(sending))
     });
+    if sent.is_err() || received.is_broken() {
+        peer.hang_up();
+    }
     all.stories.extend(received.stories);
+    all.gaps.extend(received.gaps);
     all.problems.extend(received.problems);
-    note_unsent(&host, sent, all);
-}
-
-fn join_receiving(thread: ScopedJoinHandle<'_, Received>) -> Received {
-    thread.join().unwrap_or_else(|_panic| Received {
-        problems: vec!["a receiving thread panicked".to_owned()],
-        ..Received::default()
-    })
+    note_unsent(&host, hosts_of(own_history), sent, all);
 }
 
 fn join_sending(thread: ScopedJoinHandle<'_, io::Result<()>>) -> io::Result<()> {
@@ -160,10 +260,49 @@ fn join_sending(thread: ScopedJoinHandle<'_, io::Result<()>>) -> io::Result<()> 
     thread.join().unwrap_or_else(panicked)
 }
 
-fn note_unsent(host: &str, sent: io::Result<()>, all: &mut Received) {
+fn hosts_of(stories: &[HostHistory]) -> Vec<String> {
+    let hosts = stories.iter().flat_map(|story| story.hosts.clone());
+    hosts.collect()
+}
+
+/// Notes that records did not get to `host`.
+fn note_unsent(host: &str, of: Vec<String>, sent: io::Result<()>, all: &mut Received) {
     if let Err(error) = sent {
-        all.problems
-            .push(format!("records could not be sent to {host}: {error}"));
+        all.gaps.push(RecordGap {
+            host: host.to_owned(),
+            of,
+            cause: GapCause::Connection(error.to_string()),
+        });
+    }
+}
+
+/// The gaps that a peer tells in the end.
+fn take_word(inbox: &mut Receiver<PeerEvent>) -> Result<Vec<RecordGap>, String> {
+    loop {
+        if let Frame::Message(PeerMessage::Taken(gaps)) = next_frame(inbox)? {
+            return Ok(gaps);
+        }
+    }
+}
+
+fn note_word(host: &str, word: Result<Vec<RecordGap>, String>, all: &mut Received) {
+    match word {
+        Ok(gaps) => all.gaps.extend(gaps),
+        // A connection that broke before is told already.
+        Err(_) if !all.gaps.is_empty() => {}
+        Err(reason) => {
+            let text = format!("{host} did not say whether it has all records: {reason}");
+            all.problems.push(text);
+        }
+    }
+}
+
+fn next_frame(inbox: &mut Receiver<PeerEvent>) -> Result<Frame, String> {
+    match inbox.recv_timeout(PATIENCE) {
+        Ok(PeerEvent::Frame(frame)) => Ok(frame),
+        Ok(PeerEvent::Closed(reason)) => Err(reason),
+        Err(RecvTimeoutError::Disconnected) => Err("connection closed".to_owned()),
+        Err(RecvTimeoutError::Timeout) => Err(format!("silent for {} s", PATIENCE.as_secs())),
     }
 }
 
@@ -231,16 +370,23 @@ fn give_all(out: &mut impl Write, files: &[PathBuf], stories: &[HostHistory]) ->
 }
 
 /// What is on its way in, and how many bytes of it are still to come.
+#[derive(Default)]
 struct Incoming {
     body: Body,
     left: u64,
     /// Of all reports so far.
     report_bytes: u64,
+    /// The first file that was not written. What follows is read and left, so that the peer is not held up
+    /// and hears of it.
+    unwritten: Option<FileFault>,
 }
 
+#[derive(Default)]
 enum Body {
+    /// Nothing, or a file that is not kept.
+    #[default]
     Nothing,
-    File(File),
+    File(File, PathBuf),
     Report(Vec<u8>),
 }
 
@@ -252,32 +398,37 @@ impl Incoming {
         }
         Err(invalid(format!("{} bytes did not come", self.left)))
     }
+
+    /// The disk does not take the file at `path`.
+    fn give_up(&mut self, path: &Path, error: &io::Error, records: &Path, received: &mut Received) {
+        self.unwritten.get_or_insert(FileFault::new(path, error));
+        self.body = Body::Nothing;
+        received.drop_files(records);
+    }
 }
 
-fn take_from(host: &str, inbox: &mut Receiver<PeerEvent>, records: &Path) -> Received {
+/// Takes on `here` what `host` sends.
+fn take_from(here: &str, host: &str, inbox: &mut Receiver<PeerEvent>, records: &Path) -> Received {
     let mut received = Received::default();
-    let mut incoming = Incoming {
-        body: Body::Nothing,
-        left: 0,
-        report_bytes: 0,
-    };
-    let problem = loop {
-        let frame = match inbox.recv_timeout(PATIENCE) {
-            Ok(PeerEvent::Frame(frame)) => frame,
-            Ok(PeerEvent::Closed(reason)) => break reason,
-            Err(RecvTimeoutError::Disconnected) => break "connection closed".to_owned(),
-            Err(RecvTimeoutError::Timeout) => {
-                break format!("silent for {} s", PATIENCE.as_secs());
-            }
-        };
-        match take_frame(frame, records, &mut incoming, &mut received) {
-            Ok(true) => return received,
+    let mut incoming = Incoming::default();
+    let broken = loop {
+        let taken = next_frame(inbox).and_then(|frame| {
+            let taken = take_frame(frame, records, &mut incoming, &mut received);
+            taken.map_err(|error| error.to_string())
+        });
+        match taken {
+            Ok(true) => break None,
             Ok(false) => {}
-            Err(error) => break error.to_string(),
+            Err(reason) => break Some(GapCause::Connection(reason)),
         }
     };
-    let text = format!("records of {host} are incomplete: {problem}");
-    received.problems.push(text);
+    if broken.is_some() {
+        received.drop_files(records);
+    }
+    let unwritten = incoming.unwritten.map(GapCause::Unwritable);
+    if let Some(cause) = unwritten.or(broken) {
+        received.note_gap(here, host, cause);
+    }
     received
 }
 
@@ -313,9 +464,21 @@ fn take_frame(
                     "file name {name:?} is not a record file's"
                 )));
             }
-            incoming.body = Body::File(File::create_new(records.join(&name))?);
             incoming.left = size_bytes;
-            received.names.insert(name);
+            incoming.body = Body::Nothing;
+            if incoming.unwritten.is_none() {
+                let path = records.join(&name);
+                match File::create_new(&path) {
+                    Ok(file) => {
+                        received.names.insert(name);
+                        incoming.body = Body::File(file, path);
+                    }
+                    Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                        return Err(error);
+                    }
+                    Err(error) => incoming.give_up(&path, &error, records, received),
+                }
+            }
         }
         Frame::Chunk(bytes) => {
             let length = bytes.len() as u64;
@@ -328,7 +491,12 @@ fn take_frame(
             incoming.left -= length;
             match &mut incoming.body {
                 Body::Nothing => {}
-                Body::File(file) => file.write_all(&bytes)?,
+                Body::File(file, path) => {
+                    if let Err(error) = file.write_all(&bytes) {
+                        let path = path.clone();
+                        incoming.give_up(&path, &error, records, received);
+                    }
+                }
                 Body::Report(body) => {
                     body.extend_from_slice(&bytes);
                     if incoming.left == 0 {
@@ -373,11 +541,7 @@ mod tests {
 
     fn taken(wire: &[u8]) -> io::Result<Received> {
         let (mut input, mut received) = (wire, Received::default());
-        let mut incoming = Incoming {
-            body: Body::Nothing,
-            left: 0,
-            report_bytes: 0,
-        };
+        let mut incoming = Incoming::default();
         let nowhere = Path::new("/nonexistent");
         while !take_frame(
             read_frame(&mut input)?,

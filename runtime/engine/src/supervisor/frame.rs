@@ -7,6 +7,8 @@ use serde::{Deserialize, Serialize};
 use zeroize::Zeroizing;
 
 use super::peer_status::HostTicks;
+use hil_rundir::file_fault::RecordGap;
+use hil_rundir::run_result::Outcome;
 use hil_rundir::run_seal::RunSeal;
 
 /// Largest frame either side accepts; a longer length field is an error, not an allocation.
@@ -56,13 +58,8 @@ pub enum PeerMessage {
     /// How many ticks passed without the processes of the hosts that the sender knows of. Sent in
     /// place of [`PeerMessage::Alive`] while a run goes on.
     Ticks(Vec<HostTicks>),
-    /// The run ends here, and why.
-    Stop {
-        /// In words.
-        reason: String,
-        /// How the other hosts are to take it.
-        meaning: EndMeaning,
-    },
+    /// The run ends here, in this way.
+    Stop(Outcome),
     /// Components have stopped; gateways still run for what is under way.
     Quiet,
     /// A record file follows in chunks of raw bytes.
@@ -80,18 +77,9 @@ pub enum PeerMessage {
     },
     /// Everything has been sent.
     Done,
-}
-
-/// How the other hosts are to take the end of a run on one of them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum EndMeaning {
-    /// The planned time passed.
-    Planned,
-    /// A program ended by itself without a fault.
-    Early,
-    /// It was interrupted, or something failed.
-    Broken,
+    /// What was sent has been taken, apart from these records; from the first host those of all hosts. The
+    /// last message.
+    Taken(Vec<RecordGap>),
 }
 
 /// One frame as read.

@@ -8,10 +8,11 @@ use std::path::PathBuf;
 use hil_core::layout::Field;
 
 use super::domains::DomainsError;
-use super::frame::{EndMeaning, PeerMessage};
+use super::frame::PeerMessage;
 use super::meet::PeerError;
 use super::needs::HostTooSmall;
 use super::process_group::ProcessGroupError;
+use super::process_group::Verdict;
 use crate::process::own_program::ProgramsMissing;
 use crate::security::KeyFileError;
 use hil_rundir::run_result::Outcome;
@@ -79,42 +80,37 @@ pub enum RunError {
     Emulation(EmulationError),
 }
 
+impl Verdict {
+    /// How the run ends by it; `None` when it goes on.
+    pub(super) fn outcome(self) -> Option<Outcome> {
+        match self {
+            Self::Running => None,
+            Self::Finished(text) => Some(Outcome::EndedEarly(text)),
+            Self::Failed(failure) => Some(Outcome::Failed(failure)),
+            Self::Unwritable { host, fault } => Some(Outcome::Unwritable { host, fault }),
+        }
+    }
+}
+
 impl From<ProcessGroupError> for RunError {
     fn from(error: ProcessGroupError) -> Self {
         Self::Start(error.to_string())
     }
 }
 
-/// How the other hosts are to take `outcome`.
-pub(super) fn meaning(outcome: &Outcome) -> EndMeaning {
-    match outcome {
-        Outcome::Completed => EndMeaning::Planned,
-        Outcome::EndedEarly(_) => EndMeaning::Early,
-        Outcome::Interrupted(_)
-        | Outcome::Failed(_)
-        | Outcome::EndedByPeer(_)
-        | Outcome::PeerLost(_) => EndMeaning::Broken,
-    }
-}
-
 /// What came from a peer during the run.
 pub(super) enum Heard {
     Said(PeerMessage),
-    Stopped {
-        host: String,
-        reason: String,
-        meaning: EndMeaning,
-    },
+    Stopped { host: String, outcome: Outcome },
     Lost(String),
 }
 
 impl Heard {
     pub(super) fn named(self, host: &str) -> Self {
         match self {
-            Self::Said(PeerMessage::Stop { reason, meaning }) => Self::Stopped {
+            Self::Said(PeerMessage::Stop(outcome)) => Self::Stopped {
                 host: host.to_owned(),
-                reason,
-                meaning,
+                outcome,
             },
             other => other,
         }
@@ -124,14 +120,24 @@ impl Heard {
     pub(super) fn outcome(self) -> Option<Outcome> {
         match self {
             Self::Said(_) => None,
-            Self::Stopped {
-                host,
-                reason,
-                meaning,
-            } => Some(match meaning {
-                EndMeaning::Planned => Outcome::Completed,
-                EndMeaning::Early => Outcome::EndedEarly(format!("on {host}, {reason}")),
-                EndMeaning::Broken => Outcome::EndedByPeer(format!("{host} {reason}")),
+            Self::Stopped { host, outcome } => Some(match outcome {
+                Outcome::EndedEarly(reason) => Outcome::EndedEarly(format!("on {host}, {reason}")),
+                Outcome::Interrupted(by) => {
+                    Outcome::EndedByPeer(format!("{host} interrupted by {by}"))
+                }
+                Outcome::Failed(failure) => Outcome::PeerFailed {
+                    host,
+                    reason: failure.text,
+                },
+                Outcome::PeerLost(reason) => Outcome::PeerFailed {
+                    host,
+                    reason: Outcome::PeerLost(reason).text(),
+                },
+                // What the first host heard of a third one.
+                same @ (Outcome::Completed
+                | Outcome::Unwritable { .. }
+                | Outcome::PeerFailed { .. }
+                | Outcome::EndedByPeer(_)) => same,
             }),
             Self::Lost(text) => Some(Outcome::PeerLost(text)),
         }

@@ -178,6 +178,20 @@ impl Peer {
         self.writer.stream().set_write_timeout(Some(limit))
     }
 
+    /// Ends the connection both ways: whoever waits for it, here or there, notices at once.
+    pub(crate) fn hang_up(&mut self) {
+        self.is_open = false;
+        let _already_closed = self.writer.stream().shutdown(Shutdown::Both).is_err();
+    }
+
+    /// A second handle of the connection, to end it while the halves are in use.
+    ///
+    /// # Errors
+    /// When the system gives none.
+    pub(crate) fn handle(&self) -> io::Result<TcpStream> {
+        self.writer.stream().try_clone()
+    }
+
     /// The sending half by itself, so that a thread can send while another receives.
     pub(crate) fn halves(
         &mut self,
@@ -189,7 +203,7 @@ impl Peer {
 impl Drop for Peer {
     /// Ends the connection both ways, so that the reader thread and the other end notice.
     fn drop(&mut self) {
-        let _already_closed = self.writer.stream().shutdown(Shutdown::Both).is_err();
+        self.hang_up();
     }
 }
 

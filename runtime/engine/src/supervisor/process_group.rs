@@ -16,9 +16,13 @@ use super::output_log::{LogKeeper, cut_middle};
 use super::plan::{ProcessPlan, ProcessTask};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::open_files;
+use hil_platform::text::shortened;
 use hil_rundir::event::{Event, EventKind, Interruption};
+use hil_rundir::file_fault::FileFault;
 use hil_rundir::launch::{ComponentWork, LaunchError, Work, WorkerLaunch, write};
-use hil_rundir::pipe::{ChannelProgress, FailureKind, FromProcess, ProcessReport, ToProcess};
+use hil_rundir::pipe::{
+    ChannelProgress, Failure, FailureKind, FromProcess, ProcessReport, ToProcess,
+};
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::run_seal::RunSeal;
 use hil_shm::{Room, SHARED_MEMORY_DIRECTORY};
@@ -32,6 +36,11 @@ const QUEUE_SPAN: Duration = Duration::from_millis(50);
 
 /// The last words of a process that has ended are in its pipe; reading them takes no longer.
 const LAST_WORDS_PATIENCE: Duration = Duration::from_secs(1);
+
+/// What a process says in one warning, or why it failed: about five lines of a report.
+const TEXT_CHARS_MAX: usize = 500;
+/// Warnings that are kept of the processes of a supervisor; more are counted.
+const WARNINGS_MAX: usize = 100_000;
 
 /// Why the processes could not be started.
 #[derive(Debug, thiserror::Error)]
@@ -52,7 +61,7 @@ pub(crate) enum ProcessGroupError {
 
 impl ProcessGroupError {
     /// What it means for whoever would try again.
-    pub(crate) fn kind(&self) -> FailureKind {
+    fn kind(&self) -> FailureKind {
         match self {
             Self::Spawn { source, .. } | Self::OwnPath(source) | Self::Thread(source) => {
                 FailureKind::of(source)
@@ -70,7 +79,14 @@ pub(crate) enum Verdict {
     /// A process ended by itself without a fault.
     Finished(String),
     /// A process failed.
-    Failed(String),
+    Failed(Failure),
+    /// A host cannot write a file that the run needs or records.
+    Unwritable {
+        /// The host.
+        host: String,
+        /// The file.
+        fault: FileFault,
+    },
 }
 
 /// One process with its history.
@@ -88,7 +104,9 @@ pub(crate) struct ManagedProcess {
     /// When it last said that its loops turn, or was asked to begin.
     pub(super) heard: Instant,
     seen_alive: Instant,
-    complaint: Option<(FailureKind, String)>,
+    complaint: Option<Failure>,
+    /// Warnings for which there was no room.
+    left_out_count: u64,
 }
 
 /// Puts the counts that a process tells of now in the place of those it told of before, both in its order.
@@ -121,8 +139,10 @@ pub(crate) struct ProcessGroup {
     /// When the run began.
     pub(super) started: Option<Instant>,
     events: Vec<Event>,
-    /// What the failure that ended the run means for whoever would try again.
-    failure: Option<FailureKind>,
+    /// How many of them are warnings.
+    warning_count: usize,
+    /// The first file that a process could not write, and the host of it.
+    unwritten: Option<(String, FileFault)>,
     log_keeper: Option<LogKeeper>,
 }
 
@@ -147,6 +167,7 @@ impl ProcessGroup {
             heard: Instant::ZERO,
             seen_alive: Instant::ZERO,
             complaint: None,
+            left_out_count: 0,
         });
         Ok(Self {
             members: members.collect(),
@@ -158,17 +179,44 @@ impl ProcessGroup {
             words,
             started: None,
             events: Vec::new(),
-            failure: None,
+            warning_count: 0,
+            unwritten: None,
             log_keeper: None,
         })
     }
 
     /// Starts every process; they wait for [`ProcessGroup::begin`].
-    pub(crate) fn start(&mut self) -> Result<(), ProcessGroupError> {
+    ///
+    /// # Errors
+    /// The failure that the start of the run is, as a verdict.
+    pub(crate) fn start(&mut self) -> Result<(), Verdict> {
+        let started = self.start_all();
+        started.map_err(|(index, error)| self.not_started(index, &error))
+    }
+
+    /// What it means that a process could not be started.
+    fn not_started(&self, index: usize, error: &ProcessGroupError) -> Verdict {
+        match error {
+            ProcessGroupError::Launch(LaunchError::Io { path, source }) => Verdict::Unwritable {
+                host: self.members[index].plan.host.clone(),
+                fault: FileFault::new(path, source),
+            },
+            other => Verdict::Failed(Failure {
+                kind: other.kind(),
+                text: other.to_string(),
+            }),
+        }
+    }
+
+    fn start_all(&mut self) -> Result<(), (usize, ProcessGroupError)> {
         let names = self.members.iter().map(|member| &member.plan.name);
         let logs = names.map(|name| self.folder.log(name)).collect();
-        self.log_keeper = Some(LogKeeper::start(logs).map_err(ProcessGroupError::Thread)?);
-        (0..self.members.len()).try_for_each(|index| self.spawn(index))
+        let keeper = LogKeeper::start(logs).map_err(ProcessGroupError::Thread);
+        self.log_keeper = Some(keeper.map_err(|error| (0, error))?);
+        (0..self.members.len()).try_for_each(|index| {
+            let spawned = self.spawn(index);
+            spawned.map_err(|error| (index, error))
+        })
     }
 
     fn spawn(&mut self, index: usize) -> Result<(), ProcessGroupError> {
@@ -285,6 +333,10 @@ impl ProcessGroup {
     /// Hears what the processes said, sees who died, and applies the policies.
     pub(crate) fn watch(&mut self) -> Verdict {
         self.listen();
+        // Its end, and that of others on the same disk, follows from it.
+        if let Some(verdict) = self.unwritable() {
+            return verdict;
+        }
         let now = MonotonicClock::now();
         let mut verdict = Verdict::Running;
         for index in 0..self.members.len() {
@@ -301,14 +353,29 @@ impl ProcessGroup {
                 continue;
             }
             member.child = None;
+            member.end = Some(describe_exit(status));
             self.listen();
+            if let Some(verdict) = self.unwritable() {
+                return verdict;
+            }
             let judged = self.judge(index, status, now);
             // A failure is not overridden by an orderly end seen in the same turn.
-            if !matches!(verdict, Verdict::Failed(_)) && judged != Verdict::Running {
+            let has_failed = matches!(verdict, Verdict::Failed(_) | Verdict::Unwritable { .. });
+            if !has_failed && judged != Verdict::Running {
                 verdict = judged;
             }
         }
         verdict
+    }
+
+    /// Whether a process here cannot record any more.
+    pub(super) fn cannot_record(&self) -> bool {
+        self.unwritten.is_some()
+    }
+
+    fn unwritable(&self) -> Option<Verdict> {
+        let (host, fault) = self.unwritten.clone()?;
+        Some(Verdict::Unwritable { host, fault })
     }
 
     /// What the end of a process means: it is started again, or the run ends.
@@ -316,9 +383,10 @@ impl ProcessGroup {
         let member = &mut self.members[index];
         let mut what = describe_exit(status);
         let log = self.folder.log(&member.plan.name);
-        let kind = member.complaint.as_ref().map(|(kind, _)| *kind);
-        if let Some((_, complaint)) = &member.complaint {
-            what = format!("{what}: {complaint}");
+        let complaint = member.complaint.as_ref();
+        let failure_kind = complaint.map_or(FailureKind::Fault, |failure| failure.kind);
+        if let Some(failure) = complaint {
+            what = format!("{what}: {}", failure.text);
         } else if status.signal() == Some(libc::SIGBUS)
             && let Ok(free) = Room::free()
         {
@@ -335,11 +403,8 @@ impl ProcessGroup {
         };
         let name = member.plan.name.clone();
         let is_orderly = status.success() && member.complaint.is_none();
-        let from = member.seen_alive.as_ns() - duration_ns(QUEUE_SPAN);
-        let interruption = Interruption {
-            from: Instant::from_ns(from),
-            until: None,
-        };
+        let interruption = self.interruption(index);
+        let member = &mut self.members[index];
         if self.started.is_some() && member.restart_count < limit && member.complaint.is_none() {
             member.restart_count += 1;
             let kind = EventKind::Restarted {
@@ -354,12 +419,11 @@ impl ProcessGroup {
                     self.go_on_without(now, index, error.to_string())
                 }
                 Err(error) => {
-                    let error = error.to_string();
                     let kind = EventKind::StartFailed {
-                        error: error.clone(),
+                        error: error.to_string(),
                     };
                     self.note(now, index, kind, None);
-                    Verdict::Failed(error)
+                    self.not_started(index, &error)
                 }
             };
         }
@@ -373,8 +437,19 @@ impl ProcessGroup {
         if is_orderly {
             Verdict::Finished(text)
         } else {
-            self.failure.get_or_insert(kind.unwrap_or_default());
-            Verdict::Failed(text)
+            Verdict::Failed(Failure {
+                kind: failure_kind,
+                text,
+            })
+        }
+    }
+
+    /// From when on nothing is known of what a process carried that now is lost, or records nothing more.
+    fn interruption(&self, index: usize) -> Interruption {
+        let from = self.members[index].seen_alive.as_ns() - duration_ns(QUEUE_SPAN);
+        Interruption {
+            from: Instant::from_ns(from),
+            until: None,
         }
     }
 
@@ -414,11 +489,26 @@ impl ProcessGroup {
                 }
                 FromProcess::Progress(progress) => merge(&mut member.progress, progress),
                 FromProcess::SkippedTicks(count) => member.skipped_tick_count = Some(count),
+                FromProcess::Warning(_) if self.warning_count >= WARNINGS_MAX => {
+                    member.left_out_count += 1;
+                }
                 FromProcess::Warning(text) => {
+                    self.warning_count += 1;
+                    let text = shortened(&text, TEXT_CHARS_MAX);
                     self.note(now, index, EventKind::Warning { text }, None);
                 }
+                FromProcess::Unwritable(fault) => {
+                    let host = member.plan.host.clone();
+                    self.unwritten.get_or_insert((host, fault.clone()));
+                    let kind = EventKind::Unrecorded { fault };
+                    let gap = self.interruption(index);
+                    self.note(now, index, kind, Some(gap));
+                }
                 FromProcess::Finished(report) => member.report = Some(*report),
-                FromProcess::Failed { kind, text } => member.complaint = Some((kind, text)),
+                FromProcess::Failed(Failure { kind, text }) => {
+                    let text = shortened(&text, TEXT_CHARS_MAX);
+                    member.complaint = Some(Failure { kind, text });
+                }
             }
         }
     }
@@ -493,8 +583,16 @@ impl ProcessGroup {
         self.listen();
     }
 
-    /// Takes the middle out of each long log, once nothing is written to it any more.
+    /// Takes the middle out of each long log, once nothing is written to it any more, and tells of the
+    /// warnings that are left out.
     pub(crate) fn cut_logs(&mut self) {
+        for index in 0..self.members.len() {
+            let count = self.members[index].left_out_count;
+            if count > 0 {
+                let kind = EventKind::WarningsLeftOut { count };
+                self.note(MonotonicClock::now(), index, kind, None);
+            }
+        }
         if let Some(keeper) = self.log_keeper.take() {
             keeper.finish();
         }
@@ -523,11 +621,6 @@ impl ProcessGroup {
         &self.members
     }
 
-    /// What the failure that ended the run means for whoever would try again; `None` where none did.
-    pub(crate) fn failure(&self) -> Option<FailureKind> {
-        self.failure
-    }
-
     /// What happened, in order.
     pub(crate) fn events(&self) -> &[Event] {
         &self.events
@@ -536,7 +629,71 @@ impl ProcessGroup {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
+    use hil_topology::RoleSpec;
+
     use super::*;
+
+    /// A group of one program of the user's, whose run folder is not there.
+    fn group(on_exit: OnExit) -> ProcessGroup {
+        let card = RoleSpec {
+            process: "own".to_owned(),
+            case: None,
+            role: None,
+            seed: 1,
+            inputs: Vec::new(),
+            outputs: Vec::new(),
+            parameters: toml::Table::new(),
+        };
+        let plan = ProcessPlan {
+            name: "own".to_owned(),
+            host: "pc".to_owned(),
+            task: ProcessTask::Foreign {
+                card,
+                command: vec!["own".to_owned()],
+                environment: BTreeMap::new(),
+            },
+            on_exit,
+        };
+        let places = BTreeMap::from([("pc".to_owned(), String::new())]);
+        let folder = RunFolder::existing(Path::new("/proc/no-run"));
+        ProcessGroup::new(vec![plan], places, &folder, None).unwrap()
+    }
+
+    #[test]
+    fn a_start_that_needs_a_file_that_cannot_be_written_is_told_with_it() {
+        let check = |verdict: Verdict| {
+            let Verdict::Unwritable { host, fault } = verdict else {
+                panic!("{verdict:?}");
+            };
+            assert_eq!(host, "pc");
+            assert!(fault.path.starts_with("/proc/no-run"), "{fault}");
+        };
+        check(group(OnExit::EndRun).start().unwrap_err());
+        let mut group = group(OnExit::Restart { limit: 1 });
+        group.started = Some(MonotonicClock::now());
+        check(group.judge(0, ExitStatus::from_raw(0), MonotonicClock::now()));
+    }
+
+    #[test]
+    fn a_failure_keeps_the_kind_that_its_process_gave_it() {
+        let mut group = group(OnExit::EndRun);
+        let failed = ExitStatus::from_raw(1 << 8);
+        for kind in [FailureKind::NotThereYet, FailureKind::HostTooSmall] {
+            let text = "cannot go on".to_owned();
+            group.members[0].complaint = Some(Failure { kind, text });
+            let verdict = group.judge(0, failed, MonotonicClock::now());
+            let Verdict::Failed(failure) = verdict else {
+                panic!("{verdict:?}");
+            };
+            assert_eq!(failure.kind, kind);
+            assert!(failure.text.ends_with(": cannot go on"), "{}", failure.text);
+        }
+        group.members[0].complaint = None;
+        let verdict = group.judge(0, failed, MonotonicClock::now());
+        assert!(matches!(verdict, Verdict::Failed(failure) if failure.kind == FailureKind::Fault));
+    }
 
     #[test]
     fn counts_that_are_not_told_again_stay_as_they_were() {

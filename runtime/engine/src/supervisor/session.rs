@@ -1,9 +1,11 @@
 //! One run from beginning to end. Each step is short; what a step does is in its own file.
 
 use std::collections::BTreeMap;
+use std::fmt;
+use std::io;
 use std::path::PathBuf;
-use std::thread;
 use std::time::{Duration, Instant as WallInstant, SystemTime};
+use std::{fs, thread};
 
 use hil_core::time::Instant;
 use hil_net::clock_pair::ClockPair;
@@ -12,11 +14,11 @@ use super::domains::{self, Domains};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
 use super::needs;
-use super::outcome::{Heard, RunError, RunOptions, meaning};
+use super::outcome::{Heard, RunError, RunOptions};
 use super::peer::{Peer, PeerEvent};
 use super::peer_status::{PeerStatus, greeting, own_ticks};
 use super::plan::{ProcessPlan, domain_base, plan};
-use super::process_group::{ProcessGroup, Verdict};
+use super::process_group::ProcessGroup;
 use super::rendezvous::{gather, read_key};
 use super::status_publisher::StatusPublisher;
 use crate::process::own_program;
@@ -28,11 +30,12 @@ use hil_platform::host_facts::HostFacts;
 use hil_platform::signals::Signals;
 use hil_rundir::announcement::Announcement;
 use hil_rundir::event::{Event, HostHistory, ProcessHistory, disciplines};
+use hil_rundir::file_fault::{FileFault, is_of_full_disk};
 use hil_rundir::manifest::{self, ManifestContent};
-use hil_rundir::pipe::FailureKind;
+use hil_rundir::pipe::Failure;
 use hil_rundir::protection::RunSecurity;
 use hil_rundir::run_folder::{RunFolder, utc_text};
-use hil_rundir::run_result::{Outcome, RunResult};
+use hil_rundir::run_result::{self, Outcome, RunResult};
 use hil_rundir::status::Phase;
 use hil_shm::clock_id;
 use hil_topology::emulation::EmulationLaunch;
@@ -53,6 +56,11 @@ const STOP_PATIENCE: Duration = Duration::from_secs(3);
 const END_GRACE: Duration = Duration::from_secs(3);
 /// Time for what is still under way when the components have stopped.
 const DRAIN: Duration = Duration::from_millis(200);
+/// Room that is held for a `result.json`: of any run, of each process, and of each channel with both its
+/// gateways.
+const RESULT_BYTES: u64 = 32 << 10;
+const RESULT_PROCESS_BYTES: u64 = 4 << 10;
+const RESULT_CHANNEL_BYTES: u64 = 32 << 10;
 
 /// Runs `topology` here.
 ///
@@ -78,23 +86,29 @@ pub fn run(
     // What dead runs left is no reason to refuse this one.
     domains::sweep_below(&domain_base(base));
     needs::check(&plan, base)?;
-    let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
     let discipline = HostDiscipline::gather().ok();
+    let folder = match prepare_folder(topology, &hosts, options, &facts) {
+        Ok(folder) => folder,
+        Err(unprepared) => {
+            if is_of_full_disk(&unprepared.source) && topology.has_hosts_beside(hosts.len()) {
+                console.warn(&format!("{unprepared}; telling the other hosts"));
+                let run = unprepared.folder.to_string_lossy();
+                let domains = Domains::create(&plan.hosts, base, &run)?;
+                let mut gathered =
+                    gather(topology, key.as_ref(), &hosts, &domains, signals, console);
+                let told = PeerMessage::Stop(unprepared.outcome(&hosts[0].name));
+                for peer in gathered.iter_mut().flat_map(|one| &mut one.peers) {
+                    peer.say(&told);
+                }
+            }
+            return Err(unprepared.into());
+        }
+    };
     let unwritable = |source| RunError::Folder {
         folder: folder.root().to_owned(),
         source,
     };
-    let content = ManifestContent {
-        topology,
-        topology_file: &options.topology_file,
-        hosts: &options.hosts,
-        command_line: &options.command_line,
-        layouts: &options.layouts,
-        facts: &facts,
-        realtime_minus_monotonic_ns: ClockPair::read(CLOCK_READS).ok().map(|pair| pair.offset_ns),
-    };
-    manifest::write(&content, &folder).map_err(unwritable)?;
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, base, &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
@@ -129,7 +143,6 @@ pub fn run(
         security: gathered.security,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
-        failure: FailureKind::default(),
         status_publisher,
         elsewhere: PeerStatus::new(topology, &hosts),
     };
@@ -141,7 +154,7 @@ pub fn run(
         Ok(()) => session.watch(start, topology.run().duration),
     };
     let end = MonotonicClock::now();
-    session.stop(&outcome);
+    let outcome = session.stop(outcome);
     Ok(session.conclude(folder, outcome, start, end, started, facts))
 }
 
@@ -166,13 +179,77 @@ fn clocks_known(topology: &Topology, hosts: &[&Host], peers: &[Peer], here: u64)
     has_met_all.then(|| peers.iter().all(|peer| peer.hello.clock_id == here))
 }
 
-fn make_folder(topology: &Topology, hosts: &[&Host]) -> Result<RunFolder, RunError> {
+/// A run folder that cannot be made, or not be filled with what it begins with.
+struct Unprepared {
+    folder: PathBuf,
+    source: io::Error,
+}
+
+impl Unprepared {
+    fn outcome(&self, host: &str) -> Outcome {
+        Outcome::Unwritable {
+            host: host.to_owned(),
+            fault: FileFault::new(&self.folder, &self.source),
+        }
+    }
+}
+
+impl fmt::Display for Unprepared {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(formatter, "{}: {}", self.folder.display(), self.source)
+    }
+}
+
+impl From<Unprepared> for RunError {
+    fn from(unprepared: Unprepared) -> Self {
+        let Unprepared { folder, source } = unprepared;
+        Self::Folder { folder, source }
+    }
+}
+
+/// Makes the run's folder with its manifest, and holds room for its result.
+fn prepare_folder(
+    topology: &Topology,
+    hosts: &[&Host],
+    options: &RunOptions,
+    facts: &HostFacts,
+) -> Result<RunFolder, Unprepared> {
     let parent = PathBuf::from(&topology.run().record_folder);
     let suffix = (hosts.len() < topology.hosts().len()).then(|| hosts[0].name.as_str());
-    RunFolder::create(&parent, topology.name(), suffix).map_err(|source| RunError::Folder {
-        folder: parent,
-        source,
-    })
+    let folder = match RunFolder::create(&parent, topology.name(), suffix) {
+        Ok(folder) => folder,
+        Err(source) => {
+            let folder = parent;
+            return Err(Unprepared { folder, source });
+        }
+    };
+    let content = ManifestContent {
+        topology,
+        topology_file: &options.topology_file,
+        hosts: &options.hosts,
+        command_line: &options.command_line,
+        layouts: &options.layouts,
+        facts,
+        realtime_minus_monotonic_ns: ClockPair::read(CLOCK_READS).ok().map(|pair| pair.offset_ns),
+    };
+    let written = manifest::write(&content, &folder)
+        .and_then(|()| run_result::hold_room(&folder, result_bytes(topology)));
+    match written {
+        Ok(()) => Ok(folder),
+        Err(source) => {
+            let folder = folder.root().to_owned();
+            // It holds nothing of a run yet; the error that is told is the first one.
+            let _left = fs::remove_dir_all(&folder).is_err();
+            Err(Unprepared { folder, source })
+        }
+    }
+}
+
+/// Room for a `result.json` in bytes: more than its processes and channels have been seen to take.
+fn result_bytes(topology: &Topology) -> u64 {
+    let processes = topology.processes().len() as u64;
+    let channels = topology.channels().len() as u64;
+    RESULT_BYTES + processes * RESULT_PROCESS_BYTES + channels * RESULT_CHANNEL_BYTES
 }
 
 struct Session<'a> {
@@ -195,8 +272,6 @@ struct Session<'a> {
     security: Option<RunSecurity>,
     cleaned: WallInstant,
     greeted: WallInstant,
-    /// What a failure of this supervisor's own means.
-    failure: FailureKind,
     status_publisher: StatusPublisher,
     elsewhere: PeerStatus,
 }
@@ -208,10 +283,11 @@ impl Session<'_> {
     /// # Errors
     /// Why the run ended before it began.
     fn begin(&mut self, timeout: Duration) -> Result<(), Outcome> {
-        self.process_group.start().map_err(|error| {
-            self.failure = error.kind();
-            Outcome::Failed(error.to_string())
-        })?;
+        if let Err(verdict) = self.process_group.start()
+            && let Some(outcome) = verdict.outcome()
+        {
+            return Err(outcome);
+        }
         let deadline = WallInstant::now() + timeout;
         let mut ready_peers = 0;
         let mut has_told = false;
@@ -219,7 +295,9 @@ impl Session<'_> {
             match self.look_after() {
                 None => {}
                 // Whoever ends before the run has begun has failed, however politely.
-                Some(Outcome::EndedEarly(text)) => return Err(Outcome::Failed(text)),
+                Some(Outcome::EndedEarly(text)) => {
+                    return Err(Outcome::Failed(Failure::fault(text)));
+                }
                 Some(outcome) => return Err(outcome),
             }
             self.tell(Phase::Starting);
@@ -263,7 +341,7 @@ impl Session<'_> {
                 };
                 let limit_s = timeout.as_secs();
                 let text = format!("{text} was not ready within {limit_s} s");
-                return Err(Outcome::Failed(text));
+                return Err(Outcome::Failed(Failure::fault(text)));
             }
             thread::sleep(WATCH_PERIOD);
         }
@@ -315,11 +393,7 @@ impl Session<'_> {
             self.console
                 .warn(&format!("{}: {}", event.process, event.kind));
         }
-        match verdict {
-            Verdict::Running => None,
-            Verdict::Finished(text) => Some(Outcome::EndedEarly(text)),
-            Verdict::Failed(text) => Some(Outcome::Failed(text)),
-        }
+        verdict.outcome()
     }
 
     /// Tells each peer that this host lives, and what is known of ticks.
@@ -385,17 +459,17 @@ impl Session<'_> {
     }
 
     /// Ends components everywhere first, then gateways, so that what is under way arrives, and last
-    /// the clock paths, so that an exchange follows the last message.
-    fn stop(&mut self, outcome: &Outcome) {
+    /// the clock paths, so that an exchange follows the last message. Gives how the run ended, which is
+    /// what the topology's first of the hosts that could not write says, if several say so at once.
+    fn stop(&mut self, outcome: Outcome) -> Outcome {
         self.tell(Phase::Ending);
-        let reason = outcome.text();
-        let meaning = meaning(outcome);
-        self.say_to_all(&PeerMessage::Stop { reason, meaning });
+        self.say_to_all(&PeerMessage::Stop(outcome.clone()));
         self.process_group
             .stop(STOP_PATIENCE, ProcessPlan::is_component);
         self.say_to_all(&PeerMessage::Quiet);
+        let mut told = Vec::new();
         if !matches!(outcome, Outcome::PeerLost(_)) {
-            self.wait_for_quiet();
+            told = self.wait_for_quiet();
         }
         thread::sleep(DRAIN);
         self.process_group
@@ -403,20 +477,38 @@ impl Session<'_> {
         self.process_group
             .stop(STOP_PATIENCE, ProcessPlan::is_clock_path);
         self.process_group.cut_logs();
+        self.first_unwritable(outcome, told)
     }
 
-    fn wait_for_quiet(&mut self) {
+    /// `own` outcome, unless a host before this one could not write either.
+    fn first_unwritable(&self, own: Outcome, told: Vec<Outcome>) -> Outcome {
+        let hosts = self.topology.hosts();
+        let place = |outcome: &Outcome| match outcome {
+            Outcome::Unwritable { host, .. } => hosts.iter().position(|one| one.name == *host),
+            _ => None,
+        };
+        if place(&own).is_none() {
+            return own;
+        }
+        let all = [own].into_iter().chain(told);
+        let first = all.filter(|one| place(one).is_some()).min_by_key(place);
+        first.expect("the own one is among them")
+    }
+
+    /// Gives what the other hosts said of the run's end meanwhile.
+    fn wait_for_quiet(&mut self) -> Vec<Outcome> {
         let deadline = WallInstant::now() + STOP_PATIENCE + DRAIN;
+        let mut told = Vec::new();
         while self.peers.iter().any(|peer| !peer.is_quiet) && WallInstant::now() < deadline {
-            if self
-                .hear()
-                .iter()
-                .any(|heard| matches!(heard, Heard::Lost(_)))
-            {
-                return;
+            let heard = self.hear();
+            let is_lost = heard.iter().any(|heard| matches!(heard, Heard::Lost(_)));
+            told.extend(heard.into_iter().filter_map(Heard::outcome));
+            if is_lost {
+                break;
             }
             thread::sleep(WATCH_PERIOD);
         }
+        told
     }
 
     /// Exchanges records with the other hosts and takes everything down.
@@ -441,6 +533,7 @@ impl Session<'_> {
             cards,
         };
         let mut stories = vec![own.clone()];
+        let mut gaps = Vec::new();
         if let Outcome::PeerLost(who) = &outcome {
             problems.push(format!("no records of the host that vanished ({who})"));
         } else if !self.peers.is_empty() {
@@ -450,10 +543,10 @@ impl Session<'_> {
             let first = self.is_first_host;
             let received = exchange(&mut self.peers, first, &records, &own);
             problems.extend(received.problems);
+            gaps = received.gaps;
             stories.extend(received.stories);
         }
         let has_one_clock = self.has_one_clock;
-        let failure = self.process_group.failure().unwrap_or(self.failure);
         drop(self.process_group);
         drop(self.status_publisher);
         self.announcement.withdraw();
@@ -463,6 +556,13 @@ impl Session<'_> {
             left.into_iter()
                 .map(|what| format!("left in shared memory: {what}")),
         );
+        // The same on every host.
+        let place = |story: &HostHistory| {
+            let hosts = self.topology.hosts().iter();
+            let mut names = hosts.map(|host| &host.name);
+            names.position(|name| story.hosts.contains(name))
+        };
+        stories.sort_by_key(place);
         let spans = stories.iter().flat_map(|story| {
             let span = story.span;
             story.hosts.iter().map(move |host| (host.clone(), span))
@@ -479,7 +579,6 @@ impl Session<'_> {
         RunResult {
             folder,
             outcome,
-            failure,
             spans,
             started,
             events,
@@ -489,6 +588,7 @@ impl Session<'_> {
             security: self.security,
             disciplines,
             own_hosts,
+            gaps,
             problems,
             facts,
             trace_delays: trace_delays(self.topology),

@@ -61,7 +61,10 @@ impl StatusPublisher {
         let mut status = RunStatus::new(phase, duration_ns, processes.collect());
         status.elsewhere = elsewhere.status();
         status.start_ns = process_group.started.map(Instant::as_ns);
-        if let Some(complaint) = self.file.write(status) {
+        // Where the disk takes no records, it is told already and ends the run.
+        if let Some(complaint) = self.file.write(status)
+            && !process_group.cannot_record()
+        {
             console.warn(&complaint);
         }
         let Some(start) = process_group.started.filter(|_| phase == Phase::Running) else {

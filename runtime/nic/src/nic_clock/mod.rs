@@ -150,7 +150,12 @@ impl NicWatch {
         }
         if let Some(recorder) = self.recorder.take() {
             let written = recorder.finish();
-            self.problems.extend(written.failures);
+            let failures = written.failures.iter().map(ToString::to_string);
+            self.problems.extend(failures);
+            if written.has_panicked {
+                self.problems
+                    .push("the writer of card clocks panicked".to_owned());
+            }
         }
         // In the reverse order: of two hosts with one card, the first found its former setting.
         for card in self.cards.iter_mut().rev() {

@@ -24,7 +24,6 @@ use hil_shuttle::{Shuttle, ShuttleCommand, ShuttleStatus};
 use super::{analyse, conclude};
 use hil_platform::host_facts::HostFacts;
 use hil_rundir::manifest::{self, ManifestContent};
-use hil_rundir::pipe::FailureKind;
 use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
 use hil_rundir::run_folder::RunFolder;
@@ -328,7 +327,6 @@ fn result(root: &Path, count: i64) -> RunResult {
     RunResult {
         folder: RunFolder::existing(root),
         outcome: Outcome::Completed,
-        failure: FailureKind::default(),
         spans: BTreeMap::from([
             ("control-pc".to_owned(), span(false)),
             ("robot-pc".to_owned(), span(true)),
@@ -341,6 +339,7 @@ fn result(root: &Path, count: i64) -> RunResult {
         security: None,
         disciplines: BTreeMap::new(),
         own_hosts: vec!["control-pc".to_owned()],
+        gaps: Vec::new(),
         problems: Vec::new(),
         facts: HostFacts::default(),
         trace_delays: BTreeMap::new(),

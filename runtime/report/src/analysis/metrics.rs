@@ -30,7 +30,10 @@ pub(super) fn run_facts(
         run_result::Outcome::Interrupted(_) | run_result::Outcome::EndedByPeer(_) => {
             Outcome::Stopped
         }
-        run_result::Outcome::Failed(_) | run_result::Outcome::PeerLost(_) => Outcome::Failed,
+        run_result::Outcome::Failed(_)
+        | run_result::Outcome::Unwritable { .. }
+        | run_result::Outcome::PeerFailed { .. }
+        | run_result::Outcome::PeerLost(_) => Outcome::Failed,
     };
     let files = [
         ("summary.json", "every figure of this report"),

@@ -18,6 +18,7 @@ mod radio;
 pub(crate) mod records;
 mod robot_series;
 mod score_clock;
+mod storage;
 
 use std::path::{Path, PathBuf};
 use std::{fs, io};
@@ -36,10 +37,11 @@ use crate::event_log;
 use crate::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
 use crate::terminal::{self, Style};
 use crate::trace::capture;
+use hil_rundir::file_fault::FileFault;
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::run_result::{RunResult, RunResultError};
-use hil_rundir::series;
+use hil_rundir::series::{self, SeriesError};
 use hil_topology::Topology;
 use hil_topology::registry::{Case, CaseError, Registry};
 
@@ -154,7 +156,7 @@ pub fn conclude(
         .map(|channel| channel_summary(&records, channel))
         .collect();
     summary.directions = metrics::directions(result);
-    capture::write(&mut summary, &records);
+    let mut unwritten_files = capture::write(&mut summary, &records);
     summary.faces = adapters::adapter_summaries(&records);
     summary.hardware_stamps = nics::hardware_stamps(&records);
     let outages = add_outages(&mut summary, &records, &axis);
@@ -180,7 +182,10 @@ pub fn conclude(
     summary.warnings.extend(unscored);
     let case = case.as_ref().map(|(_, case)| case.as_ref());
     let network_series = network_series.unwrap_or_default();
-    write_series(&mut summary, case, network_series, records);
+    unwritten_files.extend(write_series(&mut summary, case, network_series, records));
+    summary.record_gaps.clone_from(&result.gaps);
+    let storage = storage::warnings(result, &unwritten_files);
+    summary.warnings.splice(0..0, storage);
     let unwritten = write_texts(&summary, result).err();
     Ok(Concluded { summary, unwritten })
 }
@@ -193,11 +198,21 @@ fn write_texts(summary: &RunSummary, result: &RunResult) -> Result<(), AnalysisE
         &summary.score_events,
         &summary.link_changes,
     );
-    fs::write(&path, text).map_err(|source| AnalysisError::Write { path, source })?;
+    write_whole(&path, &text).map_err(|source| AnalysisError::Write { path, source })?;
     summary.write(&result.folder.summary())?;
     let plain = terminal::render(summary, REPORT_FILE_WIDTH, Style::Plain);
     let path = result.folder.report();
-    fs::write(&path, plain).map_err(|source| AnalysisError::Write { path, source })
+    write_whole(&path, &plain).map_err(|source| AnalysisError::Write { path, source })
+}
+
+/// Writes `text` to `path`; of a file that cannot be written in full nothing is left.
+pub(crate) fn write_whole(path: &Path, text: &str) -> io::Result<()> {
+    let written = fs::write(path, text);
+    if written.is_err() {
+        // The error that is told is the first one.
+        let _left = fs::remove_file(path).is_err();
+    }
+    written
 }
 
 /// The outages of every channel, their figures put into the summary.
@@ -219,13 +234,14 @@ fn add_outages(
     stories
 }
 
-/// Writes what the case and the network have to plot. A run whose plots cannot be written has its report still.
+/// Writes what the case and the network have to plot; gives the file that could not be written. A run whose
+/// plots cannot be written has its report still.
 fn write_series(
     summary: &mut RunSummary,
     case: Option<&dyn Case>,
     network: Vec<PlotSeries>,
     records: RunRecords<'_>,
-) {
+) -> Option<FileFault> {
     let folder = records.result.folder.series();
     let mut made = case.map_or_else(Vec::new, |case| case.series(&records.log));
     made.extend(network);
@@ -237,10 +253,12 @@ fn write_series(
             let what = format!("{}; columns in series/series.json", names.join(", "));
             summary.run.files.push(Fact::new("series/", what));
         }
+        Err(SeriesError::Write { path, source }) => return Some(FileFault::new(&path, &source)),
         Err(error) => summary
             .warnings
             .push(format!("series are missing or not whole: {error}")),
     }
+    None
 }
 
 /// What spoils the run or the reading of its figures.
@@ -250,12 +268,6 @@ fn add_warnings(summary: &mut RunSummary, records: &RunRecords<'_>) {
         .warnings
         .extend(result.problems.iter().cloned().chain(records.problems()));
     for process in &result.processes {
-        let failures = process
-            .report
-            .iter()
-            .flat_map(|report| &report.recorder_failures);
-        let named = failures.map(|failure| format!("{} could not write {failure}", process.name));
-        summary.warnings.extend(named);
         let unconnected = process
             .report
             .as_ref()

@@ -110,6 +110,7 @@ fn spoilt(summary: &RunSummary) -> Option<&'static str> {
             Some("a receiving gateway was late: no network result")
         }
         NetworkVerdict::RunFailed => Some("the run failed"),
+        NetworkVerdict::RecordsMissing { .. } => Some("records of a host are missing"),
         NetworkVerdict::EmulatedLink
         | NetworkVerdict::VirtualTime
         | NetworkVerdict::NoNetwork

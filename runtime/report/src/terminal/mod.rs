@@ -128,7 +128,9 @@ fn no_result(why: &str) -> (Tone, String) {
 /// What a run says about a network, in a few words.
 pub(crate) const fn network_word(verdict: &NetworkVerdict) -> &'static str {
     match verdict {
-        NetworkVerdict::RunFailed | NetworkVerdict::TicksUnknown => "no verdict",
+        NetworkVerdict::RunFailed
+        | NetworkVerdict::TicksUnknown
+        | NetworkVerdict::RecordsMissing { .. } => "no verdict",
         NetworkVerdict::VirtualTime => "virtual time",
         NetworkVerdict::EmulatedLink => "an emulated link",
         NetworkVerdict::NoNetwork => "no channel went over a network",
@@ -196,6 +198,11 @@ pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
         NetworkVerdict::ReceiverLate { channels } => {
             let why = ": datagrams had no room in the receive buffer, their gateway was late with";
             no_result(&format!("{why} {}", channels.join(", ")))
+        }
+        NetworkVerdict::RecordsMissing { hosts } => {
+            let hosts = hosts.join(", ");
+            let text = format!("no verdict: records of other hosts are missing on {hosts}");
+            (Tone::Caution, text)
         }
         NetworkVerdict::TicksUnknown => {
             let text = "no verdict: a component left no count of its ticks";

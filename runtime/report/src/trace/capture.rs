@@ -1,6 +1,7 @@
 //! The traces a run leaves: one file for each channel that crossed a link, drawn up from the
 //! records after the run. A trace that cannot be written costs the run nothing but that file.
 
+use std::fmt::Display;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
@@ -12,6 +13,7 @@ use hil_trace::{TraceArrival, TraceDirection, TraceHeader, TraceRecord, UNAVAILA
 use crate::analysis::link_changes;
 use crate::analysis::records::RunRecords;
 use crate::summary::{Fact, RunSummary};
+use hil_rundir::file_fault::FileFault;
 use hil_rundir::run_result::RunResult;
 use hil_topology::trace_source::file_name;
 use hil_topology::{Crossing, Direction, Via};
@@ -19,14 +21,33 @@ use hil_topology::{Crossing, Direction, Via};
 /// What a trace of clocks without a relation says of them.
 pub(crate) const NOT_ALIGNED: &str = "clocks not aligned";
 
-/// Writes the traces of a finished run and says so in its summary.
-pub(crate) fn write(summary: &mut RunSummary, records: &RunRecords<'_>) {
+/// Why there is no trace of a channel.
+enum TraceFault {
+    File(FileFault),
+    Other(String),
+}
+
+impl From<FileFault> for TraceFault {
+    fn from(fault: FileFault) -> Self {
+        Self::File(fault)
+    }
+}
+
+fn other(error: impl Display) -> TraceFault {
+    TraceFault::Other(error.to_string())
+}
+
+/// Writes the traces of a finished run and says so in its summary; gives the files that could not be
+/// written.
+pub(crate) fn write(summary: &mut RunSummary, records: &RunRecords<'_>) -> Vec<FileFault> {
     let folder = records.result.folder.traces();
+    let mut unwritten = Vec::new();
     let mut written_count = 0;
     for crossing in records.topology.crossings() {
         match write_one(records, &crossing, &folder) {
             Ok(is_written) => written_count += usize::from(is_written),
-            Err(why) => {
+            Err(TraceFault::File(fault)) => unwritten.push(fault),
+            Err(TraceFault::Other(why)) => {
                 let channel = &crossing.channel.name;
                 let text = format!("no link trace of {channel}: {why}");
                 summary.warnings.push(text);
@@ -39,6 +60,7 @@ pub(crate) fn write(summary: &mut RunSummary, records: &RunRecords<'_>) {
         );
         summary.run.files.push(Fact::new("traces/", what));
     }
+    unwritten
 }
 
 /// False when nothing was recorded of the channel.
@@ -46,7 +68,7 @@ fn write_one(
     records: &RunRecords<'_>,
     crossing: &Crossing<'_>,
     folder: &Path,
-) -> Result<bool, String> {
+) -> Result<bool, TraceFault> {
     let channel = crossing.channel;
     let traced = TraceChannel {
         size_bytes: u32::try_from(channel.message.size_bytes).unwrap_or(u32::MAX),
@@ -54,8 +76,7 @@ fn write_one(
     };
     records.consult(channel, |files, context| {
         let mut seen = Seen::default();
-        each_traced(files, context, traced, |record| seen.note(&record))
-            .map_err(|error| error.to_string())?;
+        each_traced(files, context, traced, |record| seen.note(&record)).map_err(other)?;
         if seen.count == 0 {
             return Ok(false);
         }
@@ -64,18 +85,17 @@ fn write_one(
             link_change_count: u16::try_from(change_count).unwrap_or(u16::MAX),
             ..header(records.result, crossing, seen.has_delay)
         };
-        fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+        fs::create_dir_all(folder).map_err(|error| FileFault::new(folder, &error))?;
         let path = folder.join(file_name(&channel.name));
         let mut file = TraceFile::create(&path, &header, seen.count)?;
         if seen.is_out_of_order {
             // Only where two starts of a producer overlap; sorting needs all of them at once.
-            let found = link_trace(files, context, traced).map_err(|error| error.to_string())?;
+            let found = link_trace(files, context, traced).map_err(other)?;
             for record in &found {
                 file.add(record);
             }
         } else {
-            each_traced(files, context, traced, |record| file.add(&record))
-                .map_err(|error| error.to_string())?;
+            each_traced(files, context, traced, |record| file.add(&record)).map_err(other)?;
         }
         file.finish()?;
         Ok(true)
@@ -106,14 +126,13 @@ struct TraceFile<'a> {
     path: &'a Path,
     encoder: TraceEncoder,
     file: BufWriter<File>,
-    fault: Option<String>,
+    fault: Option<TraceFault>,
 }
 
 impl<'a> TraceFile<'a> {
-    fn create(path: &'a Path, header: &TraceHeader, count: usize) -> Result<Self, String> {
-        let (encoder, bytes) =
-            TraceEncoder::new(header, count).map_err(|error| error.to_string())?;
-        let failed = |error: io::Error| format!("{}: {error}", path.display());
+    fn create(path: &'a Path, header: &TraceHeader, count: usize) -> Result<Self, TraceFault> {
+        let (encoder, bytes) = TraceEncoder::new(header, count).map_err(other)?;
+        let failed = |error: io::Error| FileFault::new(path, &error);
         let mut trace = Self {
             path,
             encoder,
@@ -131,29 +150,28 @@ impl<'a> TraceFile<'a> {
         }
         match self.encoder.record(record) {
             Ok(bytes) => self.write(&bytes),
-            Err(error) => self.fault = Some(error.to_string()),
+            Err(error) => self.fault = Some(other(error)),
         }
     }
 
     fn write(&mut self, bytes: &[u8]) {
         if let Err(error) = self.file.write_all(bytes) {
-            self.fault = Some(format!("{}: {error}", self.path.display()));
+            self.fault = Some(FileFault::new(self.path, &error).into());
         }
     }
 
-    fn finish(mut self) -> Result<(), String> {
+    fn finish(mut self) -> Result<(), TraceFault> {
         if self.fault.is_none()
             && let Err(error) = self.file.flush()
         {
-            self.fault = Some(format!("{}: {error}", self.path.display()));
+            self.fault = Some(FileFault::new(self.path, &error).into());
         }
         let Some(fault) = self.fault else {
             return Ok(());
         };
-        match fs::remove_file(self.path) {
-            Ok(()) => Err(fault),
-            Err(error) => Err(format!("{fault}; what is there of it stays: {error}")),
-        }
+        // The error that is told is the first one.
+        let _left = fs::remove_file(self.path).is_err();
+        Err(fault)
     }
 }
 

@@ -192,7 +192,13 @@ impl RecordHeader {
             File::create_new(&path).and_then(|mut file| file.write_all(&bytes).map(|()| file));
         match made {
             Ok(file) => Ok((path, file)),
-            Err(source) => Err(RecordFileError::Io { path, source }),
+            Err(source) => {
+                if source.kind() != io::ErrorKind::AlreadyExists {
+                    // A file without a header would only be one more thing to tell of.
+                    let _left = fs::remove_file(&path).is_err();
+                }
+                Err(RecordFileError::Io { path, source })
+            }
         }
     }
 

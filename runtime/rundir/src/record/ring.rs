@@ -13,6 +13,7 @@ use bytemuck::Pod;
 use hil_core::message::Envelope;
 
 use super::file::{RecordFileError, RecordHeader, RecordKind};
+use crate::file_fault::FileFault;
 
 /// How often the writer empties the rings: what a kill of the process can lose at most.
 const FLUSH_PERIOD: Duration = Duration::from_millis(20);
@@ -66,8 +67,11 @@ struct Drain {
 pub struct RecorderOutcome {
     /// Records dropped because a ring was full.
     pub dropped_count: u64,
-    /// Files that could not be written, with the reason.
-    pub failures: Vec<String>,
+    /// Files that could not be written, in the order in which that was noticed: what was in them
+    /// before is whole, and later records are in no file.
+    pub failures: Vec<FileFault>,
+    /// True when the writer's thread panicked.
+    pub has_panicked: bool,
 }
 
 /// Owns the files of one process and the thread that writes them.
@@ -79,18 +83,7 @@ pub struct Recorder {
     dropped: Arc<AtomicU64>,
     drains: Vec<Drain>,
     stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<Vec<String>>>,
-}
-
-impl RecorderOutcome {
-    /// Why a process that could not record cannot go on: the first failure stands for those that
-    /// followed from it.
-    pub fn problem(&self) -> Option<String> {
-        let first = self.failures.first()?;
-        Some(format!(
-            "cannot record: {first}; messages after that would be in no account"
-        ))
-    }
+    thread: Option<JoinHandle<Vec<FileFault>>>,
 }
 
 impl Recorder {
@@ -157,15 +150,18 @@ impl Recorder {
     /// # Errors
     /// When the system gives no thread.
     pub fn start(&mut self) -> io::Result<()> {
-        self.start_and_tell(|| ())
+        self.start_and_tell(|_fault| ())
     }
 
-    /// As [`Recorder::start`]; `on_failure` is called from the writer thread when a file can no
+    /// As [`Recorder::start`]; `on_failure` is called from the writer thread when a first file can no
     /// longer be written, so that a run does not go on for hours without its account.
     ///
     /// # Errors
     /// As [`Recorder::start`].
-    pub fn start_and_tell(&mut self, on_failure: impl Fn() + Send + 'static) -> io::Result<()> {
+    pub fn start_and_tell(
+        &mut self,
+        on_failure: impl Fn(&FileFault) + Send + 'static,
+    ) -> io::Result<()> {
         let mut drains = core::mem::take(&mut self.drains);
         let stop = Arc::clone(&self.stop);
         let builder = thread::Builder::new().name("recorder".to_owned());
@@ -176,8 +172,11 @@ impl Recorder {
                 drains.retain_mut(|drain| match flush(drain) {
                     Ok(()) => true,
                     Err(error) => {
-                        failures.push(format!("{}: {error}", drain.path.display()));
-                        on_failure();
+                        let fault = FileFault::new(&drain.path, &error);
+                        if failures.is_empty() {
+                            on_failure(&fault);
+                        }
+                        failures.push(fault);
                         false
                     }
                 });
@@ -198,14 +197,11 @@ impl Recorder {
     /// Writes what is left and ends the writer thread.
     pub fn finish(mut self) -> RecorderOutcome {
         self.stop.store(true, Ordering::Release);
-        let failures = match self.thread.take().map(JoinHandle::join) {
-            Some(Ok(failures)) => failures,
-            Some(Err(_)) => vec!["the recorder thread panicked".to_owned()],
-            None => Vec::new(),
-        };
+        let ended = self.thread.take().map(JoinHandle::join).transpose();
         RecorderOutcome {
             dropped_count: self.dropped_count(),
-            failures,
+            has_panicked: ended.is_err(),
+            failures: ended.ok().flatten().unwrap_or_default(),
         }
     }
 }
@@ -264,17 +260,17 @@ mod tests {
             file,
             path,
         });
-        let told = Arc::new(AtomicU64::new(0));
-        let counted = Arc::clone(&told);
-        let count = move || {
-            counted.fetch_add(1, Ordering::Relaxed);
-        };
-        recorder.start_and_tell(count).unwrap();
+        let (teller, told) = std::sync::mpsc::channel();
+        let tell = move |fault: &FileFault| teller.send(fault.clone()).unwrap();
+        recorder.start_and_tell(tell).unwrap();
+        let first = told.recv().unwrap();
+        assert_eq!(
+            first.to_string(),
+            "/dev/full: No space left on device (os error 28)"
+        );
         let outcome = recorder.finish();
-        assert_eq!(told.load(Ordering::Relaxed), 1);
-        let problem = outcome.problem().unwrap();
-        assert!(problem.starts_with("cannot record: /dev/full: No space left on device"));
-        assert_eq!(RecorderOutcome::default().problem(), None);
+        assert_eq!(outcome.failures, [first]);
+        assert!(told.recv().is_err(), "told once");
     }
 
     #[test]
@@ -295,7 +291,7 @@ mod tests {
             outcome,
             RecorderOutcome {
                 dropped_count: 30,
-                failures: Vec::new()
+                ..RecorderOutcome::default()
             }
         );
         let file = RecordFile::read(&folder.join("a.b.published.robot.0.rec")).unwrap();

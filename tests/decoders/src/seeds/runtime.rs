@@ -7,15 +7,15 @@ use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::layout::Field;
 use hil_core::message::Message;
 use hil_core::time::Instant;
-use hil_engine::supervisor::frame::{
-    EndMeaning, PeerHello, PeerMessage, write_chunk, write_message,
-};
+use hil_engine::supervisor::frame::{PeerHello, PeerMessage, write_chunk, write_message};
 use hil_engine::supervisor::peer_status::HostTicks;
 use hil_report::summary::{Fact, Outcome, RunFacts, RunSummary};
 use hil_rundir::event::{Event, EventKind, HostHistory, Interruption, ProcessHistory, ProcessKind};
+use hil_rundir::file_fault::{GapCause, RecordGap};
 use hil_rundir::manifest::describe_fields;
 use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
+use hil_rundir::run_result::Outcome as RunOutcome;
 use hil_shuttle::{ShuttleCommand, ShuttleStatus};
 use hil_topology::load;
 use serde_json::json;
@@ -132,10 +132,12 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
             has_one_clock: true,
         },
         PeerMessage::Alive,
-        PeerMessage::Stop {
-            reason: "Ctrl-C".to_owned(),
-            meaning: EndMeaning::Broken,
-        },
+        PeerMessage::Stop(RunOutcome::Interrupted("Ctrl-C".to_owned())),
+        PeerMessage::Taken(vec![RecordGap {
+            host: "robot-pc".to_owned(),
+            of: vec!["control-pc".to_owned()],
+            cause: GapCause::Connection("closed".to_owned()),
+        }]),
         PeerMessage::Quiet,
     ];
     let mut inputs: Vec<Vec<u8>> = messages
