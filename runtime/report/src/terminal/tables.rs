@@ -3,9 +3,13 @@
 use super::canvas::{Canvas, INDENT, Tone, left, right};
 use super::units::{duration_s, figure, seconds};
 use crate::alike::joined_labels;
-use crate::summary::{ProcessSummary, RealtimeFacts, RunEvent, ScoreMetric, host_words};
+use crate::summary::{
+    ProcessSummary, RealtimeFacts, RunEvent, RunEventKind, ScoreMetric, host_words,
+};
 use hil_platform::host_facts::HostFacts;
 use hil_platform::text::{columns, grouped};
+use hil_platform::words::counted;
+use hil_rundir::event::EventKind;
 
 /// Shorter preparations concern nobody.
 const PREPARATION_S_MIN: f64 = 0.01;
@@ -142,12 +146,22 @@ fn column(text: &str, width: usize) -> String {
     format!("{} ", left(text, width.saturating_sub(1)))
 }
 
+/// Warnings of processes on the page, the first ones; all of them are in the summary.
+const WARNINGS_SHOWN_COUNT: usize = 200;
+
 pub(super) fn events(canvas: &mut Canvas, events: &[RunEvent]) {
     if events.is_empty() {
         return;
     }
     canvas.heading("Events", "");
+    let mut warning_count = 0;
     for event in events {
+        if let RunEventKind::Process(EventKind::Warning { .. }) = event.kind {
+            warning_count += 1;
+            if warning_count > WARNINGS_SHOWN_COUNT {
+                continue;
+            }
+        }
         let what = event.what();
         let text = match event.cause() {
             Some(cause) => format!("{what} ({cause})"),
@@ -157,6 +171,11 @@ pub(super) fn events(canvas: &mut Canvas, events: &[RunEvent]) {
             .at_s
             .map_or_else(|| "time unknown".to_owned(), seconds);
         canvas.field(&at, Tone::Plain, &text);
+    }
+    let hidden = warning_count.saturating_sub(WARNINGS_SHOWN_COUNT) as u64;
+    if hidden > 0 {
+        let more = counted(hidden, "more warning");
+        canvas.field("", Tone::Plain, &format!("{more}, in summary.json"));
     }
 }
 
@@ -180,5 +199,33 @@ pub(super) fn host(canvas: &mut Canvas, facts: &HostFacts) {
     canvas.heading("Host", "");
     for fact in host_words(facts) {
         canvas.field_of(22, &fact.label, Tone::Plain, &fact.value);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::terminal::{Style, render};
+    use crate::tests::sample;
+
+    #[test]
+    fn of_many_warnings_the_first_are_shown_and_the_others_counted() {
+        let mut summary = sample::full();
+        let event = |index| RunEvent {
+            at_s: Some(1.0),
+            process: "robot".to_owned(),
+            kind: RunEventKind::Process(EventKind::Warning {
+                text: format!("said: {index}."),
+            }),
+            absence: None,
+        };
+        summary.events.splice(0..0, (0..100_000).map(event));
+        let page = render(&summary, 100, Style::Plain);
+        assert!(page.contains("said: 199.") && !page.contains("said: 200."));
+        assert!(page.contains("99,800 more warnings, in summary.json"));
+        assert!(
+            page.contains("restart 1 of at most 3"),
+            "what came after them"
+        );
     }
 }
