@@ -372,6 +372,9 @@ impl EgressBridge {
 
     /// The next piece of the long message under way, whose bytes are `payload`; the same again until
     /// [`EgressBridge::on_long_sent`] or [`EgressBridge::on_long_failed`]. `now` becomes its `handed_ns`.
+    ///
+    /// # Panics
+    /// Never: the index of a piece stays below their count.
     pub fn long_piece<'a>(&'a mut self, now: Instant, payload: &'a [u8]) -> Option<LongPiece<'a>> {
         let long = self.long.as_mut()?;
         let index = long.header.fragment_index;

@@ -390,7 +390,7 @@ fn a_peer_that_goes_takes_the_long_message_with_it() {
     egress.begin_long(0, &Envelope::default(), 1 << 20).unwrap();
     egress.on_peer_unreachable(now);
     assert!(!egress.has_long());
-    assert_eq!(egress.long_piece(now, &[0; 1 << 20]), None);
+    assert_eq!(egress.long_piece(now, &vec![0; 1 << 20]), None);
     let counts = egress.channel_counts(0);
     assert_eq!((counts.offered_count, counts.message_failed_count), (1, 1));
 }
