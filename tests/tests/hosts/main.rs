@@ -18,6 +18,7 @@ mod full_disk;
 mod hardware_stamps;
 mod kills;
 mod limits;
+mod many_channels;
 mod probe_run;
 mod secured_run;
 mod soak;

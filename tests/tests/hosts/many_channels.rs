@@ -1,0 +1,212 @@
+//! Hundreds of channels of somebody's own programs over one link, with a gateway that is killed and a cable that is
+//! pulled: both hosts come to complete and equal accounts, and no process grows.
+//!
+//! `HIL_MANY_MINUTES=30 cargo nextest run --workspace --run-ignored only -E 'test(four_hundred_channels)' --no-capture`
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+use std::{env, thread};
+
+use hil_account::{ChannelAccount, MessageFate, Stage};
+use hil_report::summary::{Outcome, RunSummary};
+use hil_tests::account::{account, describe};
+use hil_tests::lab::Lab;
+use hil_tests::run_folder::RunFolder;
+use hil_tests::split::HOSTS;
+use hil_tests::trial::{RunFiles, Trial, wait_until};
+
+const LIMIT: Duration = Duration::from_mins(3);
+/// How long the account of so many messages may take on a busy machine.
+const CONCLUDE_LIMIT: Duration = Duration::from_mins(20);
+/// Length of the long run, minutes.
+const MINUTES_VARIABLE: &str = "HIL_MANY_MINUTES";
+const MINUTES_DEFAULT: f64 = 2.0;
+
+/// Half of the channels each way, all on one link.
+fn topology(folder: &RunFolder, channel_count: usize, hz: u32, duration: Duration) -> PathBuf {
+    let program = env!("CARGO_BIN_EXE_hil-traffic");
+    let mut text = format!(
+        "version = 1\nname = \"many\"\n[run]\nduration = \"{} ms\"\nstart_timeout = \"120 s\"\n\
+         [security]\nhops = \"plain\"\n[hosts.control-pc]\naddress = \"10.77.0.1\"\n\
+         [hosts.robot-pc]\naddress = \"10.77.0.2\"\n[processes.a]\nhost = \"control-pc\"\n\
+         run = [\"{program}\", \"{hz}\"]\n[processes.b]\nhost = \"robot-pc\"\n\
+         run = [\"{program}\", \"{hz}\"]\n[links.hop]\nvia = \"udp\"\n\
+         between = [\"control-pc\", \"robot-pc\"]\nport = 7400\n\
+         receive_buffer_bytes = 4194304\n[links.hop.gateway]\nrestart_limit = 9\n",
+        duration.as_millis()
+    );
+    for index in 0..channel_count {
+        let (way, from, to) = if index % 2 == 0 {
+            ("there", "a", "b")
+        } else {
+            ("back", "b", "a")
+        };
+        let _infallible = write!(
+            text,
+            "[channels.\"{way}/{index}\"]\nlink = \"hop\"\nfrom = \"{from}\"\nto = \"{to}\"\n\
+             depth = 8\nmessage = {{ name = \"test.Bytes.v1\", size_bytes = 60, alignment_bytes = 4 }}\n"
+        );
+    }
+    let path = folder.join("many.toml");
+    fs::write(&path, text).unwrap();
+    path
+}
+
+/// Resident memory of each process of both hosts, bytes.
+fn resident(files: &[RunFiles; 2]) -> BTreeMap<String, u64> {
+    let mut found = BTreeMap::new();
+    for (host, files) in HOSTS.iter().zip(files) {
+        for process in files.processes() {
+            let read = |file: &str| fs::read_to_string(format!("/proc/{process}/{file}"));
+            let (Ok(line), Ok(status)) = (read("cmdline"), read("status")) else {
+                continue;
+            };
+            let name = line.split('\0').find(|word| word.contains("gateway-hop"));
+            let Some(name) = name.and_then(|path| path.rsplit('/').next()) else {
+                continue;
+            };
+            let mut lines = status.lines();
+            let kib = lines.find_map(|line| line.strip_prefix("VmRSS:"));
+            let kib = kib.and_then(|rest| rest.split_whitespace().next()?.parse::<u64>().ok());
+            found.insert(format!("{host} {name}"), kib.unwrap_or(0) * 1024);
+        }
+    }
+    found
+}
+
+struct Played {
+    summaries: [RunSummary; 2],
+    /// At a sixth and at five sixths of the run.
+    resident: [BTreeMap<String, u64>; 2],
+}
+
+fn play(lab: &Lab, label: &str, channel_count: usize, hz: u32, duration: Duration) -> Played {
+    let record = RunFolder::new(label);
+    let path = topology(&record, channel_count, hz, duration);
+    let trial = Trial::of(&path, record.path());
+    let mut supervisors = [0, 1].map(|index| trial.start_on(lab.host(index)));
+    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
+    wait_until(LIMIT, "messages", || {
+        let last = format!("there.{}.ingress.", (channel_count - 1) / 2 * 2);
+        files[1].record_bytes(&last) > 256
+    });
+    let began = Instant::now();
+    let sleep_until = |share: f64| {
+        thread::sleep(duration.mul_f64(share).saturating_sub(began.elapsed()));
+    };
+    sleep_until(1.0 / 6.0);
+    let early = resident(&files);
+    sleep_until(0.3);
+    files[1].kill_process("gateway-hop-robot-pc", 0, LIMIT);
+    // Somebody looks on.
+    let viewer = {
+        let mut command = lab.host(0).command(hil_tests::binary::hil_runtime_binary());
+        command.args(["top", "--once"]).arg(files[0].root());
+        command.stdout(std::process::Stdio::null());
+        command.spawn().unwrap()
+    };
+    sleep_until(0.5);
+    let interface = "eth0";
+    lab.host(1).set_link(interface, "down");
+    thread::sleep(Duration::from_secs(1));
+    lab.host(1).set_link(interface, "up");
+    sleep_until(0.7);
+    files[0].kill_process("gateway-hop-control-pc", 0, LIMIT);
+    sleep_until(5.0 / 6.0);
+    let late = resident(&files);
+    let mut viewer = viewer;
+    assert!(viewer.wait().unwrap().success());
+    for supervisor in &mut supervisors {
+        match supervisor.wait_within(duration + CONCLUDE_LIMIT) {
+            Ok(finished) => finished.assert_success(),
+            Err(reason) => panic!("{reason}"),
+        }
+    }
+    let summaries = files.each_ref().map(RunFiles::summary);
+    for (index, files) in files.iter().enumerate() {
+        files.assert_nothing_left_on(lab.host(index));
+    }
+    Played {
+        summaries,
+        resident: [early, late],
+    }
+}
+
+/// Every message has a fate that explains it. What these programs took is in no record: what the gateway gave them ends
+/// as "records unavailable", and nothing else does.
+fn assert_is_accounted_for(account: &ChannelAccount, name: &str) {
+    let said = describe(name, account);
+    let of = |fate| account.fates.of(fate);
+    assert!(account.published_count > 0, "{said}");
+    assert_eq!(account.fates.total(), account.published_count, "{said}");
+    assert_eq!(of(MessageFate::Unexplained), 0, "{said}");
+    assert_eq!(of(MessageFate::RefusedAtIngress), 0, "{said}");
+    let segments = account.segments.iter();
+    let forwarded: u64 = segments
+        .filter(|one| one.to == Stage::Forwarded)
+        .filter_map(|one| one.distribution.measured())
+        .map(|figures| figures.count)
+        .sum();
+    let given = of(MessageFate::UnknownPeerRecordsUnavailable);
+    let in_interruption = of(MessageFate::LostInInterruption);
+    assert!(
+        (given..=given + in_interruption).contains(&forwarded),
+        "{forwarded} forwarded in {said}"
+    );
+}
+
+fn check(played: &Played, channel_count: usize) {
+    let [one, other] = &played.summaries;
+    let mut fates: BTreeMap<MessageFate, u64> = BTreeMap::new();
+    for summary in [one, other] {
+        assert_eq!(summary.run.outcome, Outcome::Completed, "{:?}", summary.run);
+        assert_eq!(summary.channels.len(), channel_count);
+        assert_eq!(summary.directions.len(), 4, "two ways, two ends");
+        for channel in &summary.channels {
+            assert_is_accounted_for(account(summary, &channel.name), &channel.name);
+        }
+    }
+    for channel in &one.channels {
+        let of = |summary| serde_json::to_value(&account(summary, &channel.name).fates).unwrap();
+        assert_eq!(of(one), of(other), "{}", channel.name);
+        for fate in MessageFate::ALL {
+            *fates.entry(fate).or_default() += account(one, &channel.name).fates.of(fate);
+        }
+    }
+    fates.retain(|_, count| *count > 0);
+    println!("{channel_count} channels: {fates:?}");
+    assert!(
+        fates[&MessageFate::LostInInterruption] > 0,
+        "two gateways were killed"
+    );
+    let [early, late] = &played.resident;
+    for (name, bytes) in early {
+        let mib = |bytes: u64| bytes as f64 / 1_048_576.0;
+        let now = late.get(name).copied();
+        println!("{name}: {:.1} MiB, later {:?}", mib(*bytes), now.map(mib));
+    }
+}
+
+#[test]
+fn sixty_channels_of_own_programs_are_accounted_for_through_kills_and_a_cut() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let played = play(&lab, "sixty", 60, 20, Duration::from_secs(14));
+    check(&played, 60);
+}
+
+#[test]
+#[ignore = "takes HIL_MANY_MINUTES (2 by default) and more, and the machine for itself"]
+fn four_hundred_channels_end_in_two_equal_accounts() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let minutes = env::var(MINUTES_VARIABLE).map_or(MINUTES_DEFAULT, |text| text.parse().unwrap());
+    let duration = Duration::from_secs_f64(60.0 * minutes);
+    let played = play(&lab, "four-hundred", 400, 10, duration);
+    check(&played, 400);
+}
