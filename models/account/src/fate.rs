@@ -114,10 +114,10 @@ impl<'a> Judge<'a> {
 
     fn fate_over_gateway(&self, joined: &Joined, place: Place) -> MessageFate {
         if let Some(ingress) = joined.ingress {
-            return self.fate_after_reception(joined, &ingress);
+            return self.fate_after_reception(joined, &ingress, place);
         }
         if let Some(egress) = joined.egress {
-            if egress.flags & EgressRecord::REFUSED_BY_KERNEL != 0 {
+            if is_refused(&egress) {
                 return MessageFate::RefusedByKernel;
             }
             if self.files.ingress.is_none() {
@@ -140,18 +140,35 @@ impl<'a> Judge<'a> {
         self.in_flight_or_unexplained(place.producer_ns, self.producer_end_ns)
     }
 
-    fn fate_after_reception(&self, joined: &Joined, ingress: &IngressRecord) -> MessageFate {
+    fn fate_after_reception(
+        &self,
+        joined: &Joined,
+        ingress: &IngressRecord,
+        place: Place,
+    ) -> MessageFate {
         if let Some(forwarded_ns) = stamp(ingress.forwarded_ns) {
             return self.fate_at_consumer(joined, Some(forwarded_ns), self.consumer_end_ns);
         }
         if ingress.flags & IngressRecord::INCOMPLETE != 0 {
-            MessageFate::Incomplete
+            self.fate_of_pieces(joined, place)
         } else if ingress.flags & IngressRecord::LATE != 0 {
             MessageFate::Late
         } else if ingress.flags & IngressRecord::DUPLICATE != 0 {
             MessageFate::Duplicate
         } else {
             MessageFate::RefusedAtIngress
+        }
+    }
+
+    /// Only pieces came: because the sender stopped in the middle of it, because the run ended, or
+    /// because the others got lost.
+    fn fate_of_pieces(&self, joined: &Joined, place: Place) -> MessageFate {
+        if joined.egress.as_ref().is_some_and(is_refused) {
+            MessageFate::RefusedByKernel
+        } else if self.is_near(place.producer_ns, self.producer_end_ns) {
+            MessageFate::InFlight
+        } else {
+            MessageFate::Incomplete
         }
     }
 
@@ -197,7 +214,7 @@ impl<'a> Judge<'a> {
             .is_some_and(|ingress| stamp(ingress.forwarded_ns).is_some());
         match interruption.place {
             PathProcess::Producer => joined.egress.is_none() && joined.ingress.is_none(),
-            PathProcess::SendingGateway => joined.ingress.is_none(),
+            PathProcess::SendingGateway => joined.arrived().is_none(),
             PathProcess::ReceivingGateway => !never_left,
             PathProcess::Consumer => is_forwarded || (self.files.ingress.is_none() && !never_left),
         }
@@ -252,6 +269,11 @@ impl<'a> Judge<'a> {
             (None, None) => Position::Unknown,
         }
     }
+}
+
+/// True when the sending gateway noted that it could not send the whole message.
+const fn is_refused(egress: &EgressRecord) -> bool {
+    egress.flags & EgressRecord::REFUSED_BY_KERNEL != 0
 }
 
 /// What is known about when a message was last seen.

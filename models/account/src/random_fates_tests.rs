@@ -52,7 +52,7 @@ fn random_run(seed: u64) -> (Files, FateCounts, Vec<BurstCount>, i64) {
             let fate = if sequence + 1 == count || stream.chance(taken_ratio) {
                 MessageFate::Taken
             } else {
-                WRITABLE[usize::try_from(stream.next_u64() % 9).unwrap()]
+                WRITABLE[usize::try_from(stream.next_u64() % WRITABLE.len() as u64).unwrap()]
             };
             let published_ns = now_ns;
             files.write(

@@ -155,7 +155,7 @@ impl MessageFate {
             Self::SupersededAtInput => "superseded at the gateway's input",
             Self::RefusedByKernel => "refused by the kernel or peer absent",
             Self::LostOnWire => "lost on the wire",
-            Self::Incomplete => "incomplete: pieces of it lost on the wire",
+            Self::Incomplete => "incomplete: pieces lost on the wire",
             Self::RefusedAtIngress => "refused by the receiving gateway",
             Self::Late => "too late for the receiving gateway",
             Self::Duplicate => "received only as a duplicate",

@@ -228,6 +228,41 @@ fn duplicates_and_reordering_are_counted_beside_the_fates() {
 }
 
 #[test]
+fn a_message_in_pieces_is_judged_by_its_sender_and_the_end_of_the_run_first() {
+    let mut files = Files::delivered(100);
+    for sequence in [100, 101, 149, 150, 199] {
+        files.write(at(7, sequence), MessageFate::Incomplete);
+    }
+    // The sender stopped in the middle of two of them, one of them near the end.
+    for record in &mut files.egress {
+        if [101, 199].contains(&record.sequence) {
+            record.flags = EgressRecord::REFUSED_BY_KERNEL;
+        }
+    }
+    // What was handed over at 150 ms or later may still travel.
+    let account = account(&files.records(), &same_clock(200 * PERIOD_NS));
+    assert_eq!(account.fates.of(MessageFate::RefusedByKernel), 2);
+    assert_eq!(account.fates.of(MessageFate::InFlight), 1);
+    assert_eq!(account.fates.of(MessageFate::Incomplete), 2);
+    assert_eq!(account.fates.of(MessageFate::Taken), 100);
+}
+
+#[test]
+fn a_message_in_pieces_without_the_senders_records_is_incomplete_or_in_flight() {
+    let mut files = Files::delivered(10);
+    files.write(at(7, 10), MessageFate::Incomplete);
+    files.write(at(7, 99), MessageFate::Incomplete);
+    let records = ChannelRecords {
+        published: None,
+        egress: None,
+        ..files.records()
+    };
+    let account = account(&records, &same_clock(100 * PERIOD_NS));
+    assert_eq!(account.fates.of(MessageFate::Incomplete), 1);
+    assert_eq!(account.fates.of(MessageFate::InFlight), 1);
+}
+
+#[test]
 fn without_the_peers_files_what_cannot_be_known_is_unknown() {
     let mut files = Files::default();
     for sequence in 0..100 {

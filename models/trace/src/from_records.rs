@@ -131,7 +131,7 @@ impl Tracer<'_> {
         for (is_set, flag) in flags {
             record.flags |= if is_set { flag } else { 0 };
         }
-        let (Some(ingress), Some(departure_ns)) = (joined.ingress, departure) else {
+        let (Some(ingress), Some(departure_ns)) = (joined.arrived(), departure) else {
             return record;
         };
         if ingress.flags & IngressRecord::REORDERED != 0 {
@@ -207,6 +207,8 @@ fn trace_fate(joined: &Joined, fate: MessageFate) -> TraceFate {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wire::{decode, encode};
+    use crate::{Trace, TraceHeader};
     use hil_account::synthetic::{Files, at, same_clock};
     use hil_account::{ChannelPath, account};
 
@@ -225,6 +227,7 @@ mod tests {
             (Fate::RefusedByKernel, TraceFate::LostBeforeLink),
             (Fate::Late, TraceFate::LostAfterLink),
             (Fate::SupersededAtConsumer, TraceFate::Delivered),
+            (Fate::Incomplete, TraceFate::LostInNetwork),
             (Fate::Taken, TraceFate::Delivered),
         ];
         let mut files = Files::default();
@@ -238,7 +241,7 @@ mod tests {
         assert_eq!(found, fates.map(|(_, fate)| fate));
         let account = account(&files.records(), &context);
         assert_eq!(traced.len() as u64, account.published_count);
-        assert!(traced[6].has(TraceRecord::REORDERED) && !traced[0].has(TraceRecord::REORDERED));
+        assert!(traced[7].has(TraceRecord::REORDERED) && !traced[0].has(TraceRecord::REORDERED));
         assert!(traced[3].has(TraceRecord::REFUSED) && traced[0].has(TraceRecord::EMULATED));
         let ingress = files.ingress[0];
         assert_eq!(
@@ -247,6 +250,22 @@ mod tests {
         );
         assert_eq!((traced[0].bound_ns, traced[1].delay()), (0, None));
         assert!(traced[4].delay().is_some(), "it did arrive, too late");
+        assert_eq!(traced[6].delay(), None, "only pieces of it arrived");
+    }
+
+    #[test]
+    fn a_trace_with_an_incomplete_message_is_written_and_read_again() {
+        let mut files = Files::delivered(3);
+        files.write(at(7, 3), MessageFate::Incomplete);
+        files.write(at(7, 4), MessageFate::Taken);
+        let context = same_clock(1_000_000_000);
+        let records = link_trace(&files.records(), &context, CHANNEL).unwrap();
+        let found = (records[3].fate, records[3].delay(), records[3].bound_ns);
+        assert_eq!(found, (TraceFate::LostInNetwork, None, UNBOUNDED_NS));
+        let header = TraceHeader::new("arm/command");
+        let trace = Trace { header, records };
+        let decoded = decode(&encode(&trace).unwrap()).unwrap();
+        assert_eq!((decoded.trace, decoded.fault), (trace, None));
     }
 
     #[test]

@@ -137,9 +137,10 @@ pub(crate) struct Noted {
 }
 
 impl Noted {
-    /// What `record` tells of; `None` of no single message, and of a second copy, which says nothing
-    /// of the way of the first.
+    /// What `record` tells of; `None` of no single message, of a second copy, which says nothing of
+    /// the way of the first, and of pieces of a message that never arrived.
     pub(crate) fn of(record: &Record) -> Option<Self> {
+        const NO_ARRIVAL: u32 = IngressRecord::DUPLICATE | IngressRecord::INCOMPLETE;
         let (stage, epoch, sequence, published_ns, at_ns) = match record {
             Record::Published(one) => {
                 let at_ns = one.published_ns;
@@ -149,7 +150,7 @@ impl Noted {
                 let (published_ns, at_ns) = (one.published_ns, one.taken_ns);
                 (Stage::Sent, one.epoch, one.sequence, published_ns, at_ns)
             }
-            Record::Ingress(one) if one.flags & IngressRecord::DUPLICATE == 0 => {
+            Record::Ingress(one) if one.flags & NO_ARRIVAL == 0 => {
                 let (published_ns, at_ns) = (one.published_ns, one.received_ns);
                 (
                     Stage::Received,

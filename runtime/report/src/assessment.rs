@@ -210,7 +210,10 @@ fn no_room_warning(summary: &RunSummary, direction: &DirectionSummary) -> Option
     let count = Some(direction.no_room_count()).filter(|count| *count > 0)?;
     let accounts = carried(summary, direction).filter_map(|one| one.account.as_ref());
     let lost: u64 = accounts
-        .map(|account| account.fates.of(MessageFate::LostOnWire))
+        .map(|account| {
+            let fates = &account.fates;
+            fates.of(MessageFate::LostOnWire) + fates.of(MessageFate::Incomplete)
+        })
         .sum();
     let lost = match lost.min(count) {
         0 => String::new(),

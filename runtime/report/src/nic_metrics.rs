@@ -158,10 +158,13 @@ pub(crate) fn channel_stamps(
 }
 
 /// What came first of each message: a copy took a way of its own, behind one that was measured.
+/// A message of which only pieces came did not arrive.
 fn first_arrivals(ingress: &[IngressRecord]) -> Vec<&IngressRecord> {
     let mut seen = BTreeSet::new();
     let mut first = |one: &&IngressRecord| seen.insert((one.epoch, one.sequence));
-    ingress.iter().filter(&mut first).collect()
+    let is_whole = |one: &&IngressRecord| one.flags & IngressRecord::INCOMPLETE == 0;
+    let whole = ingress.iter().filter(is_whole);
+    whole.filter(&mut first).collect()
 }
 
 fn rx_reason(card: Option<&NicHistory>) -> String {
@@ -396,6 +399,22 @@ mod tests {
             (100, 100)
         );
         assert_eq!(figures, figures_of(true), "the first copy is the message");
+    }
+
+    #[test]
+    fn pieces_of_a_message_are_not_counted_as_received() {
+        let egress = [sent(0, 500_000_000), sent(1, 510_000_000)];
+        let mut ingress = egress.each_ref().map(came);
+        ingress[1].flags = IngressRecord::INCOMPLETE;
+        ingress[1].rx_hardware_ns = UNAVAILABLE;
+        let places = Places {
+            sender: None,
+            receiver: None,
+            path: ChannelPath::Gateway { alignment: None },
+            receiving_nic: None,
+        };
+        let figures = channel_stamps("arm/command", &egress, &ingress, &places);
+        assert_eq!((figures.received_count, figures.rx_hardware_count), (1, 1));
     }
 
     #[test]

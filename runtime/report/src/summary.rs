@@ -40,6 +40,9 @@ use hil_topology::{Channel, Topology, Via};
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 2;
 
+/// The oldest layout that is read: those before keep refusals and counters elsewhere.
+pub const SCHEMA_VERSION_MIN: u32 = 2;
+
 /// Everything a finished run has to say.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunSummary {
@@ -137,9 +140,9 @@ impl RunSummary {
     /// Reads the text of `summary.json`.
     ///
     /// # Errors
-    /// When it is not JSON of this layout, or of a newer schema version.
+    /// When it is not JSON of this layout, or of a newer schema version, or of one that is too old.
     pub fn from_json(text: &str) -> Result<Self, SummaryError> {
-        /// Read first, so that a newer layout is named as such instead of as a missing field.
+        /// Read first, so that another layout is named as such instead of as a missing field.
         #[derive(Deserialize)]
         struct Version {
             schema_version: u32,
@@ -147,6 +150,11 @@ impl RunSummary {
         let version: Version = serde_json::from_str(text).map_err(SummaryError::Decode)?;
         if version.schema_version > SCHEMA_VERSION {
             return Err(SummaryError::NewerSchema {
+                found: version.schema_version,
+            });
+        }
+        if version.schema_version < SCHEMA_VERSION_MIN {
+            return Err(SummaryError::OlderSchema {
                 found: version.schema_version,
             });
         }
@@ -176,11 +184,17 @@ pub enum SummaryError {
     #[error("the summary cannot be encoded")]
     Encode(#[source] serde_json::Error),
     /// Not JSON, or not this layout.
-    #[error("not a run summary of schema version {SCHEMA_VERSION} or below")]
+    #[error("not a run summary of schema version {SCHEMA_VERSION}")]
     Decode(#[source] serde_json::Error),
     /// Written by a newer version.
     #[error("schema version {found} is newer than {SCHEMA_VERSION}")]
     NewerSchema {
+        /// Version of the file.
+        found: u32,
+    },
+    /// Written by a version so old that its figures cannot all be read.
+    #[error("schema version {found} is older than {SCHEMA_VERSION_MIN}, the oldest that is read")]
+    OlderSchema {
         /// Version of the file.
         found: u32,
     },
@@ -507,6 +521,7 @@ impl LinkKind {
     pub const fn fate_label(self, fate: MessageFate) -> &'static str {
         match (self, fate) {
             (Self::Emulated, MessageFate::LostOnWire) => "lost by the emulated link",
+            (Self::Emulated, MessageFate::Incomplete) => "incomplete: lost by the emulated link",
             (_, fate) => fate.label(),
         }
     }

@@ -116,6 +116,34 @@ fn what_was_sent_and_did_not_arrive_is_lost_after_a_second() {
 }
 
 #[test]
+fn pieces_of_a_message_are_no_arrival() {
+    let mut account = account(true);
+    for sequence in 0..2_u64 {
+        let at_ns = sequence.cast_signed() * MS;
+        account.take(&published(sequence, at_ns));
+        account.take(&sent(sequence, at_ns));
+    }
+    account.take(&received(0, MS));
+    let pieces = |at_ns: i64| {
+        let mut one = received(1, at_ns);
+        if let Body::Record(Record::Ingress(record)) = &mut one.body {
+            record.flags = IngressRecord::INCOMPLETE;
+            record.forwarded_ns = UNAVAILABLE;
+        }
+        one
+    };
+    // Before and after it was found lost.
+    account.take(&pieces(2 * MS));
+    account.settle(1100 * MS);
+    account.take(&pieces(1100 * MS));
+    let figures = account.metrics("x", 1100 * MS);
+    assert_eq!(
+        (&figures["lost_count"], &figures["received_count"]),
+        (&json!(1), &json!(1))
+    );
+}
+
+#[test]
 fn what_was_taken_or_received_was_published() {
     let mut account = account(true);
     account.take(&taken(0, 2 * MS));

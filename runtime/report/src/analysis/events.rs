@@ -211,6 +211,12 @@ impl Way<'_> {
                 format!("lost on link {link}: emulated loss")
             }
             MessageFate::LostOnWire => format!("lost on link {link}"),
+            MessageFate::Incomplete if self.is_all_loss_emulated() => {
+                format!("incomplete, pieces of it lost on link {link}: emulated loss")
+            }
+            MessageFate::Incomplete => {
+                format!("incomplete, pieces of it lost on link {link}")
+            }
             MessageFate::LostInInterruption => self.words_of_interruption(story),
             MessageFate::InFlight => "still in flight at the end of the run".to_owned(),
             MessageFate::UnknownPeerRecordsUnavailable => {
@@ -236,7 +242,10 @@ impl Way<'_> {
     fn is_all_loss_emulated(&self) -> bool {
         let emulated_count = self.summary.count(CounterGroup::Socket, "link_lost_count");
         let account = self.summary.account.as_ref();
-        let lost_count = account.map(|account| account.fates.of(MessageFate::LostOnWire));
+        let lost_count = account.map(|account| {
+            let fates = &account.fates;
+            fates.of(MessageFate::LostOnWire) + fates.of(MessageFate::Incomplete)
+        });
         self.summary.link == LinkKind::Emulated
             && lost_count.is_some_and(|lost_count| lost_count <= emulated_count)
     }

@@ -4,7 +4,10 @@
 
 use std::collections::BTreeMap;
 
-use hil_account::{AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, account};
+use hil_account::{
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, FateCounts, MessageFate,
+    account,
+};
 use hil_arm::egm::messages::Side as ArmSide;
 use hil_core::time::Alignment;
 
@@ -373,6 +376,48 @@ fn a_newer_schema_is_refused_by_its_number() {
         RunSummary::from_json("{}"),
         Err(SummaryError::Decode(_))
     ));
+}
+
+#[test]
+fn an_older_schema_is_refused_by_its_number() {
+    let mut summary = full();
+    for version in [0, 1] {
+        summary.schema_version = version;
+        let error = RunSummary::from_json(&summary.to_json().unwrap()).unwrap_err();
+        assert!(matches!(error, SummaryError::OlderSchema { found } if found == version));
+        assert_eq!(
+            error.to_string(),
+            format!("schema version {version} is older than 2, the oldest that is read")
+        );
+    }
+}
+
+#[test]
+fn an_incomplete_message_is_put_down_to_what_carried_it() {
+    let fate = MessageFate::Incomplete;
+    let emulated = LinkKind::Emulated.fate_label(fate);
+    assert_eq!(emulated, "incomplete: lost by the emulated link");
+    assert_eq!(link("udp").fate_label(fate), fate.label());
+}
+
+#[test]
+fn incomplete_messages_may_be_what_found_no_room() {
+    let mut summary = full();
+    let account = summary.channels[0].account.as_mut().unwrap();
+    account.fates = FateCounts::default();
+    account.fates.add(MessageFate::LostOnWire, 1);
+    account.fates.add(MessageFate::Incomplete, 3);
+    summary.directions[0].counters.push(CountByName {
+        group: CounterGroup::Socket,
+        name: "kernel_drop_count".to_owned(),
+        count: 5,
+    });
+    let warnings = Assessment::of(&summary).warnings;
+    let words = "up to 4 messages lost on the wire";
+    assert!(
+        warnings.iter().any(|one| one.contains(words)),
+        "{warnings:?}"
+    );
 }
 
 #[test]

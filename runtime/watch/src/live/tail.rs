@@ -127,7 +127,8 @@ impl ChannelTail {
 
     /// The messages that a gateway of this host brought, in the order in which they came.
     pub(crate) fn arrivals(&self) -> Vec<Arrival> {
-        const NEVER_CAME: u32 = IngressRecord::DUPLICATE | IngressRecord::LATE;
+        const NEVER_CAME: u32 =
+            IngressRecord::DUPLICATE | IngressRecord::LATE | IngressRecord::INCOMPLETE;
         let received = self.ingress.iter().flatten();
         let came = received.filter(|one| one.flags & NEVER_CAME == 0);
         came.map(|one| Arrival {
@@ -330,6 +331,26 @@ mod tests {
         assert_eq!(fates(&tail).of(unknown), 0);
         assert_eq!(fates(&tail).of(MessageFate::LostOnWire), 20);
         assert!(tail.arrivals().is_empty());
+    }
+
+    #[test]
+    fn only_a_whole_message_is_an_arrival() {
+        let flags = [
+            0,
+            IngressRecord::REORDERED,
+            IngressRecord::DUPLICATE,
+            IngressRecord::LATE,
+            IngressRecord::INCOMPLETE,
+        ];
+        let each = (0_u64..).zip(flags).map(|(sequence, flags)| IngressRecord {
+            sequence,
+            flags,
+            ..bytemuck::Zeroable::zeroed()
+        });
+        let mut tail = ChannelTail::default();
+        extend(&mut tail.ingress, each, &mut tail.newest);
+        let came: Vec<_> = tail.arrivals().iter().map(|one| one.sequence).collect();
+        assert_eq!(came, [0, 1]);
     }
 
     /// What a gateway sent, one message each millisecond.
