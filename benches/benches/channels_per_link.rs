@@ -341,17 +341,15 @@ fn measure(network: &Network, folder: &Path, count: usize, options: &Options) ->
 /// Takes every message; when each was published, and how long it took to the other host.
 fn take(domain: &Domain, names: &[String], stop: &AtomicBool) -> Vec<(i64, u64)> {
     let listed: Vec<&str> = names.iter().map(String::as_str).collect();
-    let mut waiter = Waiter::open(domain, &listed).unwrap();
+    let waiter = Waiter::open(domain, &listed).unwrap();
     let mut inputs: Vec<RawInput> = names
         .iter()
         .map(|name| RawInput::open(domain, name, DEPTH).unwrap())
         .collect();
     let mut arrivals = Vec::new();
-    let mut announced = Vec::new();
     while !stop.load(Ordering::Acquire) {
         sleep_for(waiter.descriptor());
-        waiter.announced(|index| announced.push(index)).unwrap();
-        for index in announced.drain(..) {
+        for index in waiter.announced().unwrap() {
             waiter.drain(index).unwrap();
             while inputs[index]
                 .receive(&mut |envelope, _| {

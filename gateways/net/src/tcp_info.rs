@@ -93,12 +93,24 @@ impl ConnectionInfo {
 ///
 /// # Errors
 /// What the kernel answered.
-#[allow(unsafe_code, reason = "no crate wraps SIOCOUTQ")]
 pub fn unacknowledged_bytes(socket: &Socket) -> io::Result<u64> {
+    queue_bytes(socket, libc::TIOCOUTQ)
+}
+
+/// Bytes given to the kernel that have not been sent for the first time (`SIOCOUTQNSD`); of TCP only.
+///
+/// # Errors
+/// What the kernel answered.
+pub fn unsent_bytes(socket: &Socket) -> io::Result<u64> {
+    queue_bytes(socket, libc::SIOCOUTQNSD)
+}
+
+#[allow(unsafe_code, reason = "no crate wraps SIOCOUTQ and SIOCOUTQNSD")]
+fn queue_bytes(socket: &Socket, request: libc::c_ulong) -> io::Result<u64> {
     let mut count: c_int = 0;
     let descriptor = socket.as_fd().as_raw_fd();
-    // SAFETY: TIOCOUTQ, which SIOCOUTQ is on sockets, writes one int at the pointer, a live int.
-    let result = unsafe { libc::ioctl(descriptor, libc::TIOCOUTQ, &raw mut count) };
+    // SAFETY: both requests (TIOCOUTQ is SIOCOUTQ on sockets) write one int at the pointer, a live int.
+    let result = unsafe { libc::ioctl(descriptor, request, &raw mut count) };
     if result == 0 {
         Ok(u64::try_from(count).unwrap_or(0))
     } else {

@@ -21,7 +21,7 @@ const BUFFER_BYTES: usize = u16::MAX as usize + TAG_BYTES;
 /// Refused datagrams that one call passes over at most, so that a flood of them cannot keep the
 /// thread from its other work.
 pub const REFUSED_PER_LOOK_MAX: usize = 16;
-/// Bytes of the longest greeting there is: its header, 40 bytes and two names of 255.
+/// Bytes of the longest greeting there is: its header, 41 bytes and a name of 255.
 const GREETING_BYTES_MAX: usize = 1024;
 
 /// A sender as a gateway owns it: behind the seal where the hop has one. Whatever the transport,

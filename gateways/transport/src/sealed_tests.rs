@@ -29,11 +29,12 @@ fn association() -> Association {
 }
 
 fn flow() -> FlowIdentity {
-    let channel = ChannelIdentity::new(3, "arm/command", "test.Command.v1", 3_000, 8);
+    let long = ChannelIdentity::new(3, "arm/command", "test.Command.v1", 3_000, 8);
+    let short = ChannelIdentity::new(4, "arm/state", "test.State.v1", 64, 8);
     FlowIdentity {
         flow: 65_535,
         name: "link/hop/forward".to_owned(),
-        channels: vec![channel],
+        channels: vec![long, short],
     }
 }
 
@@ -136,17 +137,22 @@ fn check_conversation(mut hop: Hop) {
             epoch: 1,
             ..Envelope::default()
         };
-        let payload = vec![sequence.to_le_bytes()[0]; if sequence % 3 == 0 { 3_000 } else { 64 }];
+        let (channel, size_bytes) = if sequence % 3 == 0 {
+            (0, 3_000)
+        } else {
+            (1, 64)
+        };
+        let payload = vec![sequence.to_le_bytes()[0]; size_bytes];
         hop.egress
-            .on_local(hop.now, 0, &envelope, &payload)
+            .on_local(hop.now, channel, &envelope, &payload)
             .unwrap();
         hop.step_until(|hop| !hop.delivered.is_empty());
         assert_eq!(hop.delivered.pop(), Some(payload));
     }
     hop.egress.bye();
     hop.step_until(|hop| hop.ingress.has_left());
-    let sequences = hop.ingress.sequence_counts(0);
-    assert_eq!((sequences.received_count, sequences.lost_count), (200, 0));
+    let received = [0, 1].map(|channel| hop.ingress.sequence_counts(channel).received_count);
+    assert_eq!(received, [67, 133]);
     assert!(hop.egress.counts().round_trip_count > 5);
     assert_eq!(
         hop.ingress.refusals().total() + hop.egress.refusals().total(),

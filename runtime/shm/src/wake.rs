@@ -45,7 +45,7 @@ pub struct Waiter {
     /// Of several channels: tells which of them are announced, at a cost that does not grow with those
     /// that are not.
     group: Option<Epoll>,
-    /// The channel that is looked at after the next quiet wait.
+    /// The channel that is looked at next though nobody announced it.
     swept: usize,
 }
 
@@ -101,15 +101,18 @@ impl Waiter {
         }
     }
 
-    /// Tells `take` which channels are announced, by their index; not all of them at once where they are
-    /// many: [`Waiter::descriptor`] stays readable for the rest. A single channel is always told.
+    /// Which channels are announced, by their index; not all of them at once where they are many:
+    /// [`Waiter::descriptor`] stays readable for the rest. A single channel is always told.
     ///
     /// # Errors
     /// When the look itself fails.
-    pub fn announced(&mut self, mut take: impl FnMut(usize)) -> Result<(), ChannelError> {
+    ///
+    /// # Panics
+    /// Never: what the kernel returns are the indices it was given.
+    pub fn announced(&self) -> Result<impl Iterator<Item = usize> + use<>, ChannelError> {
+        let mut indices = [0; ANNOUNCED_PER_LOOK];
         let Some(group) = &self.group else {
-            take(0);
-            return Ok(());
+            return Ok(indices.into_iter().take(1));
         };
         // On the stack: waiting is part of the measured path, which does not allocate.
         let mut events = [EpollEvent::empty(); ANNOUNCED_PER_LOOK];
@@ -118,12 +121,10 @@ impl Waiter {
             Err(Errno::EINTR) => 0,
             Err(errno) => return Err(wait_error(&self.listeners[0].0, errno)),
         };
-        for event in &events[..found] {
-            if let Ok(index) = usize::try_from(event.data()) {
-                take(index);
-            }
+        for (index, event) in indices.iter_mut().zip(&events[..found]) {
+            *index = usize::try_from(event.data()).expect("it was an index");
         }
-        Ok(())
+        Ok(indices.into_iter().take(found))
     }
 
     /// Takes back the announcements of the channel with `index`, so that it is quiet until the next. False
@@ -131,13 +132,13 @@ impl Waiter {
     ///
     /// # Errors
     /// When the listener is broken.
-    pub fn drain(&mut self, index: usize) -> Result<bool, ChannelError> {
+    pub fn drain(&self, index: usize) -> Result<bool, ChannelError> {
         let (channel, listener) = &self.listeners[index];
         drain(channel, listener)
     }
 
-    /// The channel to look at after a quiet wait, each in its turn: whatever became of its descriptor, what
-    /// was announced is found then.
+    /// The channel to look at though nobody announced it, each in its turn: whatever became of its descriptor,
+    /// what was announced is found then.
     pub fn next_swept(&mut self) -> usize {
         let next = self.swept;
         self.swept = (next + 1) % self.listeners.len();
@@ -158,13 +159,7 @@ impl Waiter {
                 })
             }
             Ok(_) => {
-                let mut announced = [0; ANNOUNCED_PER_LOOK];
-                let mut count = 0;
-                self.announced(|index| {
-                    announced[count] = index;
-                    count += 1;
-                })?;
-                for &index in &announced[..count] {
+                for index in self.announced()? {
                     self.drain(index)?;
                 }
                 Ok(Wake::Woken)
@@ -228,8 +223,8 @@ fn open_event(
 /// One look is not enough. iceoryx2 0.10 marks the listener as idle before it empties its socket: an
 /// announcement in between is taken with the rest, and leaves the mark "has been told" on a socket
 /// with nothing in it. From then on writers tell it nothing, and its descriptor stays quiet for ever
-/// while messages pass. Such an announcement is among those that the look finds, so a look that finds
-/// none left no such mark.
+/// while messages pass. Such an announcement is nearly always among those that the look finds, and the
+/// next look takes the mark away; [`Waiter::next_swept`] is for the rest.
 fn drain(channel: &str, listener: &Listener<ipc::Service>) -> Result<bool, ChannelError> {
     let mut found = false;
     for _ in 0..DRAIN_LOOKS_MAX {

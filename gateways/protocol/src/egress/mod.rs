@@ -399,8 +399,6 @@ impl EgressBridge {
         self.counts.datagram_count += 1;
         let counts = &mut self.channels[long.channel].counts;
         counts.datagram_count += 1;
-        // A follow-up rides on the first piece.
-        long.header.follow_up = None;
         long.header.fragment_index += 1;
         if long.header.fragment_index == long.plan.count() {
             counts.sent_count += 1;

@@ -13,6 +13,7 @@ mod delivery;
 mod replies;
 mod session;
 
+use core::cmp::Ordering;
 use core::net::SocketAddr;
 use core::time::Duration;
 use std::collections::VecDeque;
@@ -21,6 +22,7 @@ use hil_core::time::Instant;
 
 use super::body::{Hello, HelloStatus};
 use super::channel::{ChannelIdentity, ChannelNumbers, FlowIdentity, SettingsError};
+use super::egress::STAGED_BYTES_MAX;
 use super::fragment::{Fragment, Reassembler, ReassemblyCounts};
 use super::refusal::{Refusal, RefusalCounts};
 use super::sequence::{Order, SequenceCounts, SequenceWindow};
@@ -41,6 +43,23 @@ pub const REFUSAL_REPLY_PERIOD: Duration = Duration::from_millis(10);
 
 /// A message that skips more numbers than this is refused until its sender greets again.
 pub const SEQUENCE_JUMP_MAX: u64 = 1 << 20;
+
+/// Messages of a channel that may be incomplete at a time.
+const REASSEMBLY_SLOTS: usize = 4;
+/// The same of a channel with long messages.
+const REASSEMBLY_SLOTS_LONG: usize = 2;
+/// How long after its last piece a message is given up: longer than a stall of TCP of two timeouts, or of a radio.
+const REASSEMBLY_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Memory that is set aside to put the messages of a channel of `size_bytes` together.
+pub const fn reassembly_bytes(size_bytes: usize) -> usize {
+    let slot_count = if size_bytes > STAGED_BYTES_MAX {
+        REASSEMBLY_SLOTS_LONG
+    } else {
+        REASSEMBLY_SLOTS
+    };
+    slot_count * size_bytes
+}
 
 /// Settings of an [`IngressBridge`].
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -63,16 +82,26 @@ pub struct IngressSettings {
 }
 
 impl IngressSettings {
-    /// Four reassembly slots, 100 ms each, reordered messages delivered.
+    /// Four reassembly slots, 1 s each, reordered messages delivered.
     pub fn new(flow: FlowIdentity, session: u32, domain: [u8; 16], clock_id: u64) -> Self {
         Self {
             flow,
             session,
             domain,
             clock_id,
-            reassembly_slots: 4,
-            reassembly_timeout: Duration::from_millis(100),
+            reassembly_slots: REASSEMBLY_SLOTS,
+            reassembly_timeout: REASSEMBLY_TIMEOUT,
             deliver_reordered: true,
+        }
+    }
+
+    /// Messages of a channel that may be incomplete at a time. Of long ones, of which a sender has one under
+    /// way, it is the one and the remains of the one before.
+    fn slot_count(&self, size_max_bytes: usize) -> usize {
+        if size_max_bytes > STAGED_BYTES_MAX {
+            self.reassembly_slots.min(REASSEMBLY_SLOTS_LONG)
+        } else {
+            self.reassembly_slots
         }
     }
 
@@ -138,7 +167,7 @@ impl IngressChannel {
         Self {
             window: SequenceWindow::new(),
             reassembler: Reassembler::new(
-                settings.reassembly_slots,
+                settings.slot_count(identity.size_max_bytes as usize),
                 identity.size_max_bytes as usize,
                 settings.reassembly_timeout,
             ),
@@ -153,15 +182,9 @@ impl IngressChannel {
     }
 }
 
-/// Messages given up that may wait for the owner; older ones give way.
-const INCOMPLETE_MAX: usize = 64;
-
 /// Puts what `reassembler` gave up of `channel` where the owner finds it.
 fn collect(incomplete: &mut VecDeque<Incomplete>, reassembler: &mut Reassembler, channel: usize) {
     while let Some(given_up) = reassembler.next_given_up() {
-        if incomplete.len() == INCOMPLETE_MAX {
-            incomplete.pop_front();
-        }
         incomplete.push_back(Incomplete::of(channel, &given_up));
     }
 }
@@ -182,6 +205,8 @@ impl IngressBridge {
     /// [`SettingsError`] names the setting, its value and its bound.
     pub fn new(settings: IngressSettings) -> Result<Self, SettingsError> {
         settings.check()?;
+        // All that can be given up between two questions of the owner.
+        let incomplete_max = settings.flow.channels.len() * (settings.reassembly_slots + 1);
         Ok(Self {
             digest: settings.flow.digest(),
             numbers: ChannelNumbers::new(&settings.flow.channels),
@@ -192,7 +217,7 @@ impl IngressBridge {
                 .map(|identity| IngressChannel::new(identity, &settings))
                 .collect(),
             split: Vec::with_capacity(settings.flow.channels.len()),
-            incomplete: VecDeque::with_capacity(INCOMPLETE_MAX),
+            incomplete: VecDeque::with_capacity(incomplete_max),
             sessions: Sessions::new(),
             replies: Replies::new(&settings),
             counts: IngressCounts::default(),
@@ -373,11 +398,16 @@ impl IngressBridge {
     }
 
     /// Only the part of the header that no version changes can be read; enough to say so.
+    /// Another version may greet for a channel.
+    fn has(&self, number: u16) -> bool {
+        number == self.settings.flow.flow || self.numbers.index_of(number).is_some()
+    }
+
     fn on_other_version(&mut self, now: Instant, arrival: ArrivalStamps, bytes: &[u8]) {
         let Some(prefix) = Prefix::decode(bytes) else {
             return;
         };
-        if prefix.kind == Some(Kind::Hello) && prefix.channel == self.settings.flow.flow {
+        if prefix.kind == Some(Kind::Hello) && self.has(prefix.channel) {
             let header = Header::new(Kind::Hello, prefix.session, prefix.channel);
             let request = Request {
                 now,
@@ -501,8 +531,14 @@ impl IngressBridge {
         deliver: &mut dyn FnMut(Delivery<'_>),
     ) -> Result<Disposition, Refusal> {
         let header = request.header;
-        if header.total_len > self.settings.flow.channels[channel].size_max_bytes {
-            return Err(Refusal::Oversize);
+        match header
+            .total_len
+            .cmp(&self.settings.flow.channels[channel].size_max_bytes)
+        {
+            Ordering::Greater => return Err(Refusal::Oversize),
+            // Nobody could take it.
+            Ordering::Less => return Err(Refusal::LengthMismatch),
+            Ordering::Equal => {}
         }
         self.sessions.check_stamps(request.arrival, header)?;
         let stream = stream_of(header);

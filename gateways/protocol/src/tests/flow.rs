@@ -365,11 +365,11 @@ fn a_long_message_leaves_between_short_ones_and_arrives_whole() {
 #[test]
 fn a_long_message_of_which_a_piece_is_missing_is_given_up_with_what_came() {
     let (mut egress, mut ingress) = long_pair();
-    let image = vec![9; 1 << 20];
+    let image = vec![9; 4 << 20];
     let delivered = send_long(&mut egress, &mut ingress, &image, |piece| piece == 500);
     assert!(delivered.iter().all(|(channel, _)| *channel == 1));
     let due = ingress.next_wakeup().unwrap();
-    assert_eq!(due, Instant::from_ns(2_000_000 + 100_000_000));
+    assert_eq!(due, Instant::from_ns(2_000_000 + 1_000_000_000));
     assert_eq!(ingress.next_incomplete(), None);
     ingress.on_wakeup(due);
     let incomplete = ingress.next_incomplete().unwrap();

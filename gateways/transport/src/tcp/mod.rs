@@ -1,4 +1,4 @@
-//! TCP: one connection per channel direction, from the sending gateway to the receiving one; the
+//! TCP: one connection each way of a link, from the sending gateway to the receiving one; the
 //! replies come back on it. The protocol above is the one of the other transports, datagram by
 //! datagram ([`frame`] has the layout); order and exactly-once delivery hold per connection.
 //!
@@ -36,7 +36,7 @@ use crate::sealed;
 use crate::socket::{GrantedOptions, SocketError, SocketSettings};
 use socket::{KEEP_ALIVE_COUNT, KEEP_ALIVE_IDLE, KEEP_ALIVE_INTERVAL, USER_TIMEOUT};
 
-/// One connection per channel direction.
+/// One connection each way of a link.
 #[derive(Debug)]
 pub struct Tcp;
 

@@ -235,13 +235,8 @@ impl DatagramSender for TcpSender {
         }
     }
 
-    /// What the kernel does not take waits here, and everything else behind it.
     fn queued_bytes(&self) -> usize {
-        if self.stream.has_backlog() {
-            usize::MAX
-        } else {
-            0
-        }
+        self.stream.unsent_bytes()
     }
 
     fn has_unsent(&self) -> bool {

@@ -18,7 +18,7 @@ use super::socket::abort;
 use super::stall::StallWatch;
 use crate::socket::{SocketError, refuse};
 use crate::{ConnectionTally, SendRefusal};
-use hil_net::tcp_info::{ConnectionInfo, unacknowledged_bytes};
+use hil_net::tcp_info::{ConnectionInfo, unacknowledged_bytes, unsent_bytes};
 
 /// What the kernel has not taken waits here: two of the longest frames, so that one always fits
 /// behind the rest of another.
@@ -299,6 +299,13 @@ impl Stream {
             (None, 1..) => self.backlogged = Some(now),
             (None, 0) | (Some(_), 1..) => {}
         }
+    }
+
+    /// Bytes that have not left this host: those that wait here and those that the kernel has not sent.
+    pub(super) fn unsent_bytes(&self) -> usize {
+        let in_kernel = self.socket.as_ref().and_then(|one| unsent_bytes(one).ok());
+        let in_kernel = usize::try_from(in_kernel.unwrap_or(0)).unwrap_or(usize::MAX);
+        in_kernel.saturating_add(self.backlog.len_bytes())
     }
 
     /// True while bytes wait here for the kernel to take them.

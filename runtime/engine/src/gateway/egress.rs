@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use hil_core::message::Envelope;
 use hil_core::record::RoundTripRecord;
 use hil_core::time::Instant;
-use hil_protocol::egress::RoundTrip;
+use hil_protocol::egress::{RoundTrip, TransmitFailure};
 use hil_protocol::{EgressBridge, EgressEvent, LocalRefusal, PeerState};
 
 use super::inputs::{Inputs, Look};
@@ -63,25 +63,40 @@ impl Egress {
     /// # Errors
     /// When the channel or the socket itself breaks, or the peer refuses the flow for good.
     pub(crate) fn run(&mut self, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
-        while !self.stop.load(Ordering::Acquire) {
-            if !self.step()? {
-                self.rest()?;
-            }
-            heartbeat.beat();
-        }
+        let carried = self.carry(heartbeat);
         if let Some(mut long) = self.long.take() {
+            let now = MonotonicClock::now();
+            self.bridge.on_long_failed(now, TransmitFailure::Local);
             long.end(&mut self.line);
         }
+        carried?;
         self.bridge.bye();
         self.line.transmit(&mut self.bridge);
         self.line.settle(&mut self.bridge)?;
         self.line.hand_over()
     }
 
+    fn carry(&mut self, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
+        while !self.stop.load(Ordering::Acquire) {
+            if !self.step()? {
+                self.rest()?;
+            }
+            heartbeat.beat();
+        }
+        Ok(())
+    }
+
     /// Sends one waiting message, or else looks after stamps, replies and appointments; false when
     /// no message waited and no channel is to be looked at.
     pub(crate) fn step(&mut self) -> Result<bool, WorkerError> {
-        let moved = self.forward()? | self.push_long();
+        let moved = if self.long.is_some() {
+            self.forward_beside_long()?
+        } else {
+            self.forward()?
+        };
+        if moved {
+            self.inputs.note_moved()?;
+        }
         if moved && !self.attention.is_overdue {
             // A producer faster than the socket must not keep replies and orders waiting for ever.
             let now = self.line.newest_handed;
@@ -100,6 +115,7 @@ impl Egress {
             self.hear()?;
             self.line.expire(now);
             self.line.clock.refresh(now);
+            self.inputs.sweep(now);
             self.is_established
                 .store(self.is_ready(), Ordering::Release);
         }
@@ -117,6 +133,20 @@ impl Egress {
     fn is_ready(&self) -> bool {
         let is_established = self.bridge.peer_state() == PeerState::Established;
         is_established && (!self.inputs.is_empty() || self.bridge.counts().round_trip_count > 1)
+    }
+
+    /// Looks at every channel that may have a message, then sends some pieces of the long message under way.
+    fn forward_beside_long(&mut self) -> Result<bool, WorkerError> {
+        let mut has_moved = false;
+        for _ in 0..self.inputs.due_count() {
+            has_moved |= self.forward()?;
+        }
+        if self.push_long() {
+            // Other channels may have been announced while its pieces left.
+            self.inputs.note_announced()?;
+            has_moved = true;
+        }
+        Ok(has_moved)
     }
 
     /// Sends some pieces of the long message under way; false when there is none, or enough of it is on its
@@ -255,7 +285,10 @@ impl Egress {
             due = Some(due.map_or(patience, |due| due.min(patience)));
         }
         match self.wait.pause(now, due) {
-            Pause::Spin => core::hint::spin_loop(),
+            Pause::Spin => {
+                core::hint::spin_loop();
+                self.inputs.note_announced()?;
+            }
             Pause::Sleep(until) => {
                 // Messages are never kept waiting for refused replies.
                 let away = self.refusal_backoff.until(now, self.refused_count());
@@ -273,8 +306,6 @@ impl Egress {
                 self.attention.has_news |= has_socket_news || away.is_some();
                 if is_announced {
                     self.inputs.note_announced()?;
-                } else if !has_socket_news {
-                    self.inputs.note_quiet();
                 }
             }
         }

@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use std::os::fd::BorrowedFd;
 
 use hil_core::message::Envelope;
+use hil_core::time::Instant;
 use hil_platform::wait::WaitMode;
 use hil_protocol::egress::STAGED_BYTES_MAX;
 use hil_rundir::launch::ChannelLaunch;
@@ -20,7 +21,16 @@ pub(super) struct Inputs {
     due: VecDeque<usize>,
     /// Channels with long messages that wait for the one under way.
     waiting: Vec<usize>,
+    /// Messages since it was asked last which channels are announced.
+    unasked_count: usize,
+    swept: Instant,
 }
+
+/// Messages of channels that are looked at already, after which it is asked whether others are announced.
+const UNASKED_MAX: usize = 8;
+/// How often some channels are looked at that nobody announced: an announcement can be lost.
+const SWEEP_PERIOD_NS: i64 = 50_000_000;
+const SWEEP_COUNT: usize = 16;
 
 /// What a look at the next channel found.
 #[derive(Debug)]
@@ -38,9 +48,18 @@ struct Input {
     port: RawInput,
     /// Its messages are too long to be sent in one go.
     is_long: bool,
-    is_due: bool,
+    place: Place,
     /// Its announcements are to be taken back.
     is_announced: bool,
+}
+
+/// Where a channel is found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Place {
+    Idle,
+    Due,
+    /// Among those that wait for the long message under way.
+    Waiting,
 }
 
 impl Inputs {
@@ -57,7 +76,7 @@ impl Inputs {
             Ok(Input {
                 port: RawInput::open(domain, &one.channel, one.depth)?,
                 is_long: one.size_bytes > STAGED_BYTES_MAX,
-                is_due: true,
+                place: Place::Due,
                 is_announced: false,
             })
         };
@@ -72,12 +91,19 @@ impl Inputs {
                 .transpose()?,
             due: (0..channels.len()).collect(),
             waiting: Vec::with_capacity(channels.len()),
+            unasked_count: 0,
+            swept: Instant::ZERO,
         })
     }
 
     /// True without channels.
     pub(super) fn is_empty(&self) -> bool {
         self.channels.is_empty()
+    }
+
+    /// How many channels are to be looked at.
+    pub(super) fn due_count(&self) -> usize {
+        self.due.len()
     }
 
     /// True while a channel is to be looked at that was not found empty.
@@ -106,7 +132,14 @@ impl Inputs {
         let is_always_looked_at = self.is_always_looked_at();
         let input = &mut self.channels[index];
         if input.is_long && !takes_long {
+            input.place = Place::Waiting;
             self.waiting.push(index);
+            // It is looked at when its turn comes; until then its announcements would end every wait.
+            if core::mem::take(&mut input.is_announced)
+                && let Some(waiter) = &self.waiter
+            {
+                waiter.drain(index)?;
+            }
             return Ok(Look::Empty);
         }
         let look = if input.is_long {
@@ -124,16 +157,21 @@ impl Inputs {
         };
         // A message may follow, or come before its announcement is taken back.
         let has_moved = !matches!(look, Look::Empty);
-        input.is_due = has_moved || input.is_announced || is_always_looked_at;
-        if input.is_due {
+        input.place = if has_moved || input.is_announced || is_always_looked_at {
             self.due.push_back(index);
-        }
+            Place::Due
+        } else {
+            Place::Idle
+        };
         Ok(look)
     }
 
     /// The long message is no longer under way: those that waited for it are looked at again.
     pub(super) fn resume_long(&mut self) {
-        self.due.extend(self.waiting.drain(..));
+        for index in self.waiting.drain(..) {
+            self.channels[index].place = Place::Due;
+            self.due.push_back(index);
+        }
     }
 
     /// Takes back the announcements of the channel that was found empty last; false when it had none. A
@@ -142,7 +180,7 @@ impl Inputs {
     /// # Errors
     /// When its listener is broken.
     pub(super) fn settle(&mut self) -> Result<bool, ChannelError> {
-        let Some((waiter, &index)) = self.waiter.as_mut().zip(self.due.back()) else {
+        let Some((waiter, &index)) = self.waiter.as_ref().zip(self.due.back()) else {
             return Ok(false);
         };
         let input = &mut self.channels[index];
@@ -158,28 +196,52 @@ impl Inputs {
         self.waiter.as_ref().map(Waiter::descriptor)
     }
 
+    /// A message was sent: after some of them, and not before every channel that is due had its turn, looks
+    /// whether others are announced, so that busy channels do not hide them.
+    ///
+    /// # Errors
+    /// When that cannot be asked.
+    pub(super) fn note_moved(&mut self) -> Result<(), ChannelError> {
+        self.unasked_count += 1;
+        if self.is_always_looked_at() || self.unasked_count < self.due.len().max(UNASKED_MAX) {
+            return Ok(());
+        }
+        self.note_announced()
+    }
+
     /// Notes which channels are announced.
     ///
     /// # Errors
     /// When that cannot be asked.
     pub(super) fn note_announced(&mut self) -> Result<(), ChannelError> {
-        let Self {
-            channels,
-            waiter,
-            due,
-            ..
-        } = self;
-        let Some(waiter) = waiter else {
+        self.unasked_count = 0;
+        let Some(waiter) = &self.waiter else {
             return Ok(());
         };
-        waiter.announced(|index| note(channels, due, index))
+        for index in waiter.announced()? {
+            if self.channels[index].place == Place::Waiting {
+                waiter.drain(index)?;
+            } else {
+                note(&mut self.channels, &mut self.due, index);
+            }
+        }
+        Ok(())
     }
 
-    /// After a quiet wait: looks at one channel all the same, each in its turn.
-    pub(super) fn note_quiet(&mut self) {
-        if let Some(waiter) = &mut self.waiter {
+    /// Looks now and then at some channels that nobody announced, each in its turn.
+    pub(super) fn sweep(&mut self, now: Instant) {
+        let Some(waiter) = &mut self.waiter else {
+            return;
+        };
+        if now.ns_since(self.swept) < SWEEP_PERIOD_NS {
+            return;
+        }
+        self.swept = now;
+        for _ in 0..SWEEP_COUNT.min(self.channels.len()) {
             let index = waiter.next_swept();
-            note(&mut self.channels, &mut self.due, index);
+            if self.channels[index].place != Place::Waiting {
+                note(&mut self.channels, &mut self.due, index);
+            }
         }
     }
 }
@@ -187,7 +249,8 @@ impl Inputs {
 fn note(channels: &mut [Input], due: &mut VecDeque<usize>, index: usize) {
     let input = &mut channels[index];
     input.is_announced = true;
-    if !core::mem::replace(&mut input.is_due, true) {
+    if input.place == Place::Idle {
+        input.place = Place::Due;
         due.push_back(index);
     }
 }

@@ -299,6 +299,10 @@ impl Line {
     ) -> Result<(), SendRefusal> {
         self.newest_handed = handed;
         let token = self.sender.send_parts(piece.head, piece.tail)?;
+        if !piece.is_last {
+            // The message's stamp is that of its last piece.
+            return Ok(());
+        }
         let pending = Pending {
             kind: Kind::Data,
             channel: Some(piece.channel),

@@ -81,6 +81,9 @@ impl LongMessage {
                     // It is tried again.
                     if let Some(record) = &mut self.record {
                         record.fragment_count -= 1;
+                        if record.fragment_count == 0 {
+                            record.handed_ns = UNAVAILABLE;
+                        }
                     }
                     self.due = now + RETRY;
                     break;
@@ -93,7 +96,8 @@ impl LongMessage {
             }
             now = MonotonicClock::now();
         }
-        line.take_due_stamps(bridge);
+        // Every piece has a stamp, which takes room until it is read.
+        line.take_stamps(bridge);
         has_moved
     }
 

@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 use hil_platform::host_facts::HostFiles;
 use hil_platform::host_limits::{Headroom, locked_memory_bound, memory_headroom, thread_headroom};
 use hil_platform::{open_files, words};
-use hil_rundir::launch::{AdapterSettings, GatewayWork};
+use hil_protocol::ingress::reassembly_bytes;
+use hil_rundir::launch::{AdapterSettings, GatewayWork, Side};
 use hil_shm::{ChannelSettings, Room, SHARED_MEMORY_DIRECTORY};
 use hil_topology::{Host, RoleSpec, Topology};
 
@@ -354,6 +355,7 @@ fn process_need(process: &ProcessPlan, room_of: &dyn Fn(&str) -> u64) -> Process
                 threads: OWN_THREADS + 1,
                 locks_memory: realtime.lock_memory,
                 channels,
+                own_bytes: 0,
             }
         }
         ProcessTask::Gateway(work) | ProcessTask::ClockPath(work) => gateway_content(work),
@@ -364,6 +366,7 @@ fn process_need(process: &ProcessPlan, room_of: &dyn Fn(&str) -> u64) -> Process
             threads: 1,
             locks_memory: false,
             channels: Vec::new(),
+            own_bytes: 0,
         },
     };
     let ProcessContent {
@@ -372,7 +375,8 @@ fn process_need(process: &ProcessPlan, room_of: &dyn Fn(&str) -> u64) -> Process
         ..
     } = opened;
     let locked_bytes = opened.locks_memory.then(|| {
-        let memory: u64 = opened.channels.iter().map(|one| room_of(one)).sum();
+        let shared: u64 = opened.channels.iter().map(|one| room_of(one)).sum();
+        let memory = shared + opened.own_bytes;
         LOCKED_PROGRAM_BYTES + LOCKED_THREAD_BYTES * threads + memory
     });
     ProcessNeed {
@@ -390,6 +394,8 @@ struct ProcessContent {
     locks_memory: bool,
     /// Names of the channels it joins.
     channels: Vec<String>,
+    /// Memory set aside for messages outside of shared memory.
+    own_bytes: u64,
 }
 
 fn channels_of(card: &RoleSpec) -> Vec<String> {
@@ -402,6 +408,14 @@ fn gateway_content(work: &GatewayWork) -> ProcessContent {
     let mut directions = work.directions.iter();
     let channels = work.directions.iter().flat_map(|one| &one.channels);
     let channels: Vec<String> = channels.map(|one| one.channel.clone()).collect();
+    let receiving = work
+        .directions
+        .iter()
+        .filter(|one| one.side == Side::Ingress);
+    let own_bytes = receiving
+        .flat_map(|one| &one.channels)
+        .map(|one| reassembly_bytes(one.size_bytes) as u64)
+        .sum();
     ProcessContent {
         open_files: OWN_FILES
             + DIRECTION_FILES * count
@@ -410,6 +424,7 @@ fn gateway_content(work: &GatewayWork) -> ProcessContent {
         threads: OWN_THREADS + 1 + count,
         locks_memory: directions.any(|one| one.realtime.lock_memory),
         channels,
+        own_bytes,
     }
 }
 
@@ -422,6 +437,7 @@ fn adapter_content(adapter: &AdapterSettings) -> ProcessContent {
         threads: OWN_THREADS + 1 + count,
         locks_memory: adapter.arms.iter().any(|arm| arm.realtime.lock_memory),
         channels: channels.collect(),
+        own_bytes: 0,
     }
 }
 

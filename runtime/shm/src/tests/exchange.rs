@@ -385,29 +385,25 @@ fn a_waiter_of_many_channels_says_which_are_announced() {
         })
         .collect();
     assert_eq!(waiter.wait(Duration::ZERO).unwrap(), Wake::TimedOut);
-    let announced = |waiter: &mut Waiter| {
-        let mut found = Vec::new();
-        waiter.announced(|index| found.push(index)).unwrap();
-        found
-    };
+    let announced = |waiter: &Waiter| waiter.announced().unwrap().collect::<Vec<_>>();
     for index in [3, 69] {
         let now = MonotonicClock::now();
         outputs[index].send(now, pose(0)).unwrap();
     }
-    let mut found = announced(&mut waiter);
+    let mut found = announced(&waiter);
     found.sort_unstable();
     assert_eq!(found, [3, 69]);
     assert!(waiter.drain(3).unwrap());
-    assert_eq!(announced(&mut waiter), [69]);
+    assert_eq!(announced(&waiter), [69]);
     assert_eq!(waiter.wait(Duration::ZERO).unwrap(), Wake::Woken);
-    assert_eq!(announced(&mut waiter), Vec::<usize>::new());
+    assert_eq!(announced(&waiter), Vec::<usize>::new());
     // All of them at once are found by looking again.
     for output in &mut outputs {
         output.send(MonotonicClock::now(), pose(0)).unwrap();
     }
     let mut seen = [false; COUNT];
     while seen.contains(&false) {
-        let found = announced(&mut waiter);
+        let found = announced(&waiter);
         assert!(!found.is_empty());
         for index in found {
             assert!(waiter.drain(index).unwrap() && !seen[index]);
