@@ -2,7 +2,7 @@
 //! channels of 64 bytes, idle and at one total rate of messages. Not a test: it asserts nothing about time.
 //!
 //! `cargo bench -p hil-benches --bench channels_per_link [-- --seconds 8 --rate 2000 --rounds 3 --channels
-//! 1,10,100,400]`, about 4 minutes. Processor time, wake-ups and memory are those of the gateways, of both
+//! 1,10,100,400]`, about 4 minutes, and a channel of 4 MiB beside a small one for half a minute. Processor time, wake-ups and memory are those of the gateways, of both
 //! hosts together; a delay is from the publication of a message to its publication on the other host.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 #![allow(
@@ -44,6 +44,15 @@ const MESSAGE: MessageType = MessageType {
     alignment_bytes: 8,
     fields: &[],
 };
+/// A camera's.
+const IMAGE: MessageType = MessageType {
+    name: "bench.Image.v1",
+    size_bytes: 4 << 20,
+    alignment_bytes: 8,
+    fields: &[],
+};
+const IMAGE_PERIOD: Duration = Duration::from_nanos(1_000_000_000 / 30);
+const COMMAND_PERIOD: Duration = Duration::from_millis(1);
 const DEPTH: usize = 16;
 /// After a change of load, before figures are taken.
 const SETTLING: Duration = Duration::from_secs(1);
@@ -162,19 +171,35 @@ struct Figures {
     delays_ns: Vec<u64>,
 }
 
+/// A channel of a link.
+#[derive(Clone)]
+struct Lane {
+    name: String,
+    message: MessageType,
+}
+
+impl Lane {
+    fn new(name: &str, message: MessageType) -> Self {
+        Self {
+            name: name.to_owned(),
+            message,
+        }
+    }
+}
+
 fn names(count: usize) -> Vec<String> {
     (0..count)
         .map(|index| format!("bench/robot-{index}"))
         .collect()
 }
 
-fn direction(side: Side, names: &[String], addresses: [SocketAddr; 2]) -> DirectionLaunch {
-    let channel = |(index, name): (usize, &String)| ChannelLaunch {
-        channel: name.clone(),
+fn direction(side: Side, lanes: &[Lane], addresses: [SocketAddr; 2]) -> DirectionLaunch {
+    let channel = |(index, lane): (usize, &Lane)| ChannelLaunch {
+        channel: lane.name.clone(),
         channel_id: u16::try_from(index).unwrap(),
-        message: MESSAGE.name.to_owned(),
-        size_bytes: MESSAGE.size_bytes,
-        alignment_bytes: MESSAGE.alignment_bytes,
+        message: lane.message.name.to_owned(),
+        size_bytes: lane.message.size_bytes,
+        alignment_bytes: lane.message.alignment_bytes,
         depth: DEPTH,
         emulation: None,
     };
@@ -195,31 +220,35 @@ fn direction(side: Side, names: &[String], addresses: [SocketAddr; 2]) -> Direct
             dscp: 0,
             priority: None,
             send_buffer_bytes: 212_992,
-            receive_buffer_bytes: 212_992,
+            receive_buffer_bytes: 212_992.max(2 * lanes[0].message.size_bytes),
             path_mtu_bytes: 1500,
             timestamps: Timestamps::Software,
         },
         wait: WaitMode::Block,
         realtime: RealtimeRequest::default(),
-        channels: names.iter().enumerate().map(channel).collect(),
+        channels: lanes.iter().enumerate().map(channel).collect(),
     }
 }
 
-fn measure(network: &Network, folder: &Path, count: usize, options: &Options) -> Figures {
-    let names = names(count);
-    let domains = [0, 1].map(|host| Domain::create(&folder.join(format!("d{host}"))).unwrap());
+/// The service of every channel on both hosts, while it is kept.
+fn hold(domains: &[Domain; 2], lanes: &[Lane]) -> Vec<ChannelHolder> {
     let mut holders = Vec::new();
-    for domain in &domains {
-        for name in &names {
+    for domain in domains {
+        for lane in lanes {
             let settings = ChannelSettings {
                 depth_max: DEPTH,
-                ..ChannelSettings::of(name, &MESSAGE)
+                ..ChannelSettings::of(&lane.name, &lane.message)
             };
             holders.push(ChannelHolder::create(domain, &settings).unwrap());
         }
     }
+    holders
+}
+
+/// The two gateway processes of a link that carries `lanes` from the first host to the second.
+fn link(network: &Network, folder: &Path, lanes: &[Lane], domains: &[Domain; 2]) -> [Worker; 2] {
     let addresses = [0, 1].map(|host| network.free_address(host).unwrap());
-    let mut gateways = [(0, Side::Egress), (1, Side::Ingress)].map(|(host, side)| {
+    [(0, Side::Egress), (1, Side::Ingress)].map(|(host, side)| {
         let records = folder.join(format!("records-{host}"));
         fs::create_dir_all(&records).unwrap();
         let launch = WorkerLaunch {
@@ -229,7 +258,7 @@ fn measure(network: &Network, folder: &Path, count: usize, options: &Options) ->
             records,
             is_sealed: false,
             work: Work::Gateway(GatewayWork {
-                directions: vec![direction(side, &names, addresses)],
+                directions: vec![direction(side, lanes, addresses)],
                 ready_within: None,
             }),
         };
@@ -237,7 +266,15 @@ fn measure(network: &Network, folder: &Path, count: usize, options: &Options) ->
         write(&path, &launch).unwrap();
         let mut command = Worker::command(&path);
         Worker::adopt(network.on(host, move || command.spawn()).unwrap())
-    });
+    })
+}
+
+fn measure(network: &Network, folder: &Path, count: usize, options: &Options) -> Figures {
+    let names = names(count);
+    let domains = [0, 1].map(|host| Domain::create(&folder.join(format!("d{host}"))).unwrap());
+    let lanes: Vec<Lane> = names.iter().map(|name| Lane::new(name, MESSAGE)).collect();
+    let holders = hold(&domains, &lanes);
+    let mut gateways = link(network, folder, &lanes, &domains);
     let mut outputs: Vec<ShmOutput> = names
         .iter()
         .map(|name| {
@@ -259,11 +296,16 @@ fn measure(network: &Network, folder: &Path, count: usize, options: &Options) ->
     let idle = usage().since(before);
 
     let stop = Arc::new(AtomicBool::new(false));
+    let is_open = Arc::new(AtomicBool::new(false));
     let receiving = {
         let (stop, names) = (Arc::clone(&stop), names.clone());
         let domain = Domain::open(domains[1].address()).unwrap();
-        thread::spawn(move || take(&domain, &names, &stop))
+        let is_open = Arc::clone(&is_open);
+        thread::spawn(move || take(&domain, &names, &is_open, &stop))
     };
+    while !is_open.load(Ordering::Acquire) {
+        thread::sleep(Duration::from_millis(1));
+    }
     let period = Duration::from_nanos(1_000_000_000 / options.rate_hz);
     let payload = [7; 64];
     let mut send_for = |span: Duration| {
@@ -338,8 +380,13 @@ fn measure(network: &Network, folder: &Path, count: usize, options: &Options) ->
     }
 }
 
-/// Takes every message; when each was published, and how long it took to the other host.
-fn take(domain: &Domain, names: &[String], stop: &AtomicBool) -> Vec<(i64, u64)> {
+/// Takes every message once `is_open` is set; when each was published, and how long it took to the other host.
+fn take(
+    domain: &Domain,
+    names: &[String],
+    is_open: &AtomicBool,
+    stop: &AtomicBool,
+) -> Vec<(i64, u64)> {
     let listed: Vec<&str> = names.iter().map(String::as_str).collect();
     let waiter = Waiter::open(domain, &listed).unwrap();
     let mut inputs: Vec<RawInput> = names
@@ -347,6 +394,7 @@ fn take(domain: &Domain, names: &[String], stop: &AtomicBool) -> Vec<(i64, u64)>
         .map(|name| RawInput::open(domain, name, DEPTH).unwrap())
         .collect();
     let mut arrivals = Vec::new();
+    is_open.store(true, Ordering::Release);
     while !stop.load(Ordering::Acquire) {
         sleep_for(waiter.descriptor());
         for index in waiter.announced().unwrap() {
@@ -390,6 +438,107 @@ fn counts_of(words: &str) -> String {
     words.join(", ")
 }
 
+/// Which channels there are, and on which links.
+struct Layout {
+    label: &'static str,
+    links: Vec<Vec<Lane>>,
+}
+
+/// Delays of a small channel at 1 kHz alone, beside a large one on its link, and with that on another link.
+fn measure_beside_images(network: &Network, span: Duration) {
+    let command = Lane::new("bench/command", MESSAGE);
+    let image = Lane::new("bench/image", IMAGE);
+    let layouts = [
+        Layout {
+            label: "alone",
+            links: vec![vec![command.clone()]],
+        },
+        Layout {
+            label: "one link",
+            links: vec![vec![image.clone(), command.clone()]],
+        },
+        Layout {
+            label: "two links",
+            links: vec![vec![image], vec![command]],
+        },
+    ];
+    for Layout { label, links } in layouts {
+        let name = format!("hil-cpl-{}-beside", std::process::id());
+        let folder = std::env::temp_dir().join(name);
+        let domains = [0, 1].map(|host| Domain::create(&folder.join(format!("d{host}"))).unwrap());
+        let lanes = links.concat();
+        let holders = hold(&domains, &lanes);
+        let mut gateways = Vec::new();
+        for (index, lanes) in links.iter().enumerate() {
+            let folder = folder.join(format!("link-{index}"));
+            gateways.extend(link(network, &folder, lanes, &domains));
+        }
+        let stop = Arc::new(AtomicBool::new(false));
+        let mut publishers = Vec::new();
+        let mut takers = Vec::new();
+        for lane in &lanes {
+            let domain = Domain::open(domains[0].address()).unwrap();
+            let (stopped, lane) = (Arc::clone(&stop), lane.clone());
+            let names = [lane.name.clone()];
+            let size_bytes = lane.message.size_bytes;
+            let period = if size_bytes == IMAGE.size_bytes {
+                IMAGE_PERIOD
+            } else {
+                COMMAND_PERIOD
+            };
+            publishers.push(thread::spawn(move || {
+                let settings = OutputSettings::default();
+                let mut output =
+                    ShmOutput::open(&domain, &lane.name, &lane.message, settings).unwrap();
+                let payload = vec![7; size_bytes];
+                let mut due = MonotonicClock::now();
+                let mut sent_count = 0;
+                while !stopped.load(Ordering::Acquire) {
+                    thread::sleep(due.saturating_duration_since(MonotonicClock::now()));
+                    output.publish(MonotonicClock::now(), &payload).unwrap();
+                    sent_count += 1;
+                    due = due + period;
+                }
+                sent_count
+            }));
+            let domain = Domain::open(domains[1].address()).unwrap();
+            let stopped = Arc::clone(&stop);
+            let is_open = AtomicBool::new(false);
+            takers.push(thread::spawn(move || {
+                take(&domain, &names, &is_open, &stopped)
+            }));
+        }
+        for gateway in &mut gateways {
+            gateway.wait_until_ready(Duration::from_mins(1));
+        }
+        thread::sleep(SETTLING + span);
+        stop.store(true, Ordering::Release);
+        let sent = publishers.into_iter().map(|one| one.join().unwrap());
+        let sent: Vec<u64> = sent.collect();
+        let came = takers.into_iter().map(|one| one.join().unwrap());
+        for ((lane, sent_count), came) in lanes.iter().zip(sent).zip(came) {
+            let mut delays: Vec<u64> = came.iter().map(|(_, delay_ns)| *delay_ns).collect();
+            let delay = Quantiles::of(&mut delays).expect("messages arrive");
+            println!(
+                "{label:>9} {:>13}: {} of {sent_count} came; delay p50 {:.0}, p99 {:.0}, p99.9 {:.0} us",
+                lane.name,
+                came.len(),
+                delay.p50_ns as f64 * 1e-3,
+                delay.p99_ns as f64 * 1e-3,
+                delay.p99_9_ns as f64 * 1e-3,
+            );
+        }
+        for gateway in gateways {
+            gateway.end(Duration::from_mins(1));
+        }
+        drop(holders);
+        for domain in domains {
+            domain.remove();
+        }
+        fs::remove_dir_all(folder).unwrap();
+    }
+}
+
 /// The middle one of three, or of whatever number there is.
 fn median(mut figures: Vec<f64>) -> f64 {
     figures.sort_unstable_by(f64::total_cmp);
@@ -405,6 +554,7 @@ fn main() {
         network.note(),
         options.rate_hz
     );
+    measure_beside_images(&network, Duration::from_secs(options.seconds));
     let folder = |name: String| -> PathBuf { std::env::temp_dir().join(name) };
     let mut of_count: BTreeMap<usize, Vec<Figures>> = BTreeMap::new();
     for round in 0..options.rounds {

@@ -15,8 +15,8 @@ use super::refusal::Refusal;
 use super::sequence::Stream;
 use crate::counts;
 
-/// Most datagrams of one message.
-pub const FRAGMENT_COUNT_MAX: usize = 1 << 15;
+/// Most datagrams of one message: enough for 16 MiB on a path of 576 bytes, with IPv6.
+pub const FRAGMENT_COUNT_MAX: usize = 40_000;
 
 /// How one message is cut.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -60,7 +60,7 @@ impl FragmentPlan {
         })
     }
 
-    /// Datagrams the message takes, 1..=32768.
+    /// Datagrams the message takes, 1..=40000.
     pub const fn count(&self) -> u16 {
         self.count
     }

@@ -21,7 +21,7 @@
 //! | 52 | 4 | `follow_up_delta_ns` | that datagram's kernel transmit stamp minus its `handed_ns`; `ff ff ff ff` none |
 //! | 56 | 4 | `total_len` | DATA: bytes of the whole message; otherwise bytes of the body |
 //! | 60 | 2 | `fragment_index` | 0-based; 0 unless DATA |
-//! | 62 | 2 | `fragment_count` | 1..=32768; 1 unless DATA |
+//! | 62 | 2 | `fragment_count` | 1..=40000; 1 unless DATA |
 //! | 64 | 4 | epoch | DATA, BYE of a channel: producer's start; otherwise 0 |
 //! | 68 | 4 | number | sealed: of the datagram under its key; otherwise 0 |
 //! | 72 | n | payload or body | |

@@ -8,6 +8,7 @@ use hil_core::time::Instant;
 use crate::fragment::{FRAGMENT_COUNT_MAX, Fragment, FragmentPlan, Reassembler};
 use crate::refusal::Refusal;
 use crate::sequence::Stream;
+use crate::wire::{HEADER_BYTES, TAG_BYTES};
 
 const STREAM: Stream = Stream {
     session: 1,
@@ -43,6 +44,13 @@ fn shuffle<T>(random: &mut RandomStream, items: &mut [T]) {
         let other = usize::try_from(random.next_u64() % (last as u64 + 1)).unwrap();
         items.swap(last, other);
     }
+}
+
+#[test]
+fn the_longest_message_passes_the_narrowest_path() {
+    let ipv6_and_udp = 48;
+    let budget = 576 - ipv6_and_udp - HEADER_BYTES - TAG_BYTES;
+    assert!(FragmentPlan::new(16 << 20, budget).is_some());
 }
 
 #[test]
