@@ -236,15 +236,13 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
         return show_study(path, &topology, args, registry, console);
     }
     check_traces(path, &args.overrides, &topology, console)?;
+    // Told before what may only be missing now.
+    check_file(path, &topology)?;
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
-        check_file(path, &topology)?;
         return Ok(show_check(path, &topology, None, console));
     }
     let hosts = hosts_here(&topology, args.host.as_deref()).map_err(usage)?;
-    if args.check {
-        check_file(path, &topology)?;
-    }
     let key = check_here(path, args, &topology, &hosts, console)?;
     if args.check {
         return Ok(show_check(path, &topology, key, console));

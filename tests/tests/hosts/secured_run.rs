@@ -15,7 +15,7 @@ use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{Split, count, direction, refused};
-use hil_tests::trial::{Trial, hop_key};
+use hil_tests::trial::{Trial, hop_key, wait_until};
 
 const LIMIT: Duration = Duration::from_mins(1);
 /// No other file of tests uses these ports.
@@ -110,11 +110,15 @@ fn hosts_with_other_keys_or_without_one_both_say_so_and_end() {
 
 #[test]
 fn a_key_is_looked_at_before_anything_starts_and_by_a_check_of_its_host() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
     let record = RunFolder::new("key-mode");
     let key = hop_key(record.path());
     fs::set_permissions(&key, Permissions::from_mode(0o644)).unwrap();
     let start = |trial: &Trial, more: &[&str]| {
-        let mut command = trial.command_here();
+        let mut command = lab.host(1).command(hil_runtime_binary());
+        command.args(trial.arguments());
         command.args(["--host", "robot-pc"]).args(more);
         ChildGuard::spawn(&mut command)
             .unwrap()
@@ -132,6 +136,10 @@ fn a_key_is_looked_at_before_anything_starts_and_by_a_check_of_its_host() {
         }
     }
     fs::set_permissions(&key, Permissions::from_mode(0o600)).unwrap();
+    // The kernel tells of the carrier of a new interface after up to a second.
+    wait_until(LIMIT, "a carrier", || {
+        start(&trial(&record), &["--check"]).status.code() != Some(75)
+    });
     let checked = start(&trial(&record), &["--check"]);
     checked.assert_success();
     let fingerprint = PreSharedKey::read(&key).unwrap().fingerprint();

@@ -322,12 +322,12 @@ fn settings_out_of_bounds_are_named() {
     let bound = 72 + 57 + 16;
     let expected = SettingsError::DatagramTooSmall { value: 144, bound };
     assert_eq!(EgressBridge::new(settings).unwrap_err(), expected);
-    let mut settings = egress_settings(1, 1 << 25);
+    let mut settings = egress_settings(1, 1 << 26);
     settings.datagram_max_bytes = 1000;
     let expected = SettingsError::TooManyFragments {
-        size_bytes: 1 << 25,
-        fragments: 36_793,
-        bound: 32_768,
+        size_bytes: 1 << 26,
+        fragments: 73_585,
+        bound: 40_000,
     };
     assert_eq!(EgressBridge::new(settings).unwrap_err(), expected);
     let mut settings = ingress_settings(1, 64);
