@@ -2,8 +2,9 @@
 //! channels of 64 bytes, idle and at one total rate of messages. Not a test: it asserts nothing about time.
 //!
 //! `cargo bench -p hil-benches --bench channels_per_link [-- --seconds 8 --rate 2000 --rounds 3 --channels
-//! 1,10,100,400]`, about 4 minutes, and a channel of 4 MiB beside a small one for half a minute. Processor time, wake-ups and memory are those of the gateways, of both
-//! hosts together; a delay is from the publication of a message to its publication on the other host.
+//! 1,10,100,400 --images true]`, about 4 minutes, and a channel of 4 MiB beside a small one for half a minute.
+//! Processor time, wake-ups and memory are those of the gateways, of both hosts together; a delay is from the
+//! publication of a message to its publication on the other host.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 #![allow(
     clippy::unwrap_used,
@@ -62,6 +63,7 @@ struct Options {
     rate_hz: u64,
     rounds: usize,
     channels: Vec<usize>,
+    with_images: bool,
 }
 
 impl Options {
@@ -71,6 +73,7 @@ impl Options {
             rate_hz: 2_000,
             rounds: 3,
             channels: vec![1, 10, 100, 400],
+            with_images: true,
         };
         let mut arguments = std::env::args().skip(1).filter(|one| one != "--bench");
         while let Some(key) = arguments.next() {
@@ -78,6 +81,7 @@ impl Options {
             match key.as_str() {
                 "--seconds" => options.seconds = value.parse().unwrap(),
                 "--rate" => options.rate_hz = value.parse().unwrap(),
+                "--images" => options.with_images = value.parse().unwrap(),
                 "--rounds" => options.rounds = value.parse().unwrap(),
                 "--channels" => {
                     options.channels = value.split(',').map(|one| one.parse().unwrap()).collect();
@@ -554,7 +558,9 @@ fn main() {
         network.note(),
         options.rate_hz
     );
-    measure_beside_images(&network, Duration::from_secs(options.seconds));
+    if options.with_images {
+        measure_beside_images(&network, Duration::from_secs(options.seconds));
+    }
     let folder = |name: String| -> PathBuf { std::env::temp_dir().join(name) };
     let mut of_count: BTreeMap<usize, Vec<Figures>> = BTreeMap::new();
     for round in 0..options.rounds {

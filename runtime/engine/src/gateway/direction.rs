@@ -12,7 +12,7 @@ use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings,
 use hil_transport::{ConnectionTally, Stalls};
 
 use super::egress::{Attention, Egress};
-use super::ingress::{Ingress, Output};
+use super::ingress::{Ingress, Output, Records};
 use super::inputs::Inputs;
 use super::kernel_clock::KernelClock;
 use super::line::Line;
@@ -28,13 +28,12 @@ use hil_rundir::launch::{DirectionLaunch, Side};
 use hil_rundir::pipe::{
     ChannelReport, CountByName, CounterGroup, DirectionReport, RunStart, StallMetrics,
 };
-use hil_rundir::record::{RecordKind, RecordSink, Recorder};
+use hil_rundir::record::{RecordKind, RecordSink, Recorder, SharedSink};
 use hil_shm::RawOutput;
 
-/// Records that the rings of one kind hold together, shared out among the channels.
-const RING_RECORDS: usize = 16_384;
-/// Each channel's ring holds as many at least: what it may bring in one period of the writer.
-const RING_RECORDS_MIN: usize = 512;
+/// Records of one kind that wait for the disk at most, of all channels together.
+const RING_RECORDS: usize = 65_536;
+const ROUND_TRIPS: usize = 4_096;
 /// Time between clock exchanges: frequent enough for a round-trip distribution, rare enough to
 /// be a fraction of any control channel's traffic.
 const SYNC_PERIOD: Duration = Duration::from_millis(100);
@@ -58,14 +57,12 @@ pub struct OpenDirection {
 enum Sinks {
     Egress {
         /// One record for each message, by channel.
-        messages: Box<[RecordSink]>,
+        messages: SharedSink,
         round_trips: RecordSink,
     },
     Ingress {
-        /// By channel.
-        messages: Vec<RecordSink>,
-        /// By channel.
-        follow_ups: Vec<RecordSink>,
+        messages: SharedSink,
+        follow_ups: SharedSink,
     },
 }
 
@@ -101,22 +98,18 @@ pub fn open(
 }
 
 fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, WorkerError> {
-    let share = RING_RECORDS / launch.channels.len().max(1);
-    let capacity = share.max(RING_RECORDS_MIN);
-    let mut of_channels = |kind, size| -> Result<Vec<RecordSink>, WorkerError> {
-        let channels = launch.channels.iter();
-        let sinks = channels.map(|one| recorder.sink(kind, &one.channel, size, capacity));
-        Ok(sinks.collect::<Result<_, _>>()?)
+    let mut of_channels = |kind, size| {
+        let names = launch.channels.iter().map(|one| one.channel.as_str());
+        recorder.shared_sink(kind, names, size, RING_RECORDS)
     };
     Ok(match launch.side {
         Side::Egress => Sinks::Egress {
-            messages: of_channels(RecordKind::Egress, size_of::<EgressRecord>())?
-                .into_boxed_slice(),
+            messages: of_channels(RecordKind::Egress, size_of::<EgressRecord>())?,
             round_trips: recorder.sink(
                 RecordKind::RoundTrip,
                 &launch.flow,
                 size_of::<RoundTripRecord>(),
-                RING_RECORDS,
+                ROUND_TRIPS,
             )?,
         },
         Side::Ingress => Sinks::Ingress {
@@ -215,13 +208,9 @@ impl OpenDirection {
                     around.clock_id,
                 );
                 let channels = launch.channels.iter().zip(self.counts);
-                let sinks = messages.into_iter().zip(follow_ups);
-                let outputs = channels.zip(sinks).map(|((one, received), sinks)| {
-                    let (messages, follow_ups) = sinks;
+                let outputs = channels.map(|(one, received)| {
                     Ok(Output {
                         port: RawOutput::open(&around.domain, &one.channel, true)?,
-                        messages,
-                        follow_ups,
                         received,
                     })
                 });
@@ -230,6 +219,10 @@ impl OpenDirection {
                     is_emulated: launch.channels.iter().any(|one| one.emulation.is_some()),
                     bridge: IngressBridge::new(settings)?,
                     outputs: outputs.collect::<Result<_, WorkerError>>()?,
+                    records: Records {
+                        messages,
+                        follow_ups,
+                    },
                     wait: WaitStrategy::new(launch.wait),
                     peer: launch.peer,
                     stop: Arc::clone(&around.stop),

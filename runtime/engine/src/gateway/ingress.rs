@@ -20,7 +20,7 @@ use super::{WorkerError, poll_descriptors};
 use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy, release};
-use hil_rundir::record::RecordSink;
+use hil_rundir::record::SharedSink;
 use hil_shm::{ChannelError, RawOutput};
 
 /// Everything the thread works with.
@@ -32,6 +32,7 @@ pub(crate) struct Ingress {
     pub(crate) bridge: IngressBridge,
     /// Where messages go, by channel; empty on a clock path, which carries none.
     pub(crate) outputs: Box<[Output]>,
+    pub(crate) records: Records,
     pub(crate) wait: WaitStrategy,
     pub(crate) peer: SocketAddr,
     pub(crate) stop: Arc<AtomicBool>,
@@ -51,12 +52,17 @@ pub(crate) struct Response {
     handed: Instant,
 }
 
-/// One local channel, and where the records of its messages go.
+/// Where the records of messages go.
+#[derive(Debug)]
+pub(crate) struct Records {
+    pub(crate) messages: SharedSink,
+    pub(crate) follow_ups: SharedSink,
+}
+
+/// One local channel.
 #[derive(Debug)]
 pub(crate) struct Output {
     pub(crate) port: RawOutput,
-    pub(crate) messages: RecordSink,
-    pub(crate) follow_ups: RecordSink,
     /// Messages delivered.
     pub(crate) received: Arc<AtomicU64>,
 }
@@ -127,7 +133,7 @@ impl Ingress {
                 flags: IngressRecord::INCOMPLETE,
                 fragment_count: u32::from(message.fragment_count),
             };
-            self.outputs[message.channel].messages.push(&record);
+            self.records.messages.push(message.channel, &record);
         }
     }
 
@@ -182,6 +188,7 @@ impl Ingress {
         let Self {
             bridge,
             outputs,
+            records,
             buffer,
             ..
         } = self;
@@ -190,13 +197,13 @@ impl Ingress {
         let mut deliver = |delivery: Delivery<'_>| {
             let output = &mut outputs[delivery.message.channel];
             output.received.fetch_add(1, Ordering::Relaxed);
-            if let Err(error) = output.publish(&arrival, &delivery) {
+            if let Err(error) = output.publish(&arrival, &delivery, records) {
                 failed = Some(error);
             }
         };
         // A refused datagram is a counter of the bridge.
         if let Ok(disposition) = bridge.on_datagram(at, stamps, bytes, &mut deliver) {
-            note_undelivered(outputs, &arrival, disposition);
+            note_undelivered(&mut records.messages, &arrival, disposition);
         }
         self.note_incomplete();
         failed.map_or(Ok(Some(at)), |error| Err(error.into()))
@@ -270,7 +277,12 @@ impl Ingress {
 }
 
 impl Output {
-    fn publish(&mut self, arrival: &Arrival, delivery: &Delivery<'_>) -> Result<(), ChannelError> {
+    fn publish(
+        &mut self,
+        arrival: &Arrival,
+        delivery: &Delivery<'_>,
+        records: &mut Records,
+    ) -> Result<(), ChannelError> {
         let message = &delivery.message;
         let mut forwarded_ns = UNAVAILABLE;
         self.port.publish_with(delivery.payload, || {
@@ -289,26 +301,27 @@ impl Output {
         } else {
             0
         };
-        self.messages
-            .push(&arrival.record(message, forwarded_ns, flags));
+        let record = arrival.record(message, forwarded_ns, flags);
+        records.messages.push(message.channel, &record);
         if let Some(FollowUp {
             sequence,
             handed_to_tx_ns,
         }) = delivery.follow_up
         {
             let session = message.session;
-            self.follow_ups.push(&FollowUpRecord {
+            let record = FollowUpRecord {
                 sequence,
                 handed_to_tx_ns,
                 session,
                 reserved: 0,
-            });
+            };
+            records.follow_ups.push(message.channel, &record);
         }
         Ok(())
     }
 }
 
-fn note_undelivered(outputs: &mut [Output], arrival: &Arrival, disposition: Disposition) {
+fn note_undelivered(messages: &mut SharedSink, arrival: &Arrival, disposition: Disposition) {
     let (message, flags) = match disposition {
         Disposition::Duplicate(message) => (message, IngressRecord::DUPLICATE),
         Disposition::Late(message) => (message, IngressRecord::LATE),
@@ -319,7 +332,6 @@ fn note_undelivered(outputs: &mut [Output], arrival: &Arrival, disposition: Disp
         | Disposition::SyncRequested
         | Disposition::Farewell => return,
     };
-    outputs[message.channel]
-        .messages
-        .push(&arrival.record(&message, UNAVAILABLE, flags));
+    let record = arrival.record(&message, UNAVAILABLE, flags);
+    messages.push(message.channel, &record);
 }

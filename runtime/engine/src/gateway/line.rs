@@ -18,7 +18,7 @@ use super::stamp_plan::StampPlan;
 use super::stamp_tracker::{STAMP_PATIENCE_NS, StampTracker};
 use super::{WorkerError, poll_descriptors};
 use hil_platform::clock::MonotonicClock;
-use hil_rundir::record::RecordSink;
+use hil_rundir::record::{RecordSink, SharedSink};
 
 /// A radio reports after its last retry, with other stations and its queue before that; the driver
 /// of a card that stamps fetches the stamp from a worker of normal priority.
@@ -31,8 +31,7 @@ const HAND_OVER_MAX: Duration = Duration::from_millis(200);
 pub(crate) struct Line {
     pub(super) sender: Box<dyn DatagramSender>,
     pending: StampTracker<Pending>,
-    /// By channel.
-    records: Box<[RecordSink]>,
+    records: SharedSink,
     pub(super) round_trips: RecordSink,
     pub(super) session: u32,
     pub(super) clock: KernelClock,
@@ -68,7 +67,7 @@ impl Pending {
 impl Line {
     pub(crate) fn new(
         sender: Box<dyn DatagramSender>,
-        records: Box<[RecordSink]>,
+        records: SharedSink,
         round_trips: RecordSink,
         session: u32,
         awaited: StampPlan,
@@ -281,7 +280,7 @@ impl Line {
     }
 
     pub(super) fn finish(&mut self, channel: usize, record: EgressRecord) {
-        self.records[channel].push(&record);
+        self.records.push(channel, &record);
     }
 
     /// Of a message that did not leave, or not as a whole.

@@ -6,4 +6,4 @@ pub mod ring;
 pub mod stored;
 
 pub use file::{RecordFile, RecordFileError, RecordKind};
-pub use ring::{RecordSink, Recorder};
+pub use ring::{RecordSink, Recorder, SharedSink};

@@ -55,11 +55,146 @@ impl RecordSink {
     }
 }
 
+/// The producing end of a ring whose records go to one file a channel: lives in a measured thread.
 #[derive(Debug)]
-struct Drain {
-    ring: rtrb::Consumer<u8>,
+pub struct SharedSink {
+    ring: rtrb::Producer<u8>,
+    dropped: Arc<AtomicU64>,
+}
+
+impl SharedSink {
+    /// Stores one record of the channel with `index`.
+    pub fn push<T: Pod>(&mut self, index: usize, record: &T) {
+        let index = (index as u64).to_le_bytes();
+        let record = bytemuck::bytes_of(record);
+        // Not in one step: the other end takes whole entries only.
+        let fits = self.ring.slots() >= index.len() + record.len();
+        let stored = fits
+            && self.ring.push_entire_slice(&index).is_ok()
+            && self.ring.push_entire_slice(record).is_ok();
+        if !stored {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Bytes of a channel's index before each record of a shared ring.
+const INDEX_BYTES: usize = size_of::<u64>();
+
+#[derive(Debug)]
+struct Target {
     file: File,
     path: PathBuf,
+}
+
+impl Target {
+    fn write(&mut self, bytes: &[u8]) -> Result<(), FileFault> {
+        let written = self.file.write_all(bytes);
+        written.map_err(|error| FileFault::new(&self.path, &error))
+    }
+}
+
+/// The writer's end of a ring.
+#[derive(Debug)]
+enum Drain {
+    Single(SingleDrain),
+    Shared(SharedDrain),
+}
+
+impl Drain {
+    /// Writes what waits and calls `fail` for each file that does not take it: that file gets no more.
+    fn flush(&mut self, fail: &mut dyn FnMut(FileFault)) {
+        match self {
+            Self::Single(drain) => drain.flush(fail),
+            Self::Shared(drain) => drain.flush(fail),
+        }
+    }
+}
+
+/// All of it goes to one file, if that can still be written.
+#[derive(Debug)]
+struct SingleDrain {
+    ring: rtrb::Consumer<u8>,
+    target: Option<Target>,
+}
+
+impl SingleDrain {
+    fn flush(&mut self, fail: &mut dyn FnMut(FileFault)) {
+        let Some(target) = &mut self.target else {
+            return;
+        };
+        let waiting = self.ring.slots();
+        let Ok(chunk) = self.ring.read_chunk(waiting) else {
+            return;
+        };
+        let (first, second) = chunk.as_slices();
+        match target.write(first).and_then(|()| target.write(second)) {
+            Ok(()) => chunk.commit_all(),
+            Err(fault) => {
+                self.target = None;
+                fail(fault);
+            }
+        }
+    }
+}
+
+/// Each record goes to the file of its channel.
+#[derive(Debug)]
+struct SharedDrain {
+    ring: rtrb::Consumer<u8>,
+    record_bytes: usize,
+    shares: Vec<Share>,
+    /// What was taken from the ring last.
+    taken: Vec<u8>,
+    /// Channels of which records were among that.
+    touched: Vec<usize>,
+    dropped: Arc<AtomicU64>,
+}
+
+/// What is a channel's.
+#[derive(Debug)]
+struct Share {
+    target: Option<Target>,
+    /// Records on their way to it.
+    staged: Vec<u8>,
+}
+
+impl SharedDrain {
+    fn flush(&mut self, fail: &mut dyn FnMut(FileFault)) {
+        let entry_bytes = INDEX_BYTES + self.record_bytes;
+        let waiting = self.ring.slots() / entry_bytes * entry_bytes;
+        let Ok(chunk) = self.ring.read_chunk(waiting) else {
+            return;
+        };
+        let (first, second) = chunk.as_slices();
+        self.taken.clear();
+        self.taken.extend_from_slice(first);
+        self.taken.extend_from_slice(second);
+        chunk.commit_all();
+        for entry in self.taken.chunks_exact(entry_bytes) {
+            let (index, record) = entry.split_at(INDEX_BYTES);
+            let index = u64::from_le_bytes(index.try_into().expect("it was split there"));
+            let index = usize::try_from(index).expect("it was one");
+            let staged = &mut self.shares[index].staged;
+            if staged.is_empty() {
+                self.touched.push(index);
+            }
+            staged.extend_from_slice(record);
+        }
+        for index in self.touched.drain(..) {
+            let Share { target, staged } = &mut self.shares[index];
+            let is_written = target.as_mut().is_some_and(|target| {
+                let written = target.write(staged);
+                written.map_err(&mut *fail).is_ok()
+            });
+            if !is_written {
+                *target = None;
+                let count = staged.len() / self.record_bytes;
+                self.dropped.fetch_add(count as u64, Ordering::Relaxed);
+            }
+            staged.clear();
+        }
+    }
 }
 
 /// What became of a recorder's files.
@@ -126,23 +261,69 @@ impl Recorder {
         record_bytes: usize,
         capacity_records: usize,
     ) -> Result<RecordSink, RecordFileError> {
-        let record_bytes_header = u32::try_from(record_bytes).expect("records are small");
-        let header = RecordHeader {
-            kind,
-            channel: channel.to_owned(),
-            record_bytes: record_bytes_header,
-            instance: self.instance,
-        };
-        let (path, file) = header.create(&self.folder, &self.writer)?;
-        let capacity_records = capacity_records
-            .min(RING_BYTES_MAX / record_bytes)
-            .max(RING_RECORDS_MIN);
-        let (producer, ring) = rtrb::RingBuffer::new(record_bytes * capacity_records);
-        self.drains.push(Drain { ring, file, path });
+        let target = self.create(kind, channel, record_bytes)?;
+        let (producer, ring) = rtrb::RingBuffer::new(ring_bytes(record_bytes, capacity_records));
+        self.drains.push(Drain::Single(SingleDrain {
+            ring,
+            target: Some(target),
+        }));
         Ok(RecordSink {
             ring: producer,
             dropped: Arc::clone(&self.dropped),
         })
+    }
+
+    /// As [`Recorder::sink`], with a file for each of `channels` and one ring for all.
+    ///
+    /// # Errors
+    /// As [`Recorder::sink`].
+    ///
+    /// # Panics
+    /// As [`Recorder::sink`].
+    pub fn shared_sink<'a>(
+        &mut self,
+        kind: RecordKind,
+        channels: impl Iterator<Item = &'a str>,
+        record_bytes: usize,
+        capacity_records: usize,
+    ) -> Result<SharedSink, RecordFileError> {
+        let mut shares = Vec::new();
+        for channel in channels {
+            shares.push(Share {
+                target: Some(self.create(kind, channel, record_bytes)?),
+                staged: Vec::new(),
+            });
+        }
+        let entry_bytes = INDEX_BYTES + record_bytes;
+        let (producer, ring) = rtrb::RingBuffer::new(ring_bytes(entry_bytes, capacity_records));
+        self.drains.push(Drain::Shared(SharedDrain {
+            ring,
+            record_bytes,
+            shares,
+            taken: Vec::new(),
+            touched: Vec::new(),
+            dropped: Arc::clone(&self.dropped),
+        }));
+        Ok(SharedSink {
+            ring: producer,
+            dropped: Arc::clone(&self.dropped),
+        })
+    }
+
+    fn create(
+        &self,
+        kind: RecordKind,
+        channel: &str,
+        record_bytes: usize,
+    ) -> Result<Target, RecordFileError> {
+        let header = RecordHeader {
+            kind,
+            channel: channel.to_owned(),
+            record_bytes: u32::try_from(record_bytes).expect("records are small"),
+            instance: self.instance,
+        };
+        let (path, file) = header.create(&self.folder, &self.writer)?;
+        Ok(Target { file, path })
     }
 
     /// Starts the writer thread. Call from a thread of normal priority: the writer inherits it.
@@ -169,17 +350,14 @@ impl Recorder {
             let mut failures = Vec::new();
             loop {
                 let is_last = stop.load(Ordering::Acquire);
-                drains.retain_mut(|drain| match flush(drain) {
-                    Ok(()) => true,
-                    Err(error) => {
-                        let fault = FileFault::new(&drain.path, &error);
+                for drain in &mut drains {
+                    drain.flush(&mut |fault| {
                         if failures.is_empty() {
                             on_failure(&fault);
                         }
                         failures.push(fault);
-                        false
-                    }
-                });
+                    });
+                }
                 if is_last {
                     return failures;
                 }
@@ -206,15 +384,10 @@ impl Recorder {
     }
 }
 
-fn flush(drain: &mut Drain) -> io::Result<()> {
-    let waiting = drain.ring.slots();
-    if let Ok(chunk) = drain.ring.read_chunk(waiting) {
-        let (first, second) = chunk.as_slices();
-        drain.file.write_all(first)?;
-        drain.file.write_all(second)?;
-        chunk.commit_all();
-    }
-    Ok(())
+/// Of a ring for so many entries, or for as many as [`RING_BYTES_MAX`] holds.
+fn ring_bytes(entry_bytes: usize, capacity: usize) -> usize {
+    let bounded = capacity.min(RING_BYTES_MAX / entry_bytes);
+    entry_bytes * bounded.max(RING_RECORDS_MIN)
 }
 
 #[cfg(test)]
@@ -255,11 +428,10 @@ mod tests {
         let path = PathBuf::from("/dev/full");
         let file = File::options().write(true).open(&path).unwrap();
         let mut recorder = Recorder::new(&env::temp_dir(), "robot", 0);
-        recorder.drains.push(Drain {
+        recorder.drains.push(Drain::Single(SingleDrain {
             ring: drained,
-            file,
-            path,
-        });
+            target: Some(Target { file, path }),
+        }));
         let (teller, told) = std::sync::mpsc::channel();
         let tell = move |fault: &FileFault| teller.send(fault.clone()).unwrap();
         recorder.start_and_tell(tell).unwrap();
@@ -271,6 +443,49 @@ mod tests {
         let outcome = recorder.finish();
         assert_eq!(outcome.failures, [first]);
         assert!(told.recv().is_err(), "told once");
+    }
+
+    #[test]
+    fn records_of_a_shared_ring_are_in_the_files_of_their_channels() {
+        let folder = env::temp_dir().join(format!("hil-shared-{}", process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let mut recorder = Recorder::new(&folder, "robot", 0);
+        let size = size_of::<PublishedRecord>();
+        let names = ["a", "b", "full"].into_iter();
+        let mut sink = recorder
+            .shared_sink(RecordKind::Published, names, size, 100)
+            .unwrap();
+        let Some(Drain::Shared(drain)) = recorder.drains.last_mut() else {
+            panic!("it was made last");
+        };
+        let full = PathBuf::from("/dev/full");
+        drain.shares[2].target = Some(Target {
+            file: File::options().write(true).open(&full).unwrap(),
+            path: full,
+        });
+        // Over the end of the ring more than once, and each time more than it holds.
+        let mut fail_count = 0;
+        for round in 0..5 {
+            for sequence in 0..102 {
+                let index = usize::try_from(sequence % 3).unwrap();
+                sink.push(index, &record(round * 1_000 + sequence));
+            }
+            drain.flush(&mut |_| fail_count += 1);
+        }
+        assert_eq!(fail_count, 1, "the full one is tried no more");
+        let outcome = recorder.finish();
+        // Two of each round did not fit, and 33 had no file.
+        assert_eq!(outcome.dropped_count, 5 * 35);
+        for (index, name) in (0..).zip(["a", "b"]) {
+            let file = RecordFile::read(&folder.join(format!("{name}.published.robot.0.rec")));
+            let read: Vec<PublishedRecord> = file.unwrap().records().collect();
+            let expected = (0..5).flat_map(|round| {
+                let own = (0..100).filter(move |sequence| sequence % 3 == index);
+                own.map(move |sequence| record(round * 1_000 + sequence))
+            });
+            assert_eq!(read, expected.collect::<Vec<_>>());
+        }
+        fs::remove_dir_all(&folder).unwrap();
     }
 
     #[test]
