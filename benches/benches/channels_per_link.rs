@@ -477,12 +477,13 @@ fn measure_beside_images(network: &Network, span: Duration) {
             let folder = folder.join(format!("link-{index}"));
             gateways.extend(link(network, &folder, lanes, &domains));
         }
-        let stop = Arc::new(AtomicBool::new(false));
+        let [is_begun, stop] = [(); 2].map(|()| Arc::new(AtomicBool::new(false)));
         let mut publishers = Vec::new();
         let mut takers = Vec::new();
         for lane in &lanes {
             let domain = Domain::open(domains[0].address()).unwrap();
-            let (stopped, lane) = (Arc::clone(&stop), lane.clone());
+            let (begun, stopped) = (Arc::clone(&is_begun), Arc::clone(&stop));
+            let lane = lane.clone();
             let names = [lane.name.clone()];
             let size_bytes = lane.message.size_bytes;
             let period = if size_bytes == IMAGE.size_bytes {
@@ -495,6 +496,9 @@ fn measure_beside_images(network: &Network, span: Duration) {
                 let mut output =
                     ShmOutput::open(&domain, &lane.name, &lane.message, settings).unwrap();
                 let payload = vec![7; size_bytes];
+                while !begun.load(Ordering::Acquire) {
+                    thread::sleep(COMMAND_PERIOD);
+                }
                 let mut due = MonotonicClock::now();
                 let mut sent_count = 0;
                 while !stopped.load(Ordering::Acquire) {
@@ -515,6 +519,7 @@ fn measure_beside_images(network: &Network, span: Duration) {
         for gateway in &mut gateways {
             gateway.wait_until_ready(Duration::from_mins(1));
         }
+        is_begun.store(true, Ordering::Release);
         thread::sleep(SETTLING + span);
         stop.store(true, Ordering::Release);
         let sent = publishers.into_iter().map(|one| one.join().unwrap());

@@ -12,7 +12,7 @@ local UNKNOWN_TIME = "-9223372036854775808"
 local kinds = {
     [1] = "DATA", [2] = "SYNC_REQ", [3] = "SYNC_RSP",
     [4] = "HELLO", [5] = "HELLO_ACK", [6] = "BYE",
-    [7] = "KEY_REQ", [8] = "KEY_ANS",
+    [7] = "KEY_REQ", [8] = "KEY_ANS", [9] = "PIECE_ACK",
 }
 local statuses = {
     [0] = "accepted", [1] = "channels differ", [2] = "one shared-memory domain",
@@ -120,6 +120,9 @@ local function dissect_body(kind, body, tree)
         return dissect_hello(body, tree)
     elseif kind == 5 then
         return dissect_hello_ack(body, tree)
+    elseif kind == 9 then
+        tree:add_le(f.ack_answers, body)
+        return body:len() == 8
     end
     return false
 end

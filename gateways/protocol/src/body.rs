@@ -1,4 +1,4 @@
-//! Bodies of greetings, answers and clock exchanges. The header before them is in
+//! Bodies of greetings, clock exchanges and answers. The header before them is in
 //! [`super::wire`]; what they mean for a session is decided by the bridges.
 //!
 //! Offsets count from the end of the header; all numbers are little-endian.
@@ -31,11 +31,17 @@
 //!
 //! | offset | bytes | field | meaning |
 //! |-------:|------:|-------|---------|
-//! | 0 | 8 | t1_ns | the request's handed_ns, repeated; an application stamp of the requester |
-//! | 8 | 8 | t2_ns | request's arrival, responder's monotonic clock |
-//! | 16 | 8 | t3_ns | response handed to the kernel, responder's monotonic clock; an application stamp, refined by the follow-up of a later response |
-//! | 24 | 1 | t2_source | [`StampSource`]: 0 application, 1 kernel software, 2 hardware |
+//! | 0 | 8 | `t1_ns` | the request's `handed_ns`, repeated; an application stamp of the requester |
+//! | 8 | 8 | `t2_ns` | request's arrival, responder's monotonic clock |
+//! | 16 | 8 | `t3_ns` | response handed to the kernel, responder's monotonic clock; an application stamp, refined by the follow-up of a later response |
+//! | 24 | 1 | `t2_source` | [`StampSource`]: 0 application, 1 kernel software, 2 hardware |
 //! | 25 | 15 | reserved | 0 |
+//!
+//! **`PIECE_ACK`** (8 bytes), for every 16th piece of a message above 64 KiB and its last one:
+//!
+//! | offset | bytes | field | meaning |
+//! |-------:|------:|-------|---------|
+//! | 0 | 8 | `answers_handed_ns` | `handed_ns` of the piece |
 
 use bytemuck::checked::try_cast;
 
@@ -49,6 +55,8 @@ pub const NAME_BYTES_MAX: usize = 255;
 pub const SYNC_BODY_BYTES: usize = 40;
 /// Bytes of a `HELLO_ACK` body.
 pub const HELLO_ACK_BODY_BYTES: usize = 40;
+/// Bytes of a `PIECE_ACK` body.
+pub const PIECE_ACK_BODY_BYTES: usize = 8;
 const HELLO_FIXED_BYTES: usize = 40;
 
 /// Who greets and what it wants to send.
@@ -246,6 +254,33 @@ impl SyncResponse {
             t2_ns: i64_at(body, 8),
             t3_ns: i64_at(body, 16),
             t2_source: try_cast(body[24]).map_err(|_unknown| Refusal::MalformedBody)?,
+        })
+    }
+}
+
+/// The receiver has taken a piece of a long message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PieceAck {
+    /// `handed_ns` of the piece.
+    pub answers_handed_ns: i64,
+}
+
+impl PieceAck {
+    /// Writes the body to the start of `buffer` and returns its length.
+    ///
+    /// # Panics
+    /// When `buffer` is shorter than [`PIECE_ACK_BODY_BYTES`].
+    pub fn encode(&self, buffer: &mut [u8]) -> usize {
+        write(buffer, 0, self.answers_handed_ns.to_le_bytes());
+        PIECE_ACK_BODY_BYTES
+    }
+
+    pub(crate) fn decode(body: &[u8]) -> Result<Self, Refusal> {
+        if body.len() != PIECE_ACK_BODY_BYTES {
+            return Err(Refusal::MalformedBody);
+        }
+        Ok(Self {
+            answers_handed_ns: i64_at(body, 0),
         })
     }
 }

@@ -16,7 +16,7 @@ causes! {
     /// Another version of the protocol.
     UnsupportedVersion => "unsupported version", "protocol version is not 2";
     /// A kind this version does not know.
-    UnknownKind => "unknown kind", "kind is outside 1 to 8";
+    UnknownKind => "unknown kind", "kind is outside 1 to 9";
     /// The header claims another length than this version's.
     BadHeaderLength => "bad header length", "header length is not 72 bytes";
     /// A flag this version does not know.

@@ -8,7 +8,7 @@
 //! |-------:|------:|-------|---------|
 //! | 0 | 4 | magic | `48 49 4c 47`, the letters `HILG` |
 //! | 4 | 1 | version | 2 |
-//! | 5 | 1 | kind | 1 DATA, 2 `SYNC_REQ`, 3 `SYNC_RSP`, 4 HELLO, 5 `HELLO_ACK`, 6 BYE; 7 `KEY_REQ`, 8 `KEY_ANS` of the seal |
+//! | 5 | 1 | kind | 1 DATA, 2 `SYNC_REQ`, 3 `SYNC_RSP`, 4 HELLO, 5 `HELLO_ACK`, 6 BYE; 7 `KEY_REQ`, 8 `KEY_ANS` of the seal; 9 `PIECE_ACK` |
 //! | 6 | 2 | flags | bit 0: sealed, what follows the header is encrypted and ends in a tag; then bits 8..16: low 8 bits of the key's generation; others 0 |
 //! | 8 | 4 | session | start of the *sending-side* gateway; replies repeat the request's |
 //! | 12 | 2 | channel | DATA: number of the channel between the two hosts; BYE: of the channel, or of the flow; otherwise of the flow |
@@ -42,7 +42,7 @@
 //! both. Their sequence is the request's number, their epoch the generation of the sender's key, and of
 //! a request `published_ns` the first bytes of the salt that generation belongs to.
 
-use super::body::{Hello, HelloAck, SyncResponse, check_sync_request};
+use super::body::{Hello, HelloAck, PieceAck, SyncResponse, check_sync_request};
 use super::fragment::{FRAGMENT_COUNT_MAX, FragmentPlan};
 use super::refusal::Refusal;
 
@@ -83,6 +83,8 @@ pub enum Kind {
     KeyRequest = 7,
     /// And gets them.
     KeyAnswer = 8,
+    /// A piece of a long message has come.
+    PieceAck = 9,
 }
 
 impl Kind {
@@ -332,6 +334,8 @@ pub enum Body<'a> {
     Hello(Hello<'a>),
     /// The answer.
     HelloAck(HelloAck),
+    /// Which piece has come.
+    PieceAck(PieceAck),
     /// Nothing.
     Bye,
 }
@@ -354,6 +358,7 @@ pub fn decode(bytes: &[u8]) -> Result<Datagram<'_>, Refusal> {
         Kind::SyncResponse => Body::SyncResponse(SyncResponse::decode(payload)?),
         Kind::Hello => Body::Hello(Hello::decode(payload)?),
         Kind::HelloAck => Body::HelloAck(HelloAck::decode(payload)?),
+        Kind::PieceAck => Body::PieceAck(PieceAck::decode(payload)?),
         Kind::Bye if payload.is_empty() => Body::Bye,
         Kind::Bye => return Err(Refusal::MalformedBody),
         // The seal takes its own out before a bridge sees them.

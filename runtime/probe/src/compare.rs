@@ -424,7 +424,7 @@ fn own(observation: &Observation) -> Option<OwnHeader> {
 fn is_forward(own: &OwnHeader) -> bool {
     !matches!(
         own.kind,
-        Kind::SyncResponse | Kind::HelloAck | Kind::KeyAnswer
+        Kind::SyncResponse | Kind::HelloAck | Kind::PieceAck | Kind::KeyAnswer
     )
 }
 

@@ -52,6 +52,7 @@ pub(crate) fn encode(datagram: &Datagram<'_>, length: usize) -> Vec<u8> {
         Body::SyncResponse(response) => response.encode(body),
         Body::Hello(hello) => hello.encode(body),
         Body::HelloAck(answer) => answer.encode(body),
+        Body::PieceAck(ack) => ack.encode(body),
         Body::Bye => 0,
     };
     assert_eq!(written_bytes, body_bytes, "bytes behind the body");

@@ -13,7 +13,7 @@ use hil_capture::writer::PacketToWrite;
 use hil_capture::{CaptureInterface, esl, writer};
 use hil_net::{Direction, link_type};
 use hil_protocol::StampSource;
-use hil_protocol::body::{Hello, HelloAck, HelloStatus, SyncResponse};
+use hil_protocol::body::{Hello, HelloAck, HelloStatus, PieceAck, SyncResponse};
 use hil_protocol::wire::{FollowUpField, HEADER_BYTES, Header, Kind};
 use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::child::run;
@@ -151,11 +151,15 @@ fn sample_frames() -> Vec<Vec<u8>> {
         t3_ns: 13,
         t2_source: StampSource::KernelSoftware,
     };
-    let mut bodies = [vec![0; 200], vec![0; 200], vec![0; 200]];
+    let piece_ack = PieceAck {
+        answers_handed_ns: -6,
+    };
+    let mut bodies = [(); 4].map(|()| vec![0; 200]);
     let lengths = [
         hello.encode(&mut bodies[0]),
         ack.encode(&mut bodies[1]),
         response.encode(&mut bodies[2]),
+        piece_ack.encode(&mut bodies[3]),
     ];
     [
         datagram(&data, b"0123456789"),
@@ -164,6 +168,7 @@ fn sample_frames() -> Vec<Vec<u8>> {
         datagram(&sample_header(Kind::Hello), &bodies[0][..lengths[0]]),
         datagram(&sample_header(Kind::HelloAck), &bodies[1][..lengths[1]]),
         datagram(&sample_header(Kind::Bye), &[]),
+        datagram(&sample_header(Kind::PieceAck), &bodies[3][..lengths[3]]),
     ]
     .iter()
     .map(|bytes| udp_frame(bytes))
@@ -191,10 +196,10 @@ fn common_fields() -> Fields {
 }
 
 /// What it must find in each.
-fn own_fields() -> [Fields; 6] {
+fn own_fields() -> [Fields; 7] {
     let dd = "d0".repeat(16);
     let d1 = "d1".repeat(16);
-    let own: [&[(&'static str, &str)]; 6] = [
+    let own: [&[(&'static str, &str)]; 7] = [
         &[
             ("hil.kind", "1"),
             ("hil.published_ns", "-9223372036854775808"),
@@ -234,6 +239,7 @@ fn own_fields() -> [Fields; 6] {
             ("hil.ack.answers_handed_ns", "-5"),
         ],
         &[("hil.kind", "6"), ("hil.payload", "")],
+        &[("hil.kind", "9"), ("hil.ack.answers_handed_ns", "-6")],
     ];
     own.map(|list| {
         list.iter()
@@ -255,7 +261,7 @@ fn the_lua_dissector_shows_every_field_of_every_kind() {
     fields.sort_unstable();
     fields.dedup();
     let packets = tshark(&file, &["-X", &dissector()], &fields);
-    assert_eq!(packets.len(), 6);
+    assert_eq!(packets.len(), 7);
     for (packet, own) in packets.iter().zip(&own) {
         for (field, expected) in common.iter().chain(own) {
             assert_eq!(packet[*field], *expected, "{field} of {packet:?}");

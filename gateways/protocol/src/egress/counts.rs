@@ -77,6 +77,10 @@ counts! {
         sync_sent_count,
         /// Clock exchanges that came back.
         round_trip_count,
+        /// Pieces of long messages that the peer acknowledged.
+        piece_ack_count,
+        /// Times that acknowledgements of pieces stayed out and those under way were counted as lost.
+        piece_silence_count,
         /// Times the peer was reported unreachable after it was not.
         peer_down_count,
         /// Times the peer came back with another session.

@@ -13,6 +13,7 @@
 
 mod counts;
 mod exchange;
+pub(crate) mod pacing;
 mod staging;
 mod transmit;
 
@@ -37,6 +38,7 @@ pub use counts::{EgressChannelCounts, EgressCounts, LocalRefusal};
 pub use exchange::RoundTrip;
 
 use exchange::Exchanges;
+use pacing::Pacing;
 use staging::Staging;
 
 /// A message up to this size is sent in one go. The pieces of a longer one leave between other messages, as
@@ -175,6 +177,8 @@ pub enum EgressEvent {
     Refused(HelloStatus),
     /// The peer does not know this session; greeting starts again.
     GreetAgain,
+    /// A piece of a long message has arrived.
+    PieceArrived,
     /// A clock exchange came back.
     RoundTrip {
         /// The exchange, with the stamps known now.
@@ -205,6 +209,7 @@ pub struct EgressBridge {
     exchanges: Exchanges,
     staging: Staging,
     long: Option<Long>,
+    pacing: Pacing,
     control: Box<[u8]>,
     last_transmit: Option<LastTransmit>,
     farewell: Farewell,
@@ -288,6 +293,7 @@ impl EgressBridge {
             channels: vec![EgressChannel::default(); settings.flow.channels.len()]
                 .into_boxed_slice(),
             long: None,
+            pacing: Pacing::new(),
             staging: Staging::new(
                 (settings.flow.size_max_bytes() as usize).min(STAGED_BYTES_MAX),
                 settings.payload_budget_bytes(),
@@ -370,6 +376,17 @@ impl EgressBridge {
         self.long.is_some()
     }
 
+    /// Until when the next piece of a long message waits, so that no more are under way than path and receiver
+    /// keep up with; `None` when it may leave. Ask before each, and again after an
+    /// [`EgressEvent::PieceArrived`].
+    pub fn piece_held_until(&mut self, now: Instant) -> Option<Instant> {
+        if self.pacing.is_silent(now) {
+            self.counts.piece_silence_count += 1;
+            self.pacing.on_silence(now);
+        }
+        self.pacing.held_until(now)
+    }
+
     /// The next piece of the long message under way, whose bytes are `payload`; the same again until
     /// [`EgressBridge::on_long_sent`] or [`EgressBridge::on_long_failed`]. `now` becomes its `handed_ns`.
     ///
@@ -379,13 +396,12 @@ impl EgressBridge {
         let long = self.long.as_mut()?;
         let index = long.header.fragment_index;
         let range = long.plan.range(index).expect("index is below the count");
-        let mut header = long.header;
-        header.handed_ns = now.as_ns();
-        header.encode(&mut long.head);
+        long.header.handed_ns = now.as_ns();
+        long.header.encode(&mut long.head);
         Some(LongPiece {
             tail: payload.get(range)?,
             channel: long.channel,
-            sequence: header.sequence,
+            sequence: long.header.sequence,
             is_last: index + 1 == long.plan.count(),
             head: &long.head,
         })
@@ -397,6 +413,7 @@ impl EgressBridge {
             return;
         };
         self.counts.datagram_count += 1;
+        self.pacing.on_sent(&long.header);
         let counts = &mut self.channels[long.channel].counts;
         counts.datagram_count += 1;
         long.header.fragment_index += 1;
@@ -665,6 +682,11 @@ impl EgressBridge {
         match datagram.body {
             Body::HelloAck(ack) => self.on_hello_ack(now, arrival, &ack),
             Body::SyncResponse(response) => self.on_sync_response(header, &response, arrival),
+            Body::PieceAck(ack) => {
+                self.pacing.on_acknowledged(now, ack.answers_handed_ns)?;
+                self.counts.piece_ack_count += 1;
+                Ok(EgressEvent::PieceArrived)
+            }
             _ => Err(Refusal::UnexpectedKind),
         }
     }

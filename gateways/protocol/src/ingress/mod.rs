@@ -23,6 +23,7 @@ use hil_core::time::Instant;
 use super::body::{Hello, HelloStatus};
 use super::channel::{ChannelIdentity, ChannelNumbers, FlowIdentity, SettingsError};
 use super::egress::STAGED_BYTES_MAX;
+use super::egress::pacing::is_acknowledged;
 use super::fragment::{Fragment, Reassembler, ReassemblyCounts};
 use super::refusal::{Refusal, RefusalCounts};
 use super::sequence::{Order, SequenceCounts, SequenceWindow};
@@ -35,7 +36,7 @@ pub use delivery::{
 pub use replies::ReplyCounts;
 
 use delivery::{delivery_of, message_of, stream_of};
-use replies::{AckRequest, Replies, SyncRequest};
+use replies::{AckRequest, PieceRequest, Replies, SyncRequest};
 use session::Sessions;
 
 /// Shortest time between two replies that refuse, or ask for a greeting.
@@ -375,7 +376,9 @@ impl IngressBridge {
         };
         match datagram.body {
             Body::Hello(hello) => return self.on_hello(request, &hello),
-            Body::SyncResponse(_) | Body::HelloAck(_) => return Err(Refusal::UnexpectedKind),
+            Body::SyncResponse(_) | Body::HelloAck(_) | Body::PieceAck(_) => {
+                return Err(Refusal::UnexpectedKind);
+            }
             Body::Data(_) | Body::SyncRequest | Body::Bye => {}
         }
         let channel = self.check_session(request)?;
@@ -575,7 +578,18 @@ impl IngressBridge {
             handed_ns: header.handed_ns,
             payload,
         };
-        let Some(assembled) = own.reassembler.insert(request.now, &fragment)? else {
+        let inserted = own.reassembler.insert(request.now, &fragment)?;
+        if is_acknowledged(header) {
+            self.replies.acknowledge_piece(&PieceRequest {
+                now: request.now,
+                session: header.session,
+                sequence: header.sequence,
+                answers_handed_ns: header.handed_ns,
+                request_bytes: request.length_bytes,
+                destination: request.arrival.peer,
+            });
+        }
+        let Some(assembled) = inserted else {
             collect(&mut self.incomplete, &mut own.reassembler, channel);
             if !self.split.contains(&channel) {
                 self.split.push(channel);

@@ -6,7 +6,10 @@ use core::net::SocketAddr;
 use hil_core::time::Instant;
 
 use super::{IngressSettings, REFUSAL_REPLY_PERIOD, Reply};
-use crate::body::{HELLO_ACK_BODY_BYTES, HelloAck, HelloStatus, SYNC_BODY_BYTES, SyncResponse};
+use crate::body::{
+    HELLO_ACK_BODY_BYTES, HelloAck, HelloStatus, PIECE_ACK_BODY_BYTES, PieceAck, SYNC_BODY_BYTES,
+    SyncResponse,
+};
 use crate::counts;
 use crate::stamps::StampSource;
 use crate::wire::{FollowUpField, HEADER_BYTES, Header, Kind};
@@ -51,6 +54,16 @@ pub(super) struct SyncRequest {
     pub(super) destination: Option<SocketAddr>,
 }
 
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PieceRequest {
+    pub(super) now: Instant,
+    pub(super) session: u32,
+    pub(super) sequence: u64,
+    pub(super) answers_handed_ns: i64,
+    pub(super) request_bytes: usize,
+    pub(super) destination: Option<SocketAddr>,
+}
+
 #[derive(Debug)]
 pub(super) struct Replies {
     session: u32,
@@ -61,6 +74,7 @@ pub(super) struct Replies {
     buffer: [u8; BUFFER_BYTES],
     ack: Option<AckRequest>,
     sync: Option<SyncRequest>,
+    piece: Option<PieceRequest>,
     follow_up: Option<FollowUpField>,
     refused_at: Option<Instant>,
     counts: ReplyCounts,
@@ -77,6 +91,7 @@ impl Replies {
             buffer: [0; BUFFER_BYTES],
             ack: None,
             sync: None,
+            piece: None,
             follow_up: None,
             refused_at: None,
             counts: ReplyCounts::default(),
@@ -106,6 +121,15 @@ impl Replies {
         self.counts.replaced_count += u64::from(replaced.is_some());
     }
 
+    pub(super) fn acknowledge_piece(&mut self, request: &PieceRequest) {
+        if request.request_bytes < HEADER_BYTES + PIECE_ACK_BODY_BYTES {
+            self.counts.amplifying_count += 1;
+            return;
+        }
+        let replaced = self.piece.replace(*request);
+        self.counts.replaced_count += u64::from(replaced.is_some());
+    }
+
     pub(super) fn set_transmit_stamp(&mut self, sequence: u64, handed_to_tx_ns: i64) {
         // u32::MAX stands for none on the wire.
         let delta = u32::try_from(handed_to_tx_ns).ok();
@@ -120,15 +144,19 @@ impl Replies {
     pub(super) fn waiting_since(&self) -> Option<Instant> {
         let ack = self.ack.as_ref().map(|request| request.now);
         let sync = self.sync.as_ref().map(|request| request.now);
-        ack.into_iter().chain(sync).min()
+        let piece = self.piece.as_ref().map(|request| request.now);
+        ack.into_iter().chain(sync).chain(piece).min()
     }
 
     pub(super) fn next(&mut self, now: Instant) -> Option<Reply<'_>> {
         if let Some(request) = self.ack.take() {
             return Some(self.hello_ack(now, &request));
         }
-        let request = self.sync.take()?;
-        Some(self.sync_response(now, &request))
+        if let Some(request) = self.sync.take() {
+            return Some(self.sync_response(now, &request));
+        }
+        let request = self.piece.take()?;
+        Some(self.piece_ack(now, &request))
     }
 
     fn hello_ack(&mut self, now: Instant, request: &AckRequest) -> Reply<'_> {
@@ -158,6 +186,17 @@ impl Replies {
         header.sequence = request.sequence;
         header.handed_ns = now.as_ns();
         header.follow_up = self.follow_up.take();
+        self.reply(header, length, request.destination)
+    }
+
+    fn piece_ack(&mut self, now: Instant, request: &PieceRequest) -> Reply<'_> {
+        let body = PieceAck {
+            answers_handed_ns: request.answers_handed_ns,
+        };
+        let length = body.encode(&mut self.buffer[HEADER_BYTES..]);
+        let mut header = Header::new(Kind::PieceAck, request.session, self.flow);
+        header.sequence = request.sequence;
+        header.handed_ns = now.as_ns();
         self.reply(header, length, request.destination)
     }
 

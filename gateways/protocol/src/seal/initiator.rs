@@ -150,7 +150,7 @@ impl Initiator {
         let fields = SealFields::read(datagram, self.root.flow)?;
         match fields.kind {
             Kind::KeyAnswer => return self.take_keys(datagram),
-            Kind::HelloAck | Kind::SyncResponse => {}
+            Kind::HelloAck | Kind::SyncResponse | Kind::PieceAck => {}
             _ => return Err(SealRefusal::WrongWay),
         }
         let traffic = self

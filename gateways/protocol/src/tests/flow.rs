@@ -308,6 +308,7 @@ fn send_long(
     assert_eq!(again, Err(crate::LocalRefusal::TransmissionPending));
     let mut piece_count = 0;
     let mut short_count = 0;
+    // Acknowledgements are not delivered here, and nothing asks for them.
     while let Some(piece) = egress.long_piece(now, image) {
         let mut datagram = piece.head.to_vec();
         datagram.extend_from_slice(piece.tail);
@@ -337,6 +338,9 @@ fn send_long(
         }
     }
     assert!(!egress.has_long());
+    let acknowledged = ingress.poll_transmit(now).unwrap();
+    assert_eq!(acknowledged.kind, Kind::PieceAck);
+    assert_eq!(ingress.poll_transmit(now), None);
     assert_eq!(piece_count, image.len().div_ceil(1384));
     delivered
 }

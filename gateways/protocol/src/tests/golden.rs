@@ -1,6 +1,6 @@
 //! The datagram format, held to written-out bytes in both directions.
 
-use crate::body::{Hello, HelloAck, HelloStatus, SyncResponse};
+use crate::body::{Hello, HelloAck, HelloStatus, PieceAck, SyncResponse};
 use crate::refusal::Refusal;
 use crate::stamps::StampSource;
 use crate::wire::{Body, FLAG_AUTHENTICATED, FollowUpField, HEADER_BYTES, Header, Kind, decode};
@@ -51,6 +51,7 @@ fn check(mut header: Header, body: Body<'_>, expected: &str) {
         Body::SyncResponse(response) => response.encode(&mut buffer[HEADER_BYTES..]),
         Body::Hello(hello) => hello.encode(&mut buffer[HEADER_BYTES..]),
         Body::HelloAck(ack) => ack.encode(&mut buffer[HEADER_BYTES..]),
+        Body::PieceAck(ack) => ack.encode(&mut buffer[HEADER_BYTES..]),
         Body::Bye => 0,
     };
     if header.kind != Kind::Data {
@@ -117,6 +118,21 @@ fn a_sync_response_has_these_bytes() {
          0f10111213141516 0000000000000000 0d0e0f1011120000
          00000000 ffffffff 28000000 0000 0100 00000000 00000000
          0807060504030201 1817161514131211 2827262524232221 01 000000000000000000000000000000",
+    );
+}
+
+#[test]
+fn a_piece_ack_has_these_bytes() {
+    let ack = PieceAck {
+        answers_handed_ns: 0x0102_0304_0506_0708,
+    };
+    check(
+        header(Kind::PieceAck),
+        Body::PieceAck(ack),
+        "48494c47 02 09 0000 01020304 0506 4800 0708090a0b0c0d0e
+         0f10111213141516 0000000000000000 0d0e0f1011120000
+         00000000 ffffffff 08000000 0000 0100 00000000 00000000
+         0807060504030201",
     );
 }
 
@@ -192,7 +208,7 @@ fn each_broken_field_has_its_own_refusal() {
         (4, 1, Refusal::UnsupportedVersion),
         (5, 0, Refusal::UnknownKind),
         (5, 7, Refusal::UnexpectedKind),
-        (5, 9, Refusal::UnknownKind),
+        (5, 10, Refusal::UnknownKind),
         (6, 2, Refusal::UnknownFlags),
         (7, 1, Refusal::UnknownFlags),
         (14, 71, Refusal::BadHeaderLength),

@@ -156,6 +156,8 @@ impl Egress {
             return false;
         };
         let has_moved = long.push(&mut self.bridge, &mut self.line);
+        // What it waits for may be a reply.
+        self.attention.is_overdue |= long.due() > self.line.newest_handed;
         if !self.bridge.has_long() {
             let channel = long.end(&mut self.line);
             let sent_count = self.bridge.channel_counts(channel).sent_count;
@@ -244,6 +246,11 @@ impl Egress {
                 Ok(EgressEvent::Refused(status)) => {
                     if self.bridge.peer_state() == PeerState::Refused(status) {
                         return Err(WorkerError::Refused(status));
+                    }
+                }
+                Ok(EgressEvent::PieceArrived) => {
+                    if let Some(long) = &mut self.long {
+                        long.on_piece_arrived();
                     }
                 }
                 Ok(EgressEvent::Accepted { .. } | EgressEvent::GreetAgain) | Err(_) => {}

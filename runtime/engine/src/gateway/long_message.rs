@@ -47,6 +47,11 @@ impl LongMessage {
         self.due
     }
 
+    /// Its next pieces may leave earlier than was thought.
+    pub(super) const fn on_piece_arrived(&mut self) {
+        self.due = Instant::ZERO;
+    }
+
     /// Sends its next pieces, if they may leave; false when none did.
     pub(super) fn push(&mut self, bridge: &mut EgressBridge, line: &mut Line) -> bool {
         let mut now = MonotonicClock::now();
@@ -57,6 +62,10 @@ impl LongMessage {
         for _ in 0..BURST_COUNT {
             if line.sender.queued_bytes() >= QUEUED_BYTES_MAX {
                 self.due = now + RETRY;
+                break;
+            }
+            if let Some(until) = bridge.piece_held_until(now) {
+                self.due = until;
                 break;
             }
             let Some(piece) = bridge.long_piece(now, self.held.payload()) else {

@@ -13,6 +13,8 @@ use hil_capture::{CaptureInterface, esl, writer};
 use hil_core::message::Envelope;
 use hil_core::time::Instant;
 use hil_net::{Direction, link_type};
+use hil_protocol::body::PieceAck;
+use hil_protocol::wire::{Body, Datagram, HEADER_BYTES, Header, Kind};
 use hil_protocol::{ArrivalStamps, EgressBridge, IngressBridge};
 use hil_transport::tcp::frame::prefix;
 
@@ -20,6 +22,7 @@ use super::{behind, numbered};
 use crate::Seed;
 use crate::bridges::{egress, ingress};
 use crate::egm::feedback;
+use crate::gateway::encode;
 
 const NOW_NS: i64 = 50_000_000_000;
 
@@ -44,6 +47,14 @@ fn all_datagrams() -> Vec<Vec<u8>> {
     while let Some(farewell) = sender.poll_transmit(Instant::from_ns(NOW_NS)) {
         made.push(farewell.datagram.to_vec());
     }
+    let mut header = Header::new(Kind::PieceAck, 100, 65_535);
+    header.handed_ns = NOW_NS;
+    header.total_len = 8;
+    let ack = PieceAck {
+        answers_handed_ns: NOW_NS - 70_000,
+    };
+    let body = Body::PieceAck(ack);
+    made.push(encode(&Datagram { header, body }, HEADER_BYTES + 8));
     made
 }
 
