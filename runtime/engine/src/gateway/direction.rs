@@ -31,8 +31,9 @@ use hil_rundir::pipe::{
 use hil_rundir::record::{RecordKind, RecordSink, Recorder, SharedSink};
 use hil_shm::RawOutput;
 
-/// Records of one kind that wait for the disk at most, of all channels together.
-const RING_RECORDS: usize = 65_536;
+/// Records of one kind that wait for the disk at most: so many for each channel, and of all together.
+const RING_RECORDS: usize = 16_384;
+const RING_RECORDS_MAX: usize = 65_536;
 const ROUND_TRIPS: usize = 4_096;
 /// Time between clock exchanges: frequent enough for a round-trip distribution, rare enough to
 /// be a fraction of any control channel's traffic.
@@ -98,9 +99,10 @@ pub fn open(
 }
 
 fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, WorkerError> {
+    let capacity = (RING_RECORDS * launch.channels.len()).min(RING_RECORDS_MAX);
     let mut of_channels = |kind, size| {
         let names = launch.channels.iter().map(|one| one.channel.as_str());
-        recorder.shared_sink(kind, names, size, RING_RECORDS)
+        recorder.shared_sink(kind, names, size, capacity)
     };
     Ok(match launch.side {
         Side::Egress => Sinks::Egress {

@@ -295,7 +295,7 @@ impl Recorder {
             });
         }
         let entry_bytes = INDEX_BYTES + record_bytes;
-        let (producer, ring) = rtrb::RingBuffer::new(ring_bytes(entry_bytes, capacity_records));
+        let (producer, ring) = in_memory(ring_bytes(entry_bytes, capacity_records));
         self.drains.push(Drain::Shared(SharedDrain {
             ring,
             record_bytes,
@@ -382,6 +382,18 @@ impl Recorder {
             failures: ended.ok().flatten().unwrap_or_default(),
         }
     }
+}
+
+/// A ring whose pages are all in memory: a first touch in the measured thread would cost it a page fault.
+fn in_memory(bytes: usize) -> (rtrb::Producer<u8>, rtrb::Consumer<u8>) {
+    let (mut producer, mut consumer) = rtrb::RingBuffer::new(bytes);
+    if let Ok(chunk) = producer.write_chunk(bytes) {
+        chunk.commit_all();
+    }
+    if let Ok(chunk) = consumer.read_chunk(bytes) {
+        chunk.commit_all();
+    }
+    (producer, consumer)
 }
 
 /// Of a ring for so many entries, or for as many as [`RING_BYTES_MAX`] holds.
