@@ -171,7 +171,7 @@ has_report() {
 # What the topology asks for, of the processes of both hosts.
 rights_are_granted() {
     local section
-    section=$(pc "$1" cat "$(newest split "$1")/report.txt" | awk '/^[^ ]/ { on = /^Real time/ } on')
+    section=$(pc "$1" cat "$(newest split "$1")/report-full.txt" | awk '/^[^ ]/ { on = /^Real time/ } on')
     ! grep '^ *refused' <<<"$section" || return 1
     grep -o 'SCHED_FIFO [45]0 granted\|locked memory granted' <<<"$section"
     [[ $(grep -c 'SCHED_FIFO [45]0 granted\|locked memory granted' <<<"$section") -eq 3 ]]
@@ -241,7 +241,7 @@ watchdog_fired() {
 }
 
 silence_is_reported() {
-    pc "$1" sh -c "grep -l 'no sign of life' $STATE/long/runs/*/report.txt | tail -n 1" | grep . &&
+    pc "$1" sh -c "grep -l 'no sign of life' $STATE/long/runs/*/report-full.txt | tail -n 1" | grep . &&
         journal long "$1" --priority warning..warning | grep -m 1 'no sign of life'
 }
 

@@ -120,7 +120,7 @@ for one in wifi["channels"]:
     over_the_radio(one, radios[one["name"]])
 stations(wifi["radio"]["hops"])
 reports = "".join(path.read_text(encoding="utf-8")
-                  for path in (ROOT / "wifi").glob("*/runs/*/report.txt"))
+                  for path in (ROOT / "wifi").glob("*/runs/*/report-full.txt"))
 check("before the queue" in reports, "the report labels the stamp")
 
 floor, cable = summary("plain"), summary("cable")

@@ -14,7 +14,8 @@ use crate::run_log::RunLog;
 use crate::study::Batch;
 
 pub use crate::score::{
-    EVENT_MESSAGES_MAX, EVENTS_MAX, ErrorSeries, MessageRef, Metric, Score, ScoreEvent, Severity,
+    EVENT_MESSAGES_MAX, EVENTS_MAX, ErrorSeries, Harm, MessageRef, Metric, Occasions, Score,
+    ScoreEvent, Severity,
 };
 
 /// A kind of experiment that a topology file can name in `[case]`.

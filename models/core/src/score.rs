@@ -22,6 +22,52 @@ pub struct Score {
     pub events: Vec<ScoreEvent>,
     /// Events that found no room.
     pub events_dropped_count: u64,
+    /// The ways in which the robot can be hurt, the gravest first; none for a case that knows of none.
+    pub harms: Vec<Harm>,
+    /// Names of the figures that a reader wants to see first, beside the harms.
+    pub headline: &'static [&'static str],
+}
+
+/// A way in which the robot can be hurt, and how often it was.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Harm {
+    /// What happened to it, in the plural, e.g. `motion loops lost`.
+    pub what: &'static str,
+    /// How often; `None` when the run did not allow to count it.
+    pub count: Option<u64>,
+    /// Of these, those that would have happened over a perfect channel too: the robot or its controller
+    /// caused them.
+    pub own_count: u64,
+    /// How often it could have happened; `None` where that cannot be counted.
+    pub occasions: Option<Occasions>,
+}
+
+/// What could have hurt the robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Occasions {
+    /// What they are, in the plural, e.g. `motion loops sent`.
+    pub what: &'static str,
+    /// How many there were.
+    pub count: u64,
+}
+
+impl Harm {
+    /// It happened `count` times, on no occasions that could be counted.
+    pub const fn new(what: &'static str, count: Option<u64>) -> Self {
+        Self {
+            what,
+            count,
+            own_count: 0,
+            occasions: None,
+        }
+    }
+
+    /// The same of `count` occasions.
+    #[must_use]
+    pub const fn of(mut self, count: u64, what: &'static str) -> Self {
+        self.occasions = Some(Occasions { what, count });
+        self
+    }
 }
 
 /// One figure with its unit, interval and method.

@@ -9,7 +9,7 @@ use crate::events::events;
 use crate::experiment::collision_interval;
 use crate::messages::{Authority, State, Truth};
 use crate::referee::{Referee, SCAN_PERIOD, Tally};
-use hil_core::case_study::{ErrorSeries, Metric, Score};
+use hil_core::case_study::{ErrorSeries, Harm, Metric, Score};
 use hil_core::run_log::RunLog;
 use hil_core::time::Instant;
 use hil_stats::histogram::{LatencyHistogram, LatencySummary};
@@ -21,6 +21,7 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
     let Some((start, end)) = span(&truths) else {
         return Score {
             metrics: vec![COLLISIONS.unavailable("the robots left no record of their motion")],
+            harms: harms(None),
             ..Score::default()
         };
     };
@@ -28,7 +29,11 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
     referee.replay(&mut truths.into_iter(), start, end);
     let run_s = end.seconds_since(start);
     let tally = referee.tally();
-    let mut score = Score::default();
+    let mut score = Score {
+        harms: harms(Some(tally)),
+        headline: &["separation_m_min", "missions_per_hour"],
+        ..Score::default()
+    };
     score.metrics.extend(collisions(tally));
     score.metrics.extend(distances(case, tally));
     score.metrics.extend(commands(tally));
@@ -38,6 +43,26 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
         score.add_event(event);
     }
     score
+}
+
+/// What an authority that comes late or not at all leads to.
+fn harms(tally: Option<&Tally>) -> Vec<Harm> {
+    let count = |of: fn(&Tally) -> u64| tally.map(of);
+    let collisions = Harm::new("collisions", count(|tally| tally.overlaps_count));
+    vec![
+        match tally {
+            Some(tally) => collisions.of(tally.sections_passed_count, "critical sections passed"),
+            None => collisions,
+        },
+        Harm::new(
+            "times past a late authority",
+            count(|tally| tally.authorities_late_count),
+        ),
+        Harm::new(
+            "stops for want of an authority",
+            count(|tally| tally.leases_ended_count),
+        ),
+    ]
 }
 
 const COLLISIONS: Label = label(

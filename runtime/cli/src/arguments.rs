@@ -73,7 +73,7 @@ or records are missing, 2 when the folder cannot be replayed at all.";
 const REPORT_EXAMPLES: &str = "\
 Examples:
   hil-runtime report runs/teleop-local-20261121-101500
-      print it again, as the run did at its end
+      print it again, as the run did at its end; --full for every figure
   hil-runtime report runs/teleop-local-20261121-101500 -o report.html
       one page with figures that opens offline and can be printed
   hil-runtime report runs/a runs/b simulated -o report.html
@@ -135,6 +135,10 @@ pub struct RunArgs {
     #[arg(long, short)]
     pub quiet: bool,
 
+    /// Print every figure, not only the answer and what led to it.
+    #[arg(long)]
+    pub full: bool,
+
     /// Folder for the shared-memory domain; otherwise below /run or the temporary folder. Both
     /// hosts of a split run must have their own.
     #[arg(long, value_name = "DIR", hide = true)]
@@ -188,6 +192,9 @@ pub struct ReportArgs {
     /// Overwrite --output whatever it is.
     #[arg(long)]
     pub force: bool,
+    /// Print every figure, not only the answer and what led to it.
+    #[arg(long)]
+    pub full: bool,
 }
 
 /// Arguments of a replay.
@@ -214,9 +221,12 @@ pub enum Command {
         /// Change one value of the file; may be repeated.
         #[arg(long = "set", value_name = "KEY=VALUE")]
         overrides: Vec<String>,
-        /// Also write the run's folder: summary.json, report.txt, events.log and the case's series.
+        /// Also write the run's folder: summary.json, reports, events.log and the case's series.
         #[arg(long, short, value_name = "DIR")]
         output: Option<PathBuf>,
+        /// Print every figure, not only the answer and what led to it.
+        #[arg(long)]
+        full: bool,
     },
     /// Compute a case's tables in virtual time, on all processors.
     #[command(

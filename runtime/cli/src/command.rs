@@ -29,7 +29,7 @@ use hil_platform::open_files;
 use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_report::analysis::{self, AnalysisError, Concluded};
-use hil_report::terminal::{self, Style};
+use hil_report::terminal;
 use hil_report::{compare, trace};
 use hil_rundir::file_fault::is_of_full_disk;
 use hil_rundir::pipe::FailureKind;
@@ -136,7 +136,17 @@ fn run_command(
             topology,
             overrides,
             output,
-        } => case_work::simulate(&topology, &overrides, output.as_deref(), registry, console),
+            full,
+        } => case_work::simulate(
+            &topology,
+            &overrides,
+            case_work::SimulatedShown {
+                output: output.as_deref(),
+                is_full: full,
+            },
+            registry,
+            console,
+        ),
         Command::Tables {
             topology,
             mut overrides,
@@ -279,7 +289,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
         let text = format!("the run is over but its report failed: {error}");
         Refusal::new(exit::INTERNAL, text)
     })?;
-    console.result(&terminal::render(&summary, columns(), Style::Coloured));
+    console.result(&terminal::page(&summary, args.full, columns()));
     if code != exit::RAN {
         console.error(&complaint(&result));
     }

@@ -179,6 +179,7 @@ pub(crate) fn attach(recording: &mut Recording, folder: &RunFolder) -> Result<()
         (folder.manifest(), "application/json"),
         (folder.summary(), "application/json"),
         (folder.report(), "text/plain"),
+        (folder.full_report(), "text/plain"),
         (folder.events(), "text/plain"),
     ] {
         // A killed run lacks some of them, which the metadata say.

@@ -7,6 +7,7 @@ pub mod adapter_metrics;
 mod adapter_warnings;
 pub(crate) mod alike;
 pub mod analysis;
+pub mod answer;
 pub mod assessment;
 pub mod clock_summary;
 pub mod compare;

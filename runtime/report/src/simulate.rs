@@ -30,9 +30,9 @@ use crate::network::NetworkReport;
 use crate::score_event::ScoreEvents;
 use crate::summary::{
     ChannelEnd, ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome,
-    RecordedMetrics, RunFacts, RunSummary, ScoreMetric,
+    RecordedMetrics, RunFacts, RunSummary,
 };
-use crate::terminal::{self, Style, percent};
+use crate::terminal::{self, percent};
 use hil_rundir::launch::Side;
 use hil_rundir::pipe::CounterGroup;
 use hil_rundir::run_folder::RunFolder;
@@ -130,7 +130,7 @@ pub fn simulate(
         .collect();
     let directions = links.iter().map(|(name, link)| link.direction(name));
     summary.directions = directions.collect();
-    summary.score = ScoreMetric::all_of(&score);
+    summary.put_score(&score);
     summary.score_events = events::explained(&score, entry.channels, &outages, &result.log);
     let watches = links.into_iter().map(|(name, link)| (name, link.watch));
     let (network, network_series) = network(
@@ -300,9 +300,12 @@ impl Simulated {
         let summary = &self.summary;
         let written = summary.write(&files.summary());
         written.map_err(|error| SimulateError::Output(error.to_string()))?;
-        let page = terminal::render(summary, REPORT_FILE_WIDTH, Style::Plain);
         let events = event_log::text(&summary.run.name, &summary.score_events, &[]);
-        for (path, text) in [(files.report(), page), (files.events(), events)] {
+        let events = [(files.events(), events)];
+        for (path, text) in terminal::text_files(&files, summary)
+            .into_iter()
+            .chain(events)
+        {
             fs::write(&path, text).map_err(|error| failed(path, error))?;
         }
         Ok(())
@@ -437,6 +440,3 @@ impl WatchedLink {
 const VIRTUAL_GATEWAY: &str = "simulate";
 /// Where a real run has its link model: behind the receiving socket.
 const VIRTUAL_SIDE: Side = Side::Ingress;
-
-/// Width of `report.txt`.
-const REPORT_FILE_WIDTH: usize = 100;

@@ -2,7 +2,7 @@
 //! are drawn from them in [`super::assessment`] whenever a summary is written.
 //!
 //! `summary.json` is one object with the fields of [`RunSummary`] under their own names plus
-//! `assessment`. Within a schema version fields are only added; a reader ignores what it does
+//! `answer` and `assessment`. Within a schema version fields are only added; a reader ignores what it does
 //! not know. Units are part of the names.
 
 use core::fmt;
@@ -18,6 +18,7 @@ use hil_protocol::transport::Description;
 use serde::{Deserialize, Serialize};
 
 use super::adapter::AdapterSummary;
+use super::answer::{Answer, HarmCount};
 use super::assessment::Assessment;
 use super::clock_summary::ClockSection;
 use super::emulation::EmulationMetrics;
@@ -80,6 +81,12 @@ pub struct RunSummary {
     pub radio: RadioReport,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
+    /// What hurt the robot, the gravest first.
+    #[serde(default)]
+    pub harms: Vec<HarmCount>,
+    /// Names of the figures of the score that a reader wants to see first.
+    #[serde(default)]
+    pub headline: Vec<String>,
     /// What happened to the robot, and what the network had done to the messages concerned.
     #[serde(default)]
     pub score_events: ScoreEvents,
@@ -112,6 +119,8 @@ impl RunSummary {
             hardware_stamps: None,
             radio: RadioReport::default(),
             score: Vec::new(),
+            harms: Vec::new(),
+            headline: Vec::new(),
             score_events: ScoreEvents::default(),
             network: None,
             record_gaps: Vec::new(),
@@ -119,20 +128,34 @@ impl RunSummary {
         }
     }
 
-    /// The text of `summary.json`, with the assessment drawn from the figures.
+    /// Takes what the case says of the robot, but the events, which need their messages.
+    pub(crate) fn put_score(&mut self, score: &Score) {
+        self.score = ScoreMetric::all_of(score);
+        self.harms = score.harms.iter().map(HarmCount::from).collect();
+        self.headline = score
+            .headline
+            .iter()
+            .map(|name| (*name).to_owned())
+            .collect();
+    }
+
+    /// The text of `summary.json`, with answer and assessment drawn from the figures.
     ///
     /// # Errors
     /// When a figure cannot be represented.
     pub fn to_json(&self) -> Result<String, SummaryError> {
         #[derive(Serialize)]
         struct Document<'a> {
+            answer: Answer,
             #[serde(flatten)]
             summary: &'a RunSummary,
             assessment: Assessment,
         }
+        let assessment = Assessment::of(self);
         let document = Document {
+            answer: Answer::of(self, &assessment),
             summary: self,
-            assessment: Assessment::of(self),
+            assessment,
         };
         serde_json::to_string_pretty(&document).map_err(SummaryError::Encode)
     }
@@ -507,6 +530,11 @@ impl LinkKind {
             Self::Emulated => "emulated link",
             Self::RecordOnly => "recorded only",
         }
+    }
+
+    /// True where messages leave shared memory, for a network or a model of one.
+    pub const fn is_crossing(self) -> bool {
+        matches!(self, Self::Network(_) | Self::Emulated)
     }
 
     /// True where the kernel can stamp the messages.

@@ -12,7 +12,8 @@ use std::{fs, io};
 /// | `manifest.json` | resolved topology, layouts of messages, versions, host facts, seed |
 /// | `result.json` | how the run ended and what its processes said, before any figure |
 /// | `summary.json` | every figure of the report |
-/// | `report.txt` | the report as printed |
+/// | `report.txt` | the report as printed, which ends in the answer |
+/// | `report-full.txt` | every figure as text, as `report --full` prints it |
 /// | `events.log` | what happened to the robot, one line each |
 /// | `series/*.csv` | what the case has to plot; `series/series.json` explains the columns |
 /// | `traces/*.trace` | what each link did to every message; `hil-runtime trace` reads them |
@@ -151,6 +152,11 @@ impl RunFolder {
     /// The report as printed, without colours.
     pub fn report(&self) -> PathBuf {
         self.root.join("report.txt")
+    }
+
+    /// Every figure as text.
+    pub fn full_report(&self) -> PathBuf {
+        self.root.join("report-full.txt")
     }
 }
 

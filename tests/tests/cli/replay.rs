@@ -120,7 +120,7 @@ fn assert_outages_and_events_are_kept(files: &RunFiles) {
         let is_lossless = account.fates.of(MessageFate::LostOnWire) == 0;
         assert_eq!(figures.longest.is_none(), is_lossless);
     }
-    let page = files.read("report.txt");
+    let page = files.read("report-full.txt");
     assert!(page.contains("  outages       "), "{page}");
     assert!(page.contains("  events.log    "), "{page}");
     let log = files.read("events.log");
@@ -140,6 +140,7 @@ fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
         "deploy/topologies/emulated.toml",
         "--set",
         "run.duration=\"10 s\"",
+        "--full",
         "--output",
         output.to_str().unwrap(),
     ];
@@ -151,16 +152,19 @@ fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
         again.stderr.contains("out: the folder is not empty"),
         "{again:?}"
     );
-    let report = run(&["report", output.to_str().unwrap()]);
+    let report = run(&["report", output.to_str().unwrap(), "--full"]);
     assert_code(&report, 0);
     assert_eq!(report.stdout.trim_end(), simulated.stdout.trim_end());
+    let brief = run(&["report", output.to_str().unwrap()]);
+    let printed = fs::read_to_string(output.join("report.txt")).unwrap();
+    assert_eq!(brief.stdout, printed);
     assert!(
         simulated.stdout.contains("Channel egm/right/command"),
         "{simulated:?}"
     );
     assert!(simulated.stdout.contains("  outages  "), "{simulated:?}");
     assert_eq!(
-        fs::read_to_string(output.join("report.txt")).unwrap(),
+        fs::read_to_string(output.join("report-full.txt")).unwrap(),
         simulated.stdout
     );
     let summary = fs::read_to_string(output.join("summary.json")).unwrap();

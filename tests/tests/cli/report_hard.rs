@@ -71,7 +71,7 @@ fn a_run_in_which_nothing_arrives_says_so_and_makes_up_no_delay() {
         assert!(account.end_to_end.distribution.measured().is_none());
         assert!(account.end_to_end.p50_interval.is_none());
     }
-    let text = files.read("report.txt");
+    let text = files.read("report-full.txt");
     assert!(text.contains("lost by the emulated link"), "{text}");
     assert!(!text.contains("lost on the wire"), "{text}");
     assert!(!text.contains("NaN") && !text.contains("inf "), "{text}");

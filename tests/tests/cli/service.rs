@@ -148,7 +148,7 @@ fn a_process_that_hangs_keeps_the_ticks_back_and_is_in_the_report() {
 
     run.signal(Signal::SIGTERM).unwrap();
     assert_eq!(run.wait_within(LIMIT).unwrap().status.code(), Some(130));
-    let report = files.read("report.txt");
+    let report = files.read("report-full.txt");
     assert!(report.contains("no sign of life for 3 s"), "{report}");
     assert!(report.contains("signs of life again"), "{report}");
 }

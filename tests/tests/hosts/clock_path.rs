@@ -173,7 +173,7 @@ fn a_slow_data_link_leaves_the_bound_as_narrow_as_the_clock_path() {
         assert_eq!(warnings(summary, "gave no exchange"), [] as [&String; 0]);
         assert!(pair.basis.starts_with("system clocks give no bound"));
     }
-    let report = report.read("report.txt");
+    let report = report.read("report-full.txt");
     for words in [
         "exchanges over the clock path, and beside the data:",
         "path                  clock path 10.78.0.1 (eth1) <-> 10.78.0.2 (eth1); ",

@@ -138,8 +138,8 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     }
     println!(
         "{}\n{}",
-        sensor_files.read("report.txt"),
-        robot_files.read("report.txt")
+        sensor_files.read("report-full.txt"),
+        robot_files.read("report-full.txt")
     );
 
     let (here, there) = (Arms::of(&sensor_files), Arms::of(&robot_files));

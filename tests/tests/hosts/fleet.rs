@@ -60,7 +60,7 @@ fn split(lab: &Lab, settings: &[&str]) -> [RunSummary; 2] {
     for (index, files) in files.iter().enumerate() {
         files.assert_nothing_left_on(lab.host(index));
     }
-    println!("{}", files[0].read("report.txt"));
+    println!("{}", files[0].read("report-full.txt"));
     files.map(|files| files.summary())
 }
 
@@ -216,6 +216,6 @@ fn an_interrupted_fleet_leaves_its_report() {
     assert_nobody_collided(&summary);
     let truth = channel(&summary, "fleet/truth");
     assert!(truth.recorded.unwrap().message_count > 0);
-    let report = files.read("report.txt");
+    let report = files.read("report-full.txt");
     assert!(report.contains("Channel fleet/truth  robots · recorded only"));
 }

@@ -65,7 +65,7 @@ fn on_a_veth_the_missing_nic_is_said_and_software_stamps_carry_the_run() {
         let software = account(&summary, &channel.channel).coverage.tx_software;
         assert_ne!(software.unwrap().stamped_count, 0, "{channel:?}");
     }
-    assert!(files.read("report.txt").contains("Hardware stamps"));
+    assert!(files.read("report-full.txt").contains("Hardware stamps"));
 }
 
 /// The guard of a card, ready. Loopback has none: what it tries in the end is refused and said.

@@ -1,7 +1,8 @@
 //! Hundreds of channels of somebody's own programs over one link, with a gateway that is killed and a cable that is
 //! pulled: both hosts come to complete and equal accounts, and no process grows.
 //!
-//! `HIL_MANY_MINUTES=30 cargo nextest run --workspace --run-ignored only -E 'test(four_hundred_channels)' --no-capture`
+//! `HIL_MANY_MINUTES=30 cargo nextest run --workspace --profile long --run-ignored only -E
+//! 'test(four_hundred_channels)'`, two minutes of it are in `./check.sh long`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -128,7 +128,7 @@ fn a_run_over_tcp_accounts_for_every_message_and_loses_none() {
             assert!(round_trip.is_some_and(|figures| figures.count > 10));
         }
     }
-    let report = page.read("report.txt");
+    let report = page.read("report-full.txt");
     assert!(report.contains("controller → robot · TCP"), "{report}");
     assert!(report.contains("\n  stalls "), "{report}");
 }

@@ -62,7 +62,7 @@ fn every_transport_carries_a_sealed_run_with_a_kill() {
                 assert!(count(ingress, "seal: opened_count") > 100, "{ingress:?}");
             }
         }
-        let report = files.read("report.txt");
+        let report = files.read("report-full.txt");
         let words = format!("controller → robot · {}", transport.label);
         assert!(report.contains(&words), "{words}: {report}");
     }

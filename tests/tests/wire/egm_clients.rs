@@ -264,7 +264,7 @@ fn driven_twice(script: &str, restart: &str, span: Duration) -> Option<(Arms, Eg
         let account = account(&summary, channel);
         assert_eq!(account.fates.of(MessageFate::Unexplained), 0, "{channel}");
     }
-    let report = files.read("report.txt");
+    let report = files.read("report-full.txt");
     let adapter = report.split("EGM robot adapter").nth(1).unwrap();
     println!(
         "EGM robot adapter{}",

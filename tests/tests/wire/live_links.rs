@@ -277,7 +277,7 @@ fn check_report(files: &RunFiles) {
         text.split_whitespace().collect::<Vec<_>>().join(" ")
     };
     let words = "link hop.backward changed by hand: delay 40.0 ms, loss 0.2";
-    assert!(plain("report.txt").contains(words));
+    assert!(plain("report-full.txt").contains(words));
     let line = format!("{at_s:.6} notice {words}");
     assert!(plain("events.log").contains(&line), "{line}");
     let trace = trace_of(files, BACKWARD);

@@ -75,7 +75,7 @@ fn counts(files: &RunFiles, name: &str) -> ReplayCounts {
     let counts = channel(&files.summary(), name).trace_replay.unwrap();
     println!("{name}: {counts:?}");
     let words: Vec<_> = files
-        .read("report.txt")
+        .read("report-full.txt")
         .split_whitespace()
         .map(str::to_owned)
         .collect();

@@ -253,7 +253,7 @@ fn a_live_shuttle_run_and_its_replay_agree() {
     let fit = run(&["trace", "fit", &folder]);
     assert!(fit.status.success(), "{}", text(&fit.stderr));
     println!("{}{}", text(&fit.stderr), text(&fit.stdout));
-    let report = files.read("report.txt");
+    let report = files.read("report-full.txt");
     assert!(report.contains("traces/"), "{report}");
 }
 

@@ -21,7 +21,7 @@ use crate::score::record::{Feedback, Record};
 use crate::score::sessions::Sessions;
 use crate::{HUMAN_FRAME, Teleoperation};
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
-use hil_core::case_study::{ErrorSeries, Score};
+use hil_core::case_study::{ErrorSeries, Harm, Score};
 use hil_core::plot::PlotSeries;
 use hil_core::run_log::RunLog;
 use hil_core::score::Metric;
@@ -61,6 +61,11 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     metrics.extend(run.inverse_kinematics());
     let mut score = Score {
         metrics,
+        harms: vec![
+            run.lost_loops(loops.as_ref()),
+            run.sessions.ended_by_themselves(&run.record),
+        ],
+        headline: &["joint_error_network_rad_rms", "tracking_lag_ms"],
         ..Score::default()
     };
     lost::add_events(&mut score, &run, loops.as_ref(), log);
@@ -194,7 +199,8 @@ impl Run {
         metrics
     }
 
-    fn causes(&self, loops: Option<&Loops>, missing: &str) -> [Metric; 7] {
+    /// How many loops were lost for each reason, by [`LossCause::kind`].
+    fn lost_by_cause(&self, loops: Option<&Loops>) -> [u64; LossCause::KIND_COUNT] {
         let mut kinds = [0_u64; LossCause::KIND_COUNT];
         for lost in loops.map_or(&[][..], |loops| &loops.lost) {
             let cause = self
@@ -203,6 +209,26 @@ impl Run {
                 .cause_of(lost.due_ns, self.counter.period_ns);
             kinds[cause.kind()] += 1;
         }
+        kinds
+    }
+
+    fn lost_loops(&self, loops: Option<&Loops>) -> Harm {
+        let harm = Harm::new("motion loops lost", loops.and_then(Loops::missing_count));
+        let Some(loops) = loops else {
+            return harm;
+        };
+        // Limits of joints and reach act the same over a perfect channel.
+        let kinds = self.lost_by_cause(Some(loops));
+        let own = [LossCause::Clipped, LossCause::Throttled, LossCause::Merged];
+        let own_count: u64 = own.map(|cause| kinds[cause.kind()]).iter().sum();
+        Harm {
+            own_count: own_count.min(harm.count.unwrap_or(0)),
+            ..harm.of(loops.sent_count() as u64, "motion loops sent")
+        }
+    }
+
+    fn causes(&self, loops: Option<&Loops>, missing: &str) -> [Metric; 7] {
+        let kinds = self.lost_by_cause(loops);
         let by = |name, text, kind: usize, what: &str| {
             let value = loops.map(|_| kinds[kind] as f64);
             label(name, text, "1").measured(value, what, missing)

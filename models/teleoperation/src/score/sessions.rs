@@ -6,7 +6,7 @@ use crate::score::loops::{Evidence, Pause, PauseAfter, Span};
 use crate::score::record::{Feedback, Record};
 use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EgmFeedback, EndCause, SessionState, Side};
 use hil_core::run_log::RunLog;
-use hil_core::score::Metric;
+use hil_core::score::{Harm, Metric};
 use hil_stats::metric::label;
 
 /// For how long after a resume the arm catches up, nanoseconds.
@@ -60,6 +60,14 @@ impl Sessions {
         // Without a single event there is no record of refusals to count.
         sessions.refused_count = (!log.raw(EGM_EVENT).is_empty()).then(|| refused(log));
         sessions
+    }
+
+    pub(crate) fn ended_by_themselves(&self, record: &Record) -> Harm {
+        let is_known = !record.feedback.is_empty();
+        Harm::new(
+            "sessions that ended by themselves",
+            is_known.then_some(self.trips.len() as u64),
+        )
     }
 
     pub(crate) fn metrics(&self, record: &Record) -> Vec<Metric> {

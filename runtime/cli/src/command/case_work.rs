@@ -9,21 +9,28 @@ use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
 use hil_report::study::{self, BatchArgs, StudyError, Wanted};
-use hil_report::terminal::{self, Style};
+use hil_report::terminal;
 use hil_report::{replay, simulate};
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::Registry;
 
 use super::{Refusal, check_traces, code_of, columns, exit, failed, load, loaded, signals, usage};
 
+/// Where a run in virtual time is shown.
+pub(super) struct SimulatedShown<'a> {
+    pub(super) output: Option<&'a Path>,
+    pub(super) is_full: bool,
+}
+
 /// `simulate`, with its report and the run's folder.
 pub(super) fn simulate(
     file: &Path,
     overrides: &[String],
-    output: Option<&Path>,
+    shown: SimulatedShown<'_>,
     registry: &Registry,
     console: &mut Console,
 ) -> Result<u8, Refusal> {
+    let SimulatedShown { output, is_full } = shown;
     let signals = signals()?;
     // Virtual time does not look at signals.
     let watch =
@@ -40,7 +47,7 @@ pub(super) fn simulate(
         });
     let mut simulated = outcome.map_err(usage)?;
     let written = output.map_or(Ok(()), |folder| simulated.write(folder));
-    let page = terminal::render(&simulated.summary, columns(), Style::Coloured);
+    let page = terminal::page(&simulated.summary, is_full, columns());
     drop(watch);
     console.result(&page);
     written.map(|()| exit::RAN).map_err(failed)

@@ -10,7 +10,7 @@ use hil_report::analysis;
 use hil_report::page::read::Material;
 use hil_report::page::{self, Format, read, write};
 use hil_report::summary::{RunSummary, SummaryError};
-use hil_report::terminal::{self, Style};
+use hil_report::terminal;
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::Registry;
 
@@ -28,7 +28,7 @@ pub(super) fn report(
         || args.figure.is_some();
     if !is_file {
         if let [run] = args.runs.as_slice() {
-            return show(run, registry, console);
+            return show(run, args.full, registry, console);
         }
         let text = "several runs need --output or --format, e.g. -o report.html";
         return Err(usage(text));
@@ -151,7 +151,12 @@ fn charts(args: &ReportArgs, materials: &[Material], console: &mut Console) -> R
 }
 
 /// The report as the run printed it.
-fn show(run: &Path, registry: &Registry, console: &mut Console) -> Result<u8, Refusal> {
+fn show(
+    run: &Path,
+    is_full: bool,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
     let folder = RunFolder::existing(run);
     if !folder.summary().is_file() && folder.result().is_file() {
         // The run ended, and what was to draw up its account did not come to that.
@@ -178,7 +183,7 @@ fn show(run: &Path, registry: &Registry, console: &mut Console) -> Result<u8, Re
     })?;
     let page = progress.during(console, "laying out the report", |_| {
         let summary = RunSummary::from_json(&text)?;
-        Ok::<_, SummaryError>(terminal::render(&summary, columns(), Style::Coloured))
+        Ok::<_, SummaryError>(terminal::page(&summary, is_full, columns()))
     });
     let page = page.map_err(|error| usage(format!("{}: {error}", path.display())))?;
     console.result(&page);

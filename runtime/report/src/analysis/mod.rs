@@ -34,8 +34,8 @@ use outages::OutageHistory;
 use records::RunRecords;
 
 use crate::event_log;
-use crate::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
-use crate::terminal::{self, Style};
+use crate::summary::{Fact, RunSummary, SummaryError};
+use crate::terminal;
 use crate::trace::capture;
 use hil_rundir::file_fault::FileFault;
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
@@ -164,7 +164,7 @@ pub fn conclude(
         Some((entry, case)) => (entry.channels, case.score(&records.log)),
         None => (&[][..], Score::default()),
     };
-    summary.score = ScoreMetric::all_of(&score);
+    summary.put_score(&score);
     summary.score_events =
         events::explained(&score, &records, &axis, &summary.channels, specs, &outages);
     let errors = case.as_ref().map(|(_, case)| case.errors(&records.log));
@@ -200,9 +200,10 @@ fn write_texts(summary: &RunSummary, result: &RunResult) -> Result<(), AnalysisE
     );
     write_whole(&path, &text).map_err(|source| AnalysisError::Write { path, source })?;
     summary.write(&result.folder.summary())?;
-    let plain = terminal::render(summary, REPORT_FILE_WIDTH, Style::Plain);
-    let path = result.folder.report();
-    write_whole(&path, &plain).map_err(|source| AnalysisError::Write { path, source })
+    for (path, text) in terminal::text_files(&result.folder, summary) {
+        write_whole(&path, &text).map_err(|source| AnalysisError::Write { path, source })?;
+    }
+    Ok(())
 }
 
 /// Writes `text` to `path`; of a file that cannot be written in full nothing is left.
@@ -285,6 +286,3 @@ fn add_warnings(summary: &mut RunSummary, records: &RunRecords<'_>) {
     let paths = pairs.iter().filter_map(clock_path::warning);
     summary.warnings.extend(paths);
 }
-
-/// Width of `report.txt`.
-const REPORT_FILE_WIDTH: usize = 100;

@@ -68,7 +68,7 @@ pub(crate) struct Run {
     pub(crate) repeat_command: Option<String>,
     /// Figures of the whole run.
     pub(crate) drawings: Vec<Drawing>,
-    /// `report.txt` as the run left it.
+    /// `report-full.txt` as the run left it.
     pub(crate) printed: Option<String>,
 }
 

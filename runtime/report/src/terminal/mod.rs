@@ -1,6 +1,8 @@
 //! Renders a summary for a terminal of 80 to 120 columns. It returns text; the caller prints it.
 
 mod adapter;
+mod answer;
+mod brief;
 mod canvas;
 mod changes;
 mod channel;
@@ -17,6 +19,7 @@ mod timeline;
 mod trace;
 mod units;
 
+pub use brief::brief;
 pub use canvas::Style;
 pub(crate) use canvas::{Tone, wrapped};
 pub(crate) use channel::{closing_text, stall_words};
@@ -28,10 +31,34 @@ pub(crate) use units::{duration_s, figure, seconds};
 use canvas::{Canvas, INDENT};
 
 use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
+use std::path::PathBuf;
+
 use super::summary::{Outcome, RunSummary};
 use hil_rundir::protection::HopProtection;
+use hil_rundir::run_folder::RunFolder;
 
-/// The report of a run as text of at most `width_columns` columns (clamped to 80..=120).
+/// Width of the files.
+const FILE_WIDTH: usize = 100;
+
+/// The report as printed and every figure, as files of the run's folder.
+pub(crate) fn text_files(folder: &RunFolder, summary: &RunSummary) -> [(PathBuf, String); 2] {
+    [
+        (
+            folder.full_report(),
+            render(summary, FILE_WIDTH, Style::Plain),
+        ),
+        // The last one: who waits for it finds all there is.
+        (folder.report(), brief(summary, FILE_WIDTH, Style::Plain)),
+    ]
+}
+
+/// The report of a run for a terminal: as a run prints it, or with every figure.
+pub fn page(summary: &RunSummary, is_full: bool, width_columns: usize) -> String {
+    let text = if is_full { render } else { brief };
+    text(summary, width_columns, Style::Coloured)
+}
+
+/// Every figure of a run as text of at most `width_columns` columns (clamped to 80..=120).
 pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> String {
     let assessment = Assessment::of(summary);
     let mut canvas = Canvas::new(width_columns, style);
@@ -66,7 +93,7 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     tables::host(&mut canvas, &summary.host_facts);
     method(&mut canvas, summary);
     files(&mut canvas, summary);
-    canvas.rule(Tone::Faint);
+    answer::answer(&mut canvas, summary, &assessment);
     canvas.finish()
 }
 

@@ -268,7 +268,7 @@ pub(crate) fn empty() -> RunSummary {
     summary
 }
 
-fn check_golden(actual: &str, file: &str, expected: &str) {
+pub(super) fn check_golden(actual: &str, file: &str, expected: &str) {
     if std::env::var_os("HIL_BLESS").is_some() {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/src/testdata");
         std::fs::write(format!("{folder}/{file}"), actual).unwrap();

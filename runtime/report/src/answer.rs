@@ -1,0 +1,508 @@
+//! The answer of a run: did the network hurt the robot, is the measurement valid, how large is the sample. It is
+//! drawn from a summary once, as data; every output says it in the same words, which are beside it.
+
+use core::fmt;
+
+use hil_core::case_study::{Occasions, Severity};
+use hil_platform::text::grouped;
+use hil_platform::words::{counted, named};
+use hil_stats::statistics::{Interval, clopper_pearson};
+use serde::{Deserialize, Serialize};
+
+use super::assessment::{Assessment, NetworkVerdict};
+use super::clock_summary::ClockSection;
+use super::score_event::ExplainedEvent;
+use super::summary::{LinkKind, RunSummary};
+use super::terminal::{Tone, duration_s, percent};
+
+/// A rate of fewer occasions is not told, and no harm in fewer is no answer.
+pub const OCCASIONS_MIN: u64 = 10;
+/// Channels, processes or hosts that are named where many have the same fault.
+const NAMED_COUNT: usize = 3;
+/// Confidence of intervals.
+const CONFIDENCE: f64 = 0.95;
+
+/// A way in which the robot can be hurt, and how often it was; see [`hil_core::case_study::Harm`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HarmCount {
+    /// What happened to it.
+    pub what: String,
+    /// How often; `None` when the run did not allow to count it.
+    pub count: Option<u64>,
+    /// Of these, those that a perfect channel would not have prevented.
+    pub own_count: u64,
+    /// What could have hurt it.
+    pub occasions: Option<OccasionCount>,
+}
+
+/// What could have hurt the robot; see [`Occasions`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OccasionCount {
+    /// What they are.
+    pub what: String,
+    /// How many there were.
+    pub count: u64,
+}
+
+impl From<&hil_core::case_study::Harm> for HarmCount {
+    fn from(harm: &hil_core::case_study::Harm) -> Self {
+        Self {
+            what: harm.what.to_owned(),
+            count: harm.count,
+            own_count: harm.own_count,
+            occasions: harm.occasions.map(|Occasions { what, count }| {
+                let what = what.to_owned();
+                OccasionCount { what, count }
+            }),
+        }
+    }
+}
+
+impl HarmCount {
+    /// Those that a perfect channel would have prevented.
+    fn beyond_own_count(&self) -> u64 {
+        self.count.unwrap_or(0).saturating_sub(self.own_count)
+    }
+
+    /// How many of how many, with the share where there are enough.
+    pub fn words(&self) -> String {
+        let Some(count) = self.count else {
+            return "unavailable: the run did not allow to count them".to_owned();
+        };
+        let mut text = grouped(count);
+        if let Some(occasions) = &self.occasions {
+            text = format!("{text} of {} {}", grouped(occasions.count), occasions.what);
+            let interval = clopper_pearson(count.min(occasions.count), occasions.count, CONFIDENCE);
+            if occasions.count >= OCCASIONS_MIN
+                && count <= occasions.count
+                && let Some(Interval { low, high }) = interval
+            {
+                let share = percent(count as f64 / occasions.count as f64);
+                let (low, high) = (percent(low), percent(high));
+                text = format!("{text}: {share} [{low}, {high}]");
+            }
+        }
+        if self.own_count > 0 {
+            let own = grouped(self.own_count);
+            text = format!("{text}; over a perfect channel {own} too");
+        }
+        text
+    }
+}
+
+/// Did the network hurt the robot?
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[serde(tag = "state", rename_all = "snake_case")]
+pub enum Hurt {
+    /// It did.
+    Yes,
+    /// It did not.
+    No,
+    /// The run cannot tell.
+    NotResolvable {
+        /// Why not.
+        because: Unresolved,
+    },
+    /// The run put no network, or no robot with a score, to the test.
+    NotTested {
+        /// Why not.
+        because: Untested,
+    },
+}
+
+/// Why a run cannot tell.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[serde(tag = "reason", rename_all = "snake_case")]
+pub enum Unresolved {
+    /// The measurement is not valid.
+    InvalidMeasurement,
+    /// Nothing happened, and too little could have.
+    SampleTooSmall {
+        /// What could have hurt the robot.
+        what: String,
+        /// How often.
+        count: u64,
+        /// How often it takes.
+        needed: u64,
+    },
+    /// What could have hurt the robot was not counted.
+    NotCounted,
+    /// The robot was hurt, and no event of the network preceded it.
+    NoNetworkEventBefore,
+    /// The robot was hurt, and times of hosts do not compare.
+    ClocksDiffer,
+}
+
+/// Why a run tests nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(tag = "reason", rename_all = "snake_case")]
+pub enum Untested {
+    /// It failed.
+    RunFailed,
+    /// No channel crossed a network or a model of one.
+    NoNetwork,
+    /// No foreign program answered.
+    NoForeignProgram,
+    /// The robot has no score that counts what hurts it.
+    NoScore,
+}
+
+/// What was put to the test.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Subject {
+    /// A network.
+    Network,
+    /// An emulated link.
+    EmulatedLink,
+    /// A link model in virtual time.
+    LinkModel,
+    /// The network of a foreign program.
+    ForeignNetwork,
+}
+
+impl fmt::Display for Subject {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Self::Network => "the network",
+            Self::EmulatedLink => "the emulated link",
+            Self::LinkModel => "the link model",
+            Self::ForeignNetwork => "the foreign program or its network",
+        })
+    }
+}
+
+/// Whether times of two hosts compare.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(tag = "state", rename_all = "snake_case")]
+pub enum Clocks {
+    /// No figure needs two.
+    NotNeeded,
+    /// All hosts read one.
+    One,
+    /// They are aligned.
+    Aligned {
+        /// Half of the widest guaranteed bound of an instant, seconds.
+        bound_s: f64,
+    },
+    /// They are not: one-way delays are unavailable.
+    Unaligned,
+}
+
+/// Whether the measurement is valid.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Measurement {
+    /// Host and link were kept up with, and no record is missing; `None` where nothing was measured.
+    pub is_valid: Option<bool>,
+    /// Whether times of two hosts compare.
+    pub clocks: Clocks,
+}
+
+/// How much the answer rests on.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Sample {
+    /// Length of the run, seconds.
+    pub duration_s: f64,
+    /// Channels that crossed a network or a model of one, else all.
+    pub channel_count: u64,
+    /// Messages published on them.
+    pub message_count: u64,
+    /// What could have hurt the robot.
+    pub occasions: Option<OccasionCount>,
+}
+
+/// The answer of a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Answer {
+    /// Did the network hurt the robot?
+    #[serde(flatten)]
+    pub hurt: Hurt,
+    /// What was put to the test.
+    pub subject: Subject,
+    /// Is the measurement valid?
+    pub measurement: Measurement,
+    /// How large is the sample?
+    pub sample: Sample,
+}
+
+impl Answer {
+    /// Draws the answer.
+    pub fn of(summary: &RunSummary, assessment: &Assessment) -> Self {
+        let occasions = summary.harms.first().and_then(|one| one.occasions.clone());
+        let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
+        let channels = summary.channels.iter().filter(|one| {
+            let has_account = one.account.is_some();
+            has_account && (one.link.is_crossing() || !has_crossed)
+        });
+        let accounts: Vec<_> = channels.filter_map(|one| one.account.as_ref()).collect();
+        Self {
+            hurt: hurt(summary, &assessment.network),
+            subject: subject(summary, &assessment.network),
+            measurement: Measurement {
+                is_valid: is_valid(&assessment.network),
+                clocks: clocks(summary),
+            },
+            sample: Sample {
+                duration_s: summary.run.duration_s,
+                channel_count: accounts.len() as u64,
+                message_count: accounts.iter().map(|one| one.published_count).sum(),
+                occasions,
+            },
+        }
+    }
+
+    /// The answer to the question whether the network hurt the robot.
+    pub fn words(&self) -> String {
+        match &self.hurt {
+            Hurt::Yes => "YES".to_owned(),
+            Hurt::No => "NO".to_owned(),
+            Hurt::NotResolvable { because } => format!("NOT RESOLVABLE: {because}"),
+            Hurt::NotTested { because } => format!("NOT TESTED: {because}"),
+        }
+    }
+
+    /// The same as a sentence of its own.
+    pub fn sentence(&self) -> String {
+        let subject = self.subject;
+        match &self.hurt {
+            Hurt::Yes => format!("YES, {subject} hurt the robot"),
+            Hurt::No => format!("NO, {subject} did not hurt the robot"),
+            Hurt::NotResolvable { .. } | Hurt::NotTested { .. } => self.words(),
+        }
+    }
+
+    /// Green only for an unhurt robot and a valid measurement.
+    pub(crate) const fn tone(&self) -> Tone {
+        match (&self.hurt, self.measurement.is_valid) {
+            (Hurt::Yes, _) => Tone::Bad,
+            (Hurt::No, Some(true)) => Tone::Good,
+            (Hurt::No | Hurt::NotResolvable { .. } | Hurt::NotTested { .. }, _) => Tone::Caution,
+        }
+    }
+
+    /// Whether the measurement is valid, in words.
+    pub(crate) fn measurement_words(&self, network: &NetworkVerdict) -> (Tone, String) {
+        let clocks = match self.measurement.clocks {
+            Clocks::NotNeeded => String::new(),
+            Clocks::One => "; all hosts read one clock".to_owned(),
+            Clocks::Aligned { bound_s } => {
+                format!(
+                    "; clocks of the hosts agree within ±{}",
+                    duration_s(bound_s)
+                )
+            }
+            Clocks::Unaligned => {
+                "; clocks are not aligned: one-way delays are unavailable".to_owned()
+            }
+        };
+        match invalid_words(network) {
+            Some(why) => (Tone::Bad, format!("NOT VALID: {why}")),
+            None if self.measurement.is_valid.is_none() => {
+                (Tone::Plain, "none of a network".to_owned())
+            }
+            None => (
+                Tone::Plain,
+                format!("valid: hosts and links were kept up with{clocks}"),
+            ),
+        }
+    }
+
+    /// How large the sample is, in words.
+    pub(crate) fn sample_words(&self) -> String {
+        let Sample {
+            duration_s: length_s,
+            channel_count,
+            message_count,
+            occasions,
+        } = &self.sample;
+        let messages = counted(*message_count, "message");
+        let channels = counted(*channel_count, "channel");
+        let text = format!("{length_s:.1} s, {messages} on {channels}");
+        match occasions {
+            Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
+                format!("{text}, {count} {what}: too small for a rate, which takes {OCCASIONS_MIN}")
+            }
+            Some(OccasionCount { what, count }) => format!("{text}, {} {what}", grouped(*count)),
+            None => text,
+        }
+    }
+}
+
+impl fmt::Display for Unresolved {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::InvalidMeasurement => formatter.write_str("the measurement is not valid"),
+            Self::SampleTooSmall {
+                what,
+                count,
+                needed,
+            } => write!(
+                formatter,
+                "no harm was seen, but the sample is too small: {count} {what}, {needed} needed"
+            ),
+            Self::NotCounted => formatter.write_str("what hurts the robot could not be counted"),
+            Self::NoNetworkEventBefore => {
+                formatter.write_str("the robot was hurt, but no network event came before it")
+            }
+            Self::ClocksDiffer => formatter.write_str(
+                "the robot was hurt, but unaligned clocks leave open whether the network came first",
+            ),
+        }
+    }
+}
+
+impl fmt::Display for Untested {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Self::RunFailed => "the run failed",
+            Self::NoNetwork => "no channel went over a network",
+            Self::NoForeignProgram => "no foreign program answered",
+            Self::NoScore => "the case counts nothing that hurts the robot",
+        })
+    }
+}
+
+fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
+    let not_tested = |because| Hurt::NotTested { because };
+    let not_resolvable = |because| Hurt::NotResolvable { because };
+    match network {
+        NetworkVerdict::RunFailed => return not_tested(Untested::RunFailed),
+        NetworkVerdict::NoNetwork => return not_tested(Untested::NoNetwork),
+        NetworkVerdict::NoForeignProgram => return not_tested(Untested::NoForeignProgram),
+        NetworkVerdict::VirtualTime
+            if !summary.channels.iter().any(|one| one.link.is_crossing()) =>
+        {
+            return not_tested(Untested::NoNetwork);
+        }
+        _ => {}
+    }
+    let Some(first) = summary.harms.first() else {
+        return not_tested(Untested::NoScore);
+    };
+    if is_valid(network) == Some(false) {
+        return not_resolvable(Unresolved::InvalidMeasurement);
+    }
+    let harms = summary.harms.iter();
+    if harms.map(HarmCount::beyond_own_count).sum::<u64>() > 0 {
+        let all = &summary.score_events;
+        if all.clocks_differ {
+            return not_resolvable(Unresolved::ClocksDiffer);
+        }
+        let mut grave = all
+            .events
+            .iter()
+            .filter(|one| one.severity > Severity::Notice);
+        if grave.any(follows_the_network) {
+            return Hurt::Yes;
+        }
+        return not_resolvable(Unresolved::NoNetworkEventBefore);
+    }
+    if first.count.is_none() {
+        return not_resolvable(Unresolved::NotCounted);
+    }
+    match &first.occasions {
+        Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
+            not_resolvable(Unresolved::SampleTooSmall {
+                what: what.clone(),
+                count: *count,
+                needed: OCCASIONS_MIN,
+            })
+        }
+        _ => Hurt::No,
+    }
+}
+
+/// Whether an outage, another network event or the loss of a message it names came before it.
+fn follows_the_network(event: &ExplainedEvent) -> bool {
+    let lost = event.messages.iter().filter_map(|one| one.fate);
+    !event.outages.is_empty()
+        || event
+            .network
+            .as_ref()
+            .is_some_and(|one| !one.events.is_empty())
+        || lost.into_iter().any(hil_account::MessageFate::is_loss)
+}
+
+fn subject(summary: &RunSummary, network: &NetworkVerdict) -> Subject {
+    let mut links = summary.channels.iter().map(|one| one.link);
+    match network {
+        NetworkVerdict::VirtualTime => Subject::LinkModel,
+        NetworkVerdict::ForeignProgram | NetworkVerdict::NoForeignProgram => {
+            Subject::ForeignNetwork
+        }
+        _ if links.any(|link| link == LinkKind::Emulated) => Subject::EmulatedLink,
+        _ => Subject::Network,
+    }
+}
+
+/// Why a measurement is not valid, in words.
+fn invalid_words(network: &NetworkVerdict) -> Option<String> {
+    let repeat = "repeat on an idle host or at a lower rate";
+    Some(match network {
+        NetworkVerdict::EmulationNotKept { channels } => {
+            let channels = named(channels, NAMED_COUNT);
+            format!("the host could not keep the emulated link of {channels}; {repeat}")
+        }
+        NetworkVerdict::HostOverran { processes } => {
+            let skipped: u64 = processes.iter().map(|one| one.skipped_tick_count).sum();
+            let due: u64 = processes.iter().map(|one| one.due_tick_count).sum();
+            let names: Vec<&str> = processes.iter().map(|one| one.process.as_str()).collect();
+            let names = named(&names, NAMED_COUNT);
+            let share = percent(skipped as f64 / due.max(1) as f64);
+            let ticks = format!("{} of {} ticks", grouped(skipped), grouped(due));
+            format!("the host overran: {names} skipped {ticks} ({share}); {repeat}")
+        }
+        NetworkVerdict::ReceiverLate { channels } => {
+            let flows = named(channels, NAMED_COUNT);
+            format!(
+                "receiving gateways were late: no room in the receive buffer of {flows}; {repeat}"
+            )
+        }
+        NetworkVerdict::TicksUnknown => "a component left no count of its ticks".to_owned(),
+        NetworkVerdict::RecordsMissing { hosts } => {
+            let hosts = named(hosts, NAMED_COUNT);
+            format!("records of other hosts are missing on {hosts}")
+        }
+        NetworkVerdict::RunFailed
+        | NetworkVerdict::VirtualTime
+        | NetworkVerdict::NoNetwork
+        | NetworkVerdict::NoForeignProgram
+        | NetworkVerdict::ForeignProgram
+        | NetworkVerdict::EmulatedLink
+        | NetworkVerdict::NetworkResult => return None,
+    })
+}
+
+/// `None` where nothing was measured.
+const fn is_valid(network: &NetworkVerdict) -> Option<bool> {
+    match network {
+        NetworkVerdict::RunFailed
+        | NetworkVerdict::VirtualTime
+        | NetworkVerdict::NoNetwork
+        | NetworkVerdict::NoForeignProgram => None,
+        NetworkVerdict::ForeignProgram
+        | NetworkVerdict::EmulatedLink
+        | NetworkVerdict::NetworkResult => Some(true),
+        NetworkVerdict::EmulationNotKept { .. }
+        | NetworkVerdict::HostOverran { .. }
+        | NetworkVerdict::ReceiverLate { .. }
+        | NetworkVerdict::TicksUnknown
+        | NetworkVerdict::RecordsMissing { .. } => Some(false),
+    }
+}
+
+fn clocks(summary: &RunSummary) -> Clocks {
+    let Some(report) = summary.network.as_ref() else {
+        return Clocks::NotNeeded;
+    };
+    let section = summary.clocks.as_ref();
+    if section.is_some_and(|ClockSection { has_one_clock, .. }| *has_one_clock) {
+        return Clocks::One;
+    }
+    match report.clock_bound_s {
+        _ if report.clocks_differ => Clocks::Unaligned,
+        Some(bound_s) if bound_s > 0.0 => Clocks::Aligned { bound_s },
+        Some(_) => Clocks::One,
+        None => Clocks::Unaligned,
+    }
+}

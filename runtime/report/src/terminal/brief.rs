@@ -1,0 +1,435 @@
+//! The report that a run prints: what happened to the robot and why, the network in a table and on one time axis,
+//! what to do next, and last the answer. At most fifty lines; `--full` has the rest.
+
+use std::collections::BTreeMap;
+
+use hil_account::network::NetworkMetrics;
+use hil_account::{ChannelAccount, MessageFate};
+use hil_core::case_study::Severity;
+use hil_platform::text::{grouped, shortened};
+use hil_platform::words::counted;
+
+use super::canvas::{Canvas, INDENT, Style, Tone, left, right};
+use super::units::{duration, percent, seconds};
+use super::{answer, timeline};
+use crate::answer::{Answer, Hurt, OCCASIONS_MIN, Unresolved, Untested};
+use crate::assessment::Assessment;
+use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
+use crate::score_event::ExplainedEvent;
+use crate::summary::{ChannelSummary, Outcome, RunSummary};
+
+/// Events of the robot, channels and warnings on the page.
+const CAUSES_SHOWN: usize = 4;
+const CHANNELS_SHOWN: usize = 7;
+const WARNINGS_SHOWN: usize = 2;
+/// Rows of the robot in the time strip.
+const ROBOT_ROWS: usize = 2;
+/// Columns of a time, of a channel's name at least, and of a figure.
+const TIME_WIDTH: usize = 13;
+const FIGURE_WIDTH: usize = 9;
+const LOST_WIDTH: usize = 18;
+/// Columns of what a command is for.
+const NEXT_WIDTH: usize = 24;
+/// Channels are alike whose figures differ by less than this share.
+const ALIKE_RATIO: f64 = 0.25;
+
+/// The report of a run as text of at most `width_columns` columns (clamped to 80..=120) and 50 lines.
+pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String {
+    let assessment = Assessment::of(summary);
+    let mut canvas = Canvas::new(width_columns, style);
+    title(&mut canvas, summary);
+    causes(&mut canvas, &summary.score_events.events);
+    channels(&mut canvas, summary);
+    strip(&mut canvas, summary);
+    warnings(&mut canvas, &assessment);
+    next(&mut canvas, summary, &Answer::of(summary, &assessment));
+    answer::answer(&mut canvas, summary, &assessment);
+    canvas.finish()
+}
+
+fn title(canvas: &mut Canvas, summary: &RunSummary) {
+    let run = &summary.run;
+    let facts = format!(
+        "{} · {} · {} · seed {} · host {}",
+        run.case, run.name, run.started, run.seed, run.host
+    );
+    let facts = shortened(&facts, canvas.width());
+    canvas.painted_line(Tone::Strong, &facts);
+    if run.outcome != Outcome::Completed {
+        let (tone, word) = super::outcome_words(run.outcome);
+        let text = shortened(&format!("{word}: {}", run.exit_reason), 2 * canvas.width());
+        canvas.paragraph(0, tone, &text);
+    }
+}
+
+/// What hurt the robot or might have, the gravest first, each with what the network did before.
+fn causes(canvas: &mut Canvas, events: &[ExplainedEvent]) {
+    let count = |severity| {
+        let chosen = events.iter().filter(|one| one.severity == severity);
+        chosen.count() as u64
+    };
+    let mut grave: Vec<&ExplainedEvent> = events
+        .iter()
+        .filter(|one| one.severity > Severity::Notice)
+        .collect();
+    grave.sort_by_key(|one| core::cmp::Reverse(one.severity));
+    let aside = [
+        counted(count(Severity::Incident), "incident"),
+        counted(count(Severity::Hazard), "hazard"),
+        counted(count(Severity::Notice), "notice"),
+    ];
+    canvas.heading("Robot, and the network before it", &aside.join(", "));
+    for event in grave.iter().take(CAUSES_SHOWN) {
+        let tone = if event.severity == Severity::Incident {
+            Tone::Bad
+        } else {
+            Tone::Caution
+        };
+        let time = event.at_s.map_or_else(|| "unavailable".to_owned(), seconds);
+        let room = canvas.width() - INDENT - TIME_WIDTH;
+        canvas.field_of(TIME_WIDTH, &time, tone, &shortened(&event.what, room));
+        let cause = format!("after {}", cause(event));
+        canvas.field_of(
+            TIME_WIDTH,
+            "",
+            Tone::Plain,
+            &shortened(&cause, 2 * room - 20),
+        );
+    }
+    if grave.is_empty() {
+        canvas.paragraph(INDENT, Tone::Plain, "no incident and no hazard");
+    }
+}
+
+/// The network event that has most to do with it.
+fn cause(event: &ExplainedEvent) -> String {
+    let network = event.network.as_ref();
+    let outage = event.outages.first().map(|one| one.words.clone());
+    let beside = || event.network_beside().first().map(|one| one.words.clone());
+    let lost = || {
+        let mut messages = event.messages.iter();
+        let lost = messages.find(|one| one.fate.is_some_and(MessageFate::is_loss));
+        lost.map(|one| format!("{} {}: {}", one.channel, grouped(one.sequence), one.words))
+    };
+    outage.or_else(beside).or_else(lost).unwrap_or_else(|| {
+        network.map_or_else(
+            || "nothing that is known of the network".to_owned(),
+            crate::network::PrecedingNetwork::nothing_words,
+        )
+    })
+}
+
+/// What a channel's line shows.
+#[derive(Debug, Clone, PartialEq)]
+struct Line {
+    delay: Option<[i64; 3]>,
+    published_count: u64,
+    lost_count: u64,
+    gap_ns: Option<i64>,
+}
+
+impl Line {
+    fn of(account: &ChannelAccount, network: Option<&NetworkMetrics>) -> Self {
+        let delay = account.end_to_end.distribution.measured();
+        let delay = delay.map(|one| [one.p50_ns, one.p99_ns, one.max_ns]);
+        // Virtual time knows what the link model did, and no other stage.
+        let on_network = network.and_then(|one| one.delay.measured());
+        let on_network = on_network.map(|one| [one.p50.value_ns, one.p99.value_ns, one.max_ns]);
+        let lost = MessageFate::ALL.into_iter().filter(|fate| fate.is_loss());
+        Self {
+            delay: delay.or(on_network),
+            published_count: account.published_count,
+            lost_count: lost.map(|fate| account.fates.of(fate)).sum(),
+            gap_ns: account.gaps.longest.map(|gap| gap.length_ns),
+        }
+    }
+
+    fn loss_ratio(&self) -> f64 {
+        self.lost_count as f64 / self.published_count.max(1) as f64
+    }
+
+    fn is_alike(&self, other: &Self) -> bool {
+        let near =
+            |one: f64, other: f64| (one - other).abs() <= ALIKE_RATIO * one.abs().max(other.abs());
+        let is_delay_near = match (self.delay, other.delay) {
+            (Some(one), Some(other)) => near(one[1] as f64, other[1] as f64),
+            (None, None) => true,
+            _ => false,
+        };
+        is_delay_near && near(self.loss_ratio(), other.loss_ratio())
+    }
+
+    /// The worse of both in everything.
+    fn worse(&self, other: &Self) -> Self {
+        Self {
+            delay: match (self.delay, other.delay) {
+                (Some(one), Some(two)) => {
+                    Some(core::array::from_fn(|index| one[index].max(two[index])))
+                }
+                (one, two) => one.or(two),
+            },
+            published_count: self.published_count + other.published_count,
+            lost_count: self.lost_count + other.lost_count,
+            gap_ns: self.gap_ns.max(other.gap_ns),
+        }
+    }
+}
+
+/// Channels whose names differ in one part only, and whose figures are alike.
+#[derive(Debug)]
+struct Group<'a> {
+    names: Vec<&'a str>,
+    line: Line,
+}
+
+impl Group<'_> {
+    /// `egm/{right,left}/command`, or the first and how many more.
+    fn name(&self, width: usize) -> String {
+        let [first, rest @ ..] = self.names.as_slice() else {
+            return String::new();
+        };
+        if rest.is_empty() {
+            return left(first, width);
+        }
+        let index = differing_part(first, rest[0]).unwrap_or(0);
+        let of = |name: &str| name.split('/').nth(index).unwrap_or_default().to_owned();
+        let all: Vec<String> = self.names.iter().map(|name| of(name)).collect();
+        let mut shown: Vec<String> = first.split('/').map(str::to_owned).collect();
+        shown[index] = format!("{{{}}}", all.join(","));
+        let whole = shown.join("/");
+        if whole.chars().count() <= width {
+            return left(&whole, width);
+        }
+        left(&format!("{first} and {} alike", rest.len()), width)
+    }
+}
+
+/// Which part of two names differs; `None` unless it is exactly one.
+fn differing_part(one: &str, other: &str) -> Option<usize> {
+    if one.split('/').count() != other.split('/').count() {
+        return None;
+    }
+    let pairs = one.split('/').zip(other.split('/')).enumerate();
+    let mut differing = pairs.filter(|(_, (one, other))| one != other);
+    let (index, _) = differing.next()?;
+    differing.next().is_none().then_some(index)
+}
+
+fn groups<'a>(channels: &[&'a ChannelSummary], network: &[ChannelNetwork]) -> Vec<Group<'a>> {
+    let mut found: Vec<Group<'_>> = Vec::new();
+    for channel in channels {
+        let Some(account) = &channel.account else {
+            continue;
+        };
+        let figures = network.iter().find(|one| one.channel == channel.name);
+        let line = Line::of(account, figures.map(|one| &one.figures));
+        let alike = found.iter_mut().find(|group| {
+            let part = differing_part(group.names[0], &channel.name);
+            let is_same_part = group
+                .names
+                .get(1)
+                .is_none_or(|second| differing_part(group.names[0], second) == part);
+            part.is_some() && is_same_part && group.line.is_alike(&line)
+        });
+        match alike {
+            Some(group) => {
+                group.names.push(&channel.name);
+                group.line = group.line.worse(&line);
+            }
+            None => found.push(Group {
+                names: vec![&channel.name],
+                line,
+            }),
+        }
+    }
+    found
+}
+
+/// One line a channel, alike ones together, those that lost most first.
+fn channels(canvas: &mut Canvas, summary: &RunSummary) {
+    let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
+    let shown: Vec<&ChannelSummary> = summary
+        .channels
+        .iter()
+        .filter(|one| one.link.is_crossing() || !has_crossed)
+        .collect();
+    let network = summary.network.as_ref();
+    let network = network.map_or(&[][..], |report| &report.channels);
+    let mut groups = groups(&shown, network);
+    if groups.is_empty() {
+        return;
+    }
+    groups.sort_by(|one, other| other.line.loss_ratio().total_cmp(&one.line.loss_ratio()));
+    canvas.heading("Channels", "from publication to the consumer");
+    let name_width = canvas.width() - INDENT - 4 * FIGURE_WIDTH - LOST_WIDTH;
+    let line = format!(
+        "{:INDENT$}{}{}{}{}{}{}",
+        "",
+        left("", name_width),
+        right("p50", FIGURE_WIDTH),
+        right("p99", FIGURE_WIDTH),
+        right("max", FIGURE_WIDTH),
+        right("lost", LOST_WIDTH),
+        right("gap", FIGURE_WIDTH)
+    );
+    canvas.painted_line(Tone::Faint, &line);
+    for group in groups.iter().take(CHANNELS_SHOWN) {
+        let Line {
+            delay,
+            published_count,
+            lost_count,
+            gap_ns,
+        } = &group.line;
+        let or_dash = |ns: Option<i64>| ns.map_or_else(|| "–".to_owned(), duration);
+        let delay = |index: usize| or_dash(delay.map(|all| all[index]));
+        let lost = match lost_count {
+            0 => format!("0 of {}", grouped(*published_count)),
+            count => format!("{} {}", grouped(*count), percent(group.line.loss_ratio())),
+        };
+        let tone = if *lost_count > 0 {
+            Tone::Caution
+        } else {
+            Tone::Plain
+        };
+        let line = format!(
+            "{:INDENT$}{}{}{}{}{}{}",
+            "",
+            group.name(name_width),
+            right(&delay(0), FIGURE_WIDTH),
+            right(&delay(1), FIGURE_WIDTH),
+            right(&delay(2), FIGURE_WIDTH),
+            canvas.paint(tone, &right(&lost, LOST_WIDTH)),
+            right(&or_dash(*gap_ns), FIGURE_WIDTH)
+        );
+        canvas.line(&line);
+    }
+    let hidden = groups.iter().skip(CHANNELS_SHOWN);
+    let hidden: usize = hidden.map(|group| group.names.len()).sum();
+    if hidden > 0 {
+        let text = format!(
+            "and {} that lost no larger share",
+            counted(hidden as u64, "channel")
+        );
+        canvas.paragraph(INDENT, Tone::Faint, &text);
+    }
+}
+
+/// The network above, the robot below, on one axis.
+fn strip(canvas: &mut Canvas, summary: &RunSummary) {
+    let Some(report) = &summary.network else {
+        return;
+    };
+    let mut rows = Vec::new();
+    for quantity in [NetworkQuantity::Loss, NetworkQuantity::Delay] {
+        rows.extend(worst_of(&report.timeline.rows, quantity));
+    }
+    let robot = report.timeline.rows.iter();
+    let robot = robot.filter(|row| matches!(row.subject, TimelineSubject::Robot { .. }));
+    rows.extend(robot.take(ROBOT_ROWS).cloned());
+    let all = Timeline {
+        step_s: report.timeline.step_s,
+        rows,
+    };
+    timeline::timeline(canvas, &all, &summary.link_changes);
+}
+
+/// The worst channel in each step.
+fn worst_of(rows: &[TimelineRow], quantity: NetworkQuantity) -> Option<TimelineRow> {
+    let of_channels: BTreeMap<&str, &TimelineRow> = rows
+        .iter()
+        .filter_map(|row| match &row.subject {
+            TimelineSubject::Channel {
+                channel,
+                quantity: found,
+            } if *found == quantity => Some((channel.as_str(), row)),
+            _ => None,
+        })
+        .collect();
+    let first = of_channels.values().next()?;
+    let mut worst = TimelineRow {
+        subject: TimelineSubject::Channel {
+            channel: "worst channel".to_owned(),
+            quantity,
+        },
+        ..(*first).clone()
+    };
+    for row in of_channels.values().skip(1) {
+        for (known, value) in worst.values.iter_mut().zip(&row.values) {
+            *known = match (*known, *value) {
+                (Some(one), Some(other)) => Some(one.max(other)),
+                (one, other) => one.or(other),
+            };
+        }
+    }
+    Some(worst)
+}
+
+fn warnings(canvas: &mut Canvas, assessment: &Assessment) {
+    let all = &assessment.warnings;
+    if all.is_empty() {
+        return;
+    }
+    canvas.heading("Warnings", "");
+    for warning in all.iter().take(WARNINGS_SHOWN) {
+        let text = shortened(warning, 2 * canvas.width() - 20);
+        canvas.paragraph(INDENT, Tone::Caution, &text);
+    }
+    let hidden = all.len().saturating_sub(WARNINGS_SHOWN) as u64;
+    if hidden > 0 {
+        let text = format!("and {} more", grouped(hidden));
+        canvas.paragraph(INDENT, Tone::Faint, &text);
+    }
+}
+
+/// Three commands with this run's paths, the one that makes a better answer first.
+fn next(canvas: &mut Canvas, summary: &RunSummary, answer: &Answer) {
+    let run = &summary.run;
+    let mut commands = Vec::new();
+    match &answer.hurt {
+        Hurt::NotResolvable {
+            because: Unresolved::SampleTooSmall { count, .. },
+        } => {
+            let factor = OCCASIONS_MIN.div_ceil((*count).max(1)) as f64 * 1.2;
+            let length_s = (run.duration_s * factor).ceil();
+            commands.push((
+                "a sample large enough",
+                format!(
+                    "{} --set run.duration='\"{length_s} s\"'",
+                    run.repeat_command
+                ),
+            ));
+        }
+        Hurt::NotResolvable {
+            because: Unresolved::InvalidMeasurement,
+        } => commands.push(("what hinders this host", "hil-runtime doctor".to_owned())),
+        Hurt::NotTested {
+            because: Untested::NoNetwork,
+        } => commands.push((
+            "over a link that hurts",
+            "hil-runtime --topology deploy/topologies/outages.toml".to_owned(),
+        )),
+        _ => {}
+    }
+    if !run.is_virtual {
+        let folder = &run.folder;
+        commands.push((
+            "as a page",
+            format!("hil-runtime report {folder} -o report.html"),
+        ));
+        commands.push((
+            "every figure",
+            format!("hil-runtime report {folder} --full"),
+        ));
+        commands.push((
+            "against a clean run",
+            format!("hil-runtime compare CLEAN-RUN {folder}"),
+        ));
+    }
+    if commands.is_empty() {
+        return;
+    }
+    canvas.heading("Next", "");
+    for (what, command) in commands.into_iter().take(3) {
+        canvas.field_of(NEXT_WIDTH, what, Tone::Plain, &command);
+    }
+}

@@ -1,0 +1,232 @@
+//! What a run answers, and the report that a run prints.
+
+use hil_core::case_study::Severity;
+
+use super::sample::{awkward, check_golden, empty, full, link};
+use crate::answer::{Answer, Clocks, HarmCount, Hurt, OccasionCount, Unresolved, Untested};
+use crate::assessment::Assessment;
+use crate::summary::{LinkKind, Outcome, RunSummary};
+use crate::terminal::{JOINT, Style, Tone, brief};
+
+fn lost_loops(count: Option<u64>, own_count: u64, sent_count: u64) -> HarmCount {
+    HarmCount {
+        what: "motion loops lost".to_owned(),
+        count,
+        own_count,
+        occasions: Some(OccasionCount {
+            what: "motion loops sent".to_owned(),
+            count: sent_count,
+        }),
+    }
+}
+
+/// A run over a network on one clock whose host kept its ticks.
+fn run(harm: HarmCount) -> RunSummary {
+    let mut summary = full();
+    summary.processes[0].skipped_tick_count = Some(0);
+    summary.harms = vec![harm];
+    summary
+}
+
+fn answer(summary: &RunSummary) -> Answer {
+    Answer::of(summary, &Assessment::of(summary))
+}
+
+#[test]
+fn a_hurt_robot_is_put_down_to_a_network_that_misbehaved_before() {
+    let summary = run(lost_loops(Some(2), 0, 40));
+    let found = answer(&summary);
+    assert_eq!(found.hurt, Hurt::Yes);
+    assert_eq!(found.sentence(), "YES, the network hurt the robot");
+    assert_eq!(found.tone(), Tone::Bad);
+    let words = "2 of 40 motion loops sent: 5.00 % [0.61 %, 16.92 %]";
+    assert_eq!(summary.harms[0].words().replace(JOINT, " "), words);
+    // Nothing happened on the network, or to a message, before it.
+    let mut alone = summary.clone();
+    for event in &mut alone.score_events.events {
+        event.outages.clear();
+        event.messages.clear();
+        if let Some(network) = &mut event.network {
+            network.events.clear();
+        }
+    }
+    let because = Unresolved::NoNetworkEventBefore;
+    assert_eq!(answer(&alone).hurt, Hurt::NotResolvable { because });
+    // Only what the robot coped with.
+    let mut coped = summary.clone();
+    for event in &mut coped.score_events.events {
+        event.severity = Severity::Notice;
+    }
+    let because = Unresolved::NoNetworkEventBefore;
+    assert_eq!(answer(&coped).hurt, Hurt::NotResolvable { because });
+    let mut unordered = summary;
+    unordered.score_events.clocks_differ = true;
+    let because = Unresolved::ClocksDiffer;
+    assert_eq!(answer(&unordered).hurt, Hurt::NotResolvable { because });
+}
+
+#[test]
+fn what_the_robot_did_to_itself_is_not_the_network() {
+    let summary = run(lost_loops(Some(2), 2, 40));
+    assert_eq!(answer(&summary).hurt, Hurt::No);
+    assert!(
+        summary.harms[0]
+            .words()
+            .ends_with("; over a perfect channel 2 too")
+    );
+    assert_eq!(answer(&run(lost_loops(Some(3), 2, 40))).hurt, Hurt::Yes);
+}
+
+#[test]
+fn a_sample_that_is_too_small_shows_no_absence_of_harm() {
+    let small = run(lost_loops(Some(0), 0, 9));
+    let Hurt::NotResolvable {
+        because: Unresolved::SampleTooSmall { count: 9, .. },
+    } = answer(&small).hurt
+    else {
+        panic!("{:?}", answer(&small));
+    };
+    assert_eq!(small.harms[0].words(), "0 of 9 motion loops sent");
+    assert!(brief(&small, 100, Style::Plain).contains("too small"));
+    let enough = answer(&run(lost_loops(Some(0), 0, 10)));
+    assert_eq!((enough.hurt.clone(), enough.tone()), (Hurt::No, Tone::Good));
+    // Harm is harm, however small the sample.
+    assert_eq!(answer(&run(lost_loops(Some(1), 0, 3))).hurt, Hurt::Yes);
+    let because = Unresolved::NotCounted;
+    assert_eq!(
+        answer(&run(lost_loops(None, 0, 40))).hurt,
+        Hurt::NotResolvable { because }
+    );
+}
+
+#[test]
+fn an_invalid_measurement_blames_nobody() {
+    for count in [0, 2] {
+        let mut summary = run(lost_loops(Some(count), 0, 40));
+        summary.processes[1].skipped_tick_count = Some(500);
+        let found = answer(&summary);
+        let because = Unresolved::InvalidMeasurement;
+        assert_eq!(found.hurt, Hurt::NotResolvable { because });
+        assert_eq!(found.measurement.is_valid, Some(false));
+        let page = brief(&summary, 100, Style::Plain);
+        assert!(
+            page.contains("NOT VALID: the host overran: robot skipped 500 of"),
+            "{page}"
+        );
+        assert!(page.contains("hil-runtime doctor"), "{page}");
+    }
+}
+
+#[test]
+fn without_a_network_or_a_score_nothing_was_tested() {
+    let tested = |change: &dyn Fn(&mut RunSummary)| {
+        let mut summary = run(lost_loops(Some(0), 0, 40));
+        change(&mut summary);
+        answer(&summary).hurt
+    };
+    let no_network = tested(&|summary| {
+        for channel in &mut summary.channels {
+            channel.link = LinkKind::SharedMemory;
+        }
+    });
+    let because = Untested::NoNetwork;
+    assert_eq!(no_network, Hurt::NotTested { because });
+    let because = Untested::NoScore;
+    assert_eq!(
+        tested(&|one| one.harms.clear()),
+        Hurt::NotTested { because }
+    );
+    let because = Untested::RunFailed;
+    let failed = tested(&|one| one.run.outcome = Outcome::Failed);
+    assert_eq!(failed, Hurt::NotTested { because });
+    // In virtual time a link model is tested, where there is one.
+    let is_virtual = |kind: LinkKind| {
+        move |summary: &mut RunSummary| {
+            summary.run.is_virtual = true;
+            for channel in &mut summary.channels {
+                channel.link = kind;
+            }
+        }
+    };
+    assert_eq!(tested(&is_virtual(LinkKind::Emulated)), Hurt::No);
+    let because = Untested::NoNetwork;
+    let direct = tested(&is_virtual(LinkKind::SharedMemory));
+    assert_eq!(direct, Hurt::NotTested { because });
+}
+
+#[test]
+fn unaligned_clocks_are_told_beside_a_valid_measurement() {
+    let mut summary = run(lost_loops(Some(0), 0, 40));
+    let network = summary.network.as_mut().unwrap();
+    network.clocks_differ = true;
+    network.clock_bound_s = None;
+    let found = answer(&summary);
+    assert_eq!(found.measurement.clocks, Clocks::Unaligned);
+    assert_eq!(found.measurement.is_valid, Some(true));
+    assert!(brief(&summary, 100, Style::Plain).contains("one-way delays are unavailable"));
+}
+
+#[test]
+fn the_printed_report_reads_as_checked_in() {
+    let hurt = run(lost_loops(Some(2), 0, 40));
+    for (summary, width, file, expected) in [
+        (
+            hurt,
+            100,
+            "brief_100.txt",
+            include_str!("../testdata/brief_100.txt"),
+        ),
+        (
+            awkward(),
+            80,
+            "brief_awkward_80.txt",
+            include_str!("../testdata/brief_awkward_80.txt"),
+        ),
+        (
+            empty(),
+            80,
+            "brief_empty_80.txt",
+            include_str!("../testdata/brief_empty_80.txt"),
+        ),
+    ] {
+        check_golden(&brief(&summary, width, Style::Plain), file, expected);
+    }
+}
+
+#[test]
+fn the_printed_report_is_a_page_and_ends_in_the_answer() {
+    let mut many = run(lost_loops(Some(2), 0, 40));
+    let channel = many.channels[0].clone();
+    for index in 0..400 {
+        let mut one = channel.clone();
+        one.name = format!("robot-{}/part-{index}/state", index % 20);
+        one.link = link("udp");
+        many.channels.push(one);
+    }
+    many.warnings = (0..50).map(|index| format!("warning {index}")).collect();
+    for summary in [many, full(), awkward(), empty()] {
+        for width in [80, 100, 120] {
+            let page = brief(&summary, width, Style::Plain);
+            let count = page.lines().count();
+            assert!(count <= 50, "{count} lines:\n{page}");
+            for line in page.lines() {
+                assert!(line.chars().count() <= width, "beyond {width}: {line}");
+            }
+            let end: Vec<&str> = page.lines().rev().take(12).collect();
+            assert!(
+                end.iter().any(|line| line.contains(" hurt the robot?")),
+                "{page}"
+            );
+        }
+    }
+}
+
+#[test]
+fn the_answer_is_in_the_summary_for_programs() {
+    let text = run(lost_loops(Some(2), 0, 40)).to_json().unwrap();
+    let json: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert_eq!(json["answer"]["state"], "yes");
+    assert_eq!(json["answer"]["subject"], "network");
+    assert_eq!(json["answer"]["measurement"]["is_valid"], true);
+    assert_eq!(json["answer"]["sample"]["occasions"]["count"], 40);
+}
