@@ -251,6 +251,11 @@ impl Answer {
         }
     }
 
+    /// What is asked.
+    pub fn question(&self) -> String {
+        format!("Did {} hurt the robot?", self.subject)
+    }
+
     /// The answer to the question whether the network hurt the robot.
     pub fn words(&self) -> String {
         match &self.hurt {
@@ -298,7 +303,7 @@ impl Answer {
         match invalid_words(network) {
             Some(why) => (Tone::Bad, format!("NOT VALID: {why}")),
             None if self.measurement.is_valid.is_none() => {
-                (Tone::Plain, "none of a network".to_owned())
+                (Tone::Plain, unmeasured_words(network).to_owned())
             }
             None => (
                 Tone::Plain,
@@ -432,6 +437,15 @@ fn subject(summary: &RunSummary, network: &NetworkVerdict) -> Subject {
         }
         _ if links.any(|link| link == LinkKind::Emulated) => Subject::EmulatedLink,
         _ => Subject::Network,
+    }
+}
+
+/// What there is in place of a measurement.
+const fn unmeasured_words(network: &NetworkVerdict) -> &'static str {
+    match network {
+        NetworkVerdict::VirtualTime => "none: virtual time tells of link models, not of a network",
+        NetworkVerdict::RunFailed => "none: the run failed",
+        _ => "none: nothing went over a network",
     }
 }
 

@@ -45,8 +45,8 @@ pub(crate) struct Run {
     pub(crate) kind: RunKind,
     /// How it ended.
     pub(crate) outcome: Verdict,
-    /// Whether it says anything about a network.
-    pub(crate) network_verdict: Verdict,
+    /// Did the network hurt the robot? Nothing of a run without a summary.
+    pub(crate) answer: Option<AnswerView>,
     /// The few figures to see first.
     pub(crate) headline: Vec<Metric>,
     pub(crate) warnings: Vec<String>,
@@ -70,6 +70,17 @@ pub(crate) struct Run {
     pub(crate) drawings: Vec<Drawing>,
     /// `report-full.txt` as the run left it.
     pub(crate) printed: Option<String>,
+}
+
+/// The answer of a run in words, as [`crate::answer::Answer`] has them.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct AnswerView {
+    pub(crate) question: String,
+    pub(crate) answer: Verdict,
+    pub(crate) measurement: Verdict,
+    pub(crate) sample: String,
+    /// What hurt the robot.
+    pub(crate) harms: Vec<Fact>,
 }
 
 /// A judgement: `tone` is `good`, `caution`, `bad` or `plain`.

@@ -94,7 +94,7 @@ pub(crate) fn page_of(materials: &[Material], steps: usize) -> Page {
 
 /// One row per run.
 fn overview(runs: &[Run]) -> Table {
-    let mut columns = vec!["run", "outcome", "network"];
+    let mut columns = vec!["run", "outcome", "did the network hurt the robot"];
     let mut names: Vec<(&str, &str)> = Vec::new();
     for figure in runs.iter().flat_map(|run| &run.headline) {
         if names.iter().all(|(name, _)| *name != figure.name) {
@@ -110,7 +110,10 @@ fn overview(runs: &[Run]) -> Table {
         let mut row = vec![
             run.name.clone(),
             run.outcome.word.clone(),
-            run.network_verdict.word.clone(),
+            run.answer.as_ref().map_or_else(
+                || words::UNAVAILABLE.to_owned(),
+                |answer| answer.answer.text.clone(),
+            ),
         ];
         for (name, _) in &names {
             let found = run.headline.iter().find(|figure| figure.name == *name);

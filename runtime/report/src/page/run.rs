@@ -2,11 +2,12 @@
 //! nothing is measured here.
 
 use super::channel::{self, Sources};
-use super::data::{Channel, FactGroup, Metric, Run, RunKind, Table, Verdict};
+use super::data::{AnswerView, Channel, FactGroup, Metric, Run, RunKind, Table, Verdict};
 use super::events::{correlation, network_events, score_events};
 use super::read::{Found, Manifest, Material};
 use super::words::{UNAVAILABLE, count};
 use super::{drawings, paper, timeline};
+use crate::answer::Answer;
 use crate::assessment::Assessment;
 use crate::clock_summary::ClockSection;
 use crate::score_event::ScoreEvents;
@@ -95,11 +96,6 @@ fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {
             word: "unfinished".to_owned(),
             text: "this run never began or was killed outright, so it left no summary".to_owned(),
         },
-        network_verdict: Verdict {
-            tone: "caution",
-            word: "no verdict".to_owned(),
-            text: "no verdict: there are no figures".to_owned(),
-        },
         missing: vec![
             "Score, channels, delays, losses and events: unavailable without summary.json."
                 .to_owned(),
@@ -132,7 +128,6 @@ fn live(key: &str, summary: &RunSummary) -> Run {
     let assessment = Assessment::of(summary);
     let facts = &summary.run;
     let (tone, word) = terminal::outcome_words(facts.outcome);
-    let (network_tone, network_text) = terminal::network_words(&assessment.network);
     let mut run = Run {
         key: key.to_owned(),
         name: facts.name.clone(),
@@ -147,11 +142,7 @@ fn live(key: &str, summary: &RunSummary) -> Run {
             word: word.to_owned(),
             text: facts.exit_reason.clone(),
         },
-        network_verdict: Verdict {
-            tone: network_tone.word(),
-            word: terminal::network_word(&assessment.network).to_owned(),
-            text: network_text,
-        },
+        answer: Some(answer_view(summary, &assessment)),
         warnings: assessment.warnings,
         facts: live_facts(summary),
         score: score(&summary.score),
@@ -182,6 +173,31 @@ fn live(key: &str, summary: &RunSummary) -> Run {
     }
     run.drawings.extend(waterfall);
     run
+}
+
+fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
+    let answer = Answer::of(summary, assessment);
+    let plain = |text: String| text.replace(terminal::JOINT, " ");
+    let (tone, words) = answer.measurement_words(&assessment.network);
+    AnswerView {
+        question: answer.question(),
+        answer: Verdict {
+            tone: answer.tone().word(),
+            word: plain(answer.words()),
+            text: plain(answer.sentence()),
+        },
+        measurement: Verdict {
+            tone: tone.word(),
+            word: "measurement".to_owned(),
+            text: plain(words),
+        },
+        sample: plain(answer.sample_words()),
+        harms: summary
+            .harms
+            .iter()
+            .map(|harm| Fact::new(&harm.what, plain(harm.words())))
+            .collect(),
+    }
 }
 
 fn links(summary: &RunSummary) -> String {

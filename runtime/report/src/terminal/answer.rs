@@ -13,7 +13,7 @@ const LABEL_WIDTH: usize = 34;
 pub(super) fn answer(canvas: &mut Canvas, summary: &RunSummary, assessment: &Assessment) {
     let answer = Answer::of(summary, assessment);
     canvas.rule(Tone::Faint);
-    let question = format!("Did {} hurt the robot?", answer.subject);
+    let question = answer.question();
     let words = answer.words();
     if columns(&question) + 2 + columns(&words) <= canvas.width() {
         let line = format!(

@@ -152,24 +152,6 @@ fn no_result(why: &str) -> (Tone, String) {
     (Tone::Bad, format!("NOT a network result{why}; {cure}"))
 }
 
-/// What a run says about a network, in a few words.
-pub(crate) const fn network_word(verdict: &NetworkVerdict) -> &'static str {
-    match verdict {
-        NetworkVerdict::RunFailed
-        | NetworkVerdict::TicksUnknown
-        | NetworkVerdict::RecordsMissing { .. } => "no verdict",
-        NetworkVerdict::VirtualTime => "virtual time",
-        NetworkVerdict::EmulatedLink => "an emulated link",
-        NetworkVerdict::NoNetwork => "no channel went over a network",
-        NetworkVerdict::ForeignProgram => "a foreign program took part over its own protocol",
-        NetworkVerdict::NoForeignProgram => "no foreign program answered",
-        NetworkVerdict::NetworkResult => "a network result",
-        NetworkVerdict::EmulationNotKept { .. }
-        | NetworkVerdict::HostOverran { .. }
-        | NetworkVerdict::ReceiverLate { .. } => "NOT a network result",
-    }
-}
-
 /// What a run says about a network, in words.
 pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
     let limit = percent(SKIPPED_TICK_RATIO_MAX);
