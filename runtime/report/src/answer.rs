@@ -131,6 +131,8 @@ pub enum Unresolved {
     NoNetworkEventBefore,
     /// The robot was hurt, and times of hosts do not compare.
     ClocksDiffer,
+    /// Of a comparison: chance alone makes such a difference.
+    WithinChance,
 }
 
 /// Why a run tests nothing.
@@ -256,14 +258,9 @@ impl Answer {
         format!("Did {} hurt the robot?", self.subject)
     }
 
-    /// The answer to the question whether the network hurt the robot.
+    /// The answer to it.
     pub fn words(&self) -> String {
-        match &self.hurt {
-            Hurt::Yes => "YES".to_owned(),
-            Hurt::No => "NO".to_owned(),
-            Hurt::NotResolvable { because } => format!("NOT RESOLVABLE: {because}"),
-            Hurt::NotTested { because } => format!("NOT TESTED: {because}"),
-        }
+        self.hurt.to_string()
     }
 
     /// The same as a sentence of its own.
@@ -333,6 +330,17 @@ impl Answer {
     }
 }
 
+impl fmt::Display for Hurt {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Yes => formatter.write_str("YES"),
+            Self::No => formatter.write_str("NO"),
+            Self::NotResolvable { because } => write!(formatter, "NOT RESOLVABLE: {because}"),
+            Self::NotTested { because } => write!(formatter, "NOT TESTED: {because}"),
+        }
+    }
+}
+
 impl fmt::Display for Unresolved {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -349,6 +357,7 @@ impl fmt::Display for Unresolved {
             Self::NoNetworkEventBefore => {
                 formatter.write_str("the robot was hurt, but no network event came before it")
             }
+            Self::WithinChance => formatter.write_str("chance alone may make such a difference"),
             Self::ClocksDiffer => formatter.write_str(
                 "the robot was hurt, but unaligned clocks leave open whether the network came first",
             ),

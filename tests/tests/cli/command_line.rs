@@ -277,7 +277,7 @@ fn a_run_in_virtual_time_depends_on_its_seed_alone() {
         finished.assert_success();
         finished.stdout
     };
-    let text = simulate(&[]);
+    let text = simulate(&["--full"]);
     assert!(
         text.contains("egm/right/command") && text.contains("tracking lag"),
         "{text}"
@@ -506,7 +506,11 @@ fn of_what_an_own_program_prints_both_ends_are_kept_and_the_rest_is_told() {
         (log.len() - note.len()) as u64 + left_out_bytes,
         printed_bytes
     );
-    assert!(finished.stdout.contains("printed more than its log keeps"));
+    assert!(
+        files
+            .read("report-full.txt")
+            .contains("printed more than its log keeps")
+    );
 }
 
 #[test]

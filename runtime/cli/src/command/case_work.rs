@@ -17,6 +17,7 @@ use hil_topology::registry::Registry;
 use super::{Refusal, check_traces, code_of, columns, exit, failed, load, loaded, signals, usage};
 
 /// Where a run in virtual time is shown.
+#[derive(Clone, Copy)]
 pub(super) struct SimulatedShown<'a> {
     pub(super) output: Option<&'a Path>,
     pub(super) is_full: bool,

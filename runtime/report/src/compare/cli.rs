@@ -49,6 +49,9 @@ pub struct CompareArgs {
     /// Judge conditions by the figures alone, without their intervals.
     #[arg(long, requires = "fail_if")]
     pub strict: bool,
+    /// Print every figure with its method, not only the answer and what differs.
+    #[arg(long)]
+    pub full: bool,
     /// What to print.
     #[arg(long, value_enum, default_value_t = CompareFormat::Text)]
     pub format: CompareFormat,

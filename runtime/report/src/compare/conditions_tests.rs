@@ -3,6 +3,7 @@
 use hil_stats::comparison::Estimate;
 
 use super::*;
+use crate::answer::Hurt;
 use crate::compare::Verdict;
 
 fn figure(metric: &str, kind: ChartKind, [low, value, high]: [f64; 3]) -> ComparedMetric {
@@ -15,6 +16,7 @@ fn figure(metric: &str, kind: ChartKind, [low, value, high]: [f64; 3]) -> Compar
             ChartKind::Loss | ChartKind::Score => None,
         },
         metric: metric.to_owned(),
+        label: metric.to_owned(),
         kind,
         unit: String::new(),
         base: estimate(1.0),
@@ -34,6 +36,9 @@ fn comparison() -> Comparison {
     let mut maximum = figure("max", ChartKind::Delay, [1.0, 3.0, 4.0]);
     maximum.ratio_interval = None;
     Comparison {
+        harms: Vec::new(),
+        hurt: Hurt::No,
+        headline: Vec::new(),
         base: Vec::new(),
         new: Vec::new(),
         same: Vec::new(),

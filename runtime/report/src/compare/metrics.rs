@@ -239,6 +239,7 @@ fn figure(
         channel: None,
         part: None,
         metric: metric.to_owned(),
+        label: metric.to_owned(),
         kind,
         unit: "1".to_owned(),
         base,
@@ -440,6 +441,7 @@ fn score_figure(metric: &ScoreMetric, base: &[ComparedRun], new: &[ComparedRun])
         (_, None, None) => (None, NO_OWN),
     };
     ComparedMetric {
+        label: metric.label.clone(),
         unit: metric.unit.clone(),
         ratio_interval: both
             .filter(|_| repeated.is_none())

@@ -2,8 +2,10 @@
 //! difference of the two and its interval, and whether the runs may be compared at all. It reads
 //! `summary.json` only.
 
+mod brief;
 pub mod cli;
 mod conditions;
+mod harms;
 mod metrics;
 mod origin;
 mod render;
@@ -17,7 +19,9 @@ use hil_stats::comparison::Estimate;
 use hil_stats::statistics::Interval;
 use serde::Serialize;
 
+use crate::answer::Hurt;
 use crate::summary::{RunSummary, SummaryError};
+use harms::ComparedHarm;
 use hil_rundir::run_folder::RunFolder;
 
 /// Why runs cannot be compared.
@@ -144,6 +148,8 @@ pub(crate) struct ComparedMetric {
     pub(crate) part: Option<Part>,
     /// `p50`, `p99`, `p99.9`, `max`, `loss`, or the score's name.
     pub(crate) metric: String,
+    /// The same for a reader.
+    pub(crate) label: String,
     pub(crate) kind: ChartKind,
     /// The unit of both: `ns`, `1`, or the score's.
     pub(crate) unit: String,
@@ -182,6 +188,12 @@ pub(crate) struct Comparison {
     pub(crate) differences: Vec<String>,
     /// Why figures must be read with care.
     pub(crate) cautions: Vec<String>,
+    /// What hurt the robots.
+    pub(crate) harms: Vec<ComparedHarm>,
+    /// Was the robot hurt more in the new runs?
+    pub(crate) hurt: Hurt,
+    /// Names of the scores to see first.
+    pub(crate) headline: Vec<String>,
     pub(crate) figures: Vec<ComparedMetric>,
 }
 
@@ -193,12 +205,18 @@ impl Comparison {
         let figures = metrics::of(base, new);
         let mut cautions = origin::cautions(base, new);
         cautions.extend(metrics::cautions(&figures, [base.len(), new.len()]));
+        let harms = harms::of(base, new);
+        let hurt = harms::hurt(&harms, base, new);
+        let headline = new.first().map(|run| run.summary.headline.clone());
         Self {
             base: folders(base),
             new: folders(new),
             same,
             differences,
             cautions,
+            harms,
+            hurt,
+            headline: headline.unwrap_or_default(),
             figures,
         }
     }

@@ -4,6 +4,7 @@ use hil_stats::comparison::Estimate;
 use hil_stats::statistics::Interval;
 
 use super::conditions::Verdicts;
+use super::harms::{ComparedHarm, QUESTION};
 use super::{ChartKind, ComparedMetric, Comparison, Part};
 use crate::terminal::{duration, figure, percent};
 
@@ -75,7 +76,7 @@ fn signed(value: f64) -> String {
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "nanoseconds of a delay")]
-fn value(one: &ComparedMetric, estimate: Option<Estimate>) -> String {
+pub(super) fn value(one: &ComparedMetric, estimate: Option<Estimate>) -> String {
     let Some(Estimate { value, .. }) = estimate else {
         return UNAVAILABLE.to_owned();
     };
@@ -128,7 +129,7 @@ pub(super) fn text(comparison: &Comparison, verdicts: &Verdicts) -> String {
     lines.join("\n")
 }
 
-fn head(comparison: &Comparison, margin: &str) -> Vec<String> {
+pub(super) fn head(comparison: &Comparison, margin: &str) -> Vec<String> {
     let folders = |runs: &[std::path::PathBuf]| {
         let names = runs.iter().map(|run| run.display().to_string());
         names.collect::<Vec<_>>().join(", ")
@@ -179,6 +180,18 @@ fn methods(comparison: &Comparison) -> Vec<String> {
 pub(super) fn markdown(comparison: &Comparison, verdicts: &Verdicts) -> String {
     let cell = |text: &str| text.replace('|', "\\|");
     let mut lines = vec!["# Comparison of runs".to_owned(), String::new()];
+    lines.push(format!(
+        "**{QUESTION} {}**",
+        cell(&comparison.hurt.to_string())
+    ));
+    lines.push(String::new());
+    for ComparedHarm { base, new, .. } in &comparison.harms {
+        let (what, base, new) = (&base.what, base.words(), new.words());
+        lines.push(format!("- {what}: base {base}; new {new}"));
+    }
+    if !comparison.harms.is_empty() {
+        lines.push(String::new());
+    }
     // A blank line around everything but between the items of a list.
     let mut was_item = false;
     for line in head(comparison, "- ") {

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::cli::{CompareArgs, CompareFormat};
 use super::conditions::{Condition, Judged, Unjudged, Verdicts};
-use super::{ComparedRun, Comparison, render};
+use super::{ComparedRun, Comparison, brief, render};
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::{Progress, Stage};
 
@@ -58,7 +58,8 @@ fn compared(args: &CompareArgs, stage: &Stage) -> Result<(String, bool), String>
     }
     let has_failed = verdicts.judged.iter().any(|one| one.holds);
     let text = match args.format {
-        CompareFormat::Text => render::text(&comparison, &verdicts),
+        CompareFormat::Text if args.full => render::text(&comparison, &verdicts),
+        CompareFormat::Text => brief::text(&comparison, &verdicts),
         CompareFormat::Md => render::markdown(&comparison, &verdicts),
         CompareFormat::Json => json(&comparison, &verdicts)?,
     };

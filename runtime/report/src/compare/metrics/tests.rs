@@ -1,6 +1,7 @@
 //! What repetitions say together, and what they do not when some of them lack a figure.
 
 use super::*;
+use crate::answer::Hurt;
 use crate::compare::Comparison;
 use crate::compare::conditions::{Condition, Verdicts};
 
@@ -41,6 +42,9 @@ fn loss(base: &[u64], new: &[u64], of: Counts) -> ComparedMetric {
 /// Whether a condition holds, or why it cannot be judged.
 fn judged(condition: &str, figure: &ComparedMetric) -> Result<bool, String> {
     let comparison = Comparison {
+        harms: Vec::new(),
+        hurt: Hurt::No,
+        headline: Vec::new(),
         base: Vec::new(),
         new: Vec::new(),
         same: Vec::new(),

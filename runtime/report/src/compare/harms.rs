@@ -1,0 +1,194 @@
+//! Was the robot hurt more in the new runs than in the base? What hurt it on both sides, pooled over the runs of each,
+//! and the answer that follows. Figures of the network are elsewhere.
+
+use hil_stats::comparison::{Share, difference};
+use hil_stats::statistics::{CONFIDENCE, Interval};
+use serde::Serialize;
+
+use super::ComparedRun;
+use crate::answer::{Answer, HarmCount, Hurt, OCCASIONS_MIN, OccasionCount, Unresolved, Untested};
+use crate::assessment::Assessment;
+
+/// What a comparison asks.
+pub(super) const QUESTION: &str = "Was the robot hurt more in the new runs?";
+
+/// A harm on both sides.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct ComparedHarm {
+    /// Of all runs of the base; its `what` is that of both.
+    pub(crate) base: HarmCount,
+    /// Of all new runs.
+    pub(crate) new: HarmCount,
+    /// Interval of the difference of the shares, new less base (Newcombe's); `None` without occasions.
+    pub(crate) difference: Option<Interval>,
+}
+
+/// What hurt the robots of both sides, in the order of the case.
+pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedHarm> {
+    let mut whats: Vec<&str> = Vec::new();
+    for harm in base.iter().chain(new).flat_map(|run| &run.summary.harms) {
+        if !whats.contains(&harm.what.as_str()) {
+            whats.push(&harm.what);
+        }
+    }
+    let compared = whats.into_iter().map(|what| {
+        let [base, new] = [base, new].map(|runs| pooled(what, runs));
+        let difference = share(&base).zip(share(&new)).and_then(|(base, new)| {
+            difference(base.estimate(CONFIDENCE)?, new.estimate(CONFIDENCE)?)
+        });
+        ComparedHarm {
+            base,
+            new,
+            difference,
+        }
+    });
+    compared.collect()
+}
+
+/// The sum over the runs; unavailable where one of them has no count.
+fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
+    let mut sum = HarmCount {
+        what: what.to_owned(),
+        count: Some(0),
+        own_count: 0,
+        occasions: None,
+    };
+    for run in runs {
+        let Some(harm) = run.summary.harms.iter().find(|one| one.what == what) else {
+            sum.count = None;
+            continue;
+        };
+        sum.count = sum.count.zip(harm.count).map(|(one, other)| one + other);
+        sum.own_count += harm.own_count;
+        if let Some(OccasionCount { what, count }) = &harm.occasions {
+            let known = sum.occasions.get_or_insert_with(|| OccasionCount {
+                what: what.clone(),
+                count: 0,
+            });
+            known.count += count;
+        }
+    }
+    sum
+}
+
+fn share(harm: &HarmCount) -> Option<Share> {
+    let of = harm.occasions.as_ref().map(|one| one.count)?;
+    Some(Share {
+        count: harm.count?.min(of),
+        of,
+    })
+}
+
+/// Whether the robot was hurt more in the new runs.
+pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[ComparedRun]) -> Hurt {
+    let not_resolvable = |because| Hurt::NotResolvable { because };
+    let mut answers = base.iter().chain(new).map(|run| {
+        let assessment = Assessment::of(&run.summary);
+        Answer::of(&run.summary, &assessment)
+    });
+    if answers.any(|one| one.measurement.is_valid == Some(false)) {
+        return not_resolvable(Unresolved::InvalidMeasurement);
+    }
+    let Some(first) = harms.first() else {
+        let because = Untested::NoScore;
+        return Hurt::NotTested { because };
+    };
+    if first.base.count.is_none() || first.new.count.is_none() {
+        return not_resolvable(Unresolved::NotCounted);
+    }
+    let differences = harms.iter().filter_map(|one| one.difference);
+    if differences.clone().any(|one| one.low > 0.0) {
+        return Hurt::Yes;
+    }
+    let is_unhurt = harms.iter().all(|one| one.new.count == Some(0));
+    let is_less = differences.clone().any(|one| one.high < 0.0);
+    match &first.new.occasions {
+        Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
+            not_resolvable(Unresolved::SampleTooSmall {
+                what: what.clone(),
+                count: *count,
+                needed: OCCASIONS_MIN,
+            })
+        }
+        _ if is_unhurt || is_less => Hurt::No,
+        _ => not_resolvable(Unresolved::WithinChance),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::tests::sample::full;
+
+    fn run(count: Option<u64>, sent_count: u64) -> ComparedRun {
+        let mut summary = full();
+        summary.processes[0].skipped_tick_count = Some(0);
+        summary.harms = vec![HarmCount {
+            what: "motion loops lost".to_owned(),
+            count,
+            own_count: 0,
+            occasions: Some(OccasionCount {
+                what: "motion loops sent".to_owned(),
+                count: sent_count,
+            }),
+        }];
+        ComparedRun {
+            folder: PathBuf::from("run"),
+            summary,
+        }
+    }
+
+    fn compared(base: &[ComparedRun], new: &[ComparedRun]) -> Hurt {
+        hurt(&of(base, new), base, new)
+    }
+
+    #[test]
+    fn more_harm_than_chance_makes_is_a_yes() {
+        let clean = [run(Some(0), 60)];
+        assert_eq!(compared(&clean, &[run(Some(9), 60)]), Hurt::Yes);
+        assert_eq!(compared(&clean, &[run(Some(0), 60)]), Hurt::No);
+        let worse = [run(Some(20), 60)];
+        assert_eq!(compared(&worse, &[run(Some(3), 60)]), Hurt::No, "less");
+        let because = Unresolved::WithinChance;
+        let chance = compared(&clean, &[run(Some(1), 60)]);
+        assert_eq!(chance, Hurt::NotResolvable { because });
+        // Repetitions are pooled.
+        let repeated: Vec<_> = (0..8).map(|_| run(Some(1), 60)).collect();
+        let clean: Vec<_> = (0..8).map(|_| run(Some(0), 60)).collect();
+        assert_eq!(compared(&clean, &repeated), Hurt::Yes);
+        assert_eq!(
+            of(&clean, &repeated)[0].new.words().split(':').next(),
+            Some("8 of 480 motion loops sent")
+        );
+    }
+
+    #[test]
+    fn what_is_not_known_is_no_answer() {
+        let clean = [run(Some(0), 60)];
+        let because = Unresolved::NotCounted;
+        let uncounted = compared(&clean, &[run(None, 60)]);
+        assert_eq!(uncounted, Hurt::NotResolvable { because });
+        let Hurt::NotResolvable {
+            because: Unresolved::SampleTooSmall { count: 4, .. },
+        } = compared(&clean, &[run(Some(0), 4)])
+        else {
+            panic!("four loops show no absence of harm");
+        };
+        let mut overrun = run(Some(9), 60);
+        overrun.summary.processes[1].skipped_tick_count = Some(500);
+        let because = Unresolved::InvalidMeasurement;
+        assert_eq!(
+            compared(&clean, &[overrun]),
+            Hurt::NotResolvable { because }
+        );
+        let mut unscored = run(None, 60);
+        unscored.summary.harms.clear();
+        let because = Untested::NoScore;
+        assert_eq!(
+            compared(&[unscored.clone()], &[unscored]),
+            Hurt::NotTested { because }
+        );
+    }
+}
