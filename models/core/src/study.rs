@@ -96,6 +96,8 @@ pub struct StudyReport {
     pub tables: Vec<Table>,
     /// What the figures were held against.
     pub criteria: Vec<Criterion>,
+    /// What follows from all of it, in a few lines, last on a page.
+    pub summary: Vec<String>,
 }
 
 impl StudyReport {

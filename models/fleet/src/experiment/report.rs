@@ -11,6 +11,8 @@ use crate::experiment::study::{FleetStudy, worlds_text};
 use crate::scenario::Scenario;
 use hil_core::study::{Cell, Column, Criterion, StudyReport, Table};
 use hil_link::impaired::DelayLaw;
+use hil_stats::comparison::{Share, difference};
+use hil_stats::statistics::{CONFIDENCE, Interval};
 
 /// The cells of a study with what came of them, as far as they were run.
 #[derive(Debug)]
@@ -70,6 +72,7 @@ pub(crate) fn report(study: &FleetStudy, results: &Results<'_>) -> StudyReport {
         notes: notes(study),
         tables,
         criteria: criteria(study, results),
+        summary: summary(study, results),
     }
 }
 
@@ -101,7 +104,7 @@ const fn column(name: &'static str, label: &'static str) -> Column {
     Column { name, label }
 }
 
-const PUBLISHED_COLUMNS: [Column; 13] = [
+const PUBLISHED_COLUMNS: [Column; 14] = [
     column("method", "Method"),
     column("loss_ratio", "PLR"),
     column("delay_ms", "Delay ms"),
@@ -114,6 +117,7 @@ const PUBLISHED_COLUMNS: [Column; 13] = [
     column("published_collisions", "Coll."),
     column("published_per_1000", "P x 1000"),
     column("published_per_1000", "95 %"),
+    column("against_paper", "Against paper"),
     column("verdict", "Accepted if"),
 ];
 
@@ -187,6 +191,8 @@ fn published_row(
         Cell::number(Some(1e3 * collisions as f64 / sections as f64), 2),
         per_1000(collision_interval(collisions, sections)),
     ]);
+    let against = ours.and_then(|(_, tally)| AgainstPaper::of(published, tally));
+    row.push(against.map_or(Cell::Absent, |one| Cell::text(one.words())));
     row.push(ours.map_or(Cell::Absent, |(cell, tally)| judged(cell, tally)));
     row
 }
@@ -202,9 +208,100 @@ fn variant_row(cell: &Experiment, tally: Option<&FleetTally>) -> Vec<Cell> {
         Cell::Count(1),
     ];
     row.extend(metrics(tally));
-    row.extend([Cell::Absent, Cell::Absent, Cell::Absent, Cell::Absent]);
+    row.extend([const { Cell::Absent }; 5]);
     row.push(judged(cell, tally));
     row
+}
+
+/// How our probability of a row stands to the paper's.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum AgainstPaper {
+    /// No difference at 5 %, in a sample of half the paper's or more.
+    Agrees,
+    /// The interval of their difference (Newcombe's) does not hold zero.
+    Differs,
+    /// No difference at 5 %, in a smaller sample.
+    Inconclusive,
+    /// The paper's row is of a real network, ours of the model of another one.
+    NotComparable,
+}
+
+impl AgainstPaper {
+    const ALL: [Self; 4] = [
+        Self::Agrees,
+        Self::Differs,
+        Self::Inconclusive,
+        Self::NotComparable,
+    ];
+
+    /// `None` while the row was not run.
+    fn of(published: &PublishedRow, tally: Option<&FleetTally>) -> Option<Self> {
+        let tally = tally?;
+        if matches!(published.condition, Condition::HardwareInTheLoop(_)) {
+            return Some(Self::NotComparable);
+        }
+        let share = |count: u64, of: u64| {
+            let count = count.min(of);
+            Share { count, of }.estimate(CONFIDENCE)
+        };
+        let paper = share(published.collisions, published.sections)?;
+        let count = tally.section_count();
+        let ours = share(tally.referee.section_collisions_count, count)?;
+        let Interval { low, high } = difference(paper, ours)?;
+        Some(if low > 0.0 || high < 0.0 {
+            Self::Differs
+        } else if 2 * count >= published.sections {
+            Self::Agrees
+        } else {
+            Self::Inconclusive
+        })
+    }
+
+    const fn words(self) -> &'static str {
+        match self {
+            Self::Agrees => "agrees",
+            Self::Differs => "differs",
+            Self::Inconclusive => "inconclusive",
+            Self::NotComparable => "not comparable",
+        }
+    }
+}
+
+/// How many rows agree with the paper, which differ, and what would decide the others.
+fn summary(study: &FleetStudy, results: &Results<'_>) -> Vec<String> {
+    let compared: Vec<(String, AgainstPaper, u64)> = results
+        .all()
+        .filter_map(|(cell, tally)| {
+            let Place::Published { row, .. } = &cell.place else {
+                return None;
+            };
+            Some((cell.name(), AgainstPaper::of(row, tally)?, row.sections))
+        })
+        .collect();
+    if compared.is_empty() {
+        return Vec::new();
+    }
+    let of = |wanted: AgainstPaper| compared.iter().filter(move |one| one.1 == wanted);
+    let counts = AgainstPaper::ALL.map(|one| format!("{} {}", one.words(), of(one).count()));
+    let mut lines = vec![format!(
+        "Against the paper, of {} rows: {}.",
+        compared.len(),
+        counts.join(", ")
+    )];
+    let differing: Vec<&str> = of(AgainstPaper::Differs)
+        .map(|one| one.0.as_str())
+        .collect();
+    if !differing.is_empty() {
+        lines.push(format!("These differ: {}.", differing.join("; ")));
+    }
+    let needed = of(AgainstPaper::Inconclusive).map(|one| one.2.div_ceil(2));
+    if let Some(sections) = needed.max() {
+        lines.push(format!(
+            "The inconclusive ones have {} critical sections each; --sections {sections} decides them.",
+            study.parameters().sections
+        ));
+    }
+    lines
 }
 
 /// Sections, collisions, probability and its interval.

@@ -327,6 +327,7 @@ impl Study for Calibration {
             ),
             notes: self.notes(),
             tables: vec![self.table(outcomes)],
+            summary: Vec::new(),
             criteria: vec![Criterion {
                 text: "at least one point of the curve exists".to_owned(),
                 is_met: outcomes.iter().all(Option::is_some).then_some(found > 0),

@@ -23,6 +23,7 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
         title: "Case study 2: motion loss rate (MLR) by condition, in virtual time".to_owned(),
         notes: notes(study),
         tables: vec![rates(rows), counts(rows), setups(rows)],
+        summary: Vec::new(),
         criteria: rows
             .iter()
             .flat_map(|row| criteria(row, study.is_fitted))

@@ -28,6 +28,9 @@ pub(super) fn text(report: &StudyReport, cost: &Cost) -> String {
     }
     page.push('\n');
     push(&mut page, format_args!("{}", cost_text(cost)));
+    for line in &report.summary {
+        push(&mut page, format_args!("{line}"));
+    }
     page
 }
 
