@@ -17,6 +17,8 @@ use super::terminal::{Tone, duration_s, percent};
 
 /// A rate of fewer occasions is not told, and no harm in fewer is no answer.
 pub const OCCASIONS_MIN: u64 = 10;
+/// A network event within seconds before explains nothing where more moments than this share have one.
+const CHANCE_MAX: f64 = 0.5;
 /// Channels, processes or hosts that are named where many have the same fault.
 const NAMED_COUNT: usize = 3;
 /// Confidence of intervals.
@@ -355,7 +357,7 @@ impl fmt::Display for Unresolved {
             ),
             Self::NotCounted => formatter.write_str("what hurts the robot could not be counted"),
             Self::NoNetworkEventBefore => {
-                formatter.write_str("the robot was hurt, but no network event came before it")
+                formatter.write_str("the robot was hurt, but no network event that explains it came before")
             }
             Self::WithinChance => formatter.write_str("chance alone may make such a difference"),
             Self::ClocksDiffer => formatter.write_str(
@@ -406,7 +408,9 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
             .events
             .iter()
             .filter(|one| one.severity > Severity::Notice);
-        if grave.any(follows_the_network) {
+        let chance = summary.network.as_ref();
+        let chance = chance.map_or(0.0, |report| report.foregoing_chance_ratio);
+        if grave.any(|event| follows_the_network(event, chance)) {
             return Hurt::Yes;
         }
         return not_resolvable(Unresolved::NoNetworkEventBefore);
@@ -426,15 +430,17 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
     }
 }
 
-/// Whether an outage, another network event or the loss of a message it names came before it.
-fn follows_the_network(event: &ExplainedEvent) -> bool {
+/// Whether an outage or a loss of the channels and messages it names came before it, or another network event
+/// that is not before most moments of the run anyway: of `chance` of them.
+fn follows_the_network(event: &ExplainedEvent, chance: f64) -> bool {
     let lost = event.messages.iter().filter_map(|one| one.fate);
+    let has_event = event
+        .network
+        .as_ref()
+        .is_some_and(|one| !one.events.is_empty());
     !event.outages.is_empty()
-        || event
-            .network
-            .as_ref()
-            .is_some_and(|one| !one.events.is_empty())
         || lost.into_iter().any(hil_account::MessageFate::is_loss)
+        || (has_event && chance <= CHANCE_MAX)
 }
 
 fn subject(summary: &RunSummary, network: &NetworkVerdict) -> Subject {

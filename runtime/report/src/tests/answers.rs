@@ -52,6 +52,17 @@ fn a_hurt_robot_is_put_down_to_a_network_that_misbehaved_before() {
     }
     let because = Unresolved::NoNetworkEventBefore;
     assert_eq!(answer(&alone).hurt, Hurt::NotResolvable { because });
+    // A network event came before, as before most moments of the run.
+    let mut noisy = summary.clone();
+    for event in &mut noisy.score_events.events {
+        event.outages.clear();
+        event.messages.clear();
+    }
+    noisy.network.as_mut().unwrap().foregoing_chance_ratio = 0.1;
+    assert_eq!(answer(&noisy).hurt, Hurt::Yes);
+    noisy.network.as_mut().unwrap().foregoing_chance_ratio = 0.9;
+    let because = Unresolved::NoNetworkEventBefore;
+    assert_eq!(answer(&noisy).hurt, Hurt::NotResolvable { because });
     // Only what the robot coped with.
     let mut coped = summary.clone();
     for event in &mut coped.score_events.events {
