@@ -35,8 +35,7 @@ pub struct Harm {
     pub what: &'static str,
     /// How often; `None` when the run did not allow to count it.
     pub count: Option<u64>,
-    /// Of these, those that would have happened over a perfect channel too: the robot or its controller
-    /// caused them.
+    /// Of these, those that limits of the robot itself made, such as the reach of an arm.
     pub own_count: u64,
     /// How often it could have happened; `None` where that cannot be counted.
     pub occasions: Option<Occasions>,

@@ -292,7 +292,7 @@ fn lease_ended(truth: &Truth, orders: &Orders) -> ScoreEvent {
         truth.caused_by_sequence,
         truth.mission_id
     );
-    orders.named(notice(truth, what), unheard)
+    orders.named(event(Severity::Hazard, truth, what), unheard)
 }
 
 /// An incident with, for each of the two robots, what led to the authority it last took and what

@@ -48,12 +48,16 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
 /// What an authority that comes late or not at all leads to.
 fn harms(tally: Option<&Tally>) -> Vec<Harm> {
     let count = |of: fn(&Tally) -> u64| tally.map(of);
-    let collisions = Harm::new("collisions", count(|tally| tally.overlaps_count));
+    let collisions = Harm::new(
+        "collisions, section checker",
+        count(|tally| tally.section_collisions_count),
+    );
     vec![
         match tally {
             Some(tally) => collisions.of(tally.sections_passed_count, "critical sections passed"),
             None => collisions,
         },
+        Harm::new("collisions, exact", count(|tally| tally.overlaps_count)),
         Harm::new(
             "times past a late authority",
             count(|tally| tally.authorities_late_count),

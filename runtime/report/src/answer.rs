@@ -3,22 +3,26 @@
 
 use core::fmt;
 
+use hil_account::network::NetworkEventKind;
+use hil_account::{MessageFate, Standing};
 use hil_core::case_study::{Occasions, Severity};
 use hil_platform::text::grouped;
 use hil_platform::words::{counted, named};
 use hil_stats::statistics::{Interval, clopper_pearson};
 use serde::{Deserialize, Serialize};
 
-use super::assessment::{Assessment, NetworkVerdict};
+use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
 use super::clock_summary::ClockSection;
 use super::score_event::ExplainedEvent;
-use super::summary::{LinkKind, RunSummary};
-use super::terminal::{Tone, duration_s, percent};
+use super::summary::{LinkKind, RunSummary, ScoreMetric};
+use super::terminal::{Tone, duration_s, figure, percent};
 
 /// A rate of fewer occasions is not told, and no harm in fewer is no answer.
 pub const OCCASIONS_MIN: u64 = 10;
 /// A network event within seconds before explains nothing where more moments than this share have one.
 const CHANCE_MAX: f64 = 0.5;
+/// Messages lost in a row that make an outage; fewer are single losses, which a lossy link always has.
+const OUTAGE_LOST_MIN: u64 = 3;
 /// Channels, processes or hosts that are named where many have the same fault.
 const NAMED_COUNT: usize = 3;
 /// Confidence of intervals.
@@ -31,7 +35,7 @@ pub struct HarmCount {
     pub what: String,
     /// How often; `None` when the run did not allow to count it.
     pub count: Option<u64>,
-    /// Of these, those that a perfect channel would not have prevented.
+    /// Of these, those that limits of the robot itself made.
     pub own_count: u64,
     /// What could have hurt it.
     pub occasions: Option<OccasionCount>,
@@ -61,7 +65,7 @@ impl From<&hil_core::case_study::Harm> for HarmCount {
 }
 
 impl HarmCount {
-    /// Those that a perfect channel would have prevented.
+    /// Those that the robot's own limits did not make.
     fn beyond_own_count(&self) -> u64 {
         self.count.unwrap_or(0).saturating_sub(self.own_count)
     }
@@ -86,7 +90,7 @@ impl HarmCount {
         }
         if self.own_count > 0 {
             let own = grouped(self.own_count);
-            text = format!("{text}; over a perfect channel {own} too");
+            text = format!("{text}; {own} by limits of the robot");
         }
         text
     }
@@ -129,6 +133,8 @@ pub enum Unresolved {
     },
     /// What could have hurt the robot was not counted.
     NotCounted,
+    /// Records of what the robot did are missing.
+    ScoreIncomplete,
     /// The robot was hurt, and no event of the network preceded it.
     NoNetworkEventBefore,
     /// The robot was hurt, and times of hosts do not compare.
@@ -262,7 +268,12 @@ impl Answer {
 
     /// The answer to it.
     pub fn words(&self) -> String {
-        self.hurt.to_string()
+        match (&self.hurt, &self.sample.occasions) {
+            (Hurt::No, Some(OccasionCount { what, count })) => {
+                format!("{} in {} {what}", self.hurt, grouped(*count))
+            }
+            _ => self.hurt.to_string(),
+        }
     }
 
     /// The same as a sentence of its own.
@@ -321,7 +332,7 @@ impl Answer {
         } = &self.sample;
         let messages = counted(*message_count, "message");
         let channels = counted(*channel_count, "channel");
-        let text = format!("{length_s:.1} s, {messages} on {channels}");
+        let text = format!("{length_s:.1} s, {messages} published on {channels}");
         match occasions {
             Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
                 format!("{text}, {count} {what}: too small for a rate, which takes {OCCASIONS_MIN}")
@@ -355,6 +366,9 @@ impl fmt::Display for Unresolved {
                 formatter,
                 "no harm was seen, but the sample is too small: {count} {what}, {needed} needed"
             ),
+            Self::ScoreIncomplete => {
+                formatter.write_str("records of what the robot did are missing")
+            }
             Self::NotCounted => formatter.write_str("what hurts the robot could not be counted"),
             Self::NoNetworkEventBefore => {
                 formatter.write_str("the robot was hurt, but no network event that explains it came before")
@@ -373,7 +387,7 @@ impl fmt::Display for Untested {
             Self::RunFailed => "the run failed",
             Self::NoNetwork => "no channel went over a network",
             Self::NoForeignProgram => "no foreign program answered",
-            Self::NoScore => "the case counts nothing that hurts the robot",
+            Self::NoScore => "no score counts what hurts this robot",
         })
     }
 }
@@ -398,24 +412,26 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
     if is_valid(network) == Some(false) {
         return not_resolvable(Unresolved::InvalidMeasurement);
     }
+    if is_score_incomplete(summary) {
+        return not_resolvable(Unresolved::ScoreIncomplete);
+    }
     let harms = summary.harms.iter();
     if harms.map(HarmCount::beyond_own_count).sum::<u64>() > 0 {
         let all = &summary.score_events;
         if all.clocks_differ {
             return not_resolvable(Unresolved::ClocksDiffer);
         }
+        let evidence = Evidence::of(summary);
         let mut grave = all
             .events
             .iter()
             .filter(|one| one.severity > Severity::Notice);
-        let chance = summary.network.as_ref();
-        let chance = chance.map_or(0.0, |report| report.foregoing_chance_ratio);
-        if grave.any(|event| follows_the_network(event, chance)) {
+        if grave.any(|event| evidence.explains(event)) {
             return Hurt::Yes;
         }
         return not_resolvable(Unresolved::NoNetworkEventBefore);
     }
-    if first.count.is_none() {
+    if summary.harms.iter().any(|one| one.count.is_none()) {
         return not_resolvable(Unresolved::NotCounted);
     }
     match &first.occasions {
@@ -430,17 +446,110 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
     }
 }
 
-/// Whether an outage or a loss of the channels and messages it names came before it, or another network event
-/// that is not before most moments of the run anyway: of `chance` of them.
-fn follows_the_network(event: &ExplainedEvent, chance: f64) -> bool {
-    let lost = event.messages.iter().filter_map(|one| one.fate);
-    let has_event = event
-        .network
-        .as_ref()
-        .is_some_and(|one| !one.events.is_empty());
-    !event.outages.is_empty()
-        || lost.into_iter().any(hil_account::MessageFate::is_loss)
-        || (has_event && chance <= CHANCE_MAX)
+/// What counts as a network's doing before an event of the robot.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Evidence {
+    /// Share of all moments of the run that have a network event in the seconds before them.
+    chance: f64,
+    clocks_differ: bool,
+}
+
+impl Evidence {
+    /// Of a run.
+    pub(crate) fn of(summary: &RunSummary) -> Self {
+        let network = summary.network.as_ref();
+        Self {
+            chance: network.map_or(0.0, |report| report.foregoing_chance_ratio),
+            clocks_differ: summary.score_events.clocks_differ,
+        }
+    }
+
+    /// Whether the network lost a message that the event names, or an outage of the channels concerned was under
+    /// way or just over, or another network event came before that does not come before most moments anyway.
+    /// What a process or a clock of ours did is no network's doing.
+    pub(crate) fn explains(self, event: &ExplainedEvent) -> bool {
+        if self.clocks_differ {
+            return false;
+        }
+        let mut messages = event.messages.iter();
+        let is_lost = messages.any(|one| {
+            matches!(
+                one.fate,
+                Some(MessageFate::LostOnWire | MessageFate::Incomplete)
+            )
+        });
+        let has_outage = event.outages.iter().any(|outage| {
+            let is_before = matches!(outage.standing, Standing::UnderWay | Standing::OverFor(_));
+            is_before && outage.lost_count >= OUTAGE_LOST_MIN
+        });
+        let network = event.network.iter().flat_map(|network| &network.events);
+        let is_network = |kind: &NetworkEventKind| {
+            !matches!(
+                kind,
+                NetworkEventKind::ProcessDown { .. } | NetworkEventKind::ClockStep { .. }
+            )
+        };
+        let mut network = network.filter(|one| is_network(&one.event.kind));
+        is_lost || has_outage || (self.chance <= CHANCE_MAX && network.next().is_some())
+    }
+}
+
+/// Records of what the robot did are missing, so that what is not in them may have happened.
+fn is_score_incomplete(summary: &RunSummary) -> bool {
+    summary.channels.iter().any(|channel| {
+        let recorded = channel.link == LinkKind::RecordOnly;
+        recorded
+            && channel.recorded.is_none_or(|found| {
+                let all = found.message_count + found.missing_count;
+                found.missing_count as f64 > SKIPPED_TICK_RATIO_MAX * all as f64
+            })
+    })
+}
+
+/// The figure in the unit that people think in, with its interval.
+pub(crate) fn metric_words(metric: &ScoreMetric) -> String {
+    let scale = UnitScale::of(&metric.unit);
+    let value = metric
+        .value
+        .map_or_else(|| "unavailable".to_owned(), |value| scale.words(value));
+    let interval = metric.interval.map_or_else(String::new, |(low, high)| {
+        format!(
+            " [{}, {}]",
+            figure(scale.factor * low),
+            figure(scale.factor * high)
+        )
+    });
+    format!("{value}{interval}")
+}
+
+/// From an SI unit to the one that people think in.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct UnitScale<'a> {
+    factor: f64,
+    unit: &'a str,
+}
+
+impl<'a> UnitScale<'a> {
+    /// Of figures in `unit`.
+    pub(crate) fn of(unit: &'a str) -> Self {
+        let (factor, unit) = match unit {
+            "rad" => (180.0 / core::f64::consts::PI, "°"),
+            "m" => (1e3, "mm"),
+            "s" => (1e3, "ms"),
+            "1" => (1.0, ""),
+            unit => (1.0, unit),
+        };
+        Self { factor, unit }
+    }
+
+    /// The value with its unit.
+    pub(crate) fn words(self, value: f64) -> String {
+        let value = figure(self.factor * value);
+        match self.unit {
+            "" => value,
+            unit => format!("{value} {unit}"),
+        }
+    }
 }
 
 fn subject(summary: &RunSummary, network: &NetworkVerdict) -> Subject {
@@ -503,7 +612,7 @@ fn invalid_words(network: &NetworkVerdict) -> Option<String> {
 }
 
 /// `None` where nothing was measured.
-const fn is_valid(network: &NetworkVerdict) -> Option<bool> {
+pub(crate) const fn is_valid(network: &NetworkVerdict) -> Option<bool> {
     match network {
         NetworkVerdict::RunFailed
         | NetworkVerdict::VirtualTime

@@ -387,6 +387,11 @@ impl EgressBridge {
         self.pacing.held_until(now)
     }
 
+    /// Whether a piece waits for an acknowledgement, so that replies are to be looked for soon.
+    pub fn awaits_piece_ack(&self) -> bool {
+        self.long.is_some() && self.pacing.awaits_acknowledgement()
+    }
+
     /// The next piece of the long message under way, whose bytes are `payload`; the same again until
     /// [`EgressBridge::on_long_sent`] or [`EgressBridge::on_long_failed`]. `now` becomes its `handed_ns`.
     ///

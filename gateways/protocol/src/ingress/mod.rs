@@ -50,7 +50,7 @@ const REASSEMBLY_SLOTS: usize = 4;
 /// The same of a channel with long messages.
 const REASSEMBLY_SLOTS_LONG: usize = 2;
 /// How long after its last piece a message is given up: longer than a stall of TCP of two timeouts, or of a radio.
-const REASSEMBLY_TIMEOUT: Duration = Duration::from_secs(1);
+pub(crate) const REASSEMBLY_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Memory that is set aside to put the messages of a channel of `size_bytes` together.
 pub const fn reassembly_bytes(size_bytes: usize) -> usize {

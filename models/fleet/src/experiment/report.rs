@@ -72,7 +72,7 @@ pub(crate) fn report(study: &FleetStudy, results: &Results<'_>) -> StudyReport {
         notes: notes(study),
         tables,
         criteria: criteria(study, results),
-        summary: summary(study, results),
+        summary: summary(results),
     }
 }
 
@@ -268,7 +268,7 @@ impl AgainstPaper {
 }
 
 /// How many rows agree with the paper, which differ, and what would decide the others.
-fn summary(study: &FleetStudy, results: &Results<'_>) -> Vec<String> {
+fn summary(results: &Results<'_>) -> Vec<String> {
     let compared: Vec<(String, AgainstPaper, u64)> = results
         .all()
         .filter_map(|(cell, tally)| {
@@ -284,7 +284,7 @@ fn summary(study: &FleetStudy, results: &Results<'_>) -> Vec<String> {
     let of = |wanted: AgainstPaper| compared.iter().filter(move |one| one.1 == wanted);
     let counts = AgainstPaper::ALL.map(|one| format!("{} {}", one.words(), of(one).count()));
     let mut lines = vec![format!(
-        "Against the paper, of {} rows: {}.",
+        "Against the paper, of {} cells: {}; one in twenty differs by chance.",
         compared.len(),
         counts.join(", ")
     )];
@@ -297,8 +297,8 @@ fn summary(study: &FleetStudy, results: &Results<'_>) -> Vec<String> {
     let needed = of(AgainstPaper::Inconclusive).map(|one| one.2.div_ceil(2));
     if let Some(sections) = needed.max() {
         lines.push(format!(
-            "The inconclusive ones have {} critical sections each; --sections {sections} decides them.",
-            study.parameters().sections
+            "The inconclusive ones have fewer than half of the paper's critical sections; --sections {sections} \
+             is enough."
         ));
     }
     lines

@@ -65,7 +65,7 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
             run.lost_loops(loops.as_ref()),
             run.sessions.ended_by_themselves(&run.record),
         ],
-        headline: &["joint_error_network_rad_rms", "tracking_lag_ms"],
+        headline: &["joint_error_network_rad_rms"],
         ..Score::default()
     };
     lost::add_events(&mut score, &run, loops.as_ref(), log);
@@ -217,12 +217,13 @@ impl Run {
         let Some(loops) = loops else {
             return harm;
         };
-        // Limits of joints and reach act the same over a perfect channel.
         let kinds = self.lost_by_cause(Some(loops));
-        let own = [LossCause::Clipped, LossCause::Throttled, LossCause::Merged];
-        let own_count: u64 = own.map(|cause| kinds[cause.kind()]).iter().sum();
+        // Slow and merged loops may be what an outage left behind; the reach of the arm is not.
+        let clipped = kinds[LossCause::Clipped.kind()];
+        let others = kinds.iter().sum::<u64>() - clipped;
+        let count = harm.count.unwrap_or(0);
         Harm {
-            own_count: own_count.min(harm.count.unwrap_or(0)),
+            own_count: count - count.min(others),
             ..harm.of(loops.sent_count() as u64, "motion loops sent")
         }
     }

@@ -65,7 +65,7 @@ impl Sessions {
     pub(crate) fn ended_by_themselves(&self, record: &Record) -> Harm {
         let is_known = !record.feedback.is_empty();
         Harm::new(
-            "sessions that ended by themselves",
+            "sessions of the right arm lost",
             is_known.then_some(self.trips.len() as u64),
         )
     }

@@ -56,6 +56,8 @@ pub(crate) struct Attention {
 const LOOK_PERIOD_BUSY_NS: i64 = 5_000_000;
 /// A spinning thread looks after its socket this often.
 const LOOK_PERIOD_NS: i64 = 500_000;
+/// And any thread so often while a long message waits for a reply.
+const LOOK_PERIOD_HELD_NS: i64 = 50_000;
 
 impl Egress {
     /// Carries the channels until told to stop, then says goodbye to the peer.
@@ -100,12 +102,16 @@ impl Egress {
         if moved && !self.attention.is_overdue {
             // A producer faster than the socket must not keep replies and orders waiting for ever.
             let now = self.line.newest_handed;
-            self.attention.is_overdue = now.ns_since(self.attention.looked) > LOOK_PERIOD_BUSY_NS;
+            let since_look = now.ns_since(self.attention.looked);
+            self.attention.is_overdue = since_look > self.look_period_ns(LOOK_PERIOD_BUSY_NS);
             return Ok(true);
         }
         let now = MonotonicClock::now();
         let since_look = now.ns_since(self.attention.looked);
-        if self.attention.has_news || self.attention.is_overdue || since_look > LOOK_PERIOD_NS {
+        if self.attention.has_news
+            || self.attention.is_overdue
+            || since_look > self.look_period_ns(LOOK_PERIOD_NS)
+        {
             self.attention.is_overdue = false;
             self.attention.has_news = false;
             self.attention.looked = now;
@@ -126,6 +132,15 @@ impl Egress {
         // for this.
         let was_announced = self.inputs.settle()?;
         Ok(moved || was_announced || self.inputs.is_any_due())
+    }
+
+    /// How often to look after the socket, where `otherwise` holds without a long message that waits for a reply.
+    fn look_period_ns(&self, otherwise: i64) -> i64 {
+        if self.bridge.awaits_piece_ack() {
+            LOOK_PERIOD_HELD_NS
+        } else {
+            otherwise
+        }
     }
 
     /// True while the peer takes messages. On a clock path the run may begin after an exchange
@@ -156,8 +171,6 @@ impl Egress {
             return false;
         };
         let has_moved = long.push(&mut self.bridge, &mut self.line);
-        // What it waits for may be a reply.
-        self.attention.is_overdue |= long.due() > self.line.newest_handed;
         if !self.bridge.has_long() {
             let channel = long.end(&mut self.line);
             let sent_count = self.bridge.channel_counts(channel).sent_count;

@@ -7,12 +7,13 @@ use hil_platform::words::counted;
 use super::conditions::Verdicts;
 use super::harms::QUESTION;
 use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict, render};
+use crate::answer::UnitScale;
 
 /// Channels on the page.
 const CHANNELS_SHOWN: usize = 12;
 /// Columns of a name and of a figure.
 const NAME_WIDTH: usize = 36;
-const FIGURE_WIDTH: usize = 24;
+const FIGURE_WIDTH: usize = 28;
 
 pub(super) fn text(comparison: &Comparison, verdicts: &Verdicts) -> String {
     let mut lines = render::head(comparison, "  ");
@@ -63,12 +64,14 @@ fn robot(lines: &mut Vec<String>, comparison: &Comparison) {
             Verdict::NotTested => String::new(),
             verdict => verdict.words().to_owned(),
         };
-        let [base, new] = [one.base, one.new].map(|side| render::value(one, side));
+        let scale = UnitScale::of(&one.unit);
+        let [base, new] = [one.base, one.new]
+            .map(|side| side.map_or_else(String::new, |side| scale.words(side.value)));
         lines.push(row(&one.label, [&base, &new, &change]));
     }
     if hidden_count > 0 {
-        let text = counted(hidden_count as u64, "further score");
-        lines.push(format!("  {text} without a difference that was shown"));
+        let text = counted(hidden_count as u64, "other score");
+        lines.push(format!("  {text}: no difference shown"));
     }
 }
 
@@ -126,14 +129,17 @@ fn channels(lines: &mut Vec<String>, comparison: &Comparison) {
 fn with_verdict(text: String, verdict: Verdict) -> String {
     match verdict {
         Verdict::NotTested | Verdict::NoDifferenceShown => text,
-        Verdict::LosesLess => format!("{text} less"),
-        Verdict::LosesMore => format!("{text} more"),
-        verdict => format!("{text} {}", verdict.words()),
+        verdict => format!("{text}, {}", verdict.words()),
     }
 }
 
 fn answer(lines: &mut Vec<String>, comparison: &Comparison) {
     lines.push(format!("{QUESTION}  {}", comparison.hurt));
+    if comparison.base.len().min(comparison.new.len()) == 1 {
+        lines.push(
+            "  one run on a side: how much runs differ by themselves is not known".to_owned(),
+        );
+    }
     for harm in &comparison.harms {
         let (base, new) = (harm.base.words(), harm.new.words());
         lines.push(format!("  {}", harm.base.what));

@@ -2,12 +2,14 @@
 //! and the answer that follows. Figures of the network are elsewhere.
 
 use hil_stats::comparison::{Share, difference};
-use hil_stats::statistics::{CONFIDENCE, Interval};
+use hil_stats::statistics::{CONFIDENCE, Interval, poisson};
 use serde::Serialize;
 
 use super::ComparedRun;
-use crate::answer::{Answer, HarmCount, Hurt, OCCASIONS_MIN, OccasionCount, Unresolved, Untested};
-use crate::assessment::Assessment;
+use crate::answer::{
+    HarmCount, Hurt, OCCASIONS_MIN, OccasionCount, Unresolved, Untested, is_valid,
+};
+use crate::assessment::{Assessment, NetworkVerdict};
 
 /// What a comparison asks.
 pub(super) const QUESTION: &str = "Was the robot hurt more in the new runs?";
@@ -19,8 +21,48 @@ pub(crate) struct ComparedHarm {
     pub(crate) base: HarmCount,
     /// Of all new runs.
     pub(crate) new: HarmCount,
-    /// Interval of the difference of the shares, new less base (Newcombe's); `None` without occasions.
-    pub(crate) difference: Option<Interval>,
+    /// Whether there was more of it in the new runs.
+    pub(crate) change: Change,
+}
+
+/// How a harm stands to that of the base.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Change {
+    /// By the whole interval of the difference of the shares (Newcombe's); of harms without occasions, by the
+    /// whole intervals of both rates (Poisson).
+    More,
+    /// Likewise.
+    Less,
+    /// Chance alone may make it.
+    NotShown,
+}
+
+impl Change {
+    fn of(base: (&HarmCount, f64), new: (&HarmCount, f64)) -> Self {
+        let ((base, base_s), (new, new_s)) = (base, new);
+        let interval = if let Some((base, new)) = share(base).zip(share(new)) {
+            base.estimate(CONFIDENCE)
+                .zip(new.estimate(CONFIDENCE))
+                .and_then(|(base, new)| difference(base, new))
+        } else if let Some((base, new)) = base.count.zip(new.count)
+            && base_s > 0.0
+            && new_s > 0.0
+        {
+            let [base, new] = [base, new].map(|count| poisson(count, CONFIDENCE));
+            Some(Interval {
+                low: new.low / new_s - base.high / base_s,
+                high: new.high / new_s - base.low / base_s,
+            })
+        } else {
+            None
+        };
+        match interval {
+            Some(interval) if interval.low > 0.0 => Self::More,
+            Some(interval) if interval.high < 0.0 => Self::Less,
+            _ => Self::NotShown,
+        }
+    }
 }
 
 /// What hurt the robots of both sides, in the order of the case.
@@ -32,14 +74,15 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedHarm>
         }
     }
     let compared = whats.into_iter().map(|what| {
-        let [base, new] = [base, new].map(|runs| pooled(what, runs));
-        let difference = share(&base).zip(share(&new)).and_then(|(base, new)| {
-            difference(base.estimate(CONFIDENCE)?, new.estimate(CONFIDENCE)?)
+        let [base_s, new_s] = [base, new].map(|runs| {
+            let lengths = runs.iter().map(|run| run.summary.run.duration_s);
+            lengths.sum::<f64>()
         });
+        let [base, new] = [base, new].map(|runs| pooled(what, runs));
         ComparedHarm {
+            change: Change::of((&base, base_s), (&new, new_s)),
             base,
             new,
-            difference,
         }
     });
     compared.collect()
@@ -82,26 +125,36 @@ fn share(harm: &HarmCount) -> Option<Share> {
 /// Whether the robot was hurt more in the new runs.
 pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[ComparedRun]) -> Hurt {
     let not_resolvable = |because| Hurt::NotResolvable { because };
-    let mut answers = base.iter().chain(new).map(|run| {
-        let assessment = Assessment::of(&run.summary);
-        Answer::of(&run.summary, &assessment)
-    });
-    if answers.any(|one| one.measurement.is_valid == Some(false)) {
+    let mut assessments = base
+        .iter()
+        .chain(new)
+        .map(|run| Assessment::of(&run.summary));
+    let is_invalid = |assessment: Assessment| {
+        let has_failed = assessment.network == NetworkVerdict::RunFailed;
+        has_failed || is_valid(&assessment.network) == Some(false)
+    };
+    if assessments.any(is_invalid) {
         return not_resolvable(Unresolved::InvalidMeasurement);
     }
     let Some(first) = harms.first() else {
         let because = Untested::NoScore;
         return Hurt::NotTested { because };
     };
-    if first.base.count.is_none() || first.new.count.is_none() {
+    if harms
+        .iter()
+        .any(|one| one.base.count.is_none() || one.new.count.is_none())
+    {
         return not_resolvable(Unresolved::NotCounted);
     }
-    let differences = harms.iter().filter_map(|one| one.difference);
-    if differences.clone().any(|one| one.low > 0.0) {
+    let changes = harms.iter().map(|one| one.change);
+    if changes.clone().any(|change| change == Change::More) {
         return Hurt::Yes;
     }
     let is_unhurt = harms.iter().all(|one| one.new.count == Some(0));
-    let is_less = differences.clone().any(|one| one.high < 0.0);
+    let is_less = changes.clone().any(|change| change == Change::Less)
+        && harms
+            .iter()
+            .all(|one| one.change == Change::Less || one.new.count == Some(0));
     match &first.new.occasions {
         Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
             not_resolvable(Unresolved::SampleTooSmall {
@@ -120,6 +173,7 @@ mod tests {
     use std::path::PathBuf;
 
     use super::*;
+    use crate::summary::Outcome;
     use crate::tests::sample::full;
 
     fn run(count: Option<u64>, sent_count: u64) -> ComparedRun {
@@ -165,6 +219,27 @@ mod tests {
     }
 
     #[test]
+    fn one_harm_that_became_less_hides_no_other_that_became_more() {
+        let with_stops = |count, stops| {
+            let mut run = run(Some(count), 60);
+            run.summary.harms.push(HarmCount {
+                what: "stops".to_owned(),
+                count: Some(stops),
+                own_count: 0,
+                occasions: None,
+            });
+            [run]
+        };
+        let better = compared(&with_stops(20, 0), &with_stops(3, 0));
+        assert_eq!(better, Hurt::No);
+        let worse = compared(&with_stops(20, 0), &with_stops(3, 500));
+        assert_eq!(worse, Hurt::Yes);
+        let because = Unresolved::WithinChance;
+        let mixed = compared(&with_stops(20, 1), &with_stops(3, 2));
+        assert_eq!(mixed, Hurt::NotResolvable { because });
+    }
+
+    #[test]
     fn what_is_not_known_is_no_answer() {
         let clean = [run(Some(0), 60)];
         let because = Unresolved::NotCounted;
@@ -176,6 +251,10 @@ mod tests {
         else {
             panic!("four loops show no absence of harm");
         };
+        let mut failed = run(Some(0), 60);
+        failed.summary.run.outcome = Outcome::Failed;
+        let because = Unresolved::InvalidMeasurement;
+        assert_eq!(compared(&clean, &[failed]), Hurt::NotResolvable { because });
         let mut overrun = run(Some(9), 60);
         overrun.summary.processes[1].skipped_tick_count = Some(500);
         let because = Unresolved::InvalidMeasurement;

@@ -1,11 +1,11 @@
 //! The answer of a run as the last lines of a report, where a reader looks first. It draws no conclusions.
 
+use super::brief::{cause, gravest};
 use super::canvas::{Canvas, Tone};
-use super::units::figure;
-use crate::answer::Answer;
+use crate::answer::{Answer, Evidence, Hurt, metric_words};
 use crate::assessment::Assessment;
-use crate::summary::{RunSummary, ScoreMetric};
-use hil_platform::text::columns;
+use crate::summary::RunSummary;
+use hil_platform::text::{columns, shortened};
 
 /// Columns of a line's label: the longest harm of a case fits.
 const LABEL_WIDTH: usize = 34;
@@ -26,40 +26,29 @@ pub(super) fn answer(canvas: &mut Canvas, summary: &RunSummary, assessment: &Ass
         canvas.painted_line(Tone::Strong, &question);
         canvas.paragraph(0, answer.tone(), &words);
     }
+    let evidence = Evidence::of(summary);
+    let gravest = gravest(&summary.score_events.events);
+    let explained = gravest.into_iter().find(|event| evidence.explains(event));
+    if answer.hurt == Hurt::Yes
+        && let Some(event) = explained
+    {
+        let words = format!("{}; before it: {}", event.what, cause(event));
+        let words = shortened(&words, 3 * (canvas.width() - LABEL_WIDTH) - 30);
+        canvas.field_of(LABEL_WIDTH, "by, first of all", Tone::Plain, &words);
+    }
     for harm in &summary.harms {
         canvas.field_of(LABEL_WIDTH, &harm.what, Tone::Plain, &harm.words());
     }
     for name in &summary.headline {
         let metric = summary.score.iter().find(|one| one.name == *name);
         if let Some(metric) = metric.filter(|one| one.value.is_some()) {
-            canvas.field_of(
-                LABEL_WIDTH,
-                &metric.label,
-                Tone::Plain,
-                &metric_words(metric),
-            );
+            let words = format!("{}, not counted as harm", metric_words(metric));
+            canvas.field_of(LABEL_WIDTH, &metric.label, Tone::Plain, &words);
         }
     }
     let (tone, words) = answer.measurement_words(&assessment.network);
     canvas.field_of(LABEL_WIDTH, "measurement", tone, &words);
-    canvas.field_of(LABEL_WIDTH, "sample", Tone::Plain, &answer.sample_words());
+    let sample = format!("{}; brackets are 95 % intervals", answer.sample_words());
+    canvas.field_of(LABEL_WIDTH, "sample", Tone::Plain, &sample);
     canvas.rule(Tone::Faint);
-}
-
-/// The figure in the unit that people think in, with its interval.
-fn metric_words(metric: &ScoreMetric) -> String {
-    let (scale, unit) = match metric.unit.as_str() {
-        "rad" => (180.0 / core::f64::consts::PI, "°"),
-        "m" => (1e3, "mm"),
-        "s" => (1e3, "ms"),
-        "1" => (1.0, ""),
-        unit => (1.0, unit),
-    };
-    let value = metric
-        .value
-        .map_or_else(|| "unavailable".to_owned(), |value| figure(scale * value));
-    let interval = metric.interval.map_or_else(String::new, |(low, high)| {
-        format!(" [{}, {}]", figure(scale * low), figure(scale * high))
-    });
-    format!("{value} {unit}{interval}").replace("  ", " ")
 }

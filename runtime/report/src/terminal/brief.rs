@@ -9,19 +9,21 @@ use hil_core::case_study::Severity;
 use hil_platform::text::{grouped, shortened};
 use hil_platform::words::counted;
 
-use super::canvas::{Canvas, INDENT, Style, Tone, left, right};
+use super::canvas::{Canvas, INDENT, Style, Tone, left, right, wrapped};
 use super::units::{duration, percent, seconds};
 use super::{answer, timeline};
-use crate::answer::{Answer, Hurt, OCCASIONS_MIN, Unresolved, Untested};
+use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested};
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
 
-/// Events of the robot, channels and warnings on the page.
-const CAUSES_SHOWN: usize = 4;
-const CHANNELS_SHOWN: usize = 7;
-const WARNINGS_SHOWN: usize = 2;
+/// Events of the robot and channels on the page.
+const CAUSES_SHOWN: usize = 3;
+const CHANNELS_SHOWN: usize = 6;
+/// Lines of a page, and of these what warnings take beside their text.
+const LINES_MAX: usize = 50;
+const WARNINGS_FRAME: usize = 3;
 /// Rows of the robot in the time strip.
 const ROBOT_ROWS: usize = 2;
 /// Columns of a time, of a channel's name at least, and of a figure.
@@ -38,13 +40,17 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
     let assessment = Assessment::of(summary);
     let mut canvas = Canvas::new(width_columns, style);
     title(&mut canvas, summary);
-    causes(&mut canvas, &summary.score_events.events);
+    causes(&mut canvas, summary);
     channels(&mut canvas, summary);
     strip(&mut canvas, summary);
-    warnings(&mut canvas, &assessment);
-    next(&mut canvas, summary, &Answer::of(summary, &assessment));
-    answer::answer(&mut canvas, summary, &assessment);
-    canvas.finish()
+    let mut end = Canvas::new(width_columns, style);
+    next(&mut end, summary, &Answer::of(summary, &assessment));
+    answer::answer(&mut end, summary, &assessment);
+    let [begin, end] = [canvas, end].map(Canvas::finish);
+    let room = LINES_MAX.saturating_sub(begin.lines().count() + end.lines().count());
+    let mut between = Canvas::new(width_columns, style);
+    warnings(&mut between, &assessment, room);
+    begin + &between.finish() + &end
 }
 
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
@@ -63,16 +69,15 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
 }
 
 /// What hurt the robot or might have, the gravest first, each with what the network did before.
-fn causes(canvas: &mut Canvas, events: &[ExplainedEvent]) {
+fn causes(canvas: &mut Canvas, summary: &RunSummary) {
+    let events = &summary.score_events.events;
+    let is_explained = |event: &ExplainedEvent| Evidence::of(summary).explains(event);
     let count = |severity| {
         let chosen = events.iter().filter(|one| one.severity == severity);
         chosen.count() as u64
     };
-    let mut grave: Vec<&ExplainedEvent> = events
-        .iter()
-        .filter(|one| one.severity > Severity::Notice)
-        .collect();
-    grave.sort_by_key(|one| core::cmp::Reverse(one.severity));
+    let grave = gravest(events);
+    let hidden = grave.len().saturating_sub(CAUSES_SHOWN) as u64;
     let aside = [
         counted(count(Severity::Incident), "incident"),
         counted(count(Severity::Hazard), "hazard"),
@@ -87,8 +92,18 @@ fn causes(canvas: &mut Canvas, events: &[ExplainedEvent]) {
         };
         let time = event.at_s.map_or_else(|| "unavailable".to_owned(), seconds);
         let room = canvas.width() - INDENT - TIME_WIDTH;
-        canvas.field_of(TIME_WIDTH, &time, tone, &shortened(&event.what, room));
-        let cause = format!("after {}", cause(event));
+        canvas.field_of(
+            TIME_WIDTH,
+            &time,
+            tone,
+            &shortened(&event.what, 2 * room - 20),
+        );
+        let relation = if is_explained(event) {
+            "after"
+        } else {
+            "beside"
+        };
+        let cause = format!("{relation} {}", cause(event));
         canvas.field_of(
             TIME_WIDTH,
             "",
@@ -99,10 +114,22 @@ fn causes(canvas: &mut Canvas, events: &[ExplainedEvent]) {
     if grave.is_empty() {
         canvas.paragraph(INDENT, Tone::Plain, "no incident and no hazard");
     }
+    if hidden > 0 {
+        let text = format!("and {} of less weight or later", counted(hidden, "event"));
+        canvas.paragraph(INDENT, Tone::Faint, &text);
+    }
+}
+
+/// Incidents, then hazards, each in order of time.
+pub(super) fn gravest(events: &[ExplainedEvent]) -> Vec<&ExplainedEvent> {
+    let grave = events.iter().filter(|one| one.severity > Severity::Notice);
+    let mut grave: Vec<&ExplainedEvent> = grave.collect();
+    grave.sort_by_key(|one| core::cmp::Reverse(one.severity));
+    grave
 }
 
 /// The network event that has most to do with it.
-fn cause(event: &ExplainedEvent) -> String {
+pub(super) fn cause(event: &ExplainedEvent) -> String {
     let network = event.network.as_ref();
     let outage = event.outages.first().map(|one| one.words.clone());
     let beside = || event.network_beside().first().map(|one| one.words.clone());
@@ -364,19 +391,34 @@ fn worst_of(rows: &[TimelineRow], quantity: NetworkQuantity) -> Option<TimelineR
     Some(worst)
 }
 
-fn warnings(canvas: &mut Canvas, assessment: &Assessment) {
+/// As many as there is room for, in `room` lines; none of them cut short.
+fn warnings(canvas: &mut Canvas, assessment: &Assessment, room: usize) {
     let all = &assessment.warnings;
     if all.is_empty() {
         return;
     }
-    canvas.heading("Warnings", "");
-    for warning in all.iter().take(WARNINGS_SHOWN) {
-        let text = shortened(warning, 2 * canvas.width() - 20);
-        canvas.paragraph(INDENT, Tone::Caution, &text);
+    if room < WARNINGS_FRAME {
+        let text = format!("{} with --full", counted(all.len() as u64, "warning"));
+        canvas.painted_line(Tone::Caution, &text);
+        return;
     }
-    let hidden = all.len().saturating_sub(WARNINGS_SHOWN) as u64;
+    let mut left = room - WARNINGS_FRAME;
+    let mut shown = Vec::new();
+    for warning in all {
+        let rows = wrapped(warning, canvas.width() - INDENT).len();
+        if rows > left {
+            break;
+        }
+        left -= rows;
+        shown.push(warning);
+    }
+    canvas.heading("Warnings", "");
+    for warning in &shown {
+        canvas.paragraph(INDENT, Tone::Caution, warning);
+    }
+    let hidden = (all.len() - shown.len()) as u64;
     if hidden > 0 {
-        let text = format!("and {} more", grouped(hidden));
+        let text = format!("{} with --full", counted(hidden, "further warning"));
         canvas.paragraph(INDENT, Tone::Faint, &text);
     }
 }
@@ -402,6 +444,9 @@ fn next(canvas: &mut Canvas, summary: &RunSummary, answer: &Answer) {
         Hurt::NotResolvable {
             because: Unresolved::InvalidMeasurement,
         } => commands.push(("what hinders this host", "hil-runtime doctor".to_owned())),
+        Hurt::NotResolvable {
+            because: Unresolved::ClocksDiffer,
+        } => commands.push(("what aligns the clocks", "hil-runtime doctor".to_owned())),
         Hurt::NotTested {
             because: Untested::NoNetwork,
         } => commands.push((
@@ -430,6 +475,7 @@ fn next(canvas: &mut Canvas, summary: &RunSummary, answer: &Answer) {
     }
     canvas.heading("Next", "");
     for (what, command) in commands.into_iter().take(3) {
-        canvas.field_of(NEXT_WIDTH, what, Tone::Plain, &command);
+        let room = 3 * (canvas.width() - NEXT_WIDTH) - 30;
+        canvas.field_of(NEXT_WIDTH, what, Tone::Plain, &shortened(&command, room));
     }
 }

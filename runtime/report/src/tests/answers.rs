@@ -83,7 +83,7 @@ fn what_the_robot_did_to_itself_is_not_the_network() {
     assert!(
         summary.harms[0]
             .words()
-            .ends_with("; over a perfect channel 2 too")
+            .ends_with("; 2 by limits of the robot")
     );
     assert_eq!(answer(&run(lost_loops(Some(3), 2, 40))).hurt, Hurt::Yes);
 }

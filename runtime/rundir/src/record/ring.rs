@@ -200,7 +200,7 @@ impl SharedDrain {
 /// What became of a recorder's files.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RecorderOutcome {
-    /// Records dropped because a ring was full.
+    /// Records dropped because a ring was full, or that were on their way to a file that failed.
     pub dropped_count: u64,
     /// Files that could not be written, in the order in which that was noticed: what was in them
     /// before is whole, and later records are in no file.
