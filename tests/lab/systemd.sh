@@ -156,10 +156,15 @@ is_waiting_and_up() {
 
 # Every channel that carried messages closes for all of them.
 account_closes() {
-    journal split "$1" | awk '$1 == "account" && $2 == "closes" { channels += 1; gsub(",", "")
+    pc "$1" cat "$(newest split "$1")/report-full.txt" | awk '$1 == "account" && $2 == "closes" { channels += 1; gsub(",", "")
             messages += $6; if ($4 != $6) open += 1 }
         END { printf "%d channels, %d messages, %d channels open", channels, messages, open
             exit channels < 4 || messages < 1000 || open > 0 }'
+}
+
+# The last lines of a run.
+journal_answers() {
+    journal split "$1" | grep -E -o 'Did the network hurt the robot\?.*'
 }
 
 has_report() {
@@ -334,7 +339,8 @@ a_split_run() {
     check "the run of 8 s goes on both" within 30 both runs split
     check "it ends on both, with success" within 60 both is_done split
     for name in "${PCS[@]}"; do
-        check "$name: the account in the journal closes" account_closes "$name"
+        check "$name: the account closes" account_closes "$name"
+        check "$name: the journal ends in the answer" journal_answers "$name"
         check "$name: report" has_report "$name"
         check "$name: real time is granted to the unprivileged user" rights_are_granted "$name"
         check "$name: the unit forbids nothing that the doctor looks at" \
