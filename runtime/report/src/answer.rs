@@ -270,7 +270,11 @@ impl Answer {
     pub fn words(&self) -> String {
         match (&self.hurt, &self.sample.occasions) {
             (Hurt::No, Some(OccasionCount { what, count })) => {
-                format!("{} in {} {what}", self.hurt, grouped(*count))
+                let most = clopper_pearson(0, *count, CONFIDENCE);
+                let most = most.map_or_else(String::new, |one| {
+                    format!(", which leaves open up to {} of them", percent(one.high))
+                });
+                format!("{} in {} {what}{most}", self.hurt, grouped(*count))
             }
             _ => self.hurt.to_string(),
         }
@@ -373,7 +377,7 @@ impl fmt::Display for Unresolved {
             Self::NoNetworkEventBefore => {
                 formatter.write_str("the robot was hurt, but no network event that explains it came before")
             }
-            Self::WithinChance => formatter.write_str("chance alone may make such a difference"),
+            Self::WithinChance => formatter.write_str("what difference there is, chance alone may make"),
             Self::ClocksDiffer => formatter.write_str(
                 "the robot was hurt, but unaligned clocks leave open whether the network came first",
             ),

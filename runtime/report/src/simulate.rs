@@ -57,6 +57,9 @@ pub enum SimulateError {
     Occupied(PathBuf),
 }
 
+/// In place of the folder of a run that left none.
+pub(crate) const NO_FOLDER: &str = "none; --output DIR writes one";
+
 /// A run in virtual time that is over.
 #[derive(Debug)]
 pub struct Simulated {
@@ -206,7 +209,7 @@ fn run_facts(topology: &Topology, file: &Path) -> RunFacts {
         duration_s: topology.run().duration.as_secs_f64(),
         outcome: Outcome::Completed,
         exit_reason: "ran its full length in virtual time".to_owned(),
-        folder: "none; --output DIR writes one".to_owned(),
+        folder: NO_FOLDER.to_owned(),
         files: Vec::new(),
         repeat_command: shell_words(&command_line),
     }

@@ -60,14 +60,10 @@ fn robot(lines: &mut Vec<String>, comparison: &Comparison) {
         lines.push(row("Robot", ["base", "new", "difference"]));
     }
     for one in shown {
-        let change = match one.verdict {
-            Verdict::NotTested => String::new(),
-            verdict => verdict.words().to_owned(),
-        };
         let scale = UnitScale::of(&one.unit);
         let [base, new] = [one.base, one.new]
             .map(|side| side.map_or_else(String::new, |side| scale.words(side.value)));
-        lines.push(row(&one.label, [&base, &new, &change]));
+        lines.push(row(&one.label, [&base, &new, one.verdict.words()]));
     }
     if hidden_count > 0 {
         let text = counted(hidden_count as u64, "other score");

@@ -35,7 +35,7 @@ channel. docs/compare.md has the methods.";
 #[derive(Debug, Args)]
 pub struct CompareArgs {
     /// Two folders of runs: the base, then the new one.
-    #[arg(value_name = "RUN", num_args = 2, conflicts_with_all = ["base", "new"], required_unless_present_all = ["base", "new"])]
+    #[arg(value_names = ["BASE", "NEW"], num_args = 2, conflicts_with_all = ["base", "new"], required_unless_present_all = ["base", "new"])]
     pub runs: Vec<PathBuf>,
     /// Repetitions of the base.
     #[arg(long, value_name = "RUN", num_args = 1.., requires = "new")]

@@ -16,6 +16,7 @@ use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested}
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
+use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
 
 /// Events of the robot and channels on the page.
@@ -455,7 +456,10 @@ fn next(canvas: &mut Canvas, summary: &RunSummary, answer: &Answer) {
         )),
         _ => {}
     }
-    if !run.is_virtual {
+    if run.folder == NO_FOLDER {
+        let command = format!("{} -o FOLDER", run.repeat_command);
+        commands.push(("to keep this run", command));
+    } else {
         let folder = &run.folder;
         commands.push((
             "as a page",
