@@ -38,9 +38,17 @@ pub(crate) enum Change {
     NotShown,
 }
 
+/// A harm of the runs of one side.
+struct Side {
+    harm: HarmCount,
+    /// Of all runs together, seconds.
+    length_s: f64,
+}
+
 impl Change {
-    fn of(base: (&HarmCount, f64), new: (&HarmCount, f64)) -> Self {
-        let ((base, base_s), (new, new_s)) = (base, new);
+    fn of(base: &Side, new: &Side) -> Self {
+        let (base_s, new_s) = (base.length_s, new.length_s);
+        let (base, new) = (&base.harm, &new.harm);
         let interval = if let Some((base, new)) = share(base).zip(share(new)) {
             base.estimate(CONFIDENCE)
                 .zip(new.estimate(CONFIDENCE))
@@ -74,15 +82,14 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedHarm>
         }
     }
     let compared = whats.into_iter().map(|what| {
-        let [base_s, new_s] = [base, new].map(|runs| {
-            let lengths = runs.iter().map(|run| run.summary.run.duration_s);
-            lengths.sum::<f64>()
+        let [base, new] = [base, new].map(|runs| Side {
+            harm: pooled(what, runs),
+            length_s: runs.iter().map(|run| run.summary.run.duration_s).sum(),
         });
-        let [base, new] = [base, new].map(|runs| pooled(what, runs));
         ComparedHarm {
-            change: Change::of((&base, base_s), (&new, new_s)),
-            base,
-            new,
+            change: Change::of(&base, &new),
+            base: base.harm,
+            new: new.harm,
         }
     });
     compared.collect()
