@@ -1,13 +1,14 @@
 //! A comparison as a page of a terminal: what differs, the robot, one line a channel, and last the answer. It
 //! computes nothing; `--full` has every figure.
 
-use hil_platform::text::{columns, grouped, shortened};
+use hil_platform::text::grouped;
 use hil_platform::words::counted;
 
 use super::conditions::Verdicts;
 use super::harms::QUESTION;
 use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict, render};
 use crate::answer::UnitScale;
+use crate::terminal::left;
 
 /// Channels on the page.
 const CHANNELS_SHOWN: usize = 12;
@@ -34,13 +35,8 @@ pub(super) fn text(comparison: &Comparison, verdicts: &Verdicts) -> String {
 }
 
 fn row(name: &str, cells: [&str; 3]) -> String {
-    let cells = cells.map(|cell| {
-        let missing = FIGURE_WIDTH.saturating_sub(columns(cell));
-        format!("{cell}{:missing$}", "")
-    });
-    let name = shortened(name, NAME_WIDTH - 1);
-    let missing = NAME_WIDTH.saturating_sub(columns(&name));
-    let line = format!("  {name}{:missing$}{}", "", cells.concat());
+    let cells = cells.map(|cell| left(cell, FIGURE_WIDTH));
+    let line = format!("  {} {}", left(name, NAME_WIDTH - 1), cells.concat());
     line.trim_end().to_owned()
 }
 

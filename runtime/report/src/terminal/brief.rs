@@ -10,6 +10,7 @@ use hil_platform::text::{grouped, shortened};
 use hil_platform::words::counted;
 
 use super::canvas::{Canvas, INDENT, Style, Tone, left, right, wrapped};
+use super::events::severity_counts;
 use super::units::{duration, percent, seconds};
 use super::{answer, timeline};
 use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested};
@@ -73,18 +74,9 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
 fn causes(canvas: &mut Canvas, summary: &RunSummary) {
     let events = &summary.score_events.events;
     let is_explained = |event: &ExplainedEvent| Evidence::of(summary).explains(event);
-    let count = |severity| {
-        let chosen = events.iter().filter(|one| one.severity == severity);
-        chosen.count() as u64
-    };
     let grave = gravest(events);
     let hidden = grave.len().saturating_sub(CAUSES_SHOWN) as u64;
-    let aside = [
-        counted(count(Severity::Incident), "incident"),
-        counted(count(Severity::Hazard), "hazard"),
-        counted(count(Severity::Notice), "notice"),
-    ];
-    canvas.heading("Robot, and the network before it", &aside.join(", "));
+    canvas.heading("Robot, and the network before it", &severity_counts(events));
     for event in grave.iter().take(CAUSES_SHOWN) {
         let tone = if event.severity == Severity::Incident {
             Tone::Bad

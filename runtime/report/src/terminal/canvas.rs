@@ -169,7 +169,7 @@ impl Canvas {
 }
 
 /// Exactly `width` columns, text at the left.
-pub(super) fn left(text: &str, width: usize) -> String {
+pub(crate) fn left(text: &str, width: usize) -> String {
     let text = shortened(text, width);
     let padding = width - columns(&text);
     format!("{text}{:padding$}", "")

@@ -25,18 +25,7 @@ pub(super) fn score_events(canvas: &mut Canvas, all: &ScoreEvents) {
     if all.events.is_empty() {
         return;
     }
-    let count = |severity| {
-        let chosen = all.events.iter().filter(|one| one.severity == severity);
-        chosen.count() as u64
-    };
-    let [incidents, hazards, notices] =
-        [Severity::Incident, Severity::Hazard, Severity::Notice].map(count);
-    let aside = [
-        counted(incidents, "incident"),
-        counted(hazards, "hazard"),
-        counted(notices, "notice"),
-    ];
-    let aside = aside.join(", ");
+    let aside = severity_counts(&all.events);
     canvas.heading(
         "What the robot did, and what the network had done to it",
         &aside,
@@ -64,6 +53,20 @@ pub(super) fn score_events(canvas: &mut Canvas, all: &ScoreEvents) {
     if !more.is_empty() {
         canvas.paragraph(INDENT, Tone::Faint, &more.join("; "));
     }
+}
+
+/// How many there are of each severity, in words.
+pub(super) fn severity_counts(events: &[ExplainedEvent]) -> String {
+    let count = |severity| {
+        let chosen = events.iter().filter(|one| one.severity == severity);
+        chosen.count() as u64
+    };
+    let counts = [
+        counted(count(Severity::Incident), "incident"),
+        counted(count(Severity::Hazard), "hazard"),
+        counted(count(Severity::Notice), "notice"),
+    ];
+    counts.join(", ")
 }
 
 /// The gravest events, the earlier ones first among equals, in the order of the score.

@@ -21,7 +21,7 @@ mod units;
 
 pub use brief::brief;
 pub use canvas::Style;
-pub(crate) use canvas::{Tone, wrapped};
+pub(crate) use canvas::{Tone, left, wrapped};
 pub(crate) use channel::{closing_text, stall_words};
 use hil_platform::text::{grouped, shortened};
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
