@@ -189,6 +189,9 @@ pub struct ReportArgs {
     /// Put the data of --format json through this template (minijinja, which reads Jinja2).
     #[arg(long, value_name = "FILE", conflicts_with_all = ["format", "figure"])]
     pub template: Option<PathBuf>,
+    /// A run over a link that does not hurt: its values stand below the first ones of a page.
+    #[arg(long, value_name = "RUN", conflicts_with = "figure")]
+    pub against: Option<PathBuf>,
     /// Overwrite --output whatever it is.
     #[arg(long)]
     pub force: bool,

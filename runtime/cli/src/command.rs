@@ -160,7 +160,7 @@ fn run_command(
         Command::Calibrate(args) => case_work::calibrate(args, registry, console),
         Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
         Command::Report(args) => report_work::report(&args, registry, console),
-        Command::Compare(args) => Ok(code_of(compare::work::work(&args, console))),
+        Command::Compare(args) => Ok(code_of(compare::work::work(&args, columns(), console))),
         Command::Trace { command } => Ok(code_of(trace::work::work(command, columns(), console))),
         Command::Link { command } => Ok(code_of(link::work::work(&command, console))),
         Command::Doctor(args) => doctor_work::doctor(&args, registry, console),

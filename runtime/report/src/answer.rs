@@ -15,7 +15,8 @@ use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
 use super::clock_summary::ClockSection;
 use super::score_event::ExplainedEvent;
 use super::summary::{LinkKind, RunSummary, ScoreMetric};
-use super::terminal::{Tone, duration_s, figure, percent};
+use hil_present::Tone;
+use hil_present::units::{duration_s, figure, percent};
 
 /// A rate of fewer occasions is not told, and no harm in fewer is no answer.
 pub const OCCASIONS_MIN: u64 = 10;

@@ -11,9 +11,9 @@ use super::adapter_warnings;
 use super::summary::{
     ChannelSummary, DirectionSummary, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary,
 };
-use super::terminal::{JOINT, percent};
 use hil_platform::text::grouped;
 use hil_platform::words::{counted, named};
+use hil_present::units::{JOINT, percent};
 
 /// Share of skipped ticks above which the host, not the network, shaped the run.
 pub const SKIPPED_TICK_RATIO_MAX: f64 = 0.001;

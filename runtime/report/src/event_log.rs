@@ -5,7 +5,7 @@ use core::fmt::Write;
 
 use super::link_change::LinkChange;
 use super::score_event::{ExplainedEvent, ScoreEvents};
-use super::terminal::JOINT;
+use hil_present::units::JOINT;
 
 /// The text of the file for the run called `name`.
 pub(crate) fn text(name: &str, all: &ScoreEvents, changes: &[LinkChange]) -> String {

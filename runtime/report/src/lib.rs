@@ -5,7 +5,6 @@
 pub mod adapter;
 pub mod adapter_metrics;
 mod adapter_warnings;
-pub(crate) mod alike;
 pub mod analysis;
 pub mod answer;
 pub mod assessment;
@@ -20,6 +19,7 @@ pub mod page;
 pub mod radio;
 pub mod replay;
 pub mod score_event;
+mod sections;
 pub mod simulate;
 pub mod study;
 pub mod summary;

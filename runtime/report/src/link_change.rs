@@ -5,7 +5,7 @@ use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome};
 use hil_link::spec::Way;
 use serde::{Deserialize, Serialize};
 
-use super::terminal::{JOINT, duration_s, seconds};
+use hil_present::units::{JOINT, duration_s, seconds};
 
 /// One order to one direction of a link.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

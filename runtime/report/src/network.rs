@@ -6,9 +6,9 @@ use hil_account::network::{NetworkEventKind, NetworkMetrics};
 use hil_stats::correlation::PairCorrelation;
 use serde::{Deserialize, Serialize};
 
-use super::terminal::{JOINT, duration_s, seconds};
 use hil_platform::text::grouped;
 use hil_platform::words::plural;
+use hil_present::units::{JOINT, duration_s, seconds};
 
 /// How long before an event of the score the network is looked at, seconds. The longest effect
 /// that is known of: a session that an outage ended takes that long to come back.

@@ -12,9 +12,9 @@ use serde_json::{Value, json};
 use crate::analysis::AnalysisError;
 use crate::analysis::records::{MessageRecords, missing_count};
 use crate::summary::RunSummary;
-use crate::terminal::wrapped;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
+use hil_present::terminal::canvas::wrapped;
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::{CaseEntry, CaseError, Registry};
 

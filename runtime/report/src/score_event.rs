@@ -7,7 +7,7 @@ use hil_core::case_study::Severity;
 use serde::{Deserialize, Serialize};
 
 use super::network::{PrecedingEvent, PrecedingNetwork};
-use super::terminal::duration_s;
+use hil_present::units::duration_s;
 
 /// The events of a run's score.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]

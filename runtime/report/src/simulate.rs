@@ -32,7 +32,8 @@ use crate::summary::{
     ChannelEnd, ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome,
     RecordedMetrics, RunFacts, RunSummary,
 };
-use crate::terminal::{self, percent};
+use crate::terminal;
+use hil_present::units::percent;
 use hil_rundir::launch::Side;
 use hil_rundir::pipe::CounterGroup;
 use hil_rundir::run_folder::RunFolder;

@@ -123,7 +123,9 @@ fn check_conditions(near: &Path, again: &Path, far: &Path) {
     let (code, ..) = compare(&["--fail-if", "max > 0.1x", "--strict"], &[near, far]);
     assert_eq!(code, Some(1), "strictly, a maximum can be judged");
     let (_, text, _) = compare(&["--fail-if", "shuttle/command:p50 > 1 s"], &[near, far]);
-    let judged = text.lines().find(|line| line.starts_with("passes: "));
+    let judged = text
+        .lines()
+        .find(|line| line.trim_start().starts_with("passes: "));
     assert!(judged.unwrap().ends_with(" s)"), "{text}");
     let (code, _, error) = compare(&[], &[near, Path::new("/nowhere")]);
     assert_eq!(code, Some(2));

@@ -121,8 +121,8 @@ fn assert_outages_and_events_are_kept(files: &RunFiles) {
         assert_eq!(figures.longest.is_none(), is_lossless);
     }
     let page = files.read("report-full.txt");
-    assert!(page.contains("  outages       "), "{page}");
-    assert!(page.contains("  events.log    "), "{page}");
+    assert!(page.contains("Outages by length"), "{page}");
+    assert!(page.contains("  events.log  "), "{page}");
     let log = files.read("events.log");
     let name = &summary.run.name;
     assert!(log.starts_with(&format!("# {name}\n")), "{log}");
@@ -159,10 +159,13 @@ fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
     let printed = fs::read_to_string(output.join("report.txt")).unwrap();
     assert_eq!(brief.stdout, printed);
     assert!(
-        simulated.stdout.contains("Channel egm/right/command"),
+        simulated.stdout.contains("  egm/right/command  "),
         "{simulated:?}"
     );
-    assert!(simulated.stdout.contains("  outages  "), "{simulated:?}");
+    assert!(
+        simulated.stdout.contains("  outages together  "),
+        "{simulated:?}"
+    );
     assert_eq!(
         fs::read_to_string(output.join("report-full.txt")).unwrap(),
         simulated.stdout

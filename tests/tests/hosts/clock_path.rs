@@ -176,7 +176,7 @@ fn a_slow_data_link_leaves_the_bound_as_narrow_as_the_clock_path() {
     let report = report.read("report-full.txt");
     for words in [
         "exchanges over the clock path, and beside the data:",
-        "path                  clock path 10.78.0.1 (eth1) <-> 10.78.0.2 (eth1); ",
+        "clock path 10.78.0.1 (eth1) <-> 10.78.0.2 (eth1); ",
         "over the clock path,",
     ] {
         assert!(report.contains(words), "{words:?} is missing:\n{report}");

@@ -217,5 +217,5 @@ fn an_interrupted_fleet_leaves_its_report() {
     let truth = channel(&summary, "fleet/truth");
     assert!(truth.recorded.unwrap().message_count > 0);
     let report = files.read("report-full.txt");
-    assert!(report.contains("Channel fleet/truth  robots · recorded only"));
+    assert!(report.contains("fleet/truth  robots · recorded only"));
 }

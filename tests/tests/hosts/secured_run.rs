@@ -65,7 +65,7 @@ fn an_ordinary_run_is_sealed_and_its_account_closes() {
             assert_eq!(account(summary, name).fates.lost_count(), 0);
         }
     }
-    assert!(report.read("report-full.txt").contains("Security"));
+    assert!(report.read("report-full.txt").contains("  security  "));
     // The secret of the run is in no file that it left.
     let launches = fs::read_dir(report.root().join("launch")).unwrap();
     for file in launches.map(|file| file.unwrap().path()) {

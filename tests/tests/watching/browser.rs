@@ -369,8 +369,8 @@ fn look_at_report(browser: &mut Browser, report: &Path, name: &str) {
     check_on_paper(&mut page, name);
 }
 
-/// What is folded on the screen, but for the text as it was printed on the terminal.
-const FOLDED: &str = "details:not(.printed details)";
+/// What is folded on the screen.
+const FOLDED: &str = "details";
 
 /// Paper cannot be unfolded: what is folded is printed whole, by the style alone and by the script where a
 /// browser does not know that style, and is folded again afterwards.

@@ -27,6 +27,11 @@ pub(super) fn report(
         || args.template.is_some()
         || args.figure.is_some();
     if !is_file {
+        if args.against.is_some() {
+            return Err(usage(
+                "--against is for a page: give --output, e.g. -o report.html",
+            ));
+        }
         if let [run] = args.runs.as_slice() {
             return show(run, args.full, registry, console);
         }
@@ -43,25 +48,28 @@ fn to_files(args: &ReportArgs, console: &mut Console) -> Result<(), Refusal> {
     if let Some(output) = args.output.as_deref().filter(|_| !is_folder) {
         write::check(output, args.force).map_err(usage)?;
     }
+    // The clean run is the last of them.
+    let folders: Vec<&PathBuf> = args.runs.iter().chain(&args.against).collect();
     let materials = Progress::begin().during(console, "reading runs", |stage| {
-        let runs = args.runs.iter().enumerate();
+        let runs = folders.iter().enumerate();
         let materials = runs.map(|(index, run)| {
             // Of the first, nothing says yet how long one takes.
-            let share = (index > 0).then(|| index as f64 / args.runs.len() as f64);
+            let share = (index > 0).then(|| index as f64 / folders.len() as f64);
             stage.tell(share, &format!("reading {}", run.display()));
             read::read(run)
         });
         materials.collect::<Result<Vec<_>, _>>()
     });
     let materials = materials.map_err(usage)?;
+    let (materials, clean) = materials.split_at(args.runs.len());
     if format == Format::Svg && template.is_none() {
-        return charts(args, &materials, console);
+        return charts(args, materials, console);
     }
     let own = template
         .as_ref()
         .map(|(name, text)| (name.as_str(), text.as_str()));
     let text = Progress::begin().during(console, "drawing", |_| {
-        page::render(&materials, format, own)
+        page::render(materials, clean.first(), format, own)
     });
     let text = text.map_err(usage)?;
     match &args.output {

@@ -13,7 +13,7 @@ use super::records::RunRecords;
 use crate::network::within;
 use crate::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::summary::{ChannelSummary, CounterGroup, LinkKind};
-use crate::terminal::duration_s;
+use hil_present::units::duration_s;
 use hil_topology::{Channel, Topology};
 
 /// The events of `score` with the fates of their messages and the outages before them.

@@ -9,8 +9,8 @@ use hil_core::time::Instant;
 use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::score_event::EventOutage;
-use crate::terminal::{duration_s, seconds};
 use hil_platform::words::counted;
+use hil_present::units::{duration_s, seconds};
 use hil_topology::Channel;
 
 /// The outages of one channel, with what gives their times a meaning.
@@ -160,7 +160,7 @@ fn words(outage: &EventOutage, interrupted: Option<&str>, later_ns: Option<i64>)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::terminal::JOINT;
+    use hil_present::units::JOINT;
 
     const MS: i64 = 1_000_000;
 

@@ -2,7 +2,6 @@
 //! difference of the two and its interval, and whether the runs may be compared at all. It reads
 //! `summary.json` only.
 
-mod brief;
 pub mod cli;
 mod conditions;
 mod harms;

@@ -1,32 +1,159 @@
-//! A comparison in words: for a terminal and as Markdown. It computes nothing.
+//! A comparison as sections, for a terminal and as Markdown. It computes nothing.
 
+use hil_platform::text::grouped;
+use hil_platform::words::counted;
+use hil_present::template::{TemplateError, markdown as document};
+use hil_present::terminal::canvas::{Canvas, Style};
+use hil_present::terminal::section;
+use hil_present::units::{duration, figure, percent};
+use hil_present::{Block, Section, Table, Tone, UNAVAILABLE};
 use hil_stats::comparison::Estimate;
 use hil_stats::statistics::Interval;
 
 use super::conditions::Verdicts;
-use super::harms::{ComparedHarm, QUESTION};
-use super::{ChartKind, ComparedMetric, Comparison, Part};
-use crate::terminal::{duration, figure, percent};
+use super::harms::QUESTION;
+use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict};
+use crate::answer::UnitScale;
 
-const UNAVAILABLE: &str = "unavailable";
-const COLUMNS: [&str; 6] = ["figure", "base", "new", "new / base", "95 %", "verdict"];
+const COLUMNS: [&str; 7] = [
+    "of",
+    "metric",
+    "base",
+    "new",
+    "new / base",
+    "95 %",
+    "verdict",
+];
+/// Channels that are listed unless every metric is asked for.
+const CHANNELS_SHOWN: usize = 12;
 
-/// One line of the table.
-struct Row {
-    group: String,
-    cells: [String; 6],
+/// What differs, the robot, one line a channel, and last the answer.
+pub(super) fn brief(comparison: &Comparison, verdicts: &Verdicts, width: usize) -> String {
+    let mut end = judged(verdicts);
+    end.note(
+        Tone::Faint,
+        "--full prints every metric with its method; intervals are 95 %.",
+    );
+    let sections = [
+        runs(comparison),
+        robot(comparison),
+        channels(comparison),
+        end,
+    ];
+    text(&sections, comparison, width)
 }
 
-fn rows(comparison: &Comparison) -> Vec<Row> {
-    let all = comparison.figures.iter();
-    all.map(|one| Row {
-        group: match &one.channel {
-            Some(channel) => channel.clone(),
-            None => "score".to_owned(),
-        },
-        cells: cells(one),
-    })
-    .collect()
+/// Every metric, and last the answer.
+pub(super) fn full(comparison: &Comparison, verdicts: &Verdicts, width: usize) -> String {
+    let sections = [
+        runs(comparison),
+        metrics(comparison),
+        methods(comparison),
+        judged(verdicts),
+    ];
+    text(&sections, comparison, width)
+}
+
+fn text(sections: &[Section], comparison: &Comparison, width: usize) -> String {
+    let mut canvas = Canvas::new(width, Style::Plain);
+    sections.iter().for_each(|one| section(&mut canvas, one));
+    canvas.blank();
+    canvas.rule(Tone::Faint);
+    canvas.paragraph(0, Tone::Strong, &format!("{QUESTION}  {}", comparison.hurt));
+    section(&mut canvas, &harms(comparison));
+    canvas.rule(Tone::Faint);
+    canvas.finish()
+}
+
+/// As Markdown: the answer first, then every metric.
+///
+/// # Errors
+/// Never; the template engine has one.
+pub(super) fn markdown(
+    comparison: &Comparison,
+    verdicts: &Verdicts,
+) -> Result<String, TemplateError> {
+    let mut answer = Section::new("answer", "", "");
+    answer.note(Tone::Strong, format!("{QUESTION} {}", comparison.hurt));
+    answer.blocks.extend(harms(comparison).blocks);
+    let sections = [
+        answer,
+        runs(comparison),
+        metrics(comparison),
+        methods(comparison),
+        judged(verdicts),
+    ];
+    document("Comparison of runs", &sections)
+}
+
+fn list(section: &mut Section, tone: Tone, items: &[String]) {
+    let items = items.to_vec();
+    if !items.is_empty() {
+        section.blocks.push(Block::List { tone, items });
+    }
+}
+
+/// The runs, and whether they may be compared.
+fn runs(comparison: &Comparison) -> Section {
+    let folders = |runs: &[std::path::PathBuf]| {
+        let names = runs.iter().map(|run| run.display().to_string());
+        names.collect::<Vec<_>>().join(", ")
+    };
+    let mut section = Section::new("runs", "Runs", "");
+    section.fact("base", Tone::Plain, folders(&comparison.base));
+    section.fact("new", Tone::Plain, folders(&comparison.new));
+    if comparison.differences.is_empty() {
+        let same = comparison.same.join(", ");
+        section.note(
+            Tone::Plain,
+            format!("The runs are comparable: same {same}."),
+        );
+    } else {
+        section.note(Tone::Caution, "The runs differ in more than their metrics:");
+        list(&mut section, Tone::Caution, &comparison.differences);
+    }
+    if !comparison.cautions.is_empty() {
+        section.note(Tone::Caution, "Read with care:");
+        list(&mut section, Tone::Caution, &comparison.cautions);
+    }
+    section
+}
+
+/// What hurt the robot on both sides.
+fn harms(comparison: &Comparison) -> Section {
+    let mut section = Section::new("harms", "", "");
+    if comparison.base.len().min(comparison.new.len()) == 1 {
+        let text = "one run on a side: how much runs differ by themselves is not known";
+        section.note(Tone::Caution, text);
+    }
+    for harm in &comparison.harms {
+        let what = &harm.base.what;
+        section.fact(format!("{what}, base"), Tone::Plain, harm.base.words());
+        section.fact(format!("{what}, new"), Tone::Plain, harm.new.words());
+    }
+    section
+}
+
+/// Conditions that were asked for.
+fn judged(verdicts: &Verdicts) -> Section {
+    let mut section = Section::new("conditions", "", "");
+    for line in verdicts.lines() {
+        section.note(Tone::Plain, line);
+    }
+    section
+}
+
+/// Every metric.
+fn metrics(comparison: &Comparison) -> Section {
+    let mut section = Section::new("metrics", "Metrics", "intervals are 95 %");
+    let mut table = Table::new("", &COLUMNS);
+    for one in &comparison.figures {
+        let of = one.channel.as_deref().unwrap_or("score").to_owned();
+        let cells = cells(one).map(Into::into);
+        table.push(core::iter::once(of.into()).chain(cells));
+    }
+    section.table(table);
+    section
 }
 
 fn cells(one: &ComparedMetric) -> [String; 6] {
@@ -76,7 +203,7 @@ fn signed(value: f64) -> String {
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "nanoseconds of a delay")]
-pub(super) fn value(one: &ComparedMetric, estimate: Option<Estimate>) -> String {
+fn value(one: &ComparedMetric, estimate: Option<Estimate>) -> String {
     let Some(Estimate { value, .. }) = estimate else {
         return UNAVAILABLE.to_owned();
     };
@@ -88,74 +215,8 @@ pub(super) fn value(one: &ComparedMetric, estimate: Option<Estimate>) -> String 
     }
 }
 
-/// For a terminal.
-pub(super) fn text(comparison: &Comparison, verdicts: &Verdicts) -> String {
-    let rows = rows(comparison);
-    let width = |column: usize| {
-        let cells = rows.iter().map(|row| row.cells[column].chars().count());
-        cells.max().unwrap_or(0).max(COLUMNS[column].len())
-    };
-    let widths: Vec<usize> = (0..COLUMNS.len()).map(width).collect();
-    let line = |cells: &[String]| {
-        let padded = cells.iter().zip(&widths).map(|(cell, width)| {
-            let missing = width.saturating_sub(cell.chars().count());
-            format!("{cell}{:missing$}", "")
-        });
-        format!("  {}", padded.collect::<Vec<_>>().join("  ").trim_end())
-    };
-    let mut lines = head(comparison, "  ");
-    lines.push(String::new());
-    lines.push(line(&COLUMNS.map(str::to_owned)));
-    let mut last = "";
-    for row in &rows {
-        if row.group != last {
-            lines.push(row.group.clone());
-            last = &row.group;
-        }
-        lines.push(line(&row.cells));
-    }
-    lines.push(String::new());
-    lines.push("Intervals are 95 %:".to_owned());
-    lines.extend(
-        methods(comparison)
-            .into_iter()
-            .map(|text| format!("  {text}")),
-    );
-    let verdicts = verdicts.lines();
-    if !verdicts.is_empty() {
-        lines.push(String::new());
-        lines.extend(verdicts);
-    }
-    lines.join("\n")
-}
-
-pub(super) fn head(comparison: &Comparison, margin: &str) -> Vec<String> {
-    let folders = |runs: &[std::path::PathBuf]| {
-        let names = runs.iter().map(|run| run.display().to_string());
-        names.collect::<Vec<_>>().join(", ")
-    };
-    let mut lines = vec![
-        format!("base  {}", folders(&comparison.base)),
-        format!("new   {}", folders(&comparison.new)),
-    ];
-    if comparison.differences.is_empty() {
-        let same = comparison.same.join(", ");
-        lines.push(format!("The runs are comparable: same {same}."));
-    } else {
-        lines.push("The runs differ in more than their figures:".to_owned());
-        let differences = comparison.differences.iter();
-        lines.extend(differences.map(|text| format!("{margin}{text}")));
-    }
-    if !comparison.cautions.is_empty() {
-        lines.push("Read with care:".to_owned());
-        let cautions = comparison.cautions.iter();
-        lines.extend(cautions.map(|text| format!("{margin}{text}")));
-    }
-    lines
-}
-
 /// Each method once, with what it was used for.
-fn methods(comparison: &Comparison) -> Vec<String> {
+fn methods(comparison: &Comparison) -> Section {
     let mut found: Vec<(&str, Vec<&str>)> = Vec::new();
     for one in &comparison.figures {
         let whom = match one.kind {
@@ -170,61 +231,97 @@ fn methods(comparison: &Comparison) -> Vec<String> {
             None => found.push((&one.method, vec![whom])),
         }
     }
-    found
-        .into_iter()
-        .map(|(method, whom)| format!("{}: {method}", whom.join(", ")))
-        .collect()
+    let mut section = Section::new("methods", "Methods", "");
+    for (method, whom) in found {
+        section.fact(whom.join(", "), Tone::Plain, method);
+    }
+    section
 }
 
-/// As Markdown.
-pub(super) fn markdown(comparison: &Comparison, verdicts: &Verdicts) -> String {
-    let cell = |text: &str| text.replace('|', "\\|");
-    let mut lines = vec!["# Comparison of runs".to_owned(), String::new()];
-    lines.push(format!(
-        "**{QUESTION} {}**",
-        cell(&comparison.hurt.to_string())
-    ));
-    lines.push(String::new());
-    for ComparedHarm { base, new, .. } in &comparison.harms {
-        let (what, base, new) = (&base.what, base.words(), new.words());
-        lines.push(format!("- {what}: base {base}; new {new}"));
+/// The scores that differ, and those to see first.
+fn robot(comparison: &Comparison) -> Section {
+    let mut section = Section::new("robot", "Robot", "");
+    let scores = || {
+        let all = comparison.figures.iter();
+        all.filter(|one| one.kind == ChartKind::Score && one.base.is_some() && one.new.is_some())
+    };
+    let is_shown = |one: &&ComparedMetric| {
+        let differs = matches!(one.verdict, Verdict::Lower | Verdict::Higher);
+        differs || comparison.headline.contains(&one.metric)
+    };
+    let mut table = Table::new("", &["score", "base", "new", "difference"]);
+    for one in scores().filter(is_shown) {
+        let scale = UnitScale::of(&one.unit);
+        let [base, new] = [one.base, one.new]
+            .map(|side| side.map_or_else(String::new, |side| scale.words(side.value)));
+        let verdict = one.verdict.words().to_owned();
+        table.push([one.label.clone(), base, new, verdict].map(Into::into));
     }
-    if !comparison.harms.is_empty() {
-        lines.push(String::new());
+    let hidden = scores().count() - table.rows.len();
+    if hidden > 0 {
+        let hidden = counted(hidden as u64, "other score");
+        table.note = format!("{hidden}: no difference shown");
     }
-    // A blank line around everything but between the items of a list.
-    let mut was_item = false;
-    for line in head(comparison, "- ") {
-        let is_item = line.starts_with("- ");
-        if was_item && !is_item {
-            lines.push(String::new());
+    if !table.rows.is_empty() || hidden > 0 {
+        section.table(table);
+    }
+    section
+}
+
+/// Loss of both sides, and how often as long the delays are; those that lose most first.
+fn channels(comparison: &Comparison) -> Section {
+    let mut section = Section::new("channels", "Channels", "");
+    let mut names: Vec<&str> = Vec::new();
+    for one in &comparison.figures {
+        if let Some(channel) = &one.channel
+            && !names.contains(&channel.as_str())
+        {
+            names.push(channel);
         }
-        lines.push(line);
-        if !is_item {
-            lines.push(String::new());
-        }
-        was_item = is_item;
     }
-    lines.push(String::new());
-    lines.push(format!("| channel | {} |", COLUMNS.join(" | ")));
-    lines.push("|---".repeat(COLUMNS.len() + 1) + "|");
-    for row in rows(comparison) {
-        let cells = row.cells.iter().map(|text| cell(text));
-        let cells = cells.collect::<Vec<_>>().join(" | ");
-        lines.push(format!("| {} | {cells} |", cell(&row.group)));
+    let metric = |channel: &str, part: Option<Part>, metric: &str| {
+        let mut all = comparison.figures.iter();
+        all.find(|one| {
+            one.channel.as_deref() == Some(channel) && one.part == part && one.metric == metric
+        })
+    };
+    let share_lost = |channel: &str| {
+        let new = metric(channel, None, "loss").and_then(|one| one.new);
+        new.map_or(0.0, |one| one.value)
+    };
+    names.sort_by(|one, other| share_lost(other).total_cmp(&share_lost(one)));
+    if names.is_empty() {
+        return section;
     }
-    lines.push(String::new());
-    lines.push("Intervals are 95 %.".to_owned());
-    lines.push(String::new());
-    lines.extend(
-        methods(comparison)
-            .into_iter()
-            .map(|text| format!("- {text}")),
-    );
-    let verdicts = verdicts.lines();
-    if !verdicts.is_empty() {
-        lines.push(String::new());
-        lines.extend(verdicts.iter().map(|one| format!("- {one}")));
+    let columns = ["channel", "lost", "p50, new / base", "p99, new / base"];
+    let mut table = Table::new("", &columns);
+    for name in names.iter().take(CHANNELS_SHOWN) {
+        let lost = metric(name, None, "loss").map_or_else(String::new, |one| {
+            let [base, new] = [one.base, one.new].map(|side| value(one, side));
+            with_verdict(format!("{base} → {new}"), one.verdict)
+        });
+        let ratio = |quantile: &str| {
+            let one = metric(name, Some(Part::EndToEnd), quantile);
+            let known = one.and_then(|one| Some((one.ratio?, one.verdict)));
+            known.map_or_else(String::new, |(ratio, verdict)| {
+                with_verdict(format!("{ratio:.2}"), verdict)
+            })
+        };
+        let cells = [(*name).to_owned(), lost, ratio("p50"), ratio("p99")];
+        table.push(cells.map(Into::into));
     }
-    lines.join("\n")
+    let hidden = names.len().saturating_sub(CHANNELS_SHOWN) as u64;
+    if hidden > 0 {
+        let hidden = grouped(hidden);
+        table.note = format!("and {hidden} more that lose no larger share");
+    }
+    section.table(table);
+    section
+}
+
+fn with_verdict(text: String, verdict: Verdict) -> String {
+    match verdict {
+        Verdict::NotTested | Verdict::NoDifferenceShown => text,
+        verdict => format!("{text}, {}", verdict.words()),
+    }
 }

@@ -6,16 +6,18 @@ use serde::Serialize;
 
 use super::cli::{CompareArgs, CompareFormat};
 use super::conditions::{Condition, Judged, Unjudged, Verdicts};
-use super::{ComparedRun, Comparison, brief, render};
+use super::{ComparedRun, Comparison, render};
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::{Progress, Stage};
 
-/// Does what the command line says.
-pub fn work(args: &CompareArgs, console: &mut Console) -> CommandEnd {
-    let compared = Progress::begin().during(console, "reading runs", |stage| compared(args, stage));
+/// Does what the command line says, on a page of `columns`.
+pub fn work(args: &CompareArgs, columns: usize, console: &mut Console) -> CommandEnd {
+    let compared = Progress::begin().during(console, "reading runs", |stage| {
+        compared(args, columns, stage)
+    });
     match compared {
         Ok((text, has_failed)) => {
-            console.result(&format!("{text}\n"));
+            console.result(&text);
             if has_failed {
                 console.error("a condition of --fail-if holds");
                 return CommandEnd::Failed;
@@ -29,7 +31,7 @@ pub fn work(args: &CompareArgs, console: &mut Console) -> CommandEnd {
     }
 }
 
-fn compared(args: &CompareArgs, stage: &Stage) -> Result<(String, bool), String> {
+fn compared(args: &CompareArgs, columns: usize, stage: &Stage) -> Result<(String, bool), String> {
     let (base, new) = sides(args);
     // Wrong words are told before folders are read.
     let conditions = args.fail_if.iter().map(|text| Condition::parse(text));
@@ -58,9 +60,11 @@ fn compared(args: &CompareArgs, stage: &Stage) -> Result<(String, bool), String>
     }
     let has_failed = verdicts.judged.iter().any(|one| one.holds);
     let text = match args.format {
-        CompareFormat::Text if args.full => render::text(&comparison, &verdicts),
-        CompareFormat::Text => brief::text(&comparison, &verdicts),
-        CompareFormat::Md => render::markdown(&comparison, &verdicts),
+        CompareFormat::Text if args.full => render::full(&comparison, &verdicts, columns),
+        CompareFormat::Text => render::brief(&comparison, &verdicts, columns),
+        CompareFormat::Md => {
+            render::markdown(&comparison, &verdicts).map_err(|error| error.to_string())?
+        }
         CompareFormat::Json => json(&comparison, &verdicts)?,
     };
     Ok((text, has_failed))
@@ -88,5 +92,6 @@ fn json(comparison: &Comparison, verdicts: &Verdicts) -> Result<String, String> 
         conditions: &verdicts.judged,
         unjudged: &verdicts.unjudged,
     };
-    serde_json::to_string_pretty(&document).map_err(|error| error.to_string())
+    let text = serde_json::to_string_pretty(&document).map_err(|error| error.to_string())?;
+    Ok(text + "\n")
 }

@@ -1,7 +1,7 @@
 //! Axes of figures: where a value lies, and which values are written beside it. Linear and logarithmic,
 //! and one whose steps are nines, for the tails of distributions.
 
-use crate::terminal::{JOINT, duration};
+use hil_present::units::{JOINT, duration};
 
 /// A scale from values to places.
 #[derive(Debug, Clone, Copy)]

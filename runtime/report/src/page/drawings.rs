@@ -1,13 +1,13 @@
 //! Which figures a run and its channels get, with the words below them.
 
-use super::channel::{Sources, bar};
 use super::charts::bursts::loss_bursts;
 use super::charts::cdf::{Curve, delay_cdf};
 use super::charts::histogram::delay_histogram;
 use super::charts::waterfall::{Bar, waterfall};
-use super::data::Drawing;
+use crate::sections::Sources;
 use hil_account::ChannelAccount;
 use hil_platform::text::grouped;
+use hil_present::Drawing;
 
 /// A name that is fit to be a file and an identifier.
 pub(super) fn name_of(parts: &[&str]) -> String {
@@ -29,7 +29,6 @@ pub(super) fn of_channel(key: &str, channel: &str, sources: &Sources<'_>) -> Vec
                 caption: caption.to_owned(),
                 svg,
                 is_wide: false,
-                plot: None,
             });
         }
     };
@@ -149,6 +148,23 @@ pub(super) fn of_accounts<'a>(
             .to_owned(),
         svg: waterfall(title, &bars)?,
         is_wide: true,
-        plot: None,
     })
+}
+
+/// The chain of a channel for the waterfall.
+fn bar(channel: &str, account: &ChannelAccount) -> Bar {
+    let parts = account
+        .segments
+        .iter()
+        .filter(|segment| !segment.is_combined);
+    let parts = parts.filter_map(|segment| {
+        let summary = segment.distribution.measured()?;
+        Some((segment.name(), summary.p50_ns))
+    });
+    let whole = account.end_to_end.distribution.measured();
+    Bar {
+        channel: channel.to_owned(),
+        parts: parts.collect(),
+        whole_ns: whole.map(|one| one.p50_ns),
+    }
 }

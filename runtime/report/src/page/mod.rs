@@ -1,24 +1,18 @@
 //! Reports as files: one self-contained page with figures, or the same data as Markdown, LaTeX, CSV,
-//! JSON or SVG, or through a user's own template. [`read`] and [`mod@write`] touch files; everything
-//! else turns what was read into text.
+//! JSON or SVG, or through a user's own template. [`read`] and [`mod@write`] touch files; everything else
+//! turns what was read into text.
 
 mod axis;
-mod channel;
 mod charts;
-pub(crate) mod csv;
 pub(crate) mod data;
 mod drawings;
-mod events;
-mod paper;
 pub mod read;
 mod run;
 pub(crate) mod series;
 mod svg;
-mod template;
 #[cfg(test)]
 mod tests;
 mod timeline;
-mod words;
 pub mod write;
 
 use std::collections::BTreeSet;
@@ -26,12 +20,14 @@ use std::path::Path;
 
 use clap::ValueEnum;
 
-use self::data::{Drawing, Page, Run, RunKind, SCHEMA_VERSION, Table};
-use self::read::Material;
-use super::terminal::JOINT;
-use hil_platform::text::grouped;
+use hil_present::template::{self, TemplateError};
+use hil_present::units::JOINT;
+use hil_present::{Cell, Drawing, Section, Table, UNAVAILABLE, csv};
+use minijinja::{Value, context};
+use serde_json::json;
 
-pub(crate) use self::template::TemplateError;
+use self::data::{Page, Run, RunKind, SCHEMA_VERSION};
+use self::read::Material;
 
 /// What a report is written as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -72,12 +68,21 @@ pub const PAGE_BYTES_MAX: usize = 2_000_000;
 const STEPS_MAX: usize = 600;
 const STEPS_MIN: usize = 40;
 
-/// The data of `materials`, with series over time thinned to `steps` points.
-pub(crate) fn page_of(materials: &[Material], steps: usize) -> Page {
+/// The data of `materials`, with series over time thinned to `steps` points. `clean` is a run over a link that
+/// does not hurt: its values stand below those to see first.
+pub(crate) fn page_of(materials: &[Material], clean: Option<&Material>, steps: usize) -> Page {
     let runs = materials.iter().enumerate();
-    let runs: Vec<Run> = runs
+    let mut runs: Vec<Run> = runs
         .map(|(index, one)| run::of(one, index, steps))
         .collect();
+    if let Some(clean) = clean.map(|clean| run::of(clean, runs.len(), steps)) {
+        for tile in runs.iter_mut().flat_map(|run| &mut run.headline) {
+            let mut found = clean.headline.iter();
+            let found = found.find(|one| one.metric.name == tile.metric.name);
+            let text = found.map_or(UNAVAILABLE, |one| &one.metric.text);
+            tile.clean = Some(text.to_owned());
+        }
+    }
     let names: Vec<&str> = runs.iter().map(|run| run.name.as_str()).collect();
     let title = match names.as_slice() {
         [one] => (*one).to_owned(),
@@ -96,65 +101,80 @@ pub(crate) fn page_of(materials: &[Material], steps: usize) -> Page {
 fn overview(runs: &[Run]) -> Table {
     let mut columns = vec!["run", "outcome", "did the network hurt the robot"];
     let mut names: Vec<(&str, &str)> = Vec::new();
-    for figure in runs.iter().flat_map(|run| &run.headline) {
-        if names.iter().all(|(name, _)| *name != figure.name) {
-            let worst = run::WORST.iter().find(|(name, _)| *name == figure.name);
-            let label = worst.map_or(figure.label.as_str(), |(_, label)| label);
-            names.push((&figure.name, label));
+    for tile in runs.iter().flat_map(|run| &run.headline) {
+        let metric = &tile.metric;
+        if names.iter().all(|(name, _)| *name != metric.name) {
+            let worst = run::WORST.iter().find(|(name, _)| *name == metric.name);
+            let label = worst.map_or(metric.label.as_str(), |(_, label)| label);
+            names.push((&metric.name, label));
         }
     }
     columns.extend(names.iter().map(|(_, label)| *label));
     columns.push("incidents and hazards");
     let mut table = Table::new("Runs", &columns);
     for run in runs {
-        let mut row = vec![
-            run.name.clone(),
-            run.outcome.word.clone(),
-            run.answer.as_ref().map_or_else(
-                || words::UNAVAILABLE.to_owned(),
-                |answer| answer.answer.text.clone(),
-            ),
+        let answer = run
+            .answer
+            .as_ref()
+            .map(|answer| answer.answer.text.as_str());
+        let mut row: Vec<Cell> = vec![
+            run.name.clone().into(),
+            run.outcome.word.clone().into(),
+            answer.unwrap_or(UNAVAILABLE).into(),
         ];
         for (name, _) in &names {
-            let found = run.headline.iter().find(|figure| figure.name == *name);
-            row.push(found.map_or_else(
-                || words::UNAVAILABLE.to_owned(),
-                |figure| match figure.interval.as_str() {
-                    "" => figure.text.clone(),
-                    interval => format!("{} ({interval})", figure.text),
+            let mut metrics = run.headline.iter().map(|tile| &tile.metric);
+            let found = metrics.find(|one| one.name == *name);
+            let text = found.map_or_else(
+                || UNAVAILABLE.to_owned(),
+                |one| match one.interval.as_str() {
+                    "" => one.text.clone(),
+                    interval => format!("{} ({interval})", one.text),
                 },
-            ));
+            );
+            row.push(text.into());
         }
-        let count = match run.kind {
-            RunKind::Unfinished => words::UNAVAILABLE.to_owned(),
-            RunKind::Live | RunKind::Virtual => grouped(run.score_events.grave_count),
-        };
-        row.push(count);
-        table.rows.push(row);
+        let is_known = run.kind != RunKind::Unfinished;
+        row.push(Cell::count(is_known.then_some(run.grave_count)));
+        table.push(row);
     }
     "Largest values are those of the channel that has the largest; intervals are 95 %."
         .clone_into(&mut table.note);
     table
 }
 
-/// The report as text; a page keeps to [`PAGE_BYTES_MAX`] by fewer points over time where it must.
+/// The report as text, with the values of a `clean` run beside the first ones; a page keeps to [`PAGE_BYTES_MAX`] by fewer points over time where it must.
 ///
 /// # Errors
 /// When the template cannot be rendered.
 pub fn render(
     materials: &[Material],
+    clean: Option<&Material>,
     format: Format,
     template: Option<(&str, &str)>,
 ) -> Result<String, TemplateError> {
     let mut steps = (STEPS_MAX / materials.len().max(1)).max(STEPS_MIN);
     loop {
-        let page = page_of(materials, steps);
+        let page = page_of(materials, clean, steps);
         let text = match (template, format) {
-            (Some((name, text)), _) => template::own(name, text, &page)?,
-            (None, Format::Html) => template::html(&page)?,
-            (None, Format::Md) => template::markdown(&page)?,
-            (None, Format::Tex) => template::tex(&page)?,
-            (None, Format::Csv) => csv::text(&page),
+            (Some((name, text)), _) => template::render(name, text, &page, context! {})?,
+            (None, Format::Html) => html(&page)?,
+            (None, Format::Md) => {
+                let text =
+                    template::render("report.md", MARKDOWN, &page, context! { mark => MARK })?;
+                text.replace(JOINT, " ")
+            }
+            (None, Format::Tex) => {
+                let text = template::render("table.tex", TEX, &page, context! { mark => MARK })?;
+                text.replace(JOINT, "~")
+            }
+            (None, Format::Csv) => {
+                let rows = page
+                    .runs
+                    .iter()
+                    .map(|run| csv::rows(&run.name, &run.sections));
+                csv::HEADER.to_owned() + &rows.collect::<String>()
+            }
             (None, Format::Json) => json(&page),
             (None, Format::Svg) => charts(&page).iter().map(|one| one.svg.as_str()).collect(),
         };
@@ -166,6 +186,35 @@ pub fn render(
     }
 }
 
+const PAGE: &str = include_str!("templates/page.html");
+const MARKDOWN: &str = include_str!("templates/report.md");
+const TEX: &str = include_str!("templates/table.tex");
+const PAGE_STYLE: &str = include_str!("templates/page.css");
+const PAGE_SCRIPT: &str = include_str!("templates/page.js");
+
+/// What marks a file as one of ours, which may be overwritten.
+const MARK: &str = "hil-runtime report";
+
+fn html(page: &Page) -> Result<String, TemplateError> {
+    let plots = page.runs.iter().flat_map(|run| &run.plots);
+    let plots: serde_json::Map<String, serde_json::Value> = plots
+        .map(|(name, plot)| (name.clone(), json!(plot)))
+        .collect();
+    // Within a script element nothing is escaped, and "</script>" ends it.
+    let data = json!(plots)
+        .to_string()
+        .replace('<', "\\u003c")
+        .replace('>', "\\u003e")
+        .replace('&', "\\u0026");
+    let extra = context! {
+        style => Value::from_safe_string(format!("{}{PAGE_STYLE}", svg::STYLE)),
+        script => Value::from_safe_string(PAGE_SCRIPT.to_owned()),
+        plots => Value::from_safe_string(data),
+        mark => MARK,
+    };
+    template::render("page.html", PAGE, page, extra)
+}
+
 fn json(page: &Page) -> String {
     // The joint is for pages; in JSON it would only surprise.
     let text = serde_json::to_string_pretty(page).expect("texts, numbers and lists");
@@ -174,12 +223,8 @@ fn json(page: &Page) -> String {
 
 /// Every figure of a page.
 pub(crate) fn charts(page: &Page) -> Vec<&Drawing> {
-    let runs = page.runs.iter();
-    runs.flat_map(|run| {
-        let channels = run.channels.iter().flat_map(|channel| &channel.drawings);
-        run.drawings.iter().chain(channels)
-    })
-    .collect()
+    let sections = page.runs.iter().flat_map(|run| &run.sections);
+    sections.flat_map(Section::drawings).collect()
 }
 
 /// Figures as files of their own: name and text. `wanted` is a name, with or without `run-1-`.
@@ -190,7 +235,7 @@ pub fn figure_files(
     materials: &[Material],
     wanted: Option<&str>,
 ) -> Result<Vec<(String, String)>, String> {
-    let page = page_of(materials, STEPS_MAX);
+    let page = page_of(materials, None, STEPS_MAX);
     let all = charts(&page);
     let is_wanted = |one: &&&Drawing| {
         wanted.is_none_or(|wanted| {

@@ -21,8 +21,6 @@ pub struct Material {
     pub(crate) found: Found,
     /// What there is to plot.
     pub(crate) series: Vec<Series>,
-    /// `report-full.txt`.
-    pub(crate) printed: Option<String>,
     /// What could not be read, in words.
     pub problems: Vec<String>,
 }
@@ -51,8 +49,6 @@ pub(crate) struct Manifest {
 
 /// Largest series that is read, bytes: an hour of two arms is a tenth of it.
 const SERIES_BYTES_MAX: u64 = 1 << 30;
-/// Largest `report-full.txt` that goes into a page, bytes.
-const PRINTED_BYTES_MAX: usize = 200_000;
 
 /// Why a folder is none of a run.
 #[derive(Debug, thiserror::Error)]
@@ -82,14 +78,11 @@ pub fn read(path: &Path) -> Result<Material, ReadError> {
         Found::Unfinished(_) => Vec::new(),
         Found::Ended(_) => all_series(&folder.series(), &mut problems),
     };
-    let printed = fs::read_to_string(folder.full_report()).ok();
-    let printed = printed.filter(|text| text.len() <= PRINTED_BYTES_MAX);
     let name = path.canonicalize().unwrap_or_else(|_error| path.to_owned());
     Ok(Material {
         folder: RunFolder::existing(&name).name(),
         found,
         series,
-        printed,
         problems,
     })
 }

@@ -3,37 +3,14 @@
 
 use core::fmt::Write;
 
+use hil_present::template::escaped;
+
 /// The style sheet of figures, for the page and for files of their own.
 pub(super) const STYLE: &str = include_str!("templates/figure.css");
 
 /// Lines that can be told apart by colour alone, also by the colour-blind (Okabe and Ito, 2008).
 /// Dashes tell further ones apart.
 pub(super) const COLOUR_COUNT: usize = 7;
-
-/// `text` for XML and HTML, within elements and quoted attributes.
-pub(super) fn escaped(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => out.push_str("&amp;"),
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '"' => out.push_str("&quot;"),
-            '\'' => out.push_str("&#39;"),
-            // XML has no word for these, not even escaped.
-            '\u{0}'..='\u{8}'
-            | '\u{b}'
-            | '\u{c}'
-            | '\u{e}'..='\u{1f}'
-            | '\u{fffe}'
-            | '\u{ffff}' => {
-                out.push('\u{fffd}');
-            }
-            _ => out.push(c),
-        }
-    }
-    out
-}
 
 /// Attributes of an element with their values escaped.
 fn attribute_list<'a>(attributes: impl Iterator<Item = (&'a str, &'a str)>) -> String {

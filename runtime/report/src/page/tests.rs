@@ -7,8 +7,9 @@ use super::series::{Series, parse};
 use super::{Format, PAGE_BYTES_MAX, figure_files, page_of, render};
 use crate::network::TimelineSubject;
 use crate::summary::RunSummary;
-use crate::terminal::{JOINT, Style};
+use crate::terminal::Style;
 use crate::tests::sample::{awkward, empty, full};
+use hil_present::units::JOINT;
 
 const HOSTILE: &str = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>&amp;]]>";
 
@@ -17,13 +18,12 @@ fn material(summary: RunSummary) -> Material {
         folder: "swing".to_owned(),
         found: Found::Ended(Box::new(summary)),
         series: Vec::new(),
-        printed: Some("as printed <b>\u{1b}[2J".to_owned()),
         problems: Vec::new(),
     }
 }
 
 fn html(material: &Material) -> String {
-    render(std::slice::from_ref(material), Format::Html, None).unwrap()
+    render(std::slice::from_ref(material), None, Format::Html, None).unwrap()
 }
 
 /// Every element that begins ends, in order; attributes are quoted, and no text has a bare `<`.
@@ -90,7 +90,7 @@ fn a_full_page_is_well_formed_and_has_the_figures_of_the_summary() {
     let summary = full();
     let account = summary.channels[0].account.as_ref().unwrap();
     let p99 = account.end_to_end.distribution.measured().unwrap().p99_ns;
-    let p99 = crate::terminal::duration(p99);
+    let p99 = hil_present::units::duration(p99);
     assert!(page.contains(&p99), "{p99}");
     assert!(!page.contains("NaN"));
 }
@@ -148,7 +148,7 @@ fn hostile_texts_stay_texts() {
     assert_well_formed(&page);
     assert!(!page.contains("<img"), "escaped nowhere");
     assert_eq!(page.matches("<script").count(), 2);
-    let markdown = render(std::slice::from_ref(&material), Format::Md, None).unwrap();
+    let markdown = render(std::slice::from_ref(&material), None, Format::Md, None).unwrap();
     // An indented line is code, and shown as it is.
     let prose = markdown.lines().filter(|line| !line.starts_with("    "));
     let markdown = prose.collect::<Vec<_>>().join("\n");
@@ -178,7 +178,6 @@ fn runs_that_went_wrong_get_pages_that_say_so() {
     };
     let unfinished = Material {
         found: Found::Unfinished(manifest),
-        printed: None,
         ..material(full())
     };
     let mut torn = material(full());
@@ -197,7 +196,7 @@ fn runs_that_went_wrong_get_pages_that_say_so() {
         assert!(page.contains(expected), "{expected}");
         assert!(page.contains("unavailable"), "{expected}");
         for format in [Format::Md, Format::Tex, Format::Csv, Format::Json] {
-            let text = render(std::slice::from_ref(&material), format, None).unwrap();
+            let text = render(std::slice::from_ref(&material), None, format, None).unwrap();
             assert!(!text.contains("NaN"), "{format:?}");
         }
     }
@@ -205,8 +204,12 @@ fn runs_that_went_wrong_get_pages_that_say_so() {
 
 #[test]
 fn no_message_is_no_zero_delay() {
-    let page = page_of(&[material(empty())], 100);
-    let figures: BTreeMap<_, _> = super::csv::rows(&page.runs[0])
+    let page = page_of(&[material(empty())], None, 100);
+    let all = page.runs[0]
+        .sections
+        .iter()
+        .flat_map(hil_present::Section::metrics);
+    let figures: BTreeMap<_, _> = all
         .filter(|(channel, _)| *channel == "arm/command")
         .map(|(_, figure)| (figure.name.clone(), figure.clone()))
         .collect();
@@ -251,7 +254,7 @@ fn a_million_values_make_a_small_page_that_says_it_is_thinned() {
     assert!(page.len() < PAGE_BYTES_MAX, "{}", page.len());
     assert!(page.contains("smallest and largest value within"));
     let many = vec![material; 12];
-    let page = render(&many, Format::Html, None).unwrap();
+    let page = render(&many, None, Format::Html, None).unwrap();
     assert!(page.contains("12 runs"));
     assert_well_formed(&page);
 }
@@ -259,9 +262,9 @@ fn a_million_values_make_a_small_page_that_says_it_is_thinned() {
 #[test]
 fn several_runs_get_a_row_each_and_figures_of_their_own() {
     let both = [material(full()), material(empty())];
-    let page = page_of(&both, 100);
+    let page = page_of(&both, None, 100);
     assert_eq!(page.overview.as_ref().unwrap().rows.len(), 2);
-    let text = render(&both, Format::Html, None).unwrap();
+    let text = render(&both, None, Format::Html, None).unwrap();
     assert_well_formed(&text);
     let ids: Vec<&str> = text
         .split(" id=\"")
@@ -278,7 +281,7 @@ fn several_runs_get_a_row_each_and_figures_of_their_own() {
 fn markdown_says_the_name_of_its_only_run_once() {
     let one = material(full());
     let headings = |materials: &[Material]| {
-        let text = render(materials, Format::Md, None).unwrap();
+        let text = render(materials, None, Format::Md, None).unwrap();
         let lines = text
             .lines()
             .filter(|line| line.starts_with("# ") || line.starts_with("## "));
@@ -291,21 +294,24 @@ fn markdown_says_the_name_of_its_only_run_once() {
 #[test]
 fn the_other_formats_have_the_same_metrics() {
     let one = [material(full())];
-    let csv = render(&one, Format::Csv, None).unwrap();
+    let csv = render(&one, None, Format::Csv, None).unwrap();
     assert!(csv.starts_with("run,channel,figure,value,unit,low,high,method\r\n"));
     assert!(csv.contains("swing-split,arm/command,p99,"), "{csv}");
-    let tex = render(&one, Format::Tex, None).unwrap();
+    let tex = render(&one, None, Format::Tex, None).unwrap();
     assert_eq!(
         tex.matches("\\begin{tabular}").count(),
         tex.matches("\\bottomrule").count()
     );
     assert!(tex.contains("\\toprule"), "{tex}");
     let json: serde_json::Value =
-        serde_json::from_str(&render(&one, Format::Json, None).unwrap()).unwrap();
-    assert_eq!(json["schema_version"], 1);
-    assert_eq!(json["runs"][0]["channels"][0]["name"], "arm/command");
+        serde_json::from_str(&render(&one, None, Format::Json, None).unwrap()).unwrap();
+    assert_eq!(json["schema_version"], 2);
+    let sections = json["runs"][0]["sections"].as_array().unwrap();
+    let channels = sections.iter().find(|one| one["id"] == "channels").unwrap();
+    assert_eq!(channels["children"][0]["subject"], "arm/command");
     let own = render(
         &one,
+        None,
         Format::Html,
         Some(("x.html", "<b>{{ runs[0].name }}</b>")),
     )
@@ -357,10 +363,10 @@ fn a_reason_is_said_once_with_all_that_it_is_for() {
         "{terminal}"
     );
     assert!(terminal.contains("unavailable, 10: no whole motion loop"));
-    let markdown = render(&[material(summary.clone())], Format::Md, None).unwrap();
+    let markdown = render(&[material(summary.clone())], None, Format::Md, None).unwrap();
     assert_eq!(markdown.matches("no whole motion loop").count(), 1);
     // For programs each figure stands by itself.
-    let csv = render(&[material(summary)], Format::Csv, None).unwrap();
+    let csv = render(&[material(summary)], None, Format::Csv, None).unwrap();
     assert_eq!(csv.matches("no whole motion loop").count(), 10);
 }
 
@@ -380,4 +386,19 @@ fn long_lists_show_their_beginning_and_how_much_is_folded() {
     assert!(shown.matches("<li>").count() == 4, "{shown}");
     let folded = rest.split("</details>").next().unwrap();
     assert!(folded.contains("odd thing 29") && folded.contains("more of"));
+}
+
+#[test]
+fn the_clean_runs_value_stands_below_each_tile() {
+    let run = [material(full())];
+    let mut summary = full();
+    summary.score[0].value = Some(0.001);
+    let clean = material(summary);
+    let page = render(&run, Some(&clean), Format::Html, None).unwrap();
+    assert_well_formed(&page);
+    let page = page.replace(JOINT, " ");
+    assert!(page.contains("clean run: 0.001000 rad"), "{page}");
+    assert!(!html(&run[0]).contains("clean run:"));
+    let nothing = render(&run, Some(&material(empty())), Format::Html, None).unwrap();
+    assert!(nothing.contains("clean run: unavailable"));
 }

@@ -6,13 +6,13 @@ use core::ops::Range;
 use hil_core::case_study::Severity;
 
 use super::charts::time::{Mark, MarkClass, over_time};
-use super::data::Drawing;
 use super::drawings::name_of;
 use super::series::{Plot, PlotPanel, Series, Thinned, thinned};
 use crate::link_change::LinkChange;
 use crate::network::{NetworkQuantity, NetworkReport, TimelineRow, TimelineSubject};
 use crate::score_event::{ExplainedEvent, ScoreEvents};
-use crate::terminal::duration_s;
+use hil_present::Drawing;
+use hil_present::units::duration_s;
 
 /// Lines of one panel; a series with more columns gets more panels.
 const LINES_MAX: usize = 7;
@@ -29,7 +29,7 @@ pub(super) fn over_run(
     changes: &[LinkChange],
     series: &[Series],
     point_count: usize,
-) -> Drawing {
+) -> (Drawing, Plot) {
     let rows = &report.timeline.rows;
     let step_s = report.timeline.step_s;
     let ends = rows.iter().map(|row| row.values.len() as f64 * step_s);
@@ -64,14 +64,14 @@ pub(super) fn over_run(
     };
     let name = name_of(&[key, "timeline"]);
     let title = "Network and robot over time";
-    Drawing {
+    let drawing = Drawing {
         svg: over_time(&name, title, &plot, &bands, &moments),
         name,
         title: title.to_owned(),
         caption,
         is_wide: true,
-        plot: Some(plot),
-    }
+    };
+    (drawing, plot)
 }
 
 /// What is shaded: outages and processes that were down; of too many the longest.
@@ -245,7 +245,7 @@ pub(super) fn of_case(
     key: &str,
     series: &[Series],
     steps: usize,
-) -> (Option<Drawing>, Vec<String>) {
+) -> (Option<(Drawing, Plot)>, Vec<String>) {
     let is_own = |one: &&Series| !one.name.starts_with("network-") && one.columns.len() > 1;
     let is_timed = |one: &&Series| {
         one.columns
@@ -287,9 +287,8 @@ pub(super) fn of_case(
         title: title.to_owned(),
         caption,
         is_wide: true,
-        plot: Some(plot),
     };
-    (Some(drawing), left_out)
+    (Some((drawing, plot)), left_out)
 }
 
 /// Panels of the case's series, and the files that found no room.

@@ -5,7 +5,7 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process;
 
-use super::template::MARK;
+use super::MARK;
 
 /// How much of a file is looked at for its mark, bytes.
 const HEAD_BYTES: u64 = 4096;

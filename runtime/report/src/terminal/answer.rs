@@ -1,11 +1,13 @@
 //! The answer of a run as the last lines of a report, where a reader looks first. It draws no conclusions.
 
-use super::brief::{cause, gravest};
-use super::canvas::{Canvas, Tone};
+use super::brief::gravest_first;
 use crate::answer::{Answer, Evidence, Hurt, metric_words};
 use crate::assessment::Assessment;
+use crate::sections::events::cause;
 use crate::summary::RunSummary;
 use hil_platform::text::{columns, shortened};
+use hil_present::Tone;
+use hil_present::terminal::canvas::Canvas;
 
 /// Columns of a line's label: the longest harm of a case fits.
 const LABEL_WIDTH: usize = 34;
@@ -27,7 +29,7 @@ pub(super) fn answer(canvas: &mut Canvas, summary: &RunSummary, assessment: &Ass
         canvas.paragraph(0, answer.tone(), &words);
     }
     let evidence = Evidence::of(summary);
-    let gravest = gravest(&summary.score_events.events);
+    let gravest = gravest_first(&summary.score_events.events);
     let explained = gravest.into_iter().find(|event| evidence.explains(event));
     if answer.hurt == Hurt::Yes
         && let Some(event) = explained

@@ -9,14 +9,18 @@ use hil_core::case_study::Severity;
 use hil_platform::text::{grouped, shortened};
 use hil_platform::words::counted;
 
-use super::canvas::{Canvas, INDENT, Style, Tone, left, right, wrapped};
-use super::events::severity_counts;
-use super::units::{duration, percent, seconds};
-use super::{answer, timeline};
+use hil_present::terminal::canvas::{Canvas, INDENT, Style, wrapped};
+use hil_present::terminal::section;
+use hil_present::units::seconds;
+use hil_present::{Block, Cell, Event, EventList, Row, Section, Table, Tone, UNAVAILABLE};
+
+use super::answer;
 use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested};
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
+use crate::sections::events::{cause, severity_counts, severity_tone};
+use crate::sections::{outcome_words, strips};
 use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
 
@@ -28,10 +32,10 @@ const LINES_MAX: usize = 50;
 const WARNINGS_FRAME: usize = 3;
 /// Rows of the robot in the time strip.
 const ROBOT_ROWS: usize = 2;
-/// Columns of a time, of a channel's name at least, and of a figure.
-const TIME_WIDTH: usize = 13;
-const FIGURE_WIDTH: usize = 9;
-const LOST_WIDTH: usize = 18;
+/// Columns of a text beside a time.
+const EVENT_MARGIN: usize = 16;
+/// Columns of a channel's name.
+const NAME_WIDTH: usize = 34;
 /// Columns of what a command is for.
 const NEXT_WIDTH: usize = 24;
 /// Channels are alike whose figures differ by less than this share.
@@ -42,9 +46,14 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
     let assessment = Assessment::of(summary);
     let mut canvas = Canvas::new(width_columns, style);
     title(&mut canvas, summary);
-    causes(&mut canvas, summary);
-    channels(&mut canvas, summary);
-    strip(&mut canvas, summary);
+    let width = canvas.width();
+    for one in [
+        causes(summary, width),
+        channels(summary),
+        over_time(summary),
+    ] {
+        section(&mut canvas, &one);
+    }
     let mut end = Canvas::new(width_columns, style);
     next(&mut end, summary, &Answer::of(summary, &assessment));
     answer::answer(&mut end, summary, &assessment);
@@ -64,79 +73,57 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
     let facts = shortened(&facts, canvas.width());
     canvas.painted_line(Tone::Strong, &facts);
     if run.outcome != Outcome::Completed {
-        let (tone, word) = super::outcome_words(run.outcome);
+        let (tone, word) = outcome_words(run.outcome);
         let text = shortened(&format!("{word}: {}", run.exit_reason), 2 * canvas.width());
         canvas.paragraph(0, tone, &text);
     }
 }
 
 /// What hurt the robot or might have, the gravest first, each with what the network did before.
-fn causes(canvas: &mut Canvas, summary: &RunSummary) {
-    let events = &summary.score_events.events;
-    let is_explained = |event: &ExplainedEvent| Evidence::of(summary).explains(event);
-    let grave = gravest(events);
-    let hidden = grave.len().saturating_sub(CAUSES_SHOWN) as u64;
-    canvas.heading("Robot, and the network before it", &severity_counts(events));
-    for event in grave.iter().take(CAUSES_SHOWN) {
-        let tone = if event.severity == Severity::Incident {
-            Tone::Bad
-        } else {
-            Tone::Caution
-        };
-        let time = event.at_s.map_or_else(|| "unavailable".to_owned(), seconds);
-        let room = canvas.width() - INDENT - TIME_WIDTH;
-        canvas.field_of(
-            TIME_WIDTH,
-            &time,
-            tone,
-            &shortened(&event.what, 2 * room - 20),
-        );
-        let relation = if is_explained(event) {
+fn causes(summary: &RunSummary, width: usize) -> Section {
+    let all = &summary.score_events.events;
+    let evidence = Evidence::of(summary);
+    let grave = gravest_first(all);
+    let title = "Robot, and the network before it";
+    let mut section = Section::new("robot", title, severity_counts(all));
+    if grave.is_empty() {
+        section.note(Tone::Plain, "no incident and no hazard");
+        return section;
+    }
+    // Two lines each at most.
+    let room = 2 * (width - EVENT_MARGIN) - 20;
+    let event = |event: &&ExplainedEvent| {
+        let relation = if evidence.explains(event) {
             "after"
         } else {
             "beside"
         };
         let cause = format!("{relation} {}", cause(event));
-        canvas.field_of(
-            TIME_WIDTH,
-            "",
-            Tone::Plain,
-            &shortened(&cause, 2 * room - 20),
-        );
-    }
-    if grave.is_empty() {
-        canvas.paragraph(INDENT, Tone::Plain, "no incident and no hazard");
-    }
-    if hidden > 0 {
-        let text = format!("and {} of less weight or later", counted(hidden, "event"));
-        canvas.paragraph(INDENT, Tone::Faint, &text);
-    }
+        Event {
+            at: event.at_s.map_or_else(|| UNAVAILABLE.to_owned(), seconds),
+            severity: event.severity_word(),
+            tone: severity_tone(event.severity),
+            what: shortened(&event.what, room),
+            beside: vec![shortened(&cause, room)],
+        }
+    };
+    let events = grave.iter().take(CAUSES_SHOWN).map(event).collect();
+    let note = match grave.len().saturating_sub(CAUSES_SHOWN) as u64 {
+        0 => String::new(),
+        hidden => format!("and {} of less weight or later", counted(hidden, "event")),
+    };
+    section
+        .blocks
+        .push(Block::Events(EventList { events, note }));
+    section
 }
 
 /// Incidents, then hazards, each in order of time.
-pub(super) fn gravest(events: &[ExplainedEvent]) -> Vec<&ExplainedEvent> {
+pub(super) fn gravest_first(events: &[ExplainedEvent]) -> Vec<&ExplainedEvent> {
     let grave = events.iter().filter(|one| one.severity > Severity::Notice);
     let mut grave: Vec<&ExplainedEvent> = grave.collect();
     grave.sort_by_key(|one| core::cmp::Reverse(one.severity));
     grave
-}
-
-/// The network event that has most to do with it.
-pub(super) fn cause(event: &ExplainedEvent) -> String {
-    let network = event.network.as_ref();
-    let outage = event.outages.first().map(|one| one.words.clone());
-    let beside = || event.network_beside().first().map(|one| one.words.clone());
-    let lost = || {
-        let mut messages = event.messages.iter();
-        let lost = messages.find(|one| one.fate.is_some_and(MessageFate::is_loss));
-        lost.map(|one| format!("{} {}: {}", one.channel, grouped(one.sequence), one.words))
-    };
-    outage.or_else(beside).or_else(lost).unwrap_or_else(|| {
-        network.map_or_else(
-            || "nothing that is known of the network".to_owned(),
-            crate::network::PrecedingNetwork::nothing_words,
-        )
-    })
 }
 
 /// What a channel's line shows.
@@ -209,7 +196,7 @@ impl Group<'_> {
             return String::new();
         };
         if rest.is_empty() {
-            return left(first, width);
+            return shortened(first, width);
         }
         let index = differing_part(first, rest[0]).unwrap_or(0);
         let of = |name: &str| name.split('/').nth(index).unwrap_or_default().to_owned();
@@ -218,9 +205,9 @@ impl Group<'_> {
         shown[index] = format!("{{{}}}", all.join(","));
         let whole = shown.join("/");
         if whole.chars().count() <= width {
-            return left(&whole, width);
+            return whole;
         }
-        left(&format!("{first} and {} alike", rest.len()), width)
+        shortened(&format!("{first} and {} alike", rest.len()), width)
     }
 }
 
@@ -266,7 +253,8 @@ fn groups<'a>(channels: &[&'a ChannelSummary], network: &[ChannelNetwork]) -> Ve
 }
 
 /// One line a channel, alike ones together, those that lost most first.
-fn channels(canvas: &mut Canvas, summary: &RunSummary) {
+fn channels(summary: &RunSummary) -> Section {
+    let mut section = Section::new("channels", "Channels", "from publication to the consumer");
     let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
     let shown: Vec<&ChannelSummary> = summary
         .channels
@@ -277,67 +265,58 @@ fn channels(canvas: &mut Canvas, summary: &RunSummary) {
     let network = network.map_or(&[][..], |report| &report.channels);
     let mut groups = groups(&shown, network);
     if groups.is_empty() {
-        return;
+        return section;
     }
     groups.sort_by(|one, other| other.line.loss_ratio().total_cmp(&one.line.loss_ratio()));
-    canvas.heading("Channels", "from publication to the consumer");
-    let name_width = canvas.width() - INDENT - 4 * FIGURE_WIDTH - LOST_WIDTH;
-    let line = format!(
-        "{:INDENT$}{}{}{}{}{}{}",
+    let mut table = Table::new(
         "",
-        left("", name_width),
-        right("p50", FIGURE_WIDTH),
-        right("p99", FIGURE_WIDTH),
-        right("max", FIGURE_WIDTH),
-        right("lost", LOST_WIDTH),
-        right("gap", FIGURE_WIDTH)
+        &["channel", "p50", "p99", "max", "lost", "%", "longest gap"],
     );
-    canvas.painted_line(Tone::Faint, &line);
     for group in groups.iter().take(CHANNELS_SHOWN) {
-        let Line {
-            delay,
-            published_count,
-            lost_count,
-            gap_ns,
-        } = &group.line;
-        let or_dash = |ns: Option<i64>| ns.map_or_else(|| "–".to_owned(), duration);
-        let delay = |index: usize| or_dash(delay.map(|all| all[index]));
-        let lost = match lost_count {
-            0 => format!("0 of {}", grouped(*published_count)),
-            count => format!("{} {}", grouped(*count), percent(group.line.loss_ratio())),
-        };
-        let tone = if *lost_count > 0 {
-            Tone::Caution
-        } else {
-            Tone::Plain
-        };
-        let line = format!(
-            "{:INDENT$}{}{}{}{}{}{}",
-            "",
-            group.name(name_width),
-            right(&delay(0), FIGURE_WIDTH),
-            right(&delay(1), FIGURE_WIDTH),
-            right(&delay(2), FIGURE_WIDTH),
-            canvas.paint(tone, &right(&lost, LOST_WIDTH)),
-            right(&or_dash(*gap_ns), FIGURE_WIDTH)
-        );
-        canvas.line(&line);
+        let line = &group.line;
+        let delay = |index: usize| Cell::duration(line.delay.map(|all| all[index]));
+        table.rows.push(Row {
+            cells: vec![
+                group.name(NAME_WIDTH).into(),
+                delay(0),
+                delay(1),
+                delay(2),
+                format!(
+                    "{} of {}",
+                    grouped(line.lost_count),
+                    grouped(line.published_count)
+                )
+                .into(),
+                Cell::Share(line.loss_ratio()),
+                Cell::duration(line.gap_ns),
+            ],
+            tone: if line.lost_count > 0 {
+                Tone::Caution
+            } else {
+                Tone::Plain
+            },
+            bar: None,
+        });
     }
     let hidden = groups.iter().skip(CHANNELS_SHOWN);
     let hidden: usize = hidden.map(|group| group.names.len()).sum();
     if hidden > 0 {
-        let text = format!(
-            "and {} that lost no larger share",
-            counted(hidden as u64, "channel")
-        );
-        canvas.paragraph(INDENT, Tone::Faint, &text);
+        let hidden = counted(hidden as u64, "channel");
+        table.note = format!("and {hidden} that lost no larger share");
     }
+    section.table(table);
+    section
 }
 
 /// The network above, the robot below, on one axis.
-fn strip(canvas: &mut Canvas, summary: &RunSummary) {
+fn over_time(summary: &RunSummary) -> Section {
+    let mut section = Section::new(
+        "over-time",
+        "Network and robot over time",
+        "each row to its own largest value, · unknown",
+    );
     let Some(report) = &summary.network else {
-        return;
+        return section;
     };
     let mut rows = Vec::new();
     for quantity in [NetworkQuantity::Loss, NetworkQuantity::Delay] {
@@ -346,11 +325,10 @@ fn strip(canvas: &mut Canvas, summary: &RunSummary) {
     let robot = report.timeline.rows.iter();
     let robot = robot.filter(|row| matches!(row.subject, TimelineSubject::Robot { .. }));
     rows.extend(robot.take(ROBOT_ROWS).cloned());
-    let all = Timeline {
-        step_s: report.timeline.step_s,
-        rows,
-    };
-    timeline::timeline(canvas, &all, &summary.link_changes);
+    let step_s = report.timeline.step_s;
+    let strips = strips(&Timeline { step_s, rows }, &summary.link_changes);
+    section.blocks.extend(strips.map(Block::Strips));
+    section
 }
 
 /// The worst channel in each step.

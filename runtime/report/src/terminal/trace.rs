@@ -8,13 +8,12 @@ use hil_trace::fit::{Fit, Ranking, TraceFit};
 use hil_trace::metrics::{Memory, RunCount, TraceMetrics};
 use hil_trace::{Trace, TraceHeader};
 
-use super::Style;
-use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
-use super::units::{duration, percent, seconds};
 use hil_platform::text::grouped;
+use hil_present::terminal::canvas::Style;
+use hil_present::terminal::render;
+use hil_present::units::{duration, percent, seconds};
+use hil_present::{Bar, Cell, Row, Section, Table, Tone};
 
-/// Columns of a label.
-const LABEL: usize = 20;
 /// Rows of a distribution.
 const PLOT_ROWS: usize = 20;
 
@@ -25,9 +24,8 @@ pub(crate) fn render_trace(
     width_columns: usize,
     style: Style,
 ) -> String {
-    let mut canvas = Canvas::new(width_columns, style);
-    heading(&mut canvas, &trace.header);
-    let mut field = |label: &str, text: &str| canvas.field_of(LABEL, label, Tone::Plain, text);
+    let mut section = section_of(&trace.header);
+    let mut field = |label: &str, text: &str| section.fact(label, Tone::Plain, text);
     let counts = &figures.counts;
     let span_s = trace.records.last().map_or(0, |record| record.published_ns) as f64 * 1e-9;
     field(
@@ -59,7 +57,7 @@ pub(crate) fn render_trace(
                 duration(interval.high_ns)
             )
         });
-        let name = format!("  p{}", quantile.quantile * 100.0);
+        let name = format!("p{}", quantile.quantile * 100.0);
         field(&name, &format!("{}{interval}", duration(quantile.value_ns)));
     }
     if figures.late_delay.measured().is_some() {
@@ -77,19 +75,18 @@ pub(crate) fn render_trace(
             grouped(counts.duplicated_count)
         ),
     );
-    canvas.paragraph(
-        INDENT,
+    section.note(
         Tone::Faint,
-        &format!(
+        format!(
             "Loss ratio with Wilson's 95 % interval over messages of known fate; quantiles with 95 % \
              intervals by resampling blocks, seed {}; memory is the autocorrelation over messages.",
             figures.seed
         ),
     );
-    canvas.finish()
+    render(&[section], width_columns, style)
 }
 
-fn heading(canvas: &mut Canvas, header: &TraceHeader) {
+fn section_of(header: &TraceHeader) -> Section {
     let of = |name: &str, otherwise: &str| {
         if name.is_empty() {
             otherwise.to_owned()
@@ -109,7 +106,7 @@ fn heading(canvas: &mut Canvas, header: &TraceHeader) {
         of(&header.run, "unknown"),
         of(&header.clock, "clocks unknown")
     );
-    canvas.heading(&of(&header.channel, "a trace"), &aside);
+    Section::new("trace", of(&header.channel, "a trace"), aside)
 }
 
 fn outage_words(figures: &TraceMetrics) -> String {
@@ -234,84 +231,65 @@ pub(crate) fn render_fit(
     width_columns: usize,
     style: Style,
 ) -> String {
-    let mut canvas = Canvas::new(width_columns, style);
-    heading(&mut canvas, header);
+    let mut section = section_of(header);
     let messages = grouped(fit.loss_message_count as u64);
-    ranking(
-        &mut canvas,
-        &format!("Loss, {messages} messages"),
-        &fit.loss,
-    );
     let tested = grouped(fit.tested_delay_count as u64);
-    ranking(
-        &mut canvas,
-        &format!("Delay, distance tested on {tested} messages"),
-        &fit.delay,
-    );
+    section.children = vec![
+        ranking(&format!("Loss, {messages} messages"), &fit.loss),
+        ranking(
+            &format!("Delay, distance tested on {tested} messages"),
+            &fit.delay,
+        ),
+    ];
+    let mut method = Section::new("method", "Method", "");
     for remark in &fit.remarks {
-        canvas.paragraph(INDENT, Tone::Caution, remark);
+        method.note(Tone::Caution, remark);
     }
-    canvas.paragraph(
-        INDENT,
+    method.note(
         Tone::Faint,
-        &format!(
+        format!(
             "AIC = 2 k - 2 ln L, smaller is better. Bursts: chi-square of their lengths. KS: largest \
              difference of the distribution functions, its probability by a parametric bootstrap of \
              199 samples, seed {}. A probability below 0.05 speaks against the law.",
             fit.seed
         ),
     );
-    canvas.blank();
-    canvas.finish()
+    render(&[section, method], width_columns, style) + "\n"
 }
 
-fn ranking(canvas: &mut Canvas, title: &str, ranking: &Ranking) {
-    section(canvas, title);
+fn ranking(title: &str, ranking: &Ranking) -> Section {
+    let mut section = Section::new("ranking", title, "");
     if !ranking.fits.is_empty() {
-        let names = format!(
-            "{:INDENT$}  {}{}{}{}{}",
-            "",
-            left("law", 18),
-            right("k", 4),
-            right("AIC", 14),
-            right("bursts p", 12),
-            right("KS (p)", 18)
-        );
-        canvas.painted_line(Tone::Faint, &names);
+        let mut table = Table::new("", &["law", "k", "AIC", "bursts p", "KS (p)"]);
+        for (index, fit) in ranking.fits.iter().enumerate() {
+            let is_best = ranking.best == Some(index);
+            table.rows.push(Row {
+                cells: fit_cells(fit),
+                tone: if is_best { Tone::Good } else { Tone::Plain },
+                bar: None,
+            });
+        }
+        section.table(table);
+        for fit in &ranking.fits {
+            let text = format!("{}; {}", fit.parameters, fit.method);
+            section.fact(&fit.law, Tone::Faint, text);
+        }
     }
-    for (index, fit) in ranking.fits.iter().enumerate() {
-        let is_best = ranking.best == Some(index);
-        let tone = if is_best { Tone::Good } else { Tone::Plain };
-        let mark = if is_best { "→ " } else { "  " };
-        let line = format!("{:INDENT$}{mark}{}", "", fit_line(fit));
-        canvas.painted_line(tone, &line);
-        canvas.paragraph(
-            INDENT + 4,
-            Tone::Faint,
-            &format!("{}; {}", fit.parameters, fit.method),
-        );
-    }
-    canvas.paragraph(INDENT, Tone::Plain, &format!("Taken: {}.", ranking.why));
+    section.note(Tone::Plain, format!("Taken: {}.", ranking.why));
+    section
 }
 
-fn fit_line(fit: &Fit) -> String {
-    let aic = fit.aic.map_or("–".to_owned(), |aic| format!("{aic:.1}"));
-    let bursts = fit
-        .bursts
-        .as_ref()
-        .map_or("–".to_owned(), |test| format!("{:.3}", test.probability));
-    let distance = match (fit.ks_distance, fit.ks_probability) {
-        (Some(distance), Some(p)) => format!("{distance:.4} ({p:.3})"),
-        _ => "–".to_owned(),
-    };
-    format!(
-        "{}{}{}{}{}",
-        left(&fit.law, 18),
-        right(&fit.parameter_count.to_string(), 4),
-        right(&aic, 14),
-        right(&bursts, 12),
-        right(&distance, 18)
-    )
+fn fit_cells(fit: &Fit) -> Vec<Cell> {
+    let or_none = |text: Option<String>| text.map_or(Cell::Missing, Cell::Text);
+    let bursts = fit.bursts.as_ref();
+    let distance = fit.ks_distance.zip(fit.ks_probability);
+    vec![
+        fit.law.clone().into(),
+        Cell::Count(fit.parameter_count as u64),
+        or_none(fit.aic.map(|aic| format!("{aic:.1}"))),
+        or_none(bursts.map(|test| format!("{:.3}", test.probability))),
+        or_none(distance.map(|(distance, p)| format!("{distance:.4} ({p:.3})"))),
+    ]
 }
 
 /// Delay distribution, burst lengths and memory as bars.
@@ -321,12 +299,10 @@ pub(crate) fn render_trace_plots(
     width_columns: usize,
     style: Style,
 ) -> String {
-    let mut canvas = Canvas::new(width_columns, style);
-    heading(&mut canvas, &trace.header);
+    let mut section = section_of(&trace.header);
     let mut delays = trace.delays_ns();
     delays.sort_unstable();
-    section(&mut canvas, "Share of the messages delivered within");
-    canvas.paragraph(INDENT, Tone::Faint, &delay_words(figures));
+    let mut within = Table::new("", &["delay", "share"]);
     for row in 0..PLOT_ROWS.min(delays.len()) {
         // From the smallest delay to the 99.9th percentile, in equal steps.
         let last = delays[(delays.len() - 1) * 999 / 1000];
@@ -334,54 +310,57 @@ pub(crate) fn render_trace_plots(
         let rows = i64::try_from(PLOT_ROWS).unwrap_or(1);
         let upto = delays[0] + (last - delays[0]) / rows * step + i64::from(step == rows) * rows;
         let share = delays.partition_point(|delay| *delay <= upto) as f64 / delays.len() as f64;
-        bar_line(&mut canvas, &duration(upto), &percent(share), share);
+        push_bar(
+            &mut within,
+            [Cell::Duration(upto), Cell::Share(share)],
+            share,
+        );
     }
-    section(&mut canvas, "Losses in a row");
-    if figures.loss_bursts.is_empty() {
-        canvas.paragraph(INDENT, Tone::Faint, "nothing was lost");
-    }
+    let title = "Share of the messages delivered within";
+    section
+        .children
+        .push(plot(title, &delay_words(figures), within));
+    let mut lost = Table::new("", &["in a row", "times"]);
     for (name, count, share) in classes(&figures.loss_bursts) {
-        bar_line(&mut canvas, &name, &grouped(count), share);
+        push_bar(&mut lost, [name.into(), Cell::Count(count)], share);
     }
+    section
+        .children
+        .push(plot("Losses in a row", "nothing was lost", lost));
     for (title, memory) in [
-        (
-            "Autocorrelation of loss, by lag in messages",
-            &figures.loss_memory,
-        ),
-        (
-            "Autocorrelation of delay, by lag in messages",
-            &figures.delay_memory,
-        ),
+        ("Autocorrelation of loss", &figures.loss_memory),
+        ("Autocorrelation of delay", &figures.delay_memory),
     ] {
-        section(&mut canvas, title);
-        let Some(memory) = memory else {
-            canvas.paragraph(INDENT, Tone::Faint, &memory_words(None));
-            continue;
-        };
-        for (index, value) in memory.coefficients.iter().enumerate().take(PLOT_ROWS) {
-            let lag = (index + 1).to_string();
-            bar_line(&mut canvas, &lag, &format!("{value:.3}"), *value);
+        let mut table = Table::new("", &["lag, messages", "coefficient"]);
+        let coefficients = memory.iter().flat_map(|memory| &memory.coefficients);
+        for (index, value) in coefficients.enumerate().take(PLOT_ROWS) {
+            let lag = Cell::Count(index as u64 + 1);
+            push_bar(&mut table, [lag, format!("{value:.3}").into()], *value);
         }
+        section
+            .children
+            .push(plot(title, &memory_words(None), table));
     }
-    canvas.finish()
+    render(&[section], width_columns, style)
 }
 
-fn section(canvas: &mut Canvas, title: &str) {
-    canvas.blank();
-    let title = format!("{:INDENT$}{title}", "");
-    canvas.painted_line(Tone::Strong, &title);
+/// `table` below its title, or why there is none.
+fn plot(title: &str, otherwise: &str, table: Table) -> Section {
+    let mut section = Section::new("plot", title, "");
+    if table.rows.is_empty() {
+        section.note(Tone::Faint, otherwise);
+    } else {
+        section.table(table);
+    }
+    section
 }
 
-fn bar_line(canvas: &mut Canvas, name: &str, value: &str, share: f64) {
-    let width = canvas.width().saturating_sub(INDENT + 30);
-    let painted = canvas.paint(Tone::Bar, &bar(0.0, share, width));
-    let line = format!(
-        "{:INDENT$}{}{}  {painted}",
-        "",
-        right(name, 12),
-        right(value, 12)
-    );
-    canvas.line(&line);
+fn push_bar(table: &mut Table, cells: [Cell; 2], end: f64) {
+    table.rows.push(Row {
+        cells: cells.to_vec(),
+        tone: Tone::Plain,
+        bar: Some(Bar { start: 0.0, end }),
+    });
 }
 
 /// Burst lengths in classes of powers of two, with their share.

@@ -6,7 +6,9 @@ use super::sample::{awkward, check_golden, empty, full, link};
 use crate::answer::{Answer, Clocks, HarmCount, Hurt, OccasionCount, Unresolved, Untested};
 use crate::assessment::Assessment;
 use crate::summary::{LinkKind, Outcome, RunSummary};
-use crate::terminal::{JOINT, Style, Tone, brief};
+use crate::terminal::{Style, brief};
+use hil_present::Tone;
+use hil_present::units::JOINT;
 
 fn lost_loops(count: Option<u64>, own_count: u64, sent_count: u64) -> HarmCount {
     HarmCount {

@@ -216,16 +216,17 @@ pub(crate) fn ticking() -> ProcessSummary {
 }
 
 #[test]
-fn the_page_shows_the_gravest_events_and_counts_the_rest() {
+fn the_report_has_every_event_and_counts_those_without_room() {
     let mut all = summary(recorded_channel());
     all.score_events = many_events("met");
     let text = render(&all, 100, Style::Plain);
     assert!(text.contains("1 incident, 0 hazards, 20 notices"), "{text}");
     assert!(text.contains("met (clock of robot-pc)"), "{text}");
-    assert_eq!(text.matches("braked (clock of robot-pc)").count(), 11);
-    assert!(text.contains(
-        "9 more events are in events.log and summary.json, or printed by --json; 17 found no room"
-    ));
+    assert_eq!(text.matches("braked (clock of robot-pc)").count(), 20);
+    assert!(
+        text.contains("17 more found no room in the score"),
+        "{text}"
+    );
     assert!(text.contains("Clocks are not aligned"));
     assert!(text.contains("and 6 more messages"));
 }

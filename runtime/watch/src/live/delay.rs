@@ -18,7 +18,7 @@ use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
-use hil_report::terminal::{JOINT, duration, unsigned_duration};
+use hil_present::units::{JOINT, duration, unsigned_duration};
 
 /// The totals reach back no further: they are of messages that are kept in memory.
 const TOTAL_MAX: Duration = Duration::from_mins(10);

@@ -9,7 +9,7 @@ use super::pace::{Pace, PaceMetrics};
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_platform::words::counted;
-use hil_report::terminal::{JOINT, duration};
+use hil_present::units::{JOINT, duration};
 use hil_rundir::live_run::Source;
 
 /// One answer.

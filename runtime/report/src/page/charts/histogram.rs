@@ -6,8 +6,8 @@ use hil_stats::histogram::DurationBin;
 use super::{Frame, HALF_WIDTH};
 use crate::page::axis::{Axis, Unit};
 use crate::page::svg::Svg;
-use crate::terminal::duration;
 use hil_platform::text::grouped;
+use hil_present::units::duration;
 
 /// The figure; `None` without a bin above zero.
 pub(in crate::page) fn delay_histogram(title: &str, bins: &[DurationBin]) -> Option<String> {

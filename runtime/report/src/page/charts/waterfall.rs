@@ -3,7 +3,7 @@
 
 use super::{FULL_WIDTH, legend, legend_height};
 use crate::page::svg::{Anchor, COLOUR_COUNT, Svg};
-use crate::terminal::{duration, percent};
+use hil_present::units::{duration, percent};
 
 /// One bar.
 #[derive(Debug, Clone)]

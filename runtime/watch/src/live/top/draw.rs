@@ -8,7 +8,7 @@ use ratatui::style::{Color, Modifier, Style};
 
 use super::view::{ChannelRow, ProcessRow, Quantiles, View};
 use hil_platform::text::shortened;
-use hil_report::terminal::{JOINT, duration, percent, unsigned_duration};
+use hil_present::units::{JOINT, duration, percent, unsigned_duration};
 
 /// Longest bar of the run's progress, columns.
 const BAR_COLUMNS: usize = 30;

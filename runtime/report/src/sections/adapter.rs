@@ -3,44 +3,50 @@
 
 use hil_stats::histogram::Distribution;
 
-use super::canvas::{Canvas, INDENT, Tone, left, right};
-use super::units::{duration, percent};
-use crate::adapter::{AdapterSegment, AdapterSummary};
+use hil_present::units::{duration, percent};
+use hil_present::{Cell, Section, Table, Tone};
+
+use crate::adapter::AdapterSummary;
 use crate::summary::Fact;
 use hil_platform::text::grouped;
 
 /// Share of the robot's messages that a sensor should answer in time.
 const ANSWERED_RATIO_MIN: f64 = 0.95;
-/// Columns of each figure.
-const FIGURE_WIDTH: usize = 10;
 
-pub(super) fn adapter(canvas: &mut Canvas, adapter: &AdapterSummary) {
+pub(super) fn adapters(adapters: &[AdapterSummary]) -> Section {
+    let mut section = Section::new("adapters", "Adapters", "to a program that is not ours");
+    section.children.extend(adapters.iter().map(adapter));
+    section
+}
+
+fn adapter(adapter: &AdapterSummary) -> Section {
     let arm = adapter.arm.word();
     let title = format!("{} of {}, {arm} arm", adapter.kind, adapter.process);
-    canvas.heading(&title, &adapter.address);
-    canvas.field("peer", Tone::Plain, &adapter.peer_state);
-    answers(canvas, adapter);
-    segments(canvas, adapter);
+    let mut section = Section::new("adapter", title, &adapter.address);
+    section.fact("peer", Tone::Plain, &adapter.peer_state);
+    answers(&mut section, adapter);
+    section.table(segments(adapter));
     if !adapter.refusals.is_empty() {
         let words: Vec<_> = adapter
             .refusals
             .iter()
             .map(|one| format!("{} {}", one.cause.label(), grouped(one.count)))
             .collect();
-        canvas.field("refused", Tone::Caution, &words.join(" · "));
+        section.fact("refused", Tone::Caution, words.join(" · "));
     }
     let counted = adapter.counters.iter().filter(|one| one.count > 0);
     let words: Vec<_> = counted
         .map(|one| format!("{} {}", one.label(), grouped(one.count)))
         .collect();
     if !words.is_empty() {
-        canvas.field("counted", Tone::Faint, &words.join(" · "));
+        section.fact("counted", Tone::Faint, words.join(" · "));
     }
     let words: Vec<_> = adapter.facts.iter().map(Fact::to_string).collect();
-    canvas.field("found", Tone::Faint, &words.join(" · "));
+    section.fact("found", Tone::Faint, words.join(" · "));
+    section
 }
 
-fn answers(canvas: &mut Canvas, adapter: &AdapterSummary) {
+fn answers(section: &mut Section, adapter: &AdapterSummary) {
     let answers = &adapter.answers;
     let total = grouped(answers.robot_message_count);
     let (tone, text) = match answers.ratio() {
@@ -63,64 +69,41 @@ fn answers(canvas: &mut Canvas, adapter: &AdapterSummary) {
             (tone, text)
         }
     };
-    canvas.field("answers", tone, &text);
+    section.fact("answers", tone, text);
 }
 
-fn segments(canvas: &mut Canvas, adapter: &AdapterSummary) {
+/// Where time went in our adapter, held against the controller's cycle.
+fn segments(adapter: &AdapterSummary) -> Table {
     let cycle = adapter.cycle_ns.map_or_else(
         || "cycle unavailable".to_owned(),
         |cycle_ns| format!("cycle {}", duration(cycle_ns)),
     );
-    let name_width = canvas.width() - INDENT - 4 * FIGURE_WIDTH;
-    let header = format!(
-        "{:INDENT$}{}{}{}{}{}",
-        "",
-        left(&cycle, name_width),
-        right("p50", FIGURE_WIDTH),
-        right("p99", FIGURE_WIDTH),
-        right("p99.9", FIGURE_WIDTH),
-        right("p99/cycle", FIGURE_WIDTH),
-    );
-    canvas.painted_line(Tone::Faint, &header);
+    let mut table = Table::new("", &[&cycle, "p50", "p99", "p99.9", "p99/cycle"]);
     for segment in &adapter.segments {
-        segment_line(canvas, segment, name_width, adapter.cycle_ns);
+        let name = Cell::Text(segment.name.clone());
+        match &segment.distribution {
+            Distribution::Unavailable { reason } => {
+                table.push([name, format!("unavailable: {reason}").into()]);
+            }
+            Distribution::Measured(one) => table.push([
+                name,
+                Cell::Duration(one.p50_ns),
+                Cell::Duration(one.p99_ns),
+                Cell::Duration(one.p999_ns),
+                Cell::share(segment.p99_of_cycle(adapter.cycle_ns)),
+            ]),
+        }
     }
-}
-
-fn segment_line(
-    canvas: &mut Canvas,
-    segment: &AdapterSegment,
-    name_width: usize,
-    cycle_ns: Option<i64>,
-) {
-    let name = left(&segment.name, name_width);
-    let line = match &segment.distribution {
-        Distribution::Unavailable { reason } => {
-            let text = canvas.paint(Tone::Faint, &format!("unavailable: {reason}"));
-            format!("{:INDENT$}{name}  {text}", "")
-        }
-        Distribution::Measured(figures) => {
-            let share = segment.p99_of_cycle(cycle_ns);
-            format!(
-                "{:INDENT$}{name}{}{}{}{}",
-                "",
-                right(&duration(figures.p50_ns), FIGURE_WIDTH),
-                right(&duration(figures.p99_ns), FIGURE_WIDTH),
-                right(&duration(figures.p999_ns), FIGURE_WIDTH),
-                right(&share.map_or_else(|| "–".to_owned(), percent), FIGURE_WIDTH),
-            )
-        }
-    };
-    canvas.line(&line);
+    table
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::adapter::Answers;
-    use crate::terminal::Style;
+    use crate::adapter::{AdapterSegment, Answers};
     use hil_arm::egm::messages::Side;
     use hil_arm::egm::wire::Cause;
+    use hil_present::terminal::{canvas::Style, render};
     use hil_rundir::pipe::{AdapterRefusal, RefusalCount};
     use hil_stats::histogram::LatencyHistogram;
     use hil_topology::AdapterKind;
@@ -162,9 +145,7 @@ mod tests {
     #[test]
     fn an_arm_shows_its_answers_its_segments_and_what_is_unavailable() {
         for width in [80, 120] {
-            let mut canvas = Canvas::new(width, Style::Plain);
-            adapter(&mut canvas, &summary());
-            let text = canvas.finish();
+            let text = render(&[adapters(&[summary()])], width, Style::Plain);
             assert!(
                 text.lines().all(|line| line.chars().count() <= width),
                 "{text}"

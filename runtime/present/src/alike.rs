@@ -3,7 +3,7 @@
 
 /// Labels as one text. Of labels that begin alike, up to their last comma, only the ends are repeated:
 /// `network, one way, p50, p99; jitter, mean`.
-pub(crate) fn joined_labels(labels: &[&str]) -> String {
+pub fn joined_labels(labels: &[&str]) -> String {
     let mut text = String::new();
     let mut before = None;
     for label in labels {

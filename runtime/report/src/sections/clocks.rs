@@ -6,25 +6,26 @@ use hil_clock::{ClockMetrics, StampKind};
 use hil_stats::bounds::BoundMetrics;
 use hil_stats::histogram::Distribution;
 
-use super::canvas::{Canvas, INDENT, Tone};
-use super::units::{duration, duration_s, unsigned_duration};
+use hil_present::units::{duration, duration_s, unsigned_duration};
+use hil_present::{Section, Tone};
+
 use crate::clock_summary::{ClockPathSummary, ClockRung, ClockSection, HostPairClock};
 use hil_platform::text::grouped;
 
-/// Column of the labels.
-const LABEL_WIDTH: usize = 22;
-
 /// Every pair of hosts with a link, and who steers each host's system clock.
-pub(super) fn clocks(canvas: &mut Canvas, section: &ClockSection) {
+pub(super) fn clocks(section: &ClockSection) -> Section {
+    let aside = "what one-way figures between hosts rest on";
+    let mut clocks = Section::new("clocks", "Clocks", aside);
     if section.pairs.is_empty() {
-        return;
-    }
-    canvas.heading("Clocks", "what one-way figures between hosts rest on");
-    for pair in &section.pairs {
-        pair_lines(canvas, pair);
+        return clocks;
     }
     if section.has_one_clock {
-        return;
+        let text = "All hosts read one clock: stamps compare as they are, bound 0.";
+        clocks.note(Tone::Good, text);
+    }
+    clocks.children.extend(section.pairs.iter().map(pair));
+    if section.has_one_clock {
+        return clocks;
     }
     for (host, discipline) in &section.hosts {
         let kernel = if discipline.is_kernel_synchronised {
@@ -36,21 +37,18 @@ pub(super) fn clocks(canvas: &mut Canvas, section: &ClockSection) {
             [", within ±", &unsigned_duration(bound_ns)].concat()
         });
         let text = format!("{}{bound}; {kernel}", discipline.basis);
-        let label = format!("system clock, {host}");
-        canvas.field_of(LABEL_WIDTH, &label, Tone::Faint, &text);
+        clocks.fact(format!("system clock, {host}"), Tone::Faint, text);
     }
+    clocks
 }
 
-fn pair_lines(canvas: &mut Canvas, pair: &HostPairClock) {
+fn pair(pair: &HostPairClock) -> Section {
     let tone = match (pair.rung, &pair.contradiction) {
         (ClockRung::None, _) | (_, Some(_)) => Tone::Caution,
         _ => Tone::Good,
     };
-    let title = format!("{} → {}", pair.from, pair.to);
-    canvas.paragraph(INDENT, Tone::Strong, &title);
-    let mut line = |label: &str, tone: Tone, text: &str| {
-        canvas.field_of(LABEL_WIDTH, label, tone, text);
-    };
+    let mut section = Section::new("pair", format!("{} → {}", pair.from, pair.to), "");
+    let mut line = |label: &str, tone: Tone, text: &str| section.fact(label, tone, text);
     let rung = format!("{}: {}", pair.rung_words(), pair.basis);
     line("aligned by", tone, &rung);
     if let Some(why) = &pair.contradiction {
@@ -74,6 +72,7 @@ fn pair_lines(canvas: &mut Canvas, pair: &HostPairClock) {
             line(label, Tone::Plain, &text);
         }
     }
+    section
 }
 
 /// The clock path, and what each of the two paths bounds by itself.
@@ -180,7 +179,7 @@ fn bound_words(bound: BoundMetrics) -> String {
 }
 
 /// The bounds of a channel's one-way figures; the round trip where a bound is wider than its figure.
-pub(super) fn one_way(canvas: &mut Canvas, account: &ChannelAccount) {
+pub(super) fn one_way(section: &mut Section, account: &ChannelAccount) {
     let segments = account
         .segments
         .iter()
@@ -197,7 +196,7 @@ pub(super) fn one_way(canvas: &mut Canvas, account: &ChannelAccount) {
             continue;
         };
         let text = format!("{name}: {}", bound_words(bound));
-        canvas.field("one-way bound", Tone::Faint, &text);
+        section.fact("one-way bound", Tone::Faint, text);
         is_wider |= distribution
             .measured()
             .is_some_and(|summary| bound.median_ns > summary.p50_ns.unsigned_abs());
@@ -216,7 +215,7 @@ pub(super) fn one_way(canvas: &mut Canvas, account: &ChannelAccount) {
             format!("a bound is wider than its figure, and the round trip is unavailable: {reason}")
         }
     };
-    canvas.field("", Tone::Caution, &text);
+    section.fact("", Tone::Caution, text);
 }
 
 /// An offset to the nanosecond: seconds of another boot, and still more than its bound shows.
@@ -228,9 +227,10 @@ fn precise(offset_ns: i64) -> String {
 mod tests {
     use super::*;
     use crate::clock_summary::ClockPathEnd;
-    use crate::terminal::Style;
     use hil_clock::{ClockMap, ClockSettings, Exchange, Requester};
     use hil_core::record::RoundTripRecord;
+    use hil_present::terminal::canvas::Style;
+    use hil_present::terminal::render;
 
     fn metrics() -> ClockMetrics {
         let exchange = |index: i64| {
@@ -281,9 +281,7 @@ mod tests {
                 }),
             }],
         };
-        let mut canvas = Canvas::new(120, Style::Plain);
-        clocks(&mut canvas, &section);
-        let text = canvas.finish();
+        let text = render(&[clocks(&section)], 120, Style::Plain);
         for words in [
             "control-pc → robot-pc",
             "+4.000000000 s",

@@ -1,6 +1,8 @@
 //! Numbers as people read them: a unit per value, three significant digits, grouped thousands.
 //! Number and unit are joined by [`JOINT`], so that no line breaks between them.
 
+use hil_platform::text::grouped;
+
 /// Stands for a blank at which a line must not break; a page turns it into one.
 pub const JOINT: char = '\u{a0}';
 
@@ -30,12 +32,12 @@ pub fn unsigned_duration(ns: u64) -> String {
     clippy::cast_possible_truncation,
     reason = "a run's durations are far below 292 years; beyond, the conversion saturates"
 )]
-pub(crate) fn duration_s(seconds: f64) -> String {
+pub fn duration_s(seconds: f64) -> String {
     duration((seconds * 1e9).round() as i64)
 }
 
 /// Seconds after the start of a run.
-pub(crate) fn seconds(value: f64) -> String {
+pub fn seconds(value: f64) -> String {
     format!("{value:.3}{JOINT}s")
 }
 
@@ -63,7 +65,7 @@ pub fn percent(ratio: f64) -> String {
 }
 
 /// A figure of a score: enough digits for its size, never more than it holds.
-pub(crate) fn figure(value: f64) -> String {
+pub fn figure(value: f64) -> String {
     let magnitude = value.abs();
     if value.fract().abs() < f64::EPSILON && magnitude < 1e9 {
         format!("{value:.0}")
@@ -82,6 +84,36 @@ pub(crate) fn figure(value: f64) -> String {
 )]
 const fn digit_count(digits: f64) -> usize {
     digits as usize
+}
+
+/// A value of this unit; a ratio of the unit `share` in per cent.
+pub fn value(value: f64, unit: &str) -> String {
+    match unit {
+        "s" => duration_s(value),
+        "share" => percent(value),
+        "1" => number(value),
+        unit => format!("{}{JOINT}{unit}", number(value)),
+    }
+}
+
+/// A pure number; whole ones in groups of digits.
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "whole and between 0 and 1e15"
+)]
+pub fn number(value: f64) -> String {
+    let is_count = value.fract().abs() < f64::EPSILON && (0.0..1e15).contains(&value);
+    if is_count {
+        grouped(value as u64)
+    } else {
+        figure(value)
+    }
+}
+
+/// Nanoseconds as seconds.
+pub fn ns_s(ns: i64) -> f64 {
+    ns as f64 * 1e-9
 }
 
 #[cfg(test)]
@@ -113,6 +145,15 @@ mod tests {
         assert_eq!(percent(0.5).replace(JOINT, " "), "50.00 %");
         assert_eq!(percent(0.000_001).replace(JOINT, " "), "<0.01 %");
         assert_eq!(percent(0.0).replace(JOINT, " "), "0.00 %");
+    }
+
+    #[test]
+    fn each_unit_has_its_words() {
+        let words = |number, unit| value(number, unit).replace(JOINT, " ");
+        assert_eq!(words(0.0012, "s"), "1.20 ms");
+        assert_eq!(words(0.5, "share"), "50.00 %");
+        assert_eq!(words(12_345.0, "1"), "12,345");
+        assert_eq!(words(-1.5, "m"), "-1.500 m");
     }
 
     #[test]

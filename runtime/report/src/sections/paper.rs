@@ -1,11 +1,10 @@
 //! A run as a row of the seed paper's tables: Tables II and III for the fleet, the motion loss rates of
 //! section III.C for teleoperation. With an interval, which the paper's have not.
 
-use super::data::Table;
-use super::words::{UNAVAILABLE, ns_s};
 use crate::network::NetworkReport;
 use crate::summary::ScoreMetric;
-use crate::terminal::{JOINT, duration_s, figure};
+use hil_present::units::{JOINT, duration_s, figure, ns_s};
+use hil_present::{Table, UNAVAILABLE};
 
 /// The table; `None` for a case that the paper has no table of. The case is known by its figures.
 pub(super) fn table(
@@ -70,15 +69,18 @@ fn fleet(
     let losses = channels().filter_map(|one| Some(one.figures.loss.measured()?.ratio));
     let delays =
         channels().filter_map(|one| Some(ns_s(one.figures.delay.measured()?.p50.value_ns)));
-    table.rows.push(vec![
-        link.to_owned(),
-        span(losses, figure),
-        span(delays, duration_s),
-        value(sections, 1.0),
-        value(collisions, 1.0),
-        value(Some(ratio), 1000.0),
-        interval(ratio, 1000.0),
-    ]);
+    table.push(
+        [
+            link.to_owned(),
+            span(losses, figure),
+            span(delays, duration_s),
+            value(sections, 1.0),
+            value(collisions, 1.0),
+            value(Some(ratio), 1000.0),
+            interval(ratio, 1000.0),
+        ]
+        .map(Into::into),
+    );
     table.note = format!(
         "PLR and delay (median) as measured, least to most of the channels. {}. The paper gives no \
          intervals, and how many critical sections there are depends on how overlaps are merged: see \
@@ -104,13 +106,16 @@ fn teleoperation(
         "Motion loss rate, as in section III.C of the seed paper",
         &columns,
     );
-    table.rows.push(vec![
-        link.to_owned(),
-        value(sent, 1.0),
-        value(executed, 1.0),
-        value(Some(ratio), 1.0),
-        interval(ratio, 1.0),
-    ]);
+    table.push(
+        [
+            link.to_owned(),
+            value(sent, 1.0),
+            value(executed, 1.0),
+            value(Some(ratio), 1.0),
+            interval(ratio, 1.0),
+        ]
+        .map(Into::into),
+    );
     table.note = format!(
         "MLR{JOINT}={JOINT}(N_S − N_a){JOINT}/{JOINT}N_S. {}. The paper's: 0 over Ethernet, 0.008 and \
          0.03 over Wi-Fi 6 at short and long range, of 890 loops each.",
@@ -161,7 +166,8 @@ mod tests {
             "0.4991",
             "0.1620 to 1.164",
         ];
-        assert_eq!(table.rows, [expected.map(str::to_owned).to_vec()]);
+        let texts = table.rows[0].cells.iter().map(hil_present::Cell::text);
+        assert_eq!(texts.collect::<Vec<_>>(), expected);
         assert!(table.note.contains("Interval of Clopper and Pearson"));
     }
 
@@ -170,7 +176,9 @@ mod tests {
         let score = [metric("motion_loss_ratio", None, None)];
         let table = table("teleoperation", &score, None, "UDP").unwrap();
         assert!(
-            table.rows[0][1..].iter().all(|cell| cell == UNAVAILABLE),
+            table.rows[0].cells[1..]
+                .iter()
+                .all(|cell| cell.text() == UNAVAILABLE),
             "{table:?}"
         );
         assert!(super::table("shuttle", &[], None, "").is_none());

@@ -1,13 +1,10 @@
-//! Data into text by templates (minijinja): the page, Markdown and `LaTeX` of this program, or a user's
-//! own. HTML is escaped wherever a template puts a value; figures alone are put as they are.
+//! Data into text by templates (minijinja): HTML, Markdown and `LaTeX`, or a user's own.
 
 use minijinja::{AutoEscape, Environment, ErrorKind, UndefinedBehavior, Value, context};
-use serde_json::json;
+use serde::Serialize;
 
-use super::data::Page;
-use super::svg::{STYLE, escaped};
-use crate::alike::joined_labels;
-use crate::terminal::JOINT;
+use crate::units::JOINT;
+use crate::{Section, joined_labels};
 
 /// Why a template gave no text.
 #[derive(Debug, thiserror::Error)]
@@ -36,55 +33,24 @@ impl TemplateError {
     }
 }
 
-const PAGE: &str = include_str!("templates/page.html");
-const MARKDOWN: &str = include_str!("templates/report.md");
-const TEX: &str = include_str!("templates/table.tex");
-const PAGE_STYLE: &str = include_str!("templates/page.css");
-const PAGE_SCRIPT: &str = include_str!("templates/page.js");
+/// What every template may import: each form's macros for sections and their blocks.
+const PARTS: [(&str, &str); 3] = [
+    ("blocks.html", include_str!("templates/blocks.html")),
+    ("blocks.md", include_str!("templates/blocks.md")),
+    ("blocks.tex", include_str!("templates/blocks.tex")),
+];
 
-/// What marks a file as one of ours, which may be overwritten.
-pub(super) const MARK: &str = "hil-runtime report";
-
-pub(super) fn html(page: &Page) -> Result<String, TemplateError> {
-    let plots = page.runs.iter().flat_map(|run| &run.drawings);
-    let plots = plots.filter_map(|one| {
-        Some((
-            one.name.clone(),
-            serde_json::to_value(one.plot.as_ref()?).ok()?,
-        ))
-    });
-    let plots: serde_json::Map<String, serde_json::Value> = plots.collect();
-    // Within a script element nothing is escaped, and "</script>" ends it.
-    let data = json!(plots)
-        .to_string()
-        .replace('<', "\\u003c")
-        .replace('>', "\\u003e")
-        .replace('&', "\\u0026");
-    let extra = context! {
-        style => Value::from_safe_string(format!("{STYLE}{PAGE_STYLE}")),
-        script => Value::from_safe_string(PAGE_SCRIPT.to_owned()),
-        plots => Value::from_safe_string(data),
-        mark => MARK,
-    };
-    rendered("page.html", PAGE, page, extra)
-}
-
-pub(super) fn markdown(page: &Page) -> Result<String, TemplateError> {
-    let extra = context! { mark => MARK };
-    Ok(rendered("report.md", MARKDOWN, page, extra)?.replace(JOINT, " "))
-}
-
-pub(super) fn tex(page: &Page) -> Result<String, TemplateError> {
-    let extra = context! { mark => MARK };
-    Ok(rendered("table.tex", TEX, page, extra)?.replace(JOINT, "~"))
-}
-
-/// A user's own template: its name, whose ending decides about escaping, and its text.
-pub(super) fn own(name: &str, text: &str, page: &Page) -> Result<String, TemplateError> {
-    rendered(name, text, page, context! {})
-}
-
-fn rendered(name: &str, text: &str, page: &Page, extra: Value) -> Result<String, TemplateError> {
+/// `data` through the template called `name`, whose ending decides about escaping; `extra` are further
+/// names it knows. HTML is escaped wherever a template puts a value that is not marked safe.
+///
+/// # Errors
+/// When the template is at fault, with its line.
+pub fn render(
+    name: &str,
+    text: &str,
+    data: &impl Serialize,
+    extra: Value,
+) -> Result<String, TemplateError> {
     let failed = |error: minijinja::Error| TemplateError::of(name, &error);
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
@@ -115,12 +81,33 @@ fn rendered(name: &str, text: &str, page: &Page, extra: Value) -> Result<String,
     environment.add_filter("xml", |text: String| {
         Value::from_safe_string(escaped(&text))
     });
+    for (name, text) in PARTS {
+        environment.add_template(name, text).map_err(failed)?;
+    }
     environment.add_template(name, text).map_err(failed)?;
     let template = environment.get_template(name).map_err(failed)?;
-    let page = Value::from_serialize(page);
+    let data = Value::from_serialize(data);
     template
-        .render(context! { ..extra, ..page })
+        .render(context! { ..extra, ..data })
         .map_err(failed)
+}
+
+/// `sections` as GitHub's Markdown below `title`.
+///
+/// # Errors
+/// Never for what a builder makes; the engine has one.
+pub fn markdown(title: &str, sections: &[Section]) -> Result<String, TemplateError> {
+    const DOCUMENT: &str = "{% from \"blocks.md\" import section %}\n# {{ title|md }}\n\n\
+        {% for s in sections %}\n{{ section(s) }}\n{% endfor %}\n";
+    let text = render(
+        "document.md",
+        DOCUMENT,
+        &context! { title, sections },
+        context! {},
+    )?;
+    let mut lines: Vec<&str> = text.lines().map(str::trim_end).collect();
+    lines.dedup_by(|one, before| one.is_empty() && before.is_empty());
+    Ok(lines.join("\n").replace(JOINT, " "))
 }
 
 /// Figures for a table: those that there are none of for one reason make one row, where the first of
@@ -158,6 +145,31 @@ fn field(figure: &Value, name: &str) -> Result<Value, minijinja::Error> {
         return Err(minijinja::Error::new(ErrorKind::UndefinedError, text));
     }
     Ok(found)
+}
+
+/// `text` for XML and HTML, within elements and quoted attributes.
+pub fn escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            // XML has no word for these, not even escaped.
+            '\u{0}'..='\u{8}'
+            | '\u{b}'
+            | '\u{c}'
+            | '\u{e}'..='\u{1f}'
+            | '\u{fffe}'
+            | '\u{ffff}' => {
+                out.push('\u{fffd}');
+            }
+            _ => out.push(c),
+        }
+    }
+    out
 }
 
 /// For a cell of a GitHub table or a line of prose.
@@ -213,24 +225,27 @@ mod tests {
 
     #[test]
     fn a_faulty_template_is_named_with_its_line() {
-        let page = super::super::page_of(&[], 10);
-        let error = own("mine.txt", "a\n{{ title }\n", &page)
+        let page = context! { title => "0 runs" };
+        let error = render("mine.txt", "a\n{{ title }\n", &page, context! {})
             .unwrap_err()
             .to_string();
         assert!(error.starts_with("template mine.txt, line 2: "), "{error}");
-        let error = own("mine.txt", "{{ titel }}", &page)
+        let error = render("mine.txt", "{{ titel }}", &page, context! {})
             .unwrap_err()
             .to_string();
         assert!(error.contains("undefined"), "{error}");
-        assert_eq!(own("mine.txt", "{{ title }}", &page).unwrap(), "0 runs");
+        assert_eq!(
+            render("mine.txt", "{{ title }}", &page, context! {}).unwrap(),
+            "0 runs"
+        );
     }
 
     #[test]
     fn what_is_no_figure_is_an_error_and_not_an_empty_row() {
-        let page = super::super::page_of(&[], 10);
+        let page = context! { title => "0 runs" };
         let used = |figures: &str| {
             let text = format!("\n{{{{ [{figures}]|alike|length }}}}");
-            own("mine.txt", &text, &page)
+            render("mine.txt", &text, &page, context! {})
         };
         assert_eq!(
             used("{'label': 'a', 'value': 1, 'method': ''}").unwrap(),

@@ -2,19 +2,20 @@
 
 use hil_account::radio::{RadioMetrics, Share, TransmitStampMetrics};
 
-use super::canvas::{Canvas, Tone};
-use super::units::percent;
+use hil_present::units::percent;
+use hil_present::{Section, Tone};
+
 use crate::radio::{ChannelRadio, RadioHopSummary, RadioReport, Spread, StationSummary};
 use hil_platform::text::grouped;
 
 /// Beside a channel's account: where it was stamped, and what the radio reported.
-pub(super) fn channel(canvas: &mut Canvas, radio: Option<&ChannelRadio>) {
+pub(super) fn channel(section: &mut Section, radio: Option<&ChannelRadio>) {
     let Some(radio) = radio else { return };
     if let Some(text) = radio.transmit_stamps.as_ref().and_then(stamp_words) {
-        canvas.field("TX stamp", Tone::Caution, &text);
+        section.fact("TX stamp", Tone::Caution, text);
     }
     if let Some(figures) = &radio.acknowledgements {
-        acknowledgements(canvas, figures);
+        acknowledgements(section, figures);
     }
 }
 
@@ -38,9 +39,8 @@ fn stamp_words(figures: &TransmitStampMetrics) -> Option<String> {
     (!words.is_empty()).then(|| words.join("; "))
 }
 
-fn acknowledgements(canvas: &mut Canvas, figures: &RadioMetrics) {
-    let text = acknowledgement_words(figures);
-    canvas.field("radio", Tone::Plain, &text);
+fn acknowledgements(section: &mut Section, figures: &RadioMetrics) {
+    section.fact("radio", Tone::Plain, acknowledgement_words(figures));
     let mut words = Vec::new();
     if let Some(share) = &figures.unacknowledged_ratio {
         words.push(format!("not acknowledged {}", share_words(share)));
@@ -52,7 +52,7 @@ fn acknowledgements(canvas: &mut Canvas, figures: &RadioMetrics) {
         ));
     }
     if !words.is_empty() {
-        canvas.field("", Tone::Faint, &words.join("; "));
+        section.fact("", Tone::Faint, words.join("; "));
     }
 }
 
@@ -114,17 +114,16 @@ fn share_words(share: &Share) -> String {
 }
 
 /// The associations of the run.
-pub(super) fn hops(canvas: &mut Canvas, report: &RadioReport) {
-    if report.hops.is_empty() {
-        return;
-    }
-    canvas.heading("Radio", "the association, sampled beside the data");
+pub(super) fn hops(report: &RadioReport) -> Section {
+    let aside = "the association, sampled beside the data";
+    let mut section = Section::new("radio", "Radio", aside);
     for hop in &report.hops {
-        hop_lines(canvas, hop);
+        hop_lines(&mut section, hop);
     }
+    section
 }
 
-fn hop_lines(canvas: &mut Canvas, hop: &RadioHopSummary) {
+fn hop_lines(section: &mut Section, hop: &RadioHopSummary) {
     let events = match hop.event_count {
         0 => "the association did not change".to_owned(),
         count => format!(
@@ -136,9 +135,9 @@ fn hop_lines(canvas: &mut Canvas, hop: &RadioHopSummary) {
         "{} on {} ({}): {events}",
         hop.interface, hop.host, hop.process
     );
-    canvas.field("radio", Tone::Plain, &text);
+    section.fact("radio", Tone::Plain, text);
     for station in &hop.stations {
-        canvas.field("", Tone::Faint, &station_words(station));
+        section.fact("", Tone::Faint, station_words(station));
     }
 }
 

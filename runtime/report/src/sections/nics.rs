@@ -6,41 +6,44 @@ use core::fmt::Write as _;
 use hil_account::nic_clock::NicClockMetrics;
 use hil_stats::histogram::Distribution;
 
-use super::canvas::{Canvas, INDENT, Tone};
-use super::units::{duration, percent, unsigned_duration};
+use hil_present::units::{duration, percent, unsigned_duration};
+use hil_present::{Section, Tone};
+
 use crate::nic_metrics::{ChannelStamps, HardwareStamps, NicSegment, NicSummary};
 use hil_platform::text::grouped;
 
-pub(super) fn hardware_stamps(canvas: &mut Canvas, stamps: &HardwareStamps) {
-    canvas.heading("Hardware stamps", "taken by the network cards");
-    for card in &stamps.cards {
-        nic_lines(canvas, card);
-    }
-    for channel in &stamps.channels {
-        channel_lines(canvas, channel);
-    }
+pub(super) fn hardware_stamps(stamps: &HardwareStamps) -> Section {
+    let mut section = Section::new(
+        "hardware-stamps",
+        "Hardware stamps",
+        "taken by the network cards",
+    );
+    section.children.extend(stamps.cards.iter().map(nic));
+    section.children.extend(stamps.channels.iter().map(channel));
+    section
 }
 
-fn nic_lines(canvas: &mut Canvas, card: &NicSummary) {
+fn nic(card: &NicSummary) -> Section {
     let story = &card.story;
     let tone = if story.is_armed {
         Tone::Plain
     } else {
         Tone::Caution
     };
-    canvas.paragraph(INDENT, Tone::Strong, &story.name());
-    canvas.field("claims", Tone::Plain, &story.claims);
-    canvas.field("armed", tone, &story.arming);
-    canvas.field("before, after", Tone::Faint, &story.restoring);
+    let mut section = Section::new("nic", story.name(), "");
+    section.fact("claims", Tone::Plain, &story.claims);
+    section.fact("armed", tone, &story.arming);
+    section.fact("before, after", Tone::Faint, &story.restoring);
     match &card.clock {
-        Some(clock) => canvas.field("card clock", Tone::Plain, &clock_words(clock)),
-        None => canvas.field("card clock", Tone::Caution, "no pair of reads"),
+        Some(clock) => section.fact("card clock", Tone::Plain, clock_words(clock)),
+        None => section.fact("card clock", Tone::Caution, "no pair of reads"),
     }
-    canvas.field("", Tone::Faint, &story.clock);
+    section.fact("", Tone::Faint, &story.clock);
     if story.failed_read_count > 0 {
         let text = format!("{} reads of it failed", grouped(story.failed_read_count));
-        canvas.field("", Tone::Caution, &text);
+        section.fact("", Tone::Caution, text);
     }
+    section
 }
 
 fn clock_words(clock: &NicClockMetrics) -> String {
@@ -77,15 +80,14 @@ fn share(count: u64, of: u64) -> String {
     format!("{} of {} ({})", grouped(count), grouped(of), percent(ratio))
 }
 
-fn channel_lines(canvas: &mut Canvas, channel: &ChannelStamps) {
+fn channel(channel: &ChannelStamps) -> Section {
     let sent = share(channel.tx_hardware_count, channel.sent_count);
     let both = grouped(channel.tx_both_count);
-    canvas.blank();
-    canvas.paragraph(INDENT, Tone::Strong, &channel.channel);
-    canvas.field(
+    let mut section = Section::new("channel", &channel.channel, "");
+    section.fact(
         "hardware TX",
         Tone::Plain,
-        &format!("{sent}, the software stamp beside it on {both}"),
+        format!("{sent}, the software stamp beside it on {both}"),
     );
     let received = share(channel.rx_hardware_count, channel.received_count);
     let reason = if channel.rx_reason.is_empty() {
@@ -93,7 +95,7 @@ fn channel_lines(canvas: &mut Canvas, channel: &ChannelStamps) {
     } else {
         format!(": {}", channel.rx_reason)
     };
-    canvas.field("hardware RX", Tone::Plain, &format!("{received}{reason}"));
+    section.fact("hardware RX", Tone::Plain, format!("{received}{reason}"));
     for segment in &channel.segments {
         let is_measured = segment.distribution.measured().is_some();
         let tone = if is_measured {
@@ -101,8 +103,9 @@ fn channel_lines(canvas: &mut Canvas, channel: &ChannelStamps) {
         } else {
             Tone::Faint
         };
-        canvas.paragraph(INDENT + 2, tone, &segment_words(segment));
+        section.fact("", tone, segment_words(segment));
     }
+    section
 }
 
 fn segment_words(segment: &NicSegment) -> String {

@@ -1,8 +1,9 @@
-//! A page of text of fixed width: padding, wrapping, bars and colours. It knows no figures.
+//! Text of a fixed width: padding, wrapping, bars and colours. It knows no numbers.
 
 use anstyle::{AnsiColor, Style as Ansi};
 
-use super::units::JOINT;
+use crate::model::Tone;
+use crate::units::JOINT;
 use hil_platform::text::{clean, columns, shortened};
 
 /// Whether the text carries colour sequences.
@@ -15,50 +16,27 @@ pub enum Style {
     Coloured,
 }
 
-/// What a piece of text means; the style decides how that looks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Tone {
-    Plain,
-    Strong,
-    Good,
-    Caution,
-    Bad,
-    Faint,
-    Bar,
-}
-
-impl Tone {
-    /// Its name where tones are few.
-    pub(crate) const fn word(self) -> &'static str {
-        match self {
-            Self::Good => "good",
-            Self::Caution => "caution",
-            Self::Bad => "bad",
-            Self::Plain | Self::Strong | Self::Faint | Self::Bar => "plain",
-        }
-    }
-}
-
 /// Narrowest and widest page.
 const WIDTH_MIN: usize = 80;
 const WIDTH_MAX: usize = 120;
 
 /// Left margin of everything below a heading.
-pub(super) const INDENT: usize = 2;
+pub const INDENT: usize = 2;
 
 /// Eighths of a block, thinnest first.
 const EIGHTHS: [char; 8] = ['▏', '▎', '▍', '▌', '▋', '▊', '▉', '█'];
 
 /// A growing page.
 #[derive(Debug)]
-pub(super) struct Canvas {
+pub struct Canvas {
     text: String,
     width: usize,
     style: Style,
 }
 
 impl Canvas {
-    pub(super) fn new(width: usize, style: Style) -> Self {
+    /// An empty one of `width` columns, clamped to 80..=120.
+    pub fn new(width: usize, style: Style) -> Self {
         Self {
             text: String::new(),
             width: width.clamp(WIDTH_MIN, WIDTH_MAX),
@@ -66,17 +44,19 @@ impl Canvas {
         }
     }
 
-    pub(super) const fn width(&self) -> usize {
+    /// Columns of a line.
+    pub const fn width(&self) -> usize {
         self.width
     }
 
-    pub(super) fn finish(self) -> String {
+    /// The text.
+    pub fn finish(self) -> String {
         self.text
     }
 
     /// `text` in `tone`; call it after padding, since sequences have no width. Padding stays
     /// unpainted, so that a line's trailing blanks can be dropped in both styles.
-    pub(super) fn paint(&self, tone: Tone, text: &str) -> String {
+    pub fn paint(&self, tone: Tone, text: &str) -> String {
         let (shown, padding) = text.split_at(text.trim_end().len());
         let ansi = match tone {
             _ if self.style == Style::Plain || shown.is_empty() => return text.to_owned(),
@@ -92,35 +72,46 @@ impl Canvas {
     }
 
     /// Ends a line; trailing blanks are dropped.
-    pub(super) fn line(&mut self, line: &str) {
+    pub fn line(&mut self, line: &str) {
         let line = line.replace(JOINT, " ");
         self.text.push_str(line.trim_end());
         self.text.push('\n');
     }
 
     /// A whole line in `tone`.
-    pub(super) fn painted_line(&mut self, tone: Tone, text: &str) {
+    pub fn painted_line(&mut self, tone: Tone, text: &str) {
         let line = self.paint(tone, text);
         self.line(&line);
     }
 
-    pub(super) fn blank(&mut self) {
+    /// An empty line.
+    pub fn blank(&mut self) {
         self.text.push('\n');
     }
 
     /// A rule across the page.
-    pub(super) fn rule(&mut self, tone: Tone) {
+    pub fn rule(&mut self, tone: Tone) {
         self.painted_line(tone, &"─".repeat(self.width));
     }
 
     /// A heading, with something faint beside it.
-    pub(super) fn heading(&mut self, title: &str, aside: &str) {
+    pub fn heading(&mut self, title: &str, aside: &str) {
+        self.heading_at(0, title, aside);
+    }
+
+    /// A heading below another one.
+    pub fn subheading(&mut self, title: &str, aside: &str) {
+        self.heading_at(INDENT, title, aside);
+    }
+
+    fn heading_at(&mut self, margin: usize, title: &str, aside: &str) {
         self.blank();
-        let title = shortened(title, self.width);
-        let room = self.width.saturating_sub(columns(&title) + 2);
-        let aside = shortened(aside, room);
+        let width = self.width - margin;
+        let title = shortened(title, width);
+        let aside = shortened(aside, width.saturating_sub(columns(&title) + 2));
         let line = format!(
-            "{}  {}",
+            "{:margin$}{}  {}",
+            "",
             self.paint(Tone::Strong, &title),
             self.paint(Tone::Faint, &aside)
         );
@@ -128,17 +119,17 @@ impl Canvas {
     }
 
     /// A label and a text that wraps beside it.
-    pub(super) fn field(&mut self, label: &str, tone: Tone, text: &str) {
+    pub fn field(&mut self, label: &str, tone: Tone, text: &str) {
         self.field_of(14, label, tone, text);
     }
 
     /// As [`Canvas::field`], with a label column of `label_width`.
-    pub(super) fn field_of(&mut self, label_width: usize, label: &str, tone: Tone, text: &str) {
+    pub fn field_of(&mut self, label_width: usize, label: &str, tone: Tone, text: &str) {
         self.field_at(INDENT, label_width, label, tone, text);
     }
 
     /// As [`Canvas::field_of`], behind `margin` columns.
-    pub(super) fn field_at(
+    pub fn field_at(
         &mut self,
         margin: usize,
         label_width: usize,
@@ -159,8 +150,24 @@ impl Canvas {
         }
     }
 
+    /// `lead` at `indent`, and a text in `tone` that wraps behind `margin`.
+    pub fn hanging(&mut self, indent: usize, margin: usize, lead: &str, tone: Tone, text: &str) {
+        let rows = wrapped(text, self.width.saturating_sub(margin).max(20));
+        let lead_width = margin.saturating_sub(indent);
+        for (index, row) in rows.iter().enumerate() {
+            let lead = if index == 0 { lead } else { "" };
+            let line = format!(
+                "{:indent$}{}{}",
+                "",
+                left(lead, lead_width),
+                self.paint(tone, row)
+            );
+            self.line(&line);
+        }
+    }
+
     /// A paragraph behind a blank margin.
-    pub(super) fn paragraph(&mut self, margin: usize, tone: Tone, text: &str) {
+    pub fn paragraph(&mut self, margin: usize, tone: Tone, text: &str) {
         for row in wrapped(text, self.width.saturating_sub(margin).max(20)) {
             let line = format!("{:margin$}{}", "", self.paint(tone, &row));
             self.line(&line);
@@ -169,21 +176,21 @@ impl Canvas {
 }
 
 /// Exactly `width` columns, text at the left.
-pub(crate) fn left(text: &str, width: usize) -> String {
+pub fn left(text: &str, width: usize) -> String {
     let text = shortened(text, width);
     let padding = width - columns(&text);
     format!("{text}{:padding$}", "")
 }
 
 /// Exactly `width` columns, text at the right.
-pub(super) fn right(text: &str, width: usize) -> String {
+pub fn right(text: &str, width: usize) -> String {
     let text = shortened(text, width);
     let padding = width - columns(&text);
     format!("{:padding$}{text}", "")
 }
 
 /// Rows of at most `width` columns, broken at blanks, or anywhere in a longer word.
-pub(crate) fn wrapped(text: &str, width: usize) -> Vec<String> {
+pub fn wrapped(text: &str, width: usize) -> Vec<String> {
     let (mut rows, mut row) = (Vec::new(), String::new());
     for word in clean(text).split(' ').filter(|word| !word.is_empty()) {
         let mut word: Vec<char> = word.chars().collect();
@@ -208,7 +215,7 @@ pub(crate) fn wrapped(text: &str, width: usize) -> Vec<String> {
 
 /// A bar from `start` to `end` on a scale of 0..=1 over `width` columns. It begins at a whole
 /// column and ends at an eighth; anything above nothing is visible.
-pub(super) fn bar(start: f64, end: f64, width: usize) -> String {
+pub fn bar(start: f64, end: f64, width: usize) -> String {
     let unit = 8 * width as u64;
     let at = |share: f64| eighths(share.clamp(0.0, 1.0) * unit as f64, unit);
     let (first, last) = (at(start) / 8, at(end));

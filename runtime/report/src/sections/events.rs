@@ -1,0 +1,246 @@
+//! What happened to the robot with the messages and the network before it, and what happened on the network.
+
+use core::cmp::Reverse;
+
+use hil_account::MessageFate;
+use hil_account::network::NetworkEventKind;
+use hil_core::case_study::Severity;
+use hil_platform::text::grouped;
+use hil_platform::words::counted;
+use hil_present::units::{duration_s, percent, seconds};
+use hil_present::{Block, Event, EventList, Section, Tone, UNAVAILABLE};
+
+use crate::network::{NetworkReport, PrecedingNetwork, TimedEvent};
+use crate::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
+
+/// Events of the robot that are listed; all of them are in the summary.
+const EVENTS_MAX: usize = 200;
+/// Messages and events of the network that are told beside each.
+const MESSAGES_SHOWN_COUNT: usize = 6;
+const NETWORK_SHOWN_COUNT: usize = 3;
+/// Events of the network that are listed: under independent losses there are hundreds alike.
+const NETWORK_EVENTS_MAX: usize = 40;
+
+/// What happened to the robot, the gravest events where there are too many, in order of time.
+pub(super) fn robot(all: &ScoreEvents) -> Section {
+    let title = "What happened to the robot, and the network before it";
+    let mut section = Section::new("robot", title, severity_counts(&all.events));
+    if all.events.is_empty() {
+        return section;
+    }
+    if all.clocks_differ {
+        let text = "Clocks are not aligned: each time counts from the start of the run on the \
+                    host named with it, and times of different hosts do not compare.";
+        section.note(Tone::Caution, text);
+    }
+    let mut note = Vec::new();
+    let total = all.events.len();
+    if total > EVENTS_MAX {
+        let total = grouped(total as u64);
+        note.push(format!(
+            "the {EVENTS_MAX} gravest of {total}; all are in events.log and summary.json"
+        ));
+    }
+    if all.dropped_count > 0 {
+        let dropped = grouped(all.dropped_count);
+        note.push(format!("{dropped} more found no room in the score"));
+    }
+    let events = gravest(&all.events, EVENTS_MAX).into_iter();
+    let events = events.map(|one| event(one, all.clocks_differ)).collect();
+    let note = note.join("; ");
+    section
+        .blocks
+        .push(Block::Events(EventList { events, note }));
+    section
+}
+
+/// The `count` gravest events, the earlier ones first among equals, in the order of the score.
+pub(crate) fn gravest(events: &[ExplainedEvent], count: usize) -> Vec<&ExplainedEvent> {
+    let mut order: Vec<usize> = (0..events.len()).collect();
+    order.sort_by_key(|index| Reverse(events[*index].severity));
+    order.truncate(count);
+    order.sort_unstable();
+    order.into_iter().map(|index| &events[index]).collect()
+}
+
+/// How many there are of each severity.
+pub(crate) fn severity_counts(events: &[ExplainedEvent]) -> String {
+    let count = |severity| {
+        let chosen = events.iter().filter(|one| one.severity == severity);
+        chosen.count() as u64
+    };
+    let counts = [
+        counted(count(Severity::Incident), "incident"),
+        counted(count(Severity::Hazard), "hazard"),
+        counted(count(Severity::Notice), "notice"),
+    ];
+    counts.join(", ")
+}
+
+/// Incidents and hazards.
+pub(crate) fn grave_count(events: &[ExplainedEvent]) -> u64 {
+    let grave = events.iter().filter(|one| one.severity > Severity::Notice);
+    grave.count() as u64
+}
+
+/// How grave an event is.
+pub(crate) const fn severity_tone(severity: Severity) -> Tone {
+    match severity {
+        Severity::Incident => Tone::Bad,
+        Severity::Hazard => Tone::Caution,
+        Severity::Notice => Tone::Plain,
+    }
+}
+
+fn event(event: &ExplainedEvent, clocks_differ: bool) -> Event {
+    let at = event.at_s.map_or_else(|| UNAVAILABLE.to_owned(), seconds);
+    let what = if clocks_differ {
+        format!("{} (clock of {})", event.what, event.clock)
+    } else {
+        event.what.clone()
+    };
+    let mut beside: Vec<String> = event.outages.iter().map(|one| one.words.clone()).collect();
+    beside.extend(
+        event
+            .network
+            .iter()
+            .flat_map(|network| before(event, network)),
+    );
+    let messages = event.messages.iter().take(MESSAGES_SHOWN_COUNT);
+    beside.extend(messages.map(message));
+    let hidden = event.messages.len().saturating_sub(MESSAGES_SHOWN_COUNT) as u64;
+    let more = hidden.saturating_add(event.messages_dropped_count);
+    if more > 0 {
+        beside.push(format!("and {} more messages", grouped(more)));
+    }
+    Event {
+        at,
+        severity: event.severity_word(),
+        tone: severity_tone(event.severity),
+        what,
+        beside,
+    }
+}
+
+/// What the network went through before `event`, unless an outage of it says so already.
+fn before(event: &ExplainedEvent, network: &PrecedingNetwork) -> Vec<String> {
+    if network.events.is_empty() {
+        return vec![network.nothing_words()];
+    }
+    let rest = event.network_beside();
+    let shown = rest.iter().take(NETWORK_SHOWN_COUNT);
+    let mut words: Vec<String> = shown.map(|one| one.words.clone()).collect();
+    let hidden = rest.len().saturating_sub(NETWORK_SHOWN_COUNT) as u64 + network.more_count;
+    if hidden > 0 {
+        let window = duration_s(network.foregoing_s);
+        let hidden = grouped(hidden);
+        words.push(format!(
+            "and {hidden} more on the network in the {window} before"
+        ));
+    }
+    words
+}
+
+/// Which message, when it was published, and what became of it.
+fn message(message: &ExplainedMessage) -> String {
+    let at = message.published_at_s.map(seconds);
+    let at = at.map_or_else(String::new, |at| format!(" at {at}"));
+    let number = grouped(message.sequence);
+    format!("{} {number}{at}: {}", message.channel, message.words)
+}
+
+/// The network event that has most to do with `event`.
+pub(crate) fn cause(event: &ExplainedEvent) -> String {
+    let network = event.network.as_ref();
+    let outage = event.outages.first().map(|one| one.words.clone());
+    let beside = || event.network_beside().first().map(|one| one.words.clone());
+    let lost = || {
+        let mut messages = event.messages.iter();
+        let lost = messages.find(|one| one.fate.is_some_and(MessageFate::is_loss));
+        lost.map(|one| format!("{} {}: {}", one.channel, grouped(one.sequence), one.words))
+    };
+    outage.or_else(beside).or_else(lost).unwrap_or_else(|| {
+        network.map_or_else(
+            || "nothing that is known of the network".to_owned(),
+            PrecedingNetwork::nothing_words,
+        )
+    })
+}
+
+/// What happened on the network, the longest events.
+pub(super) fn network(report: &NetworkReport) -> Section {
+    let mut section = Section::new("network-events", "What happened on the network", "");
+    section.is_folded = true;
+    let chosen = longest(&report.events);
+    let shown = chosen.len() as u64;
+    let total = report.events.len() as u64 + report.events_dropped_count;
+    if total == 0 {
+        return section;
+    }
+    let listed = chosen.into_iter().map(|event| Event {
+        at: seconds(event.from_s),
+        severity: "network",
+        tone: Tone::Plain,
+        what: event.words(),
+        beside: Vec::new(),
+    });
+    let chance = percent(report.foregoing_chance_ratio);
+    let window = duration_s(report.foregoing_s);
+    let mut note = format!(
+        "{chance} of all moments of the run have such an event in the {window} before them: so much would \
+         stand before an event of the score by chance."
+    );
+    if total > shown {
+        let (shown, total) = (grouped(shown), grouped(total));
+        note.push_str(&[" The ", &shown, " longest of ", &total, " events"].concat());
+        note.push_str(&[": ", &kinds(&report.events), ". All are in summary.json"].concat());
+        if report.events_dropped_count > 0 {
+            let dropped = grouped(report.events_dropped_count);
+            note.push_str(&[", but for ", &dropped, " that found no room"].concat());
+        }
+        note.push('.');
+    }
+    let events = listed.collect();
+    section
+        .blocks
+        .push(Block::Events(EventList { events, note }));
+    section
+}
+
+/// The longest events, in order of time; what lasts to the end is the longest.
+fn longest(events: &[TimedEvent]) -> Vec<&TimedEvent> {
+    let mut chosen: Vec<&TimedEvent> = events.iter().collect();
+    if chosen.len() > NETWORK_EVENTS_MAX {
+        chosen.sort_by(|a, b| b.length_s().total_cmp(&a.length_s()));
+        chosen.truncate(NETWORK_EVENTS_MAX);
+        chosen.sort_by(|a, b| a.from_s.total_cmp(&b.from_s));
+    }
+    chosen
+}
+
+/// How many there are of each kind.
+fn kinds(events: &[TimedEvent]) -> String {
+    let words = [
+        "outage",
+        "burst of losses",
+        "delay",
+        "reordering",
+        "process down",
+        "clock step",
+    ];
+    let mut counts = [0_u64; 6];
+    for event in events {
+        let index = match event.kind {
+            NetworkEventKind::Outage { .. } => 0,
+            NetworkEventKind::LossBurst { .. } => 1,
+            NetworkEventKind::Delay { .. } => 2,
+            NetworkEventKind::Reordering { .. } => 3,
+            NetworkEventKind::ProcessDown { .. } => 4,
+            NetworkEventKind::ClockStep { .. } => 5,
+        };
+        counts[index] += 1;
+    }
+    let of = words.iter().zip(counts).filter(|(_, count)| *count > 0);
+    let of = of.map(|(word, count)| format!("{word} {}", grouped(count)));
+    of.collect::<Vec<_>>().join(", ")
+}

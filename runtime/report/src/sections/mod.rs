@@ -1,0 +1,59 @@
+//! A run as the sections of a report: what each says is made here once, for every form. Nothing is measured or
+//! judged here.
+
+mod adapter;
+pub(crate) mod channel;
+mod clocks;
+pub(crate) mod events;
+mod network;
+mod nics;
+mod paper;
+mod radio;
+mod run;
+mod timeline;
+
+pub(crate) use channel::Sources;
+pub(crate) use run::outcome_words;
+pub(crate) use timeline::strips;
+
+use hil_present::{Block, Section};
+
+use crate::assessment::Assessment;
+use crate::summary::RunSummary;
+
+/// Every section of a run that has something to say, in the order of reading.
+pub(crate) fn of_run(summary: &RunSummary, assessment: &Assessment) -> Vec<Section> {
+    let network = summary.network.as_ref();
+    let mut sections = vec![
+        run::outcome(summary, assessment),
+        run::warnings(assessment),
+        run::score(summary),
+        events::robot(&summary.score_events),
+    ];
+    if let Some(report) = network {
+        let mut over_time = Section::new(
+            "over-time",
+            "Network and robot over time",
+            "each row to its own largest value, · unknown",
+        );
+        let strips = strips(&report.timeline, &summary.link_changes);
+        over_time.blocks.extend(strips.map(Block::Strips));
+        sections.push(over_time);
+        sections.push(network::preceding(report, &summary.score_events));
+        sections.push(network::network(report));
+        sections.push(events::network(report));
+    }
+    sections.push(channel::channels(summary));
+    sections.push(run::links(&summary.directions));
+    sections.push(adapter::adapters(&summary.faces));
+    sections.extend(summary.hardware_stamps.as_ref().map(nics::hardware_stamps));
+    sections.extend(summary.clocks.as_ref().map(clocks::clocks));
+    sections.push(radio::hops(&summary.radio));
+    sections.push(run::processes(&summary.processes));
+    sections.push(run::events(&summary.events));
+    sections.push(run::facts(summary));
+    sections.push(run::method(summary));
+    sections.push(run::files(&summary.run));
+    sections.retain(|section| !section.is_empty());
+    sections
+}
