@@ -54,14 +54,13 @@ pub(crate) fn event_times(
 pub(crate) fn write(
     recording: &mut Recording,
     run: &Run,
-    clocks: &Clocks,
     topics: &RunTopics,
 ) -> Result<(), WriteError> {
     recording.describe("hil.run", run_words(run))?;
     if let Some(manifest) = &run.manifest {
         describe_manifest(recording, manifest)?;
     }
-    recording.describe("hil.clocks", clock_words(run, clocks))?;
+    recording.describe("hil.clocks", clock_words(run, &topics.clocks))?;
     recording.describe("hil.channels", topics.channel_words())?;
     recording.describe("hil.recording", gap_words(run, &topics.names))?;
     attach(recording, &run.folder)?;

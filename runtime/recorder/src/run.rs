@@ -11,6 +11,7 @@ use hil_rundir::manifest::{ChannelDescription, Manifest};
 use hil_rundir::record::{RecordFile, RecordKind};
 use hil_rundir::run_folder::RunFolder;
 use hil_trace::{Trace, wire};
+use hil_watch::Seen;
 use serde_json::Value;
 
 use crate::failure::Failure;
@@ -203,26 +204,29 @@ impl Run {
         manifest.channels.iter().find(|one| one.name == channel)
     }
 
+    /// Its files of this channel and kind, with their places.
+    pub(crate) fn files_of(
+        &self,
+        channel: &str,
+        kind: RecordKind,
+    ) -> impl Iterator<Item = (usize, &RecordFile)> {
+        let files = self.files.iter().enumerate();
+        files.filter(move |(_, one)| one.header.kind == kind && one.header.channel == channel)
+    }
+
     /// Counts the messages that their producers numbered and nobody recorded.
     pub(crate) fn count_missing(&mut self) {
-        let mut seen: BTreeMap<(&str, u32), (u64, u64)> = BTreeMap::new();
+        let mut seen: BTreeMap<&str, Seen> = BTreeMap::new();
         for file in &self.files {
-            for index in 0..file.record_count() {
-                let Some((envelope, _)) = file.message(index) else {
-                    break;
-                };
-                let key = (file.header.channel.as_str(), envelope.epoch);
-                let (given, count) = seen.entry(key).or_default();
-                *given = (*given).max(envelope.sequence.saturating_add(1));
-                *count += 1;
+            let messages = (0..file.record_count()).map_while(|index| file.message(index));
+            for (envelope, _) in messages {
+                let channel = seen.entry(&file.header.channel).or_default();
+                channel.insert(envelope.epoch, envelope.sequence);
             }
         }
-        for ((channel, _), (given, count)) in seen {
-            let missing_count = given.saturating_sub(count);
-            if missing_count > 0 {
-                *self.gaps.missing.entry(channel.to_owned()).or_default() += missing_count;
-            }
-        }
+        let missing = seen.into_iter();
+        let missing = missing.map(|(channel, seen)| (channel.to_owned(), seen.missing_count()));
+        self.gaps.missing = missing.filter(|(_, count)| *count > 0).collect();
         for (channel, count) in &self.gaps.missing {
             let words = format!(
                 "{channel}: {} numbered and not recorded",

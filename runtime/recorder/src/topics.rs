@@ -255,7 +255,7 @@ fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
 }
 
 /// An event of the score as a line of a log.
-pub(crate) fn event_line(event: &ExplainedEvent, at_ns: u64) -> Option<Vec<u8>> {
+pub(crate) fn event_line(event: &ExplainedEvent, at_ns: u64) -> Option<Log> {
     let level = match event.severity {
         Severity::Notice => log::Level::Info,
         Severity::Hazard => log::Level::Warning,
@@ -263,14 +263,13 @@ pub(crate) fn event_line(event: &ExplainedEvent, at_ns: u64) -> Option<Vec<u8>> 
     };
     let outages = event.outages.iter();
     let outages = outages.map(|outage| format!(" | {}: {}", outage.channel, outage.words));
-    let line = Log {
+    Some(Log {
         timestamp: Some(timestamp(at_ns)?),
         level: level.into(),
         message: format!("{}{}", event.what, outages.collect::<String>()),
         name: "score".to_owned(),
         ..Log::default()
-    };
-    Some(line.encode_to_vec())
+    })
 }
 
 #[cfg(test)]

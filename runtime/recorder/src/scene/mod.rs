@@ -14,7 +14,6 @@ use foxglove::messages::{FrameTransforms, SceneUpdate};
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::message::Message;
 use hil_fleet::messages::{Mission, State, Truth};
-use prost::Message as _;
 use serde_json::Value;
 
 use crate::newest::Newest;
@@ -329,15 +328,15 @@ impl Scene {
             {
                 let picture = fleet.picture(now_ns, origin_ns);
                 let update = draw::moving(&picture, size, time);
-                self.moving.write(sink, stamp, &update.encode_to_vec())?;
+                self.moving.put(sink, stamp, &update)?;
                 self.picture_count += 1;
             }
         } else if self.arms.is_known() {
             let picture = self.arms.picture(now_ns, origin_ns);
             let update = draw::arms(&picture, time);
-            self.moving.write(sink, stamp, &update.encode_to_vec())?;
+            self.moving.put(sink, stamp, &update)?;
             let frames = draw::transforms(&picture, time);
-            self.frames.write(sink, stamp, &frames.encode_to_vec())?;
+            self.frames.put(sink, stamp, &frames)?;
             self.picture_count += 1;
         }
         if at_ns >= self.ground_due_ns
@@ -347,7 +346,7 @@ impl Scene {
             let stamp = Stamp::new(at_ns, self.ground_count);
             self.ground_count += 1;
             let update = draw::ground(map, time);
-            self.ground.write(sink, stamp, &update.encode_to_vec())?;
+            self.ground.put(sink, stamp, &update)?;
         }
         Ok(())
     }

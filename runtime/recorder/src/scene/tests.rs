@@ -8,6 +8,7 @@ use serde_json::json;
 
 use super::*;
 use crate::schema::Schema;
+use prost::Message as _;
 
 /// Keeps what is written, by topic.
 #[derive(Debug, Default)]
