@@ -9,7 +9,7 @@ use hil_core::record::UNAVAILABLE;
 use hil_rundir::manifest::Manifest;
 use hil_watch::{Feed, Record};
 
-use crate::facts::Words;
+use crate::facts::{Words, table};
 use crate::net::{self, MessageLatency};
 use crate::run::Run;
 
@@ -262,12 +262,12 @@ impl Clocks {
     pub(crate) fn words(&self) -> Words {
         let log_time = "instant of publication on the clock of the producer's host, plus \
                         offset_ns of that host; hosts are not aligned with each other";
-        let one_clock = self.has_one_clock;
-        let one_clock = one_clock.map_or("unknown".to_owned(), |is_one| is_one.to_string());
-        let mut words = Words::from([
-            ("log_time".to_owned(), log_time.to_owned()),
-            ("has_one_clock".to_owned(), one_clock),
-        ]);
+        let one_clock = match self.has_one_clock {
+            None => "unknown",
+            Some(true) => "true",
+            Some(false) => "false",
+        };
+        let mut words = table(&[("log_time", &log_time), ("has_one_clock", &one_clock)]);
         let hosts = self.hosts.iter();
         for (name, clock) in hosts.filter(|(name, _)| !name.is_empty() || self.hosts.len() == 1) {
             let host = if name.is_empty() { UNKNOWN_HOST } else { name };

@@ -346,19 +346,18 @@ impl LiveRecording {
     /// What was recorded so far, at the end of each file.
     fn describe_recording(&mut self, how: &str) -> Result<(), WriteError> {
         let counts = self.topics.counts;
-        let numbers = [
-            ("file_number", self.files.number() as u64),
-            ("message_count", counts.message_count),
-            ("misfit_message_count", counts.misfit_count),
-            ("timeless_record_count", counts.timeless_count),
-            ("late_record_count", self.topics.late_count()),
-            ("unordered_latency_count", self.topics.unordered_count()),
-            ("problem_count", self.problems.count),
-        ];
-        let names = &self.topics.names;
-        let mut words = facts::recording_words(&numbers, &self.problems.words, names);
-        words.insert("mode".to_owned(), "live".to_owned());
-        words.insert("ended".to_owned(), how.to_owned());
+        let mut words = facts::recording_words(&self.problems.words, &self.topics.names);
+        words.extend(facts::table(&[
+            ("file_number", &self.files.number()),
+            ("message_count", &counts.message_count),
+            ("misfit_message_count", &counts.misfit_count),
+            ("timeless_record_count", &counts.timeless_count),
+            ("late_record_count", &self.topics.late_count()),
+            ("unordered_latency_count", &self.topics.unordered_count()),
+            ("problem_count", &self.problems.count),
+            ("mode", &"live"),
+            ("ended", &how),
+        ]));
         for (channel, count) in self.topics.missed(&self.feed, self.is_silent) {
             words.insert(format!("missed {channel}"), count.to_string());
         }

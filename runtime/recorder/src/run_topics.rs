@@ -28,6 +28,7 @@ use crate::schema::Schema;
 use crate::sink::{Sink, Topic};
 use crate::timeline::{self, Step, What};
 use crate::topics::{self, Names, View, topic_of};
+use crate::view::Told;
 use crate::writer::Stamp;
 
 /// A channel that is to have topics.
@@ -123,8 +124,8 @@ impl ChannelTopics {
             |wanted: String, schema| Topic::new(names.claim(wanted), schema, &[("channel", name)]);
         let views = described.map_or(&[][..], |one| View::of(message, one.size_bytes));
         let views = views.iter().map(|view| {
-            let wanted = format!("{}{base}", view.prefix());
-            (*view, derived(wanted, view.schema()))
+            let wanted = format!("{}{base}", view.prefix);
+            (*view, derived(wanted, (view.schema)()))
         });
         Self {
             name: name.to_owned(),
@@ -419,11 +420,12 @@ impl RunTopics {
         }
         self.counts.message_count += 1;
         channel.note_written(envelope);
-        if let Some((scene, message)) = self.scene.as_mut().zip(channel.message.as_deref()) {
+        let (name, message) = (&channel.name, channel.message.as_deref());
+        if let Some((scene, message)) = self.scene.as_mut().zip(message)
+            && let Some(told) = Told::of(name, message, payload)
+        {
             let heard = Heard {
-                channel: &channel.name,
-                message,
-                payload,
+                told,
                 at_ns,
                 published_ns: envelope.published_ns,
             };

@@ -14,13 +14,9 @@ use super::source::{Progress, Source, Warning};
 use super::viewers::Viewers;
 use crate::cli::RecordOptions;
 use crate::view::Body;
-use crate::view::fleet::{FleetView, MANY_ROBOTS};
+use crate::view::fleet::FleetView;
 use crate::view::state::RunState;
 
-/// Between two pictures of robots and arms.
-const PICTURE_PERIOD: Duration = Duration::from_millis(50);
-/// Between two pictures of fleets of many robots.
-const LARGE_PICTURE_PERIOD: Duration = Duration::from_millis(200);
 /// Between two accounts of the channels.
 const CHANNELS_PERIOD: Duration = Duration::from_millis(100);
 /// Between two words on the run.
@@ -196,7 +192,7 @@ impl Engine {
                 state.how_ended = Some(how);
             }
         }
-        if let Some(map) = state.fleet.as_mut().and_then(FleetView::new_map) {
+        if let Some(map) = state.pictures.fleet.as_mut().and_then(FleetView::new_map) {
             viewers.live("/live/map", now_ns, json!(map));
         }
         // After the end the last picture stays, the one with what came in the last look.
@@ -223,21 +219,16 @@ impl Engine {
 
 /// Shows robots, arms, channels and single messages, each when it is due.
 fn pictures(state: &mut RunState, viewers: &mut Viewers, due: &mut Due, now_ns: i64) {
-    let robot_count = state.fleet.as_ref().map_or(0, FleetView::robot_count);
-    let period = if robot_count > MANY_ROBOTS {
-        LARGE_PICTURE_PERIOD
-    } else {
-        PICTURE_PERIOD
-    };
-    if is_due(&mut due.picture, period)
+    let shown = &mut state.pictures;
+    if is_due(&mut due.picture, Duration::from_nanos(shown.period_ns()))
         && let Some(origin_ns) = state.origin_ns
     {
-        if let Some(fleet) = &mut state.fleet {
+        if let Some(fleet) = &mut shown.fleet {
             let picture = json!(fleet.picture(now_ns, origin_ns));
             viewers.live("/live/fleet", now_ns, picture);
         }
-        if state.arms.is_known() {
-            let picture = json!(state.arms.picture(now_ns, origin_ns));
+        if shown.arms.is_known() {
+            let picture = json!(shown.arms.picture(now_ns, origin_ns));
             viewers.live("/live/arms", now_ns, picture);
         }
     }
@@ -269,7 +260,11 @@ fn words(shown: &mut Shown, links: &Links, viewer_count: usize, now_ns: i64) -> 
         })
     });
     let mut warnings = source.warnings();
-    let problem = state.fleet.as_ref().and_then(|fleet| fleet.problem.clone());
+    let problem = state
+        .pictures
+        .fleet
+        .as_ref()
+        .and_then(|fleet| fleet.problem.clone());
     warnings.extend(problem.map(|what| Warning {
         process: None,
         what,

@@ -34,7 +34,7 @@ use crate::split::prepare;
 use crate::view::state::RunState;
 use access::{Access, NO_ORIGIN, Refusal};
 use engine::{Engine, Showing, Shown};
-use front::{Front, GONE_AFTER, ViewerListener};
+use front::{Front, viewer_listener};
 use parameters::Links;
 use source::{Playback, Running};
 use viewers::Viewers;
@@ -252,25 +252,27 @@ fn open(
 ) -> Result<(Viewers, Front), Failure> {
     let runtime = runtime.handle();
     let address = SocketAddr::new(options.host, options.port);
-    let viewer_listener = ViewerListener::take(runtime, address, GONE_AFTER).map_err(|why| {
+    let listening = viewer_listener(runtime, address);
+    let listening = listening.and_then(|listener| Ok((listener.local_addr()?, listener)));
+    let (socket, listener) = listening.map_err(|why| {
         Failure::failed(format!(
             "cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free"
         ))
     })?;
-    let socket = SocketAddr::new(options.host, viewer_listener.port());
     let viewers = Viewers::begin(runtime, Arc::new(links.clone())).map_err(|error| {
         Failure::failed(format!(
             "cannot listen behind the socket on loopback: {error}"
         ))
     })?;
     let address = SocketAddr::new(options.host, options.http_port);
-    let page = page::serve(runtime, address, viewer_listener.port(), Arc::clone(access)).map_err(|why| {
+    let page = page::serve(runtime, address, socket.port(), Arc::clone(access)).map_err(|why| {
         Failure::failed(format!(
             "cannot serve the page at {address}: {why}; --http-port takes another, 0 any that is \
                  free"
         ))
     })?;
-    let front = viewer_listener.open(runtime, viewers.address, Arc::clone(access), page.port());
+    let access = Arc::clone(access);
+    let front = Front::open(runtime, listener, viewers.address, access, page.port());
     if !options.host.is_loopback() {
         console.warn(
             "anybody who can reach this address sees the run and may change its emulated links; \
