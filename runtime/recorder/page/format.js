@@ -95,6 +95,13 @@ export function surface(canvas) {
   return { context, width: box.width, height: box.height };
 }
 
+// A path through points [x, y], for the caller to fill or to stroke.
+export function polyline(context, points, isClosed = false) {
+  context.beginPath();
+  points.forEach(([x, y], index) => context[index ? "lineTo" : "moveTo"](x, y));
+  if (isClosed) context.closePath();
+}
+
 // A canvas without an area, as before the first layout: there is nothing to draw on, and a sheet of
 // its size may not be copied.
 export function isEmpty(canvas) {

@@ -39,7 +39,7 @@ export function showFacts(run, channels) {
     ["seed", run.seed === null ? "" : String(run.seed)],
     ["recording", recorder.file ?? ""],
     ["read", `${count(recorder.read_count)} messages${recorder.missed_count === null ? "" : `, ${count(recorder.missed_count)} missed`}`],
-    ["viewers", `${count(recorder.viewer_count)}${recorder.viewer_dropped_count > 0 ? `, ${count(recorder.viewer_dropped_count)} messages dropped for slow ones` : ""}`],
+    ["viewers", count(recorder.viewer_count)],
   ];
   const list = byId("facts");
   const shown = facts.filter(([, value]) => value !== "");
@@ -149,7 +149,7 @@ function figuresOf(channel, described) {
 }
 
 // Losses, silences and collisions up to the moment shown, the newest first.
-export function showEvents(losses, collisions, elapsedOf) {
+export function showEvents(losses, collisions) {
   const list = byId("event-list");
   const rows = [
     ...losses.slice(-MOST_EVENTS).map((loss) => ({ at_s: loss.at_s, tone: "caution", words: lossWords(loss) })),
@@ -160,7 +160,7 @@ export function showEvents(losses, collisions, elapsedOf) {
   const key = shown.length === 0 ? "none" : JSON.stringify([shown.length, shown[0], shown.at(-1)]);
   if (list.dataset.key === key) return;
   list.dataset.key = key;
-  list.replaceChildren(...shown.map((row) => make("li", { class: row.tone }, make("time", {}, seconds(elapsedOf(row.at_s), 2)), make("span", {}, row.words))));
+  list.replaceChildren(...shown.map((row) => make("li", { class: row.tone }, make("time", {}, seconds(row.at_s, 2)), make("span", {}, row.words))));
   write(byId("events-note"), shown.length === 0 ? "nothing lost, no collision since this page was opened" : rows.length > shown.length ? `the last ${shown.length}` : "");
 }
 

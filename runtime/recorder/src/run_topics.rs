@@ -265,6 +265,14 @@ pub(crate) struct Counts {
     pub(crate) timeless_count: u64,
 }
 
+impl Counts {
+    /// The time of something, which is counted when there is none.
+    const fn timed(&mut self, at_ns: Option<u64>) -> Option<u64> {
+        self.timeless_count += at_ns.is_none() as u64;
+        at_ns
+    }
+}
+
 /// When a message enters the scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Drawn {
@@ -410,8 +418,8 @@ impl RunTopics {
         sink: &mut S,
     ) -> Result<(), S::Error> {
         let channel = &mut self.channels[place];
-        let Some(at_ns) = self.clocks.message_ns(channel.host(), envelope) else {
-            self.counts.timeless_count += 1;
+        let at_ns = self.clocks.message_ns(channel.host(), envelope);
+        let Some(at_ns) = self.counts.timed(at_ns) else {
             return Ok(());
         };
         if !channel.write_message(Stamp::new(at_ns, envelope.sequence), payload, sink)? {
@@ -463,11 +471,10 @@ impl RunTopics {
     ) -> Result<(), S::Error> {
         let host = self.conditions.host_of(name);
         let at_ns = host.and_then(|host| self.clocks.time_ns(host, record.from_ns));
-        if let Some(at_ns) = at_ns {
-            return self.conditions.write(name, at_ns, record, sink);
+        match self.counts.timed(at_ns) {
+            Some(at_ns) => self.conditions.write(name, at_ns, record, sink),
+            None => Ok(()),
         }
-        self.counts.timeless_count += 1;
-        Ok(())
     }
 
     /// Writes what `decision` says, after the stamps of the message that it is about.
@@ -483,8 +490,7 @@ impl RunTopics {
             one.note_decision(decision);
         }
         self.give_out(place, &mut Joining::earliest, sink)?;
-        let Some(at_ns) = at_ns else {
-            self.counts.timeless_count += 1;
+        let Some(at_ns) = self.counts.timed(at_ns) else {
             return Ok(());
         };
         let link = &mut self.channels[place].link;
@@ -527,8 +533,8 @@ impl RunTopics {
     ) -> Result<(), S::Error> {
         let channel = &mut self.channels[place];
         while let Some(mut one) = next(&mut channel.joining) {
-            let Some(at_ns) = self.clocks.latency_ns(channel.host(), &one) else {
-                self.counts.timeless_count += 1;
+            let at_ns = self.clocks.latency_ns(channel.host(), &one);
+            let Some(at_ns) = self.counts.timed(at_ns) else {
                 continue;
             };
             let [from, to] = &channel.hosts;
@@ -549,18 +555,10 @@ impl RunTopics {
             conditions,
             ..
         } = self;
-        let mut at_ns = |channel: usize, ns| clocks.time_ns(channels[channel].host(), ns);
         let place = |name: &str| places.get(name).copied();
         let mut steps = timeline::noted_steps(run, place, &mut |channel, noted| {
-            at_ns(channel, noted.published_ns)
+            clocks.time_ns(channels[channel].host(), noted.published_ns)
         });
-        for (channel, topics) in channels.iter().enumerate() {
-            steps.extend(timeline::late_stamps(run, &topics.name).map(|late| Step {
-                at_ns: at_ns(channel, late.published_ns),
-                channel,
-                what: late.what,
-            }));
-        }
         for (file, records) in run.files.iter().enumerate() {
             let host = conditions.host_of(&records.header.channel);
             let orders = records.records::<LinkConditionRecord>().enumerate();
@@ -624,50 +622,45 @@ impl RunTopics {
     fn step<S: Sink>(&mut self, run: &Run, step: &Step, sink: &mut S) -> Result<(), S::Error> {
         let Step { at_ns, channel, .. } = *step;
         match step.what {
-            What::Message { file, index } => match run.files[file].message(index) {
-                Some((envelope, payload)) => {
-                    self.message(channel, &envelope, payload, Drawn::InOrder, sink)
+            What::Message { file, index } => {
+                if let Some((envelope, payload)) = run.files[file].message(index) {
+                    self.message(channel, &envelope, payload, Drawn::InOrder, sink)?;
                 }
-                None => Ok(()),
-            },
-            What::Record { file, index } => match net::record(&run.files[file], index) {
-                Some(record) => self.record(channel, &record, true, sink),
-                None => Ok(()),
-            },
+            }
+            What::Record { file, index } => {
+                if let Some(record) = net::record(&run.files[file], index) {
+                    self.record(channel, &record, true, sink)?;
+                }
+            }
             What::LateStamp { file, index } => {
                 if let Some(late) = run.files[file].record::<FollowUpRecord>(index)
                     && let Some(one) = self.channels[channel].joining.waiting_with(late.sequence)
                 {
                     one.note_late(&late);
                 }
-                Ok(())
             }
             What::Decision { trace, index } => {
                 let decision = &run.traces[trace].records[index];
-                self.decision(channel, at_ns, decision, sink)
+                self.decision(channel, at_ns, decision, sink)?;
             }
             What::Condition { file, index } => {
                 let file = &run.files[file];
-                match file.record::<LinkConditionRecord>(index) {
-                    Some(record) => self.condition(&file.header.channel, &record, sink),
-                    None => Ok(()),
+                if let Some(record) = file.record(index) {
+                    self.condition(&file.header.channel, &record, sink)?;
                 }
             }
             What::Event { index } => {
                 let events = run.summary.as_ref().map(|one| &one.score_events.events);
-                let event = events.and_then(|events| events.get(index));
-                let Some(at_ns) = at_ns else {
-                    self.counts.timeless_count += 1;
-                    return Ok(());
-                };
-                match event.and_then(|event| topics::event_line(event, at_ns)) {
-                    Some(line) => self
-                        .events
-                        .put(sink, Stamp::new(at_ns, index as u64), &line),
-                    None => Ok(()),
+                if let Some(at_ns) = self.counts.timed(at_ns)
+                    && let Some(event) = events.and_then(|events| events.get(index))
+                    && let Some(line) = topics::event_line(event, at_ns)
+                {
+                    self.events
+                        .put(sink, Stamp::new(at_ns, index as u64), &line)?;
                 }
             }
         }
+        Ok(())
     }
 
     /// Lets `sink` hear now of every topic that the folder of `run` has something for, `steps` of it.

@@ -7,6 +7,8 @@ use hil_core::message::Envelope;
 use hil_core::record::{FollowUpRecord, IngressRecord};
 use hil_rundir::live_run::Stage;
 use hil_rundir::record::RecordKind;
+use hil_rundir::record::file::RecordHeader;
+use hil_watch::Record;
 
 use crate::net::{self, MessageId, Noted};
 use crate::run::Run;
@@ -47,7 +49,7 @@ impl Step {
 }
 
 /// The messages of `run` and what processes noted of each. `place` gives the number of a channel, `at_ns`
-/// the time of something on it.
+/// the time of something on it; a transmit stamp that came later has that of its message's arrival.
 pub(crate) fn noted_steps(
     run: &Run,
     place: impl Fn(&str) -> Option<usize>,
@@ -55,18 +57,36 @@ pub(crate) fn noted_steps(
 ) -> Vec<Step> {
     let mut steps = Vec::new();
     for (file, records) in run.files.iter().enumerate() {
-        let Some(channel) = place(&records.header.channel) else {
+        let RecordHeader {
+            channel: name,
+            kind,
+            ..
+        } = &records.header;
+        let Some(channel) = place(name) else {
             continue;
         };
+        let late = if *kind == RecordKind::FollowUp {
+            arrivals(run, name)
+        } else {
+            BTreeMap::new()
+        };
         for index in 0..records.record_count() {
-            let (noted, what) = if records.header.kind == RecordKind::Message {
-                let message = records.message(index);
-                let noted = message.map(|(envelope, _)| published(&envelope));
-                (noted, What::Message { file, index })
-            } else {
-                let record = net::record(records, index);
-                let noted = record.as_ref().and_then(Noted::of);
-                (noted, What::Record { file, index })
+            let (noted, what) = match kind {
+                RecordKind::Message => {
+                    let message = records.message(index);
+                    let noted = message.map(|(envelope, _)| published(&envelope));
+                    (noted, What::Message { file, index })
+                }
+                RecordKind::FollowUp => {
+                    let stamp: Option<FollowUpRecord> = records.record(index);
+                    let noted = stamp.and_then(|one| late.get(&(one.session, one.sequence)));
+                    (noted.copied(), What::LateStamp { file, index })
+                }
+                _ => {
+                    let record = net::record(records, index);
+                    let noted = record.as_ref().and_then(Noted::of);
+                    (noted, What::Record { file, index })
+                }
             };
             steps.extend(noted.map(|noted| Step {
                 at_ns: at_ns(channel, &noted),
@@ -78,37 +98,19 @@ pub(crate) fn noted_steps(
     steps
 }
 
-/// A transmit stamp that came later, and when the message that it is about was published, on the clock of
-/// its producer.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct LateStamp {
-    /// Where it is.
-    pub(crate) what: What,
-    /// The publication.
-    pub(crate) published_ns: i64,
-}
-
-/// The transmit stamps of messages of `channel` that came in later datagrams.
-pub(crate) fn late_stamps(run: &Run, channel: &str) -> impl Iterator<Item = LateStamp> {
-    let mut late = Vec::new();
-    let mut published: BTreeMap<(u32, u64), i64> = BTreeMap::new();
-    for (file, records) in run.files_of(channel, RecordKind::FollowUp) {
-        if published.is_empty() {
-            let arrived = run.files_of(channel, RecordKind::Ingress);
-            let arrived = arrived.flat_map(|(_, file)| file.records::<IngressRecord>());
-            published = arrived
-                .map(|one| ((one.session, one.sequence), one.published_ns))
-                .collect();
-        }
-        for (index, one) in records.records::<FollowUpRecord>().enumerate() {
-            let published_ns = published.get(&(one.session, one.sequence));
-            late.extend(published_ns.map(|published_ns| LateStamp {
-                what: What::LateStamp { file, index },
-                published_ns: *published_ns,
-            }));
-        }
-    }
-    late.into_iter()
+/// What the receiving gateway noted of each message of `channel`, by session and number.
+fn arrivals(run: &Run, channel: &str) -> BTreeMap<(u32, u64), Noted> {
+    let files = run.files_of(channel, RecordKind::Ingress);
+    let records = files.flat_map(|(_, file)| file.records::<IngressRecord>());
+    let noted = records.map(|one| {
+        (
+            (one.session, one.sequence),
+            Noted::of(&Record::Ingress(one)),
+        )
+    });
+    noted
+        .filter_map(|(key, noted)| Some((key, noted?)))
+        .collect()
 }
 
 /// What a message says of its own publication.

@@ -265,10 +265,7 @@ fn words(shown: &mut Shown, links: &Links, viewer_count: usize, now_ns: i64) -> 
         .fleet
         .as_ref()
         .and_then(|fleet| fleet.problem.clone());
-    warnings.extend(problem.map(|what| Warning {
-        process: None,
-        what,
-    }));
+    warnings.extend(problem.map(Warning::of_the_run));
     let overruns = source.overruns();
     let mut run = state.run(now_ns);
     run["links"] = listed.collect();

@@ -1,6 +1,7 @@
 //! Where the records of a served run come from: a finished run's folder, each record when it happened, or a
 //! live run, as its feed tells of it.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
@@ -45,6 +46,14 @@ pub(crate) struct Warning {
     pub(crate) process: Option<String>,
     /// What.
     pub(crate) what: String,
+}
+
+impl Warning {
+    /// Of no single process.
+    pub(crate) const fn of_the_run(what: String) -> Self {
+        let process = None;
+        Self { process, what }
+    }
 }
 
 /// A run's records as they come.
@@ -228,16 +237,9 @@ impl Source for Playback {
     }
 
     fn warnings(&self) -> Vec<Warning> {
-        let Some(summary) = &self.run.summary else {
-            return Vec::new();
-        };
-        let warnings = Assessment::of(summary).warnings.into_iter();
-        warnings
-            .map(|what| Warning {
-                process: None,
-                what,
-            })
-            .collect()
+        let summary = self.run.summary.iter();
+        let warnings = summary.flat_map(|summary| Assessment::of(summary).warnings);
+        warnings.map(Warning::of_the_run).collect()
     }
 }
 
@@ -411,33 +413,24 @@ impl Source for Running {
         self.overruns.clone()
     }
 
-    /// What the processes said on their standard error so far.
+    /// What the processes said last on their standard error.
     fn warnings(&self) -> Vec<Warning> {
         let folder = self.feed.run().folder.join("logs");
-        let Ok(entries) = fs::read_dir(folder) else {
-            return Vec::new();
-        };
-        let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
-        paths.sort();
+        let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+        let paths: BTreeSet<_> = entries.map(|entry| entry.path()).collect();
         let mut warnings = Vec::new();
         for path in paths {
-            let Ok(text) = end_of(&path) else {
-                continue;
-            };
             let process = path
                 .file_stem()
                 .map(|name| name.to_string_lossy().into_owned());
-            let lines: Vec<&str> = text
-                .lines()
-                .filter(|line| !line.trim().is_empty())
-                .collect();
-            let last = lines.len().saturating_sub(LINES_MAX);
-            for line in &lines[last..] {
-                warnings.push(Warning {
-                    process: process.clone(),
-                    what: (*line).to_owned(),
-                });
-            }
+            let text = end_of(&path).unwrap_or_default();
+            let lines = text.lines().filter(|line| !line.trim().is_empty());
+            let lines: Vec<&str> = lines.collect();
+            let last = lines[lines.len().saturating_sub(LINES_MAX)..].iter();
+            warnings.extend(last.map(|line| Warning {
+                process: process.clone(),
+                what: (*line).to_owned(),
+            }));
         }
         warnings
     }
