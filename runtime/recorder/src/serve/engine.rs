@@ -1,14 +1,13 @@
 //! Reads what came of a run and shows what is due, round by round; waits for a run where there is
 //! none.
 
-use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use foxglove::websocket::Parameter;
 use hil_platform::console::Console;
 use serde_json::{Value, json};
 
-use super::parameters::Links;
+use super::parameters::{Links, RunWithLinks};
 use super::recording::Recording;
 use super::source::{Progress, Source, Warning};
 use super::viewers::Viewers;
@@ -51,8 +50,8 @@ pub(crate) struct Shown {
     pub(crate) source: Box<dyn Source>,
     /// How fast, if it is played back.
     pub(crate) playback_speed: Option<f64>,
-    /// Its folder and resolved topology, if it goes on: its links can be changed.
-    pub(crate) links: Option<(PathBuf, Value)>,
+    /// Itself, if it goes on.
+    pub(crate) links: Option<RunWithLinks>,
 }
 
 /// Which run is shown, and how it stands.
@@ -112,9 +111,9 @@ impl Engine {
         }
         // What is played back is on record already.
         let goes_on = self.target.as_ref().zip(shown.links.as_ref());
-        self.recording = goes_on.map(|(target, (folder, _))| {
+        self.recording = goes_on.map(|(target, run)| {
             self.recorded_count += 1;
-            Recording::begin(folder, target, self.recorded_count)
+            Recording::begin(&run.folder, target, self.recorded_count)
         });
         self.shown = Some(shown);
         self.due = Due::default();

@@ -35,7 +35,7 @@ use crate::view::state::RunState;
 use access::{Access, NO_ORIGIN, Refusal};
 use engine::{Engine, Showing, Shown};
 use front::{Front, viewer_listener};
-use parameters::Links;
+use parameters::{Links, RunWithLinks};
 use source::{Playback, Running};
 use viewers::Viewers;
 
@@ -74,16 +74,10 @@ pub(crate) fn serve(
     let access = Arc::new(admitted(options));
     let (viewers, front) = open(options, &runtime, &links, &access, console)?;
     let target = options.record.clone().map(|output| RecordOptions {
-        run: None,
         output,
-        wait: false,
-        below: None,
-        from_now: false,
-        split_size: None,
         flush: FLUSH,
-        force: false,
         no_scene: options.no_scene,
-        folder: None,
+        ..RecordOptions::default()
     });
     let mut engine = Engine::new(viewers, links, target);
     match shown {
@@ -186,7 +180,10 @@ fn watch(run: LiveRun) -> Result<Shown, Failure> {
     let (running, facts) = Running::open(run).map_err(Failure::failed)?;
     Ok(Shown {
         state: RunState::new(facts),
-        links: Some((folder, running.topology().clone())),
+        links: Some(RunWithLinks {
+            folder,
+            topology: running.topology().clone(),
+        }),
         source: Box::new(running),
         playback_speed: None,
     })

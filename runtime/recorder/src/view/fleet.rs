@@ -40,7 +40,7 @@ pub(crate) struct FleetPicture {
 }
 
 /// A robot of it.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Default, Serialize)]
 pub(crate) struct RobotPicture {
     pub(crate) fleet: u32,
     pub(crate) id: u32,
@@ -322,14 +322,7 @@ fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Opti
         phase: word,
         is_waiting: phase == Phase::AtPoint || (phase == Phase::Driving && is_standing),
         mission: (mission != 0).then_some(mission),
-        path: None,
-        goal: None,
-        path_index: None,
-        granted_index: None,
-        last_index: None,
-        granted_m: None,
-        ahead: Vec::new(),
-        granted: Vec::new(),
+        ..RobotPicture::default()
     };
     if let (Some(id), Some(scene)) = (robot.path_of(mission), scene)
         && let Some(path) = scene.world.paths.get(id)

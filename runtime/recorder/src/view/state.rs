@@ -109,8 +109,7 @@ impl RunState {
             "elapsed_s": self.elapsed_s(now_ns),
             "duration_s": facts.duration.map(|one| one.as_secs_f64()),
             "hosts_here": facts.hosts_here, "hosts": facts.hosts,
-            "topology_hash": facts.identity.as_ref().map(|(hash, _)| hash),
-            "seed": facts.identity.as_ref().map(|(_, seed)| seed),
+            "topology_hash": facts.topology_hash, "seed": facts.seed,
             "channels": facts.channels_json(),
             "recorder": { "read_count": self.read_count },
         })
