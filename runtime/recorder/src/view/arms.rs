@@ -6,7 +6,6 @@ use hil_arm::yumi::arm::Arm;
 use hil_arm::yumi::description::{self, Rod};
 use hil_arm::yumi::{Joints, Pose};
 use serde::Serialize;
-use serde_json::{Value, json};
 
 use super::{Told, rounded, seconds};
 
@@ -17,10 +16,30 @@ pub(crate) type Frame = [f64; 7];
 #[derive(Debug, Serialize)]
 pub(crate) struct ArmsPicture {
     at_s: f64,
-    body: Value,
-    fingers: Value,
+    body: [RodPicture; 3],
+    fingers: [RodPicture; 2],
     pub(crate) shapes: Vec<Shape>,
     pub(crate) arms: Vec<ArmPicture>,
+}
+
+/// A rod in the frame of whoever has it.
+#[derive(Debug, Serialize)]
+#[expect(clippy::struct_field_names, reason = "each in its unit")]
+struct RodPicture {
+    from_m: [f64; 3],
+    to_m: [f64; 3],
+    radius_m: f64,
+}
+
+impl From<Rod> for RodPicture {
+    fn from(rod: Rod) -> Self {
+        let round = |place: [f64; 3]| place.map(|number| (number * 1e4).round() / 1e4);
+        Self {
+            from_m: round(rod.from_m),
+            to_m: round(rod.to_m),
+            radius_m: rod.radius_m,
+        }
+    }
 }
 
 /// A link of an arm, from one frame to another.
@@ -110,8 +129,8 @@ impl ArmsView {
         });
         ArmsPicture {
             at_s: seconds(now_ns - origin_ns),
-            body: json!(description::body().map(rod)),
-            fingers: json!(description::fingers().map(rod)),
+            body: description::body().map(RodPicture::from),
+            fingers: description::fingers().map(RodPicture::from),
             shapes: shapes.collect(),
             arms: self.arms.iter().map(|arm| arm.picture(now_ns)).collect(),
         }
@@ -185,12 +204,6 @@ impl OneArm {
     }
 }
 
-/// A rod in the frame of whoever has it.
-fn rod(rod: Rod) -> Value {
-    let round = |place: [f64; 3]| place.map(|number| (number * 1e4).round() / 1e4);
-    json!({ "from_m": round(rod.from_m), "to_m": round(rod.to_m), "radius_m": rod.radius_m })
-}
-
 fn is_finite(joints: &Joints) -> bool {
     joints.iter().all(|angle| angle.is_finite())
 }
@@ -200,6 +213,7 @@ mod tests {
     use super::*;
     use bytemuck::Zeroable;
     use hil_arm::yumi::arm::RIGHT_START_RAD;
+    use serde_json::{Value, json};
 
     #[test]
     fn an_arm_that_is_where_it_shall_be_has_no_error_and_its_tool_at_its_last_frame() {
