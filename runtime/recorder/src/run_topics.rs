@@ -273,17 +273,6 @@ impl Counts {
     }
 }
 
-/// When a message enters the scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Drawn {
-    /// At once: messages come in order of time.
-    InOrder,
-    /// Once what was published before it has come.
-    Later,
-    /// Never: the pictures of its time are drawn.
-    Never,
-}
-
 impl RunTopics {
     /// Names the topics of a run with this resolved topology. Without a scene, what it takes to draw one
     /// is not worked out.
@@ -383,12 +372,9 @@ impl RunTopics {
                 let Some(place) = self.places.get(&channel.description.name).copied() else {
                     return Ok(());
                 };
-                let drawn = if *origin == Origin::OtherHost {
-                    Drawn::Never
-                } else {
-                    Drawn::Later
-                };
-                self.message(place, envelope, payload, drawn, sink)
+                // Of what another host sends at the end the pictures are drawn already.
+                let is_drawn = *origin != Origin::OtherHost;
+                self.message(place, envelope, payload, is_drawn, sink)
             }
             Event::Record {
                 channel,
@@ -414,7 +400,7 @@ impl RunTopics {
         place: usize,
         envelope: &Envelope,
         payload: &[u8],
-        drawn: Drawn,
+        is_drawn: bool,
         sink: &mut S,
     ) -> Result<(), S::Error> {
         let channel = &mut self.channels[place];
@@ -430,18 +416,14 @@ impl RunTopics {
         channel.note_written(envelope);
         let (name, message) = (&channel.name, channel.message.as_deref());
         if let Some((scene, message)) = self.scene.as_mut().zip(message)
-            && let Some(told) = Told::of(name, message, payload)
+            && let Some(told) = Told::of(name, message, payload).filter(|_| is_drawn)
         {
             let heard = Heard {
                 told,
                 at_ns,
                 published_ns: envelope.published_ns,
             };
-            match drawn {
-                Drawn::InOrder => scene.take(&heard, sink)?,
-                Drawn::Later => scene.hold(&heard, sink)?,
-                Drawn::Never => {}
-            }
+            scene.hold(&heard, sink)?;
         }
         Ok(())
     }
@@ -624,7 +606,11 @@ impl RunTopics {
         match step.what {
             What::Message { file, index } => {
                 if let Some((envelope, payload)) = run.files[file].message(index) {
-                    self.message(channel, &envelope, payload, Drawn::InOrder, sink)?;
+                    self.message(channel, &envelope, payload, true, sink)?;
+                    // They come in order of time.
+                    if let Some(scene) = &mut self.scene {
+                        scene.draw_held(sink)?;
+                    }
                 }
             }
             What::Record { file, index } => {

@@ -165,10 +165,7 @@ impl Scene {
     }
 
     /// Takes a message, after the pictures that are due before it. Messages come in order of time.
-    ///
-    /// # Errors
-    /// When the sink cannot take a picture.
-    pub(crate) fn take<S: Sink>(&mut self, heard: &Heard, sink: &mut S) -> Result<(), S::Error> {
+    fn take<S: Sink>(&mut self, heard: &Heard, sink: &mut S) -> Result<(), S::Error> {
         if !self.pictures.shows(&heard.told) {
             return Ok(());
         }
@@ -229,12 +226,20 @@ impl Scene {
         Ok(())
     }
 
+    /// Takes everything that waits: nothing comes any more that was before it.
+    ///
+    /// # Errors
+    /// When the sink cannot take a picture.
+    pub(crate) fn draw_held<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        self.take_until(u64::MAX, usize::MAX, sink)
+    }
+
     /// Takes everything that waits, and draws what the last messages said.
     ///
     /// # Errors
     /// When the sink cannot take the picture.
     pub(crate) fn finish<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
-        self.take_until(u64::MAX, usize::MAX, sink)?;
+        self.draw_held(sink)?;
         if self.origin_ns.is_none() {
             return Ok(());
         }
