@@ -1,6 +1,6 @@
 // The fleet from above: ground, ways, critical sections, vehicles to scale and where they met.
 
-import { FONT, age, isEmpty, make, polyline, quantity, surface, write } from "./format.js";
+import { FONT, age, isEmpty, keepOnly, make, polyline, quantity, surface, write } from "./format.js";
 
 const PADDING_PX = 14;
 const NUMBER_FITS_PX = 15;
@@ -295,11 +295,7 @@ export class FleetScene {
       mark.style.background = this.colours.series[robot.id % 7];
       Object.assign(text.dataset, { x: drawn.x_px.toFixed(1), y: drawn.y_px.toFixed(1), xM: robot.x_m, yM: robot.y_m });
     }
-    for (const [key, { item }] of this.chips) {
-      if (present.has(key)) continue;
-      item.remove();
-      this.chips.delete(key);
-    }
+    keepOnly(this.chips, present);
   }
 
   chip(key, robot) {

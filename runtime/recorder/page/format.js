@@ -68,6 +68,15 @@ export function keepAt(parent, index, child) {
   if (parent.children[index] !== child) parent.insertBefore(child, parent.children[index] ?? null);
 }
 
+// Forgets the items of a map, and takes them off the page, whose keys are not present any more.
+export function keepOnly(items, present) {
+  for (const [key, { item }] of items) {
+    if (present.has(key)) continue;
+    item.remove();
+    items.delete(key);
+  }
+}
+
 // The page's colours as the stylesheet has them now; they change with the system's light or dark.
 export function palette() {
   const style = getComputedStyle(document.documentElement);

@@ -1,6 +1,6 @@
 // Strip charts of delays: one strip per segment of a channel, or per channel, over the last stretch of time.
 
-import { FONT, UNAVAILABLE, keepAt, make, microseconds, polyline, surface, write } from "./format.js";
+import { FONT, UNAVAILABLE, keepAt, keepOnly, make, microseconds, polyline, surface, write } from "./format.js";
 
 const WHOLE = "published to taken";
 const LEFT_PX = 58;
@@ -63,11 +63,7 @@ export class Strips {
       keepAt(this.list, index, this.strips.get(key).item);
       this.drawOne(this.strips.get(key), one, samples, losses, moment, colours);
     }
-    for (const [key, strip] of this.strips) {
-      if (present.has(key)) continue;
-      strip.item.remove();
-      this.strips.delete(key);
-    }
+    keepOnly(this.strips, present);
   }
 
   // Few strips are drawn large; of many, each stays high enough to be read. Those without a figure take

@@ -24,7 +24,6 @@ use crate::joining::Joining;
 use crate::net::{self, LinkDecision, MessageLatency};
 use crate::run::Run;
 use crate::scene::{Heard, Scene};
-use crate::schema::Schema;
 use crate::sink::{Sink, Topic};
 use crate::timeline::{self, Step, What};
 use crate::topics::{self, Names, View, topic_of};
@@ -47,8 +46,8 @@ pub(crate) struct Wanted<'a> {
 }
 
 impl Wanted<'_> {
-    /// How its messages are written field by field, with their schema; or why they cannot be.
-    fn typed(&self) -> Result<(Codec, Schema), String> {
+    /// How its messages are written field by field; or why they cannot be.
+    fn typed(&self) -> Result<Codec, String> {
         let described = self
             .described
             .ok_or("the manifest does not tell of this channel")?;
@@ -104,7 +103,7 @@ impl ChannelTopics {
     fn of(wanted: &Wanted<'_>, own: String, names: &mut Names) -> Self {
         let (name, described) = (wanted.name, wanted.described);
         let mut untyped = None;
-        let (codec, schema) = wanted.typed().unwrap_or_else(|why| {
+        let codec = wanted.typed().unwrap_or_else(|why| {
             untyped = Some(why);
             Codec::opaque(0)
         });
@@ -118,7 +117,7 @@ impl ChannelTopics {
             ("size_bytes", &size),
             ("clock_host", hosts[0].as_deref().unwrap_or_default()),
         ];
-        let own = Topic::new(own, schema, &metadata);
+        let own = Topic::new(own, codec.schema.clone(), &metadata);
         let base = topic_of(name);
         let mut derived =
             |wanted: String, schema| Topic::new(names.claim(wanted), schema, &[("channel", name)]);

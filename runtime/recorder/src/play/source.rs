@@ -37,7 +37,6 @@ struct Wanted {
     topic: String,
     channel: String,
     codec: Codec,
-    schema: Schema,
 }
 
 /// A topic of the file.
@@ -77,7 +76,7 @@ pub(crate) fn known_channels(path: &Path) -> Result<String, Failure> {
 /// Reads the messages of `channels`, whose layouts are those of the run they go into.
 pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Material, Failure> {
     let wanted = channels.iter().map(|channel| {
-        let (codec, schema) = if channel.fields.is_empty() {
+        let codec = if channel.fields.is_empty() {
             Codec::opaque(channel.size_bytes)
         } else {
             Codec::typed(&channel.message, &channel.fields, channel.size_bytes)
@@ -87,7 +86,6 @@ pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Mate
             topic: topic_of(&channel.name),
             channel: channel.name.clone(),
             codec,
-            schema,
         })
     });
     let mut reading = Reading {
@@ -185,11 +183,11 @@ impl Reading {
     /// The file's schema must be the one that the live channel's layout gives.
     fn check(&self, wanted: &Wanted, schema_id: u16) -> Result<(), Failure> {
         let schema = self.schemas.get(&schema_id);
-        if schema == Some(&wanted.schema) {
+        if schema == Some(&wanted.codec.schema) {
             return Ok(());
         }
         let found = schema.map_or("an unknown schema", |schema| schema.name.as_str());
-        let (channel, name) = (&wanted.channel, &wanted.schema.name);
+        let (channel, name) = (&wanted.channel, &wanted.codec.schema.name);
         let fields = if found == name {
             " with other fields"
         } else {
