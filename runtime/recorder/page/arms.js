@@ -1,6 +1,6 @@
 // The robot's arms in space: measured solid, commanded as an outline; own projection, far parts first.
 
-import { FONT, age, isEmpty, make, quantity, surface, write } from "./format.js";
+import { FONT, age, isEmpty, make, polyline, quantity, surface, write } from "./format.js";
 
 const START = { turn: -0.62, tilt: 0.36, zoom: 1 };
 const CENTRE = [0.2, 0, 0.26];
@@ -10,8 +10,8 @@ const TRAIL_S = 2;
 const NEAR_M = 0.2;
 
 export class ArmScene {
-  constructor(canvas, list, redraw) {
-    Object.assign(this, { canvas, list_: list, redraw, chips: new Map(), tools: [], ...START });
+  constructor(canvas, list) {
+    Object.assign(this, { canvas, list_: list, chips: new Map(), tools: [], ...START });
   }
 
   legend() {
@@ -74,9 +74,7 @@ export class ArmScene {
     const line = (from, to) => {
       const [a, b] = [this.project(from), this.project(to)];
       if (!a || !b) return;
-      context.beginPath();
-      context.moveTo(a.x, a.y);
-      context.lineTo(b.x, b.y);
+      polyline(context, [[a.x, a.y], [b.x, b.y]]);
       context.stroke();
     };
     const { x, y, step } = FLOOR_M;
@@ -131,10 +129,7 @@ export class ArmScene {
     const draw = (points, style, line) => {
       context.strokeStyle = style;
       context.lineWidth = line;
-      context.beginPath();
-      points.forEach((point, index) => {
-        if (index === 0) context.moveTo(point.x, point.y); else context.lineTo(point.x, point.y);
-      });
+      polyline(context, points.map(({ x, y }) => [x, y]));
       context.stroke();
     };
     const seen = (points) => points.map((point) => this.project(point)).filter(Boolean);
@@ -162,9 +157,7 @@ export class ArmScene {
       const [dx, dy] = [(end.x - origin.x) * unit, (end.y - origin.y) * unit];
       context.strokeStyle = context.fillStyle = colour;
       context.lineWidth = 2;
-      context.beginPath();
-      context.moveTo(...corner);
-      context.lineTo(corner[0] + dx, corner[1] + dy);
+      polyline(context, [corner, [corner[0] + dx, corner[1] + dy]]);
       context.stroke();
       context.fillText(name, corner[0] + dx * 1.45, corner[1] + dy * 1.45);
     });
@@ -211,9 +204,7 @@ function stroke(context, { a, b }, style, width, alpha, shift = 0) {
   context.globalAlpha = alpha;
   context.strokeStyle = style;
   context.lineWidth = width;
-  context.beginPath();
-  context.moveTo(a.x + shift, a.y + shift);
-  context.lineTo(b.x + shift, b.y + shift);
+  polyline(context, [a, b].map(({ x, y }) => [x + shift, y + shift]));
   context.stroke();
   context.globalAlpha = 1;
 }

@@ -1,6 +1,6 @@
 // The fleet from above: ground, ways, critical sections, vehicles to scale and where they met.
 
-import { FONT, age, isEmpty, make, quantity, surface, write } from "./format.js";
+import { FONT, age, isEmpty, keepOnly, make, polyline, quantity, surface, write } from "./format.js";
 
 const PADDING_PX = 14;
 const NUMBER_FITS_PX = 15;
@@ -8,8 +8,8 @@ const FRESH_COLLISION_S = 5;
 const MOST_ZOOM = 12;
 
 export class FleetScene {
-  constructor(canvas, robots, redraw) {
-    Object.assign(this, { canvas, robots, redraw, fleet: 0, zoom: 1, pan: [0, 0], drawn: [], chips: new Map() });
+  constructor(canvas, robots) {
+    Object.assign(this, { canvas, robots, fleet: 0, zoom: 1, pan: [0, 0], drawn: [], chips: new Map() });
   }
 
   legend() {
@@ -76,12 +76,7 @@ export class FleetScene {
   }
 
   trace(context, points, isClosed) {
-    context.beginPath();
-    points.forEach(([x, y], index) => {
-      const place = this.at(x, y);
-      if (index === 0) context.moveTo(...place); else context.lineTo(...place);
-    });
-    if (isClosed) context.closePath();
+    polyline(context, points.map(([x, y]) => this.at(x, y)), isClosed);
   }
 
   // What does not move is drawn once per size, zoom and colour scheme.
@@ -204,10 +199,7 @@ export class FleetScene {
     context.stroke();
     context.setLineDash([]);
     // The bow: a light wedge at the end that goes first.
-    context.beginPath();
-    context.moveTo(long * 0.44, 0);
-    context.lineTo(long * 0.27, wide * 0.3);
-    context.lineTo(long * 0.27, -wide * 0.3);
+    polyline(context, [[long * 0.44, 0], [long * 0.27, wide * 0.3], [long * 0.27, -wide * 0.3]]);
     context.fillStyle = robot.is_stale ? colour : this.colours.panel;
     context.globalAlpha = 0.85;
     context.fill();
@@ -275,19 +267,15 @@ export class FleetScene {
     const wanted_m = 90 / this.scale;
     const decade = 10 ** Math.floor(Math.log10(wanted_m));
     const length_m = [5, 2, 1].map((step) => step * decade).find((step) => step <= wanted_m);
-    const [left, bottom] = [width / 2 - (length_m * this.scale) / 2, height - 3];
+    const [left, right, bottom] = [width / 2 - (length_m * this.scale) / 2, width / 2 + (length_m * this.scale) / 2, height - 3];
     context.strokeStyle = context.fillStyle = this.colours.faint;
     context.lineWidth = 1.5;
-    context.beginPath();
-    context.moveTo(left, bottom - 4);
-    context.lineTo(left, bottom);
-    context.lineTo(left + length_m * this.scale, bottom);
-    context.lineTo(left + length_m * this.scale, bottom - 4);
+    polyline(context, [[left, bottom - 4], [left, bottom], [right, bottom], [right, bottom - 4]]);
     context.stroke();
     context.font = `12px ${FONT}`;
     context.textAlign = "left";
     context.textBaseline = "alphabetic";
-    context.fillText(`${length_m} m`, left + length_m * this.scale + 6, bottom);
+    context.fillText(`${length_m} m`, right + 6, bottom);
   }
 
   // The same in words, for those who do not see the drawing, and for tests.
@@ -307,11 +295,7 @@ export class FleetScene {
       mark.style.background = this.colours.series[robot.id % 7];
       Object.assign(text.dataset, { x: drawn.x_px.toFixed(1), y: drawn.y_px.toFixed(1), xM: robot.x_m, yM: robot.y_m });
     }
-    for (const [key, { item }] of this.chips) {
-      if (present.has(key)) continue;
-      item.remove();
-      this.chips.delete(key);
-    }
+    keepOnly(this.chips, present);
   }
 
   chip(key, robot) {

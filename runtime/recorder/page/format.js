@@ -68,6 +68,15 @@ export function keepAt(parent, index, child) {
   if (parent.children[index] !== child) parent.insertBefore(child, parent.children[index] ?? null);
 }
 
+// Forgets the items of a map, and takes them off the page, whose keys are not present any more.
+export function keepOnly(items, present) {
+  for (const [key, { item }] of items) {
+    if (present.has(key)) continue;
+    item.remove();
+    items.delete(key);
+  }
+}
+
 // The page's colours as the stylesheet has them now; they change with the system's light or dark.
 export function palette() {
   const style = getComputedStyle(document.documentElement);
@@ -93,6 +102,13 @@ export function surface(canvas) {
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.clearRect(0, 0, box.width, box.height);
   return { context, width: box.width, height: box.height };
+}
+
+// A path through points [x, y], for the caller to fill or to stroke.
+export function polyline(context, points, isClosed = false) {
+  context.beginPath();
+  points.forEach(([x, y], index) => context[index ? "lineTo" : "moveTo"](x, y));
+  if (isClosed) context.closePath();
 }
 
 // A canvas without an area, as before the first layout: there is nothing to draw on, and a sheet of

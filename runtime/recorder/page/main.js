@@ -178,7 +178,7 @@ function drawPanels(moment) {
     write(byId("axis-end"), view.isPaused ? "moment shown" : document.body.dataset.state === "lost" ? "last heard" : "now");
   }
   const fleet = scene === "fleet" ? at("fleet", moment) : undefined;
-  showEvents(losses, fleet?.collisions ?? [], (at_s) => at_s);
+  showEvents(losses, fleet?.collisions ?? []);
   if (scene) canvas.setAttribute("aria-label", scenes[scene].summary(at(scene, moment)));
   offerFleets();
 }

@@ -1,6 +1,6 @@
 // Head of the page, table of channels, warnings and events: what is written rather than drawn.
 
-import { UNAVAILABLE, byId, count, keepAt, make, microseconds, quantity, seconds, share, write } from "./format.js";
+import { UNAVAILABLE, byId, count, keepAt, keepOnly, make, microseconds, quantity, seconds, share, write } from "./format.js";
 import { boundText } from "./strips.js";
 
 const STATES = { waiting: ["waiting for a run", "caution"], running: ["running", "good"], ended: ["ended", ""] };
@@ -39,7 +39,7 @@ export function showFacts(run, channels) {
     ["seed", run.seed === null ? "" : String(run.seed)],
     ["recording", recorder.file ?? ""],
     ["read", `${count(recorder.read_count)} messages${recorder.missed_count === null ? "" : `, ${count(recorder.missed_count)} missed`}`],
-    ["viewers", `${count(recorder.viewer_count)}${recorder.viewer_dropped_count > 0 ? `, ${count(recorder.viewer_dropped_count)} messages dropped for slow ones` : ""}`],
+    ["viewers", count(recorder.viewer_count)],
   ];
   const list = byId("facts");
   const shown = facts.filter(([, value]) => value !== "");
@@ -91,16 +91,12 @@ export class ChannelTable {
   show(channels, run, chosen) {
     const described = new Map((run?.channels ?? []).map((channel) => [channel.name, channel]));
     const present = new Set(channels.map((channel) => channel.name));
-    for (const [name, row] of this.rows) {
-      if (present.has(name)) continue;
-      row.row.remove();
-      this.rows.delete(name);
-    }
+    keepOnly(this.rows, present);
     for (const [index, channel] of channels.entries()) {
       if (!this.rows.has(channel.name)) this.rows.set(channel.name, this.row(channel.name));
-      const { row, cells } = this.rows.get(channel.name);
-      keepAt(this.body, index, row);
-      row.classList.toggle("chosen", channel.name === chosen);
+      const { item, cells } = this.rows.get(channel.name);
+      keepAt(this.body, index, item);
+      item.classList.toggle("chosen", channel.name === chosen);
       const texts = figuresOf(channel, described.get(channel.name));
       for (const [name, text] of Object.entries(texts)) {
         write(cells[name], text);
@@ -114,14 +110,14 @@ export class ChannelTable {
   row(name) {
     const button = make("button", { type: "button" }, name);
     button.addEventListener("click", () => this.choose(name));
-    const row = make("tr", { "data-channel": name }, make("th", { scope: "row" }, button));
+    const item = make("tr", { "data-channel": name }, make("th", { scope: "row" }, button));
     const cells = {};
     for (const label of ["way", "link", "rate", "published", "taken", "lost", "share lost", "p50", "p99", "max", "clock bound"]) {
       const isText = label === "way" || label === "link";
       cells[label] = make("td", { "data-label": label, class: isText ? undefined : "n" });
-      row.append(cells[label]);
+      item.append(cells[label]);
     }
-    return { row, cells };
+    return { item, cells };
   }
 }
 
@@ -149,7 +145,7 @@ function figuresOf(channel, described) {
 }
 
 // Losses, silences and collisions up to the moment shown, the newest first.
-export function showEvents(losses, collisions, elapsedOf) {
+export function showEvents(losses, collisions) {
   const list = byId("event-list");
   const rows = [
     ...losses.slice(-MOST_EVENTS).map((loss) => ({ at_s: loss.at_s, tone: "caution", words: lossWords(loss) })),
@@ -160,7 +156,7 @@ export function showEvents(losses, collisions, elapsedOf) {
   const key = shown.length === 0 ? "none" : JSON.stringify([shown.length, shown[0], shown.at(-1)]);
   if (list.dataset.key === key) return;
   list.dataset.key = key;
-  list.replaceChildren(...shown.map((row) => make("li", { class: row.tone }, make("time", {}, seconds(elapsedOf(row.at_s), 2)), make("span", {}, row.words))));
+  list.replaceChildren(...shown.map((row) => make("li", { class: row.tone }, make("time", {}, seconds(row.at_s, 2)), make("span", {}, row.words))));
   write(byId("events-note"), shown.length === 0 ? "nothing lost, no collision since this page was opened" : rows.length > shown.length ? `the last ${shown.length}` : "");
 }
 

@@ -8,7 +8,7 @@ const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 4000;
 
 export class Socket {
-  // handlers: opened(info), message(topic, time_s, bytes), parameters(list, id), lost(retry_ms),
+  // handlers: opened(info), message(topic, time_s, bytes), parameters(list), lost(),
   // status(level, text). `wanted` says of a topic whether the page reads it.
   constructor(url, wanted, handlers) {
     this.url = url;
@@ -30,7 +30,7 @@ export class Socket {
   }
 
   retry() {
-    this.handlers.lost(this.retryMs);
+    this.handlers.lost();
     setTimeout(() => this.connect(), this.retryMs);
     this.retryMs = Math.min(this.retryMs * 2, LAST_RETRY_MS);
   }
@@ -104,7 +104,7 @@ export class Socket {
       const parameterNames = message.parameters.map((parameter) => parameter.name);
       if (parameterNames.length > 0) this.send({ op: "subscribeParameterUpdates", parameterNames });
     }
-    this.handlers.parameters(message.parameters, message.id);
+    this.handlers.parameters(message.parameters);
   }
 
   // True when the request left; the server's answer comes to `parameters` under the same id.

@@ -1,6 +1,6 @@
 // Strip charts of delays: one strip per segment of a channel, or per channel, over the last stretch of time.
 
-import { FONT, UNAVAILABLE, keepAt, make, microseconds, surface, write } from "./format.js";
+import { FONT, UNAVAILABLE, keepAt, keepOnly, make, microseconds, polyline, surface, write } from "./format.js";
 
 const WHOLE = "published to taken";
 const LEFT_PX = 58;
@@ -63,11 +63,7 @@ export class Strips {
       keepAt(this.list, index, this.strips.get(key).item);
       this.drawOne(this.strips.get(key), one, samples, losses, moment, colours);
     }
-    for (const [key, strip] of this.strips) {
-      if (present.has(key)) continue;
-      strip.item.remove();
-      this.strips.delete(key);
-    }
+    keepOnly(this.strips, present);
   }
 
   // Few strips are drawn large; of many, each stays high enough to be read. Those without a figure take
@@ -125,15 +121,13 @@ export class Strips {
       const piece = thinned(whole, this.drawn_s / (width - LEFT_PX));
       context.fillStyle = context.strokeStyle = colours.series[0];
       context.globalAlpha = 0.22;
-      context.beginPath();
-      piece.forEach((point, index) => context[index ? "lineTo" : "moveTo"](x(point.time), scale.y(point.figures.p99_us)));
-      [...piece].reverse().forEach((point) => context.lineTo(x(point.time), scale.y(point.figures.p50_us)));
+      const curve = (figure) => piece.map((point) => [x(point.time), scale.y(point.figures[figure])]);
+      polyline(context, [...curve("p99_us"), ...curve("p50_us").reverse()]);
       context.fill();
       context.globalAlpha = 1;
       context.lineWidth = 1.6;
       context.lineJoin = "round";
-      context.beginPath();
-      piece.forEach((point, index) => context[index ? "lineTo" : "moveTo"](x(point.time), scale.y(point.figures.p50_us)));
+      polyline(context, curve("p50_us"));
       if (piece.length === 1) context.lineTo(x(piece[0].time) + 1.5, scale.y(piece[0].figures.p50_us));
       context.stroke();
     }
@@ -149,9 +143,7 @@ export class Strips {
     context.lineWidth = 1;
     for (const { value, y } of scale.ticks) {
       context.strokeStyle = colours.rule;
-      context.beginPath();
-      context.moveTo(LEFT_PX, y);
-      context.lineTo(width, y);
+      polyline(context, [[LEFT_PX, y], [width, y]]);
       context.stroke();
       context.fillStyle = colours.faint;
       context.fillText(value === 0 ? "0" : microseconds(value).replace(/\.0+ /, " "), LEFT_PX - 6, Math.min(Math.max(y, 7), height - 7));
@@ -159,9 +151,8 @@ export class Strips {
     const step = this.drawn_s / 6;
     context.strokeStyle = colours.rule;
     for (let number = 1; number < 6; number += 1) {
-      context.beginPath();
-      context.moveTo(x(from + number * step), 0);
-      context.lineTo(x(from + number * step), height);
+      const at = x(from + number * step);
+      polyline(context, [[at, 0], [at, height]]);
       context.stroke();
     }
   }

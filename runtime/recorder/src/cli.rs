@@ -159,7 +159,7 @@ pub(crate) enum Command {
 }
 
 /// What to record, and how.
-#[derive(Debug, Clone, Args)]
+#[derive(Debug, Clone, Default, Args)]
 #[allow(clippy::struct_excessive_bools, reason = "options of a command line")]
 pub(crate) struct RecordOptions {
     /// Name of the run, the beginning of it, or its folder; the only one if left out.

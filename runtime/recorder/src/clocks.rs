@@ -9,7 +9,7 @@ use hil_core::record::UNAVAILABLE;
 use hil_rundir::manifest::Manifest;
 use hil_watch::{Feed, Record};
 
-use crate::facts::Words;
+use crate::facts::{Words, table};
 use crate::net::{self, MessageLatency};
 use crate::run::Run;
 
@@ -52,26 +52,6 @@ fn at(offset_ns: i64, monotonic_ns: i64) -> Option<u64> {
     u64::try_from(monotonic_ns.checked_add(offset_ns)?).ok()
 }
 
-/// What a recording says of all clocks.
-fn words(has_one_clock: Option<bool>) -> Words {
-    let log_time = "instant of publication on the clock of the producer's host, plus offset_ns of \
-                    that host; hosts are not aligned with each other";
-    let one_clock = has_one_clock.map_or("unknown".to_owned(), |is_one| is_one.to_string());
-    Words::from([
-        ("log_time".to_owned(), log_time.to_owned()),
-        ("has_one_clock".to_owned(), one_clock),
-    ])
-}
-
-/// What a recording says of the clock of `host`.
-fn host_words(host: &str, basis: Basis, offset_ns: Option<i64>, words: &mut Words) {
-    let host = if host.is_empty() { UNKNOWN_HOST } else { host };
-    words.insert(format!("{host}/basis"), basis.words().to_owned());
-    if let Some(offset_ns) = offset_ns {
-        words.insert(format!("{host}/offset_ns"), offset_ns.to_string());
-    }
-}
-
 /// True when every host of `run` reads one clock; `None` when its folder does not tell.
 pub(crate) fn has_one_clock(run: &Run) -> Option<bool> {
     let section = run.summary.as_ref().and_then(|one| one.clocks.as_ref());
@@ -79,100 +59,6 @@ pub(crate) fn has_one_clock(run: &Run) -> Option<bool> {
     section
         .map(|section| section.has_one_clock)
         .or(is_one_machine.then_some(true))
-}
-
-/// One host's clock.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct HostClock {
-    /// Real-time minus monotonic clock, nanoseconds; one value for the whole run, so that the
-    /// differences of times stay those of the monotonic clock.
-    offset_ns: i64,
-    basis: Basis,
-    /// What its gateways noted.
-    noted: Option<Noted>,
-}
-
-/// The offsets that the gateways of one host noted, nanoseconds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[expect(clippy::struct_field_names, reason = "each in its unit")]
-struct Noted {
-    first_ns: i64,
-    lowest_ns: i64,
-    highest_ns: i64,
-}
-
-/// The clocks of a run's folder.
-#[derive(Debug, Default)]
-pub(crate) struct Clocks {
-    hosts: BTreeMap<String, HostClock>,
-    /// True when every host reads one clock; `None` when unknown.
-    pub(crate) has_one_clock: Option<bool>,
-}
-
-impl Clocks {
-    /// What the run noted of them.
-    pub(crate) fn of(run: &Run) -> Self {
-        let manifest = run.manifest.as_ref();
-        let from_manifest = manifest.and_then(|one| one.realtime_minus_monotonic_ns);
-        let hosts_here = manifest.map_or(&[][..], |one| &one.hosts_here);
-        let described = manifest.map_or(&[][..], |manifest| &manifest.channels);
-        let noted = noted_offsets(run);
-        let has_one_clock = has_one_clock(run);
-        // Hosts that read one clock share one offset, or their times would differ by how well each
-        // of them read it.
-        let first = noted.values().next().map(|one| one.first_ns);
-        let shared = first.or(from_manifest);
-        let shared = shared.filter(|_| has_one_clock == Some(true));
-        let producers = described.iter().filter_map(|one| one.from_host.as_ref());
-        let unknown = String::new();
-        let names = producers.chain(noted.keys()).chain([&unknown]);
-        let clock = |name: &String| {
-            let noted = noted.get(name).copied();
-            let from_manifest = from_manifest.filter(|_| hosts_here.contains(name));
-            let (own, basis) = match (noted, from_manifest, shared) {
-                (Some(noted), ..) => (noted.first_ns, Basis::Gateways),
-                (None, Some(offset_ns), _) => (offset_ns, Basis::Manifest),
-                (None, None, Some(shared)) => (shared, Basis::OtherHost),
-                (None, None, None) => (0, Basis::None),
-            };
-            HostClock {
-                offset_ns: shared.unwrap_or(own),
-                basis,
-                noted,
-            }
-        };
-        Self {
-            hosts: names.map(|name| (name.clone(), clock(name))).collect(),
-            has_one_clock,
-        }
-    }
-
-    /// The recording's time of an instant on the clock of `host`; `None` before that clock's origin.
-    pub(crate) fn time_ns(&self, host: &str, monotonic_ns: i64) -> Option<u64> {
-        at(self.hosts.get(host)?.offset_ns, monotonic_ns)
-    }
-
-    /// From the monotonic clock of `host` to the recording's times, nanoseconds; 0 where no relation
-    /// is known.
-    pub(crate) fn offset_ns(&self, host: Option<&str>) -> i64 {
-        let clock = self.hosts.get(host.unwrap_or_default());
-        clock.map_or(0, |clock| clock.offset_ns)
-    }
-
-    /// What a recording says of them; of the unknown host only where there is no other.
-    pub(crate) fn words(&self) -> Words {
-        let mut words = words(self.has_one_clock);
-        let hosts = self.hosts.iter();
-        for (host, clock) in hosts.filter(|(name, _)| !name.is_empty() || self.hosts.len() == 1) {
-            host_words(host, clock.basis, Some(clock.offset_ns), &mut words);
-            if let Some(noted) = clock.noted {
-                let (lowest, highest) = (noted.lowest_ns, noted.highest_ns);
-                words.insert(format!("{host}/offset_lowest_ns"), lowest.to_string());
-                words.insert(format!("{host}/offset_highest_ns"), highest.to_string());
-            }
-        }
-        words
-    }
 }
 
 /// True when every host with a channel ran on the machine that wrote the manifest, or there is only
@@ -186,62 +72,94 @@ fn is_one_machine(manifest: &Manifest) -> bool {
     hosts.len() == 1 || (!hosts.is_empty() && hosts.iter().all(is_here))
 }
 
-/// By host; a host that no manifest names is left out.
-fn noted_offsets(run: &Run) -> BTreeMap<String, Noted> {
-    let mut noted: BTreeMap<String, Noted> = BTreeMap::new();
-    for file in &run.files {
-        let Some(described) = run.described(&file.header.channel) else {
-            continue;
-        };
-        for record in net::records(file) {
-            let (host, offset_ns) = match record {
-                Record::Egress(one) => (&described.from_host, one.realtime_offset_ns),
-                Record::Ingress(one) => (&described.to_host, one.realtime_offset_ns),
-                _ => break,
-            };
-            let Some(host) = host.as_ref().filter(|_| offset_ns != UNAVAILABLE) else {
-                continue;
-            };
-            let one = noted.entry(host.clone()).or_insert(Noted {
-                first_ns: offset_ns,
-                lowest_ns: offset_ns,
-                highest_ns: offset_ns,
-            });
-            one.lowest_ns = one.lowest_ns.min(offset_ns);
-            one.highest_ns = one.highest_ns.max(offset_ns);
-        }
-    }
-    noted
+/// How the times of a host become those of the recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct HostClock {
+    basis: Basis,
+    /// Real-time minus monotonic clock, nanoseconds; one value for the whole run, so that the
+    /// differences of times stay those of the monotonic clock. Of [`Basis::Arrival`] that of the
+    /// recording's machine.
+    offset_ns: i64,
 }
 
-/// The clocks of a run that goes. Once chosen, a host's offset stays, so that the differences of its times
-/// are those of its clock.
+/// The offsets that the gateways of one host noted, nanoseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(clippy::struct_field_names, reason = "each in its unit")]
+struct Noted {
+    first_ns: i64,
+    lowest_ns: i64,
+    highest_ns: i64,
+}
+
+/// The clocks of a run's hosts.
 #[derive(Debug, Default)]
-pub(crate) struct LiveClocks {
-    /// Real-time minus monotonic clock of this machine.
+pub(crate) struct Clocks {
+    /// Real-time minus monotonic clock of the machine that wrote the manifest.
     own_offset_ns: Option<i64>,
     hosts_here: Vec<String>,
-    chosen: BTreeMap<String, Basis>,
-    /// Of hosts whose clock is another one, by what their gateways noted; known at the end.
-    noted_ns: BTreeMap<String, i64>,
-    /// How the clocks stand, as far as it is known by now.
+    /// Once chosen, a host's offset stays.
+    hosts: BTreeMap<String, HostClock>,
+    noted: BTreeMap<String, Noted>,
+    /// The run still goes: what is not known yet is decided when it is first asked for.
+    is_live: bool,
+    /// True when every host reads one clock; `None` when unknown.
     pub(crate) has_one_clock: Option<bool>,
 }
 
-impl LiveClocks {
-    /// What the run's announcement and manifest say.
-    pub(crate) fn of(feed: &Feed) -> Self {
+impl Clocks {
+    /// What a run's folder tells of them.
+    pub(crate) fn of_run(run: &Run) -> Self {
+        let manifest = run.manifest.as_ref();
+        let mut clocks = Self {
+            own_offset_ns: manifest.and_then(|one| one.realtime_minus_monotonic_ns),
+            hosts_here: manifest.map_or_else(Vec::new, |one| one.hosts_here.clone()),
+            has_one_clock: has_one_clock(run),
+            ..Self::default()
+        };
+        for file in &run.files {
+            if let Some(described) = run.described(&file.header.channel) {
+                let hosts = [&described.from_host, &described.to_host];
+                for record in net::records(file) {
+                    clocks.note(hosts.map(|host| host.as_deref()), &record);
+                }
+            }
+        }
+        // Hosts that read one clock share one offset, or their times would differ by how well each
+        // of them read it.
+        let first = clocks.noted.values().next().map(|one| one.first_ns);
+        let shared = first.or(clocks.own_offset_ns).filter(|_| clocks.compares());
+        let described = manifest.map_or(&[][..], |manifest| &manifest.channels);
+        let producers = described.iter().filter_map(|one| one.from_host.clone());
+        let names: BTreeSet<String> = producers.chain(clocks.noted.keys().cloned()).collect();
+        for name in names.into_iter().chain([String::new()]) {
+            let from_manifest = clocks.own_offset_ns;
+            let from_manifest = from_manifest.filter(|_| clocks.hosts_here.contains(&name));
+            let (own_ns, basis) = match (clocks.noted.get(&name), from_manifest, shared) {
+                (Some(noted), ..) => (noted.first_ns, Basis::Gateways),
+                (None, Some(offset_ns), _) => (offset_ns, Basis::Manifest),
+                (None, None, Some(shared)) => (shared, Basis::OtherHost),
+                (None, None, None) => (0, Basis::None),
+            };
+            let offset_ns = shared.unwrap_or(own_ns);
+            clocks.hosts.insert(name, HostClock { basis, offset_ns });
+        }
+        clocks
+    }
+
+    /// What the announcement and the manifest of a run that goes say.
+    pub(crate) fn of_feed(feed: &Feed) -> Self {
         let mut clocks = Self {
             own_offset_ns: feed.manifest().realtime_minus_monotonic_ns,
             hosts_here: feed.manifest().hosts_here.clone(),
             has_one_clock: feed.has_one_clock(),
+            is_live: true,
             ..Self::default()
         };
         for channel in feed.channels() {
             let host = channel.description.from_host.as_deref().unwrap_or_default();
             // Where the offset of a clock is not known yet, the first message decides.
             if clocks.has_one_clock.is_some() || clocks.is_here(host) {
-                clocks.basis(host);
+                clocks.clock(host);
             }
         }
         clocks
@@ -256,68 +174,117 @@ impl LiveClocks {
         self.has_one_clock == Some(true)
     }
 
-    /// What a gateway of `host` read.
-    pub(crate) fn note(&mut self, host: &str, offset_ns: i64) {
-        if offset_ns != UNAVAILABLE && !self.noted_ns.contains_key(host) {
-            self.noted_ns.insert(host.to_owned(), offset_ns);
+    /// What a gateway read beside a message of a channel between `hosts`.
+    pub(crate) fn note(&mut self, [from, to]: [Option<&str>; 2], record: &Record) {
+        let (host, offset_ns) = match record {
+            Record::Egress(one) => (from, one.realtime_offset_ns),
+            Record::Ingress(one) => (to, one.realtime_offset_ns),
+            _ => return,
+        };
+        let Some(host) = host.filter(|_| offset_ns != UNAVAILABLE) else {
+            return;
+        };
+        if let Some(one) = self.noted.get_mut(host) {
+            one.lowest_ns = one.lowest_ns.min(offset_ns);
+            one.highest_ns = one.highest_ns.max(offset_ns);
+            return;
         }
+        let first = Noted {
+            first_ns: offset_ns,
+            lowest_ns: offset_ns,
+            highest_ns: offset_ns,
+        };
+        self.noted.insert(host.to_owned(), first);
     }
 
-    fn basis(&mut self, host: &str) -> Basis {
-        if let Some(basis) = self.chosen.get(host) {
-            return *basis;
+    /// `None` of a host that a folder does not name.
+    fn clock(&mut self, host: &str) -> Option<HostClock> {
+        if let Some(clock) = self.hosts.get(host) {
+            return Some(*clock);
         }
-        let is_here = self.is_here(host);
-        let basis = match (self.own_offset_ns, is_here) {
-            (None, _) if is_here || self.compares() => Basis::None,
+        let basis = match (self.own_offset_ns, self.is_here(host)) {
+            _ if !self.is_live => return None,
+            (None, is_here) if is_here || self.compares() => Basis::None,
             (Some(_), true) => Basis::Manifest,
             (Some(_), false) if self.compares() => Basis::OtherHost,
             _ => Basis::Arrival,
         };
-        self.chosen.insert(host.to_owned(), basis);
-        basis
+        let offset_ns = self.own_offset_ns.unwrap_or(0);
+        let clock = HostClock { basis, offset_ns };
+        self.hosts.insert(host.to_owned(), clock);
+        Some(clock)
     }
 
-    fn own(&self, monotonic_ns: i64) -> Option<u64> {
-        at(self.own_offset_ns.unwrap_or(0), monotonic_ns)
-    }
-
-    /// The time of an instant on the clock of `host`; `None` when that clock is another one and
-    /// its offset was not recorded.
+    /// The recording's time of an instant on the clock of `host`; `None` before that clock's origin, and
+    /// when nothing is known of the clock.
     pub(crate) fn time_ns(&mut self, host: &str, monotonic_ns: i64) -> Option<u64> {
-        match self.basis(host) {
-            Basis::Arrival => at(*self.noted_ns.get(host)?, monotonic_ns),
-            _ => self.own(monotonic_ns),
+        let clock = self.clock(host)?;
+        match clock.basis {
+            Basis::Arrival => at(self.noted.get(host)?.first_ns, monotonic_ns),
+            _ => at(clock.offset_ns, monotonic_ns),
+        }
+    }
+
+    /// The time of something published on `host` that arrived here at `arrived_ns`, where that is known.
+    fn arrival_ns(
+        &mut self,
+        host: &str,
+        published_ns: i64,
+        arrived_ns: Option<i64>,
+    ) -> Option<u64> {
+        let clock = self.clock(host)?;
+        match arrived_ns.filter(|_| clock.basis == Basis::Arrival) {
+            Some(arrived_ns) => at(clock.offset_ns, arrived_ns),
+            None => self.time_ns(host, published_ns),
         }
     }
 
     /// The time of a message whose producer runs on `host`.
     pub(crate) fn message_ns(&mut self, host: &str, envelope: &Envelope) -> Option<u64> {
-        if self.basis(host) == Basis::Arrival && envelope.is_forwarded() {
-            return self.own(envelope.forwarded_ns);
-        }
-        self.time_ns(host, envelope.published_ns)
+        let arrived_ns = envelope.is_forwarded().then_some(envelope.forwarded_ns);
+        self.arrival_ns(host, envelope.published_ns, arrived_ns)
     }
 
     /// The time of the stamps of a message whose producer runs on `host`.
     pub(crate) fn latency_ns(&mut self, host: &str, one: &MessageLatency) -> Option<u64> {
-        if self.basis(host) == Basis::Arrival
-            && let Some(arrived_ns) = one.forwarded_ns.or(one.received_ns)
-        {
-            return self.own(arrived_ns);
-        }
-        self.time_ns(host, one.published_ns?)
+        let published_ns = one.published_ns.unwrap_or(UNAVAILABLE);
+        self.arrival_ns(host, published_ns, one.forwarded_ns.or(one.received_ns))
     }
 
-    /// What a recording says of them.
+    /// From the monotonic clock of `host` to the recording's times, nanoseconds; 0 where no relation
+    /// is known.
+    pub(crate) fn offset_ns(&self, host: Option<&str>) -> i64 {
+        let clock = self.hosts.get(host.unwrap_or_default());
+        clock.map_or(0, |clock| clock.offset_ns)
+    }
+
+    /// What a recording says of them; of the unknown host only where there is no other.
     pub(crate) fn words(&self) -> Words {
-        let mut words = words(self.has_one_clock);
-        for (host, basis) in &self.chosen {
-            let offset_ns = match basis {
-                Basis::Arrival => self.noted_ns.get(host).copied(),
-                _ => Some(self.own_offset_ns.unwrap_or(0)),
+        let log_time = "instant of publication on the clock of the producer's host, plus \
+                        offset_ns of that host; hosts are not aligned with each other";
+        let one_clock = match self.has_one_clock {
+            None => "unknown",
+            Some(true) => "true",
+            Some(false) => "false",
+        };
+        let mut words = table(&[("log_time", &log_time), ("has_one_clock", &one_clock)]);
+        let hosts = self.hosts.iter();
+        for (name, clock) in hosts.filter(|(name, _)| !name.is_empty() || self.hosts.len() == 1) {
+            let host = if name.is_empty() { UNKNOWN_HOST } else { name };
+            words.insert(format!("{host}/basis"), clock.basis.words().to_owned());
+            let noted = self.noted.get(name);
+            let offset_ns = match clock.basis {
+                Basis::Arrival => noted.map(|noted| noted.first_ns),
+                _ => Some(clock.offset_ns),
             };
-            host_words(host, *basis, offset_ns, &mut words);
+            let figures = [
+                ("offset_ns", offset_ns),
+                ("offset_lowest_ns", noted.map(|noted| noted.lowest_ns)),
+                ("offset_highest_ns", noted.map(|noted| noted.highest_ns)),
+            ];
+            for (key, ns) in figures {
+                words.extend(ns.map(|ns| (format!("{host}/{key}"), ns.to_string())));
+            }
         }
         words
     }
@@ -326,13 +293,16 @@ impl LiveClocks {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use bytemuck::Zeroable;
+    use hil_core::record::IngressRecord;
 
-    fn clocks(has_one_clock: Option<bool>) -> LiveClocks {
-        LiveClocks {
+    fn clocks(has_one_clock: Option<bool>) -> Clocks {
+        Clocks {
             own_offset_ns: Some(1000),
             hosts_here: vec!["here".to_owned()],
+            is_live: true,
             has_one_clock,
-            ..LiveClocks::default()
+            ..Clocks::default()
         }
     }
 
@@ -345,6 +315,14 @@ mod tests {
         }
     }
 
+    fn note(clocks: &mut Clocks, offset_ns: i64) {
+        let record = Record::Ingress(IngressRecord {
+            realtime_offset_ns: offset_ns,
+            ..IngressRecord::zeroed()
+        });
+        clocks.note([None, Some("there")], &record);
+    }
+
     #[test]
     fn another_clock_is_not_read_as_ones_own() {
         let mut one = clocks(Some(true));
@@ -353,8 +331,8 @@ mod tests {
         let mut two = clocks(Some(false));
         assert_eq!(two.message_ns("there", &envelope(true)), Some(1070));
         assert_eq!(two.message_ns("there", &envelope(false)), None);
-        two.note("there", 9);
-        two.note("there", 99);
+        note(&mut two, 9);
+        note(&mut two, 99);
         assert_eq!(two.message_ns("there", &envelope(false)), Some(14));
         // What comes to be known later moves no time that was chosen.
         two.has_one_clock = Some(true);

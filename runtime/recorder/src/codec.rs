@@ -15,10 +15,12 @@ pub(crate) struct Codec {
     /// `google.protobuf.BytesValue`.
     fields: Vec<FieldDescription>,
     size_bytes: usize,
+    /// What they look like to a reader.
+    pub(crate) schema: Schema,
 }
 
 impl Codec {
-    /// For messages with this layout, and their schema.
+    /// For messages with this layout.
     ///
     /// # Errors
     /// When the layout does not describe exactly `size_bytes`.
@@ -26,17 +28,21 @@ impl Codec {
         message: &str,
         fields: &[FieldDescription],
         size_bytes: usize,
-    ) -> Result<(Self, Schema), LayoutFault> {
-        let schema = schema::of_layout(message, fields, size_bytes)?;
-        let fields = fields.to_vec();
-        Ok((Self { fields, size_bytes }, schema))
+    ) -> Result<Self, LayoutFault> {
+        Ok(Self {
+            schema: schema::of_layout(message, fields, size_bytes)?,
+            fields: fields.to_vec(),
+            size_bytes,
+        })
     }
 
-    /// For messages whose layout is not known, and the schema of their bytes. What is read must have
-    /// `size_bytes`.
-    pub(crate) fn opaque(size_bytes: usize) -> (Self, Schema) {
-        let fields = Vec::new();
-        (Self { fields, size_bytes }, schema::opaque())
+    /// For messages whose layout is not known. What is read must have `size_bytes`.
+    pub(crate) fn opaque(size_bytes: usize) -> Self {
+        Self {
+            fields: Vec::new(),
+            size_bytes,
+            schema: schema::opaque(),
+        }
     }
 
     /// Appends `message` to `out`; false, with nothing appended, when it has another size than its
@@ -320,7 +326,7 @@ mod tests {
 
     fn codec<M: Message>() -> Codec {
         let fields = describe_fields(M::FIELDS);
-        Codec::typed(M::NAME, &fields, size_of::<M>()).unwrap().0
+        Codec::typed(M::NAME, &fields, size_of::<M>()).unwrap()
     }
 
     #[test]
@@ -347,7 +353,7 @@ mod tests {
         let arrival = codec::<EgmArrival>();
         assert!(!arrival.encode(&[0; 159], &mut out) && out.is_empty());
         assert!(arrival.encode(&[0; 160], &mut out));
-        assert!(Codec::opaque(7).0.encode(&[], &mut out));
+        assert!(Codec::opaque(7).encode(&[], &mut out));
     }
 
     #[test]
@@ -407,8 +413,8 @@ mod tests {
 
     #[test]
     fn a_message_without_fields_comes_back_from_its_wrapper() {
-        let (codec, schema) = Codec::opaque(3);
-        assert_eq!(schema.name, "google.protobuf.BytesValue");
+        let codec = Codec::opaque(3);
+        assert_eq!(codec.schema.name, "google.protobuf.BytesValue");
         let mut out = Vec::new();
         assert!(codec.encode(&[1, 2, 3], &mut out));
         assert_eq!(codec.decode(&out), Ok(vec![1, 2, 3]));
@@ -439,8 +445,8 @@ mod tests {
         };
         // Field 1, a varint of 300.
         let data = [0x08, 0xac, 0x02];
-        let (narrow, _) = Codec::typed("x", &[field(KindDescription::U8)], 1).unwrap();
-        let (wide, _) = Codec::typed("x", &[field(KindDescription::U16)], 2).unwrap();
+        let narrow = Codec::typed("x", &[field(KindDescription::U8)], 1).unwrap();
+        let wide = Codec::typed("x", &[field(KindDescription::U16)], 2).unwrap();
         assert_eq!(wide.decode(&data), Ok(vec![0x2c, 0x01]));
         let range = "the value of a does not fit into its 1 bytes";
         assert_eq!(narrow.decode(&data), Err(range.to_owned()));

@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 
 use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome};
-use prost::Message as _;
 use serde_json::Value;
 
 use crate::schema::own_message;
@@ -141,7 +140,7 @@ impl Conditions {
         };
         let ordered = OrderedCondition::of(&direction.link, &direction.way, record);
         let at = Stamp::new(at_ns, record.number);
-        direction.topic.write(sink, at, &ordered.encode_to_vec())
+        direction.topic.put(sink, at, &ordered)
     }
 }
 

@@ -86,9 +86,7 @@ impl RecordedMessages {
     /// # Errors
     /// When they do not describe exactly `size_bytes`, or have no form in a file.
     pub fn new(fields: &[FieldDescription], size_bytes: usize) -> Result<Self, LayoutFault> {
-        Ok(Self(
-            Codec::typed("input.Message.v1", fields, size_bytes)?.0,
-        ))
+        Ok(Self(Codec::typed("input.Message.v1", fields, size_bytes)?))
     }
 
     /// The message as it lies in memory that a file has as `data`.

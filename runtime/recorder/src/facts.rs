@@ -2,12 +2,13 @@
 //! is missing. Names and keys are in `docs/recordings.md`; all values are text.
 
 use std::collections::BTreeMap;
+use std::fmt::Display;
 use std::fs;
 
 use hil_arm::yumi::description::Urdf;
 use hil_rundir::manifest::Manifest;
 use hil_rundir::run_folder::RunFolder;
-use serde_json::Value;
+use serde_json::json;
 
 use crate::clocks::{self, Clocks};
 use crate::run::Run;
@@ -54,45 +55,53 @@ pub(crate) fn event_times(
 pub(crate) fn write(
     recording: &mut Recording,
     run: &Run,
-    clocks: &Clocks,
     topics: &RunTopics,
 ) -> Result<(), WriteError> {
     recording.describe("hil.run", run_words(run))?;
     if let Some(manifest) = &run.manifest {
         describe_manifest(recording, manifest)?;
     }
-    recording.describe("hil.clocks", clock_words(run, clocks))?;
+    recording.describe("hil.clocks", clock_words(run, &topics.clocks))?;
     recording.describe("hil.channels", topics.channel_words())?;
     recording.describe("hil.recording", gap_words(run, &topics.names))?;
     attach(recording, &run.folder)?;
     attach_robot(recording, topics.messages())
 }
 
+/// A table of words.
+pub(crate) fn table(pairs: &[(&str, &dyn Display)]) -> Words {
+    let pairs = pairs.iter();
+    let pairs = pairs.map(|(key, value)| ((*key).to_owned(), value.to_string()));
+    pairs.collect()
+}
+
 /// What ran.
 pub(crate) fn run_words(run: &Run) -> Words {
-    let mut words = Words::new();
-    let mut put = |key: &str, value: String| words.insert(key.to_owned(), value);
-    put("name", run.folder.name());
+    let mut words = table(&[
+        ("name", &run.folder.name()),
+        (
+            "exit_reason",
+            &"no summary: the run was killed, or it cannot be read",
+        ),
+    ]);
     if let Some(manifest) = &run.manifest {
-        put("topology_hash", manifest.topology_hash.clone());
-        put("seed", manifest.seed.to_string());
-        put("program", manifest.program.name.clone());
-        put("program_version", manifest.program.version.clone());
-        put("created", manifest.created.clone());
-        put("hosts_here", manifest.hosts_here.join(", "));
-        put(
-            "command_line",
-            Value::from(manifest.command_line.clone()).to_string(),
-        );
+        words.extend(table(&[
+            ("topology_hash", &manifest.topology_hash),
+            ("seed", &manifest.seed),
+            ("program", &manifest.program.name),
+            ("program_version", &manifest.program.version),
+            ("created", &manifest.created),
+            ("hosts_here", &manifest.hosts_here.join(", ")),
+            ("command_line", &json!(manifest.command_line)),
+        ]));
     }
     if let Some(summary) = &run.summary {
-        put("case", summary.run.case.clone());
-        put("started", summary.run.started.clone());
-        put("duration_s", summary.run.duration_s.to_string());
-        put("exit_reason", summary.run.exit_reason.clone());
-    } else {
-        let why = "no summary: the run was killed, or it cannot be read";
-        put("exit_reason", why.to_owned());
+        words.extend(table(&[
+            ("case", &summary.run.case),
+            ("started", &summary.run.started),
+            ("duration_s", &summary.run.duration_s),
+            ("exit_reason", &summary.run.exit_reason),
+        ]));
     }
     words
 }
@@ -108,28 +117,24 @@ fn clock_words(run: &Run, clocks: &Clocks) -> Words {
 
 fn gap_words(run: &Run, names: &Names) -> Words {
     let gaps = &run.gaps;
-    let counts = [
-        ("unreadable_file_count", gaps.unreadable_file_count),
-        ("truncated_file_count", gaps.truncated_file_count),
-        ("truncated_bytes", gaps.truncated_bytes),
-        ("misfit_message_count", gaps.misfit_count),
-        ("timeless_record_count", gaps.timeless_count),
-    ];
-    let mut words = recording_words(&counts, &gaps.words, names);
+    let mut words = recording_words(&gaps.words, names);
+    words.extend(table(&[
+        ("unreadable_file_count", &gaps.unreadable_file_count),
+        ("truncated_file_count", &gaps.truncated_file_count),
+        ("truncated_bytes", &gaps.truncated_bytes),
+        ("misfit_message_count", &gaps.misfit_count),
+        ("timeless_record_count", &gaps.timeless_count),
+    ]));
     for (channel, count) in &gaps.missing {
         words.insert(format!("missing {channel}"), count.to_string());
     }
     words
 }
 
-/// What a recording says of itself: counts, gaps in words, and topics that could not have the name
-/// that they should.
-pub(crate) fn recording_words(counts: &[(&str, u64)], gaps: &[String], names: &Names) -> Words {
-    let counts = counts.iter();
-    let counts = counts.map(|(key, count)| ((*key).to_owned(), count.to_string()));
-    let mut words: Words = counts.collect();
-    let version = env!("CARGO_PKG_VERSION").to_owned();
-    words.insert("recorder_version".to_owned(), version);
+/// What a recording says of itself: gaps in words, and topics that could not have the name that they
+/// should.
+pub(crate) fn recording_words(gaps: &[String], names: &Names) -> Words {
+    let mut words = table(&[("recorder_version", &env!("CARGO_PKG_VERSION"))]);
     for (gap, number) in gaps.iter().zip(1..) {
         words.insert(format!("gap_{number:04}"), gap.clone());
     }
@@ -149,8 +154,7 @@ pub(crate) fn describe_manifest(
 ) -> Result<(), WriteError> {
     let (topology, host) = (&manifest.topology, &manifest.host_facts);
     for (name, value) in [("hil.topology", topology), ("hil.host_facts", host)] {
-        let json = ("json".to_owned(), value.to_string());
-        recording.describe(name, Words::from([json]))?;
+        recording.describe(name, table(&[("json", value)]))?;
     }
     Ok(())
 }

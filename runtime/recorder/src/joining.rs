@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use hil_rundir::live_run::Stage;
 use hil_watch::{Record, Seen};
 
-use crate::net::{self, Latencies, MessageId, MessageLatency, Noted};
+use crate::net::{MessageId, MessageLatency, Noted};
 use crate::newest::Newest;
 
 /// How much later a message must have been published, at every stage here, for those before it to be
@@ -29,7 +29,7 @@ const WAITING_MAX: usize = 1 << 16;
 #[derive(Debug, Default)]
 pub(crate) struct Joining {
     told: Vec<Told>,
-    waiting: Latencies,
+    waiting: BTreeMap<MessageId, MessageLatency>,
     /// The same by instant of publication, nanoseconds.
     order: BTreeMap<(i64, MessageId), First>,
     given: Seen,
@@ -88,14 +88,22 @@ impl Joining {
             self.late_count += u64::from(is_late);
             return;
         }
-        if !self.waiting.contains_key(&key) {
+        let waiting = self.waiting.entry(key).or_insert_with(|| {
             let first = First {
                 came: now,
                 is_of_this_host,
             };
             self.order.insert((published_ns, key), first);
-        }
-        net::join(&mut self.waiting, key, record);
+            MessageLatency::new(key)
+        });
+        waiting.note(record);
+    }
+
+    /// The message with this number, of whichever start, among those that wait: of a folder, whose messages
+    /// come one by one, the only one.
+    pub(crate) fn waiting_with(&mut self, sequence: u64) -> Option<&mut MessageLatency> {
+        let mut waiting = self.waiting.values_mut();
+        waiting.find(|one| one.sequence == sequence)
     }
 
     /// The earliest message, if stamps of messages published well after it are there from every stage.

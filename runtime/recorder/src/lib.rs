@@ -1,11 +1,10 @@
 //! `hil-recorder`: the runs of `hil-runtime` as MCAP files, for tools that others wrote. It is a
 //! program of its own so that the real-time binary carries none of what this needs.
 //!
-//! Read in this order: `run` and `clocks`, what there is and when it was; `schema` and
-//! `codec`, what a message looks like; `topics`, `net` and `run_topics`, what is made of it;
-//! `writer`, the file; `convert`, all of them together. While a run goes, `live` makes the same topics of
-//! its events for any `sink`, and `record` puts them into files; `pace` keeps it out of the run's
-//! way. `scan` reads files as far as their `lengths` hold, for `recover`; `play` feeds what `codec`
+//! Read in this order: `run`, `timeline` and `clocks`, what there is and when it was; `schema` and
+//! `codec`, what a message looks like; `topics`, `net` and `run_topics`, what is made of it, for any
+//! `sink`, of a folder as of a run that goes; `writer`, the file; `convert`, all of them together. `record`
+//! does the same while a run goes; `pace` keeps it out of the run's way. `scan` reads files as far as their `lengths` hold, for `recover`; `play` feeds what `codec`
 //! makes of them into a run. `view` is the state of a run that goes on, `serve` shows it.
 //!
 //! The program is [`run()`]; nothing else is for other crates but [`decoders`], for tests.
@@ -23,7 +22,6 @@ mod facts;
 mod failure;
 mod joining;
 mod lengths;
-mod live;
 mod net;
 mod newest;
 mod pace;
@@ -38,6 +36,7 @@ mod schema;
 mod serve;
 mod sink;
 mod split;
+mod timeline;
 mod topics;
 mod view;
 mod writer;

@@ -1,9 +1,7 @@
 //! What the network did to each message, as topics: the stamps of every stage beside each other, and
 //! the verdict of the link. It judges nothing by itself: fates and bounds are those of the run.
 
-use std::collections::BTreeMap;
-
-use hil_core::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
+use hil_core::record::{FollowUpRecord, IngressRecord, stamp};
 use hil_rundir::live_run::Stage;
 use hil_rundir::record::{RecordFile, RecordKind};
 use hil_trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
@@ -110,10 +108,6 @@ fn bound_ns(record: &TraceRecord) -> Option<u64> {
         .filter(|bound_ns| *bound_ns != UNBOUNDED_NS)
 }
 
-fn stamp(ns: i64) -> Option<i64> {
-    (ns != UNAVAILABLE).then_some(ns)
-}
-
 /// Which message of a channel: the start of its producer, and its number since then.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct MessageId {
@@ -175,47 +169,21 @@ impl Noted {
     }
 }
 
-/// The records of a file that tell of single messages, in order.
-pub(crate) fn records(file: &RecordFile) -> Box<dyn Iterator<Item = Record> + '_> {
+/// The record with `index` of a file of records that tell of single messages, or of a link.
+pub(crate) fn record(file: &RecordFile, index: usize) -> Option<Record> {
     match file.header.kind {
-        RecordKind::Published => Box::new(file.records().map(Record::Published)),
-        RecordKind::Taken => Box::new(file.records().map(Record::Taken)),
-        RecordKind::Egress => Box::new(file.records().map(Record::Egress)),
-        RecordKind::Ingress => Box::new(file.records().map(Record::Ingress)),
-        _ => Box::new(core::iter::empty()),
+        RecordKind::Published => file.record(index).map(Record::Published),
+        RecordKind::Taken => file.record(index).map(Record::Taken),
+        RecordKind::Egress => file.record(index).map(Record::Egress),
+        RecordKind::Ingress => file.record(index).map(Record::Ingress),
+        RecordKind::LinkCondition => file.record(index).map(Record::LinkCondition),
+        _ => None,
     }
 }
 
-/// The stamps of the messages of one channel.
-pub(crate) type Latencies = BTreeMap<MessageId, MessageLatency>;
-
-/// Joins the record files of one channel. `has_one_clock` says that stamps of both ends compare.
-pub(crate) fn latencies<'a>(
-    files: &(impl Iterator<Item = &'a RecordFile> + Clone),
-    trace: Option<&Trace>,
-    has_one_clock: bool,
-) -> Latencies {
-    let mut joined = Latencies::new();
-    for record in files.clone().flat_map(records) {
-        if let Some(noted) = Noted::of(&record) {
-            join(&mut joined, noted.message, &record);
-        }
-    }
-    follow_up(&mut joined, files);
-    if has_one_clock {
-        joined.values_mut().for_each(MessageLatency::compare_ends);
-    }
-    if let Some(trace) = trace {
-        add_link_delays(&mut joined, trace);
-    }
-    joined
-}
-
-/// Puts a record of `message` beside the others of it.
-pub(crate) fn join(joined: &mut Latencies, message: MessageId, record: &Record) {
-    let one = joined.entry(message);
-    one.or_insert_with(|| MessageLatency::new(message))
-        .note(record);
+/// Such records of a file, in order.
+pub(crate) fn records(file: &RecordFile) -> impl Iterator<Item = Record> + '_ {
+    (0..file.record_count()).map_while(|index| record(file, index))
 }
 
 impl MessageLatency {
@@ -257,69 +225,31 @@ impl MessageLatency {
         }
     }
 
+    /// Takes a transmit stamp that came in a later datagram. It needs the sender's offset, so it is used
+    /// only beside one that the sender noted.
+    pub(crate) fn note_late(&mut self, late: &FollowUpRecord) {
+        if self.tx_realtime_ns.is_none() {
+            let left = self.handed_ns.zip(self.sender_realtime_offset_ns);
+            self.tx_realtime_ns = left.and_then(|(handed_ns, offset_ns)| {
+                let left_ns = handed_ns.checked_add(late.handed_to_tx_ns)?;
+                left_ns.checked_add(offset_ns)
+            });
+        }
+    }
+
+    /// Takes the delay that the run worked out with its clocks' alignment.
+    pub(crate) fn note_decision(&mut self, record: &TraceRecord) {
+        if record.fate != TraceFate::Unknown {
+            self.link_delay_ns = record.delay();
+            self.link_delay_bound_ns = bound_ns(record);
+        }
+    }
+
     /// Works out the delay from end to end, as both read one clock.
     pub(crate) fn compare_ends(&mut self) {
         let ends = self.taken_ns.zip(self.published_ns);
         self.delay_ns = ends.and_then(|(taken, published)| taken.checked_sub(published));
     }
-}
-
-/// Transmit stamps that came in later datagrams, for messages whose sender left no records. They
-/// need the sender's offset, so they are used only beside one that the sender noted.
-fn follow_up<'a>(joined: &mut Latencies, files: &(impl Iterator<Item = &'a RecordFile> + Clone)) {
-    let of_kind = |kind| files.clone().filter(move |file| file.header.kind == kind);
-    let mut epochs: BTreeMap<(u32, u64), u32> = BTreeMap::new();
-    for file in of_kind(RecordKind::Ingress) {
-        for record in file.records::<IngressRecord>() {
-            epochs.insert((record.session, record.sequence), record.epoch);
-        }
-    }
-    for file in of_kind(RecordKind::FollowUp) {
-        for record in file.records::<FollowUpRecord>() {
-            let sequence = record.sequence;
-            let epoch = epochs.get(&(record.session, sequence)).copied();
-            let one = epoch.and_then(|epoch| joined.get_mut(&MessageId { epoch, sequence }));
-            let Some(one) = one.filter(|one| one.tx_realtime_ns.is_none()) else {
-                continue;
-            };
-            let left = one.handed_ns.zip(one.sender_realtime_offset_ns);
-            one.tx_realtime_ns = left.and_then(|(handed_ns, offset_ns)| {
-                let left_ns = handed_ns.checked_add(record.handed_to_tx_ns)?;
-                left_ns.checked_add(offset_ns)
-            });
-        }
-    }
-}
-
-/// The delays that the run worked out with its clocks' alignment.
-fn add_link_delays(joined: &mut Latencies, trace: &Trace) {
-    let starts = starts(joined);
-    for record in &trace.records {
-        if record.fate == TraceFate::Unknown {
-            continue;
-        }
-        let sequence = record.sequence;
-        let epoch = starts.get(usize::from(record.start)).copied();
-        let message = epoch.map(|epoch| MessageId { epoch, sequence });
-        if let Some(one) = message.and_then(|message| joined.get_mut(&message)) {
-            one.link_delay_ns = record.delay();
-            one.link_delay_bound_ns = bound_ns(record);
-        }
-    }
-}
-
-/// The producer's starts in the order of their first messages: a trace counts them, records name them.
-fn starts(joined: &Latencies) -> Vec<u32> {
-    let mut first: BTreeMap<u32, i64> = BTreeMap::new();
-    for one in joined.values() {
-        if let Some(published_ns) = one.published_ns {
-            let earliest = first.entry(one.epoch).or_insert(published_ns);
-            *earliest = published_ns.min(*earliest);
-        }
-    }
-    let mut starts: Vec<(i64, u32)> = first.into_iter().map(|(epoch, at)| (at, epoch)).collect();
-    starts.sort_unstable();
-    starts.into_iter().map(|(_, epoch)| epoch).collect()
 }
 
 /// When the message was published, on the sender's monotonic clock; `None` where the trace does not

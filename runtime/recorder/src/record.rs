@@ -1,5 +1,5 @@
 //! Recording a run while it goes: events of the run become topics, topics go to files, files are flushed
-//! by the clock. What a topic holds is decided in [`crate::live`], what a file is in
+//! by the clock. What a topic holds is decided in [`crate::run_topics`], what a file is in
 //! [`crate::split`].
 
 use std::collections::BTreeMap;
@@ -15,9 +15,9 @@ use hil_watch::{Event, Feed, Poll};
 use crate::cli::RecordOptions;
 use crate::facts::{self, Words};
 use crate::failure::Failure;
-use crate::live::LiveTopics;
 use crate::pace::Pace;
 use crate::run::Run;
+use crate::run_topics::RunTopics;
 use crate::split::{Files, prepare, target};
 use crate::writer::WriteError;
 
@@ -103,8 +103,8 @@ pub(crate) fn record(options: &RecordOptions, look: Look<'_>) -> Result<Recorded
         feed.skip_to_now();
     }
     let files = Files::begin(&target, split_bytes, force)?;
-    let live = LiveTopics::of(&feed, !options.no_scene);
-    let mut recording = LiveRecording::begin(feed, live, files)?;
+    let topics = RunTopics::of_feed(&feed, !options.no_scene);
+    let mut recording = LiveRecording::begin(feed, topics, files)?;
     let signal = recording.run(options.flush, look)?;
     recording.finish(signal)
 }
@@ -157,7 +157,7 @@ impl Problems {
 
 struct LiveRecording {
     feed: Feed,
-    live: LiveTopics,
+    topics: RunTopics,
     files: Files,
     /// All records of the run have come.
     is_silent: bool,
@@ -168,9 +168,9 @@ struct LiveRecording {
 }
 
 impl LiveRecording {
-    fn begin(feed: Feed, live: LiveTopics, files: Files) -> Result<Self, WriteError> {
+    fn begin(feed: Feed, topics: RunTopics, files: Files) -> Result<Self, WriteError> {
         let mut recording = Self {
-            live,
+            topics,
             feed,
             files,
             is_silent: false,
@@ -194,7 +194,7 @@ impl LiveRecording {
             let polled = self.poll()?;
             let now = Instant::now();
             if polled != Poll::Busy {
-                self.live.settle(now, &mut self.files)?;
+                self.topics.settle(now, &mut self.files)?;
             }
             // What was there before the recorder is not to wait for its first period.
             let is_abreast = polled == Poll::Idle && !has_caught_up;
@@ -211,7 +211,7 @@ impl LiveRecording {
             }
             let since_told = now.duration_since(told);
             if since_told >= PROGRESS_PERIOD {
-                let count = self.live.topics.counts.message_count;
+                let count = self.topics.counts.message_count;
                 let rate_hz = (count - told_count) as f64 / since_told.as_secs_f64();
                 (told, told_count) = (now, count);
                 if let Some(signal) = look(&self.progress(rate_hz)) {
@@ -226,7 +226,7 @@ impl LiveRecording {
     }
 
     fn progress(&self, rate_hz: f64) -> Progress<'_> {
-        let missed = self.live.missed(&self.feed, false);
+        let missed = self.topics.missed(&self.feed, false);
         Progress {
             run: &self.feed.run().name,
             rate_hz,
@@ -237,7 +237,7 @@ impl LiveRecording {
     }
 
     fn poll(&mut self) -> Result<Poll, WriteError> {
-        self.live.clocks.has_one_clock = self.feed.has_one_clock();
+        self.topics.clocks.has_one_clock = self.feed.has_one_clock();
         let mut failed = None;
         let polled = self.feed.poll(&mut |event| {
             match &event {
@@ -247,7 +247,7 @@ impl LiveRecording {
                 Event::Message { .. } | Event::Record { .. } => {}
             }
             if failed.is_none() {
-                failed = self.live.take(&event, &mut self.files).err();
+                failed = self.topics.take(&event, &mut self.files).err();
             }
         });
         failed.map_or(Ok(polled), Err)
@@ -260,7 +260,7 @@ impl LiveRecording {
         while polled == Poll::Busy {
             polled = self.poll()?;
         }
-        self.live.flush_joins(&mut self.files)?;
+        self.topics.flush_joins(&mut self.files)?;
         Ok(polled)
     }
 
@@ -275,10 +275,10 @@ impl LiveRecording {
     fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, Failure> {
         // A run may be over before the ground of its fleet was made.
         let since = Instant::now();
-        while !self.live.is_scene_ready() && since.elapsed() < GROUND_WITHIN {
-            thread::sleep(GROUND_PAUSE);
-        }
-        if let Some(scene) = &mut self.live.topics.scene {
+        if let Some(scene) = &mut self.topics.scene {
+            while scene.awaits_ground() && since.elapsed() < GROUND_WITHIN {
+                thread::sleep(GROUND_PAUSE);
+            }
             scene.finish(&mut self.files)?;
             for problem in scene.problems() {
                 self.problems.note(&problem);
@@ -290,7 +290,7 @@ impl LiveRecording {
             if let Err(error) = run.read_traces() {
                 run.gaps.leave_out(error.to_string());
             }
-            self.live.conclude(&run, &mut self.files)?;
+            self.topics.conclude(&run, &mut self.files)?;
         }
         let how = match signal {
             Some(signal) => format!("the recorder was ended by {signal}, the run went on"),
@@ -304,8 +304,8 @@ impl LiveRecording {
         }
         self.files.open().describe("hil.end", end)?;
         facts::attach(self.files.open(), &run.folder)?;
-        let counts = self.live.topics.counts;
-        let missed = self.live.missed(&self.feed, self.is_silent);
+        let counts = self.topics.counts;
+        let missed = self.topics.missed(&self.feed, self.is_silent);
         let mut words = self.problems.words.clone();
         if self.has_summary {
             words.extend(run.gaps.words.iter().cloned());
@@ -335,38 +335,37 @@ impl LiveRecording {
             "exit_reason".to_owned(),
             "recorded while it went".to_owned(),
         );
-        self.told_clocks = self.live.clocks.words();
+        self.told_clocks = self.topics.clocks.words();
         let file = self.files.open();
         file.describe("hil.clocks", self.told_clocks.clone())?;
         file.describe("hil.run", words)?;
         facts::describe_manifest(file, self.feed.manifest())?;
-        facts::attach_robot(file, self.live.topics.messages())
+        facts::attach_robot(file, self.topics.messages())
     }
 
     /// What was recorded so far, at the end of each file.
     fn describe_recording(&mut self, how: &str) -> Result<(), WriteError> {
-        let counts = self.live.topics.counts;
-        let numbers = [
-            ("file_number", self.files.number() as u64),
-            ("message_count", counts.message_count),
-            ("misfit_message_count", counts.misfit_count),
-            ("timeless_record_count", counts.timeless_count),
-            ("late_record_count", self.live.late_count()),
-            ("unordered_latency_count", self.live.unordered_count()),
-            ("problem_count", self.problems.count),
-        ];
-        let names = &self.live.topics.names;
-        let mut words = facts::recording_words(&numbers, &self.problems.words, names);
-        words.insert("mode".to_owned(), "live".to_owned());
-        words.insert("ended".to_owned(), how.to_owned());
-        for (channel, count) in self.live.missed(&self.feed, self.is_silent) {
+        let counts = self.topics.counts;
+        let mut words = facts::recording_words(&self.problems.words, &self.topics.names);
+        words.extend(facts::table(&[
+            ("file_number", &self.files.number()),
+            ("message_count", &counts.message_count),
+            ("misfit_message_count", &counts.misfit_count),
+            ("timeless_record_count", &counts.timeless_count),
+            ("late_record_count", &self.topics.late_count()),
+            ("unordered_latency_count", &self.topics.unordered_count()),
+            ("problem_count", &self.problems.count),
+            ("mode", &"live"),
+            ("ended", &how),
+        ]));
+        for (channel, count) in self.topics.missed(&self.feed, self.is_silent) {
             words.insert(format!("missed {channel}"), count.to_string());
         }
-        for (channel, count) in self.live.earlier(&self.feed) {
+        for (channel, count) in self.topics.earlier(&self.feed) {
             words.insert(format!("before {channel}"), count.to_string());
         }
-        let clocks = self.live.clocks.words();
-        let channels = self.live.topics.channel_words();
+        let clocks = self.topics.clocks.words();
+        let channels = self.topics.channel_words();
         let file = self.files.open();
         // Offsets of other clocks come with the last records.
         if clocks != self.told_clocks {

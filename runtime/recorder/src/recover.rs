@@ -8,6 +8,7 @@ use std::sync::Arc;
 use mcap::records::Record;
 use mcap::{Attachment, Channel, Schema};
 
+use crate::facts::{Words, table};
 use crate::failure::Failure;
 use crate::scan::{Loss, ScanEnd, scan};
 use crate::sink::Sink as _;
@@ -117,23 +118,16 @@ fn attempt(
 }
 
 /// What the new file says of where it comes from.
-fn words(from: &Path, recovered: &Recovered) -> BTreeMap<String, String> {
+fn words(from: &Path, recovered: &Recovered) -> Words {
     let name = from.file_name().unwrap_or_default().to_string_lossy();
     let lost = recovered.lost_count();
     let lost = lost.map_or_else(|| "unknown".to_owned(), |count| count.to_string());
-    let words = [
-        ("recovered_from", name.into_owned()),
-        ("recorder_version", env!("CARGO_PKG_VERSION").to_owned()),
-        ("lost_message_count", lost),
-        (
-            "message_count_without_topic",
-            recovered.homeless_count.to_string(),
-        ),
-    ];
-    let words = words
-        .into_iter()
-        .map(|(key, value)| (key.to_owned(), value));
-    let mut words: BTreeMap<String, String> = words.collect();
+    let mut words = table(&[
+        ("recovered_from", &name),
+        ("recorder_version", &env!("CARGO_PKG_VERSION")),
+        ("lost_message_count", &lost),
+        ("message_count_without_topic", &recovered.homeless_count),
+    ]);
     for (loss, number) in recovered.end.losses.iter().zip(1..) {
         words.insert(format!("loss_{number:04}"), loss_words(loss));
     }

@@ -2,8 +2,8 @@
 //! rest is used. It makes no topic of anything.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
+use std::{fs, io};
 
 use hil_platform::words::counted_plainly;
 use hil_report::summary::RunSummary;
@@ -11,6 +11,7 @@ use hil_rundir::manifest::{ChannelDescription, Manifest};
 use hil_rundir::record::{RecordFile, RecordKind};
 use hil_rundir::run_folder::RunFolder;
 use hil_trace::{Trace, wire};
+use hil_watch::Seen;
 use serde_json::Value;
 
 use crate::failure::Failure;
@@ -96,17 +97,19 @@ impl Run {
                 path.display()
             )));
         }
-        let paths = listed(&folder.records())?;
+        let files = folder.record_files();
+        let mut files = files.map_err(|source| not_a_run(&folder.records(), &source))?;
+        // By name, so that the starts of a restarted process come in order.
+        files.sort();
         let mut run = Self::without_records(folder);
-        let size = |path: &PathBuf| fs::metadata(path).map_or(0, |file| file.len());
-        let all_bytes: u64 = paths.iter().map(size).sum();
+        let all_bytes: u64 = files.iter().map(|(_, bytes)| bytes).sum();
         let mut read_bytes = 0;
-        for path in paths {
+        for (path, bytes) in files {
             let share = read_bytes as f64 / all_bytes.max(1) as f64;
             if !goes_on(share, &path.display().to_string()) {
                 break;
             }
-            read_bytes += size(&path);
+            read_bytes += bytes;
             run.read_records(&path);
         }
         run.read_traces()?;
@@ -117,7 +120,13 @@ impl Run {
     pub(crate) fn without_records(folder: RunFolder) -> Self {
         let mut gaps = Gaps::default();
         Self {
-            manifest: read_manifest(&folder.manifest(), &mut gaps),
+            manifest: Manifest::read(&folder)
+                .inspect_err(|why| {
+                    let path = folder.manifest();
+                    let path = path.display();
+                    gaps.leave_out(format!("{path}: {why}; without the run's own layouts"));
+                })
+                .ok(),
             summary: read_summary(&folder, &mut gaps),
             files: Vec::new(),
             traces: Vec::new(),
@@ -131,23 +140,24 @@ impl Run {
     /// # Errors
     /// When the folder of traces cannot be listed.
     pub(crate) fn read_traces(&mut self) -> Result<(), Failure> {
-        if self.folder.traces().is_dir() {
-            for path in listed(&self.folder.traces())? {
-                self.read_trace(&path);
-            }
+        let folder = self.folder.traces();
+        if !folder.is_dir() {
+            return Ok(());
+        }
+        let entries = fs::read_dir(&folder)
+            .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect());
+        let mut paths: Vec<PathBuf> = entries.map_err(|source| not_a_run(&folder, &source))?;
+        paths.retain(|path| path.extension().is_some_and(|ending| ending == "trace"));
+        paths.sort();
+        for path in paths {
+            self.read_trace(&path);
         }
         Ok(())
     }
 
     fn read_records(&mut self, path: &Path) {
-        if path.extension().is_none_or(|extension| extension != "rec") {
-            return;
-        }
         match RecordFile::read(path) {
-            Ok(file) => {
-                if !KINDS.contains(&file.header.kind) {
-                    return;
-                }
+            Ok(file) if KINDS.contains(&file.header.kind) => {
                 if file.truncated_bytes > 0 {
                     self.gaps.truncated_file_count += 1;
                     self.gaps.truncated_bytes += file.truncated_bytes as u64;
@@ -159,19 +169,12 @@ impl Run {
                 }
                 self.files.push(file);
             }
-            Err(error) => {
-                self.gaps.leave_out(format!("{error}; left out"));
-            }
+            Ok(_) => {}
+            Err(error) => self.gaps.leave_out(format!("{error}; left out")),
         }
     }
 
     fn read_trace(&mut self, path: &Path) {
-        if path
-            .extension()
-            .is_none_or(|extension| extension != "trace")
-        {
-            return;
-        }
         let decoded = fs::read(path)
             .map_err(|error| error.to_string())
             .and_then(|bytes| wire::decode(&bytes).map_err(|fault| fault.to_string()));
@@ -203,26 +206,29 @@ impl Run {
         manifest.channels.iter().find(|one| one.name == channel)
     }
 
+    /// Its files of this channel and kind, with their places.
+    pub(crate) fn files_of(
+        &self,
+        channel: &str,
+        kind: RecordKind,
+    ) -> impl Iterator<Item = (usize, &RecordFile)> {
+        let files = self.files.iter().enumerate();
+        files.filter(move |(_, one)| one.header.kind == kind && one.header.channel == channel)
+    }
+
     /// Counts the messages that their producers numbered and nobody recorded.
     pub(crate) fn count_missing(&mut self) {
-        let mut seen: BTreeMap<(&str, u32), (u64, u64)> = BTreeMap::new();
+        let mut seen: BTreeMap<&str, Seen> = BTreeMap::new();
         for file in &self.files {
-            for index in 0..file.record_count() {
-                let Some((envelope, _)) = file.message(index) else {
-                    break;
-                };
-                let key = (file.header.channel.as_str(), envelope.epoch);
-                let (given, count) = seen.entry(key).or_default();
-                *given = (*given).max(envelope.sequence.saturating_add(1));
-                *count += 1;
+            let messages = (0..file.record_count()).map_while(|index| file.message(index));
+            for (envelope, _) in messages {
+                let channel = seen.entry(&file.header.channel).or_default();
+                channel.insert(envelope.epoch, envelope.sequence);
             }
         }
-        for ((channel, _), (given, count)) in seen {
-            let missing_count = given.saturating_sub(count);
-            if missing_count > 0 {
-                *self.gaps.missing.entry(channel.to_owned()).or_default() += missing_count;
-            }
-        }
+        let missing = seen.into_iter();
+        let missing = missing.map(|(channel, seen)| (channel.to_owned(), seen.missing_count()));
+        self.gaps.missing = missing.filter(|(_, count)| *count > 0).collect();
         for (channel, count) in &self.gaps.missing {
             let words = format!(
                 "{channel}: {} numbered and not recorded",
@@ -244,26 +250,9 @@ impl Run {
     }
 }
 
-fn listed(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
-    let mut paths: Vec<PathBuf> = fs::read_dir(folder)
-        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
-        .map_err(|source| {
-            let folder = folder.display();
-            Failure::usage(format!("{folder}: not a run's folder: {source}"))
-        })?;
-    // By name, so that the starts of a restarted process come in order.
-    paths.sort();
-    Ok(paths)
-}
-
-fn read_manifest(path: &Path, gaps: &mut Gaps) -> Option<Manifest> {
-    let read = fs::read_to_string(path).map_err(|error| error.to_string());
-    let read = read.and_then(|text| serde_json::from_str(&text).map_err(|e| e.to_string()));
-    read.inspect_err(|why| {
-        let what = "the run's own layouts";
-        gaps.leave_out(format!("{}: {why}; without {what}", path.display()));
-    })
-    .ok()
+fn not_a_run(folder: &Path, source: &io::Error) -> Failure {
+    let folder = folder.display();
+    Failure::usage(format!("{folder}: not a run's folder: {source}"))
 }
 
 /// A run that was killed has none, which is said and is no gap in what was recorded of it.

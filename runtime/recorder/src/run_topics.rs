@@ -1,27 +1,37 @@
 //! The topics of a whole run: of each channel its messages, what viewers make of them, the stamps of each
-//! and the verdicts of its link; of the run its links' orders, its score and its scene. Both a finished run's
-//! folder and a run that still goes are written through this; they differ in when each thing is known.
+//! and the verdicts of its link; of the run its links' orders, its score and its scene. A run that goes
+//! comes as the events of its feed, a finished run's folder as steps in order of time; both go through the
+//! same methods.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Instant;
 
 use hil_core::message::Envelope;
+use hil_core::record::{FollowUpRecord, UNAVAILABLE};
 use hil_link::condition::LinkConditionRecord;
+use hil_rundir::live_run::Stage;
 use hil_rundir::manifest::ChannelDescription;
+use hil_rundir::record::RecordKind;
 use hil_trace::TraceRecord;
-use prost::Message as _;
+use hil_watch::{Event, Feed, Origin, Record, Seen};
 use serde_json::Value;
 
+use crate::clocks::Clocks;
 use crate::codec::Codec;
 use crate::conditions::Conditions;
 use crate::facts::{self, Words};
+use crate::joining::Joining;
 use crate::net::{self, LinkDecision, MessageLatency};
 use crate::run::Run;
 use crate::scene::{Heard, Scene};
-use crate::schema::Schema;
 use crate::sink::{Sink, Topic};
+use crate::timeline::{self, Step, What};
 use crate::topics::{self, Names, View, topic_of};
+use crate::view::Told;
 use crate::writer::Stamp;
 
 /// A channel that is to have topics.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Wanted<'a> {
     /// The channel.
     pub(crate) name: &'a str,
@@ -29,11 +39,15 @@ pub(crate) struct Wanted<'a> {
     pub(crate) described: Option<&'a ChannelDescription>,
     /// Sizes of its messages by its record files.
     pub(crate) recorded_bytes: Vec<usize>,
+    /// What processes here note of its messages while the run goes.
+    pub(crate) noted: &'a [Stage],
+    /// A program of the user's writes it, which keeps no records.
+    pub(crate) is_unrecorded: bool,
 }
 
 impl Wanted<'_> {
-    /// How its messages are written field by field, with their schema; or why they cannot be.
-    fn typed(&self) -> Result<(Codec, Schema), String> {
+    /// How its messages are written field by field; or why they cannot be.
+    fn typed(&self) -> Result<Codec, String> {
         let described = self
             .described
             .ok_or("the manifest does not tell of this channel")?;
@@ -54,8 +68,8 @@ impl Wanted<'_> {
 pub(crate) struct ChannelTopics {
     /// The channel.
     pub(crate) name: String,
-    /// Host of its producer; empty when the manifest does not tell.
-    pub(crate) host: String,
+    /// Hosts of its producer and its consumer, where the manifest tells.
+    hosts: [Option<String>; 2],
     /// Its message, where the manifest names it.
     pub(crate) message: Option<String>,
     /// Its messages.
@@ -66,8 +80,14 @@ pub(crate) struct ChannelTopics {
     /// The stamps of each message.
     pub(crate) latency: Topic,
     /// The verdicts of its link.
-    pub(crate) link: Topic,
-    buffer: Vec<u8>,
+    link: Topic,
+    joining: Joining,
+    written: Seen,
+    /// Messages that were to come, by what the processes noted.
+    due: Seen,
+    /// Of these, how many have not come.
+    outstanding_count: u64,
+    is_unrecorded: bool,
 }
 
 impl ChannelTopics {
@@ -83,32 +103,32 @@ impl ChannelTopics {
     fn of(wanted: &Wanted<'_>, own: String, names: &mut Names) -> Self {
         let (name, described) = (wanted.name, wanted.described);
         let mut untyped = None;
-        let (codec, schema) = wanted.typed().unwrap_or_else(|why| {
+        let codec = wanted.typed().unwrap_or_else(|why| {
             untyped = Some(why);
             Codec::opaque(0)
         });
         let message = described.map_or("", |one| &one.message);
         let size = described.map_or(String::new(), |one| one.size_bytes.to_string());
-        let host = described.and_then(|one| one.from_host.as_deref());
-        let host = host.unwrap_or_default();
+        let hosts = described.map(|one| [one.from_host.clone(), one.to_host.clone()]);
+        let hosts = hosts.unwrap_or_default();
         let metadata = [
             ("channel", name),
             ("message", message),
             ("size_bytes", &size),
-            ("clock_host", host),
+            ("clock_host", hosts[0].as_deref().unwrap_or_default()),
         ];
-        let own = Topic::new(own, schema, &metadata);
+        let own = Topic::new(own, codec.schema.clone(), &metadata);
         let base = topic_of(name);
         let mut derived =
             |wanted: String, schema| Topic::new(names.claim(wanted), schema, &[("channel", name)]);
         let views = described.map_or(&[][..], |one| View::of(message, one.size_bytes));
         let views = views.iter().map(|view| {
-            let wanted = format!("{}{base}", view.prefix());
-            (*view, derived(wanted, view.schema()))
+            let wanted = format!("{}{base}", view.prefix);
+            (*view, derived(wanted, (view.schema)()))
         });
         Self {
             name: name.to_owned(),
-            host: host.to_owned(),
+            hosts,
             message: described.map(|one| one.message.clone()),
             own,
             codec,
@@ -116,8 +136,17 @@ impl ChannelTopics {
             views: views.collect(),
             latency: derived(format!("/net{base}/latency"), MessageLatency::schema()),
             link: derived(format!("/net{base}/link"), LinkDecision::schema()),
-            buffer: Vec::new(),
+            joining: Joining::new(wanted.noted),
+            written: Seen::default(),
+            due: Seen::default(),
+            outstanding_count: 0,
+            is_unrecorded: wanted.is_unrecorded,
         }
+    }
+
+    /// Host of its producer; empty when the manifest does not tell.
+    fn host(&self) -> &str {
+        self.hosts[0].as_deref().unwrap_or_default()
     }
 
     /// Lets `sink` hear now of the topics that are made of the messages.
@@ -143,11 +172,10 @@ impl ChannelTopics {
         sink: &mut S,
     ) -> Result<bool, S::Error> {
         if self.own.is_wanted(sink) {
-            self.buffer.clear();
-            if !self.codec.encode(payload, &mut self.buffer) {
+            let encode = |buffer: &mut Vec<u8>| self.codec.encode(payload, buffer);
+            if !self.own.write_with(sink, at, encode)? {
                 return Ok(false);
             }
-            self.own.write(sink, at, &self.buffer)?;
         }
         for (view, topic) in &mut self.views {
             if topic.is_wanted(sink)
@@ -172,31 +200,34 @@ impl ChannelTopics {
         if !self.latency.is_wanted(sink) {
             return Ok(());
         }
-        self.buffer.clear();
-        stamps.encode_raw(&mut self.buffer);
         let at = Stamp::new(at_ns, stamps.sequence);
-        self.latency.write(sink, at, &self.buffer)
-    }
-
-    /// Writes what the link did to a message.
-    ///
-    /// # Errors
-    /// When the sink cannot take it.
-    pub(crate) fn write_decision<S: Sink>(
-        &mut self,
-        at_ns: u64,
-        record: &TraceRecord,
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
-        self.buffer.clear();
-        LinkDecision::of(record).encode_raw(&mut self.buffer);
-        let at = Stamp::new(at_ns, record.sequence);
-        self.link.write(sink, at, &self.buffer)
+        self.latency.put(sink, at, stamps)
     }
 
     /// Why its messages are kept as bytes, if there are any that are.
     pub(crate) fn untyped(&self) -> Option<&str> {
         self.untyped.as_deref().filter(|_| self.own.is_declared())
+    }
+
+    fn note_written(&mut self, envelope: &Envelope) {
+        let is_new = self.written.insert(envelope.epoch, envelope.sequence);
+        if is_new && self.due.contains(envelope.epoch, envelope.sequence) {
+            self.outstanding_count -= 1;
+        }
+    }
+
+    /// Notes that a message is to come: its producer here published it, or a gateway here did.
+    fn note_due(&mut self, record: &Record, is_of_this_host: bool) {
+        let (epoch, sequence) = match record {
+            Record::Published(one) => (one.epoch, one.sequence),
+            Record::Ingress(one) if one.forwarded_ns != UNAVAILABLE && is_of_this_host => {
+                (one.epoch, one.sequence)
+            }
+            _ => return,
+        };
+        if self.due.insert(epoch, sequence) && !self.written.contains(epoch, sequence) {
+            self.outstanding_count += 1;
+        }
     }
 }
 
@@ -205,14 +236,18 @@ impl ChannelTopics {
 pub(crate) struct RunTopics {
     /// Those of each channel.
     pub(crate) channels: Vec<ChannelTopics>,
+    /// Their places, by name.
+    places: BTreeMap<String, usize>,
     /// Names that were not free among them.
     pub(crate) names: Names,
     /// Events of the score.
-    pub(crate) events: Topic,
+    events: Topic,
     /// Orders to emulated links.
-    pub(crate) conditions: Conditions,
+    conditions: Conditions,
     /// What viewers draw, if that is wanted.
     pub(crate) scene: Option<Scene>,
+    /// The clocks of the recording.
+    pub(crate) clocks: Clocks,
     /// What was written so far.
     pub(crate) counts: Counts,
 }
@@ -229,102 +264,72 @@ pub(crate) struct Counts {
     pub(crate) timeless_count: u64,
 }
 
-/// When a message enters the scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Drawn {
-    /// At once: messages come in order of time.
-    InOrder,
-    /// Once what was published before it has come.
-    Later,
-    /// Never: the pictures of its time are drawn.
-    Never,
-}
-
-/// Something of a run's folder that is to be written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum What {
-    /// A message of a record file.
-    Message { file: usize, index: usize },
-    /// The stamps of a message.
-    Latency { index: usize },
-    /// The verdict of a link.
-    Link { trace: usize, index: usize },
-    /// An order to a link.
-    Condition { file: usize, index: usize },
-    /// An event of the score.
-    Event { index: usize },
-}
-
-/// Something and its place: by time, then the channel, so that the order is the same each time.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct Item {
-    at_ns: u64,
-    channel: usize,
-    what: What,
-}
-
-/// What of a run's folder is to be written.
-#[derive(Debug, Default)]
-pub(crate) struct Plan {
-    /// Each with its time.
-    pub(crate) items: Vec<Item>,
-    /// What has no time on the recording's clock.
-    pub(crate) timeless_count: u64,
-}
-
-impl Plan {
-    /// Adds something of a channel, or what is of none with the number behind the last.
-    pub(crate) fn put(&mut self, at_ns: Option<u64>, channel: usize, what: What) {
-        match at_ns {
-            Some(at_ns) => self.items.push(Item {
-                at_ns,
-                channel,
-                what,
-            }),
-            None => self.timeless_count += 1,
-        }
-    }
-
-    /// Adds what only the end of a run tells: the verdicts of its links and the events of its score.
-    /// `time_ns` gives the time of an instant on the clock of a host.
-    pub(crate) fn put_end(
-        &mut self,
-        run: &Run,
-        channels: &[ChannelTopics],
-        time_ns: &mut dyn FnMut(&str, i64) -> Option<u64>,
-    ) {
-        for (trace, whole) in run.traces.iter().enumerate() {
-            let name = &whole.header.channel;
-            let Some(channel) = channels.iter().position(|one| one.name == *name) else {
-                continue;
-            };
-            for index in 0..whole.records.len() {
-                let published_ns = net::published_ns(whole, index);
-                let at_ns = published_ns.and_then(|ns| time_ns(&channels[channel].host, ns));
-                self.put(at_ns, channel, What::Link { trace, index });
-            }
-        }
-        for (index, at_ns) in facts::event_times(run, time_ns).into_iter().enumerate() {
-            self.put(at_ns, channels.len(), What::Event { index });
-        }
+impl Counts {
+    /// The time of something, which is counted when there is none.
+    const fn timed(&mut self, at_ns: Option<u64>) -> Option<u64> {
+        self.timeless_count += at_ns.is_none() as u64;
+        at_ns
     }
 }
 
 impl RunTopics {
     /// Names the topics of a run with this resolved topology. Without a scene, what it takes to draw one
     /// is not worked out.
-    pub(crate) fn new(wanted: Vec<Wanted<'_>>, topology: &Value, has_scene: bool) -> Self {
+    fn new(wanted: Vec<Wanted<'_>>, topology: &Value, clocks: Clocks, has_scene: bool) -> Self {
         let mut names = Names::default();
         let case = &topology["case"];
+        let channels = ChannelTopics::of_all(wanted, &mut names);
+        let places = channels.iter().map(|one| one.name.clone());
         Self {
-            channels: ChannelTopics::of_all(wanted, &mut names),
+            places: places.zip(0..).collect(),
+            channels,
             events: topics::event_topic(&mut names),
             conditions: Conditions::of(topology, &mut names),
             scene: has_scene
                 .then(|| Scene::new(case["name"].as_str(), &case["parameters"], &mut names)),
             names,
+            clocks,
             counts: Counts::default(),
         }
+    }
+
+    /// The topics of a run that goes; they appear with their first message.
+    pub(crate) fn of_feed(feed: &Feed, has_scene: bool) -> Self {
+        let wanted = feed.channels().map(|channel| {
+            let name = &channel.description.name;
+            let mut announced = feed.run().channels.iter();
+            let announced = announced.find(|announced| announced.name == *name);
+            Wanted {
+                name,
+                described: Some(&channel.description),
+                recorded_bytes: Vec::new(),
+                noted: announced.map_or(&[], |one| &one.noted),
+                is_unrecorded: channel.is_unrecorded(),
+            }
+        });
+        let (wanted, topology) = (wanted.collect(), &feed.manifest().topology);
+        Self::new(wanted, topology, Clocks::of_feed(feed), has_scene)
+    }
+
+    /// The topics of a run's folder.
+    pub(crate) fn of_run(run: &Run, has_scene: bool) -> Self {
+        let names = run.channels();
+        let wanted = names.iter().map(|name| Wanted {
+            name,
+            described: run.described(name),
+            recorded_bytes: run
+                .files_of(name, RecordKind::Message)
+                .map(|(_, file)| file.header.record_bytes as usize)
+                .map(|bytes| bytes.saturating_sub(size_of::<Envelope>()))
+                .collect(),
+            ..Wanted::default()
+        });
+        Self::new(
+            wanted.collect(),
+            run.topology(),
+            Clocks::of_run(run),
+            has_scene,
+        )
     }
 
     /// The names of the messages, a channel each.
@@ -347,85 +352,395 @@ impl RunTopics {
         self.channels.iter().map(describe).collect()
     }
 
-    /// Writes a message of the channel with this place; false when its size is not that of the channel,
-    /// and it was left out.
+    /// Makes of an event what is to be made of it.
     ///
     /// # Errors
     /// When the sink cannot take it.
-    pub(crate) fn message<S: Sink>(
+    pub(crate) fn take<S: Sink>(
+        &mut self,
+        event: &Event<'_>,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        match event {
+            Event::Message {
+                channel,
+                origin,
+                envelope,
+                payload,
+            } => {
+                let Some(place) = self.places.get(&channel.description.name).copied() else {
+                    return Ok(());
+                };
+                // Of what another host sends at the end the pictures are drawn already.
+                let is_drawn = *origin != Origin::OtherHost;
+                self.message(place, envelope, payload, is_drawn, sink)
+            }
+            Event::Record {
+                channel,
+                record: Record::LinkCondition(record),
+                ..
+            } => self.condition(channel, record, sink),
+            Event::Record {
+                channel,
+                is_of_this_host,
+                record,
+                ..
+            } => match self.places.get(*channel).copied() {
+                Some(place) => self.record(place, record, *is_of_this_host, sink),
+                None => Ok(()),
+            },
+            Event::Silent => self.flush_joins(sink),
+            Event::Problem(_) | Event::Ended { .. } => Ok(()),
+        }
+    }
+
+    fn message<S: Sink>(
         &mut self,
         place: usize,
-        at_ns: u64,
         envelope: &Envelope,
         payload: &[u8],
-        drawn: Drawn,
+        is_drawn: bool,
         sink: &mut S,
-    ) -> Result<bool, S::Error> {
+    ) -> Result<(), S::Error> {
         let channel = &mut self.channels[place];
+        let at_ns = self.clocks.message_ns(channel.host(), envelope);
+        let Some(at_ns) = self.counts.timed(at_ns) else {
+            return Ok(());
+        };
         if !channel.write_message(Stamp::new(at_ns, envelope.sequence), payload, sink)? {
             self.counts.misfit_count += 1;
-            return Ok(false);
+            return Ok(());
         }
         self.counts.message_count += 1;
-        if let Some((scene, message)) = self.scene.as_mut().zip(channel.message.as_deref()) {
+        channel.note_written(envelope);
+        let (name, message) = (&channel.name, channel.message.as_deref());
+        if let Some((scene, message)) = self.scene.as_mut().zip(message)
+            && let Some(told) = Told::of(name, message, payload).filter(|_| is_drawn)
+        {
             let heard = Heard {
-                channel: &channel.name,
-                message,
-                payload,
+                told,
                 at_ns,
                 published_ns: envelope.published_ns,
             };
-            match drawn {
-                Drawn::InOrder => scene.take(&heard, sink)?,
-                Drawn::Later => scene.hold(&heard, sink)?,
-                Drawn::Never => {}
-            }
+            scene.hold(&heard, sink)?;
         }
-        Ok(true)
+        Ok(())
     }
 
-    /// Writes what was planned of `run`, whose stamps were joined to `latencies`, by channel.
+    fn record<S: Sink>(
+        &mut self,
+        place: usize,
+        record: &Record,
+        is_of_this_host: bool,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        let channel = &mut self.channels[place];
+        let hosts = channel.hosts.each_ref().map(Option::as_deref);
+        self.clocks.note(hosts, record);
+        channel.note_due(record, is_of_this_host);
+        channel
+            .joining
+            .take(record, is_of_this_host, Instant::now());
+        self.give_out(place, &mut Joining::next, sink)
+    }
+
+    fn condition<S: Sink>(
+        &mut self,
+        name: &str,
+        record: &LinkConditionRecord,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        let host = self.conditions.host_of(name);
+        let at_ns = host.and_then(|host| self.clocks.time_ns(host, record.from_ns));
+        match self.counts.timed(at_ns) {
+            Some(at_ns) => self.conditions.write(name, at_ns, record, sink),
+            None => Ok(()),
+        }
+    }
+
+    /// Writes what `decision` says, after the stamps of the message that it is about.
+    fn decision<S: Sink>(
+        &mut self,
+        place: usize,
+        at_ns: Option<u64>,
+        decision: &TraceRecord,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        let sequence = decision.sequence;
+        if let Some(one) = self.channels[place].joining.waiting_with(sequence) {
+            one.note_decision(decision);
+        }
+        self.give_out(place, &mut Joining::earliest, sink)?;
+        let Some(at_ns) = self.counts.timed(at_ns) else {
+            return Ok(());
+        };
+        let link = &mut self.channels[place].link;
+        link.put(
+            sink,
+            Stamp::new(at_ns, sequence),
+            &LinkDecision::of(decision),
+        )
+    }
+
+    /// Nothing more is to be read by `now`: gives out the stamps of messages that were held for long
+    /// enough, and draws the scene as far as it is known.
+    ///
+    /// # Errors
+    /// When the sink cannot take them.
+    pub(crate) fn settle<S: Sink>(&mut self, now: Instant, sink: &mut S) -> Result<(), S::Error> {
+        if let Some(scene) = &mut self.scene {
+            scene.settle(sink)?;
+        }
+        let mut places = 0..self.channels.len();
+        places
+            .try_for_each(|place| self.give_out(place, &mut |joining| joining.next_held(now), sink))
+    }
+
+    /// Gives out the stamps of all messages that are still waited for.
+    ///
+    /// # Errors
+    /// When the sink cannot take them.
+    pub(crate) fn flush_joins<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        let mut places = 0..self.channels.len();
+        places.try_for_each(|place| self.give_out(place, &mut Joining::earliest, sink))
+    }
+
+    /// Writes the stamps of the messages that `next` gives out.
+    fn give_out<S: Sink>(
+        &mut self,
+        place: usize,
+        next: &mut dyn FnMut(&mut Joining) -> Option<MessageLatency>,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        let channel = &mut self.channels[place];
+        while let Some(mut one) = next(&mut channel.joining) {
+            let at_ns = self.clocks.latency_ns(channel.host(), &one);
+            let Some(at_ns) = self.counts.timed(at_ns) else {
+                continue;
+            };
+            let [from, to] = &channel.hosts;
+            if self.clocks.compares() || (from.is_some() && from == to) {
+                one.compare_ends();
+            }
+            channel.write_latency(at_ns, &one, sink)?;
+        }
+        Ok(())
+    }
+
+    /// All that is in the folder of `run`, in order of time.
+    pub(crate) fn steps(&mut self, run: &Run) -> Vec<Step> {
+        let Self {
+            channels,
+            clocks,
+            places,
+            conditions,
+            ..
+        } = self;
+        let place = |name: &str| places.get(name).copied();
+        let mut steps = timeline::noted_steps(run, place, &mut |channel, noted| {
+            clocks.time_ns(channels[channel].host(), noted.published_ns)
+        });
+        for (file, records) in run.files.iter().enumerate() {
+            let host = conditions.host_of(&records.header.channel);
+            let orders = records.records::<LinkConditionRecord>().enumerate();
+            let is_of_link = records.header.kind == RecordKind::LinkCondition;
+            steps.extend(orders.filter(|_| is_of_link).map(|(index, one)| Step {
+                at_ns: host.and_then(|host| clocks.time_ns(host, one.from_ns)),
+                channel: channels.len(),
+                what: What::Condition { file, index },
+            }));
+        }
+        steps.extend(self.end_steps(run));
+        steps.sort_unstable();
+        steps
+    }
+
+    /// What only the end of a run tells: the verdicts of its links and the events of its score.
+    fn end_steps(&mut self, run: &Run) -> Vec<Step> {
+        let mut steps = Vec::new();
+        for (trace, whole) in run.traces.iter().enumerate() {
+            let Some(channel) = self.places.get(&whole.header.channel).copied() else {
+                continue;
+            };
+            let host = self.channels[channel].host();
+            steps.extend((0..whole.records.len()).map(|index| Step {
+                at_ns: net::published_ns(whole, index).and_then(|ns| self.clocks.time_ns(host, ns)),
+                channel,
+                what: What::Decision { trace, index },
+            }));
+        }
+        let times = facts::event_times(run, &mut |host, ns| self.clocks.time_ns(host, ns));
+        steps.extend(times.into_iter().enumerate().map(|(index, at_ns)| Step {
+            at_ns,
+            channel: self.channels.len(),
+            what: What::Event { index },
+        }));
+        steps
+    }
+
+    /// Takes what the folder of `run` has of one channel and one moment, and writes all of it.
     ///
     /// # Errors
     /// When the sink cannot take it.
-    pub(crate) fn write<S: Sink>(
+    pub(crate) fn moment<S: Sink>(
         &mut self,
         run: &Run,
-        latencies: &[Vec<MessageLatency>],
-        item: Item,
+        steps: &[Step],
         sink: &mut S,
     ) -> Result<(), S::Error> {
-        let Item { at_ns, channel, .. } = item;
-        match item.what {
+        for step in steps {
+            self.step(run, step, sink)?;
+        }
+        match steps
+            .first()
+            .filter(|one| one.channel < self.channels.len())
+        {
+            Some(step) => self.give_out(step.channel, &mut Joining::earliest, sink),
+            None => Ok(()),
+        }
+    }
+
+    fn step<S: Sink>(&mut self, run: &Run, step: &Step, sink: &mut S) -> Result<(), S::Error> {
+        let Step { at_ns, channel, .. } = *step;
+        match step.what {
             What::Message { file, index } => {
                 if let Some((envelope, payload)) = run.files[file].message(index) {
-                    self.message(channel, at_ns, &envelope, payload, Drawn::InOrder, sink)?;
+                    self.message(channel, &envelope, payload, true, sink)?;
+                    // They come in order of time.
+                    if let Some(scene) = &mut self.scene {
+                        scene.draw_held(sink)?;
+                    }
                 }
             }
-            What::Latency { index } => {
-                let stamps = &latencies[channel][index];
-                self.channels[channel].write_latency(at_ns, stamps, sink)?;
+            What::Record { file, index } => {
+                if let Some(record) = net::record(&run.files[file], index) {
+                    self.record(channel, &record, true, sink)?;
+                }
             }
-            What::Link { trace, index } => {
-                let record = &run.traces[trace].records[index];
-                self.channels[channel].write_decision(at_ns, record, sink)?;
+            What::LateStamp { file, index } => {
+                if let Some(late) = run.files[file].record::<FollowUpRecord>(index)
+                    && let Some(one) = self.channels[channel].joining.waiting_with(late.sequence)
+                {
+                    one.note_late(&late);
+                }
+            }
+            What::Decision { trace, index } => {
+                let decision = &run.traces[trace].records[index];
+                self.decision(channel, at_ns, decision, sink)?;
             }
             What::Condition { file, index } => {
                 let file = &run.files[file];
-                if let Some(record) = file.record::<LinkConditionRecord>(index) {
-                    let channel = &file.header.channel;
-                    self.conditions.write(channel, at_ns, &record, sink)?;
+                if let Some(record) = file.record(index) {
+                    self.condition(&file.header.channel, &record, sink)?;
                 }
             }
             What::Event { index } => {
                 let events = run.summary.as_ref().map(|one| &one.score_events.events);
-                let event = events.and_then(|events| events.get(index));
-                if let Some(line) = event.and_then(|event| topics::event_line(event, at_ns)) {
-                    let at = Stamp::new(at_ns, index as u64);
-                    self.events.write(sink, at, &line)?;
+                if let Some(at_ns) = self.counts.timed(at_ns)
+                    && let Some(event) = events.and_then(|events| events.get(index))
+                    && let Some(line) = topics::event_line(event, at_ns)
+                {
+                    self.events
+                        .put(sink, Stamp::new(at_ns, index as u64), &line)?;
                 }
             }
         }
         Ok(())
+    }
+
+    /// Lets `sink` hear now of every topic that the folder of `run` has something for, `steps` of it.
+    ///
+    /// # Errors
+    /// When it has no room for them.
+    pub(crate) fn declare<S: Sink>(
+        &mut self,
+        run: &Run,
+        steps: &[Step],
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        for channel in &mut self.channels {
+            let mut files = run.files_of(&channel.name, RecordKind::Message);
+            if files.next().is_some() {
+                channel.own.declare(sink)?;
+            }
+        }
+        let stamped = steps.iter().filter_map(|step| match step.what {
+            What::Record { .. } => Some(step.channel),
+            _ => None,
+        });
+        let stamped: BTreeSet<usize> = stamped.collect();
+        for (place, channel) in self.channels.iter_mut().enumerate() {
+            if channel.own.is_declared() {
+                channel.declare_views(sink)?;
+            }
+            if stamped.contains(&place) {
+                channel.latency.declare(sink)?;
+            }
+            let mut traces = run.traces.iter();
+            if traces.any(|trace| trace.header.channel == channel.name) {
+                channel.link.declare(sink)?;
+            }
+        }
+        let told = run.summary.as_ref().map(|one| &one.score_events.events);
+        if told.is_some_and(|events| !events.is_empty()) {
+            self.events.declare(sink)?;
+        }
+        for file in &run.files {
+            self.conditions.declare(&file.header.channel, sink)?;
+        }
+        if let Some(scene) = &mut self.scene {
+            let recorded = self.channels.iter().filter(|one| one.own.is_declared());
+            scene.declare(recorded.filter_map(|one| one.message.as_deref()), sink)?;
+        }
+        Ok(())
+    }
+
+    /// Writes what only the end of the run tells: the verdicts of its links, and the events of its
+    /// score.
+    ///
+    /// # Errors
+    /// When the sink cannot take it.
+    pub(crate) fn conclude<S: Sink>(&mut self, run: &Run, sink: &mut S) -> Result<(), S::Error> {
+        let steps = self.end_steps(run);
+        steps.iter().try_for_each(|step| self.step(run, step, sink))
+    }
+
+    /// Messages that should be there and are not, by channel. `is_silent` says that all records of
+    /// the run have come, so that what is not there will not come.
+    pub(crate) fn missed(&self, feed: &Feed, is_silent: bool) -> BTreeMap<String, u64> {
+        let counts = self.channels.iter().map(|channel| {
+            let is_known = is_silent && channel.due.count() > 0;
+            let unseen_count = feed.missed_count(&channel.name);
+            let count = if is_known {
+                channel.outstanding_count
+            } else {
+                unseen_count
+            };
+            (channel.name.clone(), count)
+        });
+        counts.filter(|(_, count)| *count > 0).collect()
+    }
+
+    /// Messages that were published before anybody looked, by channel: of own programs, whose
+    /// messages nobody records.
+    pub(crate) fn earlier(&self, feed: &Feed) -> BTreeMap<String, u64> {
+        let unrecorded = self.channels.iter().filter(|channel| channel.is_unrecorded);
+        let counts = unrecorded.filter_map(|channel| {
+            let count = feed.counters(&channel.name)?.earlier_count;
+            Some((channel.name.clone(), count))
+        });
+        counts.filter(|(_, count)| *count > 0).collect()
+    }
+
+    /// Stamps that came for messages that had been waited for long enough.
+    pub(crate) fn late_count(&self) -> u64 {
+        let channels = self.channels.iter();
+        channels.map(|one| one.joining.late_count).sum()
+    }
+
+    /// Messages whose stamps were given out after those of a message published later.
+    pub(crate) fn unordered_count(&self) -> u64 {
+        let channels = self.channels.iter();
+        channels.map(|one| one.joining.unordered_count).sum()
     }
 }

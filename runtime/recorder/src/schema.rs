@@ -1,5 +1,5 @@
 //! Protobuf schemas: of a message from the layout that its run wrote down, and of the recorder's own
-//! messages. It encodes nothing; [`crate::encode`] does, by the same checked layout.
+//! messages. It encodes nothing; [`crate::codec`] does, by the same checked layout.
 //!
 //! Field numbers are positions in the layout, from 1; a `reserved` field keeps its number and is
 //! left out. A changed layout has a new version in its message's name, so numbers never change

@@ -41,6 +41,8 @@ pub(crate) struct Topic {
     schema: Schema,
     metadata: BTreeMap<String, String>,
     number: Option<u16>,
+    /// Room for one message as it is written.
+    buffer: Vec<u8>,
 }
 
 impl Topic {
@@ -62,6 +64,7 @@ impl Topic {
             schema,
             metadata,
             number: None,
+            buffer: Vec::new(),
         }
     }
 
@@ -99,5 +102,36 @@ impl Topic {
     ) -> Result<(), S::Error> {
         let number = self.declare(sink)?;
         sink.write(number, at, data)
+    }
+
+    /// A message of it that `encode` puts into an empty buffer; false, and nothing is written, when that
+    /// gives false.
+    pub(crate) fn write_with<S: Sink>(
+        &mut self,
+        sink: &mut S,
+        at: Stamp,
+        encode: impl FnOnce(&mut Vec<u8>) -> bool,
+    ) -> Result<bool, S::Error> {
+        self.buffer.clear();
+        if !encode(&mut self.buffer) {
+            return Ok(false);
+        }
+        let number = self.declare(sink)?;
+        sink.write(number, at, &self.buffer)?;
+        Ok(true)
+    }
+
+    /// A protobuf message of it.
+    pub(crate) fn put<S: Sink>(
+        &mut self,
+        sink: &mut S,
+        at: Stamp,
+        message: &impl prost::Message,
+    ) -> Result<(), S::Error> {
+        self.write_with(sink, at, |buffer| {
+            message.encode_raw(buffer);
+            true
+        })
+        .map(drop)
     }
 }

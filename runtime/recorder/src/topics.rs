@@ -65,75 +65,88 @@ pub(crate) fn topic_of(channel: &str) -> String {
 }
 
 /// A topic that is made of a channel's messages for viewers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum View {
-    /// Joint positions that an arm is commanded.
-    CommandedJoints,
-    /// Joint positions that an arm reports.
-    MeasuredJoints,
-    /// Where an arm reports its tool.
-    Tool,
-    /// Vehicles as boxes.
-    Vehicles,
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct View {
+    /// The topic's name before the channel's.
+    pub(crate) prefix: &'static str,
+    /// Its schema.
+    pub(crate) schema: fn() -> Schema,
+    draw: fn(Published<'_>) -> Option<Vec<u8>>,
+}
+
+/// A message of a channel.
+#[derive(Debug, Clone, Copy)]
+struct Published<'a> {
+    channel: &'a str,
+    at: Timestamp,
+    payload: &'a [u8],
 }
 
 impl View {
+    /// Joint positions that an arm is commanded.
+    const COMMANDED_JOINTS: Self = Self {
+        prefix: "/joints",
+        schema: well_known::<JointStates>,
+        draw: |published| {
+            let command: EgmCommand = read(published.payload)?;
+            let speeds = command.flags & EgmCommand::HAS_SPEED != 0;
+            let speeds = speeds.then_some(&command.speed_rad_per_s);
+            Some(joints(published, &command.position_rad, speeds).encode_to_vec())
+        },
+    };
+    /// Joint positions that an arm reports.
+    const MEASURED_JOINTS: Self = Self {
+        prefix: "/joints",
+        schema: well_known::<JointStates>,
+        draw: |published| {
+            let feedback: EgmFeedback = read(published.payload)?;
+            Some(joints(published, &feedback.measured_rad, None).encode_to_vec())
+        },
+    };
+    /// Where an arm reports its tool.
+    const TOOL: Self = Self {
+        prefix: "/tool",
+        schema: well_known::<PoseInFrame>,
+        draw: |published| {
+            let feedback: EgmFeedback = read(published.payload)?;
+            let [w, i, j, k] = feedback.tool.quaternion_wxyz;
+            let tool = PoseInFrame {
+                timestamp: Some(published.at),
+                frame_id: "body".to_owned(),
+                pose: Some(pose(feedback.tool.position_m, [i, j, k, w])),
+            };
+            Some(tool.encode_to_vec())
+        },
+    };
+    /// Vehicles as boxes.
+    const VEHICLES: Self = Self {
+        prefix: "/scene",
+        schema: well_known::<SceneUpdate>,
+        draw: |published| {
+            let state = read(published.payload)?;
+            Some(vehicle(&state, published.at).encode_to_vec())
+        },
+    };
+
     /// The views of a message; none of one whose size is not that of our type of that name.
     pub(crate) fn of(message: &str, size_bytes: usize) -> &'static [Self] {
         match message {
-            EgmCommand::NAME if size_bytes == size_of::<EgmCommand>() => &[Self::CommandedJoints],
+            EgmCommand::NAME if size_bytes == size_of::<EgmCommand>() => &[Self::COMMANDED_JOINTS],
             EgmFeedback::NAME if size_bytes == size_of::<EgmFeedback>() => {
-                &[Self::MeasuredJoints, Self::Tool]
+                &[Self::MEASURED_JOINTS, Self::TOOL]
             }
-            State::NAME if size_bytes == size_of::<State>() => &[Self::Vehicles],
+            State::NAME if size_bytes == size_of::<State>() => &[Self::VEHICLES],
             _ => &[],
-        }
-    }
-
-    /// The topic's name before the channel's.
-    pub(crate) const fn prefix(self) -> &'static str {
-        match self {
-            Self::CommandedJoints | Self::MeasuredJoints => "/joints",
-            Self::Tool => "/tool",
-            Self::Vehicles => "/scene",
-        }
-    }
-
-    /// Its schema.
-    pub(crate) fn schema(self) -> Schema {
-        match self {
-            Self::CommandedJoints | Self::MeasuredJoints => well_known::<JointStates>(),
-            Self::Tool => well_known::<PoseInFrame>(),
-            Self::Vehicles => well_known::<SceneUpdate>(),
         }
     }
 
     /// What `payload`, a message of `channel` published at `at_ns`, looks like; nothing when it has
     /// another size.
     pub(crate) fn show(self, channel: &str, at_ns: u64, payload: &[u8]) -> Option<Vec<u8>> {
-        let timestamp = Some(timestamp(at_ns)?);
-        Some(match self {
-            Self::CommandedJoints => {
-                let command: EgmCommand = read(payload)?;
-                let speeds = command.flags & EgmCommand::HAS_SPEED != 0;
-                let speeds = speeds.then_some(&command.speed_rad_per_s);
-                joints(channel, timestamp, &command.position_rad, speeds).encode_to_vec()
-            }
-            Self::MeasuredJoints => {
-                let feedback: EgmFeedback = read(payload)?;
-                joints(channel, timestamp, &feedback.measured_rad, None).encode_to_vec()
-            }
-            Self::Tool => {
-                let feedback: EgmFeedback = read(payload)?;
-                let [w, i, j, k] = feedback.tool.quaternion_wxyz;
-                PoseInFrame {
-                    timestamp,
-                    frame_id: "body".to_owned(),
-                    pose: Some(pose(feedback.tool.position_m, [i, j, k, w])),
-                }
-                .encode_to_vec()
-            }
-            Self::Vehicles => vehicle(&read(payload)?, timestamp).encode_to_vec(),
+        (self.draw)(Published {
+            channel,
+            at: timestamp(at_ns)?,
+            payload,
         })
     }
 }
@@ -164,12 +177,11 @@ pub(crate) fn side_of(channel: &str) -> Option<Side> {
 }
 
 fn joints(
-    channel: &str,
-    timestamp: Option<Timestamp>,
+    published: Published<'_>,
     positions_rad: &[f64; 7],
     speeds_rad_per_s: Option<&[f64; 7]>,
 ) -> JointStates {
-    let side = side_of(channel).map_or("", Side::word);
+    let side = side_of(published.channel).map_or("", Side::word);
     let joints = positions_rad.iter().enumerate();
     let joints = joints.map(|(index, position_rad)| JointState {
         name: joint_name(side, index),
@@ -178,7 +190,7 @@ fn joints(
         ..JointState::default()
     });
     JointStates {
-        timestamp,
+        timestamp: Some(published.at),
         joints: joints.collect(),
     }
 }
@@ -215,7 +227,7 @@ pub(crate) fn cube(
     }
 }
 
-fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
+fn vehicle(state: &State, at: Timestamp) -> SceneUpdate {
     let (fleet, robot) = (state.header.fleet_id, state.header.robot_id);
     let (sine, cosine) = (state.heading_rad / 2.0).sin_cos();
     let turned = [0.0, 0.0, sine, cosine];
@@ -240,7 +252,7 @@ fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
         ..TextPrimitive::default()
     };
     let entity = SceneEntity {
-        timestamp,
+        timestamp: Some(at),
         frame_id: "map".to_owned(),
         id: format!("fleet {fleet} robot {robot}"),
         lifetime: Some(Duration::new(VEHICLE_SHOWN_S, 0)),
@@ -255,7 +267,7 @@ fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
 }
 
 /// An event of the score as a line of a log.
-pub(crate) fn event_line(event: &ExplainedEvent, at_ns: u64) -> Option<Vec<u8>> {
+pub(crate) fn event_line(event: &ExplainedEvent, at_ns: u64) -> Option<Log> {
     let level = match event.severity {
         Severity::Notice => log::Level::Info,
         Severity::Hazard => log::Level::Warning,
@@ -263,14 +275,13 @@ pub(crate) fn event_line(event: &ExplainedEvent, at_ns: u64) -> Option<Vec<u8>> 
     };
     let outages = event.outages.iter();
     let outages = outages.map(|outage| format!(" | {}: {}", outage.channel, outage.words));
-    let line = Log {
+    Some(Log {
         timestamp: Some(timestamp(at_ns)?),
         level: level.into(),
         message: format!("{}{}", event.what, outages.collect::<String>()),
         name: "score".to_owned(),
         ..Log::default()
-    };
-    Some(line.encode_to_vec())
+    })
 }
 
 #[cfg(test)]
@@ -295,7 +306,7 @@ mod tests {
         let mut command = EgmCommand::zeroed();
         command.position_rad = [0.1, 0.2, 0.7, 0.3, 0.4, 0.5, 0.6];
         let payload = bytemuck::bytes_of(&command);
-        let show = |payload| View::CommandedJoints.show("egm/left/command", 5, payload);
+        let show = |payload| View::COMMANDED_JOINTS.show("egm/left/command", 5, payload);
         let joints = JointStates::decode(show(payload).unwrap().as_slice()).unwrap();
         let joint = &joints.joints[2];
         assert_eq!(
@@ -311,7 +322,7 @@ mod tests {
     fn a_vehicle_stands_where_it_says() {
         let mut state = State::zeroed();
         (state.x_m, state.y_m, state.heading_rad) = (3.0, -4.0, core::f64::consts::PI);
-        let shown = View::Vehicles.show("fleet/state", 5, bytemuck::bytes_of(&state));
+        let shown = View::VEHICLES.show("fleet/state", 5, bytemuck::bytes_of(&state));
         let update = SceneUpdate::decode(shown.unwrap().as_slice()).unwrap();
         let pose = update.entities[0].cubes[0].pose.unwrap();
         assert_eq!(pose.position.map(|at| (at.x, at.y)), Some((3.0, -4.0)));

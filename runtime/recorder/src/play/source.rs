@@ -37,7 +37,15 @@ struct Wanted {
     topic: String,
     channel: String,
     codec: Codec,
-    schema: Schema,
+}
+
+/// A topic of the file.
+struct Known {
+    topic: String,
+    metadata: BTreeMap<String, String>,
+    /// Which of the wanted it is.
+    place: Option<usize>,
+    /// Its messages so far.
     count: u64,
 }
 
@@ -48,30 +56,16 @@ fn scanned(path: &Path, visit: &mut Visit<'_>) -> Result<ScanEnd, Failure> {
 
 /// The channels of a run whose messages a file has, with their number, in words.
 pub(crate) fn known_channels(path: &Path) -> Result<String, Failure> {
-    let mut channels: BTreeMap<u16, (String, u64)> = BTreeMap::new();
-    scanned(path, &mut |_, record| {
-        match record {
-            Record::Channel(topic) => {
-                // What is made of messages names their channel, and no message.
-                let is_own = topic.metadata.contains_key("message");
-                if let Some(channel) = topic.metadata.get("channel").filter(|_| is_own) {
-                    let known = channels.entry(topic.id);
-                    known.or_insert_with(|| (channel.clone(), 0));
-                }
-            }
-            Record::Message { header, .. } => {
-                if let Some((_, count)) = channels.get_mut(&header.channel_id) {
-                    *count += 1;
-                }
-            }
-            _ => {}
-        }
-        true
-    })?;
-    let known = channels.into_values();
-    let known: Vec<String> = known
-        .map(|(channel, count)| format!("{channel} ({})", counted_plainly(count, "message")))
-        .collect();
+    let mut reading = Reading::default();
+    scanned(path, &mut |_, record| reading.visit(record).is_ok())?;
+    // What is made of messages names their channel, and no message.
+    let known = reading.topics.into_values();
+    let known = known.filter(|one| one.metadata.contains_key("message"));
+    let known = known.filter_map(|one| {
+        let count = counted_plainly(one.count, "message");
+        Some(format!("{} ({count})", one.metadata.get("channel")?))
+    });
+    let known: Vec<String> = known.collect();
     Ok(if known.is_empty() {
         "no channel of a run".to_owned()
     } else {
@@ -82,7 +76,7 @@ pub(crate) fn known_channels(path: &Path) -> Result<String, Failure> {
 /// Reads the messages of `channels`, whose layouts are those of the run they go into.
 pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Material, Failure> {
     let wanted = channels.iter().map(|channel| {
-        let (codec, schema) = if channel.fields.is_empty() {
+        let codec = if channel.fields.is_empty() {
             Codec::opaque(channel.size_bytes)
         } else {
             Codec::typed(&channel.message, &channel.fields, channel.size_bytes)
@@ -92,8 +86,6 @@ pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Mate
             topic: topic_of(&channel.name),
             channel: channel.name.clone(),
             codec,
-            schema,
-            count: 0,
         })
     });
     let mut reading = Reading {
@@ -110,11 +102,8 @@ pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Mate
         let words = format!("{file}: {fault}");
         return Err(Failure { words, ..fault });
     }
-    let known: Vec<String> = reading
-        .topics
-        .into_values()
-        .map(|(topic, _)| topic)
-        .collect();
+    let known = reading.topics.into_values().map(|one| one.topic);
+    let known: Vec<String> = known.collect();
     let mut wanted = reading.wanted.iter();
     if let Some(absent) = wanted.find(|one| !known.contains(&one.topic)) {
         let (topic, known) = (&absent.topic, known.join(", "));
@@ -142,8 +131,8 @@ pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Mate
 struct Reading {
     wanted: Vec<Wanted>,
     schemas: BTreeMap<u16, Schema>,
-    /// By the file's number: its topic, and which of the wanted it is.
-    topics: BTreeMap<u16, (String, Option<usize>)>,
+    /// By the file's number.
+    topics: BTreeMap<u16, Known>,
     /// With their times on the recording's axis.
     messages: Vec<Recorded>,
 }
@@ -161,21 +150,28 @@ impl Reading {
                 if let Some(place) = place {
                     self.check(&self.wanted[place], channel.schema_id)?;
                 }
-                self.topics.insert(channel.id, (channel.topic, place));
+                self.topics.entry(channel.id).or_insert(Known {
+                    topic: channel.topic,
+                    metadata: channel.metadata,
+                    place,
+                    count: 0,
+                });
             }
             Record::Message { header, data } => {
-                let Some((topic, Some(place))) = self.topics.get(&header.channel_id) else {
+                let Some(known) = self.topics.get_mut(&header.channel_id) else {
                     return Ok(());
                 };
-                let wanted = &mut self.wanted[*place];
-                wanted.count += 1;
-                let payload = wanted.codec.decode(&data).map_err(|fault| {
-                    let count = wanted.count;
+                known.count += 1;
+                let Some(place) = known.place else {
+                    return Ok(());
+                };
+                let payload = self.wanted[place].codec.decode(&data).map_err(|fault| {
+                    let Known { topic, count, .. } = known;
                     Failure::failed(format!("message {count} of topic {topic}: {fault}"))
                 })?;
                 self.messages.push(Recorded {
                     after_ns: header.publish_time,
-                    channel: *place,
+                    channel: place,
                     payload,
                 });
             }
@@ -187,11 +183,11 @@ impl Reading {
     /// The file's schema must be the one that the live channel's layout gives.
     fn check(&self, wanted: &Wanted, schema_id: u16) -> Result<(), Failure> {
         let schema = self.schemas.get(&schema_id);
-        if schema == Some(&wanted.schema) {
+        if schema == Some(&wanted.codec.schema) {
             return Ok(());
         }
         let found = schema.map_or("an unknown schema", |schema| schema.name.as_str());
-        let (channel, name) = (&wanted.channel, &wanted.schema.name);
+        let (channel, name) = (&wanted.channel, &wanted.codec.schema.name);
         let fields = if found == name {
             " with other fields"
         } else {

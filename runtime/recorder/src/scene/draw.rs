@@ -185,7 +185,7 @@ fn collision(hit: &Collision, index: usize, now_s: f64, at: Timestamp) -> SceneE
     }
     entity.metadata = vec![
         word("robots", hit.robots),
-        word("kind", &hit.kind),
+        word("kind", hit.kind),
         word("basis", hit.basis),
     ];
     entity

@@ -13,21 +13,16 @@ use std::collections::BTreeMap;
 use foxglove::messages::{FrameTransforms, SceneUpdate};
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::message::Message;
-use hil_fleet::messages::{Mission, State, Truth};
-use prost::Message as _;
+use hil_fleet::messages::State;
 use serde_json::Value;
 
 use crate::newest::Newest;
 use crate::sink::{Sink, Topic};
 use crate::topics::{Names, timestamp, well_known};
-use crate::view::arms::ArmsView;
-use crate::view::fleet::{FleetView, MANY_ROBOTS};
+use crate::view::fleet::FleetView;
+use crate::view::{PERIOD_NS, Pictures, Told};
 use crate::writer::Stamp;
 
-/// Between two pictures, of the run's time: 20 Hz.
-const PERIOD_NS: u64 = 50_000_000;
-/// The same for fleets of many robots.
-const LARGE_PERIOD_NS: u64 = 200_000_000;
 /// Between two pictures of the ground: whoever opens one of several files, or the middle of a
 /// stream, has it within this time.
 const GROUND_PERIOD_NS: u64 = 10_000_000_000;
@@ -43,21 +38,13 @@ const WAITING_MAX: usize = 50_000;
 
 /// A message that says something of the scene.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Heard<'a> {
-    /// Its channel.
-    pub(crate) channel: &'a str,
-    /// Its message's name.
-    pub(crate) message: &'a str,
-    /// Itself.
-    pub(crate) payload: &'a [u8],
+pub(crate) struct Heard {
+    /// What it says.
+    pub(crate) told: Told,
     /// When it was published, on the recording's axis.
     pub(crate) at_ns: u64,
     /// When it was published, on its producer's clock.
     pub(crate) published_ns: i64,
-}
-
-fn is_of_fleet(message: &str) -> bool {
-    [State::NAME, Mission::NAME, Truth::NAME].contains(&message)
 }
 
 /// True when messages of this name are about arms.
@@ -65,20 +52,10 @@ pub(crate) fn is_of_arms(message: &str) -> bool {
     [EgmCommand::NAME, EgmFeedback::NAME].contains(&message)
 }
 
-/// A message that waits for those before it.
-#[derive(Debug)]
-struct Waiting {
-    channel: String,
-    message: String,
-    payload: Vec<u8>,
-    published_ns: i64,
-}
-
 /// The scene's topics, and what they show.
 #[derive(Debug)]
 pub(crate) struct Scene {
-    fleet: Option<FleetView>,
-    arms: ArmsView,
+    pictures: Pictures,
     moving: Topic,
     ground: Topic,
     frames: Topic,
@@ -91,7 +68,7 @@ pub(crate) struct Scene {
     /// Messages of a run that goes come channel by channel, the scene wants them in order of time: they
     /// wait until what could come before them has come, and until there is a ground to draw them on. By
     /// time, then by arrival.
-    waiting: BTreeMap<(u64, u64), Waiting>,
+    waiting: BTreeMap<(u64, u64), Heard>,
     arrived_count: u64,
     newest: Newest,
     /// Messages that went on before the ground was known.
@@ -102,7 +79,6 @@ impl Scene {
     /// The scene of a run of `case` with these `[case.parameters]`. The ground of a fleet is made
     /// from now on, in a thread of its own.
     pub(crate) fn new(case: Option<&str>, parameters: &Value, names: &mut Names) -> Self {
-        let is_fleet = case == Some("fleet");
         let mut scene_topic = |name: &str| {
             Topic::new(
                 names.claim(name.to_owned()),
@@ -113,8 +89,7 @@ impl Scene {
         let (moving, ground) = (scene_topic("/scene"), scene_topic("/scene/ground"));
         let frames = names.claim("/tf".to_owned());
         Self {
-            fleet: is_fleet.then(|| FleetView::new(parameters)),
-            arms: ArmsView::new(),
+            pictures: Pictures::of(case, parameters),
             moving,
             ground,
             frames: Topic::new(frames, well_known::<FrameTransforms>(), &[]),
@@ -132,7 +107,7 @@ impl Scene {
 
     /// False while the ground of a fleet is being made; pictures drawn before lack what rests on it.
     pub(crate) fn is_ready(&mut self) -> bool {
-        let Some(fleet) = &mut self.fleet else {
+        let Some(fleet) = &mut self.pictures.fleet else {
             return true;
         };
         fleet.new_map();
@@ -146,7 +121,7 @@ impl Scene {
 
     /// What the scene lacks, once it is finished.
     pub(crate) fn problems(&mut self) -> Vec<String> {
-        let fleet = self.fleet.as_ref();
+        let fleet = self.pictures.fleet.as_ref();
         let problem = fleet.and_then(|fleet| fleet.problem.clone());
         let mut problems: Vec<String> = problem.into_iter().collect();
         if self.groundless_count > 0 {
@@ -174,7 +149,7 @@ impl Scene {
     ) -> Result<(), S::Error> {
         let (mut has_fleet, mut has_arms) = (false, false);
         for message in messages {
-            has_fleet |= message == State::NAME && self.fleet.is_some();
+            has_fleet |= message == State::NAME && self.pictures.fleet.is_some();
             has_arms |= is_of_arms(message);
         }
         if has_fleet || has_arms {
@@ -190,16 +165,8 @@ impl Scene {
     }
 
     /// Takes a message, after the pictures that are due before it. Messages come in order of time.
-    ///
-    /// # Errors
-    /// When the sink cannot take a picture.
-    pub(crate) fn take<S: Sink>(
-        &mut self,
-        heard: &Heard<'_>,
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
-        let is_fleets = self.fleet.is_some() && is_of_fleet(heard.message);
-        if !is_fleets && !is_of_arms(heard.message) {
+    fn take<S: Sink>(&mut self, heard: &Heard, sink: &mut S) -> Result<(), S::Error> {
+        if !self.pictures.shows(&heard.told) {
             return Ok(());
         }
         if self.origin_ns.is_none() {
@@ -209,15 +176,8 @@ impl Scene {
         }
         self.draw_until(heard.at_ns, sink)?;
         let at_ns = signed(heard.at_ns);
-        if is_fleets {
-            if let Some(fleet) = &mut self.fleet {
-                let offset_ns = at_ns.saturating_sub(heard.published_ns);
-                fleet.take(heard.message, heard.payload, at_ns, offset_ns);
-            }
-        } else {
-            self.arms
-                .take(heard.channel, heard.message, heard.payload, at_ns);
-        }
+        let offset_ns = at_ns.saturating_sub(heard.published_ns);
+        self.pictures.take(&heard.told, at_ns, offset_ns);
         Ok(())
     }
 
@@ -225,22 +185,9 @@ impl Scene {
     ///
     /// # Errors
     /// When the sink cannot take a picture.
-    pub(crate) fn hold<S: Sink>(
-        &mut self,
-        heard: &Heard<'_>,
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
-        if !is_of_fleet(heard.message) && !is_of_arms(heard.message) {
-            return Ok(());
-        }
-        let waiting = Waiting {
-            channel: heard.channel.to_owned(),
-            message: heard.message.to_owned(),
-            payload: heard.payload.to_vec(),
-            published_ns: heard.published_ns,
-        };
+    pub(crate) fn hold<S: Sink>(&mut self, heard: &Heard, sink: &mut S) -> Result<(), S::Error> {
         let key = (heard.at_ns, self.arrived_count);
-        self.waiting.insert(key, waiting);
+        self.waiting.insert(key, *heard);
         self.arrived_count += 1;
         self.newest.take(signed(heard.at_ns));
         let excess_count = self.waiting.len().saturating_sub(WAITING_MAX);
@@ -272,18 +219,19 @@ impl Scene {
             let Some(first) = first.filter(|first| first.key().0 <= until_ns) else {
                 break;
             };
-            let ((at_ns, _), one) = first.remove_entry();
-            let heard = Heard {
-                channel: &one.channel,
-                message: &one.message,
-                payload: &one.payload,
-                at_ns,
-                published_ns: one.published_ns,
-            };
+            let heard = first.remove();
             self.groundless_count += u64::from(!self.is_ready());
             self.take(&heard, sink)?;
         }
         Ok(())
+    }
+
+    /// Takes everything that waits: nothing comes any more that was before it.
+    ///
+    /// # Errors
+    /// When the sink cannot take a picture.
+    pub(crate) fn draw_held<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        self.take_until(u64::MAX, usize::MAX, sink)
     }
 
     /// Takes everything that waits, and draws what the last messages said.
@@ -291,7 +239,7 @@ impl Scene {
     /// # Errors
     /// When the sink cannot take the picture.
     pub(crate) fn finish<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
-        self.take_until(u64::MAX, usize::MAX, sink)?;
+        self.draw_held(sink)?;
         if self.origin_ns.is_none() {
             return Ok(());
         }
@@ -306,12 +254,7 @@ impl Scene {
         }
         while self.next_ns <= at_ns {
             self.draw(self.next_ns, sink)?;
-            let robots = self.fleet.as_ref().map_or(0, FleetView::robot_count);
-            self.next_ns += if robots > MANY_ROBOTS {
-                LARGE_PERIOD_NS
-            } else {
-                PERIOD_NS
-            };
+            self.next_ns += self.pictures.period_ns();
         }
         Ok(())
     }
@@ -323,31 +266,32 @@ impl Scene {
         let (now_ns, origin_ns) = (signed(at_ns), signed(origin_ns));
         let stamp = Stamp::new(at_ns, self.picture_count);
         self.is_ready();
-        if let Some(fleet) = &mut self.fleet {
+        let shown = &mut self.pictures;
+        if let Some(fleet) = &mut shown.fleet {
             if fleet.robot_count() > 0
                 && let Some(size) = fleet.vehicle_size_m()
             {
                 let picture = fleet.picture(now_ns, origin_ns);
                 let update = draw::moving(&picture, size, time);
-                self.moving.write(sink, stamp, &update.encode_to_vec())?;
+                self.moving.put(sink, stamp, &update)?;
                 self.picture_count += 1;
             }
-        } else if self.arms.is_known() {
-            let picture = self.arms.picture(now_ns, origin_ns);
+        } else if shown.arms.is_known() {
+            let picture = shown.arms.picture(now_ns, origin_ns);
             let update = draw::arms(&picture, time);
-            self.moving.write(sink, stamp, &update.encode_to_vec())?;
+            self.moving.put(sink, stamp, &update)?;
             let frames = draw::transforms(&picture, time);
-            self.frames.write(sink, stamp, &frames.encode_to_vec())?;
+            self.frames.put(sink, stamp, &frames)?;
             self.picture_count += 1;
         }
         if at_ns >= self.ground_due_ns
-            && let Some(map) = self.fleet.as_ref().and_then(FleetView::map)
+            && let Some(map) = self.pictures.fleet.as_ref().and_then(FleetView::map)
         {
             self.ground_due_ns = at_ns.saturating_add(GROUND_PERIOD_NS);
             let stamp = Stamp::new(at_ns, self.ground_count);
             self.ground_count += 1;
             let update = draw::ground(map, time);
-            self.ground.write(sink, stamp, &update.encode_to_vec())?;
+            self.ground.put(sink, stamp, &update)?;
         }
         Ok(())
     }

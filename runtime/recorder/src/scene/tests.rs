@@ -8,6 +8,7 @@ use serde_json::json;
 
 use super::*;
 use crate::schema::Schema;
+use prost::Message as _;
 
 /// Keeps what is written, by topic.
 #[derive(Debug, Default)]
@@ -65,11 +66,9 @@ fn state(robot: u32, number: u64) -> (State, u64) {
     (state, 1_000_000_000 + 20_000_000 * number)
 }
 
-fn told(state: &State, at_ns: u64) -> Heard<'_> {
+fn told(state: &State, at_ns: u64) -> Heard {
     Heard {
-        channel: "fleet/state",
-        message: State::NAME,
-        payload: bytemuck::bytes_of(state),
+        told: Told::State(*state),
         at_ns,
         published_ns: signed(at_ns),
     }
@@ -103,7 +102,13 @@ fn robots_move_at_the_pace_of_the_pictures_and_each_picture_is_whole() {
         assert_eq!(update.deletions.len(), 1);
         let cube = &update.entities[0].cubes[0];
         let size = cube.size.unwrap();
-        let footprint = scene.fleet.as_ref().unwrap().vehicle_size_m().unwrap();
+        let footprint = scene
+            .pictures
+            .fleet
+            .as_ref()
+            .unwrap()
+            .vehicle_size_m()
+            .unwrap();
         assert_eq!(([size.x, size.y], size.z), (footprint, 0.4));
     }
 }
@@ -244,9 +249,7 @@ fn arms_are_shapes_and_frames_commanded_and_measured() {
             (EgmFeedback::NAME, bytemuck::bytes_of(&feedback)),
         ] {
             let heard = Heard {
-                channel: "egm/right/any",
-                message,
-                payload,
+                told: Told::of("egm/right/any", message, payload).unwrap(),
                 at_ns,
                 published_ns: signed(at_ns),
             };

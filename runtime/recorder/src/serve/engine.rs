@@ -1,26 +1,21 @@
 //! Reads what came of a run and shows what is due, round by round; waits for a run where there is
 //! none.
 
-use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use foxglove::websocket::Parameter;
 use hil_platform::console::Console;
 use serde_json::{Value, json};
 
-use super::parameters::Links;
+use super::parameters::{Links, RunWithLinks};
 use super::recording::Recording;
 use super::source::{Progress, Source, Warning};
 use super::viewers::Viewers;
 use crate::cli::RecordOptions;
 use crate::view::Body;
-use crate::view::fleet::{FleetView, MANY_ROBOTS};
+use crate::view::fleet::FleetView;
 use crate::view::state::RunState;
 
-/// Between two pictures of robots and arms.
-const PICTURE_PERIOD: Duration = Duration::from_millis(50);
-/// Between two pictures of fleets of many robots.
-const LARGE_PICTURE_PERIOD: Duration = Duration::from_millis(200);
 /// Between two accounts of the channels.
 const CHANNELS_PERIOD: Duration = Duration::from_millis(100);
 /// Between two words on the run.
@@ -55,8 +50,8 @@ pub(crate) struct Shown {
     pub(crate) source: Box<dyn Source>,
     /// How fast, if it is played back.
     pub(crate) playback_speed: Option<f64>,
-    /// Its folder and resolved topology, if it goes on: its links can be changed.
-    pub(crate) links: Option<(PathBuf, Value)>,
+    /// Itself, if it goes on.
+    pub(crate) links: Option<RunWithLinks>,
 }
 
 /// Which run is shown, and how it stands.
@@ -116,9 +111,9 @@ impl Engine {
         }
         // What is played back is on record already.
         let goes_on = self.target.as_ref().zip(shown.links.as_ref());
-        self.recording = goes_on.map(|(target, (folder, _))| {
+        self.recording = goes_on.map(|(target, run)| {
             self.recorded_count += 1;
-            Recording::begin(folder, target, self.recorded_count)
+            Recording::begin(&run.folder, target, self.recorded_count)
         });
         self.shown = Some(shown);
         self.due = Due::default();
@@ -196,7 +191,7 @@ impl Engine {
                 state.how_ended = Some(how);
             }
         }
-        if let Some(map) = state.fleet.as_mut().and_then(FleetView::new_map) {
+        if let Some(map) = state.pictures.fleet.as_mut().and_then(FleetView::new_map) {
             viewers.live("/live/map", now_ns, json!(map));
         }
         // After the end the last picture stays, the one with what came in the last look.
@@ -223,21 +218,16 @@ impl Engine {
 
 /// Shows robots, arms, channels and single messages, each when it is due.
 fn pictures(state: &mut RunState, viewers: &mut Viewers, due: &mut Due, now_ns: i64) {
-    let robot_count = state.fleet.as_ref().map_or(0, FleetView::robot_count);
-    let period = if robot_count > MANY_ROBOTS {
-        LARGE_PICTURE_PERIOD
-    } else {
-        PICTURE_PERIOD
-    };
-    if is_due(&mut due.picture, period)
+    let shown = &mut state.pictures;
+    if is_due(&mut due.picture, Duration::from_nanos(shown.period_ns()))
         && let Some(origin_ns) = state.origin_ns
     {
-        if let Some(fleet) = &mut state.fleet {
+        if let Some(fleet) = &mut shown.fleet {
             let picture = json!(fleet.picture(now_ns, origin_ns));
             viewers.live("/live/fleet", now_ns, picture);
         }
-        if state.arms.is_known() {
-            let picture = json!(state.arms.picture(now_ns, origin_ns));
+        if shown.arms.is_known() {
+            let picture = json!(shown.arms.picture(now_ns, origin_ns));
             viewers.live("/live/arms", now_ns, picture);
         }
     }
@@ -269,11 +259,12 @@ fn words(shown: &mut Shown, links: &Links, viewer_count: usize, now_ns: i64) -> 
         })
     });
     let mut warnings = source.warnings();
-    let problem = state.fleet.as_ref().and_then(|fleet| fleet.problem.clone());
-    warnings.extend(problem.map(|what| Warning {
-        process: None,
-        what,
-    }));
+    let problem = state
+        .pictures
+        .fleet
+        .as_ref()
+        .and_then(|fleet| fleet.problem.clone());
+    warnings.extend(problem.map(Warning::of_the_run));
     let overruns = source.overruns();
     let mut run = state.run(now_ns);
     run["links"] = listed.collect();

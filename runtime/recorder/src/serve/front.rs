@@ -5,13 +5,13 @@
 //! an address that is drawn by lot out of the sixteen million there, and at any free port: a page that
 //! would go around this door has to guess both.
 
-use std::fs::File;
-use std::io::{self, Read as _};
+use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::os::fd::AsFd;
 use std::sync::Arc;
 use std::time::Duration;
 
+use hil_platform::random::random_bytes;
 use nix::sys::socket::{setsockopt, sockopt};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::tcp::{ReadHalf, WriteHalf};
@@ -46,7 +46,7 @@ const BUFFER_BYTES: usize = 32 * 1024;
 const KERNEL_BYTES: u32 = 128 * 1024;
 /// How long a viewer may neither acknowledge nor have room for what it is sent: one whose cable was
 /// pulled says no goodbye, and would keep its seat for the kernel's two hours.
-pub(super) const GONE_AFTER: Duration = Duration::from_secs(30);
+const GONE_AFTER: Duration = Duration::from_secs(30);
 /// Out of file descriptors, mostly: others must close first.
 const PAUSE: Duration = Duration::from_millis(50);
 
@@ -55,9 +55,7 @@ const PAUSE: Duration = Duration::from_millis(50);
 /// # Errors
 /// When the kernel has no random numbers.
 pub(super) fn hidden_address() -> io::Result<Ipv4Addr> {
-    let mut random = [0; 3];
-    File::open("/dev/urandom")?.read_exact(&mut random)?;
-    Ok(hidden(random))
+    random_bytes().map(hidden)
 }
 
 fn hidden([a, b, c]: [u8; 3]) -> Ipv4Addr {
@@ -108,52 +106,12 @@ pub(super) fn listen(
     socket.listen(1024)
 }
 
-/// The port that viewers connect to, before anybody is let in.
-#[derive(Debug)]
-pub(super) struct ViewerListener {
-    listener: TcpListener,
-    port: u16,
-}
-
-impl ViewerListener {
-    /// Takes `address`; connections wait. Viewers that take nothing for `gone_after` lose their place.
-    ///
-    /// # Errors
-    /// When it cannot be had.
-    pub(super) fn take(
-        runtime: &Handle,
-        address: SocketAddr,
-        gone_after: Duration,
-    ) -> io::Result<Self> {
-        let listener = listen(runtime, address, gone_after, KERNEL_BYTES)?;
-        let port = listener.local_addr()?.port();
-        Ok(Self { listener, port })
-    }
-
-    /// The port.
-    pub(super) const fn port(&self) -> u16 {
-        self.port
-    }
-
-    /// Lets in who `access` lets in, to the library's server at `server`. `page_port` is that of our
-    /// own page.
-    pub(super) fn open(
-        self,
-        runtime: &Handle,
-        server: SocketAddr,
-        access: Arc<Access>,
-        page_port: u16,
-    ) -> Front {
-        let context = Arc::new(ServerContext {
-            access,
-            page_port,
-            server,
-            seats: Arc::new(Semaphore::new(SEATS)),
-        });
-        let (close, closed) = oneshot::channel();
-        let task = runtime.spawn(attend(self.listener, context, closed));
-        Front { close, task }
-    }
+/// The port that viewers connect to; nobody is let in yet.
+///
+/// # Errors
+/// When it cannot be had.
+pub(super) fn viewer_listener(runtime: &Handle, address: SocketAddr) -> io::Result<TcpListener> {
+    listen(runtime, address, GONE_AFTER, KERNEL_BYTES)
 }
 
 /// The open door.
@@ -164,6 +122,26 @@ pub(super) struct Front {
 }
 
 impl Front {
+    /// Lets those who come to `listener` in to the library's server at `server`, if `access` does.
+    /// `page_port` is that of our own page.
+    pub(super) fn open(
+        runtime: &Handle,
+        listener: TcpListener,
+        server: SocketAddr,
+        access: Arc<Access>,
+        page_port: u16,
+    ) -> Self {
+        let context = Arc::new(ServerContext {
+            access,
+            page_port,
+            server,
+            seats: Arc::new(Semaphore::new(SEATS)),
+        });
+        let (close, closed) = oneshot::channel();
+        let task = runtime.spawn(attend(listener, context, closed));
+        Self { close, task }
+    }
+
     /// Lets nobody in any more, and closes all connections: those of polite viewers, who have heard
     /// the server's goodbye, are at their end already.
     pub(super) fn end(self, runtime: &Handle) {
@@ -345,7 +323,7 @@ async fn pass(from: ReadHalf<'_>, mut to: WriteHalf<'_>) -> io::Result<()> {
 
 #[cfg(test)]
 mod tests {
-    use std::io::Write as _;
+    use std::io::{Read as _, Write as _};
     use std::net::{TcpListener as StdListener, TcpStream as StdStream};
     use std::thread;
 
@@ -358,7 +336,7 @@ mod tests {
     const LIMIT: Duration = Duration::from_mins(1);
 
     /// A door before what listens at `server`: its address, and what keeps it open.
-    fn viewer_listener(server: SocketAddr) -> (SocketAddr, Front, Runtime) {
+    fn door(server: SocketAddr) -> (SocketAddr, Front, Runtime) {
         door_for(server, GONE_AFTER)
     }
 
@@ -366,10 +344,10 @@ mod tests {
         let mut builder = Builder::new_multi_thread();
         let runtime = builder.worker_threads(2).enable_all().build().unwrap();
         let loopback = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
-        let viewer_listener = ViewerListener::take(runtime.handle(), loopback, gone_after).unwrap();
-        let address = SocketAddr::new(loopback.ip(), viewer_listener.port());
+        let listener = listen(runtime.handle(), loopback, gone_after, KERNEL_BYTES).unwrap();
+        let address = listener.local_addr().unwrap();
         let access = Arc::new(Access::new(&[], &[], None));
-        let front = viewer_listener.open(runtime.handle(), server, access, 80);
+        let front = Front::open(runtime.handle(), listener, server, access, 80);
         (address, front, runtime)
     }
 
@@ -422,7 +400,7 @@ mod tests {
             // Only now, when the other way is closed already.
             stream.write_all(&bytes).unwrap();
         });
-        let (address, front, runtime) = viewer_listener(server);
+        let (address, front, runtime) = door(server);
         let mut stream = viewer(address);
         let body: Vec<u8> = (0..=250).cycle().take(BYTES).collect();
         stream.write_all(&body).unwrap();
@@ -444,7 +422,7 @@ mod tests {
     fn a_viewer_hears_that_there_is_nothing_to_see() {
         let (listener, server) = listener();
         drop(listener);
-        let (address, front, runtime) = viewer_listener(server);
+        let (address, front, runtime) = door(server);
         let mut stream = viewer(address);
         let mut answer = String::new();
         stream.read_to_string(&mut answer).unwrap();
@@ -460,7 +438,7 @@ mod tests {
     #[test]
     fn one_that_neither_reads_nor_goes_does_not_keep_the_door_open() {
         let (listener, server) = listener();
-        let (address, front, runtime) = viewer_listener(server);
+        let (address, front, runtime) = door(server);
         let mut stream = viewer(address);
         let writing = writing_on(&listener);
         let mut first = [0; 1];

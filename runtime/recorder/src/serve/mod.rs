@@ -34,8 +34,8 @@ use crate::split::prepare;
 use crate::view::state::RunState;
 use access::{Access, NO_ORIGIN, Refusal};
 use engine::{Engine, Showing, Shown};
-use front::{Front, GONE_AFTER, ViewerListener};
-use parameters::Links;
+use front::{Front, viewer_listener};
+use parameters::{Links, RunWithLinks};
 use source::{Playback, Running};
 use viewers::Viewers;
 
@@ -74,16 +74,10 @@ pub(crate) fn serve(
     let access = Arc::new(admitted(options));
     let (viewers, front) = open(options, &runtime, &links, &access, console)?;
     let target = options.record.clone().map(|output| RecordOptions {
-        run: None,
         output,
-        wait: false,
-        below: None,
-        from_now: false,
-        split_size: None,
         flush: FLUSH,
-        force: false,
         no_scene: options.no_scene,
-        folder: None,
+        ..RecordOptions::default()
     });
     let mut engine = Engine::new(viewers, links, target);
     match shown {
@@ -186,7 +180,10 @@ fn watch(run: LiveRun) -> Result<Shown, Failure> {
     let (running, facts) = Running::open(run).map_err(Failure::failed)?;
     Ok(Shown {
         state: RunState::new(facts),
-        links: Some((folder, running.topology().clone())),
+        links: Some(RunWithLinks {
+            folder,
+            topology: running.topology().clone(),
+        }),
         source: Box::new(running),
         playback_speed: None,
     })
@@ -252,25 +249,27 @@ fn open(
 ) -> Result<(Viewers, Front), Failure> {
     let runtime = runtime.handle();
     let address = SocketAddr::new(options.host, options.port);
-    let viewer_listener = ViewerListener::take(runtime, address, GONE_AFTER).map_err(|why| {
+    let listening = viewer_listener(runtime, address);
+    let listening = listening.and_then(|listener| Ok((listener.local_addr()?, listener)));
+    let (socket, listener) = listening.map_err(|why| {
         Failure::failed(format!(
             "cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free"
         ))
     })?;
-    let socket = SocketAddr::new(options.host, viewer_listener.port());
     let viewers = Viewers::begin(runtime, Arc::new(links.clone())).map_err(|error| {
         Failure::failed(format!(
             "cannot listen behind the socket on loopback: {error}"
         ))
     })?;
     let address = SocketAddr::new(options.host, options.http_port);
-    let page = page::serve(runtime, address, viewer_listener.port(), Arc::clone(access)).map_err(|why| {
+    let page = page::serve(runtime, address, socket.port(), Arc::clone(access)).map_err(|why| {
         Failure::failed(format!(
             "cannot serve the page at {address}: {why}; --http-port takes another, 0 any that is \
                  free"
         ))
     })?;
-    let front = viewer_listener.open(runtime, viewers.address, Arc::clone(access), page.port());
+    let access = Arc::clone(access);
+    let front = Front::open(runtime, listener, viewers.address, access, page.port());
     if !options.host.is_loopback() {
         console.warn(
             "anybody who can reach this address sees the run and may change its emulated links; \

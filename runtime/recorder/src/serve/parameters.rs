@@ -83,8 +83,17 @@ impl Wish {
     }
 }
 
-/// The run whose links are shown from now on: its folder and resolved topology, or none.
-struct Change(Option<(PathBuf, Value)>);
+/// A run that goes on, whose links can be changed.
+#[derive(Debug, Clone)]
+pub(crate) struct RunWithLinks {
+    /// Its folder.
+    pub(crate) folder: PathBuf,
+    /// Its resolved topology.
+    pub(crate) topology: Value,
+}
+
+/// The run that is shown from now on, if its links can be changed.
+struct Change(Option<RunWithLinks>);
 
 /// Something to do for a viewer, or for the run's sake.
 enum Request {
@@ -121,9 +130,8 @@ impl Links {
         links
     }
 
-    /// From now on, the links of the run in `folder` with this resolved topology; those of no run
-    /// with `None`.
-    pub(crate) fn show(&self, run: Option<(PathBuf, Value)>) {
+    /// From now on, the links of this run; those of no run with `None`.
+    pub(crate) fn show(&self, run: Option<RunWithLinks>) {
         *locked(&self.change) = Some(Change(run));
         // A full queue wakes the thread as well.
         let _is_heard = self.ask.try_send(Request::Wake).is_ok();
@@ -183,12 +191,11 @@ impl ParameterHandler for Links {
 /// The thread that gives orders.
 #[derive(Default)]
 struct Worker {
+    shown: Option<RunWithLinks>,
     run: Option<RunLinks>,
-    folder: Option<PathBuf>,
     /// The launch files when the links were opened.
     launches: BTreeMap<OsString, u64>,
     change: Arc<Mutex<Option<Change>>>,
-    topology: Value,
     wishes: Arc<Mutex<Wishes>>,
 }
 
@@ -197,11 +204,9 @@ impl Worker {
         loop {
             let request = asked.recv_timeout(LOOK_PERIOD);
             let change = locked(&self.change).take();
-            if let Some(Change(run)) = change {
-                let (folder, topology) = run.unzip();
+            if let Some(Change(shown)) = change {
                 self.run = None;
-                self.folder = folder;
-                self.topology = topology.unwrap_or_default();
+                self.shown = shown;
                 locked(&self.wishes).clear();
                 self.look();
             }
@@ -231,7 +236,7 @@ impl Worker {
 
     /// Takes over what the gateways have on record.
     fn look(&mut self) {
-        let Some(folder) = &self.folder else {
+        let Some(RunWithLinks { folder, topology }) = &self.shown else {
             return;
         };
         // Gateways begin after the run is announced, one after the other, and may begin again. The links
@@ -248,7 +253,7 @@ impl Worker {
         };
         for direction in run.directions() {
             if let Ok((condition, _)) = run.condition(direction) {
-                let spec = &self.topology["links"][&direction.link][direction.way.word()];
+                let spec = &topology["links"][&direction.link][direction.way.word()];
                 let mut wishes = locked(&self.wishes);
                 let name = direction.name();
                 let before = wishes.get(&name).copied();

@@ -1,20 +1,21 @@
 //! Where the records of a served run come from: a finished run's folder, each record when it happened, or a
 //! live run, as its feed tells of it.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use hil_core::record::UNAVAILABLE;
+use hil_core::record::stamp;
 use hil_core::time::duration_ns;
 use hil_platform::clock::MonotonicClock;
 use hil_report::assessment::Assessment;
 use hil_report::summary::RunSummary;
 use hil_rundir::live_run::{LiveRun, Stage};
-use hil_rundir::record::{RecordFile, RecordKind};
+use hil_rundir::record::RecordKind;
 use hil_rundir::status::{self, Overruns};
-use hil_watch::{Event, Feed, FeedError, Origin, Poll, Record, WatchedChannel};
+use hil_watch::{Event, Feed, FeedError, Origin, Poll, WatchedChannel};
 use serde::Serialize;
 
 use super::engine::REST;
@@ -23,6 +24,7 @@ use crate::failure::Failure;
 use crate::net::{self, Noted};
 use crate::pace::Pace;
 use crate::run::Run;
+use crate::timeline::{Step, What, noted_steps};
 use crate::view::facts::RunFacts;
 use crate::view::{Body, LiveRecord};
 
@@ -44,6 +46,14 @@ pub(crate) struct Warning {
     pub(crate) process: Option<String>,
     /// What.
     pub(crate) what: String,
+}
+
+impl Warning {
+    /// Of no single process.
+    pub(crate) const fn of_the_run(what: String) -> Self {
+        let process = None;
+        Self { process, what }
+    }
 }
 
 /// A run's records as they come.
@@ -100,21 +110,6 @@ pub(crate) struct Playback {
     has_one_clock: bool,
 }
 
-/// A record and its time on the recording's axis.
-#[derive(Debug)]
-struct Step {
-    at_ns: i64,
-    channel: usize,
-    what: What,
-}
-
-/// Messages stay in their file, they are the most of it.
-#[derive(Debug)]
-enum What {
-    Message { file: usize, index: usize },
-    Record(Record),
-}
-
 impl Playback {
     /// Reads the run at `path`; `goes_on` hears the share that is read and the name of each file, and
     /// ends it with false.
@@ -128,7 +123,7 @@ impl Playback {
         goes_on: &mut dyn FnMut(f64, &str) -> bool,
     ) -> Result<(Self, RunFacts), Failure> {
         let run = Run::read(path, goes_on)?;
-        let clocks = Clocks::of(&run);
+        let clocks = Clocks::of_run(&run);
         let (name, manifest) = (run.folder.name(), run.manifest.as_ref());
         let mut facts = RunFacts::new(&name, manifest, &run.channels(), &clocks);
         for channel in &mut facts.channels {
@@ -137,12 +132,17 @@ impl Playback {
                 file.header.kind == RecordKind::Published && file.header.channel == channel.name
             });
         }
-        let mut steps = Vec::new();
-        for (index, file) in run.files.iter().enumerate() {
-            if let Some((channel, described)) = facts.channel(&file.header.channel) {
-                plan(index, file, channel, described.offsets_ns, &mut steps);
-            }
-        }
+        let place = |name: &str| facts.channel(name).map(|(place, _)| place);
+        let mut steps = noted_steps(&run, place, &mut |channel, noted| {
+            let [sender, receiver] = facts.channels[channel].offsets_ns;
+            let offset_ns = match noted.stage {
+                Stage::Published | Stage::Sent => sender,
+                Stage::Received | Stage::Taken => receiver,
+            };
+            let at_ns = stamp(noted.at_ns)?.saturating_add(offset_ns);
+            u64::try_from(at_ns).ok()
+        });
+        steps.retain(|step| step.at_ns.is_some());
         steps.sort_by_key(|step| step.at_ns);
         let playback = Self {
             run,
@@ -162,17 +162,21 @@ impl Playback {
     }
 
     fn begin_ns(&self) -> i64 {
-        self.steps.first().map_or(0, |step| step.at_ns)
+        self.steps.first().map_or(0, at_ns)
     }
 
     fn end_ns(&self) -> i64 {
-        self.steps.last().map_or(0, |step| step.at_ns)
+        self.steps.last().map_or(0, at_ns)
     }
 
     fn how(&self) -> String {
         let unknown = || "no summary: it was killed, or goes on elsewhere".to_owned();
         self.run.summary.as_ref().map_or_else(unknown, how_ended)
     }
+}
+
+fn at_ns(step: &Step) -> i64 {
+    step.at_ns.map_or(0, u64::cast_signed)
 }
 
 /// How a run ended, in words.
@@ -194,20 +198,23 @@ impl Source for Playback {
             let Some(step) = self
                 .steps
                 .get(self.next)
-                .filter(|step| step.at_ns <= now_ns)
+                .filter(|step| at_ns(step) <= now_ns)
             else {
                 break;
             };
             self.next += 1;
-            let body = match &step.what {
-                What::Record(record) => Some(Body::Record(*record)),
-                What::Message { file, index } => self.run.files[*file]
-                    .message(*index)
+            let body = match step.what {
+                What::Record { file, index } => {
+                    net::record(&self.run.files[file], index).map(Body::Record)
+                }
+                What::Message { file, index } => self.run.files[file]
+                    .message(index)
                     .map(|(_, payload)| Body::Message(payload.to_vec())),
+                _ => None,
             };
             if let Some(body) = body {
                 take(&LiveRecord {
-                    at_ns: step.at_ns,
+                    at_ns: at_ns(step),
                     channel: step.channel,
                     body,
                 });
@@ -230,56 +237,9 @@ impl Source for Playback {
     }
 
     fn warnings(&self) -> Vec<Warning> {
-        let Some(summary) = &self.run.summary else {
-            return Vec::new();
-        };
-        let warnings = Assessment::of(summary).warnings.into_iter();
-        warnings
-            .map(|what| Warning {
-                process: None,
-                what,
-            })
-            .collect()
-    }
-}
-
-/// Adds what is in `file`, the `number`th, to the steps; what has no time is left out.
-fn plan(
-    number: usize,
-    file: &RecordFile,
-    channel: usize,
-    offsets_ns: [i64; 2],
-    steps: &mut Vec<Step>,
-) {
-    let [sender, receiver] = offsets_ns;
-    let mut add = |ns: i64, offset_ns: i64, what: What| {
-        if ns != UNAVAILABLE {
-            steps.push(Step {
-                at_ns: ns.saturating_add(offset_ns),
-                channel,
-                what,
-            });
-        }
-    };
-    if file.header.kind == RecordKind::Message {
-        for index in 0..file.record_count() {
-            if let Some((envelope, _)) = file.message(index) {
-                let what = What::Message {
-                    file: number,
-                    index,
-                };
-                add(envelope.published_ns, sender, what);
-            }
-        }
-    }
-    for record in net::records(file) {
-        if let Some(noted) = Noted::of(&record) {
-            let shift_ns = match noted.stage {
-                Stage::Published | Stage::Sent => sender,
-                Stage::Received | Stage::Taken => receiver,
-            };
-            add(noted.at_ns, shift_ns, What::Record(record));
-        }
+        let summary = self.run.summary.iter();
+        let warnings = summary.flat_map(|summary| Assessment::of(summary).warnings);
+        warnings.map(Warning::of_the_run).collect()
     }
 }
 
@@ -453,33 +413,24 @@ impl Source for Running {
         self.overruns.clone()
     }
 
-    /// What the processes said on their standard error so far.
+    /// What the processes said last on their standard error.
     fn warnings(&self) -> Vec<Warning> {
         let folder = self.feed.run().folder.join("logs");
-        let Ok(entries) = fs::read_dir(folder) else {
-            return Vec::new();
-        };
-        let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
-        paths.sort();
+        let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+        let paths: BTreeSet<_> = entries.map(|entry| entry.path()).collect();
         let mut warnings = Vec::new();
         for path in paths {
-            let Ok(text) = end_of(&path) else {
-                continue;
-            };
             let process = path
                 .file_stem()
                 .map(|name| name.to_string_lossy().into_owned());
-            let lines: Vec<&str> = text
-                .lines()
-                .filter(|line| !line.trim().is_empty())
-                .collect();
-            let last = lines.len().saturating_sub(LINES_MAX);
-            for line in &lines[last..] {
-                warnings.push(Warning {
-                    process: process.clone(),
-                    what: (*line).to_owned(),
-                });
-            }
+            let text = end_of(&path).unwrap_or_default();
+            let lines = text.lines().filter(|line| !line.trim().is_empty());
+            let lines: Vec<&str> = lines.collect();
+            let last = lines[lines.len().saturating_sub(LINES_MAX)..].iter();
+            warnings.extend(last.map(|line| Warning {
+                process: process.clone(),
+                what: (*line).to_owned(),
+            }));
         }
         warnings
     }

@@ -184,7 +184,7 @@ impl Viewers {
         let wanted = facts.channels.iter().map(|one| Wanted {
             name: &one.name,
             described: one.described.as_ref(),
-            recorded_bytes: Vec::new(),
+            ..Wanted::default()
         });
         let mut words = Vec::new();
         for mut channel in ChannelTopics::of_all(wanted.collect(), &mut names) {

@@ -45,8 +45,7 @@ pub(crate) struct Account {
     counts: Counts,
     rate: Recent,
     window_lost: Recent,
-    segments: Vec<Samples>,
-    whole: Samples,
+    lengths: [Samples; LENGTHS],
     left_ns: Option<i64>,
     arrived_ns: Option<i64>,
     period_ns: i64,
@@ -84,7 +83,6 @@ impl Account {
             has_one_clock,
         };
         Self {
-            segments: way.segments().iter().map(|_| Samples::default()).collect(),
             way,
             is_by_message: channel.is_by_message,
             ..Self::default()
@@ -157,12 +155,15 @@ impl Account {
     fn update(&mut self, message: MessageId, at_ns: i64, record: &Record) {
         let joined = self.under_way.entry(message);
         let joined = joined.or_insert_with(|| Joined::new(message, at_ns));
+        let before = joined.lengths_ns(self.way);
         joined.note(record);
-        let (segments, whole) = (&mut self.segments, &mut self.whole);
-        joined.news(self.way, &mut |segment, length_ns| {
-            let samples = segment.and_then(|index| segments.get_mut(index));
-            samples.unwrap_or(whole).add(at_ns, length_ns);
-        });
+        let now = joined.lengths_ns(self.way);
+        joined.stamps.delay_ns = now[WHOLE];
+        for (samples, (before, now)) in self.lengths.iter_mut().zip(before.iter().zip(now)) {
+            if let Some(length_ns) = now.filter(|_| before.is_none()) {
+                samples.add(at_ns, length_ns);
+            }
+        }
         if self.under_way.len() > UNDER_WAY_MAX {
             self.under_way.pop_first();
             self.counts.forgotten += 1;
@@ -230,12 +231,13 @@ impl Account {
 
     /// The channel's entry in `/live/channels`.
     pub(crate) fn metrics(&mut self, name: &str, now_ns: i64) -> Value {
-        let named = self.way.segments().iter().zip(&mut self.segments);
+        let named = self.way.segments().iter().zip(&mut self.lengths);
         let segments: Vec<Value> = named
             .map(|(name, samples)| samples.metrics(name, now_ns))
             .collect();
-        let one_way = self.whole.is_available;
-        let one_way = one_way.then(|| self.whole.metrics("published-taken", now_ns));
+        let whole = &mut self.lengths[WHOLE];
+        let one_way = whole.is_available;
+        let one_way = one_way.then(|| whole.metrics("published-taken", now_ns));
         let can_tell = self.way.has_link && self.counts.received.is_some();
         let window_lost = self.window_lost.count(now_ns);
         let arrived_ns = self.arrived_ns.filter(|_| self.way.has_link);
@@ -324,12 +326,12 @@ struct Joined {
     first_ns: i64,
     is_refused: bool,
     has_ingress: bool,
-    /// Segments already counted, by bit; the last bit is the whole way.
-    counted: u16,
 }
 
-/// The bit of the whole way, published to taken.
-const WHOLE: usize = 15;
+/// Lengths of a message's way: its segments, as many as there can be, and the whole.
+const LENGTHS: usize = LINK_SEGMENTS.len() + 1;
+/// Which of them is the whole way, published to taken.
+const WHOLE: usize = LINK_SEGMENTS.len();
 
 impl Joined {
     /// A message first heard of at `at_ns`.
@@ -363,42 +365,28 @@ impl Joined {
         self.is_refused || self.stamps.handed_ns.is_some()
     }
 
-    /// Hears of each segment whose two ends are known now and were not before: its place among
-    /// [`Way::segments`], `None` for the whole way, and its length.
-    fn news(&mut self, way: Way, hear: &mut dyn FnMut(Option<usize>, i64)) {
+    /// The lengths whose two ends are known: those of [`Way::segments`], then the whole way.
+    fn lengths_ns(&self, way: Way) -> [Option<i64>; LENGTHS] {
         let one = &self.stamps;
-        let mut counted = self.counted;
-        let mut offer = |bit: usize, length_ns: Option<i64>| {
-            let is_new = counted & (1 << bit) == 0;
-            if let Some(length_ns) = length_ns.filter(|_| is_new) {
-                counted |= 1 << bit;
-                hear((bit != WHOLE).then_some(bit), length_ns);
-            }
-        };
-        let whole =
-            span(one.published_ns, one.taken_ns).filter(|_| way.has_one_clock || !way.has_link);
-        if way.has_link {
-            let tx_ns = minus(one.tx_realtime_ns, one.sender_realtime_offset_ns);
-            let rx_ns = minus(one.rx_realtime_ns, one.receiver_realtime_offset_ns);
-            let wire = span(one.tx_realtime_ns, one.rx_realtime_ns).filter(|_| way.has_one_clock);
-            let segments = [
-                span(one.published_ns, one.gateway_taken_ns),
-                span(one.gateway_taken_ns, one.handed_ns),
-                span(one.handed_ns, tx_ns),
-                wire,
-                span(rx_ns, one.received_ns),
-                span(one.received_ns, one.forwarded_ns),
-                span(one.forwarded_ns, one.taken_ns),
-            ];
-            for (bit, length_ns) in segments.into_iter().enumerate() {
-                offer(bit, length_ns);
-            }
-        } else {
-            offer(0, whole);
+        let whole = span(one.published_ns, one.taken_ns);
+        if !way.has_link {
+            let mut lengths = [None; LENGTHS];
+            (lengths[0], lengths[WHOLE]) = (whole, whole);
+            return lengths;
         }
-        offer(WHOLE, whole);
-        self.counted = counted;
-        self.stamps.delay_ns = whole;
+        let tx_ns = minus(one.tx_realtime_ns, one.sender_realtime_offset_ns);
+        let rx_ns = minus(one.rx_realtime_ns, one.receiver_realtime_offset_ns);
+        let wire = span(one.tx_realtime_ns, one.rx_realtime_ns);
+        [
+            span(one.published_ns, one.gateway_taken_ns),
+            span(one.gateway_taken_ns, one.handed_ns),
+            span(one.handed_ns, tx_ns),
+            wire.filter(|_| way.has_one_clock),
+            span(rx_ns, one.received_ns),
+            span(one.received_ns, one.forwarded_ns),
+            span(one.forwarded_ns, one.taken_ns),
+            whole.filter(|_| way.has_one_clock),
+        ]
     }
 }
 

@@ -5,12 +5,9 @@ use hil_arm::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
 use hil_arm::yumi::arm::Arm;
 use hil_arm::yumi::description::{self, Rod};
 use hil_arm::yumi::{Joints, Pose};
-use hil_core::message::Message;
 use serde::Serialize;
-use serde_json::{Value, json};
 
-use super::{rounded, seconds};
-use crate::topics::{read, side_of};
+use super::{Told, rounded, seconds};
 
 /// Position, and the quaternion w, x, y, z.
 pub(crate) type Frame = [f64; 7];
@@ -19,10 +16,30 @@ pub(crate) type Frame = [f64; 7];
 #[derive(Debug, Serialize)]
 pub(crate) struct ArmsPicture {
     at_s: f64,
-    body: Value,
-    fingers: Value,
+    body: [RodPicture; 3],
+    fingers: [RodPicture; 2],
     pub(crate) shapes: Vec<Shape>,
     pub(crate) arms: Vec<ArmPicture>,
+}
+
+/// A rod in the frame of whoever has it.
+#[derive(Debug, Serialize)]
+#[expect(clippy::struct_field_names, reason = "each in its unit")]
+struct RodPicture {
+    from_m: [f64; 3],
+    to_m: [f64; 3],
+    radius_m: f64,
+}
+
+impl From<Rod> for RodPicture {
+    fn from(rod: Rod) -> Self {
+        let round = |place: [f64; 3]| place.map(|number| (number * 1e4).round() / 1e4);
+        Self {
+            from_m: round(rod.from_m),
+            to_m: round(rod.to_m),
+            radius_m: rod.radius_m,
+        }
+    }
 }
 
 /// A link of an arm, from one frame to another.
@@ -81,20 +98,16 @@ impl ArmsView {
         }
     }
 
-    /// Takes a message of `channel` at `at_ns`; which arm it is about, the channel's name tells.
-    pub(crate) fn take(&mut self, channel: &str, message: &str, payload: &[u8], at_ns: i64) {
-        let Some(side) = side_of(channel) else {
-            return;
-        };
-        let arm = &mut self.arms[side.index()];
-        match message {
-            EgmCommand::NAME => {
-                arm.command = read(payload).map(|one| (one, at_ns)).or(arm.command);
+    /// Takes what was told at `at_ns`.
+    pub(crate) fn take(&mut self, told: &Told, at_ns: i64) {
+        match *told {
+            Told::Command(side, command) => {
+                self.arms[side.index()].command = Some((command, at_ns));
             }
-            EgmFeedback::NAME => {
-                arm.feedback = read(payload).map(|one| (one, at_ns)).or(arm.feedback);
+            Told::Feedback(side, feedback) => {
+                self.arms[side.index()].feedback = Some((feedback, at_ns));
             }
-            _ => {}
+            Told::State(_) | Told::Mission(_) | Told::Truth(_) => {}
         }
     }
 
@@ -116,8 +129,8 @@ impl ArmsView {
         });
         ArmsPicture {
             at_s: seconds(now_ns - origin_ns),
-            body: json!(description::body().map(rod)),
-            fingers: json!(description::fingers().map(rod)),
+            body: description::body().map(RodPicture::from),
+            fingers: description::fingers().map(RodPicture::from),
             shapes: shapes.collect(),
             arms: self.arms.iter().map(|arm| arm.picture(now_ns)).collect(),
         }
@@ -191,12 +204,6 @@ impl OneArm {
     }
 }
 
-/// A rod in the frame of whoever has it.
-fn rod(rod: Rod) -> Value {
-    let round = |place: [f64; 3]| place.map(|number| (number * 1e4).round() / 1e4);
-    json!({ "from_m": round(rod.from_m), "to_m": round(rod.to_m), "radius_m": rod.radius_m })
-}
-
 fn is_finite(joints: &Joints) -> bool {
     joints.iter().all(|angle| angle.is_finite())
 }
@@ -206,6 +213,7 @@ mod tests {
     use super::*;
     use bytemuck::Zeroable;
     use hil_arm::yumi::arm::RIGHT_START_RAD;
+    use serde_json::{Value, json};
 
     #[test]
     fn an_arm_that_is_where_it_shall_be_has_no_error_and_its_tool_at_its_last_frame() {
@@ -215,10 +223,8 @@ mod tests {
         (feedback.measured_rad, feedback.state) = (RIGHT_START_RAD, 4);
         feedback.flags = EgmFeedback::HOLDING;
         assert!(!view.is_known());
-        let bytes = bytemuck::bytes_of(&command);
-        view.take("egm/right/command", EgmCommand::NAME, bytes, 0);
-        let bytes = bytemuck::bytes_of(&feedback);
-        view.take("egm/right/feedback", EgmFeedback::NAME, bytes, 500_000_000);
+        view.take(&Told::Command(Side::Right, command), 0);
+        view.take(&Told::Feedback(Side::Right, feedback), 500_000_000);
         let picture = json!(view.picture(1_000_000_000, 0));
         let [right, left] = [0, 1].map(|arm| &picture["arms"][arm]);
         assert_eq!(
@@ -246,18 +252,8 @@ mod tests {
         command.position_rad = RIGHT_START_RAD;
         feedback.measured_rad = RIGHT_START_RAD;
         feedback.measured_rad[0] += 0.01;
-        view.take(
-            "egm/right/command",
-            EgmCommand::NAME,
-            bytemuck::bytes_of(&command),
-            0,
-        );
-        view.take(
-            "egm/right/feedback",
-            EgmFeedback::NAME,
-            bytemuck::bytes_of(&feedback),
-            0,
-        );
+        view.take(&Told::Command(Side::Right, command), 0);
+        view.take(&Told::Feedback(Side::Right, feedback), 0);
         let error_mm = json!(view.picture(0, 0))["arms"][0]["tool_error_mm"]
             .as_f64()
             .unwrap();

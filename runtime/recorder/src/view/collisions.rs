@@ -6,9 +6,8 @@ use std::collections::{BTreeSet, VecDeque};
 use hil_core::time::Instant;
 use hil_fleet::geometry::{Footprint, Pose};
 use hil_fleet::messages::Truth;
-use hil_fleet::referee::{Referee, SCAN_PERIOD};
+use hil_fleet::referee::{IncidentKind, Referee, SCAN_PERIOD};
 use serde::Serialize;
-use serde_json::{Value, json};
 
 use super::ground::Ground;
 use super::{rounded, seconds};
@@ -30,7 +29,7 @@ pub(crate) struct Collision {
     pub(crate) y_m: f64,
     /// `truth` or `states`.
     pub(crate) basis: &'static str,
-    pub(crate) kind: Value,
+    pub(crate) kind: IncidentKind,
 }
 
 /// Finds collisions.
@@ -95,7 +94,7 @@ impl Collisions {
             x_m: rounded(one.position_m[0]),
             y_m: rounded(one.position_m[1]),
             basis: "truth",
-            kind: json!(one.kind),
+            kind: one.kind,
         });
         let news: Vec<Collision> = news.collect();
         self.known_count = incidents.len();
@@ -131,7 +130,7 @@ impl Collisions {
                         x_m: rounded(0.5 * (pose.x_m + there.x_m)),
                         y_m: rounded(0.5 * (pose.y_m + there.y_m)),
                         basis: "states",
-                        kind: json!("overlap"),
+                        kind: IncidentKind::Overlap,
                     });
                 }
             }

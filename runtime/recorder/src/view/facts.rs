@@ -27,8 +27,10 @@ pub(crate) struct RunFacts {
     pub(crate) hosts_here: Vec<String>,
     /// All of them.
     pub(crate) hosts: Vec<String>,
-    /// Hash of the topology, and the seed.
-    pub(crate) identity: Option<(String, u64)>,
+    /// Hash of the topology.
+    pub(crate) topology_hash: Option<String>,
+    /// The seed.
+    pub(crate) seed: Option<u64>,
     /// The channels.
     pub(crate) channels: Vec<ChannelFacts>,
     /// The links.
@@ -144,7 +146,8 @@ impl RunFacts {
             duration: duration.and_then(hil_topology::read_duration),
             hosts_here: manifest.hosts_here.clone(),
             hosts: names(&topology["hosts"]).collect(),
-            identity: Some((manifest.topology_hash.clone(), manifest.seed)),
+            topology_hash: Some(manifest.topology_hash.clone()),
+            seed: Some(manifest.seed),
             channels: channels.collect(),
             links: links.collect(),
             ..Self::default()

@@ -3,9 +3,8 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc::{Receiver, TryRecvError};
 
-use hil_core::message::Message;
 use hil_fleet::geometry::{Footprint, Pose};
-use hil_fleet::messages::{Mission, NO_AUTHORITY, Phase, State, TO_GOAL, Truth};
+use hil_fleet::messages::{NO_AUTHORITY, Phase, State, TO_GOAL};
 use hil_fleet::path::{Path, PathId};
 use hil_fleet::scenario::Scene;
 use hil_fleet::world::World;
@@ -15,11 +14,8 @@ use serde_json::Value;
 use super::collisions::{Collision, Collisions};
 use super::ground::{self, Ground, MapPicture, points};
 use super::sections::{Areas, OnPath, Point, SectionPicture, of_pair};
-use super::{rounded, seconds};
-use crate::topics::read;
+use super::{Told, rounded, seconds};
 
-/// Robots from which on a fleet's picture is drawn more seldom.
-pub(crate) const MANY_ROBOTS: usize = 64;
 /// A state older than this is shown as stale.
 const STALE_NS: i64 = 1_000_000_000;
 /// Points of a way ahead.
@@ -44,7 +40,7 @@ pub(crate) struct FleetPicture {
 }
 
 /// A robot of it.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Default, Serialize)]
 pub(crate) struct RobotPicture {
     pub(crate) fleet: u32,
     pub(crate) id: u32,
@@ -131,36 +127,30 @@ impl FleetView {
         }
     }
 
-    /// Takes a message; `offset_ns` leads from its producer's clock to the axis.
-    pub(crate) fn take(&mut self, message: &str, payload: &[u8], at_ns: i64, offset_ns: i64) {
-        match message {
-            State::NAME => {
-                if let Some(state) = read::<State>(payload).filter(State::is_sound) {
-                    self.offset_ns = offset_ns;
-                    let header = state.header;
-                    if let Some(robot) = self.robot(header.fleet_id, header.robot_id) {
-                        robot.state = Some((state, at_ns));
-                    }
+    /// Takes what was told at `at_ns`; `offset_ns` leads from its producer's clock to the axis.
+    pub(crate) fn take(&mut self, told: &Told, at_ns: i64, offset_ns: i64) {
+        match *told {
+            Told::State(state) => {
+                self.offset_ns = offset_ns;
+                let header = state.header;
+                if let Some(robot) = self.robot(header.fleet_id, header.robot_id) {
+                    robot.state = Some((state, at_ns));
                 }
             }
-            Mission::NAME => {
-                if let Some(mission) = read::<Mission>(payload) {
-                    let header = mission.header;
-                    if let Some(robot) = self.robot(header.fleet_id, header.robot_id) {
-                        robot.learn(header.mission_id, mission.path_id);
-                    }
+            Told::Mission(mission) => {
+                let header = mission.header;
+                if let Some(robot) = self.robot(header.fleet_id, header.robot_id) {
+                    robot.learn(header.mission_id, mission.path_id);
                 }
             }
-            Truth::NAME => {
-                if let Some(truth) = read::<Truth>(payload) {
-                    self.offset_ns = offset_ns;
-                    if let Some(robot) = self.robot(truth.fleet_id, truth.robot_id) {
-                        robot.learn(truth.mission_id, truth.path_id);
-                    }
-                    self.collisions.on_truth(truth);
+            Told::Truth(truth) => {
+                self.offset_ns = offset_ns;
+                if let Some(robot) = self.robot(truth.fleet_id, truth.robot_id) {
+                    robot.learn(truth.mission_id, truth.path_id);
                 }
+                self.collisions.on_truth(truth);
             }
-            _ => {}
+            Told::Command(..) | Told::Feedback(..) => {}
         }
     }
 
@@ -332,14 +322,7 @@ fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Opti
         phase: word,
         is_waiting: phase == Phase::AtPoint || (phase == Phase::Driving && is_standing),
         mission: (mission != 0).then_some(mission),
-        path: None,
-        goal: None,
-        path_index: None,
-        granted_index: None,
-        last_index: None,
-        granted_m: None,
-        ahead: Vec::new(),
-        granted: Vec::new(),
+        ..RobotPicture::default()
     };
     if let (Some(id), Some(scene)) = (robot.path_of(mission), scene)
         && let Some(path) = scene.world.paths.get(id)

@@ -2,7 +2,8 @@
 
 use super::*;
 use bytemuck::Zeroable;
-use hil_fleet::messages::{Header, TruthKind};
+use hil_core::message::Message;
+use hil_fleet::messages::{Header, Mission, Truth, TruthKind};
 use serde_json::json;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
@@ -30,6 +31,12 @@ fn header(robot_id: u32) -> Header {
     }
 }
 
+fn hear(view: &mut FleetView, message: &str, payload: &[u8], at_ns: i64) {
+    if let Some(told) = Told::of("fleet/any", message, payload) {
+        view.take(&told, at_ns, 0);
+    }
+}
+
 fn tell(view: &mut FleetView, robot: u32, [x_m, y_m]: [f64; 2], index: i32, at_ns: i64) {
     let mission = Mission {
         header: header(robot),
@@ -46,8 +53,8 @@ fn tell(view: &mut FleetView, robot: u32, [x_m, y_m]: [f64; 2], index: i32, at_n
         phase: Phase::Driving as u8,
         ..State::default()
     };
-    view.take(Mission::NAME, bytemuck::bytes_of(&mission), at_ns, 0);
-    view.take(State::NAME, bytemuck::bytes_of(&state), at_ns, 0);
+    hear(view, Mission::NAME, bytemuck::bytes_of(&mission), at_ns);
+    hear(view, State::NAME, bytemuck::bytes_of(&state), at_ns);
 }
 
 #[test]
@@ -118,7 +125,7 @@ fn the_referee_judges_where_the_truth_is_recorded() {
             kind: TruthKind::MissionStarted as u32,
             ..Truth::zeroed()
         };
-        view.take(Truth::NAME, bytemuck::bytes_of(&truth), 0, 0);
+        hear(&mut view, Truth::NAME, bytemuck::bytes_of(&truth), 0);
     }
     let early = json!(view.picture(S / 2, 0));
     assert_eq!(
@@ -136,7 +143,7 @@ fn the_referee_judges_where_the_truth_is_recorded() {
 fn nonsense_is_not_shown() {
     let (mut view, _) = view();
     tell(&mut view, 0, [f64::NAN, 0.0], 3, 0);
-    view.take(State::NAME, &[1, 2, 3], 0, 0);
+    hear(&mut view, State::NAME, &[1, 2, 3], 0);
     assert_eq!(json!(view.picture(0, 0))["robots"], json!([]));
     tell(&mut view, 0, [0.0, 0.0], i32::MAX, 0);
     assert_eq!(

@@ -11,7 +11,7 @@ use hil_fleet::geometry::{Bounds, Footprint};
 use hil_fleet::path::{Path, PathId};
 use hil_fleet::scenario::{Scenario, Scene};
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::Value;
 
 use super::rounded;
 use super::sections::{Areas, Point};
@@ -41,10 +41,19 @@ pub(crate) struct MapPicture {
     pub(crate) obstacles: Vec<Bounds>,
     pub(crate) bays: Vec<BayPicture>,
     pub(crate) footprint: Footprint,
-    paths: Vec<Value>,
+    paths: Vec<PathPicture>,
     pub(crate) conflict_areas: Vec<Vec<Point>>,
     pub(crate) fleet_count: u32,
     robot_count: usize,
+}
+
+/// A way from bay to bay.
+#[derive(Debug, Serialize)]
+struct PathPicture {
+    id: u32,
+    from: usize,
+    to: usize,
+    points: Vec<Point>,
 }
 
 /// Where a vehicle parks.
@@ -92,8 +101,12 @@ fn map(parameters: &FleetParameters, scene: &Scene) -> Result<MapPicture, Parame
     let paths: Vec<_> = forward
         .map(|route| {
             let path = world.path(route.path);
-            let points = points(path, 0, path.last_index(), each.clamp(2, 200));
-            json!({ "id": route.path.0, "from": route.from, "to": route.to, "points": points })
+            PathPicture {
+                id: route.path.0,
+                from: route.from,
+                to: route.to,
+                points: points(path, 0, path.last_index(), each.clamp(2, 200)),
+            }
         })
         .collect();
     Ok(MapPicture {

@@ -6,8 +6,7 @@ use serde_json::{Value, json};
 use super::account::Account;
 use super::arms::ArmsView;
 use super::facts::RunFacts;
-use super::fleet::FleetView;
-use super::{Body, LiveRecord, seconds};
+use super::{Body, LiveRecord, Pictures, Told, seconds};
 
 /// A run while it goes on.
 #[derive(Debug)]
@@ -18,10 +17,8 @@ pub(crate) struct RunState {
     pub(crate) how_ended: Option<String>,
     /// Of each channel.
     pub(crate) accounts: Vec<Account>,
-    /// Of a run whose case is a fleet.
-    pub(crate) fleet: Option<FleetView>,
-    /// Whatever the case is.
-    pub(crate) arms: ArmsView,
+    /// What it looks like.
+    pub(crate) pictures: Pictures,
     /// The first record's time.
     pub(crate) origin_ns: Option<i64>,
     /// When it ended.
@@ -32,18 +29,16 @@ pub(crate) struct RunState {
 impl RunState {
     /// A run without a record yet.
     pub(crate) fn new(facts: RunFacts) -> Self {
-        let is_fleet = facts.case.as_deref() == Some("fleet");
-        let fleet = is_fleet.then(|| FleetView::new(&facts.parameters));
-        Self::with(facts, fleet)
+        let pictures = Pictures::of(facts.case.as_deref(), &facts.parameters);
+        Self::with(facts, pictures)
     }
 
-    fn with(facts: RunFacts, fleet: Option<FleetView>) -> Self {
+    fn with(facts: RunFacts, pictures: Pictures) -> Self {
         let channels = facts.channels.iter();
         let accounts = channels.map(|channel| Account::new(channel, facts.has_one_clock));
         Self {
             accounts: accounts.collect(),
-            fleet,
-            arms: ArmsView::new(),
+            pictures,
             how_ended: None,
             origin_ns: None,
             ended_ns: None,
@@ -54,11 +49,13 @@ impl RunState {
 
     /// Begins again with the same run; what takes long to work out is kept.
     pub(crate) fn rewind(&mut self) {
-        let mut fleet = self.fleet.take();
+        let mut fleet = self.pictures.fleet.take();
         if let Some(fleet) = &mut fleet {
             fleet.rewind();
         }
-        *self = Self::with(core::mem::take(&mut self.facts), fleet);
+        let arms = ArmsView::new();
+        let facts = core::mem::take(&mut self.facts);
+        *self = Self::with(facts, Pictures { fleet, arms });
     }
 
     /// Stamps of all hosts compare from now on.
@@ -84,10 +81,9 @@ impl RunState {
         if let Body::Message(payload) = &record.body {
             self.read_count += 1;
             let message = channel.message().unwrap_or_default();
-            self.arms
-                .take(&channel.name, message, payload, record.at_ns);
-            if let Some(fleet) = &mut self.fleet {
-                fleet.take(message, payload, record.at_ns, channel.offsets_ns[0]);
+            if let Some(told) = Told::of(&channel.name, message, payload) {
+                let offset_ns = channel.offsets_ns[0];
+                self.pictures.take(&told, record.at_ns, offset_ns);
             }
         }
     }
@@ -113,8 +109,7 @@ impl RunState {
             "elapsed_s": self.elapsed_s(now_ns),
             "duration_s": facts.duration.map(|one| one.as_secs_f64()),
             "hosts_here": facts.hosts_here, "hosts": facts.hosts,
-            "topology_hash": facts.identity.as_ref().map(|(hash, _)| hash),
-            "seed": facts.identity.as_ref().map(|(_, seed)| seed),
+            "topology_hash": facts.topology_hash, "seed": facts.seed,
             "channels": facts.channels_json(),
             "recorder": { "read_count": self.read_count },
         })
