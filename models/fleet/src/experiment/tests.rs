@@ -12,7 +12,7 @@ use crate::scenario::{Scenario, Scene, WorldParameters};
 use crate::section::Side;
 use crate::{FLEET_TRUTH, Fleet, FleetParameters};
 use hil_core::case_study::CaseStudy;
-use hil_core::simulation::{Carrier, Simulation};
+use hil_core::simulation::{Carrier, Observe, Simulation};
 use hil_core::study::Study;
 use hil_core::time::Instant;
 
@@ -57,11 +57,20 @@ fn fast(
 ) -> (Vec<Truth>, FleetTally) {
     let setup = setup_of(parameters, links);
     let mut experiment = Experiment::new(&scene_of(parameters), &setup, seed).unwrap();
-    let mut truth = Vec::new();
-    experiment.start(&mut |record| truth.push(*record));
+    let mut truths = Truths::default();
     let end = Instant::from_ns(run_s * 1_000_000_000);
-    experiment.run_until(end, &mut |record| truth.push(*record));
-    (truth, experiment.tally())
+    experiment.run_until(end, &mut truths);
+    (truths.0, experiment.tally())
+}
+
+/// Keeps all records.
+#[derive(Default)]
+struct Truths(Vec<Truth>);
+
+impl Observe<FleetModel> for Truths {
+    fn recorded(&mut self, _now: Instant, truth: &Truth) {
+        self.0.push(*truth);
+    }
 }
 
 /// Truth of the same components joined by the generic driver, by robot.
