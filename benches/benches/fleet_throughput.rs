@@ -96,8 +96,7 @@ impl Case {
         let mut experiment = Experiment::new(&self.scene, &setup, seed).unwrap();
         let end_ns = robot_seconds * 1_000_000_000 / i64::from(self.robots);
         let before_s = processor_s();
-        experiment.start(&mut |_| {});
-        experiment.run_until(Instant::from_ns(end_ns), &mut |_| {});
+        experiment.run_until(Instant::from_ns(end_ns), &mut ());
         let after_s = processor_s();
         let tally = experiment.tally();
         Round {

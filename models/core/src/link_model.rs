@@ -42,6 +42,11 @@ impl Fate {
             Self::Delivered(_) | Self::Lost => None,
         }
     }
+
+    /// Its arrivals, in order of time.
+    pub fn arrivals(self) -> impl Iterator<Item = Instant> {
+        self.arrival().into_iter().chain(self.second_arrival())
+    }
 }
 
 /// Which message of its channel is offered. All pieces of a message have its number, and so has what a

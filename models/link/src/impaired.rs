@@ -8,6 +8,7 @@ use core::time::Duration;
 use crate::options::{options, words};
 use crate::outages::OutageLink;
 use hil_core::case_study::ParameterError;
+use hil_core::link_model::{Fate, LinkModel};
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
@@ -103,9 +104,22 @@ impl ImpairedLink {
         })
     }
 
-    /// Offers a message; hands each of its arrivals, at most two, to `deliver`. Calls come in
-    /// non-decreasing `now`.
-    pub fn offer(&mut self, now: Instant, deliver: &mut dyn FnMut(Instant)) {
+    /// What became of the messages so far.
+    pub fn counts(&self) -> LinkCounts {
+        self.counts
+    }
+
+    fn extra_ms(&mut self, ratio: f64, up_to_ms: f64) -> Option<f64> {
+        if ratio <= 0.0 {
+            return None;
+        }
+        let (is_met, share) = (self.random.chance(ratio), self.random.uniform());
+        is_met.then_some(share * up_to_ms)
+    }
+}
+
+impl LinkModel for ImpairedLink {
+    fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
         self.counts.offered_count += 1;
         let stall = self.stalls.as_mut().and_then(|link| link.outage_at(now));
         let sets_out = stall.map_or(now, |stall| stall.end);
@@ -125,28 +139,16 @@ impl ImpairedLink {
         let second_ms = self.extra_ms(told.duplicate_ratio, told.duplicate_lag_ms);
         if is_lost {
             self.counts.lost_count += 1;
-            return;
+            return Fate::Lost;
         }
         self.counts.held_count += u64::from(held_ms.is_some());
-        let at = sets_out + milliseconds(delay_ms + held_ms.unwrap_or(0.0));
-        deliver(at);
-        if let Some(lag_ms) = second_ms {
-            self.counts.duplicated_count += 1;
-            deliver(at + milliseconds(lag_ms));
-        }
-    }
-
-    /// What became of the messages so far.
-    pub fn counts(&self) -> LinkCounts {
-        self.counts
-    }
-
-    fn extra_ms(&mut self, ratio: f64, up_to_ms: f64) -> Option<f64> {
-        if ratio <= 0.0 {
-            return None;
-        }
-        let (is_met, share) = (self.random.chance(ratio), self.random.uniform());
-        is_met.then_some(share * up_to_ms)
+        let first = sets_out + milliseconds(delay_ms + held_ms.unwrap_or(0.0));
+        let Some(lag_ms) = second_ms else {
+            return Fate::Delivered(first);
+        };
+        self.counts.duplicated_count += 1;
+        let second = first + milliseconds(lag_ms);
+        Fate::Duplicated { first, second }
     }
 }
 
@@ -170,11 +172,9 @@ mod tests {
     /// Offers a message every 10 ms; gives the arrivals of each.
     fn arrivals(link: &mut ImpairedLink, count: i64) -> Vec<Vec<i64>> {
         let offer = |index| {
-            let mut times = Vec::new();
-            link.offer(Instant::from_ns(index * 10_000_000), &mut |at| {
-                times.push(at.as_ns() - index * 10_000_000);
-            });
-            times
+            let now = Instant::from_ns(index * 10_000_000);
+            let arrivals = link.offer(now, 0).arrivals();
+            arrivals.map(|at| at.ns_since(now)).collect()
         };
         (0..count).map(offer).collect()
     }

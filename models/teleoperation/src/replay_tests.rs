@@ -34,21 +34,6 @@ fn case() -> Teleoperation {
     Teleoperation::new(parameters, 4).unwrap()
 }
 
-#[derive(Debug)]
-struct Stalling(ImpairedLink);
-
-impl Carrier for Stalling {
-    fn offer(
-        &mut self,
-        now: Instant,
-        envelope: &Envelope,
-        payload: &[u8],
-        deliver: &mut dyn FnMut(Instant, Envelope, &[u8]),
-    ) {
-        self.0.offer(now, &mut |at| deliver(at, *envelope, payload));
-    }
-}
-
 /// Commands come late, twice, in bursts and out of order.
 fn simulated(case: &Teleoperation, duration_s: f64) -> RunLog {
     let bad = |name: &str| {
@@ -64,7 +49,7 @@ fn simulated(case: &Teleoperation, duration_s: f64) -> RunLog {
         };
         let stream = |what| RandomStream::new(9, &format!("{name} {what}"));
         let link = ImpairedLink::new(impairments, stream("fate"), stream("stall")).unwrap();
-        let link: Box<dyn Carrier> = Box::new(Stalling(link));
+        let link: Box<dyn Carrier> = Box::new(link);
         (name.to_owned(), link)
     };
     let carriers: BTreeMap<_, _> = [EGM_RIGHT_COMMAND, EGM_LEFT_COMMAND].map(bad).into();

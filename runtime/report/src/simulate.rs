@@ -2,11 +2,10 @@
 //! links. It starts no process and opens no socket.
 
 mod events;
-mod watched;
+mod links;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 use std::{fs, io};
 
 use hil_account::network::{Moment, NetworkContext};
@@ -17,7 +16,7 @@ use hil_core::case_study::ErrorSeries;
 use hil_core::link_model::{LinkModel, ReplayTally};
 use hil_core::plot::PlotSeries;
 use hil_core::run_log::RunLog;
-use hil_core::simulation::{Carrier, ChannelCounts, Simulation, SimulationError, SimulationResult};
+use hil_core::simulation::{Carrier, ChannelCounts, Simulation, SimulationResult};
 use hil_core::time::{Instant, duration_ns};
 use hil_stats::histogram::Distribution;
 
@@ -42,7 +41,7 @@ use hil_topology::emulation::EmulationLaunch;
 use hil_topology::registry::{Case, Registry};
 use hil_topology::{Channel, Crossing, Program, Topology};
 
-use self::watched::Watch;
+use self::links::{DatagramLink, LinkAccount, LinkAccounts, Progress};
 
 /// Why there is no outcome, or not all of its files.
 #[derive(Debug, thiserror::Error)]
@@ -97,14 +96,8 @@ pub fn simulate(
             .model(&name)
             .map_err(|error| refused(error.to_string()))?;
         let replay = link.replay_tally();
-        let (carrier, watch) = Watch::over(link);
-        carriers.insert(name.clone(), carrier);
-        let link = WatchedLink {
-            emulation,
-            replay,
-            watch,
-        };
-        links.insert(name, link);
+        carriers.insert(name.clone(), Box::new(DatagramLink(link)));
+        links.insert(name, EmulatedLink { emulation, replay });
     }
     let roles = entry
         .roles
@@ -112,15 +105,26 @@ pub fn simulate(
         .map(|role| case.role(role).map(|made| (*role, made)))
         .collect::<Option<Vec<_>>>()
         .ok_or_else(|| refused("the case lists a role it cannot make".to_owned()))?;
+    let duration = topology.run().duration;
+    let names = links.keys().cloned();
+    let mut accounts = LinkAccounts(names.map(|name| (name, LinkAccount::default())).collect());
+    let progress = Progress {
+        duration,
+        next: Instant::ZERO,
+        watch,
+    };
     let result = Simulation::of_roles(entry.name, entry.channels, roles, carriers)
-        .and_then(|simulation| run_watched(simulation, topology.run().duration, watch))
+        .and_then(|simulation| simulation.run_observed(duration, &mut (&mut accounts, progress)))
         .map_err(|error| refused(error.to_string()))?;
     let score = case.score(&result.log);
-    let duration = topology.run().duration;
     let mut summary = RunSummary::new(run_facts(topology, file));
-    let outages: Vec<_> = links
-        .iter()
-        .map(|(name, link)| events::history(name.clone(), link.watch.outages(), duration))
+    let mut accounts = accounts.0;
+    let outages: Vec<_> = accounts
+        .iter_mut()
+        .map(|(name, account)| {
+            let outages = core::mem::take(&mut account.outages).finish();
+            events::history(name.clone(), outages, duration)
+        })
         .collect();
     let channels = topology.channels().iter();
     summary.channels = channels
@@ -136,10 +140,9 @@ pub fn simulate(
     summary.directions = directions.collect();
     summary.put_score(&score);
     summary.score_events = events::explained(&score, entry.channels, &outages, &result.log);
-    let watches = links.into_iter().map(|(name, link)| (name, link.watch));
     let (network, network_series) = network(
         topology,
-        watches.collect(),
+        accounts,
         &result.log,
         case.errors(&result.log),
         &mut summary.score_events,
@@ -157,7 +160,7 @@ pub fn simulate(
 /// The report and the series of every channel that a link model carried; `None` when none did.
 fn network(
     topology: &Topology,
-    watches: Vec<(String, Watch)>,
+    accounts: BTreeMap<String, LinkAccount>,
     log: &RunLog,
     errors: Vec<ErrorSeries>,
     events: &mut ScoreEvents,
@@ -165,10 +168,9 @@ fn network(
     let seed = topology.run().seed;
     let length_ns = duration_ns(topology.run().duration);
     let mut builder = NetworkBuilder::default();
-    for (name, watch) in watches {
+    for (name, account) in accounts {
         let crossing = topology.crossings().find(|one| one.channel.name == name)?;
-        let (passages, duplicated_count) = watch.passages();
-        let passages = passages.into_iter().collect();
+        let passages = account.passages.into_iter().collect();
         let payload = log.raw(&name).first();
         builder.add(ChannelPassages {
             channel: &name,
@@ -182,7 +184,7 @@ fn network(
                 path: ChannelPath::SharedMemory,
                 run_ns: Some((0, length_ns)),
                 payload_bytes: payload.map(|message| message.payload.len() as u64),
-                duplicated_count: Some(duplicated_count),
+                duplicated_count: Some(account.duplicated_count),
                 round_trips_ns: &[],
                 seed,
             },
@@ -214,18 +216,6 @@ fn run_facts(topology: &Topology, file: &Path) -> RunFacts {
         files: Vec::new(),
         repeat_command: shell_words(&command_line),
     }
-}
-
-/// Runs for `duration`; tells `watch` which share of it is over.
-fn run_watched(
-    simulation: Simulation,
-    duration: Duration,
-    watch: &mut dyn FnMut(f64),
-) -> Result<SimulationResult, SimulationError> {
-    simulation.run_watched(duration, &mut |now| {
-        let passed = now.saturating_duration_since(Instant::ZERO);
-        watch(passed.as_secs_f64() / duration.as_secs_f64());
-    })
 }
 
 fn refuse_faces(topology: &Topology) -> Result<(), String> {
@@ -321,17 +311,16 @@ fn channel_summary(
     topology: &Topology,
     channel: &Channel,
     result: &SimulationResult,
-    link: Option<&WatchedLink>,
+    link: Option<&EmulatedLink>,
 ) -> ChannelSummary {
     let recorded = result.recorded_counts.get(channel.name.as_str());
     let counts = result.channels.get(channel.name.as_str());
-    let lost_count = link.map_or(0, |link| link.watch.lost_count());
     ChannelSummary {
         name: channel.name.clone(),
         from: channel.from.clone(),
         to: channel.to.clone(),
         link: LinkKind::of(topology, channel),
-        account: counts.map(|counts| account(counts, lost_count)),
+        account: counts.map(account),
         outages: None,
         emulation: None,
         trace_replay: link.and_then(|link| Some(link.replay.as_ref()?.counts())),
@@ -339,14 +328,18 @@ fn channel_summary(
             message_count: *count,
             missing_count: 0,
         }),
-        ends: link.map(WatchedLink::end).into_iter().collect(),
+        ends: link.and(counts).map(link_end).into_iter().collect(),
     }
 }
 
-fn account(counts: &ChannelCounts, lost_count: u64) -> ChannelAccount {
+fn account(counts: &ChannelCounts) -> ChannelAccount {
     const REASON: &str = "virtual time notes what a link did, and no stage of a message";
     let unavailable = || Distribution::unavailable(REASON);
-    let published_count = counts.published_count;
+    let ChannelCounts {
+        published_count,
+        lost_count,
+        ..
+    } = *counts;
     let in_flight_count = counts.in_flight_count.min(published_count - lost_count);
     let mut fates = FateCounts::default();
     for (fate, count) in [
@@ -395,33 +388,31 @@ fn account(counts: &ChannelCounts, lost_count: u64) -> ChannelAccount {
     }
 }
 
-/// A link model under watch.
-struct WatchedLink {
-    emulation: EmulationLaunch,
-    replay: Option<ReplayTally>,
-    watch: Watch,
+/// The counts of a link model, where a real run has those of its gateways.
+fn link_end(counts: &ChannelCounts) -> ChannelEnd {
+    let causes = counts.losses.into_iter().flat_map(|causes| {
+        [
+            ("link_outage_lost_count", causes.outage_count),
+            ("link_chance_lost_count", causes.chance_count),
+            ("link_queue_lost_count", causes.queue_count),
+        ]
+    });
+    let all = [("link_lost_count", counts.lost_count)];
+    let counters = all.into_iter().chain(causes);
+    ChannelEnd {
+        process: VIRTUAL_GATEWAY.to_owned(),
+        direction: VIRTUAL_SIDE,
+        counters: CountByName::all(CounterGroup::Own, counters).collect(),
+    }
 }
 
-impl WatchedLink {
-    /// Its own counts, where a real run has its gateways.
-    fn end(&self) -> ChannelEnd {
-        let causes = self.watch.loss_causes();
-        let causes = causes.into_iter().flat_map(|causes| {
-            [
-                ("link_outage_lost_count", causes.outage_count),
-                ("link_chance_lost_count", causes.chance_count),
-                ("link_queue_lost_count", causes.queue_count),
-            ]
-        });
-        let all = [("link_lost_count", self.watch.lost_count())];
-        let counters = all.into_iter().chain(causes);
-        ChannelEnd {
-            process: VIRTUAL_GATEWAY.to_owned(),
-            direction: VIRTUAL_SIDE,
-            counters: CountByName::all(CounterGroup::Own, counters).collect(),
-        }
-    }
+/// A link model of the topology.
+struct EmulatedLink {
+    emulation: EmulationLaunch,
+    replay: Option<ReplayTally>,
+}
 
+impl EmulatedLink {
     /// The model of `channel`.
     fn direction(&self, channel: &str) -> DirectionSummary {
         let mut facts = vec![Fact::new("model", self.emulation.describe())];

@@ -3,11 +3,11 @@
 
 use crate::coordinator::counters::{CoordinatorCounts, SafeCounts};
 use crate::coordinator::parameters::CoordinatorMode;
-use crate::experiment::driver::{Experiment, Links, Setup, StatusPath};
+use crate::experiment::driver::{Links, Setup, StatusPath};
 use crate::messages::MessageOrder;
 use crate::referee::Tally;
 use crate::robot::TrackerKind;
-use crate::scenario::{Scenario, Scene};
+use crate::scenario::Scenario;
 use hil_core::time::Instant;
 use hil_link::impaired::{DelayLaw, Impairments, LinkCounts};
 use hil_link::wifi::WifiPreset;
@@ -435,40 +435,6 @@ pub struct CollidedRun {
 const COLLIDED_MAX: usize = 8;
 
 impl FleetTally {
-    pub(crate) fn of(experiment: &Experiment) -> Self {
-        let [commands, status] = experiment.link_counts();
-        let run_s = experiment.now().seconds_since(Instant::ZERO);
-        let first_at = experiment.incidents().first();
-        Self {
-            referee: *experiment.referee.tally(),
-            coordinator: experiment.coordinator.counters().counts,
-            safe: experiment.coordinator.counters().safe,
-            commands,
-            status,
-            superseded_count: experiment.superseded_count(),
-            run_s,
-            robot_s: run_s * experiment.robots().len() as f64,
-            collided: first_at
-                .map(|incident| CollidedRun {
-                    replica: 0,
-                    seed: 0,
-                    first_at: incident.at,
-                })
-                .into_iter()
-                .collect(),
-            ..Self::default()
-        }
-    }
-
-    /// Adds what only the study knows of a run.
-    pub(crate) fn conclude(&mut self, seed: u64, replica: u64, cell: &Cell, scene: &Scene) {
-        let robot = &cell.setup.robot;
-        self.stop_error_bound_m = robot.stop_error_bound_m(&scene.world.vehicle);
-        for run in &mut self.collided {
-            (run.seed, run.replica) = (seed, replica);
-        }
-    }
-
     /// Adds another run.
     pub fn merge(&mut self, other: &Self) {
         merge_referee(&mut self.referee, &other.referee);

@@ -10,7 +10,9 @@ mod study;
 mod tests;
 
 pub use cells::FleetTally;
-pub use driver::{Experiment, Links, Observer, Setup, StatusPath};
+pub use driver::{
+    Experiment, FleetLinks, FleetMessage, FleetModel, FleetRank, Links, Setup, StatusPath,
+};
 pub use study::{TableParameters, TablePart};
 
 pub(crate) use cells::collision_interval;

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::case::FleetParameters;
 use crate::experiment::cells::{
-    Cell, FleetTally, SCENARIOS, mechanism_cells, published_cells, scenario_name,
+    Cell, CollidedRun, FleetTally, SCENARIOS, mechanism_cells, published_cells, scenario_name,
 };
 use crate::experiment::driver::{Experiment, Setup};
 use crate::experiment::report::{self, Results};
@@ -210,21 +210,28 @@ impl Study for FleetStudy {
         let seed = self.seed_of(task);
         let mut experiment = Experiment::new(scene, &cell.setup, seed)
             .expect("the setup was checked when the study was made");
-        experiment.start(&mut |_| {});
         let (mut newest_count, mut newest_at) = (0, Instant::ZERO);
         loop {
             let until = Instant::from_ns(experiment.now().as_ns() + LOOK_NS);
-            experiment.run_until(until, &mut |_| {});
+            experiment.run_until(until, &mut ());
             let count = experiment.section_count();
             if count > newest_count {
                 (newest_count, newest_at) = (count, until);
             }
             let is_standing = until.ns_since(newest_at) > STAND_NS;
             if count >= task.sections || is_standing {
-                let mut tally = experiment.tally();
-                tally.conclude(seed, task.replica, cell, scene);
-                tally.stand_count = u64::from(is_standing);
-                return Some(tally);
+                let robot = &cell.setup.robot;
+                let first = experiment.incidents().first();
+                return Some(FleetTally {
+                    stop_error_bound_m: robot.stop_error_bound_m(&scene.world.vehicle),
+                    stand_count: u64::from(is_standing),
+                    collided: Vec::from_iter(first.map(|incident| CollidedRun {
+                        replica: task.replica,
+                        seed,
+                        first_at: incident.at,
+                    })),
+                    ..experiment.tally()
+                });
             }
             if !watch(count as f64 / task.sections as f64) {
                 return None;

@@ -12,7 +12,8 @@ use crate::scenario::{Scenario, Scene, WorldParameters};
 use crate::section::Side;
 use crate::{FLEET_TRUTH, Fleet, FleetParameters};
 use hil_core::case_study::CaseStudy;
-use hil_core::simulation::{Carrier, Simulation};
+use hil_core::simulation::{Carrier, Observe, Simulation};
+use hil_core::study::Study;
 use hil_core::time::Instant;
 
 fn parameters(scenario: Scenario, tracker: TrackerKind) -> FleetParameters {
@@ -56,11 +57,20 @@ fn fast(
 ) -> (Vec<Truth>, FleetTally) {
     let setup = setup_of(parameters, links);
     let mut experiment = Experiment::new(&scene_of(parameters), &setup, seed).unwrap();
-    let mut truth = Vec::new();
-    experiment.start(&mut |record| truth.push(*record));
+    let mut truths = Truths::default();
     let end = Instant::from_ns(run_s * 1_000_000_000);
-    experiment.run_until(end, &mut |record| truth.push(*record));
-    (truth, experiment.tally())
+    experiment.run_until(end, &mut truths);
+    (truths.0, experiment.tally())
+}
+
+/// Keeps all records.
+#[derive(Default)]
+struct Truths(Vec<Truth>);
+
+impl Observe<FleetModel> for Truths {
+    fn recorded(&mut self, _now: Instant, truth: &Truth) {
+        self.0.push(*truth);
+    }
 }
 
 /// Truth of the same components joined by the generic driver, by robot.
@@ -215,4 +225,135 @@ fn the_robot_that_yields_stops_waits_and_enters_when_the_closed_form_says() {
     );
     assert_eq!(tally.referee.sections_passed_count, 1);
     assert_eq!(tally.any_collision_count(), 0);
+}
+
+/// Figures of one run of a cell, to the bit.
+#[derive(Debug, PartialEq, Eq)]
+struct Pinned {
+    cell: &'static str,
+    sections: u64,
+    collisions: u64,
+    missions: u64,
+    applied: u64,
+    commands: [u64; 2],
+    states: [u64; 2],
+    superseded: u64,
+    travelled_m_bits: u64,
+    stop_error_m_bits: u64,
+}
+
+/// Recorded before the drivers of fleet, teleoperation and the generic one became one.
+const PINNED: [Pinned; 7] = [
+    Pinned {
+        cell: "harbor, loss 0.1, 100 ms, 3 copies",
+        sections: 105,
+        collisions: 0,
+        missions: 21,
+        applied: 286,
+        commands: [288, 1],
+        states: [0, 0],
+        superseded: 0,
+        travelled_m_bits: 4_667_313_523_248_899_002,
+        stop_error_m_bits: 4_605_202_897_834_773_312,
+    },
+    Pinned {
+        cell: "harbor, 100 ms, nominal steps, delayed status, delay unknown",
+        sections: 102,
+        collisions: 0,
+        missions: 28,
+        applied: 342,
+        commands: [377, 0],
+        states: [80_243, 0],
+        superseded: 0,
+        travelled_m_bits: 4_668_440_237_050_994_231,
+        stop_error_m_bits: 4_597_563_206_887_644_416,
+    },
+    Pinned {
+        cell: "harbor, long-range Wi-Fi 6",
+        sections: 100,
+        collisions: 0,
+        missions: 28,
+        applied: 336,
+        commands: [377, 6],
+        states: [80_166, 2668],
+        superseded: 0,
+        travelled_m_bits: 4_668_429_853_508_544_314,
+        stop_error_m_bits: 4_597_294_244_010_337_280,
+    },
+    Pinned {
+        cell: "harbor, 10 % repeated to 3 s late, safe",
+        sections: 117,
+        collisions: 0,
+        missions: 28,
+        applied: 2255,
+        commands: [2290, 0],
+        states: [80_370, 0],
+        superseded: 0,
+        travelled_m_bits: 4_668_562_792_122_302_471,
+        stop_error_m_bits: 0,
+    },
+    Pinned {
+        cell: "warehouse, stalls, mean 3 s in 30 s, legacy",
+        sections: 115,
+        collisions: 0,
+        missions: 28,
+        applied: 178,
+        commands: [250, 0],
+        states: [50_948, 0],
+        superseded: 0,
+        travelled_m_bits: 4_657_688_720_174_610_774,
+        stop_error_m_bits: 0,
+    },
+    Pinned {
+        cell: "warehouse, overrun to 4 s, legacy",
+        sections: 120,
+        collisions: 0,
+        missions: 36,
+        applied: 173,
+        commands: [215, 0],
+        states: [63_036, 0],
+        superseded: 0,
+        travelled_m_bits: 4_659_107_493_767_640_605,
+        stop_error_m_bits: 0,
+    },
+    Pinned {
+        cell: "warehouse, loss 30 %, both, safe",
+        sections: 106,
+        collisions: 0,
+        missions: 36,
+        applied: 1213,
+        commands: [1806, 543],
+        states: [65_101, 19_476],
+        superseded: 0,
+        travelled_m_bits: 4_659_555_519_458_713_483,
+        stop_error_m_bits: 0,
+    },
+];
+
+#[test]
+fn cells_of_the_tables_keep_their_figures_to_the_bit() {
+    for expected in &PINNED {
+        let mut parameters = FleetParameters::default();
+        parameters.tables.sections = 100;
+        parameters.tables.sections_per_task = 100;
+        parameters.tables.cells = vec![expected.cell.to_owned()];
+        let study = FleetStudy::new(&parameters, 7).unwrap();
+        assert_eq!(study.task_count(), 1, "{}", expected.cell);
+        let tally = study.run(0, &mut |_| true).unwrap();
+        let link =
+            |counts: &hil_link::impaired::LinkCounts| [counts.offered_count, counts.lost_count];
+        let found = Pinned {
+            cell: expected.cell,
+            sections: tally.section_count(),
+            collisions: tally.any_collision_count(),
+            missions: tally.referee.missions_done_count,
+            applied: tally.referee.authorities_applied_count,
+            commands: link(&tally.commands),
+            states: link(&tally.status),
+            superseded: tally.superseded_count,
+            travelled_m_bits: tally.referee.travelled_m.to_bits(),
+            stop_error_m_bits: tally.referee.stop_error_max_m.to_bits(),
+        };
+        assert_eq!(&found, expected);
+    }
 }

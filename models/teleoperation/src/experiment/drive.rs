@@ -1,8 +1,8 @@
 //! One run in virtual time, bare: the real controller of the right arm, the commands of a whole run
-//! and a channel between them, cycle by cycle. It records nothing but what the tables need; a
-//! test holds it against the simulation of the whole case.
+//! and a channel between them. It records nothing but what the tables need; a test holds it
+//! against the simulation of the whole case.
 
-use std::collections::VecDeque;
+use core::time::Duration;
 
 use crate::experiment::trajectory::{Trajectory, requested};
 use crate::score::loops::{Evidence, Loops, LossCause, Pause, PauseAfter, Span};
@@ -10,8 +10,9 @@ use hil_arm::egm::controller::Controller;
 use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EgmStartParameters, EndCause, SessionState};
 use hil_arm::egm::parameters::ControllerSettings;
 use hil_arm::yumi::arm::Arm;
-use hil_core::link_model::{Fate, LinkModel, PerfectLink};
+use hil_core::link_model::{LinkModel, PerfectLink};
 use hil_core::random::RandomStream;
+use hil_core::simulation::{Due, Medium, Model, Network, Observe, Simulation};
 use hil_core::study::Watch;
 use hil_core::time::{Instant, duration_ns};
 use hil_link::outages::{OutageLink, Outages};
@@ -94,117 +95,103 @@ pub(crate) fn drive(
     seed: u64,
     watch: Watch<'_>,
 ) -> Option<Tally> {
-    let cycle_ns = duration_ns(setup.settings.cycle);
     let end_ns = trajectory.end.as_ns();
-    let stride = (SAMPLE_NS / cycle_ns).max(1);
-    let look = (end_ns / cycle_ns / LOOK_COUNT).max(1);
-    let mut run = Run::new(trajectory, setup, seed);
-    let capacity = usize::try_from(end_ns / cycle_ns / stride + 1).unwrap_or(0);
-    let mut moved: Vec<Sample> = Vec::with_capacity(capacity);
-    let tool = Arm::right();
-    let mut cycle = 1;
-    while cycle * cycle_ns <= end_ns {
-        let at_ns = cycle * cycle_ns;
-        run.cycle(Instant::from_ns(at_ns));
-        if cycle % stride == 0 {
-            moved.push((at_ns, tool.tool(run.arm.measured_rad()).translation.y));
-        }
-        if cycle % look == 0 && !watch(at_ns as f64 / end_ns as f64) {
+    let network = Links {
+        forward: link(setup.channel, seed, Way::Forward),
+        backward: link(setup.channel, seed, Way::Backward),
+    };
+    let mut simulation = Simulation::of(Run::new(trajectory, setup), network);
+    for look in 0..LOOK_COUNT {
+        if !watch(look as f64 / LOOK_COUNT as f64) {
             return None;
         }
-        cycle += 1;
+        // A cycle at the very end belongs to the run.
+        let until_ns = end_ns / LOOK_COUNT * (look + 1) + end_ns % LOOK_COUNT + 1;
+        simulation.run_until(Instant::from_ns(until_ns), &mut ());
     }
-    run.happened.finish(end_ns);
-    let loops = trajectory
-        .counter
-        .count_peaks(&trajectory.sent_peaks_ns, &moved)
-        .expect("a trajectory is as long as its loops");
-    Some(run.happened.tally(trajectory, &loops, end_ns))
+    Some(simulation.into_model().tally(end_ns))
 }
 
-/// A run under way.
+/// A run under way: the arm, and who commands it.
 #[derive(Debug)]
 struct Run<'a> {
     trajectory: &'a Trajectory,
     setup: &'a Setup,
     arm: Controller,
-    forward: Box<dyn LinkModel>,
-    backward: Box<dyn LinkModel>,
-    next_send_ns: i64,
-    /// When feedback arrives that is still to be answered.
-    answers: VecDeque<Instant>,
-    /// Commands under way: arrival, and when they were sent.
-    in_flight: VecDeque<(Instant, Instant)>,
+    next_cycle: Instant,
+    /// When the next command is sent on a grid; `None` when feedback is answered.
+    next_send: Option<Instant>,
+    send_period: Duration,
     idle_since: Option<Instant>,
     happened: Happened,
+    /// Where the tool is, now and then.
+    moved: Vec<Sample>,
+    tool: Arm,
+}
+
+/// What passes between controller and arm.
+#[derive(Debug, Clone, Copy)]
+enum Message {
+    /// The command of the trajectory at this instant, when it was sent.
+    Command(Instant),
+    Feedback,
+}
+
+/// What comes first of several things at one instant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Rank {
+    Cycle,
+    Send,
+    Arrival,
+}
+
+/// Both ways between controller and arm.
+#[derive(Debug)]
+struct Links {
+    forward: Box<dyn LinkModel>,
+    backward: Box<dyn LinkModel>,
+}
+
+impl Network<Message> for Links {
+    fn offer(
+        &mut self,
+        now: Instant,
+        message: &Message,
+        mut deliver: impl FnMut(Instant, Message),
+    ) {
+        let link = match message {
+            Message::Command(_) => &mut self.forward,
+            Message::Feedback => &mut self.backward,
+        };
+        for at in link.offer(now, MESSAGE_BYTES).arrivals() {
+            deliver(at, *message);
+        }
+    }
 }
 
 impl<'a> Run<'a> {
     /// The robot's first cycle is done, and guided motion is asked for.
-    fn new(trajectory: &'a Trajectory, setup: &'a Setup, seed: u64) -> Self {
+    fn new(trajectory: &'a Trajectory, setup: &'a Setup) -> Self {
+        let send_period_ns = match setup.sending {
+            Sending::Frame => Some(trajectory.frame_ns),
+            Sending::Free(period_ns) => Some(period_ns),
+            Sending::Coupled => None,
+        };
+        let begin = Instant::from_ns(trajectory.begin_ns());
         Self {
             arm: requested(&setup.settings),
-            forward: link(setup.channel, seed, Way::Forward),
-            backward: link(setup.channel, seed, Way::Backward),
-            next_send_ns: trajectory.begin_ns(),
-            answers: VecDeque::with_capacity(4096),
-            in_flight: VecDeque::with_capacity(4096),
+            next_cycle: Instant::ZERO + setup.settings.cycle,
+            next_send: send_period_ns.map(|_| begin),
+            send_period: Duration::from_nanos(send_period_ns.unwrap_or(0).unsigned_abs()),
             idle_since: None,
             happened: Happened {
                 pause_began: Some((0, PauseAfter::Start)),
                 ..Happened::default()
             },
+            moved: Vec::new(),
+            tool: Arm::right(),
             trajectory,
             setup,
-        }
-    }
-
-    fn cycle(&mut self, at: Instant) {
-        match self.setup.sending {
-            Sending::Frame => self.send_every(self.trajectory.frame_ns, at),
-            Sending::Free(period_ns) => self.send_every(period_ns, at),
-            Sending::Coupled => self.answer(at),
-        }
-        while let Some((arrived, sent)) = self.in_flight.front().copied() {
-            if arrived >= at {
-                break;
-            }
-            self.in_flight.pop_front();
-            if let Some(command) = self.trajectory.at(sent) {
-                // A refusal is the arm's answer; no client listens.
-                let _refused = self.arm.receive(arrived, command).is_err();
-            }
-        }
-        let happened = &mut self.happened;
-        self.arm.cycle(at, &mut |event| happened.note(&event));
-        happened.note_throttle(at.as_ns(), self.arm.is_throttled());
-        if self.setup.sending == Sending::Coupled
-            && let Fate::Delivered(heard) = self.backward.offer(at, MESSAGE_BYTES)
-        {
-            self.answers.push_back(heard);
-        }
-        self.trigger(at);
-    }
-
-    /// Everything sent on a grid before `at`.
-    fn send_every(&mut self, period_ns: i64, at: Instant) {
-        while self.next_send_ns < at.as_ns() {
-            self.send(Instant::from_ns(self.next_send_ns));
-            self.next_send_ns += period_ns;
-        }
-    }
-
-    /// Answers to all feedback that arrived before `at`.
-    fn answer(&mut self, at: Instant) {
-        while let Some(heard) = self.answers.front().copied().filter(|heard| *heard < at) {
-            self.answers.pop_front();
-            self.send(heard);
-        }
-    }
-
-    fn send(&mut self, now: Instant) {
-        if let Fate::Delivered(arrived) = self.forward.offer(now, MESSAGE_BYTES) {
-            self.in_flight.push_back((arrived, now));
         }
     }
 
@@ -221,6 +208,74 @@ impl<'a> Run<'a> {
             self.idle_since = asked.err().map(|_| at);
         }
     }
+
+    fn tally(mut self, end_ns: i64) -> Tally {
+        self.happened.finish(end_ns);
+        let trajectory = self.trajectory;
+        let loops = trajectory
+            .counter
+            .count_peaks(&trajectory.sent_peaks_ns, &self.moved)
+            .expect("a trajectory is as long as its loops");
+        self.happened.tally(trajectory, &loops, end_ns)
+    }
+}
+
+impl Model for Run<'_> {
+    type Message = Message;
+    type Record = ();
+    type Network = Links;
+    type Rank = Rank;
+
+    fn rank(_message: &Message) -> Rank {
+        Rank::Arrival
+    }
+
+    fn start<O: Observe<Self>>(&mut self, _medium: &mut Medium<'_, Self, O>) {}
+
+    fn next(&self) -> Option<Due<Rank>> {
+        let cycle = Due {
+            at: self.next_cycle,
+            rank: Rank::Cycle,
+        };
+        let rank = Rank::Send;
+        let send = self.next_send.map(|at| Due { at, rank });
+        Some(send.map_or(cycle, |send| cycle.min(send)))
+    }
+
+    fn advance<O: Observe<Self>>(&mut self, rank: Rank, medium: &mut Medium<'_, Self, O>) {
+        let now = medium.now;
+        if rank == Rank::Send {
+            medium.send(&Message::Command(now));
+            self.next_send = Some(now + self.send_period);
+            return;
+        }
+        let happened = &mut self.happened;
+        self.arm.cycle(now, &mut |event| happened.note(&event));
+        happened.note_throttle(now.as_ns(), self.arm.is_throttled());
+        if self.setup.sending == Sending::Coupled {
+            medium.send(&Message::Feedback);
+        }
+        self.trigger(now);
+        self.next_cycle = now + self.setup.settings.cycle;
+        let cycle_ns = duration_ns(self.setup.settings.cycle);
+        let stride = (SAMPLE_NS / cycle_ns).max(1);
+        if now.as_ns() / cycle_ns % stride == 0 {
+            let tool = self.tool.tool(self.arm.measured_rad());
+            self.moved.push((now.as_ns(), tool.translation.y));
+        }
+    }
+
+    fn receive<O: Observe<Self>>(&mut self, message: Message, medium: &mut Medium<'_, Self, O>) {
+        match message {
+            Message::Command(sent) => {
+                if let Some(command) = self.trajectory.at(sent) {
+                    // A refusal is the arm's answer; no client listens.
+                    let _refused = self.arm.receive(medium.now, command).is_err();
+                }
+            }
+            Message::Feedback => medium.send(&Message::Command(medium.now)),
+        }
+    }
 }
 
 /// A command or a feedback of one arm with our datagram's header; only the radio looks at it.
@@ -235,7 +290,7 @@ fn link(channel: Channel, seed: u64, way: Way) -> Box<dyn LinkModel> {
     match channel {
         Channel::Perfect => Box::new(PerfectLink),
         Channel::Loss(ratio) => {
-            let link = LinkSpec::fixed(core::time::Duration::ZERO, ratio);
+            let link = LinkSpec::fixed(Duration::ZERO, ratio);
             link.build(&LinkPlace::alone(seed, direction))
                 .expect("conditions name ratios")
         }

@@ -3,7 +3,7 @@
 use core::time::Duration;
 use std::collections::BTreeMap;
 
-use super::conditions::{Expected, LONG_RANGE, SHORT_RANGE, base, changed, conditions};
+use super::conditions::{Condition, Expected, LONG_RANGE, SHORT_RANGE, base, changed, conditions};
 use super::drive::{Channel, OUTAGE_STREAM, Tally, drive};
 use super::study::seed_of;
 use super::trajectory::Trajectory;
@@ -252,3 +252,80 @@ fn a_calibration_finds_the_rate_it_is_asked_for_and_says_where_there_is_none() {
     assert!(case.calibration("mlr", 0.01).unwrap().is_some());
     assert!(case.calibration("age", 0.01).unwrap().is_none());
 }
+
+/// Recorded before the drivers of fleet, teleoperation and the generic one became one.
+#[test]
+fn conditions_of_the_table_keep_their_figures_to_the_bit() {
+    let study = study(|parameters| {
+        parameters.tables.loops = 60;
+        parameters.tables.seeds = 1;
+    });
+    for expected in PINNED {
+        let wanted = |condition: &&Condition| condition.name == expected.condition;
+        let condition = study.conditions.iter().find(wanted).unwrap();
+        let tally = drive(&study.trajectory, &condition.setup, 11, &mut |_| true).unwrap();
+        let found = Pinned {
+            condition: expected.condition,
+            executed_count: tally.executed_count,
+            trip_count: tally.trip_count,
+            lost: &tally.lost,
+            hold_ratio_bits: tally.hold_ratio.to_bits(),
+        };
+        assert_eq!(found, expected);
+    }
+}
+
+/// Figures of one run under a condition.
+#[derive(Debug, PartialEq, Eq)]
+struct Pinned<'a> {
+    condition: &'static str,
+    executed_count: u64,
+    trip_count: u64,
+    lost: &'a [usize],
+    hold_ratio_bits: u64,
+}
+
+const PINNED: [Pinned<'_>; 6] = [
+    Pinned {
+        condition: "loss-0.5",
+        executed_count: 60,
+        trip_count: 0,
+        lost: &[],
+        hold_ratio_bits: 4_582_575_524_660_966_996,
+    },
+    Pinned {
+        condition: "long-range",
+        executed_count: 60,
+        trip_count: 1,
+        lost: &[],
+        hold_ratio_bits: 4_585_742_259_267_998_290,
+    },
+    Pinned {
+        condition: "wifi6-long-range",
+        executed_count: 59,
+        trip_count: 3,
+        lost: &[20],
+        hold_ratio_bits: 4_585_484_288_380_158_818,
+    },
+    Pinned {
+        condition: "buffered-coupled-fifo1",
+        executed_count: 60,
+        trip_count: 0,
+        lost: &[],
+        hold_ratio_bits: 4_566_995_390_719_744_408,
+    },
+    Pinned {
+        condition: "cycle-4032-free-250",
+        executed_count: 60,
+        trip_count: 0,
+        lost: &[],
+        hold_ratio_bits: 0,
+    },
+    Pinned {
+        condition: "external-trigger",
+        executed_count: 60,
+        trip_count: 0,
+        lost: &[],
+        hold_ratio_bits: 4_572_824_880_087_506_456,
+    },
+];
