@@ -167,7 +167,6 @@ fn network(
     for (name, watch) in watches {
         let crossing = topology.crossings().find(|one| one.channel.name == name)?;
         let (passages, duplicated_count) = watch.passages();
-        let passages = passages.into_iter().collect();
         let payload = log.raw(&name).first();
         builder.add(ChannelPassages {
             channel: &name,

@@ -4,7 +4,7 @@
 use std::cell::RefCell;
 use std::rc::Rc;
 
-use hil_account::network::{Crossing, Passage};
+use hil_account::network::{Crossing, Passage, Passages};
 use hil_account::{Outage, OutageFinder};
 use hil_core::link_model::{LinkModel, LossCauses};
 use hil_core::message::Envelope;
@@ -21,7 +21,7 @@ struct Seen {
     outages: OutageFinder,
     lost_count: u64,
     causes: Option<LossCauses>,
-    passages: Vec<Passage>,
+    passages: Passages,
     duplicated_count: u64,
 }
 
@@ -52,7 +52,7 @@ impl Watch {
     }
 
     /// The way of every message so far, and how many copies came on top.
-    pub(super) fn passages(&self) -> (Vec<Passage>, u64) {
+    pub(super) fn passages(&self) -> (Passages, u64) {
         let mut seen = self.0.borrow_mut();
         (core::mem::take(&mut seen.passages), seen.duplicated_count)
     }
@@ -83,7 +83,7 @@ impl Carrier for Watched {
         seen.lost_count += u64::from(fate.arrival().is_none());
         seen.causes = self.link.loss_causes();
         seen.duplicated_count += u64::from(fate.second_arrival().is_some());
-        seen.passages.push(passage(now, envelope, fate.arrival()));
+        seen.passages.push(&passage(now, envelope, fate.arrival()));
         let published_ns = Some(now.as_ns());
         match fate.arrival() {
             Some(at) => seen.outages.arrived(published_ns, Some(at.as_ns())),
@@ -148,6 +148,7 @@ mod tests {
         }
         assert_eq!(delivered_count, 20);
         let (passages, duplicated_count) = watch.passages();
+        let passages: Vec<_> = passages.each().collect();
         assert_eq!((passages.len(), duplicated_count), (30, 0));
         assert_eq!(passages[9].delay_ns, Some(3_000_000));
         assert_eq!(passages[10].crossing, Crossing::LostByNetwork);
