@@ -1,42 +1,60 @@
 //! Decides what became of each message. It concludes from records only: the absence of a record
-//! means something only in a file that is at hand.
+//! means something only where records of its kind are at hand.
 
-use super::join::{Join, Joined, Key};
-use super::metrics::{Gap, InterruptionMetrics};
+use super::fold::RecordsAtHand;
+use super::history::MessageHistory;
 use super::stage::{MessageFate, Side};
-use super::{AccountContext, ChannelPath, ChannelRecords, Interruption, PathProcess, RunSpan};
+use super::{AccountContext, Interruption, PathProcess};
 use hil_core::record::{EgressRecord, IngressRecord, stamp};
 use hil_core::time::{Instant, RemoteInstant, duration_ns};
 
-/// Judges messages in key order.
-#[derive(Debug)]
-pub(super) struct Judge<'a> {
-    files: ChannelRecords<'a>,
-    is_gateway: bool,
-    path: ChannelPath<'a>,
-    last_egress: Option<Key>,
-    last_taken: Option<Key>,
+/// How a reader of a buffer stands to a message that it has not taken.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) enum Reading {
+    /// It took a later one, or so many later ones came that this one was pushed out of its buffer.
+    Passed,
+    /// The message is in its buffer.
+    Waiting,
+    /// None of these is known.
+    #[default]
+    Unknown,
+}
+
+/// How the two readers on a message's way stand to it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Readings {
+    /// The sending gateway.
+    pub(super) gateway: Reading,
+    /// The consumer.
+    pub(super) consumer: Reading,
+}
+
+/// What a message became, and the interruption that cost it, by its place in the context.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Verdict {
+    pub(super) fate: MessageFate,
+    pub(super) interruption_index: Option<usize>,
+}
+
+/// What messages are judged by, beside their own records.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Evidence<'a> {
+    context: &'a AccountContext<'a>,
+    at_hand: RecordsAtHand,
+    /// End of the run on each host's clock, where known.
     producer_end_ns: Option<i64>,
     consumer_end_ns: Option<i64>,
     flight_ns: i64,
-    interruptions: &'a [Interruption],
-    lost_counts: Vec<u64>,
-    /// The interruption that cost the message judged last, by its place in the context.
-    pub(super) last_hit: Option<usize>,
-    /// Where the previous message of known place was, for those without any.
-    previous_producer_ns: Option<i64>,
-    previous_consumer_ns: Option<i64>,
+    /// True when no record comes any more.
+    is_whole: bool,
 }
 
-impl<'a> Judge<'a> {
-    pub(super) fn new(
-        records: &ChannelRecords<'a>,
-        context: &AccountContext<'a>,
-        join: &Join<'_>,
-    ) -> Self {
+impl<'a> Evidence<'a> {
+    /// While records still come.
+    pub(super) fn new(context: &'a AccountContext<'a>, at_hand: RecordsAtHand) -> Self {
         let path = context.path;
-        let end = |run: Option<RunSpan>| run.map(|run| run.end.as_ns());
-        let (producer_end, consumer_end) = (end(context.producer_run), end(context.consumer_run));
+        let [producer_end_ns, consumer_end_ns] =
+            [context.producer_run, context.consumer_run].map(|run| run.map(|run| run.end.as_ns()));
         // A converted end counts from as early as it may have been.
         let to_producer = |ns: i64| {
             let (end, bound_ns) = path.to_remote(Instant::from_ns(ns))?;
@@ -47,110 +65,91 @@ impl<'a> Judge<'a> {
             Some(end.as_ns().saturating_sub_unsigned(bound_ns))
         };
         Self {
-            files: *records,
-            is_gateway: context.path.is_gateway(),
-            path,
-            last_egress: join.last_egress,
-            last_taken: join.last_taken,
-            producer_end_ns: producer_end.or_else(|| to_producer(consumer_end?)),
-            consumer_end_ns: consumer_end.or_else(|| to_consumer(producer_end?)),
+            context,
+            at_hand,
+            producer_end_ns: producer_end_ns.or_else(|| to_producer(consumer_end_ns?)),
+            consumer_end_ns: consumer_end_ns.or_else(|| to_consumer(producer_end_ns?)),
             flight_ns: duration_ns(context.flight_time_max),
-            interruptions: context.interruptions,
-            lost_counts: vec![0; context.interruptions.len()],
-            last_hit: None,
-            previous_producer_ns: None,
-            previous_consumer_ns: None,
+            is_whole: false,
         }
     }
 
-    /// The fate of one message; remembers what its interruption cost.
-    pub(super) fn judge(&mut self, joined: &Joined) -> MessageFate {
-        let place = Place::of(joined);
-        let fate = self.fate(joined, place);
-        self.previous_producer_ns = place.producer_ns.or(self.previous_producer_ns);
-        self.previous_consumer_ns = place.consumer_ns.or(self.previous_consumer_ns);
-        fate
+    /// The same when no record comes any more.
+    pub(super) const fn at_end(mut self) -> Self {
+        self.is_whole = true;
+        self
     }
 
-    /// What each interruption cost, with the silence it caused.
-    pub(super) fn interruptions(&self, gaps: &[Option<Gap>]) -> Vec<InterruptionMetrics> {
-        let costs = self.lost_counts.iter().zip(gaps);
-        self.interruptions
-            .iter()
-            .zip(costs)
-            .map(|(interruption, (lost_count, gap))| InterruptionMetrics {
-                process: interruption.process.clone(),
-                cause: interruption.cause.clone(),
-                length_ns: interruption.until.ns_since(interruption.from),
-                lost_count: *lost_count,
-                gap: *gap,
-            })
-            .collect()
+    /// True for what was seen so late in the run that it may still have been under way at its end.
+    fn is_near(&self, at_ns: Option<i64>, end_ns: Option<i64>) -> bool {
+        let ends = at_ns.zip(end_ns);
+        ends.is_some_and(|(at_ns, end_ns)| at_ns >= end_ns.saturating_sub(self.flight_ns))
     }
 
-    fn fate(&mut self, joined: &Joined, place: Place) -> MessageFate {
-        self.last_hit = None;
-        if joined.taken.is_some() {
-            return MessageFate::Taken;
+    /// The fate of a message by its own records; `None` while it hangs on records that may still come.
+    fn fate(
+        &self,
+        message: &MessageHistory,
+        place: Place,
+        readings: Readings,
+    ) -> Option<MessageFate> {
+        if message.taken.is_some() {
+            return Some(MessageFate::Taken);
         }
-        let fate = if self.is_gateway {
-            self.fate_over_gateway(joined, place)
-        } else {
-            self.fate_at_consumer(joined, place.producer_ns, self.producer_end_ns)
-        };
-        let hit = (0..self.interruptions.len()).find(|index| {
-            let interruption = &self.interruptions[*index];
-            self.is_within_reach(joined, interruption) && self.is_hit(fate, place, interruption)
-        });
-        self.last_hit = hit;
-        match hit {
-            Some(index) => {
-                self.lost_counts[index] = self.lost_counts[index].saturating_add(joined.count);
-                MessageFate::LostInInterruption
-            }
-            None => fate,
+        if !self.context.path.is_gateway() {
+            return self.fate_at_consumer(
+                place.producer_ns,
+                self.producer_end_ns,
+                readings.consumer,
+            );
         }
-    }
-
-    fn fate_over_gateway(&self, joined: &Joined, place: Place) -> MessageFate {
-        if let Some(ingress) = joined.ingress {
-            return self.fate_after_reception(joined, &ingress, place);
-        }
-        if let Some(egress) = joined.egress {
-            if is_refused(&egress) {
-                return MessageFate::RefusedByKernel;
-            }
-            if self.files.ingress.is_none() {
-                return MessageFate::UnknownPeerRecordsUnavailable;
-            }
-            if self.is_near(place.producer_ns, self.producer_end_ns) {
-                return MessageFate::InFlight;
-            }
-            return match stamp(egress.handed_ns) {
-                Some(_) => MessageFate::LostOnWire,
-                None => MessageFate::Unexplained,
+        if let Some(ingress) = message.ingress {
+            return match stamp(ingress.forwarded_ns) {
+                Some(forwarded_ns) => {
+                    let arrived_ns = Some(forwarded_ns);
+                    self.fate_at_consumer(arrived_ns, self.consumer_end_ns, readings.consumer)
+                }
+                None => Some(self.fate_at_reception(message, &ingress, place)),
             };
         }
-        if self.files.egress.is_none() {
-            return MessageFate::UnknownPeerRecordsUnavailable;
+        if let Some(egress) = message.egress {
+            return Some(if is_refused(&egress) {
+                MessageFate::RefusedByKernel
+            } else if !self.at_hand.ingress {
+                MessageFate::UnknownPeerRecordsUnavailable
+            } else if self.is_near(place.producer_ns, self.producer_end_ns) {
+                MessageFate::InFlight
+            } else if stamp(egress.handed_ns).is_some() {
+                MessageFate::LostOnWire
+            } else {
+                MessageFate::Unexplained
+            });
         }
-        if self.last_egress.is_some_and(|last| joined.key < last) {
-            return MessageFate::SupersededAtInput;
+        if !self.at_hand.egress {
+            return Some(MessageFate::UnknownPeerRecordsUnavailable);
         }
-        self.in_flight_or_unexplained(place.producer_ns, self.producer_end_ns)
+        let superseded = MessageFate::SupersededAtInput;
+        let (at_ns, end_ns) = (place.producer_ns, self.producer_end_ns);
+        self.fate_in_buffer(readings.gateway, superseded, at_ns, end_ns)
     }
 
-    fn fate_after_reception(
+    /// Of a message that was received and not forwarded.
+    fn fate_at_reception(
         &self,
-        joined: &Joined,
+        message: &MessageHistory,
         ingress: &IngressRecord,
         place: Place,
     ) -> MessageFate {
-        if let Some(forwarded_ns) = stamp(ingress.forwarded_ns) {
-            return self.fate_at_consumer(joined, Some(forwarded_ns), self.consumer_end_ns);
-        }
         if ingress.flags & IngressRecord::INCOMPLETE != 0 {
-            self.fate_of_pieces(joined, place)
+            // Only pieces came: because the sender stopped in the middle of it, because the run ended,
+            // or because the others got lost.
+            if message.egress.as_ref().is_some_and(is_refused) {
+                MessageFate::RefusedByKernel
+            } else if self.is_near(place.producer_ns, self.producer_end_ns) {
+                MessageFate::InFlight
+            } else {
+                MessageFate::Incomplete
+            }
         } else if ingress.flags & IngressRecord::LATE != 0 {
             MessageFate::Late
         } else if ingress.flags & IngressRecord::DUPLICATE != 0 {
@@ -160,70 +159,102 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// Only pieces came: because the sender stopped in the middle of it, because the run ended, or
-    /// because the others got lost.
-    fn fate_of_pieces(&self, joined: &Joined, place: Place) -> MessageFate {
-        if joined.egress.as_ref().is_some_and(is_refused) {
-            MessageFate::RefusedByKernel
-        } else if self.is_near(place.producer_ns, self.producer_end_ns) {
-            MessageFate::InFlight
-        } else {
-            MessageFate::Incomplete
-        }
-    }
-
     fn fate_at_consumer(
         &self,
-        joined: &Joined,
-        arrived_ns: Option<i64>,
+        at_ns: Option<i64>,
         end_ns: Option<i64>,
-    ) -> MessageFate {
-        if self.files.taken.is_none() {
-            return MessageFate::UnknownPeerRecordsUnavailable;
+        reading: Reading,
+    ) -> Option<MessageFate> {
+        if !self.at_hand.taken {
+            return Some(MessageFate::UnknownPeerRecordsUnavailable);
         }
-        if self.last_taken.is_some_and(|last| joined.key < last) {
-            return MessageFate::SupersededAtConsumer;
-        }
-        self.in_flight_or_unexplained(arrived_ns, end_ns)
+        self.fate_in_buffer(reading, MessageFate::SupersededAtConsumer, at_ns, end_ns)
     }
 
-    fn in_flight_or_unexplained(&self, at_ns: Option<i64>, end_ns: Option<i64>) -> MessageFate {
-        if self.is_near(at_ns, end_ns) {
-            MessageFate::InFlight
-        } else {
-            MessageFate::Unexplained
+    /// Of a message that was put before a reader at `at_ns` and not taken.
+    fn fate_in_buffer(
+        &self,
+        reading: Reading,
+        superseded: MessageFate,
+        at_ns: Option<i64>,
+        end_ns: Option<i64>,
+    ) -> Option<MessageFate> {
+        match reading {
+            Reading::Passed => Some(superseded),
+            Reading::Waiting | Reading::Unknown if !self.is_whole => None,
+            // It is where it was put, however long ago: its reader took nothing any more.
+            Reading::Waiting => Some(MessageFate::InFlight),
+            Reading::Unknown if self.is_near(at_ns, end_ns) => Some(MessageFate::InFlight),
+            Reading::Unknown => Some(MessageFate::Unexplained),
         }
-    }
-
-    fn is_near(&self, at_ns: Option<i64>, end_ns: Option<i64>) -> bool {
-        let Some((at_ns, end_ns)) = at_ns.zip(end_ns) else {
-            return false;
-        };
-        at_ns >= end_ns.saturating_sub(self.flight_ns)
     }
 
     /// True when the message could have been in or before the interrupted process.
-    fn is_within_reach(&self, joined: &Joined, interruption: &Interruption) -> bool {
-        if !self.is_gateway {
+    fn is_within_reach(&self, message: &MessageHistory, interruption: &Interruption) -> bool {
+        if !self.context.path.is_gateway() {
             return true;
         }
         let never_left =
-            self.files.egress.is_some() && joined.egress.is_none() && joined.ingress.is_none();
-        let is_forwarded = joined
+            self.at_hand.egress && message.egress.is_none() && message.ingress.is_none();
+        let is_forwarded = message
             .ingress
             .is_some_and(|ingress| stamp(ingress.forwarded_ns).is_some());
         match interruption.place {
-            PathProcess::Producer => joined.egress.is_none() && joined.ingress.is_none(),
-            PathProcess::SendingGateway => joined.arrived().is_none(),
+            PathProcess::Producer => message.egress.is_none() && message.ingress.is_none(),
+            PathProcess::SendingGateway => message.arrived().is_none(),
             PathProcess::ReceivingGateway => !never_left,
-            PathProcess::Consumer => is_forwarded || (self.files.ingress.is_none() && !never_left),
+            PathProcess::Consumer => is_forwarded || (!self.at_hand.ingress && !never_left),
         }
+    }
+}
+
+/// Judges messages in key order.
+#[derive(Debug, Default)]
+pub(super) struct Judge {
+    /// Where the previous message of known place was, for those without any.
+    previous: Place,
+}
+
+impl Judge {
+    /// The verdict on one message; `None` while it hangs on records that may still come. Where
+    /// `must_judge`, a message that may still be taken is in flight.
+    pub(super) fn judge(
+        &mut self,
+        message: &MessageHistory,
+        evidence: &Evidence<'_>,
+        readings: Readings,
+        must_judge: bool,
+    ) -> Option<Verdict> {
+        let place = Place::of(message);
+        let in_flight = must_judge.then_some(MessageFate::InFlight);
+        let fate = evidence.fate(message, place, readings).or(in_flight)?;
+        let mut interruptions = evidence.context.interruptions.iter();
+        let is_cause = |one: &Interruption| {
+            evidence.is_within_reach(message, one) && self.is_hit(fate, place, one, evidence)
+        };
+        let hit = match fate {
+            MessageFate::Taken => None,
+            _ => interruptions.position(is_cause),
+        };
+        self.previous.producer_ns = place.producer_ns.or(self.previous.producer_ns);
+        self.previous.consumer_ns = place.consumer_ns.or(self.previous.consumer_ns);
+        Some(Verdict {
+            fate: hit.map_or(fate, |_| MessageFate::LostInInterruption),
+            interruption_index: hit,
+        })
     }
 
     /// True when the message was last seen while the process was down, or shortly before and
     /// nothing recorded says that it got lost otherwise.
-    fn is_hit(&self, fate: MessageFate, place: Place, interruption: &Interruption) -> bool {
-        let (seen_ns, bound_ns, is_exact) = match self.position(place, interruption.place.side()) {
+    fn is_hit(
+        &self,
+        fate: MessageFate,
+        place: Place,
+        interruption: &Interruption,
+        evidence: &Evidence<'_>,
+    ) -> bool {
+        let side = interruption.place.side();
+        let (seen_ns, bound_ns, is_exact) = match self.position(place, side, evidence) {
             Position::Exact(seen_ns) => (seen_ns, 0, true),
             Position::Within(seen_ns, bound_ns) => (seen_ns, bound_ns, true),
             Position::After(seen_ns) => (seen_ns, 0, false),
@@ -245,20 +276,20 @@ impl<'a> Judge<'a> {
             // Its record says otherwise, but if it was somewhat later, its cause is the same.
             _ => !is_exact,
         };
-        may_have_been_inside && (from_ns.saturating_sub(self.flight_ns)..from_ns).contains(&seen_ns)
+        may_have_been_inside
+            && (from_ns.saturating_sub(evidence.flight_ns)..from_ns).contains(&seen_ns)
     }
 
     /// When the message was last seen, on the clock of one host.
-    fn position(&self, place: Place, side: Side) -> Position {
+    fn position(&self, place: Place, side: Side, evidence: &Evidence<'_>) -> Position {
         let (exact_ns, previous_ns) = match side {
-            Side::Producer => (place.producer_ns, self.previous_producer_ns),
-            Side::Consumer => (place.consumer_ns, self.previous_consumer_ns),
+            Side::Producer => (place.producer_ns, self.previous.producer_ns),
+            Side::Consumer => (place.consumer_ns, self.previous.consumer_ns),
         };
         let localised = || {
             let remote = RemoteInstant::from_ns(place.producer_ns?);
-            self.path
-                .localise(remote)
-                .filter(|_| side == Side::Consumer)
+            let path = evidence.context.path;
+            path.localise(remote).filter(|_| side == Side::Consumer)
         };
         if let Some(exact_ns) = exact_ns {
             return Position::Exact(exact_ns);
@@ -288,30 +319,30 @@ enum Position {
 }
 
 /// The last instants at which a message was seen on each host.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct Place {
     producer_ns: Option<i64>,
     consumer_ns: Option<i64>,
 }
 
 impl Place {
-    fn of(joined: &Joined) -> Self {
-        let published = joined
+    fn of(message: &MessageHistory) -> Self {
+        let published = message
             .published
             .and_then(|record| stamp(record.published_ns));
-        let egress = joined.egress.and_then(|record| {
+        let egress = message.egress.and_then(|record| {
             stamp(record.handed_ns)
                 .or(stamp(record.taken_ns))
                 .or(stamp(record.published_ns))
         });
-        let sender = joined
+        let sender = message
             .ingress
             .and_then(|record| stamp(record.handed_ns).or(stamp(record.published_ns)));
-        let arrived = joined
+        let arrived = message
             .ingress
             .and_then(|record| stamp(record.forwarded_ns).or(stamp(record.received_ns)));
-        let origin = joined.taken.and_then(|record| stamp(record.published_ns));
-        let taken = joined.taken.and_then(|record| stamp(record.taken_ns));
+        let origin = message.taken.and_then(|record| stamp(record.published_ns));
+        let taken = message.taken.and_then(|record| stamp(record.taken_ns));
         Self {
             producer_ns: egress.or(sender).or(published).or(origin),
             consumer_ns: taken.or(arrived),

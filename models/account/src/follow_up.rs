@@ -1,9 +1,9 @@
 //! Transmit stamps that the sender reported in later datagrams, found by its session and the number of
 //! the message. A session numbers without holes but for losses, so they lie in a row.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
-use super::{ChannelRecords, each};
+use hil_core::record::{FollowUpRecord, IngressRecord};
 
 /// A number that no stamp was reported for.
 const NONE: i32 = i32::MIN;
@@ -12,9 +12,9 @@ const NONE: i32 = i32::MIN;
 #[derive(Debug, Default)]
 pub(super) struct FollowUps {
     sessions: BTreeMap<u32, Reported>,
-    /// Sequence numbers up to this occur in more than one epoch of the session, so a stamp for
-    /// them could belong to either message.
-    ambiguous_to: BTreeMap<u32, u64>,
+    /// The highest number of each start of the producer that came in a session: a stamp for a number
+    /// that two of them reached could belong to either message.
+    tops: BTreeMap<u32, Vec<(u32, u64)>>,
 }
 
 /// What was reported in one session.
@@ -23,7 +23,7 @@ struct Reported {
     /// Number of the first in `row`.
     first: u64,
     /// Handed over to transmitted, nanoseconds, or [`NONE`].
-    row: Vec<i32>,
+    row: VecDeque<i32>,
     /// What does not fit there.
     apart: BTreeMap<u64, i64>,
 }
@@ -57,6 +57,22 @@ impl Reported {
     /// Longest run of numbers without a stamp that is kept as such.
     const HOLE_MAX: u64 = 4_096;
 
+    /// Lets go of what nobody asks for any more: messages are asked for in order, a few late ones
+    /// excepted.
+    fn forget_before(&mut self, sequence: u64) {
+        let lowest = sequence.saturating_sub(Self::HOLE_MAX);
+        while self.first < lowest && self.row.pop_front().is_some() {
+            self.first += 1;
+        }
+        while self
+            .apart
+            .first_key_value()
+            .is_some_and(|(one, _)| *one < lowest)
+        {
+            self.apart.pop_first();
+        }
+    }
+
     fn find(&self, sequence: u64) -> Option<i64> {
         let place = sequence.checked_sub(self.first).map(usize::try_from);
         let in_row = place
@@ -73,46 +89,34 @@ impl Reported {
 }
 
 impl FollowUps {
-    pub(super) fn new(records: &ChannelRecords<'_>) -> Self {
-        let mut sessions: BTreeMap<u32, Reported> = BTreeMap::new();
-        for record in each(records.follow_up) {
-            let session = sessions.entry(record.session).or_default();
-            session.add(record.sequence, record.handed_to_tx_ns);
-        }
-        if sessions.is_empty() {
-            return Self::default();
-        }
-        let mut highest: BTreeMap<(u32, u32), u64> = BTreeMap::new();
-        for record in each(records.ingress) {
-            let entry = highest.entry((record.session, record.epoch)).or_insert(0);
-            *entry = (*entry).max(record.sequence);
-        }
-        let mut tops: BTreeMap<u32, Vec<u64>> = BTreeMap::new();
-        for ((session, _), sequence) in highest {
-            tops.entry(session).or_default().push(sequence);
-        }
-        let ambiguous_to = tops
-            .into_iter()
-            .filter_map(|(session, mut sequences)| {
-                sequences.sort_unstable_by(|a, b| b.cmp(a));
-                sequences.get(1).map(|second| (session, *second))
-            })
-            .collect();
-        Self {
-            sessions,
-            ambiguous_to,
+    /// True when no stamp was reported.
+    pub(super) fn is_empty(&self) -> bool {
+        self.sessions.is_empty()
+    }
+
+    /// Takes in a reported stamp.
+    pub(super) fn add(&mut self, record: &FollowUpRecord) {
+        let session = self.sessions.entry(record.session).or_default();
+        session.add(record.sequence, record.handed_to_tx_ns);
+    }
+
+    /// Notes which numbers of which start of the producer came in a session.
+    pub(super) fn note_arrival(&mut self, record: &IngressRecord) {
+        let tops = self.tops.entry(record.session).or_default();
+        match tops.iter_mut().find(|(epoch, _)| *epoch == record.epoch) {
+            Some((_, top)) => *top = record.sequence.max(*top),
+            None => tops.push((record.epoch, record.sequence)),
         }
     }
 
-    pub(super) fn find(&self, session: u32, sequence: u64) -> Option<i64> {
-        if self
-            .ambiguous_to
-            .get(&session)
-            .is_some_and(|to| sequence <= *to)
-        {
-            return None;
-        }
-        self.sessions.get(&session)?.find(sequence)
+    /// The stamp of a message that came in a session; those of lower numbers are forgotten.
+    pub(super) fn take(&mut self, session: u32, sequence: u64) -> Option<i64> {
+        let reported = self.sessions.get_mut(&session)?;
+        let found = reported.find(sequence);
+        reported.forget_before(sequence);
+        let tops = self.tops.get(&session)?;
+        let reaching_count = tops.iter().filter(|(_, top)| *top >= sequence).count();
+        found.filter(|_| reaching_count < 2)
     }
 }
 
@@ -151,5 +155,8 @@ mod tests {
             ]
         );
         assert!(reported.row.len() < 10_000, "one far number costs no room");
+        reported.forget_before(20_000);
+        assert_eq!((reported.row.len(), reported.apart.len()), (0, 1));
+        assert_eq!(reported.find(far), Some(5));
     }
 }

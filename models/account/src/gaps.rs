@@ -1,15 +1,15 @@
 //! Losses in a row, and silences at the consumer with what caused them. It does not judge single
 //! messages: see [`super::fate`].
 
-use std::collections::BTreeMap;
+use core::cmp::Reverse;
+use std::collections::{BTreeMap, BinaryHeap};
 
-use super::join::Key;
+use super::history::MessageHistory;
 use super::metrics::{BurstCount, Gap, Gaps};
-use super::stage::{MessageFate, Side};
-use super::{AccountContext, ChannelRecords, Interruption, each};
+use super::stage::Side;
+use super::{AccountContext, Interruption, RunSpan};
 use hil_core::record::stamp;
 use hil_stats::histogram::LatencyHistogram;
-use hil_stats::in_order::in_order;
 
 /// Counts runs of successive losses; anything else, and a restart of the producer, ends a run.
 #[derive(Debug, Default)]
@@ -20,13 +20,14 @@ pub(super) struct Bursts {
 }
 
 impl Bursts {
-    pub(super) fn count(&mut self, key: Key, fate: MessageFate, count: u64) {
-        if !fate.is_loss() || key.epoch_rank != self.epoch_rank {
+    pub(super) fn count(&mut self, message: &MessageHistory) {
+        let is_loss = message.fate.is_loss();
+        if !is_loss || message.key.epoch_rank != self.epoch_rank {
             self.end();
-            self.epoch_rank = key.epoch_rank;
+            self.epoch_rank = message.key.epoch_rank;
         }
-        if fate.is_loss() {
-            self.length = self.length.saturating_add(count);
+        if is_loss {
+            self.length = self.length.saturating_add(message.count);
         }
     }
 
@@ -49,6 +50,10 @@ impl Bursts {
     }
 }
 
+/// Messages that are held until those taken before them have come: they come in the order of their
+/// numbers. A second of messages at 2 kHz.
+const WINDOW: usize = 2_048;
+
 /// One taken message, on both clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct TakenAt {
@@ -57,63 +62,95 @@ struct TakenAt {
     sequence: u64,
 }
 
-/// The silences between taken messages, and for each interruption the longest it overlaps.
-pub(super) fn gaps(
-    records: &ChannelRecords<'_>,
-    context: &AccountContext<'_>,
-) -> (Gaps, Vec<Option<Gap>>) {
-    let run = context.consumer_run;
-    let start_ns = run.map_or(0, |run| run.start.as_ns());
-    let read = || {
-        each(records.taken).filter_map(|record| {
-            let at = TakenAt {
+/// Collects the silences between taken messages, and for each interruption the longest it overlaps.
+#[derive(Debug)]
+pub(super) struct GapFold<'a> {
+    interruptions: &'a [Interruption],
+    run: Option<RunSpan>,
+    window: BinaryHeap<Reverse<TakenAt>>,
+    last: Option<TakenAt>,
+    histogram: LatencyHistogram,
+    longest: Option<Gap>,
+    longest_unattributed: Option<Gap>,
+    of_interruption: Vec<Option<Gap>>,
+}
+
+impl<'a> GapFold<'a> {
+    pub(super) fn new(context: &AccountContext<'a>) -> Self {
+        Self {
+            interruptions: context.interruptions,
+            run: context.consumer_run,
+            window: BinaryHeap::new(),
+            last: None,
+            histogram: LatencyHistogram::default(),
+            longest: None,
+            longest_unattributed: None,
+            of_interruption: vec![None; context.interruptions.len()],
+        }
+    }
+
+    pub(super) fn count(&mut self, message: &MessageHistory) {
+        let taken = message.taken.and_then(|record| {
+            Some(TakenAt {
                 taken_ns: stamp(record.taken_ns)?,
                 published_ns: record.published_ns,
                 sequence: record.sequence,
-            };
-            Some((at, ()))
-        })
-    };
-    let mut histogram = LatencyHistogram::default();
-    let (mut longest, mut longest_unattributed) = (None, None);
-    let mut of_interruption = vec![None; context.interruptions.len()];
-    let mut last: Option<TakenAt> = None;
-    for (after, ()) in in_order(read) {
-        let Some(before) = last.replace(after) else {
-            continue;
+            })
+        });
+        self.window.extend(taken.map(Reverse));
+        if self.window.len() > WINDOW {
+            self.close_next();
+        }
+    }
+
+    /// The silence before the earliest of those held; false without any.
+    fn close_next(&mut self) -> bool {
+        let Some(Reverse(after)) = self.window.pop() else {
+            return false;
+        };
+        let Some(before) = self.last.replace(after) else {
+            return true;
         };
         let length_ns = after.taken_ns.saturating_sub(before.taken_ns);
-        histogram.record(length_ns);
+        self.histogram.record(length_ns);
+        let start_ns = self.run.map_or(0, |run| run.start.as_ns());
         let mut gap = Gap {
             start_ns: before.taken_ns.saturating_sub(start_ns),
             length_ns,
             after_sequence: before.sequence,
             interruption_index: None,
         };
-        for (index, interruption) in context.interruptions.iter().enumerate() {
+        for (index, interruption) in self.interruptions.iter().enumerate() {
             if overlaps(interruption, before, after) {
                 gap.interruption_index = gap.interruption_index.or(Some(index));
-                keep_longer(&mut of_interruption[index], gap);
+                keep_longer(&mut self.of_interruption[index], gap);
             }
         }
-        keep_longer(&mut longest, gap);
+        keep_longer(&mut self.longest, gap);
         if gap.interruption_index.is_none() {
-            keep_longer(&mut longest_unattributed, gap);
+            keep_longer(&mut self.longest_unattributed, gap);
         }
+        true
     }
-    let tail_ns = |last: TakenAt| Some(run?.end.as_ns().saturating_sub(last.taken_ns));
-    let reason = if records.taken.is_some() {
-        "fewer than two messages were taken"
-    } else {
-        "the consumer's records are not at hand"
-    };
-    let gaps = Gaps {
-        between_taken: histogram.distribution(reason),
-        longest,
-        longest_unattributed,
-        last_taken_to_run_end_ns: last.and_then(tail_ns),
-    };
-    (gaps, of_interruption)
+
+    /// The silences, and by interruption the longest it overlaps.
+    pub(super) fn finish(mut self, has_records: bool) -> (Gaps, Vec<Option<Gap>>) {
+        while self.close_next() {}
+        let run = self.run;
+        let tail_ns = |last: TakenAt| Some(run?.end.as_ns().saturating_sub(last.taken_ns));
+        let reason = if has_records {
+            "fewer than two messages were taken"
+        } else {
+            "the consumer's records are not at hand"
+        };
+        let gaps = Gaps {
+            between_taken: self.histogram.distribution(reason),
+            longest: self.longest,
+            longest_unattributed: self.longest_unattributed,
+            last_taken_to_run_end_ns: self.last.and_then(tail_ns),
+        };
+        (gaps, self.of_interruption)
+    }
 }
 
 /// Compares on the clock of the interrupted process's host; the publication times of the two

@@ -1,91 +1,218 @@
-//! The fate of single messages, for those who ask about them by name: the same judgement as in
-//! the account, not summed up.
+//! What is known of one message: its records, its copies, and what became of it.
 
-use std::collections::{BTreeMap, BTreeSet};
-
-use serde::{Deserialize, Serialize};
-
-use super::join::Joined;
+use super::ChannelPath;
+use super::network::{Crossing, Passage};
 use super::stage::MessageFate;
-use super::{AccountContext, ChannelRecords, each_judged};
-use hil_core::record::{IngressRecord, stamp};
+use hil_core::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord, stamp};
 use hil_core::time::RemoteInstant;
 
-/// What became of one message.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// A message's place: the order of the producer's starts, then the sequence number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Key {
+    /// Rank of the producer's start, from 0.
+    pub epoch_rank: u32,
+    /// Sequence number.
+    pub sequence: u64,
+}
+
+/// Everything that is known of one message, or of some in a row that no record mentions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MessageHistory {
-    /// Its fate.
+    /// Its place; that of the first of several.
+    pub key: Key,
+    /// The producer's start, as the records name it.
+    pub epoch: u32,
+    /// 1, or the length of a run of sequence numbers that no record mentions.
+    pub count: u64,
+    /// The producer's.
+    pub published: Option<PublishedRecord>,
+    /// The sending gateway's: of several the one of the sending that arrived.
+    pub egress: Option<EgressRecord>,
+    /// The receiving gateway's: of several the one of the copy that was forwarded.
+    pub ingress: Option<IngressRecord>,
+    /// The consumer's.
+    pub taken: Option<TakenRecord>,
+    /// From handing it to the kernel to its transmit stamp, as the sender reported.
+    pub handed_to_tx_ns: Option<i64>,
+    /// All its arrivals.
+    pub copies: Copies,
+    /// What became of it.
     pub fate: MessageFate,
-    /// When it was published, on the producer's host clock, nanoseconds.
-    pub published_ns: Option<i64>,
-    /// Published to taken, nanoseconds; `None` for a message that was not taken, and between
-    /// hosts whose clocks are not aligned.
-    pub delay_ns: Option<i64>,
-    /// How far `delay_ns` may be off because two hosts' clocks are in it; zero on one clock.
-    pub delay_bound_ns: Option<u64>,
-    /// A later message of the channel came before it.
-    pub is_overtaken: bool,
-    /// Index of the interruption that cost it, when it was lost in one.
+    /// The interruption that cost it, by its place in the context.
     pub interruption_index: Option<usize>,
 }
 
-/// The stories of the `wanted` messages, each given by the producer's start and the sequence
-/// number. A message that no record mentions is left out.
-pub fn stories(
-    records: &ChannelRecords<'_>,
-    context: &AccountContext<'_>,
-    wanted: &BTreeSet<(u32, u64)>,
-) -> BTreeMap<(u32, u64), MessageHistory> {
-    let mut found = BTreeMap::new();
-    each_judged(records, context, |joined, fate, interruption_index| {
-        let Some(key) = key(joined).filter(|key| wanted.contains(key)) else {
-            return;
-        };
-        let delay = delay(joined, context);
-        let story = MessageHistory {
-            fate,
-            published_ns: joined.published_ns(),
-            delay_ns: delay.map(|(delay_ns, _)| delay_ns),
-            delay_bound_ns: delay.map(|(_, bound_ns)| bound_ns),
-            is_overtaken: joined
-                .ingress
-                .is_some_and(|ingress| ingress.flags & IngressRecord::REORDERED != 0),
-            interruption_index,
-        };
-        found.insert(key, story);
-    });
-    found
+/// What the receiving gateway noted with the copies of a message.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Copies {
+    /// Came after a message with a higher number.
+    pub reordered_count: u64,
+    /// Seen before.
+    pub duplicated_count: u64,
+    /// Older than the sequence window.
+    pub late_count: u64,
+    /// When the first of those seen before came, on the consumer's host clock.
+    pub second_received_ns: Option<i64>,
 }
 
-/// Epoch and sequence number; `None` for a run of numbers that no record mentions.
-fn key(joined: &Joined) -> Option<(u32, u64)> {
-    let epochs = [
-        joined.published.map(|record| record.epoch),
-        joined.egress.map(|record| record.epoch),
-        joined.ingress.map(|record| record.epoch),
-        joined.taken.map(|record| record.epoch),
-    ];
-    let epoch = epochs.into_iter().flatten().next()?;
-    Some((epoch, joined.key.sequence))
+impl Copies {
+    /// Counts one arrival.
+    pub(super) fn note(&mut self, record: &IngressRecord) {
+        let has = |flag: u32| record.flags & flag != 0;
+        self.reordered_count += u64::from(has(IngressRecord::REORDERED));
+        self.late_count += u64::from(has(IngressRecord::LATE));
+        if has(IngressRecord::DUPLICATE) {
+            self.duplicated_count += 1;
+            self.second_received_ns.get_or_insert(record.received_ns);
+        }
+    }
+
+    /// Adds the arrivals of another message.
+    pub fn add(&mut self, other: &Self) {
+        self.reordered_count += other.reordered_count;
+        self.duplicated_count += other.duplicated_count;
+        self.late_count += other.late_count;
+    }
 }
 
-fn delay(joined: &Joined, context: &AccountContext<'_>) -> Option<(i64, u64)> {
-    let taken = joined.taken?;
-    let (published_ns, taken_ns) = (stamp(taken.published_ns)?, stamp(taken.taken_ns)?);
-    let remote = RemoteInstant::from_ns(published_ns);
-    let (published, bound_ns) = context.path.localise(remote)?;
-    Some((taken_ns.saturating_sub(published.as_ns()), bound_ns))
+impl MessageHistory {
+    /// One of which nothing but its number is known.
+    pub(super) const fn unrecorded(key: Key, epoch: u32) -> Self {
+        Self {
+            key,
+            epoch,
+            count: 1,
+            published: None,
+            egress: None,
+            ingress: None,
+            taken: None,
+            handed_to_tx_ns: None,
+            copies: Copies {
+                reordered_count: 0,
+                duplicated_count: 0,
+                late_count: 0,
+                second_received_ns: None,
+            },
+            fate: MessageFate::Unexplained,
+            interruption_index: None,
+        }
+    }
+
+    /// False for a run of numbers that no record mentions.
+    pub const fn is_recorded(&self) -> bool {
+        self.published.is_some()
+            || self.egress.is_some()
+            || self.ingress.is_some()
+            || self.taken.is_some()
+    }
+
+    /// What the receiving gateway noted of the whole message; `None` also where only pieces of it came.
+    pub fn arrived(&self) -> Option<IngressRecord> {
+        let is_whole = |one: &IngressRecord| one.flags & IngressRecord::INCOMPLETE == 0;
+        self.ingress.filter(is_whole)
+    }
+
+    /// True when a later message of the channel came before it.
+    pub fn is_overtaken(&self) -> bool {
+        let has_flag = |one: IngressRecord| one.flags & IngressRecord::REORDERED != 0;
+        self.ingress.is_some_and(has_flag)
+    }
+
+    /// When it was published, on the producer's host clock, from whichever record carries it.
+    pub fn published_ns(&self) -> Option<i64> {
+        let stamps = [
+            self.published.map(|record| record.published_ns),
+            self.egress.map(|record| record.published_ns),
+            self.ingress.map(|record| record.published_ns),
+            self.taken.map(|record| record.published_ns),
+        ];
+        stamps.into_iter().flatten().find_map(stamp)
+    }
+
+    /// When it was handed to the kernel, on the producer's host clock.
+    pub fn handed_ns(&self) -> Option<i64> {
+        let by_sender = self.egress.and_then(|record| stamp(record.handed_ns));
+        by_sender.or_else(|| stamp(self.ingress?.handed_ns))
+    }
+
+    /// Published to taken and how far that may be off because two hosts' clocks are in it, nanoseconds;
+    /// `None` for a message that was not taken, and between hosts whose clocks are not aligned.
+    pub fn delay_ns(&self, path: ChannelPath<'_>) -> Option<(i64, u64)> {
+        let taken = self.taken?;
+        let (published_ns, taken_ns) = (stamp(taken.published_ns)?, stamp(taken.taken_ns)?);
+        let (published, bound_ns) = path.localise(RemoteInstant::from_ns(published_ns))?;
+        Some((taken_ns.saturating_sub(published.as_ns()), bound_ns))
+    }
+
+    /// Its way over the network.
+    pub fn passage(&self, path: ChannelPath<'_>) -> Passage {
+        let handed_ns = self.handed_ns();
+        let received_ns = self.arrived().and_then(|record| stamp(record.received_ns));
+        let sent = handed_ns.and_then(|ns| path.localise(RemoteInstant::from_ns(ns)));
+        let delay = sent.zip(received_ns);
+        Passage {
+            epoch_rank: self.key.epoch_rank,
+            sequence: self.key.sequence,
+            count: self.count,
+            offered_ns: handed_ns.or_else(|| self.published_ns()),
+            received_ns,
+            delay_ns: delay.map(|((sent, _), ns)| ns.saturating_sub(sent.as_ns())),
+            delay_bound_ns: delay.map_or(0, |((_, bound_ns), _)| bound_ns),
+            crossing: self.crossing(),
+        }
+    }
+
+    /// What the network did to it.
+    pub fn crossing(&self) -> Crossing {
+        match self.fate {
+            // What happened behind the receiving gateway is not the network's.
+            _ if self.arrived().is_some() => Crossing::Arrived,
+            MessageFate::Taken | MessageFate::SupersededAtConsumer => Crossing::Arrived,
+            MessageFate::LostOnWire | MessageFate::Incomplete => Crossing::LostByNetwork,
+            MessageFate::InFlight
+            | MessageFate::Unexplained
+            | MessageFate::UnknownPeerRecordsUnavailable => Crossing::Unknown,
+            MessageFate::SupersededAtInput
+            | MessageFate::RefusedByKernel
+            | MessageFate::RefusedAtIngress
+            | MessageFate::Late
+            | MessageFate::Duplicate
+            | MessageFate::LostInInterruption => Crossing::LostByHost,
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
-    use crate::synthetic::{Files, TAKEN_NS, at, same_clock};
-    use crate::{ChannelPath, Interruption, PathProcess, account};
-    use hil_core::time::Instant;
+    use crate::synthetic::{Files, HANDED_NS, RECEIVED_NS, TAKEN_NS, at, same_clock};
+    use crate::{AccountContext, Interruption, PathProcess, account, each_history};
+    use hil_core::time::{Alignment, Instant};
+
+    fn passages(files: &Files, context: &AccountContext<'_>) -> Vec<Passage> {
+        let mut found = Vec::new();
+        each_history(&files.records(), context, |one| {
+            found.push(one.passage(context.path));
+        });
+        found
+    }
+
+    /// By start of the producer and number.
+    fn histories(
+        files: &Files,
+        context: &AccountContext<'_>,
+    ) -> BTreeMap<(u32, u64), MessageHistory> {
+        let mut found = BTreeMap::new();
+        each_history(&files.records(), context, |one| {
+            found.insert((one.epoch, one.key.sequence), *one);
+        });
+        found
+    }
 
     #[test]
-    fn each_story_has_the_fate_that_the_account_counts() {
+    fn each_history_has_the_fate_that_the_account_counts() {
         use MessageFate as Fate;
         let fates = [
             Fate::Taken,
@@ -102,26 +229,31 @@ mod tests {
         }
         files.ingress.last_mut().unwrap().flags = IngressRecord::REORDERED;
         let context = same_clock(1_000_000_000);
-        let wanted: BTreeSet<(u32, u64)> = (0..9).map(|sequence| (7, sequence)).collect();
-        let found = stories(&files.records(), &context, &wanted);
-        let found_fates: Vec<_> = found.values().map(|story| story.fate).collect();
+        let found = histories(&files, &context);
+        let found_fates: Vec<_> = found.values().map(|one| one.fate).collect();
         assert_eq!(found_fates, fates);
-        assert_eq!(found[&(7, 6)].delay_ns, Some(TAKEN_NS));
-        assert_eq!(found[&(7, 1)].delay_ns, None);
-        assert_eq!(found[&(7, 1)].published_ns, Some(at(7, 1).published_ns));
-        assert!(found[&(7, 6)].is_overtaken && !found[&(7, 0)].is_overtaken);
+        assert_eq!(found[&(7, 6)].delay_ns(context.path), Some((TAKEN_NS, 0)));
+        assert_eq!(found[&(7, 1)].delay_ns(context.path), None);
+        assert_eq!(found[&(7, 1)].published_ns(), Some(at(7, 1).published_ns));
+        assert!(found[&(7, 6)].is_overtaken() && !found[&(7, 0)].is_overtaken());
         let account = account(&files.records(), &context);
         assert_eq!(account.fates.of(Fate::LostOnWire), 1);
     }
 
     #[test]
-    fn a_message_of_another_start_or_without_record_is_not_there() {
-        let files = Files::delivered(3);
+    fn a_message_without_a_record_is_told_by_its_number_and_has_no_delay_without_an_alignment() {
+        let mut files = Files::delivered(3);
+        files.write(at(7, 5), MessageFate::Taken);
         let context = AccountContext::new(ChannelPath::Gateway { alignment: None });
-        let wanted = BTreeSet::from([(7, 2), (7, 3), (8, 2)]);
-        let found = stories(&files.records(), &context, &wanted);
-        assert_eq!(found.keys().copied().collect::<Vec<_>>(), [(7, 2)]);
-        assert_eq!(found[&(7, 2)].delay_ns, None, "clocks are not aligned");
+        let found = histories(&files, &context);
+        let recorded: Vec<_> = found.values().map(MessageHistory::is_recorded).collect();
+        assert_eq!(recorded, [true, true, true, false, true]);
+        assert_eq!(found[&(7, 3)].count, 2);
+        assert_eq!(
+            found[&(7, 2)].delay_ns(context.path),
+            None,
+            "clocks are not aligned"
+        );
     }
 
     #[test]
@@ -141,9 +273,60 @@ mod tests {
             down(published_ns, published_ns + 5_000_000),
         ];
         let context = same_clock(1_000_000_000).with_interruptions(&interruptions);
-        let wanted = BTreeSet::from([(7, 9), (7, 10)]);
-        let found = stories(&files.records(), &context, &wanted);
+        let found = histories(&files, &context);
         assert_eq!(found[&(7, 10)].interruption_index, Some(1));
         assert_eq!(found[&(7, 9)].interruption_index, None);
+    }
+
+    #[test]
+    fn losses_of_the_host_are_kept_apart_from_those_of_the_network() {
+        use Crossing::{Arrived, LostByHost, LostByNetwork};
+        use MessageFate as Fate;
+        let mut files = Files::default();
+        for (sequence, fate) in (0_u64..).zip([
+            Fate::Taken,
+            Fate::LostOnWire,
+            Fate::SupersededAtInput,
+            Fate::RefusedByKernel,
+            Fate::Late,
+            Fate::SupersededAtConsumer,
+            Fate::Taken,
+        ]) {
+            files.write(at(7, sequence), fate);
+        }
+        let found = passages(&files, &same_clock(1_000_000_000));
+        let crossings: Vec<_> = found.iter().map(|one| one.crossing).collect();
+        assert_eq!(
+            crossings,
+            [
+                Arrived,
+                LostByNetwork,
+                LostByHost,
+                LostByHost,
+                Arrived,
+                Arrived,
+                Arrived
+            ]
+        );
+        assert_eq!(found[0].delay_ns, Some(RECEIVED_NS - HANDED_NS));
+        assert_eq!(found[1].offered_ns, Some(at(7, 1).published_ns + HANDED_NS));
+        assert_eq!(found[2].offered_ns, Some(at(7, 2).published_ns));
+    }
+
+    #[test]
+    fn a_delay_between_hosts_needs_an_alignment_and_carries_its_bound() {
+        let files = Files::delivered(3);
+        let unaligned = AccountContext::new(ChannelPath::Gateway { alignment: None });
+        let found = passages(&files, &unaligned);
+        assert!(found.iter().all(|one| one.delay_ns.is_none()));
+        assert!(found.iter().all(|one| one.received_ns.is_some()));
+        let alignment = Some(Alignment {
+            offset_ns: 500,
+            bound_ns: 70,
+        });
+        let aligned = AccountContext::new(ChannelPath::Gateway { alignment });
+        let found = passages(&files, &aligned);
+        assert_eq!(found[1].delay_ns, Some(RECEIVED_NS - HANDED_NS - 500));
+        assert_eq!(found[1].delay_bound_ns, 70);
     }
 }

@@ -16,16 +16,18 @@
 //! the alignment; the bound beside each figure that crosses hosts says how far that may be off.
 #![forbid(unsafe_code)]
 
+mod account;
 mod fate;
+#[cfg(test)]
+mod feed_tests;
+mod fold;
 mod follow_up;
 mod gaps;
 mod history;
-mod join;
 mod metrics;
 pub mod network;
 pub mod nic_clock;
 mod outage;
-mod passage;
 pub mod radio;
 #[cfg(test)]
 mod random_fates_tests;
@@ -38,24 +40,22 @@ mod tests;
 use core::fmt::Debug;
 use core::time::Duration;
 
-pub use history::{MessageHistory, stories};
-pub use join::{Joined, Key};
+pub use account::{AccountFold, account};
+pub use fold::{ChannelFold, FirstNumber, FoldSettings, RecordEvent, RecordsAtHand, each_history};
+pub use history::{Copies, Key, MessageHistory};
 pub use metrics::{
     BurstCount, ChannelAccount, Closing, ClosingMetrics, Coverage, EndToEnd, FateCounts, Gap, Gaps,
     InterruptionMetrics, SegmentMetrics, StampCoverage,
 };
 pub use outage::{
     EventTime, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFinder, OutageMetrics,
-    Preceding, Standing, outages, preceding,
+    Preceding, Standing, preceding,
 };
-pub use passage::passages;
 pub use stage::{MessageFate, Side, Stage};
 
 use hil_clock::{ClockMap, ClockSettings};
-use hil_core::random::RandomStream;
 use hil_core::record::{EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord};
 use hil_core::time::{Alignment, Instant, RemoteInstant};
-use hil_stats::histogram::LatencyHistogram;
 
 /// Largest difference between end-to-end and the sum of segments for a message that closes.
 pub const RESIDUAL_LIMIT_NS: i64 = 1_000;
@@ -64,9 +64,22 @@ pub const RESIDUAL_LIMIT_NS: i64 = 1_000;
 /// with an error below this.
 pub const ORDER_TOLERANCE_NS: i64 = 1_000;
 
-/// How long a message may travel before it counts as lost instead of in flight, unless the
-/// caller knows better.
-pub const FLIGHT_TIME_MAX: Duration = Duration::from_millis(50);
+/// How long a message may travel before it counts as lost instead of in flight, on a link that
+/// delays none on purpose.
+const FLIGHT_TIME_MAX: Duration = Duration::from_millis(50);
+
+/// Share of the messages of an emulated link that are not under way for longer than is allowed for.
+pub const FLIGHT_QUANTILE: f64 = 0.9999;
+
+/// Longest time from what a record tells until the record is in its file: processes write every 20 ms,
+/// each at its own time.
+pub const WRITING_TIME_MAX: Duration = Duration::from_millis(100);
+
+/// The longest flight after which a missing message is lost, on a link that delays messages on purpose by
+/// up to `link_delay`, at [`FLIGHT_QUANTILE`]. The one definition for reports and for those who watch.
+pub const fn flight_time_max(link_delay: Duration) -> Duration {
+    FLIGHT_TIME_MAX.saturating_add(link_delay)
+}
 
 /// The record files of one channel. `None` means the file is not at hand, which differs from an
 /// empty one: nothing is concluded from the absence of a record in an absent file.
@@ -82,21 +95,6 @@ pub struct ChannelRecords<'a> {
     pub follow_up: Option<&'a dyn RecordSource<FollowUpRecord>>,
     /// The consumer's.
     pub taken: Option<&'a dyn RecordSource<TakenRecord>>,
-}
-
-impl ChannelRecords<'_> {
-    /// Those that a channel carried so can have.
-    fn on(self, path: ChannelPath<'_>) -> Self {
-        if path.is_gateway() {
-            return self;
-        }
-        Self {
-            egress: None,
-            ingress: None,
-            follow_up: None,
-            ..self
-        }
-    }
 }
 
 /// How a channel gets from its producer to its consumer.
@@ -269,10 +267,13 @@ pub struct AccountContext<'a> {
     pub producer_run: Option<RunSpan>,
     /// The run on the consumer's host clock, if known.
     pub consumer_run: Option<RunSpan>,
-    /// Longest time a message may travel; see [`FLIGHT_TIME_MAX`]. Messages seen last within
+    /// Longest time a message may travel; see [`flight_time_max`]. Messages seen last within
     /// this time of the end of the run count as in flight, and those seen last within this time
     /// before an interruption count as lost in it.
     pub flight_time_max: Duration,
+    /// Messages that a reader of the channel has room for, if known: one that so many came after was
+    /// pushed out, and any other that was not taken waits.
+    pub depth: Option<usize>,
     /// True when both network cards take their stamps from one hardware clock.
     pub cards_share_clock: bool,
     /// Round trips of the gateways' clock exchange, nanoseconds.
@@ -290,6 +291,7 @@ impl<'a> AccountContext<'a> {
             producer_run: None,
             consumer_run: None,
             flight_time_max: FLIGHT_TIME_MAX,
+            depth: None,
             cards_share_clock: false,
             round_trips_ns: &[],
             seed: 0,
@@ -302,99 +304,6 @@ impl<'a> AccountContext<'a> {
         self.interruptions = interruptions;
         self
     }
-}
-
-/// Draws up the account of one channel. Time grows with the number of records; so does memory, by the
-/// few bytes a message that exact quantiles take, unless the source holds its records itself.
-///
-/// # Panics
-/// Never for any records; it asserts its own invariant, that the fates sum to the published
-/// count.
-pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> ChannelAccount {
-    let records = records.on(context.path);
-    let join = join::Join::new(&records);
-    let producer_restart_count = join.epoch_count.saturating_sub(1);
-    let mut judge = fate::Judge::new(&records, context, &join);
-    let mut book = segments::SegmentBook::new(&records, context);
-    let mut bursts = gaps::Bursts::default();
-    let mut fates = FateCounts::default();
-    let mut published_count = 0_u64;
-    for joined in join {
-        let fate = judge.judge(&joined);
-        fates.add(fate, joined.count);
-        bursts.count(joined.key, fate, joined.count);
-        book.count(&joined);
-        published_count = published_count.saturating_add(joined.count);
-    }
-    assert_eq!(
-        fates.total(),
-        published_count,
-        "every published message has exactly one fate"
-    );
-    let (gaps, gap_of_interruption) = gaps::gaps(&records, context);
-    let flags = [
-        IngressRecord::REORDERED,
-        IngressRecord::DUPLICATE,
-        IngressRecord::LATE,
-    ];
-    let [reordered_count, duplicated_count, late_count] = flag_counts(&records, flags);
-    let mut random = RandomStream::new(context.seed, "measure.account.bootstrap");
-    ChannelAccount {
-        published_count,
-        published_unrecorded_count: records
-            .published
-            .map(|published| published_count.saturating_sub(published.count())),
-        producer_restart_count,
-        fates,
-        reordered_count,
-        duplicated_count,
-        late_count,
-        segments: book.segments(),
-        hardware_wire: book.hardware_wire(),
-        end_to_end: book.end_to_end(&mut random),
-        closing: book.closing(),
-        coverage: book.coverage,
-        round_trip: round_trip(context),
-        loss_bursts: bursts.finish(),
-        gaps,
-        interruptions: judge.interruptions(&gap_of_interruption),
-    }
-}
-
-/// Hands every message of a channel to `take`, in the order of the producer's starts and numbers: what
-/// is recorded of it, what became of it, and the interruption that cost it, by its place in the context.
-/// A judge remembers the message before, so it sees all of them, whatever the caller wants.
-pub fn each_judged(
-    records: &ChannelRecords<'_>,
-    context: &AccountContext<'_>,
-    mut take: impl FnMut(&Joined, MessageFate, Option<usize>),
-) {
-    let records = records.on(context.path);
-    let join = join::Join::new(&records);
-    let mut judge = fate::Judge::new(&records, context, &join);
-    for joined in join {
-        let fate = judge.judge(&joined);
-        take(&joined, fate, judge.last_hit);
-    }
-}
-
-/// How many arrivals have each of `flags`; `None` without the receiving gateway's records.
-fn flag_counts<const N: usize>(records: &ChannelRecords<'_>, flags: [u32; N]) -> [Option<u64>; N] {
-    let mut counts = [records.ingress.map(|_| 0_u64); N];
-    for record in each(records.ingress) {
-        for (count, flag) in counts.iter_mut().flatten().zip(flags) {
-            *count += u64::from(record.flags & flag != 0);
-        }
-    }
-    counts
-}
-
-fn round_trip(context: &AccountContext<'_>) -> hil_stats::histogram::Distribution {
-    let mut histogram = LatencyHistogram::default();
-    for round_trip_ns in context.round_trips_ns {
-        histogram.record(*round_trip_ns);
-    }
-    histogram.distribution("no clock exchange took place")
 }
 
 /// The records of one kind, in the order they were written.

@@ -6,9 +6,8 @@ use core::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::join::Joined;
+use super::history::MessageHistory;
 use super::stage::{MessageFate, Side};
-use super::{AccountContext, ChannelRecords, each_judged};
 use hil_core::record::stamp;
 use hil_core::time::{Instant, duration_ns};
 
@@ -139,33 +138,24 @@ impl OutageFinder {
         self.found
     }
 
-    fn see(&mut self, joined: &Joined, fate: MessageFate, interruption: Option<usize>) {
-        let published_ns = joined.published_ns();
-        match fate {
+    /// Adds a message; they come in the order in which they settle.
+    pub fn add(&mut self, message: &MessageHistory) {
+        let published_ns = message.published_ns();
+        match message.fate {
             MessageFate::Taken | MessageFate::SupersededAtConsumer => {
-                let taken_ns = joined.taken.and_then(|record| stamp(record.taken_ns));
+                let taken_ns = message.taken.and_then(|record| stamp(record.taken_ns));
                 self.arrived(published_ns, taken_ns);
             }
             fate if fate.is_loss() => {
                 let is_first = !self.is_open;
-                self.lost(joined.key.sequence, joined.count, published_ns);
+                self.lost(message.key.sequence, message.count, published_ns);
                 if let Some(outage) = self.found.last_mut().filter(|_| is_first) {
-                    outage.interruption_index = interruption;
+                    outage.interruption_index = message.interruption_index;
                 }
             }
             _ => {}
         }
     }
-}
-
-/// Every outage of a channel, in the order of its messages. Time and memory grow with the number
-/// of records.
-pub fn outages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Vec<Outage> {
-    let mut finder = OutageFinder::default();
-    each_judged(records, context, |joined, fate, interruption| {
-        finder.see(joined, fate, interruption);
-    });
-    finder.finish()
 }
 
 /// The outages of a channel in figures.

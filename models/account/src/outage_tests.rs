@@ -2,8 +2,16 @@
 
 use super::*;
 use crate::synthetic::{Files, PERIOD_NS, TAKEN_NS, at, same_clock};
-use crate::{ChannelPath, Interruption, PathProcess, account};
+use crate::{
+    AccountContext, ChannelPath, ChannelRecords, Interruption, PathProcess, account, each_history,
+};
 use MessageFate as Fate;
+
+fn outages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Vec<Outage> {
+    let mut finder = OutageFinder::default();
+    each_history(records, context, |message| finder.add(message));
+    finder.finish()
+}
 
 /// One message per millisecond; `fate` says what becomes of each.
 fn files(count: u64, fate: impl Fn(u64) -> Fate) -> Files {

@@ -10,7 +10,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::stage::MessageFate;
-use crate::{AccountContext, ChannelRecords, RecordSource, each_judged};
+use crate::{MessageHistory, RecordSource, RecordsAtHand};
 use hil_core::record::{EgressRecord, UNAVAILABLE, stamp};
 use hil_stats::statistics::{Interval, wilson};
 
@@ -63,16 +63,25 @@ pub struct RadioFates {
 }
 
 impl RadioRow {
-    fn add(&mut self, fate: HandedFate) {
+    fn add(&mut self, message: &MessageHistory) {
         self.count += 1;
         let Some(fates) = &mut self.fates else { return };
-        match fate {
-            HandedFate::Arrived => fates.arrived_count += 1,
-            HandedFate::Lost => fates.lost_count += 1,
-            HandedFate::Interrupted => fates.interrupted_count += 1,
-            HandedFate::InFlight => fates.in_flight_count += 1,
+        match message.fate {
+            _ if message.arrived().is_some() => fates.arrived_count += 1,
+            MessageFate::Taken | MessageFate::SupersededAtConsumer => fates.arrived_count += 1,
+            MessageFate::LostInInterruption => fates.interrupted_count += 1,
+            MessageFate::InFlight => fates.in_flight_count += 1,
             // Without any receiver's records all of them are unknown, and with them none is.
-            HandedFate::Unknown => self.fates = None,
+            MessageFate::UnknownPeerRecordsUnavailable | MessageFate::Unexplained => {
+                self.fates = None;
+            }
+            MessageFate::LostOnWire
+            | MessageFate::SupersededAtInput
+            | MessageFate::RefusedByKernel
+            | MessageFate::Incomplete
+            | MessageFate::RefusedAtIngress
+            | MessageFate::Late
+            | MessageFate::Duplicate => fates.lost_count += 1,
         }
     }
 }
@@ -122,7 +131,7 @@ pub struct TransmitStampMetrics {
 /// Where the transmit stamps of `egress` were taken.
 pub fn transmit_stamps(egress: &dyn RecordSource<EgressRecord>) -> TransmitStampMetrics {
     let mut figures = TransmitStampMetrics::default();
-    for record in handed(egress) {
+    for record in egress.each().filter(is_handed) {
         figures.handed_count += 1;
         let is_before_queue = record.flags & EgressRecord::STAMPED_BEFORE_QUEUE != 0;
         let counter = match (record.tx_software_ns == UNAVAILABLE, is_before_queue) {
@@ -135,34 +144,46 @@ pub fn transmit_stamps(egress: &dyn RecordSource<EgressRecord>) -> TransmitStamp
     figures
 }
 
-/// Sets what the radio reported against what arrived; `None` when no radio reported anything or
-/// the sending gateway's records are not at hand. Fates are those of the account, so that what was
-/// under way at the end, or met a gateway that was down, counts as neither lost in the air nor above it.
-pub fn radio_metrics(
-    records: &ChannelRecords<'_>,
-    context: &AccountContext<'_>,
-) -> Option<RadioMetrics> {
-    let reports = EgressRecord::RADIO_ACKNOWLEDGED | EgressRecord::RADIO_UNACKNOWLEDGED;
-    if !records
-        .egress?
-        .each()
-        .any(|record| record.flags & reports != 0)
-    {
-        return None;
+/// Sets what the radio reported against what arrived, message by message. Fates are those of the account, so
+/// that what was under way at the end, or met a gateway that was down, counts as neither lost in the air
+/// nor above it.
+#[derive(Debug)]
+pub struct RadioFold {
+    /// Acknowledged, not acknowledged, without a report.
+    rows: [RadioRow; 3],
+}
+
+impl RadioFold {
+    /// Of no message.
+    pub fn new(at_hand: RecordsAtHand) -> Self {
+        let fates = at_hand.ingress.then(RadioFates::default);
+        Self {
+            rows: [RadioRow { count: 0, fates }; 3],
+        }
     }
-    let fates = records.ingress.map(|_| RadioFates::default());
-    let mut rows = [RadioRow { count: 0, fates }; 3];
-    each_handed(records, context, |record, fate| {
-        let row = if record.flags & EgressRecord::RADIO_ACKNOWLEDGED != 0 {
-            0
-        } else if record.flags & EgressRecord::RADIO_UNACKNOWLEDGED != 0 {
-            1
-        } else {
-            2
+
+    /// Adds a message; one that was not handed to the kernel does not count.
+    pub fn add(&mut self, message: &MessageHistory) {
+        let Some(egress) = message.egress.filter(is_handed) else {
+            return;
         };
-        rows[row].add(fate);
-    });
-    Some(metrics(rows))
+        let [acknowledged, unacknowledged, unreported] = &mut self.rows;
+        let row = if egress.flags & EgressRecord::RADIO_ACKNOWLEDGED != 0 {
+            acknowledged
+        } else if egress.flags & EgressRecord::RADIO_UNACKNOWLEDGED != 0 {
+            unacknowledged
+        } else {
+            unreported
+        };
+        row.add(message);
+    }
+
+    /// What came of it; `None` when no radio reported anything.
+    pub fn finish(self) -> Option<RadioMetrics> {
+        let [acknowledged, unacknowledged, _] = &self.rows;
+        let reported_count = acknowledged.count + unacknowledged.count;
+        (reported_count > 0).then(|| metrics(self.rows))
+    }
 }
 
 fn metrics(rows: [RadioRow; 3]) -> RadioMetrics {
@@ -190,58 +211,6 @@ fn metrics(rows: [RadioRow; 3]) -> RadioMetrics {
     }
 }
 
-/// The messages that were handed to the kernel.
-fn handed(egress: &dyn RecordSource<EgressRecord>) -> impl Iterator<Item = EgressRecord> {
-    egress.each().filter(|record| {
-        record.handed_ns != UNAVAILABLE && record.flags & EgressRecord::REFUSED_BY_KERNEL == 0
-    })
-}
-
-/// What became of a message behind the sending radio.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum HandedFate {
-    /// The receiving gateway has it.
-    Arrived,
-    /// Never received, while everything worked.
-    Lost,
-    /// Lost while a process on its way was down, which is no fault of the air.
-    Interrupted,
-    /// Still under way when the run ended.
-    InFlight,
-    /// The receiving gateway's records are not at hand.
-    Unknown,
-}
-
-/// Hands the sending gateway's record of every message that was handed to the kernel to `take`, with what
-/// became of it.
-pub(super) fn each_handed(
-    records: &ChannelRecords<'_>,
-    context: &AccountContext<'_>,
-    mut take: impl FnMut(&EgressRecord, HandedFate),
-) {
-    each_judged(records, context, |joined, fate, _| {
-        let handed = joined.egress.filter(is_handed);
-        let Some(egress) = handed else { return };
-        let fate = match fate {
-            _ if joined.arrived().is_some() => HandedFate::Arrived,
-            MessageFate::Taken | MessageFate::SupersededAtConsumer => HandedFate::Arrived,
-            MessageFate::LostInInterruption => HandedFate::Interrupted,
-            MessageFate::InFlight => HandedFate::InFlight,
-            MessageFate::UnknownPeerRecordsUnavailable | MessageFate::Unexplained => {
-                HandedFate::Unknown
-            }
-            MessageFate::LostOnWire
-            | MessageFate::SupersededAtInput
-            | MessageFate::RefusedByKernel
-            | MessageFate::Incomplete
-            | MessageFate::RefusedAtIngress
-            | MessageFate::Late
-            | MessageFate::Duplicate => HandedFate::Lost,
-        };
-        take(&egress, fate);
-    });
-}
-
 /// True for a message that was handed to the kernel and not refused.
 fn is_handed(record: &EgressRecord) -> bool {
     stamp(record.handed_ns).is_some() && record.flags & EgressRecord::REFUSED_BY_KERNEL == 0
@@ -250,12 +219,24 @@ fn is_handed(record: &EgressRecord) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{ChannelPath, Interruption, PathProcess, RunSpan};
+    use crate::{
+        AccountContext, ChannelPath, ChannelRecords, Interruption, PathProcess, RunSpan,
+        each_history,
+    };
     use hil_core::record::IngressRecord;
     use hil_core::time::{Alignment, Instant};
 
     const ACK: u32 = EgressRecord::RADIO_ACKNOWLEDGED;
     const NO_ACK: u32 = EgressRecord::RADIO_UNACKNOWLEDGED;
+
+    fn radio_metrics(
+        records: &ChannelRecords<'_>,
+        context: &AccountContext<'_>,
+    ) -> Option<RadioMetrics> {
+        let mut fold = RadioFold::new(RecordsAtHand::of(records, context));
+        each_history(records, context, |message| fold.add(message));
+        fold.finish()
+    }
 
     fn sent(sequence: u64, flags: u32) -> EgressRecord {
         EgressRecord {
@@ -273,9 +254,10 @@ mod tests {
         }
     }
 
-    fn came(sequence: u64) -> IngressRecord {
+    fn came(sent: &EgressRecord) -> IngressRecord {
         IngressRecord {
-            sequence,
+            sequence: sent.sequence,
+            published_ns: sent.published_ns,
             epoch: 1,
             ..bytemuck::Zeroable::zeroed()
         }
@@ -284,12 +266,12 @@ mod tests {
     /// One message of each kind, two of the kind asked about last.
     fn example() -> (Vec<EgressRecord>, Vec<IngressRecord>) {
         let flags = [ACK, ACK, NO_ACK, NO_ACK, 0, 0, NO_ACK];
-        let egress = flags
+        let egress: Vec<_> = flags
             .into_iter()
             .zip(0..)
             .map(|(f, s)| sent(s, f))
             .collect();
-        let ingress = [0, 2, 4].into_iter().map(came).collect();
+        let ingress = [0, 2, 4].map(|index| came(&egress[index])).to_vec();
         (egress, ingress)
     }
 
@@ -342,7 +324,9 @@ mod tests {
         };
         // One a second. 3 meets a gateway that is down, 9 is under way when the run ends, 5 is lost.
         let egress: Vec<_> = (0..10).map(|one| second(one, NO_ACK)).collect();
-        let ingress: Vec<_> = [0, 1, 2, 4, 6, 7, 8].into_iter().map(came).collect();
+        let ingress = [0, 1, 2, 4, 6, 7, 8]
+            .map(|index| came(&egress[index]))
+            .to_vec();
         let records = ChannelRecords {
             egress: Some(&egress),
             ingress: Some(&ingress),

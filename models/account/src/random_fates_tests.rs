@@ -5,6 +5,7 @@ use core::time::Duration;
 
 use super::synthetic::{Files, PERIOD_NS, Written, at, same_clock};
 use super::*;
+use hil_core::random::RandomStream;
 
 const MS: i64 = 1_000_000;
 
@@ -75,7 +76,7 @@ fn random_run(seed: u64) -> (Files, FateCounts, Vec<BurstCount>, i64) {
     }
     // The run goes on long enough that nothing above can still be travelling.
     now_ns += 100 * MS;
-    for index in 0..stream.next_u64() % 4 {
+    for index in (0..stream.next_u64() % 4).rev() {
         let published_ns = now_ns - 1 - i64::try_from(index).unwrap() * 10;
         let sequence = files.published.last().unwrap().sequence + 1;
         files.write(

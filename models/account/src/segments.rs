@@ -1,10 +1,11 @@
 //! Where the time of each message went, and whether the parts add up. It judges no fate: see
 //! [`super::fate`].
 
-use super::join::Joined;
+use super::fold::RecordsAtHand;
+use super::history::MessageHistory;
 use super::metrics::{Closing, ClosingMetrics, Coverage, EndToEnd, SegmentMetrics, StampCoverage};
 use super::stage::{Side, Stage};
-use super::{AccountContext, ChannelPath, ChannelRecords, ORDER_TOLERANCE_NS, RESIDUAL_LIMIT_NS};
+use super::{AccountContext, ChannelPath, ORDER_TOLERANCE_NS, RESIDUAL_LIMIT_NS};
 use hil_core::random::RandomStream;
 use hil_core::record::{EgressRecord, stamp};
 use hil_core::time::RemoteInstant;
@@ -34,14 +35,9 @@ struct Timeline {
 
 impl Timeline {
     /// A direct channel has no stages between its ends, whatever a record claims.
-    fn of(joined: &Joined, is_gateway: bool) -> Self {
-        let (egress, ingress, taken) = (joined.egress, joined.arrived(), joined.taken);
-        let published_ns = joined
-            .published
-            .and_then(|record| stamp(record.published_ns))
-            .or_else(|| stamp(egress?.published_ns))
-            .or_else(|| stamp(ingress?.published_ns))
-            .or_else(|| stamp(taken?.published_ns));
+    fn of(message: &MessageHistory, is_gateway: bool) -> Self {
+        let (egress, ingress, taken) = (message.egress, message.arrived(), message.taken);
+        let published_ns = message.published_ns();
         let sender_handed_ns = ingress.and_then(|record| stamp(record.handed_ns));
         let handed_ns = egress
             .and_then(|record| stamp(record.handed_ns))
@@ -67,7 +63,7 @@ impl Timeline {
             })
         };
         // A follow-up is a difference on the sender's host, so it needs no real-time clock.
-        let followed_up = || Some(sender_handed_ns?.saturating_add(joined.handed_to_tx_ns?));
+        let followed_up = || Some(sender_handed_ns?.saturating_add(message.handed_to_tx_ns?));
         let transmitted = egress
             .and_then(|e| kernel(Stage::TxSoftware, e.tx_software_ns, e.realtime_offset_ns))
             .or_else(|| plain(Stage::TxSoftware, followed_up()));
@@ -101,8 +97,8 @@ impl Timeline {
 
 /// Collects segments, closing and coverage over the messages of a channel.
 #[derive(Debug)]
-pub(super) struct SegmentBook<'a> {
-    files: ChannelRecords<'a>,
+pub(super) struct SegmentFold<'a> {
+    at_hand: RecordsAtHand,
     is_gateway: bool,
     path: ChannelPath<'a>,
     cards_share_clock: bool,
@@ -120,12 +116,12 @@ pub(super) struct SegmentBook<'a> {
     pub(super) coverage: StampCoverage,
 }
 
-impl<'a> SegmentBook<'a> {
-    pub(super) fn new(records: &ChannelRecords<'a>, context: &AccountContext<'a>) -> Self {
+impl<'a> SegmentFold<'a> {
+    pub(super) fn new(at_hand: RecordsAtHand, context: &AccountContext<'a>) -> Self {
         let covers = |is_known: bool| is_known.then(Coverage::default);
-        let (egress, ingress) = (records.egress.is_some(), records.ingress.is_some());
+        let (egress, ingress) = (at_hand.egress, at_hand.ingress);
         Self {
-            files: *records,
+            at_hand,
             is_gateway: context.path.is_gateway(),
             path: context.path,
             cards_share_clock: context.cards_share_clock,
@@ -150,7 +146,7 @@ impl<'a> SegmentBook<'a> {
                 residual: Distribution::unavailable("no message was taken"),
             },
             coverage: StampCoverage {
-                tx_software: covers(egress || (ingress && records.follow_up.is_some())),
+                tx_software: covers(egress || (ingress && at_hand.follow_up)),
                 tx_hardware: covers(egress),
                 rx_software: covers(ingress),
                 rx_hardware: covers(ingress),
@@ -160,12 +156,12 @@ impl<'a> SegmentBook<'a> {
 
     /// Counts one message. Segments are of taken messages, so that they belong to the same
     /// messages as end-to-end; of all messages when the consumer's records are not at hand.
-    pub(super) fn count(&mut self, joined: &Joined) {
-        self.cover(joined);
-        if self.files.taken.is_some() && joined.taken.is_none() {
+    pub(super) fn count(&mut self, message: &MessageHistory) {
+        self.cover(message);
+        if self.at_hand.taken && message.taken.is_none() {
             return;
         }
-        let timeline = Timeline::of(joined, self.is_gateway);
+        let timeline = Timeline::of(message, self.is_gateway);
         let (mut sum_ns, mut is_ordered) = (0_i64, true);
         for mark in timeline.marks.iter().flatten() {
             self.mark_counts[mark.stage.index()] += 1;
@@ -183,8 +179,8 @@ impl<'a> SegmentBook<'a> {
             }
             is_ordered &= length_ns >= -ORDER_TOLERANCE_NS.saturating_add_unsigned(bound_ns);
         }
-        self.count_hardware(joined);
-        self.close(joined, &timeline, sum_ns, is_ordered);
+        self.count_hardware(message);
+        self.close(message, &timeline, sum_ns, is_ordered);
     }
 
     /// A length and how far it may be off. On one clock, two kernel stamps are compared raw, so
@@ -203,8 +199,14 @@ impl<'a> SegmentBook<'a> {
         Some((to.host_ns.saturating_sub(local.as_ns()), bound_ns))
     }
 
-    fn close(&mut self, joined: &Joined, timeline: &Timeline, sum_ns: i64, is_ordered: bool) {
-        let Some(taken) = joined.taken.filter(|_| self.path.is_aligned()) else {
+    fn close(
+        &mut self,
+        message: &MessageHistory,
+        timeline: &Timeline,
+        sum_ns: i64,
+        is_ordered: bool,
+    ) {
+        let Some(taken) = message.taken.filter(|_| self.path.is_aligned()) else {
             return;
         };
         let published = stamp(taken.published_ns)
@@ -226,7 +228,9 @@ impl<'a> SegmentBook<'a> {
             self.residual.record(residual_ns);
         }
         match residual_ns {
-            Some(_) if self.misses_stage(joined, timeline) => self.closing.missing_stage_count += 1,
+            Some(_) if self.misses_stage(message, timeline) => {
+                self.closing.missing_stage_count += 1
+            }
             None => self.closing.missing_stage_count += 1,
             Some(_) if !is_ordered => self.closing.negative_segment_count += 1,
             Some(residual_ns) if residual_ns > RESIDUAL_LIMIT_NS => {
@@ -244,12 +248,12 @@ impl<'a> SegmentBook<'a> {
 
     /// True when a file at hand lacks a stage the message must have passed. Kernel stamps may
     /// be missing: their segments are combined.
-    fn misses_stage(&self, joined: &Joined, timeline: &Timeline) -> bool {
+    fn misses_stage(&self, message: &MessageHistory, timeline: &Timeline) -> bool {
         let lacks = |stage: Stage| {
             let mut marks = timeline.marks.iter().flatten();
             !marks.any(|mark| mark.stage == stage)
         };
-        if self.files.published.is_some() && joined.published.is_none() {
+        if self.at_hand.published && message.published.is_none() {
             return true;
         }
         if !self.is_gateway {
@@ -257,15 +261,15 @@ impl<'a> SegmentBook<'a> {
         }
         let sent = [Stage::TakenByGateway, Stage::HandedToKernel];
         let arrived = [Stage::Received, Stage::Forwarded];
-        (self.files.egress.is_some() && (joined.egress.is_none() || sent.into_iter().any(lacks)))
-            || (self.files.ingress.is_some()
-                && (joined.ingress.is_none() || arrived.into_iter().any(lacks)))
+        (self.at_hand.egress && (message.egress.is_none() || sent.into_iter().any(lacks)))
+            || (self.at_hand.ingress
+                && (message.ingress.is_none() || arrived.into_iter().any(lacks)))
     }
 
-    fn cover(&mut self, joined: &Joined) {
+    fn cover(&mut self, message: &MessageHistory) {
         let has = |ns: i64| stamp(ns).is_some();
         let coverage = &mut self.coverage;
-        let handed = joined.egress.filter(|record| {
+        let handed = message.egress.filter(|record| {
             has(record.handed_ns) && record.flags & EgressRecord::REFUSED_BY_KERNEL == 0
         });
         if let Some(egress) = handed {
@@ -275,13 +279,13 @@ impl<'a> SegmentBook<'a> {
             ] {
                 coverage.get_or_insert_default().count(has(ns));
             }
-        } else if self.files.egress.is_none()
-            && joined.ingress.is_some()
+        } else if !self.at_hand.egress
+            && message.ingress.is_some()
             && let Some(coverage) = &mut coverage.tx_software
         {
-            coverage.count(joined.handed_to_tx_ns.is_some_and(has));
+            coverage.count(message.handed_to_tx_ns.is_some_and(has));
         }
-        if let Some(ingress) = joined.arrived() {
+        if let Some(ingress) = message.arrived() {
             for (coverage, ns) in [
                 (&mut coverage.rx_software, ingress.rx_software_ns),
                 (&mut coverage.rx_hardware, ingress.rx_hardware_ns),
@@ -291,11 +295,11 @@ impl<'a> SegmentBook<'a> {
         }
     }
 
-    fn count_hardware(&mut self, joined: &Joined) {
-        let sent_ns = joined
+    fn count_hardware(&mut self, message: &MessageHistory) {
+        let sent_ns = message
             .egress
             .and_then(|record| stamp(record.tx_hardware_ns));
-        let received_ns = joined
+        let received_ns = message
             .ingress
             .and_then(|record| stamp(record.rx_hardware_ns));
         if let Some((sent_ns, received_ns)) = sent_ns.zip(received_ns)
@@ -349,12 +353,12 @@ impl<'a> SegmentBook<'a> {
                 continue;
             }
             let (owner, has_file) = match stage {
-                Stage::Published => ("producer", self.files.published.is_some()),
+                Stage::Published => ("producer", self.at_hand.published),
                 Stage::Received | Stage::RxSoftware | Stage::Forwarded => {
-                    ("receiving gateway", self.files.ingress.is_some())
+                    ("receiving gateway", self.at_hand.ingress)
                 }
-                Stage::Taken => ("consumer", self.files.taken.is_some()),
-                _ => ("sending gateway", self.files.egress.is_some()),
+                Stage::Taken => ("consumer", self.at_hand.taken),
+                _ => ("sending gateway", self.at_hand.egress),
             };
             return if has_file {
                 format!("no message has \"{stage}\"")
@@ -380,7 +384,7 @@ impl<'a> SegmentBook<'a> {
     }
 
     pub(super) fn end_to_end(&self, random: &mut RandomStream) -> EndToEnd {
-        let reason = match (self.path.is_aligned(), self.files.taken.is_some()) {
+        let reason = match (self.path.is_aligned(), self.at_hand.taken) {
             (false, _) => NOT_ALIGNED,
             (_, false) => NO_CONSUMER,
             _ => "no message was taken",
@@ -409,7 +413,7 @@ impl<'a> SegmentBook<'a> {
         let unavailable = |reason: &str| Closing::Unavailable {
             reason: reason.to_owned(),
         };
-        match (self.path.is_aligned(), self.files.taken.is_some()) {
+        match (self.path.is_aligned(), self.at_hand.taken) {
             (false, _) => unavailable(NOT_ALIGNED),
             (_, false) => unavailable(NO_CONSUMER),
             _ => Closing::Checked(ClosingMetrics {

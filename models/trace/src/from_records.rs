@@ -1,10 +1,8 @@
-//! What a link did to every message of a channel, from the joined records: the substance of a
+//! What a link did to every message of a channel, from its joined records: the substance of a
 //! [`Trace`](super::Trace). It judges as the account does and writes no file.
 
-use std::collections::BTreeMap;
-
 use super::{TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
-use hil_account::{AccountContext, ChannelRecords, Joined, MessageFate, each, each_judged};
+use hil_account::{AccountContext, ChannelRecords, MessageFate, MessageHistory, each_history};
 use hil_core::record::{IngressRecord, stamp};
 use hil_core::time::RemoteInstant;
 
@@ -60,24 +58,22 @@ pub fn each_traced(
     channel: TraceChannel,
     mut take: impl FnMut(TraceRecord),
 ) -> Result<(), TooManyMessages> {
-    let copies = second_arrivals(records);
     let origin_ns = context.producer_run.map(|run| run.start.as_ns());
     let mut tracer = Tracer {
         context,
         channel,
-        copies: &copies,
         origin_ns,
         last_published_ns: 0,
     };
     let mut count = 0_u64;
-    each_judged(records, context, |joined, fate, interruption| {
-        count = count.saturating_add(joined.count);
+    each_history(records, context, |message| {
+        count = count.saturating_add(message.count);
         if count > TRACE_MESSAGES_MAX {
             return;
         }
-        for step in 0..joined.count {
-            let mut record = tracer.record(joined, fate, interruption.is_some());
-            record.sequence = joined.key.sequence + step;
+        for step in 0..message.count {
+            let mut record = tracer.record(message);
+            record.sequence = message.key.sequence + step;
             take(record);
         }
     });
@@ -87,58 +83,49 @@ pub fn each_traced(
     Ok(())
 }
 
-/// When the second copy of a message arrived, on the consumer's host clock, by start of the
-/// producer and sequence number.
-fn second_arrivals(records: &ChannelRecords<'_>) -> BTreeMap<(u32, u64), i64> {
-    let mut copies = BTreeMap::new();
-    for record in each(records.ingress) {
-        if record.flags & IngressRecord::DUPLICATE != 0 {
-            let key = (record.epoch, record.sequence);
-            copies.entry(key).or_insert(record.received_ns);
-        }
-    }
-    copies
-}
-
 struct Tracer<'a> {
     context: &'a AccountContext<'a>,
     channel: TraceChannel,
-    copies: &'a BTreeMap<(u32, u64), i64>,
     origin_ns: Option<i64>,
     last_published_ns: i64,
 }
 
 impl Tracer<'_> {
-    fn record(&mut self, joined: &Joined, fate: MessageFate, is_interrupted: bool) -> TraceRecord {
-        let published = joined.published_ns();
+    fn record(&mut self, message: &MessageHistory) -> TraceRecord {
+        let published = message.published_ns();
         // A run without a known start begins with its first message.
         let origin_ns = *self.origin_ns.get_or_insert(published.unwrap_or(0));
         let since_start = |ns: i64| ns.saturating_sub(origin_ns);
         let published_ns = published.map_or(self.last_published_ns, since_start);
         self.last_published_ns = published_ns;
         let size_bytes = self.channel.size_bytes;
-        let mut record = TraceRecord::published(published_ns, joined.key.sequence, size_bytes);
-        record.start = u16::try_from(joined.key.epoch_rank).unwrap_or(u16::MAX);
-        record.fate = trace_fate(joined, fate);
-        let departure = departure_ns(joined);
+        let mut record = TraceRecord::published(published_ns, message.key.sequence, size_bytes);
+        record.start = u16::try_from(message.key.epoch_rank).unwrap_or(u16::MAX);
+        record.fate = trace_fate(message);
+        let departure = departure_ns(message);
         record.departure_ns = departure.map_or(published_ns, since_start);
         let flags = [
             (published.is_none(), TraceRecord::INSTANT_ASSUMED),
             (self.channel.is_emulated, TraceRecord::EMULATED),
-            (fate == MessageFate::RefusedByKernel, TraceRecord::REFUSED),
-            (is_interrupted, TraceRecord::INTERRUPTED),
+            (
+                message.fate == MessageFate::RefusedByKernel,
+                TraceRecord::REFUSED,
+            ),
+            (
+                message.interruption_index.is_some(),
+                TraceRecord::INTERRUPTED,
+            ),
         ];
         for (is_set, flag) in flags {
             record.flags |= if is_set { flag } else { 0 };
         }
-        let (Some(ingress), Some(departure_ns)) = (joined.arrived(), departure) else {
+        let (Some(ingress), Some(departure_ns)) = (message.arrived(), departure) else {
             return record;
         };
-        if ingress.flags & IngressRecord::REORDERED != 0 {
+        if message.is_overtaken() {
             record.flags |= TraceRecord::REORDERED;
         }
-        let key = (ingress.epoch, ingress.sequence);
-        let second = self.copies.get(&key).copied();
+        let second = message.copies.second_received_ns;
         let second = second.filter(|_| ingress.flags & IngressRecord::DUPLICATE == 0);
         self.put_delays(&mut record, departure_ns, ingress.received_ns, second);
         record
@@ -169,32 +156,28 @@ impl Tracer<'_> {
 }
 
 /// When it was handed to the link, on the producer's host clock.
-fn departure_ns(joined: &Joined) -> Option<i64> {
-    let stamps = [
-        joined.egress.map(|record| record.handed_ns),
-        joined.ingress.map(|record| record.handed_ns),
-        joined.egress.map(|record| record.taken_ns),
-    ];
-    let handed = stamps.into_iter().flatten().find_map(stamp);
-    handed.or_else(|| joined.published_ns())
+fn departure_ns(message: &MessageHistory) -> Option<i64> {
+    let taken_ns = || message.egress.and_then(|record| stamp(record.taken_ns));
+    let handed_ns = message.handed_ns().or_else(taken_ns);
+    handed_ns.or_else(|| message.published_ns())
 }
 
 /// Whether the link delivered it; what the consumer made of it is not the link's business.
-fn trace_fate(joined: &Joined, fate: MessageFate) -> TraceFate {
-    if let Some(ingress) = joined.arrived() {
+fn trace_fate(message: &MessageHistory) -> TraceFate {
+    if let Some(ingress) = message.arrived() {
         return match stamp(ingress.forwarded_ns) {
             Some(_) => TraceFate::Delivered,
             None => TraceFate::LostAfterLink,
         };
     }
-    match fate {
+    match message.fate {
         MessageFate::Taken | MessageFate::SupersededAtConsumer => TraceFate::Delivered,
         MessageFate::SupersededAtInput | MessageFate::RefusedByKernel => TraceFate::LostBeforeLink,
         MessageFate::LostOnWire | MessageFate::Incomplete => TraceFate::LostInNetwork,
         MessageFate::RefusedAtIngress | MessageFate::Late | MessageFate::Duplicate => {
             TraceFate::LostAfterLink
         }
-        MessageFate::LostInInterruption => match joined.egress {
+        MessageFate::LostInInterruption => match message.egress {
             Some(_) => TraceFate::LostInNetwork,
             None => TraceFate::LostBeforeLink,
         },

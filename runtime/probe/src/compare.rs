@@ -7,10 +7,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
+use hil_account::{AccountContext, ChannelPath, ChannelRecords, each_history};
 use hil_capture::flow::OwnHeader;
 use hil_capture::join::Joined;
 use hil_capture::observe::{Observation, Stream};
-use hil_core::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_core::record::{EgressRecord, IngressRecord, stamp};
 use hil_net::Direction;
 use hil_protocol::transport::IpProtocol;
 use hil_protocol::wire::Kind;
@@ -434,23 +435,19 @@ fn is_data(own: &OwnHeader) -> bool {
 
 /// Departure and arrival of each message by the gateways' kernel stamps.
 fn gateway_wire(side: &GatewaySide) -> BTreeMap<Message, (i64, i64)> {
+    let records = ChannelRecords {
+        egress: Some(&side.egress),
+        ingress: Some(&side.ingress),
+        ..ChannelRecords::default()
+    };
+    let path = ChannelPath::Gateway { alignment: None };
     let mut gateway = BTreeMap::new();
-    let departures: BTreeMap<Message, i64> = side
-        .egress
-        .iter()
-        .filter(|one| one.tx_software_ns != UNAVAILABLE)
-        .map(|one| ((one.epoch, one.sequence), one.tx_software_ns))
-        .collect();
-    let is_stamped = |one: &&IngressRecord| one.rx_software_ns != UNAVAILABLE;
-    for one in side.ingress.iter().filter(is_stamped) {
-        let key = (one.epoch, one.sequence);
-        if let Some(departure) = departures.get(&key) {
-            // A duplicate arrives later under the same number; the first one counts.
-            gateway
-                .entry(key)
-                .or_insert((*departure, one.rx_software_ns));
-        }
-    }
+    each_history(&records, &AccountContext::new(path), |message| {
+        let left_ns = message.egress.and_then(|one| stamp(one.tx_software_ns));
+        let came_ns = message.ingress.and_then(|one| stamp(one.rx_software_ns));
+        let both = left_ns.zip(came_ns);
+        gateway.extend(both.map(|both| ((message.epoch, message.key.sequence), both)));
+    });
     gateway
 }
 

@@ -1,11 +1,9 @@
 //! From the records of a run to what the cards' stamps say: per card its clock against the host's,
 //! per channel the segments that end or begin in a card, each with its bound. It opens no card.
 
-use std::collections::{BTreeMap, BTreeSet};
-
-use hil_account::ChannelPath;
 use hil_account::nic_clock::{Bounded, NicClockMetrics, NicTimeline};
-use hil_core::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_account::{AccountContext, ChannelPath, ChannelRecords, each_history};
+use hil_core::record::{EgressRecord, IngressRecord, stamp};
 use hil_core::time::RemoteInstant;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
 use serde::{Deserialize, Serialize};
@@ -72,8 +70,6 @@ pub(crate) struct Places<'a> {
     pub(crate) sender: Option<&'a NicTimeline>,
     /// Clock of the receiving card.
     pub(crate) receiver: Option<&'a NicTimeline>,
-    /// From the sending host's clock to the receiving host's.
-    pub(crate) path: ChannelPath<'a>,
     /// The receiving card, if there is one.
     pub(crate) receiving_nic: Option<&'a NicHistory>,
 }
@@ -107,10 +103,6 @@ impl SegmentTimes {
     }
 }
 
-fn stamp(ns: i64) -> Option<i64> {
-    (ns != UNAVAILABLE).then_some(ns)
-}
-
 /// `later` minus `earlier`, where both are on one clock.
 fn between(later: Bounded, earlier: Bounded) -> Bounded {
     Bounded {
@@ -126,45 +118,119 @@ const fn exact(value_ns: i64) -> Bounded {
     }
 }
 
-/// The hardware stamps of `channel`; `None` when its messages passed no card.
+/// The hardware stamps of `channel`. Of copies of a message the one that was forwarded counts, and a message
+/// of which only pieces came did not arrive.
 pub(crate) fn channel_stamps(
     channel: &str,
-    egress: &[EgressRecord],
-    ingress: &[IngressRecord],
+    records: &ChannelRecords<'_>,
+    context: &AccountContext<'_>,
     places: &Places<'_>,
 ) -> ChannelStamps {
-    let is_sent = |one: &&EgressRecord| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0;
-    let sent: Vec<&EgressRecord> = egress.iter().filter(is_sent).collect();
-    let stamped = || sent.iter().filter(|one| one.tx_hardware_ns != UNAVAILABLE);
-    let ingress = first_arrivals(ingress);
-    let is_stamped = |one: &&&IngressRecord| one.rx_hardware_ns != UNAVAILABLE;
-    let rx_hardware_count = ingress.iter().filter(is_stamped).count() as u64;
+    let mut found = StampFold::default();
+    each_history(records, context, |message| {
+        let left = message
+            .egress
+            .and_then(|record| found.departure(&record, places));
+        if let Some(record) = message.arrived() {
+            found.arrival(&record, left, context.path, places);
+        }
+    });
+    let no_tx = match places.sender {
+        Some(_) => "no message has a stamp of the sending card",
+        None => "the sending card's clock was not read",
+    };
+    let no_rx = "no message has a stamp of the receiving card";
     ChannelStamps {
         channel: channel.to_owned(),
-        sent_count: sent.len() as u64,
-        tx_hardware_count: stamped().count() as u64,
-        tx_both_count: stamped()
-            .filter(|one| one.tx_software_ns != UNAVAILABLE)
-            .count() as u64,
-        received_count: ingress.len() as u64,
-        rx_hardware_count,
-        rx_reason: if rx_hardware_count == 0 {
+        sent_count: found.sent_count,
+        tx_hardware_count: found.tx_hardware_count,
+        tx_both_count: found.tx_both_count,
+        received_count: found.received_count,
+        rx_hardware_count: found.rx_hardware_count,
+        rx_reason: if found.rx_hardware_count == 0 {
             rx_reason(places.receiving_nic)
         } else {
             String::new()
         },
-        segments: segments(&sent, &ingress, places),
+        segments: vec![
+            found
+                .handed
+                .segment("handed to the kernel → card sends", no_tx),
+            found
+                .software
+                .segment("TX stamp (software) → card sends", no_tx),
+            found.wire.segment("card sends → card receives", no_rx),
+            found
+                .stack
+                .segment("card receives → RX stamp (software)", no_rx),
+        ],
     }
 }
 
-/// What came first of each message: a copy took a way of its own, behind one that was measured.
-/// A message of which only pieces came did not arrive.
-fn first_arrivals(ingress: &[IngressRecord]) -> Vec<&IngressRecord> {
-    let mut seen = BTreeSet::new();
-    let mut first = |one: &&IngressRecord| seen.insert((one.epoch, one.sequence));
-    let is_whole = |one: &&IngressRecord| one.flags & IngressRecord::INCOMPLETE == 0;
-    let whole = ingress.iter().filter(is_whole);
-    whole.filter(&mut first).collect()
+/// Collects the stamps of a channel's messages.
+#[derive(Default)]
+struct StampFold {
+    sent_count: u64,
+    tx_hardware_count: u64,
+    tx_both_count: u64,
+    received_count: u64,
+    rx_hardware_count: u64,
+    handed: SegmentTimes,
+    software: SegmentTimes,
+    wire: SegmentTimes,
+    stack: SegmentTimes,
+}
+
+/// A stamp of the sending card; without a place on the host's monotonic clock where the clock of the card
+/// does not say.
+struct Departure(Option<Bounded>);
+
+impl StampFold {
+    /// Counts what left; gives its stamp.
+    fn departure(&mut self, record: &EgressRecord, places: &Places<'_>) -> Option<Departure> {
+        if record.flags & EgressRecord::REFUSED_BY_KERNEL != 0 {
+            return None;
+        }
+        self.sent_count += 1;
+        let nic_ns = stamp(record.tx_hardware_ns)?;
+        self.tx_hardware_count += 1;
+        let left = places.sender.and_then(|clock| clock.to_realtime(nic_ns));
+        let monotonic = left.map(|left| Bounded {
+            value_ns: left.value_ns.saturating_sub(record.realtime_offset_ns),
+            ..left
+        });
+        let handed = exact(record.handed_ns);
+        self.handed
+            .note(monotonic.map(|left| between(left, handed)));
+        if let Some(software_ns) = stamp(record.tx_software_ns) {
+            self.tx_both_count += 1;
+            let software = exact(software_ns);
+            self.software.note(left.map(|left| between(left, software)));
+        }
+        Some(Departure(monotonic))
+    }
+
+    fn arrival(
+        &mut self,
+        record: &IngressRecord,
+        left: Option<Departure>,
+        path: ChannelPath<'_>,
+        places: &Places<'_>,
+    ) {
+        self.received_count += 1;
+        let Some(nic_ns) = stamp(record.rx_hardware_ns) else {
+            return;
+        };
+        self.rx_hardware_count += 1;
+        let came = places.receiver.and_then(|clock| clock.to_realtime(nic_ns));
+        if let Some(software_ns) = stamp(record.rx_software_ns) {
+            let software = exact(software_ns);
+            self.stack.note(came.map(|came| between(software, came)));
+        }
+        if let Some(Departure(left)) = left {
+            self.wire.note(crossing(left, came, record, path));
+        }
+    }
 }
 
 fn rx_reason(card: Option<&NicHistory>) -> String {
@@ -176,57 +242,6 @@ fn rx_reason(card: Option<&NicHistory>) -> String {
         }
         Some(_) => "granted by the receiving card, but none came".to_owned(),
     }
-}
-
-fn segments(
-    sent: &[&EgressRecord],
-    ingress: &[&IngressRecord],
-    places: &Places<'_>,
-) -> Vec<NicSegment> {
-    let place = |clock: Option<&NicTimeline>, ns: i64| clock?.to_realtime(ns);
-    let mut handed = SegmentTimes::default();
-    let mut software = SegmentTimes::default();
-    let mut departures: BTreeMap<(u32, u64), Option<Bounded>> = BTreeMap::new();
-    for record in sent {
-        let Some(nic_ns) = stamp(record.tx_hardware_ns) else {
-            continue;
-        };
-        let left = place(places.sender, nic_ns);
-        let monotonic = left.map(|left| Bounded {
-            value_ns: left.value_ns.saturating_sub(record.realtime_offset_ns),
-            ..left
-        });
-        handed.note(monotonic.map(|left| between(left, exact(record.handed_ns))));
-        if let Some(software_ns) = stamp(record.tx_software_ns) {
-            software.note(left.map(|left| between(left, exact(software_ns))));
-        }
-        departures.insert((record.epoch, record.sequence), monotonic);
-    }
-    let mut stack = SegmentTimes::default();
-    let mut wire = SegmentTimes::default();
-    for record in ingress {
-        let Some(nic_ns) = stamp(record.rx_hardware_ns) else {
-            continue;
-        };
-        let came = place(places.receiver, nic_ns);
-        if let Some(software_ns) = stamp(record.rx_software_ns) {
-            stack.note(came.map(|came| between(exact(software_ns), came)));
-        }
-        if let Some(left) = departures.get(&(record.epoch, record.sequence)) {
-            wire.note(crossing(*left, came, record, places.path));
-        }
-    }
-    let no_tx = match places.sender {
-        Some(_) => "no message has a stamp of the sending card",
-        None => "the sending card's clock was not read",
-    };
-    let no_rx = "no message has a stamp of the receiving card";
-    vec![
-        handed.segment("handed to the kernel → card sends", no_tx),
-        software.segment("TX stamp (software) → card sends", no_tx),
-        wire.segment("card sends → card receives", no_rx),
-        stack.segment("card receives → RX stamp (software)", no_rx),
-    ]
 }
 
 /// From one card to the other on the receiving host's clock.
@@ -253,6 +268,7 @@ fn crossing(
 mod tests {
     use super::*;
     use hil_account::nic_clock::NicClockRecord;
+    use hil_core::record::UNAVAILABLE;
     use hil_core::time::Alignment;
 
     const EPOCH_NS: i64 = 1_700_000_000_000_000_000;
@@ -355,12 +371,24 @@ mod tests {
         let places = Places {
             sender: Some(&ours),
             receiver: Some(&theirs),
-            path: ChannelPath::Gateway {
-                alignment: Some(alignment),
-            },
             receiving_nic: Some(&story),
         };
-        channel_stamps("arm/command", &egress, &ingress, &places)
+        stamps_of(&egress, &ingress, Some(alignment), &places)
+    }
+
+    fn stamps_of(
+        egress: &Vec<EgressRecord>,
+        ingress: &Vec<IngressRecord>,
+        alignment: Option<Alignment>,
+        places: &Places<'_>,
+    ) -> ChannelStamps {
+        let records = ChannelRecords {
+            egress: Some(egress),
+            ingress: Some(ingress),
+            ..ChannelRecords::default()
+        };
+        let context = AccountContext::new(ChannelPath::Gateway { alignment });
+        channel_stamps("arm/command", &records, &context, places)
     }
 
     fn median(segment: &NicSegment) -> (i64, i64) {
@@ -403,17 +431,16 @@ mod tests {
 
     #[test]
     fn pieces_of_a_message_are_not_counted_as_received() {
-        let egress = [sent(0, 500_000_000), sent(1, 510_000_000)];
-        let mut ingress = egress.each_ref().map(came);
+        let egress = vec![sent(0, 500_000_000), sent(1, 510_000_000)];
+        let mut ingress: Vec<_> = egress.iter().map(came).collect();
         ingress[1].flags = IngressRecord::INCOMPLETE;
         ingress[1].rx_hardware_ns = UNAVAILABLE;
         let places = Places {
             sender: None,
             receiver: None,
-            path: ChannelPath::Gateway { alignment: None },
             receiving_nic: None,
         };
-        let figures = channel_stamps("arm/command", &egress, &ingress, &places);
+        let figures = stamps_of(&egress, &ingress, None, &places);
         assert_eq!((figures.received_count, figures.rx_hardware_count), (1, 1));
     }
 
@@ -437,10 +464,9 @@ mod tests {
         let places = Places {
             sender: None,
             receiver: None,
-            path: ChannelPath::SharedMemory,
             receiving_nic: None,
         };
-        let figures = channel_stamps("x", &[sent(0, 5)], &[], &places);
+        let figures = stamps_of(&vec![sent(0, 5)], &Vec::new(), None, &places);
         assert_eq!(figures.tx_hardware_count, 1);
         assert_eq!(figures.segments[0].unplaced_count, 1);
         assert!(figures.segments[0].distribution.measured().is_none());

@@ -170,12 +170,11 @@ fn network(
     let mut builder = NetworkBuilder::default();
     for (name, account) in accounts {
         let crossing = topology.crossings().find(|one| one.channel.name == name)?;
-        let passages = account.passages.into_iter().collect();
         let payload = log.raw(&name).first();
         builder.add(ChannelPassages {
             channel: &name,
             hosts: [&crossing.from_host.name, &crossing.to_host.name],
-            passages: &passages,
+            passages: &account.passages,
             other_events: Vec::new(),
             duration_ns: length_ns,
             // Virtual time begins with the run, for all hosts alike.

@@ -1,6 +1,7 @@
 //! What an observer hears of a run, one thing at a time.
 
 use bytemuck::Pod;
+use hil_account::RecordEvent;
 use hil_account::nic_clock::NicClockRecord;
 use hil_core::message::Envelope;
 use hil_core::record::{
@@ -92,6 +93,19 @@ pub enum Record {
 }
 
 impl Record {
+    /// The record as the account of its channel takes it; `None` of a kind that says nothing of the
+    /// way of a message.
+    pub(crate) const fn of_message(&self) -> Option<RecordEvent> {
+        match *self {
+            Self::Published(record) => Some(RecordEvent::Published(record)),
+            Self::Taken(record) => Some(RecordEvent::Taken(record)),
+            Self::Egress(record) => Some(RecordEvent::Egress(record)),
+            Self::Ingress(record) => Some(RecordEvent::Ingress(record)),
+            Self::FollowUp(record) => Some(RecordEvent::FollowUp(record)),
+            _ => None,
+        }
+    }
+
     /// The records of a batch, in order; none of a batch of messages.
     pub(super) fn each(batch: &Batch<'_>, take: &mut dyn FnMut(Self)) {
         fn all<R: Pod>(batch: &Batch<'_>, of: fn(R) -> Record, take: &mut dyn FnMut(Record)) {

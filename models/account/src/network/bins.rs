@@ -67,12 +67,7 @@ pub struct NetworkBins {
 impl NetworkBins {
     /// Of a run of `duration_ns`. Messages are put where they were handed to the network, silences
     /// where the receiver had them. `width_ns` is above zero.
-    pub fn of<P: Passages + ?Sized>(
-        passages: &P,
-        duration_ns: i64,
-        width_ns: i64,
-        place: &Place<'_>,
-    ) -> Self {
+    pub fn of(passages: &Passages, duration_ns: i64, width_ns: i64, place: &Place<'_>) -> Self {
         let width_ns = width_ns.max(1);
         let count = usize::try_from(duration_ns.max(1).saturating_add(width_ns - 1) / width_ns)
             .unwrap_or(1);
@@ -194,9 +189,9 @@ fn index_of(ns: i64, width_ns: i64, count: usize) -> Option<usize> {
 
 /// Within a silence its length so far grows from bin to bin. Where it begins is a place on the axis; how
 /// long it is, the receiver's own clock says.
-fn silences<P: Passages + ?Sized>(
+fn silences(
     bins: &mut [NetworkBin],
-    passages: &P,
+    passages: &Passages,
     duration_ns: i64,
     width_ns: i64,
     place: &Place<'_>,

@@ -112,8 +112,8 @@ pub struct InterarrivalJitter {
     pub bound_ns: f64,
 }
 
-pub(super) fn delays<P: Passages + ?Sized>(
-    passages: &P,
+pub(super) fn delays(
+    passages: &Passages,
     path: ChannelPath<'_>,
     random: &mut RandomStream,
 ) -> Metric<DelayMetrics> {
@@ -166,7 +166,7 @@ pub(super) fn delays<P: Passages + ?Sized>(
 }
 
 /// The delays of the messages that arrived, as a histogram.
-pub(super) fn delay_bins<P: Passages + ?Sized>(passages: &P) -> Vec<DurationBin> {
+pub(super) fn delay_bins(passages: &Passages) -> Vec<DurationBin> {
     let mut histogram = LatencyHistogram::default();
     let arrived = passages.each().filter(is_arrived);
     for delay_ns in arrived.filter_map(|one| one.delay_ns) {
@@ -220,8 +220,8 @@ pub(super) fn at_share(ascending: &[i64], share: f64) -> i64 {
     ascending[place_of(share, ascending.len())]
 }
 
-pub(super) fn successive<P: Passages + ?Sized>(
-    passages: &P,
+pub(super) fn successive(
+    passages: &Passages,
     path: ChannelPath<'_>,
 ) -> Metric<SuccessiveVariation> {
     let mut magnitudes = Samples::default();
@@ -291,7 +291,7 @@ fn difference(before: &Ends, after: &Ends, path: ChannelPath<'_>) -> Option<Diff
     })
 }
 
-fn jitter<P: Passages + ?Sized>(passages: &P, path: ChannelPath<'_>) -> InterarrivalJitter {
+fn jitter(passages: &Passages, path: ChannelPath<'_>) -> InterarrivalJitter {
     let read = || {
         passages.each().filter_map(|one| {
             one.offered_ns?;

@@ -96,7 +96,7 @@ const fn producer(ns: i64) -> Moment {
 }
 
 /// Every event of the passages of one channel, in order of time.
-pub fn network_events<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
+pub fn network_events(passages: &Passages) -> Vec<NetworkEvent> {
     let mut found = losses(passages);
     found.extend(late(passages));
     found.extend(reordering(passages));
@@ -104,7 +104,7 @@ pub fn network_events<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
     found
 }
 
-fn losses<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
+fn losses(passages: &Passages) -> Vec<NetworkEvent> {
     let (runs, _) = loss_runs(passages);
     let mut found = Vec::new();
     for cluster in clusters(&runs) {
@@ -152,7 +152,7 @@ fn losses<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
 /// What a delay must exceed to be an event: the median and one mean period, so that the next
 /// message should have been there; and the 99th percentile, as messages of several robots may follow
 /// each other at once. `None` without delays or a period.
-fn delay_limit_ns<P: Passages + ?Sized>(passages: &P) -> Option<i64> {
+fn delay_limit_ns(passages: &Passages) -> Option<i64> {
     let mut delays_ns = Samples::default();
     let (mut ends, mut count): (Option<(i64, i64)>, i64) = (None, 0);
     for one in passages.each() {
@@ -173,7 +173,7 @@ fn delay_limit_ns<P: Passages + ?Sized>(passages: &P) -> Option<i64> {
     Some(limit_ns.max(delays_ns.at_share(0.99)))
 }
 
-fn late<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
+fn late(passages: &Passages) -> Vec<NetworkEvent> {
     let Some(limit_ns) = delay_limit_ns(passages) else {
         return Vec::new();
     };
@@ -222,7 +222,7 @@ fn late<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
     found
 }
 
-fn reordering<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
+fn reordering(passages: &Passages) -> Vec<NetworkEvent> {
     let (found, _) = extents(arrivals(passages).map(|(_, number)| number));
     let near = |before: &(u64, u64), after: &(u64, u64)| after.0 - before.0 <= BURST_GAP_MIN;
     let mut times = arrivals(passages).map(|(ns, _)| ns).zip(0_u64..);

@@ -1,30 +1,13 @@
-//! The passages of a channel one after the other, as often as they are asked for: as they are, or in a
-//! few bytes each, as for every message of a long run. It computes no figure.
+//! The passages of a channel one after the other, as often as they are asked for, in a few bytes each. It
+//! computes no figure.
 
 use super::{Crossing, Passage};
 use hil_core::packed::{Unpacked, put};
 
-/// Passages in the order of epochs and sequence numbers.
-pub trait Passages {
-    /// All of them from the first on.
-    fn each(&self) -> impl Iterator<Item = Passage> + '_;
-}
-
-impl Passages for [Passage] {
-    fn each(&self) -> impl Iterator<Item = Passage> + '_ {
-        self.iter().copied()
-    }
-}
-
-impl Passages for Vec<Passage> {
-    fn each(&self) -> impl Iterator<Item = Passage> + '_ {
-        self.iter().copied()
-    }
-}
-
-/// Passages in about a dozen bytes each: what of a message follows from the one before takes one.
+/// Passages in the order of epochs and sequence numbers, in about a dozen bytes each: what of a message
+/// follows from the one before takes one.
 #[derive(Debug, Clone, Default)]
-pub struct PackedPassages {
+pub struct Passages {
     bytes: Vec<u8>,
     last: Follows,
 }
@@ -86,7 +69,7 @@ impl Follows {
     }
 }
 
-impl PackedPassages {
+impl Passages {
     /// Appends the next one.
     pub fn push(&mut self, one: &Passage) {
         let mut head = crossing_number(one.crossing) << CROSSING_SHIFT;
@@ -124,28 +107,27 @@ impl PackedPassages {
         put(bytes, wider.cast_signed());
     }
 
+    /// All of them from the first on.
+    pub fn each(&self) -> impl Iterator<Item = Passage> + '_ {
+        Unpacking {
+            numbers: Unpacked(&self.bytes),
+            last: Follows::default(),
+        }
+    }
+
     #[cfg(test)]
     fn byte_count(&self) -> usize {
         self.bytes.len()
     }
 }
 
-impl FromIterator<Passage> for PackedPassages {
+impl FromIterator<Passage> for Passages {
     fn from_iter<I: IntoIterator<Item = Passage>>(passages: I) -> Self {
         let mut packed = Self::default();
         for one in passages {
             packed.push(&one);
         }
         packed
-    }
-}
-
-impl Passages for PackedPassages {
-    fn each(&self) -> impl Iterator<Item = Passage> + '_ {
-        Unpacking {
-            numbers: Unpacked(&self.bytes),
-            last: Follows::default(),
-        }
     }
 }
 
@@ -222,9 +204,9 @@ mod tests {
             crossing: CROSSINGS[index as usize % 4],
         };
         let passages: Vec<Passage> = (0..5_000).map(&mut passage).collect();
-        let packed: PackedPassages = passages.iter().copied().collect();
-        assert!(packed.each().eq(passages.each()));
-        assert_eq!(PackedPassages::default().each().count(), 0);
+        let packed: Passages = passages.iter().copied().collect();
+        assert!(packed.each().eq(passages.iter().copied()));
+        assert_eq!(Passages::default().each().count(), 0);
         for (number, crossing) in (0..).zip(CROSSINGS) {
             assert_eq!(crossing_number(crossing), number);
         }
@@ -250,7 +232,7 @@ mod tests {
                 crossing: Crossing::Arrived,
             }
         };
-        let packed: PackedPassages = (0..count).map(passage).collect();
+        let packed: Passages = (0..count).map(passage).collect();
         let bytes = packed.byte_count() as f64 / count as f64;
         assert!(bytes < 14.0, "{bytes} bytes");
     }

@@ -85,7 +85,7 @@ pub(super) struct LossRun {
 }
 
 /// Runs of losses, and how many messages the network was handed.
-pub(super) fn loss_runs<P: Passages + ?Sized>(passages: &P) -> (Vec<LossRun>, u64) {
+pub(super) fn loss_runs(passages: &Passages) -> (Vec<LossRun>, u64) {
     let mut runs: Vec<LossRun> = Vec::new();
     let (mut is_open, mut place) = (false, 0_u64);
     for one in passages.each() {
@@ -128,10 +128,7 @@ pub(super) fn clusters(runs: &[LossRun]) -> impl Iterator<Item = &[LossRun]> {
     })
 }
 
-pub(super) fn losses<P: Passages + ?Sized>(
-    passages: &P,
-    run_ns: Option<(i64, i64)>,
-) -> Metric<LossMetrics> {
+pub(super) fn losses(passages: &Passages, run_ns: Option<(i64, i64)>) -> Metric<LossMetrics> {
     let (runs, of_count) = loss_runs(passages);
     let lost_count = runs
         .iter()

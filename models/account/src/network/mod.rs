@@ -1,7 +1,7 @@
 //! What the network did to the messages of one channel and direction, in the terms of the
 //! Internet's measurement standards: one-way delay and its variation (RFC 5481, RFC 3393,
 //! RFC 3550), loss and its bursts (RFC 3611), reordering (RFC 4737), throughput. It reads
-//! [`Passage`]s, which [`crate::passages`] makes from records; it opens no file and knows
+//! [`Passage`]s, which [`crate::MessageHistory::passage`] makes; it opens no file and knows
 //! no robot.
 //!
 //! The network begins where the sending gateway hands a message to the kernel and ends where the
@@ -30,7 +30,7 @@ pub use events::{
     CLOCK_READING_AGE_NS_MAX, EVENT_OUTAGE_MIN_NS, NetworkEvent, NetworkEventKind, clock_steps,
     interruptions, network_events,
 };
-pub use list::{PackedPassages, Passages};
+pub use list::Passages;
 pub use loss::{BURST_GAP_MIN, BurstMetrics, LongestLoss, LossMetrics};
 pub use order::OrderMetrics;
 
@@ -168,7 +168,7 @@ pub struct NetworkMetrics {
 
 impl NetworkMetrics {
     /// The figures of `passages`, which are in the order of epochs and sequence numbers.
-    pub fn of<P: Passages + ?Sized>(passages: &P, context: &NetworkContext<'_>) -> Self {
+    pub fn of(passages: &Passages, context: &NetworkContext<'_>) -> Self {
         let counts = Counts::of(passages);
         let offered_count = counts.arrived.saturating_add(counts.lost);
         let on_network =
@@ -214,7 +214,7 @@ struct Counts {
 }
 
 impl Counts {
-    fn of<P: Passages + ?Sized>(passages: &P) -> Self {
+    fn of(passages: &Passages) -> Self {
         let mut counts = Self::default();
         for one in passages.each() {
             let count = match one.crossing {

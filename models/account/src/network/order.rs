@@ -24,7 +24,7 @@ pub struct OrderMetrics {
     pub extent_max: Option<u64>,
 }
 
-pub(super) fn order<P: Passages + ?Sized>(passages: &P) -> Metric<OrderMetrics> {
+pub(super) fn order(passages: &Passages) -> Metric<OrderMetrics> {
     let (found, count) = extents(arrivals(passages).map(|(_, number)| number));
     if count == 0 {
         return Metric::unavailable("no message is known to have arrived");
@@ -47,9 +47,7 @@ pub(super) fn order<P: Passages + ?Sized>(passages: &P) -> Metric<OrderMetrics> 
 
 /// When each message that arrived did, in the order of arrival, and its number among them in the order
 /// in which they were sent. Equal times keep that order.
-pub(super) fn arrivals<P: Passages + ?Sized>(
-    passages: &P,
-) -> impl Iterator<Item = (i64, u64)> + use<'_, P> {
+pub(super) fn arrivals(passages: &Passages) -> impl Iterator<Item = (i64, u64)> + use<'_> {
     in_order(move || {
         let arrived = passages.each().filter(is_arrived);
         arrived.filter_map(|one| one.received_ns).zip(0..)

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_account::{EventTime, MessageFate, MessageHistory, Side, stories};
+use hil_account::{EventTime, MessageFate, MessageHistory, Side, each_history};
 use hil_core::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
 use hil_core::time::{Instant, RemoteInstant};
 
@@ -36,10 +36,10 @@ pub(super) fn explained(
         let way = Way {
             axis,
             host: topology.process(&channel.from).map(|one| one.host.as_str()),
-            stories: if channel.is_recorded_only() {
+            messages: if channel.is_recorded_only() {
                 BTreeMap::new()
             } else {
-                records.consult(channel, |files, context| stories(files, context, wanted))
+                named_messages(records, channel, wanted)
             },
             channel,
             summary: channels.iter().find(|one| one.name == *name)?,
@@ -147,11 +147,41 @@ fn unavailable(message: &MessageRef, why: &str) -> ExplainedMessage {
     }
 }
 
+/// A message that an event of the score names.
+struct NamedMessage {
+    history: MessageHistory,
+    /// Published to taken and how far that may be off, nanoseconds; `None` for a message that was not
+    /// taken, and between hosts whose clocks are not aligned.
+    delay_ns: Option<(i64, u64)>,
+}
+
+/// Those of `wanted`, by the producer's start and the number, of which `channel` has a record.
+fn named_messages(
+    records: &RunRecords<'_>,
+    channel: &Channel,
+    wanted: &BTreeSet<(u32, u64)>,
+) -> BTreeMap<(u32, u64), NamedMessage> {
+    let mut found = BTreeMap::new();
+    records.consult(channel, |files, context| {
+        each_history(files, context, |message| {
+            let key = (message.epoch, message.key.sequence);
+            if message.is_recorded() && wanted.contains(&key) {
+                let named = NamedMessage {
+                    history: *message,
+                    delay_ns: message.delay_ns(context.path),
+                };
+                found.insert(key, named);
+            }
+        });
+    });
+    found
+}
+
 /// All that is known of one channel's messages.
 struct Way<'a> {
     channel: &'a Channel,
     summary: &'a ChannelSummary,
-    stories: BTreeMap<(u32, u64), MessageHistory>,
+    messages: BTreeMap<(u32, u64), NamedMessage>,
     axis: &'a RunAxis<'a>,
     /// Of its producer.
     host: Option<&'a str>,
@@ -162,18 +192,18 @@ impl Way<'_> {
         if self.channel.is_recorded_only() {
             return unavailable(message, "its channel is only recorded and crosses no link");
         }
-        let Some(story) = self.stories.get(&(message.epoch, message.sequence)) else {
+        let Some(named) = self.messages.get(&(message.epoch, message.sequence)) else {
             return unavailable(message, "no process left a record of it");
         };
-        let published = story.published_ns.map(Instant::from_ns);
+        let published = named.history.published_ns().map(Instant::from_ns);
         ExplainedMessage {
             published_at_s: published
                 .zip(self.host)
                 .and_then(|(published, host)| self.axis.place_s(host, published)),
-            fate: Some(story.fate),
-            delay_s: story.delay_ns.map(|ns| ns as f64 * 1e-9),
-            delay_bound_s: story.delay_bound_ns.map(|ns| ns as f64 * 1e-9),
-            words: self.words(story),
+            fate: Some(named.history.fate),
+            delay_s: named.delay_ns.map(|(ns, _)| ns as f64 * 1e-9),
+            delay_bound_s: named.delay_ns.map(|(_, bound_ns)| bound_ns as f64 * 1e-9),
+            words: self.words(named),
             ..unavailable(message, "")
         }
     }
@@ -182,25 +212,24 @@ impl Way<'_> {
     fn lost_published_ns(&self, event: &ScoreEvent) -> Vec<i64> {
         let messages = event.messages.iter();
         let named = messages.filter(|message| message.channel == self.channel.name);
-        let stories =
-            named.filter_map(|message| self.stories.get(&(message.epoch, message.sequence)));
-        let lost = stories.filter(|story| story.fate.is_loss());
-        lost.filter_map(|story| story.published_ns).collect()
+        let known =
+            named.filter_map(|message| self.messages.get(&(message.epoch, message.sequence)));
+        let lost = known.filter(|one| one.history.fate.is_loss());
+        lost.filter_map(|one| one.history.published_ns()).collect()
     }
 
-    fn words(&self, story: &MessageHistory) -> String {
+    fn words(&self, named: &NamedMessage) -> String {
         let link = self.channel.link.as_deref().unwrap_or_default();
-        match story.fate {
+        match named.history.fate {
             MessageFate::Taken => {
-                let how = match story.delay_ns {
-                    Some(ns) => {
-                        let bound_ns = story.delay_bound_ns.unwrap_or(0);
+                let how = match named.delay_ns {
+                    Some((ns, bound_ns)) => {
                         let bound = within(bound_ns, ns);
                         format!("delivered after {}{bound}", duration_s(ns as f64 * 1e-9))
                     }
                     None => "delivered; delay unavailable: clocks not aligned".to_owned(),
                 };
-                let overtaken = if story.is_overtaken {
+                let overtaken = if named.history.is_overtaken() {
                     ", overtaken by a later message"
                 } else {
                     ""
@@ -217,7 +246,7 @@ impl Way<'_> {
             MessageFate::Incomplete => {
                 format!("incomplete, pieces of it lost on link {link}")
             }
-            MessageFate::LostInInterruption => self.words_of_interruption(story),
+            MessageFate::LostInInterruption => self.words_of_interruption(&named.history),
             MessageFate::InFlight => "still in flight at the end of the run".to_owned(),
             MessageFate::UnknownPeerRecordsUnavailable => {
                 "unavailable: no records of the other host".to_owned()
@@ -226,13 +255,13 @@ impl Way<'_> {
         }
     }
 
-    fn words_of_interruption(&self, story: &MessageHistory) -> String {
+    fn words_of_interruption(&self, message: &MessageHistory) -> String {
         let account = self.summary.account.as_ref();
         let interruption = account
-            .zip(story.interruption_index)
+            .zip(message.interruption_index)
             .and_then(|(account, index)| account.interruptions.get(index));
         interruption.map_or_else(
-            || story.fate.label().to_owned(),
+            || message.fate.label().to_owned(),
             |one| format!("lost while {} was down ({})", one.process, one.cause),
         )
     }

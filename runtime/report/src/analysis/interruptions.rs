@@ -6,7 +6,7 @@
 
 use std::time::Duration;
 
-use hil_account::{FLIGHT_TIME_MAX, Interruption, PathProcess};
+use hil_account::{Interruption, PathProcess, flight_time_max};
 use hil_core::record::{IngressRecord, PublishedRecord, RoundTripRecord, UNAVAILABLE};
 use hil_core::time::{Instant, duration_ns};
 
@@ -185,7 +185,9 @@ impl Stall {
         let (start, end) = *result.spans.get(host)?;
         let from_ns = self.last_sign_ns.unwrap_or(start.as_ns());
         // What came last may be under way at the end of any run.
-        let until_ns = end.as_ns().saturating_sub(duration_ns(FLIGHT_TIME_MAX));
+        let until_ns = end
+            .as_ns()
+            .saturating_sub(duration_ns(flight_time_max(Duration::ZERO)));
         let mut waited = came_ns.filter(|at_ns| *at_ns != UNAVAILABLE);
         waited.find(|at_ns| (from_ns..until_ns).contains(at_ns))?;
         let from = Instant::from_ns(from_ns);

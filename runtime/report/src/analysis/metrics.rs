@@ -4,7 +4,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use hil_account::account;
+use hil_account::radio::{RadioFold, RadioMetrics};
+use hil_account::{AccountFold, ChannelAccount, Outage, OutageFinder, RecordsAtHand, each_history};
 use hil_core::record::IngressRecord;
 
 use super::axis::RunAxis;
@@ -167,6 +168,40 @@ pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
     }
 }
 
+/// What one reading of the messages of a channel gives.
+#[derive(Debug)]
+pub(super) struct ChannelReading {
+    pub(super) account: ChannelAccount,
+    pub(super) outages: Vec<Outage>,
+    pub(super) acknowledgements: Option<RadioMetrics>,
+}
+
+impl ChannelReading {
+    /// Reads the messages of `channel`; `None` when it leaves none, or only for the record.
+    pub(super) fn of(records: &RunRecords<'_>, channel: &Channel) -> Option<Self> {
+        if channel.is_recorded_only() || !records.has(&channel.name) {
+            return None;
+        }
+        Some(records.consult(channel, |files, context| {
+            let at_hand = RecordsAtHand::of(files, context);
+            let mut account = AccountFold::new(at_hand, context);
+            let mut outages = OutageFinder::default();
+            let mut radio = RadioFold::new(at_hand);
+            each_history(files, context, |message| {
+                account.add(message);
+                outages.add(message);
+                radio.add(message);
+            });
+            Self {
+                account: account.finish(),
+                outages: outages.finish(),
+                acknowledgements: radio.finish(),
+            }
+        }))
+    }
+}
+
+/// The summary of a channel; its account is still to be put in.
 pub(super) fn channel_summary(records: &RunRecords<'_>, channel: &Channel) -> ChannelSummary {
     let result = records.result;
     let mut trace_replay = None;
@@ -196,8 +231,7 @@ pub(super) fn channel_summary(records: &RunRecords<'_>, channel: &Channel) -> Ch
         from: channel.from.clone(),
         to: channel.to.clone(),
         link: LinkKind::of(records.topology, channel),
-        account: (records.has(&channel.name) && !channel.is_recorded_only())
-            .then(|| records.consult(channel, account)),
+        account: None,
         outages: None,
         emulation: EmulationMetrics::of(
             records.of_kind::<IngressRecord>(&channel.name, |files| files.ingress.as_ref()),

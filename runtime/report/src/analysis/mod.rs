@@ -20,16 +20,20 @@ mod robot_series;
 mod score_clock;
 mod storage;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
 use hil_account::MessageFate;
+use hil_account::radio::RadioMetrics;
 use hil_core::case_study::Score;
 use hil_core::plot::PlotSeries;
 
 use axis::RunAxis;
 use clocks::HostClocks;
-use metrics::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
+use metrics::{
+    ChannelReading, channel_summary, process_summary, realtime_facts, run_event, run_facts,
+};
 use outages::OutageHistory;
 use records::RunRecords;
 
@@ -150,23 +154,28 @@ pub fn conclude(
         .map(|event| run_event(&axis, event))
         .collect();
     summary.link_changes = link_changes::of_run(&records, &axis);
-    summary.channels = topology
-        .channels()
-        .iter()
+    let channels = topology.channels().iter();
+    summary.channels = channels
         .map(|channel| channel_summary(&records, channel))
         .collect();
+    let found = read_channels(&mut summary, &records, &axis);
     summary.directions = metrics::directions(result);
     let mut unwritten_files = capture::write(&mut summary, &records);
     summary.faces = adapters::adapter_summaries(&records);
     summary.hardware_stamps = nics::hardware_stamps(&records);
-    let outages = add_outages(&mut summary, &records, &axis);
     let (specs, score) = match &case {
         Some((entry, case)) => (entry.channels, case.score(&records.log)),
         None => (&[][..], Score::default()),
     };
     summary.put_score(&score);
-    summary.score_events =
-        events::explained(&score, &records, &axis, &summary.channels, specs, &outages);
+    summary.score_events = events::explained(
+        &score,
+        &records,
+        &axis,
+        &summary.channels,
+        specs,
+        &found.outages,
+    );
     let errors = case.as_ref().map(|(_, case)| case.errors(&records.log));
     let network = network::of_run(
         &records,
@@ -177,7 +186,7 @@ pub fn conclude(
     );
     let (network, network_series) = network.unzip();
     summary.network = network;
-    radio::add(&mut summary, &records, &axis);
+    radio::add(&mut summary, &records, &axis, found.acknowledgements);
     add_warnings(&mut summary, &records);
     summary.warnings.extend(unscored);
     let case = case.as_ref().map(|(_, case)| case.as_ref());
@@ -216,23 +225,39 @@ pub(crate) fn write_whole(path: &Path, text: &str) -> io::Result<()> {
     written
 }
 
-/// The outages of every channel, their figures put into the summary.
-fn add_outages(
+/// What is found in the messages of all channels beside what a summary shows of each.
+struct MessageFindings {
+    outages: Vec<OutageHistory>,
+    /// What radios acknowledged, by channel.
+    acknowledgements: BTreeMap<String, RadioMetrics>,
+}
+
+/// Reads the messages of every channel and puts its account and its outages into the summary.
+fn read_channels(
     summary: &mut RunSummary,
     records: &RunRecords<'_>,
     axis: &RunAxis<'_>,
-) -> Vec<OutageHistory> {
-    let mut stories = Vec::new();
+) -> MessageFindings {
+    let mut found = MessageFindings {
+        outages: Vec::new(),
+        acknowledgements: BTreeMap::new(),
+    };
     for (summary, channel) in summary.channels.iter_mut().zip(records.topology.channels()) {
+        let Some(reading) = ChannelReading::of(records, channel) else {
+            continue;
+        };
         let unknown = MessageFate::UnknownPeerRecordsUnavailable;
-        let fates = summary.account.as_ref().map(|account| &account.fates);
-        let is_partial = fates.is_some_and(|fates| fates.of(unknown) > 0);
-        if let Some(story) = OutageHistory::of(records, axis, channel, is_partial) {
-            summary.outages = story.metrics();
-            stories.push(story);
-        }
+        let is_partial = reading.account.fates.of(unknown) > 0;
+        summary.account = Some(reading.account);
+        let history = OutageHistory::of(records, axis, channel, reading.outages, is_partial);
+        summary.outages = history.as_ref().and_then(OutageHistory::metrics);
+        found.outages.extend(history);
+        let radio = reading.acknowledgements;
+        found
+            .acknowledgements
+            .extend(radio.map(|radio| (channel.name.clone(), radio)));
     }
-    stories
+    found
 }
 
 /// Writes what the case and the network have to plot; gives the file that could not be written. A run whose

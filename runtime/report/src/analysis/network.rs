@@ -6,14 +6,12 @@ use std::collections::BTreeMap;
 
 use hil_account::network::{
     Moment, NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind,
-    NetworkMetrics, PackedPassages, Place, bin_width_ns, clock_steps, interruptions,
-    network_events,
+    NetworkMetrics, Passages, Place, bin_width_ns, clock_steps, interruptions, network_events,
 };
-use hil_account::{Side, passages};
+use hil_account::{Side, each_history};
 use hil_core::case_study::ErrorSeries;
 use hil_core::plot::PlotSeries;
 use hil_core::random::RandomStream;
-use hil_core::record::IngressRecord;
 use hil_core::time::Instant;
 use hil_stats::correlation::{self, LagWindow};
 
@@ -46,7 +44,7 @@ const LAG_MAX_S: f64 = PRECEDING_S;
 pub(crate) struct ChannelPassages<'a> {
     pub(crate) channel: &'a str,
     pub(crate) hosts: [&'a str; 2],
-    pub(crate) passages: &'a PackedPassages,
+    pub(crate) passages: &'a Passages,
     /// What the passages alone do not show.
     pub(crate) other_events: Vec<NetworkEvent>,
     pub(crate) duration_ns: i64,
@@ -466,8 +464,12 @@ fn add_channel(
         axis.place_ns(host, at.ns)
     };
     records.consult(channel, |files, context| {
-        let ways = passages(files, context);
-        let is_copy = |record: &IngressRecord| record.flags & IngressRecord::DUPLICATE != 0;
+        let mut ways = Passages::default();
+        let mut duplicated_count = 0;
+        each_history(files, context, |message| {
+            ways.push(&message.passage(context.path));
+            duplicated_count += message.copies.duplicated_count;
+        });
         let mut other_events = interruptions(context);
         other_events.extend(clock_steps(files));
         builder.add(ChannelPassages {
@@ -481,9 +483,7 @@ fn add_channel(
                 path: context.path,
                 run_ns: Some((producer_start.as_ns(), producer_end.as_ns())),
                 payload_bytes,
-                duplicated_count: files
-                    .ingress
-                    .map(|ingress| ingress.each().filter(is_copy).count() as u64),
+                duplicated_count: files.ingress.map(|_| duplicated_count),
                 round_trips_ns: context.round_trips_ns,
                 seed: context.seed,
             },

@@ -30,17 +30,13 @@ pub(super) fn hardware_stamps(records: &RunRecords<'_>) -> Option<HardwareStamps
     let passing = records.topology.crossings().filter(passes_nic);
     let channels = passing.map(|crossing| {
         let name = &crossing.channel.name;
-        let egress = records.of_kind(name, |files| files.egress.as_ref());
-        let ingress = records.of_kind(name, |files| files.ingress.as_ref());
-        let (egress, ingress) = (egress.collect::<Vec<_>>(), ingress.collect::<Vec<_>>());
-        records.consult(crossing.channel, |_, context| {
+        records.consult(crossing.channel, |files, context| {
             let places = Places {
                 sender: timelines.get(crossing.from_host.name.as_str()),
                 receiver: timelines.get(crossing.to_host.name.as_str()),
-                path: context.path,
                 receiving_nic: nic_of(result, &crossing.to_host.name),
             };
-            channel_stamps(name, &egress, &ingress, &places)
+            channel_stamps(name, files, context, &places)
         })
     });
     let stamps = HardwareStamps {

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_account::{EventTime, Outage, OutageMetrics, Side, Standing, outages, preceding};
+use hil_account::{EventTime, Outage, OutageMetrics, Side, Standing, preceding};
 use hil_core::time::Instant;
 
 use super::axis::RunAxis;
@@ -32,18 +32,15 @@ pub(crate) struct OutageHistory {
 }
 
 impl OutageHistory {
-    /// The outages of `channel` as its records have them; `None` when it leaves none.
+    /// The `outages` of `channel`; `None` when it has no known producer.
     pub(super) fn of(
         records: &RunRecords<'_>,
         axis: &RunAxis<'_>,
         channel: &Channel,
+        outages: Vec<Outage>,
         is_partial: bool,
     ) -> Option<Self> {
-        if channel.is_recorded_only() || !records.has(&channel.name) {
-            return None;
-        }
         let host = &records.topology.process(&channel.from)?.host;
-        let outages = records.consult(channel, outages);
         Some(Self {
             channel: channel.name.clone(),
             placed_ns: placed(&outages, |ns| axis.place_ns(host, ns)),

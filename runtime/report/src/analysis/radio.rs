@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 
-use hil_account::radio::{radio_metrics, transmit_stamps};
+use hil_account::radio::{RadioMetrics, transmit_stamps};
 use hil_core::record::UNAVAILABLE;
 use hil_core::time::Instant;
 
@@ -18,19 +18,23 @@ use hil_rundir::radio_record::{
     NO_CODE, NO_RATE, NO_SIGNAL, RadioRecord, RateRecord, SAMPLE, command,
 };
 
-/// Puts everything about radios into the summary.
-pub(super) fn add(summary: &mut RunSummary, records: &RunRecords<'_>, axis: &RunAxis<'_>) {
+/// Puts everything about radios into the summary; `acknowledgements` are by channel.
+pub(super) fn add(
+    summary: &mut RunSummary,
+    records: &RunRecords<'_>,
+    axis: &RunAxis<'_>,
+    mut acknowledgements: BTreeMap<String, RadioMetrics>,
+) {
     let (topology, result) = (records.topology, records.result);
     let mut report = RadioReport::default();
     for channel in topology.channels() {
         if topology.crossing(channel).is_some() {
-            report
-                .channels
-                .push(records.consult(channel, |files, context| ChannelRadio {
-                    channel: channel.name.clone(),
-                    transmit_stamps: files.egress.map(transmit_stamps),
-                    acknowledgements: radio_metrics(files, context),
-                }));
+            report.channels.push(ChannelRadio {
+                channel: channel.name.clone(),
+                transmit_stamps: records
+                    .consult(channel, |files, _| files.egress.map(transmit_stamps)),
+                acknowledgements: acknowledgements.remove(&channel.name),
+            });
         }
     }
     for (name, samples) in &records.radios {

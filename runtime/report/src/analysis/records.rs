@@ -11,8 +11,8 @@ use std::time::Duration;
 use bytemuck::Pod;
 use hil_account::nic_clock::{NicClockRecord, NicTimeline};
 use hil_account::{
-    AccountContext, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption, ORDER_TOLERANCE_NS,
-    RunSpan,
+    AccountContext, ChannelPath, ChannelRecords, FLIGHT_QUANTILE, Interruption, ORDER_TOLERANCE_NS,
+    RunSpan, flight_time_max,
 };
 use hil_core::record::{
     EgressRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
@@ -31,10 +31,6 @@ use hil_rundir::record::{RecordFile, RecordFileError, RecordKind};
 use hil_rundir::run_result::RunResult;
 use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{Channel, Topology};
-
-/// Share of the messages of an emulated link that are not under way for longer than is allowed for:
-/// at the end of a run, what is younger may still arrive.
-const FLIGHT_QUANTILE: f64 = 0.9999;
 
 /// A finished run: what it was to be, how it went, and every record file that it left.
 #[derive(Debug)]
@@ -280,7 +276,8 @@ impl<'a> RunRecords<'a> {
             interruptions: &interruptions,
             producer_run: span_of(&channel.from),
             consumer_run: channel.to.as_deref().and_then(span_of),
-            flight_time_max: FLIGHT_TIME_MAX + delay.max(changed).unwrap_or(Duration::ZERO),
+            flight_time_max: flight_time_max(delay.max(changed).unwrap_or(Duration::ZERO)),
+            depth: Some(channel.depth),
             cards_share_clock,
             round_trips_ns: &round_trips_ns,
             seed: topology.run().seed,

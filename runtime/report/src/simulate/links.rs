@@ -5,7 +5,7 @@ use core::time::Duration;
 use std::collections::BTreeMap;
 
 use hil_account::OutageFinder;
-use hil_account::network::{Crossing, Passage};
+use hil_account::network::{Crossing, Passage, Passages};
 use hil_core::link_model::{LinkModel, LossCauses};
 use hil_core::message::Envelope;
 use hil_core::simulation::{Carrier, CaseModel, ChannelMessage, Observe};
@@ -40,7 +40,9 @@ impl Carrier for DatagramLink {
 #[derive(Debug, Default)]
 pub(super) struct LinkAccount {
     /// Every message in order.
-    pub(super) passages: Vec<Passage>,
+    pub(super) passages: Passages,
+    /// Sequence number of the newest.
+    newest: Option<u64>,
     /// Copies that came on top.
     pub(super) duplicated_count: u64,
     /// What was lost in a row.
@@ -49,7 +51,8 @@ pub(super) struct LinkAccount {
 
 impl LinkAccount {
     fn push(&mut self, now: Instant, envelope: &Envelope, arrival: Option<Instant>) {
-        self.passages.push(Passage {
+        self.newest = Some(envelope.sequence);
+        self.passages.push(&Passage {
             epoch_rank: envelope.epoch,
             sequence: envelope.sequence,
             count: 1,
@@ -70,9 +73,7 @@ impl LinkAccount {
     }
 
     fn is_newest(&self, envelope: &Envelope) -> bool {
-        self.passages
-            .last()
-            .is_some_and(|newest| newest.sequence == envelope.sequence)
+        self.newest == Some(envelope.sequence)
     }
 }
 
@@ -173,9 +174,10 @@ mod tests {
             .unwrap();
         let counts = result.channels[name];
         let account = accounts.0.remove(name).unwrap();
-        assert_eq!(account.passages.len() as u64, counts.published_count);
+        let passages: Vec<Passage> = account.passages.each().collect();
+        assert_eq!(passages.len() as u64, counts.published_count);
         let of_delivered = |passage: &&Passage| passage.delay_ns == Some(3_000_000);
-        let delivered = account.passages.iter().filter(of_delivered).count() as u64;
+        let delivered = passages.iter().filter(of_delivered).count() as u64;
         assert_eq!(delivered + counts.lost_count, counts.published_count);
         assert_eq!(account.duplicated_count, 1);
         let outages = account.outages.finish();

@@ -1,8 +1,8 @@
 //! The records of a run that never was, for the reports that are checked in.
 
 use hil_account::{
-    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Interruption, OutageMetrics,
-    PathProcess, RunSpan, account, outages,
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Interruption, OutageFinder,
+    OutageMetrics, PathProcess, RunSpan, account, each_history,
 };
 use hil_core::random::RandomStream;
 use hil_core::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
@@ -107,9 +107,12 @@ impl Files {
 
     /// The outages of the same channel on one clock.
     pub(crate) fn outages(&self) -> OutageMetrics {
-        let found = self.consult(Some(Alignment::SAME_CLOCK), outages);
+        let mut found = OutageFinder::default();
+        self.consult(Some(Alignment::SAME_CLOCK), |records, context| {
+            each_history(records, context, |message| found.add(message));
+        });
         let end = Instant::from_ns(5_000 * PERIOD_NS);
-        OutageMetrics::of(&found, Some(end))
+        OutageMetrics::of(&found.finish(), Some(end))
     }
 
     fn consult<T>(

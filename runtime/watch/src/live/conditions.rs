@@ -6,6 +6,7 @@ use std::io;
 use std::path::Path;
 use std::time::Duration;
 
+use hil_account::FLIGHT_QUANTILE;
 use hil_core::time::duration_ns;
 use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome, flow_name};
 use hil_link::spec::Way;
@@ -16,8 +17,6 @@ use hil_rundir::record::RecordFileError;
 use hil_topology::Topology;
 use hil_topology::emulation::EmulationLaunch;
 
-/// Share of the messages of an emulated link that are not under way for longer than is allowed for.
-const FLIGHT_QUANTILE: f64 = 0.9999;
 /// A delay that was taken back counts for so long after its last message came: until all who met
 /// that message have written it down.
 const AFTERWARDS: Duration = Duration::from_secs(1);

@@ -232,7 +232,7 @@ fn text(head: &str, account: &ChannelAccount, clock: &Clock) -> String {
                 unsigned_duration(bound_ns),
                 clock.exchange_count.unwrap_or(0),
             );
-            format!("clock: within ±{bound}, by {count} exchanges")
+            format!("clock: within ±{bound}, by the {count} exchanges so far")
         }
         _ => "clock: not aligned".to_owned(),
     };

@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use std::thread;
 use std::time::{Duration, Instant as WallInstant};
 
-use hil_account::{AccountContext, ChannelAccount, ChannelPath, FLIGHT_TIME_MAX, RunSpan};
+use hil_account::{AccountContext, ChannelAccount, ChannelPath, WRITING_TIME_MAX, flight_time_max};
 use hil_clock::{ClockMap, ClockSettings, Exchange, Requester};
 use hil_core::message::Envelope;
 use hil_core::record::RoundTripRecord;
-use hil_core::time::{Alignment, Instant, duration_ns};
+use hil_core::time::{Alignment, duration_ns};
 use hil_link::condition::{LinkCondition, LinkConditionRecord};
 use hil_link::spec::Way;
 
@@ -35,9 +35,6 @@ const POLL_BYTES_MAX: usize = 4 << 20;
 const POLL_MESSAGES_MAX: usize = 4096;
 /// Exchanges older than this say nothing about now.
 const EXCHANGES_SPAN_NS: i64 = 30_000_000_000;
-/// The processes of a run write their records every 20 ms, each at its own time: a message is
-/// missed only when its records are late by more than this.
-const WRITING: Duration = Duration::from_millis(100);
 
 /// Why a run cannot be observed.
 #[derive(Debug, thiserror::Error)]
@@ -140,13 +137,20 @@ impl Observer {
             .map(LinkConditions::of)
             .unwrap_or_default();
         problems.extend(conditions.read(&records));
+        let channels = manifest.channels.iter();
+        let tails = channels.map(|one| {
+            let is_gateway = hosts_of(one, topology.as_ref()).is_some();
+            let known = topology.as_ref().and_then(|known| known.channel(&one.name));
+            let depth = known.map(|channel| channel.depth);
+            (one.name.clone(), ChannelTail::new(is_gateway, depth))
+        });
         Ok(Self {
+            tails: tails.collect(),
             follower,
             conditions,
             run,
             manifest,
             topology,
-            tails: BTreeMap::new(),
             round_trips: BTreeMap::new(),
             arrivals: BTreeMap::new(),
             passive: BTreeMap::new(),
@@ -293,13 +297,28 @@ impl Observer {
                 RecordKind::LinkCondition => {
                     conditions.add(channel, batch.records::<LinkConditionRecord>());
                 }
-                _ => tails.entry(channel.to_owned()).or_default().add(batch),
+                _ => {
+                    if let Some(tail) = tails.get_mut(channel) {
+                        tail.add(batch);
+                    }
+                }
             }
         });
         // A link that lets nothing through leaves its far end's records as they are: they are at hand.
         for header in follower.headers() {
             if let Some(tail) = tails.get_mut(&header.channel) {
                 tail.expect(header.kind);
+            }
+        }
+        let now_ns = MonotonicClock::now().as_ns();
+        for (channel, tail) in tails {
+            let settling = settling(conditions.flight_time(channel));
+            tail.settle(now_ns, duration_ns(settling));
+            if tail.notes_late_record() {
+                problems.push(format!(
+                    "{channel}: records came after their messages had been counted without them; the run's \
+                     report will have them"
+                ));
             }
         }
         problems.extend(follower.take_problems());
@@ -352,7 +371,8 @@ impl Observer {
             is_forwarded: true, ..
         }) = self.source(channel)
         {
-            return Some(self.tails.get(channel)?.arrivals());
+            let tail = self.tails.get(channel).filter(|tail| !tail.is_empty())?;
+            return Some(tail.arrivals().iter().copied().collect());
         }
         self.arrivals.get(channel).cloned()
     }
@@ -362,7 +382,8 @@ impl Observer {
     pub(crate) fn brought_count(&self, channel: &str) -> Option<usize> {
         let to_host = self.ends(channel).1?;
         let is_here = self.run.hosts().any(|here| here == to_host);
-        let tail = self.tails.get(channel).filter(|_| is_here)?;
+        let tail = self.tails.get(channel);
+        let tail = tail.filter(|tail| is_here && !tail.is_empty())?;
         Some(tail.arrivals().len())
     }
 
@@ -375,12 +396,15 @@ impl Observer {
     pub(crate) fn take_arrivals(&mut self, channel: &str) -> Vec<Arrival> {
         let arrivals = self.arrivals(channel).unwrap_or_default();
         self.arrivals.remove(channel);
-        self.tails.remove(channel);
+        if let Some(tail) = self.tails.get_mut(channel) {
+            tail.take_arrivals();
+        }
         arrivals
     }
 
-    /// The account of the messages of `channel` of the last `window`; `None` when no record tells of
-    /// them.
+    /// The account of the messages of `channel` of the last `window` that have settled; `None` when no
+    /// record tells of them. The fates are those of the report, but for interruptions, which nobody knows
+    /// yet; the bounds are wider, as only past exchanges tell of the clocks.
     pub(crate) fn account(&self, channel: &str, window: Duration) -> Option<ChannelAccount> {
         let tail = self.tails.get(channel).filter(|tail| !tail.is_empty())?;
         let hosts = self.hosts_of(channel);
@@ -395,23 +419,8 @@ impl Observer {
             (Some(_), Some(map)) => ChannelPath::Mapped { map },
             (Some(_), None) => ChannelPath::Gateway { alignment: None },
         };
-        let now = MonotonicClock::now();
-        let span = RunSpan {
-            start: Instant::ZERO,
-            end: now,
-        };
-        let is_here = |host: Option<&String>| {
-            host.is_some_and(|host| self.run.hosts().any(|here| here == host))
-        };
-        let (from, to) = self.ends(channel);
-        let context = AccountContext {
-            producer_run: is_here(from).then_some(span),
-            consumer_run: is_here(to).then_some(span),
-            flight_time_max: FLIGHT_TIME_MAX + self.settling(channel),
-            ..AccountContext::new(path)
-        };
-        let (span_ns, settling_ns) = (duration_ns(window), duration_ns(self.settling(channel)));
-        Some(tail.account(span_ns, settling_ns, &context))
+        let context = AccountContext::new(path);
+        Some(tail.account(duration_ns(window), &context))
     }
 
     /// True when all hosts of the run read one clock.
@@ -425,14 +434,9 @@ impl Observer {
 
     /// Both hosts of a channel that crosses a link; without a topology, of one between two hosts.
     pub(crate) fn hosts_of(&self, channel: &str) -> Option<(String, String)> {
-        let (from, to) = self.ends(channel);
-        let (from, to) = (from?, to?);
-        let is_between = match &self.topology {
-            Some(topology) => topology.crossing(topology.channel(channel)?).is_some(),
-            // Two hosts may have two clocks: they are one only where that is known.
-            None => from != to,
-        };
-        is_between.then(|| (from.clone(), to.clone()))
+        let mut channels = self.manifest.channels.iter();
+        let found = channels.find(|one| one.name == channel)?;
+        hosts_of(found, self.topology.as_ref())
     }
 
     /// What the direction `way` of `link` was ordered to do, as far as this host knows.
@@ -447,12 +451,7 @@ impl Observer {
     }
 
     fn longest_settling(&self) -> Duration {
-        WRITING + self.conditions.longest_flight_time()
-    }
-
-    /// How long after its publication a message may still be on its way, or that to a file.
-    fn settling(&self, channel: &str) -> Duration {
-        WRITING + self.conditions.flight_time(channel)
+        settling(self.conditions.longest_flight_time())
     }
 
     fn ends(&self, channel: &str) -> (Option<&String>, Option<&String>) {
@@ -535,6 +534,25 @@ impl Observer {
         }
         None
     }
+}
+
+/// Both hosts of a channel that crosses a link; without a topology, of one between two hosts.
+fn hosts_of(channel: &ChannelDescription, topology: Option<&Topology>) -> Option<(String, String)> {
+    let (from, to) = (channel.from_host.as_ref()?, channel.to_host.as_ref()?);
+    let is_between = match topology {
+        Some(topology) => topology
+            .crossing(topology.channel(&channel.name)?)
+            .is_some(),
+        // Two hosts may have two clocks: they are one only where that is known.
+        None => from != to,
+    };
+    is_between.then(|| (from.clone(), to.clone()))
+}
+
+/// How long after its publication a message may still be on its way, or that to a file, over a link that
+/// delays messages by up to `link_delay` on purpose.
+fn settling(link_delay: Duration) -> Duration {
+    flight_time_max(link_delay) + WRITING_TIME_MAX
 }
 
 /// The topology that a run wrote into its manifest.
