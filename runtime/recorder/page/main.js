@@ -3,7 +3,7 @@
 import { ArmScene, TRAIL_S, trailsOf } from "./arms.js";
 import { Conditions } from "./conditions.js";
 import { FleetScene } from "./fleet.js";
-import { age, byId, palette, seconds, write } from "./format.js";
+import { age, byId, make, palette, seconds, write } from "./format.js";
 import { Gestures } from "./gestures.js";
 import { KEPT_S, Shelf, View } from "./history.js";
 import { ChannelTable, showEvents, showFacts, showRun, showWarnings } from "./panels.js";
@@ -197,9 +197,7 @@ function offerFleets() {
   group.hidden = number < 2;
   if (group.childElementCount !== number && number > 1) {
     group.replaceChildren(...Array.from({ length: number }, (_, fleet) => {
-      const button = document.createElement("button");
-      button.type = "button";
-      button.textContent = `fleet ${fleet}`;
+      const button = make("button", { type: "button" }, `fleet ${fleet}`);
       button.addEventListener("click", () => {
         scenes.fleet.fleet = fleet;
         redraw();

@@ -8,7 +8,8 @@ use hil_rundir::manifest::{ChannelDescription, Manifest};
 use hil_shuttle::Shuttle;
 use hil_teleoperation::Teleoperation;
 use hil_topology::registry::Registry;
-use serde_json::{Value, json};
+use serde::Serialize;
+use serde_json::Value;
 
 use crate::clocks::Clocks;
 
@@ -39,32 +40,36 @@ pub(crate) struct RunFacts {
     pub(crate) has_one_clock: bool,
 }
 
-/// A channel.
-#[derive(Debug, Default, Clone)]
+/// A channel, as `/live/run` lists it.
+#[derive(Debug, Default, Clone, Serialize)]
 pub(crate) struct ChannelFacts {
     /// Name.
     pub(crate) name: String,
-    /// What the manifest says of it.
-    pub(crate) described: Option<ChannelDescription>,
-    /// Process that publishes, and the one that takes.
-    pub(crate) ends: [Option<String>; 2],
-    /// Their hosts.
-    pub(crate) hosts: [Option<String>; 2],
+    /// Its message, where the manifest names it.
+    pub(crate) message: Option<String>,
+    /// Size of its messages, bytes.
+    pub(crate) size_bytes: Option<usize>,
+    /// Process that publishes.
+    pub(crate) from: Option<String>,
+    /// The one that takes.
+    pub(crate) to: Option<String>,
+    /// Host of the first.
+    pub(crate) from_host: Option<String>,
+    /// Host of the second.
+    pub(crate) to_host: Option<String>,
     /// How it travels.
     pub(crate) via: String,
     /// The link that it crosses.
     pub(crate) link: Option<String>,
+    /// What the manifest says of it.
+    #[serde(skip)]
+    pub(crate) described: Option<ChannelDescription>,
     /// No producer's record tells when its messages were published; the messages themselves do.
+    #[serde(skip)]
     pub(crate) is_by_message: bool,
     /// From the monotonic clocks of the two hosts to the recording's axis, nanoseconds.
+    #[serde(skip)]
     pub(crate) offsets_ns: [i64; 2],
-}
-
-impl ChannelFacts {
-    /// Its message, where the manifest names it.
-    pub(crate) fn message(&self) -> Option<&str> {
-        self.described.as_ref().map(|one| one.message.as_str())
-    }
 }
 
 /// A link.
@@ -99,10 +104,9 @@ impl RunFacts {
             }
         }
         for channel in &mut facts.channels {
-            let [from, to] = &channel.hosts;
-            let to = to.as_ref().or(from.as_ref());
-            channel.offsets_ns =
-                [from.as_ref(), to].map(|host| clocks.offset_ns(host.map(String::as_str)));
+            let from = channel.from_host.as_deref();
+            let to = channel.to_host.as_deref().or(from);
+            channel.offsets_ns = [from, to].map(|host| clocks.offset_ns(host));
         }
         facts
     }
@@ -128,11 +132,16 @@ impl RunFacts {
                 (_, Some(link)) => topology["links"][link]["via"].as_str().unwrap_or("unknown"),
                 _ => "shared-memory",
             };
+            let [from, to] = ends(&one.name, topology);
             ChannelFacts {
                 name: one.name.clone(),
+                message: Some(one.message.clone()),
+                size_bytes: Some(one.size_bytes),
+                from,
+                to,
+                from_host: one.from_host.clone(),
+                to_host: one.to_host.clone(),
                 described: Some(one.clone()),
-                ends: ends(&one.name, topology),
-                hosts: [one.from_host.clone(), one.to_host.clone()],
                 via: via.to_owned(),
                 link: link.map(str::to_owned),
                 is_by_message: one.to_host.is_none(),
@@ -158,21 +167,6 @@ impl RunFacts {
     pub(crate) fn channel(&self, name: &str) -> Option<(usize, &ChannelFacts)> {
         let mut channels = self.channels.iter().enumerate();
         channels.find(|(_, channel)| channel.name == name)
-    }
-
-    /// Its channels as `/live/run` lists them.
-    pub(crate) fn channels_json(&self) -> Vec<Value> {
-        let channels = self.channels.iter();
-        let listed = channels.map(|one| {
-            json!({
-                "name": one.name, "message": one.message(),
-                "size_bytes": one.described.as_ref().map(|described| described.size_bytes),
-                "from": one.ends[0], "to": one.ends[1],
-                "from_host": one.hosts[0], "to_host": one.hosts[1],
-                "via": one.via, "link": one.link,
-            })
-        });
-        listed.collect()
     }
 }
 

@@ -80,7 +80,7 @@ impl RunState {
         self.accounts[record.channel].take(record);
         if let Body::Message(payload) = &record.body {
             self.read_count += 1;
-            let message = channel.message().unwrap_or_default();
+            let message = channel.message.as_deref().unwrap_or_default();
             if let Some(told) = Told::of(&channel.name, message, payload) {
                 let offset_ns = channel.offsets_ns[0];
                 self.pictures.take(&told, record.at_ns, offset_ns);
@@ -110,7 +110,7 @@ impl RunState {
             "duration_s": facts.duration.map(|one| one.as_secs_f64()),
             "hosts_here": facts.hosts_here, "hosts": facts.hosts,
             "topology_hash": facts.topology_hash, "seed": facts.seed,
-            "channels": facts.channels_json(),
+            "channels": facts.channels,
             "recorder": { "read_count": self.read_count },
         })
     }
@@ -123,7 +123,7 @@ impl RunState {
             account.settle(now_ns);
             channels.push(account.metrics(&facts.name, now_ns));
             // Another host's clock may be anything.
-            let from_host = facts.hosts[0].as_ref();
+            let from_host = facts.from_host.as_ref();
             let is_here = from_host.is_some_and(|host| self.facts.hosts_here.contains(host));
             let origin_ns = self
                 .origin_ns
