@@ -8,9 +8,9 @@ use core::time::Duration;
 use std::collections::{BTreeMap, BinaryHeap};
 use std::rc::Rc;
 
-use crate::case_study::{CaseStudy, ChannelSpec, inputs_of, outputs_of};
-use crate::component::Role;
-use crate::endpoint::{Endpoint, InputPort, OutputPort, PortCountError};
+use crate::case_study::{CaseStudy, ChannelSpec, channels_of};
+use crate::component::{Port, Role};
+use crate::endpoint::{Endpoint, InputPort, OutputPort, PortError};
 use crate::link_model::{LinkModel, PerfectLink};
 use crate::message::Envelope;
 use crate::run_log::RunLog;
@@ -64,15 +64,8 @@ pub enum SimulationError {
         channel: String,
     },
     /// The case's roles and channels contradict each other.
-    #[error("role {role} of case {case}: {source}")]
-    Wiring {
-        /// The case.
-        case: &'static str,
-        /// The role.
-        role: &'static str,
-        /// Which side does not fit.
-        source: PortCountError,
-    },
+    #[error(transparent)]
+    Ports(PortError),
     /// The case lists a role it cannot make.
     #[error("case {case} lists role {role} but makes none")]
     MissingRole {
@@ -181,23 +174,24 @@ impl Simulation {
         }
         let mut endpoints = Vec::new();
         for (role, component) in roles {
-            let inputs = inputs_of(specs, role)
-                .map(|spec| SimInput {
-                    channel: Rc::clone(&channels[spec.name]),
+            let open_input = |port: &Port| {
+                Ok(SimInput {
+                    channel: Rc::clone(&channels[port.name]),
                 })
-                .collect();
-            let outputs = outputs_of(specs, role)
-                .map(|spec| SimOutput {
-                    name: spec.name,
-                    destination: match recorded.get(spec.name) {
+            };
+            let open_output = |port: &Port| {
+                Ok(SimOutput {
+                    name: port.name,
+                    destination: match recorded.get(port.name) {
                         Some(count) => SimDestination::Record(Rc::clone(count)),
-                        None => SimDestination::Channel(Rc::clone(&channels[spec.name])),
+                        None => SimDestination::Channel(Rc::clone(&channels[port.name])),
                     },
                     log: Rc::clone(&log),
                 })
-                .collect();
-            let endpoint = Endpoint::new(component, inputs, outputs)
-                .map_err(|source| SimulationError::Wiring { case, role, source })?;
+            };
+            let stated = channels_of(case, specs, role);
+            let endpoint = Endpoint::join(component, &stated, open_input, open_output)
+                .map_err(SimulationError::Ports)?;
             endpoints.push(endpoint);
         }
         Ok(Self {

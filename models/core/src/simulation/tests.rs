@@ -1,48 +1,30 @@
 //! Tests of the virtual-time driver.
 
 use super::*;
-use bytemuck::{Pod, Zeroable};
+use crate::component::{Component, Output, Ports, into_role};
+use crate::time::Tick;
 
-use crate::component::{Component, Outbox, into_role};
-use crate::message::Message;
-use crate::time::PeriodicTimer;
-
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-struct Status {
-    position_m: f64,
-}
-
-impl Message for Status {
-    const NAME: &'static str = "test.Status.v1";
+crate::message! {
+    struct Status = "test.Status.v1" { position_m: f64 }
 }
 
 /// Tells the record where it is, and nobody listens.
-#[derive(Debug)]
-struct Diarist(PeriodicTimer);
+#[derive(Debug, Default)]
+struct Diarist {
+    diary: Output<Status>,
+}
 
 impl Component for Diarist {
-    type Input = Status;
-    type Output = Status;
-
-    fn on_start(&mut self, now: Instant) {
-        self.0.start(now);
+    fn ports(&self, ports: &mut Ports<Self>) {
+        ports.input("a/heard", |_, _, _: &Status| {});
+        ports.output("a/diary", |own| &mut own.diary);
+        ports.every(Duration::from_millis(100), Self::on_tick);
     }
+}
 
-    fn on_message(&mut self, _: Instant, _: &Status, _: &mut Outbox<Status>) {}
-
-    fn on_tick(&mut self, now: Instant, out: &mut Outbox<Status>) {
-        if self.0.poll(now).is_some() {
-            out.send(Status { position_m: 1.0 });
-        }
-    }
-
-    fn next_tick(&self) -> Option<Instant> {
-        self.0.next()
-    }
-
-    fn skipped_ticks(&self) -> u64 {
-        self.0.skipped_total()
+impl Diarist {
+    fn on_tick(&mut self, _now: Instant, _tick: Tick) {
+        self.diary.send(Status { position_m: 1.0 });
     }
 }
 
@@ -52,8 +34,7 @@ const DIARY: &[ChannelSpec] = &[
 ];
 
 fn diary(carriers: BTreeMap<String, Box<dyn Carrier>>) -> Result<Simulation, SimulationError> {
-    let diarist = Diarist(PeriodicTimer::new(Duration::from_millis(100)));
-    let roles = vec![("diarist", into_role(diarist))];
+    let roles = vec![("diarist", into_role(Diarist::default()))];
     Simulation::of_roles("diary", DIARY, roles, carriers)
 }
 
@@ -78,4 +59,17 @@ fn a_carrier_for_a_recorded_channel_is_refused() {
         error.to_string(),
         "channel a/diary of case diary is only recorded; nothing carries it"
     );
+}
+
+#[test]
+fn a_role_that_does_not_fit_its_case_does_not_start() {
+    const MISSPELT: &[ChannelSpec] = &[
+        ChannelSpec::of::<Status>("a/herd", "other", "diarist"),
+        ChannelSpec::recorded::<Status>("a/diary", "diarist"),
+    ];
+    let roles = vec![("diarist", into_role(Diarist::default()))];
+    let error = Simulation::of_roles("diary", MISSPELT, roles, BTreeMap::new()).unwrap_err();
+    let expected = "input port a/heard of role diarist takes test.Status.v1 (8 bytes aligned to 8), \
+                    but case diary states no such channel";
+    assert_eq!(error.to_string(), expected);
 }
