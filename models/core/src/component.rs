@@ -459,6 +459,21 @@ mod tests {
     }
 
     #[test]
+    fn a_port_of_a_role_never_grows() {
+        let mut port = Output::default();
+        port.reserve();
+        let room = port.messages.capacity();
+        for _ in 0..2 {
+            for value in 0..2 * OUTPUT_CAPACITY {
+                port.send(small_of(u32::try_from(value).unwrap()));
+            }
+            let dropped_count = port.flush(0, &mut |_, _| {});
+            assert_eq!(dropped_count, OUTPUT_CAPACITY as u64);
+            assert_eq!(port.messages.capacity(), room);
+        }
+    }
+
+    #[test]
     fn periods_are_called_on_their_grids_from_the_start_and_skipped_points_counted() {
         let mut role = into_role(Both::default());
         assert_eq!(role.next_tick(), None);
