@@ -16,10 +16,9 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use bytemuck::{Pod, Zeroable};
 use hil_benches::{Case, Comparison, HostFacts, compare, json_line, pin_to_cpu, table};
 use hil_core::endpoint::{InputPort, OutputPort};
-use hil_core::message::{Message, MessageType};
+use hil_core::message::MessageType;
 use hil_core::time::Instant as HostInstant;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::domain_address::DomainAddress;
@@ -34,17 +33,11 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString, ZeroCopySend, ipc};
 
-/// One cache line, as a joint command has.
-#[derive(Debug, Default, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
-#[repr(C)]
-#[type_name("bench.Line.v1")]
-struct Line {
-    count: u64,
-    fill: [u64; 7],
-}
-
-impl Message for Line {
-    const NAME: &'static str = "bench.Line.v1";
+hil_core::message! {
+    /// One cache line, as a joint command has.
+    #[derive(Default, ZeroCopySend)]
+    #[type_name("bench.Line.v1")]
+    struct Line = "bench.Line.v1", 64 bytes { count: u64, fill: [u64; 7] }
 }
 
 fn line(count: u64) -> Line {

@@ -7,7 +7,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::component::Role;
-use crate::message::{Message, MessageType};
+use crate::endpoint::{RoleChannels, StatedChannel};
+use crate::message::{Message, MessageType, TypeInfo};
 use crate::plot::PlotSeries;
 use crate::replay::Replay;
 use crate::run_log::RunLog;
@@ -29,7 +30,7 @@ pub trait CaseStudy: Sized + Debug + 'static {
     const SUMMARY: &'static str;
     /// The roles, in the order reports list them.
     const ROLES: &'static [&'static str];
-    /// The channels between the roles; a role's ports follow the order of this list.
+    /// The channels between the roles; each role has the ports of its channels' names.
     const CHANNELS: &'static [ChannelSpec];
     /// False when a role keeps what the others rely on, so that one started anew in the midst of
     /// a run would be wrong about the world: a topology may not ask for its restart then.
@@ -68,8 +69,10 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// A fresh instance of the role called `name`; `None` if the case has no such role.
     fn role(&self, name: &str) -> Option<Box<dyn Role>>;
 
-    /// What the robot did, from the messages of a finished run.
-    fn score(&self, log: &RunLog) -> Score;
+    /// What the robot did, from the messages of a finished run; nothing by default.
+    fn score(&self, _log: &RunLog) -> Score {
+        Score::default()
+    }
 
     /// The robot's errors over time, to be held against what the network did at the time; none by
     /// default, and then only the events of the score are.
@@ -154,22 +157,22 @@ impl ChannelSpec {
     }
 }
 
-/// The channels `role` reads, in port order.
-pub fn inputs_of<'a>(
-    channels: &'a [ChannelSpec],
-    role: &'a str,
-) -> impl Iterator<Item = &'a ChannelSpec> {
-    channels
-        .iter()
-        .filter(move |channel| channel.to == Some(role))
-}
-
-/// The channels `role` writes, those that are only recorded included, in port order.
-pub fn outputs_of<'a>(
-    channels: &'a [ChannelSpec],
-    role: &'a str,
-) -> impl Iterator<Item = &'a ChannelSpec> {
-    channels.iter().filter(move |channel| channel.from == role)
+/// What `channels` of the case called `case` state for `role`.
+pub fn channels_of(case: &str, channels: &[ChannelSpec], role: &str) -> RoleChannels {
+    let stated = |is_end: &dyn Fn(&ChannelSpec) -> bool| {
+        let channels = channels.iter().filter(|channel| is_end(channel));
+        let stated = channels.map(|channel| StatedChannel {
+            name: channel.name.to_owned(),
+            message: TypeInfo::of(&channel.message),
+        });
+        stated.collect()
+    };
+    RoleChannels {
+        role: role.to_owned(),
+        stated_by: format!("case {case}"),
+        inputs: stated(&|channel| channel.to == Some(role)),
+        outputs: stated(&|channel| channel.from == role),
+    }
 }
 
 /// A parameter that the case cannot work with.
@@ -206,4 +209,109 @@ impl ParameterError {
         }
         Err(Self::new(key, format!("{value} is outside {allowed_text}")))
     }
+
+    /// As [`ParameterError::check`] for a key below `table`, e.g. `world.`, with the bounds as text.
+    ///
+    /// # Errors
+    /// Names the key, the value and the bounds.
+    pub fn check_range(
+        table: &str,
+        key: &str,
+        value: f64,
+        allowed: core::ops::RangeInclusive<f64>,
+    ) -> Result<(), Self> {
+        let text = format!("{} to {}", allowed.start(), allowed.end());
+        Self::check(&format!("{table}{key}"), value, allowed, &text)
+    }
+}
+
+/// A parameter that may have a range.
+pub trait Bounded {
+    /// Its number; `None` for one that is left out.
+    fn number(&self) -> Option<f64>;
+}
+
+impl Bounded for f64 {
+    fn number(&self) -> Option<f64> {
+        Some(*self)
+    }
+}
+
+impl Bounded for u32 {
+    fn number(&self) -> Option<f64> {
+        Some(f64::from(*self))
+    }
+}
+
+impl<T: Bounded> Bounded for Option<T> {
+    fn number(&self) -> Option<f64> {
+        self.as_ref().and_then(T::number)
+    }
+}
+
+/// Declares parameters, each once: key, meaning, type, default and range. Gives the structure, which
+/// reads from `[case.parameters]` and refuses unknown keys, its defaults and `check`.
+///
+/// `in "table."` says below which table the keys are; `check NAME` names a method that checks the keys
+/// together, each of which is within its range by then.
+///
+/// ```
+/// hil_core::parameters! {
+///     /// What a user sets.
+///     pub struct WheelParameters in "wheels." {
+///         /// Control rate, Hz.
+///         rate_hz: f64 = 100.0, in 1.0..=1000.0;
+///         /// Wheels.
+///         wheel_count: u32 = 4, in 2.0..=18.0;
+///         /// Whether they steer.
+///         is_steering: bool = false;
+///     }
+/// }
+/// let wheels = WheelParameters { wheel_count: 1, ..WheelParameters::default() };
+/// let error = wheels.check().unwrap_err();
+/// assert_eq!(error.to_string(), "wheels.wheel_count 1 is outside 2 to 18");
+/// ```
+#[macro_export]
+macro_rules! parameters {
+    ($(#[$meta:meta])* $vis:vis struct $structure:ident $(in $table:literal)? {
+        $($(#[$field_meta:meta])* $field:ident: $kind:ty = $default:expr
+            $(, in $allowed:expr)?;)+
+    } $(check $together:ident;)?) => {
+        $(#[$meta])*
+        #[derive(Debug, Clone, PartialEq, $crate::serde::Serialize, $crate::serde::Deserialize)]
+        #[serde(crate = "hil_core::serde", deny_unknown_fields, default)]
+        $vis struct $structure {
+            $(
+                $(#[$field_meta])*
+                $(#[doc = concat!("\n\nAllowed: `", stringify!($allowed), "`.")])?
+                $vis $field: $kind,
+            )+
+        }
+
+        impl Default for $structure {
+            fn default() -> Self {
+                Self { $($field: $default,)+ }
+            }
+        }
+
+        impl $structure {
+            /// Checks every number against its range.
+            ///
+            /// # Errors
+            /// The first key that is refused, with its value and its range.
+            $vis fn check(&self) -> Result<(), $crate::case_study::ParameterError> {
+                const TABLE: &str = concat!($($table)?);
+                $($(
+                    if let Some(number) = $crate::case_study::Bounded::number(&self.$field) {
+                        let key = stringify!($field);
+                        $crate::case_study::ParameterError::check_range(
+                            TABLE, key, number, $allowed,
+                        )?;
+                    }
+                )?)+
+                $(self.$together()?;)?
+                Ok(())
+            }
+        }
+    };
 }

@@ -1,61 +1,92 @@
 //! A component: one role of a robot's loop as a state machine. It neither waits nor sends; it is
-//! handed messages and the time, and fills an outbox.
+//! handed messages and the time, and puts its own messages into its output ports.
+//!
+//! ```
+//! use core::time::Duration;
+//! use hil_core::component::{Component, Output, Ports};
+//! use hil_core::time::{Instant, Tick};
+//!
+//! hil_core::message! { pub struct Position = "example.Position.v1" { pub position_m: f64 } }
+//! hil_core::message! { pub struct Speed = "example.Speed.v1" { pub speed_mps: f64 } }
+//!
+//! /// Drives to the origin.
+//! #[derive(Debug, Default)]
+//! struct Controller { speed: Output<Speed>, position_m: f64 }
+//!
+//! impl Component for Controller {
+//!     fn ports(&self, ports: &mut Ports<Self>) {
+//!         ports.input("cart/position", Self::on_position);
+//!         ports.output("cart/speed", |own| &mut own.speed);
+//!         ports.every(Duration::from_millis(10), Self::on_tick);
+//!     }
+//! }
+//!
+//! impl Controller {
+//!     fn on_position(&mut self, _now: Instant, position: &Position) {
+//!         self.position_m = position.position_m;
+//!     }
+//!
+//!     fn on_tick(&mut self, _now: Instant, _tick: Tick) {
+//!         self.speed.send(Speed { speed_mps: -5.0 * self.position_m });
+//!     }
+//! }
+//! ```
 
-use core::fmt::Debug;
+use core::fmt::{self, Debug};
+use core::time::Duration;
 
-use crate::message::{MessageSet, MessageType};
-use crate::time::Instant;
+use crate::message::{Message, MessageType};
+use crate::time::{Instant, PeriodicTimer, Tick};
 
-/// What a user writes: a controller, a robot model, a source of motion.
-pub trait Component {
-    /// What arrives, one port per message type.
-    type Input: MessageSet;
-    /// What leaves, one port per message type.
-    type Output: MessageSet;
+/// What a user writes: a controller, a robot model, a source of motion. One body of code runs in
+/// virtual and in real time.
+pub trait Component: Debug + Sized + 'static {
+    /// Declares the ports and what is called periodically; called once, before anything else.
+    fn ports(&self, ports: &mut Ports<Self>);
 
-    /// Called once, before anything else; anchors timers at `now`.
-    fn on_start(&mut self, now: Instant);
+    /// Called once before the first message and tick; periods begin at `now` too.
+    fn start(&mut self, _now: Instant) {}
 
-    /// Called for each message, in order of arrival per port.
-    fn on_message(&mut self, now: Instant, input: &Self::Input, out: &mut Outbox<Self::Output>);
+    /// Called when [`Component::next_tick`] or a period is due, before what is called periodically;
+    /// when nothing of its own is due, it does nothing.
+    fn tick(&mut self, _now: Instant) {}
 
-    /// Called when [`Component::next_tick`] is due; may be called early and then does nothing.
-    fn on_tick(&mut self, now: Instant, out: &mut Outbox<Self::Output>);
+    /// When this component wants [`Component::tick`], beside its periods; `None` for never.
+    fn next_tick(&self) -> Option<Instant> {
+        None
+    }
 
-    /// When this component next wants [`Component::on_tick`]; `None` if only messages drive it.
-    fn next_tick(&self) -> Option<Instant>;
-
-    /// Grid points of the component's own timer that went by without a tick.
-    fn skipped_ticks(&self) -> u64;
-
-    /// Messages one call may give at most; asked once, when the component becomes a role.
-    /// Beyond it messages are dropped and counted.
-    fn outbox_capacity(&self) -> usize {
-        OUTBOX_CAPACITY
+    /// Grid points of timers of its own that passed without a tick; those of periods are counted
+    /// anyway.
+    fn skipped_ticks(&self) -> u64 {
+        0
     }
 }
 
-/// The messages a component gives in one call; bounded, and every refusal is counted.
+/// Messages an output port takes in one call of its component: a few for each of dozens of robots.
+pub const OUTPUT_CAPACITY: usize = 256;
+
+/// An output port: a field of its component. It takes up to [`OUTPUT_CAPACITY`] messages in one call,
+/// which leave when the call has ended; it drops and counts what is beyond.
 #[derive(Debug)]
-pub struct Outbox<T> {
-    messages: Vec<T>,
-    capacity: usize,
+pub struct Output<M> {
+    messages: Vec<M>,
     dropped_count: u64,
 }
 
-impl<T> Outbox<T> {
-    /// An empty outbox that takes at most `capacity` messages per call.
-    pub fn with_capacity(capacity: usize) -> Self {
+impl<M> Default for Output<M> {
+    fn default() -> Self {
         Self {
-            messages: Vec::with_capacity(capacity),
-            capacity,
+            messages: Vec::new(),
             dropped_count: 0,
         }
     }
+}
 
-    /// Gives a message; a full outbox drops and counts it.
-    pub fn send(&mut self, message: T) {
-        if self.messages.len() < self.capacity {
+impl<M> Output<M> {
+    /// Gives a message; a full port drops and counts it.
+    pub fn send(&mut self, message: M) {
+        if self.messages.len() < OUTPUT_CAPACITY {
             self.messages.push(message);
         } else {
             self.dropped_count += 1;
@@ -63,13 +94,130 @@ impl<T> Outbox<T> {
     }
 
     /// Takes the messages out, oldest first.
-    pub fn drain(&mut self) -> impl Iterator<Item = T> + '_ {
+    pub fn drain(&mut self) -> impl Iterator<Item = M> + '_ {
         self.messages.drain(..)
     }
 
-    /// Messages refused because the outbox was full.
+    /// Messages refused because the port was full, since its role last took them out.
     pub fn dropped_count(&self) -> u64 {
         self.dropped_count
+    }
+}
+
+/// A port of a role: joined by its name to the channel of that name, if that carries its messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Port {
+    /// Name, also of the channel.
+    pub name: &'static str,
+    /// What passes.
+    pub message: MessageType,
+}
+
+/// Hands the bytes of a message to a component; false when they are no message of the port.
+type Take<C> = Box<dyn Fn(&mut C, Instant, &[u8]) -> bool>;
+/// Finds an output port in its component.
+type Find<C> = Box<dyn for<'a> Fn(&'a mut C) -> &'a mut dyn AnyOutput>;
+
+/// The ports and periods of a component, as [`Component::ports`] declares them.
+pub struct Ports<C> {
+    inputs: Vec<Port>,
+    takes: Vec<Take<C>>,
+    outputs: Vec<Port>,
+    finds: Vec<Find<C>>,
+    periods: Vec<Period<C>>,
+}
+
+struct Period<C> {
+    timer: PeriodicTimer,
+    call: fn(&mut C, Instant, Tick),
+}
+
+impl<C: 'static> Ports<C> {
+    const fn new() -> Self {
+        Self {
+            inputs: Vec::new(),
+            takes: Vec::new(),
+            outputs: Vec::new(),
+            finds: Vec::new(),
+            periods: Vec::new(),
+        }
+    }
+
+    /// Messages of the channel `name` go to `take`, in order of arrival. Waiting messages of several
+    /// ports are taken port by port, in the order of declaration.
+    ///
+    /// # Panics
+    /// When there is an input of this name already.
+    pub fn input<M: Message>(&mut self, name: &'static str, take: fn(&mut C, Instant, &M)) {
+        declare::<M>(&mut self.inputs, name);
+        self.takes.push(Box::new(move |component, now, payload| {
+            // In place, or as a copy where the bytes are not aligned.
+            if let Ok(message) = bytemuck::try_from_bytes(payload) {
+                take(component, now, message);
+            } else if let Ok(message) = bytemuck::try_pod_read_unaligned(payload) {
+                take(component, now, &message);
+            } else {
+                return false;
+            }
+            true
+        }));
+    }
+
+    /// Messages of the port that `find` returns go to the channel `name`.
+    ///
+    /// # Panics
+    /// When there is an output of this name already.
+    pub fn output<M: Message>(&mut self, name: &'static str, find: fn(&mut C) -> &mut Output<M>) {
+        declare::<M>(&mut self.outputs, name);
+        self.finds.push(Box::new(move |component| find(component)));
+    }
+
+    /// Calls `call` on the grid `start + n * period`, the first time at the start. A late call stands
+    /// for the newest grid point that is due, and says how many it passed over.
+    ///
+    /// # Panics
+    /// When `period` is zero.
+    pub fn every(&mut self, period: Duration, call: fn(&mut C, Instant, Tick)) {
+        let timer = PeriodicTimer::new(period);
+        self.periods.push(Period { timer, call });
+    }
+}
+
+fn declare<M: Message>(ports: &mut Vec<Port>, name: &'static str) {
+    let is_new = ports.iter().all(|port| port.name != name);
+    assert!(is_new, "a component declares its port {name} twice");
+    let message = MessageType::of::<M>();
+    ports.push(Port { name, message });
+}
+
+impl<C> Debug for Ports<C> {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            inputs, outputs, ..
+        } = self;
+        let mut ports = formatter.debug_struct("Ports");
+        ports.field("inputs", inputs).field("outputs", outputs);
+        ports.finish_non_exhaustive()
+    }
+}
+
+/// An output port whose message type is no longer known.
+trait AnyOutput {
+    fn reserve(&mut self);
+    /// Gives all messages to `emit` as those of `port`; returns how many were dropped before.
+    fn flush(&mut self, port: usize, emit: Emit<'_>) -> u64;
+}
+
+impl<M: Message> AnyOutput for Output<M> {
+    fn reserve(&mut self) {
+        self.messages.reserve_exact(OUTPUT_CAPACITY);
+    }
+
+    fn flush(&mut self, port: usize, emit: Emit<'_>) -> u64 {
+        for message in self.messages.drain(..) {
+            emit(port, bytemuck::bytes_of(&message));
+        }
+        core::mem::take(&mut self.dropped_count)
     }
 }
 
@@ -79,93 +227,143 @@ pub type Emit<'a> = &'a mut dyn FnMut(usize, &[u8]);
 /// A component whose message types are known only at run time: what a process runs and what the
 /// simulation drives. Made from any [`Component`] by [`into_role`].
 pub trait Role: Debug {
-    /// Message type of each input port.
-    fn inputs(&self) -> &'static [MessageType];
+    /// The input ports.
+    fn inputs(&self) -> &[Port];
 
-    /// Message type of each output port.
-    fn outputs(&self) -> &'static [MessageType];
+    /// The output ports.
+    fn outputs(&self) -> &[Port];
 
-    /// See [`Component::on_start`].
+    /// See [`Component::start`].
     fn start(&mut self, now: Instant);
 
-    /// See [`Component::on_message`]. False when `payload` is not a message of `port`; the
-    /// component does not see it then.
+    /// Hands over a message that came in through the input port `port`. False when `payload` is not a
+    /// message of the port, or there is no such port; the component does not see it then.
     fn message(&mut self, now: Instant, port: usize, payload: &[u8], emit: Emit<'_>) -> bool;
 
-    /// See [`Component::on_tick`].
+    /// Calls what is due, see [`Role::next_tick`].
     fn tick(&mut self, now: Instant, emit: Emit<'_>);
 
-    /// See [`Component::next_tick`].
+    /// When the role next wants [`Role::tick`]; `None` if only messages drive it.
     fn next_tick(&self) -> Option<Instant>;
 
-    /// See [`Component::skipped_ticks`].
+    /// Grid points of periods and timers that passed without a tick.
     fn skipped_ticks(&self) -> u64;
 
-    /// Messages refused by the component's full outbox.
+    /// Messages refused by full output ports.
     fn outbox_dropped(&self) -> u64;
 }
 
-/// Messages one call of a component may give unless it says otherwise: a few for each of dozens
-/// of robots.
-pub const OUTBOX_CAPACITY: usize = 256;
+impl dyn Role + '_ {
+    /// [`Role::message`] by the port's name, for who drives a role without channels.
+    ///
+    /// # Panics
+    /// When the role has no such port, or one of another type.
+    pub fn hear<M: Message>(&mut self, now: Instant, port: &str, message: &M, emit: Emit<'_>) {
+        let index = index_of(self.inputs(), port);
+        let (expected, found) = (self.inputs()[index].message, MessageType::of::<M>());
+        assert!(expected == found, "{port} takes {expected}, not {found}");
+        self.message(now, index, bytemuck::bytes_of(message), emit);
+    }
 
-/// Hides the message types of `component` behind [`Role`].
-pub fn into_role<C: Component + Debug + 'static>(component: C) -> Box<dyn Role> {
-    let outbox = Outbox::with_capacity(component.outbox_capacity());
-    Box::new(ErasedComponent { component, outbox })
+    /// The number by which the output port called `name` emits.
+    ///
+    /// # Panics
+    /// When the role has no such port.
+    pub fn output(&self, name: &str) -> usize {
+        index_of(self.outputs(), name)
+    }
+}
+
+fn index_of(ports: &[Port], name: &str) -> usize {
+    let index = ports.iter().position(|port| port.name == name);
+    index.unwrap_or_else(|| panic!("no port is called {name}"))
+}
+
+/// Hides the message types of `component` behind [`Role`], with room in its output ports.
+///
+/// # Panics
+/// When it declares two ports of one side by one name, or a period of zero.
+pub fn into_role<C: Component>(mut component: C) -> Box<dyn Role> {
+    let mut ports = Ports::new();
+    component.ports(&mut ports);
+    for find in &ports.finds {
+        find(&mut component).reserve();
+    }
+    Box::new(ErasedComponent {
+        component,
+        ports,
+        dropped_count: 0,
+    })
 }
 
 #[derive(Debug)]
-struct ErasedComponent<C: Component> {
+struct ErasedComponent<C> {
     component: C,
-    outbox: Outbox<C::Output>,
+    ports: Ports<C>,
+    dropped_count: u64,
 }
 
-impl<C: Component> ErasedComponent<C> {
+impl<C> ErasedComponent<C> {
     fn flush(&mut self, emit: Emit<'_>) {
-        for message in self.outbox.drain() {
-            emit(message.port(), message.as_bytes());
+        for (port, find) in self.ports.finds.iter().enumerate() {
+            self.dropped_count += find(&mut self.component).flush(port, emit);
         }
     }
 }
 
-impl<C: Component + Debug> Role for ErasedComponent<C> {
-    fn inputs(&self) -> &'static [MessageType] {
-        C::Input::PORTS
+impl<C: Component> Role for ErasedComponent<C> {
+    fn inputs(&self) -> &[Port] {
+        &self.ports.inputs
     }
 
-    fn outputs(&self) -> &'static [MessageType] {
-        C::Output::PORTS
+    fn outputs(&self) -> &[Port] {
+        &self.ports.outputs
     }
 
     fn start(&mut self, now: Instant) {
-        self.component.on_start(now);
+        self.component.start(now);
+        for period in &mut self.ports.periods {
+            period.timer.start(now);
+        }
     }
 
     fn message(&mut self, now: Instant, port: usize, payload: &[u8], emit: Emit<'_>) -> bool {
-        let Some(input) = C::Input::from_bytes(port, payload) else {
-            return false;
-        };
-        self.component.on_message(now, &input, &mut self.outbox);
+        let Self {
+            component, ports, ..
+        } = self;
+        let take = ports.takes.get(port);
+        let is_taken = take.is_some_and(|take| take(component, now, payload));
         self.flush(emit);
-        true
+        is_taken
     }
 
     fn tick(&mut self, now: Instant, emit: Emit<'_>) {
-        self.component.on_tick(now, &mut self.outbox);
+        let Self {
+            component, ports, ..
+        } = self;
+        component.tick(now);
+        for Period { timer, call } in &mut ports.periods {
+            if let Some(tick) = timer.poll(now) {
+                call(component, now, tick);
+            }
+        }
         self.flush(emit);
     }
 
     fn next_tick(&self) -> Option<Instant> {
-        self.component.next_tick()
+        let periods = self.ports.periods.iter();
+        let ticks = periods.filter_map(|period| period.timer.next());
+        ticks.chain(self.component.next_tick()).min()
     }
 
     fn skipped_ticks(&self) -> u64 {
-        self.component.skipped_ticks()
+        let periods = self.ports.periods.iter();
+        let skipped = periods.map(|period| period.timer.skipped_total());
+        skipped.sum::<u64>() + self.component.skipped_ticks()
     }
 
     fn outbox_dropped(&self) -> u64 {
-        self.outbox.dropped_count()
+        self.dropped_count
     }
 }
 
@@ -173,13 +371,132 @@ impl<C: Component + Debug> Role for ErasedComponent<C> {
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_full_outbox_drops_and_counts() {
-        let mut outbox = Outbox::with_capacity(2);
-        for value in 0..5 {
-            outbox.send(value);
+    crate::message! {
+        struct Small = "test.Small.v1" { value: u32, spare: [u32; 3] }
+    }
+
+    crate::message! {
+        struct Large = "test.Large.v1" { value: [f64; 3] }
+    }
+
+    fn small_of(value: u32) -> Small {
+        Small {
+            value,
+            spare: [0; 3],
         }
-        assert_eq!(outbox.drain().collect::<Vec<_>>(), [0, 1]);
-        assert_eq!(outbox.dropped_count(), 3);
+    }
+
+    /// Hears both messages, repeats the number of each call, and floods one port.
+    #[derive(Debug, Default)]
+    struct Both {
+        small: Output<Small>,
+        large: Output<Large>,
+    }
+
+    impl Component for Both {
+        fn ports(&self, ports: &mut Ports<Self>) {
+            ports.input("a/small", Self::on_small);
+            ports.input("a/large", Self::on_large);
+            ports.output("b/small", |own| &mut own.small);
+            ports.output("b/large", |own| &mut own.large);
+            ports.every(Duration::from_nanos(10), Self::on_short);
+            ports.every(Duration::from_nanos(25), Self::on_long);
+        }
+    }
+
+    impl Both {
+        fn on_small(&mut self, _: Instant, message: &Small) {
+            self.small.send(*message);
+        }
+
+        fn on_large(&mut self, _: Instant, message: &Large) {
+            for _ in 0..OUTPUT_CAPACITY + 3 {
+                self.large.send(*message);
+            }
+        }
+
+        fn on_short(&mut self, _: Instant, _: Tick) {
+            self.small.send(small_of(10));
+        }
+
+        fn on_long(&mut self, _: Instant, tick: Tick) {
+            let value = u32::try_from(tick.index).unwrap();
+            self.small.send(small_of(value));
+        }
+    }
+
+    fn emitted(call: impl FnOnce(Emit<'_>)) -> Vec<(usize, Vec<u8>)> {
+        let mut all = Vec::new();
+        call(&mut |port, bytes: &[u8]| all.push((port, bytes.to_vec())));
+        all
+    }
+
+    #[test]
+    fn a_message_goes_to_the_method_of_its_port_and_a_wrong_size_to_none() {
+        let mut role = into_role(Both::default());
+        let small = small_of(7);
+        let bytes = bytemuck::bytes_of(&small);
+        let said = emitted(|emit| assert!(role.message(Instant::ZERO, 0, bytes, emit)));
+        assert_eq!(said, [(0, bytes.to_vec())]);
+        for (port, payload) in [(1, bytes), (2, bytes), (0, &[0; 24][..])] {
+            let said = emitted(|emit| assert!(!role.message(Instant::ZERO, port, payload, emit)));
+            assert!(said.is_empty());
+        }
+        let said = emitted(|emit| role.hear(Instant::ZERO, "a/small", &small, emit));
+        assert_eq!(said.len(), 1);
+    }
+
+    #[test]
+    fn a_full_port_drops_and_counts() {
+        let mut role = into_role(Both::default());
+        let large = Large { value: [1.0; 3] };
+        for calls in 1..3 {
+            let said = emitted(|emit| role.hear(Instant::ZERO, "a/large", &large, emit));
+            assert_eq!(said.len(), OUTPUT_CAPACITY);
+            assert!(said.iter().all(|one| one.0 == 1));
+            assert_eq!(role.outbox_dropped(), calls * 3);
+        }
+    }
+
+    #[test]
+    fn a_port_of_a_role_never_grows() {
+        let mut port = Output::default();
+        port.reserve();
+        let room = port.messages.capacity();
+        for _ in 0..2 {
+            for value in 0..2 * OUTPUT_CAPACITY {
+                port.send(small_of(u32::try_from(value).unwrap()));
+            }
+            let dropped_count = port.flush(0, &mut |_, _| {});
+            assert_eq!(dropped_count, OUTPUT_CAPACITY as u64);
+            assert_eq!(port.messages.capacity(), room);
+        }
+    }
+
+    #[test]
+    fn periods_are_called_on_their_grids_from_the_start_and_skipped_points_counted() {
+        let mut role = into_role(Both::default());
+        assert_eq!(role.next_tick(), None);
+        role.start(Instant::from_ns(100));
+        assert_eq!(role.next_tick(), Some(Instant::from_ns(100)));
+        assert_eq!(
+            emitted(|emit| role.tick(Instant::from_ns(100), emit)).len(),
+            2
+        );
+        assert_eq!(role.next_tick(), Some(Instant::from_ns(110)));
+        let said = emitted(|emit| role.tick(Instant::from_ns(152), emit));
+        let small = |value| (0, bytemuck::bytes_of(&small_of(value)).to_vec());
+        assert_eq!(said, [small(10), small(2)]);
+        assert_eq!(role.skipped_ticks(), 4 + 1);
+        assert_eq!(role.next_tick(), Some(Instant::from_ns(160)));
+    }
+
+    #[test]
+    #[should_panic(expected = "declares its port a/small twice")]
+    fn a_port_of_one_side_is_declared_once() {
+        let mut ports = Ports::<Both>::new();
+        ports.input("a/small", Both::on_small);
+        ports.output("a/small", |own| &mut own.small);
+        ports.input("a/small", Both::on_small);
     }
 }

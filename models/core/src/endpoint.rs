@@ -3,8 +3,8 @@
 
 use core::fmt::Debug;
 
-use crate::component::Role;
-use crate::message::Envelope;
+use crate::component::{Port, Role};
+use crate::message::{Envelope, MessageType, TypeInfo};
 use crate::time::Instant;
 
 /// Takes messages from a channel.
@@ -62,41 +62,139 @@ pub struct Endpoint<I, O> {
     outputs: Vec<O>,
 }
 
-/// The ports do not fit the role.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("role has {expected} {side} ports, {given} were given")]
-pub struct PortCountError {
-    /// `input` or `output`.
-    pub side: &'static str,
-    /// Ports of the role.
-    pub expected: usize,
-    /// Ports given.
-    pub given: usize,
+/// A channel of a role as someone else states it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StatedChannel {
+    /// Name, also of the port.
+    pub name: String,
+    /// What it carries.
+    pub message: TypeInfo,
+}
+
+/// The channels of a role as a case or a file states them.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RoleChannels {
+    /// The role.
+    pub role: String,
+    /// Who states them: a case or a file.
+    pub stated_by: String,
+    /// Those it reads.
+    pub inputs: Vec<StatedChannel>,
+    /// Those it writes.
+    pub outputs: Vec<StatedChannel>,
+}
+
+/// Which way messages pass a port.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PortSide {
+    /// To the role.
+    Input,
+    /// From the role.
+    Output,
+}
+
+/// A port of a role and the channel of its name do not fit each other.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}", sentence(self))]
+pub struct PortError {
+    /// The role.
+    pub role: String,
+    /// Who states the channel, see [`RoleChannels::stated_by`].
+    pub stated_by: String,
+    /// Input or output.
+    pub side: PortSide,
+    /// Name of port or channel.
+    pub port: String,
+    /// What the role takes or gives there; `None` when it has no such port.
+    pub expected: Option<Box<MessageType>>,
+    /// What is stated; `None` when no such channel is.
+    pub found: Option<Box<TypeInfo>>,
+}
+
+fn sentence(error: &PortError) -> String {
+    let PortError {
+        role,
+        stated_by,
+        port,
+        ..
+    } = error;
+    let (side, verb) = match error.side {
+        PortSide::Input => ("input", "takes"),
+        PortSide::Output => ("output", "gives"),
+    };
+    match (&error.expected, &error.found) {
+        (Some(expected), Some(found)) => format!(
+            "{side} port {port} of role {role} {verb} {expected}, but {stated_by} states {found}"
+        ),
+        (Some(expected), None) => format!(
+            "{side} port {port} of role {role} {verb} {expected}, but {stated_by} states no such \
+             channel"
+        ),
+        (None, found) => {
+            let found = found.as_ref().map(|found| format!(" of {found}"));
+            let found = found.unwrap_or_default();
+            format!(
+                "{stated_by} states the {side} channel {port}{found}, but role {role} has no such \
+                 port"
+            )
+        }
+    }
+}
+
+impl RoleChannels {
+    /// Whether each port of `role` has the channel of its name and type, and each channel a port.
+    ///
+    /// # Errors
+    /// The first pair that does not fit.
+    pub fn check(&self, role: &dyn Role) -> Result<(), PortError> {
+        let sides = [
+            (PortSide::Input, role.inputs(), &self.inputs),
+            (PortSide::Output, role.outputs(), &self.outputs),
+        ];
+        for (side, ports, channels) in sides {
+            let fault =
+                |port: &str, expected: Option<MessageType>, found: Option<&TypeInfo>| PortError {
+                    role: self.role.clone(),
+                    stated_by: self.stated_by.clone(),
+                    side,
+                    port: port.to_owned(),
+                    expected: expected.map(Box::new),
+                    found: found.cloned().map(Box::new),
+                };
+            for port in ports {
+                let mut channels = channels.iter();
+                let channel = channels.find(|channel| channel.name == port.name);
+                let found = channel.map(|channel| &channel.message);
+                if found != Some(&TypeInfo::of(&port.message)) {
+                    return Err(fault(port.name, Some(port.message), found));
+                }
+            }
+            for channel in channels {
+                if ports.iter().all(|port| port.name != channel.name) {
+                    return Err(fault(&channel.name, None, Some(&channel.message)));
+                }
+            }
+        }
+        Ok(())
+    }
 }
 
 impl<E, I: InputPort<Error = E>, O: OutputPort<Error = E>> Endpoint<I, O> {
-    /// Joins `role` to one port per message type, in port order.
+    /// Joins the ports of `role` to `channels` by name and type, and opens each.
     ///
     /// # Errors
-    /// When the number of ports differs from what the role declares.
-    pub fn new(
+    /// When a port and its channel do not fit, or one cannot be opened.
+    pub fn join<F: From<PortError>>(
         role: Box<dyn Role>,
-        inputs: Vec<I>,
-        outputs: Vec<O>,
-    ) -> Result<Self, PortCountError> {
-        let check = |side, expected: usize, given: usize| {
-            if expected == given {
-                Ok(())
-            } else {
-                Err(PortCountError {
-                    side,
-                    expected,
-                    given,
-                })
-            }
-        };
-        check("input", role.inputs().len(), inputs.len())?;
-        check("output", role.outputs().len(), outputs.len())?;
+        channels: &RoleChannels,
+        open_input: impl FnMut(&Port) -> Result<I, F>,
+        open_output: impl FnMut(&Port) -> Result<O, F>,
+    ) -> Result<Self, F> {
+        channels.check(role.as_ref())?;
+        let inputs = role.inputs().iter().map(open_input);
+        let inputs = inputs.collect::<Result<_, F>>()?;
+        let outputs = role.outputs().iter().map(open_output);
+        let outputs = outputs.collect::<Result<_, F>>()?;
         Ok(Self {
             role,
             inputs,
@@ -177,5 +275,90 @@ fn emitter<'a, E, O: OutputPort<Error = E>>(
         Err(error) => {
             failed.get_or_insert(error);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::component::{Component, Output, Ports, into_role};
+
+    crate::message! {
+        struct Command = "test.Command.v1" { speed_mps: f64 }
+    }
+
+    crate::message! {
+        struct Status = "test.Status.v1" { position_m: [f64; 2] }
+    }
+
+    #[derive(Debug, Default)]
+    struct Robot {
+        status: Output<Status>,
+    }
+
+    impl Component for Robot {
+        fn ports(&self, ports: &mut Ports<Self>) {
+            ports.input("left/command", |_, _, _: &Command| {});
+            ports.input("right/command", |_, _, _: &Command| {});
+            ports.output("robot/status", |own| &mut own.status);
+        }
+    }
+
+    fn channel<M: crate::message::Message>(name: &str) -> StatedChannel {
+        StatedChannel {
+            name: name.to_owned(),
+            message: TypeInfo::of(&MessageType::of::<M>()),
+        }
+    }
+
+    #[track_caller]
+    fn check(change: impl FnOnce(&mut RoleChannels), expected: Result<(), &str>) {
+        let mut channels = RoleChannels {
+            role: "robot".to_owned(),
+            stated_by: "robot.json".to_owned(),
+            inputs: vec![
+                channel::<Command>("right/command"),
+                channel::<Command>("left/command"),
+            ],
+            outputs: vec![channel::<Status>("robot/status")],
+        };
+        change(&mut channels);
+        let found = channels.check(into_role(Robot::default()).as_ref());
+        let found = found.map_err(|error| error.to_string());
+        assert_eq!(found, expected.map_err(str::to_owned));
+    }
+
+    #[test]
+    fn ports_and_channels_are_joined_by_name_and_type_and_not_by_position() {
+        check(|_| {}, Ok(()));
+        check(|channels| channels.inputs.reverse(), Ok(()));
+        check(
+            |channels| channels.inputs[1] = channel::<Status>("left/command"),
+            Err(
+                "input port left/command of role robot takes test.Command.v1 (8 bytes aligned to \
+                 8), but robot.json states test.Status.v1 (16 bytes aligned to 8)",
+            ),
+        );
+        check(
+            |channels| channels.outputs[0].message.size_bytes = 12,
+            Err(
+                "output port robot/status of role robot gives test.Status.v1 (16 bytes aligned to \
+                 8), but robot.json states test.Status.v1 (12 bytes aligned to 8)",
+            ),
+        );
+        check(
+            |channels| drop(channels.inputs.remove(0)),
+            Err(
+                "input port right/command of role robot takes test.Command.v1 (8 bytes aligned to \
+                 8), but robot.json states no such channel",
+            ),
+        );
+        check(
+            |channels| channels.outputs.push(channel::<Command>("robot/truth")),
+            Err(
+                "robot.json states the output channel robot/truth of test.Command.v1 (8 bytes \
+                 aligned to 8), but role robot has no such port",
+            ),
+        );
     }
 }

@@ -1,9 +1,7 @@
 //! The fields of a message as they lie in memory, for programs that do not know its type: a
 //! recorder, a live page, an export. Nothing on the measured path reads this.
 //!
-//! A layout is written once beside the type by [`layout!`](crate::layout!); names and types are
-//! checked by the compiler, and that the fields cover every byte in order is an assertion at build
-//! time, so a layout cannot fall behind its type.
+//! [`message!`](crate::message!) makes a layout from the declaration of a type.
 
 use serde::{Deserialize, Serialize};
 
@@ -94,7 +92,7 @@ pub struct Field {
 
 impl Field {
     /// The field `name` of `S` at `offset_bytes`, of the type that `get` returns: what
-    /// [`layout!`](crate::layout!) calls.
+    /// [`message!`](crate::message!) calls.
     pub const fn of<S, V: FieldValue>(
         name: &'static str,
         offset_bytes: usize,
@@ -169,74 +167,17 @@ impl<V: FieldValue, const N: usize> FieldValue for [V; N] {
     };
 }
 
-/// States the fields of a type, in order; the build fails unless they cover it.
-///
-/// ```
-/// use bytemuck::{Pod, Zeroable};
-/// use hil_core::layout::{FieldKind, FieldValue};
-/// use hil_core::message::Message;
-///
-/// #[derive(Debug, Clone, Copy, Pod, Zeroable)]
-/// #[repr(C)]
-/// struct Wheels { speed_mps: [f64; 2], flags: u64 }
-/// hil_core::layout!(Wheels { speed_mps, flags });
-/// impl Message for Wheels {
-///     const NAME: &'static str = "example.Wheels.v1";
-///     const FIELDS: &'static [hil_core::layout::Field] = Wheels::LAYOUT;
-/// }
-/// assert_eq!(Wheels::FIELDS[0].count, Some(2));
-/// assert_eq!(Wheels::FIELDS[1].kind, FieldKind::U64);
-/// ```
-#[macro_export]
-macro_rules! layout {
-    ($structure:ident { $($field:ident),+ $(,)? }) => {
-        impl $structure {
-            /// Its fields as they lie in memory.
-            #[allow(unreachable_pub, reason = "as visible as its type")]
-            pub const LAYOUT: &'static [$crate::layout::Field] = &[$(
-                $crate::layout::Field::of(
-                    stringify!($field),
-                    ::core::mem::offset_of!($structure, $field),
-                    |whole: &$structure| &whole.$field,
-                ),
-            )+];
-        }
-
-        const _: () = assert!(
-            $crate::layout::covers($structure::LAYOUT, size_of::<$structure>()),
-            concat!("the layout of ", stringify!($structure), " does not cover it")
-        );
-
-        impl $crate::layout::FieldValue for $structure {
-            const KIND: $crate::layout::FieldKind = $crate::layout::FieldKind::Record {
-                name: stringify!($structure),
-                fields: $structure::LAYOUT,
-            };
-            const COUNT: Option<usize> = None;
-        }
-    };
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[derive(Debug, Clone, Copy)]
-    #[repr(C)]
-    struct Inner {
-        a: u16,
-        b: [u8; 6],
+    crate::message! {
+        struct Inner { a: u16, b: [u8; 6] }
     }
-    crate::layout!(Inner { a, b });
 
-    #[derive(Debug, Clone, Copy)]
-    #[repr(C)]
-    struct Outer {
-        pair: [Inner; 2],
-        grid: [[f32; 2]; 3],
-        at_ns: i64,
+    crate::message! {
+        struct Outer { pair: [Inner; 2], grid: [[f32; 2]; 3], at_ns: i64 }
     }
-    crate::layout!(Outer { pair, grid, at_ns });
 
     #[test]
     fn arrays_of_arrays_are_flat_and_structures_keep_their_fields() {

@@ -12,6 +12,12 @@
 //! 7. [`study`]: batches of virtual-time runs that end in tables.
 #![forbid(unsafe_code)]
 
+// The macros name this crate as their users do.
+extern crate self as hil_core;
+
+#[doc(hidden)]
+pub use {bytemuck, serde};
+
 pub mod arrival;
 pub mod case_study;
 pub mod component;

@@ -1,30 +1,19 @@
 //! What a message is, and what every message carries. Datagram layout is not here: see
 //! `hil_protocol::wire`.
 
-use core::fmt::Debug;
+use core::fmt;
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::Pod;
 
 use crate::layout::Field;
 
 /// A fixed-size message without padding, so that its shared-memory layout is its wire layout.
-///
-/// ```
-/// use bytemuck::{Pod, Zeroable};
-/// use hil_core::message::Message;
-///
-/// #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-/// #[repr(C)]
-/// struct Wheels { speed_mps: [f64; 2] }
-/// impl Message for Wheels { const NAME: &'static str = "example.Wheels.v1"; }
-/// assert_eq!(hil_core::message::MessageType::of::<Wheels>().size_bytes, 16);
-/// ```
-pub trait Message: Pod + Debug + Send + 'static {
+/// Declared by [`message!`](crate::message!).
+pub trait Message: Pod + fmt::Debug + Send + 'static {
     /// Name and version, e.g. `hil.EgmCommand.v1`. A changed layout needs a new version.
     const NAME: &'static str;
-    /// Its fields, by [`layout!`](crate::layout!); empty where nobody stated them, and who records
-    /// such messages keeps their bytes.
-    const FIELDS: &'static [Field] = &[];
+    /// Its fields, in the order in which they lie in memory.
+    const FIELDS: &'static [Field];
 }
 
 /// A message's identity at run time: what two hosts compare before they trust bytes.
@@ -57,6 +46,58 @@ impl MessageType {
     }
 }
 
+impl fmt::Display for MessageType {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        TypeInfo::of(self).fmt(formatter)
+    }
+}
+
+/// Name, size and alignment of messages as a file or another process states them.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TypeInfo {
+    /// See [`Message::NAME`].
+    pub name: String,
+    /// Size of one message.
+    pub size_bytes: usize,
+    /// Alignment in shared memory.
+    pub alignment_bytes: usize,
+}
+
+impl TypeInfo {
+    /// The identity of a message type as this program was compiled.
+    pub fn of(message: &MessageType) -> Self {
+        Self {
+            name: message.name.to_owned(),
+            size_bytes: message.size_bytes,
+            alignment_bytes: message.alignment_bytes,
+        }
+    }
+}
+
+impl fmt::Display for TypeInfo {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            name,
+            size_bytes,
+            alignment_bytes,
+        } = self;
+        write!(
+            formatter,
+            "{name} ({size_bytes} bytes aligned to {alignment_bytes})"
+        )
+    }
+}
+
+/// True when `name` ends in a version: `.v` and digits.
+pub const fn has_version(name: &str) -> bool {
+    let bytes = name.as_bytes();
+    let mut start = bytes.len();
+    while start > 0 && bytes[start - 1].is_ascii_digit() {
+        start -= 1;
+    }
+    start < bytes.len() && start > 2 && bytes[start - 1] == b'v' && bytes[start - 2] == b'.'
+}
+
 /// 64-bit FNV-1a over name, size and alignment (as little-endian u64): travels in every datagram.
 ///
 /// It guards against a wrong build on one host, not against an adversary.
@@ -79,24 +120,25 @@ pub const fn fnv1a(mut hash: u64, bytes: &[u8]) -> u64 {
     hash
 }
 
-/// What every message carries beside its payload: one cache line, the user header of the
-/// shared-memory sample.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
-#[repr(C)]
-pub struct Envelope {
-    /// Counts the producer's messages on this channel from 0.
-    pub sequence: u64,
-    /// When the producer published, on the *producer's* host clock, nanoseconds.
-    pub published_ns: i64,
-    /// When a gateway published it on this host, nanoseconds on this host's clock; meaningful
-    /// only with [`Envelope::FORWARDED`].
-    pub forwarded_ns: i64,
-    /// Changes with every start of the producer: a restart is not a loss.
-    pub epoch: u32,
-    /// [`Envelope::FORWARDED`]; all other bits are zero.
-    pub flags: u32,
-    /// Zero; room to grow without a new layout.
-    pub reserved: [u64; 4],
+crate::message! {
+    /// What every message carries beside its payload: one cache line, the user header of the
+    /// shared-memory sample.
+    #[derive(Eq, Default)]
+    pub struct Envelope, 64 bytes {
+        /// Counts the producer's messages on this channel from 0.
+        pub sequence: u64,
+        /// When the producer published, on the *producer's* host clock, nanoseconds.
+        pub published_ns: i64,
+        /// When a gateway published it on this host, nanoseconds on this host's clock; meaningful
+        /// only with [`Envelope::FORWARDED`].
+        pub forwarded_ns: i64,
+        /// Changes with every start of the producer: a restart is not a loss.
+        pub epoch: u32,
+        /// [`Envelope::FORWARDED`]; all other bits are zero.
+        pub flags: u32,
+        /// Zero; room to grow without a new layout.
+        pub reserved: [u64; 4],
+    }
 }
 
 impl Envelope {
@@ -109,151 +151,142 @@ impl Envelope {
     }
 }
 
-const _: () = assert!(size_of::<Envelope>() == 64);
-
-/// Declares a structure of plain numbers whose fields can be read without its type; with a name
-/// it is a [`Message`]. The build fails unless the fields cover it, see
-/// [`layout!`](crate::layout!).
+/// Declares a message, or without a name a structure that messages contain, from one list of fields.
+///
+/// It gives the structure a fixed layout without padding, the traits of plain data, the table of its
+/// fields ([`Message::FIELDS`]) and, with a name, [`Message`]. The build fails when the name has no
+/// version, when the size is not the one stated, when the fields leave a gap, or when a field is no
+/// number, array or structure of such. The size may be left out.
 ///
 /// ```
-/// use bytemuck::{Pod, Zeroable};
 /// use hil_core::layout::FieldKind;
-/// use hil_core::message::Message;
+/// use hil_core::message::{Message, MessageType};
 ///
 /// hil_core::message! {
 ///     /// What the wheels do.
-///     #[derive(Debug, Clone, Copy, Pod, Zeroable)]
-///     #[repr(C)]
-///     pub struct Wheels = "example.Wheels.v1" {
+///     pub struct Wheels = "example.Wheels.v1", 24 bytes {
 ///         /// Left and right.
 ///         pub speed_mps: [f64; 2],
 ///         /// Bits.
 ///         pub flags: u64,
 ///     }
 /// }
-/// assert_eq!(Wheels::NAME, "example.Wheels.v1");
+/// assert_eq!(MessageType::of::<Wheels>().to_string(), "example.Wheels.v1 (24 bytes aligned to 8)");
+/// assert_eq!(Wheels::FIELDS[0].count, Some(2));
 /// assert_eq!(Wheels::FIELDS[1].kind, FieldKind::U64);
+/// ```
+///
+/// ```compile_fail
+/// hil_core::message! {
+///     pub struct Wheels = "example.Wheels.v1", 16 bytes { pub speed_mps: [f64; 3] }
+/// }
+/// ```
+///
+/// ```compile_fail
+/// hil_core::message! {
+///     pub struct Wheels = "example.Wheels" { pub speed_mps: [f64; 3] }
+/// }
 /// ```
 #[macro_export]
 macro_rules! message {
-    ($(#[$meta:meta])* $vis:vis struct $structure:ident $(= $name:literal)? {
+    ($(#[$meta:meta])* $vis:vis struct $structure:ident
+        $(= $name:literal)? $(, $size:literal bytes)? {
         $($(#[$field_meta:meta])* $field_vis:vis $field:ident: $kind:ty),+ $(,)?
     }) => {
         $(#[$meta])*
+        #[derive(Debug, Clone, Copy, PartialEq, $crate::bytemuck::Pod, $crate::bytemuck::Zeroable)]
+        #[bytemuck(crate = "hil_core::bytemuck")]
+        #[repr(C)]
         $vis struct $structure {
             $($(#[$field_meta])* $field_vis $field: $kind,)+
         }
 
-        $crate::layout!($structure { $($field),+ });
+        impl $structure {
+            /// Its fields as they lie in memory.
+            #[allow(unreachable_pub, reason = "as visible as its type")]
+            pub const LAYOUT: &'static [$crate::layout::Field] = &[$(
+                $crate::layout::Field::of(
+                    stringify!($field),
+                    ::core::mem::offset_of!($structure, $field),
+                    |whole: &$structure| &whole.$field,
+                ),
+            )+];
+        }
 
-        $(impl $crate::message::Message for $structure {
-            const NAME: &'static str = $name;
-            const FIELDS: &'static [$crate::layout::Field] = Self::LAYOUT;
-        })?
+        impl $crate::layout::FieldValue for $structure {
+            const KIND: $crate::layout::FieldKind = $crate::layout::FieldKind::Record {
+                name: stringify!($structure),
+                fields: $structure::LAYOUT,
+            };
+            const COUNT: Option<usize> = None;
+        }
+
+        const _: () = {
+            assert!(
+                $crate::layout::covers($structure::LAYOUT, size_of::<$structure>()),
+                concat!("the fields of ", stringify!($structure), " do not cover it")
+            );
+            assert!(
+                align_of::<$structure>() <= $crate::message::ALIGNMENT_MAX,
+                concat!(stringify!($structure), " needs a larger alignment than messages have")
+            );
+            $(assert!(
+                size_of::<$structure>() == $size,
+                concat!(stringify!($structure), " has not the stated size")
+            );)?
+        };
+
+        $(
+            const _: () = assert!(
+                $crate::message::has_version($name),
+                concat!("the name ", $name, " does not end in a version like .v1")
+            );
+
+            impl $crate::message::Message for $structure {
+                const NAME: &'static str = $name;
+                const FIELDS: &'static [$crate::layout::Field] = Self::LAYOUT;
+            }
+        )?
     };
 }
 
-/// The messages one side of a component takes or gives: one [`Message`] type, or an enum made
-/// by [`message_set!`](crate::message_set) with one variant per port.
-pub trait MessageSet: Debug + Copy + 'static {
-    /// The message type of each port, in port order.
-    const PORTS: &'static [MessageType];
+/// Largest alignment of a message: it follows the [`Envelope`] in shared memory and in record files.
+pub const ALIGNMENT_MAX: usize = align_of::<Envelope>();
 
-    /// Reads the message that arrived on `port`; `None` for an unknown port or a wrong size.
-    fn from_bytes(port: usize, bytes: &[u8]) -> Option<Self>;
-
-    /// The port this message belongs to.
-    fn port(&self) -> usize;
-
-    /// The payload as it lies in shared memory.
-    fn as_bytes(&self) -> &[u8];
-}
-
-impl<M: Message> MessageSet for M {
-    const PORTS: &'static [MessageType] = &[MessageType::of::<M>()];
-
-    fn from_bytes(port: usize, bytes: &[u8]) -> Option<Self> {
-        (port == 0)
-            .then(|| bytemuck::try_pod_read_unaligned(bytes).ok())
-            .flatten()
-    }
-
-    fn port(&self) -> usize {
-        0
-    }
-
-    fn as_bytes(&self) -> &[u8] {
-        bytemuck::bytes_of(self)
-    }
-}
-
-/// Defines an enum of messages, one port per variant in the order written.
+/// Declares an enum that messages carry as a number, with the way back from the number.
 ///
 /// ```
-/// use hil_core::message::{Message, MessageSet};
-/// # use bytemuck::{Pod, Zeroable};
-///
-/// #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-/// #[repr(C)]
-/// pub struct Speed { mps: f64 }
-/// impl Message for Speed { const NAME: &'static str = "example.Speed.v1"; }
-///
-/// #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-/// #[repr(C)]
-/// pub struct Position { m: f64 }
-/// impl Message for Position { const NAME: &'static str = "example.Position.v1"; }
-///
-/// hil_core::message_set! {
-///     /// Everything an observer hears.
-///     pub enum Heard { Speed(Speed), Position(Position) }
+/// hil_core::numbered! {
+///     /// What a door is.
+///     pub enum Door: u32 {
+///         /// Nobody can pass.
+///         Closed = 0,
+///         /// Everybody can.
+///         Open = 3,
+///     }
 /// }
-/// assert_eq!(Heard::PORTS.len(), 2);
+/// assert_eq!(Door::from_number(3), Some(Door::Open));
+/// assert_eq!(Door::from_number(1), None);
 /// ```
 #[macro_export]
-macro_rules! message_set {
-    ($(#[$meta:meta])* $vis:vis enum $name:ident { $($variant:ident($message:ty)),+ $(,)? }) => {
+macro_rules! numbered {
+    ($(#[$meta:meta])* $vis:vis enum $name:ident: $number:ident {
+        $($(#[$variant_meta:meta])* $variant:ident = $value:literal),+ $(,)?
+    }) => {
         $(#[$meta])*
-        #[derive(Debug, Clone, Copy, PartialEq)]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+        #[repr($number)]
         $vis enum $name {
-            $(
-                #[doc = concat!("A [`", stringify!($message), "`].")]
-                $variant($message),
-            )+
+            $($(#[$variant_meta])* $variant = $value,)+
         }
 
-        impl $crate::message::MessageSet for $name {
-            const PORTS: &'static [$crate::message::MessageType] =
-                &[$($crate::message::MessageType::of::<$message>()),+];
-
-            fn from_bytes(port: usize, bytes: &[u8]) -> Option<Self> {
-                let mut index = 0;
-                $(
-                    if index == port {
-                        return <$message as $crate::message::MessageSet>::from_bytes(0, bytes)
-                            .map(Self::$variant);
-                    }
-                    index += 1;
-                )+
-                // Read once more so that the last increment is not an unused assignment.
-                debug_assert!(index == Self::PORTS.len());
-                None
-            }
-
-            fn port(&self) -> usize {
-                let mut index = 0;
-                $(
-                    if matches!(self, Self::$variant(_)) {
-                        return index;
-                    }
-                    index += 1;
-                )+
-                index
-            }
-
-            fn as_bytes(&self) -> &[u8] {
-                match self {
-                    $(Self::$variant(message) =>
-                        $crate::message::MessageSet::as_bytes(message),)+
+        impl $name {
+            /// The one with this number; `None` for an unknown number.
+            #[allow(unreachable_pub, reason = "as visible as its type")]
+            pub const fn from_number(number: $number) -> Option<Self> {
+                match number {
+                    $($value => Some(Self::$variant),)+
+                    _ => None,
                 }
             }
         }
@@ -264,40 +297,14 @@ macro_rules! message_set {
 mod tests {
     use super::*;
 
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    struct Small {
-        value: u32,
-    }
-
-    impl Message for Small {
-        const NAME: &'static str = "test.Small.v1";
-    }
-
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    struct Large {
-        value: [f64; 3],
-    }
-
-    impl Message for Large {
-        const NAME: &'static str = "test.Large.v1";
-    }
-
-    message_set! {
-        /// Both.
-        enum Both { Small(Small), Large(Large) }
-    }
-
     #[test]
-    fn a_set_finds_the_variant_by_port_and_refuses_a_wrong_size() {
-        let large = Both::Large(Large {
-            value: [1.0, 2.0, 3.0],
-        });
-        assert_eq!(large.port(), 1);
-        assert_eq!(Both::from_bytes(1, large.as_bytes()), Some(large));
-        assert_eq!(Both::from_bytes(0, large.as_bytes()), None);
-        assert_eq!(Both::from_bytes(2, large.as_bytes()), None);
+    fn a_version_is_digits_after_a_v() {
+        for name in ["a.v1", "hil.EgmCommand.v12"] {
+            assert!(has_version(name), "{name}");
+        }
+        for name in ["", "1", "v1", ".v1", "a.v", "a.1", "a.v1b", "av1"] {
+            assert!(!has_version(name), "{name}");
+        }
     }
 
     #[test]

@@ -227,17 +227,10 @@ impl Score {
 
 #[cfg(test)]
 mod tests {
-    use bytemuck::{Pod, Zeroable};
-
     use super::*;
-    use crate::message::Message;
 
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    struct Any(u64);
-
-    impl Message for Any {
-        const NAME: &'static str = "test.Any.v1";
+    crate::message! {
+        struct Any = "test.Any.v1" { value: u64 }
     }
 
     fn event(severity: Severity, at_ns: i64) -> ScoreEvent {

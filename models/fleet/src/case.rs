@@ -1,7 +1,5 @@
 //! The case study `fleet`: which roles and channels there are, and what they share.
 
-use serde::{Deserialize, Serialize};
-
 use crate::controller::Controller;
 use crate::coordinator::parameters::{CoordinatorMode, CoordinatorParameters};
 use crate::experiment::{FleetStudy, TableParameters};
@@ -116,46 +114,29 @@ impl CaseStudy for Fleet {
     }
 }
 
-/// `[case.parameters]` of the fleet case. The defaults are the seed paper's figures where it
-/// gives them (section III.B, Table I) and the original implementation's otherwise.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct FleetParameters {
-    /// Independent fleets that share the channels, 1..=64: critical sections come so many times
-    /// faster.
-    pub fleets: u32,
-    /// Vehicle, map and number of robots.
-    pub world: WorldParameters,
-    /// How robots drive and take orders.
-    pub robot: RobotParameters,
-    /// Who goes first, and how it is told.
-    pub coordinator: CoordinatorParameters,
-    /// Where robots are sent.
-    pub missions: MissionParameters,
-    /// What `hil-runtime tables` computes.
-    pub tables: TableParameters,
-}
-
-impl Default for FleetParameters {
-    fn default() -> Self {
-        Self {
-            fleets: 1,
-            world: WorldParameters::default(),
-            robot: RobotParameters::default(),
-            coordinator: CoordinatorParameters::default(),
-            missions: MissionParameters::default(),
-            tables: TableParameters::default(),
-        }
-    }
+hil_core::parameters! {
+    /// `[case.parameters]` of the fleet case. The defaults are the seed paper's figures where it
+    /// gives them (section III.B, Table I) and the original implementation's otherwise.
+    pub struct FleetParameters {
+        /// Independent fleets that share the channels: critical sections come so many times
+        /// faster.
+        fleets: u32 = 1, in 1.0..=64.0;
+        /// Vehicle, map and number of robots.
+        world: WorldParameters = WorldParameters::default();
+        /// How robots drive and take orders.
+        robot: RobotParameters = RobotParameters::default();
+        /// Who goes first, and how it is told.
+        coordinator: CoordinatorParameters = CoordinatorParameters::default();
+        /// Where robots are sent.
+        missions: MissionParameters = MissionParameters::default();
+        /// What `hil-runtime tables` computes.
+        tables: TableParameters = TableParameters::default();
+    } check check_tables;
 }
 
 impl FleetParameters {
-    /// Checks every number but the world's, which is checked when it is built.
-    ///
-    /// # Errors
-    /// The first key outside its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        ParameterError::check("fleets", f64::from(self.fleets), 1.0..=64.0, "1 to 64")?;
+    /// The world is checked when it is built.
+    fn check_tables(&self) -> Result<(), ParameterError> {
         self.robot.check()?;
         self.coordinator.check()?;
         self.missions.check()?;

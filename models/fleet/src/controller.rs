@@ -4,12 +4,13 @@
 use core::time::Duration;
 use std::collections::VecDeque;
 
+use crate::case::{FLEET_AUTHORITY, FLEET_MISSION, FLEET_STATE};
 use crate::coordinator::Coordinator;
 use crate::coordinator::parameters::CoordinatorParameters;
-use crate::messages::{State, ToRobot};
+use crate::messages::{Authority, Mission, State, ToRobot};
 use crate::mission::{MissionParameters, MissionSource};
 use crate::scenario::Scene;
-use hil_core::component::{Component, OUTBOX_CAPACITY, Outbox};
+use hil_core::component::{Component, OUTPUT_CAPACITY, Output, Ports};
 use hil_core::random::RandomStream;
 use hil_core::time::{Instant, PeriodicTimer};
 
@@ -17,8 +18,10 @@ use hil_core::time::{Instant, PeriodicTimer};
 #[derive(Debug)]
 pub struct Controller {
     fleets: Vec<Beat>,
-    /// Decided but not given yet: an outbox holds less than a large fleet can be told at once.
+    /// Decided but not given yet: a port holds less than a large fleet can be told at once.
     waiting: VecDeque<ToRobot>,
+    authority: Output<Authority>,
+    mission: Output<Mission>,
 }
 
 /// A coordinator and its timer.
@@ -47,7 +50,9 @@ impl Controller {
         });
         Self {
             fleets: fleets.collect(),
-            waiting: VecDeque::with_capacity(OUTBOX_CAPACITY),
+            waiting: VecDeque::with_capacity(OUTPUT_CAPACITY),
+            authority: Output::default(),
+            mission: Output::default(),
         }
     }
 }
@@ -65,35 +70,42 @@ pub(crate) fn coordinator_of(
     Coordinator::new(scene, parameters, fleet, source)
 }
 
-impl Component for Controller {
-    type Input = State;
-    type Output = ToRobot;
+impl Controller {
+    fn on_state(&mut self, now: Instant, state: &State) {
+        if let Some(beat) = self.fleets.get_mut(state.header.fleet_id as usize) {
+            beat.coordinator.on_state(now, state);
+        }
+    }
+}
 
-    fn on_start(&mut self, now: Instant) {
+impl Component for Controller {
+    fn ports(&self, ports: &mut Ports<Self>) {
+        ports.input(FLEET_STATE, Self::on_state);
+        ports.output(FLEET_AUTHORITY, |own| &mut own.authority);
+        ports.output(FLEET_MISSION, |own| &mut own.mission);
+    }
+
+    fn start(&mut self, now: Instant) {
         for beat in &mut self.fleets {
             beat.timer.start(now + beat.offset);
         }
     }
 
-    fn on_message(&mut self, now: Instant, input: &State, _out: &mut Outbox<ToRobot>) {
-        if let Some(beat) = self.fleets.get_mut(input.header.fleet_id as usize) {
-            beat.coordinator.on_state(now, input);
-        }
-    }
-
-    fn on_tick(&mut self, now: Instant, out: &mut Outbox<ToRobot>) {
-        let Self {
-            fleets, waiting, ..
-        } = self;
-        if waiting.is_empty() {
-            let mut due = fleets.iter_mut();
+    fn tick(&mut self, now: Instant) {
+        if self.waiting.is_empty() {
+            let mut due = self.fleets.iter_mut();
             let due = due.find_map(|beat| beat.timer.poll(now).map(|_| &mut beat.coordinator));
             if let Some(coordinator) = due {
+                let waiting = &mut self.waiting;
                 coordinator.on_cycle(now, &mut |message| waiting.push_back(message));
             }
         }
-        for message in waiting.drain(..waiting.len().min(OUTBOX_CAPACITY)) {
-            out.send(message);
+        let given_count = self.waiting.len().min(OUTPUT_CAPACITY);
+        for message in self.waiting.drain(..given_count) {
+            match message {
+                ToRobot::Authority(authority) => self.authority.send(authority),
+                ToRobot::Mission(mission) => self.mission.send(mission),
+            }
         }
     }
 

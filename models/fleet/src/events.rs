@@ -167,7 +167,7 @@ struct Watch {
 
 impl Watch {
     fn see(&mut self, truth: &Truth, orders: &Orders, found: &mut Found) {
-        let Some(kind) = TruthKind::of(truth.kind) else {
+        let Some(kind) = TruthKind::from_number(truth.kind) else {
             return;
         };
         if truth.mission_id != self.mission_id {

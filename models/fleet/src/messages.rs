@@ -2,14 +2,12 @@
 //! Names and meanings follow VDA 5050 (order = mission, base = authority, state); the encoding is
 //! our own fixed-size one. Nothing here decides anything.
 
-use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
 hil_core::message! {
     /// What the three messages between controller and robot begin with, 24 bytes.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct Header {
+    #[derive(Eq, Default)]
+    pub struct Header, 24 bytes {
         /// Which of the independent fleets that share the channel.
         pub fleet_id: u32,
         /// Robot within its fleet, from 0.
@@ -34,33 +32,24 @@ pub enum MessageOrder {
     Strict,
 }
 
-/// What a robot is about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Phase {
-    /// In a bay without a mission.
-    Parked = 0,
-    /// On its way.
-    Driving = 1,
-    /// Standing at the end of its authority, short of its goal.
-    AtPoint = 2,
-    /// Standing at its goal.
-    Done = 3,
-}
-
-impl Phase {
-    /// The phase a message names; `None` for an unknown number.
-    pub fn of(number: u8) -> Option<Self> {
-        let phases = [Self::Parked, Self::Driving, Self::AtPoint, Self::Done];
-        phases.get(usize::from(number)).copied()
+hil_core::numbered! {
+    /// What a robot is about.
+    pub enum Phase: u8 {
+        /// In a bay without a mission.
+        Parked = 0,
+        /// On its way.
+        Driving = 1,
+        /// Standing at the end of its authority, short of its goal.
+        AtPoint = 2,
+        /// Standing at its goal.
+        Done = 3,
     }
 }
 
 hil_core::message! {
     /// Robot to controller, every tracking period (VDA 5050 `state`), 96 bytes.
-    #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct State = "hil.FleetState.v1" {
+    #[derive(Default)]
+    pub struct State = "hil.FleetState.v1", 96 bytes {
         /// Who, which mission, when.
         pub header: Header,
         /// When the robot sampled its motion, nanoseconds on its clock.
@@ -111,15 +100,14 @@ impl State {
         reals.iter().all(|value| value.is_finite())
             && self.speed_mps.is_finite()
             && self.acceleration_mps2.is_finite()
-            && Phase::of(self.phase).is_some()
+            && Phase::from_number(self.phase).is_some()
     }
 }
 
 hil_core::message! {
     /// Controller to robot: how far it may go (the end of VDA 5050's *base*), 48 bytes.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct Authority = "hil.FleetAuthority.v1" {
+    #[derive(Eq, Default)]
+    pub struct Authority = "hil.FleetAuthority.v1", 48 bytes {
         /// To whom, for which mission.
         pub header: Header,
         /// Grows with every change of this mission's authority, from 1 (`orderUpdateId`); a repeat
@@ -145,9 +133,8 @@ impl Authority {
 hil_core::message! {
     /// Controller to robot: the path to drive (VDA 5050 `order`), repeated until a state shows the
     /// mission, 48 bytes. Path geometry is not sent: both ends make it, and compare by hash.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct Mission = "hil.FleetMission.v1" {
+    #[derive(Eq, Default)]
+    pub struct Mission = "hil.FleetMission.v1", 48 bytes {
         /// To whom; `mission_id` is the new mission.
         pub header: Header,
         /// Which path, as [`PathId`](crate::path::PathId) numbers them.
@@ -171,9 +158,8 @@ impl Mission {
 hil_core::message! {
     /// Robot to recorder, never over the network: its motion from this instant until the next such
     /// record, `s(t) = travelled + speed t + acceleration t^2 / 2`, never backwards. 64 bytes.
-    #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct Truth = "hil.FleetTruth.v1" {
+    #[derive(Default)]
+    pub struct Truth = "hil.FleetTruth.v1", 64 bytes {
         /// When, nanoseconds on the robots' clock.
         pub at_ns: i64,
         /// Which fleet.
@@ -201,63 +187,37 @@ hil_core::message! {
     }
 }
 
-/// Why a truth record was written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[repr(u32)]
-pub enum TruthKind {
-    /// The acceleration changed, or a tick of a stepped tracker.
-    Motion = 0,
-    /// A mission began.
-    MissionStarted = 1,
-    /// The goal was reached.
-    MissionDone = 2,
-    /// An authority was applied.
-    AuthorityApplied = 3,
-    /// An authority came too late: the robot could not stop at it any more and went past.
-    AuthorityLate = 4,
-    /// An authority behind the robot was ignored; the old one stays in force.
-    AuthorityIgnored = 5,
-    /// An authority was refused because the robot could not stop at it; the old one stays.
-    AuthorityRefused = 6,
-    /// An older or repeated authority or mission was passed over.
-    MessageStale = 7,
-    /// The lease of the authority ended and the robot braked.
-    LeaseEnded = 8,
-    /// The robot was put at its goal to clear a stuck fleet.
-    Replaced = 9,
-}
-
-impl TruthKind {
-    /// The kind a record names; `None` for an unknown number.
-    pub fn of(number: u32) -> Option<Self> {
-        const KINDS: [TruthKind; 10] = [
-            TruthKind::Motion,
-            TruthKind::MissionStarted,
-            TruthKind::MissionDone,
-            TruthKind::AuthorityApplied,
-            TruthKind::AuthorityLate,
-            TruthKind::AuthorityIgnored,
-            TruthKind::AuthorityRefused,
-            TruthKind::MessageStale,
-            TruthKind::LeaseEnded,
-            TruthKind::Replaced,
-        ];
-        KINDS.get(number as usize).copied()
+hil_core::numbered! {
+    /// Why a truth record was written.
+    pub enum TruthKind: u32 {
+        /// The acceleration changed, or a tick of a stepped tracker.
+        Motion = 0,
+        /// A mission began.
+        MissionStarted = 1,
+        /// The goal was reached.
+        MissionDone = 2,
+        /// An authority was applied.
+        AuthorityApplied = 3,
+        /// An authority came too late: the robot could not stop at it any more and went past.
+        AuthorityLate = 4,
+        /// An authority behind the robot was ignored; the old one stays in force.
+        AuthorityIgnored = 5,
+        /// An authority was refused because the robot could not stop at it; the old one stays.
+        AuthorityRefused = 6,
+        /// An older or repeated authority or mission was passed over.
+        MessageStale = 7,
+        /// The lease of the authority ended and the robot braked.
+        LeaseEnded = 8,
+        /// The robot was put at its goal to clear a stuck fleet.
+        Replaced = 9,
     }
 }
 
-hil_core::message_set! {
-    /// What a fleet controller gives: one port, and so one flow, per kind.
-    pub enum ToRobot { Authority(Authority), Mission(Mission) }
+/// What a fleet controller gives.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ToRobot {
+    /// How far a robot may go.
+    Authority(Authority),
+    /// What a robot shall drive.
+    Mission(Mission),
 }
-
-hil_core::message_set! {
-    /// What the robots give: states for the controller, truth for the recorder.
-    pub enum FromRobot { State(State), Truth(Truth) }
-}
-
-const _: () = assert!(size_of::<Header>() == 24);
-const _: () = assert!(size_of::<State>() == 96);
-const _: () = assert!(size_of::<Authority>() == 48);
-const _: () = assert!(size_of::<Mission>() == 48);
-const _: () = assert!(size_of::<Truth>() == 64);

@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::floor_index;
 use crate::scenario::Scene;
 use crate::world::{BayIndex, Route};
-use hil_core::case_study::ParameterError;
 use hil_core::random::RandomStream;
 
 /// How goals are chosen.
@@ -24,36 +23,16 @@ pub enum MissionMode {
     Once,
 }
 
-/// `[case.parameters.missions]`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct MissionParameters {
-    /// How goals are chosen.
-    pub mode: MissionMode,
-    /// Missions after which a robot stays parked; 0 for no end. `once` gives one at most.
-    pub missions_per_robot: u32,
-    /// How long a robot stays in a bay before its next mission, seconds, 0..=3600.
-    pub parking_s: f64,
-}
-
-impl Default for MissionParameters {
-    fn default() -> Self {
-        Self {
-            mode: MissionMode::default(),
-            missions_per_robot: 0,
-            parking_s: 3.0,
-        }
-    }
-}
-
-impl MissionParameters {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// Names the key, below `missions`, and its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        let allowed = 0.0..=3600.0;
-        ParameterError::check("missions.parking_s", self.parking_s, allowed, "0 to 3600")
+hil_core::parameters! {
+    /// `[case.parameters.missions]`.
+    #[derive(Copy)]
+    pub struct MissionParameters in "missions." {
+        /// How goals are chosen.
+        mode: MissionMode = MissionMode::default();
+        /// Missions after which a robot stays parked; 0 for no end. `once` gives one at most.
+        missions_per_robot: u32 = 0;
+        /// How long a robot stays in a bay before its next mission, seconds.
+        parking_s: f64 = 3.0, in 0.0..=3600.0;
     }
 }
 

@@ -1,14 +1,15 @@
 //! The role "robots": every robot of every fleet, driven by whichever event is next. It routes
 //! messages by their ids and decides nothing.
 
-use crate::messages::{FromRobot, Header, ToRobot, Truth};
+use crate::case::{FLEET_AUTHORITY, FLEET_MISSION, FLEET_STATE, FLEET_TRUTH};
+use crate::messages::{Authority, Header, Mission, State, Truth};
 use crate::robot::{Robot, RobotParameters};
 use crate::scenario::Scene;
-use hil_core::component::{Component, Outbox};
+use hil_core::component::{Component, Output, Ports};
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
-/// Robots handled per call, so that what they give fits an outbox; the rest are due at once.
+/// Robots handled per call, so that what they give fits the ports; the rest are due at once.
 const ROBOTS_PER_CALL: usize = 8;
 
 /// All robots of a run.
@@ -23,6 +24,8 @@ pub struct Robots {
     started_count: usize,
     started: Option<Instant>,
     unknown_count: u64,
+    state: Output<State>,
+    truth: Output<Truth>,
 }
 
 impl Robots {
@@ -47,6 +50,8 @@ impl Robots {
             started_count: 0,
             started: None,
             unknown_count: 0,
+            state: Output::default(),
+            truth: Output::default(),
         }
     }
 
@@ -64,12 +69,37 @@ impl Robots {
     }
 
     /// Starts robot `index` unless it runs already.
-    fn start_robot(&mut self, index: usize, truth: &mut dyn FnMut(Truth)) {
+    fn start_robot(&mut self, index: usize) {
         if let (Some(started), false) = (self.started, self.is_running[index]) {
-            self.members[index].start(started, truth);
+            let truth = &mut self.truth;
+            self.members[index].start(started, &mut |record| truth.send(record));
             self.due[index] = self.members[index].next_event();
             self.is_running[index] = true;
         }
+    }
+
+    /// Hands a message with this header to its robot.
+    fn hear(&mut self, header: &Header, take: impl FnOnce(&mut Robot, &mut dyn FnMut(Truth))) {
+        let Some(index) = self.index_of(header).filter(|_| self.started.is_some()) else {
+            self.unknown_count += 1;
+            return;
+        };
+        self.start_robot(index);
+        let truth = &mut self.truth;
+        take(&mut self.members[index], &mut |record| truth.send(record));
+        self.due[index] = self.members[index].next_event();
+    }
+
+    fn on_authority(&mut self, now: Instant, authority: &Authority) {
+        self.hear(&authority.header, |robot, truth| {
+            robot.on_authority(now, authority, truth);
+        });
+    }
+
+    fn on_mission(&mut self, now: Instant, mission: &Mission) {
+        self.hear(&mission.header, |robot, truth| {
+            robot.on_mission(now, mission, truth);
+        });
     }
 }
 
@@ -79,38 +109,23 @@ pub fn robot_stream(seed: u64, fleet_id: u32, robot_id: u32) -> RandomStream {
 }
 
 impl Component for Robots {
-    type Input = ToRobot;
-    type Output = FromRobot;
+    fn ports(&self, ports: &mut Ports<Self>) {
+        ports.input(FLEET_AUTHORITY, Self::on_authority);
+        ports.input(FLEET_MISSION, Self::on_mission);
+        ports.output(FLEET_STATE, |own| &mut own.state);
+        ports.output(FLEET_TRUTH, |own| &mut own.truth);
+    }
 
-    fn on_start(&mut self, now: Instant) {
+    fn start(&mut self, now: Instant) {
         self.started = Some(now);
     }
 
-    fn on_message(&mut self, now: Instant, input: &ToRobot, out: &mut Outbox<FromRobot>) {
-        let header = match input {
-            ToRobot::Authority(authority) => &authority.header,
-            ToRobot::Mission(mission) => &mission.header,
-        };
-        let Some(index) = self.index_of(header).filter(|_| self.started.is_some()) else {
-            self.unknown_count += 1;
-            return;
-        };
-        let mut truth = |record| out.send(FromRobot::Truth(record));
-        self.start_robot(index, &mut truth);
-        let robot = &mut self.members[index];
-        match input {
-            ToRobot::Authority(authority) => robot.on_authority(now, authority, &mut truth),
-            ToRobot::Mission(mission) => robot.on_mission(now, mission, &mut truth),
-        }
-        self.due[index] = robot.next_event();
-    }
-
-    fn on_tick(&mut self, now: Instant, out: &mut Outbox<FromRobot>) {
+    fn tick(&mut self, now: Instant) {
         let count = self.members.len();
         if self.started_count < count {
             let end = count.min(self.started_count + ROBOTS_PER_CALL);
             for index in self.started_count..end {
-                self.start_robot(index, &mut |record| out.send(FromRobot::Truth(record)));
+                self.start_robot(index);
             }
             self.started_count = end;
             return;
@@ -120,10 +135,10 @@ impl Component for Robots {
             if *due > now {
                 continue;
             }
-            let state = robot.on_event(now, &mut |record| out.send(FromRobot::Truth(record)));
+            let state = robot.on_event(now, &mut |record| self.truth.send(record));
             *due = robot.next_event();
             if let Some(state) = state {
-                out.send(FromRobot::State(state));
+                self.state.send(state);
             }
             handled += 1;
             if handled == ROBOTS_PER_CALL {
@@ -162,47 +177,61 @@ impl Robots {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::messages::{Authority, TO_GOAL};
+    use crate::messages::TO_GOAL;
     use crate::robot::RobotCounters;
     use crate::robot::tests::{authority, mission, scene};
     use crate::scenario::Scenario;
-    use hil_core::component::OUTBOX_CAPACITY;
 
-    fn drive(seed: u64, until: Instant) -> (Vec<FromRobot>, u64, RobotCounters) {
+    /// What 20 fleets said and counted.
+    #[derive(Debug, PartialEq)]
+    struct Outcome {
+        states: Vec<State>,
+        truths: Vec<Truth>,
+        dropped_count: u64,
+        counters: RobotCounters,
+    }
+
+    fn drive(seed: u64, until: Instant) -> Outcome {
         let scene = scene(Scenario::ThreeCycle);
         let mut robots = Robots::new(&scene, &RobotParameters::default(), 20, seed);
-        let mut out = Outbox::with_capacity(OUTBOX_CAPACITY);
-        let mut given = Vec::new();
-        robots.on_start(Instant::ZERO);
+        let (mut states, mut truths) = (Vec::new(), Vec::new());
+        let mut listen = |robots: &mut Robots| {
+            states.extend(robots.state.drain());
+            truths.extend(robots.truth.drain());
+        };
+        robots.start(Instant::ZERO);
         for fleet_id in 0..25 {
             let mut mission = mission(&scene, 1, 1, 2);
             mission.header.fleet_id = fleet_id;
-            robots.on_message(Instant::ZERO, &ToRobot::Mission(mission), &mut out);
+            robots.on_mission(Instant::ZERO, &mission);
             let mut go: Authority = authority(1, 1, TO_GOAL, 0);
             (go.header.fleet_id, go.header.robot_id) = (fleet_id, 1);
-            robots.on_message(Instant::ZERO, &ToRobot::Authority(go), &mut out);
-            given.extend(out.drain());
+            robots.on_authority(Instant::ZERO, &go);
+            listen(&mut robots);
         }
         while let Some(due) = robots.next_tick().filter(|due| *due <= until) {
-            robots.on_tick(due, &mut out);
-            given.extend(out.drain());
+            robots.tick(due);
+            listen(&mut robots);
         }
         assert_eq!(robots.unknown_count(), 10);
-        (given, out.dropped_count(), robots.counters())
+        Outcome {
+            states,
+            truths,
+            dropped_count: robots.state.dropped_count() + robots.truth.dropped_count(),
+            counters: robots.counters(),
+        }
     }
 
     #[test]
     fn every_robot_of_every_fleet_reports_and_nothing_is_dropped() {
-        let (given, dropped_count, counters) = drive(1, Instant::from_ns(60_000_000_000));
-        assert_eq!(dropped_count, 0);
-        assert_eq!(counters.missions_done_count, 20);
-        assert_eq!(counters.skipped_ticks_count, 0);
-        let states = given.iter().filter_map(|message| match message {
-            FromRobot::State(state) => Some((state.header.fleet_id, state.header.robot_id)),
-            FromRobot::Truth(_) => None,
-        });
-        let mut ids: Vec<_> = states.collect();
-        assert_eq!(ids.len() as u64, counters.states_count);
+        let outcome = drive(1, Instant::from_ns(60_000_000_000));
+        assert_eq!(outcome.dropped_count, 0);
+        assert_eq!(outcome.counters.missions_done_count, 20);
+        assert_eq!(outcome.counters.skipped_ticks_count, 0);
+        let states = outcome.states.iter();
+        let ids = states.map(|state| (state.header.fleet_id, state.header.robot_id));
+        let mut ids: Vec<_> = ids.collect();
+        assert_eq!(ids.len() as u64, outcome.counters.states_count);
         ids.sort_unstable();
         ids.dedup();
         assert_eq!(ids.len(), 60);
@@ -211,7 +240,8 @@ mod tests {
     #[test]
     fn equal_seeds_give_equal_robots_and_other_seeds_other_phases() {
         let until = Instant::from_ns(3_000_000_000);
-        assert_eq!(drive(1, until), drive(1, until));
-        assert_ne!(drive(1, until).0, drive(2, until).0);
+        let (first, again, other) = (drive(1, until), drive(1, until), drive(2, until));
+        assert_eq!(first, again);
+        assert_ne!((first.states, first.truths), (other.states, other.truths));
     }
 }

@@ -40,60 +40,39 @@ pub enum Scenario {
     Custom,
 }
 
-/// `[case.parameters.world]`. What is not given is the scenario's own.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct WorldParameters {
-    /// Where the fleet drives.
-    pub scenario: Scenario,
-    /// Number of robots, 1..=448. Harbor and warehouse grow by one yard or hall for every 7; the
-    /// other scenarios have as many robots as starts, at most this many.
-    pub robots: u32,
-    /// Way between neighbouring path poses at most, metres, 0.01..=5.
-    pub path_spacing_m: f64,
-    /// Which overlaps count as one critical section.
-    pub merge: MergePolicy,
-    /// Vehicle length, metres, 0.05..=100.
-    pub length_m: Option<f64>,
-    /// Vehicle width, metres, 0.05..=100.
-    pub width_m: Option<f64>,
-    /// Largest speed, m/s, 0.01..=100.
-    pub speed_max_mps: Option<f64>,
-    /// Largest acceleration and deceleration, m/s^2, 0.01..=100.
-    pub acceleration_mps2: Option<f64>,
-    /// Smallest turning radius of planned paths, metres, 0.05..=1000.
-    pub turning_radius_m: Option<f64>,
-    /// What planned paths keep between vehicle and everything else, metres, 0..=100.
-    pub clearance_m: Option<f64>,
-    /// `custom`: the ground, metres.
-    pub bounds: Option<Bounds>,
-    /// `custom`: what no vehicle may touch.
-    pub obstacles: Vec<Bounds>,
-    /// `custom`: where robots park.
-    pub bays: Vec<BayParameters>,
-    /// `custom`: paths given pose by pose. When there are any, none is planned.
-    pub paths: Vec<PathParameters>,
-}
-
-impl Default for WorldParameters {
-    fn default() -> Self {
-        Self {
-            scenario: Scenario::default(),
-            robots: 7,
-            path_spacing_m: 0.3,
-            merge: MergePolicy::default(),
-            length_m: None,
-            width_m: None,
-            speed_max_mps: None,
-            acceleration_mps2: None,
-            turning_radius_m: None,
-            clearance_m: None,
-            bounds: None,
-            obstacles: Vec::new(),
-            bays: Vec::new(),
-            paths: Vec::new(),
-        }
-    }
+hil_core::parameters! {
+    /// `[case.parameters.world]`. What is not given is the scenario's own.
+    pub struct WorldParameters in "world." {
+        /// Where the fleet drives.
+        scenario: Scenario = Scenario::default();
+        /// Number of robots. Harbor and warehouse grow by one yard or hall for every 7; the
+        /// other scenarios have as many robots as starts, at most this many.
+        robots: u32 = 7, in 1.0..=448.0;
+        /// Way between neighbouring path poses at most, metres.
+        path_spacing_m: f64 = 0.3, in 0.01..=5.0;
+        /// Which overlaps count as one critical section.
+        merge: MergePolicy = MergePolicy::default();
+        /// Vehicle length, metres.
+        length_m: Option<f64> = None, in 0.05..=100.0;
+        /// Vehicle width, metres.
+        width_m: Option<f64> = None, in 0.05..=100.0;
+        /// Largest speed, m/s.
+        speed_max_mps: Option<f64> = None, in 0.01..=100.0;
+        /// Largest acceleration and deceleration, m/s^2.
+        acceleration_mps2: Option<f64> = None, in 0.01..=100.0;
+        /// Smallest turning radius of planned paths, metres.
+        turning_radius_m: Option<f64> = None, in 0.05..=1000.0;
+        /// What planned paths keep between vehicle and everything else, metres.
+        clearance_m: Option<f64> = None, in 0.0..=100.0;
+        /// `custom`: the ground, metres.
+        bounds: Option<Bounds> = None;
+        /// `custom`: what no vehicle may touch.
+        obstacles: Vec<Bounds> = Vec::new();
+        /// `custom`: where robots park.
+        bays: Vec<BayParameters> = Vec::new();
+        /// `custom`: paths given pose by pose. When there are any, none is planned.
+        paths: Vec<PathParameters> = Vec::new();
+    } check check_custom;
 }
 
 /// Which end of the paths a bay is.
@@ -224,23 +203,7 @@ impl WorldParameters {
         }
     }
 
-    fn check(&self) -> Result<(), ParameterError> {
-        let vehicle = self.vehicle();
-        let (length_m, width_m) = (vehicle.footprint.length_m, vehicle.footprint.width_m);
-        let numbers = [
-            ("length_m", length_m, 0.05, 100.0),
-            ("width_m", width_m, 0.05, 100.0),
-            ("speed_max_mps", vehicle.speed_max_mps, 0.01, 100.0),
-            ("acceleration_mps2", vehicle.acceleration_mps2, 0.01, 100.0),
-            ("path_spacing_m", self.path_spacing_m, 0.01, 5.0),
-            ("turning_radius_m", self.turning_radius_m(), 0.05, 1000.0),
-            ("clearance_m", self.clearance_m(), 0.0, 100.0),
-            ("robots", f64::from(self.robots), 1.0, 448.0),
-        ];
-        for (key, value, min, max) in numbers {
-            let key = format!("world.{key}");
-            ParameterError::check(&key, value, min..=max, &format!("{min} to {max}"))?;
-        }
+    fn check_custom(&self) -> Result<(), ParameterError> {
         if self.scenario != Scenario::Custom {
             let given = [
                 ("world.bounds", self.bounds.is_some()),

@@ -10,6 +10,10 @@ use crate::follower::{Followed, Follower};
 use crate::messages::HumanFrame;
 use crate::parameters::{LeftArm, ResumePolicy, SendPolicy, TeleoperationParameters};
 use crate::robot::arms;
+use crate::{
+    EGM_LEFT_COMMAND, EGM_LEFT_FEEDBACK, EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, HUMAN_FRAME,
+    MOTION_REQUEST, MOTION_RESPONSE,
+};
 use hil_arm::egm::messages::{
     EgmCommand, EgmFeedback, EgmStartParameters, MotionKind, MotionOutcome, MotionRefusal,
     MotionRequest, MotionResponse, SessionState, Side,
@@ -18,27 +22,8 @@ use hil_arm::egm::parameters::GuidedArms;
 use hil_arm::yumi::arm::Arm;
 use hil_arm::yumi::inverse::Reach;
 use hil_arm::yumi::{JOINT_COUNT, Pose};
-use hil_core::component::{Component, Outbox};
-use hil_core::time::{Instant, PeriodicTimer};
-
-hil_core::message_set! {
-    /// What the controller hears, in channel order.
-    pub(crate) enum ControllerInput {
-        Frame(HumanFrame),
-        RightFeedback(EgmFeedback),
-        LeftFeedback(EgmFeedback),
-        Response(MotionResponse),
-    }
-}
-
-hil_core::message_set! {
-    /// What the controller says, in channel order.
-    pub(crate) enum ControllerOutput {
-        RightCommand(EgmCommand),
-        LeftCommand(EgmCommand),
-        Request(MotionRequest),
-    }
-}
+use hil_core::component::{Component, Output, Ports};
+use hil_core::time::Instant;
 
 /// Frames farther apart than this count as one this far apart: after an outage the arm does not
 /// get the whole gap's worth of speed at once.
@@ -73,8 +58,7 @@ pub(crate) struct Controller {
     guided: GuidedArms,
     arms: [ArmSender; 2],
     source_time_ns: Option<i64>,
-    /// Ticks of `send = "free"`.
-    send_timer: Option<PeriodicTimer>,
+    request: Output<MotionRequest>,
 }
 
 /// One arm as the controller sees it.
@@ -87,6 +71,7 @@ struct ArmSender {
     /// What the newest frame came to.
     command: Option<EgmCommand>,
     next_seqno: u32,
+    output: Output<EgmCommand>,
 }
 
 #[derive(Debug)]
@@ -111,6 +96,7 @@ impl ArmSender {
             engaged: None,
             command: None,
             next_seqno: 0,
+            output: Output::default(),
         }
     }
 
@@ -191,7 +177,7 @@ impl ArmSender {
     }
 
     /// Sends the newest command, if there is one.
-    fn send(&mut self, out: &mut Outbox<ControllerOutput>) {
+    fn send(&mut self) {
         let Some(mut command) = self.command else {
             return;
         };
@@ -201,10 +187,7 @@ impl ArmSender {
         }
         command.seqno = self.next_seqno;
         self.next_seqno = self.next_seqno.wrapping_add(1);
-        out.send(match self.side {
-            Side::Right => ControllerOutput::RightCommand(command),
-            Side::Left => ControllerOutput::LeftCommand(command),
-        });
+        self.output.send(command);
     }
 }
 
@@ -225,20 +208,17 @@ impl Controller {
     pub(crate) fn new(parameters: TeleoperationParameters) -> Self {
         let trigger_after = Duration::from_secs_f64(parameters.trigger_after_s);
         let client = MotionClient::new(parameters.egm_start.message(), trigger_after);
-        let is_free = parameters.send == SendPolicy::Free;
-        let send_timer = is_free
-            .then(|| PeriodicTimer::new(Duration::from_secs_f64(1.0 / parameters.send_hz())));
         Self {
             guided: parameters.egm.guided_arms(),
             parameters,
             client,
             arms: Side::BOTH.map(ArmSender::new),
             source_time_ns: None,
-            send_timer,
+            request: Output::default(),
         }
     }
 
-    fn on_frame(&mut self, frame: &HumanFrame, out: &mut Outbox<ControllerOutput>) {
+    fn on_frame(&mut self, _now: Instant, frame: &HumanFrame) {
         let since_previous_ns = self
             .source_time_ns
             .map_or(0, |previous| frame.source_time_ns.saturating_sub(previous));
@@ -253,78 +233,54 @@ impl Controller {
         for arm in &mut self.arms {
             arm.on_frame(&self.parameters, &seen);
             if self.parameters.send == SendPolicy::Frame {
-                arm.send(out);
+                arm.send();
             }
         }
     }
 
-    fn on_feedback(
-        &mut self,
-        now: Instant,
-        side: Side,
-        feedback: &EgmFeedback,
-        out: &mut Outbox<ControllerOutput>,
-    ) {
+    fn on_feedback(&mut self, now: Instant, side: Side, feedback: &EgmFeedback) {
         if self.guided.include(side) {
             self.client.on_feedback(now, side, feedback);
         }
         let arm = &mut self.arms[side.index()];
         arm.on_feedback(feedback);
         if self.parameters.send == SendPolicy::Coupled {
-            arm.send(out);
+            arm.send();
         }
     }
 }
 
 impl Component for Controller {
-    type Input = ControllerInput;
-    type Output = ControllerOutput;
-
-    fn on_start(&mut self, now: Instant) {
-        if let Some(timer) = &mut self.send_timer {
-            timer.start(now);
+    fn ports(&self, ports: &mut Ports<Self>) {
+        ports.input(HUMAN_FRAME, Self::on_frame);
+        ports.input(EGM_RIGHT_FEEDBACK, |own, now, feedback| {
+            own.on_feedback(now, Side::Right, feedback);
+        });
+        ports.input(EGM_LEFT_FEEDBACK, |own, now, feedback| {
+            own.on_feedback(now, Side::Left, feedback);
+        });
+        ports.input(MOTION_RESPONSE, |own, _, response| {
+            own.client.on_response(response);
+        });
+        ports.output(EGM_RIGHT_COMMAND, |own| &mut own.arms[0].output);
+        ports.output(EGM_LEFT_COMMAND, |own| &mut own.arms[1].output);
+        ports.output(MOTION_REQUEST, |own| &mut own.request);
+        if self.parameters.send == SendPolicy::Free {
+            let period = Duration::from_secs_f64(1.0 / self.parameters.send_hz());
+            ports.every(period, |own, _, _| {
+                own.arms.iter_mut().for_each(ArmSender::send);
+            });
         }
     }
 
-    fn on_message(
-        &mut self,
-        now: Instant,
-        input: &ControllerInput,
-        out: &mut Outbox<ControllerOutput>,
-    ) {
-        match input {
-            ControllerInput::Frame(frame) => self.on_frame(frame, out),
-            ControllerInput::RightFeedback(feedback) => {
-                self.on_feedback(now, Side::Right, feedback, out);
-            }
-            ControllerInput::LeftFeedback(feedback) => {
-                self.on_feedback(now, Side::Left, feedback, out);
-            }
-            ControllerInput::Response(response) => self.client.on_response(response),
-        }
-    }
-
-    fn on_tick(&mut self, now: Instant, out: &mut Outbox<ControllerOutput>) {
+    fn tick(&mut self, now: Instant) {
         if let Some(request) = self.client.ask(now) {
-            out.send(ControllerOutput::Request(request));
-        }
-        let is_due = |timer: &mut PeriodicTimer| timer.poll(now).is_some();
-        if self.send_timer.as_mut().is_some_and(is_due) {
-            for arm in &mut self.arms {
-                arm.send(out);
-            }
+            self.request.send(request);
         }
     }
 
     fn next_tick(&self) -> Option<Instant> {
-        let send = self.send_timer.as_ref().and_then(PeriodicTimer::next);
-        self.client.next_ask().into_iter().chain(send).min()
-    }
-
-    fn skipped_ticks(&self) -> u64 {
-        self.send_timer
-            .as_ref()
-            .map_or(0, PeriodicTimer::skipped_total)
+        self.client.next_ask()
     }
 }
 

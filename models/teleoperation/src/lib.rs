@@ -84,9 +84,8 @@ use hil_core::replay::Replay;
 use hil_core::run_log::RunLog;
 use hil_core::study::{Batch, into_batch};
 
-pub use crate::parameters::{
-    EgmStartRequest, LeftArm, ResumePolicy, SendPolicy, TeleoperationParameters,
-};
+pub use crate::parameters::{LeftArm, ResumePolicy, SendPolicy, TeleoperationParameters};
+pub use hil_arm::egm::parameters::EgmStartRequest;
 
 /// Channel from human to controller.
 pub const HUMAN_FRAME: &str = "human/frame";

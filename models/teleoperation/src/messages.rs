@@ -1,17 +1,13 @@
 //! What the human tells the controller. Layout only: no behaviour, no units other than SI. What
 //! controller and robot tell each other is in [`hil_arm::egm::messages`].
 
-use bytemuck::{Pod, Zeroable};
-
 use hil_arm::yumi::Pose;
 
 hil_core::message! {
     /// Human to controller: where root and hands are.
     ///
     /// Frame of reference: the capture's own, x to the person's left, y up, z forward, metres.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct HumanFrame = "hil.HumanFrame.v1" {
+    pub struct HumanFrame = "hil.HumanFrame.v1", 184 bytes {
         /// Grid point of the capture, counted from its start; a skipped point leaves a gap.
         pub frame_index: u64,
         /// Time of this frame since the capture's start, on the motion's own time axis: the same on
@@ -26,10 +22,10 @@ hil_core::message! {
     }
 }
 
-const _: () = assert!(size_of::<HumanFrame>() == 184);
-
 #[cfg(test)]
 mod tests {
+    use bytemuck::Zeroable;
+
     use super::*;
 
     #[test]

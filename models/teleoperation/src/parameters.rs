@@ -11,8 +11,7 @@ use crate::experiment::TableParameters;
 use crate::follower::MappingSettings;
 use crate::motion::{Motion, Recording};
 use crate::swing::Swing;
-use hil_arm::egm::messages::EgmStartParameters;
-use hil_arm::egm::parameters::EgmParameters;
+use hil_arm::egm::parameters::{EgmParameters, EgmStartRequest};
 use hil_core::case_study::ParameterError;
 
 /// What the left arm does.
@@ -52,159 +51,60 @@ pub enum ResumePolicy {
     Reclutch,
 }
 
-/// `[case.parameters.egm_start]`: what the controller asks the robot to change when it asks for
-/// guided motion. A key left out keeps the robot's setting; ranges are those of
-/// [`EgmParameters`].
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct EgmStartRequest {
-    /// See [`EgmParameters::comm_timeout_s`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub comm_timeout_s: Option<f64>,
-    /// See [`EgmParameters::condition_time_s`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub condition_time_s: Option<f64>,
-    /// See [`EgmParameters::max_speed_deviation_deg_per_s`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub max_speed_deviation_deg_per_s: Option<f64>,
-    /// See [`EgmParameters::max_position_deviation_deg`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub max_position_deviation_deg: Option<f64>,
-    /// See [`EgmParameters::ramp_in_s`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub ramp_in_s: Option<f64>,
-    /// See [`EgmParameters::position_correction_ratio`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub position_correction_ratio: Option<f64>,
-    /// See [`EgmParameters::position_gain_per_s`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub position_gain_per_s: Option<f64>,
-    /// See [`EgmParameters::low_pass_hz`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub low_pass_hz: Option<f64>,
-}
-
-impl EgmStartRequest {
-    /// As it travels; a key left out is NaN.
-    pub(crate) fn message(&self) -> EgmStartParameters {
-        let keep = f64::NAN;
-        EgmStartParameters {
-            comm_timeout_s: self.comm_timeout_s.unwrap_or(keep),
-            condition_time_s: self.condition_time_s.unwrap_or(keep),
-            max_speed_deviation_rad_per_s: self
-                .max_speed_deviation_deg_per_s
-                .map_or(keep, f64::to_radians),
-            max_position_deviation_rad: self
-                .max_position_deviation_deg
-                .map_or(keep, f64::to_radians),
-            ramp_in_s: self.ramp_in_s.unwrap_or(keep),
-            position_correction_ratio: self.position_correction_ratio.unwrap_or(keep),
-            position_gain_per_s: self.position_gain_per_s.unwrap_or(keep),
-            low_pass_hz: self.low_pass_hz.unwrap_or(keep),
-        }
-    }
-
-    /// Checks the keys as if the robot had them: its ranges are the same.
-    fn check(&self) -> Result<(), ParameterError> {
-        let as_settings = EgmParameters {
-            comm_timeout_s: self.comm_timeout_s,
-            condition_time_s: self.condition_time_s,
-            max_speed_deviation_deg_per_s: self.max_speed_deviation_deg_per_s,
-            max_position_deviation_deg: self.max_position_deviation_deg,
-            ramp_in_s: self.ramp_in_s,
-            position_correction_ratio: self.position_correction_ratio,
-            position_gain_per_s: self.position_gain_per_s,
-            low_pass_hz: self.low_pass_hz,
-            ..EgmParameters::default()
-        };
-        as_settings.settings().map(|_| ()).map_err(|error| {
-            let key = error.key.trim_start_matches("egm.");
-            ParameterError::new(&format!("egm_start.{key}"), error.problem)
-        })
-    }
-}
-
-/// `[case.parameters]` of the teleoperation case. The defaults are the seed paper's figures where
-/// it gives them (section III.C) and the maker's defaults otherwise.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct TeleoperationParameters {
-    /// Length of one motion loop, 0.5..=60 s.
-    pub motion_period_s: f64,
-    /// How long the human rests before the motion begins, 0..=60 s: nobody swings before guided
-    /// motion runs, and an arm that engages in the midst of a swing works off its centre.
-    pub motion_start_s: f64,
-    /// Frame rate of the motion capture, 10..=1000 Hz.
-    pub rate_hz: f64,
-    /// How far the synthetic human swings the hand to either side, 0.01..=0.4 m. Without effect
-    /// with a `motion_file`.
-    pub amplitude_m: f64,
-    /// Standard deviation of a loop's period as a share of the period, 0..=0.05; the amplitude's
-    /// is three times that. Zero repeats the same loop for ever.
-    pub loop_variation_ratio: f64,
-    /// Tool path length per hand path length, 0.1..=2.
-    pub mapping_scale_ratio: f64,
-    /// Farthest a target may move between two frames, 0.001..=1 m.
-    pub jump_max_m: f64,
-    /// What the left arm does.
-    pub left_arm: LeftArm,
-    /// True adds the joints' own speed to each command, so that the robot need not lag.
-    pub feed_forward: bool,
-    /// When commands are sent.
-    pub send: SendPolicy,
-    /// Commands per second and arm with `send = "free"`, 1..=1000 Hz; 250 when left out. Refused
-    /// with any other `send`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub send_hz: Option<f64>,
-    /// Where an arm goes when guided motion is back.
-    pub resume: ResumePolicy,
-    /// How long the way of `resume = "blend"` takes, 0.1..=10 s.
-    pub blend_s: f64,
-    /// How long it takes until an arm that went idle is asked to start again, 0..=60 s: with
-    /// `egm.restart = "external_trigger"` people and programs take 2 to 10.
-    pub trigger_after_s: f64,
-    /// A BVH motion file to play instead of the synthetic swing. Whoever can open files puts its
-    /// text in by [`TeleoperationParameters::read_files`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub motion_file: Option<String>,
-    /// Length unit of the motion file, 0.0001..=1 m.
-    pub motion_unit_m: f64,
-    /// The robot's settings.
-    pub egm: EgmParameters,
-    /// What the controller asks for instead of them.
-    pub egm_start: EgmStartRequest,
-    /// What `hil-runtime tables` and `calibrate` compute.
-    pub tables: TableParameters,
-    /// Text of `motion_file`; never in a topology file.
-    #[serde(skip)]
-    pub motion_text: Option<String>,
-}
-
-impl Default for TeleoperationParameters {
-    fn default() -> Self {
-        Self {
-            motion_period_s: 4.033,
-            motion_start_s: 2.0,
-            rate_hz: 125.0,
-            amplitude_m: 0.1875,
-            loop_variation_ratio: 0.0,
-            mapping_scale_ratio: 0.8,
-            jump_max_m: 0.02,
-            left_arm: LeftArm::Hold,
-            feed_forward: false,
-            send: SendPolicy::Frame,
-            send_hz: None,
-            resume: ResumePolicy::Jump,
-            blend_s: 1.0,
-            trigger_after_s: 3.0,
-            motion_file: None,
-            motion_unit_m: 0.01,
-            egm: EgmParameters::default(),
-            egm_start: EgmStartRequest::default(),
-            tables: TableParameters::default(),
-            motion_text: None,
-        }
-    }
+hil_core::parameters! {
+    /// `[case.parameters]` of the teleoperation case. The defaults are the seed paper's figures where
+    /// it gives them (section III.C) and the maker's defaults otherwise.
+    pub struct TeleoperationParameters {
+        /// Length of one motion loop, s.
+        motion_period_s: f64 = 4.033, in 0.5..=60.0;
+        /// How long the human rests before the motion begins, s: nobody swings before guided
+        /// motion runs, and an arm that engages in the midst of a swing works off its centre.
+        motion_start_s: f64 = 2.0, in 0.0..=60.0;
+        /// Frame rate of the motion capture, Hz.
+        rate_hz: f64 = 125.0, in 10.0..=1000.0;
+        /// How far the synthetic human swings the hand to either side, m. Without effect
+        /// with a `motion_file`.
+        amplitude_m: f64 = 0.1875, in 0.01..=0.4;
+        /// Standard deviation of a loop's period as a share of the period; the amplitude's
+        /// is three times that. Zero repeats the same loop for ever.
+        loop_variation_ratio: f64 = 0.0, in 0.0..=0.05;
+        /// Tool path length per hand path length.
+        mapping_scale_ratio: f64 = 0.8, in 0.1..=2.0;
+        /// Farthest a target may move between two frames, m.
+        jump_max_m: f64 = 0.02, in 0.001..=1.0;
+        /// What the left arm does.
+        left_arm: LeftArm = LeftArm::Hold;
+        /// True adds the joints' own speed to each command, so that the robot need not lag.
+        feed_forward: bool = false;
+        /// When commands are sent.
+        send: SendPolicy = SendPolicy::Frame;
+        /// Commands per second and arm with `send = "free"`, Hz; 250 when left out. Refused
+        /// with any other `send`.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        send_hz: Option<f64> = None, in 1.0..=1000.0;
+        /// Where an arm goes when guided motion is back.
+        resume: ResumePolicy = ResumePolicy::Jump;
+        /// How long the way of `resume = "blend"` takes, s.
+        blend_s: f64 = 1.0, in 0.1..=10.0;
+        /// How long it takes until an arm that went idle is asked to start again, s: with
+        /// `egm.restart = "external_trigger"` people and programs take 2 to 10.
+        trigger_after_s: f64 = 3.0, in 0.0..=60.0;
+        /// A BVH motion file to play instead of the synthetic swing. Whoever can open files puts its
+        /// text in by [`TeleoperationParameters::read_files`].
+        #[serde(skip_serializing_if = "Option::is_none")]
+        motion_file: Option<String> = None;
+        /// Length unit of the motion file, m.
+        motion_unit_m: f64 = 0.01, in 1e-4..=1.0;
+        /// The robot's settings.
+        egm: EgmParameters = EgmParameters::default();
+        /// What the controller asks for instead of them.
+        egm_start: EgmStartRequest = EgmStartRequest::default();
+        /// What `hil-runtime tables` and `calibrate` compute.
+        tables: TableParameters = TableParameters::default();
+        /// Text of `motion_file`; never in a topology file.
+        #[serde(skip)]
+        motion_text: Option<String> = None;
+    } check check_together;
 }
 
 /// Commands per second and arm where nothing is said: as many as the robot has cycles.
@@ -230,27 +130,7 @@ impl TeleoperationParameters {
         Ok(())
     }
 
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// The first key outside its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        let ranges = [
-            ("motion_period_s", self.motion_period_s, 0.5, 60.0),
-            ("motion_start_s", self.motion_start_s, 0.0, 60.0),
-            ("rate_hz", self.rate_hz, 10.0, 1000.0),
-            ("amplitude_m", self.amplitude_m, 0.01, 0.4),
-            ("loop_variation_ratio", self.loop_variation_ratio, 0.0, 0.05),
-            ("mapping_scale_ratio", self.mapping_scale_ratio, 0.1, 2.0),
-            ("jump_max_m", self.jump_max_m, 0.001, 1.0),
-            ("send_hz", self.send_hz(), 1.0, 1000.0),
-            ("blend_s", self.blend_s, 0.1, 10.0),
-            ("trigger_after_s", self.trigger_after_s, 0.0, 60.0),
-            ("motion_unit_m", self.motion_unit_m, 1e-4, 1.0),
-        ];
-        for (key, value, min, max) in ranges {
-            ParameterError::check(key, value, min..=max, &format!("{min} to {max}"))?;
-        }
+    fn check_together(&self) -> Result<(), ParameterError> {
         if let Some(send_hz) = self.send_hz
             && self.send != SendPolicy::Free
         {

@@ -4,13 +4,16 @@
 
 use std::collections::VecDeque;
 
-use crate::robot::{Robot, RobotInput, RobotOutput};
-use crate::{EGM_EVENT, EGM_LEFT_FEEDBACK, EGM_RECEIVED, EGM_RIGHT_FEEDBACK, MOTION_RECEIVED};
+use crate::robot::Robot;
+use crate::{
+    EGM_EVENT, EGM_LEFT_COMMAND, EGM_LEFT_FEEDBACK, EGM_RECEIVED, EGM_RIGHT_COMMAND,
+    EGM_RIGHT_FEEDBACK, MOTION_RECEIVED, MOTION_REQUEST,
+};
 use hil_arm::egm::messages::{
-    EgmArrival, EgmEvent, EgmEventKind, EgmFeedback, MotionArrival, Side,
+    EgmArrival, EgmCommand, EgmEvent, EgmEventKind, EgmFeedback, MotionArrival, MotionRequest, Side,
 };
 use hil_arm::egm::parameters::ControllerSettings;
-use hil_core::component::{Component, Outbox};
+use hil_core::component::{Emit, Role, into_role};
 use hil_core::replay::Replay;
 use hil_core::run_log::RunLog;
 use hil_core::time::Instant;
@@ -28,37 +31,52 @@ pub(crate) fn replay(settings: ControllerSettings, log: &RunLog) -> Replay {
         return replay;
     };
     let mut recorded = Recorded::read(log, start);
-    let mut robot = Robot::new(settings);
-    let mut out = Outbox::with_capacity(robot.outbox_capacity());
-    robot.on_start(start);
+    let mut robot = into_role(Robot::new(settings));
+    let ports = [EGM_RIGHT_FEEDBACK, EGM_LEFT_FEEDBACK].map(|name| robot.output(name));
+    let end = recorded.end();
+    let mut compare = |port: usize, payload: &[u8]| {
+        if let Some(side) = Side::BOTH
+            .into_iter()
+            .find(|side| ports[side.index()] == port)
+        {
+            recorded.compare(side, &bytemuck::pod_read_unaligned(payload), &mut replay);
+        }
+    };
+    robot.start(start);
+    let mut input_count = 0;
     for (at, input) in arrivals(log, start) {
-        run_until(&mut robot, at, &mut out, |said| {
-            recorded.compare(said, &mut replay);
-        });
-        robot.on_message(at, &input, &mut out);
-        replay.input_count += 1;
+        run_until(robot.as_mut(), at, &mut compare);
+        match input {
+            Input::Command(Side::Right, command) => {
+                robot.hear(at, EGM_RIGHT_COMMAND, &command, &mut compare);
+            }
+            Input::Command(Side::Left, command) => {
+                robot.hear(at, EGM_LEFT_COMMAND, &command, &mut compare);
+            }
+            Input::Request(request) => robot.hear(at, MOTION_REQUEST, &request, &mut compare),
+        }
+        input_count += 1;
     }
-    if let Some(end) = recorded.end() {
-        run_until(&mut robot, end, &mut out, |said| {
-            recorded.compare(said, &mut replay);
-        });
+    if let Some(end) = end {
+        run_until(robot.as_mut(), end, &mut compare);
     }
+    replay.input_count = input_count;
     recorded.note_the_rest(&mut replay);
     replay
 }
 
 /// Ticks `robot` at each of its grid points up to and including `until`.
-fn run_until(
-    robot: &mut Robot,
-    until: Instant,
-    out: &mut Outbox<RobotOutput>,
-    mut hear: impl FnMut(&RobotOutput),
-) {
+fn run_until(robot: &mut dyn Role, until: Instant, hear: Emit<'_>) {
     while let Some(due) = robot.next_tick().filter(|due| *due <= until) {
-        robot.on_tick(due, out);
-        out.drain().for_each(|said| hear(&said));
+        robot.tick(due, hear);
     }
-    out.drain().for_each(|said| hear(&said));
+}
+
+/// What a robot hears.
+#[derive(Debug)]
+enum Input {
+    Command(Side, EgmCommand),
+    Request(MotionRequest),
 }
 
 /// When the robot started; more than one if its process was started anew.
@@ -81,21 +99,19 @@ fn successor(log: &RunLog, start: Instant) -> Option<Instant> {
 
 /// What the robot started at `start` heard, in the order in which it matters: commands before
 /// requests of the same instant, because a request is taken with the next cycle anyway.
-fn arrivals(log: &RunLog, start: Instant) -> Vec<(Instant, RobotInput)> {
+fn arrivals(log: &RunLog, start: Instant) -> Vec<(Instant, Input)> {
     let commands = log
         .messages::<EgmArrival>(EGM_RECEIVED)
         .map(|(_, arrival)| {
-            let input = if arrival.side == Side::Right.number() {
-                RobotInput::RightCommand(arrival.command)
-            } else {
-                RobotInput::LeftCommand(arrival.command)
-            };
+            let is_right = arrival.side == Side::Right.number();
+            let side = if is_right { Side::Right } else { Side::Left };
+            let input = Input::Command(side, arrival.command);
             (Instant::from_ns(arrival.at_ns), input)
         });
     let requests = log
         .messages::<MotionArrival>(MOTION_RECEIVED)
         .map(|(_, arrival)| {
-            let input = RobotInput::Request(arrival.request);
+            let input = Input::Request(arrival.request);
             (Instant::from_ns(arrival.at_ns), input)
         });
     let until = successor(log, start);
@@ -162,15 +178,7 @@ impl Recorded {
         last.map(|(at, _)| *at).max()
     }
 
-    fn compare(&mut self, said: &RobotOutput, replay: &mut Replay) {
-        let (side, replayed) = match said {
-            RobotOutput::RightFeedback(feedback) => (Side::Right, feedback),
-            RobotOutput::LeftFeedback(feedback) => (Side::Left, feedback),
-            RobotOutput::Response(_)
-            | RobotOutput::Event(_)
-            | RobotOutput::CommandArrived(_)
-            | RobotOutput::RequestArrived(_) => return,
-        };
+    fn compare(&mut self, side: Side, replayed: &EgmFeedback, replay: &mut Replay) {
         let queue = &mut self.0[side.index()];
         // A robot that came late left cycles out of the record.
         let is_due = |next: &mut (Instant, EgmFeedback)| next.1.cycle_index <= replayed.cycle_index;

@@ -12,9 +12,9 @@ use crate::{
     TeleoperationParameters,
 };
 use hil_arm::egm::parameters::RestartPolicy;
-use hil_core::case_study::{CaseStudy, ChannelSpec, inputs_of, outputs_of};
-use hil_core::component::into_role;
-use hil_core::endpoint::{Endpoint, InputPort, OutputPort};
+use hil_core::case_study::{CaseStudy, channels_of};
+use hil_core::component::{Port, into_role};
+use hil_core::endpoint::{Endpoint, InputPort, OutputPort, PortError};
 use hil_core::message::Envelope;
 use hil_core::random::RandomStream;
 use hil_core::simulation::{Carrier, Simulation};
@@ -243,25 +243,25 @@ impl OutputPort for Recorder {
 /// The robot of `case` as a process on a busy machine: it hears what the simulated one of `heard`
 /// was sent, looks up when it gets round to it, and starts at a time of its own.
 fn live(case: &Teleoperation, heard: &RunLog, begin: Instant, end: Instant) -> (RunLog, u64) {
-    let specs: &'static [ChannelSpec] = Teleoperation::CHANNELS;
     let shift = Duration::from_nanos(begin.as_ns().unsigned_abs());
-    let inputs = inputs_of(specs, "robot").map(|spec| {
-        let sent = heard.raw(spec.name).iter();
-        Waiting(
-            sent.map(|logged| {
-                let at = Instant::from_ns(logged.envelope.published_ns) + shift;
-                (at, logged.payload.clone())
-            })
-            .collect(),
-        )
-    });
+    let waiting = |port: &Port| {
+        let sent = heard.raw(port.name).iter();
+        let sent = sent.map(|logged| {
+            let at = Instant::from_ns(logged.envelope.published_ns) + shift;
+            (at, logged.payload.clone())
+        });
+        Ok::<_, PortError>(Waiting(sent.collect()))
+    };
     let log = Rc::new(RefCell::new(RunLog::default()));
-    let outputs = outputs_of(specs, "robot").map(|spec| Recorder {
-        name: spec.name,
-        log: Rc::clone(&log),
-    });
+    let recorder = |port: &Port| {
+        Ok(Recorder {
+            name: port.name,
+            log: Rc::clone(&log),
+        })
+    };
     let role = into_role(Robot::new(case.settings));
-    let mut endpoint = Endpoint::new(role, inputs.collect(), outputs.collect()).unwrap();
+    let stated = channels_of(Teleoperation::NAME, Teleoperation::CHANNELS, "robot");
+    let mut endpoint = Endpoint::join(role, &stated, waiting, recorder).unwrap();
     endpoint.start(begin);
     let mut random = RandomStream::new(2, "busy machine");
     let mut now = begin;

@@ -9,6 +9,10 @@
 use core::time::Duration;
 
 use crate::motion_server::MotionServer;
+use crate::{
+    EGM_EVENT, EGM_LEFT_COMMAND, EGM_LEFT_FEEDBACK, EGM_RECEIVED, EGM_RIGHT_COMMAND,
+    EGM_RIGHT_FEEDBACK, MOTION_RECEIVED, MOTION_REQUEST, MOTION_RESPONSE,
+};
 use hil_arm::egm::controller::Controller;
 use hil_arm::egm::messages::{
     EgmArrival, EgmCommand, EgmEvent, EgmFeedback, MotionArrival, MotionRequest, MotionResponse,
@@ -17,8 +21,8 @@ use hil_arm::egm::messages::{
 use hil_arm::egm::parameters::ControllerSettings;
 use hil_arm::yumi::Joints;
 use hil_arm::yumi::arm::{Arm, LEFT_START_RAD, RIGHT_START_RAD};
-use hil_core::component::{Component, Outbox};
-use hil_core::time::{Instant, PeriodicTimer, duration_ns};
+use hil_core::component::{Component, Output, Ports};
+use hil_core::time::{Instant, Tick, duration_ns};
 
 /// Where the arms are at the robot's start, right then left.
 const START_RAD: [Joints; 2] = [RIGHT_START_RAD, LEFT_START_RAD];
@@ -28,31 +32,9 @@ pub(crate) fn arms() -> [Arm; 2] {
     [Arm::right(), Arm::left()]
 }
 
-hil_core::message_set! {
-    /// What the robot hears, in channel order.
-    pub(crate) enum RobotInput {
-        RightCommand(EgmCommand),
-        LeftCommand(EgmCommand),
-        Request(MotionRequest),
-    }
-}
-
-hil_core::message_set! {
-    /// What the robot says, in channel order.
-    pub(crate) enum RobotOutput {
-        RightFeedback(EgmFeedback),
-        LeftFeedback(EgmFeedback),
-        Response(MotionResponse),
-        Event(EgmEvent),
-        CommandArrived(EgmArrival),
-        RequestArrived(MotionArrival),
-    }
-}
-
 /// The role.
 #[derive(Debug)]
 pub(crate) struct Robot {
-    timer: PeriodicTimer,
     period: Duration,
     started: Option<Instant>,
     /// The next grid point to go through.
@@ -60,6 +42,12 @@ pub(crate) struct Robot {
     arms: [Arm; 2],
     controllers: [Controller; 2],
     server: MotionServer,
+    /// By arm.
+    feedback: [Output<EgmFeedback>; 2],
+    response: Output<MotionResponse>,
+    event: Output<EgmEvent>,
+    command_received: Output<EgmArrival>,
+    request_received: Output<MotionArrival>,
 }
 
 impl Robot {
@@ -67,13 +55,17 @@ impl Robot {
     pub(crate) fn new(settings: ControllerSettings) -> Self {
         let controller = |side: Side| Controller::new(side, settings, START_RAD[side.index()]);
         Self {
-            timer: PeriodicTimer::new(settings.cycle),
             period: settings.cycle,
             started: None,
             next_cycle: 0,
             arms: arms(),
             controllers: Side::BOTH.map(controller),
             server: MotionServer::new(arms(), settings.cycle),
+            feedback: Default::default(),
+            response: Output::default(),
+            event: Output::default(),
+            command_received: Output::default(),
+            request_received: Output::default(),
         }
     }
 
@@ -84,7 +76,7 @@ impl Robot {
     }
 
     /// Goes through every grid point up to and including `now`.
-    fn advance(&mut self, now: Instant, out: &mut Outbox<RobotOutput>) {
+    fn advance(&mut self, now: Instant) {
         let Some(start) = self.started else { return };
         loop {
             let at = self.grid_point(start, self.next_cycle);
@@ -94,77 +86,71 @@ impl Robot {
             self.next_cycle += 1;
             self.server.take_request(&mut self.controllers);
             for controller in &mut self.controllers {
-                controller.cycle(at, &mut |event| out.send(RobotOutput::Event(event)));
+                controller.cycle(at, &mut |event| self.event.send(event));
             }
             self.server.answer(&self.controllers, &mut |response| {
-                out.send(RobotOutput::Response(response));
+                self.response.send(response);
             });
         }
     }
 
-    fn receive(&mut self, now: Instant, side: Side, command: &EgmCommand) -> RobotOutput {
+    fn on_command(&mut self, now: Instant, side: Side, command: &EgmCommand) {
+        // First everything this command comes too late for.
+        self.advance(now);
         // A refusal is counted by the controller and told by the next cycle's events.
         let _told_later = self.controllers[side.index()].receive(now, command);
-        RobotOutput::CommandArrived(EgmArrival {
+        self.command_received.send(EgmArrival {
             at_ns: now.as_ns(),
             side: side.number(),
             reserved: 0,
             command: *command,
-        })
+        });
     }
 
-    fn feedback(&self, side: Side) -> EgmFeedback {
-        let controller = &self.controllers[side.index()];
-        let tool = self.arms[side.index()].tool(controller.measured_rad());
-        controller.feedback(&tool.into())
+    fn on_request(&mut self, now: Instant, request: &MotionRequest) {
+        self.advance(now);
+        if let Some(response) = self.server.receive(request, &self.controllers) {
+            self.response.send(response);
+        }
+        self.request_received.send(MotionArrival {
+            at_ns: now.as_ns(),
+            request: *request,
+        });
+    }
+
+    /// A late robot reports its newest cycle only; its period counts those it passed over.
+    fn on_tick(&mut self, now: Instant, _tick: Tick) {
+        self.advance(now);
+        for side in Side::BOTH {
+            let index = side.index();
+            let controller = &self.controllers[index];
+            let tool = self.arms[index].tool(controller.measured_rad());
+            self.feedback[index].send(controller.feedback(&tool.into()));
+        }
     }
 }
 
 impl Component for Robot {
-    type Input = RobotInput;
-    type Output = RobotOutput;
+    fn ports(&self, ports: &mut Ports<Self>) {
+        ports.input(EGM_RIGHT_COMMAND, |own, now, command| {
+            own.on_command(now, Side::Right, command);
+        });
+        ports.input(EGM_LEFT_COMMAND, |own, now, command| {
+            own.on_command(now, Side::Left, command);
+        });
+        ports.input(MOTION_REQUEST, Self::on_request);
+        ports.output(EGM_RIGHT_FEEDBACK, |own| &mut own.feedback[0]);
+        ports.output(EGM_LEFT_FEEDBACK, |own| &mut own.feedback[1]);
+        ports.output(MOTION_RESPONSE, |own| &mut own.response);
+        ports.output(EGM_EVENT, |own| &mut own.event);
+        ports.output(EGM_RECEIVED, |own| &mut own.command_received);
+        ports.output(MOTION_RECEIVED, |own| &mut own.request_received);
+        ports.every(self.period, Self::on_tick);
+    }
 
-    fn on_start(&mut self, now: Instant) {
-        self.timer.start(now);
+    fn start(&mut self, now: Instant) {
         self.started = Some(now);
         self.next_cycle = 0;
-    }
-
-    fn on_message(&mut self, now: Instant, input: &RobotInput, out: &mut Outbox<RobotOutput>) {
-        // First everything this message comes too late for.
-        self.advance(now, out);
-        let arrival = match input {
-            RobotInput::RightCommand(command) => self.receive(now, Side::Right, command),
-            RobotInput::LeftCommand(command) => self.receive(now, Side::Left, command),
-            RobotInput::Request(request) => {
-                let refused = self.server.receive(request, &self.controllers);
-                if let Some(response) = refused {
-                    out.send(RobotOutput::Response(response));
-                }
-                RobotOutput::RequestArrived(MotionArrival {
-                    at_ns: now.as_ns(),
-                    request: *request,
-                })
-            }
-        };
-        out.send(arrival);
-    }
-
-    fn on_tick(&mut self, now: Instant, out: &mut Outbox<RobotOutput>) {
-        self.advance(now, out);
-        // A late robot reports its newest cycle only; the timer counts those it passed over.
-        if self.timer.poll(now).is_some() {
-            out.send(RobotOutput::RightFeedback(self.feedback(Side::Right)));
-            out.send(RobotOutput::LeftFeedback(self.feedback(Side::Left)));
-        }
-    }
-
-    fn next_tick(&self) -> Option<Instant> {
-        self.timer.next()
-    }
-
-    fn skipped_ticks(&self) -> u64 {
-        self.timer.skipped_total()
     }
 }
 

@@ -9,6 +9,8 @@ use hil_arm::egm::messages::{
 use hil_arm::egm::parameters::{EgmParameters, GuidedArms, Preset, StartMode};
 use hil_arm::yumi::Pose;
 use hil_arm::yumi::arm::POSITION_MAX_RAD;
+use hil_core::component::{Role, into_role};
+use hil_core::message::Message;
 
 const CYCLE_NS: i64 = 4_000_000;
 
@@ -25,9 +27,8 @@ fn settings() -> ControllerSettings {
 
 /// A robot, when it is, and what it said so far.
 struct Bench {
-    robot: Robot,
+    robot: Box<dyn Role>,
     now: Instant,
-    out: Outbox<RobotOutput>,
     responses: Vec<MotionResponse>,
     feedback: [Vec<EgmFeedback>; 2],
     events: Vec<EgmEvent>,
@@ -40,12 +41,11 @@ impl Bench {
     }
 
     fn with(settings: ControllerSettings) -> Self {
-        let mut robot = Robot::new(settings);
-        robot.on_start(Instant::ZERO);
+        let mut robot = into_role(Robot::new(settings));
+        robot.start(Instant::ZERO);
         Self {
             robot,
             now: Instant::ZERO,
-            out: Outbox::with_capacity(1000),
             responses: Vec::new(),
             feedback: [Vec::new(), Vec::new()],
             events: Vec::new(),
@@ -53,31 +53,37 @@ impl Bench {
         }
     }
 
-    fn listen(&mut self) {
-        for said in self.out.drain() {
-            match said {
-                RobotOutput::RightFeedback(feedback) => self.feedback[0].push(feedback),
-                RobotOutput::LeftFeedback(feedback) => self.feedback[1].push(feedback),
-                RobotOutput::Response(response) => self.responses.push(response),
-                RobotOutput::Event(event) => self.events.push(event),
-                RobotOutput::CommandArrived(_) | RobotOutput::RequestArrived(_) => {
-                    self.arrival_count += 1;
-                }
+    fn listen(&mut self, said: &[(usize, Vec<u8>)]) {
+        for (port, bytes) in said {
+            match self.robot.outputs()[*port].name {
+                EGM_RIGHT_FEEDBACK => self.feedback[0].push(bytemuck::pod_read_unaligned(bytes)),
+                EGM_LEFT_FEEDBACK => self.feedback[1].push(bytemuck::pod_read_unaligned(bytes)),
+                MOTION_RESPONSE => self.responses.push(bytemuck::pod_read_unaligned(bytes)),
+                EGM_EVENT => self.events.push(bytemuck::pod_read_unaligned(bytes)),
+                _ => self.arrival_count += 1,
             }
         }
     }
 
-    fn hear(&mut self, input: &RobotInput) {
-        self.robot.on_message(self.now, input, &mut self.out);
-        self.listen();
+    fn hear<M: Message>(&mut self, channel: &str, message: &M) {
+        let mut said = Vec::new();
+        let mut emit = |port, bytes: &[u8]| said.push((port, bytes.to_vec()));
+        self.robot.hear(self.now, channel, message, &mut emit);
+        self.listen(&said);
+    }
+
+    fn tick(&mut self, at: Instant) {
+        let mut said = Vec::new();
+        let mut emit = |port, bytes: &[u8]| said.push((port, bytes.to_vec()));
+        self.robot.tick(at, &mut emit);
+        self.listen(&said);
     }
 
     /// Punctual ticks for `seconds`.
     fn run(&mut self, seconds: f64) {
         let end = self.now + Duration::from_secs_f64(seconds);
         while let Some(due) = self.robot.next_tick().filter(|due| *due <= end) {
-            self.robot.on_tick(due, &mut self.out);
-            self.listen();
+            self.tick(due);
         }
         self.now = end;
     }
@@ -85,7 +91,7 @@ impl Bench {
     /// The outcome of a request: at once, and, when it began something, within `seconds`.
     fn ask(&mut self, request: &MotionRequest, seconds: f64) -> Vec<MotionResponse> {
         self.responses.clear();
-        self.hear(&RobotInput::Request(*request));
+        self.hear(MOTION_REQUEST, request);
         self.run(seconds);
         let mut answers = self.responses.clone();
         answers.retain(|answer| answer.request_id == request.request_id);
@@ -317,10 +323,10 @@ fn a_stop_interrupts_a_start() {
     bench.run(0.1);
     let mut start = request(MotionKind::EgmStart, &[Side::Right]);
     start.request_id = 1;
-    bench.hear(&RobotInput::Request(start));
+    bench.hear(MOTION_REQUEST, &start);
     bench.run(0.02);
     let stop = request(MotionKind::EgmStop, &[Side::Right]);
-    bench.hear(&RobotInput::Request(stop));
+    bench.hear(MOTION_REQUEST, &stop);
     bench.run(0.5);
     let of_start: Vec<_> = bench
         .responses
@@ -337,9 +343,9 @@ fn requests_of_one_instant_are_carried_out_one_per_cycle_and_a_flood_is_refused(
     bench.run(0.1);
     let mut away = request(MotionKind::MoveJoints, &[Side::Right]);
     away.joints_rad[0][0] += 0.3;
-    bench.hear(&RobotInput::Request(away));
+    bench.hear(MOTION_REQUEST, &away);
     for _ in 0..200 {
-        bench.hear(&RobotInput::Request(request(MotionKind::Home, &Side::BOTH)));
+        bench.hear(MOTION_REQUEST, &request(MotionKind::Home, &Side::BOTH));
     }
     bench.run(0.5);
     assert_eq!(bench.arrival_count, 201);
@@ -370,29 +376,21 @@ fn a_late_robot_moves_as_a_punctual_one_and_reports_its_newest_cycle_only() {
         arrivals.extend((1..300).map(|index| (index * 8_000_000 + 1_234_567, Some(index))));
         for (at_ns, index) in arrivals {
             while let Some(tick_ns) = ticks.next_if(|tick_ns| *tick_ns <= at_ns) {
-                bench
-                    .robot
-                    .on_tick(Instant::from_ns(tick_ns), &mut bench.out);
-                bench.listen();
+                bench.tick(Instant::from_ns(tick_ns));
             }
             bench.now = Instant::from_ns(at_ns);
             let Some(index) = index else {
-                bench.hear(&RobotInput::Request(request(
-                    MotionKind::EgmStart,
-                    &Side::BOTH,
-                )));
+                let start = request(MotionKind::EgmStart, &Side::BOTH);
+                bench.hear(MOTION_REQUEST, &start);
                 continue;
             };
             let mut command = EgmCommand::zeroed();
             command.position_rad = START_RAD[0];
             command.position_rad[0] += 1e-3 * index as f64;
-            bench.hear(&RobotInput::RightCommand(command));
+            bench.hear(EGM_RIGHT_COMMAND, &command);
         }
         for tick_ns in ticks {
-            bench
-                .robot
-                .on_tick(Instant::from_ns(tick_ns), &mut bench.out);
-            bench.listen();
+            bench.tick(Instant::from_ns(tick_ns));
         }
         bench
     };
@@ -445,12 +443,12 @@ fn a_command_acts_only_from_the_first_grid_point_later_than_its_arrival() {
         bench.ask(&request(MotionKind::EgmStart, &[Side::Right]), 0.199);
         let tick = Instant::from_ns(arrived_ns);
         while let Some(due) = bench.robot.next_tick().filter(|due| *due < tick) {
-            bench.robot.on_tick(due, &mut bench.out);
+            bench.tick(due);
         }
         bench.now = tick;
         let mut command = EgmCommand::zeroed();
         command.position_rad = START_RAD[0];
-        bench.hear(&RobotInput::RightCommand(command));
+        bench.hear(EGM_RIGHT_COMMAND, &command);
         bench.run(0.1);
         let took = |feedback: &&EgmFeedback| feedback.has(EgmFeedback::HAS_REFERENCE);
         bench.feedback[0].iter().find(took).unwrap().cycle_index

@@ -9,7 +9,7 @@ use bytemuck::Zeroable;
 use crate::messages::HumanFrame;
 use crate::{
     EGM_EVENT, EGM_LEFT_COMMAND, EGM_LEFT_FEEDBACK, EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK,
-    MOTION_REQUEST, MOTION_RESPONSE, ResumePolicy, SendPolicy, Teleoperation,
+    HUMAN_FRAME, MOTION_REQUEST, MOTION_RESPONSE, ResumePolicy, SendPolicy, Teleoperation,
     TeleoperationParameters,
 };
 use hil_arm::egm::messages::{
@@ -330,11 +330,11 @@ fn commands_go_out_per_frame_per_feedback_or_by_the_clock() {
     assert!(count(SendPolicy::Free, 100.0).abs_diff(200) <= 1);
 }
 
-/// Everything one call of a role said on its port `port`.
-fn hear<M: Message>(role: &mut dyn Role, port: usize, message: &M) -> Vec<(usize, Vec<u8>)> {
+/// Everything one call of a role said, with the number of its output port.
+fn hear<M: Message>(role: &mut dyn Role, port: &str, message: &M) -> Vec<(usize, Vec<u8>)> {
     let mut said = Vec::new();
     let mut emit = |port: usize, bytes: &[u8]| said.push((port, bytes.to_vec()));
-    assert!(role.message(Instant::ZERO, port, bytemuck::bytes_of(message), &mut emit));
+    role.hear(Instant::ZERO, port, message, &mut emit);
     said
 }
 
@@ -363,7 +363,7 @@ fn an_arm_engages_on_a_sound_frame_after_its_own_sound_feedback_of_a_running_ses
     let mut controller = case(|_| {}).role("controller").unwrap();
     let controller = controller.as_mut();
     controller.start(Instant::ZERO);
-    assert!(hear(controller, 0, &frame()).is_empty());
+    assert!(hear(controller, HUMAN_FRAME, &frame()).is_empty());
 
     let mut clock_ms = 0;
     let mut next = |change: &dyn Fn(&mut EgmFeedback)| {
@@ -381,24 +381,24 @@ fn an_arm_engages_on_a_sound_frame_after_its_own_sound_feedback_of_a_running_ses
         next(&|feedback| feedback.state = 77),
         next(&|feedback| feedback.measured_rad[3] = f64::NAN),
     ] {
-        assert!(hear(controller, 1, &unfit).is_empty());
-        assert!(hear(controller, 0, &frame()).is_empty());
+        assert!(hear(controller, EGM_RIGHT_FEEDBACK, &unfit).is_empty());
+        assert!(hear(controller, HUMAN_FRAME, &frame()).is_empty());
     }
-    assert!(hear(controller, 1, &next(&|_| {})).is_empty());
+    assert!(hear(controller, EGM_RIGHT_FEEDBACK, &next(&|_| {})).is_empty());
     let mut broken = frame();
     broken.right_hand.position_m[0] = f64::INFINITY;
-    assert!(hear(controller, 0, &broken).is_empty());
+    assert!(hear(controller, HUMAN_FRAME, &broken).is_empty());
 
     // The right arm runs, the left does not: one command.
-    let said = hear(controller, 0, &frame());
+    let said = hear(controller, HUMAN_FRAME, &frame());
     assert_eq!(said.len(), 1);
-    assert_eq!(said[0].0, 0);
+    assert_eq!(said[0].0, controller.output(EGM_RIGHT_COMMAND));
     let command: EgmCommand = bytemuck::pod_read_unaligned(&said[0].1);
     assert!(apart_rad(&command.position_rad, &RIGHT_START_RAD) < 1e-6);
     assert_eq!(command.answered_cycle, 4);
 
     // Once engaged, a broken frame holds the target and says so.
-    let said = hear(controller, 0, &broken);
+    let said = hear(controller, HUMAN_FRAME, &broken);
     let command: EgmCommand = bytemuck::pod_read_unaligned(&said[0].1);
     let flags = EgmCommand::JUMP_LIMITED | EgmCommand::ANSWERS;
     assert_eq!(command.flags, flags);
@@ -407,7 +407,7 @@ fn an_arm_engages_on_a_sound_frame_after_its_own_sound_feedback_of_a_running_ses
     // Feedback that comes late changes nothing.
     let mut late = running();
     late.state = SessionState::Idle as u32;
-    assert!(hear(controller, 1, &late).is_empty());
+    assert!(hear(controller, EGM_RIGHT_FEEDBACK, &late).is_empty());
     assert_eq!(controller.next_tick(), None);
 }
 
@@ -418,15 +418,15 @@ fn a_refusal_that_will_last_ends_the_asking() {
     controller.start(Instant::ZERO);
     let mut idle = running();
     (idle.state, idle.session) = (SessionState::Idle as u32, 0);
-    hear(controller, 1, &idle);
+    hear(controller, EGM_RIGHT_FEEDBACK, &idle);
     assert_eq!(controller.next_tick(), Some(Instant::ZERO));
     let mut response = MotionResponse::zeroed();
     response.outcome = MotionOutcome::Refused as u32;
     response.refusal = MotionRefusal::Busy as u32;
-    hear(controller, 3, &response);
+    hear(controller, MOTION_RESPONSE, &response);
     assert_eq!(controller.next_tick(), Some(Instant::ZERO));
     response.refusal = MotionRefusal::BadNumber as u32;
-    hear(controller, 3, &response);
+    hear(controller, MOTION_RESPONSE, &response);
     assert_eq!(controller.next_tick(), None);
 }
 

@@ -1,14 +1,13 @@
 //! The launcher's hold on a channel: creates both of its services and keeps them alive while
 //! writers and readers come, die and come again.
 
-use hil_core::message::MessageType;
+use hil_core::message::{MessageType, TypeInfo};
 use iceoryx2::prelude::ipc;
 use iceoryx2::service::port_factory::event;
 
 use super::domain::Domain;
 use super::error::ChannelError;
 use super::raw::{self, ByteService};
-use super::type_info::TypeInfo;
 
 /// A channel to be created.
 #[derive(Debug, Clone, PartialEq, Eq)]

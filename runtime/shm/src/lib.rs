@@ -31,7 +31,6 @@ mod observer;
 mod ports;
 mod raw;
 mod sequence;
-mod type_info;
 mod wake;
 
 #[cfg(test)]
@@ -48,5 +47,4 @@ pub use observer::observer_depth;
 pub use ports::{ShmInput, ShmOutput, TypedInput, TypedOutput};
 pub use raw::{ENVELOPE_TYPE_NAME, HeldMessage, RawInput, RawOutput};
 pub use sequence::{InputCounters, OutputSettings, SequenceTracker, Sequencer, Stamp};
-pub use type_info::TypeInfo;
 pub use wake::{Waiter, Wake};

@@ -5,14 +5,13 @@
 use core::marker::PhantomData;
 
 use hil_core::endpoint::{InputPort, OutputPort};
-use hil_core::message::{Envelope, Message, MessageSet, MessageType};
+use hil_core::message::{Envelope, Message, MessageType, TypeInfo};
 use hil_core::time::Instant;
 
 use super::domain::Domain;
 use super::error::ChannelError;
 use super::raw::{ByteReader, RawOutput};
 use super::sequence::{InputCounters, OutputSettings, SequenceTracker, Sequencer};
-use super::type_info::TypeInfo;
 
 /// A role's output on a channel.
 #[derive(Debug)]
@@ -178,7 +177,7 @@ impl<M: Message> TypedOutput<M> {
     /// # Errors
     /// When the channel is broken; having no reader is not an error.
     pub fn send(&mut self, now: Instant, message: M) -> Result<(), ChannelError> {
-        self.output.send(now, message.as_bytes())
+        self.output.send(now, bytemuck::bytes_of(&message))
     }
 }
 
@@ -208,7 +207,8 @@ impl<M: Message> TypedInput<M> {
     pub fn receive(&mut self) -> Result<Option<(Envelope, M)>, ChannelError> {
         // The channel carries messages of this type and no others.
         let taken = self.input.take(|envelope, payload| {
-            M::from_bytes(0, payload).map(|message| (*envelope, message))
+            let message = bytemuck::try_pod_read_unaligned(payload).ok();
+            message.map(|message| (*envelope, message))
         })?;
         Ok(taken.flatten())
     }

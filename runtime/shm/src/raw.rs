@@ -7,7 +7,7 @@ use core::mem::MaybeUninit;
 use core::{fmt, slice};
 use std::os::fd::BorrowedFd;
 
-use hil_core::message::Envelope;
+use hil_core::message::{Envelope, TypeInfo};
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::LoanError;
 use iceoryx2::port::listener::Listener;
@@ -31,7 +31,6 @@ use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
 use super::holder::ChannelSettings;
-use super::type_info::TypeInfo;
 use super::wake;
 
 /// What every channel's user header is called; changes when the envelope's layout does.

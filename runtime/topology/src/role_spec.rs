@@ -18,9 +18,9 @@ pub struct RoleSpec {
     pub role: Option<String>,
     /// Seed of the run.
     pub seed: u64,
-    /// Channels it reads; those of its role in port order.
+    /// Channels it reads; those of its role in the order of the case.
     pub inputs: Vec<RoleChannel>,
-    /// Channels it writes; those of its role in port order.
+    /// Channels it writes; those of its role in the order of the case.
     pub outputs: Vec<RoleChannel>,
     /// Every parameter of the case; empty without a role.
     pub parameters: toml::Table,

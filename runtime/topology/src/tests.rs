@@ -18,10 +18,8 @@ mod wifi;
 use core::time::Duration;
 use std::path::{Path, PathBuf};
 
-use bytemuck::{Pod, Zeroable};
 use hil_core::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
 use hil_core::component::Role;
-use hil_core::message::Message;
 use hil_core::run_log::RunLog;
 use hil_fleet::Fleet;
 use hil_link::delay::DelayLaw;
@@ -32,14 +30,8 @@ use serde::{Deserialize, Serialize};
 
 use super::*;
 
-#[derive(Debug, Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
-struct Frame {
-    joints_rad: [f64; 7],
-}
-
-impl Message for Frame {
-    const NAME: &'static str = "test.Frame.v1";
+hil_core::message! {
+    struct Frame = "test.Frame.v1" { joints_rad: [f64; 7] }
 }
 
 #[derive(Debug, Default, Serialize, Deserialize)]

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use bytemuck::bytes_of;
 use hil_core::message::Envelope;
+use hil_core::message::TypeInfo;
 use hil_core::random::RandomStream;
 use hil_core::record::{IngressRecord, PublishedRecord, UNAVAILABLE};
 
@@ -17,7 +18,7 @@ use hil_rundir::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source, start_tic
 use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
 use hil_rundir::select::{SelectError, running_runs_below, select};
-use hil_shm::{ChannelHolder, ChannelSettings, Domain, RawOutput, TypeInfo, observer_depth};
+use hil_shm::{ChannelHolder, ChannelSettings, Domain, RawOutput, observer_depth};
 
 /// A folder of the test's own, and a short name for a domain below it.
 struct Place(PathBuf);

@@ -1,9 +1,9 @@
 //! Messages of guided motion as they lie in shared memory. Layout only; SI units and radians; joints
 //! in chain order, see [`crate::yumi`]. The maker's own datagrams are in [`crate::egm::wire`].
 
-use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
+pub use crate::egm::parameters::EgmStartParameters;
 use crate::yumi::{Joints, Pose};
 
 /// One of the robot's two arms, each a motion task of its own.
@@ -41,9 +41,7 @@ impl Side {
 
 hil_core::message! {
     /// To the robot: where one arm shall be.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmCommand = "hil.EgmCommand.v1" {
+    pub struct EgmCommand = "hil.EgmCommand.v1", 144 bytes {
         /// The human frame this command answers; a foreign client's counts its datagrams instead.
         pub frame_index: u64,
         /// Time of that frame on the motion's own time axis; of a foreign client, zero.
@@ -77,13 +75,9 @@ impl EgmCommand {
     pub const PARKED: u32 = 1 << 5;
 }
 
-const _: () = assert!(size_of::<EgmCommand>() == 144);
-
 hil_core::message! {
     /// From the robot, every cycle: where one arm is.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmFeedback = "hil.EgmFeedback.v1" {
+    pub struct EgmFeedback = "hil.EgmFeedback.v1", 216 bytes {
         /// Controller cycle, counted from the robot's start; a skipped cycle leaves a gap.
         pub cycle_index: u64,
         /// [`EgmCommand::frame_index`] of the reference in use; meaningless without
@@ -142,24 +136,22 @@ impl EgmFeedback {
     }
 }
 
-const _: () = assert!(size_of::<EgmFeedback>() == 216);
-
-/// What an arm's motion task is doing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u32)]
-pub enum SessionState {
-    /// No session, none coming by itself: a request must start one.
-    Idle = 0,
-    /// A motion of its own (joint, linear, home) is under way.
-    Moving = 1,
-    /// The last session ended; the program waits before it starts the next.
-    Waiting = 2,
-    /// Moving to the fine point from which guided motion starts, and setting it up.
-    Activating = 3,
-    /// Guided motion runs.
-    Running = 4,
-    /// A session is ending by its ramp.
-    Stopping = 5,
+hil_core::numbered! {
+    /// What an arm's motion task is doing.
+    pub enum SessionState: u32 {
+        /// No session, none coming by itself: a request must start one.
+        Idle = 0,
+        /// A motion of its own (joint, linear, home) is under way.
+        Moving = 1,
+        /// The last session ended; the program waits before it starts the next.
+        Waiting = 2,
+        /// Moving to the fine point from which guided motion starts, and setting it up.
+        Activating = 3,
+        /// Guided motion runs.
+        Running = 4,
+        /// A session is ending by its ramp.
+        Stopping = 5,
+    }
 }
 
 impl SessionState {
@@ -179,9 +171,7 @@ impl SessionState {
 hil_core::message! {
     /// To the record: something happened to an arm's session. What `value`, `limit` and `count` mean,
     /// `kind` says.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmEvent = "hil.EgmEvent.v1" {
+    pub struct EgmEvent = "hil.EgmEvent.v1", 56 bytes {
         /// Grid time of the cycle in which it happened, the robot's clock.
         pub at_ns: i64,
         /// That cycle.
@@ -203,75 +193,71 @@ hil_core::message! {
     }
 }
 
-const _: () = assert!(size_of::<EgmEvent>() == 56);
-
-/// What an [`EgmEvent`] tells.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u32)]
-pub enum EgmEventKind {
-    /// The controller's first cycle: the origin of its grid.
-    Started = 0,
-    /// A session is being set up; `value`: seconds that takes.
-    Activating = 1,
-    /// Guided motion runs; `value`: seconds since the last session ended (or since the start).
-    Running = 2,
-    /// A session ended; `cause`: [`EndCause`]; `value` against `limit`: what tripped it, in the
-    /// cause's unit. Holding ends with it untold, throttling just before.
-    Ended = 3,
-    /// `MaxSpeedDeviation` began to bind; `value`: deg/s asked, `limit`: deg/s allowed.
-    SpeedThrottled = 4,
-    /// It has not bound for half a second, or the session ends; `value`: highest deg/s asked since
-    /// it began to bind, `limit`: deg/s allowed, `count`: nanoseconds from there to when it last did.
-    SpeedFree = 5,
-    /// Commands stopped coming: the last one goes on acting; `value`: seconds since it was taken.
-    HoldBegan = 6,
-    /// Commands are back; `value`: seconds without.
-    HoldEnded = 7,
-    /// A command was refused; `cause`: [`CommandRefusal`]; `value` against `limit`: joint value
-    /// (rad); `count`: joint, chain order from 0. Told for the first of a row of equal refusals.
-    CommandRefused = 8,
-    /// The queue of `limit` commands was full: `count` were dropped so far. Told again only after
-    /// it was half empty.
-    QueueOverflow = 9,
-    /// A motion of its own began; `cause`: the request's kind.
-    MotionBegan = 10,
-    /// A motion of its own ended; `value`: seconds it took.
-    MotionEnded = 11,
+hil_core::numbered! {
+    /// What an [`EgmEvent`] tells.
+    pub enum EgmEventKind: u32 {
+        /// The controller's first cycle: the origin of its grid.
+        Started = 0,
+        /// A session is being set up; `value`: seconds that takes.
+        Activating = 1,
+        /// Guided motion runs; `value`: seconds since the last session ended (or since the start).
+        Running = 2,
+        /// A session ended; `cause`: [`EndCause`]; `value` against `limit`: what tripped it, in the
+        /// cause's unit. Holding ends with it untold, throttling just before.
+        Ended = 3,
+        /// `MaxSpeedDeviation` began to bind; `value`: deg/s asked, `limit`: deg/s allowed.
+        SpeedThrottled = 4,
+        /// It has not bound for half a second, or the session ends; `value`: highest deg/s asked since
+        /// it began to bind, `limit`: deg/s allowed, `count`: nanoseconds from there to when it last did.
+        SpeedFree = 5,
+        /// Commands stopped coming: the last one goes on acting; `value`: seconds since it was taken.
+        HoldBegan = 6,
+        /// Commands are back; `value`: seconds without.
+        HoldEnded = 7,
+        /// A command was refused; `cause`: [`CommandRefusal`]; `value` against `limit`: joint value
+        /// (rad); `count`: joint, chain order from 0. Told for the first of a row of equal refusals.
+        CommandRefused = 8,
+        /// The queue of `limit` commands was full: `count` were dropped so far. Told again only after
+        /// it was half empty.
+        QueueOverflow = 9,
+        /// A motion of its own began; `cause`: the request's kind.
+        MotionBegan = 10,
+        /// A motion of its own ended; `value`: seconds it took.
+        MotionEnded = 11,
+    }
 }
 
-/// Why a session ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u32)]
-pub enum EndCause {
-    /// No command that was not refused came for `CommTimeout`; unit: s.
-    CommTimeout = 1,
-    /// All joints stayed within the convergence window for `CondTime`; unit: s.
-    ConditionTime = 2,
-    /// A joint went farther from the start than `MaxPosDeviation`; unit: deg; `count`: joint,
-    /// chain order from 0.
-    PositionDeviation = 3,
-    /// A request asked for it; unit: s from there to the end.
-    Requested = 4,
+hil_core::numbered! {
+    /// Why a session ended.
+    pub enum EndCause: u32 {
+        /// No command that was not refused came for `CommTimeout`; unit: s.
+        CommTimeout = 1,
+        /// All joints stayed within the convergence window for `CondTime`; unit: s.
+        ConditionTime = 2,
+        /// A joint went farther from the start than `MaxPosDeviation`; unit: deg; `count`: joint,
+        /// chain order from 0.
+        PositionDeviation = 3,
+        /// A request asked for it; unit: s from there to the end.
+        Requested = 4,
+    }
 }
 
-/// Why a command never reached the servo.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u32)]
-pub enum CommandRefusal {
-    /// A position or speed is not a number or infinite.
-    NotFinite = 1,
-    /// A position is outside the joint's limits.
-    OutsideLimits = 2,
-    /// Guided motion does not run: nobody takes commands.
-    NoSession = 3,
+hil_core::numbered! {
+    /// Why a command never reached the servo.
+    pub enum CommandRefusal: u32 {
+        /// A position or speed is not a number or infinite.
+        NotFinite = 1,
+        /// A position is outside the joint's limits.
+        OutsideLimits = 2,
+        /// Guided motion does not run: nobody takes commands.
+        NoSession = 3,
+    }
 }
 
 hil_core::message! {
     /// To the record: a command as it arrived at the controller, before anything was made of it. With
     /// [`MotionArrival`] and [`EgmEventKind::Started`] it is all that a replay needs.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmArrival = "hil.EgmArrival.v1" {
+    pub struct EgmArrival = "hil.EgmArrival.v1", 160 bytes {
         /// When, on the robot's clock.
         pub at_ns: i64,
         /// [`Side::index`].
@@ -283,13 +269,9 @@ hil_core::message! {
     }
 }
 
-const _: () = assert!(size_of::<EgmArrival>() == 160);
-
 hil_core::message! {
     /// To the motion server: do something that guided motion is not, or start and stop that.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct MotionRequest = "hil.MotionRequest.v1" {
+    pub struct MotionRequest = "hil.MotionRequest.v1", 312 bytes {
         /// The sender's number; the responses carry it.
         pub request_id: u64,
         /// [`MotionKind`] as a number.
@@ -315,70 +297,28 @@ impl MotionRequest {
     }
 }
 
-const _: () = assert!(size_of::<MotionRequest>() == 312);
-
-hil_core::message! {
-    /// What a session shall differ in from the controller's own settings; NaN keeps the setting.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmStartParameters {
-        /// `CommTimeout`, s.
-        pub comm_timeout_s: f64,
-        /// `CondTime`, s.
-        pub condition_time_s: f64,
-        /// `MaxSpeedDeviation`, rad/s.
-        pub max_speed_deviation_rad_per_s: f64,
-        /// `MaxPosDeviation`, rad.
-        pub max_position_deviation_rad: f64,
-        /// `RampInTime`, s.
-        pub ramp_in_s: f64,
-        /// `PosCorrGain`, 0..=1.
-        pub position_correction_ratio: f64,
-        /// Proportional position gain, 1/s.
-        pub position_gain_per_s: f64,
-        /// Low-pass corner, Hz; 0 switches it off.
-        pub low_pass_hz: f64,
+hil_core::numbered! {
+    /// What a request asks for.
+    pub enum MotionKind: u32 {
+        /// Only the state.
+        GetState = 0,
+        /// A joint motion (`MoveAbsJ`).
+        MoveJoints = 1,
+        /// A straight line of the tool (`MoveL`) of at most 5000 cycles, i.e. 20 s at 4 ms.
+        MoveLinear = 2,
+        /// Start guided motion.
+        EgmStart = 3,
+        /// Stop guided motion.
+        EgmStop = 4,
+        /// A joint motion to the home posture.
+        Home = 5,
     }
-}
-
-impl EgmStartParameters {
-    /// Keeps every setting.
-    pub const KEEP: Self = Self {
-        comm_timeout_s: f64::NAN,
-        condition_time_s: f64::NAN,
-        max_speed_deviation_rad_per_s: f64::NAN,
-        max_position_deviation_rad: f64::NAN,
-        ramp_in_s: f64::NAN,
-        position_correction_ratio: f64::NAN,
-        position_gain_per_s: f64::NAN,
-        low_pass_hz: f64::NAN,
-    };
-}
-
-/// What a request asks for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u32)]
-pub enum MotionKind {
-    /// Only the state.
-    GetState = 0,
-    /// A joint motion (`MoveAbsJ`).
-    MoveJoints = 1,
-    /// A straight line of the tool (`MoveL`) of at most 5000 cycles, i.e. 20 s at 4 ms.
-    MoveLinear = 2,
-    /// Start guided motion.
-    EgmStart = 3,
-    /// Stop guided motion.
-    EgmStop = 4,
-    /// A joint motion to the home posture.
-    Home = 5,
 }
 
 hil_core::message! {
     /// From the motion server: at once when a request is taken or refused, and once more when what
     /// it began has ended.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct MotionResponse = "hil.MotionResponse.v1" {
+    pub struct MotionResponse = "hil.MotionResponse.v1", 144 bytes {
         /// [`MotionRequest::request_id`].
         pub request_id: u64,
         /// [`MotionRequest::kind`].
@@ -396,48 +336,44 @@ hil_core::message! {
     }
 }
 
-const _: () = assert!(size_of::<MotionResponse>() == 144);
-
-/// How a request stands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u32)]
-pub enum MotionOutcome {
-    /// Taken; a motion or activation is under way.
-    Accepted = 1,
-    /// What was asked is reached.
-    Done = 2,
-    /// Not taken; see [`MotionResponse::refusal`].
-    Refused = 3,
-    /// Taken, but something else ended it.
-    Interrupted = 4,
+hil_core::numbered! {
+    /// How a request stands.
+    pub enum MotionOutcome: u32 {
+        /// Taken; a motion or activation is under way.
+        Accepted = 1,
+        /// What was asked is reached.
+        Done = 2,
+        /// Not taken; see [`MotionResponse::refusal`].
+        Refused = 3,
+        /// Taken, but something else ended it.
+        Interrupted = 4,
+    }
 }
 
-/// Why a request was not taken.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u32)]
-pub enum MotionRefusal {
-    /// No such kind.
-    UnknownKind = 1,
-    /// No arm, or one that does not exist.
-    NoArm = 2,
-    /// A number is not finite or outside its range, or a linear motion is so slow that it would
-    /// last more than 5000 cycles.
-    BadNumber = 3,
-    /// The target is outside a joint's limits.
-    OutsideLimits = 4,
-    /// No joint position puts the tool there, or none on the straight line to it.
-    Unreachable = 5,
-    /// Another motion is under way.
-    Busy = 6,
-    /// Guided motion runs, and the request needs it not to.
-    GuidedMotionRuns = 7,
+hil_core::numbered! {
+    /// Why a request was not taken.
+    pub enum MotionRefusal: u32 {
+        /// No such kind.
+        UnknownKind = 1,
+        /// No arm, or one that does not exist.
+        NoArm = 2,
+        /// A number is not finite or outside its range, or a linear motion is so slow that it would
+        /// last more than 5000 cycles.
+        BadNumber = 3,
+        /// The target is outside a joint's limits.
+        OutsideLimits = 4,
+        /// No joint position puts the tool there, or none on the straight line to it.
+        Unreachable = 5,
+        /// Another motion is under way.
+        Busy = 6,
+        /// Guided motion runs, and the request needs it not to.
+        GuidedMotionRuns = 7,
+    }
 }
 
 hil_core::message! {
     /// To the record: a request as it arrived at the motion server.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct MotionArrival = "hil.MotionArrival.v1" {
+    pub struct MotionArrival = "hil.MotionArrival.v1", 320 bytes {
         /// When, on the robot's clock.
         pub at_ns: i64,
         /// The request.
@@ -445,41 +381,11 @@ hil_core::message! {
     }
 }
 
-const _: () = assert!(size_of::<MotionArrival>() == 320);
-
 impl Side {
     /// The side with this number, see [`Side::index`].
     pub fn from_index(index: u32) -> Option<Self> {
         Self::BOTH.into_iter().find(|side| side.number() == index)
     }
-}
-
-macro_rules! read_back {
-    ($($kind:ident: $what:literal, [$($variant:ident),+ $(,)?];)+) => {$(
-        impl $kind {
-            #[doc = concat!("The ", $what, " with this number.")]
-            pub fn from_number(number: u32) -> Option<Self> {
-                [$(Self::$variant),+].into_iter().find(|known| *known as u32 == number)
-            }
-        }
-    )+};
-}
-
-read_back! {
-    EgmEventKind: "kind of event", [
-        Started, Activating, Running, Ended, SpeedThrottled, SpeedFree, HoldBegan, HoldEnded,
-        CommandRefused, QueueOverflow, MotionBegan, MotionEnded,
-    ];
-    SessionState: "state", [Idle, Moving, Waiting, Activating, Running, Stopping];
-    EndCause: "cause", [CommTimeout, ConditionTime, PositionDeviation, Requested];
-    CommandRefusal: "refusal", [NotFinite, OutsideLimits, NoSession];
-    MotionKind: "kind of request", [
-        GetState, MoveJoints, MoveLinear, EgmStart, EgmStop, Home,
-    ];
-    MotionOutcome: "outcome", [Accepted, Done, Refused, Interrupted];
-    MotionRefusal: "refusal", [
-        UnknownKind, NoArm, BadNumber, OutsideLimits, Unreachable, Busy, GuidedMotionRuns,
-    ];
 }
 
 impl MotionKind {

@@ -9,7 +9,6 @@ pub mod arm;
 pub mod description;
 pub mod inverse;
 
-use bytemuck::{Pod, Zeroable};
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 
 /// Joints of one arm.
@@ -21,24 +20,19 @@ pub type Joints = [f64; JOINT_COUNT];
 /// The maker's joint number (1..=7) of each place in the chain.
 pub const CHAIN_TO_MAKER: [usize; JOINT_COUNT] = [1, 2, 7, 3, 4, 5, 6];
 
-/// A frame seen from another, as it travels: plain numbers, which may be nonsense.
-///
-/// Kinematics computes with [`Isometry3`], which is always a rigid motion; [`Pose::isometry`]
-/// is the gate between the two.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct Pose {
-    /// Origin, metres.
-    pub position_m: [f64; 3],
-    /// Rotation as a quaternion, scalar part first (Hamilton convention, active); of unit length
-    /// in every message this crate sends.
-    pub quaternion_wxyz: [f64; 4],
+hil_core::message! {
+    /// A frame seen from another, as it travels: plain numbers, which may be nonsense.
+    ///
+    /// Kinematics computes with [`Isometry3`], which is always a rigid motion; [`Pose::isometry`]
+    /// is the gate between the two.
+    pub struct Pose, 56 bytes {
+        /// Origin, metres.
+        pub position_m: [f64; 3],
+        /// Rotation as a quaternion, scalar part first (Hamilton convention, active); of unit length
+        /// in every message this crate sends.
+        pub quaternion_wxyz: [f64; 4],
+    }
 }
-
-hil_core::layout!(Pose {
-    position_m,
-    quaternion_wxyz
-});
 
 impl Pose {
     /// Largest magnitude of any number of a pose: far beyond any robot or person, far below
@@ -86,6 +80,8 @@ mod tests {
 
 #[cfg(test)]
 mod pose_tests {
+    use bytemuck::Zeroable;
+
     use super::*;
 
     const POSE: Pose = Pose {

@@ -5,9 +5,9 @@ use core::convert::Infallible;
 use core::time::Duration;
 use std::collections::{BTreeMap, VecDeque};
 
-use crate::case_study::{CaseStudy, ChannelSpec};
-use crate::component::Role;
-use crate::endpoint::{Endpoint, InputPort, OutputPort, PortCountError};
+use crate::case_study::{CaseStudy, ChannelSpec, channels_of};
+use crate::component::{Port, Role};
+use crate::endpoint::{Endpoint, InputPort, OutputPort, PortError};
 use crate::link_model::{LinkModel, LossCauses, PerfectLink};
 use crate::message::Envelope;
 use crate::run_log::RunLog;
@@ -66,15 +66,8 @@ pub enum SimulationError {
         channel: String,
     },
     /// The case's roles and channels contradict each other.
-    #[error("role {role} of case {case}: {source}")]
-    Wiring {
-        /// The case.
-        case: &'static str,
-        /// The role.
-        role: &'static str,
-        /// Which side does not fit.
-        source: PortCountError,
-    },
+    #[error(transparent)]
+    Ports(PortError),
     /// The case lists a role it cannot make.
     #[error("case {case} lists role {role} but makes none")]
     MissingRole {
@@ -366,18 +359,19 @@ impl Simulation {
         }
         let (mut endpoints, mut outputs) = (Vec::new(), Vec::new());
         for (role, component) in roles {
-            let mut inputs = Vec::new();
-            for channel in channels.iter_mut().filter(|one| one.spec.to == Some(role)) {
-                let (endpoint, port) = (endpoints.len(), inputs.len());
-                channel.to = Some(PortPlace { endpoint, port });
-                inputs.push(Inbox::default());
+            let stated = channels_of(case, specs, role);
+            // Joined before: every port has a channel of its name.
+            let place = |port: &Port| specs.iter().position(|spec| spec.name == port.name);
+            stated.check(component.as_ref()).map_err(SimulationError::Ports)?;
+            for (port, channel) in component.inputs().iter().filter_map(place).enumerate() {
+                let endpoint = endpoints.len();
+                channels[channel].to = Some(PortPlace { endpoint, port });
             }
-            let written: Vec<usize> = (0..specs.len())
-                .filter(|&channel| specs[channel].from == role)
-                .collect();
-            let ports = written.iter().map(|_| Outbox::default()).collect();
-            let endpoint = Endpoint::new(component, inputs, ports)
-                .map_err(|source| SimulationError::Wiring { case, role, source })?;
+            let written: Vec<usize> = component.outputs().iter().filter_map(place).collect();
+            let open_input = |_: &Port| Ok(Inbox::default());
+            let open_output = |_: &Port| Ok(Outbox::default());
+            let endpoint = Endpoint::join(component, &stated, open_input, open_output)
+                .map_err(SimulationError::Ports)?;
             endpoints.push(endpoint);
             outputs.push(written);
         }

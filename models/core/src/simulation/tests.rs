@@ -3,51 +3,33 @@
 use core::time::Duration;
 use std::collections::BTreeMap;
 
-use bytemuck::{Pod, Zeroable};
-
 use super::*;
 use crate::case_study::ChannelSpec;
-use crate::component::{Component, Outbox, into_role};
+use crate::component::{Component, Output, Ports, into_role};
 use crate::link_model::PerfectLink;
-use crate::message::Message;
-use crate::time::PeriodicTimer;
+use crate::time::Tick;
 
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-struct Status {
-    position_m: f64,
-}
-
-impl Message for Status {
-    const NAME: &'static str = "test.Status.v1";
+crate::message! {
+    struct Status = "test.Status.v1" { position_m: f64 }
 }
 
 /// Tells the record where it is, and nobody listens.
-#[derive(Debug)]
-struct Diarist(PeriodicTimer);
+#[derive(Debug, Default)]
+struct Diarist {
+    diary: Output<Status>,
+}
 
 impl Component for Diarist {
-    type Input = Status;
-    type Output = Status;
-
-    fn on_start(&mut self, now: Instant) {
-        self.0.start(now);
+    fn ports(&self, ports: &mut Ports<Self>) {
+        ports.input("a/heard", |_, _, _: &Status| {});
+        ports.output("a/diary", |own| &mut own.diary);
+        ports.every(Duration::from_millis(100), Self::on_tick);
     }
+}
 
-    fn on_message(&mut self, _: Instant, _: &Status, _: &mut Outbox<Status>) {}
-
-    fn on_tick(&mut self, now: Instant, out: &mut Outbox<Status>) {
-        if self.0.poll(now).is_some() {
-            out.send(Status { position_m: 1.0 });
-        }
-    }
-
-    fn next_tick(&self) -> Option<Instant> {
-        self.0.next()
-    }
-
-    fn skipped_ticks(&self) -> u64 {
-        self.0.skipped_total()
+impl Diarist {
+    fn on_tick(&mut self, _now: Instant, _tick: Tick) {
+        self.diary.send(Status { position_m: 1.0 });
     }
 }
 
@@ -57,8 +39,7 @@ const DIARY: &[ChannelSpec] = &[
 ];
 
 fn diary(carriers: BTreeMap<String, Box<dyn Carrier>>) -> Result<Simulation, SimulationError> {
-    let diarist = Diarist(PeriodicTimer::new(Duration::from_millis(100)));
-    let roles = vec![("diarist", into_role(diarist))];
+    let roles = vec![("diarist", into_role(Diarist::default()))];
     Simulation::of_roles("diary", DIARY, roles, carriers)
 }
 
@@ -205,30 +186,26 @@ fn messages_arrive_by_time_then_rank_then_order_and_their_slots_are_used_again()
 /// Answers at once; one that begins speaks first.
 #[derive(Debug)]
 struct Echo {
+    ports: [&'static str; 2],
     begins: bool,
+    said: Output<Status>,
 }
 
 impl Component for Echo {
-    type Input = Status;
-    type Output = Status;
-
-    fn on_start(&mut self, _: Instant) {}
-
-    fn on_message(&mut self, _: Instant, heard: &Status, out: &mut Outbox<Status>) {
-        out.send(*heard);
+    fn ports(&self, ports: &mut Ports<Self>) {
+        let [heard, said] = self.ports;
+        ports.input(heard, |own, _, heard: &Status| own.said.send(*heard));
+        ports.output(said, |own| &mut own.said);
     }
 
-    fn on_tick(&mut self, _: Instant, out: &mut Outbox<Status>) {
-        self.begins = false;
-        out.send(Status { position_m: 0.0 });
+    fn tick(&mut self, _: Instant) {
+        if core::mem::take(&mut self.begins) {
+            self.said.send(Status { position_m: 0.0 });
+        }
     }
 
     fn next_tick(&self) -> Option<Instant> {
         self.begins.then_some(Instant::ZERO)
-    }
-
-    fn skipped_ticks(&self) -> u64 {
-        0
     }
 }
 
@@ -239,9 +216,16 @@ fn roles_that_answer_each_other_without_delay_are_refused() {
         ChannelSpec::of::<Status>("a/back", "other", "one"),
     ];
     let run = |begins| {
+        let echo = |ports, begins| {
+            into_role(Echo {
+                ports,
+                begins,
+                said: Output::default(),
+            })
+        };
         let roles = vec![
-            ("one", into_role(Echo { begins })),
-            ("other", into_role(Echo { begins: false })),
+            ("one", echo(["a/back", "a/there"], begins)),
+            ("other", echo(["a/there", "a/back"], false)),
         ];
         let simulation = Simulation::of_roles("echo", ECHOES, roles, BTreeMap::new()).unwrap();
         simulation.run(Duration::from_secs(1))
@@ -252,4 +236,17 @@ fn roles_that_answer_each_other_without_delay_are_refused() {
         run(true).unwrap_err(),
         SimulationError::ZeroDelayLoop { at }
     );
+}
+
+#[test]
+fn a_role_that_does_not_fit_its_case_does_not_start() {
+    const MISSPELT: &[ChannelSpec] = &[
+        ChannelSpec::of::<Status>("a/herd", "other", "diarist"),
+        ChannelSpec::recorded::<Status>("a/diary", "diarist"),
+    ];
+    let roles = vec![("diarist", into_role(Diarist::default()))];
+    let error = Simulation::of_roles("diary", MISSPELT, roles, BTreeMap::new()).unwrap_err();
+    let expected = "input port a/heard of role diarist takes test.Status.v1 (8 bytes aligned to 8), \
+                    but case diary states no such channel";
+    assert_eq!(error.to_string(), expected);
 }

@@ -20,87 +20,40 @@ pub enum CoordinatorMode {
     Safe,
 }
 
-/// `[case.parameters.coordinator]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct CoordinatorParameters {
-    /// The rules.
-    pub mode: CoordinatorMode,
-    /// Who goes first when both could wait.
-    pub policy: PolicyName,
-    /// Control period, 10..=60000 ms.
-    pub control_period_ms: f64,
-    /// Largest message delay the coordinator reckons with, 0..=60000 ms; the channel's may differ.
-    pub known_delay_ms: f64,
-    /// Tracking period of the robots it reckons with, 1..=10000 ms.
-    pub tracking_period_ms: f64,
-    /// Copies sent of every authority, 1..=10.
-    pub replicas: u32,
-    /// How states that overtook each other are taken.
-    pub message_order: MessageOrder,
-    /// Path poses kept between a wait point and the section, 0..=100.
-    pub trailing_points: u32,
-    /// Missions begun per control period, 1..=1000.
-    pub missions_per_cycle: u32,
-    /// Time without way after which a robot is put at its goal, 1..=100000 s.
-    pub stuck_after_s: f64,
-    /// Reverse orders to break up cycles of waiting robots.
-    pub break_deadlocks: bool,
-    /// Robots stamp states with the controller's clock, so that a state's age means something.
-    pub clock_is_shared: bool,
-    /// What only the safe mode needs.
-    pub safe: SafeParameters,
-}
-
-impl Default for CoordinatorParameters {
-    fn default() -> Self {
-        Self {
-            mode: CoordinatorMode::default(),
-            policy: PolicyName::default(),
-            control_period_ms: 1000.0,
-            known_delay_ms: 0.0,
-            tracking_period_ms: 30.0,
-            replicas: 1,
-            message_order: MessageOrder::default(),
-            trailing_points: 3,
-            missions_per_cycle: 1,
-            stuck_after_s: 120.0,
-            break_deadlocks: true,
-            clock_is_shared: true,
-            safe: SafeParameters::default(),
-        }
-    }
+hil_core::parameters! {
+    /// `[case.parameters.coordinator]`.
+    pub struct CoordinatorParameters in "coordinator." {
+        /// The rules.
+        mode: CoordinatorMode = CoordinatorMode::default();
+        /// Who goes first when both could wait.
+        policy: PolicyName = PolicyName::default();
+        /// Control period, ms.
+        control_period_ms: f64 = 1000.0, in 10.0..=60_000.0;
+        /// Largest message delay the coordinator reckons with, ms; the channel's may differ.
+        known_delay_ms: f64 = 0.0, in 0.0..=60_000.0;
+        /// Tracking period of the robots it reckons with, ms.
+        tracking_period_ms: f64 = 30.0, in 1.0..=10_000.0;
+        /// Copies sent of every authority.
+        replicas: u32 = 1, in 1.0..=10.0;
+        /// How states that overtook each other are taken.
+        message_order: MessageOrder = MessageOrder::default();
+        /// Path poses kept between a wait point and the section.
+        trailing_points: u32 = 3, in 0.0..=100.0;
+        /// Missions begun per control period.
+        missions_per_cycle: u32 = 1, in 1.0..=1000.0;
+        /// Time without way after which a robot is put at its goal, s.
+        stuck_after_s: f64 = 120.0, in 1.0..=100_000.0;
+        /// Reverse orders to break up cycles of waiting robots.
+        break_deadlocks: bool = true;
+        /// Robots stamp states with the controller's clock, so that a state's age means something.
+        clock_is_shared: bool = true;
+        /// What only the safe mode needs.
+        safe: SafeParameters = SafeParameters::default();
+    } check check_safe;
 }
 
 impl CoordinatorParameters {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// Names the key, its value and its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        let numbers = [
-            ("control_period_ms", self.control_period_ms, 10.0, 60_000.0),
-            ("known_delay_ms", self.known_delay_ms, 0.0, 60_000.0),
-            ("tracking_period_ms", self.tracking_period_ms, 1.0, 10_000.0),
-            ("replicas", f64::from(self.replicas), 1.0, 10.0),
-            (
-                "trailing_points",
-                f64::from(self.trailing_points),
-                0.0,
-                100.0,
-            ),
-            (
-                "missions_per_cycle",
-                f64::from(self.missions_per_cycle),
-                1.0,
-                1000.0,
-            ),
-            ("stuck_after_s", self.stuck_after_s, 1.0, 100_000.0),
-        ];
-        for (key, value, min, max) in numbers {
-            let key = format!("coordinator.{key}");
-            ParameterError::check(&key, value, min..=max, &format!("{min} to {max}"))?;
-        }
+    fn check_safe(&self) -> Result<(), ParameterError> {
         self.safe.check()
     }
 

@@ -412,7 +412,7 @@ impl RobotView {
         self.state = Some(*state);
         let index = self.index();
         self.has_moved |= index != old_index;
-        match Phase::of(state.phase) {
+        match Phase::from_number(state.phase) {
             Some(Phase::AtPoint) => self.waiting_since = self.waiting_since.or(Some(now)),
             _ => self.waiting_since = None,
         }
@@ -424,7 +424,7 @@ impl RobotView {
             mission.best_index = index;
             mission.last_progress = now;
         }
-        if Phase::of(state.phase) == Some(Phase::Done) {
+        if Phase::from_number(state.phase) == Some(Phase::Done) {
             mission.done_at.get_or_insert(now);
         }
     }

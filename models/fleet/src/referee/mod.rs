@@ -196,7 +196,7 @@ impl Referee {
         let is_known = robot < self.per_fleet && index < self.tracks.len();
         let has_path =
             truth.path_id == NO_PATH || self.world.paths.get(PathId(truth.path_id)).is_some();
-        let kind = TruthKind::of(truth.kind)?;
+        let kind = TruthKind::from_number(truth.kind)?;
         (is_finite && is_known && has_path).then_some((index, kind))
     }
 

@@ -23,7 +23,6 @@ use crate::robot::authority::{Grant, Proposal, Verdict, is_newer, reach_of};
 use crate::robot::tracker::{Limits, Tracker};
 use crate::scenario::Scene;
 use crate::world::{BayIndex, Vehicle, World};
-use hil_core::case_study::ParameterError;
 use hil_core::random::RandomStream;
 use hil_core::time::{Instant, duration_ns};
 
@@ -690,70 +689,26 @@ pub enum TrackerKind {
     LegacyRk4,
 }
 
-/// `[case.parameters.robot]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct RobotParameters {
-    /// How a robot follows its path.
-    pub tracker: TrackerKind,
-    /// From tick to tick, and so from state to state, of a robot under way, 1..=1000 ms.
-    pub tracking_period_ms: f64,
-    /// From state to state of a robot without a mission, 1..=10000 ms.
-    pub parked_period_ms: f64,
-    /// True lengthens each tick of the legacy tracker by U[0, `inflation_delay_ms`), as the
-    /// original does when a message delay is configured. Without effect on the exact tracker.
-    pub step_inflation: bool,
-    /// How much `step_inflation` lengthens a tick at most, 0..=10000 ms.
-    pub inflation_delay_ms: f64,
-    /// What becomes of authorities and missions that arrive out of order or twice.
-    pub message_order: MessageOrder,
-}
-
-impl Default for RobotParameters {
-    fn default() -> Self {
-        Self {
-            tracker: TrackerKind::Exact,
-            tracking_period_ms: 30.0,
-            parked_period_ms: 300.0,
-            step_inflation: false,
-            inflation_delay_ms: 0.0,
-            message_order: MessageOrder::Legacy,
-        }
+hil_core::parameters! {
+    /// `[case.parameters.robot]`.
+    pub struct RobotParameters in "robot." {
+        /// How a robot follows its path.
+        tracker: TrackerKind = TrackerKind::Exact;
+        /// From tick to tick, and so from state to state, of a robot under way, ms.
+        tracking_period_ms: f64 = 30.0, in 1.0..=1000.0;
+        /// From state to state of a robot without a mission, ms.
+        parked_period_ms: f64 = 300.0, in 1.0..=10_000.0;
+        /// True lengthens each tick of the legacy tracker by U[0, `inflation_delay_ms`), as the
+        /// original does when a message delay is configured. Without effect on the exact tracker.
+        step_inflation: bool = false;
+        /// How much `step_inflation` lengthens a tick at most, ms.
+        inflation_delay_ms: f64 = 0.0, in 0.0..=10_000.0;
+        /// What becomes of authorities and missions that arrive out of order or twice.
+        message_order: MessageOrder = MessageOrder::Legacy;
     }
 }
 
 impl RobotParameters {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// The first key outside its range; keys begin with `robot.`.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        let ranges = [
-            (
-                "robot.tracking_period_ms",
-                self.tracking_period_ms,
-                1.0,
-                1000.0,
-            ),
-            (
-                "robot.parked_period_ms",
-                self.parked_period_ms,
-                1.0,
-                10_000.0,
-            ),
-            (
-                "robot.inflation_delay_ms",
-                self.inflation_delay_ms,
-                0.0,
-                10_000.0,
-            ),
-        ];
-        for (key, value, min, max) in ranges {
-            ParameterError::check(key, value, min..=max, &format!("{min} to {max}"))?;
-        }
-        Ok(())
-    }
-
     /// How far past an authority that came in time a robot can come to rest, at most.
     ///
     /// The exact tracker: 0. The legacy tracker: `3 v T + v TT / 2` with `v` the largest speed,

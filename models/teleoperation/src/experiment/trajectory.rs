@@ -7,13 +7,14 @@ use bytemuck::Zeroable;
 
 use crate::messages::HumanFrame;
 use crate::score::loops::LoopCounter;
-use crate::{ResumePolicy, SendPolicy, Teleoperation};
+use crate::{
+    EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, HUMAN_FRAME, ResumePolicy, SendPolicy, Teleoperation,
+};
 use hil_arm::egm::controller::Controller;
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
 use hil_arm::egm::parameters::{ControllerSettings, StartMode};
 use hil_arm::yumi::arm::{Arm, RIGHT_START_RAD};
 use hil_core::case_study::{CaseStudy, ParameterError};
-use hil_core::component::Role;
 use hil_core::time::{Instant, duration_ns};
 use hil_stats::series::{Sample, peaks};
 
@@ -126,12 +127,14 @@ fn commands(case: &Teleoperation, first_frame: i64, frame_count: i64) -> Vec<Egm
     let mut player = case.player();
     let frame_ns = duration_ns(case.parameters.frame_period());
     let mut commands = Vec::with_capacity(usize::try_from(frame_count).unwrap_or(0));
-    hear(
-        controller.as_mut(),
-        FEEDBACK_PORT,
-        &running_feedback(),
-        &mut commands,
-    );
+    let right = controller.output(EGM_RIGHT_COMMAND);
+    let mut emit = |port, bytes: &[u8]| {
+        if port == right {
+            commands.push(bytemuck::pod_read_unaligned(bytes));
+        }
+    };
+    let at = Instant::ZERO;
+    controller.hear(at, EGM_RIGHT_FEEDBACK, &running_feedback(), &mut emit);
     for frame in first_frame..first_frame + frame_count {
         let source_time_ns = frame * frame_ns;
         let pose = player.at(source_time_ns as f64 * 1e-9);
@@ -142,29 +145,9 @@ fn commands(case: &Teleoperation, first_frame: i64, frame_count: i64) -> Vec<Egm
             right_hand: pose.right_hand.into(),
             left_hand: pose.left_hand.into(),
         };
-        hear(controller.as_mut(), FRAME_PORT, &message, &mut commands);
+        controller.hear(at, HUMAN_FRAME, &message, &mut emit);
     }
     commands
-}
-
-/// Ports of the controller role, in the case's order of channels.
-const FRAME_PORT: usize = 0;
-const FEEDBACK_PORT: usize = 1;
-const RIGHT_COMMAND_PORT: usize = 0;
-
-fn hear<M: bytemuck::Pod>(
-    controller: &mut dyn Role,
-    port: usize,
-    message: &M,
-    commands: &mut Vec<EgmCommand>,
-) {
-    let bytes = bytemuck::bytes_of(message);
-    let is_known = controller.message(Instant::ZERO, port, bytes, &mut |port, bytes| {
-        if port == RIGHT_COMMAND_PORT {
-            commands.push(bytemuck::pod_read_unaligned(bytes));
-        }
-    });
-    assert!(is_known, "the controller knows the messages of its ports");
 }
 
 fn running_feedback() -> EgmFeedback {

@@ -1,12 +1,14 @@
 //! The process of one component: the same endpoint that virtual time drives, on shared-memory
 //! ports and a real clock.
 
+use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use hil_core::component::Role;
-use hil_core::endpoint::Endpoint;
-use hil_core::message::{Envelope, MessageType};
+use hil_core::component::{Port, Role};
+use hil_core::endpoint::{Endpoint, RoleChannels, StatedChannel};
+use hil_core::message::{Envelope, TypeInfo};
 use hil_core::record::{PublishedRecord, TakenRecord};
 
 use super::heartbeat::Heartbeat;
@@ -40,27 +42,30 @@ pub(super) fn open<'a>(
     recorder: &mut Recorder,
 ) -> Result<Opened<'a>, WorkerError> {
     let card: RoleSpec = read(&work.card)?;
-    let counts = Counts::of(&card);
-    let sinks = Sinks::open(&card, recorder)?;
-    let skipped_ticks = Some(Arc::clone(&counts.skipped));
+    let Opening { counters, parts } = Opening::of(&card, recorder)?;
+    let skipped = Arc::new(AtomicU64::new(NO_TIMER));
+    let skipped_ticks = Some(Arc::clone(&skipped));
+    let heartbeat = Heartbeat::default();
     let job = Job {
         name: "main".to_owned(),
-        counters: counts.taken.iter().chain(&counts.given).cloned().collect(),
-        heartbeat: Some(counts.heartbeat.clone()),
+        counters,
+        heartbeat: Some(heartbeat.clone()),
         connect: Box::new(move |thread| {
             let asked = MonotonicClock::now();
             let role = make_role(&card, registry)?;
             let prepared_in = MonotonicClock::now().saturating_duration_since(asked);
             let domain = open_domain(launch)?;
             let waiter = open_waiter(&domain, &card, work.wait)?;
-            let endpoint = connect(role, &domain, &card, work.wait, sinks, &counts)?;
+            let channels = channels_of(&card, &work.card);
+            let endpoint = connect(role, &channels, &domain, work.wait, parts)?;
             warn_of_spinning("", work.wait, work.realtime.cpu);
             thread.claim(&work.realtime);
             Ok(Box::new(Component {
                 endpoint,
                 waiter,
                 wait: WaitStrategy::new(work.wait),
-                counts,
+                skipped,
+                heartbeat,
                 report: ProcessReport {
                     preparation_s: Some(prepared_in.as_secs_f64()),
                     ..ProcessReport::default()
@@ -81,7 +86,9 @@ struct Component {
     endpoint: ComponentEndpoint,
     waiter: Option<Waiter>,
     wait: WaitStrategy,
-    counts: Counts,
+    /// Ticks that passed without the role; [`NO_TIMER`] for one that has none.
+    skipped: Arc<AtomicU64>,
+    heartbeat: Heartbeat,
     report: ProcessReport,
     /// Outlives the ports.
     _domain: Domain,
@@ -99,128 +106,137 @@ fn make_role(card: &RoleSpec, registry: &Registry) -> Result<Box<dyn Role>, Work
     })
 }
 
-/// Live counters of a component's ports, in port order.
-struct Counts {
-    taken: Vec<Counter>,
-    given: Vec<Counter>,
-    /// Ticks that passed without the role; [`NO_TIMER`] for one that has none.
-    skipped: Arc<AtomicU64>,
-    heartbeat: Heartbeat,
-}
-
-impl Counts {
-    fn of(card: &RoleSpec) -> Self {
-        let counter = |channel: &RoleChannel, what| Counter {
-            channel: channel.name.clone(),
-            what,
-            count: Arc::default(),
-        };
-        let given = |channel: &RoleChannel| {
-            let what = if channel.is_recorded_only {
-                "recorded"
-            } else {
-                "published"
-            };
-            counter(channel, what)
-        };
-        Self {
-            taken: card
-                .inputs
-                .iter()
-                .map(|one| counter(one, "taken"))
-                .collect(),
-            given: card.outputs.iter().map(given).collect(),
-            skipped: Arc::new(AtomicU64::new(NO_TIMER)),
-            heartbeat: Heartbeat::default(),
-        }
+/// The channels that the card in `file` states for its role.
+fn channels_of(card: &RoleSpec, file: &Path) -> RoleChannels {
+    let stated = |channels: &[RoleChannel]| {
+        let channels = channels.iter().map(|channel| StatedChannel {
+            name: channel.name.clone(),
+            message: TypeInfo {
+                name: channel.message_name.clone(),
+                size_bytes: channel.message_size_bytes,
+                alignment_bytes: channel.message_alignment_bytes,
+            },
+        });
+        channels.collect()
+    };
+    RoleChannels {
+        role: card.role.clone().unwrap_or_default(),
+        stated_by: file.display().to_string(),
+        inputs: stated(&card.inputs),
+        outputs: stated(&card.outputs),
     }
 }
 
-/// The record rings of a component, in port order.
-struct Sinks {
-    taken: Vec<RecordSink>,
-    given: Vec<GivenSinks>,
+/// What is opened of a component before its thread begins.
+struct Opening {
+    /// Of its ports, in the card's order.
+    counters: Vec<Counter>,
+    parts: Parts,
 }
 
-/// The record rings of one output.
-struct GivenSinks {
+/// What ports need beside shared memory, by channel.
+#[derive(Default)]
+struct Parts {
+    inputs: BTreeMap<String, InputParts>,
+    outputs: BTreeMap<String, OutputParts>,
+}
+
+struct InputParts {
+    depth: usize,
+    sink: RecordSink,
+    taken: Arc<AtomicU64>,
+}
+
+struct OutputParts {
     /// The producer's side of the account; `None` when there is nothing to account for.
     published: Option<RecordSink>,
     messages: RecordSink,
+    given: Arc<AtomicU64>,
 }
 
-impl Sinks {
-    fn open(card: &RoleSpec, recorder: &mut Recorder) -> Result<Self, RecordFileError> {
-        let mut taken = Vec::new();
+impl Opening {
+    fn of(card: &RoleSpec, recorder: &mut Recorder) -> Result<Self, RecordFileError> {
+        let mut counters = Vec::new();
+        let mut counter = |channel: &RoleChannel, what| {
+            let count = Arc::default();
+            counters.push(Counter {
+                channel: channel.name.clone(),
+                what,
+                count: Arc::clone(&count),
+            });
+            count
+        };
+        let mut parts = Parts::default();
         for channel in &card.inputs {
             let size = size_of::<TakenRecord>();
-            taken.push(recorder.sink(RecordKind::Taken, &channel.name, size, RING_RECORDS)?);
+            let input = InputParts {
+                depth: channel.depth,
+                sink: recorder.sink(RecordKind::Taken, &channel.name, size, RING_RECORDS)?,
+                taken: counter(channel, "taken"),
+            };
+            parts.inputs.insert(channel.name.clone(), input);
         }
-        let mut given = Vec::new();
         for channel in &card.outputs {
             let mut sink = |kind, size| recorder.sink(kind, &channel.name, size, RING_RECORDS);
             let is_accounted = !channel.is_recorded_only;
             let message_size = size_of::<Envelope>() + channel.message_size_bytes;
-            given.push(GivenSinks {
+            let what = if is_accounted {
+                "published"
+            } else {
+                "recorded"
+            };
+            let output = OutputParts {
                 published: is_accounted
                     .then(|| sink(RecordKind::Published, size_of::<PublishedRecord>()))
                     .transpose()?,
                 messages: sink(RecordKind::Message, message_size)?,
-            });
+                given: counter(channel, what),
+            };
+            parts.outputs.insert(channel.name.clone(), output);
         }
-        Ok(Self { taken, given })
+        Ok(Self { counters, parts })
     }
 }
 
 fn connect(
     role: Box<dyn Role>,
+    channels: &RoleChannels,
     domain: &Domain,
-    card: &RoleSpec,
     wait: WaitMode,
-    sinks: Sinks,
-    counts: &Counts,
+    parts: Parts,
 ) -> Result<ComponentEndpoint, WorkerError> {
+    const STATED: &str = "a joined port has a channel of its name";
     let settings = output_settings();
-    let mut inputs = Vec::new();
-    let declared: Vec<MessageType> = role.inputs().to_vec();
-    for (((channel, message), sink), taken) in card
-        .inputs
-        .iter()
-        .zip(declared)
-        .zip(sinks.taken)
-        .zip(&counts.taken)
-    {
-        inputs.push(RecordedInput {
-            port: ShmInput::open(domain, &channel.name, &message, channel.depth)?,
+    let Parts {
+        mut inputs,
+        mut outputs,
+    } = parts;
+    let open_input = |port: &Port| {
+        let InputParts { depth, sink, taken } = inputs.remove(port.name).expect(STATED);
+        Ok(RecordedInput {
+            port: ShmInput::open(domain, port.name, &port.message, depth)?,
             sink,
-            taken: Arc::clone(&taken.count),
+            taken,
             wait: WaitStrategy::new(wait),
-        });
-    }
-    let mut outputs = Vec::new();
-    let declared: Vec<MessageType> = role.outputs().to_vec();
-    for (((channel, message), sinks), given) in card
-        .outputs
-        .iter()
-        .zip(declared)
-        .zip(sinks.given)
-        .zip(&counts.given)
-    {
-        let destination = match sinks.published {
+        })
+    };
+    let open_output = |port: &Port| {
+        let output = outputs.remove(port.name).expect(STATED);
+        let destination = match output.published {
             Some(sink) => {
-                let port = ShmOutput::open(domain, &channel.name, &message, settings)?;
+                let port = ShmOutput::open(domain, port.name, &port.message, settings)?;
                 let port = Box::new(port);
                 Destination::Channel { port, sink }
             }
             None => Destination::Record(Sequencer::new(settings)),
         };
-        outputs.push(RecordedOutput {
+        Ok(RecordedOutput {
             destination,
-            messages: sinks.messages,
-            given: Arc::clone(&given.count),
-        });
-    }
-    Ok(Endpoint::new(role, inputs, outputs)?)
+            messages: output.messages,
+            given: output.given,
+        })
+    };
+    Endpoint::join(role, channels, open_input, open_output)
 }
 
 /// A component without inputs, or one that spins, listens for no wake-ups.
@@ -249,10 +265,10 @@ impl JobWork for Component {
         while !orders.is_stopping() {
             let ticks = self.report.ticks;
             self.turn()?;
-            self.counts.heartbeat.beat();
+            self.heartbeat.beat();
             if self.report.ticks != ticks {
                 let skipped = self.endpoint.role().skipped_ticks();
-                self.counts.skipped.store(skipped, Ordering::Relaxed);
+                self.skipped.store(skipped, Ordering::Relaxed);
             }
         }
         Ok(())
@@ -325,5 +341,29 @@ mod tests {
         let error = make_role(&role_spec("shuttle", "pilot"), &registry).unwrap_err();
         assert_eq!(error.to_string(), "case shuttle has no role pilot");
         assert!(make_role(&role_spec("shuttle", "robot"), &registry).is_ok());
+    }
+
+    #[test]
+    fn a_role_spec_with_another_message_is_refused_with_both_sides() {
+        let mut registry = Registry::default();
+        registry.add::<Shuttle>();
+        let mut card = role_spec("shuttle", "controller");
+        let channel = |name: &str, message: &str, size| RoleChannel {
+            name: name.to_owned(),
+            message_name: message.to_owned(),
+            message_size_bytes: size,
+            message_alignment_bytes: 8,
+            depth: 1,
+            is_recorded_only: false,
+        };
+        card.outputs = vec![channel("shuttle/command", "hil.ShuttleCommand.v1", 16)];
+        card.inputs = vec![channel("shuttle/status", "hil.ShuttleStatus.v2", 24)];
+        let role = make_role(&card, &registry).unwrap();
+        let channels = channels_of(&card, Path::new("/run/controller.json"));
+        let error = channels.check(role.as_ref()).map_err(WorkerError::from);
+        let expected = "input port shuttle/status of role controller takes hil.ShuttleStatus.v1 (8 \
+                        bytes aligned to 8), but /run/controller.json states hil.ShuttleStatus.v2 \
+                        (24 bytes aligned to 8)";
+        assert_eq!(error.unwrap_err().to_string(), expected);
     }
 }

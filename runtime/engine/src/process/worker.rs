@@ -10,7 +10,7 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 use std::{io, thread};
 
-use hil_core::endpoint::PortCountError;
+use hil_core::endpoint::PortError;
 use hil_protocol::SettingsError;
 use hil_protocol::body::HelloStatus;
 use hil_transport::socket::SocketError;
@@ -65,9 +65,9 @@ pub enum WorkerError {
     /// The case refused its parameters.
     #[error(transparent)]
     Case(#[from] CaseError),
-    /// The number of a component's channels.
+    /// A port of the component and its channel do not fit each other.
     #[error(transparent)]
-    Ports(#[from] PortCountError),
+    Ports(#[from] PortError),
     /// The shared-memory domain.
     #[error(transparent)]
     Domain(#[from] DomainError),

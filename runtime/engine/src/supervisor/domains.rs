@@ -6,15 +6,14 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant as WallInstant};
 use std::{fs, thread};
 
+use hil_core::message::TypeInfo;
 use hil_link::condition::{LinkChangeRequest, ORDER_TYPE_NAME};
 
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::gateway::link_control::ORDERS_MAX;
 use hil_platform::domain_address::checked_root_path;
 use hil_rundir::announcement::withdraw_abandoned;
-use hil_shm::{
-    ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo, observer_depth,
-};
+use hil_shm::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, observer_depth};
 use hil_topology::Channel;
 
 /// Writers at a time: one, and its successor while the dead one is not cleaned up yet.

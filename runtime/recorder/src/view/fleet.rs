@@ -276,7 +276,7 @@ impl FleetView {
 
 fn on_path(id: u32, robot: &Robot, world: &World) -> Option<OnPath> {
     let (state, _) = robot.state?;
-    let (Phase::Driving | Phase::AtPoint) = Phase::of(state.phase)? else {
+    let (Phase::Driving | Phase::AtPoint) = Phase::from_number(state.phase)? else {
         return None;
     };
     let path = robot.path_of(state.header.mission_id)?;
@@ -301,7 +301,7 @@ fn granted(state: &State, path: &Path) -> Option<usize> {
 
 fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Option<RobotPicture> {
     let (state, at_ns) = robot.state?;
-    let phase = Phase::of(state.phase)?;
+    let phase = Phase::from_number(state.phase)?;
     let word = match phase {
         Phase::Parked => "parked",
         Phase::Driving => "driving",

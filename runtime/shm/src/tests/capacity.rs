@@ -5,8 +5,9 @@ use std::os::unix::fs::MetadataExt;
 
 use super::super::capacity::Room;
 use super::super::raw::{RawInput, RawOutput};
-use super::super::{ChannelHolder, ChannelSettings, Domain, TypeInfo, Waiter};
+use super::super::{ChannelHolder, ChannelSettings, Domain, Waiter};
 use super::{assert_nothing_left, root_path};
+use hil_core::message::TypeInfo;
 
 const PAGE_BYTES: u64 = 4096;
 const CHANNEL: &str = "arm/pose";

@@ -10,21 +10,16 @@ use std::fs;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use bytemuck::{Pod, Zeroable};
-use hil_core::message::{Message, MessageType};
+use hil_core::message::MessageType;
 
 use super::{ChannelHolder, ChannelSettings, Domain};
 
-/// Carried by most tests.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub(crate) struct Pose {
-    pub(crate) position_m: [f64; 3],
-    pub(crate) index: u64,
-}
-
-impl Message for Pose {
-    const NAME: &'static str = "test.Pose.v1";
+hil_core::message! {
+    /// Carried by most tests.
+    pub(crate) struct Pose = "test.Pose.v1" {
+        pub(crate) position_m: [f64; 3],
+        pub(crate) index: u64,
+    }
 }
 
 pub(crate) const POSE: MessageType = MessageType::of::<Pose>();

@@ -1,9 +1,9 @@
 //! What `raw.rs` expects of iceoryx2's hidden interface, said so plainly that an upgrade which
 //! changes it fails here and not in a gateway.
 
-use hil_core::message::Envelope;
+use hil_core::message::{Envelope, TypeInfo};
 
-use super::super::{ChannelHolder, ChannelSettings, Domain, RawInput, RawOutput, TypeInfo};
+use super::super::{ChannelHolder, ChannelSettings, Domain, RawInput, RawOutput};
 use super::{assert_nothing_left, root_path};
 
 #[test]

@@ -26,8 +26,6 @@ mod tests;
 use core::time::Duration;
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
-
 use crate::coordinator::counters::SafeCounts;
 use crate::coordinator::parameters::CoordinatorParameters;
 use crate::coordinator::safe::ledger::{Ledger, StateEffect};
@@ -510,58 +508,31 @@ pub(crate) fn lookahead_s(cycle_s: f64, round_trip_s: f64, reserve_ms: f64) -> f
     cycle_s + round_trip_s + 1e-3 * reserve_ms
 }
 
-/// `[case.parameters.coordinator.safe]`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct SafeParameters {
-    /// How far robots may stop from the end of their authority, 0..=1000 m; 0 for the exact
-    /// tracker, [`RobotParameters::stop_error_bound_m`](crate::robot::RobotParameters::stop_error_bound_m) for the stepped one.
-    pub stop_error_m: f64,
-    /// Authority beyond what a robot needs in order not to brake before the next one comes, as
-    /// time at its speed, 0..=60000 ms.
-    pub reserve_ms: f64,
-    /// How long a robot waits before the order of all is kept until it is through, 1..=100000 s.
-    pub patience_s: f64,
-    /// Take authority back, by acknowledged shrinks, where the policy prefers another robot.
-    pub takes_back: bool,
-    /// How long an authority holds after its receipt, 0..=3600000 ms; 0 for ever. Needs
-    /// `delay_bound_ms`.
-    pub lease_ms: f64,
-    /// Measured largest delay of a message either way, its error included, 0..=3600000 ms. Only
-    /// with a lease; with a shared clock it is watched.
-    pub delay_bound_ms: f64,
-}
-
-impl Default for SafeParameters {
-    fn default() -> Self {
-        Self {
-            stop_error_m: 0.0,
-            reserve_ms: 200.0,
-            patience_s: 60.0,
-            takes_back: true,
-            lease_ms: 0.0,
-            delay_bound_ms: 0.0,
-        }
-    }
+hil_core::parameters! {
+    /// `[case.parameters.coordinator.safe]`.
+    #[derive(Copy)]
+    pub struct SafeParameters in "coordinator.safe." {
+        /// How far robots may stop from the end of their authority, m; 0 for the exact
+        /// tracker, [`RobotParameters::stop_error_bound_m`](crate::robot::RobotParameters::stop_error_bound_m) for the stepped one.
+        stop_error_m: f64 = 0.0, in 0.0..=1000.0;
+        /// Authority beyond what a robot needs in order not to brake before the next one comes, as
+        /// time at its speed, ms.
+        reserve_ms: f64 = 200.0, in 0.0..=60_000.0;
+        /// How long a robot waits before the order of all is kept until it is through, s.
+        patience_s: f64 = 60.0, in 1.0..=100_000.0;
+        /// Take authority back, by acknowledged shrinks, where the policy prefers another robot.
+        takes_back: bool = true;
+        /// How long an authority holds after its receipt, ms; 0 for ever. Needs
+        /// `delay_bound_ms`.
+        lease_ms: f64 = 0.0, in 0.0..=3_600_000.0;
+        /// Measured largest delay of a message either way, its error included, ms. Only
+        /// with a lease; with a shared clock it is watched.
+        delay_bound_ms: f64 = 0.0, in 0.0..=3_600_000.0;
+    } check check_lease;
 }
 
 impl SafeParameters {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// Names the key, its value and its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        let numbers = [
-            ("stop_error_m", self.stop_error_m, 0.0, 1000.0),
-            ("reserve_ms", self.reserve_ms, 0.0, 60_000.0),
-            ("patience_s", self.patience_s, 1.0, 100_000.0),
-            ("lease_ms", self.lease_ms, 0.0, 3_600_000.0),
-            ("delay_bound_ms", self.delay_bound_ms, 0.0, 3_600_000.0),
-        ];
-        for (key, value, min, max) in numbers {
-            let key = format!("coordinator.safe.{key}");
-            ParameterError::check(&key, value, min..=max, &format!("{min} to {max}"))?;
-        }
+    fn check_lease(&self) -> Result<(), ParameterError> {
         if self.lease_ms > 0.0 && self.delay_bound_ms <= 0.0 {
             return Err(ParameterError::new(
                 "coordinator.safe.delay_bound_ms",
