@@ -34,7 +34,7 @@ use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, ShmOutput, Waiter,
 };
 use hil_tests::worker::Worker;
-use hil_topology::Timestamps;
+use hil_topology::SocketOptions;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::{TimeSpec, TimeValLike};
 use serde_json::json;
@@ -221,12 +221,10 @@ fn direction(side: Side, lanes: &[Lane], addresses: [SocketAddr; 2]) -> Directio
             transport: "udp".to_owned(),
             options: BTreeMap::new(),
             interface: None,
-            dscp: 0,
-            priority: None,
-            send_buffer_bytes: 212_992,
-            receive_buffer_bytes: 212_992.max(2 * lanes[0].message.size_bytes),
-            path_mtu_bytes: 1500,
-            timestamps: Timestamps::Software,
+            common: SocketOptions {
+                receive_buffer_bytes: 212_992.max(2 * lanes[0].message.size_bytes),
+                ..SocketOptions::TEMPLATE
+            },
         },
         wait: WaitMode::Block,
         realtime: RealtimeRequest::default(),

@@ -27,7 +27,7 @@ use hil_rundir::record::{RecordFile, Recorder};
 use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, Waiter,
 };
-use hil_topology::{AdapterKind, AdapterSend, RoleChannel, Timestamps};
+use hil_topology::{AdapterKind, EgmAdapter, RoleChannel};
 
 use crate::gateway::hosts::{Hosts, Joint, Plan, SetupError};
 use crate::gateway::network::Network;
@@ -349,15 +349,13 @@ fn settings(host: usize, listens_at: std::net::SocketAddr) -> AdapterSettings {
     };
     AdapterSettings {
         role: "bench".to_owned(),
-        kind,
-        axes: 7,
-        robotware: 7,
+        egm: EgmAdapter {
+            kind,
+            ..EgmAdapter::TEMPLATE
+        },
         cycle_ns: 4_000_000,
         planned_lead_ns: 16_000_000,
         wait: WaitMode::Block,
-        send: AdapterSend::Coupled,
-        timestamps: Timestamps::Software,
-        dscp: 0,
         interface: None,
         arms: vec![ArmLaunch {
             arm: ArmSide::Right,

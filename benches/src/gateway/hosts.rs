@@ -22,7 +22,7 @@ use hil_rundir::record::{RecordFile, RecordKind, RecordSink, Recorder};
 use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, Waiter,
 };
-use hil_topology::Timestamps;
+use hil_topology::{SocketOptions, Timestamps};
 
 use super::network::Network;
 
@@ -354,15 +354,13 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
             transport: "udp".to_owned(),
             options: BTreeMap::new(),
             interface: None,
-            dscp: 0,
-            priority: None,
-            send_buffer_bytes: 212_992,
-            receive_buffer_bytes: 212_992,
-            path_mtu_bytes: 1500,
-            timestamps: if plan.is_stamped {
-                Timestamps::Software
-            } else {
-                Timestamps::Off
+            common: SocketOptions {
+                timestamps: if plan.is_stamped {
+                    Timestamps::Software
+                } else {
+                    Timestamps::Off
+                },
+                ..SocketOptions::TEMPLATE
             },
         },
         wait: plan.wait,

@@ -51,6 +51,8 @@ impl Capabilities {
 pub struct TransportOption {
     /// The key in the topology.
     pub key: &'static str,
+    /// What it means: whole sentences.
+    pub about: &'static str,
     /// What it is when the file does not say.
     pub default: i64,
     /// Smallest allowed.

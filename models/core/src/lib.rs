@@ -9,7 +9,8 @@
 //! 4. [`link_model`]: what the driver asks of a link.
 //! 5. [`record`]: what each process notes of a message.
 //! 6. [`mod@layout`]: the fields of a message, for programs that do not know its type.
-//! 7. [`study`]: batches of virtual-time runs that end in tables.
+//! 7. [`mod@options`]: keys of tables with their types, defaults and ranges, declared once.
+//! 8. [`study`]: batches of virtual-time runs that end in tables.
 #![forbid(unsafe_code)]
 
 // The macros name this crate as their users do.
@@ -25,6 +26,7 @@ pub mod endpoint;
 pub mod layout;
 pub mod link_model;
 pub mod message;
+pub mod options;
 pub mod packed;
 pub mod plot;
 pub mod random;

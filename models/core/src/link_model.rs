@@ -172,25 +172,26 @@ impl LinkModel for PerfectLink {
     }
 }
 
-/// Which record a message meets.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum TraceMatch {
-    /// The n-th message of the channel meets the n-th record: equal departures have equal counts. Counted
-    /// over all starts of its producer: a start's first comes after the last one offered before.
-    #[default]
-    Index,
-    /// The record published last at that time of the run: counted from the run's start where the
-    /// trace says how long its run was, else from its first record. Before the first record the
-    /// first, in a later round the last of the round before.
-    Time,
-    /// The record of the same tick: as many periods after the first message of its channel as the
-    /// record is after the first of the trace, however many were missed and however long it is. What
-    /// nobody published live is lost, so the other end hears at each tick what it heard live. A
-    /// trace without a period, or of a producer that was started anew, is matched by index instead,
-    /// and the counts say so. The first message offered belongs to the tick of its number: to none
-    /// too early, and to one too late by what was missed before it.
-    Tick,
+crate::words! {
+    /// Which record a message meets.
+    #[derive(Default)]
+    pub enum TraceMatch {
+        /// The n-th message of the channel meets the n-th record: equal departures have equal counts. Counted
+        /// over all starts of its producer: a start's first comes after the last one offered before.
+        #[default]
+        Index = "index",
+        /// The record published last at that time of the run: counted from the run's start where the
+        /// trace says how long its run was, else from its first record. Before the first record the
+        /// first, in a later round the last of the round before.
+        Time = "time",
+        /// The record of the same tick: as many periods after the first message of its channel as the
+        /// record is after the first of the trace, however many were missed and however long it is. What
+        /// nobody published live is lost, so the other end hears at each tick what it heard live. A
+        /// trace without a period, or of a producer that was started anew, is matched by index instead,
+        /// and the counts say so. The first message offered belongs to the tick of its number: to none
+        /// too early, and to one too late by what was missed before it.
+        Tick = "tick",
+    }
 }
 
 /// What a replay met so far. Read it while the link works, or after.

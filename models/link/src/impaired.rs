@@ -5,15 +5,16 @@
 
 use core::time::Duration;
 
-use crate::options::{options, words};
 use crate::outages::OutageLink;
 use hil_core::case_study::ParameterError;
 use hil_core::link_model::{Fate, LinkModel};
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
+use hil_core::{options, words};
 
 words! {
     /// How a link's delay is drawn.
+    #[derive(Default)]
     pub enum DelayLaw {
         /// Every message takes `delay_ms`.
         #[default]

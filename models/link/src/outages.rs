@@ -9,9 +9,11 @@ use core::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::options::{Field, Kind, Options, Slot};
 use hil_core::case_study::ParameterError;
 use hil_core::link_model::{Fate, LinkModel};
+use hil_core::options::{
+    Field, Kind, Options, Scalar as _, Setting, Shape, Slot, Value, optional_table, table,
+};
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
@@ -33,23 +35,39 @@ const HOUR_S: f64 = 3600.0;
 /// Share of the time that outages may take up.
 const DOWN_RATIO_MAX: f64 = 0.95;
 
-/// The length of an outage is a time in files, as `mean`.
+/// The mean length of an outage, which is a time in files and seconds here.
+#[derive(Debug)]
+struct MeanLength<'o>(&'o mut f64);
+
+impl Value for MeanLength<'_> {
+    fn get(&self) -> Option<Setting> {
+        Some(Setting::Number(*self.0))
+    }
+
+    fn set(&mut self, setting: Setting) -> Result<(), String> {
+        *self.0 = Duration::from_setting(setting)?.as_secs_f64();
+        Ok(())
+    }
+}
+
 impl Options for Outages {
     fn fields(&mut self) -> Vec<Field<'_>> {
-        let option = |key, slot| Field {
-            key,
-            is_required: false,
-            hint: "",
-            slot,
-        };
-        let lengths = Duration::from_millis(1)..=Duration::from_hours(1);
+        let lengths = Shape::Time(Duration::from_millis(1)..=Duration::from_hours(1));
+        let mean = Slot::Value(Box::new(MeanLength(&mut self.mean_s)), lengths);
+        let per_hour = self.per_hour.slot(0.0..=100_000.0);
         vec![
-            option("mean", Slot::Seconds(&mut self.mean_s, lengths)),
-            option(
+            Field::new("mean", "Mean length of an outage, exponential.", mean),
+            Field::new(
                 "per_hour",
-                Slot::Number(&mut self.per_hour, 0.0..=100_000.0),
+                "Outages that begin per hour on average; 0 for none. With the mean length they take up at \
+                 most 95 % of the time.",
+                per_hour,
             ),
-            option("buffered", Slot::Boolean(&mut self.buffered)),
+            Field::new(
+                "buffered",
+                "What is offered during an outage: false loses it, true delivers it at the end, in order.",
+                self.buffered.slot(()),
+            ),
         ]
     }
 
@@ -72,10 +90,13 @@ impl Kind for Outages {
         per_hour: 0.0,
         buffered: false,
     };
-    const HINT: &'static str = "a table";
 
     fn slot(&mut self, (): ()) -> Slot<'_> {
-        Slot::Table(self)
+        table(self)
+    }
+
+    fn optional(value: &mut Option<Self>, (): ()) -> Slot<'_> {
+        optional_table(value)
     }
 }
 

@@ -10,8 +10,8 @@
 
 use core::time::Duration;
 
-use crate::options::options;
 use hil_core::case_study::ParameterError;
+use hil_core::options;
 use hil_core::time::{Instant, duration_ns};
 
 options! {
@@ -19,7 +19,7 @@ options! {
     #[derive(Copy, Eq)]
     pub struct RateLimit {
         /// Rate.
-        bits_per_second: u64, in 1_000..=100_000_000_000;
+        bits_per_second: u64, in 1_000..=100_000_000_000, hint "an integer, e.g. 10_000_000";
         /// Bytes that may wait, the message being sent included. By default what Linux gives a socket,
         /// twice over: a hundred full frames.
         queue_bytes: u64 = 150_000, in 64..=67_108_864;

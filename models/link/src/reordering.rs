@@ -3,7 +3,7 @@
 
 use core::time::Duration;
 
-use crate::options::options;
+use hil_core::options;
 use hil_core::random::RandomStream;
 
 /// Longest time a message is held back, or its copy comes later.

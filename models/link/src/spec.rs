@@ -26,15 +26,18 @@ use core::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::chain::LinkChain;
-use super::delay::DelayLaw;
+use super::delay::{DelayLaw, TIMES};
 use super::loss::LossLaw;
-use super::options::Options;
 use super::outages::Outages;
 use super::rate::RateLimit;
 use super::reordering::{Duplication, Reordering};
 use super::wifi::WifiSpec;
 use hil_core::case_study::ParameterError;
 use hil_core::link_model::LinkModel;
+use hil_core::options;
+use hil_core::options::{
+    Field, Kind, Options, Scalar as _, Setting, Shape, Short, Slot, Templates, short_table, table,
+};
 
 /// One direction of a link. The default does nothing.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -111,30 +114,12 @@ impl LinkSpec {
     /// # Errors
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
-        let mut spec = self.clone();
-        spec.outages.check()?;
-        if let Some(wifi) = &self.wifi {
+        let Self { outages, wifi, .. } = self;
+        outages.check()?;
+        if let Some(wifi) = wifi {
             wifi.check()?;
         }
-        spec.loss.check()?;
-        spec.delay.check()?;
-        let mut tables = spec.tables().into_iter();
-        tables.try_for_each(|(_, part)| part.check_all())
-    }
-
-    /// The parts that are tables of their own in files, by key, where they are there.
-    pub fn tables(&mut self) -> Vec<(&'static str, &mut dyn Options)> {
-        let mut tables: Vec<(&'static str, &mut dyn Options)> = Vec::new();
-        if let Some(rate) = &mut self.rate {
-            tables.push(("rate", rate));
-        }
-        if let Some(reordering) = &mut self.reordering {
-            tables.push(("reordering", reordering));
-        }
-        if let Some(duplication) = &mut self.duplication {
-            tables.push(("duplication", duplication));
-        }
-        tables
+        LinkParts::from(self).check()
     }
 
     /// The model of the channel at `place`, on a clock that reads zero when the run starts: the
@@ -193,4 +178,194 @@ impl LinkSpec {
         }
         parts.join(", ")
     }
+}
+
+options! {
+    /// The parts of a link that each direction can have of its own, as far as a file states them.
+    pub struct LinkParts {
+        /// How long a message is under way: a law with its options.
+        delay: Option<LinkDelay>;
+        /// What is lost by chance: a law with its options.
+        loss: Option<LossLaw>;
+        /// A rate with a queue in front of it.
+        rate: Option<RateLimit>;
+        /// Messages that are held back.
+        reordering: Option<Reordering>;
+        /// Messages that arrive twice.
+        duplication: Option<Duplication>;
+    }
+}
+
+impl LinkParts {
+    /// Those of one direction: its own, and where it has none those of both.
+    #[must_use]
+    pub fn or(self, both: &Self) -> Self {
+        let both = both.clone();
+        Self {
+            delay: self.delay.or(both.delay),
+            loss: self.loss.or(both.loss),
+            rate: self.rate.or(both.rate),
+            reordering: self.reordering.or(both.reordering),
+            duplication: self.duplication.or(both.duplication),
+        }
+    }
+}
+
+/// A link without outages and without a radio.
+impl From<LinkParts> for LinkSpec {
+    fn from(parts: LinkParts) -> Self {
+        let delay = parts.delay.unwrap_or(LinkDelay::UNSET);
+        Self {
+            loss: parts.loss.unwrap_or_default(),
+            rate: parts.rate,
+            delay: delay.law,
+            reorders: delay.reorders,
+            reordering: parts.reordering,
+            duplication: parts.duplication,
+            ..Self::default()
+        }
+    }
+}
+
+/// All of them but outages and radio, which both directions share.
+impl From<&LinkSpec> for LinkParts {
+    fn from(spec: &LinkSpec) -> Self {
+        Self {
+            delay: Some(LinkDelay {
+                law: spec.delay.clone(),
+                reorders: spec.reorders,
+            }),
+            loss: Some(spec.loss),
+            rate: spec.rate,
+            reordering: spec.reordering,
+            duplication: spec.duplication,
+        }
+    }
+}
+
+/// The delay of a link: a table that names a law, or a time alone for the same delay of all messages.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LinkDelay {
+    /// The law.
+    pub law: DelayLaw,
+    /// See [`LinkSpec::reorders`].
+    pub reorders: bool,
+}
+
+impl LinkDelay {
+    const fn of(law: DelayLaw) -> Self {
+        Self {
+            law,
+            reorders: false,
+        }
+    }
+}
+
+impl Options for LinkDelay {
+    fn fields(&mut self) -> Vec<Field<'_>> {
+        let is_fixed = self.law.is_fixed();
+        let mut fields = self.law.fields();
+        if !is_fixed {
+            fields.push(Field::new(
+                "reorders",
+                "Whether a message with a shorter delay overtakes the one before it. False makes it wait.",
+                self.reorders.slot(()),
+            ));
+        }
+        fields
+    }
+
+    fn check_together(&self) -> Result<(), ParameterError> {
+        self.law.check_together()
+    }
+}
+
+impl Short for LinkDelay {
+    const TEMPLATES: Option<Templates> = named_law(DelayLaw::NAMES);
+    const KEY: &'static str = "delay";
+    const ABOUT: &'static str = "The same delay of all messages.";
+
+    fn template(index: usize) -> Self {
+        Self::of(DelayLaw::named(DelayLaw::NAMES[index]).unwrap_or_default())
+    }
+
+    fn chosen(&self) -> Option<&'static str> {
+        Some(self.law.name())
+    }
+
+    fn shape() -> Shape {
+        Shape::Time(TIMES)
+    }
+
+    fn short(&self) -> Option<Setting> {
+        match &self.law {
+            DelayLaw::Fixed(law) => Some(Setting::Time(law.delay)),
+            _ => None,
+        }
+    }
+
+    fn of_short(setting: Setting) -> Result<Self, String> {
+        Ok(Self::of(DelayLaw::fixed(Duration::from_setting(setting)?)))
+    }
+}
+
+impl Short for LossLaw {
+    const TEMPLATES: Option<Templates> = named_law(Self::NAMES);
+    const KEY: &'static str = "loss_ratio";
+    const ABOUT: &'static str = "Share of the messages that is lost, each by itself.";
+
+    fn template(index: usize) -> Self {
+        Self::named(Self::NAMES[index]).unwrap_or_default()
+    }
+
+    fn chosen(&self) -> Option<&'static str> {
+        Some(self.name())
+    }
+
+    fn shape() -> Shape {
+        Shape::Number(0.0..=1.0)
+    }
+
+    fn short(&self) -> Option<Setting> {
+        match self {
+            Self::Bernoulli(law) => Some(Setting::Number(law.ratio)),
+            _ => None,
+        }
+    }
+
+    fn of_short(setting: Setting) -> Result<Self, String> {
+        Ok(Self::bernoulli(f64::from_setting(setting)?))
+    }
+}
+
+/// A table that names its law.
+const fn named_law(names: &'static [&'static str]) -> Option<Templates> {
+    Some(Templates {
+        key: "law",
+        names,
+        chosen: None,
+        is_required: true,
+    })
+}
+
+macro_rules! law_tables {
+    ($($kind:ty = $unset:expr;)*) => {$(
+        impl Kind for $kind {
+            type Range = ();
+            const UNSET: Self = $unset;
+
+            fn slot(&mut self, (): ()) -> Slot<'_> {
+                table(self)
+            }
+
+            fn optional(value: &mut Option<Self>, (): ()) -> Slot<'_> {
+                short_table(value)
+            }
+        }
+    )*};
+}
+
+law_tables! {
+    LinkDelay = Self::of(DelayLaw::fixed(Duration::ZERO));
+    LossLaw = Self::bernoulli(0.0);
 }

@@ -9,6 +9,7 @@ use crate::trace_offers::{OfferGrid, Offered};
 use crate::trace_ticks::Ticks;
 use hil_core::link_model::{Fate, LinkModel, MessageNumber, ReplayEvent, ReplayTally, TraceMatch};
 use hil_core::time::{Instant, RemoteInstant};
+use hil_core::words;
 
 /// A trace as far as a replay needs it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -49,17 +50,18 @@ pub enum ReplayFate {
     Unknown,
 }
 
-/// What a message meets that comes after the end of the trace.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum TraceEnd {
-    /// The trace from its beginning.
-    #[default]
-    Wrap,
-    /// A link that delivers at once.
-    Perfect,
-    /// A link that delivers nothing.
-    Lost,
+words! {
+    /// What a message meets that comes after the end of the trace.
+    #[derive(Default)]
+    pub enum TraceEnd {
+        /// The trace from its beginning.
+        #[default]
+        Wrap = "wrap",
+        /// A link that delivers at once.
+        Perfect = "perfect",
+        /// A link that delivers nothing.
+        Lost = "lost",
+    }
 }
 
 /// How a trace is replayed.

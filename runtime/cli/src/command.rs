@@ -168,8 +168,8 @@ fn run_command(
         Command::Top(args) => live_work::top(&args, registry, console),
         Command::Probe(args) => Ok(hil_probe::run(&args, console)),
         Command::Documents { folder } => documents::write(Cli::command(), &folder)
-            .and_then(|_paths| documents::write_schema(&hil_topology::schema(), &folder))
-            .and_then(|_path| documents::write_robot(&folder))
+            .and_then(|_paths| documents::write_keys(&folder))
+            .and_then(|()| documents::write_robot(&folder))
             .map(|_path| exit::RAN)
             .map_err(failed),
         Command::Sweep => {

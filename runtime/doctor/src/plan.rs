@@ -143,7 +143,7 @@ impl Plan {
     pub fn of(topology: &Topology, here: &[String]) -> Self {
         let is_here = |host: &Host| here.contains(&host.name);
         let mut plan = Self {
-            record_folder: PathBuf::from(&topology.run().record_folder),
+            record_folder: PathBuf::from(topology.run().record.as_ref()),
             ..Self::default()
         };
         for host in topology.hosts().iter().filter(|host| is_here(host)) {
@@ -159,10 +159,10 @@ impl Plan {
                     address,
                 }));
             plan.interfaces.extend(host.interface.clone());
-            if let Some(end) = &host.clock {
+            if let Some(end) = host.clock() {
                 plan.addresses.push(end.address);
                 plan.interfaces.extend(end.interface.clone());
-                plan.clock_end.get_or_insert_with(|| end.clone());
+                plan.clock_end.get_or_insert(end);
             }
             for process in topology.processes_on(&host.name) {
                 let key = format!("processes.{}", process.name);
@@ -199,9 +199,8 @@ impl Plan {
             for (host, address) in [(path.from, path.asking), (path.to, path.answering)] {
                 if is_here(host) {
                     let key = format!("hosts.{}.clock_port", host.name);
-                    let end = host.clock.as_ref();
                     plan.ports.push(WantedPort {
-                        interface: end.and_then(|end| end.interface.clone()),
+                        interface: host.clock_interface.clone(),
                         is_dispensable: true,
                         address_key: format!("hosts.{}.clock_address", host.name),
                         ..WantedPort::new(IpProtocol::Udp, host, address, &path.name(), key)
@@ -251,7 +250,7 @@ impl Plan {
     }
 
     fn pin(&mut self, of: &str, table: &str, execution: &Execution) {
-        self.pins.extend(execution.cpus.iter().map(|cpu| Pin {
+        self.pins.extend(execution.cpu.iter().map(|cpu| Pin {
             cpu: usize::from(*cpu),
             key: format!("{table}.cpu"),
             of: of.to_owned(),
@@ -286,7 +285,7 @@ impl Plan {
                 link: crossing.link.name.clone(),
                 channel: channel.name.clone(),
                 message_bytes: channel.message.size_bytes,
-                path_mtu_bytes: crossing.hop.path_mtu_bytes,
+                path_mtu_bytes: crossing.hop.socket.path_mtu_bytes,
                 own: from.gateway_address(),
                 header_bytes: capabilities.header_bytes(from.gateway_address()),
                 cut_by: capabilities.cuts_to_path.then_some(transport.label),

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
 use hil_topology::emulation::EmulationLaunch;
-use hil_topology::{AdapterKind, AdapterSend, RoleChannel, Timestamps};
+use hil_topology::{EgmAdapter, RoleChannel, SocketOptions};
 
 /// How to start one process of the run that this binary plays.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -151,18 +151,8 @@ pub struct SocketLaunch {
     pub options: BTreeMap<String, i64>,
     /// Interface to bind to.
     pub interface: Option<String>,
-    /// Differentiated-services code point (RFC 2474), 0..=63.
-    pub dscp: u8,
-    /// `SO_PRIORITY`.
-    pub priority: Option<u32>,
-    /// Send buffer to ask for.
-    pub send_buffer_bytes: usize,
-    /// Receive buffer to ask for.
-    pub receive_buffer_bytes: usize,
-    /// Largest IP packet of the path.
-    pub path_mtu_bytes: usize,
-    /// Kernel stamps to ask for.
-    pub timestamps: Timestamps,
+    /// What the topology says of it, whatever the transport.
+    pub common: SocketOptions,
 }
 
 /// What a process is told that speaks with a foreign program.
@@ -171,24 +161,14 @@ pub struct SocketLaunch {
 pub struct AdapterSettings {
     /// The role that the foreign program plays.
     pub role: String,
-    /// Which side of the protocol we are.
-    pub kind: AdapterKind,
-    /// Joints of an arm on the wire, 6 or 7.
-    pub axes: u8,
-    /// Generation of the robot's software, 6 or 7.
-    pub robotware: u8,
+    /// What the topology says of it.
+    pub egm: EgmAdapter,
     /// The robot's cycle as the case has it.
     pub cycle_ns: u64,
     /// How far its planned joints are ahead of the measured.
     pub planned_lead_ns: u64,
     /// How to wait.
     pub wait: WaitMode,
-    /// When a sensor adapter sends.
-    pub send: AdapterSend,
-    /// Kernel stamps to ask for.
-    pub timestamps: Timestamps,
-    /// Differentiated-services code point (RFC 2474), 0..=63.
-    pub dscp: u8,
     /// Interface to bind to.
     pub interface: Option<String>,
     /// One thread and one socket each.
@@ -198,17 +178,17 @@ pub struct AdapterSettings {
 }
 
 impl AdapterSettings {
-    /// [`AdapterSettings::axes`] in the words of the protocol.
+    /// [`EgmAdapter::axes`] in the words of the protocol.
     pub const fn axes(&self) -> Axes {
-        match self.axes {
+        match self.egm.axes {
             6 => Axes::Six,
             _ => Axes::Seven,
         }
     }
 
-    /// [`AdapterSettings::robotware`] in the words of the protocol.
+    /// [`EgmAdapter::robotware`] in the words of the protocol.
     pub const fn robotware(&self) -> RobotWare {
-        match self.robotware {
+        match self.egm.robotware {
             6 => RobotWare::Six,
             _ => RobotWare::Seven,
         }

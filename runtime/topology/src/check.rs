@@ -1,16 +1,15 @@
 //! What the tables say about each other: hosts and processes. Channels and links follow in
 //! `check_channels`. Nothing is read here; the result is the checked topology.
 
-use super::adapter::EgmAdapter;
 use super::check_adapter::{check_adapter, check_adapters, is_dispensable};
-use super::clock_path::{self, ClockEntry};
-use super::errors::{Fault, Faults, Place};
-use super::file::{CaseEntry, File, HostEntry, ProcessEntry};
+use super::check_channels;
+use super::checks::Checks;
+use super::clock_path;
+use super::errors::Fault;
 use super::known::{KnownCase, KnownCases, ParameterFault};
 use super::model::{Case, Host, OnExit, Process, Program, Topology};
-use super::reader::At;
-use super::tree::{Node, Table, Value, join, to_plain_table};
-use super::{check_channels, limits};
+use super::tables::{CaseTable, File, ProcessTable};
+use super::tree::{self, Table, Value, join, to_plain_table};
 
 /// Name of the host of a file without `[hosts]`.
 const IMPLICIT_HOST: &str = "local";
@@ -24,33 +23,29 @@ pub(super) enum Needs {
     Case,
 }
 
-/// Checks `file`; the result is meaningless if `faults` is not empty afterwards.
-pub(super) fn check(file: File<'_>, known: &KnownCases, needs: Needs, faults: &Faults) -> Topology {
-    let runs_nothing = file.processes.is_empty() && needs == Needs::Case;
-    let case_entry = file.case.as_ref();
-    let known_case = case_entry.and_then(|entry| find_case(entry, known, faults));
-    let case = match (case_entry, known_case) {
-        (Some(entry), Some(known)) => check_case(entry, known, file.run.seed, faults),
-        _ => None,
-    };
-    let (hosts, clock_entries) = check_hosts(file.hosts, faults);
+/// Checks `file`; the result is meaningless if anything is refused.
+pub(super) fn check(file: File, known: &KnownCases, needs: Needs, checks: &Checks<'_>) -> Topology {
+    if file.extends.is_some() {
+        // Layers take it out of files, so it can only come from an override.
+        checks.refuse_because("extends", "is read from files only, not from an override");
+    }
+    let runs_nothing = file.processes.0.is_empty() && needs == Needs::Case;
+    let known_case = file.case.as_ref();
+    let known_case = known_case.and_then(|case| find_case(case, known, checks));
+    let case = known_case.and_then(|known| check_case(known, file.run.seed, checks));
+    let hosts = check_hosts(file.hosts.0.into_iter(), checks);
     let roles = Roles {
         known: known_case,
-        has_case: case_entry.is_some(),
+        has_case: file.case.is_some(),
     };
-    if file.processes.is_empty() && !runs_nothing {
+    if file.processes.0.is_empty() && !runs_nothing {
         let hint = "a topology has at least one [processes.<name>]";
-        faults.add(
-            "processes",
-            Some(file.place),
-            Fault::Missing(hint.to_owned()),
-        );
+        checks.refuse_at("processes".to_owned(), "", Fault::Missing(hint.to_owned()));
     }
-    let processes = check_processes(&file.processes, &hosts, &roles, faults);
-    let written = case_entry.and_then(|entry| entry.parameters);
-    check_adapters(&file.processes, &processes, case.as_ref(), written, faults);
-    if let (Some(entry), Some(known), false) = (case_entry, known_case, runs_nothing) {
-        check_every_role_is_played(known, &processes, entry.place, faults);
+    let processes = check_processes(file.processes.0.into_iter(), &hosts, &roles, checks);
+    check_adapters(&processes, case.as_ref(), checks);
+    if let (Some(known), false) = (known_case, runs_nothing) {
+        check_every_role_is_played(known, &processes, checks);
     }
     let mut topology = Topology {
         name: file.name,
@@ -60,150 +55,107 @@ pub(super) fn check(file: File<'_>, known: &KnownCases, needs: Needs, faults: &F
         processes,
         channels: Vec::new(),
         links: Vec::new(),
-        security: file.security,
+        security: file.security.resolve(),
     };
+    let links = check_channels::routes(&file.links.0, checks);
     // Without the case, its channels would look like foreign ones.
-    if known_case.is_some() || case_entry.is_none() {
-        let tables = check_channels::Tables {
-            channels: &file.channels,
-            processes: &file.processes,
-        };
-        check_channels::check(&mut topology, known_case, tables, file.links, faults);
+    if known_case.is_some() || file.case.is_none() {
+        check_channels::check(&mut topology, known_case, &file.channels.0, links, checks);
     }
-    clock_path::check(&topology, &clock_entries, faults);
+    clock_path::check(&topology, checks);
     topology
 }
 
 fn find_case<'k>(
-    entry: &CaseEntry<'_>,
+    case: &CaseTable,
     known: &'k KnownCases,
-    faults: &Faults,
+    checks: &Checks<'_>,
 ) -> Option<&'k KnownCase> {
     let allowed = || known.names().map(str::to_owned).collect::<Vec<_>>();
-    let Some(name) = &entry.name else {
-        let fault = Fault::Missing(format!("one of {}", super::suggest::listed(&allowed())));
-        faults.add("case.name", Some(entry.place), fault);
+    let Some(name) = &case.name else {
+        let hint = format!("one of {}", super::suggest::listed(&allowed()));
+        checks.refuse("case.name", Fault::Missing(hint));
         return None;
     };
-    let case = known.get(&name.value);
-    if case.is_none() {
+    let found = known.get(name);
+    if found.is_none() {
         let fault = Fault::UnknownWord {
-            value: name.value.clone(),
+            value: name.clone(),
             expected: "a case study of this program",
             allowed: allowed(),
         };
-        faults.add("case.name", Some(name.place), fault);
+        checks.refuse("case.name", fault);
     }
-    case
+    found
 }
 
-fn check_case(
-    entry: &CaseEntry<'_>,
-    known: &KnownCase,
-    seed: u64,
-    faults: &Faults,
-) -> Option<Case> {
+fn check_case(known: &KnownCase, seed: u64, checks: &Checks<'_>) -> Option<Case> {
     let empty = Table::new();
-    let table = entry.parameters.unwrap_or(&empty);
-    match (known.check_parameters)(&to_plain_table(table), seed) {
-        Ok(parameters) => Some(Case {
-            name: known.name.to_owned(),
-            parameters,
-        }),
-        Err(found) => {
-            for fault in found {
-                add_parameter_fault(fault, table, entry.place, faults);
-            }
-            None
-        }
-    }
-}
-
-/// Finds the line of a parameter; a parameter left at its default has none, then the case's. A
-/// key may end in an index, as in `bays[2]`.
-fn add_parameter_fault(fault: ParameterFault, table: &Table, place: Place, faults: &Faults) {
-    let mut path = "case.parameters".to_owned();
-    let mut below = Some(table);
-    let mut deepest: Option<&Node> = None;
-    for step in &fault.key {
-        let (key, index) = split_index(step);
-        path = join(&path, key);
-        let node = below.and_then(|table| table.get(key));
-        let item = match (node.map(|node| &node.value), index) {
-            (Some(Value::Array(items)), Some(index)) => items.get(index),
-            _ => None,
-        };
-        if let Some(index) = index {
-            path = format!("{path}[{index}]");
-        }
-        let Some(node) = item.or(node) else {
-            break;
-        };
-        deepest = Some(node);
-        below = match &node.value {
-            Value::Table(table) => Some(table),
-            _ => None,
-        };
-    }
-    let place = deepest.map_or(place, |node| {
-        if fault.is_unknown_key {
-            node.key_place
-        } else {
-            node.place
-        }
-    });
-    let fault = if fault.is_unknown_key {
-        Fault::UnknownKey {
-            allowed: fault.valid_keys,
-        }
-    } else {
-        Fault::Parameter(fault.message)
+    let table = match tree::find(checks.tree, "case.parameters").map(|node| &node.value) {
+        Some(Value::Table(table)) => table,
+        _ => &empty,
     };
-    faults.add(path, Some(place), fault);
+    let checked = (known.check_parameters)(&to_plain_table(table), seed);
+    let refuse = |found: Vec<ParameterFault>| {
+        for fault in found {
+            refuse_parameter(fault, checks);
+        }
+    };
+    let parameters = checked.map_err(refuse).ok()?;
+    Some(Case {
+        name: known.name.to_owned(),
+        parameters,
+    })
 }
 
-/// `bays[2]` as `bays` and 2.
-fn split_index(step: &str) -> (&str, Option<usize>) {
-    let parts = step.strip_suffix(']').and_then(|rest| rest.split_once('['));
-    let found = parts.and_then(|(key, index)| Some((key, index.parse().ok()?)));
-    found.map_or((step, None), |(key, index)| (key, Some(index)))
-}
-
-/// The hosts, and where the clock address of each stands.
-fn check_hosts(entries: Vec<HostEntry>, faults: &Faults) -> (Vec<Host>, Vec<Option<ClockEntry>>) {
-    if entries.is_empty() {
-        let host = Host {
-            name: IMPLICIT_HOST.to_owned(),
-            address: None,
-            interface: None,
-            control_port: u16::try_from(limits::HOST_CONTROL_PORT.default)
-                .expect("a default port is within 1..=65535"),
-            clock: None,
-        };
-        return (vec![host], vec![None]);
+/// A parameter left at its default has no line: then the fault is at that of its table.
+fn refuse_parameter(fault: ParameterFault, checks: &Checks<'_>) {
+    let (keys, last) = match fault.key.split_last() {
+        Some((last, keys)) => (keys, last),
+        None => return checks.refuse("case.parameters", Fault::Parameter(fault.message)),
+    };
+    // A key may end in an index, as in `bays[2]`, which needs no quotes.
+    let below = |path: String, step: &String| match step.split_once('[') {
+        Some((key, index)) => format!("{}[{index}", join(&path, key)),
+        None => join(&path, step),
+    };
+    let table = keys.iter().fold("case.parameters".to_owned(), below);
+    if fault.is_unknown_key {
+        let allowed = fault.valid_keys;
+        checks.refuse_key(&table, last, Fault::UnknownKey { allowed });
+    } else {
+        checks.refuse(below(table, last), Fault::Parameter(fault.message));
     }
-    let with_address = entries.iter().find(|entry| entry.host.address.is_some());
-    let with_address = with_address.map(|entry| entry.host.name.clone());
-    for (index, entry) in entries.iter().enumerate() {
-        let host = &entry.host;
-        let key = join(&entry.path, "address");
-        if let (None, Some(other)) = (host.address, &with_address) {
-            let hint = format!("host `{other}` has one, so every host needs one");
-            faults.add(key, Some(entry.place), Fault::Missing(hint));
+}
+
+/// The hosts by name.
+fn check_hosts(tables: impl Iterator<Item = (String, Host)>, checks: &Checks<'_>) -> Vec<Host> {
+    let named = |(name, host)| Host { name, ..host };
+    let hosts: Vec<Host> = tables.map(named).collect();
+    if hosts.is_empty() {
+        let name = IMPLICIT_HOST.to_owned();
+        return vec![named((name, Host::TEMPLATE))];
+    }
+    let with_address = hosts.iter().find(|host| host.address.is_some());
+    for (index, host) in hosts.iter().enumerate() {
+        let key = join(&join("hosts", &host.name), "address");
+        if let (None, Some(other)) = (host.address, with_address) {
+            let hint = format!("host `{}` has one, so every host needs one", other.name);
+            checks.refuse(key, Fault::Missing(hint));
             continue;
         }
-        let same = |earlier: &&HostEntry| {
-            host.control_address().is_some()
-                && earlier.host.control_address() == host.control_address()
+        let same = |earlier: &&Host| {
+            host.control_address().is_some() && earlier.control_address() == host.control_address()
         };
-        if let Some(earlier) = entries[..index].iter().find(same) {
-            let other = &earlier.host.name;
-            let fault = format!("and control_port are those of host `{other}` already");
-            faults.add(key, Some(entry.place), Fault::Inconsistent(fault));
+        if let Some(earlier) = hosts[..index].iter().find(same) {
+            let other = &earlier.name;
+            checks.refuse_because(
+                key,
+                format!("and control_port are those of host `{other}` already"),
+            );
         }
     }
-    let hosts = entries.into_iter().map(|entry| (entry.host, entry.clock));
-    hosts.unzip()
+    hosts
 }
 
 /// What a process may say as its role.
@@ -213,132 +165,117 @@ struct Roles<'k> {
 }
 
 fn check_processes(
-    entries: &[ProcessEntry],
+    tables: impl Iterator<Item = (String, ProcessTable)>,
     hosts: &[Host],
     roles: &Roles<'_>,
-    faults: &Faults,
+    checks: &Checks<'_>,
 ) -> Vec<Process> {
     let mut processes: Vec<Process> = Vec::new();
-    for entry in entries {
-        let role = entry
-            .role
-            .as_ref()
-            .and_then(|role| check_role(entry, role, roles, &processes, faults));
-        let adapter = entry.egm.as_ref().zip(roles.known).zip(role.as_ref());
-        let adapter =
-            adapter.and_then(|((adapter, case), role)| check_adapter(adapter, role, case, faults));
+    for (name, table) in tables {
+        let path = join("processes", &name);
+        let role = check_role(&table, &path, roles, &processes, checks);
+        let adapter = table.egm.zip(roles.known).zip(role.as_ref());
+        let adapter = adapter.and_then(|((adapter, case), role)| {
+            check_adapter(adapter, &join(&path, "egm"), role, case, checks)
+        });
+        let program = match (table.run, role, adapter) {
+            (Some(command), role, _) => Program::Command {
+                role,
+                command,
+                environment: table.env,
+            },
+            (None, Some(role), Some(adapter)) => Program::Egm { role, adapter },
+            (None, role, _) => Program::BuiltIn {
+                role: role.unwrap_or_default(),
+            },
+        };
         processes.push(Process {
-            name: entry.name.clone(),
-            host: check_host(entry, hosts, faults),
-            program: program(entry, role, adapter),
-            execution: entry.execution.clone(),
-            on_exit: entry.on_exit,
+            name,
+            host: check_host(table.host, &path, hosts, checks),
+            program,
+            execution: table.execution,
+            restarts: table.restarts,
         });
     }
     processes
 }
 
-fn program(entry: &ProcessEntry, role: Option<String>, adapter: Option<EgmAdapter>) -> Program {
-    match (&entry.command, role, adapter) {
-        (Some(command), role, _) => Program::Command {
-            role,
-            command: command.clone(),
-            environment: entry.environment.clone(),
-        },
-        (None, Some(role), Some(adapter)) => Program::Egm { role, adapter },
-        (None, role, _) => Program::BuiltIn {
-            role: role.unwrap_or_default(),
-        },
-    }
-}
-
 fn check_role(
-    entry: &ProcessEntry,
-    role: &At<String>,
+    table: &ProcessTable,
+    path: &str,
     roles: &Roles<'_>,
     earlier: &[Process],
-    faults: &Faults,
+    checks: &Checks<'_>,
 ) -> Option<String> {
-    let add = |fault| faults.add(join(&entry.path, "role"), Some(role.place), fault);
+    let role = table.role.as_ref()?;
+    let refuse = |fault| checks.refuse(join(path, "role"), fault);
     let Some(case) = roles.known else {
         if !roles.has_case {
-            add(Fault::Inconsistent(format!(
-                "`{}` needs a [case] that has this role",
-                role.value
-            )));
+            let fault = format!("`{role}` needs a [case] that has this role");
+            refuse(Fault::Inconsistent(fault));
         }
         return None;
     };
-    if !case.roles.contains(&role.value.as_str()) {
-        add(Fault::UnknownWord {
-            value: role.value.clone(),
+    if !case.roles.contains(&role.as_str()) {
+        refuse(Fault::UnknownWord {
+            value: role.clone(),
             expected: "a role of the case",
             allowed: case.roles.iter().map(|&role| role.to_owned()).collect(),
         });
         return None;
     }
     // An adapter knows nothing of the world that it could be wrong about.
-    let has_memory = entry.egm.is_none();
-    if !case.may_restart && has_memory && entry.on_exit != OnExit::EndRun {
+    let has_memory = table.egm.is_none();
+    if !case.may_restart && has_memory && table.restarts.on_exit() != OnExit::EndRun {
         let problem = format!(
             "a role of case {} started anew would be wrong about the world; use \"end-run\"",
             case.name
         );
-        let key = join(&entry.path, "on_exit");
-        faults.add(key, Some(role.place), Fault::Inconsistent(problem));
+        checks.refuse_because(join(path, "on_exit"), problem);
     }
-    let same = |process: &&Process| process.role() == Some(&role.value);
+    let same = |process: &&Process| process.role() == Some(role);
     if let Some(other) = earlier.iter().find(same) {
-        let (role, other) = (&role.value, &other.name);
-        add(Fault::Inconsistent(format!(
-            "`{role}` is played by process `{other}` already"
-        )));
+        let fault = format!("`{role}` is played by process `{}` already", other.name);
+        refuse(Fault::Inconsistent(fault));
     }
-    Some(role.value.clone())
+    Some(role.clone())
 }
 
-fn check_host(entry: &ProcessEntry, hosts: &[Host], faults: &Faults) -> String {
-    let names = || {
-        hosts
-            .iter()
-            .map(|host| host.name.clone())
-            .collect::<Vec<_>>()
-    };
-    let key = join(&entry.path, "host");
-    let Some(host) = &entry.host else {
+fn check_host(host: Option<String>, path: &str, hosts: &[Host], checks: &Checks<'_>) -> String {
+    let names = || hosts.iter().map(|host| host.name.clone());
+    let key = join(path, "host");
+    let Some(host) = host else {
         if let [only] = hosts {
             return only.name.clone();
         }
-        let hint = format!("one of {}", super::suggest::listed(&names()));
-        faults.add(key, Some(entry.place), Fault::Missing(hint));
+        let hint = format!(
+            "one of {}",
+            super::suggest::listed(&names().collect::<Vec<_>>())
+        );
+        checks.refuse(key, Fault::Missing(hint));
         return String::new();
     };
-    if !hosts.iter().any(|known| known.name == host.value) {
+    if !hosts.iter().any(|known| known.name == host) {
         let fault = Fault::UnknownWord {
-            value: host.value.clone(),
+            value: host.clone(),
             expected: "a host of this file",
-            allowed: names(),
+            allowed: names().collect(),
         };
-        faults.add(key, Some(host.place), fault);
+        checks.refuse(key, fault);
     }
-    host.value.clone()
+    host
 }
 
-fn check_every_role_is_played(
-    case: &KnownCase,
-    processes: &[Process],
-    place: Place,
-    faults: &Faults,
-) {
+fn check_every_role_is_played(case: &KnownCase, processes: &[Process], checks: &Checks<'_>) {
     for role in case.roles {
         let is_played = |process: &Process| process.role() == Some(role);
         // A role that a faulty process meant to play is not missing.
         if !processes.iter().any(is_played)
-            && faults.is_empty()
+            && checks.is_clean()
             && !is_dispensable(role, case, processes)
         {
             let hint = format!("no process plays role `{role}` of case `{}`", case.name);
-            faults.add("processes", Some(place), Fault::Missing(hint));
+            checks.refuse_at("processes".to_owned(), "case", Fault::Missing(hint));
         }
     }
 }

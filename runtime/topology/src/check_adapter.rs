@@ -5,12 +5,12 @@ use hil_arm::egm::messages::{EgmCommand, EgmFeedback, Side};
 use hil_core::case_study::ChannelSpec;
 use hil_core::message::Message;
 
-use super::adapter::{AdapterEntry, AdapterKind, EgmAdapter};
-use super::errors::{Fault, Faults};
-use super::file::ProcessEntry;
+use super::adapter::{AdapterKind, EgmAdapter, ROBOT_SENDS};
+use super::checks::Checks;
+use super::errors::Fault;
 use super::known::KnownCase;
 use super::model::{Case, Process, Program};
-use super::tree::{Table, Value, join};
+use super::tree::join;
 
 /// The channel with the commands to one arm, by its name in every case.
 pub const fn command_channel(side: Side) -> &'static str {
@@ -30,10 +30,11 @@ pub const fn feedback_channel(side: Side) -> &'static str {
 
 /// The adapter of a process that plays `role` of `case`.
 pub(super) fn check_adapter(
-    entry: &AdapterEntry,
+    mut adapter: EgmAdapter,
+    path: &str,
     role: &str,
     case: &KnownCase,
-    faults: &Faults,
+    checks: &Checks<'_>,
 ) -> Option<EgmAdapter> {
     let Some(kind) = kind_of(role, case) else {
         let roles = case
@@ -47,34 +48,20 @@ pub(super) fn check_adapter(
             format!("only {} does", roles.join(" or "))
         };
         let fault = format!("needs a role that speaks EGM, which `{role}` does not: {allowed}");
-        faults.add(
-            entry.path.clone(),
-            Some(entry.place),
-            Fault::Inconsistent(fault),
-        );
+        checks.refuse_because(path, fault);
         return None;
     };
-    if kind == AdapterKind::Robot && entry.says_when_to_send {
-        let fault = "does not apply to a robot adapter, which sends with every cycle of the robot";
-        let key = join(&entry.path, "send");
-        faults.add(
-            key,
-            Some(entry.place),
-            Fault::Inconsistent(fault.to_owned()),
-        );
+    adapter.kind = kind;
+    if kind == AdapterKind::Robot {
+        checks.refuse_present(path, ["send", "send_hz"], ROBOT_SENDS);
     }
-    if kind == AdapterKind::Sensor && entry.axes == 6 {
+    if kind == AdapterKind::Sensor && adapter.axes == 6 {
         let fault = "is 6, but our controller moves seven joints: a robot of six axes would not \
                      follow J7 and does not measure it; allowed in a sensor adapter: 7";
-        let key = join(&entry.path, "axes");
-        faults.add(
-            key,
-            Some(entry.place),
-            Fault::Inconsistent(fault.to_owned()),
-        );
+        checks.refuse_because(join(path, "axes"), fault);
     }
     if kind == AdapterKind::Robot
-        && let Some((side, address)) = entry
+        && let Some((side, address)) = adapter
             .addresses()
             .find(|(_, address)| address.ip().is_unspecified())
     {
@@ -82,19 +69,17 @@ pub(super) fn check_adapter(
             "\"{address}\" is no address to send to; write that of the host with the foreign \
              program"
         );
-        let key = join(&entry.path, side.word());
-        faults.add(key, Some(entry.place), Fault::Inconsistent(fault));
+        checks.refuse_because(join(path, side.word()), fault);
     }
-    for (side, _) in entry.addresses() {
+    for (side, _) in adapter.addresses() {
         for (name, message) in wire(side) {
             if !case.channels.iter().any(|spec| is(spec, name, message)) {
                 let fault = format!("case `{}` has no channel {name} of {message}", case.name);
-                let key = join(&entry.path, side.word());
-                faults.add(key, Some(entry.place), Fault::Inconsistent(fault));
+                checks.refuse_because(join(path, side.word()), fault);
             }
         }
     }
-    Some(entry.adapter(kind))
+    Some(adapter)
 }
 
 /// Both channels of an arm with the messages they must carry.
@@ -147,58 +132,43 @@ pub(super) fn is_played_by_adapter(process: &Process) -> bool {
     matches!(process.program, Program::Egm { .. })
 }
 
-/// Checks the adapters of all processes against each other and against the case's parameters: all of
-/// them, and those that the file writes, with their places.
-pub(super) fn check_adapters(
-    entries: &[ProcessEntry],
-    processes: &[Process],
-    case: Option<&Case>,
-    written: Option<&Table>,
-    faults: &Faults,
-) {
+/// Checks the adapters of all processes against each other and against the case's parameters.
+pub(super) fn check_adapters(processes: &[Process], case: Option<&Case>, checks: &Checks<'_>) {
     let mut taken = Vec::new();
-    for (entry, process) in entries.iter().zip(processes) {
-        let (Some(table), Program::Egm { adapter, .. }) = (&entry.egm, &process.program) else {
+    for process in processes {
+        let Program::Egm { adapter, .. } = &process.program else {
             continue;
         };
-        for (side, address) in table.addresses() {
+        let path = join(&join("processes", &process.name), "egm");
+        for (side, address) in adapter.addresses() {
             if let Some((other, _)) = taken.iter().find(|(_, known)| *known == address) {
                 let fault = format!("\"{address}\" is an address of process `{other}` already");
-                let key = join(&table.path, side.word());
-                faults.add(key, Some(table.place), Fault::Inconsistent(fault));
+                checks.refuse_because(join(&path, side.word()), fault);
             }
             if adapter.kind == AdapterKind::Sensor {
                 taken.push((process.name.clone(), address));
             }
         }
         if adapter.kind == AdapterKind::Robot {
-            check_sessions(table, case, written, faults);
+            check_sessions(&path, case, checks);
         }
     }
 }
 
 /// The maker's protocol has no word for starting a session, so nobody could ask for the first one,
 /// nor for another after a session ended.
-fn check_sessions(
-    entry: &AdapterEntry,
-    case: Option<&Case>,
-    written: Option<&Table>,
-    faults: &Faults,
-) {
+fn check_sessions(path: &str, case: Option<&Case>, checks: &Checks<'_>) {
     let Some(case) = case else { return };
     let value = |key| case.parameters.get("egm")?.get(key)?.as_str();
     let why = "but a foreign program cannot request a session (EGM has no word for it)";
     let refuse = |key: &str, value: &str, allowed: &str| {
-        let node = written.and_then(|table| match &table.get("egm")?.value {
-            Value::Table(egm) => egm.get(key),
-            _ => None,
-        });
-        let place = node.map_or(entry.place, |node| node.place);
-        let by_default = if node.is_none() { " by default" } else { "" };
+        let parameter = join("case.parameters.egm", key);
+        let is_written = checks.has(&parameter);
+        let by_default = if is_written { "" } else { " by default" };
         let fault =
             format!("is \"{value}\"{by_default}, {why}; allowed beside a robot adapter: {allowed}");
-        let key = join("case.parameters.egm", key);
-        faults.add(key, Some(place), Fault::Inconsistent(fault));
+        let place = if is_written { parameter.as_str() } else { path };
+        checks.refuse_at(parameter.clone(), place, Fault::Inconsistent(fault));
     };
     let start = value("start").unwrap_or("request");
     if start != "power-on" {

@@ -1,43 +1,50 @@
 //! What channels and links say about processes and hosts: which process ends a channel, which
 //! link carries it, and which ports links take. See `check`.
 
+use std::collections::BTreeMap;
+
 use hil_core::case_study::ChannelSpec;
 
 use super::check_adapter::is_played_by_adapter;
-use super::errors::{Fault, Faults, Place};
-use super::file::{ChannelEntry, ProcessEntry};
-use super::file_links::{LinkEntry, crossing_words};
+use super::checks::Checks;
+use super::errors::Fault;
 use super::known::KnownCase;
+use super::links::{Link, LinkTable, Via, crossing_words};
 use super::model::{Channel, Host, LinkPorts, MessageLayout, Process, Program, Topology};
-use super::model_links::{Link, Via};
-use super::reader::At;
+use super::tables::ChannelTable;
 use super::tree::join;
 
-/// The tables that say where a channel goes.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Tables<'a> {
-    pub channels: &'a [ChannelEntry],
-    pub processes: &'a [ProcessEntry],
+/// The links by name, each checked by itself.
+pub(super) fn routes<'a>(
+    links: &'a BTreeMap<String, LinkTable>,
+    checks: &Checks<'_>,
+) -> Vec<Route<'a>> {
+    let route = |(name, table): (&'a String, &'a LinkTable)| Route {
+        name,
+        via: table.via(&join("links", name), checks),
+        named: table.hosts(),
+        used: None,
+    };
+    links.iter().map(route).collect()
 }
 
 /// Fills in channels and links.
 pub(super) fn check(
     topology: &mut Topology,
     case: Option<&KnownCase>,
-    tables: Tables<'_>,
-    links: Vec<LinkEntry>,
-    faults: &Faults,
+    tables: &BTreeMap<String, ChannelTable>,
+    links: Vec<Route<'_>>,
+    checks: &Checks<'_>,
 ) {
-    let entries = tables.channels;
     let mut channels = case.map_or(Vec::new(), |case| {
-        case_channels(case, &topology.processes, entries, faults)
+        case_channels(case, &topology.processes, tables, checks)
     });
     let of_case: Vec<_> = case.map_or(Vec::new(), |case| {
         case.channels.iter().map(|spec| spec.name).collect()
     });
-    for entry in entries {
-        if !of_case.contains(&entry.name.as_str()) {
-            channels.extend(foreign_channel(entry, topology, &of_case, faults));
+    for (name, table) in tables {
+        if !of_case.contains(&name.as_str()) {
+            channels.extend(foreign_channel(name, table, topology, &of_case, checks));
         }
     }
     for (index, channel) in channels.iter_mut().enumerate() {
@@ -45,45 +52,31 @@ pub(super) fn check(
     }
     let mut routes = Routes {
         topology,
-        links: &links,
-        tables,
-        between: vec![None; links.len()],
-        faults,
+        links,
+        checks,
     };
     for channel in &mut channels {
         routes.assign(channel);
     }
-    let mut between = core::mem::take(&mut routes.between);
     routes.check_named_hosts();
-    check_port_ranges(topology, &links, &between, faults);
+    routes.check_port_ranges();
+    let links = core::mem::take(&mut routes.links);
     topology.channels = channels;
-    topology.links = links
-        .into_iter()
-        .zip(&mut between)
-        .map(|(entry, between)| Link {
-            name: entry.name,
-            // A missing `via` is a fault already, so this link is never seen.
-            via: entry.via.unwrap_or(Via::SharedMemory),
-            between: entry
-                .between
-                .map(|hosts| hosts.map(|host| host.value))
-                .or_else(|| between.take()),
-        })
-        .collect();
+    topology.links = links.into_iter().map(Route::into_link).collect();
 }
 
 /// The channels of the case, with what the file says about them.
 fn case_channels(
     case: &KnownCase,
     processes: &[Process],
-    entries: &[ChannelEntry],
-    faults: &Faults,
+    tables: &BTreeMap<String, ChannelTable>,
+    checks: &Checks<'_>,
 ) -> Vec<Channel> {
     let mut channels = Vec::new();
     for spec in case.channels {
-        let entry = entries.iter().find(|entry| entry.name == spec.name);
-        if let Some(entry) = entry {
-            check_case_entry(case, spec, entry, faults);
+        let table = tables.get(spec.name);
+        if let Some(table) = table {
+            check_case_table(case, spec, table, checks);
         }
         let player = |role| {
             processes
@@ -95,9 +88,18 @@ fn case_channels(
         // A foreign program leaves nothing in our record.
         let is_recorded_here = spec.is_recorded_only() && !from.is_some_and(is_played_by_adapter);
         let Some(from) = from.filter(|_| to.is_some() || is_recorded_here) else {
-            refuse_unplayed(spec, entry, faults);
+            if table.is_some() && checks.is_clean() {
+                // A setting of a channel that is not there would be ignored in silence.
+                let fault = format!(
+                    "has nothing to set: no process of this file plays role `{}`, so the channel is \
+                     not there",
+                    spec.from
+                );
+                checks.refuse_because(join("channels", spec.name), fault);
+            }
             continue;
         };
+        let depth = table.map_or(ChannelTable::TEMPLATE.depth, |table| table.depth);
         channels.push(Channel {
             channel_id: 0,
             name: spec.name.to_owned(),
@@ -108,12 +110,8 @@ fn case_channels(
             },
             from: from.name.clone(),
             to: to.map(|to| to.name.clone()),
-            depth: match (spec.is_recorded_only(), entry) {
-                (true, _) => 0,
-                (false, Some(entry)) => entry.depth,
-                (false, None) => ChannelEntry::default_depth(),
-            },
-            link: entry.and_then(ChannelEntry::link_name),
+            depth: if spec.is_recorded_only() { 0 } else { depth },
+            link: table.and_then(|table| table.link.clone()),
             is_carried: false,
             is_foreign: false,
         });
@@ -121,104 +119,87 @@ fn case_channels(
     channels
 }
 
-/// A setting of a channel that is not there would be ignored in silence.
-fn refuse_unplayed(spec: &ChannelSpec, entry: Option<&ChannelEntry>, faults: &Faults) {
-    let Some(entry) = entry.filter(|_| faults.is_empty()) else {
-        return;
-    };
-    let fault = format!(
-        "has nothing to set: no process of this file plays role `{}`, so the channel is not there",
-        spec.from
-    );
-    faults.add(
-        entry.path.clone(),
-        Some(entry.place),
-        Fault::Inconsistent(fault),
-    );
-}
-
 /// What the file may say of a channel that the case declares.
-fn check_case_entry(case: &KnownCase, spec: &ChannelSpec, entry: &ChannelEntry, faults: &Faults) {
-    let places = [
-        (
-            "message",
-            entry.message.as_ref().map(|message| message.place),
-        ),
-        ("from", entry.from.as_ref().map(|from| from.place)),
-        ("to", entry.to.as_ref().map(|to| to.place)),
+fn check_case_table(
+    case: &KnownCase,
+    spec: &ChannelSpec,
+    table: &ChannelTable,
+    checks: &Checks<'_>,
+) {
+    let path = join("channels", spec.name);
+    let is_stated = [
+        ("message", table.message.is_some()),
+        ("from", table.from.is_some()),
+        ("to", table.to.is_some()),
     ];
-    for (key, place) in places {
-        if place.is_some() {
-            let fault = format!("is given by case `{}` for this channel", case.name);
-            faults.add(join(&entry.path, key), place, Fault::Inconsistent(fault));
-        }
+    for (key, _) in is_stated.into_iter().filter(|(_, is_stated)| *is_stated) {
+        let fault = format!("is given by case `{}` for this channel", case.name);
+        checks.refuse_because(join(&path, key), fault);
     }
     if !spec.is_recorded_only() {
         return;
     }
     let why = "the messages of this channel only go to the run's record, on the host of their \
                producer";
-    if let Some(link) = &entry.link {
-        let fault = Fault::Inconsistent(format!("is `{}`, but {why}", link.value));
-        faults.add(join(&entry.path, "link"), Some(link.place), fault);
+    if let Some(link) = &table.link {
+        checks.refuse_because(join(&path, "link"), format!("is `{link}`, but {why}"));
     } else {
-        let fault = Fault::Inconsistent(format!("has nothing to set: {why}"));
-        faults.add(entry.path.clone(), Some(entry.place), fault);
+        checks.refuse_because(path, format!("has nothing to set: {why}"));
     }
 }
 
 /// A channel between the user's own programs.
 fn foreign_channel(
-    entry: &ChannelEntry,
+    name: &str,
+    table: &ChannelTable,
     topology: &Topology,
     of_case: &[&str],
-    faults: &Faults,
+    checks: &Checks<'_>,
 ) -> Option<Channel> {
-    let is_declared = entry.message.is_some() || entry.from.is_some() || entry.to.is_some();
+    let path = join("channels", name);
+    let is_declared = table.message.is_some() || table.from.is_some() || table.to.is_some();
     if !is_declared && !of_case.is_empty() {
         // Far more often a slip in a name than a foreign channel without any of its keys.
         let fault = Fault::UnknownWord {
-            value: entry.name.clone(),
+            value: name.to_owned(),
             expected: "a channel of the case; a foreign one states message, from and to",
             allowed: of_case.iter().map(|&name| name.to_owned()).collect(),
         };
-        faults.add(entry.path.clone(), Some(entry.place), fault);
+        checks.refuse(path, fault);
         return None;
     }
-    if entry.message.is_none() {
+    if table.message.is_none() {
         let hint = "a foreign channel states { name, size_bytes, alignment_bytes }";
-        let key = join(&entry.path, "message");
-        faults.add(key, Some(entry.place), Fault::Missing(hint.to_owned()));
+        checks.refuse(join(&path, "message"), Fault::Missing(hint.to_owned()));
     }
-    let from = check_end(entry, "from", entry.from.as_ref(), topology, faults);
-    let to = check_end(entry, "to", entry.to.as_ref(), topology, faults);
+    let from = check_end(join(&path, "from"), table.from.as_ref(), topology, checks);
+    let to = check_end(join(&path, "to"), table.to.as_ref(), topology, checks);
     let (from, to) = (from?, to?);
     if from == to {
-        let fault = Fault::Inconsistent(format!("is process `{to}`, as is `from`"));
-        let place = entry.to.as_ref().map(|end| end.place);
-        faults.add(join(&entry.path, "to"), place, fault);
+        checks.refuse_because(
+            join(&path, "to"),
+            format!("is process `{to}`, as is `from`"),
+        );
     }
     Some(Channel {
         channel_id: 0,
-        name: entry.name.clone(),
-        message: entry.message.as_ref()?.value.clone(),
+        name: name.to_owned(),
+        message: table.message.clone()?,
         from,
         to: Some(to),
-        depth: entry.depth,
-        link: entry.link_name(),
+        depth: table.depth,
+        link: table.link.clone(),
         is_carried: false,
         is_foreign: true,
     })
 }
 
 fn check_end(
-    entry: &ChannelEntry,
-    key: &str,
-    end: Option<&At<String>>,
+    path: String,
+    end: Option<&String>,
     topology: &Topology,
-    faults: &Faults,
+    checks: &Checks<'_>,
 ) -> Option<String> {
-    let path = join(&entry.path, key);
     let own = |process: &&Process| matches!(process.program, Program::Command { .. });
     let names = || {
         let own = topology.processes.iter().filter(own);
@@ -226,36 +207,58 @@ fn check_end(
     };
     let Some(end) = end else {
         let hint = "a foreign channel states from and to which process it goes".to_owned();
-        faults.add(path, Some(entry.place), Fault::Missing(hint));
+        checks.refuse(path, Fault::Missing(hint));
         return None;
     };
-    let fault = match topology.process(&end.value) {
-        Some(process) if own(&process) => return Some(end.value.clone()),
+    let fault = match topology.process(end) {
+        Some(process) if own(&process) => return Some(end.clone()),
         Some(_) => Fault::Inconsistent(format!(
-            "is process `{}`, a built-in role, which has the channels of its case only",
-            end.value
+            "is process `{end}`, a built-in role, which has the channels of its case only"
         )),
         None => Fault::UnknownWord {
-            value: end.value.clone(),
+            value: end.clone(),
             expected: "a process of this file with `run`",
             allowed: names(),
         },
     };
-    faults.add(path, Some(end.place), fault);
+    checks.refuse(path, fault);
     None
 }
 
-/// Which link carries which channel.
-struct Routes<'a> {
-    topology: &'a Topology,
-    links: &'a [LinkEntry],
-    tables: Tables<'a>,
-    /// Hosts of each link, in alphabetical order, from the first channel that uses it.
-    between: Vec<Option<[String; 2]>>,
-    faults: &'a Faults,
+/// A link on its way to being checked.
+#[derive(Debug)]
+pub(super) struct Route<'a> {
+    name: &'a String,
+    /// `None` when `via` is missing or faulty.
+    via: Option<Via>,
+    /// As the file has them.
+    named: Option<[&'a String; 2]>,
+    /// Its hosts in alphabetical order, from the first channel that uses it.
+    used: Option<[String; 2]>,
 }
 
-impl Routes<'_> {
+impl Route<'_> {
+    fn into_link(self) -> Link {
+        Link {
+            name: self.name.clone(),
+            // A missing `via` is a fault already, so this link is never seen.
+            via: self.via.unwrap_or(Via::SharedMemory),
+            between: self
+                .named
+                .map(|hosts| hosts.map(String::clone))
+                .or(self.used),
+        }
+    }
+}
+
+/// Which link carries which channel.
+struct Routes<'t, 'l> {
+    topology: &'t Topology,
+    links: Vec<Route<'l>>,
+    checks: &'t Checks<'t>,
+}
+
+impl Routes<'_, '_> {
     /// Checks the link of `channel` against the hosts of its ends.
     fn assign(&mut self, channel: &mut Channel) {
         let host_of = |name: &str| self.topology.process(name).map(|process| &process.host);
@@ -297,12 +300,12 @@ impl Routes<'_> {
 
     fn carry(&mut self, channel: &mut Channel, index: usize, hosts: [String; 2]) {
         let link = &self.links[index];
-        let given = link.between.as_ref().map(|between| {
-            let mut given = between.clone().map(|host| host.value);
+        let given = link.named.map(|between| {
+            let mut given = between.map(String::clone);
             given.sort_unstable();
             given
         });
-        let between = given.or_else(|| self.between[index].clone());
+        let between = given.or_else(|| link.used.clone());
         if let Some([first, second]) = between.filter(|between| *between != hosts) {
             let [from, to] = &hosts;
             let fault = Fault::Inconsistent(format!(
@@ -313,7 +316,7 @@ impl Routes<'_> {
             self.refuse(channel, fault);
             return;
         }
-        self.between[index] = Some(hosts);
+        self.links[index].used = Some(hosts);
         channel.is_carried = true;
     }
 
@@ -322,7 +325,7 @@ impl Routes<'_> {
         let Some(name) = &channel.link else {
             return Ok(None);
         };
-        let index = self.links.iter().position(|link| link.name == *name);
+        let index = self.links.iter().position(|link| link.name == name);
         if index.is_none() {
             let fault = Fault::UnknownWord {
                 value: name.clone(),
@@ -353,81 +356,70 @@ impl Routes<'_> {
 
     /// Points at the channel's own table or, without one, at what puts its consumer elsewhere.
     fn refuse(&self, channel: &Channel, fault: Fault) {
-        let key = join(&join("channels", &channel.name), "link");
-        let mut entries = self.tables.channels.iter();
-        let entry = entries.find(|entry| entry.name == channel.name);
-        let place = entry.map(|entry| place_of(entry.link.as_ref(), entry.place));
-        let consumer = || {
-            let mut processes = self.tables.processes.iter();
-            let consumer = processes.find(|process| Some(&process.name) == channel.to.as_ref())?;
-            Some(place_of(consumer.host.as_ref(), consumer.place))
-        };
-        self.faults.add(key, place.or_else(consumer), fault);
+        let table = join("channels", &channel.name);
+        let key = join(&table, "link");
+        let consumer = join("processes", channel.to.as_deref().unwrap_or_default());
+        if self.checks.has(&table) {
+            self.checks.refuse(key, fault);
+        } else {
+            self.checks.refuse_at(key, &join(&consumer, "host"), fault);
+        }
     }
 
     /// `between` names hosts of the file.
     fn check_named_hosts(&self) {
         let hosts = || self.topology.hosts.iter().map(|host| host.name.clone());
-        for link in self.links {
-            for host in link.between.iter().flatten() {
-                if self.topology.host(&host.value).is_none() {
+        for link in &self.links {
+            for (index, host) in link.named.iter().flatten().enumerate() {
+                if self.topology.host(host).is_none() {
                     let fault = Fault::UnknownWord {
-                        value: host.value.clone(),
+                        value: (*host).clone(),
                         expected: "a host of this file",
                         allowed: hosts().collect(),
                     };
-                    let key = join(&link.path, "between");
-                    self.faults.add(key, Some(host.place), fault);
+                    let key = join(&join("links", link.name), "between");
+                    let item = format!("{key}[{index}]");
+                    self.checks.refuse_at(key, &item, fault);
                 }
             }
         }
     }
-}
 
-fn place_of(value: Option<&At<String>>, table: Place) -> Place {
-    value.map_or(table, |value| value.place)
-}
-
-/// Ports of different links must differ even between different hosts: on one PC they meet.
-fn check_port_ranges(
-    topology: &Topology,
-    links: &[LinkEntry],
-    between: &[Option<[String; 2]>],
-    faults: &Faults,
-) {
-    let mut taken: Vec<(&str, core::ops::Range<u32>)> = Vec::new();
-    for (link, hosts) in links.iter().zip(between) {
-        let hop = link.via.as_ref().and_then(Via::hop);
-        // A link that carries nothing takes no ports.
-        let Some((hop, hosts)) = hop.zip(hosts.as_ref()) else {
-            continue;
-        };
-        let [one, other] = hosts.each_ref().map(|name| {
-            let host = topology.host(name);
-            host.map(Host::gateway_address)
-        });
-        let count = LinkPorts::count(one == other);
-        let range = u32::from(hop.port)..u32::from(hop.port) + u32::from(count);
-        let last = range.end - 1;
-        let add = |fault: String| {
-            let key = join(&link.path, "port");
-            faults.add(key, Some(link.place), Fault::Inconsistent(fault));
-        };
-        if last > u32::from(u16::MAX) {
-            let port = hop.port;
-            add(format!(
-                "{port} leaves no ports below 65536: a link takes {count}"
-            ));
-        }
-        let overlaps = |(_, other): &&(&str, core::ops::Range<u32>)| {
-            range.start < other.end && other.start < range.end
-        };
-        if let Some((other, _)) = taken.iter().find(overlaps) {
+    /// Ports of different links must differ even between different hosts: on one PC they meet.
+    fn check_port_ranges(&self) {
+        let mut taken: Vec<(&str, core::ops::Range<u32>)> = Vec::new();
+        for link in &self.links {
+            let hop = link.via.as_ref().and_then(Via::hop);
+            // A link that carries nothing takes no ports.
+            let Some((hop, hosts)) = hop.zip(link.used.as_ref()) else {
+                continue;
+            };
+            let [one, other] = hosts.each_ref().map(|name| {
+                let host = self.topology.host(name);
+                host.map(Host::gateway_address)
+            });
+            let count = LinkPorts::count(one == other);
             let base = hop.port;
-            add(format!(
-                "{base} to {last} overlaps with the ports of link `{other}`"
-            ));
+            let range = u32::from(base)..u32::from(base) + u32::from(count);
+            let last = range.end - 1;
+            let refuse = |fault: String| {
+                let key = join(&join("links", link.name), "port");
+                self.checks.refuse_because(key, fault);
+            };
+            if last > u32::from(u16::MAX) {
+                refuse(format!(
+                    "{base} leaves no ports below 65536: a link takes {count}"
+                ));
+            }
+            let overlaps = |(_, other): &&(&str, core::ops::Range<u32>)| {
+                range.start < other.end && other.start < range.end
+            };
+            if let Some((other, _)) = taken.iter().find(overlaps) {
+                refuse(format!(
+                    "{base} to {last} overlaps with the ports of link `{other}`"
+                ));
+            }
+            taken.push((link.name, range));
         }
-        taken.push((&link.name, range));
     }
 }

@@ -1,13 +1,12 @@
-//! Clock paths: the addresses over which two hosts exchange clocks beside the link under test. Read,
-//! checked, and paired here; nothing is opened.
+//! Clock paths: the addresses over which two hosts exchange clocks beside the link under test.
+//! Checked and paired here; nothing is opened.
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, SocketAddr};
 
-use super::errors::{Fault, Faults, Place};
-use super::limits;
+use super::checks::Checks;
+use super::errors::Fault;
 use super::model::{Host, Topology};
-use super::reader::Reader;
 use super::tree::join;
 use crate::CHANNEL_NAME_BYTES_MAX;
 
@@ -51,8 +50,7 @@ impl ClockPath<'_> {
     /// `clock path 10.78.0.1 (eth1) <-> 10.78.0.2 (eth1)`.
     pub fn describe(&self) -> String {
         let end = |host: &Host, address: &SocketAddr| {
-            let interface = host.clock.as_ref().and_then(|end| end.interface.as_deref());
-            describe_end(&address.ip().to_string(), interface)
+            describe_end(&address.ip().to_string(), host.clock_interface.as_deref())
         };
         let (from, to) = (end(self.from, &self.asking), end(self.to, &self.answering));
         format!("clock path {from} <-> {to}")
@@ -137,161 +135,66 @@ impl Topology {
         let pairs = self.linked_pairs().into_iter();
         let hosts = pairs.filter_map(|(one, other)| self.host(one).zip(self.host(other)));
         hosts
-            .filter(|(one, other)| one.clock.is_some() && other.clock.is_some())
+            .filter(|(one, other)| one.clock_address.is_some() && other.clock_address.is_some())
             .collect()
     }
 }
 
 /// Where `host` is on the clock path that follows those of `before`.
 fn end_of(host: &Host, before: &[(&Host, &Host)]) -> Option<SocketAddr> {
-    let end = host.clock.as_ref()?;
+    let end = host.clock()?;
     let is_own = |(one, other): &&(&Host, &Host)| one.name == host.name || other.name == host.name;
     let offset = u16::try_from(before.iter().filter(is_own).count()).ok()?;
     Some(SocketAddr::new(end.address, end.port.checked_add(offset)?))
 }
 
-/// A clock address as the file has it.
-#[derive(Debug)]
-pub(super) struct ClockEntry {
-    pub path: String,
-    pub place: Place,
-    /// Of the port, or of the address where the port is the default.
-    pub port_place: Place,
-}
-
-/// Reads the keys of a host's clock path.
-pub(super) fn read(reader: &mut Reader<'_>) -> (Option<ClockEnd>, Option<ClockEntry>) {
-    let text = reader.text("clock_address");
-    let place = text.as_ref().map(|text| text.place);
-    let address = text.and_then(|text| read_address(reader, "clock_address", &text.value));
-    let interface = read_interface(reader, "clock_interface");
-    let port: Option<u16> = reader.integer("clock_port", &limits::HOST_CLOCK_PORT);
-    if !reader.has("clock_address") {
-        let why = "needs `clock_address`: it belongs to a path for clock exchanges";
-        reader.refuse_present(&["clock_interface", "clock_port"], why);
-    }
-    if !reader.has("address") {
-        let why = "needs `address`: without it this host and its peers run on one PC, on one clock";
-        reader.refuse_present(&["clock_address"], why);
-    }
-    let default = u16::try_from(limits::HOST_CLOCK_PORT.default);
-    let end = address.map(|address| ClockEnd {
-        address,
-        interface,
-        port: port.unwrap_or(default.expect("a default port is within 1..=65535")),
-    });
-    let entry = place.map(|place| ClockEntry {
-        path: reader.path.clone(),
-        place,
-        port_place: reader.place_of("clock_port").unwrap_or(place),
-    });
-    (end, entry)
-}
-
-/// The address of one host.
-pub(super) fn read_address(reader: &Reader<'_>, key: &str, text: &str) -> Option<IpAddr> {
-    let parsed: Option<IpAddr> = text.parse().ok();
-    let address = parsed.filter(|address| !address.is_unspecified() && !address.is_multicast());
-    if address.is_none() {
-        let fault = Fault::Inconsistent(format!("\"{text}\" is no address of one host"));
-        reader.refuse(key, fault);
-    } else if address.is_some_and(is_link_local_v6) {
-        reader.refuse(key, Fault::Inconsistent(link_local_fault(text)));
-    }
-    address
-}
-
-/// Why a link-local address without a scope is refused.
-pub(super) fn link_local_fault(text: &str) -> String {
-    format!(
-        "\"{text}\" is link-local: it says nothing without an interface, and its scope differs from \
-         host to host; give the host a unique local address (fd00::/8) or use IPv4"
-    )
-}
-
-/// Of `fe80::/10` (RFC 4291, 2.5.6): the kernel refuses it without a scope.
-const fn is_link_local_v6(address: IpAddr) -> bool {
-    matches!(address, IpAddr::V6(address) if address.is_unicast_link_local())
-}
-
-/// The name of an interface.
-pub(super) fn read_interface(reader: &mut Reader<'_>, key: &'static str) -> Option<String> {
-    let interface = reader.text(key).map(|interface| interface.value);
-    if interface
-        .as_deref()
-        .is_some_and(|name| !is_interface_name(name))
-    {
-        let fault = "is no interface name: 1 to 15 letters without blank or slash";
-        reader.refuse(key, Fault::Inconsistent(fault.to_owned()));
-    }
-    interface
-}
-
-/// `IFNAMSIZ` is 16 with the terminating zero.
-fn is_interface_name(name: &str) -> bool {
-    (1..=15).contains(&name.len()) && !name.contains([' ', '/', ':']) && name.is_ascii()
-}
-
-/// Checks the clock addresses against each other and against what the links use; `entries` are in
-/// the order of the hosts.
-pub(super) fn check(topology: &Topology, entries: &[Option<ClockEntry>], faults: &Faults) {
-    for (index, (host, entry)) in topology.hosts().iter().zip(entries).enumerate() {
-        let (Some(end), Some(entry)) = (&host.clock, entry) else {
-            continue;
-        };
-        check_owner(topology, index, end.address, entry, faults);
+/// Checks the clock addresses against each other and against what the links use.
+pub(super) fn check(topology: &Topology, checks: &Checks<'_>) {
+    let with_clock = || {
+        let hosts = topology.hosts().iter();
+        hosts.filter_map(|host| Some((host, host.clock()?)))
+    };
+    for (host, end) in with_clock() {
+        check_owner(topology, host, end.address, checks);
     }
     // Without a host or a channel that is meant, these would be noise.
-    if !faults.is_empty() || topology.processes().is_empty() {
+    if !checks.is_clean() || topology.processes().is_empty() {
         return;
     }
-    for (host, entry) in topology.hosts().iter().zip(entries) {
-        if let (Some(end), Some(entry)) = (&host.clock, entry) {
-            check_use(topology, host, end, entry, faults);
-            check_ports(topology, host, end, entry, faults);
-        }
+    for (host, end) in with_clock() {
+        check_use(topology, host, &end, checks);
+        check_ports(topology, host, &end, checks);
     }
 }
 
-/// An address belongs to one host, the one at `index`.
-fn check_owner(
-    topology: &Topology,
-    index: usize,
-    address: IpAddr,
-    entry: &ClockEntry,
-    faults: &Faults,
-) {
-    let key = join(&entry.path, "clock_address");
-    for (place, other) in topology.hosts().iter().enumerate() {
-        if place == index {
-            continue;
-        }
-        let is_clock = other
-            .clock
-            .as_ref()
-            .is_some_and(|end| end.address == address);
-        let what = match (is_clock && place < index, other.address == Some(address)) {
+/// Notes what is wrong with the clock address of `host`.
+fn refuse(host: &Host, checks: &Checks<'_>, why: String) {
+    let path = join(&join("hosts", &host.name), "clock_address");
+    checks.refuse_because(path, why);
+}
+
+/// An address belongs to one host.
+fn check_owner(topology: &Topology, host: &Host, address: IpAddr, checks: &Checks<'_>) {
+    let others = topology
+        .hosts()
+        .iter()
+        .filter(|other| other.name != host.name);
+    for other in others {
+        // Of two equal clock addresses, the second by name is told.
+        let is_clock = other.clock_address == Some(address) && other.name < host.name;
+        let what = match (is_clock, other.address == Some(address)) {
             (true, _) => "clock_address",
             (false, true) => "address",
             (false, false) => continue,
         };
         let fault = format!("is the {what} of host `{}` already: {address}", other.name);
-        faults.add(key.clone(), Some(entry.place), Fault::Inconsistent(fault));
+        refuse(host, checks, fault);
     }
 }
 
 /// Some other host must be there to exchange clocks with, in the same family of addresses.
-fn check_use(
-    topology: &Topology,
-    host: &Host,
-    end: &ClockEnd,
-    entry: &ClockEntry,
-    faults: &Faults,
-) {
-    let add = |fault: String| {
-        let key = join(&entry.path, "clock_address");
-        faults.add(key, Some(entry.place), Fault::Inconsistent(fault));
-    };
+fn check_use(topology: &Topology, host: &Host, end: &ClockEnd, checks: &Checks<'_>) {
+    let add = |fault: String| refuse(host, checks, fault);
     let name = host.name.as_str();
     let linked: Vec<&Host> = topology
         .linked_pairs()
@@ -308,7 +211,7 @@ fn check_use(
         ));
         return;
     }
-    if linked.iter().all(|other| other.clock.is_none()) {
+    if linked.iter().all(|other| other.clock_address.is_none()) {
         let names: Vec<String> = linked.iter().map(|other| other.name.clone()).collect();
         let names = super::suggest::listed(&names);
         add(format!(
@@ -317,19 +220,21 @@ fn check_use(
         ));
     }
     for other in linked {
-        let Some(its) = &other.clock else { continue };
-        if its.address.is_ipv4() != end.address.is_ipv4() {
+        let Some(its) = other.clock_address else {
+            continue;
+        };
+        if its.is_ipv4() != end.address.is_ipv4() {
             add(format!(
                 "{} and that of host `{}`, {}, are of different IP versions",
-                end.address, other.name, its.address
+                end.address, other.name, its
             ));
         }
-        check_name(topology, host, other, entry, faults);
+        check_name(topology, host, other, checks);
     }
 }
 
 /// The path's name stands in the headers of its record files, among the names of channels.
-fn check_name(topology: &Topology, host: &Host, other: &Host, entry: &ClockEntry, faults: &Faults) {
+fn check_name(topology: &Topology, host: &Host, other: &Host, checks: &Checks<'_>) {
     if host.name > other.name {
         return;
     }
@@ -353,21 +258,21 @@ fn check_name(topology: &Topology, host: &Host, other: &Host, entry: &ClockEntry
     } else {
         return;
     };
-    let key = join(&entry.path, "clock_address");
-    faults.add(key, Some(entry.place), Fault::Inconsistent(fault));
+    refuse(host, checks, fault);
 }
 
 /// A host's clock paths take ports from `clock_port` on, and no channel uses one of them.
-fn check_ports(
-    topology: &Topology,
-    host: &Host,
-    end: &ClockEnd,
-    entry: &ClockEntry,
-    faults: &Faults,
-) {
+fn check_ports(topology: &Topology, host: &Host, end: &ClockEnd, checks: &Checks<'_>) {
     let add = |fault: String| {
-        let key = join(&entry.path, "clock_port");
-        faults.add(key, Some(entry.port_place), Fault::Inconsistent(fault));
+        let host = join("hosts", &host.name);
+        let path = join(&host, "clock_port");
+        // By default the port follows from the address.
+        let place = if checks.has(&path) {
+            path.clone()
+        } else {
+            join(&host, "clock_address")
+        };
+        checks.refuse_at(path, &place, Fault::Inconsistent(fault));
     };
     let pairs = topology.clock_pairs();
     let is_own = |(one, other): &&(&Host, &Host)| one.name == host.name || other.name == host.name;

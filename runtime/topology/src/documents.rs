@@ -10,7 +10,8 @@ use clap_complete::Shell;
 use clap_mangen::Man;
 use clap_mangen::roff::Roff;
 use hil_arm::yumi::description::Urdf;
-use serde_json::Value;
+
+use super::schema::{reference, schema};
 
 /// Begins the list of exit codes in the help of a program.
 const EXIT_CODES: &str = "Exit codes:";
@@ -57,18 +58,18 @@ pub fn write(command: Command, folder: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(written)
 }
 
-/// Writes the schema of topology files below `folder`: `schema/topology.schema.json`.
+/// Writes what can stand in a topology file below `folder`: `schema/topology.schema.json`, and the page of all
+/// keys as `schema/topology.md`.
 ///
 /// # Errors
-/// When it cannot be written.
-pub fn write_schema(schema: &Value, folder: &Path) -> io::Result<PathBuf> {
+/// When one cannot be written.
+pub fn write_keys(folder: &Path) -> io::Result<()> {
     let folder = folder.join("schema");
     fs::create_dir_all(&folder)?;
-    let path = folder.join("topology.schema.json");
-    let mut text = serde_json::to_string_pretty(schema)?;
+    let mut text = serde_json::to_string_pretty(&schema())?;
     text.push('\n');
-    fs::write(&path, text)?;
-    Ok(path)
+    fs::write(folder.join("topology.schema.json"), text)?;
+    fs::write(folder.join("topology.md"), reference())
 }
 
 /// Writes the description of the robot below `folder`: `robots/yumi.urdf`.

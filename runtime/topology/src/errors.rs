@@ -7,7 +7,6 @@ use core::ops::Range;
 
 use annotate_snippets::{AnnotationKind, Group, Level, Renderer, Snippet};
 
-use super::schema::{RequestedKeys, Shape};
 use super::suggest::{listed, nearest};
 
 /// Errors that are told at once: of a file that is no topology at all, every line would be one.
@@ -89,7 +88,7 @@ pub enum Fault {
         /// What it is.
         found: &'static str,
         /// What it must be.
-        expected: &'static str,
+        expected: String,
     },
     /// A number beyond its bounds.
     #[error("{value} is outside {allowed}")]
@@ -265,37 +264,9 @@ pub(super) struct Place {
 #[derive(Debug, Default)]
 pub(super) struct Faults {
     found: RefCell<Vec<(String, Fault, Option<Place>)>>,
-    asked: Option<RefCell<RequestedKeys>>,
 }
 
 impl Faults {
-    /// Also notes what the readers ask for.
-    pub(super) fn with_notes() -> Self {
-        Self {
-            asked: Some(RefCell::default()),
-            ..Self::default()
-        }
-    }
-
-    /// Notes that `key` of the table at `path` was asked for.
-    pub(super) fn note(&self, path: &str, key: &'static str, shape: impl FnOnce() -> Shape) {
-        if let Some(asked) = &self.asked {
-            asked.borrow_mut().add(path, key, shape());
-        }
-    }
-
-    /// Notes that the table at `path` is handed on as it is.
-    pub(super) fn note_unread(&self, path: &str) {
-        if let Some(asked) = &self.asked {
-            asked.borrow_mut().add_unread(path);
-        }
-    }
-
-    /// What was noted.
-    pub(super) fn into_notes(self) -> RequestedKeys {
-        self.asked.map(RefCell::into_inner).unwrap_or_default()
-    }
-
     /// Notes a fault, unless its key has one already, or is said to be missing because something
     /// below it is faulty: what follows from a fault is noise.
     pub(super) fn add(&self, key: impl Into<String>, place: Option<Place>, fault: Fault) {

@@ -6,8 +6,12 @@ use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use super::errors::{Fault, Faults, Place, Source};
-use super::limits::{EXTENDS_DEPTH_MAX, FILE_BYTES_MAX};
 use super::tree::{self, Node, Table, Value};
+
+/// Longest chain of files that extend each other.
+const EXTENDS_DEPTH_MAX: usize = 16;
+/// Largest topology file.
+const FILE_BYTES_MAX: u64 = 1_048_576;
 
 /// Reads layers; keeps their texts for the error messages.
 #[derive(Debug, Default)]
@@ -62,7 +66,7 @@ impl Layers {
             }
             other => Fault::WrongType {
                 found: other.type_name(),
-                expected: "a string with the path of a file",
+                expected: "a string with the path of a file".to_owned(),
             },
         };
         self.faults.add("extends", Some(extends.place), fault);

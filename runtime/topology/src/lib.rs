@@ -1,11 +1,13 @@
 //! The topology file: hosts, processes, channels and links in TOML, read, checked, and written
 //! back. It starts nothing and opens no socket.
 //!
-//! Reading goes in steps, each in its own file: [`load`] joins the `extends` chain and the
-//! overrides into one tree whose every key remembers its place (`layers`, `tree`); each table is
-//! read by itself (`reader`, `file`); then the tables are checked against each other (`check`)
-//! and become a [`Topology`]. Bounds of numbers are in `limits` alone. Whatever is wrong is
-//! collected with file, line and column into [`TopologyErrors`].
+//! Each table declares its keys once, with type, default, range and meaning: those that stay as they
+//! are in `model`, `links`, `adapter`, `security` and `trace_source`, the others in `tables`. Reading
+//! goes in steps: [`load`] joins the `extends` chain and the overrides into one tree whose every key
+//! remembers its place (`layers`, `tree`); it is read as the declarations say (`reader`); then the tables
+//! are checked against each other (`check`) and become a [`Topology`]. Whatever is wrong is collected
+//! with file, line and column into [`TopologyErrors`]. The resolved text (`resolved`), the JSON schema and
+//! the reference page (`schema`) are made from the declarations too.
 //!
 //! A program registers its case studies in [`KnownCases`]; [`which_host`] says which host of the
 //! topology this machine is; [`RoleSpec`] is all that a process is told.
@@ -15,21 +17,17 @@ mod adapter;
 mod check;
 mod check_adapter;
 mod check_channels;
+mod checks;
 mod clock_path;
 pub mod documents;
 pub mod emulation;
 pub mod emulation_room;
 mod errors;
-mod file;
-mod file_impairments;
-mod file_links;
-mod file_trace;
 mod host;
 mod known;
 mod layers;
-mod limits;
+mod links;
 mod model;
-mod model_links;
 mod names;
 mod parameter_reader;
 mod reader;
@@ -39,13 +37,14 @@ mod role_spec;
 mod schema;
 mod security;
 mod suggest;
+mod tables;
 pub mod trace_source;
 mod tree;
 mod units;
 
 use std::path::Path;
 
-pub use adapter::{AdapterKind, AdapterSend, EgmAdapter};
+pub use adapter::{AdapterKind, AdapterSend, EgmAdapter, SendClock};
 pub use check_adapter::{command_channel, feedback_channel};
 pub use clock_path::{ClockEnd, ClockPath, describe_end};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
@@ -53,14 +52,13 @@ pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host
 pub use known::{
     KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with, parameters_of,
 };
+pub use links::{Emulation, Gateway, Hop, Link, SocketOptions, Timestamps, Via, transport};
 pub use model::{
-    Case, Channel, Crossing, Direction, Execution, Host, LinkPorts, MessageLayout, OnExit, Process,
-    Program, Run, Scheduling, Topology, Wait,
+    AtExit, Case, Channel, Crossing, Direction, Execution, Host, LinkPorts, MessageLayout, OnExit,
+    Process, Program, Restarts, Run, Scheduling, SchedulingClass, Topology, Wait,
 };
-pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via, transport};
 pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
 pub use role_spec::{RoleChannel, RoleSpec};
-pub use schema::schema;
 pub use security::{Hops, Security};
 
 pub use units::duration_within;
@@ -187,8 +185,14 @@ fn read_and_check(
         end: 0,
     };
     let topology = {
-        let file = file::read(&table, top, &layers.faults);
-        check::check(file, known, needs, &layers.faults)
+        let mut file = tables::File::TEMPLATE;
+        reader::read(&mut file, &table, top, &layers.faults);
+        let checks = checks::Checks {
+            tree: &table,
+            faults: &layers.faults,
+            top,
+        };
+        check::check(file, known, needs, &checks)
     };
     let topology = topology.with_traces_beside(path).with_key_beside(path);
     if layers.faults.is_empty() {

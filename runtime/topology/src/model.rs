@@ -1,20 +1,23 @@
 //! The checked topology: what runs where, which channels join it, and over which links. Every
-//! reference resolves and every number is within `limits`; it reads no file and starts nothing.
+//! reference resolves and every number is within its range. Tables that are in the file as they are
+//! here declare their keys here; it reads no file and starts nothing.
 
-use core::fmt;
 use core::time::Duration;
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
+use hil_core::case_study::ParameterError;
 use hil_core::message::type_hash;
+use hil_core::{options, words};
 use hil_link::condition::{flow_label, flow_name};
 use hil_link::spec::{LinkSpec, Way};
 
-use super::model_links::{Hop, Link};
-
 use super::adapter::EgmAdapter;
 use super::clock_path::ClockEnd;
+use super::links::{Hop, Link};
 use super::security::Security;
+use super::tables::{FOLDER, HOST_ADDRESS, INTERFACE, NAME};
 
 /// A topology file after every check. Only [`load`](super::load) and [`parse`](super::parse)
 /// make one.
@@ -30,19 +33,22 @@ pub struct Topology {
     pub(super) security: Security,
 }
 
-/// `[run]`: how long, from which seed, recorded where.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Run {
-    /// How long the roles run once all hosts are ready.
-    pub duration: Duration,
-    /// Seed of every random stream of the run.
-    pub seed: u64,
-    /// Folder that receives one sub-folder per run.
-    pub record_folder: String,
-    /// How long a host waits for its peers before the run starts.
-    pub start_timeout: Duration,
-    /// How long a host may be silent during the run before it counts as gone.
-    pub peer_timeout: Duration,
+options! {
+    /// How long, from which seed, recorded where.
+    #[derive(Eq)]
+    pub struct Run {
+        /// How long the roles run once all hosts are ready.
+        duration: Duration = Duration::from_secs(20), in Duration::from_millis(100)..=Duration::from_hours(7 * 24);
+        /// Seed of every random stream of the run.
+        seed: u64 = 1, in 0..=i64::MAX.unsigned_abs();
+        /// Folder that receives one sub-folder per run.
+        record: Cow<'static, str> = Cow::Borrowed("runs"), in FOLDER;
+        /// How long a host waits for its peers before the run starts.
+        start_timeout: Duration = Duration::from_secs(30), in Duration::from_secs(1)..=Duration::from_hours(1);
+        /// How long a host may be silent during the run before it counts as gone. The default lets a radio
+        /// roam, and notices a host that vanished within half a minute.
+        peer_timeout: Duration = Duration::from_secs(30), in Duration::from_secs(1)..=Duration::from_hours(1);
+    }
 }
 
 /// `[case]`: the case study.
@@ -54,25 +60,57 @@ pub struct Case {
     pub parameters: toml::Table,
 }
 
-/// One `[hosts.<name>]`, or the single implicit host `local`.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Host {
-    /// Its key.
-    pub name: String,
-    /// Address on the link under test; `None` when it runs on this PC beside its peers.
-    pub address: Option<IpAddr>,
-    /// Interface its gateways bind to, when named.
-    pub interface: Option<String>,
-    /// TCP port of its supervisor; meaningful only with an address.
-    pub control_port: u16,
-    /// Where it exchanges clocks beside the link under test, if it does.
-    pub clock: Option<ClockEnd>,
+/// Why a key of a host without an address is refused.
+const ONE_SUPERVISOR: &str =
+    "needs `address`: without it one supervisor runs this host and its peers";
+/// Why a key of a host without a clock path is refused.
+const NO_CLOCK_PATH: &str = "needs `clock_address`: it belongs to a path for clock exchanges";
+
+options! {
+    /// A host. A file without any has one, `local`.
+    #[derive(Eq)]
+    pub struct Host
+    with {
+        /// Its key.
+        name: String = String::new(),
+    }
+    {
+        /// Address on the link under test. All hosts have one, or none has, and then all run on this PC.
+        address: Option<IpAddr>, in HOST_ADDRESS;
+        /// Interface that its gateways bind to.
+        interface: Option<String>, in INTERFACE, needs(address, Host::has_address, ONE_SUPERVISOR);
+        /// TCP port of its supervisor.
+        control_port: u16 = 7_399, in 1_024..=65_535, needs(address, Host::has_address, ONE_SUPERVISOR);
+        /// Address where it exchanges clocks, beside the link under test.
+        clock_address: Option<IpAddr>, in HOST_ADDRESS, needs(address, Host::has_address,
+            "needs `address`: without it this host and its peers run on one PC, on one clock");
+        /// Interface that clock exchanges bind to.
+        clock_interface: Option<String>, in INTERFACE,
+            needs(clock_address, |host| host.clock_address.is_some(), NO_CLOCK_PATH);
+        /// UDP port of its first clock path; each further one takes the next. The default leaves room for
+        /// ten below the ports of links.
+        clock_port: u16 = 7_390, in 1_024..=65_535,
+            needs(clock_address, |host| host.clock_address.is_some(), NO_CLOCK_PATH);
+    }
 }
 
 impl Host {
     /// Where gateways reach it: its address, or loopback when all hosts run on this PC.
     pub fn gateway_address(&self) -> IpAddr {
         self.address.unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST))
+    }
+
+    fn has_address(&self) -> bool {
+        self.address.is_some()
+    }
+
+    /// Where it exchanges clocks beside the link under test, if it does.
+    pub fn clock(&self) -> Option<ClockEnd> {
+        Some(ClockEnd {
+            address: self.clock_address?,
+            interface: self.clock_interface.clone(),
+            port: self.clock_port,
+        })
     }
 
     /// Where its supervisor listens; `None` when one supervisor runs all hosts.
@@ -94,7 +132,7 @@ pub struct Process {
     /// How the kernel schedules it and how it waits.
     pub execution: Execution,
     /// What its end means for the run.
-    pub on_exit: OnExit,
+    pub restarts: Restarts,
 }
 
 impl Process {
@@ -133,19 +171,47 @@ pub enum Program {
     },
 }
 
-/// How the kernel schedules a process or a gateway, and how it waits for messages.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Execution {
-    /// Cores it may use; empty means any.
-    pub cpus: Vec<u16>,
-    /// Scheduling class.
-    pub scheduling: Scheduling,
-    /// Lock all pages in memory.
-    pub locks_memory: bool,
-    /// How late the kernel may fire its timers.
-    pub timer_slack: Duration,
-    /// How it waits for the next message or tick.
-    pub wait: Wait,
+options! {
+    /// How the kernel schedules a process or a gateway, and how it waits for messages.
+    #[derive(Eq)]
+    pub struct Execution as part {
+        /// Cores it may use; none for any.
+        cpu: Vec<u16> = Vec::new(), in 0..=1_023;
+        /// Scheduling class.
+        scheduling: SchedulingClass = SchedulingClass::Other;
+        /// Priority, 1 (low) to 99. The default is below the 50 that threaded interrupt handlers get on
+        /// `PREEMPT_RT`, so that the network card is served first.
+        priority: u8 = 40, in 1..=99,
+            needs(scheduling, |one| one.scheduling == SchedulingClass::Fifo, "needs scheduling = \"fifo\"");
+        /// Lock all pages in memory.
+        lock_memory: bool = false;
+        /// How late the kernel may fire its timers.
+        timer_slack: Duration = Duration::from_micros(1), in Duration::from_nanos(1)..=Duration::from_millis(1);
+        /// How it waits for the next message or tick.
+        wait: Wait = Wait::Block;
+    }
+}
+
+impl Execution {
+    /// Scheduling class with its priority.
+    pub const fn scheduling(&self) -> Scheduling {
+        match self.scheduling {
+            SchedulingClass::Other => Scheduling::Other,
+            SchedulingClass::Fifo => Scheduling::Fifo {
+                priority: self.priority,
+            },
+        }
+    }
+}
+
+words! {
+    /// Scheduling class, by its word.
+    pub enum SchedulingClass {
+        /// `SCHED_OTHER`, the normal class.
+        Other = "other",
+        /// `SCHED_FIFO`.
+        Fifo = "fifo",
+    }
 }
 
 /// Scheduling class.
@@ -160,15 +226,51 @@ pub enum Scheduling {
     },
 }
 
-/// How a thread waits.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Wait {
-    /// Sleep until woken: little CPU, a wake-up per message.
-    Block,
-    /// Sleep until shortly before the expected arrival, then poll.
-    Hybrid,
-    /// Poll without pause; needs a core of its own.
-    Spin,
+words! {
+    /// How a thread waits.
+    pub enum Wait {
+        /// Sleep until woken: little CPU, a wake-up per message.
+        Block = "block",
+        /// Sleep until shortly before the expected arrival, then poll.
+        Hybrid = "hybrid",
+        /// Poll without pause; needs a core of its own.
+        Spin = "spin",
+    }
+}
+
+options! {
+    /// What the end of a process means.
+    #[derive(Copy, Eq)]
+    pub struct Restarts as part {
+        /// What the end of it means for the run. A gateway is started again by default: it holds no state
+        /// of the robot, and the messages lost meanwhile are counted.
+        on_exit: AtExit = AtExit::EndRun;
+        /// It is started again at most this often in one run.
+        restart_limit: u32 = 3, in 1..=100,
+            needs(on_exit, |one| one.on_exit == AtExit::Restart, "needs on_exit = \"restart\"");
+    }
+}
+
+impl Restarts {
+    /// What the end means, with its limit.
+    pub const fn on_exit(self) -> OnExit {
+        match self.on_exit {
+            AtExit::EndRun => OnExit::EndRun,
+            AtExit::Restart => OnExit::Restart {
+                limit: self.restart_limit,
+            },
+        }
+    }
+}
+
+words! {
+    /// What the end of a process means, by its word.
+    pub enum AtExit {
+        /// It ends the run: a restarted robot model would invalidate it.
+        EndRun = "end-run",
+        /// It is started again.
+        Restart = "restart",
+    }
 }
 
 /// What the end of a process means.
@@ -183,21 +285,38 @@ pub enum OnExit {
     },
 }
 
-/// Identity of a channel's messages; owned, because foreign channels name theirs in the file.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct MessageLayout {
-    /// Name and version, e.g. `hil.EgmCommand.v1`.
-    pub name: String,
-    /// Size of one message.
-    pub size_bytes: usize,
-    /// Alignment in shared memory, a power of two.
-    pub alignment_bytes: usize,
+options! {
+    /// Identity of a channel's messages; owned, because foreign channels name theirs in the file.
+    #[derive(Eq)]
+    pub struct MessageLayout {
+        /// Name and version, e.g. `hil.EgmCommand.v1`.
+        name: String, in NAME, hint "a foreign channel states the name and size of its messages";
+        /// Size of one message.
+        size_bytes: usize, in 1..=16_777_216,
+            hint "a foreign channel states the name and size of its messages";
+        /// Alignment in shared memory, a power of two.
+        alignment_bytes: usize = 8, in 1..=64;
+    }
+    check MessageLayout::check_alignment;
 }
 
 impl MessageLayout {
     /// The hash both hosts compare; equals that of the message type of the same identity.
     pub fn hash(&self) -> u64 {
         type_hash(&self.name, self.size_bytes, self.alignment_bytes)
+    }
+
+    fn check_alignment(&self) -> Result<(), ParameterError> {
+        let alignment = self.alignment_bytes;
+        if !alignment.is_power_of_two() {
+            let problem = format!("{alignment} is no power of two");
+            return Err(ParameterError::new("alignment_bytes", problem));
+        }
+        if self.size_bytes.is_multiple_of(alignment) {
+            return Ok(());
+        }
+        let problem = format!("is no multiple of alignment_bytes, which is {alignment}");
+        Err(ParameterError::new("size_bytes", problem))
     }
 }
 
@@ -428,27 +547,3 @@ impl Topology {
         u16::MAX - number
     }
 }
-
-macro_rules! words {
-    ($type:ident { $($variant:ident = $word:literal),+ $(,)? }) => {
-        impl $type {
-            /// Every word the file may say, with its meaning.
-            pub(super) const WORDS: &'static [(&'static str, Self)] =
-                &[$(($word, Self::$variant)),+];
-
-            /// The word in the file.
-            pub const fn word(self) -> &'static str {
-                match self { $(Self::$variant => $word),+ }
-            }
-        }
-
-        impl fmt::Display for $type {
-            fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-                formatter.write_str(self.word())
-            }
-        }
-    };
-}
-pub(super) use words;
-
-words!(Wait { Block = "block", Hybrid = "hybrid", Spin = "spin" });

@@ -1,409 +1,364 @@
-//! Reads one table of the tree key by key. Whatever is wrong is noted with its place and the
-//! reading goes on, so that one attempt shows every fault; keys nobody asked for are refused.
+//! Reads tables of the tree as their declarations say ([`Options`]). Whatever is wrong is noted with
+//! its place and the reading goes on, so that one attempt shows every fault; keys that no declaration
+//! has are refused.
 
-use core::time::Duration;
-use std::collections::BTreeMap;
+use hil_core::options::{Field, Options, Setting, Shape, Slot, Table as TableSlot, Tables};
 
 use super::errors::{Fault, Faults, Place};
-use super::limits::{Limit, NAME_LENGTH_MAX, RangeText};
-use super::schema::Shape;
+use super::tables::{NAME, NAME_WITH_SLASHES};
 use super::tree::{Node, Table, Value, join};
-use super::units::parse_duration;
-
-/// A value with the place it stands at.
-#[derive(Debug, Clone)]
-pub(super) struct At<T> {
-    pub value: T,
-    pub place: Place,
-}
+use super::units::{format_duration, parse_duration};
 
 /// A table being read.
 #[derive(Debug)]
-pub(super) struct Reader<'t> {
+struct Reader<'t> {
     /// Path of the table.
-    pub path: String,
+    path: String,
     /// Where its key stands.
-    pub place: Place,
+    place: Place,
     table: &'t Table,
-    asked: Vec<&'static str>,
     faults: &'t Faults,
+    /// Keys that its declarations have.
+    known: Vec<&'static str>,
+    /// Those of them whose value was refused.
+    refused: Vec<&'static str>,
+}
+
+/// Reads the whole file into `options`; `top` is where a missing table would stand.
+pub(super) fn read(options: &mut dyn Options, table: &Table, top: Place, faults: &Faults) {
+    let mut reader = Reader::new(String::new(), top, table, faults);
+    reader.options(options);
+    reader.finish();
 }
 
 impl<'t> Reader<'t> {
-    /// Reads `table`, whose key is `path`.
-    pub(super) fn new(path: String, place: Place, table: &'t Table, faults: &'t Faults) -> Self {
+    fn new(path: String, place: Place, table: &'t Table, faults: &'t Faults) -> Self {
         Self {
             path,
             place,
             table,
-            asked: Vec::new(),
             faults,
+            known: Vec::new(),
+            refused: Vec::new(),
         }
     }
 
-    /// The path of `key` in this table.
-    pub(super) fn path_of(&self, key: &str) -> String {
-        join(&self.path, key)
+    fn add(&self, key: &str, place: Place, fault: Fault) {
+        self.faults.add(join(&self.path, key), Some(place), fault);
     }
 
     /// Notes a fault of `key`, at its value if it has one, else at the table.
-    pub(super) fn refuse(&self, key: &str, fault: Fault) {
+    fn refuse(&self, key: &str, fault: Fault) {
         let place = self.table.get(key).map_or(self.place, |node| node.place);
-        self.faults.add(self.path_of(key), Some(place), fault);
+        self.add(key, place, fault);
     }
 
-    /// True when the table has `key`; does not make the key known.
-    pub(super) fn has(&self, key: &str) -> bool {
+    fn has(&self, key: &str) -> bool {
         self.table.contains_key(key)
     }
 
-    /// Where the value of `key` stands; does not make the key known.
-    pub(super) fn place_of(&self, key: &str) -> Option<Place> {
-        self.table.get(key).map(|node| node.place)
-    }
-
-    /// True when `key` is a table; does not make the key known.
-    pub(super) fn is_table(&self, key: &str) -> bool {
-        let node = self.table.get(key);
-        node.is_some_and(|node| matches!(node.value, Value::Table(_)))
-    }
-
-    /// Notes that each present key of `keys` does not belong here, and why.
-    pub(super) fn refuse_present(&self, keys: &[&'static str], why: &str) {
-        for key in keys {
-            if let Some(node) = self.table.get(*key) {
-                let fault = Fault::Inconsistent(why.to_owned());
-                let path = self.path_of(key);
-                self.faults.add(path, Some(node.key_place), fault);
-            }
-        }
-    }
-
-    /// The value of `key`, which becomes a known key; what it may be is noted for the schema.
-    fn node(&mut self, key: &'static str, shape: impl FnOnce() -> Shape) -> Option<&'t Node> {
-        self.asked.push(key);
-        self.faults.note(&self.path, key, shape);
+    /// The value of `key`, which becomes a known key.
+    fn node(&mut self, key: &'static str) -> Option<&'t Node> {
+        self.known.push(key);
         self.table.get(key)
     }
 
-    fn wrong_type<T>(&self, key: &str, node: &Node, expected: &'static str) -> Option<T> {
-        let found = node.value.type_name();
-        let fault = Fault::WrongType { found, expected };
-        self.faults.add(self.path_of(key), Some(node.place), fault);
-        None
-    }
-
-    /// A string.
-    pub(super) fn text(&mut self, key: &'static str) -> Option<At<String>> {
-        self.text_as(key, || Shape::Text)
-    }
-
-    fn text_as(&mut self, key: &'static str, shape: impl FnOnce() -> Shape) -> Option<At<String>> {
-        let node = self.node(key, shape)?;
-        match &node.value {
-            Value::Text(text) => Some(At {
-                value: text.clone(),
-                place: node.place,
-            }),
-            _ => self.wrong_type(key, node, "a string"),
+    /// Reads every option. True when all that are required are there and all fit together.
+    fn options(&mut self, options: &mut dyn Options) -> bool {
+        let mut is_usable = true;
+        for field in options.fields() {
+            let key = field.key;
+            let is_read = self.field(field);
+            if !is_read {
+                self.refused.push(key);
+            }
+            is_usable &= is_read;
         }
-    }
-
-    /// A string that can name a folder and a shared-memory service.
-    pub(super) fn name(&mut self, key: &'static str) -> Option<At<String>> {
-        let name = self.text_as(key, || Shape::Name)?;
-        if !is_name(&name.value, false) {
-            self.refuse(key, bad_name(&name.value, false));
-            return None;
-        }
-        Some(name)
-    }
-
-    /// A boolean.
-    pub(super) fn boolean(&mut self, key: &'static str) -> Option<bool> {
-        let node = self.node(key, || Shape::Boolean)?;
-        match &node.value {
-            Value::Boolean(boolean) => Some(*boolean),
-            _ => self.wrong_type(key, node, "true or false"),
-        }
-    }
-
-    /// An integer within `limit`.
-    pub(super) fn integer<T>(&mut self, key: &'static str, limit: &Limit<i64>) -> Option<T>
-    where
-        T: TryFrom<i64>,
-    {
-        let node = self.node(key, || Shape::integer(limit))?;
-        self.integer_of(key, node, limit)
-    }
-
-    fn integer_of<T>(&self, key: &str, node: &Node, limit: &Limit<i64>) -> Option<T>
-    where
-        T: TryFrom<i64>,
-    {
-        let Value::Integer(integer) = &node.value else {
-            return self.wrong_type(key, node, "an integer");
-        };
-        let within = limit.allows(integer).then(|| T::try_from(*integer).ok());
-        within.flatten().or_else(|| {
-            self.out_of_range(key, node, &integer.to_string(), limit);
-            None
-        })
-    }
-
-    /// One integer within `limit`, or an array of them; empty when the key is absent.
-    pub(super) fn integers<T>(&mut self, key: &'static str, limit: &Limit<i64>) -> Vec<T>
-    where
-        T: TryFrom<i64>,
-    {
-        let Some(node) = self.node(key, || Shape::integers(limit)) else {
-            return Vec::new();
-        };
-        match &node.value {
-            Value::Array(items) => items
-                .iter()
-                .filter_map(|item| self.integer_of(key, item, limit))
-                .collect(),
-            Value::Integer(_) => self.integer_of(key, node, limit).into_iter().collect(),
-            _ => {
-                let nothing: Option<T> =
-                    self.wrong_type(key, node, "an integer or an array of integers");
-                nothing.into_iter().collect()
+        // Whether an option has a meaning is known only now that all are read.
+        for field in options.fields() {
+            let Some(condition) = field.condition.filter(|condition| !condition.is_met) else {
+                continue;
+            };
+            if let Some(node) = self.table.get(field.key)
+                && !self.refused.contains(&condition.key)
+            {
+                let fault = Fault::Inconsistent(condition.why.to_owned());
+                self.add(field.key, node.key_place, fault);
             }
         }
-    }
-
-    /// A number within `limit`; integers are numbers.
-    pub(super) fn number(&mut self, key: &'static str, limit: &Limit<f64>) -> Option<f64> {
-        let node = self.node(key, || Shape::number(limit))?;
-        self.number_of(key, node, limit)
-    }
-
-    fn number_of(&self, key: &str, node: &Node, limit: &Limit<f64>) -> Option<f64> {
-        let number = match &node.value {
-            Value::Number(number) => *number,
-            Value::Integer(integer) => *integer as f64,
-            _ => return self.wrong_type(key, node, "a number"),
-        };
-        if limit.allows(&number) {
-            return Some(number);
+        // Each option is within its range by now; what is left is what they say together.
+        if is_usable && let Err(error) = options.check_together() {
+            self.refuse(&error.key, Fault::Inconsistent(error.problem));
+            return false;
         }
-        self.out_of_range(key, node, &number.to_string(), limit);
-        None
+        is_usable
     }
 
-    /// An array of numbers within `limit`.
-    pub(super) fn numbers(&mut self, key: &'static str, limit: &Limit<f64>) -> Option<Vec<f64>> {
-        let node = self.node(key, || Shape::numbers(limit))?;
-        let Value::Array(items) = &node.value else {
-            return self.wrong_type(key, node, "an array of numbers");
+    /// Reads one option; false when it is missing or refused.
+    fn field(&mut self, field: Field<'_>) -> bool {
+        let key = field.key;
+        let is_missing = field.is_required && !self.has(key);
+        if is_missing {
+            let hint = match &field.slot {
+                Slot::Value(_, Shape::Words(words)) => format!("write {}", one_of(words)),
+                Slot::Value(_, shape) if field.hint.is_empty() => expected(shape).to_owned(),
+                _ => field.hint.to_owned(),
+            };
+            self.refuse(key, Fault::Missing(hint));
+        }
+        let is_read = match field.slot {
+            Slot::Value(mut value, shape) => {
+                let node = self.node(key);
+                node.is_none_or(|node| self.value(key, node, &shape, &mut *value))
+            }
+            Slot::Table(mut slot) => self.table(key, &mut *slot),
+            Slot::Part(options) => self.options(options),
+            Slot::Tables(tables, has_slashes) => self.tables(key, tables, has_slashes),
+            Slot::Free => {
+                let node = self.node(key);
+                node.is_none_or(|node| self.below(key, node, "a table").is_some())
+            }
         };
-        let items = items.iter().map(|item| self.number_of(key, item, limit));
-        all_of(items)
+        is_read && !is_missing
     }
 
-    /// An array of durations within `limit`.
-    pub(super) fn durations(
-        &mut self,
-        key: &'static str,
-        limit: &Limit<Duration>,
-    ) -> Option<Vec<Duration>> {
-        let node = self.node(key, || Shape::durations(limit))?;
-        let Value::Array(items) = &node.value else {
-            return self.wrong_type(
-                key,
-                node,
-                "an array of durations, e.g. [\"1 ms\", \"2 ms\"]",
-            );
+    fn value(
+        &self,
+        key: &str,
+        node: &Node,
+        shape: &Shape,
+        value: &mut dyn hil_core::options::Value,
+    ) -> bool {
+        let Some(setting) = self.setting(key, node, shape) else {
+            return false;
         };
-        let items = items.iter().map(|item| self.duration_of(key, item, limit));
-        all_of(items)
+        let set = value.set(setting);
+        set.map_err(|why| self.add(key, node.place, Fault::Inconsistent(why)))
+            .is_ok()
     }
 
-    /// A duration within `limit`, written with its unit.
-    pub(super) fn duration(
-        &mut self,
-        key: &'static str,
-        limit: &Limit<Duration>,
-    ) -> Option<Duration> {
-        let node = self.node(key, || Shape::duration(limit))?;
-        self.duration_of(key, node, limit)
-    }
-
-    fn duration_of(&self, key: &str, node: &Node, limit: &Limit<Duration>) -> Option<Duration> {
-        let Value::Text(text) = &node.value else {
-            return self.wrong_type(key, node, "a string with a duration, e.g. \"20 ms\"");
-        };
-        match parse_duration(text) {
-            Ok(duration) if limit.allows(&duration) => return Some(duration),
-            Ok(_) => self.out_of_range(key, node, &format!("\"{text}\""), limit),
-            Err(error) => {
-                let fault = Fault::Duration {
-                    value: text.clone(),
-                    reason: error.to_string(),
+    /// The value at `node` without its type, where `shape` allows it.
+    fn setting(&self, key: &str, node: &Node, shape: &Shape) -> Option<Setting> {
+        let setting = match (shape, &node.value) {
+            (Shape::Boolean, Value::Boolean(value)) => Setting::Boolean(*value),
+            (Shape::Integer(_), Value::Integer(value)) => Setting::Integer(*value),
+            (Shape::Number(_), Value::Number(value)) => Setting::Number(*value),
+            (Shape::Number(_), Value::Integer(value)) => Setting::Number(*value as f64),
+            (Shape::Time(_), Value::Text(text)) => match parse_duration(text) {
+                Ok(time) => Setting::Time(time),
+                Err(error) => {
+                    let (value, reason) = (text.clone(), error.to_string());
+                    self.add(key, node.place, Fault::Duration { value, reason });
+                    return None;
+                }
+            },
+            (Shape::Text(rule), Value::Text(text)) => {
+                if let Err(why) = (rule.check)(text) {
+                    self.add(key, node.place, Fault::Inconsistent(why));
+                    return None;
+                }
+                Setting::Text(text.clone())
+            }
+            (Shape::Words(words), Value::Text(text)) => {
+                self.word(key, node, words)?;
+                Setting::Text(text.clone())
+            }
+            (Shape::List(each) | Shape::OneOrMore(each), Value::Array(items)) => {
+                // Each is read, so that every fault is noted.
+                let read = items.iter().map(|item| self.setting(key, item, each));
+                let read: Vec<Option<Setting>> = read.collect();
+                return read
+                    .into_iter()
+                    .collect::<Option<Vec<_>>>()
+                    .map(Setting::List);
+            }
+            (Shape::OneOrMore(each), Value::Integer(_)) => {
+                return Some(Setting::List(vec![self.setting(key, node, each)?]));
+            }
+            (Shape::Texts, Value::Table(table)) => {
+                let below = join(&self.path, key);
+                let reader = Reader::new(below, node.key_place, table, self.faults);
+                let text = |(name, node): (&String, &Node)| match &node.value {
+                    Value::Text(text) => Some((name.clone(), text.clone())),
+                    _ => reader.wrong_type(name, node, "a string"),
                 };
-                self.faults.add(self.path_of(key), Some(node.place), fault);
+                let read: Vec<Option<(String, String)>> = table.iter().map(text).collect();
+                return read.into_iter().collect::<Option<_>>().map(Setting::Texts);
             }
+            _ => return self.wrong_type(key, node, expected(shape)),
+        };
+        if shape.allows(&setting) {
+            return Some(setting);
         }
+        let value = match &node.value {
+            Value::Text(text) => format!("\"{text}\""),
+            Value::Number(number) => number.to_string(),
+            other => other.to_plain().to_string(),
+        };
+        let allowed = range_text(shape);
+        self.add(key, node.place, Fault::OutOfRange { value, allowed });
         None
     }
 
-    fn out_of_range(&self, key: &str, node: &Node, value: &str, limit: &dyn RangeText) {
-        let fault = Fault::OutOfRange {
-            value: value.to_owned(),
-            allowed: limit.range_text(),
+    /// The index of the word at `node` in `words`.
+    fn word(&self, key: &str, node: &Node, words: &[&'static str]) -> Option<usize> {
+        let Value::Text(text) = &node.value else {
+            return self.wrong_type(key, node, "a string");
         };
-        self.faults.add(self.path_of(key), Some(node.place), fault);
-    }
-
-    /// One word of a fixed list.
-    pub(super) fn word<T: Copy>(
-        &mut self,
-        key: &'static str,
-        words: &[(&'static str, T)],
-    ) -> Option<T> {
-        let shape = || Shape::Words(words.iter().map(|(word, _)| *word).collect());
-        let text = self.text_as(key, shape)?;
-        let found = words.iter().find(|(word, _)| *word == text.value);
+        let found = words.iter().position(|word| word == text);
         if found.is_none() {
             let fault = Fault::UnknownWord {
-                value: text.value,
-                expected: "an allowed word",
-                allowed: words.iter().map(|(word, _)| (*word).to_owned()).collect(),
-            };
-            self.refuse(key, fault);
-        }
-        found.map(|(_, value)| *value)
-    }
-
-    /// An array of strings.
-    pub(super) fn texts(&mut self, key: &'static str) -> Option<At<Vec<At<String>>>> {
-        let node = self.node(key, || Shape::Texts)?;
-        let Value::Array(items) = &node.value else {
-            return self.wrong_type(key, node, "an array of strings");
-        };
-        let text = |item: &Node| match &item.value {
-            Value::Text(text) => Some(At {
                 value: text.clone(),
-                place: item.place,
-            }),
-            _ => self.wrong_type(key, item, "a string"),
-        };
-        let texts: Option<Vec<_>> = items.iter().map(text).collect();
-        texts.map(|value| At {
-            value,
-            place: node.place,
-        })
-    }
-
-    /// A table of strings, e.g. environment variables.
-    pub(super) fn text_table(&mut self, key: &'static str) -> BTreeMap<String, String> {
-        let node = self.node(key, || Shape::TextTable);
-        let Some(reader) = node.and_then(|node| self.table_of(key, node)) else {
-            return BTreeMap::new();
-        };
-        let mut texts = BTreeMap::new();
-        for (name, node) in reader.table {
-            if let Value::Text(text) = &node.value {
-                texts.insert(name.clone(), text.clone());
-            } else {
-                let _nothing: Option<()> = reader.wrong_type(name, node, "a string");
-            }
+                expected: "an allowed word",
+                allowed: words.iter().map(|word| (*word).to_owned()).collect(),
+            };
+            self.add(key, node.place, fault);
         }
-        texts
+        found
     }
 
-    /// A table; the caller ends it with [`Reader::finish`].
-    pub(super) fn table(&mut self, key: &'static str) -> Option<Reader<'t>> {
-        self.table_or(key, "a table")
+    fn wrong_type<T>(&self, key: &str, node: &Node, expected: impl Into<String>) -> Option<T> {
+        let (found, expected) = (node.value.type_name(), expected.into());
+        self.add(key, node.place, Fault::WrongType { found, expected });
+        None
     }
 
-    /// As [`Reader::table`], with words of its own for anything else.
-    pub(super) fn table_or(
-        &mut self,
-        key: &'static str,
-        expected: &'static str,
-    ) -> Option<Reader<'t>> {
-        let node = self.node(key, || Shape::Table)?;
-        if matches!(node.value, Value::Table(_)) {
-            return self.table_of(key, node);
-        }
-        self.wrong_type(key, node, expected)
-    }
-
-    fn table_of(&self, key: &str, node: &'t Node) -> Option<Reader<'t>> {
+    /// The reader of the table at `node`; the caller ends it with [`Reader::finish`].
+    fn below(&self, key: &str, node: &'t Node, expected: impl Into<String>) -> Option<Self> {
         match &node.value {
-            Value::Table(table) => Some(Reader::new(
-                self.path_of(key),
-                node.key_place,
-                table,
-                self.faults,
-            )),
-            _ => self.wrong_type(key, node, "a table"),
+            Value::Table(table) => {
+                let path = join(&self.path, key);
+                Some(Reader::new(path, node.key_place, table, self.faults))
+            }
+            _ => self.wrong_type(key, node, expected),
         }
     }
 
-    /// The tables of a table, by name.
-    pub(super) fn named_tables(&mut self, key: &'static str) -> Vec<(String, Reader<'t>)> {
-        let node = self.node(key, || Shape::Tables);
-        let Some(reader) = node.and_then(|node| self.table_of(key, node)) else {
-            return Vec::new();
-        };
-        let has_slashes = key == "channels";
-        let mut tables = Vec::new();
-        for (name, node) in reader.table {
-            if !is_name(name, has_slashes) {
-                let path = reader.path_of(name);
-                let fault = bad_name(name, has_slashes);
-                self.faults.add(path, Some(node.key_place), fault);
-            } else if let Some(table) = reader.table_of(name, node) {
-                tables.push((name.clone(), table));
+    /// Reads a table with options of its own, or what stands in its place.
+    fn table(&mut self, key: &'static str, slot: &mut dyn TableSlot) -> bool {
+        let node = self.node(key);
+        let mut expected = "a table".to_owned();
+        let mut is_usable = true;
+        if let Some(mut short) = slot.shorthand() {
+            if short.key != key {
+                let short_node = self.node(short.key);
+                if node.is_some()
+                    && let Some(short_node) = short_node
+                {
+                    let why = format!("beside [{key}] says the {key} twice; leave one of them out");
+                    self.add(short.key, short_node.key_place, Fault::Inconsistent(why));
+                } else if let Some(node) = short_node {
+                    is_usable = self.value(short.key, node, &short.shape, &mut *short.value);
+                }
+                expected = format!("a table with options; did you mean `{}`?", short.key);
+            } else if let Some(node) = node.filter(|node| !matches!(node.value, Value::Table(_))) {
+                return self.value(key, node, &short.shape, &mut *short.value);
             }
         }
-        tables
+        let Some(node) = node else { return is_usable };
+        let Some(mut below) = self.below(key, node, expected) else {
+            return false;
+        };
+        let mut template = Some(0);
+        if let Some(templates) = slot.templates() {
+            let named = below.node(templates.key);
+            if templates.is_required {
+                template = None;
+                if named.is_none() {
+                    below.refuse(templates.key, Fault::Missing(one_of(templates.names)));
+                }
+            }
+            if let Some(node) = named {
+                let index = below.word(templates.key, node, templates.names);
+                is_usable &= index.is_some();
+                template = index.or(template);
+            }
+        }
+        // The keys that belong here depend on the template: without it none is unknown.
+        let Some(template) = template else {
+            return false;
+        };
+        is_usable &= below.options(slot.open(template));
+        below.finish();
+        is_usable
     }
 
-    /// The tree below this table, for what is handed on unread.
-    pub(super) fn unread(&self) -> &'t Table {
-        self.faults.note_unread(&self.path);
-        self.table
-    }
-
-    /// Refuses every key that was not asked for.
-    pub(super) fn finish(self) {
-        for (key, node) in self.table {
-            if self.asked.contains(&key.as_str()) {
+    /// Reads the tables of a table, by name.
+    fn tables(&mut self, key: &'static str, tables: &mut dyn Tables, has_slashes: bool) -> bool {
+        let Some(node) = self.node(key) else {
+            return true;
+        };
+        let Some(reader) = self.below(key, node, "a table") else {
+            return false;
+        };
+        let rule = if has_slashes { NAME_WITH_SLASHES } else { NAME };
+        let mut is_usable = true;
+        for (name, node) in reader.table {
+            if let Err(why) = (rule.check)(name) {
+                reader.add(name, node.key_place, Fault::Inconsistent(why));
+            } else if let Some(mut below) = reader.below(name, node, "a table") {
+                is_usable &= below.options(tables.open(name));
+                below.finish();
                 continue;
             }
-            let mut allowed: Vec<_> = self.asked.iter().map(|key| (*key).to_owned()).collect();
+            is_usable = false;
+        }
+        is_usable
+    }
+
+    /// Refuses every key that no declaration has.
+    fn finish(self) {
+        for (key, node) in self.table {
+            if self.known.contains(&key.as_str()) {
+                continue;
+            }
+            let mut allowed: Vec<_> = self.known.iter().map(|key| (*key).to_owned()).collect();
             allowed.sort_unstable();
-            let path = self.path_of(key);
-            let fault = Fault::UnknownKey { allowed };
-            self.faults.add(path, Some(node.key_place), fault);
+            self.add(key, node.key_place, Fault::UnknownKey { allowed });
         }
     }
 }
 
-/// All of them, each asked for, so that every fault is noted.
-fn all_of<T>(items: impl Iterator<Item = Option<T>>) -> Option<Vec<T>> {
-    let read: Vec<Option<T>> = items.collect();
-    read.into_iter().collect()
+/// `one of "a", "b"`.
+fn one_of(words: &[&str]) -> String {
+    let quoted: Vec<_> = words.iter().map(|word| format!("\"{word}\"")).collect();
+    format!("one of {}", quoted.join(", "))
 }
 
-fn is_name(name: &str, may_have_slashes: bool) -> bool {
-    let is_allowed = |letter: char| {
-        letter.is_ascii_alphanumeric()
-            || matches!(letter, '-' | '_' | '.')
-            || (may_have_slashes && letter == '/')
-    };
-    let starts_well = name.starts_with(|letter: char| letter.is_ascii_alphanumeric());
-    starts_well && name.len() <= NAME_LENGTH_MAX && name.chars().all(is_allowed)
+/// What a value must be, with its article.
+fn expected(shape: &Shape) -> &'static str {
+    match shape {
+        Shape::Boolean => "true or false",
+        Shape::Integer(_) => "an integer",
+        Shape::Number(_) => "a number",
+        Shape::Time(_) => "a string with a duration, e.g. \"20 ms\"",
+        Shape::Text(_) | Shape::Words(_) => "a string",
+        Shape::List(each) => match **each {
+            Shape::Time(_) => "an array of durations, e.g. [\"1 ms\", \"2 ms\"]",
+            Shape::Number(_) => "an array of numbers",
+            _ => "an array of strings",
+        },
+        Shape::OneOrMore(_) => "an integer or an array of integers",
+        Shape::Texts => "a table",
+    }
 }
 
-fn bad_name(name: &str, may_have_slashes: bool) -> Fault {
-    let slash = if may_have_slashes { ", `/`" } else { "" };
-    Fault::Inconsistent(format!(
-        "`{name}` is no name: 1 to {NAME_LENGTH_MAX} letters, digits, `-`, `_`, `.`{slash}, \
-         starting with a letter or digit"
-    ))
+/// The range of a shape in the words of the file; empty for one without.
+pub(super) fn range_text(shape: &Shape) -> String {
+    fn range(min: &str, max: &str) -> String {
+        if min == max {
+            min.to_owned()
+        } else {
+            format!("{min} to {max}")
+        }
+    }
+    match shape {
+        Shape::Integer(ends) => range(&ends.start().to_string(), &ends.end().to_string()),
+        Shape::Number(ends) => range(&ends.start().to_string(), &ends.end().to_string()),
+        Shape::Time(ends) => {
+            let [min, max] = [ends.start(), ends.end()].map(|end| format_duration(*end));
+            format!("\"{min}\" to \"{max}\"")
+        }
+        _ => String::new(),
+    }
 }

@@ -1,16 +1,15 @@
 //! The checked topology written back: every default spelled out, in the shape of the file. It is
 //! what a run's manifest keeps and what two hosts compare.
 
-use core::time::Duration;
+use std::time::Duration;
 
 use hil_core::message::{FNV_OFFSET, fnv1a};
+use hil_core::options::{Options, Setting, Shape, Slot};
 use serde::Serialize;
 use toml::{Table, Value};
 
-use super::file_impairments::{resolved_part, resolved_spec};
-use super::file_trace::resolved_trace;
-use super::model::{Channel, Execution, Host, OnExit, Process, Program, Scheduling, Topology};
-use super::model_links::{Gateway, Hop, Link, Via};
+use super::model::{Channel, Process, Program, Topology};
+use super::tables::{ChannelTable, ProcessTable};
 use super::units::format_duration;
 
 impl Topology {
@@ -29,34 +28,35 @@ impl Topology {
 
     fn resolved_with(&self, key_path: bool) -> Table {
         let mut table = Table::new();
-        put(&mut table, "version", super::limits::VERSION.default);
+        put(&mut table, "version", 1);
         put(&mut table, "name", self.name.as_str());
-        put(&mut table, "run", self.resolved_run());
+        put(&mut table, "run", written(&mut self.run.clone()));
         if let Some(case) = &self.case {
             let mut case_table = Table::new();
             put(&mut case_table, "name", case.name.as_str());
             put(&mut case_table, "parameters", case.parameters.clone());
             put(&mut table, "case", case_table);
         }
-        let hosts = self
-            .hosts
-            .iter()
-            .map(|host| (host.name.clone(), resolved_host(host)));
+        let hosts = self.hosts.iter();
+        let hosts = hosts.map(|host| (host.name.clone(), written(&mut host.clone())));
         put_named(&mut table, "hosts", hosts);
         let processes = self.processes.iter();
-        let processes = processes.map(|process| (process.name.clone(), resolved_process(process)));
+        let processes = processes.map(|process| (process.name.clone(), process.resolved()));
         put_named(&mut table, "processes", processes);
         // What is only recorded has nothing to set, and a file that says otherwise is refused.
         let channels = self.channels.iter();
         let channels = channels.filter(|channel| !channel.is_recorded_only());
-        let channels = channels.map(|channel| (channel.name.clone(), resolved_channel(channel)));
+        let channels =
+            channels.map(|channel| (channel.name.clone(), written(&mut channel.table())));
         put_named(&mut table, "channels", channels);
-        let links = self
-            .links
-            .iter()
-            .map(|link| (link.name.clone(), resolved_link(link)));
+        let links = self.links.iter();
+        let links = links.map(|link| (link.name.clone(), link.resolved()));
         put_named(&mut table, "links", links);
-        if let Some(security) = self.security.resolved(key_path) {
+        if self.security.hops.is_some() {
+            let mut security = written(&mut self.security.clone());
+            if !key_path {
+                security.remove("key");
+            }
             put(&mut table, "security", security);
         }
         table
@@ -74,23 +74,51 @@ impl Topology {
         let text = text.expect("tables with string keys can be written as TOML");
         fnv1a(FNV_OFFSET, text.as_bytes())
     }
-
-    fn resolved_run(&self) -> Table {
-        let run = &self.run;
-        let mut table = Table::new();
-        put(&mut table, "duration", duration(run.duration));
-        put(&mut table, "seed", integer(run.seed));
-        put(&mut table, "record", run.record_folder.as_str());
-        put(&mut table, "start_timeout", duration(run.start_timeout));
-        put(&mut table, "peer_timeout", duration(run.peer_timeout));
-        table
-    }
 }
 
 /// The resolved form, as in [`Topology::resolved`].
 impl Serialize for Topology {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         self.resolved().serialize(serializer)
+    }
+}
+
+impl Process {
+    fn resolved(&self) -> Table {
+        let (run, env) = match &self.program {
+            Program::Command {
+                command,
+                environment,
+                ..
+            } => (Some(command.clone()), environment.clone()),
+            _ => (None, Default::default()),
+        };
+        let egm = match &self.program {
+            Program::Egm { adapter, .. } => Some(adapter.clone()),
+            _ => None,
+        };
+        written(&mut ProcessTable {
+            host: Some(self.host.clone()),
+            role: self.role().map(str::to_owned),
+            run,
+            env,
+            egm,
+            execution: self.execution.clone(),
+            restarts: self.restarts,
+        })
+    }
+}
+
+impl Channel {
+    fn table(&self) -> ChannelTable {
+        let foreign = self.is_foreign.then_some(self);
+        ChannelTable {
+            depth: self.depth,
+            link: self.link.clone(),
+            message: foreign.map(|channel| channel.message.clone()),
+            from: foreign.map(|channel| channel.from.clone()),
+            to: foreign.and_then(|channel| channel.to.clone()),
+        }
     }
 }
 
@@ -105,169 +133,75 @@ fn put_named(table: &mut Table, key: &str, tables: impl Iterator<Item = (String,
     put(table, key, named);
 }
 
-pub(super) fn duration(duration: Duration) -> Value {
-    Value::String(format_duration(duration))
-}
-
-/// Every integer of a checked topology came from a TOML integer.
-pub(super) fn integer(value: impl TryInto<i64>) -> Value {
-    let value = value.try_into().ok();
-    Value::Integer(value.expect("limits keep every number within 64 bits"))
-}
-
-fn resolved_host(host: &Host) -> Table {
+/// Every option of a table.
+fn written(options: &mut dyn Options) -> Table {
     let mut table = Table::new();
-    if let Some(address) = host.address {
-        put(&mut table, "address", address.to_string());
-        put(&mut table, "control_port", integer(host.control_port));
-    }
-    if let Some(interface) = &host.interface {
-        put(&mut table, "interface", interface.as_str());
-    }
-    if let Some(clock) = &host.clock {
-        put(&mut table, "clock_address", clock.address.to_string());
-        put(&mut table, "clock_port", integer(clock.port));
-        if let Some(interface) = &clock.interface {
-            put(&mut table, "clock_interface", interface.as_str());
-        }
-    }
+    write(options, &mut table);
     table
 }
 
-fn resolved_process(process: &Process) -> Table {
-    let mut table = Table::new();
-    put(&mut table, "host", process.host.as_str());
-    if let Some(role) = process.role() {
-        put(&mut table, "role", role);
-    }
-    if let Program::Command {
-        command,
-        environment,
-        ..
-    } = &process.program
-    {
-        put(&mut table, "run", command.clone());
-        let variables = environment.iter();
-        let variables: Table = variables
-            .map(|(name, value)| (name.clone(), Value::String(value.clone())))
-            .collect();
-        put(&mut table, "env", variables);
-    }
-    if let Program::Egm { adapter, .. } = &process.program {
-        put(&mut table, "egm", adapter.resolved());
-    }
-    put_execution(&mut table, &process.execution);
-    put_on_exit(&mut table, process.on_exit);
-    table
-}
-
-fn put_execution(table: &mut Table, execution: &Execution) {
-    let cpus: Vec<Value> = execution.cpus.iter().map(|&cpu| integer(cpu)).collect();
-    put(table, "cpu", cpus);
-    match execution.scheduling {
-        Scheduling::Other => put(table, "scheduling", "other"),
-        Scheduling::Fifo { priority } => {
-            put(table, "scheduling", "fifo");
-            put(table, "priority", integer(priority));
-        }
-    }
-    put(table, "lock_memory", execution.locks_memory);
-    put(table, "timer_slack", duration(execution.timer_slack));
-    put(table, "wait", execution.wait.word());
-}
-
-fn put_on_exit(table: &mut Table, on_exit: OnExit) {
-    match on_exit {
-        OnExit::EndRun => put(table, "on_exit", "end-run"),
-        OnExit::Restart { limit } => {
-            put(table, "on_exit", "restart");
-            put(table, "restart_limit", integer(limit));
-        }
-    }
-}
-
-fn resolved_channel(channel: &Channel) -> Table {
-    let mut table = Table::new();
-    put(&mut table, "depth", integer(channel.depth));
-    if let Some(link) = &channel.link {
-        put(&mut table, "link", link.as_str());
-    }
-    if channel.is_foreign {
-        let mut message = Table::new();
-        put(&mut message, "name", channel.message.name.as_str());
-        put(
-            &mut message,
-            "size_bytes",
-            integer(channel.message.size_bytes),
-        );
-        put(
-            &mut message,
-            "alignment_bytes",
-            integer(channel.message.alignment_bytes),
-        );
-        put(&mut table, "message", message);
-        put(&mut table, "from", channel.from.as_str());
-        if let Some(to) = &channel.to {
-            put(&mut table, "to", to.as_str());
-        }
-    }
-    table
-}
-
-fn resolved_link(link: &Link) -> Table {
-    let mut table = Table::new();
-    if let Some(between) = &link.between {
-        put(&mut table, "between", between.to_vec());
-    }
-    put(&mut table, "via", link.via.word());
-    match &link.via {
-        Via::SharedMemory => {}
-        Via::Network(hop) => put_hop(&mut table, hop),
-        Via::Emulated(hop, emulation) => {
-            put_hop(&mut table, hop);
-            let (forward, backward) = (emulation.forward.clone(), emulation.backward.clone());
-            // A radio has outages of its own, and the link then has none beside them.
-            match forward.wifi {
-                Some(mut wifi) => put(&mut table, "wifi", resolved_part(&mut wifi)),
-                None => put(
-                    &mut table,
-                    "outages",
-                    resolved_part(&mut { forward.outages }),
-                ),
+/// Adds every option that has a meaning to `table`. A value that stands in place of a table is written
+/// where it says all that the table does.
+pub(super) fn write(options: &mut dyn Options, table: &mut Table) {
+    let fields = options.fields().into_iter();
+    for field in fields.filter(|field| field.condition.is_none_or(|condition| condition.is_met)) {
+        let key = field.key;
+        match field.slot {
+            Slot::Value(value, shape) => {
+                if let Some(setting) = value.get() {
+                    put(table, key, plain(&setting, &shape));
+                }
             }
-            put(&mut table, "forward", resolved_spec(forward));
-            put(&mut table, "backward", resolved_spec(backward));
-            if let Some(trace) = &emulation.trace {
-                put(&mut table, "trace", resolved_trace(trace));
+            Slot::Table(mut slot) => {
+                if let Some(short) = slot.shorthand()
+                    && let Some(setting) = short.value.get()
+                {
+                    put(table, short.key, plain(&setting, &short.shape));
+                    continue;
+                }
+                let chosen = slot
+                    .templates()
+                    .and_then(|one| Some((one.key, one.chosen?)));
+                let Some(options) = slot.options() else {
+                    continue;
+                };
+                let mut below = written(options);
+                if let Some((key, name)) = chosen {
+                    put(&mut below, key, name);
+                }
+                put(table, key, below);
             }
+            Slot::Part(part) => write(part, table),
+            // The file as a whole is not written from its declaration: what it lacks is filled in.
+            Slot::Tables(..) | Slot::Free => {}
         }
     }
-    table
 }
 
-fn put_hop(table: &mut Table, hop: &Hop) {
-    put(table, "port", integer(hop.port));
-    for (key, value) in &hop.options {
-        put(table, key, *value);
+/// A value as TOML has it.
+pub(super) fn plain(setting: &Setting, shape: &Shape) -> Value {
+    match (setting, shape) {
+        (Setting::Number(seconds), Shape::Time(_)) => {
+            Value::String(format_duration(Duration::from_secs_f64(*seconds)))
+        }
+        (Setting::List(items), Shape::List(each) | Shape::OneOrMore(each)) => {
+            Value::Array(items.iter().map(|item| plain(item, each)).collect())
+        }
+        (Setting::Boolean(value), _) => Value::from(*value),
+        (Setting::Integer(value), _) => Value::from(*value),
+        (Setting::Number(value), _) => Value::from(*value),
+        (Setting::Time(value), _) => Value::String(format_duration(*value)),
+        (Setting::Text(text), _) => Value::from(text.as_str()),
+        (Setting::List(items), _) => {
+            Value::Array(items.iter().map(|item| plain(item, shape)).collect())
+        }
+        (Setting::Texts(texts), _) => {
+            let texts = texts.iter();
+            Value::Table(
+                texts
+                    .map(|(name, text)| (name.clone(), text.as_str().into()))
+                    .collect(),
+            )
+        }
     }
-    put(table, "dscp", integer(hop.dscp));
-    if let Some(priority) = hop.socket_priority {
-        put(table, "socket_priority", integer(priority));
-    }
-    put(table, "send_buffer_bytes", integer(hop.send_buffer_bytes));
-    put(
-        table,
-        "receive_buffer_bytes",
-        integer(hop.receive_buffer_bytes),
-    );
-    put(table, "timestamps", hop.timestamps.word());
-    put(table, "path_mtu_bytes", integer(hop.path_mtu_bytes));
-    put(table, "gateway", resolved_gateway(&hop.gateway));
-}
-
-fn resolved_gateway(gateway: &Gateway) -> Table {
-    let mut table = Table::new();
-    put_execution(&mut table, &gateway.execution);
-    put_on_exit(&mut table, gateway.on_exit);
-    table
 }

@@ -1,202 +1,25 @@
-//! The JSON Schema of topology files, for editors that complete and check what they hold while it is
-//! typed. It checks no file itself.
-//!
-//! Nobody writes it: the readers of `file` note every key they ask for, with its type, range and
-//! words, while they read texts that lead them into each of their branches. What they would refuse
-//! as unknown, the schema refuses; what two keys say together, only a reader can judge.
+//! What can stand in a topology file, made from the declarations of its tables: the JSON Schema, for
+//! editors that complete and check what they hold while it is typed, and the reference page of all keys.
+//! They check no file themselves; what two keys say together, only a reader can judge.
 
-use core::fmt::{Display, Write as _};
-use core::time::Duration;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
-use hil_link::delay::DelayLaw;
-use hil_link::loss::LossLaw;
+use hil_core::options::{Field, Options, Shape, Slot, Table as TableSlot};
 use serde_json::{Map, Value, json};
 
-use super::errors::{Faults, Place, Source};
-use super::file;
-use super::limits::{Limit, NAME_LENGTH_MAX};
-use super::tree::{self, join};
-use super::units::{format_duration, unit_words};
+use super::reader::range_text;
+use super::resolved::plain;
+use super::tables::{File, NAME, NAME_WITH_SLASHES};
+use super::units::unit_words;
 
 const DIALECT: &str = "https://json-schema.org/draft/2020-12/schema";
 /// Stands for the name of a host, process, channel or link.
-const ANY_NAME: &str = "any";
-/// Every table that a file can have, but those that take the place of another value.
-const TABLES: &str = "
-run = {}
-security = {}
-case.parameters = {}
-hosts.any = {}
-processes.any = { egm = {}, env = {} }
-channels.any.message = {}
-links.any.gateway = {}
-";
-/// The tables below a link and below each of its directions.
-const IMPAIRMENTS: [&str; 3] = ["rate = {}", "reordering = {}", "duplication = {}"];
-/// What stands in one place of the whole link only.
-const OF_WHOLE_LINK: [&str; 5] = [
-    "outages = {}",
-    "wifi = \"short-range\"",
-    "wifi = { outages = {} }",
-    "trace = \"folder\"",
-    "trace = { files = {} }",
-];
-
-/// What a key of a table may be.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) enum Shape {
-    Text,
-    /// A text that can name a folder and a shared-memory service.
-    Name,
-    Boolean,
-    /// One of these.
-    Words(Vec<&'static str>),
-    Integer {
-        min: i64,
-        max: i64,
-    },
-    /// One or several.
-    Integers {
-        min: i64,
-        max: i64,
-    },
-    Number {
-        min: f64,
-        max: f64,
-    },
-    Numbers {
-        min: f64,
-        max: f64,
-    },
-    Duration {
-        min: Duration,
-        max: Duration,
-    },
-    Durations {
-        min: Duration,
-        max: Duration,
-    },
-    Texts,
-    /// Texts by names that the file chooses.
-    TextTable,
-    Table,
-    /// Tables by names that the file chooses.
-    Tables,
-}
-
-impl Shape {
-    pub(super) const fn integer(limit: &Limit<i64>) -> Self {
-        let Limit { min, max, .. } = *limit;
-        Self::Integer { min, max }
-    }
-
-    pub(super) const fn integers(limit: &Limit<i64>) -> Self {
-        let Limit { min, max, .. } = *limit;
-        Self::Integers { min, max }
-    }
-
-    pub(super) const fn number(limit: &Limit<f64>) -> Self {
-        let Limit { min, max, .. } = *limit;
-        Self::Number { min, max }
-    }
-
-    pub(super) const fn numbers(limit: &Limit<f64>) -> Self {
-        let Limit { min, max, .. } = *limit;
-        Self::Numbers { min, max }
-    }
-
-    pub(super) const fn duration(limit: &Limit<Duration>) -> Self {
-        let Limit { min, max, .. } = *limit;
-        Self::Duration { min, max }
-    }
-
-    pub(super) const fn durations(limit: &Limit<Duration>) -> Self {
-        let Limit { min, max, .. } = *limit;
-        Self::Durations { min, max }
-    }
-}
-
-/// What readers asked for, by the path of the table.
-#[derive(Debug, Default)]
-pub(super) struct RequestedKeys {
-    tables: BTreeMap<String, BTreeMap<&'static str, Vec<Shape>>>,
-    /// Tables that no reader looks into.
-    unread: BTreeSet<String>,
-}
-
-impl RequestedKeys {
-    /// Adds a key of the table at `path`.
-    pub(super) fn add(&mut self, path: &str, key: &'static str, shape: Shape) {
-        let table = self.tables.entry(path.to_owned()).or_default();
-        let shapes = table.entry(key).or_default();
-        if !shapes.contains(&shape) {
-            shapes.push(shape);
-        }
-    }
-
-    /// Adds a table that is handed on.
-    pub(super) fn add_unread(&mut self, path: &str) {
-        self.unread.insert(path.to_owned());
-    }
-
-    fn object(&self, path: &str) -> Value {
-        if self.unread.contains(path) {
-            return json!({ "type": "object" });
-        }
-        // A test checks that no table is without keys.
-        let keys = self.tables.get(path).into_iter().flatten();
-        let mut properties = Map::new();
-        for (key, shapes) in keys {
-            let mut all = shapes
-                .iter()
-                .map(|shape| self.value(&join(path, key), shape));
-            let value = match (all.next(), all.len()) {
-                (Some(only), 0) => only,
-                (first, _) => json!({ "anyOf": first.into_iter().chain(all).collect::<Vec<_>>() }),
-            };
-            properties.insert((*key).to_owned(), value);
-        }
-        json!({ "type": "object", "properties": properties, "additionalProperties": false })
-    }
-
-    fn value(&self, path: &str, shape: &Shape) -> Value {
-        match shape {
-            Shape::Text => json!({ "type": "string" }),
-            Shape::Name => json!({ "type": "string", "pattern": name_pattern(false) }),
-            Shape::Boolean => json!({ "type": "boolean" }),
-            Shape::Words(words) => json!({ "enum": words }),
-            Shape::Integer { min, max } => integer(*min, *max),
-            Shape::Integers { min, max } => {
-                let one = integer(*min, *max);
-                json!({ "anyOf": [one, { "type": "array", "items": one }] })
-            }
-            Shape::Number { min, max } => number(*min, *max),
-            Shape::Numbers { min, max } => {
-                json!({ "type": "array", "items": number(*min, *max) })
-            }
-            Shape::Duration { min, max } => duration(*min, *max),
-            Shape::Durations { min, max } => {
-                json!({ "type": "array", "items": duration(*min, *max) })
-            }
-            Shape::Texts => json!({ "type": "array", "items": { "type": "string" } }),
-            Shape::TextTable => {
-                json!({ "type": "object", "additionalProperties": { "type": "string" } })
-            }
-            Shape::Table => self.object(path),
-            Shape::Tables => json!({
-                "type": "object",
-                "propertyNames": { "pattern": name_pattern(path == "channels") },
-                "additionalProperties": self.object(&join(path, ANY_NAME)),
-            }),
-        }
-    }
-}
+const ANY_NAME: &str = "<name>";
 
 /// The schema of topology files (JSON Schema, draft 2020-12). Durations are texts, whose range
 /// stands in a description; a file that extends another may leave out any key.
-pub fn schema() -> Value {
-    let mut schema = asked().object("");
+pub(super) fn schema() -> Value {
+    let mut schema = object(&mut File::TEMPLATE.clone());
     let head = [
         ("$schema", json!(DIALECT)),
         ("title", json!("hil-runtime topology")),
@@ -214,90 +37,285 @@ pub fn schema() -> Value {
     schema
 }
 
-/// What the readers ask for in all their branches.
-fn asked() -> RequestedKeys {
-    let faults = Faults::with_notes();
-    for text in texts() {
-        let sources = [Source {
-            name: "schema".to_owned(),
-            text,
-        }];
-        let place = Place {
-            source_index: 0,
-            start: 0,
-            end: 0,
-        };
-        if let Some(table) = tree::parse(&sources, 0, &faults) {
-            drop(file::read(&table, place, &faults));
+fn object(options: &mut dyn Options) -> Value {
+    let mut keys = Keys::default();
+    keys.add_all(options);
+    keys.object()
+}
+
+/// What each key of a table may be.
+#[derive(Debug, Default)]
+struct Keys(BTreeMap<&'static str, Vec<Value>>);
+
+impl Keys {
+    fn add(&mut self, key: &'static str, about: &str, mut value: Value) {
+        if let Some(value) = value.as_object_mut() {
+            let own = value.get("description").and_then(Value::as_str);
+            let description = match own {
+                Some(own) => format!("{} {own}", one_line(about)),
+                None => one_line(about),
+            };
+            value.insert("description".to_owned(), json!(description.trim()));
+        }
+        let values = self.0.entry(key).or_default();
+        if !values.contains(&value) {
+            values.push(value);
         }
     }
-    faults.into_notes()
-}
 
-/// Texts that lead the readers into every branch. They are no topologies: what they lack is noted
-/// as a fault, and nobody looks at it.
-fn texts() -> Vec<String> {
-    let mut impairments: Vec<String> = IMPAIRMENTS.map(str::to_owned).to_vec();
-    impairments.extend(
-        DelayLaw::NAMES
-            .iter()
-            .map(|law| format!("delay = {{ law = \"{law}\" }}")),
-    );
-    impairments.extend(
-        LossLaw::NAMES
-            .iter()
-            .map(|law| format!("loss = {{ law = \"{law}\" }}")),
-    );
-    let directions = ["forward", "backward"];
-    let mut texts = vec![TABLES.to_owned()];
-    texts.extend(OF_WHOLE_LINK.map(of_link));
-    for impairment in impairments {
-        texts.push(of_link(&impairment));
-        let below =
-            directions.map(|direction| of_link(&format!("{direction} = {{ {impairment} }}")));
-        texts.extend(below);
+    fn add_all(&mut self, options: &mut dyn Options) {
+        for field in options.fields() {
+            let (key, about) = (field.key, field.about);
+            match field.slot {
+                Slot::Value(_, shape) => self.add(key, about, value(&shape)),
+                Slot::Part(part) => self.add_all(part),
+                Slot::Table(mut slot) => {
+                    if let Some(short) = slot.shorthand() {
+                        self.add(short.key, short.about, value(&short.shape));
+                    }
+                    self.add(key, about, table(&mut *slot));
+                }
+                Slot::Tables(tables, has_slashes) => {
+                    let rule = if has_slashes { NAME_WITH_SLASHES } else { NAME };
+                    let tables = json!({
+                        "type": "object",
+                        "propertyNames": { "pattern": rule.pattern },
+                        "additionalProperties": object(tables.open(ANY_NAME)),
+                    });
+                    self.add(key, about, tables);
+                }
+                Slot::Free => self.add(key, about, json!({ "type": "object" })),
+            }
+        }
     }
-    texts
-}
 
-fn of_link(text: &str) -> String {
-    format!("links.{ANY_NAME}.{text}")
-}
-
-fn integer(min: i64, max: i64) -> Value {
-    json!({ "type": "integer", "minimum": min, "maximum": max })
-}
-
-fn number(min: f64, max: f64) -> Value {
-    json!({ "type": "number", "minimum": min, "maximum": max })
-}
-
-fn duration(min: Duration, max: Duration) -> Value {
-    let mut units = String::new();
-    for word in unit_words() {
-        write!(units, "{word}|").expect("a String takes all");
+    fn object(self) -> Value {
+        let mut properties = Map::new();
+        for (key, mut values) in self.0 {
+            let value = match (values.pop(), values.is_empty()) {
+                (Some(only), true) => only,
+                (last, _) => {
+                    values.extend(last);
+                    json!({ "anyOf": values })
+                }
+            };
+            properties.insert(key.to_owned(), value);
+        }
+        json!({ "type": "object", "properties": properties, "additionalProperties": false })
     }
-    json!({
-        "type": "string",
-        "pattern": format!("^\\s*[0-9]+(\\.[0-9]+)?\\s*({units}µs)\\s*$"),
-        "description": range(&format_duration(min), &format_duration(max)),
+}
+
+/// A table with the keys of all that it may start from.
+fn table(slot: &mut dyn TableSlot) -> Value {
+    let mut keys = Keys::default();
+    let mut count = 1;
+    if let Some(templates) = slot.templates() {
+        count = templates.names.len();
+        keys.add(templates.key, "", json!({ "enum": templates.names }));
+    }
+    for template in 0..count {
+        keys.add_all(slot.open(template));
+    }
+    keys.object()
+}
+
+fn value(shape: &Shape) -> Value {
+    match shape {
+        Shape::Boolean => json!({ "type": "boolean" }),
+        Shape::Integer(range) => {
+            json!({ "type": "integer", "minimum": range.start(), "maximum": range.end() })
+        }
+        Shape::Number(range) => {
+            json!({ "type": "number", "minimum": range.start(), "maximum": range.end() })
+        }
+        Shape::Time(_) => {
+            let units = unit_words().collect::<Vec<_>>().join("|");
+            json!({
+                "type": "string",
+                "pattern": format!("^\\s*[0-9]+(\\.[0-9]+)?\\s*({units}|µs)\\s*$"),
+                "description": format!("A duration with its unit, {}.", range_text(shape)),
+            })
+        }
+        Shape::Text(rule) => match rule.pattern {
+            Some(pattern) => json!({ "type": "string", "pattern": pattern }),
+            None => json!({ "type": "string" }),
+        },
+        Shape::Words(words) => json!({ "enum": words }),
+        Shape::List(each) => json!({ "type": "array", "items": value(each) }),
+        Shape::OneOrMore(each) => {
+            let one = value(each);
+            json!({ "anyOf": [one, { "type": "array", "items": one }] })
+        }
+        Shape::Texts => json!({ "type": "object", "additionalProperties": { "type": "string" } }),
+    }
+}
+
+/// The documentation of an option in one line.
+fn one_line(about: &str) -> String {
+    about.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// What stands above the generated part of the reference page.
+const HEAD: &str = "# Keys of a topology file
+
+Made from the declarations of the tables; `hil-runtime documents FOLDER` writes the same as a JSON Schema. A key without a
+default may be left out unless it is required. Durations are texts with a unit (h, min, s, ms, us, ns). What several
+keys say together is checked by `hil-runtime --topology FILE --check`, which also prints every key in force.
+";
+
+/// The reference page of all keys of a topology file, in Markdown. Tables with equal keys share a section.
+pub(super) fn reference() -> String {
+    let mut sections = Sections::default();
+    sections.add("", &mut File::TEMPLATE.clone(), "");
+    let mut merged: Vec<Section> = Vec::new();
+    for section in sections.0 {
+        let is_alike = |one: &&mut Section| one.note == section.note && one.rows == section.rows;
+        match merged.iter_mut().find(is_alike) {
+            Some(same) => same.titles.extend(section.titles),
+            None => merged.push(section),
+        }
+    }
+    let mut page = HEAD.to_owned();
+    for Section { titles, note, rows } in merged {
+        page += &format!("\n## {}{note}\n\n", titles.join(", "));
+        page += "| Key | Value | Default | Meaning |\n|---|---|---|---|\n";
+        page += &rows;
+    }
+    page
+}
+
+/// The keys of tables that have them alike.
+#[derive(Debug)]
+struct Section {
+    titles: Vec<String>,
+    /// The template that its keys belong to.
+    note: String,
+    rows: String,
+}
+
+#[derive(Debug, Default)]
+struct Sections(Vec<Section>);
+
+impl Sections {
+    /// Adds the table at `path`, and those below it. Gives back its index.
+    fn add(&mut self, path: &str, options: &mut dyn Options, note: &str) -> usize {
+        let index = self.0.len();
+        let title = match path {
+            "" => "The file".to_owned(),
+            path => format!("`[{path}]`"),
+        };
+        self.0.push(Section {
+            titles: vec![title],
+            note: note.to_owned(),
+            rows: String::new(),
+        });
+        self.0[index].rows = self.rows(path, options);
+        index
+    }
+
+    fn rows(&mut self, path: &str, options: &mut dyn Options) -> String {
+        let mut rows = String::new();
+        for field in options.fields() {
+            let (key, default) = (field.key, default_of(&field));
+            let about = match &field.condition {
+                Some(condition) => format!("{} {}.", field.about, sentence(condition.why)),
+                None => field.about.to_owned(),
+            };
+            let below = format!("{path}.{key}").trim_start_matches('.').to_owned();
+            rows += &match field.slot {
+                Slot::Value(_, shape) => row(key, &shape_text(&shape), &default, &about),
+                Slot::Part(part) => self.rows(path, part),
+                Slot::Table(mut slot) => self.table(&below, &about, key, &mut *slot),
+                Slot::Tables(tables, _) => {
+                    self.add(&format!("{below}.{ANY_NAME}"), tables.open(ANY_NAME), "");
+                    row(key, "tables by name", "", &about)
+                }
+                Slot::Free => row(key, "a table", "", &about),
+            };
+        }
+        rows
+    }
+
+    /// Adds the sections of a table; gives back its rows in that of the table above.
+    fn table(&mut self, path: &str, about: &str, key: &str, slot: &mut dyn TableSlot) -> String {
+        let mut value = "a table".to_owned();
+        match slot.templates() {
+            None => {
+                self.add(path, slot.open(0), "");
+            }
+            Some(one) if one.is_required => {
+                for (index, name) in one.names.iter().enumerate() {
+                    let note = format!(" with `{} = \"{name}\"`", one.key);
+                    self.add(path, slot.open(index), &note);
+                }
+                value = format!("a table with `{}`", one.key);
+            }
+            Some(one) => {
+                let index = self.add(path, slot.open(0), "");
+                let names = shape_text(&Shape::Words(one.names.to_vec()));
+                let head = row(
+                    one.key,
+                    &names,
+                    "the first",
+                    "What the other keys start from.",
+                );
+                self.0[index].rows.insert_str(0, &head);
+            }
+        }
+        let short = slot.shorthand();
+        let short = short.map(|one| row(one.key, &shape_text(&one.shape), "", one.about));
+        short.unwrap_or_default() + &row(key, &value, "", about)
+    }
+}
+
+fn row(key: &str, value: &str, default: &str, about: &str) -> String {
+    format!("| `{key}` | {value} | {default} | {} |\n", one_line(about))
+}
+
+/// A reason as a sentence without its full stop.
+fn sentence(why: &str) -> String {
+    let mut letters = why.chars();
+    letters.next().map_or_else(String::new, |first| {
+        first.to_uppercase().chain(letters).collect()
     })
 }
 
-fn range(min: &dyn Display, max: &dyn Display) -> String {
-    format!("a duration with its unit, {min} to {max}")
+fn default_of(field: &Field<'_>) -> String {
+    match &field.slot {
+        _ if field.is_required => "required".to_owned(),
+        Slot::Value(value, shape) => {
+            let setting = value.get();
+            setting.map_or_else(String::new, |one| format!("`{}`", plain(&one, shape)))
+        }
+        _ => String::new(),
+    }
 }
 
-/// As the readers have it, in `is_name`.
-fn name_pattern(may_have_slashes: bool) -> String {
-    let slash = if may_have_slashes { "/" } else { "" };
-    let rest = NAME_LENGTH_MAX - 1;
-    format!("^[A-Za-z0-9][A-Za-z0-9._{slash}-]{{0,{rest}}}$")
+/// What a value may be, in words.
+fn shape_text(shape: &Shape) -> String {
+    let range = range_text(shape);
+    match shape {
+        Shape::Boolean => "true or false".to_owned(),
+        Shape::Integer(_) => format!("integer, {range}"),
+        Shape::Number(_) => format!("number, {range}"),
+        Shape::Time(_) => format!("duration, {range}"),
+        Shape::Text(rule) => rule.what.to_owned(),
+        Shape::Words(words) => {
+            let quoted: Vec<_> = words.iter().map(|word| format!("`\"{word}\"`")).collect();
+            quoted.join(", ")
+        }
+        Shape::List(each) => format!("array, each: {}", shape_text(each)),
+        Shape::OneOrMore(each) => format!("{}, or an array of them", shape_text(each)),
+        Shape::Texts => "texts by name".to_owned(),
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::errors::{Faults, Place, Source};
+    use crate::tree::join;
+    use crate::{reader, tree};
 
     fn objects<'v>(value: &'v Value, found: &mut Vec<&'v Value>) {
         if value["additionalProperties"] == json!(false) {
@@ -311,47 +329,117 @@ mod tests {
     }
 
     #[test]
-    fn the_texts_lead_into_every_table_and_their_keys_are_all_known() {
+    fn every_table_of_the_schema_has_keys() {
         let schema = schema();
         let mut found = Vec::new();
         objects(&schema, &mut found);
+        assert!(found.len() > 30, "{}", found.len());
         for object in found {
             let properties = object["properties"].as_object().unwrap();
             assert!(!properties.is_empty(), "{object}");
         }
         let link = &schema["properties"]["links"]["additionalProperties"]["properties"];
-        for key in super::super::file_impairments::EMULATION_KEYS {
+        for key in [
+            "via",
+            "port",
+            "dscp",
+            "gateway",
+            "outages",
+            "wifi",
+            "trace",
+            "loss_ratio",
+        ] {
             assert!(!link[key].is_null(), "{key}: {link}");
         }
         // A law's own keys, in a direction too.
         let delay = &link["backward"]["properties"]["delay"]["anyOf"];
         assert!(delay.to_string().contains("mean_excess"), "{delay}");
         let parameters = &schema["properties"]["case"]["properties"]["parameters"];
-        assert_eq!(*parameters, json!({ "type": "object" }));
+        assert_eq!(parameters["type"], "object");
+        assert!(parameters["additionalProperties"].is_null(), "{parameters}");
+    }
+
+    /// The paths of all keys below `schema`, but for the options of laws, which depend on the law.
+    fn paths(schema: &Value, path: &str, found: &mut Vec<String>) {
+        let forms = schema["anyOf"].as_array().into_iter().flatten();
+        forms.for_each(|form| paths(form, path, found));
+        let tables = &schema["additionalProperties"];
+        if tables.is_object() {
+            paths(tables, &join(path, "any"), found);
+        }
+        for (key, value) in schema["properties"].as_object().into_iter().flatten() {
+            let below = join(path, key);
+            if !matches!(key.as_str(), "delay" | "loss") {
+                paths(value, &below, found);
+            }
+            found.push(below);
+        }
     }
 
     #[test]
     fn a_file_with_every_key_of_the_schema_has_no_unknown_one() {
-        for (path, keys) in asked().tables {
-            for key in keys.into_keys() {
-                let path = join(&path, key);
-                let faults = Faults::default();
-                let sources = [Source {
-                    name: "schema".to_owned(),
-                    text: format!("{path} = 7"),
-                }];
-                let place = Place {
-                    source_index: 0,
-                    start: 0,
-                    end: 0,
-                };
-                let table = tree::parse(&sources, 0, &faults).unwrap();
-                drop(file::read(&table, place, &faults));
-                let words = faults.into_errors(Vec::from(sources)).to_string();
-                // Which keys of a law are known depends on the law.
-                let depends = path.contains(".loss.") || path.contains(".delay.");
-                assert!(depends || !words.contains("is not a known key"), "{words}");
+        let mut found = Vec::new();
+        paths(&schema(), "", &mut found);
+        assert!(found.len() > 150, "{}", found.len());
+        for path in found {
+            let faults = Faults::default();
+            let sources = [Source {
+                name: "schema".to_owned(),
+                text: format!("{path} = 7"),
+            }];
+            let place = Place {
+                source_index: 0,
+                start: 0,
+                end: 0,
+            };
+            let table = tree::parse(&sources, 0, &faults).unwrap();
+            reader::read(&mut File::TEMPLATE.clone(), &table, place, &faults);
+            let words = faults.into_errors(Vec::from(sources)).to_string();
+            assert!(!words.contains("is not a known key"), "{words}");
+        }
+    }
+
+    /// Checks every value of a table, of the tables below it and of all that they start from.
+    fn check_defaults(options: &mut dyn Options, count: &mut usize) {
+        for field in options.fields() {
+            let (key, is_required) = (field.key, field.is_required);
+            match field.slot {
+                Slot::Value(value, shape) => {
+                    let setting = value.get().filter(|_| !is_required);
+                    *count += usize::from(setting.is_some());
+                    assert!(setting.is_none_or(|one| shape.allows(&one)), "{key}");
+                }
+                Slot::Part(part) => check_defaults(part, count),
+                Slot::Table(mut slot) => {
+                    let names = slot.templates().map_or(1, |one| one.names.len());
+                    (0..names).for_each(|index| check_defaults(slot.open(index), count));
+                }
+                Slot::Tables(tables, _) => check_defaults(tables.open("any"), count),
+                Slot::Free => {}
             }
         }
+    }
+
+    /// `HIL_WRITE_DOCS=1` writes the page anew.
+    #[test]
+    fn the_reference_page_states_every_key_as_it_is_declared() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/topology.md");
+        let page = reference();
+        if std::env::var_os("HIL_WRITE_DOCS").is_some() {
+            std::fs::write(path, &page).unwrap();
+        }
+        let written = std::fs::read_to_string(path).unwrap_or_default();
+        assert!(
+            written == page,
+            "docs/topology.md is not up to date: run this with HIL_WRITE_DOCS=1"
+        );
+    }
+
+    #[test]
+    fn every_default_lies_within_its_own_range() {
+        let mut count = 0;
+        check_defaults(&mut File::TEMPLATE.clone(), &mut count);
+        assert!(count > 100, "{count}");
+        assert!(!Shape::Number(0.0..=1.0).allows(&hil_core::options::Setting::Number(f64::NAN)));
     }
 }

@@ -1,73 +1,58 @@
 //! `[security]`: whether the hops of a run are sealed, and with which key. It reads no key.
 
-use core::fmt;
 use std::path::{Path, PathBuf};
 
-use toml::Table;
+use hil_core::case_study::ParameterError;
+use hil_core::{options, words};
 
-use super::errors::Fault;
-use super::model::{Topology, words};
-use super::reader::Reader;
-use super::resolved::put;
+use super::model::Topology;
+use super::tables::KEY_FILE;
+use super::trace_source::BaseFolder;
 
-/// What `[security]` says.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Security {
-    /// Whether hops are sealed; `None` when the file does not say.
-    pub hops: Option<Hops>,
-    /// The key file as the topology names it.
-    pub key: Option<String>,
-    /// The folder that a relative path counts from.
-    pub(super) base: BaseFolder,
+options! {
+    /// Whether the hops of a run are sealed, and with which key.
+    #[derive(Eq)]
+    pub struct Security
+    with {
+        /// The folder that a relative path counts from.
+        #[serde(skip)]
+        base: BaseFolder = BaseFolder(PathBuf::new()),
+    }
+    {
+        /// Whether hops are sealed. With a key they are unless the file says otherwise.
+        hops: Option<Hops>;
+        /// The key file, as `hil-runtime key new` makes it. A relative path starts from the folder of the
+        /// topology file.
+        key: Option<String>, in KEY_FILE;
+    }
+    check Security::check_key;
 }
 
-/// Where the topology file is. It is not part of what the topology says: all folders are equal.
-#[derive(Debug, Clone, Default)]
-pub(super) struct BaseFolder(PathBuf);
-
-impl PartialEq for BaseFolder {
-    fn eq(&self, _other: &Self) -> bool {
-        true
+words! {
+    /// How datagrams travel between two hosts.
+    pub enum Hops {
+        /// Encrypted and authenticated with a key.
+        Sealed = "sealed",
+        /// Readable and forgeable by whoever reaches the wire.
+        Plain = "plain",
     }
 }
 
-impl Eq for BaseFolder {}
-
-/// How datagrams travel between two hosts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Hops {
-    /// Encrypted and authenticated with a key.
-    Sealed,
-    /// Readable and forgeable by whoever reaches the wire.
-    Plain,
-}
-
-words!(Hops { Sealed = "sealed", Plain = "plain" });
-
 impl Security {
-    pub(super) fn read(reader: Option<Reader<'_>>) -> Self {
-        let Some(mut reader) = reader else {
-            return Self::default();
-        };
-        let key = reader.text("key").map(|key| key.value);
-        if key.as_deref() == Some("") {
-            let fault = "is empty, expected the path of a key file".to_owned();
-            reader.refuse("key", Fault::Inconsistent(fault));
+    fn check_key(&self) -> Result<(), ParameterError> {
+        if self.hops == Some(Hops::Sealed) && self.key.is_none() {
+            let problem = "is missing: hops = \"sealed\" needs the path of a key file, as `hil-runtime key \
+                           new` makes it";
+            return Err(ParameterError::new("key", problem));
         }
-        let said = reader.word("hops", Hops::WORDS);
-        if said == Some(Hops::Sealed) && key.is_none() && !reader.has("key") {
-            let hint =
-                "hops = \"sealed\" needs the path of a key file, as `hil-runtime key new` makes it";
-            reader.refuse("key", Fault::Missing(hint.to_owned()));
-        }
-        let implied = key.is_some().then_some(Hops::Sealed);
-        let hops = said.or(implied);
-        reader.finish();
-        Self {
-            hops,
-            key,
-            base: BaseFolder::default(),
-        }
+        Ok(())
+    }
+
+    /// The same with what a key implies.
+    pub(super) fn resolve(mut self) -> Self {
+        let implied = self.key.is_some().then_some(Hops::Sealed);
+        self.hops = self.hops.or(implied);
+        self
     }
 
     /// The key file of sealed hops, a relative path counted from the topology file.
@@ -75,16 +60,6 @@ impl Security {
         let is_sealed = self.hops == Some(Hops::Sealed);
         let key = self.key.as_ref().filter(|_| is_sealed)?;
         Some(self.base.0.join(key))
-    }
-
-    /// Written back; `with_key` keeps the path, which may differ between hosts that mean one run.
-    pub(super) fn resolved(&self, with_key: bool) -> Option<Table> {
-        let mut table = Table::new();
-        put(&mut table, "hops", self.hops?.word());
-        if let Some(key) = self.key.as_ref().filter(|_| with_key) {
-            put(&mut table, "key", key.as_str());
-        }
-        Some(table)
     }
 }
 

@@ -215,7 +215,7 @@ fn what_a_file_leaves_out_has_the_documented_default() {
     let topology = load_shipped("shuttle-local.toml", &[]);
     assert_eq!(topology.run().duration, Duration::from_secs(20));
     assert_eq!(topology.run().seed, 1);
-    assert_eq!(topology.run().record_folder, "runs");
+    assert_eq!(topology.run().record, "runs");
     assert_eq!(topology.run().start_timeout, Duration::from_secs(30));
     let [host] = topology.hosts() else {
         panic!("one implicit host");
@@ -223,10 +223,10 @@ fn what_a_file_leaves_out_has_the_documented_default() {
     assert_eq!(host.name, "local");
     assert!(topology.is_all_local());
     let robot = topology.process("robot").unwrap();
-    assert_eq!(robot.execution.scheduling, Scheduling::Other);
+    assert_eq!(robot.execution.scheduling(), Scheduling::Other);
     assert_eq!(robot.execution.wait, Wait::Block);
     assert_eq!(robot.execution.timer_slack, Duration::from_micros(1));
-    assert_eq!(robot.on_exit, OnExit::EndRun);
+    assert_eq!(robot.restarts.on_exit(), OnExit::EndRun);
     assert!(
         topology
             .channels()
@@ -244,14 +244,14 @@ fn what_a_file_leaves_out_has_the_documented_default() {
 fn every_key_of_a_process_reaches_the_checked_topology() {
     let topology = parse_good(EVERYTHING);
     let human = topology.process("human").unwrap();
-    assert_eq!(human.execution.cpus, [2]);
+    assert_eq!(human.execution.cpu, [2]);
     assert_eq!(
-        human.execution.scheduling,
+        human.execution.scheduling(),
         Scheduling::Fifo { priority: 41 }
     );
-    assert!(human.execution.locks_memory);
+    assert!(human.execution.lock_memory);
     assert_eq!(human.execution.wait, Wait::Spin);
-    assert_eq!(human.on_exit, OnExit::Restart { limit: 2 });
+    assert_eq!(human.restarts.on_exit(), OnExit::Restart { limit: 2 });
     let Program::Command {
         role,
         command,
@@ -317,11 +317,14 @@ fn every_key_of_a_channel_and_its_link_reaches_the_checked_topology() {
     assert_eq!(image.spec, None);
     assert_eq!(image.from_host.name, "robot-pc");
     assert_eq!(
-        command.hop.gateway.execution.scheduling,
+        command.hop.gateway.execution.scheduling(),
         Scheduling::Fifo { priority: 40 }
     );
-    assert_eq!(command.hop.gateway.on_exit, OnExit::EndRun);
-    assert_eq!(image.hop.gateway.on_exit, OnExit::Restart { limit: 3 });
+    assert_eq!(command.hop.gateway.restarts.on_exit(), OnExit::EndRun);
+    assert_eq!(
+        image.hop.gateway.restarts.on_exit(),
+        OnExit::Restart { limit: 3 }
+    );
     assert_eq!(topology.link("spare").unwrap().between, None);
     assert_eq!(
         topology.hosts()[0]
@@ -437,7 +440,7 @@ fn overrides_need_no_quotes_and_the_last_one_wins() {
     assert_eq!(spec.delay, DelayLaw::fixed(Duration::from_millis(10)));
     assert_eq!(spec.loss, LossLaw::bernoulli(0.5));
     assert_eq!(crossing.channel.depth, 2);
-    assert_eq!(topology.process("robot").unwrap().execution.cpus, [1, 2]);
+    assert_eq!(topology.process("robot").unwrap().execution.cpu, [1, 2]);
 }
 
 #[test]

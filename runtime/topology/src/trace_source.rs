@@ -7,7 +7,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use std::{fs, io};
 
+use hil_core::case_study::ParameterError;
 use hil_core::link_model::TraceMatch;
+use hil_core::options;
+use hil_core::options::{Scalar as _, Setting, Shape, Short, Templates, TextRule};
+use hil_link::delay::DELAY_MAX;
 use hil_link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};
 use hil_trace::fault::TraceFault;
 use hil_trace::wire::Decoded;
@@ -21,19 +25,50 @@ pub fn file_name(channel: &str) -> String {
     format!("{}.trace", channel.replace('/', "."))
 }
 
-/// `[links.<name>.trace]`: paths are as written, relative to the topology file.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct TraceSource {
-    /// Folder with one file per channel, named as a run names them.
-    pub folder: Option<String>,
-    /// Files by channel; they go before the folder.
-    pub files: BTreeMap<String, String>,
-    /// How they are replayed.
-    pub replay: TraceReplay,
-    /// What the paths start from.
-    pub base: BaseFolder,
-    /// What was read of them, so that nobody reads a file twice for it.
-    pub noted: NotedDelays,
+options! {
+    /// Recorded traces of a link. Paths are as written, relative to the topology file.
+    #[derive(Eq)]
+    pub struct TraceSource as short
+    with {
+        /// What the paths start from.
+        #[serde(skip)]
+        base: BaseFolder = BaseFolder(PathBuf::new()),
+        /// What was read of them, so that nobody reads a file twice for it.
+        #[serde(skip)]
+        noted: NotedDelays = NotedDelays::NOTHING,
+    }
+    {
+        /// Folder with one file per channel, named as a run names them.
+        folder: Option<String>;
+        /// Files by channel; they go before the folder.
+        files: Option<BTreeMap<String, String>>;
+        /// Which record a message meets.
+        r#match: TraceMatch = TraceMatch::Index;
+        /// What comes after the last record.
+        end: TraceEnd = TraceEnd::Wrap;
+        /// Delay of a delivered message whose delay the trace does not know.
+        delay: Option<Duration>, in Duration::ZERO..=DELAY_MAX;
+    }
+    check TraceSource::check_names;
+}
+
+/// The traces of a link are a table, or the folder alone.
+impl Short for TraceSource {
+    const TEMPLATES: Option<Templates> = None;
+    const KEY: &'static str = "trace";
+    const ABOUT: &'static str = "The folder of the traces.";
+
+    fn template(_index: usize) -> Self {
+        Self::of_folder(None)
+    }
+
+    fn shape() -> Shape {
+        Shape::Text(TextRule::ANY)
+    }
+
+    fn of_short(setting: Setting) -> Result<Self, String> {
+        String::from_setting(setting).map(|folder| Self::of_folder(Some(folder)))
+    }
 }
 
 /// The folder of the topology file. Where a file lies is no part of what it says, so any two are
@@ -51,18 +86,32 @@ impl Eq for BaseFolder {}
 
 /// The longest delay of each trace that was read. It is kept beside what names the files and is no
 /// part of it, so any two are equal.
-#[derive(Debug, Clone, Default)]
-pub struct NotedDelays(Arc<Mutex<BTreeMap<PathBuf, Duration>>>);
+#[derive(Debug, Clone)]
+pub struct NotedDelays(Option<Arc<Mutex<BTreeMap<PathBuf, Duration>>>>);
 
 impl NotedDelays {
+    /// Of a topology that names no trace: nothing is kept.
+    const NOTHING: Self = Self(None);
+
     fn get(&self, file: &Path) -> Option<Duration> {
-        let noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        noted.get(file).copied()
+        let noted = self.0.as_ref()?.lock();
+        noted
+            .unwrap_or_else(PoisonError::into_inner)
+            .get(file)
+            .copied()
     }
 
     fn note(&self, file: &Path, delay_max: Duration) {
-        let mut noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        noted.insert(file.to_owned(), delay_max);
+        if let Some(noted) = &self.0 {
+            let mut noted = noted.lock().unwrap_or_else(PoisonError::into_inner);
+            noted.insert(file.to_owned(), delay_max);
+        }
+    }
+}
+
+impl Default for NotedDelays {
+    fn default() -> Self {
+        Self(Some(Arc::default()))
     }
 }
 
@@ -152,14 +201,42 @@ pub enum TraceFileError {
 }
 
 impl TraceSource {
+    /// Nothing but a folder, with notes of its own.
+    fn of_folder(folder: Option<String>) -> Self {
+        Self {
+            noted: NotedDelays::default(),
+            folder,
+            ..Self::TEMPLATE
+        }
+    }
+
+    fn check_names(&self) -> Result<(), ParameterError> {
+        if self.folder.is_some() || self.files.is_some() {
+            return Ok(());
+        }
+        let problem = "is missing: name a folder of traces, e.g. \"runs/NAME/traces\", or files = { \
+                       \"CHANNEL\" = \"FILE\" }";
+        Err(ParameterError::new("folder", problem))
+    }
+
+    /// How they are replayed.
+    pub const fn replay(&self) -> TraceReplay {
+        TraceReplay {
+            matching: self.r#match,
+            end: self.end,
+            delay_otherwise: self.delay,
+        }
+    }
+
     /// The trace of `channel` on `link`; `None` for one that is not named where no folder is.
     pub fn launch(&self, link: &str, channel: &str) -> Option<TraceLaunch> {
-        let (key, named) = if let Some(file) = self.files.get(channel) {
-            (format!("files.\"{channel}\""), PathBuf::from(file))
-        } else {
-            let folder = Path::new(self.folder.as_ref()?);
-            ("folder".to_owned(), folder.join(file_name(channel)))
-        };
+        let (key, named) =
+            if let Some(file) = self.files.as_ref().and_then(|files| files.get(channel)) {
+                (format!("files.\"{channel}\""), PathBuf::from(file))
+            } else {
+                let folder = Path::new(self.folder.as_ref()?);
+                ("folder".to_owned(), folder.join(file_name(channel)))
+            };
         let file = self.base.0.join(named);
         // A gateway may run in another folder.
         let file = std::path::absolute(&file).unwrap_or(file);
@@ -167,7 +244,7 @@ impl TraceSource {
             key: format!("links.{link}.trace.{key}"),
             delay_max: self.noted.get(&file),
             file,
-            replay: self.replay,
+            replay: self.replay(),
             noted: self.noted.clone(),
         })
     }
@@ -308,11 +385,9 @@ mod tests {
 
     fn source(folder: Option<&str>, channel: &str, file: &str) -> TraceSource {
         TraceSource {
-            folder: folder.map(str::to_owned),
-            files: BTreeMap::from([(channel.to_owned(), file.to_owned())]),
-            replay: TraceReplay::default(),
+            files: Some(BTreeMap::from([(channel.to_owned(), file.to_owned())])),
             base: BaseFolder(PathBuf::from("/lab")),
-            noted: NotedDelays::default(),
+            ..TraceSource::of_folder(folder.map(str::to_owned))
         }
     }
 

@@ -180,18 +180,45 @@ pub(super) fn merge(base: &mut Table, overlay: Table) {
 
 /// Where `path` stands in `table`, or as much of it as the files say; `None` where they say nothing of it.
 pub(super) fn place_of(table: &Table, path: &str) -> Option<Place> {
-    let (mut table, mut found) = (table, None);
-    for key in segments(path) {
-        let Some(node) = table.get(&key) else { break };
-        match &node.value {
-            Value::Table(below) => {
-                found = Some(node.key_place);
-                table = below;
-            }
-            _ => return Some(node.place),
-        }
+    let (_, deepest) = walk(table, path);
+    deepest.map(|node| match &node.value {
+        Value::Table(_) => node.key_place,
+        _ => node.place,
+    })
+}
+
+/// The key at `path`, which may end in an index as in `bays[2]`.
+pub(super) fn find<'t>(table: &'t Table, path: &str) -> Option<&'t Node> {
+    walk(table, path).0
+}
+
+/// The key at `path`, and the deepest one on the way to it.
+fn walk<'t>(table: &'t Table, path: &str) -> (Option<&'t Node>, Option<&'t Node>) {
+    let (mut below, mut deepest) = (Some(table), None);
+    for step in segments(path) {
+        let (key, index) = split_index(&step);
+        let Some(node) = below.and_then(|table| table.get(key)) else {
+            return (None, deepest);
+        };
+        let item = match (&node.value, index) {
+            (Value::Array(items), Some(index)) => items.get(index),
+            _ => None,
+        };
+        let node = item.unwrap_or(node);
+        deepest = Some(node);
+        below = match &node.value {
+            Value::Table(table) => Some(table),
+            _ => None,
+        };
     }
-    found
+    (deepest, deepest)
+}
+
+/// `bays[2]` as `bays` and 2.
+fn split_index(step: &str) -> (&str, Option<usize>) {
+    let parts = step.strip_suffix(']').and_then(|rest| rest.split_once('['));
+    let found = parts.and_then(|(key, index)| Some((key, index.parse().ok()?)));
+    found.map_or((step, None), |(key, index)| (key, Some(index)))
 }
 
 /// The keys of a path that [`join`] made.

@@ -24,7 +24,7 @@ use hil_tests::account::{account, assert_every_message_is_accounted_for};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
 use hil_tests::worker::Worker;
-use hil_topology::Timestamps;
+use hil_topology::{SocketOptions, Timestamps};
 
 const CHANNEL: &str = "shuttle/command";
 const FLOW: &str = "hil/link/hop/forward";
@@ -95,12 +95,12 @@ fn direction(side: Side, [local, peer]: [SocketAddr; 2]) -> DirectionLaunch {
             transport: "udp".to_owned(),
             options: BTreeMap::new(),
             interface: None,
-            dscp: 0,
-            priority: None,
-            send_buffer_bytes: 1 << 16,
-            receive_buffer_bytes: 1 << 16,
-            path_mtu_bytes: 1500,
-            timestamps: Timestamps::Off,
+            common: SocketOptions {
+                send_buffer_bytes: 1 << 16,
+                receive_buffer_bytes: 1 << 16,
+                timestamps: Timestamps::Off,
+                ..SocketOptions::TEMPLATE
+            },
         },
         wait: WaitMode::Block,
         realtime: RealtimeRequest::default(),

@@ -20,7 +20,7 @@ use hil_rundir::record::RecordFile;
 use hil_shm::{ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, ShmOutput};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::worker::Worker;
-use hil_topology::Timestamps;
+use hil_topology::SocketOptions;
 use hil_topology::emulation::EmulationLaunch;
 
 const LIMIT: Duration = Duration::from_mins(1);
@@ -90,12 +90,11 @@ fn direction(side: Side, addresses: [SocketAddr; 2], spec: Option<&LinkSpec>) ->
             transport: "udp".to_owned(),
             options: BTreeMap::new(),
             interface: None,
-            dscp: 0,
-            priority: None,
-            send_buffer_bytes: 1 << 20,
-            receive_buffer_bytes: 8 << 20,
-            path_mtu_bytes: 1500,
-            timestamps: Timestamps::Software,
+            common: SocketOptions {
+                send_buffer_bytes: 1 << 20,
+                receive_buffer_bytes: 8 << 20,
+                ..SocketOptions::TEMPLATE
+            },
         },
         wait: WaitMode::Block,
         realtime: RealtimeRequest::default(),

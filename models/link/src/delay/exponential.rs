@@ -4,8 +4,8 @@
 //! `P(delay > min + x) = exp(-x / mean_excess)`; a draw above `max` is drawn anew.
 
 use super::{DELAY_MAX, Density, Fitted, Law, LawFit, SCALES, TIMES, mean_of, ms, ms_fitted};
-use crate::options::options;
 use core::time::Duration;
+use hil_core::options;
 use hil_core::random::RandomStream;
 
 options! {

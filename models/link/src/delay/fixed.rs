@@ -2,8 +2,8 @@
 //! paper (Lv et al., section II.B). It models no variation at all.
 
 use super::{Density, Law, TIMES, ms};
-use crate::options::options;
 use core::time::Duration;
+use hil_core::options;
 use hil_core::random::RandomStream;
 
 options! {

@@ -3,9 +3,9 @@
 //! order: successive delays are independent.
 
 use super::{Density, Law, TIMES, ms};
-use crate::options::options;
 use core::time::Duration;
 use hil_core::case_study::ParameterError;
+use hil_core::options;
 use hil_core::random::RandomStream;
 
 /// Most bins.

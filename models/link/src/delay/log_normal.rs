@@ -9,9 +9,9 @@
 use super::{
     DELAY_MAX, Density, Fitted, Law, LawFit, SCALES, TIMES, ends_of, mean_of, ms, ms_fitted,
 };
-use crate::options::options;
 use core::f64::consts::PI;
 use core::time::Duration;
+use hil_core::options;
 use hil_core::random::RandomStream;
 use hil_stats::special::normal_distribution;
 

@@ -19,8 +19,9 @@ use core::fmt::{self, Debug};
 use core::ops::RangeInclusive;
 use core::time::Duration;
 
-use crate::options::{Options, Slot, laws};
+use crate::laws::laws;
 use hil_core::case_study::ParameterError;
+use hil_core::options::{Options, Setting, Shape, Slot};
 use hil_core::random::RandomStream;
 use hil_core::time::duration_ns;
 
@@ -55,7 +56,7 @@ laws! {
 /// Longest delay of any law.
 pub const DELAY_MAX: Duration = Duration::from_secs(10);
 /// Range of a delay.
-const TIMES: RangeInclusive<Duration> = Duration::ZERO..=DELAY_MAX;
+pub(super) const TIMES: RangeInclusive<Duration> = Duration::ZERO..=DELAY_MAX;
 /// Range of a time that the draws are a multiple of.
 const SCALES: RangeInclusive<Duration> = Duration::from_nanos(1)..=DELAY_MAX;
 
@@ -165,17 +166,21 @@ impl DelayLaw {
     /// # Errors
     /// Why it does not.
     pub fn with_numbers(mut self, fitted: &dyn Fitted) -> Result<Self, String> {
-        for (field, number) in self.options().fields().into_iter().zip(fitted.numbers()) {
-            match field.slot {
-                Slot::Duration(time, _) => {
+        for (field, number) in self.fields().into_iter().zip(fitted.numbers()) {
+            let Slot::Value(mut value, shape) = field.slot else {
+                unreachable!("a fitted law has values only");
+            };
+            value.set(match shape {
+                Shape::Time(_) => {
                     let rounded = Duration::try_from_secs_f64((number * 1e9).round() * 1e-9);
                     let name = field.key;
-                    *time = rounded
-                        .map_err(|_no_time| format!("whose {name} of {number} s is no time"))?;
+                    Setting::Time(
+                        rounded
+                            .map_err(|_no_time| format!("whose {name} of {number} s is no time"))?,
+                    )
                 }
-                Slot::Number(value, _) => *value = number,
-                slot => unreachable!("a fitted law has times and numbers, no {slot:?}"),
-            }
+                _ => Setting::Number(number),
+            })?;
         }
         self.accepted()
     }

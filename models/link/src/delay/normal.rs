@@ -8,9 +8,9 @@
 //! more than asked at mean = 2 deviations, 0.15 % at 3.
 
 use super::{DELAY_MAX, Density, Fitted, Law, LawFit, SCALES, TIMES, mean_of, ms, ms_fitted};
-use crate::options::options;
 use core::f64::consts::PI;
 use core::time::Duration;
+use hil_core::options;
 use hil_core::random::RandomStream;
 use hil_stats::special::normal_distribution;
 

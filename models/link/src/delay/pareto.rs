@@ -7,8 +7,8 @@
 //! a shape of 2. A draw above `max` is drawn anew, so mean and variance that come out are finite.
 
 use super::{DELAY_MAX, Density, Fitted, Law, LawFit, SCALES, TIMES, mean_of, ms, ms_fitted};
-use crate::options::options;
 use core::time::Duration;
+use hil_core::options;
 use hil_core::random::RandomStream;
 
 options! {

@@ -2,9 +2,9 @@
 //! theory behind it; no real link has these edges.
 
 use super::{DELAY_MAX, Density, Fitted, Law, LawFit, TIMES, ends_of, ms, ms_fitted};
-use crate::options::options;
 use core::time::Duration;
 use hil_core::case_study::ParameterError;
+use hil_core::options;
 use hil_core::random::RandomStream;
 
 options! {

@@ -2,7 +2,7 @@
 //! paper (Lv et al., section II.B). It has no memory.
 
 use super::{Law, Losses};
-use crate::options::options;
+use hil_core::options;
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 

@@ -11,7 +11,7 @@ use core::ops::RangeInclusive;
 use core::time::Duration;
 
 use super::{Law, Losses};
-use crate::options::options;
+use hil_core::options;
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 

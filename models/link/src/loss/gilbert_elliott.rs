@@ -9,7 +9,7 @@
 //! the long-run shares, so that the promised ratio holds from the first message on.
 
 use super::{Law, Losses};
-use crate::options::options;
+use hil_core::options;
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 

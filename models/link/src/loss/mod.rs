@@ -10,8 +10,9 @@ mod tests;
 
 use core::fmt::{self, Debug};
 
-use crate::options::{Options, laws};
+use crate::laws::laws;
 use hil_core::case_study::ParameterError;
+use hil_core::options::Options;
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 

@@ -228,7 +228,7 @@ fn each_law_stands_in_the_table_of_the_documentation_with_all_its_keys() {
             .lines()
             .find(|line| line.starts_with(&format!("| `{name}` |")));
         let row = row.unwrap_or_else(|| panic!("{name} has no row"));
-        for field in law.options().fields() {
+        for field in law.fields() {
             let key = field.key;
             assert!(row.contains(&format!("`{key}`")), "{name}: {key} in {row}");
             assert!(

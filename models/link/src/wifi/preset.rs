@@ -4,6 +4,7 @@
 
 use crate::outages::Outages;
 use crate::wifi::spec::WifiSpec;
+use hil_core::options::{Scalar as _, Setting, Shape, Short, Templates};
 
 /// A link by name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -17,6 +18,8 @@ pub enum WifiPreset {
 impl WifiPreset {
     /// All of them.
     pub const ALL: [Self; 2] = [Self::ShortRange, Self::LongRange];
+
+    const NAMES: &'static [&'static str] = &[Self::ALL[0].name(), Self::ALL[1].name()];
 
     /// Its name in files.
     pub const fn name(self) -> &'static str {
@@ -50,6 +53,32 @@ const LONG_RANGE: WifiSpec = WifiSpec {
     },
     ..WifiSpec::TEMPLATE
 };
+
+/// A radio is a table that starts from a preset, or the name of one.
+impl Short for WifiSpec {
+    const TEMPLATES: Option<Templates> = Some(Templates {
+        key: "preset",
+        names: WifiPreset::NAMES,
+        chosen: None,
+        is_required: false,
+    });
+    const KEY: &'static str = "wifi";
+    const ABOUT: &'static str = "A preset as it is.";
+
+    fn template(index: usize) -> Self {
+        WifiPreset::ALL[index].spec()
+    }
+
+    fn shape() -> Shape {
+        Shape::Words(WifiPreset::NAMES.to_vec())
+    }
+
+    fn of_short(setting: Setting) -> Result<Self, String> {
+        let name = String::from_setting(setting)?;
+        let preset = WifiPreset::named(&name).ok_or_else(|| format!("no preset is `{name}`"))?;
+        Ok(preset.spec())
+    }
+}
 
 #[cfg(test)]
 mod tests {

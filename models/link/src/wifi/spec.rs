@@ -3,15 +3,16 @@
 
 use core::time::Duration;
 
-use crate::options::{Word as _, options, words};
 use crate::outages::Outages;
 use crate::wifi::phy::PPDU_MAX_NS;
 use crate::wifi::rate::Rates;
 use crate::wifi::{channel, contention};
 use hil_core::case_study::ParameterError;
+use hil_core::{options, words};
 
 words! {
     /// EDCA access category, which decides how long a frame defers (IEEE 802.11-2020, 10.23.2).
+    #[derive(Default)]
     pub enum AccessCategory {
         /// `AC_BK`.
         Background = "background",
@@ -27,6 +28,7 @@ words! {
 
 words! {
     /// Which direction's receiver dozes between beacons, so that its frames wait at the access point.
+    #[derive(Default)]
     pub enum PowerSave {
         /// None: both ends stay awake.
         #[default]
@@ -49,7 +51,7 @@ options! {
     /// A Wi-Fi 6 link between two stations. The defaults are the preset `wifi6-short-range`.
     #[derive(Copy)]
     #[serde(default)]
-    pub struct WifiSpec {
+    pub struct WifiSpec as short {
         /// Distance of the two radios, m.
         distance_m: f64 = 20.0, in 1.0..=300.0;
         /// Walls between them.
@@ -189,7 +191,7 @@ impl WifiSpec {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::options::{Options, Slot};
+    use hil_core::options::{Options, Setting, Shape, Slot};
 
     #[test]
     fn every_number_is_refused_by_name_on_both_sides_of_its_range() {
@@ -199,25 +201,31 @@ mod tests {
         for index in 0..count {
             for side in 0..3 {
                 let mut spec = base;
-                let field = spec.fields().swap_remove(index);
-                let key = field.key;
-                match field.slot {
-                    Slot::Number(value, range) => {
-                        *value = [range.start() - 1e-3, range.end() + 1e-3, f64::NAN][side];
-                    }
-                    Slot::Count(value, range) => {
-                        let outside = [range.start().checked_sub(1), Some(range.end() + 1)];
-                        match outside.get(side) {
-                            Some(Some(count)) => *value = *count,
-                            // A count cannot hold what is below zero or no number.
-                            _ => continue,
-                        }
-                    }
-                    _ => continue,
+                if let Some(key) = put_outside(&mut spec, index, side) {
+                    assert_eq!(spec.check().unwrap_err().key, key, "{side}");
                 }
-                assert_eq!(spec.check().unwrap_err().key, key, "{side}");
             }
         }
+    }
+
+    /// Puts the option at `index` below its range, above it, or to what is no number; its key, if that
+    /// can be.
+    fn put_outside(spec: &mut WifiSpec, index: usize, side: usize) -> Option<&'static str> {
+        let field = spec.fields().swap_remove(index);
+        let Slot::Value(mut value, shape) = field.slot else {
+            return None;
+        };
+        let outside = match shape {
+            Shape::Number(range) => {
+                Setting::Number([range.start() - 1e-3, range.end() + 1e-3, f64::NAN][side])
+            }
+            Shape::Integer(range) if side < 2 => {
+                Setting::Integer([range.start() - 1, range.end() + 1][side])
+            }
+            _ => return None,
+        };
+        // A count cannot hold what is below zero.
+        value.set(outside).ok().map(|()| field.key)
     }
 
     #[test]

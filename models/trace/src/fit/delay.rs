@@ -3,9 +3,9 @@
 use core::time::Duration;
 
 use super::{Fit, NEARLY_FIXED, REFUSED_BELOW, Ranking, duration_text};
+use hil_core::options::{Options as _, Setting, Slot};
 use hil_core::random::RandomStream;
 use hil_link::delay::{DelayLaw, Fitted, Histogram, LawFit};
-use hil_link::options::Slot;
 use hil_stats::goodness::ks_distance;
 use hil_stats::special::ceil_count;
 
@@ -122,23 +122,28 @@ fn bootstrap(
 /// `[links.LINK.delay]` with the first `option_count` options of `law`.
 fn toml(mut law: DelayLaw, option_count: usize) -> String {
     let mut lines = format!("\n[links.LINK.delay]\nlaw = \"{}\"\n", law.name());
-    for field in law.options().fields().into_iter().take(option_count) {
-        let time = |time: &Duration| duration_text(time.as_secs_f64());
-        let value = match field.slot {
-            Slot::Duration(value, _) => time(value),
-            Slot::Number(value, _) => format!("{value:?}"),
-            Slot::Durations(values, _) => {
-                format!(
-                    "[{}]",
-                    values.iter().map(time).collect::<Vec<_>>().join(", ")
-                )
-            }
-            Slot::Numbers(values, _) => format!("{values:?}"),
-            slot => unreachable!("no delay law has a {slot:?}"),
+    for field in law.fields().into_iter().take(option_count) {
+        let Slot::Value(value, _) = field.slot else {
+            unreachable!("a delay law has values only");
         };
-        lines.extend([field.key, " = ", &value, "\n"]);
+        if let Some(setting) = value.get() {
+            lines.extend([field.key, " = ", &text(&setting), "\n"]);
+        }
     }
     lines
+}
+
+/// A value as a topology writes it.
+fn text(setting: &Setting) -> String {
+    match setting {
+        Setting::Time(time) => duration_text(time.as_secs_f64()),
+        Setting::Number(number) => format!("{number:?}"),
+        Setting::List(items) => {
+            let items: Vec<_> = items.iter().map(text).collect();
+            format!("[{}]", items.join(", "))
+        }
+        other => unreachable!("no delay law has a {other:?}"),
+    }
 }
 
 /// One delay for all, the middle one; how far the others are from it stands beside it.

@@ -59,7 +59,7 @@ impl OpenedArm {
         recorder: &mut Recorder,
     ) -> Result<Self, WorkerError> {
         let settings = socket_settings(adapter, arm);
-        let (socket, granted, what) = match adapter.kind {
+        let (socket, granted, what) = match adapter.egm.kind {
             AdapterKind::Robot => {
                 let socket = UdpSender::open(&settings)?;
                 let from = socket.local_address().map_err(WorkerError::Address)?;
@@ -117,7 +117,7 @@ impl OpenedArm {
         };
         Ok(JoinedArm {
             arm: self.join(adapter, arm, domain)?,
-            work: match adapter.kind {
+            work: match adapter.egm.kind {
                 AdapterKind::Robot => Box::new(RobotWork::new(adapter, arm.arm)),
                 AdapterKind::Sensor => Box::new(SensorWork::new(adapter, arm.arm)),
             },
@@ -133,7 +133,7 @@ impl OpenedArm {
     ) -> Result<Arm, WorkerError> {
         let command = MessageType::of::<EgmCommand>();
         let feedback = MessageType::of::<EgmFeedback>();
-        let (outgoing, incoming) = match adapter.kind {
+        let (outgoing, incoming) = match adapter.egm.kind {
             AdapterKind::Robot => (feedback, command),
             AdapterKind::Sensor => (command, feedback),
         };
@@ -222,15 +222,15 @@ fn socket_settings(adapter: &AdapterSettings, arm: &ArmLaunch) -> SocketSettings
     } else {
         Ipv6Addr::UNSPECIFIED.into()
     };
-    let local = match adapter.kind {
+    let local = match adapter.egm.kind {
         AdapterKind::Robot => SocketAddr::new(any, 0),
         AdapterKind::Sensor => arm.address,
     };
     SocketSettings {
         interface: adapter.interface.clone(),
         // 0 is the kernel's default; setting it would only reset the priority.
-        dscp: (adapter.dscp > 0).then_some(adapter.dscp),
-        timestamps: timestamp_mode(adapter.timestamps),
+        dscp: (adapter.egm.dscp > 0).then_some(adapter.egm.dscp),
+        timestamps: timestamp_mode(adapter.egm.timestamps),
         ..SocketSettings::new(local, arm.address)
     }
 }

@@ -60,12 +60,12 @@ pub(crate) fn open<'a>(
 
 fn probe_settings(adapter: &AdapterSettings) -> Option<ProbeSettings> {
     // A robot that speaks first has no address yet, and then loopback is probed.
-    let target = (adapter.kind == AdapterKind::Robot)
+    let target = (adapter.egm.kind == AdapterKind::Robot)
         .then(|| adapter.arms.first())
         .flatten()
         .map(|arm| SocketAddr::new(arm.address.ip(), DISCARD_PORT));
-    (adapter.timestamps != Timestamps::Off).then(|| ProbeSettings {
-        timestamps: timestamp_mode(adapter.timestamps),
+    (adapter.egm.timestamps != Timestamps::Off).then(|| ProbeSettings {
+        timestamps: timestamp_mode(adapter.egm.timestamps),
         interface: adapter.interface.clone().filter(|_| target.is_some()),
         transmit_target: target,
         proof_count: 5,

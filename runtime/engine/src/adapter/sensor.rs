@@ -57,7 +57,7 @@ struct Taken {
 
 impl SensorWork {
     pub(super) fn new(adapter: &AdapterSettings, side: Side) -> Self {
-        let policy = match adapter.send {
+        let policy = match adapter.egm.send() {
             // Half a cycle leaves the answer in the cycle it belongs to.
             AdapterSend::Coupled => SendPolicy::Coupled {
                 patience: Duration::from_nanos(adapter.cycle_ns / 2),

@@ -26,7 +26,7 @@ use hil_rundir::launch::{AdapterSettings, ArmLaunch};
 use hil_rundir::pipe::AdapterRefusal;
 use hil_rundir::record::Recorder;
 use hil_shm::{ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput};
-use hil_topology::{AdapterKind, AdapterSend, RoleChannel, Timestamps};
+use hil_topology::{AdapterKind, EgmAdapter, RoleChannel};
 
 const FEEDBACK: &str = "egm/right/feedback";
 const COMMAND: &str = "egm/right/command";
@@ -166,15 +166,13 @@ fn settings(kind: AdapterKind, address: SocketAddr) -> AdapterSettings {
     };
     AdapterSettings {
         role: "test".to_owned(),
-        kind,
-        axes: 7,
-        robotware: 7,
+        egm: EgmAdapter {
+            kind,
+            ..EgmAdapter::TEMPLATE
+        },
         cycle_ns: 4_000_000,
         planned_lead_ns: 16_000_000,
         wait: WaitMode::Spin,
-        send: AdapterSend::Coupled,
-        timestamps: Timestamps::Software,
-        dscp: 0,
         interface: None,
         arms: vec![ArmLaunch {
             arm: Side::Right,

@@ -93,7 +93,7 @@ pub fn open(
     recorder: &mut Recorder,
     start: &RunStart,
 ) -> Result<OpenDirection, WorkerError> {
-    let plan = StampPlan::asked(timestamp_mode(launch.socket.timestamps));
+    let plan = StampPlan::asked(timestamp_mode(launch.socket.common.timestamps));
     let socket = OpenSocket::open(launch, plan, start, None)?;
     OpenDirection::new(launch, recorder, socket, plan)
 }
@@ -315,9 +315,9 @@ impl Direction {
                 )
             }
             BridgeLoop::Ingress(ingress) => {
-                if launch.socket.dscp > 0 {
+                if launch.socket.common.dscp > 0 {
                     let counters = ingress.receiver.counters();
-                    facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
+                    facts.extend(counters::mark_fact(launch.socket.common.dscp, &counters));
                 }
                 (
                     counters::ingress_state(ingress),

@@ -118,16 +118,17 @@ fn security_fact(seal: Option<&RunSeal>) -> (String, String) {
 
 fn socket_settings(launch: &DirectionLaunch, plan: StampPlan) -> SocketSettings {
     let socket = &launch.socket;
+    let common = &socket.common;
     SocketSettings {
         interface: socket.interface.clone(),
         // 0 is the kernel's default; setting it would only reset the priority.
-        dscp: (socket.dscp > 0).then_some(socket.dscp),
-        priority: socket.priority,
-        send_buffer_bytes: Some(socket.send_buffer_bytes),
-        receive_buffer_bytes: Some(socket.receive_buffer_bytes),
+        dscp: (common.dscp > 0).then_some(common.dscp),
+        priority: common.socket_priority,
+        send_buffer_bytes: Some(common.send_buffer_bytes),
+        receive_buffer_bytes: Some(common.receive_buffer_bytes),
         timestamps: plan.mode,
         wants_radio_reports: plan.asks_radio,
-        path_mtu_bytes: Some(socket.path_mtu_bytes),
+        path_mtu_bytes: Some(common.path_mtu_bytes),
         options: socket.options.clone(),
         ..SocketSettings::new(launch.local, launch.peer)
     }
@@ -154,7 +155,7 @@ fn access_category(granted: GrantedOptions) -> (String, String) {
 fn held_bytes_max(launch: &DirectionLaunch) -> usize {
     let messages = launch.channels.iter().map(|one| one.size_bytes);
     let longest = messages.max().unwrap_or(0) + wire::HEADER_BYTES + wire::TAG_BYTES;
-    longest.max(512).min(launch.socket.path_mtu_bytes)
+    longest.max(512).min(launch.socket.common.path_mtu_bytes)
 }
 
 /// What the channels meet, once where all of them meet the same.

@@ -65,7 +65,7 @@ impl TimestampingSetup {
 
     /// What the sockets of `direction` are to ask for.
     pub(crate) fn plan(&self, direction: &DirectionLaunch) -> StampPlan {
-        let asked = timestamp_mode(direction.socket.timestamps);
+        let asked = timestamp_mode(direction.socket.common.timestamps);
         let has_reports = transport_of(&direction.socket)
             .is_ok_and(|one| one.description().capabilities.has_radio_reports);
         let plan = match (&self.found, direction.side) {
@@ -138,16 +138,16 @@ pub(super) fn arm(work: &GatewayWork) -> TimestampingSetup {
         TimestampingSetup::without_probe(text)
     } else {
         let mut directions = work.directions.iter();
-        let stamped = directions.find(|one| one.socket.timestamps != Timestamps::Off);
+        let stamped = directions.find(|one| one.socket.common.timestamps != Timestamps::Off);
         let mut armed = arm_and_describe(stamped.map(|direction| ProbeSettings {
-            timestamps: timestamp_mode(direction.socket.timestamps),
+            timestamps: timestamp_mode(direction.socket.common.timestamps),
             interface: direction.socket.interface.clone(),
             transmit_target: Some(SocketAddr::new(direction.peer.ip(), DISCARD_PORT)),
             proof_count: 5,
             bound: PROBE_BOUND,
         }));
         if let (Some((first, second)), Some(stamped)) = (&armed.found, stamped) {
-            let asked = timestamp_mode(stamped.socket.timestamps);
+            let asked = timestamp_mode(stamped.socket.common.timestamps);
             let fallback = StampPlan::found(asked, first, second.as_ref()).fallback();
             armed
                 .facts

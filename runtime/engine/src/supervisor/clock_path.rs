@@ -10,10 +10,8 @@ use super::plan::{ProcessPlan, ProcessTask};
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
 use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side, SocketLaunch};
-use hil_topology::{ClockPath, Host, OnExit, Timestamps, Topology, clock_process_name};
+use hil_topology::{ClockPath, Host, OnExit, SocketOptions, Topology, clock_process_name};
 
-/// Buffer asked of the kernel in each direction: a second of exchanges, with room.
-const BUFFER_BYTES: usize = 212_992;
 /// What every host must accept (RFC 791) holds a greeting with names of any length there may be.
 const PATH_MTU_BYTES: usize = 576;
 /// How often one end is started again in a run.
@@ -65,13 +63,11 @@ fn direction(path: &ClockPath<'_>, host: &Host, side: Side) -> DirectionLaunch {
         socket: SocketLaunch {
             transport: registry::PLAIN.description().name.to_owned(),
             options: BTreeMap::new(),
-            interface: host.clock.as_ref().and_then(|end| end.interface.clone()),
-            dscp: 0,
-            priority: None,
-            send_buffer_bytes: BUFFER_BYTES,
-            receive_buffer_bytes: BUFFER_BYTES,
-            path_mtu_bytes: PATH_MTU_BYTES,
-            timestamps: Timestamps::Software,
+            interface: host.clock_interface.clone(),
+            common: SocketOptions {
+                path_mtu_bytes: PATH_MTU_BYTES,
+                ..SocketOptions::TEMPLATE
+            },
         },
         wait: WaitMode::Block,
         realtime: RealtimeRequest::default(),
@@ -141,7 +137,10 @@ mod tests {
         for end in [asking, answering] {
             assert!(end.is_clock_path());
             assert_eq!(end.flow_number, u16::MAX);
-            assert_eq!(end.socket.timestamps, Timestamps::Software);
+            assert_eq!(
+                end.socket.common.timestamps,
+                hil_topology::Timestamps::Software
+            );
             assert_eq!(end.wait, WaitMode::Block);
         }
     }

@@ -207,7 +207,7 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
         name: process.name.clone(),
         host: process.host.clone(),
         task,
-        on_exit: process.on_exit,
+        on_exit: process.restarts.on_exit(),
     }
 }
 
@@ -251,15 +251,10 @@ fn adapter_settings(
     let is_used = |channel: &&RoleChannel| arms.iter().any(|arm| arm.input == **channel);
     AdapterSettings {
         role: role.to_owned(),
-        kind: adapter.kind,
-        axes: adapter.axes,
-        robotware: adapter.robotware,
+        egm: adapter.clone(),
         cycle_ns: nanoseconds(cycle),
         planned_lead_ns: nanoseconds(cycle) * delay_cycles,
         wait: wait_mode(process.execution.wait),
-        send: adapter.send,
-        timestamps: adapter.timestamps,
-        dscp: adapter.dscp,
         interface,
         spare: card
             .inputs
@@ -316,7 +311,7 @@ fn gateways_on(topology: &Topology, host: &Host) -> Vec<ProcessPlan> {
                     directions,
                     ready_within: None,
                 }),
-                on_exit: hop.gateway.on_exit,
+                on_exit: hop.gateway.restarts.on_exit(),
             });
         }
     }
@@ -359,14 +354,9 @@ fn direction(
         peer,
         socket: SocketLaunch {
             interface: here.interface.clone(),
-            dscp: hop.dscp,
-            priority: hop.socket_priority,
-            send_buffer_bytes: hop.send_buffer_bytes,
-            receive_buffer_bytes: hop.receive_buffer_bytes,
             transport: hop.transport.name.to_owned(),
             options: hop.options.clone(),
-            path_mtu_bytes: hop.path_mtu_bytes,
-            timestamps: hop.timestamps,
+            common: hop.socket.clone(),
         },
         wait: wait_mode(hop.gateway.execution.wait),
         realtime: realtime(&hop.gateway.execution, index),
@@ -377,15 +367,15 @@ fn direction(
 /// The request for thread number `index` of something that runs as `execution` says: its CPUs
 /// are dealt out in turn.
 fn realtime(execution: &Execution, index: usize) -> RealtimeRequest {
-    let cpu = (!execution.cpus.is_empty())
-        .then(|| usize::from(execution.cpus[index % execution.cpus.len()]));
+    let cpu = (!execution.cpu.is_empty())
+        .then(|| usize::from(execution.cpu[index % execution.cpu.len()]));
     RealtimeRequest {
         cpu,
-        policy: match execution.scheduling {
+        policy: match execution.scheduling() {
             Scheduling::Other => SchedulingPolicy::Other,
             Scheduling::Fifo { priority } => SchedulingPolicy::Fifo { priority },
         },
-        lock_memory: execution.locks_memory,
+        lock_memory: execution.lock_memory,
         timer_slack: Some(execution.timer_slack),
     }
 }

@@ -214,7 +214,7 @@ fn prepare_folder(
     options: &RunOptions,
     facts: &HostFacts,
 ) -> Result<RunFolder, Unprepared> {
-    let parent = PathBuf::from(&topology.run().record_folder);
+    let parent = PathBuf::from(topology.run().record.as_ref());
     let suffix = (hosts.len() < topology.hosts().len()).then(|| hosts[0].name.as_str());
     let folder = match RunFolder::create(&parent, topology.name(), suffix) {
         Ok(folder) => folder,

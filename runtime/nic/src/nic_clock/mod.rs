@@ -180,7 +180,7 @@ impl Drop for NicWatch {
 /// True when a gateway or adapter on `host` asks for hardware stamps of datagrams.
 fn wants_cards(topology: &Topology, host: &Host) -> bool {
     let of_hops = topology.crossings().any(|crossing| {
-        crossing.hop.timestamps == Timestamps::Hardware
+        crossing.hop.socket.timestamps == Timestamps::Hardware
             && [crossing.from_host, crossing.to_host]
                 .iter()
                 .any(|end| end.name == host.name)

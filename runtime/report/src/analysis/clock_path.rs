@@ -83,7 +83,7 @@ fn end(host: &Host, address: &str) -> ClockPathEnd {
     ClockPathEnd {
         host: host.name.clone(),
         address: address.to_owned(),
-        interface: host.clock.as_ref().and_then(|end| end.interface.clone()),
+        interface: host.clock_interface.clone(),
     }
 }
 

@@ -47,7 +47,7 @@ pub(super) fn hardware_stamps(records: &RunRecords<'_>) -> Option<HardwareStamps
 }
 
 fn passes_nic(crossing: &Crossing<'_>) -> bool {
-    crossing.hop.timestamps == Timestamps::Hardware
+    crossing.hop.socket.timestamps == Timestamps::Hardware
 }
 
 fn nic_of<'a>(result: &'a RunResult, host: &str) -> Option<&'a NicHistory> {

@@ -124,7 +124,7 @@ fn who_stands_in_for_the_robot_sees_a_sensor_and_leaves_no_record() {
     let topology = good(ROBOT);
     let adapter = adapter(&topology, "yumi");
     assert_eq!(adapter.kind, AdapterKind::Sensor);
-    assert_eq!(adapter.send, AdapterSend::Free { rate_hz: 125.0 });
+    assert_eq!(adapter.send(), AdapterSend::Free { rate_hz: 125.0 });
     assert!(!names(&topology).contains(&"egm/event"));
     assert!(names(&topology).contains(&"human/frame"));
 }
@@ -147,7 +147,7 @@ fn an_adapter_may_be_started_again_although_the_case_remembers() {
         "role = \"controller\"\non_exit = \"restart\"",
     );
     assert_eq!(
-        good(&text).process("client").unwrap().on_exit,
+        good(&text).process("client").unwrap().restarts.on_exit(),
         OnExit::Restart { limit: 3 }
     );
 }

@@ -33,7 +33,7 @@ struct Faulty(&'static str, &'static str, &'static str, &'static str);
 const FAULTY: &[Faulty] = &[
     Faulty(
         "processes.controller.role = \"controller\"",
-        "processes.controller.role = \"controller\" #!\nprocesses.controller.on_exit = \"restart\"",
+        "processes.controller.role = \"controller\"\nprocesses.controller.on_exit = \"restart\" #!",
         "processes.controller.on_exit",
         "started anew",
     ),

@@ -49,7 +49,7 @@ fn a_chain_of_files_merges_tables_and_replaces_arrays() {
     assert_eq!(topology.name(), "middle");
     assert_eq!(topology.run().seed, 5);
     let controller = topology.process("controller").unwrap();
-    assert_eq!(controller.execution.cpus, [4]);
+    assert_eq!(controller.execution.cpu, [4]);
     assert_eq!(controller.execution.wait, Wait::Hybrid);
 }
 

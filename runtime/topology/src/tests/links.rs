@@ -1,9 +1,9 @@
 //! What an emulated link can be told to do: every law, its inheritance, its way back to a file, and
 //! its faults.
 
+use hil_core::options::{Options as _, Shape, Slot};
 use hil_link::delay::{Exponential, Histogram, LogNormal, Normal, Pareto, Uniform};
 use hil_link::loss::{Bursts, GilbertElliott};
-use hil_link::options::Slot;
 use hil_link::rate::RateLimit;
 use hil_link::reordering::{Duplication, Reordering};
 
@@ -98,11 +98,11 @@ fn every_delay_law_of_the_list_is_read_with_its_required_keys_and_written_back()
         let mut law = DelayLaw::named(name).unwrap();
         let mut text = format!("[links.hop.delay]\nlaw = \"{name}\"\n");
         let mut has_list = false;
-        for field in law.options().fields() {
+        for field in law.fields() {
             let value = match field.slot {
                 _ if !field.is_required => continue,
-                Slot::Duration(..) => "\"3 ms\"".to_owned(),
-                Slot::Number(_, range) => {
+                Slot::Value(_, Shape::Time(_)) => "\"3 ms\"".to_owned(),
+                Slot::Value(_, Shape::Number(range)) => {
                     format!("{:?}", 1.5_f64.clamp(*range.start(), *range.end()))
                 }
                 _ => {
@@ -197,7 +197,6 @@ fn defaults_of_the_file_are_those_of_the_models() {
     );
     assert_eq!((rate.queue_bytes, rate.overhead_bytes), (150_000, 28));
     assert_eq!(outages, hil_link::outages::Outages::default());
-    assert_eq!(limits::LINK_DELAY.max, hil_link::delay::DELAY_MAX);
 }
 
 /// Tables of a link, the key of the one error, and what it says.

@@ -181,7 +181,7 @@ fn a_link_over_tcp_has_ports_and_a_hop_and_no_model() {
     assert_eq!(image.hop.transport.name, "tcp");
     assert_eq!((image.ports.sender, image.ports.receiver), (9001, 9001));
     assert_eq!(image.spec, None);
-    assert_eq!(image.hop.timestamps, Timestamps::Off);
+    assert_eq!(image.hop.socket.timestamps, Timestamps::Off);
     let written = topology.to_toml();
     let again = parse("again.toml", &written, &[], &known()).unwrap();
     assert_eq!(again, topology);

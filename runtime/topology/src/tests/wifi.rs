@@ -1,6 +1,6 @@
 //! A radio in a topology file: presets, what differs from them, and what is refused.
 
-use hil_link::options::{Options, Slot};
+use hil_core::options::{Options, Shape, Slot};
 use hil_link::wifi::{AccessCategory, PowerSave, WifiPreset};
 
 use super::faulty::GOOD;
@@ -54,8 +54,8 @@ fn a_table_says_what_differs_from_its_preset_and_is_written_back() {
 fn every_number_of_a_radio_is_refused_by_name_outside_its_range() {
     for field in WifiPreset::ShortRange.spec().fields() {
         let above = match field.slot {
-            Slot::Number(_, range) => (range.end() + 1.0).to_string(),
-            Slot::Count(_, range) => (range.end() + 1).to_string(),
+            Slot::Value(_, Shape::Number(range)) => (range.end() + 1.0).to_string(),
+            Slot::Value(_, Shape::Integer(range)) => (range.end() + 1).to_string(),
             _ => continue,
         };
         let text = with(&format!("[links.hop.wifi]\n{} = {above}\n", field.key));
