@@ -405,17 +405,6 @@ pub trait Scalar: Debug + Sized {
     fn from_setting(setting: Setting) -> Result<Self, String>;
 }
 
-impl<T: Scalar> Value for T {
-    fn get(&self) -> Option<Setting> {
-        Some(self.to_setting())
-    }
-
-    fn set(&mut self, setting: Setting) -> Result<(), String> {
-        *self = T::from_setting(setting)?;
-        Ok(())
-    }
-}
-
 /// An option that may be left out.
 #[derive(Debug)]
 struct Maybe<'o, T>(&'o mut Option<T>);
@@ -435,13 +424,14 @@ impl<T: Scalar> Value for Maybe<'_, T> {
 #[derive(Debug)]
 struct There<'o, T>(&'o mut T);
 
-impl<T: Value> Value for There<'_, T> {
+impl<T: Scalar> Value for There<'_, T> {
     fn get(&self) -> Option<Setting> {
-        self.0.get()
+        Some(self.0.to_setting())
     }
 
     fn set(&mut self, setting: Setting) -> Result<(), String> {
-        self.0.set(setting)
+        *self.0 = T::from_setting(setting)?;
+        Ok(())
     }
 }
 

@@ -281,7 +281,7 @@ impl Options for LinkDelay {
 }
 
 impl Short for LinkDelay {
-    const TEMPLATES: Option<Templates> = named_law(DelayLaw::NAMES);
+    const TEMPLATES: Option<Templates> = Some(named_law(DelayLaw::NAMES));
     const KEY: &'static str = "delay";
     const ABOUT: &'static str = "The same delay of all messages.";
 
@@ -310,7 +310,7 @@ impl Short for LinkDelay {
 }
 
 impl Short for LossLaw {
-    const TEMPLATES: Option<Templates> = named_law(Self::NAMES);
+    const TEMPLATES: Option<Templates> = Some(named_law(Self::NAMES));
     const KEY: &'static str = "loss_ratio";
     const ABOUT: &'static str = "Share of the messages that is lost, each by itself.";
 
@@ -339,13 +339,13 @@ impl Short for LossLaw {
 }
 
 /// A table that names its law.
-const fn named_law(names: &'static [&'static str]) -> Option<Templates> {
-    Some(Templates {
+const fn named_law(names: &'static [&'static str]) -> Templates {
+    Templates {
         key: "law",
         names,
         chosen: None,
         is_required: true,
-    })
+    }
 }
 
 macro_rules! law_tables {

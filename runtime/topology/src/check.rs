@@ -110,9 +110,8 @@ fn check_case(known: &KnownCase, seed: u64, checks: &Checks<'_>) -> Option<Case>
 
 /// A parameter left at its default has no line: then the fault is at that of its table.
 fn refuse_parameter(fault: ParameterFault, checks: &Checks<'_>) {
-    let (keys, last) = match fault.key.split_last() {
-        Some((last, keys)) => (keys, last),
-        None => return checks.refuse("case.parameters", Fault::Parameter(fault.message)),
+    let Some((last, keys)) = fault.key.split_last() else {
+        return checks.refuse("case.parameters", Fault::Parameter(fault.message));
     };
     // A key may end in an index, as in `bays[2]`, which needs no quotes.
     let below = |path: String, step: &String| match step.split_once('[') {

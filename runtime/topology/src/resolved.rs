@@ -1,6 +1,7 @@
 //! The checked topology written back: every default spelled out, in the shape of the file. It is
 //! what a run's manifest keeps and what two hosts compare.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use hil_core::message::{FNV_OFFSET, fnv1a};
@@ -91,7 +92,7 @@ impl Process {
                 environment,
                 ..
             } => (Some(command.clone()), environment.clone()),
-            _ => (None, Default::default()),
+            _ => (None, BTreeMap::default()),
         };
         let egm = match &self.program {
             Program::Egm { adapter, .. } => Some(adapter.clone()),

@@ -177,7 +177,7 @@ pub(super) fn reference() -> String {
     }
     let mut page = HEAD.to_owned();
     for Section { titles, note, rows } in merged {
-        page += &format!("\n## {}{note}\n\n", titles.join(", "));
+        page.extend(["\n## ", &titles.join(", "), &note, "\n\n"]);
         page += "| Key | Value | Default | Meaning |\n|---|---|---|---|\n";
         page += &rows;
     }

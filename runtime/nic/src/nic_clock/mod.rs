@@ -288,10 +288,8 @@ mod tests {
     fn host(interface: Option<&str>) -> Host {
         Host {
             name: "robot-pc".to_owned(),
-            address: None,
             interface: interface.map(str::to_owned),
-            control_port: 7399,
-            clock: None,
+            ..Host::TEMPLATE
         }
     }
 
