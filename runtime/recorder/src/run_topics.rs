@@ -614,7 +614,8 @@ impl RunTopics {
             }
             What::Record { file, index } => {
                 if let Some(record) = net::record(&run.files[file], index) {
-                    self.record(channel, &record, true, sink)?;
+                    let joining = &mut self.channels[channel].joining;
+                    joining.take(&record, true, Instant::now());
                 }
             }
             What::LateStamp { file, index } => {

@@ -1,11 +1,11 @@
 //! What the views of a run show, drawn as the viewers' schema has it, by the live page's rules
 //! (`page/fleet.js`, `page/arms.js`). Heights are for the eye; no message carries any.
 
+use foxglove::messages::line_primitive::Type as LineKind;
 use foxglove::messages::{
     Color, CylinderPrimitive, Duration, FrameTransform, FrameTransforms, KeyValuePair,
     LinePrimitive, Point3, SceneEntity, SceneEntityDeletion, SceneUpdate, SpherePrimitive,
-    TextPrimitive, Timestamp, TriangleListPrimitive, Vector3, line_primitive,
-    scene_entity_deletion,
+    TextPrimitive, Timestamp, TriangleListPrimitive, Vector3, scene_entity_deletion,
 };
 use hil_fleet::geometry::Bounds;
 use serde::Serialize;
@@ -123,7 +123,9 @@ fn robot(one: &RobotPicture, [length, width]: [f64; 2], at: Timestamp) -> SceneE
         if way.len() > 1 {
             let way = way.iter().map(|point| lifted(*point, WAY_M)).collect();
             let color = color(paint, alpha);
-            entity.lines.push(line(way, thickness, false, color));
+            entity
+                .lines
+                .push(line(LineKind::LineStrip, way, thickness, color));
         }
     }
     let label = if one.is_stale {
@@ -161,7 +163,8 @@ fn section(one: &SectionPicture, at: Timestamp) -> SceneEntity {
     entity.triangles = inside.into_iter().collect();
     let corners = one.polygon.iter();
     let corners = corners.map(|point| lifted(*point, 2.0 * SECTION_M));
-    let edge = line(corners.collect(), edge_m, true, color(paint, edge_alpha));
+    let color = color(paint, edge_alpha);
+    let edge = line(LineKind::LineLoop, corners.collect(), edge_m, color);
     entity.lines = vec![edge];
     entity.metadata = vec![
         word("robots", one.robots),
@@ -179,7 +182,12 @@ fn collision(hit: &Collision, index: usize, now_s: f64, at: Timestamp) -> SceneE
     let mut entity = of_fleet(hit.fleet, &format!("collision {index}"), at);
     let cross = [[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]]
         .map(|[along, across]| lifted([x + along * arm_m, y + across * arm_m], MARK_M));
-    entity.lines = vec![strokes(cross.to_vec(), 0.12, color(BAD, alpha))];
+    entity.lines = vec![line(
+        LineKind::LineList,
+        cross.to_vec(),
+        0.12,
+        color(BAD, alpha),
+    )];
     if is_fresh {
         entity.spheres = vec![ball([x, y, HEIGHT_M], 1.2, color(BAD, 0.25))];
     }
@@ -198,7 +206,7 @@ fn ground_of(map: &MapPicture, fleet: u32, at: Timestamp) -> SceneEntity {
     let (low, high) = corners(&map.bounds);
     let edge = [low, [high[0], low[1]], high, [low[0], high[1]]];
     let edge = edge.map(|point| lifted(point, 0.0)).to_vec();
-    entity.lines = vec![line(edge, 0.06, true, color(FAINT, 0.8))];
+    entity.lines = vec![line(LineKind::LineLoop, edge, 0.06, color(FAINT, 0.8))];
     for area in &map.conflict_areas {
         let area = filled(area, 0.0, color(FAINT, 0.08));
         entity.triangles.extend(area);
@@ -219,7 +227,8 @@ fn ground_of(map: &MapPicture, fleet: u32, at: Timestamp) -> SceneEntity {
                 let x = bay.x_m + along * cosine - across * sine;
                 lifted([x, bay.y_m + along * sine + across * cosine], SECTION_M)
             });
-        let edge = line(corners.to_vec(), 0.03, true, color(FAINT, 0.55));
+        let color_of_edge = color(FAINT, 0.55);
+        let edge = line(LineKind::LineLoop, corners.to_vec(), 0.03, color_of_edge);
         entity.lines.push(edge);
         let above = [bay.x_m, bay.y_m, MARK_M];
         let name = text(bay.id.to_string(), above, 0.5 * width, color(FAINT, 0.8));
@@ -273,7 +282,12 @@ pub(super) fn arms(picture: &ArmsPicture, at: Timestamp) -> SceneUpdate {
         if let Some((desired, measured)) = desired.zip(measured) {
             let mut entity = entity(BODY.to_owned(), format!("{side} tool error"), at);
             let ends = [desired, measured].map(|[x, y, z, ..]| lifted([*x, *y], *z));
-            entity.lines = vec![strokes(ends.to_vec(), 0.006, color(BAD, 1.0))];
+            entity.lines = vec![line(
+                LineKind::LineList,
+                ends.to_vec(),
+                0.006,
+                color(BAD, 1.0),
+            )];
             entities.push(entity);
         }
     }
@@ -327,13 +341,8 @@ const fn lifted([x, y]: Point, z: f64) -> Point3 {
     Point3 { x, y, z }
 }
 
-/// A line through `points`, `thickness` metres thick; closed where `is_closed`.
-fn line(points: Vec<Point3>, thickness: f64, is_closed: bool, color: Color) -> LinePrimitive {
-    let kind = if is_closed {
-        line_primitive::Type::LineLoop
-    } else {
-        line_primitive::Type::LineStrip
-    };
+/// A line, or separate strokes of two points each, through `points`, `thickness` metres thick.
+fn line(kind: LineKind, points: Vec<Point3>, thickness: f64, color: Color) -> LinePrimitive {
     LinePrimitive {
         r#type: kind.into(),
         pose: Some(pose([0.0; 3], UNTURNED)),
@@ -341,14 +350,6 @@ fn line(points: Vec<Point3>, thickness: f64, is_closed: bool, color: Color) -> L
         points,
         color: Some(color),
         ..LinePrimitive::default()
-    }
-}
-
-/// Separate strokes, two points each.
-fn strokes(points: Vec<Point3>, thickness: f64, color: Color) -> LinePrimitive {
-    LinePrimitive {
-        r#type: line_primitive::Type::LineList.into(),
-        ..line(points, thickness, false, color)
     }
 }
 
