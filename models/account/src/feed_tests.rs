@@ -46,7 +46,7 @@ impl Run {
         let mut files = Files::default();
         let mut interruptions = Vec::new();
         let mut now_ns = 5 * MS;
-        let epochs = &[70_u32, 4, 900][..1 + usize::try_from(up_to(&mut stream, 2)).unwrap()];
+        let epochs = &[70_u32, 4, 900][..=usize::try_from(up_to(&mut stream, 2)).unwrap()];
         for epoch in epochs {
             let count = 50 + up_to(&mut stream, 400);
             let outage = up_to(&mut stream, count)..up_to(&mut stream, count) + 40;
@@ -54,9 +54,7 @@ impl Run {
             let kill_from = up_to(&mut stream, 2 * count);
             let kill = kill_from..kill_from + 30;
             for sequence in 0..count {
-                let fate = if kill.contains(&sequence) {
-                    MessageFate::LostOnWire
-                } else if outage.contains(&sequence) {
+                let fate = if kill.contains(&sequence) || outage.contains(&sequence) {
                     MessageFate::LostOnWire
                 } else if pause.contains(&sequence) {
                     MessageFate::SupersededAtConsumer
@@ -279,7 +277,7 @@ impl Run {
             }
             let path = context.path;
             fold.settle(&context, now_ns - settling_ns, &mut |one| {
-                told.add(one, path)
+                told.add(one, path);
             });
         }
         let map = self.clock_map(i64::MAX);
@@ -291,14 +289,9 @@ impl Run {
 
     /// In the order of publication, a few records at a time.
     fn in_pieces(&self, stream: &mut RandomStream) -> Told {
-        let published_ns = |event: &RecordEvent| match event {
-            RecordEvent::Published(one) => one.published_ns,
-            RecordEvent::Egress(one) => one.published_ns,
-            RecordEvent::Ingress(one) => one.published_ns,
-            RecordEvent::Taken(one) => one.published_ns,
-            // It comes with its message or later.
-            RecordEvent::FollowUp(_) => i64::MIN,
-        };
+        // A transmit stamp comes with its message or later.
+        let published_ns =
+            |event: &RecordEvent| event.message().map_or(i64::MIN, |one| one.published_ns);
         let mut events: Vec<RecordEvent> = self.events.iter().map(|(_, event)| *event).collect();
         events.sort_by_key(published_ns);
         let map = self.clock_map(i64::MAX);
@@ -309,7 +302,9 @@ impl Run {
         while !rest.is_empty() {
             let count = usize::try_from(1 + up_to(stream, 11)).unwrap();
             let (piece, left) = rest.split_at(count.min(rest.len()));
-            piece.iter().for_each(|event| fold.push(event));
+            for event in piece {
+                fold.push(event);
+            }
             rest = left;
             let until_ns = rest
                 .first()
@@ -364,7 +359,9 @@ impl Told {
 
     fn outages(&self) -> Vec<Outage> {
         let mut finder = OutageFinder::default();
-        self.messages.iter().for_each(|one| finder.add(one));
+        for message in &self.messages {
+            finder.add(message);
+        }
         finder.finish()
     }
 
@@ -501,31 +498,26 @@ fn watched(count: u64, fate: impl Fn(u64) -> MessageFate) -> (usize, FateCounts)
             published_ns: signed(sequence) * PERIOD_NS,
         };
         files.write(message, fate(sequence));
-        files
-            .published
-            .iter()
-            .for_each(|one| fold.push(&RecordEvent::Published(*one)));
-        files
-            .egress
-            .iter()
-            .for_each(|one| fold.push(&RecordEvent::Egress(*one)));
-        files
-            .ingress
-            .iter()
-            .for_each(|one| fold.push(&RecordEvent::Ingress(*one)));
-        files
-            .follow_up
-            .iter()
-            .for_each(|one| fold.push(&RecordEvent::FollowUp(*one)));
-        files
-            .taken
-            .iter()
-            .for_each(|one| fold.push(&RecordEvent::Taken(*one)));
+        for one in files.published {
+            fold.push(&RecordEvent::Published(one));
+        }
+        for one in files.egress {
+            fold.push(&RecordEvent::Egress(one));
+        }
+        for one in files.ingress {
+            fold.push(&RecordEvent::Ingress(one));
+        }
+        for one in files.follow_up {
+            fold.push(&RecordEvent::FollowUp(one));
+        }
+        for one in files.taken {
+            fold.push(&RecordEvent::Taken(one));
+        }
         held_max = held_max.max(fold.held_count());
         if sequence % 10 == 0 {
             let until_ns = message.published_ns - settling_ns;
             fold.settle(&context, until_ns, &mut |one| {
-                fates.add(one.fate, one.count)
+                fates.add(one.fate, one.count);
             });
         }
     }

@@ -11,7 +11,7 @@ use std::collections::VecDeque;
 
 use super::fate::{Evidence, Judge, Reading, Readings};
 use super::follow_up::FollowUps;
-use super::history::{Copies, Key, MessageHistory};
+use super::history::{Key, MessageHistory};
 use super::{AccountContext, ChannelRecords, RecordSource, each};
 use hil_core::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE, stamp,
@@ -31,6 +31,40 @@ pub enum RecordEvent {
     FollowUp(FollowUpRecord),
     /// The consumer's.
     Taken(TakenRecord),
+}
+
+/// The message that a record is of, as the record names it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MessageName {
+    /// The producer's start.
+    pub epoch: u32,
+    /// Sequence number.
+    pub sequence: u64,
+    /// Publication on the producer's host clock; [`UNAVAILABLE`] where unknown.
+    pub published_ns: i64,
+}
+
+impl RecordEvent {
+    /// The message; `None` of a transmit stamp, which names the sender's session instead.
+    pub const fn message(&self) -> Option<MessageName> {
+        let (epoch, sequence, published_ns) = match self {
+            Self::Published(one) => (one.epoch, one.sequence, one.published_ns),
+            Self::Egress(one) => (one.epoch, one.sequence, one.published_ns),
+            Self::Ingress(one) => (one.epoch, one.sequence, one.published_ns),
+            Self::Taken(one) => (one.epoch, one.sequence, one.published_ns),
+            Self::FollowUp(_) => return None,
+        };
+        Some(MessageName {
+            epoch,
+            sequence,
+            published_ns,
+        })
+    }
+
+    /// True for what a gateway writes.
+    const fn is_of_gateway(&self) -> bool {
+        !matches!(self, Self::Published(_) | Self::Taken(_))
+    }
 }
 
 /// The kinds of records of a channel that are at hand: only there does the absence of a record say
@@ -149,62 +183,54 @@ impl Buffer {
     }
 }
 
-/// The records of a message that has not settled.
-#[derive(Debug, Default)]
+/// A message that has not settled.
+#[derive(Debug)]
 struct Pending {
-    published: Option<PublishedRecord>,
-    egress: Option<EgressRecord>,
-    /// A restarted gateway may send a message again.
+    message: MessageHistory,
+    /// What other starts of the sending gateway noted of it: they may send it again.
     resent: Vec<EgressRecord>,
-    ingress: Option<IngressRecord>,
-    taken: Option<TakenRecord>,
-    copies: Copies,
 }
 
 impl Pending {
     fn add(&mut self, event: &RecordEvent) {
+        let message = &mut self.message;
         match event {
             RecordEvent::Published(record) => {
-                self.published.get_or_insert(*record);
+                message.published.get_or_insert(*record);
             }
-            RecordEvent::Egress(record) => match &self.egress {
-                None => self.egress = Some(*record),
+            RecordEvent::Egress(record) => match &message.egress {
+                None => message.egress = Some(*record),
                 Some(first) if first.session != record.session => self.resent.push(*record),
                 Some(_) => {}
             },
             RecordEvent::Ingress(record) => {
-                self.copies.note(record);
+                message.copies.note(record);
                 // The copy that was forwarded is the message, the others are its duplicates.
-                let is_better = self.ingress.is_none_or(|best| {
+                let is_better = message.ingress.is_none_or(|best| {
                     best.forwarded_ns == UNAVAILABLE && record.forwarded_ns != UNAVAILABLE
                 });
                 if is_better {
-                    self.ingress = Some(*record);
+                    message.ingress = Some(*record);
                 }
             }
             RecordEvent::Taken(record) => {
-                self.taken.get_or_insert(*record);
+                message.taken.get_or_insert(*record);
             }
             RecordEvent::FollowUp(_) => {}
         }
     }
 
-    /// The sending that arrived, else the first.
-    fn sending(&self) -> Option<EgressRecord> {
-        let session = self.ingress.map(|record| record.session);
-        let mut all = self.egress.iter().chain(&self.resent);
-        let arrived = all.find(|record| Some(record.session) == session);
-        arrived.or(self.egress.as_ref()).copied()
-    }
-
-    fn published_ns(&self) -> Option<i64> {
-        let stamps = [
-            self.published.map(|record| record.published_ns),
-            self.egress.map(|record| record.published_ns),
-            self.ingress.map(|record| record.published_ns),
-            self.taken.map(|record| record.published_ns),
-        ];
-        stamps.into_iter().flatten().find_map(stamp)
+    /// The message, with the sending that arrived, else the first.
+    fn message(&self) -> MessageHistory {
+        let mut message = self.message;
+        if let Some((ingress, egress)) = message.ingress.zip(message.egress)
+            && egress.session != ingress.session
+        {
+            let mut others = self.resent.iter();
+            let arrived = others.find(|record| record.session == ingress.session);
+            message.egress = Some(*arrived.unwrap_or(&egress));
+        }
+        message
     }
 }
 
@@ -250,13 +276,12 @@ impl ChannelFold {
     }
 
     /// Knows from now on that records of these kinds are at hand, beside those known already.
-    pub fn expect(&mut self, kinds: RecordsAtHand) {
-        let is_gateway = self.settings.is_gateway;
+    pub const fn expect(&mut self, kinds: RecordsAtHand) {
         let at_hand = &mut self.at_hand;
         at_hand.published |= kinds.published;
-        at_hand.egress |= kinds.egress && is_gateway;
-        at_hand.ingress |= kinds.ingress && is_gateway;
-        at_hand.follow_up |= kinds.follow_up && is_gateway;
+        at_hand.egress |= kinds.egress;
+        at_hand.ingress |= kinds.ingress;
+        at_hand.follow_up |= kinds.follow_up;
         at_hand.taken |= kinds.taken;
     }
 
@@ -275,43 +300,35 @@ impl ChannelFold {
         self.late_record_count
     }
 
-    /// Takes in a record. Its kind is at hand from now on.
+    /// Takes in a record. Its kind is at hand from now on. What gateways write of a channel without any says
+    /// nothing.
     pub fn push(&mut self, event: &RecordEvent) {
-        let is_gateway = self.settings.is_gateway;
+        if event.is_of_gateway() && !self.settings.is_gateway {
+            return;
+        }
         match event {
-            RecordEvent::Published(record) => {
-                self.at_hand.published = true;
-                let (epoch, sequence) = (record.epoch, record.sequence);
-                self.insert(epoch, sequence, record.published_ns, event);
-            }
-            RecordEvent::Taken(record) => {
-                self.at_hand.taken = true;
-                let (epoch, sequence) = (record.epoch, record.sequence);
-                self.insert(epoch, sequence, record.published_ns, event);
-            }
-            RecordEvent::Egress(record) if is_gateway => {
-                self.at_hand.egress = true;
-                let (epoch, sequence) = (record.epoch, record.sequence);
-                self.insert(epoch, sequence, record.published_ns, event);
-            }
-            RecordEvent::Ingress(record) if is_gateway => {
+            RecordEvent::Published(_) => self.at_hand.published = true,
+            RecordEvent::Egress(_) => self.at_hand.egress = true,
+            RecordEvent::Ingress(record) => {
                 self.at_hand.ingress = true;
                 self.follow_ups.note_arrival(record);
-                let (epoch, sequence) = (record.epoch, record.sequence);
-                self.insert(epoch, sequence, record.published_ns, event);
             }
-            RecordEvent::FollowUp(record) if is_gateway => {
+            RecordEvent::FollowUp(record) => {
                 self.at_hand.follow_up = true;
                 self.follow_ups.add(record);
             }
-            RecordEvent::Egress(_) | RecordEvent::Ingress(_) | RecordEvent::FollowUp(_) => {}
+            RecordEvent::Taken(_) => self.at_hand.taken = true,
+        }
+        if let Some(name) = event.message() {
+            self.insert(name, event);
         }
     }
 
-    fn insert(&mut self, epoch: u32, sequence: u64, published_ns: i64, event: &RecordEvent) {
+    fn insert(&mut self, name: MessageName, event: &RecordEvent) {
         let settings = self.settings;
-        let index = self.index_of(epoch);
+        let index = self.index_of(name.epoch);
         let epoch = &mut self.epochs[index];
+        let sequence = name.sequence;
         match event {
             RecordEvent::Published(_) if settings.is_gateway => {
                 epoch.input.offer(sequence, settings.depth);
@@ -335,7 +352,7 @@ impl ChannelFold {
         let known_count = epoch.pending.len();
         epoch.pending(sequence).add(event);
         self.held_count += epoch.pending.len() - known_count;
-        if let Some(published_ns) = stamp(published_ns)
+        if let Some(published_ns) = stamp(name.published_ns)
             && published_ns < epoch.first_published_ns
         {
             epoch.first_published_ns = published_ns;
@@ -419,16 +436,14 @@ impl ChannelFold {
             epoch_rank: epoch.rank.unwrap_or(self.rank_count),
             sequence: next.min(sequence),
         };
-        let mut message = MessageHistory::unrecorded(key, epoch.number);
-        if next < sequence {
-            message.count = sequence - next;
-        } else if let Some((_, pending)) = epoch.pending.front() {
-            message.published = pending.published;
-            message.egress = pending.sending();
-            message.ingress = pending.ingress;
-            message.taken = pending.taken;
-            message.copies = pending.copies;
-        }
+        let mut message = match epoch.pending.front() {
+            Some((_, pending)) if next >= sequence => pending.message(),
+            _ => MessageHistory {
+                count: sequence.saturating_sub(next),
+                ..MessageHistory::unrecorded(epoch.number)
+            },
+        };
+        message.key = key;
         // Of a message that was taken nobody asks.
         let readings = match message.taken {
             Some(_) => Readings::default(),
@@ -523,7 +538,11 @@ impl Epoch {
             .get(place)
             .is_none_or(|(one, _)| *one != sequence)
         {
-            self.pending.insert(place, (sequence, Pending::default()));
+            let pending = Pending {
+                message: MessageHistory::unrecorded(self.number),
+                resent: Vec::new(),
+            };
+            self.pending.insert(place, (sequence, pending));
         }
         &mut self.pending[place].1
     }
@@ -538,7 +557,7 @@ impl Epoch {
         let mut stamps = self
             .pending
             .iter()
-            .filter_map(|(_, one)| one.published_ns());
+            .filter_map(|(_, one)| one.message.published_ns());
         stamps
             .next()
             .filter(|at_ns| *at_ns <= until_ns)

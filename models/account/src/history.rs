@@ -76,10 +76,13 @@ impl Copies {
 }
 
 impl MessageHistory {
-    /// One of which nothing but its number is known.
-    pub(super) const fn unrecorded(key: Key, epoch: u32) -> Self {
+    /// One of which nothing is known but the start of its producer.
+    pub(super) const fn unrecorded(epoch: u32) -> Self {
         Self {
-            key,
+            key: Key {
+                epoch_rank: 0,
+                sequence: 0,
+            },
             epoch,
             count: 1,
             published: None,

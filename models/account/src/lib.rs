@@ -41,7 +41,9 @@ use core::fmt::Debug;
 use core::time::Duration;
 
 pub use account::{AccountFold, account};
-pub use fold::{ChannelFold, FirstNumber, FoldSettings, RecordEvent, RecordsAtHand, each_history};
+pub use fold::{
+    ChannelFold, FirstNumber, FoldSettings, MessageName, RecordEvent, RecordsAtHand, each_history,
+};
 pub use history::{Copies, Key, MessageHistory};
 pub use metrics::{
     BurstCount, ChannelAccount, Closing, ClosingMetrics, Coverage, EndToEnd, FateCounts, Gap, Gaps,

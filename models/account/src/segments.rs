@@ -229,7 +229,7 @@ impl<'a> SegmentFold<'a> {
         }
         match residual_ns {
             Some(_) if self.misses_stage(message, timeline) => {
-                self.closing.missing_stage_count += 1
+                self.closing.missing_stage_count += 1;
             }
             None => self.closing.missing_stage_count += 1,
             Some(_) if !is_ordered => self.closing.negative_segment_count += 1,

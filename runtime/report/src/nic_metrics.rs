@@ -183,6 +183,7 @@ struct StampFold {
 
 /// A stamp of the sending card; without a place on the host's monotonic clock where the clock of the card
 /// does not say.
+#[derive(Clone, Copy)]
 struct Departure(Option<Bounded>);
 
 impl StampFold {
@@ -267,6 +268,7 @@ fn crossing(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hil_account::RecordSource;
     use hil_account::nic_clock::NicClockRecord;
     use hil_core::record::UNAVAILABLE;
     use hil_core::time::Alignment;
@@ -377,8 +379,8 @@ mod tests {
     }
 
     fn stamps_of(
-        egress: &Vec<EgressRecord>,
-        ingress: &Vec<IngressRecord>,
+        egress: &dyn RecordSource<EgressRecord>,
+        ingress: &dyn RecordSource<IngressRecord>,
         alignment: Option<Alignment>,
         places: &Places<'_>,
     ) -> ChannelStamps {
@@ -431,8 +433,8 @@ mod tests {
 
     #[test]
     fn pieces_of_a_message_are_not_counted_as_received() {
-        let egress = vec![sent(0, 500_000_000), sent(1, 510_000_000)];
-        let mut ingress: Vec<_> = egress.iter().map(came).collect();
+        let egress = [sent(0, 500_000_000), sent(1, 510_000_000)];
+        let mut ingress = egress.each_ref().map(came);
         ingress[1].flags = IngressRecord::INCOMPLETE;
         ingress[1].rx_hardware_ns = UNAVAILABLE;
         let places = Places {
@@ -466,7 +468,7 @@ mod tests {
             receiver: None,
             receiving_nic: None,
         };
-        let figures = stamps_of(&vec![sent(0, 5)], &Vec::new(), None, &places);
+        let figures = stamps_of(&[sent(0, 5)], &Vec::new(), None, &places);
         assert_eq!(figures.tx_hardware_count, 1);
         assert_eq!(figures.segments[0].unplaced_count, 1);
         assert!(figures.segments[0].distribution.measured().is_none());

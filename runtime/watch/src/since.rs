@@ -40,14 +40,8 @@ impl Since {
         record: &Record,
         is_of_this_host: bool,
     ) -> bool {
-        let (epoch, sequence) = match record {
-            Record::Published(one) => (one.epoch, one.sequence),
-            Record::Taken(one) => (one.epoch, one.sequence),
-            Record::Egress(one) => (one.epoch, one.sequence),
-            Record::Ingress(one) => (one.epoch, one.sequence),
-            _ => return true,
-        };
-        self.admits(channel, epoch, sequence, is_of_this_host)
+        let message = record.of_message().and_then(|event| event.message());
+        message.is_none_or(|one| self.admits(channel, one.epoch, one.sequence, is_of_this_host))
     }
 
     fn note(&mut self, channel: &str, epoch: u32, sequence: u64) {

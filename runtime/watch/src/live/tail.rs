@@ -71,13 +71,7 @@ impl ChannelTail {
     fn push(&mut self, event: &RecordEvent) {
         const NEVER_CAME: u32 =
             IngressRecord::DUPLICATE | IngressRecord::LATE | IngressRecord::INCOMPLETE;
-        let published_ns = match event {
-            RecordEvent::Published(record) => stamp(record.published_ns),
-            RecordEvent::Egress(record) => stamp(record.published_ns),
-            RecordEvent::Ingress(record) => stamp(record.published_ns),
-            RecordEvent::Taken(record) => stamp(record.published_ns),
-            RecordEvent::FollowUp(_) => None,
-        };
+        let published_ns = event.message().and_then(|one| stamp(one.published_ns));
         if let RecordEvent::Ingress(record) = event
             && record.flags & NEVER_CAME == 0
         {
