@@ -22,6 +22,7 @@ pub use {bytemuck, serde};
 pub mod arrival;
 pub mod case_study;
 pub mod component;
+pub mod counts;
 pub mod endpoint;
 pub mod layout;
 pub mod link_model;

@@ -123,13 +123,115 @@ pub struct Table {
     pub notes: Vec<String>,
 }
 
+impl Table {
+    /// A table with a row for each of `rows`.
+    pub fn of<T>(name: &str, title: &str, fields: &[Field<T>], rows: &[T]) -> Self {
+        let cells = |row| Field::cells(fields, Some(row)).collect();
+        Self {
+            name: name.to_owned(),
+            title: title.to_owned(),
+            columns: Field::columns(fields).collect(),
+            rows: rows.iter().map(cells).collect(),
+            notes: Vec::new(),
+        }
+    }
+}
+
 /// One column of a table.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Column {
     /// Snake-case name with unit suffix, for a file.
     pub name: &'static str,
     /// The words a page prints.
     pub label: &'static str,
+}
+
+impl Column {
+    /// The column `name` under `label`.
+    pub const fn new(name: &'static str, label: &'static str) -> Self {
+        Self { name, label }
+    }
+}
+
+/// A column with the figure that it shows of a `T`.
+#[derive(Debug)]
+pub struct Field<T> {
+    column: Column,
+    figure: Figure<T>,
+}
+
+#[derive(Debug)]
+enum Figure<T> {
+    Text(fn(&T) -> String),
+    Count(fn(&T) -> u64),
+    Number {
+        value: fn(&T) -> Option<f64>,
+        decimals: usize,
+    },
+    Interval {
+        ends: fn(&T) -> Option<(f64, f64)>,
+        decimals: usize,
+    },
+}
+
+impl<T> Field<T> {
+    /// A column of words.
+    pub const fn text(name: &'static str, label: &'static str, text: fn(&T) -> String) -> Self {
+        Self {
+            column: Column { name, label },
+            figure: Figure::Text(text),
+        }
+    }
+
+    /// A column of numbers of things.
+    pub const fn count(name: &'static str, label: &'static str, count: fn(&T) -> u64) -> Self {
+        Self {
+            column: Column { name, label },
+            figure: Figure::Count(count),
+        }
+    }
+
+    /// A column of figures, printed with so many decimals.
+    pub const fn number(
+        name: &'static str,
+        label: &'static str,
+        decimals: usize,
+        value: fn(&T) -> Option<f64>,
+    ) -> Self {
+        Self {
+            column: Column { name, label },
+            figure: Figure::Number { value, decimals },
+        }
+    }
+
+    /// A column of intervals, printed with so many decimals.
+    pub const fn interval(
+        name: &'static str,
+        label: &'static str,
+        decimals: usize,
+        ends: fn(&T) -> Option<(f64, f64)>,
+    ) -> Self {
+        Self {
+            column: Column { name, label },
+            figure: Figure::Interval { ends, decimals },
+        }
+    }
+
+    /// The columns of `fields`.
+    pub fn columns(fields: &[Self]) -> impl Iterator<Item = Column> {
+        fields.iter().map(|field| field.column)
+    }
+
+    /// The cells of `fields` in the row of `of`; without it they are empty.
+    pub fn cells(fields: &[Self], of: Option<&T>) -> impl Iterator<Item = Cell> {
+        fields.iter().map(move |field| match (of, &field.figure) {
+            (None, _) => Cell::Absent,
+            (Some(of), Figure::Text(text)) => Cell::Text(text(of)),
+            (Some(of), Figure::Count(count)) => Cell::Count(count(of)),
+            (Some(of), Figure::Number { value, decimals }) => Cell::number(value(of), *decimals),
+            (Some(of), Figure::Interval { ends, decimals }) => Cell::interval(ends(of), *decimals),
+        })
+    }
 }
 
 /// One cell of a table.
@@ -306,6 +408,31 @@ mod tests {
         };
         assert!(report(vec![criterion(Some(true)), criterion(None)]).is_passed());
         assert!(!report(vec![criterion(Some(true)), criterion(Some(false))]).is_passed());
+    }
+
+    #[test]
+    fn fields_give_columns_and_cells_and_empty_cells_of_nothing() {
+        const FIELDS: [Field<u64>; 4] = [
+            Field::text("parity", "Parity", |n| {
+                if n % 2 == 0 { "even" } else { "odd" }.to_owned()
+            }),
+            Field::count("number", "Number", |n| *n),
+            Field::number("inverse", "Inverse", 2, |n| {
+                (*n > 0).then(|| 1.0 / *n as f64)
+            }),
+            Field::interval("around", "Around", 1, |n| {
+                Some((*n as f64 - 0.5, *n as f64 + 0.5))
+            }),
+        ];
+        let labels: Vec<_> = Field::columns(&FIELDS).map(|column| column.label).collect();
+        assert_eq!(labels, ["Parity", "Number", "Inverse", "Around"]);
+        let shown = |of| -> Vec<String> {
+            let cells = Field::cells(&FIELDS, of);
+            cells.map(|cell| cell.shown()).collect()
+        };
+        assert_eq!(shown(Some(&4)), ["even", "4", "0.25", "3.5 to 4.5"]);
+        assert_eq!(shown(Some(&0))[2], "-");
+        assert_eq!(shown(None), ["-"; 4]);
     }
 
     #[test]

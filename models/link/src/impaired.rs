@@ -59,19 +59,21 @@ impl Default for Impairments {
     }
 }
 
-/// What became of the messages offered.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct LinkCounts {
-    /// Messages offered.
-    pub offered_count: u64,
-    /// Messages of which no copy arrived.
-    pub lost_count: u64,
-    /// Messages that arrived twice.
-    pub duplicated_count: u64,
-    /// Messages held back.
-    pub held_count: u64,
-    /// Messages that waited for the end of a stall.
-    pub stalled_count: u64,
+hil_core::counts! {
+    /// What became of the messages offered.
+    #[derive(Eq)]
+    pub struct LinkCounts {
+        /// Messages offered.
+        offered_count: u64;
+        /// Messages of which no copy arrived.
+        lost_count: u64;
+        /// Messages that arrived twice.
+        duplicated_count: u64;
+        /// Messages held back.
+        held_count: u64;
+        /// Messages that waited for the end of a stall.
+        stalled_count: u64;
+    }
 }
 
 /// The link.

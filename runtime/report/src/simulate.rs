@@ -108,13 +108,15 @@ pub fn simulate(
     let duration = topology.run().duration;
     let names = links.keys().cloned();
     let mut accounts = LinkAccounts(names.map(|name| (name, LinkAccount::default())).collect());
-    let progress = Progress {
+    let mut progress = Progress {
         duration,
         next: Instant::ZERO,
         watch,
     };
     let result = Simulation::of_roles(entry.name, entry.channels, roles, carriers)
-        .and_then(|simulation| simulation.run_observed(duration, &mut (&mut accounts, progress)))
+        .and_then(|simulation| {
+            simulation.run_observed(duration, &mut (&mut accounts, &mut progress))
+        })
         .map_err(|error| refused(error.to_string()))?;
     let score = case.score(&result.log);
     let mut summary = RunSummary::new(run_facts(topology, file));

@@ -87,34 +87,8 @@ pub trait Observe<M: Model> {
 
 impl<M: Model> Observe<M> for () {}
 
-impl<M: Model, O: Observe<M>> Observe<M> for &mut O {
-    fn offered(&mut self, now: Instant, message: &M::Message) {
-        (**self).offered(now, message);
-    }
-
-    fn delivered(&mut self, now: Instant, message: &M::Message, at: Instant) {
-        (**self).delivered(now, message, at);
-    }
-
-    fn dropped(&mut self, now: Instant, message: &M::Message) {
-        (**self).dropped(now, message);
-    }
-
-    fn recorded(&mut self, now: Instant, record: &M::Record) {
-        (**self).recorded(now, record);
-    }
-
-    fn next_tick(&self) -> Option<Instant> {
-        (**self).next_tick()
-    }
-
-    fn ticked(&mut self, now: Instant) {
-        (**self).ticked(now);
-    }
-}
-
 /// Both, the first one first.
-impl<M: Model, A: Observe<M>, B: Observe<M>> Observe<M> for (A, B) {
+impl<M: Model, A: Observe<M>, B: Observe<M>> Observe<M> for (&mut A, &mut B) {
     fn offered(&mut self, now: Instant, message: &M::Message) {
         self.0.offered(now, message);
         self.1.offered(now, message);

@@ -12,81 +12,68 @@ pub struct CoordinatorCounters {
     pub safe: SafeCounts,
 }
 
-macro_rules! counts {
-    ($(#[$of:meta])* $type:ident: $($(#[$doc:meta])* $name:ident,)*) => {
-        $(#[$of])*
-        #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-        pub struct $type {
-            $($(#[$doc])* pub $name: u64,)*
-        }
-
-        impl $type {
-            /// Adds what another coordinator counted.
-            pub fn merge(&mut self, other: &Self) {
-                $(self.$name += other.$name;)*
-            }
-        }
-    };
-}
-
-counts! {
+hil_core::counts! {
     /// The plain counts of a coordinator.
-    CoordinatorCounts:
-    /// States taken over into a robot's view.
-    states_accepted,
-    /// States of robots without a mission, or of the mission before the present one.
-    states_outdated,
-    /// States with a number that is not finite, an unknown phase or an index beyond the path.
-    states_unsound,
-    /// States of a fleet or robot this coordinator does not have, or of a mission it never gave.
-    states_unknown,
-    /// States that arrived after one with a newer header.
-    states_reordered,
-    /// States with the header of one that arrived before.
-    states_duplicate,
-    /// Of the reordered and duplicate states, those that the strict order dropped.
-    states_dropped,
-    /// Missions whose end a state showed, those ended by a reset included.
-    missions_done,
-    /// Decisions that changed a robot's authority.
-    authority_changes,
-    /// Authorities sent again because the robot did not show them in time.
-    authority_repeats,
-    /// Authority messages sent; each change and each repeat makes one per replica.
-    authority_messages,
-    /// Critical sections that a robot passed: the "total CS counts" of the seed paper's tables.
-    sections_obsolete,
-    /// Critical sections that went away because a robot was reset.
-    sections_abandoned,
-    /// Changes of the order in which two robots go through a section.
-    order_reversals,
-    /// Dependencies made on purpose because neither robot could get past the other.
-    artificial_dependencies,
-    /// Cycles of waiting robots that broke up because one order was reversed.
-    deadlocks_broken,
-    /// Robots put at their goal because they made no way for too long.
-    resets,
+    #[derive(Eq, Serialize)]
+    pub struct CoordinatorCounts {
+        /// States taken over into a robot's view.
+        states_accepted: u64;
+        /// States of robots without a mission, or of the mission before the present one.
+        states_outdated: u64;
+        /// States with a number that is not finite, an unknown phase or an index beyond the path.
+        states_unsound: u64;
+        /// States of a fleet or robot this coordinator does not have, or of a mission it never gave.
+        states_unknown: u64;
+        /// States that arrived after one with a newer header.
+        states_reordered: u64;
+        /// States with the header of one that arrived before.
+        states_duplicate: u64;
+        /// Of the reordered and duplicate states, those that the strict order dropped.
+        states_dropped: u64;
+        /// Missions whose end a state showed, those ended by a reset included.
+        missions_done: u64;
+        /// Decisions that changed a robot's authority.
+        authority_changes: u64;
+        /// Authorities sent again because the robot did not show them in time.
+        authority_repeats: u64;
+        /// Authority messages sent; each change and each repeat makes one per replica.
+        authority_messages: u64;
+        /// Critical sections that a robot passed: the "total CS counts" of the seed paper's tables.
+        sections_obsolete: u64;
+        /// Critical sections that went away because a robot was reset.
+        sections_abandoned: u64;
+        /// Changes of the order in which two robots go through a section.
+        order_reversals: u64;
+        /// Dependencies made on purpose because neither robot could get past the other.
+        artificial_dependencies: u64;
+        /// Cycles of waiting robots that broke up because one order was reversed.
+        deadlocks_broken: u64;
+        /// Robots put at their goal because they made no way for too long.
+        resets: u64;
+    }
 }
 
-counts! {
+hil_core::counts! {
     /// Counts of the safe rules.
-    SafeCounts:
-    /// Extensions not given because no order was found in which all could still finish.
-    grants_withheld,
-    /// Missions not begun in a cycle because no order with them was found, per cycle.
-    admissions_deferred,
-    /// Robots that made no way for too long, once per standstill.
-    stuck,
-    /// States that say what cannot be.
-    states_impossible,
-    /// States that show an authority that was never given.
-    authorities_exceeded,
-    /// States that show a robot beyond its authority by more than the stop margin.
-    margins_exceeded,
-    /// Authorities counted as ended because their lease ran out unanswered.
-    leases_expired,
-    /// States older than the delay bound a lease rests on.
-    delay_bound_violations,
-    /// Cycles without grants because the delay bound was violated.
-    cycles_frozen,
+    #[derive(Eq, Serialize)]
+    pub struct SafeCounts {
+        /// Extensions not given because no order was found in which all could still finish.
+        grants_withheld: u64;
+        /// Missions not begun in a cycle because no order with them was found, per cycle.
+        admissions_deferred: u64;
+        /// Robots that made no way for too long, once per standstill.
+        stuck: u64;
+        /// States that say what cannot be.
+        states_impossible: u64;
+        /// States that show an authority that was never given.
+        authorities_exceeded: u64;
+        /// States that show a robot beyond its authority by more than the stop margin.
+        margins_exceeded: u64;
+        /// Authorities counted as ended because their lease ran out unanswered.
+        leases_expired: u64;
+        /// States older than the delay bound a lease rests on.
+        delay_bound_violations: u64;
+        /// Cycles without grants because the delay bound was violated.
+        cycles_frozen: u64;
+    }
 }

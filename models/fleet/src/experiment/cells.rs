@@ -35,24 +35,28 @@ pub(crate) const fn published_rows(scenario: Scenario) -> &'static [PublishedRow
 
 /// One experiment of the tables.
 #[derive(Debug, Clone)]
-pub(crate) struct Cell {
-    /// Which world.
-    pub(crate) scenario: Scenario,
-    /// Where its figures go.
-    pub(crate) place: Place,
-    /// Everything else.
+pub(crate) struct CellSpec {
+    pub(crate) id: CellId,
+    /// All that sets it apart.
     pub(crate) setup: Setup,
     /// What its figures are held against.
     pub(crate) demand: Demand,
 }
 
+/// Which cell: a world and a place in the tables.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct CellId {
+    pub(crate) scenario: Scenario,
+    pub(crate) place: Place,
+}
+
 /// A cell's place in the tables.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Place {
     /// Beside a published row, with so many copies of every message.
     Published { row: PublishedRow, copies: u32 },
-    /// Below the published rows: what one change to a row does.
-    Variant { text: &'static str },
+    /// Below the published rows.
+    Variant(Variant),
     /// In the table of mechanisms.
     Mechanism {
         mechanism: Mechanism,
@@ -75,15 +79,20 @@ pub(crate) enum Demand {
     NoneAtAll,
 }
 
-impl Cell {
+impl core::fmt::Display for CellId {
     /// What the cell is called, whatever its position among the others.
-    pub(crate) fn name(&self) -> String {
+    fn fmt(&self, formatter: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let name = self.seed_name();
         match self.place {
-            Place::Published { copies: 1, .. } => self.seed_name().replace("1 copies", "1 copy"),
-            _ => self.seed_name(),
+            Place::Published { copies: 1, .. } => {
+                formatter.write_str(&name.replace("1 copies", "1 copy"))
+            }
+            _ => formatter.write_str(&name),
         }
     }
+}
 
+impl CellId {
     /// What the seeds of its runs are drawn from: equal as long as equal tables are wanted.
     pub(crate) fn seed_name(&self) -> String {
         let scenario = scenario_name(self.scenario);
@@ -95,7 +104,7 @@ impl Cell {
                 } => format!("{scenario}, loss {loss_ratio}, {delay_ms} ms, {copies} copies"),
                 Condition::HardwareInTheLoop(network) => format!("{scenario}, {network}"),
             },
-            Place::Variant { text } => format!("{scenario}, {text}"),
+            Place::Variant(variant) => format!("{scenario}, {}", variant.label()),
             Place::Mechanism { mechanism, mode } => {
                 format!("{scenario}, {}, {}", mechanism.label(), mode_name(*mode))
             }
@@ -113,7 +122,7 @@ pub(crate) const fn mode_name(mode: CoordinatorMode) -> &'static str {
 
 /// The static rows of Tables II and III as the original simulates them, with one and with three
 /// copies where packets are lost, and the variants that show where the collisions come from.
-pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
+pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<CellSpec> {
     let mut cells = Vec::new();
     for scenario in SCENARIOS {
         for row in published_rows(scenario) {
@@ -128,15 +137,17 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
                 }
             };
             let copies: &[u32] = if loss_ratio > 0.0 { &[1, 3] } else { &[1] };
-            cells.extend(copies.iter().map(|&copies| Cell {
-                scenario,
-                place: Place::Published { row: *row, copies },
+            cells.extend(copies.iter().map(|&copies| CellSpec {
+                id: CellId {
+                    scenario,
+                    place: Place::Published { row: *row, copies },
+                },
                 setup: original(base, delay_ms, law, loss_ratio, copies),
                 demand: demand_of(scenario, loss_ratio, delay_ms, copies),
             }));
         }
         if scenario == Scenario::Harbor {
-            cells.extend(variants(base, law));
+            cells.extend(Variant::ALL.map(|variant| variant.cell(base, law)));
         }
     }
     cells
@@ -175,7 +186,7 @@ fn wifi_cell(
     scenario: Scenario,
     row: PublishedRow,
     network: PublishedNetwork,
-) -> Option<Cell> {
+) -> Option<CellSpec> {
     let preset = match network {
         PublishedNetwork::ShortRange => WifiPreset::ShortRange,
         PublishedNetwork::LongRange => WifiPreset::LongRange,
@@ -185,9 +196,11 @@ fn wifi_cell(
     setup.robot.step_inflation = false;
     setup.links.status_path = StatusPath::Network;
     setup.links.wifi = Some(preset.spec());
-    Some(Cell {
-        scenario,
-        place: Place::Published { row, copies: 1 },
+    Some(CellSpec {
+        id: CellId {
+            scenario,
+            place: Place::Published { row, copies: 1 },
+        },
         setup,
         demand: Demand::None,
     })
@@ -212,40 +225,61 @@ fn demand_of(scenario: Scenario, loss_ratio: f64, delay_ms: f64, copies: u32) ->
 
 /// Harbor, 100 ms, no loss, with one thing changed; the last changes all that the network could
 /// be blamed for, and keeps the nominal steps.
-fn variants(base: &Setup, law: DelayLaw) -> Vec<Cell> {
-    let row = || original(base, 100.0, law, 0.0, 1);
-    let variant = |text, demand, change: fn(&mut Setup)| {
-        let mut setup = row();
-        change(&mut setup);
-        Cell {
-            scenario: Scenario::Harbor,
-            place: Place::Variant { text },
-            setup,
-            demand,
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Variant {
+    /// Steps as long as they should be.
+    NominalSteps,
+    /// A tracker without error.
+    ExactTracker,
+    /// Robots wait 6 poses before a section.
+    WideMargin,
+    /// Steps as long as they should be, status over the network, the delay unknown.
+    DelayedStatus,
+}
+
+impl Variant {
+    /// All of them, in the order of the table.
+    const ALL: [Self; 4] = [
+        Self::NominalSteps,
+        Self::ExactTracker,
+        Self::WideMargin,
+        Self::DelayedStatus,
+    ];
+
+    /// What a table calls it; the seeds of its cells are drawn from it too.
+    pub(crate) const fn label(self) -> &'static str {
+        match self {
+            Self::NominalSteps => "100 ms, steps of nominal length",
+            Self::ExactTracker => "100 ms, exact tracker",
+            Self::WideMargin => "100 ms, margin of 6 poses",
+            Self::DelayedStatus => "100 ms, nominal steps, delayed status, delay unknown",
         }
-    };
-    vec![
-        variant(
-            "100 ms, steps of nominal length",
-            Demand::NoneSeen,
-            |setup| setup.robot.step_inflation = false,
-        ),
-        variant("100 ms, exact tracker", Demand::NoneSeen, |setup| {
-            setup.robot.tracker = TrackerKind::Exact;
-        }),
-        variant("100 ms, margin of 6 poses", Demand::NoneSeen, |setup| {
-            setup.coordinator.trailing_points = 6;
-        }),
-        variant(
-            "100 ms, nominal steps, delayed status, delay unknown",
-            Demand::None,
-            |setup| {
+    }
+
+    fn cell(self, base: &Setup, law: DelayLaw) -> CellSpec {
+        let mut setup = original(base, 100.0, law, 0.0, 1);
+        match self {
+            Self::NominalSteps => setup.robot.step_inflation = false,
+            Self::ExactTracker => setup.robot.tracker = TrackerKind::Exact,
+            Self::WideMargin => setup.coordinator.trailing_points = 6,
+            Self::DelayedStatus => {
                 setup.robot.step_inflation = false;
                 setup.links.status_path = StatusPath::Network;
                 setup.coordinator.known_delay_ms = 0.0;
+            }
+        }
+        CellSpec {
+            id: CellId {
+                scenario: Scenario::Harbor,
+                place: Place::Variant(self),
             },
-        ),
-    ]
+            setup,
+            demand: match self {
+                Self::DelayedStatus => Demand::None,
+                _ => Demand::NoneSeen,
+            },
+        }
+    }
 }
 
 /// What the network, or the controller's host, does in a row of the table of mechanisms.
@@ -363,7 +397,7 @@ fn stall_both(setup: &mut Setup, mean_s: f64) {
 
 /// Each mechanism with each coordinator in each scenario: status over the network, robots that
 /// stop where they mean to, and a coordinator that knows of no delay.
-pub(crate) fn mechanism_cells(base: &Setup) -> Vec<Cell> {
+pub(crate) fn mechanism_cells(base: &Setup) -> Vec<CellSpec> {
     let mut cells = Vec::new();
     for mechanism in Mechanism::ALL {
         for scenario in SCENARIOS {
@@ -378,9 +412,11 @@ pub(crate) fn mechanism_cells(base: &Setup) -> Vec<Cell> {
                 };
                 setup.links = Links::default();
                 mechanism.apply(&mut setup);
-                cells.push(Cell {
-                    scenario,
-                    place: Place::Mechanism { mechanism, mode },
+                cells.push(CellSpec {
+                    id: CellId {
+                        scenario,
+                        place: Place::Mechanism { mechanism, mode },
+                    },
                     setup,
                     demand: match mode {
                         CoordinatorMode::Legacy => Demand::None,
@@ -437,11 +473,11 @@ const COLLIDED_MAX: usize = 8;
 impl FleetTally {
     /// Adds another run.
     pub fn merge(&mut self, other: &Self) {
-        merge_referee(&mut self.referee, &other.referee);
+        self.referee.merge(&other.referee);
         self.coordinator.merge(&other.coordinator);
         self.safe.merge(&other.safe);
-        merge_link(&mut self.commands, &other.commands);
-        merge_link(&mut self.status, &other.status);
+        self.commands.merge(&other.commands);
+        self.status.merge(&other.status);
         self.superseded_count += other.superseded_count;
         self.run_s += other.run_s;
         self.robot_s += other.robot_s;
@@ -491,42 +527,6 @@ pub(crate) fn collision_interval(collisions: u64, sections: u64) -> Option<(f64,
         return None;
     }
     clopper_pearson(collisions, sections, 0.95).map(|interval| (interval.low, interval.high))
-}
-
-fn merge_link(sum: &mut LinkCounts, other: &LinkCounts) {
-    sum.offered_count += other.offered_count;
-    sum.lost_count += other.lost_count;
-    sum.duplicated_count += other.duplicated_count;
-    sum.held_count += other.held_count;
-    sum.stalled_count += other.stalled_count;
-}
-
-fn merge_referee(sum: &mut Tally, other: &Tally) {
-    sum.sections_created_count += other.sections_created_count;
-    sum.sections_passed_count += other.sections_passed_count;
-    sum.sections_dropped_count += other.sections_dropped_count;
-    sum.encounters_count += other.encounters_count;
-    sum.section_collisions_count += other.section_collisions_count;
-    sum.overlaps_count += other.overlaps_count;
-    sum.outside_count += other.outside_count;
-    sum.separation_min_m = match (sum.separation_min_m, other.separation_min_m) {
-        (Some(one), Some(other)) => Some(one.min(other)),
-        (one, other) => one.or(other),
-    };
-    sum.stop_error_max_m = sum.stop_error_max_m.max(other.stop_error_max_m);
-    sum.late_overshoot_max_m = sum.late_overshoot_max_m.max(other.late_overshoot_max_m);
-    sum.travelled_m += other.travelled_m;
-    sum.missions_started_count += other.missions_started_count;
-    sum.missions_done_count += other.missions_done_count;
-    sum.replaced_count += other.replaced_count;
-    sum.authorities_applied_count += other.authorities_applied_count;
-    sum.authorities_late_count += other.authorities_late_count;
-    sum.authorities_ignored_count += other.authorities_ignored_count;
-    sum.authorities_refused_count += other.authorities_refused_count;
-    sum.stale_count += other.stale_count;
-    sum.leases_ended_count += other.leases_ended_count;
-    sum.scans_count += other.scans_count;
-    sum.unsound_count += other.unsound_count;
 }
 
 /// One row.
@@ -640,10 +640,10 @@ mod tests {
         let mechanisms = mechanism_cells(&base);
         assert_eq!(mechanisms.len(), 13 * 4);
         let cells = published.iter().chain(&mechanisms);
-        let names: BTreeSet<_> = cells.clone().map(Cell::name).collect();
+        let names: BTreeSet<String> = cells.clone().map(|cell| cell.id.to_string()).collect();
         assert_eq!(names.len(), published.len() + mechanisms.len());
         for cell in cells {
-            assert_eq!(cell.setup.check(), Ok(()), "{}", cell.name());
+            assert_eq!(cell.setup.check(), Ok(()), "{}", cell.id);
         }
     }
 

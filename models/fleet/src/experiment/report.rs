@@ -1,77 +1,64 @@
 //! The tables: Tables II and III beside our figures, what the robots did in each row, and the table
 //! of mechanisms. It computes intervals and ratios, nothing else.
 
-use crate::coordinator::counters::SafeCounts;
 use crate::coordinator::parameters::CoordinatorMode;
 use crate::experiment::cells::{
-    Cell as Experiment, Condition, Demand, FleetTally, Mechanism, Place, PublishedRow, SCENARIOS,
-    collision_interval, mode_name, published_rows, scenario_name,
+    CellSpec, CollidedRun, Condition, Demand, FleetTally, Mechanism, Place, PublishedRow,
+    SCENARIOS, collision_interval, mode_name, published_rows, scenario_name,
 };
 use crate::experiment::study::{FleetStudy, worlds_text};
 use crate::scenario::Scenario;
-use hil_core::study::{Cell, Column, Criterion, StudyReport, Table};
+use hil_core::study::{Cell, Column, Criterion, Field, StudyReport, Table};
 use hil_link::impaired::DelayLaw;
 use hil_stats::comparison::{Share, difference};
 use hil_stats::statistics::{CONFIDENCE, Interval};
 
-/// The cells of a study with what came of them, as far as they were run.
+/// A cell with what came of it; `None` when it was not run.
 #[derive(Debug)]
-pub(crate) struct Results<'a> {
-    cells: Vec<(&'a Experiment, Option<FleetTally>)>,
+pub(crate) struct CellResult<'a> {
+    pub(crate) cell: &'a CellSpec,
+    pub(crate) tally: Option<FleetTally>,
 }
 
-impl<'a> Results<'a> {
-    /// Results in the order of their cells.
-    pub(crate) fn of(cells: Vec<(&'a Experiment, Option<FleetTally>)>) -> Self {
-        Self { cells }
+impl CellResult<'_> {
+    fn place(&self) -> &Place {
+        &self.cell.id.place
     }
 
-    /// All cells, and what came of those that were run.
-    pub(crate) fn all(&self) -> impl Iterator<Item = (&'a Experiment, Option<&FleetTally>)> {
-        self.cells
-            .iter()
-            .map(|(cell, tally)| (*cell, tally.as_ref()))
+    fn is_mechanism(&self) -> bool {
+        matches!(self.place(), Place::Mechanism { .. })
     }
+}
 
-    /// What came of the cell of a mechanism.
-    pub(crate) fn mechanism(
-        &self,
-        scenario: Scenario,
-        mechanism: Mechanism,
-        mode: CoordinatorMode,
-    ) -> Option<&FleetTally> {
-        let is_it = |cell: &Experiment| {
-            cell.scenario == scenario && cell.place == Place::Mechanism { mechanism, mode }
-        };
-        let (_, tally) = self.cells.iter().find(|(cell, _)| is_it(cell))?;
-        tally.as_ref()
-    }
+/// What came of the cell of a mechanism.
+fn mechanism_tally<'a>(
+    results: &'a [CellResult<'_>],
+    scenario: Scenario,
+    mechanism: Mechanism,
+    mode: CoordinatorMode,
+) -> Option<&'a FleetTally> {
+    let place = Place::Mechanism { mechanism, mode };
+    let mut results = results.iter();
+    let found = results.find(|one| one.cell.id.scenario == scenario && *one.place() == place)?;
+    found.tally.as_ref()
 }
 
 /// The whole report.
-pub(crate) fn report(study: &FleetStudy, results: &Results<'_>) -> StudyReport {
-    let has = |is_wanted: fn(&Place) -> bool| {
-        let mut cells = study.cells.iter();
-        cells.any(|cell| is_wanted(&cell.place))
-    };
+pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyReport {
     let mut tables = Vec::new();
-    if has(|place| !matches!(place, Place::Mechanism { .. })) {
-        for scenario in SCENARIOS {
-            tables.push(published_table(scenario, results));
-        }
+    if !results.iter().all(CellResult::is_mechanism) {
+        tables.extend(SCENARIOS.map(|scenario| published_table(scenario, results)));
         tables.push(motion_table(results));
     }
-    if has(|place| matches!(place, Place::Mechanism { .. })) {
-        for scenario in SCENARIOS {
-            tables.push(mechanism_table(scenario, results));
-        }
+    if results.iter().any(CellResult::is_mechanism) {
+        tables.extend(SCENARIOS.map(|scenario| mechanism_table(scenario, results)));
         tables.push(command_table(results));
     }
     StudyReport {
         title: "Case study 1: collisions per critical section (CS), in virtual time".to_owned(),
         notes: notes(study),
         tables,
-        criteria: criteria(study, results),
+        criteria: criteria(results),
         summary: summary(results),
     }
 }
@@ -100,54 +87,78 @@ fn notes(study: &FleetStudy) -> Vec<String> {
     ]
 }
 
-const fn column(name: &'static str, label: &'static str) -> Column {
-    Column { name, label }
-}
+/// What Tables II and III show of ours.
+const FOUND: [Field<FleetTally>; 4] = [
+    Field::count("sections", "CS", FleetTally::section_count),
+    Field::text("collisions", "Collisions", collisions),
+    Field::number("per_1000", "P x 1000", 2, per_1000),
+    Field::interval("per_1000", "95 %", 2, interval_per_1000),
+];
 
-const PUBLISHED_COLUMNS: [Column; 14] = [
-    column("method", "Method"),
-    column("loss_ratio", "PLR"),
-    column("delay_ms", "Delay ms"),
-    column("copies", "Copies"),
-    column("sections", "CS"),
-    column("collisions", "Collisions"),
-    column("per_1000", "P x 1000"),
-    column("per_1000", "95 %"),
-    column("published_sections", "Paper: CS"),
-    column("published_collisions", "Coll."),
-    column("published_per_1000", "P x 1000"),
-    column("published_per_1000", "95 %"),
-    column("against_paper", "Against paper"),
-    column("verdict", "Accepted if"),
+/// What they show of the paper's.
+const PUBLISHED: [Field<PublishedRow>; 4] = [
+    Field::count("published_sections", "Paper: CS", |row| row.sections),
+    Field::count("published_collisions", "Coll.", |row| row.collisions),
+    Field::number("published_per_1000", "P x 1000", 2, |row| {
+        Some(1e3 * row.collisions as f64 / row.sections as f64)
+    }),
+    Field::interval("published_per_1000", "95 %", 2, |row| {
+        collision_interval(row.collisions, row.sections).map(thousandfold)
+    }),
 ];
 
 /// Table II or III.
-fn published_table(scenario: Scenario, results: &Results<'_>) -> Table {
+fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
     let (name, title) = match scenario {
         Scenario::Harbor => ("table-2-harbor", "Table II, harbor"),
         _ => ("table-3-warehouse", "Table III, warehouse"),
     };
     let mut rows = Vec::new();
+    let ours = || {
+        let of_scenario = |one: &&CellResult<'_>| one.cell.id.scenario == scenario;
+        results.iter().filter(of_scenario)
+    };
     for published in published_rows(scenario) {
-        let ours = results.all().filter(|(cell, _)| {
-            let is_row =
-                |place: &Place| matches!(place, Place::Published { row, .. } if row == published);
-            cell.scenario == scenario && is_row(&cell.place)
-        });
         let before = rows.len();
-        rows.extend(ours.map(|(cell, tally)| published_row(published, Some((cell, tally)))));
+        for one in ours() {
+            if let Place::Published { row, copies } = one.place()
+                && row == published
+            {
+                rows.push(published_row(published, Some((one, *copies))));
+            }
+        }
         if rows.len() == before {
             rows.push(published_row(published, None));
         }
     }
-    let variants = results.all().filter(|(cell, _)| {
-        cell.scenario == scenario && matches!(cell.place, Place::Variant { .. })
-    });
-    rows.extend(variants.map(|(cell, tally)| variant_row(cell, tally)));
+    for one in ours() {
+        if let Place::Variant(variant) = one.place() {
+            let mut row = vec![
+                Cell::text(variant.label()),
+                Cell::number(Some(0.0), 1),
+                Cell::number(Some(100.0), 0),
+                Cell::Count(1),
+            ];
+            row.extend(Field::cells(&FOUND, one.tally.as_ref()));
+            row.extend(Field::cells(&PUBLISHED, None));
+            row.extend([Cell::Absent, judged(one)]);
+            rows.push(row);
+        }
+    }
+    let mut columns = vec![
+        Column::new("method", "Method"),
+        Column::new("loss_ratio", "PLR"),
+        Column::new("delay_ms", "Delay ms"),
+        Column::new("copies", "Copies"),
+    ];
+    columns.extend(Field::columns(&FOUND));
+    columns.extend(Field::columns(&PUBLISHED));
+    columns.push(Column::new("against_paper", "Against paper"));
+    columns.push(Column::new("verdict", "Accepted if"));
     Table {
         name: name.to_owned(),
         title: title.to_owned(),
-        columns: PUBLISHED_COLUMNS.to_vec(),
+        columns,
         rows,
         notes: vec![
             "rows measured with hardware in the loop depend on hosts and radio; ours beside them \
@@ -160,10 +171,8 @@ fn published_table(scenario: Scenario, results: &Results<'_>) -> Table {
     }
 }
 
-fn published_row(
-    published: &PublishedRow,
-    ours: Option<(&Experiment, Option<&FleetTally>)>,
-) -> Vec<Cell> {
+/// A published row beside ours of so many copies, if there is one.
+fn published_row(published: &PublishedRow, ours: Option<(&CellResult<'_>, u32)>) -> Vec<Cell> {
     let mut row = match published.condition {
         Condition::Static {
             loss_ratio,
@@ -179,37 +188,13 @@ fn published_row(
             Cell::Absent,
         ],
     };
-    row.push(match ours.map(|(cell, _)| &cell.place) {
-        Some(Place::Published { copies, .. }) => Cell::Count(u64::from(*copies)),
-        _ => Cell::Absent,
-    });
-    row.extend(metrics(ours.and_then(|(_, tally)| tally)));
-    let (sections, collisions) = (published.sections, published.collisions);
-    row.extend([
-        Cell::Count(sections),
-        Cell::Count(collisions),
-        Cell::number(Some(1e3 * collisions as f64 / sections as f64), 2),
-        per_1000(collision_interval(collisions, sections)),
-    ]);
-    let against = ours.and_then(|(_, tally)| AgainstPaper::of(published, tally));
+    row.push(ours.map_or(Cell::Absent, |(_, copies)| Cell::Count(copies.into())));
+    let tally = ours.and_then(|(one, _)| one.tally.as_ref());
+    row.extend(Field::cells(&FOUND, tally));
+    row.extend(Field::cells(&PUBLISHED, Some(published)));
+    let against = tally.and_then(|tally| AgainstPaper::of(published, tally));
     row.push(against.map_or(Cell::Absent, |one| Cell::text(one.words())));
-    row.push(ours.map_or(Cell::Absent, |(cell, tally)| judged(cell, tally)));
-    row
-}
-
-fn variant_row(cell: &Experiment, tally: Option<&FleetTally>) -> Vec<Cell> {
-    let Place::Variant { text } = cell.place else {
-        return Vec::new();
-    };
-    let mut row = vec![
-        Cell::text(text),
-        Cell::number(Some(0.0), 1),
-        Cell::number(Some(100.0), 0),
-        Cell::Count(1),
-    ];
-    row.extend(metrics(tally));
-    row.extend([const { Cell::Absent }; 5]);
-    row.push(judged(cell, tally));
+    row.push(ours.map_or(Cell::Absent, |(one, _)| judged(one)));
     row
 }
 
@@ -234,9 +219,8 @@ impl AgainstPaper {
         Self::NotComparable,
     ];
 
-    /// `None` while the row was not run.
-    fn of(published: &PublishedRow, tally: Option<&FleetTally>) -> Option<Self> {
-        let tally = tally?;
+    /// `None` without an interval of both.
+    fn of(published: &PublishedRow, tally: &FleetTally) -> Option<Self> {
         if matches!(published.condition, Condition::HardwareInTheLoop(_)) {
             return Some(Self::NotComparable);
         }
@@ -268,14 +252,15 @@ impl AgainstPaper {
 }
 
 /// How many rows agree with the paper, which differ, and what would decide the others.
-fn summary(results: &Results<'_>) -> Vec<String> {
-    let compared: Vec<(String, AgainstPaper, u64)> = results
-        .all()
-        .filter_map(|(cell, tally)| {
-            let Place::Published { row, .. } = &cell.place else {
+fn summary(results: &[CellResult<'_>]) -> Vec<String> {
+    let compared: Vec<_> = results
+        .iter()
+        .filter_map(|one| {
+            let Place::Published { row, .. } = one.place() else {
                 return None;
             };
-            Some((cell.name(), AgainstPaper::of(row, tally)?, row.sections))
+            let against = AgainstPaper::of(row, one.tally.as_ref()?)?;
+            Some((one.cell.id, against, row.sections))
         })
         .collect();
     if compared.is_empty() {
@@ -288,8 +273,8 @@ fn summary(results: &Results<'_>) -> Vec<String> {
         compared.len(),
         counts.join(", ")
     )];
-    let differing: Vec<&str> = of(AgainstPaper::Differs)
-        .map(|one| one.0.as_str())
+    let differing: Vec<String> = of(AgainstPaper::Differs)
+        .map(|one| one.0.to_string())
         .collect();
     if !differing.is_empty() {
         lines.push(format!("These differ: {}.", differing.join("; ")));
@@ -304,38 +289,35 @@ fn summary(results: &Results<'_>) -> Vec<String> {
     lines
 }
 
-/// Sections, collisions, probability and its interval.
-fn metrics(tally: Option<&FleetTally>) -> [Cell; 4] {
-    let Some(tally) = tally else {
-        return [Cell::Absent, Cell::Absent, Cell::Absent, Cell::Absent];
-    };
-    [
-        Cell::Count(tally.section_count()),
-        collisions_cell(tally),
-        Cell::number(tally.collision_ratio().map(|ratio| 1e3 * ratio), 2),
-        per_1000(tally.collision_interval()),
-    ]
-}
-
-fn collisions_cell(tally: &FleetTally) -> Cell {
+fn collisions(tally: &FleetTally) -> String {
     let seen = &tally.referee;
-    Cell::text(format!(
+    format!(
         "{} / {} / {}",
         seen.section_collisions_count, seen.overlaps_count, seen.outside_count
-    ))
+    )
 }
 
-fn per_1000(ends: Option<(f64, f64)>) -> Cell {
-    Cell::interval(ends.map(|(low, high)| (1e3 * low, 1e3 * high)), 2)
+fn per_1000(tally: &FleetTally) -> Option<f64> {
+    tally.collision_ratio().map(|ratio| 1e3 * ratio)
+}
+
+fn interval_per_1000(tally: &FleetTally) -> Option<(f64, f64)> {
+    tally.collision_interval().map(thousandfold)
+}
+
+fn thousandfold((low, high): (f64, f64)) -> (f64, f64) {
+    (1e3 * low, 1e3 * high)
 }
 
 /// What a cell is held against, and whether it holds.
-fn judged(cell: &Experiment, tally: Option<&FleetTally>) -> Cell {
-    let text = demand_text(cell.demand);
-    if cell.demand == Demand::None {
+fn judged(one: &CellResult<'_>) -> Cell {
+    let demand = one.cell.demand;
+    let text = demand_text(demand);
+    if demand == Demand::None {
         return Cell::text(text);
     }
-    let verdict = match tally.and_then(|tally| verdict_of(cell.demand, tally)) {
+    let tally = one.tally.as_ref();
+    let verdict = match tally.and_then(|tally| verdict_of(demand, tally)) {
         Some(true) => "met",
         Some(false) => "MISSED",
         None => "too few",
@@ -343,180 +325,178 @@ fn judged(cell: &Experiment, tally: Option<&FleetTally>) -> Cell {
     Cell::text(format!("{text}: {verdict}"))
 }
 
-const MOTION_COLUMNS: [Column; 13] = [
-    column("cell", "Row"),
-    column("separation_min_m", "Closest m"),
-    column("stop_error_max_m", "Past point m"),
-    column("stop_error_bound_m", "Bound m"),
-    column("late_overshoot_max_m", "Late, past m"),
-    column("late", "Late"),
-    column("ignored", "Ignored"),
-    column("order_reversals", "Reversals"),
-    column("deadlocks_broken", "Deadlocks"),
-    column("resets", "Resets"),
-    column("missions_per_hour", "Missions/h"),
-    column("robot_km", "Robot-km"),
-    column("collisions_per_1000_km", "Coll./1000 km"),
+const MOTION: [Field<FleetTally>; 12] = [
+    Field::number("separation_min_m", "Closest m", 2, |t| {
+        t.referee.separation_min_m
+    }),
+    Field::number("stop_error_max_m", "Past point m", 2, |t| {
+        Some(t.referee.stop_error_max_m)
+    }),
+    Field::number("stop_error_bound_m", "Bound m", 2, |t| {
+        Some(t.stop_error_bound_m)
+    }),
+    Field::number("late_overshoot_max_m", "Late, past m", 2, |t| {
+        Some(t.referee.late_overshoot_max_m)
+    }),
+    Field::count("late", "Late", |t| t.referee.authorities_late_count),
+    Field::count("ignored", "Ignored", |t| {
+        t.referee.authorities_ignored_count
+    }),
+    Field::count("order_reversals", "Reversals", |t| {
+        t.coordinator.order_reversals
+    }),
+    Field::count("deadlocks_broken", "Deadlocks", |t| {
+        t.coordinator.deadlocks_broken
+    }),
+    Field::count("resets", "Resets", |t| t.coordinator.resets),
+    Field::number(
+        "missions_per_hour",
+        "Missions/h",
+        0,
+        FleetTally::missions_per_hour,
+    ),
+    Field::number("robot_km", "Robot-km", 0, |t| {
+        Some(1e-3 * t.referee.travelled_m)
+    }),
+    Field::number("collisions_per_1000_km", "Coll./1000 km", 2, |t| {
+        let robot_km = 1e-3 * t.referee.travelled_m;
+        (robot_km > 0.0).then(|| 1e3 * t.collision_count() as f64 / robot_km)
+    }),
 ];
 
 /// What the robots did in each row of Tables II and III.
-fn motion_table(results: &Results<'_>) -> Table {
-    let rows = results
-        .all()
-        .filter(|(cell, _)| !matches!(cell.place, Place::Mechanism { .. }))
-        .map(|(cell, tally)| {
-            let mut row = vec![Cell::text(cell.name())];
-            row.extend(motion_cells(tally));
-            row
-        });
+fn motion_table(results: &[CellResult<'_>]) -> Table {
     Table {
         name: "motion".to_owned(),
         title: "Tables II and III: what the robots did".to_owned(),
-        columns: MOTION_COLUMNS.to_vec(),
-        rows: rows.collect(),
         notes: vec![
             "past point: farthest stop beyond an order that came in time; bound: 3 v (TT + D) + v \
              TT / 2 for the stepped tracker, 0 for the exact one; late: orders too late to stop at"
                 .to_owned(),
         ],
+        ..by_cell(
+            "Row",
+            &MOTION,
+            results.iter().filter(|one| !one.is_mechanism()),
+        )
     }
 }
 
-fn motion_cells(tally: Option<&FleetTally>) -> Vec<Cell> {
-    let Some(tally) = tally else {
-        return vec![Cell::Absent; MOTION_COLUMNS.len() - 1];
-    };
-    let (seen, decided) = (&tally.referee, &tally.coordinator);
-    let robot_km = 1e-3 * seen.travelled_m;
-    let per_1000_km = (robot_km > 0.0).then(|| 1e3 * tally.collision_count() as f64 / robot_km);
-    vec![
-        Cell::number(seen.separation_min_m, 2),
-        Cell::number(Some(seen.stop_error_max_m), 2),
-        Cell::number(Some(tally.stop_error_bound_m), 2),
-        Cell::number(Some(seen.late_overshoot_max_m), 2),
-        Cell::Count(seen.authorities_late_count),
-        Cell::Count(seen.authorities_ignored_count),
-        Cell::Count(decided.order_reversals),
-        Cell::Count(decided.deadlocks_broken),
-        Cell::Count(decided.resets),
-        Cell::number(tally.missions_per_hour(), 0),
-        Cell::number(Some(robot_km), 0),
-        Cell::number(per_1000_km, 2),
-    ]
+/// A row for each of `results`.
+fn by_cell<'a>(
+    label: &'static str,
+    fields: &[Field<FleetTally>],
+    results: impl Iterator<Item = &'a CellResult<'a>>,
+) -> Table {
+    let rows = results.map(|one| {
+        let mut row = vec![Cell::text(one.cell.id.to_string())];
+        row.extend(Field::cells(fields, one.tally.as_ref()));
+        row
+    });
+    let mut columns = vec![Column::new("cell", label)];
+    columns.extend(Field::columns(fields));
+    Table {
+        rows: rows.collect(),
+        columns,
+        ..Table::default()
+    }
 }
 
-const MECHANISM_COLUMNS: [Column; 12] = [
-    column("mechanism", "What the network does"),
-    column("legacy_sections", "Legacy: CS"),
-    column("legacy_collisions", "Collisions"),
-    column("legacy_per_1000", "P x 1000"),
-    column("legacy_per_1000", "95 %"),
-    column("legacy_resets", "Resets"),
-    column("legacy_missions_per_hour", "Missions/h"),
-    column("safe_sections", "Safe: CS"),
-    column("safe_collisions", "Collisions"),
-    column("safe_per_1000_high", "P x 1000 below"),
-    column("safe_stuck", "Stuck"),
-    column("safe_missions_per_hour", "Missions/h"),
+const LEGACY: [Field<FleetTally>; 6] = [
+    Field::count("legacy_sections", "Legacy: CS", FleetTally::section_count),
+    Field::text("legacy_collisions", "Collisions", collisions),
+    Field::number("legacy_per_1000", "P x 1000", 2, per_1000),
+    Field::interval("legacy_per_1000", "95 %", 2, interval_per_1000),
+    Field::count("legacy_resets", "Resets", |t| t.coordinator.resets),
+    Field::number(
+        "legacy_missions_per_hour",
+        "Missions/h",
+        0,
+        FleetTally::missions_per_hour,
+    ),
+];
+
+const SAFE: [Field<FleetTally>; 5] = [
+    Field::count("safe_sections", "Safe: CS", FleetTally::section_count),
+    Field::text("safe_collisions", "Collisions", collisions),
+    Field::number("safe_per_1000_high", "P x 1000 below", 3, |t| {
+        Some(interval_per_1000(t)?.1)
+    }),
+    Field::count("safe_stuck", "Stuck", |t| t.safe.stuck),
+    Field::number(
+        "safe_missions_per_hour",
+        "Missions/h",
+        0,
+        FleetTally::missions_per_hour,
+    ),
 ];
 
 /// What each impairment does to each coordinator.
-fn mechanism_table(scenario: Scenario, results: &Results<'_>) -> Table {
-    let absent = || vec![Cell::Absent; 6];
+fn mechanism_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
     let rows = Mechanism::ALL.into_iter().map(|mechanism| {
-        let of = |mode| results.mechanism(scenario, mechanism, mode);
-        let mut cells = vec![Cell::text(mechanism.label())];
-        cells.extend(of(CoordinatorMode::Legacy).map_or_else(absent, |tally| {
-            let mut cells = metrics(Some(tally)).to_vec();
-            cells.push(Cell::Count(tally.coordinator.resets));
-            cells.push(Cell::number(tally.missions_per_hour(), 0));
-            cells
-        }));
-        let safe = of(CoordinatorMode::Safe).map_or_else(absent, |tally| {
-            let high = tally.collision_interval().map(|(_, high)| 1e3 * high);
-            let [sections, collisions, ..] = metrics(Some(tally));
-            vec![
-                sections,
-                collisions,
-                Cell::number(high, 3),
-                Cell::Count(tally.safe.stuck),
-                Cell::number(tally.missions_per_hour(), 0),
-            ]
-        });
-        cells.extend(safe.into_iter().take(5));
-        cells
+        let of = |mode| mechanism_tally(results, scenario, mechanism, mode);
+        let mut row = vec![Cell::text(mechanism.label())];
+        row.extend(Field::cells(&LEGACY, of(CoordinatorMode::Legacy)));
+        row.extend(Field::cells(&SAFE, of(CoordinatorMode::Safe)));
+        row
     });
+    let mut columns = vec![Column::new("mechanism", "What the network does")];
+    columns.extend(Field::columns(&LEGACY));
+    columns.extend(Field::columns(&SAFE));
+    let scenario = scenario_name(scenario);
     Table {
-        name: format!("mechanisms-{}", scenario_name(scenario)),
+        name: format!("mechanisms-{scenario}"),
         title: format!(
-            "What causes collisions, {}: status over the network, exact tracker, delay unknown to \
-             the coordinator",
-            scenario_name(scenario)
+            "What causes collisions, {scenario}: status over the network, exact tracker, delay \
+             unknown to the coordinator"
         ),
-        columns: MECHANISM_COLUMNS.to_vec(),
+        columns,
         rows: rows.collect(),
         notes: Vec::new(),
     }
 }
 
-const COMMAND_COLUMNS: [Column; 13] = [
-    column("cell", "Cell"),
-    column("commands", "Commands"),
-    column("commands_lost", "Lost"),
-    column("states", "States"),
-    column("states_lost", "Lost"),
-    column("repeats", "Repeats"),
-    column("late", "Late"),
-    column("ignored", "Ignored"),
-    column("refused", "Refused"),
-    column("stale", "Stale"),
-    column("order_reversals", "Reversals"),
-    column("stop_error_max_m", "Past point m"),
-    column("separation_min_m", "Closest m"),
+const COMMANDS: [Field<FleetTally>; 12] = [
+    Field::count("commands", "Commands", |t| t.commands.offered_count),
+    Field::count("commands_lost", "Lost", |t| t.commands.lost_count),
+    Field::count("states", "States", |t| t.status.offered_count),
+    Field::count("states_lost", "Lost", |t| t.status.lost_count),
+    Field::count("repeats", "Repeats", |t| t.coordinator.authority_repeats),
+    Field::count("late", "Late", |t| t.referee.authorities_late_count),
+    Field::count("ignored", "Ignored", |t| {
+        t.referee.authorities_ignored_count
+    }),
+    Field::count("refused", "Refused", |t| {
+        t.referee.authorities_refused_count
+    }),
+    Field::count("stale", "Stale", |t| t.referee.stale_count),
+    Field::count("order_reversals", "Reversals", |t| {
+        t.coordinator.order_reversals
+    }),
+    Field::number("stop_error_max_m", "Past point m", 2, |t| {
+        Some(t.referee.stop_error_max_m)
+    }),
+    Field::number("separation_min_m", "Closest m", 2, |t| {
+        t.referee.separation_min_m
+    }),
 ];
 
 /// What became of the commands in each cell of the table of mechanisms.
-fn command_table(results: &Results<'_>) -> Table {
-    let rows = results
-        .all()
-        .filter(|(cell, _)| matches!(cell.place, Place::Mechanism { .. }))
-        .map(|(cell, tally)| {
-            let mut row = vec![Cell::text(cell.name())];
-            row.extend(tally.map_or_else(
-                || vec![Cell::Absent; COMMAND_COLUMNS.len() - 1],
-                |tally| command_cells(tally).to_vec(),
-            ));
-            row
-        });
+fn command_table(results: &[CellResult<'_>]) -> Table {
     Table {
         name: "commands".to_owned(),
         title: "What causes collisions: what became of the messages".to_owned(),
-        columns: COMMAND_COLUMNS.to_vec(),
-        rows: rows.collect(),
         notes: vec![
             "late: too late to stop at; ignored: behind the robot, which drove on; refused: not \
              applied because it could not stop (safe); stale: older than one applied"
                 .to_owned(),
         ],
+        ..by_cell(
+            "Cell",
+            &COMMANDS,
+            results.iter().filter(|one| one.is_mechanism()),
+        )
     }
-}
-
-fn command_cells(tally: &FleetTally) -> [Cell; 12] {
-    let (seen, decided) = (&tally.referee, &tally.coordinator);
-    [
-        Cell::Count(tally.commands.offered_count),
-        Cell::Count(tally.commands.lost_count),
-        Cell::Count(tally.status.offered_count),
-        Cell::Count(tally.status.lost_count),
-        Cell::Count(decided.authority_repeats),
-        Cell::Count(seen.authorities_late_count),
-        Cell::Count(seen.authorities_ignored_count),
-        Cell::Count(seen.authorities_refused_count),
-        Cell::Count(seen.stale_count),
-        Cell::Count(decided.order_reversals),
-        Cell::number(Some(seen.stop_error_max_m), 2),
-        Cell::number(seen.separation_min_m, 2),
-    ]
 }
 
 /// Critical sections from which a demand is judged whatever its interval.
@@ -544,11 +524,10 @@ pub(crate) fn demand_text(demand: Demand) -> String {
 pub(crate) fn verdict_of(demand: Demand, tally: &FleetTally) -> Option<bool> {
     let is_decisive = tally.section_count() >= DECISIVE_COUNT;
     // Without an interval there are no sections, or more collisions than sections.
-    let Some((low, high)) = tally.collision_interval() else {
+    let Some((low, high)) = interval_per_1000(tally) else {
         return (tally.any_collision_count() > 0 && demand != Demand::None).then_some(false);
     };
-    let (low, high) = (1e3 * low, 1e3 * high);
-    let per_1000 = 1e3 * tally.collision_ratio()?;
+    let per_1000 = per_1000(tally)?;
     match demand {
         Demand::None => None,
         Demand::Below(bound) if high < bound => Some(true),
@@ -566,65 +545,45 @@ pub(crate) fn verdict_of(demand: Demand, tally: &FleetTally) -> Option<bool> {
     }
 }
 
+/// A criterion; without `known` nothing could be judged, for want of `missing`.
+fn criterion(text: String, known: Option<(Option<bool>, String)>, missing: &str) -> Criterion {
+    let (is_met, finding) = known.unwrap_or_else(|| (None, missing.to_owned()));
+    Criterion {
+        text,
+        is_met,
+        finding,
+    }
+}
+
+const NOT_RUN: &str = "not run to its end";
+
 /// Everything the study is held against.
-pub(crate) fn criteria(study: &FleetStudy, results: &Results<'_>) -> Vec<Criterion> {
-    let mut criteria: Vec<_> = results
-        .all()
-        .filter(|(cell, _)| {
-            let is_published = !matches!(cell.place, Place::Mechanism { .. });
-            is_published && cell.demand != Demand::None
+pub(crate) fn criteria(results: &[CellResult<'_>]) -> Vec<Criterion> {
+    let published = results.iter().filter(|one| !one.is_mechanism());
+    let mut criteria: Vec<_> = published
+        .filter(|one| one.cell.demand != Demand::None)
+        .map(|one| {
+            let CellSpec { id, demand, .. } = one.cell;
+            let known = one.tally.as_ref().map(|tally| {
+                let is_met = verdict_of(*demand, tally);
+                (is_met, collisions_text(tally))
+            });
+            criterion(format!("{id}: {}", demand_text(*demand)), known, NOT_RUN)
         })
-        .map(|(cell, tally)| of_cell(cell, tally))
         .collect();
-    let has_mechanisms = study
-        .cells
-        .iter()
-        .any(|cell| matches!(cell.place, Place::Mechanism { .. }));
-    if has_mechanisms {
+    if results.iter().any(CellResult::is_mechanism) {
         criteria.extend(safe_criteria(results));
-        criteria.extend(SCENARIOS.map(|scenario| {
-            let of = |mode| results.mechanism(scenario, Mechanism::Clean, mode);
-            throughput(
-                scenario_name(scenario),
-                of(CoordinatorMode::Legacy),
-                of(CoordinatorMode::Safe),
-            )
-        }));
-        criteria.extend(SCENARIOS.map(|scenario| {
-            let of = |mechanism| results.mechanism(scenario, mechanism, CoordinatorMode::Legacy);
-            loss_exceeds_delay(
-                scenario_name(scenario),
-                of(Mechanism::CommandLoss10),
-                of(Mechanism::Delay300Ms),
-            )
-        }));
+        criteria.extend(SCENARIOS.map(|scenario| throughput(scenario, results)));
+        criteria.extend(SCENARIOS.map(|scenario| loss_exceeds_delay(scenario, results)));
     }
     criteria
 }
 
-fn of_cell(cell: &Experiment, tally: Option<&FleetTally>) -> Criterion {
-    let text = format!("{}: {}", cell.name(), demand_text(cell.demand));
-    let Some(tally) = tally else {
-        return Criterion {
-            text,
-            is_met: None,
-            finding: "not run to its end".to_owned(),
-        };
-    };
-    Criterion {
-        text,
-        is_met: verdict_of(cell.demand, tally),
-        finding: collisions_text(tally),
-    }
-}
-
 fn collisions_text(tally: &FleetTally) -> String {
     let seen = &tally.referee;
-    let per_1000 = tally
-        .collision_interval()
-        .map_or_else(String::new, |(low, high)| {
-            format!(", {:.2} to {:.2} per 1000", 1e3 * low, 1e3 * high)
-        });
+    let per_1000 = interval_per_1000(tally).map_or_else(String::new, |(low, high)| {
+        format!(", {low:.2} to {high:.2} per 1000")
+    });
     format!(
         "{} collisions, {} overlaps in {} CS{per_1000}",
         seen.section_collisions_count,
@@ -635,122 +594,106 @@ fn collisions_text(tally: &FleetTally) -> String {
 
 /// The safe coordinator: no collision by any checker; no robot that stands for ever, and nothing
 /// seen that its proof rules out.
-fn safe_criteria(results: &Results<'_>) -> [Criterion; 3] {
-    let is_safe = |cell: &Experiment| matches!(cell.place, Place::Mechanism { mode, .. } if mode == CoordinatorMode::Safe);
-    let (mut sections, mut collisions, mut stands) = (0, 0, 0);
-    let (mut safe, mut seen_again) = (SafeCounts::default(), Vec::new());
-    let (mut cell_count, mut ended_count) = (0, 0);
-    for (cell, tally) in results.all().filter(|(cell, _)| is_safe(cell)) {
-        cell_count += 1;
-        let Some(tally) = tally else {
-            continue;
-        };
+fn safe_criteria(results: &[CellResult<'_>]) -> [Criterion; 3] {
+    let is_safe = |one: &&CellResult<'_>| matches!(one.place(), Place::Mechanism { mode, .. } if *mode == CoordinatorMode::Safe);
+    let cells = results.iter().filter(is_safe);
+    let cell_count = cells.clone().count();
+    let (mut sum, mut seen_again) = (FleetTally::default(), String::new());
+    let (mut ended_count, mut collisions) = (0, 0);
+    for (id, tally) in cells.filter_map(|one| Some((one.cell.id, one.tally.as_ref()?))) {
         ended_count += 1;
-        safe.merge(&tally.safe);
-        sections += tally.section_count();
         collisions += tally.any_collision_count();
-        stands += tally.stand_count;
-        seen_again.extend(tally.collided.iter().map(|run| {
-            format!(
-                "{}, run {}, seed {}, first at {}",
-                cell.name(),
-                run.replica,
-                run.seed,
-                run.first_at
-            )
-        }));
+        sum.merge(tally);
+        for run in &tally.collided {
+            let CollidedRun {
+                replica,
+                seed,
+                first_at,
+            } = run;
+            let again = format!("; {id}, run {replica}, seed {seed}, first at {first_at}");
+            seen_again.push_str(&again);
+        }
     }
     // One is enough to miss a demand; to meet it takes all cells, and something to see in them.
+    let sections = sum.section_count();
     let is_telling = ended_count == cell_count && sections >= TELLING_COUNT;
-    let judged = |is_met: bool| (!is_met || is_telling).then_some(is_met);
-    let mut finding =
-        format!("{collisions} in {sections} CS of {ended_count} of {cell_count} cells");
-    if !seen_again.is_empty() {
-        finding.push_str("; ");
-        finding.push_str(&seen_again.join("; "));
-    }
-    let mode = mode_name(CoordinatorMode::Safe);
+    let safe = &sum.safe;
     let impossible = safe.states_impossible + safe.authorities_exceeded + safe.margins_exceeded;
+    let judged = |what: &str, is_met: bool, finding: String| Criterion {
+        text: format!("{}: {what}", mode_name(CoordinatorMode::Safe)),
+        is_met: (!is_met || is_telling).then_some(is_met),
+        finding,
+    };
     [
-        Criterion {
-            text: format!("{mode}: no collision by any checker, in any row run"),
-            is_met: judged(collisions == 0),
-            finding,
-        },
-        Criterion {
-            text: format!("{mode}: no robot stuck, no fleet at a stand"),
-            is_met: judged(safe.stuck == 0 && stands == 0),
-            finding: format!(
-                "{} robots made no way for too long, {stands} runs came to a stand",
-                safe.stuck
+        judged(
+            "no collision by any checker, in any row run",
+            collisions == 0,
+            format!(
+                "{collisions} in {sections} CS of {ended_count} of {cell_count} cells{seen_again}"
             ),
-        },
-        Criterion {
-            text: format!("{mode}: nothing that its proof rules out"),
-            is_met: judged(impossible == 0),
-            finding: format!(
+        ),
+        judged(
+            "no robot stuck, no fleet at a stand",
+            safe.stuck == 0 && sum.stand_count == 0,
+            format!(
+                "{} robots made no way for too long, {} runs came to a stand",
+                safe.stuck, sum.stand_count
+            ),
+        ),
+        judged(
+            "nothing that its proof rules out",
+            impossible == 0,
+            format!(
                 "{} impossible states, {} beyond their authority, {} beyond the stop margin",
                 safe.states_impossible, safe.authorities_exceeded, safe.margins_exceeded
             ),
-        },
+        ),
     ]
 }
 
-fn throughput(scenario: &str, legacy: Option<&FleetTally>, safe: Option<&FleetTally>) -> Criterion {
-    let rate = |tally: Option<&FleetTally>| {
+/// Safety costs little where nothing is wrong.
+fn throughput(scenario: Scenario, results: &[CellResult<'_>]) -> Criterion {
+    let rate = |mode| {
+        let tally = mechanism_tally(results, scenario, Mechanism::Clean, mode);
         let is_telling = |tally: &&FleetTally| tally.section_count() >= RATE_SECTIONS_MIN;
         tally.filter(is_telling)?.missions_per_hour()
     };
-    let rates = rate(legacy).zip(rate(safe));
-    let text = format!("{scenario}: safe keeps 90 % of legacy's missions per hour when clean");
-    let Some((legacy, safe)) = rates else {
-        return Criterion {
-            text,
-            is_met: None,
-            finding: format!("not run to its end, or with fewer than {RATE_SECTIONS_MIN} CS"),
-        };
-    };
-    let ratio = safe / legacy;
-    Criterion {
-        text,
-        is_met: Some(ratio >= THROUGHPUT_RATIO_MIN),
-        finding: format!("{safe:.0} of {legacy:.0} per hour, {:.1} %", 100.0 * ratio),
-    }
+    let rates = rate(CoordinatorMode::Legacy).zip(rate(CoordinatorMode::Safe));
+    let known = rates.map(|(legacy, safe)| {
+        let ratio = safe / legacy;
+        let finding = format!("{safe:.0} of {legacy:.0} per hour, {:.1} %", 100.0 * ratio);
+        (Some(ratio >= THROUGHPUT_RATIO_MIN), finding)
+    });
+    let scenario = scenario_name(scenario);
+    criterion(
+        format!("{scenario}: safe keeps 90 % of legacy's missions per hour when clean"),
+        known,
+        &format!("{NOT_RUN}, or with fewer than {RATE_SECTIONS_MIN} CS"),
+    )
 }
 
 /// Losing commands causes collisions where delaying them does not.
-fn loss_exceeds_delay(
-    scenario: &str,
-    loss: Option<&FleetTally>,
-    delay: Option<&FleetTally>,
-) -> Criterion {
-    let ends = loss
-        .and_then(FleetTally::collision_interval)
-        .zip(delay.and_then(FleetTally::collision_interval));
-    let text = format!("{scenario}, legacy: losing 10 % of the commands is worse than 300 ms");
-    let Some((loss, delay)) = ends else {
-        return Criterion {
-            text,
-            is_met: None,
-            finding: "not run to its end".to_owned(),
+fn loss_exceeds_delay(scenario: Scenario, results: &[CellResult<'_>]) -> Criterion {
+    let ends = |mechanism| {
+        let tally = mechanism_tally(results, scenario, mechanism, CoordinatorMode::Legacy);
+        tally.and_then(interval_per_1000)
+    };
+    let both = ends(Mechanism::CommandLoss10).zip(ends(Mechanism::Delay300Ms));
+    let known = both.map(|(loss, delay)| {
+        let is_met = if loss.0 > delay.1 {
+            Some(true)
+        } else {
+            (loss.1 < delay.0).then_some(false)
         };
-    };
-    let is_met = if loss.0 > delay.1 {
-        Some(true)
-    } else {
-        (loss.1 < delay.0).then_some(false)
-    };
-    Criterion {
-        text,
-        is_met,
-        finding: format!(
+        let finding = format!(
             "{:.2} to {:.2} against {:.2} to {:.2} per 1000",
-            1e3 * loss.0,
-            1e3 * loss.1,
-            1e3 * delay.0,
-            1e3 * delay.1
-        ),
-    }
+            loss.0, loss.1, delay.0, delay.1
+        );
+        (is_met, finding)
+    });
+    let scenario = scenario_name(scenario);
+    let text = format!("{scenario}, legacy: losing 10 % of the commands is worse than 300 ms");
+    criterion(text, known, NOT_RUN)
 }
 
 #[cfg(test)]

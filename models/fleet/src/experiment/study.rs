@@ -5,10 +5,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::case::FleetParameters;
 use crate::experiment::cells::{
-    Cell, CollidedRun, FleetTally, SCENARIOS, mechanism_cells, published_cells, scenario_name,
+    CellSpec, CollidedRun, FleetTally, SCENARIOS, mechanism_cells, published_cells, scenario_name,
 };
 use crate::experiment::driver::{Experiment, Setup};
-use crate::experiment::report::{self, Results};
+use crate::experiment::report::{self, CellResult};
 use crate::scenario::{Scenario, Scene, WorldParameters};
 use hil_core::case_study::ParameterError;
 use hil_core::random::RandomStream;
@@ -83,7 +83,7 @@ pub(crate) struct FleetStudy {
     pub(crate) seed: u64,
     scenes: Vec<(Scenario, Scene)>,
     /// The cells in order.
-    pub(crate) cells: Vec<Cell>,
+    pub(crate) cells: Vec<CellSpec>,
 }
 
 /// One task: a run of one cell.
@@ -122,7 +122,7 @@ impl FleetStudy {
         }
         if !tables.cells.is_empty() {
             let is_wanted = |name: &str| tables.cells.iter().any(|part| name.contains(part));
-            cells.retain(|cell| is_wanted(&cell.name()));
+            cells.retain(|cell| is_wanted(&cell.id.to_string()));
         }
         if cells.is_empty() {
             let problem = format!("{:?} is part of no cell's name", tables.cells);
@@ -133,7 +133,7 @@ impl FleetStudy {
         }
         let mut scenes = Vec::new();
         for scenario in SCENARIOS {
-            if cells.iter().any(|cell| cell.scenario == scenario) {
+            if cells.iter().any(|cell| cell.id.scenario == scenario) {
                 let world = WorldParameters {
                     scenario,
                     ..parameters.world.clone()
@@ -185,7 +185,7 @@ impl FleetStudy {
 
     /// The seed of a task depends on what it is about, not on its place among the others.
     fn seed_of(&self, task: Task) -> u64 {
-        let cell = self.cells[task.cell].seed_name();
+        let cell = self.cells[task.cell].id.seed_name();
         let name = format!("{cell}, run {}", task.replica);
         RandomStream::new(self.seed, &name).next_u64()
     }
@@ -200,13 +200,13 @@ impl Study for FleetStudy {
     }
 
     fn label(&self, task: usize) -> String {
-        self.cells[self.task(task).cell].name()
+        self.cells[self.task(task).cell].id.to_string()
     }
 
     fn run(&self, task: usize, watch: Watch<'_>) -> Option<FleetTally> {
         let task = self.task(task);
         let cell = &self.cells[task.cell];
-        let scene = self.scene(cell.scenario);
+        let scene = self.scene(cell.id.scenario);
         let seed = self.seed_of(task);
         let mut experiment = Experiment::new(scene, &cell.setup, seed)
             .expect("the setup was checked when the study was made");
@@ -250,8 +250,11 @@ impl Study for FleetStudy {
             }
             Some(sum)
         });
-        let results: Vec<_> = self.cells.iter().zip(tallies).collect();
-        report::report(self, &Results::of(results))
+        let cells = self.cells.iter().zip(tallies);
+        let results: Vec<_> = cells
+            .map(|(cell, tally)| CellResult { cell, tally })
+            .collect();
+        report::report(self, &results)
     }
 }
 

@@ -436,56 +436,66 @@ impl Track {
     }
 }
 
-/// Counts of one run, all fleets together.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
-pub struct Tally {
-    /// Critical sections of two missions under way at once, both still ahead.
-    pub sections_created_count: u64,
-    /// Of those, the ones a robot drove through to the end: the original's count.
-    pub sections_passed_count: u64,
-    /// Of those, the ones that ended because a robot was replaced.
-    pub sections_dropped_count: u64,
-    /// Of those, the ones both robots were in at the same time.
-    pub encounters_count: u64,
-    /// Sections with a collision by the original's checker: both robots in the section, and
-    /// footprints overlapping at the last path poses passed. One count per section until they
-    /// separate.
-    pub section_collisions_count: u64,
-    /// Times two robots of a fleet overlapped where they truly were, until they separated.
-    pub overlaps_count: u64,
-    /// Of those, the ones that began outside every section of the two: the section list misses
-    /// them.
-    pub outside_count: u64,
-    /// Smallest distance between two robots of a fleet, metres; `None` when none came near.
-    pub separation_min_m: Option<f64>,
-    /// Farthest a robot went past an authority that came in time, metres.
-    pub stop_error_max_m: f64,
-    /// Farthest a robot went past an authority that came too late, metres.
-    pub late_overshoot_max_m: f64,
-    /// Way driven, metres.
-    pub travelled_m: f64,
-    /// Missions begun.
-    pub missions_started_count: u64,
-    /// Missions driven to their goal.
-    pub missions_done_count: u64,
-    /// Robots put at their goal to clear a stuck fleet.
-    pub replaced_count: u64,
-    /// Authorities applied in time.
-    pub authorities_applied_count: u64,
-    /// Authorities applied too late to stop at.
-    pub authorities_late_count: u64,
-    /// Authorities behind the robot, ignored.
-    pub authorities_ignored_count: u64,
-    /// Authorities refused because the robot could not stop at them.
-    pub authorities_refused_count: u64,
-    /// Older or repeated messages passed over.
-    pub stale_count: u64,
-    /// Leases that ended.
-    pub leases_ended_count: u64,
-    /// Scans made.
-    pub scans_count: u64,
-    /// Truth records that name an unknown fleet, robot, path or kind, or no finite motion.
-    pub unsound_count: u64,
+hil_core::counts! {
+    /// Counts of one run, all fleets together.
+    #[derive(Serialize)]
+    pub struct Tally {
+        /// Critical sections of two missions under way at once, both still ahead.
+        sections_created_count: u64;
+        /// Of those, the ones a robot drove through to the end: the original's count.
+        sections_passed_count: u64;
+        /// Of those, the ones that ended because a robot was replaced.
+        sections_dropped_count: u64;
+        /// Of those, the ones both robots were in at the same time.
+        encounters_count: u64;
+        /// Sections with a collision by the original's checker: both robots in the section, and
+        /// footprints overlapping at the last path poses passed. One count per section until they
+        /// separate.
+        section_collisions_count: u64;
+        /// Times two robots of a fleet overlapped where they truly were, until they separated.
+        overlaps_count: u64;
+        /// Of those, the ones that began outside every section of the two: the section list misses
+        /// them.
+        outside_count: u64;
+        /// Smallest distance between two robots of a fleet, metres; `None` when none came near.
+        separation_min_m: Option<f64> => least;
+        /// Farthest a robot went past an authority that came in time, metres.
+        stop_error_max_m: f64 => f64::max;
+        /// Farthest a robot went past an authority that came too late, metres.
+        late_overshoot_max_m: f64 => f64::max;
+        /// Way driven, metres.
+        travelled_m: f64;
+        /// Missions begun.
+        missions_started_count: u64;
+        /// Missions driven to their goal.
+        missions_done_count: u64;
+        /// Robots put at their goal to clear a stuck fleet.
+        replaced_count: u64;
+        /// Authorities applied in time.
+        authorities_applied_count: u64;
+        /// Authorities applied too late to stop at.
+        authorities_late_count: u64;
+        /// Authorities behind the robot, ignored.
+        authorities_ignored_count: u64;
+        /// Authorities refused because the robot could not stop at them.
+        authorities_refused_count: u64;
+        /// Older or repeated messages passed over.
+        stale_count: u64;
+        /// Leases that ended.
+        leases_ended_count: u64;
+        /// Scans made.
+        scans_count: u64;
+        /// Truth records that name an unknown fleet, robot, path or kind, or no finite motion.
+        unsound_count: u64;
+    }
+}
+
+/// The smaller of two distances that may be unknown.
+fn least(one: Option<f64>, other: Option<f64>) -> Option<f64> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(one.min(other)),
+        (one, other) => one.or(other),
+    }
 }
 
 impl Tally {

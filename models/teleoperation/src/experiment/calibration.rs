@@ -4,7 +4,6 @@
 use crate::Teleoperation;
 use crate::experiment::conditions::{back_after, base, changed, without_time_out};
 use crate::experiment::drive::{Channel, Setup, drive};
-use crate::experiment::report::column;
 use crate::experiment::study::seed_of;
 use crate::experiment::trajectory::Trajectory;
 use hil_arm::egm::parameters::ControllerSettings;
@@ -338,14 +337,14 @@ impl Study for Calibration {
 }
 
 const COLUMNS: [Column; 8] = [
-    column("mechanism", "Mechanism"),
-    column("outage_mean_s", "Mean (s)"),
-    column("outages_per_hour", "Outages/h"),
-    column("outages_per_hour_interval", "95 %"),
-    column("down_ratio", "Time down"),
-    column("mlr_tried", "MLR tried"),
-    column("tries", "Tries"),
-    column("remark", "Remark"),
+    Column::new("mechanism", "Mechanism"),
+    Column::new("outage_mean_s", "Mean (s)"),
+    Column::new("outages_per_hour", "Outages/h"),
+    Column::new("outages_per_hour_interval", "95 %"),
+    Column::new("down_ratio", "Time down"),
+    Column::new("mlr_tried", "MLR tried"),
+    Column::new("tries", "Tries"),
+    Column::new("remark", "Remark"),
 ];
 
 impl Calibration {

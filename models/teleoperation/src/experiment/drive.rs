@@ -5,7 +5,7 @@
 use core::time::Duration;
 
 use crate::experiment::trajectory::{Trajectory, requested};
-use crate::score::loops::{Evidence, Loops, LossCause, Pause, PauseAfter, Span};
+use crate::score::loops::{Evidence, Loops, LostByKind, Pause, PauseAfter, Span};
 use hil_arm::egm::controller::Controller;
 use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EgmStartParameters, EndCause, SessionState};
 use hil_arm::egm::parameters::ControllerSettings;
@@ -60,8 +60,7 @@ pub(crate) struct Tally {
     pub(crate) sent_count: u64,
     pub(crate) executed_count: u64,
     pub(crate) extra_count: u64,
-    /// Lost loops by [`LossCause::kind`].
-    pub(crate) lost_counts: [u64; LossCause::KIND_COUNT],
+    pub(crate) lost_counts: LostByKind,
     /// Which loops were lost.
     pub(crate) lost: Vec<usize>,
     pub(crate) trip_count: u64,
@@ -388,20 +387,13 @@ impl Happened {
     }
 
     fn tally(&self, trajectory: &Trajectory, loops: &Loops, end_ns: i64) -> Tally {
-        let mut lost_counts = [0; LossCause::KIND_COUNT];
-        for lost in &loops.lost {
-            let cause = self
-                .evidence
-                .cause_of(lost.due_ns, trajectory.counter.period_ns);
-            lost_counts[cause.kind()] += 1;
-        }
         let holds = self.evidence.holds.iter();
         let held_ns: i64 = holds.map(|hold| hold.end_ns - hold.begin_ns).sum();
         Tally {
             sent_count: loops.sent_count() as u64,
             executed_count: loops.executed_count as u64,
             extra_count: loops.extra_count as u64,
-            lost_counts,
+            lost_counts: (self.evidence).lost_by_kind(loops, trajectory.counter.period_ns),
             lost: loops.lost.iter().map(|lost| lost.index).collect(),
             trip_count: self.trip_count,
             hours: end_ns as f64 / 3.6e12,

@@ -3,8 +3,8 @@
 use crate::experiment::conditions::{Condition, Expected, PUBLISHED_LOOPS};
 use crate::experiment::drive::Tally;
 use crate::experiment::study::MotionLossStudy;
-use crate::score::loops::LossCause;
-use hil_core::study::{Cell, Column, Criterion, StudyReport, Table};
+use crate::score::loops::LossKind;
+use hil_core::study::{Criterion, Field, StudyReport, Table};
 use hil_stats::series::Estimate;
 use hil_stats::statistics::{CONFIDENCE, poisson};
 
@@ -26,7 +26,7 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
         summary: Vec::new(),
         criteria: rows
             .iter()
-            .flat_map(|row| criteria(row, study.is_fitted))
+            .flat_map(|row| row.criteria(study.is_fitted))
             .collect(),
     }
 }
@@ -55,53 +55,106 @@ fn notes(study: &MotionLossStudy) -> Vec<String> {
     ]
 }
 
-pub(super) const fn column(name: &'static str, label: &'static str) -> Column {
-    Column { name, label }
+impl Row<'_> {
+    fn rates(&self) -> Vec<f64> {
+        self.runs.iter().map(|run| run.loss_ratio()).collect()
+    }
+
+    fn mean(&self, figure: fn(&Tally) -> f64) -> Option<f64> {
+        let total: f64 = self.runs.iter().map(|run| figure(run)).sum();
+        (!self.runs.is_empty()).then(|| total / self.runs.len() as f64)
+    }
+
+    fn sum(&self, count: impl Fn(&Tally) -> u64) -> u64 {
+        self.runs.iter().map(|run| count(run)).sum()
+    }
+
+    fn sent(&self) -> u64 {
+        self.sum(|run| run.sent_count)
+    }
+
+    fn lost(&self, kind: LossKind) -> u64 {
+        self.sum(|run| run.lost_counts[kind as usize])
+    }
+
+    fn name(&self) -> String {
+        self.condition.name.to_owned()
+    }
+
+    /// Student's interval of the mean rate.
+    fn runs_interval(&self) -> Option<(f64, f64)> {
+        let (low, high) = Estimate::of_mean(&self.rates())?.interval?;
+        Some((low.max(0.0), high))
+    }
+
+    /// The rate's interval by the count of all runs' missing loops.
+    fn poisson_interval(&self) -> Option<(f64, f64)> {
+        let missing = poisson(self.sum(Tally::missing_count), CONFIDENCE);
+        let sent = self.sent() as f64;
+        (sent > 0.0).then(|| (missing.low / sent, missing.high / sent))
+    }
+
+    fn range(&self) -> Option<(f64, f64)> {
+        let rates = self.rates();
+        let lowest = rates.iter().copied().reduce(f64::min)?;
+        let highest = rates.iter().copied().reduce(f64::max)?;
+        Some((lowest, highest))
+    }
 }
 
-const RATE_COLUMNS: [Column; 7] = [
-    column("condition", "Condition"),
-    column("mlr_mean", "MLR"),
-    column("mlr_sd", "sd"),
-    column("mlr_runs", "95 % of runs"),
-    column("mlr_poisson", "95 % Poisson"),
-    column("trips_per_hour", "Trips/h"),
-    column("hold_ratio", "Held"),
-];
-
 fn rates(rows: &[Row<'_>]) -> Table {
+    let fields: [Field<Row<'_>>; 7] = [
+        Field::text("condition", "Condition", Row::name),
+        Field::number("mlr_mean", "MLR", 5, |row| row.mean(Tally::loss_ratio)),
+        Field::number("mlr_sd", "sd", 5, |row| deviation(&row.rates())),
+        Field::interval("mlr_runs", "95 % of runs", 5, Row::runs_interval),
+        Field::interval("mlr_poisson", "95 % Poisson", 5, Row::poisson_interval),
+        Field::number("trips_per_hour", "Trips/h", 1, |row| {
+            row.mean(|run| run.trip_count as f64 / run.hours)
+        }),
+        Field::number("hold_ratio", "Held", 5, |row| {
+            row.mean(|run| run.hold_ratio)
+        }),
+    ];
     Table {
-        name: "motion-loss".to_owned(),
-        title: "Motion loss rate by condition".to_owned(),
-        columns: RATE_COLUMNS.to_vec(),
-        rows: rows.iter().map(rate_cells).collect(),
         notes: vec![
             "95 % of runs: Student's interval of the mean; Poisson: of all runs' missing loops"
                 .to_owned(),
         ],
+        ..Table::of(
+            "motion-loss",
+            "Motion loss rate by condition",
+            &fields,
+            rows,
+        )
     }
 }
 
-const COUNT_COLUMNS: [Column; 11] = [
-    column("condition", "Condition"),
-    column("run_count", "Runs"),
-    column("sent_count", "Sent"),
-    column("executed_count", "Executed"),
-    column("lost_by_trip_count", "Trip"),
-    column("lost_by_hold_count", "Held"),
-    column("lost_by_clipping_count", "Clip"),
-    column("lost_by_throttling_count", "Slow"),
-    column("lost_by_merging_count", "Merged"),
-    column("extra_count", "Extra"),
-    column("mlr_range", "Lowest to highest"),
-];
-
 fn counts(rows: &[Row<'_>]) -> Table {
+    // In virtual time feedback is never missing, so the last kind has no column.
+    let fields: [Field<Row<'_>>; 11] = [
+        Field::text("condition", "Condition", Row::name),
+        Field::count("run_count", "Runs", |row| row.runs.len() as u64),
+        Field::count("sent_count", "Sent", Row::sent),
+        Field::count("executed_count", "Executed", |row| {
+            row.sum(|run| run.executed_count)
+        }),
+        Field::count("lost_by_trip_count", "Trip", |row| row.lost(LossKind::Trip)),
+        Field::count("lost_by_hold_count", "Held", |row| row.lost(LossKind::Held)),
+        Field::count("lost_by_clipping_count", "Clip", |row| {
+            row.lost(LossKind::Clipped)
+        }),
+        Field::count("lost_by_throttling_count", "Slow", |row| {
+            row.lost(LossKind::Throttled)
+        }),
+        Field::count("lost_by_merging_count", "Merged", |row| {
+            row.lost(LossKind::Merged)
+        }),
+        Field::count("extra_count", "Extra", |row| row.sum(|run| run.extra_count)),
+        Field::interval("mlr_range", "Lowest to highest", 5, Row::range),
+    ];
+    let title = "Motion loops by condition: sent, executed, lost by cause";
     Table {
-        name: "motion-loss-counts".to_owned(),
-        title: "Motion loops by condition: sent, executed, lost by cause".to_owned(),
-        columns: COUNT_COLUMNS.to_vec(),
-        rows: rows.iter().map(count_cells).collect(),
         notes: vec![
             "lost to: Trip: no session; Held: no commands; Clip: inverse kinematics; Slow: \
              MaxSpeedDeviation; Merged: none of these"
@@ -110,80 +163,18 @@ fn counts(rows: &[Row<'_>]) -> Table {
              hides one of them in the rate"
                 .to_owned(),
         ],
+        ..Table::of("motion-loss-counts", title, &fields, rows)
     }
 }
 
 fn setups(rows: &[Row<'_>]) -> Table {
-    let named = |row: &Row<'_>| {
-        vec![
-            Cell::text(row.condition.name),
-            Cell::text(&row.condition.text),
-        ]
-    };
-    Table {
-        name: "motion-loss-conditions".to_owned(),
-        title: "The conditions".to_owned(),
-        columns: vec![
-            column("condition", "Condition"),
-            column("setup", "Channel and robot"),
-        ],
-        rows: rows.iter().map(named).collect(),
-        notes: Vec::new(),
-    }
-}
-
-fn rates_of(runs: &[&Tally]) -> Vec<f64> {
-    runs.iter().map(|run| run.loss_ratio()).collect()
-}
-
-fn sum(runs: &[&Tally], count: impl Fn(&Tally) -> u64) -> u64 {
-    runs.iter().map(|run| count(run)).sum()
-}
-
-fn rate_cells(row: &Row<'_>) -> Vec<Cell> {
-    let runs = &row.runs;
-    let mean = |figure: fn(&Tally) -> f64| {
-        let total: f64 = runs.iter().map(|run| figure(run)).sum();
-        (!runs.is_empty()).then(|| total / runs.len() as f64)
-    };
-    let rates = rates_of(runs);
-    let interval = Estimate::of_mean(&rates).and_then(|known| known.interval);
-    let sent = sent(runs);
-    let missing = poisson(sum(runs, Tally::missing_count), CONFIDENCE);
-    let of_sent = |value: f64| value / sent as f64;
-    vec![
-        Cell::text(row.condition.name),
-        Cell::number(mean(Tally::loss_ratio), 5),
-        Cell::number(deviation(&rates), 5),
-        Cell::interval(interval.map(|(low, high)| (low.max(0.0), high)), 5),
-        Cell::interval(
-            (sent > 0).then(|| (of_sent(missing.low), of_sent(missing.high))),
-            5,
-        ),
-        Cell::number(mean(|run| run.trip_count as f64 / run.hours), 1),
-        Cell::number(mean(|run| run.hold_ratio), 5),
-    ]
-}
-
-fn count_cells(row: &Row<'_>) -> Vec<Cell> {
-    let runs = &row.runs;
-    let rates = rates_of(runs);
-    let lowest = rates.iter().copied().fold(f64::INFINITY, f64::min);
-    let highest = rates.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let mut cells = vec![
-        Cell::text(row.condition.name),
-        Cell::Count(runs.len() as u64),
-        Cell::Count(sent(runs)),
-        Cell::Count(sum(runs, |run| run.executed_count)),
+    let fields: [Field<Row<'_>>; 2] = [
+        Field::text("condition", "Condition", Row::name),
+        Field::text("setup", "Channel and robot", |row| {
+            row.condition.text.clone()
+        }),
     ];
-    // In virtual time feedback is never missing, so the last kind has no column.
-    let kinds = 0..LossCause::Unseen.kind();
-    cells.extend(kinds.map(|kind| Cell::Count(sum(runs, |run| run.lost_counts[kind]))));
-    cells.extend([
-        Cell::Count(sum(runs, |run| run.extra_count)),
-        Cell::interval((!rates.is_empty()).then_some((lowest, highest)), 5),
-    ]);
-    cells
+    Table::of("motion-loss-conditions", "The conditions", &fields, rows)
 }
 
 /// Standard deviation of the runs.
@@ -194,103 +185,85 @@ pub(crate) fn deviation(values: &[f64]) -> Option<f64> {
     (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt())
 }
 
-fn criteria(row: &Row<'_>, is_fitted: bool) -> Vec<Criterion> {
-    let Row { condition, runs } = row;
-    match condition.expected {
-        Expected::NothingLost { nor_tripped } => vec![nothing_lost(condition, runs, nor_tripped)],
-        Expected::Published {
-            lost,
-            mean_low,
-            mean_high,
-        } => vec![
-            mean_in_range(condition, runs, mean_low, mean_high, is_fitted),
-            runs_in_interval(condition, runs, lost, is_fitted),
-        ],
-        Expected::Open => Vec::new(),
-    }
-}
-
-fn nothing_lost(condition: &Condition, runs: &[&Tally], nor_tripped: bool) -> Criterion {
-    let lost = sum(runs, Tally::missing_count);
-    let unanswered = sum(runs, |run| run.lost_counts.iter().sum());
-    let extra = sum(runs, |run| run.extra_count);
-    let trips = sum(runs, |run| run.trip_count);
-    let trips_text = if nor_tripped {
-        " and no session ends"
-    } else {
-        ""
-    };
-    let is_met = lost + unanswered + extra == 0 && (!nor_tripped || trips == 0);
-    Criterion {
-        text: format!("{}: MLR is 0 exactly{trips_text}", condition.name),
-        is_met: (!runs.is_empty()).then_some(is_met),
-        finding: format!("{lost} of {} loops lost, {trips} trips", sent(runs)),
-    }
-}
-
-fn sent(runs: &[&Tally]) -> u64 {
-    sum(runs, |run| run.sent_count)
-}
-
 /// Runs of which a mean says something.
 const RUNS_MIN: usize = 12;
 
-fn mean_in_range(
-    condition: &Condition,
-    runs: &[&Tally],
-    low: f64,
-    high: f64,
-    is_fitted: bool,
-) -> Criterion {
-    let rates = rates_of(runs);
-    let mean = rates.iter().sum::<f64>() / rates.len().max(1) as f64;
-    let is_judged = is_fitted && runs.len() >= RUNS_MIN;
-    Criterion {
-        text: format!(
-            "{}: mean MLR of at least {RUNS_MIN} runs in {low} to {high}",
-            condition.name
-        ),
-        is_met: is_judged.then(|| (low..=high).contains(&mean)),
-        finding: if runs.is_empty() {
-            "no run".to_owned()
-        } else {
-            format!("{mean:.5} in {} runs", runs.len())
-        },
+impl Row<'_> {
+    fn criteria(&self, is_fitted: bool) -> Vec<Criterion> {
+        match self.condition.expected {
+            Expected::NothingLost { nor_tripped } => vec![self.nothing_lost(nor_tripped)],
+            Expected::Published {
+                lost,
+                mean_low,
+                mean_high,
+            } => vec![
+                self.mean_in_range(mean_low, mean_high, is_fitted),
+                self.runs_in_interval(lost, is_fitted),
+            ],
+            Expected::Open => Vec::new(),
+        }
     }
-}
 
-/// A run that agrees with the published one lies in the interval of its count in 95 % of cases, so
-/// some may lie outside: as many as chance allows in one of 40 tables.
-fn runs_in_interval(
-    condition: &Condition,
-    runs: &[&Tally],
-    lost: u32,
-    is_fitted: bool,
-) -> Criterion {
-    let interval = poisson(u64::from(lost), CONFIDENCE);
-    let of_published = |run: &&&Tally| {
-        let missing = run.loss_ratio() * f64::from(PUBLISHED_LOOPS);
-        (interval.low..=interval.high).contains(&missing)
-    };
-    let inside = runs.iter().filter(of_published).count();
-    let needed = fewest_inside(runs.len());
-    // A short run's count has another scatter than the published one's.
-    let is_judged = is_fitted
-        && !runs.is_empty()
-        && runs
-            .iter()
-            .all(|run| run.sent_count == u64::from(PUBLISHED_LOOPS));
-    Criterion {
-        text: format!(
-            "{}: single runs of {PUBLISHED_LOOPS} loops in the Poisson interval of {lost} lost, \
-             {:.1} to {:.1}; at least {needed} of {}",
-            condition.name,
-            interval.low,
-            interval.high,
-            runs.len()
-        ),
-        is_met: is_judged.then_some(inside >= needed),
-        finding: format!("{inside} of {} inside; 95 % are expected", runs.len()),
+    fn nothing_lost(&self, nor_tripped: bool) -> Criterion {
+        let lost = self.sum(Tally::missing_count);
+        let unanswered = self.sum(|run| run.lost_counts.iter().sum());
+        let extra = self.sum(|run| run.extra_count);
+        let trips = self.sum(|run| run.trip_count);
+        let trips_text = if nor_tripped {
+            " and no session ends"
+        } else {
+            ""
+        };
+        let is_met = lost + unanswered + extra == 0 && (!nor_tripped || trips == 0);
+        Criterion {
+            text: format!("{}: MLR is 0 exactly{trips_text}", self.condition.name),
+            is_met: (!self.runs.is_empty()).then_some(is_met),
+            finding: format!("{lost} of {} loops lost, {trips} trips", self.sent()),
+        }
+    }
+
+    fn mean_in_range(&self, low: f64, high: f64, is_fitted: bool) -> Criterion {
+        let mean = self.mean(Tally::loss_ratio);
+        let judged = mean.filter(|_| is_fitted && self.runs.len() >= RUNS_MIN);
+        Criterion {
+            text: format!(
+                "{}: mean MLR of at least {RUNS_MIN} runs in {low} to {high}",
+                self.condition.name
+            ),
+            is_met: judged.map(|mean| (low..=high).contains(&mean)),
+            finding: mean.map_or_else(
+                || "no run".to_owned(),
+                |mean| format!("{mean:.5} in {} runs", self.runs.len()),
+            ),
+        }
+    }
+
+    /// A run that agrees with the published one lies in the interval of its count in 95 % of cases,
+    /// so some may lie outside: as many as chance allows in one of 40 tables.
+    fn runs_in_interval(&self, lost: u32, is_fitted: bool) -> Criterion {
+        let runs = &self.runs;
+        let interval = poisson(u64::from(lost), CONFIDENCE);
+        let of_published = |run: &&&Tally| {
+            let missing = run.loss_ratio() * f64::from(PUBLISHED_LOOPS);
+            (interval.low..=interval.high).contains(&missing)
+        };
+        let inside = runs.iter().filter(of_published).count();
+        let needed = fewest_inside(runs.len());
+        // A short run's count has another scatter than the published one's.
+        let is_as_long = |run: &&Tally| run.sent_count == u64::from(PUBLISHED_LOOPS);
+        let is_judged = is_fitted && !runs.is_empty() && runs.iter().all(is_as_long);
+        Criterion {
+            text: format!(
+                "{}: single runs of {PUBLISHED_LOOPS} loops in the Poisson interval of {lost} lost, \
+                 {:.1} to {:.1}; at least {needed} of {}",
+                self.condition.name,
+                interval.low,
+                interval.high,
+                runs.len()
+            ),
+            is_met: is_judged.then_some(inside >= needed),
+            finding: format!("{inside} of {} inside; 95 % are expected", runs.len()),
+        }
     }
 }
 

@@ -240,19 +240,41 @@ pub(crate) enum LossCause {
     Unseen,
 }
 
-impl LossCause {
-    /// The kinds, in the order of lists.
-    pub(crate) const KIND_COUNT: usize = 6;
+/// The kinds of [`LossCause`], in the order of lists.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub(crate) enum LossKind {
+    /// [`LossCause::Trip`].
+    Trip,
+    /// [`LossCause::Held`].
+    Held,
+    /// [`LossCause::Clipped`].
+    Clipped,
+    /// [`LossCause::Throttled`].
+    Throttled,
+    /// [`LossCause::Merged`].
+    Merged,
+    /// [`LossCause::Unseen`].
+    Unseen,
+}
 
-    /// Its place in lists.
-    pub(crate) const fn kind(self) -> usize {
+impl LossKind {
+    pub(crate) const COUNT: usize = 6;
+}
+
+/// Lost loops by [`LossKind`].
+pub(crate) type LostByKind = [u64; LossKind::COUNT];
+
+impl LossCause {
+    /// Its kind.
+    pub(crate) const fn kind(self) -> LossKind {
         match self {
-            Self::Trip(_) => 0,
-            Self::Held => 1,
-            Self::Clipped => 2,
-            Self::Throttled => 3,
-            Self::Merged => 4,
-            Self::Unseen => 5,
+            Self::Trip(_) => LossKind::Trip,
+            Self::Held => LossKind::Held,
+            Self::Clipped => LossKind::Clipped,
+            Self::Throttled => LossKind::Throttled,
+            Self::Merged => LossKind::Merged,
+            Self::Unseen => LossKind::Unseen,
         }
     }
 
@@ -330,6 +352,17 @@ impl Evidence {
         } else {
             LossCause::Merged
         }
+    }
+}
+
+impl Evidence {
+    /// How many of the lost loops of `loops` were lost for each reason.
+    pub(crate) fn lost_by_kind(&self, loops: &Loops, period_ns: f64) -> LostByKind {
+        let mut counts = LostByKind::default();
+        for lost in &loops.lost {
+            counts[self.cause_of(lost.due_ns, period_ns).kind() as usize] += 1;
+        }
+        counts
     }
 }
 

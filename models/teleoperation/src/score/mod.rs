@@ -16,7 +16,7 @@ mod tests;
 
 use crate::messages::HumanFrame;
 use crate::score::joint_error::JointError;
-use crate::score::loops::{LoopCounter, Loops, LossCause};
+use crate::score::loops::{LoopCounter, Loops, LossKind, LostByKind};
 use crate::score::record::{Feedback, Record};
 use crate::score::sessions::Sessions;
 use crate::{HUMAN_FRAME, Teleoperation};
@@ -199,17 +199,9 @@ impl Run {
         metrics
     }
 
-    /// How many loops were lost for each reason, by [`LossCause::kind`].
-    fn lost_by_cause(&self, loops: Option<&Loops>) -> [u64; LossCause::KIND_COUNT] {
-        let mut kinds = [0_u64; LossCause::KIND_COUNT];
-        for lost in loops.map_or(&[][..], |loops| &loops.lost) {
-            let cause = self
-                .sessions
-                .evidence
-                .cause_of(lost.due_ns, self.counter.period_ns);
-            kinds[cause.kind()] += 1;
-        }
-        kinds
+    fn lost_by_kind(&self, loops: &Loops) -> LostByKind {
+        let evidence = &self.sessions.evidence;
+        evidence.lost_by_kind(loops, self.counter.period_ns)
     }
 
     fn lost_loops(&self, loops: Option<&Loops>) -> Harm {
@@ -217,10 +209,9 @@ impl Run {
         let Some(loops) = loops else {
             return harm;
         };
-        let kinds = self.lost_by_cause(Some(loops));
+        let kinds = self.lost_by_kind(loops);
         // Slow and merged loops may be what an outage left behind; the reach of the arm is not.
-        let clipped = kinds[LossCause::Clipped.kind()];
-        let others = kinds.iter().sum::<u64>() - clipped;
+        let others = kinds.iter().sum::<u64>() - kinds[LossKind::Clipped as usize];
         let count = harm.count.unwrap_or(0);
         Harm {
             own_count: count - count.min(others),
@@ -229,46 +220,46 @@ impl Run {
     }
 
     fn causes(&self, loops: Option<&Loops>, missing: &str) -> [Metric; 7] {
-        let kinds = self.lost_by_cause(loops);
-        let by = |name, text, kind: usize, what: &str| {
-            let value = loops.map(|_| kinds[kind] as f64);
+        let kinds = loops.map(|loops| self.lost_by_kind(loops));
+        let by = |kind: LossKind, name, text, what: &str| {
+            let value = kinds.map(|kinds| kinds[kind as usize] as f64);
             label(name, text, "1").measured(value, what, missing)
         };
         [
             by(
+                LossKind::Trip,
                 "loops_lost_by_trip_count",
                 "loops lost without a session",
-                0,
                 "sent peaks that no executed one answers, with no session in part of their loop",
             ),
             by(
+                LossKind::Held,
                 "loops_lost_by_hold_count",
                 "loops lost in a hold",
-                1,
                 "of the others, those with a hold in their loop",
             ),
             by(
+                LossKind::Clipped,
                 "loops_lost_by_clipping_count",
                 "loops lost to inverse kinematics",
-                2,
                 "of the others, those with limited or unreachable commands in their loop",
             ),
             by(
+                LossKind::Throttled,
                 "loops_lost_by_throttling_count",
                 "loops lost to MaxSpeedDeviation",
-                3,
                 "of the others, those with MaxSpeedDeviation binding in a fifth of their loop",
             ),
             by(
+                LossKind::Merged,
                 "loops_lost_by_merging_count",
                 "loops merged with a neighbour",
-                4,
                 "the others: too little motion between two peaks",
             ),
             by(
+                LossKind::Unseen,
                 "loops_lost_unseen_count",
                 "loops lost without feedback",
-                5,
                 "of those with a session, as far as is known: no feedback in part of their loop",
             ),
             label("loops_extra_count", "executed loops that answer none", "1").measured(

@@ -82,7 +82,7 @@ pub(crate) fn motion_loops(run: &Run) -> Option<PlotSeries> {
                 since_s(*sent),
                 executed.map_or(f64::NAN, since_s),
                 f64::from(u8::from(cause.is_some())),
-                cause.map_or(0.0, |cause: LossCause| cause.kind() as f64 + 1.0),
+                cause.map_or(0.0, |cause: LossCause| f64::from(cause.kind() as u8 + 1)),
             ]
         });
     Some(PlotSeries {

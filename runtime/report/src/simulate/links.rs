@@ -163,14 +163,14 @@ mod tests {
         let mut shares = Vec::new();
         let mut watch = |share| shares.push(share);
         let duration = Duration::from_millis(500);
-        let progress = Progress {
+        let mut progress = Progress {
             duration,
             next: Instant::ZERO,
             watch: &mut watch,
         };
         let simulation = Simulation::new(&case, carriers).unwrap();
         let result = simulation
-            .run_observed(duration, &mut (&mut accounts, progress))
+            .run_observed(duration, &mut (&mut accounts, &mut progress))
             .unwrap();
         let counts = result.channels[name];
         let account = accounts.0.remove(name).unwrap();
