@@ -103,7 +103,7 @@ const PUBLISHED: [Field<PublishedRow>; 4] = [
         Some(1e3 * row.collisions as f64 / row.sections as f64)
     }),
     Field::interval("published_per_1000", "95 %", 2, |row| {
-        collision_interval(row.collisions, row.sections).map(thousandfold)
+        collision_interval(row.collisions, row.sections).map(|(low, high)| (1e3 * low, 1e3 * high))
     }),
 ];
 
@@ -121,10 +121,10 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
     for published in published_rows(scenario) {
         let before = rows.len();
         for one in ours() {
-            if let Place::Published { row, copies } = one.place()
+            if let Place::Published { row, .. } = one.place()
                 && row == published
             {
-                rows.push(published_row(published, Some((one, *copies))));
+                rows.push(published_row(published, Some(one)));
             }
         }
         if rows.len() == before {
@@ -171,8 +171,8 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
     }
 }
 
-/// A published row beside ours of so many copies, if there is one.
-fn published_row(published: &PublishedRow, ours: Option<(&CellResult<'_>, u32)>) -> Vec<Cell> {
+/// A published row beside ours, if there is one.
+fn published_row(published: &PublishedRow, ours: Option<&CellResult<'_>>) -> Vec<Cell> {
     let mut row = match published.condition {
         Condition::Static {
             loss_ratio,
@@ -188,13 +188,16 @@ fn published_row(published: &PublishedRow, ours: Option<(&CellResult<'_>, u32)>)
             Cell::Absent,
         ],
     };
-    row.push(ours.map_or(Cell::Absent, |(_, copies)| Cell::Count(copies.into())));
-    let tally = ours.and_then(|(one, _)| one.tally.as_ref());
+    row.push(match ours.map(CellResult::place) {
+        Some(Place::Published { copies, .. }) => Cell::Count(u64::from(*copies)),
+        _ => Cell::Absent,
+    });
+    let tally = ours.and_then(|one| one.tally.as_ref());
     row.extend(Field::cells(&FOUND, tally));
     row.extend(Field::cells(&PUBLISHED, Some(published)));
     let against = tally.and_then(|tally| AgainstPaper::of(published, tally));
     row.push(against.map_or(Cell::Absent, |one| Cell::text(one.words())));
-    row.push(ours.map_or(Cell::Absent, |(one, _)| judged(one)));
+    row.push(ours.map_or(Cell::Absent, judged));
     row
 }
 
@@ -302,11 +305,9 @@ fn per_1000(tally: &FleetTally) -> Option<f64> {
 }
 
 fn interval_per_1000(tally: &FleetTally) -> Option<(f64, f64)> {
-    tally.collision_interval().map(thousandfold)
-}
-
-fn thousandfold((low, high): (f64, f64)) -> (f64, f64) {
-    (1e3 * low, 1e3 * high)
+    tally
+        .collision_interval()
+        .map(|(low, high)| (1e3 * low, 1e3 * high))
 }
 
 /// What a cell is held against, and whether it holds.
