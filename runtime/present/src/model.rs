@@ -365,6 +365,16 @@ impl Table {
         }
     }
 
+    /// Ranks the column of `label`, see [`Column::rank`].
+    #[must_use]
+    pub fn ranked(mut self, label: &str, rank: u8) -> Self {
+        let mut columns = self.columns.iter_mut();
+        if let Some(column) = columns.find(|one| one.label == label) {
+            column.rank = rank;
+        }
+        self
+    }
+
     /// One more row.
     pub fn push(&mut self, cells: impl IntoIterator<Item = Cell>) {
         self.rows.push(Row {

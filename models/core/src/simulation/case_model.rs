@@ -362,7 +362,9 @@ impl Simulation {
             let stated = channels_of(case, specs, role);
             // Joined before: every port has a channel of its name.
             let place = |port: &Port| specs.iter().position(|spec| spec.name == port.name);
-            stated.check(component.as_ref()).map_err(SimulationError::Ports)?;
+            stated
+                .check(component.as_ref())
+                .map_err(SimulationError::Ports)?;
             for (port, channel) in component.inputs().iter().filter_map(place).enumerate() {
                 let endpoint = endpoints.len();
                 channels[channel].to = Some(PortPlace { endpoint, port });

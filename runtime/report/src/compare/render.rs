@@ -56,7 +56,9 @@ pub(super) fn full(comparison: &Comparison, verdicts: &Verdicts, width: usize) -
 
 fn text(sections: &[Section], comparison: &Comparison, width: usize) -> String {
     let mut canvas = Canvas::new(width, Style::Plain);
-    sections.iter().for_each(|one| section(&mut canvas, one));
+    for one in sections {
+        section(&mut canvas, one);
+    }
     canvas.blank();
     canvas.rule(Tone::Faint);
     canvas.paragraph(0, Tone::Strong, &format!("{QUESTION}  {}", comparison.hurt));

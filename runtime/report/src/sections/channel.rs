@@ -169,7 +169,9 @@ fn metrics(section: &mut Section, sources: &Sources<'_>) {
             "unknown: no records",
         )),
     }
-    all.into_iter().for_each(|one| section.metric(one));
+    for one in all {
+        section.metric(one);
+    }
 }
 
 /// What an account says that is no number.
@@ -716,11 +718,9 @@ fn segment_row(name: &str, distribution: &Distribution, bound: Option<u64>) -> R
 /// The segments one after the other with their medians as bars, then the whole, then what a missing stamp
 /// made one of.
 fn segment_table(account: &ChannelAccount) -> Table {
-    let mut table = Table::new("Where the time went", &SEGMENT_COLUMNS);
-    for (label, rank) in [("p90", 2), ("off by at most", 1)] {
-        let column = table.columns.iter_mut().find(|one| one.label == label);
-        column.into_iter().for_each(|one| one.rank = rank);
-    }
+    let mut table = Table::new("Where the time went", &SEGMENT_COLUMNS)
+        .ranked("p90", 2)
+        .ranked("off by at most", 1);
     let median = |segment: &SegmentMetrics| {
         let summary = segment.distribution.measured();
         summary.map_or(0.0, |summary| summary.p50_ns.max(0) as f64)

@@ -30,12 +30,10 @@ pub(super) fn network(report: &NetworkReport) -> Section {
         "longest",
         "reordered",
     ];
-    let mut table = Table::new("", &columns);
     // A narrow terminal does without; they stand with the channel as well.
-    for (label, rank) in [("p99.9", 2), ("reordered", 1)] {
-        let column = table.columns.iter_mut().find(|one| one.label == label);
-        column.into_iter().for_each(|one| one.rank = rank);
-    }
+    let mut table = Table::new("", &columns)
+        .ranked("p99.9", 2)
+        .ranked("reordered", 1);
     for one in &report.channels {
         let name = Cell::Text(one.channel.clone());
         let cells = core::iter::once(name).chain(row(&one.figures));

@@ -375,9 +375,9 @@ pub(super) fn facts(summary: &RunSummary) -> Section {
 pub(super) fn method(summary: &RunSummary) -> Section {
     let mut section = Section::new("method", "How to read this", "");
     if !summary.channels.is_empty() {
-        METHOD
-            .iter()
-            .for_each(|text| section.note(Tone::Faint, *text));
+        for text in METHOD {
+            section.note(Tone::Faint, text);
+        }
     }
     section
 }

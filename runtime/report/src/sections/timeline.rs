@@ -29,12 +29,12 @@ pub(crate) fn strips(all: &Timeline, changes: &[LinkChange]) -> Option<Strips> {
                 }
                 last = channel;
                 strip.tone = Tone::Bar;
-                strip.what = match quantity {
+                let what = match quantity {
                     NetworkQuantity::Loss => "lost",
                     NetworkQuantity::Delay => "delay",
                     NetworkQuantity::Silence => "silence",
-                }
-                .to_owned();
+                };
+                what.clone_into(&mut strip.what);
             }
         }
         rows.push(strip);

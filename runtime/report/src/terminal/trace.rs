@@ -310,11 +310,7 @@ pub(crate) fn render_trace_plots(
         let rows = i64::try_from(PLOT_ROWS).unwrap_or(1);
         let upto = delays[0] + (last - delays[0]) / rows * step + i64::from(step == rows) * rows;
         let share = delays.partition_point(|delay| *delay <= upto) as f64 / delays.len() as f64;
-        push_bar(
-            &mut within,
-            [Cell::Duration(upto), Cell::Share(share)],
-            share,
-        );
+        push_bar(&mut within, Cell::Duration(upto), Cell::Share(share), share);
     }
     let title = "Share of the messages delivered within";
     section
@@ -322,7 +318,7 @@ pub(crate) fn render_trace_plots(
         .push(plot(title, &delay_words(figures), within));
     let mut lost = Table::new("", &["in a row", "times"]);
     for (name, count, share) in classes(&figures.loss_bursts) {
-        push_bar(&mut lost, [name.into(), Cell::Count(count)], share);
+        push_bar(&mut lost, name.into(), Cell::Count(count), share);
     }
     section
         .children
@@ -335,7 +331,7 @@ pub(crate) fn render_trace_plots(
         let coefficients = memory.iter().flat_map(|memory| &memory.coefficients);
         for (index, value) in coefficients.enumerate().take(PLOT_ROWS) {
             let lag = Cell::Count(index as u64 + 1);
-            push_bar(&mut table, [lag, format!("{value:.3}").into()], *value);
+            push_bar(&mut table, lag, format!("{value:.3}").into(), *value);
         }
         section
             .children
@@ -355,9 +351,9 @@ fn plot(title: &str, otherwise: &str, table: Table) -> Section {
     section
 }
 
-fn push_bar(table: &mut Table, cells: [Cell; 2], end: f64) {
+fn push_bar(table: &mut Table, name: Cell, value: Cell, end: f64) {
     table.rows.push(Row {
-        cells: cells.to_vec(),
+        cells: vec![name, value],
         tone: Tone::Plain,
         bar: Some(Bar { start: 0.0, end }),
     });
