@@ -13,6 +13,7 @@ const PERIOD: Duration = Duration::from_millis(10);
 pub(crate) struct Cart {
     position_m: f64,
     speed_mps: f64,
+    moved_until: Option<Instant>,
     state: Output<State>,
 }
 
@@ -29,8 +30,11 @@ impl Cart {
         self.speed_mps = command.speed_mps;
     }
 
-    fn on_tick(&mut self, _now: Instant, _tick: Tick) {
-        self.position_m += self.speed_mps * PERIOD.as_secs_f64();
+    fn on_tick(&mut self, now: Instant, _tick: Tick) {
+        // The time that passed, not the period: a late tick stands for several.
+        let passed = now.saturating_duration_since(self.moved_until.unwrap_or(now));
+        self.moved_until = Some(now);
+        self.position_m += self.speed_mps * passed.as_secs_f64();
         self.state.send(State {
             position_m: self.position_m,
             speed_mps: self.speed_mps,

@@ -15,7 +15,7 @@ use hil_core::time::Instant;
 use hil_runtime::Runtime;
 
 hil_core::message! {
-    struct Command = "example.CartCommand.v1" { speed_mps: f64, middle_m: f64 }
+    struct Command = "example.CartCommand.v1" { speed_mps: f64 }
 }
 hil_core::message! {
     struct State = "example.CartState.v1" { position_m: f64, speed_mps: f64 }
@@ -41,7 +41,6 @@ impl Controller {
     fn on_state(&mut self, _now: Instant, state: &State) {
         self.command.send(Command {
             speed_mps: self.gain_per_s * (0.5 - state.position_m),
-            middle_m: 0.5,
         });
     }
 }

@@ -108,6 +108,9 @@ pub enum FirstNumber {
     OnRecord,
 }
 
+/// How many times as many messages are held in all as are held though they are due.
+const HELD_MAX_FACTOR: usize = 16;
+
 /// What is fixed about a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FoldSettings {
@@ -117,8 +120,9 @@ pub struct FoldSettings {
     pub depth: Option<usize>,
     /// Where its numbers begin.
     pub first_number: FirstNumber,
-    /// Most messages that are held; the oldest of more is told as what is known of it by then. `None`
-    /// for no limit.
+    /// Most messages that are held though they are due, because what comes later decides on them; of more
+    /// the oldest is told as what is known of it by then. Sixteen times as many are held in all, due or
+    /// not. `None` for no limit.
     pub held_max: Option<usize>,
 }
 
@@ -409,11 +413,22 @@ impl ChannelFold {
         take: &mut dyn FnMut(&MessageHistory),
     ) {
         self.sort();
+        let max = self.settings.held_max.unwrap_or(usize::MAX);
+        let due = |epoch: &Epoch| epoch.due_count(until_ns);
+        let mut due_count: usize = self.epochs[self.first_open..].iter().map(due).sum();
         for index in self.first_open..self.epochs.len() {
-            while let Some(sequence) = self.epochs[index].due(until_ns) {
-                if !self.tell_one(index, sequence, evidence, take) {
+            loop {
+                let is_full = self.held_count > max.saturating_mul(HELD_MAX_FACTOR);
+                let until_ns = until_ns.filter(|_| !is_full);
+                let Some(sequence) = self.epochs[index].due(until_ns) else {
+                    break;
+                };
+                let held_count = self.held_count;
+                let is_crowded = is_full || due_count > max;
+                if !self.tell_one(index, sequence, evidence, is_crowded, take) {
                     return;
                 }
+                due_count = due_count.saturating_sub(held_count - self.held_count);
             }
             if self.first_open == index && self.epochs[index].pending.is_empty() {
                 self.first_open += 1;
@@ -428,6 +443,7 @@ impl ChannelFold {
         index: usize,
         sequence: u64,
         evidence: &Evidence<'_>,
+        is_crowded: bool,
         take: &mut dyn FnMut(&MessageHistory),
     ) -> bool {
         let epoch = &self.epochs[index];
@@ -452,10 +468,6 @@ impl ChannelFold {
                 consumer: self.reading(index, key.sequence, |one| &one.consumer),
             },
         };
-        let is_crowded = self
-            .settings
-            .held_max
-            .is_some_and(|max| self.held_count > max);
         let verdict = self.judge.judge(&message, evidence, readings, is_crowded);
         let Some(verdict) = verdict else {
             return false;
@@ -545,6 +557,18 @@ impl Epoch {
             self.pending.insert(place, (sequence, pending));
         }
         &mut self.pending[place].1
+    }
+
+    /// Messages published by `until_ns`, or all.
+    fn due_count(&self, until_ns: Option<i64>) -> usize {
+        let Some(until_ns) = until_ns else {
+            return self.pending.len();
+        };
+        let is_due = |(_, one): &(u64, Pending)| {
+            let published_ns = one.message.published_ns();
+            published_ns.is_none_or(|at_ns| at_ns <= until_ns)
+        };
+        self.pending.partition_point(is_due)
     }
 
     /// The lowest number that has not settled, if it was published by then; without an instant, if a

@@ -65,8 +65,10 @@ pub trait Component: Debug + Sized + 'static {
 
 /// Messages an output port takes in one call of its component: a few for each of dozens of robots.
 pub const OUTPUT_CAPACITY: usize = 256;
+/// Memory of an output port, unless two messages take more.
+const OUTPUT_BYTES: usize = 1 << 20;
 
-/// An output port: a field of its component. It takes up to [`OUTPUT_CAPACITY`] messages in one call,
+/// An output port: a field of its component. It takes up to [`Output::CAPACITY`] messages in one call,
 /// which leave when the call has ended; it drops and counts what is beyond.
 #[derive(Debug)]
 pub struct Output<M> {
@@ -84,9 +86,23 @@ impl<M> Default for Output<M> {
 }
 
 impl<M> Output<M> {
+    /// Messages that one takes in one call: [`OUTPUT_CAPACITY`], fewer of large ones, at least two.
+    pub const CAPACITY: usize = {
+        let size = if size_of::<M>() == 0 {
+            1
+        } else {
+            size_of::<M>()
+        };
+        match OUTPUT_BYTES / size {
+            0..2 => 2,
+            2..OUTPUT_CAPACITY => OUTPUT_BYTES / size,
+            _ => OUTPUT_CAPACITY,
+        }
+    };
+
     /// Gives a message; a full port drops and counts it.
     pub fn send(&mut self, message: M) {
-        if self.messages.len() < OUTPUT_CAPACITY {
+        if self.messages.len() < Self::CAPACITY {
             self.messages.push(message);
         } else {
             self.dropped_count += 1;
@@ -210,13 +226,14 @@ trait AnyOutput {
 
 impl<M: Message> AnyOutput for Output<M> {
     fn reserve(&mut self) {
-        self.messages.reserve_exact(OUTPUT_CAPACITY);
+        self.messages.reserve_exact(Self::CAPACITY);
     }
 
     fn flush(&mut self, port: usize, emit: Emit<'_>) -> u64 {
-        for message in self.messages.drain(..) {
-            emit(port, bytemuck::bytes_of(&message));
+        for message in &self.messages {
+            emit(port, bytemuck::bytes_of(message));
         }
+        self.messages.clear();
         core::mem::take(&mut self.dropped_count)
     }
 }
@@ -233,8 +250,11 @@ pub trait Role: Debug {
     /// The output ports.
     fn outputs(&self) -> &[Port];
 
-    /// See [`Component::start`].
+    /// See [`Component::start`]; what it sends stays in its ports until [`Role::flush`].
     fn start(&mut self, now: Instant);
+
+    /// Takes out what the output ports hold.
+    fn flush(&mut self, emit: Emit<'_>);
 
     /// Hands over a message that came in through the input port `port`. False when `payload` is not a
     /// message of the port, or there is no such port; the component does not see it then.
@@ -303,14 +323,6 @@ struct ErasedComponent<C> {
     dropped_count: u64,
 }
 
-impl<C> ErasedComponent<C> {
-    fn flush(&mut self, emit: Emit<'_>) {
-        for (port, find) in self.ports.finds.iter().enumerate() {
-            self.dropped_count += find(&mut self.component).flush(port, emit);
-        }
-    }
-}
-
 impl<C: Component> Role for ErasedComponent<C> {
     fn inputs(&self) -> &[Port] {
         &self.ports.inputs
@@ -318,6 +330,12 @@ impl<C: Component> Role for ErasedComponent<C> {
 
     fn outputs(&self) -> &[Port] {
         &self.ports.outputs
+    }
+
+    fn flush(&mut self, emit: Emit<'_>) {
+        for (port, find) in self.ports.finds.iter().enumerate() {
+            self.dropped_count += find(&mut self.component).flush(port, emit);
+        }
     }
 
     fn start(&mut self, now: Instant) {
@@ -456,6 +474,37 @@ mod tests {
             assert!(said.iter().all(|one| one.0 == 1));
             assert_eq!(role.outbox_dropped(), calls * 3);
         }
+    }
+
+    #[test]
+    fn a_port_of_large_messages_has_room_for_fewer() {
+        assert_eq!(Output::<[u8; 64]>::CAPACITY, 256);
+        assert_eq!(Output::<[u8; 100_000]>::CAPACITY, 10);
+        assert_eq!(Output::<[u8; 4 << 20]>::CAPACITY, 2);
+    }
+
+    /// Says hello when it starts.
+    #[derive(Debug, Default)]
+    struct Greeter {
+        said: Output<Small>,
+    }
+
+    impl Component for Greeter {
+        fn ports(&self, ports: &mut Ports<Self>) {
+            ports.output("b/small", |own| &mut own.said);
+        }
+
+        fn start(&mut self, _now: Instant) {
+            self.said.send(small_of(1));
+        }
+    }
+
+    #[test]
+    fn what_a_component_sends_when_it_starts_leaves_at_once() {
+        let mut role = into_role(Greeter::default());
+        role.start(Instant::ZERO);
+        assert_eq!(emitted(|emit| role.flush(emit)).len(), 1);
+        assert!(emitted(|emit| role.flush(emit)).is_empty());
     }
 
     #[test]

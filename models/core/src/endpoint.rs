@@ -202,9 +202,23 @@ impl<E, I: InputPort<Error = E>, O: OutputPort<Error = E>> Endpoint<I, O> {
         })
     }
 
-    /// Starts the role; call once before the first poll.
-    pub fn start(&mut self, now: Instant) {
+    /// Starts the role and gives what it sends at once; call once before the first poll.
+    ///
+    /// # Errors
+    /// The first port that fails.
+    pub fn start(&mut self, now: Instant) -> Result<Activity, E> {
+        let mut activity = Activity::default();
+        let mut failed = None;
         self.role.start(now);
+        let mut emit = emitter(
+            &mut self.outputs,
+            now,
+            &mut activity.sent_count,
+            &mut failed,
+        );
+        self.role.flush(&mut emit);
+        drop(emit);
+        failed.map_or(Ok(activity), Err)
     }
 
     /// Takes the waiting messages, port by port, then ticks the role when due.

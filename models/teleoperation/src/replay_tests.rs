@@ -262,7 +262,10 @@ fn live(case: &Teleoperation, heard: &RunLog, begin: Instant, end: Instant) -> (
     let role = into_role(Robot::new(case.settings));
     let stated = channels_of(Teleoperation::NAME, Teleoperation::CHANNELS, "robot");
     let mut endpoint = Endpoint::join(role, &stated, waiting, recorder).unwrap();
-    endpoint.start(begin);
+    match endpoint.start(begin) {
+        Ok(_) => {}
+        Err(never) => match never {},
+    }
     let mut random = RandomStream::new(2, "busy machine");
     let mut now = begin;
     while now <= end {

@@ -1,13 +1,13 @@
-//! The doctor's report as text: the worst first, what is ok in one line each, the measurement where
-//! one was asked for, a summary last. It returns a string; who prints it, and whether the terminal
-//! takes colour, is the caller's business.
+//! The doctor's report as text: the worst first, what is ok in one line each, the measurement where one was asked for,
+//! a summary last. It returns a string; who prints it, and whether the terminal takes colour, is the caller's business.
 
-use core::fmt::Write as _;
-
-use anstyle::{AnsiColor, Style};
 use hil_platform::host_facts::Fact;
 use hil_platform::realtime::{GrantOutcome, RealtimeGrantItem};
+use hil_platform::text::columns;
 use hil_platform::words::plural;
+use hil_present::terminal::canvas::{Canvas, INDENT, Style, left};
+use hil_present::terminal::section;
+use hil_present::{Block, Cell, Section, Table, Tone};
 
 use super::latency::{LatencyReport, Quantiles, Standing, us_up};
 use super::{DoctorReport, Finding, Severity};
@@ -16,32 +16,17 @@ use super::{DoctorReport, Finding, Severity};
 const WIDTH: usize = 100;
 /// Columns of the severity.
 const LABEL: usize = 11;
-/// Columns before the words of `why`, `fix` and `from`.
-const INDENT: usize = 14;
+/// Columns before `why`, `fix` and `from`.
+const REASON_INDENT: usize = 14;
 
-const GOOD: Style = AnsiColor::Green.on_default();
-const PLAIN: Style = Style::new().dimmed();
-const UNKNOWN: Style = AnsiColor::Cyan.on_default();
-const CAREFUL: Style = AnsiColor::Yellow.on_default().bold();
-const BAD: Style = AnsiColor::Red.on_default().bold();
-
-/// `word` in the colour of its tone.
-fn mark(word: &str, tone: Style, has_colour: bool) -> String {
-    if has_colour {
-        format!("{tone}{word}{tone:#}")
-    } else {
-        word.to_owned()
-    }
-}
-
-/// The word for people, of one width, and its tone.
-fn label(severity: Severity) -> (&'static str, Style) {
+/// The word for people, and its tone.
+const fn label(severity: Severity) -> (&'static str, Tone) {
     match severity {
-        Severity::Ok => ("ok         ", GOOD),
-        Severity::Note => ("note       ", PLAIN),
-        Severity::CannotTell => ("cannot tell", UNKNOWN),
-        Severity::Warning => ("WARNING    ", CAREFUL),
-        Severity::Error => ("ERROR      ", BAD),
+        Severity::Ok => ("ok", Tone::Good),
+        Severity::Note => ("note", Tone::Faint),
+        Severity::CannotTell => ("cannot tell", Tone::Bar),
+        Severity::Warning => ("WARNING", Tone::Caution),
+        Severity::Error => ("ERROR", Tone::Bad),
     }
 }
 
@@ -49,23 +34,29 @@ impl DoctorReport {
     /// The report: the worst findings first, each with why it matters, what to do and where it was
     /// read; then the measurement, where one was asked for; a summary last.
     pub fn to_text(&self, has_colour: bool) -> String {
-        let mut text = String::new();
+        let style = if has_colour {
+            Style::Coloured
+        } else {
+            Style::Plain
+        };
+        let mut canvas = Canvas::new(WIDTH, style);
         let facts = &self.host;
         let fact = |label| facts.find(label).map_or_else(String::new, Fact::to_text);
         let [host, kernel, cores] = ["hostname", "kernel", "cores"].map(fact);
-        push(&mut text, &format!("{host}: {kernel}, {cores}"));
-        let widths = self.findings.iter().map(|one| one.title.chars().count());
-        let width = widths.max().unwrap_or(0);
+        canvas.line(&format!("{host}: {kernel}, {cores}"));
+        let widest = self.findings.iter().map(|one| columns(&one.title)).max();
         for severity in Severity::ALL.into_iter().rev() {
-            for finding in self.of_severity(severity) {
-                push_finding(&mut text, finding, width, has_colour);
+            for one in self.of_severity(severity) {
+                finding(&mut canvas, one, widest.unwrap_or(0));
             }
         }
         if let Some(latency) = self.latency.as_ref().filter(|one| one.is_thorough) {
-            push(&mut text, "");
-            push_latency(&mut text, latency, has_colour);
+            for one in [wakeups(latency), gaps(latency), surroundings(latency)] {
+                section(&mut canvas, &one);
+            }
+            claims(&mut canvas, latency);
         }
-        push(&mut text, "");
+        canvas.blank();
         // `1 error, 2 warnings, 3 cannot be told, 0 to note, 9 ok`.
         let counted = |severity, what| {
             let count = self.count(severity);
@@ -79,16 +70,16 @@ impl DoctorReport {
             self.count(Severity::Note),
             self.count(Severity::Ok)
         );
-        push(&mut text, &summary);
-        text
+        canvas.line(&summary);
+        canvas.finish()
     }
 }
 
-fn push_finding(text: &mut String, finding: &Finding, width: usize, has_colour: bool) {
+fn finding(canvas: &mut Canvas, finding: &Finding, width: usize) {
     let (word, tone) = label(finding.severity);
-    let word = mark(word, tone, has_colour);
-    let lead = format!("{word}  {:width$}  ", finding.title);
-    push_behind(text, &lead, LABEL + 2 + width + 2, &finding.value);
+    let word = canvas.paint(tone, &left(word, LABEL));
+    let lead = format!("{word}  {}  ", left(&finding.title, width));
+    canvas.behind(&lead, LABEL + width + 4, Tone::Plain, &finding.value);
     if finding.severity == Severity::Ok {
         return;
     }
@@ -98,15 +89,13 @@ fn push_finding(text: &mut String, finding: &Finding, width: usize, has_colour: 
     if finding.severity >= Severity::Warning {
         parts.push(("from", &name));
     }
-    for (label, words) in parts {
-        let label = mark(&format!("{label:4}"), PLAIN, has_colour);
-        push_behind(text, &format!("{:INDENT$}{label} ", ""), INDENT + 5, words);
+    for (label, words) in parts.into_iter().filter(|(_, words)| !words.is_empty()) {
+        canvas.field_at(REASON_INDENT, 5, label, Tone::Plain, words);
     }
 }
 
-/// The measurement: what was measured and how, the figures side by side, what else went on, what may
-/// be claimed.
-fn push_latency(text: &mut String, report: &LatencyReport, has_colour: bool) {
+/// How late threads woke up, and how they ran, said once where they agree.
+fn wakeups(report: &LatencyReport) -> Section {
     let period_ms = report.period_ns as f64 / 1e6;
     let duration_s = report.duration_ns as f64 / 1e9;
     let ended = if report.is_interrupted {
@@ -114,45 +103,19 @@ fn push_latency(text: &mut String, report: &LatencyReport, has_colour: bool) {
     } else {
         ""
     };
-    let head = format!("Wake-ups: absolute sleeps of {period_ms} ms for {duration_s} s{ended}");
-    push(text, &head);
-    push_row(text, "", &["count", "skipped", "preempted"], &QUANTILES);
+    let aside = format!("absolute sleeps of {period_ms} ms for {duration_s} s{ended}");
+    let mut section = Section::new("wake-ups", "Wake-ups", aside);
+    let mut table = quantile_table(["count", "skipped", "preempted"]);
     for one in report.measured_wakeups() {
         let counts = [
-            Some(one.count),
-            Some(one.skipped_count),
-            one.preempted_count,
+            Cell::Count(one.count),
+            Cell::Count(one.skipped_count),
+            Cell::count(one.preempted_count),
         ];
-        let cells = counts.map(or_dash);
-        push_row(text, &place(one.cpu), &cells, &quantile_cells(one.lateness));
+        let cells = core::iter::once(place(one.cpu)).chain(counts);
+        table.push(cells.chain(quantile_cells(one.lateness)));
     }
-    push_scheduling(text, report);
-    if !report.gaps.is_empty() {
-        let ns = report.gaps.iter().map(|one| one.measured_ns).max();
-        let s = ns.unwrap_or(0) as f64 / 1e9;
-        let head =
-            format!("Gaps over 10 us of a busy poller, {s:.1} s per CPU, one after the other");
-        push(text, "");
-        push(text, &head);
-        push_row(
-            text,
-            "",
-            &["gaps/s", "ms/s lost", "as throttle"],
-            &QUANTILES,
-        );
-        for one in report.measured_gaps() {
-            let (rate, lost) = (one.per_second(), one.lost_ms_per_s());
-            let throttled = or_dash(one.throttle_like_count);
-            let cells = [format!("{rate:.0}"), format!("{lost:.1}"), throttled];
-            push_row(text, &place(one.cpu), &cells, &quantile_cells(one.length));
-        }
-    }
-    push_surroundings(text, report);
-    push_claims(text, report, has_colour);
-}
-
-/// How the threads ran, said once where they agree.
-fn push_scheduling(text: &mut String, report: &LatencyReport) {
+    section.table(table);
     let mut seen: Vec<&RealtimeGrantItem> = Vec::new();
     for item in report.wakeups.iter().flat_map(|one| &one.scheduling.items) {
         if !seen.contains(&item) {
@@ -162,13 +125,40 @@ fn push_scheduling(text: &mut String, report: &LatencyReport) {
     let is_granted = |item: &&RealtimeGrantItem| item.outcome == GrantOutcome::Granted;
     let (granted, refused): (Vec<_>, Vec<_>) = seen.into_iter().partition(is_granted);
     let granted: Vec<String> = granted.into_iter().map(ToString::to_string).collect();
-    push_behind(text, "  ", 2, &granted.join(", "));
-    for item in refused {
-        push_behind(text, "  ", 2, &item.to_string());
+    if !granted.is_empty() {
+        section.note(Tone::Plain, granted.join(", "));
     }
+    for item in refused {
+        section.note(Tone::Caution, item.to_string());
+    }
+    section
 }
 
-fn push_surroundings(text: &mut String, report: &LatencyReport) {
+/// When a busy poller lost its CPU.
+fn gaps(report: &LatencyReport) -> Section {
+    let ns = report.gaps.iter().map(|one| one.measured_ns).max();
+    let s = ns.unwrap_or(0) as f64 / 1e9;
+    let aside = format!("over 10 us of a busy poller, {s:.1} s per CPU, one after the other");
+    let mut section = Section::new("gaps", "Gaps", aside);
+    if report.gaps.is_empty() {
+        return section;
+    }
+    let mut table = quantile_table(["gaps/s", "ms/s lost", "as throttle"]);
+    for one in report.measured_gaps() {
+        let counts = [
+            format!("{:.0}", one.per_second()).into(),
+            format!("{:.1}", one.lost_ms_per_s()).into(),
+            Cell::count(one.throttle_like_count),
+        ];
+        let cells = core::iter::once(place(one.cpu)).chain(counts);
+        table.push(cells.chain(quantile_cells(one.length)));
+    }
+    section.table(table);
+    section
+}
+
+/// What else went on.
+fn surroundings(report: &LatencyReport) -> Section {
     let around = &report.surroundings;
     let load = match (&around.load_before, &around.load_after) {
         (Fact::Available(before), Fact::Available(after)) => {
@@ -188,96 +178,55 @@ fn push_surroundings(text: &mut String, report: &LatencyReport) {
         Fact::Unavailable(reason) => format!("steal time unavailable ({reason})"),
     };
     let machine = around.virtual_machine.to_text();
-    let line = format!("Meanwhile: {load}; {ticks}; virtual machine: {machine}");
-    push(text, "");
-    push(text, &line);
+    let mut section = Section::new("meanwhile", "Meanwhile", "");
+    section.note(
+        Tone::Plain,
+        format!("{load}; {ticks}; virtual machine: {machine}"),
+    );
+    section
 }
 
-fn push_claims(text: &mut String, report: &LatencyReport, has_colour: bool) {
-    push(text, "");
-    push(text, "What this host supports, as it is now");
-    let widths = report.claims.iter().map(|one| one.claim.chars().count());
-    let width = widths.max().unwrap_or(0);
-    let mut rules: Vec<&str> = Vec::new();
+fn claims(canvas: &mut Canvas, report: &LatencyReport) {
+    canvas.heading("What this host supports, as it is now", "");
+    let widest = report.claims.iter().map(|one| columns(&one.claim)).max();
+    let width = widest.unwrap_or(0);
+    let mut rules: Vec<String> = Vec::new();
     for claim in &report.claims {
         let (word, tone) = match claim.standing {
-            Standing::Supportable => ("yes", GOOD),
-            Standing::NotSupportable => ("no ", BAD),
-            Standing::NotMeasured => ("?  ", UNKNOWN),
+            Standing::Supportable => ("yes", Tone::Good),
+            Standing::NotSupportable => ("no", Tone::Bad),
+            Standing::NotMeasured => ("?", Tone::Bar),
         };
-        let word = mark(word, tone, has_colour);
-        let lead = format!("  {word}  {:width$}  ", claim.claim);
-        push_behind(text, &lead, 7 + width + 2, &claim.why);
-        if !rules.contains(&claim.rule.as_str()) {
-            rules.push(&claim.rule);
+        let word = canvas.paint(tone, &left(word, 3));
+        let lead = format!("{:INDENT$}{word}  {}  ", "", left(&claim.claim, width));
+        canvas.behind(&lead, INDENT + 3 + width + 4, Tone::Plain, &claim.why);
+        if !rules.contains(&claim.rule) {
+            rules.push(claim.rule.clone());
         }
     }
-    push(text, "  Rules, in the order of the lines:");
-    for rule in rules {
-        push_behind(text, "  - ", 4, rule);
-    }
+    let mut section = Section::new("rules", "Rules", "in the order of the lines");
+    let tone = Tone::Plain;
+    section.blocks.push(Block::List { tone, items: rules });
+    self::section(canvas, &section);
 }
 
-const QUANTILES: [&str; 4] = ["p50", "p99", "p99.9", "max us"];
+/// A row a CPU: three columns, then quantiles in microseconds.
+fn quantile_table(columns: [&str; 3]) -> Table {
+    let [first, second, third] = columns;
+    let columns = ["", first, second, third, "p50", "p99", "p99.9", "max us"];
+    Table::new("", &columns)
+}
 
 /// As the claims round, so that a figure is the same in both.
-fn quantile_cells(figures: Option<Quantiles>) -> [String; 4] {
-    let cells = |of: Quantiles| [of.p50_ns, of.p99_ns, of.p999_ns, of.max_ns].map(Some);
-    let cells = figures.map_or([None; 4], cells);
-    cells.map(|ns| or_dash(ns.map(us_up)))
+fn quantile_cells(found: Option<Quantiles>) -> [Cell; 4] {
+    let cells = |of: Quantiles| [of.p50_ns, of.p99_ns, of.p999_ns, of.max_ns];
+    let us = |ns: i64| Cell::Count(us_up(ns).unsigned_abs());
+    found.map_or([const { Cell::Missing }; 4], |of| cells(of).map(us))
 }
 
-fn or_dash(figure: Option<impl ToString>) -> String {
-    figure.map_or("-".to_owned(), |figure| figure.to_string())
-}
-
-fn place(cpu: Option<usize>) -> String {
+fn place(cpu: Option<usize>) -> Cell {
     cpu.map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"))
-}
-
-fn push_row<C: AsRef<str>, Q: AsRef<str>>(
-    text: &mut String,
-    name: &str,
-    cells: &[C; 3],
-    quantiles: &[Q; 4],
-) {
-    let mut line = format!("  {name:18}");
-    let cells = cells.iter().map(AsRef::as_ref);
-    for cell in cells.chain(quantiles.iter().map(AsRef::as_ref)) {
-        write!(line, "{cell:>12}").expect("a string takes every write");
-    }
-    push(text, &line);
-}
-
-fn push(text: &mut String, line: &str) {
-    writeln!(text, "{}", line.trim_end()).expect("a string takes every write");
-}
-
-/// Wrapped words behind `lead`, which takes `indent` columns; further lines leave these blank.
-fn push_behind(text: &mut String, lead: &str, indent: usize, words: &str) {
-    let room = WIDTH.saturating_sub(indent).max(30);
-    for (index, line) in wrapped(words, room).iter().enumerate() {
-        if index == 0 {
-            push(text, &format!("{lead}{line}"));
-        } else {
-            push(text, &format!("{:indent$}{line}", ""));
-        }
-    }
-}
-
-/// Words broken into lines of at most `width` characters; a longer word keeps a line to itself.
-fn wrapped(words: &str, width: usize) -> Vec<String> {
-    let mut lines: Vec<String> = Vec::new();
-    for word in words.split_whitespace() {
-        match lines.last_mut() {
-            Some(line) if line.chars().count() + 1 + word.chars().count() <= width => {
-                line.push(' ');
-                line.push_str(word);
-            }
-            _ => lines.push(word.to_owned()),
-        }
-    }
-    lines
+        .into()
 }
 
 #[cfg(test)]
@@ -324,18 +273,5 @@ mod tests {
             }
         }
         assert_eq!(plain, report().to_text(false));
-    }
-
-    #[test]
-    fn long_explanations_are_wrapped_at_words() {
-        assert_eq!(
-            wrapped("one two three four", 9),
-            ["one two", "three", "four"]
-        );
-        assert_eq!(wrapped("", 9), Vec::<String>::new());
-        assert_eq!(
-            wrapped("extraordinarily long", 5),
-            ["extraordinarily", "long"]
-        );
     }
 }

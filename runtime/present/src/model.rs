@@ -44,7 +44,11 @@ impl Tone {
 
 impl Serialize for Tone {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(self.word())
+        serializer.serialize_str(match self {
+            Self::Strong => "strong",
+            Self::Faint => "faint",
+            tone => tone.word(),
+        })
     }
 }
 
@@ -163,6 +167,9 @@ pub struct Metric {
 impl Metric {
     /// A number with its text.
     pub fn new(name: &str, label: &str, unit: &str, value: f64) -> Self {
+        if !value.is_finite() {
+            return Self::unavailable(name, label, unit, "it is no finite number");
+        }
         Self {
             name: name.to_owned(),
             label: label.to_owned(),
@@ -205,7 +212,9 @@ impl Metric {
     /// With its interval of 95 %.
     #[must_use]
     pub fn within(mut self, interval: Option<(f64, f64)>) -> Self {
-        if let Some((low, high)) = interval.filter(|_| self.value.is_some()) {
+        let is_finite = |(low, high): &(f64, f64)| low.is_finite() && high.is_finite();
+        let interval = interval.filter(|ends| self.value.is_some() && is_finite(ends));
+        if let Some((low, high)) = interval {
             (self.low, self.high) = (Some(low), Some(high));
             let [low, high] = [low, high].map(|end| units::value(end, &self.unit));
             // A unit that both ends have is said once.
@@ -272,13 +281,6 @@ pub enum Cell {
     Duration(i64),
     /// A ratio, shown in per cent.
     Share(f64),
-    /// A number of a unit, as in [`Metric::unit`].
-    Value {
-        /// The number.
-        value: f64,
-        /// Its unit.
-        unit: &'static str,
-    },
     /// There is none here.
     Missing,
 }
@@ -306,7 +308,6 @@ impl Cell {
             Self::Count(count) => grouped(*count),
             Self::Duration(ns) => duration(*ns),
             Self::Share(ratio) => percent(*ratio),
-            Self::Value { value, unit } => units::value(*value, unit),
             Self::Missing => "–".to_owned(),
         }
     }
@@ -318,7 +319,6 @@ impl Cell {
             Self::Count(count) => Some((*count as f64, "1")),
             Self::Duration(ns) => Some((units::ns_s(*ns), "s")),
             Self::Share(ratio) => Some((*ratio, "share")),
-            Self::Value { value, unit } => Some((*value, unit)),
         }
     }
 

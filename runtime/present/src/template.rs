@@ -35,9 +35,9 @@ impl TemplateError {
 
 /// What every template may import: each form's macros for sections and their blocks.
 const PARTS: [(&str, &str); 3] = [
-    ("blocks.html", include_str!("templates/blocks.html")),
-    ("blocks.md", include_str!("templates/blocks.md")),
-    ("blocks.tex", include_str!("templates/blocks.tex")),
+    ("hil/blocks.html", include_str!("templates/blocks.html")),
+    ("hil/blocks.md", include_str!("templates/blocks.md")),
+    ("hil/blocks.tex", include_str!("templates/blocks.tex")),
 ];
 
 /// `data` through the template called `name`, whose ending decides about escaping; `extra` are further
@@ -56,9 +56,10 @@ pub fn render(
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.set_trim_blocks(true);
     environment.set_lstrip_blocks(true);
-    let is_html = [".html", ".htm", ".xml", ".svg"]
-        .iter()
-        .any(|ending| name.ends_with(ending));
+    let is_html = [".html", ".htm", ".xml", ".svg"].iter().any(|ending| {
+        let name = name.trim_end_matches(".j2").trim_end_matches(".jinja");
+        name.ends_with(ending)
+    });
     environment.set_auto_escape_callback(move |_| {
         if is_html {
             AutoEscape::Html
@@ -95,9 +96,9 @@ pub fn render(
 /// `sections` as GitHub's Markdown below `title`.
 ///
 /// # Errors
-/// Never for what a builder makes; the engine has one.
+/// When a template of this program is at fault.
 pub fn markdown(title: &str, sections: &[Section]) -> Result<String, TemplateError> {
-    const DOCUMENT: &str = "{% from \"blocks.md\" import section %}\n# {{ title|md }}\n\n\
+    const DOCUMENT: &str = "{% from \"hil/blocks.md\" import section %}\n# {{ title|md }}\n\n\
         {% for s in sections %}\n{{ section(s) }}\n{% endfor %}\n";
     let text = render(
         "document.md",

@@ -5,10 +5,10 @@ pub mod canvas;
 use crate::model::{
     Block, Cell, Event, EventList, Field, Metric, Row, Section, Strips, Table, Tone,
 };
-use crate::units::seconds;
+use crate::units::{duration_s, seconds};
 use crate::{joined_labels, model};
 use canvas::{Canvas, INDENT, Style, bar, left, right};
-use hil_platform::text::columns;
+use hil_platform::text::{columns, shortened};
 
 /// Columns of a fact's label.
 const LABEL_MIN: usize = 14;
@@ -68,7 +68,7 @@ fn blocks(canvas: &mut Canvas, blocks: &[Block]) {
             Block::Note { tone, text } => canvas.paragraph(INDENT, *tone, text),
             Block::List { tone, items } => {
                 for item in items {
-                    canvas.hanging(INDENT, INDENT + 2, "·", *tone, item);
+                    canvas.behind(&format!("{:INDENT$}· ", ""), INDENT + 2, *tone, item);
                 }
             }
             Block::Command { text } => canvas.paragraph(INDENT + 2, Tone::Strong, text),
@@ -82,7 +82,8 @@ fn facts(canvas: &mut Canvas, facts: &[Field]) {
     let widest = facts.iter().map(|fact| columns(&fact.label) + 1).max();
     let width = widest.unwrap_or(0).clamp(LABEL_MIN, LABEL_MAX);
     for fact in facts {
-        canvas.field_of(width, &fact.label, fact.tone, &fact.value);
+        let label = shortened(&fact.label, width - 1);
+        canvas.field_of(width, &label, fact.tone, &fact.value);
     }
 }
 
@@ -109,10 +110,19 @@ fn metrics(canvas: &mut Canvas, metrics: &[Metric]) {
         } else {
             Tone::Faint
         };
-        let label = left(&metric.label, label_width);
-        let value = canvas.paint(tone, &left(&metric.text, VALUE_WIDTH));
-        let line = format!("{:INDENT$}{label}  {value}", "");
-        let room = canvas.width() - INDENT - label_width - VALUE_WIDTH - 4;
+        let label = if columns(&metric.label) > label_width {
+            canvas.paragraph(INDENT, Tone::Plain, &metric.label);
+            ""
+        } else {
+            &metric.label
+        };
+        // A value is never cut short.
+        let width = VALUE_WIDTH.max(columns(&metric.text));
+        let value = canvas.paint(tone, &left(&metric.text, width));
+        let line = format!("{:INDENT$}{}  {value}", "", left(label, label_width));
+        let room = canvas
+            .width()
+            .saturating_sub(INDENT + label_width + width + 4);
         match metric.interval.as_str() {
             "" => canvas.line(&line),
             interval if columns(interval) + 2 <= room => {
@@ -158,13 +168,19 @@ impl Layout {
             let cells = cells.map(|row| columns(&row.cells[index].text())).max();
             cells.unwrap_or(0).max(columns(&table.columns[index].label))
         };
-        let mut shown: Vec<usize> = (0..table.columns.len()).collect();
-        let mut widths: Vec<usize> = shown.iter().map(|index| width_of(*index)).collect();
+        let has_value = |index: &usize| {
+            let mut cells = table.rows.iter().filter_map(|row| row.cells.get(*index));
+            table.columns[*index].rank == 0 || cells.any(|cell| *cell != Cell::Missing)
+        };
+        let has_bar = table.rows.iter().any(|row| row.bar.is_some());
+        let mut shown: Vec<usize> = (0..table.columns.len()).filter(has_value).collect();
+        let mut widths: Vec<usize> = (0..table.columns.len()).map(width_of).collect();
         let total = |shown: &[usize], widths: &[usize]| {
             let gaps = GAP * shown.len().saturating_sub(1);
             shown.iter().map(|index| widths[*index]).sum::<usize>() + gaps
         };
-        while total(&shown, &widths) > room {
+        let wanted = if has_bar { GAP + BAR_MIN } else { 0 };
+        while total(&shown, &widths) + wanted > room {
             let rank = |index: &usize| table.columns[*index].rank;
             match shown
                 .iter()
@@ -199,7 +215,6 @@ impl Layout {
             let mut cells = table.rows.iter().filter_map(|row| row.cells.get(index));
             cells.any(Cell::is_number)
         });
-        let has_bar = table.rows.iter().any(|row| row.bar.is_some());
         let left = room.saturating_sub(total(&shown, &widths) + GAP);
         Self {
             are_numbers: are_numbers.collect(),
@@ -253,8 +268,11 @@ fn table_row(canvas: &mut Canvas, table: &Table, layout: &Layout, row: &Row) {
         let before: Vec<String> = before
             .map(|(index, text)| layout.padded(index, text))
             .collect();
-        let margin = INDENT + columns(&before.join(&gap)) + if before.is_empty() { 0 } else { GAP };
-        canvas.hanging(INDENT, margin, &before.join(&gap), Tone::Faint, reason);
+        let mut lead = format!("{:INDENT$}{}", "", before.join(&gap));
+        if !before.is_empty() {
+            lead.push_str(&gap);
+        }
+        canvas.behind(&lead, columns(&lead), Tone::Faint, reason);
         return;
     }
     let cells = layout
@@ -326,9 +344,11 @@ pub fn strips(canvas: &mut Canvas, strips: &Strips) {
     let [begin, middle, end] = [0.0, 0.5, 1.0].map(|share| seconds(share * strips.whole_s));
     let half = room / 2;
     let axis_margin = INDENT + name_width + WHAT_WIDTH;
+    let column = format!("a column is {}", duration_s(strips.whole_s / room as f64));
     let axis = format!(
-        "{:axis_margin$}{}{}{}",
+        "{:INDENT$}{}{}{}{}",
         "",
+        left(&column, axis_margin - INDENT),
         left(&begin, half.saturating_sub(4)),
         left(&middle, half.saturating_sub(6)),
         right(&end, room.saturating_sub(2 * half) + 10)

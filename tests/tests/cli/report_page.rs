@@ -186,9 +186,9 @@ fn virtual_time_becomes_a_page_and_every_other_form() {
     let lost = first["figures"]["loss"]["ratio"].to_string();
     assert!(csv.stdout.contains(&lost), "{lost}: {}", csv.stdout);
     for (name, words) in [
-        ("a.md", "| figure | value |"),
+        ("a.md", "| metric | value |"),
         ("a.tex", "\\toprule"),
-        ("a.json", "\"schema_version\": 1"),
+        ("a.json", "\"schema_version\": 2"),
     ] {
         let path = record.join(name);
         report(&[&teleoperation, Path::new("-o"), &path]).assert_success();

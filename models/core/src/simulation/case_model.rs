@@ -226,9 +226,12 @@ impl Model for CaseModel {
     }
 
     fn start<O: Observe<Self>>(&mut self, medium: &mut Medium<'_, Self, O>) {
-        for (endpoint, due) in self.endpoints.iter_mut().zip(&mut self.due) {
-            endpoint.start(medium.now);
-            *due = endpoint.next_wakeup();
+        for index in 0..self.endpoints.len() {
+            match self.endpoints[index].start(medium.now) {
+                Ok(_) => {}
+                Err(never) => match never {},
+            }
+            self.give(index, medium);
         }
     }
 
@@ -264,6 +267,32 @@ impl Model for CaseModel {
             Ok(_) => {}
             Err(never) => match never {},
         }
+        self.give(index, medium);
+    }
+
+    fn receive<O: Observe<Self>>(
+        &mut self,
+        message: ChannelMessage,
+        medium: &mut Medium<'_, Self, O>,
+    ) {
+        let channel = &mut medium.network.0[message.channel];
+        let Some(to) = channel.to else {
+            return;
+        };
+        channel.counts.taken_count += 1;
+        self.endpoints[to.endpoint].inputs_mut()[to.port]
+            .0
+            .push_back(message);
+        let due = &mut self.due[to.endpoint];
+        *due = Some(due.map_or(medium.now, |due| due.min(medium.now)));
+    }
+}
+
+impl CaseModel {
+    /// Notes when an endpoint has something to do, and gives what it sent to the channels.
+    fn give<O: Observe<Self>>(&mut self, index: usize, medium: &mut Medium<'_, Self, O>) {
+        let now = medium.now;
+        let endpoint = &mut self.endpoints[index];
         self.due[index] = endpoint.next_wakeup();
         let ports = endpoint.outputs_mut().iter_mut();
         for (port, &channel) in ports.zip(&self.outputs[index]) {
@@ -288,23 +317,6 @@ impl Model for CaseModel {
                 }
             }
         }
-    }
-
-    fn receive<O: Observe<Self>>(
-        &mut self,
-        message: ChannelMessage,
-        medium: &mut Medium<'_, Self, O>,
-    ) {
-        let channel = &mut medium.network.0[message.channel];
-        let Some(to) = channel.to else {
-            return;
-        };
-        channel.counts.taken_count += 1;
-        self.endpoints[to.endpoint].inputs_mut()[to.port]
-            .0
-            .push_back(message);
-        let due = &mut self.due[to.endpoint];
-        *due = Some(due.map_or(medium.now, |due| due.min(medium.now)));
     }
 }
 

@@ -261,7 +261,7 @@ impl JobWork for Component {
         if !orders.wait_for_start() {
             return Ok(());
         }
-        self.endpoint.start(MonotonicClock::now());
+        self.endpoint.start(MonotonicClock::now())?;
         while !orders.is_stopping() {
             let ticks = self.report.ticks;
             self.turn()?;

@@ -118,12 +118,7 @@ impl Canvas {
         self.line(&line);
     }
 
-    /// A label and a text that wraps beside it.
-    pub fn field(&mut self, label: &str, tone: Tone, text: &str) {
-        self.field_of(14, label, tone, text);
-    }
-
-    /// As [`Canvas::field`], with a label column of `label_width`.
+    /// A label in a column of `label_width`, and a text that wraps beside it.
     pub fn field_of(&mut self, label_width: usize, label: &str, tone: Tone, text: &str) {
         self.field_at(INDENT, label_width, label, tone, text);
     }
@@ -137,41 +132,25 @@ impl Canvas {
         tone: Tone,
         text: &str,
     ) {
-        let rows = wrapped(text, self.width - margin - label_width);
-        for (index, row) in rows.iter().enumerate() {
-            let label = if index == 0 { label } else { "" };
-            let line = format!(
-                "{:margin$}{}{}",
-                "",
-                self.paint(Tone::Faint, &left(label, label_width)),
-                self.paint(tone, row)
-            );
-            self.line(&line);
-        }
+        let label = self.paint(Tone::Faint, &left(label, label_width));
+        let lead = format!("{:margin$}{label}", "");
+        self.behind(&lead, margin + label_width, tone, text);
     }
 
-    /// `lead` at `indent`, and a text in `tone` that wraps behind `margin`.
-    pub fn hanging(&mut self, indent: usize, margin: usize, lead: &str, tone: Tone, text: &str) {
+    /// `lead`, which takes `margin` columns and may be painted, and a text in `tone` that wraps behind it.
+    pub fn behind(&mut self, lead: &str, margin: usize, tone: Tone, text: &str) {
+        let blank = " ".repeat(margin);
         let rows = wrapped(text, self.width.saturating_sub(margin).max(20));
-        let lead_width = margin.saturating_sub(indent);
         for (index, row) in rows.iter().enumerate() {
-            let lead = if index == 0 { lead } else { "" };
-            let line = format!(
-                "{:indent$}{}{}",
-                "",
-                left(lead, lead_width),
-                self.paint(tone, row)
-            );
+            let lead = if index == 0 { lead } else { &blank };
+            let line = format!("{lead}{}", self.paint(tone, row));
             self.line(&line);
         }
     }
 
     /// A paragraph behind a blank margin.
     pub fn paragraph(&mut self, margin: usize, tone: Tone, text: &str) {
-        for row in wrapped(text, self.width.saturating_sub(margin).max(20)) {
-            let line = format!("{:margin$}{}", "", self.paint(tone, &row));
-            self.line(&line);
-        }
+        self.behind(&" ".repeat(margin), margin, tone, text);
     }
 }
 

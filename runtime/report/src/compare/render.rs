@@ -70,7 +70,7 @@ fn text(sections: &[Section], comparison: &Comparison, width: usize) -> String {
 /// As Markdown: the answer first, then every metric.
 ///
 /// # Errors
-/// Never; the template engine has one.
+/// When a template of this program is at fault.
 pub(super) fn markdown(
     comparison: &Comparison,
     verdicts: &Verdicts,
@@ -130,8 +130,8 @@ fn harms(comparison: &Comparison) -> Section {
     }
     for harm in &comparison.harms {
         let what = &harm.base.what;
-        section.fact(format!("{what}, base"), Tone::Plain, harm.base.words());
-        section.fact(format!("{what}, new"), Tone::Plain, harm.new.words());
+        section.fact(format!("base: {what}"), Tone::Plain, harm.base.words());
+        section.fact(format!("new: {what}"), Tone::Plain, harm.new.words());
     }
     section
 }

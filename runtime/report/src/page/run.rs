@@ -64,7 +64,11 @@ fn unfinished(key: String, manifest: &Manifest, material: &Material) -> Run {
             word: "unfinished".to_owned(),
             text: "this run never began or was killed outright, so it left no summary".to_owned(),
         },
-        sections: vec![missing(lacks), facts],
+        sections: vec![
+            missing(lacks),
+            facts,
+            sections::repeat(Some(&manifest.command_line.join(" "))),
+        ],
         repeat_command: Some(manifest.command_line.join(" ")).filter(|line| !line.is_empty()),
         ..Run::default()
     }
@@ -130,9 +134,14 @@ fn draw(
                 steps,
             );
             run.plots.insert(drawing.name.clone(), plot);
-            if let Some(index) = find(sections, "over-time") {
-                sections[index].blocks.insert(0, Block::Drawing(drawing));
-            }
+            let index = find(sections, "over-time").unwrap_or_else(|| {
+                sections.insert(
+                    0,
+                    Section::new("over-time", "Network and robot over time", ""),
+                );
+                0
+            });
+            sections[index].blocks.insert(0, Block::Drawing(drawing));
         }
         None => lacks.push(
             "Network over time: no channel crossed a network, so there is nothing to draw."

@@ -17,7 +17,7 @@ use hil_stats::statistics::{CONFIDENCE, IntervalNs, wilson};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_present::units::{
-    JOINT, duration, duration_s, figure, ns_s, number, percent, seconds, unsigned_duration,
+    duration, duration_s, figure, ns_s, number, percent, seconds, unsigned_duration,
 };
 use hil_present::{Bar, Cell, Metric, Row, Section, Table, Tone, UNAVAILABLE};
 use hil_rundir::pipe::StallMetrics;
@@ -125,9 +125,6 @@ fn channel(one: &ChannelSummary, summary: &RunSummary) -> Section {
     if let Some(counts) = &one.trace_replay {
         section.fact("trace replay", Tone::Plain, replay_words(counts));
     }
-    if let Some(longest) = one.outages.as_ref().and_then(|outages| outages.longest) {
-        section.fact("longest outage", Tone::Plain, longest_words(longest));
-    }
     if let Some(account) = &one.account {
         section
             .blocks
@@ -162,12 +159,15 @@ fn metrics(section: &mut Section, sources: &Sources<'_>) {
     }
     match sources.outages {
         Some(outages) => all.extend(outage_metrics(outages)),
-        None => all.push(Metric::unavailable(
-            "outage_count",
-            "outages",
-            "1",
-            "unknown: no records",
-        )),
+        None if sources.crosses => {
+            let reason = match sources.account {
+                None => NO_ACCOUNT,
+                Some(_) => "the fate of some messages is unknown",
+            };
+            all.push(Metric::unavailable("outage_count", "outages", "1", reason));
+        }
+        // What crosses no network has no outage of one.
+        None => {}
     }
     for one in all {
         section.metric(one);
@@ -195,7 +195,8 @@ fn facts(section: &mut Section, account: &ChannelAccount) {
         }
     }
     clocks::one_way(section, account);
-    if let Some(text) = burst_words(account) {
+    if !account.loss_bursts.is_empty() {
+        let text = runs_words(account.loss_bursts.iter().copied());
         section.fact("lost in a row", Tone::Plain, text);
     }
     let gaps = &account.gaps;
@@ -464,14 +465,22 @@ fn end_to_end(sources: &Sources<'_>) -> Vec<Metric> {
 
 fn network(sources: &Sources<'_>) -> Vec<Metric> {
     let Some(network) = sources.network else {
-        return ONE_WAY.unavailable(NO_NETWORK);
+        let mut all = ONE_WAY.unavailable(NO_NETWORK);
+        let round_trips = sources.account.map(|account| &account.round_trip);
+        all.extend(round_trips.into_iter().flat_map(round_trip));
+        return all;
     };
     let mut all = match &network.delay {
         Measured::Unavailable { reason } => ONE_WAY.unavailable(reason),
         Measured::Measured(delay) => one_way(delay),
     };
     all.extend(successive(&network.successive));
-    all.extend(round_trip(&network.round_trip));
+    let of_account = sources.account.map(|account| &account.round_trip);
+    let is_measured = network.round_trip.measured().is_some();
+    let found = of_account
+        .filter(|_| !is_measured)
+        .unwrap_or(&network.round_trip);
+    all.extend(round_trip(found));
     let too_few = "fewer than two messages";
     for (name, label, unit, value) in [
         (
@@ -623,15 +632,7 @@ fn round_trip(found: &Distribution) -> Vec<Metric> {
 
 fn outage_metrics(outages: &OutageMetrics) -> Vec<Metric> {
     let longest = outages.longest.as_ref();
-    let where_from = longest.map_or_else(String::new, |one| {
-        let open = if one.is_open {
-            ", to the end of the run"
-        } else {
-            ""
-        };
-        let lost = counted(one.lost_count, "message");
-        format!("from {:.3}{JOINT}s, {lost} lost{open}", ns_s(one.start_ns))
-    });
+    let where_from = longest.copied().map_or_else(String::new, longest_words);
     let longest = longest.map(|one| ns_s(one.length_ns));
     vec![
         Metric::new("outage_count", "outages", "1", outages.outage_count as f64)
@@ -836,9 +837,6 @@ fn stamp_table(account: &ChannelAccount) -> Option<Table> {
             Cell::share(found.and_then(|one| one.ratio())),
         ]);
     }
-    if let Some(Distribution::Unavailable { reason }) = &account.hardware_wire {
-        table.note = format!("card to card {UNAVAILABLE}: {reason}");
-    }
     Some(table)
 }
 
@@ -921,25 +919,22 @@ fn closing_words(figures: &ClosingMetrics) -> Option<(Tone, String)> {
     Some((if is_whole { Tone::Good } else { Tone::Plain }, text))
 }
 
-/// Lengths of loss runs with how often each occurred; of many, the shortest and the longest.
-fn burst_words(account: &ChannelAccount) -> Option<String> {
-    const SHOWN_COUNT: usize = 8;
-    let bursts = &account.loss_bursts;
-    let longest = bursts.last()?;
-    let word = |burst: &BurstCount| {
-        let times = match burst.count {
+/// How often so many messages were lost in a row, the longest first.
+fn runs_words(runs: impl DoubleEndedIterator<Item = BurstCount> + ExactSizeIterator) -> String {
+    let hidden = runs.len().saturating_sub(RUNS_SHOWN_COUNT);
+    let shown = runs.rev().take(RUNS_SHOWN_COUNT).map(|run| {
+        let times = match run.count {
             1 => "once".to_owned(),
+            2 => "twice".to_owned(),
             count => format!("{} times", grouped(count)),
         };
-        format!("{} {times}", grouped(burst.length_messages))
-    };
-    let shown = bursts.iter().take(SHOWN_COUNT).map(word);
+        format!("{} {times}", grouped(run.length_messages))
+    });
     let mut text = shown.collect::<Vec<_>>().join(", ");
-    if bursts.len() > SHOWN_COUNT {
-        text.push_str(" … ");
-        text.push_str(&word(longest));
+    if hidden > 0 {
+        let _infallible = write!(text, ", {hidden} shorter lengths");
     }
-    Some(text)
+    text
 }
 
 fn gap_words(account: &ChannelAccount, gap: Gap) -> String {
@@ -966,8 +961,7 @@ fn longest_words(longest: LongestOutage) -> String {
         seconds_of(end)
     };
     format!(
-        "longest {}, {} to {until}, {} lost from {} on",
-        duration(longest.length_ns),
+        "{} to {until}, {} lost from {} on",
         seconds_of(longest.start_ns),
         counted(longest.lost_count, "message"),
         grouped(longest.first_sequence),
@@ -992,23 +986,11 @@ fn border(ns: i64) -> String {
 }
 
 fn loss_runs_words(loss: &LossMetrics) -> String {
-    let times = |count: u64| match count {
-        1 => "once".to_owned(),
-        2 => "twice".to_owned(),
-        count => format!("{} times", grouped(count)),
-    };
-    let shown: Vec<String> = loss
-        .runs
-        .iter()
-        .rev()
-        .take(RUNS_SHOWN_COUNT)
-        .map(|run| format!("{} {}", grouped(run.length_messages), times(run.count)))
-        .collect();
-    let mut text = shown.join(", ");
-    let hidden = loss.runs.len().saturating_sub(RUNS_SHOWN_COUNT);
-    if hidden > 0 {
-        let _infallible = write!(text, ", {hidden} shorter lengths");
-    }
+    let runs = loss.runs.iter().map(|run| BurstCount {
+        length_messages: run.length_messages,
+        count: run.count,
+    });
+    let mut text = runs_words(runs);
     if let Some(longest) = loss.longest {
         let start = seconds(longest.start_ns as f64 * 1e-9);
         let open = if longest.is_open { ", to the end" } else { "" };

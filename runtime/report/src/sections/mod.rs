@@ -13,7 +13,7 @@ mod run;
 mod timeline;
 
 pub(crate) use channel::Sources;
-pub(crate) use run::outcome_words;
+pub(crate) use run::{outcome_words, repeat};
 pub(crate) use timeline::strips;
 
 use hil_present::{Block, Section};
@@ -54,6 +54,7 @@ pub(crate) fn of_run(summary: &RunSummary, assessment: &Assessment) -> Vec<Secti
     sections.push(run::facts(summary));
     sections.push(run::method(summary));
     sections.push(run::files(&summary.run));
+    sections.push(repeat(Some(&summary.run.repeat_command)));
     sections.retain(|section| !section.is_empty());
     sections
 }

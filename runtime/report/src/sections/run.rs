@@ -382,14 +382,28 @@ pub(super) fn method(summary: &RunSummary) -> Section {
     section
 }
 
-/// The run's folder, and the command that repeats the run.
+/// The run's folder and what is in it.
 pub(super) fn files(run: &RunFacts) -> Section {
     let mut section = Section::new("files", "Files", "");
     section.fact("folder", Tone::Plain, &run.folder);
     for file in &run.files {
         section.fact(&file.label, Tone::Plain, &file.value);
     }
-    section.fact("repeat with", Tone::Strong, &run.repeat_command);
+    section
+}
+
+/// The command that makes the run again.
+pub(crate) fn repeat(command: Option<&str>) -> Section {
+    let mut section = Section::new("repeat", "Repeat this run", "");
+    match command.filter(|command| !command.is_empty()) {
+        Some(command) => section.blocks.push(Block::Command {
+            text: command.to_owned(),
+        }),
+        None => section.note(
+            Tone::Faint,
+            "unavailable: the folder does not say with which command it was made",
+        ),
+    }
     section
 }
 

@@ -109,14 +109,13 @@ impl ChannelTail {
     /// Settles what was published `settling_ns` ago: by then all who met it have written it down. How far the
     /// producer's clock has come is known from its newest stamp and from the time since that was read.
     pub(crate) fn settle(&mut self, now_ns: i64, settling_ns: i64) {
-        let Some(newest) = &mut self.newest else {
-            return;
-        };
-        let read_ns = *newest.read_ns.get_or_insert(now_ns);
-        let producer_ns = newest
-            .published_ns
-            .saturating_add(now_ns.saturating_sub(read_ns));
-        let until_ns = producer_ns.saturating_sub(settling_ns);
+        // Without a publication on record nothing is due; only what is too much to hold is told.
+        let until_ns = self.newest.as_mut().map_or(i64::MIN, |newest| {
+            let read_ns = *newest.read_ns.get_or_insert(now_ns);
+            let passed_ns = now_ns.saturating_sub(read_ns);
+            let producer_ns = newest.published_ns.saturating_add(passed_ns);
+            producer_ns.saturating_sub(settling_ns)
+        });
         self.settled_until_ns = self.settled_until_ns.max(until_ns);
         // No clock but the producer's is asked: no end of the run and no interruption is known.
         let context = AccountContext::new(if self.is_gateway {
