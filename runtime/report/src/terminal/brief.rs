@@ -287,7 +287,7 @@ fn channels(summary: &RunSummary) -> Section {
                     grouped(line.published_count)
                 )
                 .into(),
-                Cell::Share(line.loss_ratio()),
+                Cell::share((line.published_count > 0).then(|| line.loss_ratio())),
                 Cell::duration(line.gap_ns),
             ],
             tone: if line.lost_count > 0 {
