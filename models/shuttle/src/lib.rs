@@ -123,10 +123,6 @@ impl Component for Controller {
 }
 
 impl Controller {
-    #[expect(
-        clippy::trivially_copy_pass_by_ref,
-        reason = "a port hands over messages of any size in one way"
-    )]
     fn on_status(&mut self, _now: Instant, status: &ShuttleStatus) {
         self.position_m = status.position_m;
     }

@@ -186,7 +186,10 @@ pub(super) fn score(summary: &RunSummary) -> Section {
     );
     section.blocks.extend(paper.map(Block::Table));
     for one in &summary.score {
-        let metric = Metric::maybe(&one.name, &one.label, &one.unit, one.value, &one.method);
+        // A ratio is shown in per cent, as everywhere.
+        let is_ratio = one.unit == "1" && one.name.ends_with("_ratio");
+        let unit = if is_ratio { "share" } else { &one.unit };
+        let metric = Metric::maybe(&one.name, &one.label, unit, one.value, &one.method);
         section.metric(metric.within(one.interval).by(&one.method));
     }
     section
