@@ -11,7 +11,7 @@ use hil_stats::comparison::Estimate;
 use hil_stats::statistics::Interval;
 
 use super::conditions::Verdicts;
-use super::harms::QUESTION;
+use super::harms::{ComparedHarm, QUESTION};
 use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict};
 use crate::answer::UnitScale;
 
@@ -128,10 +128,10 @@ fn harms(comparison: &Comparison) -> Section {
         let text = "one run on a side: how much runs differ by themselves is not known";
         section.note(Tone::Caution, text);
     }
-    for harm in &comparison.harms {
-        let what = &harm.base.what;
-        section.fact(format!("base: {what}"), Tone::Plain, harm.base.words());
-        section.fact(format!("new: {what}"), Tone::Plain, harm.new.words());
+    for ComparedHarm { base, new, .. } in &comparison.harms {
+        section.note(Tone::Strong, &base.what);
+        section.fact("base", Tone::Plain, base.words());
+        section.fact("new", Tone::Plain, new.words());
     }
     section
 }
@@ -256,7 +256,10 @@ fn robot(comparison: &Comparison) -> Section {
         let scale = UnitScale::of(&one.unit);
         let [base, new] = [one.base, one.new]
             .map(|side| side.map_or_else(String::new, |side| scale.words(side.value)));
-        let verdict = one.verdict.words().to_owned();
+        let mut verdict = one.verdict.words().to_owned();
+        if base == new && one.verdict != Verdict::NoDifferenceShown {
+            verdict.push_str(", by less than the digits shown");
+        }
         table.push([one.label.clone(), base, new, verdict].map(Into::into));
     }
     let hidden = scores().count() - table.rows.len();

@@ -273,9 +273,15 @@ fn number(value: f64, step: f64) -> String {
     if value.abs() >= 1e6 || (step.abs() < 1e-9 && value.abs() > 0.0) {
         return format!("{value:.2e}");
     }
-    let decimals = (-(step.abs().max(1e-9)).log10() - 1e-9)
+    let least = (-(step.abs().max(1e-9)).log10() - 1e-9)
         .ceil()
         .clamp(0.0, 9.0) as usize;
+    // A step of 0.25 has a digit more than its size.
+    let is_exact = |decimals: &usize| {
+        let scale = 10_f64.powi(i32::try_from(*decimals).unwrap_or(9));
+        (value * scale - (value * scale).round()).abs() < step.abs() * scale * 1e-3
+    };
+    let decimals = (least..=least + 1).find(is_exact).unwrap_or(least);
     let text = format!("{value:.decimals$}");
     let is_zero = text.bytes().all(|b| matches!(b, b'-' | b'0' | b'.'));
     if is_zero { "0".to_owned() } else { text }
@@ -309,6 +315,8 @@ mod tests {
             words(&axis.ticks(Unit::Share)),
             ["50 %", "0 %", "90 %", "99 %", "99.9 %"]
         );
+        assert_eq!(number(0.25, 0.25), "0.25");
+        assert_eq!(number(0.5, 0.25), "0.5");
         let axis = Axis::linear(-0.02, 0.02, 0.0, 140.0);
         assert_eq!(words(&axis.ticks(Unit::Number)), ["-0.02", "0", "0.02"]);
     }

@@ -77,6 +77,8 @@ pub(crate) struct AnswerView {
     pub(crate) answer: Verdict,
     pub(crate) measurement: Verdict,
     pub(crate) sample: String,
+    /// The first thing that hurt the robot and what the network did before, where it did.
+    pub(crate) cause: Option<String>,
     /// What hurt the robot.
     pub(crate) harms: Vec<Field>,
 }

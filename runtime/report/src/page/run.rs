@@ -8,7 +8,7 @@ use super::data::{AnswerView, Run, RunKind, Tile, Verdict};
 use super::drawings;
 use super::read::{Found, Manifest, Material};
 use super::timeline;
-use crate::answer::Answer;
+use crate::answer::{Answer, Hurt};
 use crate::assessment::Assessment;
 use crate::sections::{self, Sources, outcome_words};
 use crate::summary::{RunSummary, host_words};
@@ -198,6 +198,10 @@ fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
             text: plain(words),
         },
         sample: plain(answer.sample_words()),
+        cause: (answer.hurt == Hurt::Yes)
+            .then(|| sections::events::first_harm(summary))
+            .flatten()
+            .map(plain),
         harms: summary
             .harms
             .iter()

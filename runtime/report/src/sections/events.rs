@@ -10,8 +10,10 @@ use hil_platform::words::counted;
 use hil_present::units::{duration_s, percent, seconds};
 use hil_present::{Block, Event, EventList, Section, Tone, UNAVAILABLE};
 
+use crate::answer::Evidence;
 use crate::network::{NetworkReport, PrecedingNetwork, TimedEvent};
 use crate::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
+use crate::summary::RunSummary;
 
 /// Events of the robot that are listed; all of them are in the summary.
 const EVENTS_MAX: usize = 200;
@@ -165,6 +167,22 @@ pub(crate) fn cause(event: &ExplainedEvent) -> String {
             PrecedingNetwork::nothing_words,
         )
     })
+}
+
+/// Incidents, then hazards, each in order of time.
+pub(crate) fn gravest_first(events: &[ExplainedEvent]) -> Vec<&ExplainedEvent> {
+    let grave = events.iter().filter(|one| one.severity > Severity::Notice);
+    let mut grave: Vec<&ExplainedEvent> = grave.collect();
+    grave.sort_by_key(|one| Reverse(one.severity));
+    grave
+}
+
+/// The gravest event that the network explains, and what the network did before it.
+pub(crate) fn first_harm(summary: &RunSummary) -> Option<String> {
+    let evidence = Evidence::of(summary);
+    let gravest = gravest_first(&summary.score_events.events).into_iter();
+    let event = gravest.into_iter().find(|event| evidence.explains(event))?;
+    Some(format!("{}; before it: {}", event.what, cause(event)))
 }
 
 /// What happened on the network, the longest events.

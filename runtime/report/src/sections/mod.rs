@@ -34,7 +34,7 @@ pub(crate) fn of_run(summary: &RunSummary, assessment: &Assessment) -> Vec<Secti
         let mut over_time = Section::new(
             "over-time",
             "Network and robot over time",
-            "each row to its own largest value, · unknown",
+            "largest value a column, own scale a row, · unknown",
         );
         let strips = strips(&report.timeline, &summary.link_changes);
         over_time.blocks.extend(strips.map(Block::Strips));

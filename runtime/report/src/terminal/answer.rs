@@ -1,9 +1,8 @@
 //! The answer of a run as the last lines of a report, where a reader looks first. It draws no conclusions.
 
-use super::brief::gravest_first;
-use crate::answer::{Answer, Evidence, Hurt, metric_words};
+use crate::answer::{Answer, Hurt, metric_words};
 use crate::assessment::Assessment;
-use crate::sections::events::cause;
+use crate::sections::events::first_harm;
 use crate::summary::RunSummary;
 use hil_platform::text::{columns, shortened};
 use hil_present::Tone;
@@ -28,15 +27,11 @@ pub(super) fn answer(canvas: &mut Canvas, summary: &RunSummary, assessment: &Ass
         canvas.painted_line(Tone::Strong, &question);
         canvas.paragraph(0, answer.tone(), &words);
     }
-    let evidence = Evidence::of(summary);
-    let gravest = gravest_first(&summary.score_events.events);
-    let explained = gravest.into_iter().find(|event| evidence.explains(event));
     if answer.hurt == Hurt::Yes
-        && let Some(event) = explained
+        && let Some(words) = first_harm(summary)
     {
-        let words = format!("{}; before it: {}", event.what, cause(event));
         let words = shortened(&words, 3 * (canvas.width() - LABEL_WIDTH) - 30);
-        canvas.field_of(LABEL_WIDTH, "by, first of all", Tone::Plain, &words);
+        canvas.field_of(LABEL_WIDTH, "first harm", Tone::Plain, &words);
     }
     for harm in &summary.harms {
         canvas.field_of(LABEL_WIDTH, &harm.what, Tone::Plain, &harm.words());

@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 
 use hil_account::network::NetworkMetrics;
 use hil_account::{ChannelAccount, MessageFate};
-use hil_core::case_study::Severity;
 use hil_platform::text::{grouped, shortened};
 use hil_platform::words::counted;
 
@@ -19,7 +18,7 @@ use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested}
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
-use crate::sections::events::{cause, severity_counts, severity_tone};
+use crate::sections::events::{cause, gravest_first, severity_counts, severity_tone};
 use crate::sections::{outcome_words, strips};
 use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
@@ -116,14 +115,6 @@ fn causes(summary: &RunSummary, width: usize) -> Section {
         .blocks
         .push(Block::Events(EventList { events, note }));
     section
-}
-
-/// Incidents, then hazards, each in order of time.
-pub(super) fn gravest_first(events: &[ExplainedEvent]) -> Vec<&ExplainedEvent> {
-    let grave = events.iter().filter(|one| one.severity > Severity::Notice);
-    let mut grave: Vec<&ExplainedEvent> = grave.collect();
-    grave.sort_by_key(|one| core::cmp::Reverse(one.severity));
-    grave
 }
 
 /// What a channel's line shows.
@@ -313,7 +304,7 @@ fn over_time(summary: &RunSummary) -> Section {
     let mut section = Section::new(
         "over-time",
         "Network and robot over time",
-        "each row to its own largest value, · unknown",
+        "largest value a column, own scale a row, · unknown",
     );
     let Some(report) = &summary.network else {
         return section;
@@ -407,8 +398,8 @@ fn next(canvas: &mut Canvas, summary: &RunSummary, answer: &Answer) {
             commands.push((
                 "a sample large enough",
                 format!(
-                    "{} --set run.duration='\"{length_s} s\"'",
-                    run.repeat_command
+                    "{} --set 'run.duration=\"{length_s} s\"'",
+                    without_duration(&run.repeat_command)
                 ),
             ));
         }
@@ -452,4 +443,14 @@ fn next(canvas: &mut Canvas, summary: &RunSummary, answer: &Answer) {
         let room = 3 * (canvas.width() - NEXT_WIDTH) - 30;
         canvas.field_of(NEXT_WIDTH, what, Tone::Plain, &shortened(&command, room));
     }
+}
+
+/// A command without the length that it was given.
+fn without_duration(command: &str) -> String {
+    const BEGIN: &str = " --set 'run.duration=";
+    let Some((before, rest)) = command.split_once(BEGIN) else {
+        return command.to_owned();
+    };
+    let rest = rest.split_once('\'').map_or("", |(_, rest)| rest);
+    before.to_owned() + rest
 }
