@@ -72,9 +72,21 @@ pub fn figure(value: f64) -> String {
     } else if (1e-3..1e6).contains(&magnitude) {
         let digits = 3.0 - magnitude.log10().floor().clamp(-3.0, 3.0);
         format!("{value:.*}", digit_count(digits))
+    } else if (1e6..1e15).contains(&magnitude) {
+        let sign = if value < 0.0 { "-" } else { "" };
+        format!("{sign}{}", grouped(whole(magnitude)))
     } else {
         format!("{value:.3e}")
     }
+}
+
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "the caller asks for 1e6 to 1e15"
+)]
+const fn whole(value: f64) -> u64 {
+    value.round() as u64
 }
 
 #[allow(
@@ -163,5 +175,6 @@ mod tests {
         assert_eq!(figure(0.001_234_56), "0.001235");
         assert_eq!(figure(1.234_56e-6), "1.235e-6");
         assert_eq!(figure(-0.5), "-0.5000");
+        assert_eq!(figure(7_315_012.4), "7,315,012");
     }
 }
