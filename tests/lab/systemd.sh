@@ -176,7 +176,7 @@ has_report() {
 # What the topology asks for, of the processes of both hosts.
 rights_are_granted() {
     local section
-    section=$(pc "$1" cat "$(newest split "$1")/report-full.txt" | awk '/^[^ ]/ { on = /^Real time/ } on')
+    section=$(pc "$1" cat "$(newest split "$1")/report-full.txt" | awk '/^(  )?[A-Z]/ { on = /^  Real time/ } on')
     ! grep '^ *refused' <<<"$section" || return 1
     grep -o 'SCHED_FIFO [45]0 granted\|locked memory granted' <<<"$section"
     [[ $(grep -c 'SCHED_FIFO [45]0 granted\|locked memory granted' <<<"$section") -eq 3 ]]
