@@ -460,7 +460,7 @@ impl ChannelFold {
             },
         };
         message.key = key;
-        // Of a message that was taken nobody asks.
+        // A message that was taken needs no reading.
         let readings = match message.taken {
             Some(_) => Readings::default(),
             None => Readings {

@@ -1,4 +1,4 @@
-//! What is known of one message: its records, its copies, and what became of it.
+//! What is known of one message: its records, its copies and its fate.
 
 use super::ChannelPath;
 use super::network::{Crossing, Passage};
@@ -36,7 +36,7 @@ pub struct MessageHistory {
     pub handed_to_tx_ns: Option<i64>,
     /// All its arrivals.
     pub copies: Copies,
-    /// What became of it.
+    /// Its fate.
     pub fate: MessageFate,
     /// The interruption that cost it, by its place in the context.
     pub interruption_index: Option<usize>,

@@ -43,7 +43,7 @@ const BOOTSTRAP: &str = "95 % by block bootstrap, as successive delays are corre
 const NO_ACCOUNT: &str = "no records of this channel";
 const NO_NETWORK: &str = "no figures of a network under this channel";
 
-/// Lengths of runs of losses that are told.
+/// Lengths of runs of losses that are listed.
 const RUNS_SHOWN_COUNT: usize = 8;
 
 impl<'a> Sources<'a> {

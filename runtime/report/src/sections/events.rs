@@ -17,7 +17,7 @@ use crate::summary::RunSummary;
 
 /// Events of the robot that are listed; all of them are in the summary.
 const EVENTS_MAX: usize = 200;
-/// Messages and events of the network that are told beside each.
+/// Messages and events of the network that are listed beside each.
 const MESSAGES_SHOWN_COUNT: usize = 6;
 const NETWORK_SHOWN_COUNT: usize = 3;
 /// Events of the network that are listed: under independent losses there are hundreds alike.
@@ -143,7 +143,7 @@ fn before(event: &ExplainedEvent, network: &PrecedingNetwork) -> Vec<String> {
     words
 }
 
-/// Which message, when it was published, and what became of it.
+/// Which message, when it was published, and its fate.
 fn message(message: &ExplainedMessage) -> String {
     let at = message.published_at_s.map(seconds);
     let at = at.map_or_else(String::new, |at| format!(" at {at}"));

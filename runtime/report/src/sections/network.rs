@@ -12,7 +12,7 @@ use hil_present::{Cell, Section, Table, Tone};
 use crate::network::{Correlation, CorrelationTests, NetworkReport, TestedPair};
 use crate::score_event::ScoreEvents;
 
-/// Pairs of series that are told one by one.
+/// Pairs of series that are listed one by one.
 const PAIRS_SHOWN_COUNT: usize = 6;
 
 /// A line a channel.

@@ -15,7 +15,7 @@ use hil_platform::words::counted;
 use hil_rundir::event::EventKind;
 use hil_rundir::protection::HopProtection;
 
-/// Shorter preparations concern nobody.
+/// Shorter preparations are not shown.
 const PREPARATION_S_MIN: f64 = 0.01;
 /// Changes of links that are listed; all of them are in the summary and in events.log.
 const CHANGES_SHOWN_COUNT: usize = 10;

@@ -36,7 +36,7 @@ impl Carrier for DatagramLink {
     }
 }
 
-/// What became of the messages of one link.
+/// The messages of one link: passages, copies, outages.
 #[derive(Debug, Default)]
 pub(super) struct LinkAccount {
     /// Every message in order.
@@ -109,7 +109,7 @@ pub(super) struct Progress<'w> {
     pub(super) watch: &'w mut dyn FnMut(f64),
 }
 
-/// How often a run's progress is told.
+/// How often a run's progress is shown.
 const LOOK_COUNT: u32 = 1000;
 
 impl Observe<CaseModel> for Progress<'_> {

@@ -109,7 +109,7 @@ impl ChannelTail {
     /// Settles what was published `settling_ns` ago: by then all who met it have written it down. How far the
     /// producer's clock has come is known from its newest stamp and from the time since that was read.
     pub(crate) fn settle(&mut self, now_ns: i64, settling_ns: i64) {
-        // Without a publication on record nothing is due; only what is too much to hold is told.
+        // Without a publication on record nothing is due; only messages beyond the limit settle.
         let until_ns = self.newest.as_mut().map_or(i64::MIN, |newest| {
             let read_ns = *newest.read_ns.get_or_insert(now_ns);
             let passed_ns = now_ns.saturating_sub(read_ns);
