@@ -435,7 +435,7 @@ fn connections_that_never_become_a_greeting_keep_no_run_from_its_start_or_end() 
     println!("{security}");
     for words in [
         "connections came to nothing",
-        "foreign address",
+        "from 10.77.0.66 of an address that is not awaited",
         "another key",
     ] {
         assert!(security.contains(words), "{words}: {security}");
