@@ -479,12 +479,11 @@ fn complaint(result: &RunResult) -> String {
 /// For a run that did not come about.
 fn exit_code_of_error(error: &RunError) -> u8 {
     match error {
-        RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. })
-        | RunError::SecretMissing(_) => exit::PEER_ABSENT,
+        RunError::Peer(PeerError::Absent { .. }) | RunError::SecretMissing(_) => exit::PEER_ABSENT,
         RunError::Folder { source, .. } if source.kind() == ErrorKind::PermissionDenied => {
             exit::FORBIDDEN
         }
-        RunError::Peer(PeerError::Key { .. }) | RunError::Key(_) => exit::FORBIDDEN,
+        RunError::Key(_) => exit::FORBIDDEN,
         RunError::Peer(PeerError::Listen { source, .. } | PeerError::Own { source, .. })
             if is_passing(source) =>
         {

@@ -47,6 +47,25 @@ fn assert_says(finished: &Finished, words: &[&str]) {
     }
 }
 
+/// A file's name and its contents with what would set the terminal's title, clear it and turn a line around.
+#[test]
+fn what_others_wrote_never_steers_the_terminal() {
+    let folder = RunFolder::new("escapes");
+    fs::create_dir_all(folder.path()).unwrap();
+    let name = "a\u{1b}]0;title\u{7}.toml";
+    let absent = run_in(folder.path(), &["--topology", name]);
+    let text = "[run]\nname = \"x\u{202e}\"\n# \u{9b}2J\nno = 1\n";
+    fs::write(folder.join("b.toml"), text).unwrap();
+    let faulty = run_in(folder.path(), &["--topology", "b.toml", "--check"]);
+    for finished in [&absent, &faulty] {
+        assert!(!finished.status.success(), "{finished:?}");
+        let shown = format!("{}{}", finished.stdout, finished.stderr);
+        let steers = |c: char| (c.is_control() && c != '\n') || c == '\u{202e}';
+        assert!(!shown.contains(steers), "{shown:?}");
+    }
+    assert_says(&absent, &["\\x1b]0;title\\x07"]);
+}
+
 #[test]
 fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
     let folder = workspace_folder().join("deploy/topologies");

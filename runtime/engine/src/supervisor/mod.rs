@@ -20,6 +20,7 @@ mod progress_line;
 mod rendezvous;
 mod session;
 mod status_publisher;
+mod strangers;
 
 pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;
