@@ -6,6 +6,7 @@ mod command_line;
 mod compare;
 mod doctor;
 mod help;
+mod inherited;
 mod play;
 mod progress;
 mod replay;
