@@ -120,7 +120,7 @@ fn no_program_that_a_run_starts_gets_its_shared_memory_or_what_its_parent_had_op
     let seen = fs::read_to_string(&seen).unwrap();
     // Before the run, at its end, and the user's own program.
     assert_eq!(seen.matches("total 0").count(), 3, "{seen}");
-    for word in ["/dev/shm", "left-open", "live.json"] {
+    for word in ["/dev/shm", "left-open", ".service", "node_monitor"] {
         let count = seen.matches(word).count();
         println!("{word}: {count} descriptors in the hands of others");
         assert_eq!(count, 0, "{seen}");

@@ -7,6 +7,7 @@ mod compare;
 mod doctor;
 mod help;
 mod inherited;
+mod other_users;
 mod play;
 mod progress;
 mod replay;
