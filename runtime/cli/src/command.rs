@@ -26,6 +26,7 @@ use hil_engine::supervisor::{self, HostTooSmall, PeerError, RunError, RunOptions
 use hil_nic::nic_clock::guard;
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::open_files;
+use hil_platform::own_process;
 use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_report::analysis::{self, AnalysisError, Concluded};
@@ -56,6 +57,10 @@ mod exit {
 
 /// Does what the command line says.
 pub(crate) fn run(registry: &Registry) -> ExitCode {
+    if let Err(error) = own_process::begin() {
+        Console::new(false).error(&format!("cannot begin: {error}"));
+        return ExitCode::from(exit::INTERNAL);
+    }
     let cli: Cli = match documents::command_line() {
         Ok(cli) => cli,
         Err(help) => {

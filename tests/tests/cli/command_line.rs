@@ -244,7 +244,16 @@ fn an_interrupted_run_leaves_a_complete_report_and_nothing_else() {
 }
 
 #[test]
-fn a_second_ctrl_c_ends_the_program_at_once_and_its_processes_with_it() {
+fn a_second_signal_ends_the_program_at_once_and_its_processes_with_it() {
+    for signals in [
+        [Signal::SIGINT, Signal::SIGINT],
+        [Signal::SIGTERM, Signal::SIGINT],
+    ] {
+        end_at_once(signals);
+    }
+}
+
+fn end_at_once([first, second]: [Signal; 2]) {
     let record = RunFolder::new("twice");
     let mark = record.path().display().to_string();
     // A program that will not stop when asked, so that the first Ctrl-C takes its time.
@@ -263,13 +272,13 @@ fn a_second_ctrl_c_ends_the_program_at_once_and_its_processes_with_it() {
     wait_until(LIMIT, "the begin of the run", || {
         files.record_bytes("shuttle.command.published.") > 1024
     });
-    child.signal(Signal::SIGINT).unwrap();
+    child.signal(first).unwrap();
     // The controller ends when asked; then the supervisor waits for the own program alone.
     wait_until(LIMIT, "the end of the controller", || {
         files.process("controller", 0).is_none()
     });
     assert!(child.is_running());
-    child.signal(Signal::SIGINT).unwrap();
+    child.signal(second).unwrap();
     let finished = child.wait_within(LIMIT).unwrap();
     assert_code(&finished, 131);
     assert!(!files.has_report(), "the report would have taken time");

@@ -64,8 +64,8 @@ pub fn become_program(
     if parent_id() != supervisor {
         return Err(OwnProgramError::Orphaned(name));
     }
-    let restored = open_files::close_inherited()
-        .and_then(|()| open_files.map_or(Ok(()), open_files::set_limit));
+    let restored =
+        open_files::withhold().and_then(|()| open_files.map_or(Ok(()), open_files::set_limit));
     restored.map_err(|source| OwnProgramError::Descriptors {
         program: name.clone(),
         source,

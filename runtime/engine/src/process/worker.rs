@@ -104,9 +104,9 @@ pub enum WorkerError {
     /// No thread.
     #[error("cannot start a thread: {0}")]
     Thread(io::Error),
-    /// What the supervisor left open.
-    #[error("cannot close what the supervisor has open: {0}")]
-    Inherited(io::Error),
+    /// What it has open cannot be kept from processes that the role may start.
+    #[error("cannot list its open files: {0}")]
+    OpenFiles(io::Error),
     /// The run's secret, without which its hops are not opened.
     #[error("the supervisor did not give the run's secret")]
     SecretMissing,
@@ -221,10 +221,7 @@ impl Drop for EndTeller {
 /// # Errors
 /// When something cannot be opened or breaks; the supervisor is told as well.
 pub fn run(launch: &Path, registry: &Registry) -> Result<(), WorkerError> {
-    // What the supervisor has open is not this process's.
-    let outcome = open_files::close_inherited()
-        .map_err(WorkerError::Inherited)
-        .and_then(|()| open_and_run(launch, registry));
+    let outcome = open_and_run(launch, registry);
     if let Err(error) = &outcome {
         if let WorkerError::Record(RecordFileError::Io { path, source }) = error {
             say(&FromProcess::Unwritable(FileFault::new(path, source)));
@@ -330,6 +327,11 @@ fn run_jobs(
             if connected_count == job_count {
                 if !is_ready && gateway.as_mut().is_none_or(|one| one.is_ready(now)) {
                     is_ready = true;
+                    // A role may start programs, which must not get the shared memory of the run.
+                    if let Err(error) = open_files::withhold() {
+                        outcome = Err(WorkerError::OpenFiles(error));
+                        break;
+                    }
                     say(&FromProcess::Ready);
                 }
                 if let Some(gateway) = &mut gateway {

@@ -10,10 +10,10 @@ use hil_arm::egm::messages::Side as ArmSide;
 use hil_arm::egm::parameters::{ControllerSettings, EgmParameters};
 use hil_core::message::{FNV_OFFSET, fnv1a};
 use hil_link::condition::flow_name;
-use nix::unistd::{AccessFlags, access};
 
 use super::clock_path;
 use hil_platform::domain_address::domain_base_candidates;
+use hil_platform::own_folder::OwnFolder;
 use hil_platform::realtime::{RealtimeRequest, SchedulingPolicy};
 use hil_platform::wait::WaitMode;
 use hil_rundir::announcement;
@@ -402,14 +402,12 @@ pub(crate) fn domain_base(base: Option<&PathBuf>) -> PathBuf {
     base.cloned().unwrap_or_else(default_domain_base)
 }
 
-/// The first candidate that this user may use; the last one is the user's own.
+/// The first candidate that is this user's alone, or can be made so; the last one is tried by who uses it.
 fn default_domain_base() -> PathBuf {
-    let is_usable = |folder: &PathBuf| {
-        std::fs::create_dir_all(folder).is_ok() && access(folder, AccessFlags::W_OK).is_ok()
-    };
     let mut candidates = domain_base_candidates();
     let last = candidates.pop().unwrap_or_default();
-    candidates.into_iter().find(is_usable).unwrap_or(last)
+    let is_own = |folder: &PathBuf| OwnFolder::create(folder).is_ok();
+    candidates.into_iter().find(is_own).unwrap_or(last)
 }
 
 #[cfg(test)]
