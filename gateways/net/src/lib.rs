@@ -63,10 +63,28 @@ pub struct TransmitStamp {
 
 /// Numbers of `https://www.tcpdump.org/linktypes.html` that a capture may have.
 pub mod link_type {
+    /// BSD loopback: the address family in the capturing host's byte order.
+    pub const NULL: u16 = 0;
     /// Ethernet.
     pub const ETHERNET: u16 = 1;
+    /// PPP, with or without address and control bytes.
+    pub const PPP: u16 = 9;
+    /// [`RAW`] as some systems number it.
+    pub const RAW_12: u16 = 12;
+    /// [`RAW`] as OpenBSD numbers it.
+    pub const RAW_14: u16 = 14;
+    /// PPP in HDLC-like framing.
+    pub const PPP_SERIAL: u16 = 50;
+    /// A `PPPoE` session without the Ethernet header.
+    pub const PPP_ETHER: u16 = 51;
     /// IPv4 or IPv6 without anything before it.
     pub const RAW: u16 = 101;
+    /// 802.11 without radio information.
+    pub const IEEE802_11: u16 = 105;
+    /// OpenBSD loopback: the address family in network byte order.
+    pub const LOOP: u16 = 108;
+    /// 802.11 behind a radiotap header.
+    pub const RADIOTAP: u16 = 127;
     /// Linux cooked capture, version 1.
     pub const LINUX_SLL: u16 = 113;
     /// IPv4.

@@ -5,10 +5,13 @@ use core::fmt::Write as _;
 use std::path::Path;
 
 use hil_capture::flow::FlowFilter;
-use hil_capture::join::{JoinMetrics, Joined, OrderSource};
+use hil_capture::join::{
+    CountedDoubt, Doubt, JoinMetrics, JoinSettings, Joined, Loss, OrderSource,
+};
 use hil_capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_capture::pairing::join_all;
 use hil_capture::point::{PointMetrics, single_point_metrics};
+use hil_capture::watch::Unread;
 use hil_stats::histogram::Distribution;
 use hil_stats::statistics::IntervalNs;
 use serde::Serialize;
@@ -63,6 +66,19 @@ impl Reading {
         if let Some(port) = point.esl_port {
             let _infallible = write!(text, ":port{port}");
         }
+        for (word, number) in [
+            ("if", point.interface_number),
+            ("vlan", point.vlan.map(u32::from)),
+        ] {
+            if let Some(number) = number {
+                let _infallible = write!(text, ":{word}{number}");
+            }
+        }
+        match point.radio_leg {
+            Some((true, false)) => text.push_str(":to-ap"),
+            Some((false, true)) => text.push_str(":from-ap"),
+            _ => {}
+        }
         if point.direction != hil_net::Direction::Unknown {
             let _infallible = write!(text, " ({})", point.direction.label());
         }
@@ -73,7 +89,7 @@ impl Reading {
     fn nic_streams(&self) -> impl Iterator<Item = (&Point, &Stream, &Vec<Observation>, u64)> {
         let seen = self.of_cards.seen().iter();
         let streams = seen.flat_map(|(point, seen)| {
-            let streams = seen.streams.iter();
+            let streams = seen.iter();
             streams.map(move |(stream, list)| (point, stream, list))
         });
         streams.map(|(point, stream, list)| {
@@ -88,15 +104,15 @@ impl Reading {
             let of_kernel = self.observer.seen().iter();
             let all: usize = of_kernel
                 .filter(|(one, _)| is_same_place(one))
-                .filter_map(|(_, seen)| seen.streams.get(stream).map(Vec::len))
+                .filter_map(|(_, seen)| seen.get(stream).map(Vec::len))
                 .sum();
             (point, stream, list, all as u64)
         })
     }
 
     /// Every stream at two points, joined.
-    pub(super) fn joined(&self, window_ns: i64) -> Vec<(Stream, Joined)> {
-        join_all(&self.observer, window_ns)
+    pub(super) fn joined(&self, settings: &JoinSettings) -> Vec<(Stream, Joined)> {
+        join_all(&self.observer, settings)
     }
 
     /// True when a file has a fault or says that packets were dropped.
@@ -182,7 +198,7 @@ pub(super) struct Report {
 
 impl Report {
     /// Draws up the figures.
-    pub(super) fn of(reading: &Reading, window_ns: i64, is_one_clock: bool) -> Self {
+    pub(super) fn of(reading: &Reading, settings: &JoinSettings) -> Self {
         let stream_report = |stream: &Stream| StreamReport {
             flow: reading.observer.flows()[stream.flow_index].to_string(),
             source: stream.source.to_string(),
@@ -192,7 +208,7 @@ impl Report {
         };
         let mut points = Vec::new();
         for (point, seen) in reading.observer.seen() {
-            for (stream, observations) in &seen.streams {
+            for (stream, observations) in seen {
                 points.extend(
                     single_point_metrics(observations).map(|figures| PointReport {
                         point: reading.name(point),
@@ -216,11 +232,12 @@ impl Report {
                 },
             }));
         }
-        let joins = reading.joined(window_ns).into_iter();
-        let clocks =
-            |one: &Joined| PointClocks::of(&one.first_point, &one.second_point, is_one_clock);
+        let joins = reading.joined(settings).into_iter();
+        let clocks = |one: &Joined| {
+            PointClocks::of(&one.first_point, &one.second_point, settings.is_one_clock)
+        };
         Self {
-            schema_version: 1,
+            schema_version: 2,
             files: reading.files.iter().map(file_report).collect(),
             packets: *reading.observer.counts(),
             points,
@@ -235,6 +252,42 @@ impl Report {
                 })
                 .collect(),
         }
+    }
+
+    /// True when loss is unavailable between two points, or a clock was set.
+    pub(super) fn has_doubts(&self) -> bool {
+        let is_doubtful = |one: &JoinReport| {
+            one.figures.loss.count().is_none()
+                || one
+                    .figures
+                    .clock_steps
+                    .iter()
+                    .any(|steps| !steps.is_empty())
+        };
+        self.joins.iter().any(is_doubtful)
+    }
+
+    /// What makes figures unavailable, in words.
+    pub(super) fn complaints(&self) -> Vec<String> {
+        let mut complaints = Vec::new();
+        for one in &self.joins {
+            if let Loss::Unavailable { doubts, .. } = &one.figures.loss {
+                let why = doubts_text(doubts);
+                complaints.push(format!("loss from {} to {}: {why}", one.first, one.second));
+            }
+            for (point, steps) in [&one.first, &one.second]
+                .into_iter()
+                .zip(&one.figures.clock_steps)
+            {
+                complaints.extend(steps.iter().map(|step| {
+                    format!(
+                        "{point}: its clock was set by {}: delays are unavailable",
+                        time(step.by_ns)
+                    )
+                }));
+            }
+        }
+        complaints
     }
 
     /// True when no packet was read at all.
@@ -269,6 +322,7 @@ impl Report {
             ),
             (counts.later_fragment_count, "later fragments, left out"),
             (counts.stampless_count, "without a time stamp, left out"),
+            (counts.radio_retry_count, "sent again by a radio, left out"),
             (
                 counts.backward_stamp_count,
                 "earlier than the one before, put in order",
@@ -308,6 +362,7 @@ impl Report {
 
 fn file_report(file: &CaptureFile) -> FileReport {
     let names = file.interfaces.iter().enumerate();
+    let names = names.filter(|(_, one)| one.repeats.is_none());
     FileReport {
         path: file.path.display().to_string(),
         format: file.format,
@@ -328,7 +383,7 @@ fn file_report(file: &CaptureFile) -> FileReport {
 fn file_line(file: &FileReport) -> String {
     let format = file.format.unwrap_or("unknown format");
     let dropped = match file.dropped_count {
-        Some(count) => format!("{count} dropped by the kernel"),
+        Some(count) => format!("{count} dropped"),
         None => "drops unknown".to_owned(),
     };
     let faults = match file.fault_count {
@@ -379,24 +434,47 @@ fn point_lines(lines: &mut Vec<String>, figures: &PointMetrics) {
 fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
     let order = match figures.order {
         OrderSource::PacketDirection => "by the packets' direction",
+        OrderSource::HopLimit => "by the time to live",
         OrderSource::Stamps => "by most stamps",
+        OrderSource::RoundTrip => "by the round trip",
+        OrderSource::Missing => "by what is missing",
+        OrderSource::Unknown => "order unknown",
     };
     lines.push(format!(
         "  seen        {} then {} ({order}), {} at both, {} at an edge",
         figures.first_count, figures.second_count, figures.matched_count, figures.edge_count
     ));
+    let lost = match &figures.loss {
+        Loss::Counted(loss) => format!("{}{}", loss.count, percent(loss.ratio, loss.interval)),
+        Loss::Unavailable { range, doubts } => {
+            let range = range.map(|(least, most)| format!(" ({least} to {most})"));
+            let range = range.unwrap_or_default();
+            format!("unavailable{range}: {}", doubts_text(doubts))
+        }
+    };
     lines.push(format!(
-        "  lost        {}{}, {} duplicated, {} unexplained",
-        figures.lost_count,
-        percent(figures.loss_ratio, figures.loss_interval),
-        figures.duplicated_count,
-        figures.unexplained_count
+        "  lost        {lost}, {} duplicated, {} unexplained",
+        figures.duplicated_count, figures.unexplained_count
     ));
-    if !figures.loss_bursts.is_empty() {
-        let bursts = figures.loss_bursts.iter();
+    if let Loss::Counted(loss) = &figures.loss
+        && !loss.bursts.is_empty()
+    {
+        let bursts = loss.bursts.iter();
         let bursts = bursts.map(|(length, count)| format!("{count}x{length}"));
         let words: Vec<String> = bursts.collect();
         lines.push(format!("  loss bursts {}", words.join(" ")));
+    }
+    for (which, steps) in ["first", "second"].into_iter().zip(&figures.clock_steps) {
+        for step in steps {
+            let by = time(step.by_ns);
+            lines.push(format!("  clock step  {by} at the {which} point"));
+        }
+    }
+    if let Some(shift) = figures.delay_shift {
+        let by = time(shift.by_ns);
+        lines.push(format!(
+            "  level       {by} more from one datagram on: a clock set, or another way"
+        ));
     }
     lines.push(format!("  delay       {}", quantiles(&figures.delay)));
     for (name, interval) in [
@@ -414,10 +492,11 @@ fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
         "  variation   {} (RFC 5481)",
         quantiles(&figures.variation)
     ));
-    if let (Some(last), Some(mean)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
-        let (last, mean) = (last * 1e-3, mean * 1e-3);
+    if let (Some(last_ns), Some(mean_ns)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
         lines.push(format!(
-            "  jitter      {last:.2} us at the end, {mean:.2} us mean (RFC 3550)"
+            "  jitter      {:.2} us at the end, {:.2} us mean (RFC 3550)",
+            last_ns * 1e-3,
+            mean_ns * 1e-3
         ));
     }
     let interval = percent(None, figures.reordered_interval);
@@ -425,6 +504,29 @@ fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
         "  reordered   {}{interval}, extent at most {} (RFC 4737)",
         figures.reordered_count, figures.reordering_extent_max
     ));
+}
+
+/// Why loss is unavailable.
+fn doubts_text(doubts: &[CountedDoubt]) -> String {
+    let words = doubts
+        .iter()
+        .map(|CountedDoubt { doubt, count }| match doubt {
+            Doubt::Unread(Unread::LinkType { link_type }) => {
+                format!("{count} of link type {link_type}, which is not read")
+            }
+            Doubt::Unread(Unread::CutShort) => format!("{count} captured too short"),
+            Doubt::Unread(Unread::Malformed) => format!("{count} malformed"),
+            Doubt::Unread(Unread::Encrypted) => format!("{count} encrypted"),
+            Doubt::Unread(Unread::Aggregate) => {
+                format!("{count} hold several datagrams (segmentation or receive offload)")
+            }
+            Doubt::Unread(Unread::NoStamp) => format!("{count} without a time stamp"),
+            Doubt::Dropped => format!("{count} dropped by the capture"),
+            Doubt::Order => {
+                format!("{count} at one point only, and which comes first is unknown (--one-clock)")
+            }
+        });
+    words.collect::<Vec<String>>().join(", ")
 }
 
 fn percent(ratio: Option<f64>, interval: Option<(f64, f64)>) -> String {

@@ -9,7 +9,7 @@ use std::{fs, io};
 
 use hil_account::{AccountContext, ChannelPath, ChannelRecords, each_history};
 use hil_capture::flow::OwnHeader;
-use hil_capture::join::Joined;
+use hil_capture::join::{JoinSettings, Joined};
 use hil_capture::observe::{Observation, Stream};
 use hil_core::record::{EgressRecord, IngressRecord, stamp};
 use hil_net::Direction;
@@ -180,7 +180,7 @@ type Message = (u32, u64);
 pub(super) fn compare(
     run: &Path,
     captures: &Reading,
-    window_ns: i64,
+    settings: &JoinSettings,
     stage: &Stage,
 ) -> Result<Comparison, CompareError> {
     let folder = RunFolder::existing(run);
@@ -194,7 +194,7 @@ pub(super) fn compare(
         return Err(CompareError::NothingOfRun { capture, run });
     }
     let summary = summary(&folder)?;
-    let joined = captures.joined(window_ns);
+    let joined = captures.joined(settings);
     let numbers = channel_numbers(&sides, captures);
     let is_read = |name: &str| {
         summary
@@ -241,7 +241,7 @@ fn file_without(sides: &BTreeMap<String, GatewaySide>, captures: &Reading) -> Op
     let has_some = |index: usize| {
         let points = captures.observer.seen().iter();
         let points = points.filter(|(point, _)| point.file_index == index);
-        let mut observations = points.flat_map(|(_, seen)| seen.streams.values().flatten());
+        let mut observations = points.flat_map(|(_, seen)| seen.values().flatten());
         observations.any(|one| own(one).is_some_and(is_of_run))
     };
     let mut files = captures.files.iter().enumerate();
@@ -339,7 +339,7 @@ fn channel_numbers(
     }
     let mut numbers = BTreeMap::new();
     let seen = captures.observer.seen().values();
-    for observation in seen.flat_map(|seen| seen.streams.values().flatten()) {
+    for observation in seen.flat_map(|seen| seen.values().flatten()) {
         let Some(own) = observation
             .identity
             .own
@@ -367,7 +367,7 @@ impl Probe<'_> {
     fn headers(&self, direction: Direction) -> impl Iterator<Item = OwnHeader> + '_ {
         let points = self.captures.observer.seen().iter();
         let points = points.filter(move |(point, _)| point.direction == direction);
-        let streams = points.flat_map(|(_, seen)| &seen.streams);
+        let streams = points.flat_map(|(_, seen)| seen);
         let ours = streams.filter(|(stream, _)| {
             self.number.is_some() && stream.own.map(|(channel, _)| channel) == self.number
         });
@@ -404,7 +404,7 @@ impl Probe<'_> {
             if self.number.is_none() || stream.own.map(|(channel, _)| channel) != self.number {
                 continue;
             }
-            for pair in &joined.pairs {
+            for pair in joined.pairs.iter().filter(|pair| pair.is_stamped()) {
                 let Some(own) = own(&pair.first).filter(|own| own.kind == Kind::Data) else {
                     continue;
                 };

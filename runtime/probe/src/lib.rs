@@ -17,6 +17,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use hil_capture::flow::FlowFilter;
+use hil_capture::join::JoinSettings;
 use hil_core::time::duration_ns;
 use hil_net::filter::FILTER_COUNT_MAX;
 use hil_net::packet_ring::{RingError, RingStamps};
@@ -70,7 +71,7 @@ pub fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
             }
             let words = "reading records of the run";
             let compared = Progress::begin().during(console, words, |stage| {
-                compare::compare(run, &captures, duration_ns(reading.window), stage)
+                compare::compare(run, &captures, &settings(reading, false), stage)
             });
             match compared {
                 Ok(comparison) => {
@@ -101,6 +102,13 @@ fn paths<'a>(file: &'a Path, second: Option<&'a Path>) -> Vec<&'a Path> {
 fn json(value: &impl serde::Serialize) -> String {
     let text = serde_json::to_string_pretty(value);
     format!("{}\n", text.expect("figures are numbers and words"))
+}
+
+fn settings(reading: &ReadingArgs, is_one_clock: bool) -> JoinSettings {
+    JoinSettings {
+        window_ns: duration_ns(reading.window),
+        is_one_clock,
+    }
 }
 
 /// The flows asked for, or our own.
@@ -145,9 +153,10 @@ fn analyse(
         return exit::USAGE;
     };
     let report = Progress::begin().during(console, "drawing up the figures", |_| {
-        Report::of(&captures, duration_ns(reading.window), is_one_clock)
+        Report::of(&captures, &settings(reading, is_one_clock))
     });
-    let complaints = captures.complaints();
+    let mut complaints = captures.complaints();
+    complaints.extend(report.complaints());
     for complaint in &complaints {
         console.warn(complaint);
     }
@@ -159,7 +168,7 @@ fn analyse(
     } else {
         report.to_text()
     });
-    if captures.has_gaps() {
+    if captures.has_gaps() || report.has_doubts() {
         exit::GAPS
     } else {
         exit::DONE
