@@ -29,6 +29,9 @@ const NAMED_COUNT: usize = 3;
 /// Confidence of intervals.
 const CONFIDENCE: f64 = 0.95;
 
+/// What an answer counts as harm, beside the counts that it lists.
+pub(crate) const COUNTED_AS_HARM: &str = "these, less those by limits of the robot";
+
 /// A way in which the robot can be hurt, and how often it was; see [`hil_core::case_study::Harm`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct HarmCount {
@@ -520,8 +523,8 @@ pub(crate) fn metric_words(metric: &ScoreMetric) -> String {
     let interval = metric.interval.map_or_else(String::new, |(low, high)| {
         format!(
             " [{}, {}]",
-            figure(scale.factor * low),
-            figure(scale.factor * high)
+            figure(scale.scaled(low)),
+            figure(scale.scaled(high))
         )
     });
     format!("{value}{interval}")
@@ -547,9 +550,19 @@ impl<'a> UnitScale<'a> {
         Self { factor, unit }
     }
 
+    /// The unit that people think in; empty for a number.
+    pub(crate) const fn unit(self) -> &'a str {
+        self.unit
+    }
+
+    /// The value in that unit.
+    pub(crate) fn scaled(self, value: f64) -> f64 {
+        self.factor * value
+    }
+
     /// The value with its unit.
     pub(crate) fn words(self, value: f64) -> String {
-        let value = figure(self.factor * value);
+        let value = figure(self.scaled(value));
         match self.unit {
             "" => value,
             unit => format!("{value} {unit}"),
