@@ -171,7 +171,7 @@ fn run_command(
         Command::Doctor(args) => doctor_work::doctor(&args, registry, console),
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
-        Command::Probe(args) => Ok(hil_probe::run(&args, console)),
+        Command::Probe(args) => Ok(hil_probe::run(&args, columns(), console)),
         Command::Documents { folder } => documents::write(Cli::command(), &folder)
             .and_then(|_paths| documents::write_keys(&folder))
             .and_then(|()| documents::write_robot(&folder))

@@ -156,10 +156,12 @@ struct Layout {
     widths: Vec<usize>,
     are_numbers: Vec<bool>,
     bar_width: usize,
+    /// Labels of columns that there was no room for.
+    left_out: Vec<String>,
 }
 
 impl Layout {
-    fn of(table: &Table, room: usize) -> Self {
+    fn of(table: &Table, room: Option<usize>) -> Self {
         let width_of = |index: usize| {
             let cells = table
                 .rows
@@ -180,6 +182,8 @@ impl Layout {
             shown.iter().map(|index| widths[*index]).sum::<usize>() + gaps
         };
         let wanted = if has_bar { GAP + BAR_MIN } else { 0 };
+        let room = room.unwrap_or_else(|| total(&shown, &widths) + wanted);
+        let mut left_out = Vec::new();
         while total(&shown, &widths) + wanted > room {
             let rank = |index: &usize| table.columns[*index].rank;
             match shown
@@ -188,7 +192,10 @@ impl Layout {
                 .filter(|index| rank(index) > 0)
                 .max_by_key(rank)
             {
-                Some(least) => shown.retain(|index| *index != least),
+                Some(least) => {
+                    left_out.insert(0, table.columns[least].label.clone());
+                    shown.retain(|index| *index != least);
+                }
                 None => break,
             }
         }
@@ -221,6 +228,7 @@ impl Layout {
             bar_width: if has_bar && left >= BAR_MIN { left } else { 0 },
             shown,
             widths,
+            left_out,
         }
     }
 
@@ -239,7 +247,7 @@ pub fn table(canvas: &mut Canvas, table: &Table) {
     if !table.title.is_empty() {
         canvas.paragraph(INDENT, Tone::Faint, &table.title);
     }
-    let layout = Layout::of(table, canvas.width() - INDENT);
+    let layout = Layout::of(table, canvas.table_room());
     let gap = " ".repeat(GAP);
     let head = layout
         .shown
@@ -251,6 +259,10 @@ pub fn table(canvas: &mut Canvas, table: &Table) {
     }
     for row in &table.rows {
         table_row(canvas, table, &layout, row);
+    }
+    if !layout.left_out.is_empty() {
+        let text = format!("no room for the columns: {}", layout.left_out.join(", "));
+        canvas.paragraph(INDENT, Tone::Faint, &text);
     }
     if !table.note.is_empty() {
         canvas.paragraph(INDENT, Tone::Faint, &table.note);
@@ -376,7 +388,7 @@ fn marks(strips: &Strips, room: usize) -> String {
 }
 
 /// `width` columns, each as high as the largest value of its time.
-fn strip(values: &[Option<f64>], width: usize) -> String {
+pub(crate) fn strip(values: &[Option<f64>], width: usize) -> String {
     let largest = values.iter().flatten().copied().fold(0.0, f64::max);
     let column = |index: usize| {
         let from = index * values.len() / width;
@@ -460,6 +472,7 @@ mod tests {
     fn a_table_without_room_drops_the_column_of_highest_rank_and_keeps_reasons_whole() {
         let mut one = Table::new("", &["channel", "p50", "p99"]);
         one.columns.push(Column {
+            key: String::new(),
             label: "what a page with room has besides".to_owned(),
             rank: 1,
         });
@@ -479,9 +492,10 @@ mod tests {
         });
         let narrow = text_of(80, |canvas| table(canvas, &one));
         assert!(
-            !narrow.contains("besides") && narrow.contains("1.50 µs"),
+            narrow.contains("columns: what a page") && narrow.contains("1.50 µs"),
             "{narrow}"
         );
+        assert!(!narrow.contains("1,234"), "{narrow}");
         let wide = text_of(120, |canvas| table(canvas, &one));
         assert!(wide.contains("besides") && wide.contains("1,234"), "{wide}");
         for (text, width) in [(&narrow, 80), (&wide, 120)] {

@@ -1,7 +1,6 @@
 //! One or two captures, drawn up: what each point saw of each flow, and what two points say of it
-//! together. Text and JSON come from the same figures.
+//! together. Sections and JSON come from the same figures.
 
-use core::fmt::Write as _;
 use std::path::Path;
 
 use hil_capture::flow::FlowFilter;
@@ -18,6 +17,10 @@ use serde::Serialize;
 
 use super::files::{CaptureFile, FileError, read};
 use super::point_clocks::PointClocks;
+use hil_platform::text::grouped;
+use hil_present::units::{duration, duration_s, percent, seconds};
+use hil_present::{Cell, Section, Table, Tone};
+use hil_report::quantile_table;
 
 /// Captures read, and every point in them.
 #[derive(Debug)]
@@ -295,19 +298,28 @@ impl Report {
         self.packets.packet_count == 0
     }
 
-    pub(super) fn to_text(&self) -> String {
-        let mut lines: Vec<String> = self.files.iter().map(file_line).collect();
+    pub(super) fn sections(&self) -> Vec<Section> {
+        let mut sections = vec![self.captures()];
+        sections.extend(self.points.iter().map(point_section));
+        sections.extend(self.joins.iter().map(join_section));
+        sections
+    }
+
+    /// What was read.
+    fn captures(&self) -> Section {
+        let mut section = Section::new("captures", "Captures", "");
+        for file in &self.files {
+            section.fact("file", Tone::Plain, file_words(file));
+        }
         let counts = &self.packets;
-        lines.push(format!(
-            "{} packets: {} followed, {} of other flows, {} not IP, {} not UDP, {} unreadable",
-            counts.packet_count,
-            counts.followed_count,
-            counts.other_flow_count,
-            counts.not_ip_count,
-            counts.not_udp_count,
-            counts.unreadable_count
-        ));
+        let mut table = Table::new("", &["packets", ""]);
         for (count, what) in [
+            (counts.packet_count, "read"),
+            (counts.followed_count, "followed"),
+            (counts.other_flow_count, "of other flows"),
+            (counts.not_ip_count, "not IP"),
+            (counts.not_udp_count, "not UDP"),
+            (counts.unreadable_count, "unreadable"),
             (
                 counts.foreign_count,
                 "with a flow's address but of another protocol",
@@ -333,30 +345,13 @@ impl Report {
                 "for which the ET2000 names no or several ports",
             ),
         ] {
-            if count > 0 {
-                lines.push(format!("  {count} {what}"));
+            if count > 0 || table.rows.len() < 2 {
+                table.push([Cell::Count(count), what.into()]);
             }
         }
-        for point in &self.points {
-            lines.push(String::new());
-            lines.push(format!(
-                "{}  at {}",
-                stream_line(&point.stream),
-                point.point
-            ));
-            if let Some(all) = point.kernel_stamped_count {
-                lines.push(format!("  {all} arrived, of which"));
-            }
-            point_lines(&mut lines, &point.figures);
-        }
-        for joined in &self.joins {
-            lines.push(String::new());
-            lines.push(stream_line(&joined.stream));
-            lines.push(format!("  from {} to {}", joined.first, joined.second));
-            lines.push(format!("  clock       {}", joined.clocks.words()));
-            join_lines(&mut lines, &joined.figures);
-        }
-        lines.join("\n") + "\n"
+        table.note = "kinds of which there are none are not listed".to_owned();
+        section.table(table);
+        section
     }
 }
 
@@ -380,58 +375,85 @@ fn file_report(file: &CaptureFile) -> FileReport {
     }
 }
 
-fn file_line(file: &FileReport) -> String {
+fn file_words(file: &FileReport) -> String {
     let format = file.format.unwrap_or("unknown format");
     let dropped = match file.dropped_count {
-        Some(count) => format!("{count} dropped"),
+        Some(count) => format!("{} dropped", grouped(count)),
         None => "drops unknown".to_owned(),
     };
     let faults = match file.fault_count {
         0 => String::new(),
-        count => format!(", {count} faults"),
+        count => format!(", {} faults", grouped(count)),
     };
     format!(
         "{}: {format}, {} packets on {}, {dropped}{faults}",
         file.path,
-        file.packet_count,
+        grouped(file.packet_count),
         file.interfaces.join(" and ")
     )
 }
 
-fn stream_line(stream: &StreamReport) -> String {
+/// A section under the name of a stream.
+fn stream_section(id: &str, stream: &StreamReport) -> Section {
     let own = match (stream.channel, stream.kind) {
         (Some(channel), Some(kind)) => format!(" channel {channel} {kind}"),
         _ => String::new(),
     };
-    format!(
-        "{}{own}  {} -> {}",
-        stream.flow, stream.source, stream.destination
-    )
+    let ends = format!("{} -> {}", stream.source, stream.destination);
+    Section::new(id, format!("{}{own}", stream.flow), ends)
 }
 
-fn point_lines(lines: &mut Vec<String>, figures: &PointMetrics) {
-    let seconds = figures.last_ns.saturating_sub(figures.first_ns) as f64 * 1e-9;
-    lines.push(format!(
-        "  {} datagrams, {} bytes in {seconds:.3} s",
-        figures.datagram_count, figures.payload_bytes
-    ));
-    lines.push(format!("  interval    {}", quantiles(&figures.interval)));
+fn point_section(point: &PointReport) -> Section {
+    let mut section = stream_section("point", &point.stream);
+    let mut fact = |label: &str, words: String| section.fact(label, Tone::Plain, words);
+    let figures = &point.figures;
+    fact("at", point.point.clone());
+    if let Some(all) = point.kernel_stamped_count {
+        fact("arrived", format!("{}, of which", grouped(all)));
+    }
+    let length_ns = figures.last_ns.saturating_sub(figures.first_ns);
+    fact(
+        "datagrams",
+        format!(
+            "{}, {} bytes in {}",
+            grouped(figures.datagram_count),
+            grouped(figures.payload_bytes),
+            seconds(length_ns as f64 * 1e-9)
+        ),
+    );
     if let Some(gap) = figures.longest_gap {
-        let after = gap.from_ns.saturating_sub(figures.first_ns) as f64 * 1e-9;
-        let length = time(gap.length_ns);
-        lines.push(format!("  longest gap {length} after {after:.3} s"));
+        let after_ns = gap.from_ns.saturating_sub(figures.first_ns);
+        let after = seconds(after_ns as f64 * 1e-9);
+        fact(
+            "longest gap",
+            format!("{} after {after}", duration(gap.length_ns)),
+        );
     }
     if let Some(numbers) = figures.numbers {
         let repeated = numbers.repeated_count;
-        let repeated = repeated.map_or("unknown (pieces)".to_owned(), |count| count.to_string());
-        lines.push(format!(
-            "  numbers     {} series, step {}, {} skipped, {repeated} repeated, {} reordered",
-            numbers.series_count, numbers.step, numbers.skipped_count, numbers.reordered_count
-        ));
+        let repeated = repeated.map_or_else(|| "unknown (pieces)".to_owned(), grouped);
+        fact(
+            "numbers",
+            format!(
+                "{} series, step {}, {} skipped, {repeated} repeated, {} reordered",
+                grouped(numbers.series_count),
+                numbers.step,
+                grouped(numbers.skipped_count),
+                grouped(numbers.reordered_count)
+            ),
+        );
     }
+    section.table(quantile_table(&[("interval", &figures.interval)]));
+    section
 }
 
-fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
+fn join_section(joined: &JoinReport) -> Section {
+    let mut section = stream_section("join", &joined.stream);
+    let mut fact = |label: &str, words: String| section.fact(label, Tone::Plain, words);
+    let figures = &joined.figures;
+    fact("from", joined.first.clone());
+    fact("to", joined.second.clone());
+    fact("clock", joined.clocks.words().to_owned());
     let order = match figures.order {
         OrderSource::PacketDirection => "by the packets' direction",
         OrderSource::HopLimit => "by the time to live",
@@ -440,70 +462,90 @@ fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
         OrderSource::Missing => "by what is missing",
         OrderSource::Unknown => "order unknown",
     };
-    lines.push(format!(
-        "  seen        {} then {} ({order}), {} at both, {} at an edge",
-        figures.first_count, figures.second_count, figures.matched_count, figures.edge_count
-    ));
+    fact("order", order.to_owned());
     let lost = match &figures.loss {
-        Loss::Counted(loss) => format!("{}{}", loss.count, percent(loss.ratio, loss.interval)),
+        Loss::Counted(loss) => {
+            let ratio = loss
+                .ratio
+                .map_or_else(String::new, |ratio| format!(" = {}", percent(ratio)));
+            format!(
+                "{}{ratio}{}",
+                grouped(loss.count),
+                wilson_words(loss.interval)
+            )
+        }
         Loss::Unavailable { range, doubts } => {
-            let range = range.map(|(least, most)| format!(" ({least} to {most})"));
-            let range = range.unwrap_or_default();
-            format!("unavailable{range}: {}", doubts_text(doubts))
+            let range =
+                range.map(|(least, most)| format!(" ({} to {})", grouped(least), grouped(most)));
+            format!(
+                "unavailable{}: {}",
+                range.unwrap_or_default(),
+                doubts_text(doubts)
+            )
         }
     };
-    lines.push(format!(
-        "  lost        {lost}, {} duplicated, {} unexplained",
-        figures.duplicated_count, figures.unexplained_count
-    ));
+    fact("lost", lost);
     if let Loss::Counted(loss) = &figures.loss
         && !loss.bursts.is_empty()
     {
         let bursts = loss.bursts.iter();
         let bursts = bursts.map(|(length, count)| format!("{count}x{length}"));
-        let words: Vec<String> = bursts.collect();
-        lines.push(format!("  loss bursts {}", words.join(" ")));
+        fact("loss bursts", bursts.collect::<Vec<_>>().join(" "));
     }
     for (which, steps) in ["first", "second"].into_iter().zip(&figures.clock_steps) {
         for step in steps {
-            let by = time(step.by_ns);
-            lines.push(format!("  clock step  {by} at the {which} point"));
+            fact(
+                "clock step",
+                format!("{} at the {which} point", duration(step.by_ns)),
+            );
         }
     }
     if let Some(shift) = figures.delay_shift {
-        let by = time(shift.by_ns);
-        lines.push(format!(
-            "  level       {by} more from one datagram on: a clock set, or another way"
-        ));
+        let by = duration(shift.by_ns);
+        fact(
+            "level",
+            format!("{by} more from one datagram on: a clock set, or another way"),
+        );
     }
-    lines.push(format!("  delay       {}", quantiles(&figures.delay)));
-    for (name, interval) in [
-        ("p50", figures.delay_p50_interval),
-        ("p99", figures.delay_p99_interval),
+    let extent = figures.reordering_extent_max;
+    let interval = wilson_words(figures.reordered_interval);
+    fact(
+        "reordering",
+        format!("extent at most {extent}{interval}, RFC 4737"),
+    );
+    if let (Some(last), Some(mean)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
+        let (last, mean) = (duration_s(last * 1e-9), duration_s(mean * 1e-9));
+        fact(
+            "jitter",
+            format!("{last} at the end, {mean} mean (RFC 3550)"),
+        );
+    }
+    for (label, interval) in [
+        ("delay, p50", figures.delay_p50_interval),
+        ("delay, p99", figures.delay_p99_interval),
     ] {
         if let Some(IntervalNs { low_ns, high_ns }) = interval {
-            let (low, high) = (time(low_ns), time(high_ns));
-            lines.push(format!(
-                "    {name} in {low} to {high} (95 %, block bootstrap)"
-            ));
+            let (low, high) = (duration(low_ns), duration(high_ns));
+            fact(label, format!("{low} to {high} (95 %, block bootstrap)"));
         }
     }
-    lines.push(format!(
-        "  variation   {} (RFC 5481)",
-        quantiles(&figures.variation)
-    ));
-    if let (Some(last_ns), Some(mean_ns)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
-        lines.push(format!(
-            "  jitter      {:.2} us at the end, {:.2} us mean (RFC 3550)",
-            last_ns * 1e-3,
-            mean_ns * 1e-3
-        ));
-    }
-    let interval = percent(None, figures.reordered_interval);
-    lines.push(format!(
-        "  reordered   {}{interval}, extent at most {} (RFC 4737)",
-        figures.reordered_count, figures.reordering_extent_max
-    ));
+    let counts = [
+        ("first", figures.first_count),
+        ("second", figures.second_count),
+        ("both", figures.matched_count),
+        ("at an edge", figures.edge_count),
+        ("duplicated", figures.duplicated_count),
+        ("unexplained", figures.unexplained_count),
+        ("reordered", figures.reordered_count),
+    ];
+    let mut seen = Table::new("", &counts.map(|(label, _)| label));
+    seen.push(counts.map(|(_, count)| Cell::Count(count)));
+    section.table(seen);
+    section.table(quantile_table(&[
+        ("delay", &figures.delay),
+        ("variation, RFC 5481", &figures.variation),
+    ]));
+    section
 }
 
 /// Why loss is unavailable.
@@ -529,38 +571,9 @@ fn doubts_text(doubts: &[CountedDoubt]) -> String {
     words.collect::<Vec<String>>().join(", ")
 }
 
-fn percent(ratio: Option<f64>, interval: Option<(f64, f64)>) -> String {
-    let mut text = String::new();
-    if let Some(ratio) = ratio {
-        // Writing to a string cannot fail.
-        let _infallible = write!(text, " = {:.4} %", 100.0 * ratio).is_ok();
-    }
-    if let Some((low, high)) = interval {
-        let (low, high) = (100.0 * low, 100.0 * high);
-        let _infallible = write!(text, " ({low:.4} to {high:.4} %, Wilson 95 %)").is_ok();
-    }
-    text
-}
-
-/// Nanoseconds in a unit of at most four digits before the point.
-pub(super) fn time(ns: i64) -> String {
-    match ns.unsigned_abs() {
-        0..10_000_000 => format!("{:.2} us", ns as f64 * 1e-3),
-        10_000_000..10_000_000_000 => format!("{:.2} ms", ns as f64 * 1e-6),
-        _ => format!("{:.3} s", ns as f64 * 1e-9),
-    }
-}
-
-pub(super) fn quantiles(distribution: &Distribution) -> String {
-    match distribution {
-        Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
-        Distribution::Measured(one) => format!(
-            "min {}  p50 {}  p99 {}  p99.9 {}  max {}",
-            time(one.min_ns),
-            time(one.p50_ns),
-            time(one.p99_ns),
-            time(one.p999_ns),
-            time(one.max_ns)
-        ),
-    }
+/// An interval of a share.
+fn wilson_words(interval: Option<(f64, f64)>) -> String {
+    interval.map_or_else(String::new, |(low, high)| {
+        format!(" ({} to {}, Wilson 95 %)", percent(low), percent(high))
+    })
 }

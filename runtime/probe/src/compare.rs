@@ -2,7 +2,6 @@
 //! between the kernel's stamps, message by message. Neither side knows of the other: the run's come
 //! from record files and summary, the probe's from captures.
 
-use core::fmt::Write as _;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::{fs, io};
@@ -18,9 +17,11 @@ use hil_protocol::wire::Kind;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
 use serde::Serialize;
 
-use super::analyse::{Reading, quantiles};
+use super::analyse::Reading;
 use super::point_clocks::WireClocks;
 use hil_platform::progress::Stage;
+use hil_present::{Cell, Row, Section, Table, Tone, UNAVAILABLE};
+use hil_report::quantile_table;
 use hil_report::summary::{CounterGroup, LinkKind, RunSummary, SummaryError};
 use hil_rundir::launch::Side;
 use hil_rundir::record::{RecordFile, RecordFileError, RecordKind};
@@ -93,6 +94,53 @@ impl ChannelComparison {
                 .medians_apart_us()
                 .is_some_and(|apart| apart <= limit_us)
     }
+
+    fn section(&self, limit_us: f64) -> Section {
+        let mut section = Section::new("channel", &self.channel, "");
+        let mut counts = Table::new("", &["datagrams", "gateways", "probe", ""]);
+        for (what, both) in [
+            ("sent", self.sent),
+            ("received", self.received),
+            ("messages sent", self.data_sent),
+            ("messages received", self.data_received),
+        ] {
+            let (tone, word) = if both.is_equal() {
+                (Tone::Plain, "equal")
+            } else {
+                (Tone::Bad, "DIFFERENT")
+            };
+            let gateway = match both.gateway {
+                Some(count) => Cell::Count(count),
+                None => "unknown".into(),
+            };
+            counts.rows.push(Row {
+                cells: vec![what.into(), gateway, Cell::Count(both.probe), word.into()],
+                tone,
+                bar: None,
+            });
+        }
+        section.table(counts);
+        section.table(quantile_table(&[
+            ("wire, gateways", &self.gateway_wire),
+            ("wire, probe", &self.probe_wire),
+            ("probe - gateways", &self.difference),
+            ("  at departure", &self.departure_difference),
+            ("  at arrival", &self.arrival_difference),
+        ]));
+        let (tone, words) = match self.medians_apart_us() {
+            Some(apart) if apart <= limit_us => (
+                Tone::Plain,
+                format!("{apart:.2} µs apart, at most {limit_us} µs"),
+            ),
+            Some(apart) => (
+                Tone::Bad,
+                format!("{apart:.2} µs apart, MORE than {limit_us} µs"),
+            ),
+            None => (Tone::Caution, UNAVAILABLE.to_owned()),
+        };
+        section.fact("medians", tone, words);
+        section
+    }
 }
 
 /// The whole comparison.
@@ -112,57 +160,19 @@ impl Comparison {
         !channels.is_empty() && channels.iter().all(|one| one.agrees_within(limit_us))
     }
 
-    pub(super) fn to_text(&self, limit_us: f64) -> String {
-        let clocks = self.clocks.words();
-        let mut text = format!("{}: gateways and probe; {clocks}\n", self.run);
-        for one in &self.channels {
-            let _infallible = write!(text, "\n{}\n", one.channel);
-            for (what, counts) in [
-                ("sent", one.sent),
-                ("received", one.received),
-                ("messages sent", one.data_sent),
-                ("messages received", one.data_received),
-            ] {
-                let gateway = counts
-                    .gateway
-                    .map_or("unknown".to_owned(), |n| n.to_string());
-                let word = if counts.is_equal() {
-                    "equal"
-                } else {
-                    "DIFFERENT"
-                };
-                let _infallible = writeln!(
-                    text,
-                    "  {what:<18}{gateway:>10} {:>10}  {word}",
-                    counts.probe
-                );
-            }
-            for (what, distribution) in [
-                ("wire, gateways", &one.gateway_wire),
-                ("wire, probe", &one.probe_wire),
-                ("probe - gateways", &one.difference),
-                ("  at departure", &one.departure_difference),
-                ("  at arrival", &one.arrival_difference),
-            ] {
-                let _infallible = writeln!(text, "  {what:<18}{}", quantiles(distribution));
-            }
-            let verdict = match one.medians_apart_us() {
-                Some(apart) if apart <= limit_us => {
-                    format!("  medians {apart:.2} us apart, at most {limit_us} us\n")
-                }
-                Some(apart) => format!("  medians {apart:.2} us apart, MORE than {limit_us} us\n"),
-                None => "  medians unavailable\n".to_owned(),
-            };
-            text.push_str(&verdict);
-        }
+    pub(super) fn sections(&self, limit_us: f64) -> Vec<Section> {
+        let mut head = Section::new("run", &self.run, "gateways and probe");
+        head.note(Tone::Plain, self.clocks.words());
+        let mut sections = vec![head];
+        sections.extend(self.channels.iter().map(|one| one.section(limit_us)));
+        let mut rest = Section::new("left-out", "Not compared", "");
         if !self.left_out.is_empty() {
             let names = self.left_out.join(", ");
-            let _infallible = write!(
-                text,
-                "\nnot compared, as they go over TCP, which does not keep datagrams: {names}\n"
-            );
+            let why = "they go over TCP, which does not keep datagrams";
+            rest.note(Tone::Plain, format!("{names}: {why}"));
         }
-        text
+        sections.push(rest);
+        sections
     }
 }
 

@@ -146,7 +146,7 @@ impl ProcessGroup {
         places: BTreeMap<String, String>,
         folder: &RunFolder,
         seal: Option<RunSeal>,
-    ) -> Result<Self, ProcessGroupError> {
+    ) -> Self {
         let (sender, words) = sync_channel(WORDS_MAX);
         let members = plans.into_iter().map(|plan| ManagedProcess {
             plan,
@@ -162,7 +162,7 @@ impl ProcessGroup {
             complaint: None,
             left_out_count: 0,
         });
-        Ok(Self {
+        Self {
             members: members.collect(),
             places,
             folder: folder.clone(),
@@ -174,7 +174,7 @@ impl ProcessGroup {
             warning_count: 0,
             unwritten: None,
             log_keeper: None,
-        })
+        }
     }
 
     /// Starts every process; they wait for [`ProcessGroup::begin`].
@@ -652,7 +652,7 @@ mod tests {
         };
         let places = BTreeMap::from([("pc".to_owned(), String::new())]);
         let folder = RunFolder::existing(Path::new("/proc/no-run"));
-        ProcessGroup::new(vec![plan], places, &folder, None).unwrap()
+        ProcessGroup::new(vec![plan], places, &folder, None)
     }
 
     #[test]

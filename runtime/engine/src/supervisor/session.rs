@@ -116,7 +116,7 @@ pub fn run(
     let peers = gathered.peers;
     let here = clock_id()?;
     let process_group =
-        ProcessGroup::new(plan.processes, domains.addresses(), &folder, gathered.seal)?;
+        ProcessGroup::new(plan.processes, domains.addresses(), &folder, gathered.seal);
     let announcement = Announcement::make(
         topology,
         &folder,

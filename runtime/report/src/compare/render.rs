@@ -135,7 +135,7 @@ fn harms(comparison: &Comparison) -> Section {
             section.fact("new less base", Tone::Plain, difference_words(difference));
         }
     }
-    section.note(Tone::Strong, "of both");
+    section.note(Tone::Strong, "cause, validity and what is left open");
     if let Some(words) = &comparison.first_harm {
         section.fact("first harm, new", Tone::Plain, words);
     }
@@ -150,8 +150,9 @@ fn harms(comparison: &Comparison) -> Section {
         };
         section.fact("measurement", tone, words);
     }
-    for words in left_open(comparison) {
-        section.fact("left open", Tone::Plain, words);
+    for (index, words) in left_open(comparison).into_iter().enumerate() {
+        let label = if index == 0 { "left open" } else { "" };
+        section.fact(label, Tone::Plain, words);
     }
     section
 }
@@ -178,7 +179,7 @@ fn left_open(comparison: &Comparison) -> Vec<String> {
             let difference = one.difference.as_ref();
             if let Some(of) = difference.filter(|one| one.interval.high > 0.0) {
                 let most = more_words(of, of.interval.high);
-                open.push(format!("up to {most} of {}", one.base.what));
+                open.push(format!("{}: up to {most} would not show", one.base.what));
             }
         }
     }

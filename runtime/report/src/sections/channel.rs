@@ -716,6 +716,24 @@ fn segment_row(name: &str, distribution: &Distribution, bound: Option<u64>) -> R
     }
 }
 
+/// A row for each distribution: its quantiles, or why there are none.
+pub fn quantile_table(rows: &[(&str, &Distribution)]) -> Table {
+    let mut table = Table::new("", &["", "min", "p50", "p99", "p99.9", "max"]);
+    for (name, distribution) in rows {
+        let mut cells = vec![Cell::from(*name)];
+        match distribution {
+            Distribution::Unavailable { reason } => {
+                cells.push(format!("{UNAVAILABLE}: {reason}").into());
+            }
+            Distribution::Measured(one) => cells.extend(
+                [one.min_ns, one.p50_ns, one.p99_ns, one.p999_ns, one.max_ns].map(Cell::Duration),
+            ),
+        }
+        table.push(cells);
+    }
+    table
+}
+
 /// The segments one after the other with their medians as bars, then the whole, then what a missing stamp
 /// made one of.
 fn segment_table(account: &ChannelAccount) -> Table {

@@ -13,6 +13,7 @@ mod run;
 mod timeline;
 
 pub(crate) use channel::Sources;
+pub use channel::quantile_table;
 pub(crate) use run::{outcome_words, repeat};
 pub(crate) use timeline::strips;
 

@@ -51,5 +51,4 @@ pub(super) fn answer(canvas: &mut Canvas, summary: &RunSummary, assessment: &Ass
     canvas.field_of(LABEL_WIDTH, "measurement", tone, &words);
     let sample = format!("{}; brackets are 95 % intervals", answer.sample_words());
     canvas.field_of(LABEL_WIDTH, "sample", Tone::Plain, &sample);
-    canvas.rule(Tone::Faint);
 }
