@@ -443,7 +443,11 @@ impl HardwareStamping {
 /// # Safety
 /// `data` points to the live structure that `request` reads and writes.
 #[allow(unsafe_code, reason = "the kernel follows the pointer it is given")]
-unsafe fn device_request(interface: &str, request: c_ulong, data: *mut c_char) -> io::Result<()> {
+pub(super) unsafe fn device_request(
+    interface: &str,
+    request: c_ulong,
+    data: *mut c_char,
+) -> io::Result<()> {
     let mut name: [c_char; libc::IFNAMSIZ] = [0; libc::IFNAMSIZ];
     // One byte stays zero as the end of the name.
     if interface.len() >= name.len() || interface.is_empty() {

@@ -21,6 +21,7 @@ mod rendezvous;
 mod session;
 mod status_publisher;
 
+pub(crate) use child::describe_exit;
 pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;
 pub use needs::{HostTooSmall, Shortfall, check_host};
