@@ -25,6 +25,8 @@ Examples:
       this host's share of the loop; start the same command on the other host
   hil-runtime --topology deploy/topologies/split.toml --check
       say what is wrong with the file, start nothing
+  hil-runtime join --link 'delay 5ms loss 1%' -- ./ctrl 10.77.0.2 -- ./robot
+      two programs of your own that speak IP, and a link between them
   hil-runtime simulate --topology deploy/topologies/emulated.toml
       the same loop and link in virtual time, in a moment
   hil-runtime tables --topology deploy/topologies/tables.toml
@@ -52,8 +54,8 @@ const JOIN_EXAMPLES: &str = "\
 Examples:
   hil-runtime join -- ping -c 20 10.77.0.2 -- sleep 60
       what a bare cable does to twenty echoes
-  hil-runtime join --link 'delay 5ms loss 1%' -- ./controller 10.77.0.2 -- ./robot
-      the same two programs with a link that hurts between them
+  hil-runtime join --link 'delay 5ms loss 1%' -- ./ctrl 10.77.0.2 -- ./robot
+      a controller and a robot with a link that hurts between them
   hil-runtime join --link outages.toml -- iperf3 -c 10.77.0.2 -- iperf3 -s
       over the link of a topology file
 
@@ -231,8 +233,8 @@ pub struct JoinArgs {
     /// one link. Without it nothing is delayed or lost on purpose.
     #[arg(long, value_name = "WORDS|FILE")]
     pub link: Option<String>,
-    /// How long the programs run, e.g. "30 s", where none of them ends before.
-    #[arg(long, value_name = "TIME", default_value = "168 h")]
+    /// How long the programs run, e.g. 30s, where none of them ends before.
+    #[arg(long, value_name = "TIME", default_value = "168h")]
     pub duration: String,
     /// Seed of the link's losses and delays.
     #[arg(long, value_name = "N", default_value_t = 1)]
