@@ -352,16 +352,18 @@ impl LabHost {
             .create(true)
             .append(true)
             .open(disk.join(FILLER));
-        let filler = filler.unwrap();
-        let mut from = filler.metadata().unwrap().len();
+        let filler = filler.expect("a file on the disk");
+        let length = filler.metadata().map(|data| data.len());
+        let mut from = length.expect("an open file has a length");
         // Others write meanwhile.
         wait_until(SETUP_LIMIT, "a full disk", || {
-            let free = statvfs(&disk).unwrap();
+            let free = statvfs(&disk).expect("a mounted disk");
             let free_bytes = free.blocks_available() * free.fragment_size();
             let Some(rest) = free_bytes.checked_sub(kept).filter(|rest| *rest > 0) else {
                 return true;
             };
-            let [at, length] = [from, rest].map(|bytes| i64::try_from(bytes).unwrap());
+            let [at, length] =
+                [from, rest].map(|bytes| i64::try_from(bytes).expect("less than 8 EiB"));
             if fallocate(&filler, FallocateFlags::empty(), at, length).is_ok() {
                 from += rest;
             }

@@ -7,16 +7,20 @@
 //! - [`nic_arming`] and [`nic_clock`]: setting a card up to stamp, and reading its clock.
 //! - [`clock_pair`]: from the real-time clock of the stamps to the monotonic clock of the run.
 //! - [`radio`]: whether the peer radio acknowledged each datagram.
-//! - [`packet_ring`], [`ring_frame`] and [`filter`]: a tap of an interface.
+//! - [`packet_ring`], [`ring_frame`] and [`filter`]: a tap of an interface, and the end of a cable.
+//! - [`offload`]: what an interface leaves to hardware.
+//! - [`handover`]: descriptors from one process to another.
 //! - [`tcp_info`]: what the kernel tells of a TCP connection.
 //! - [`mod@interface`]: which interface has an address.
 
 pub mod clock_pair;
 pub mod control;
 pub mod filter;
+pub mod handover;
 pub mod interface;
 pub mod nic_arming;
 pub mod nic_clock;
+pub mod offload;
 pub mod packet_ring;
 mod packet_socket;
 pub mod radio;

@@ -456,7 +456,7 @@ pub fn interface_mtu_bytes(interface: &str) -> io::Result<u32> {
 /// # Safety
 /// `data` points to the live structure that `request` reads and writes, or the request takes none.
 #[allow(unsafe_code, reason = "the kernel follows the pointer it is given")]
-unsafe fn device_request(
+pub(super) unsafe fn device_request(
     interface: &str,
     request: c_ulong,
     data: *mut c_char,

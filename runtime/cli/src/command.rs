@@ -2,6 +2,7 @@
 
 mod case_work;
 mod doctor_work;
+mod join_work;
 mod live_work;
 mod report_work;
 
@@ -132,11 +133,13 @@ fn run_command(
         Command::Become {
             supervisor,
             open_files,
+            inside,
             program,
-        } => own_program::become_program(supervisor, open_files, &program)
+        } => own_program::become_program(supervisor, open_files, inside, &program)
             .map(done)
             .map_err(failed),
         Command::CardGuard(args) => guard::run(&args).map(done).map_err(failed),
+        Command::Join(args) => join_work::join(&args, registry, console),
         Command::Simulate {
             topology,
             overrides,
@@ -250,28 +253,39 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
     if args.check && topology.processes().is_empty() {
         return show_study(path, &topology, args, registry, console);
     }
-    check_traces(path, &args.overrides, &topology, console)?;
+    carry_out(path, args, &topology, registry, console)
+}
+
+/// Runs `topology`, or checks whether it could, and prints its report.
+fn carry_out(
+    path: &Path,
+    args: &RunArgs,
+    topology: &Topology,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    check_traces(path, &args.overrides, topology, console)?;
     // Told before what may only be missing now.
-    check_file(path, &topology)?;
+    check_file(path, topology)?;
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
-        return Ok(show_check(path, &topology, None, console));
+        return Ok(show_check(path, topology, None, console));
     }
-    let hosts = hosts_here(&topology, args.host.as_deref()).map_err(usage)?;
-    let key = check_here(path, args, &topology, &hosts, console)?;
+    let hosts = hosts_here(topology, args.host.as_deref()).map_err(usage)?;
+    let key = check_here(path, args, topology, &hosts, console)?;
     if args.check {
-        return Ok(show_check(path, &topology, key, console));
+        return Ok(show_check(path, topology, key, console));
     }
     let signals = signals()?;
     let options = RunOptions {
         hosts,
         domain_root: args.domain_root.clone(),
-        topology_file: path.clone(),
+        topology_file: path.to_path_buf(),
         command_line: env::args().collect(),
-        layouts: layouts(&topology, registry),
+        layouts: layouts(topology, registry),
     };
     console.serve();
-    let result = supervisor::run(&topology, &options, &signals, console)
+    let result = supervisor::run(topology, &options, &signals, console)
         .map_err(|error| Refusal::new(exit_code_of_error(&error), error))?;
     let code = match exit_code(&result.outcome) {
         exit::RAN if result.has_gaps() => exit::FAILED,
@@ -283,7 +297,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
         // What the folder cannot give back, because its disk is full, is still in memory.
         analysed.or_else(|error| {
             let concluded =
-                analysis::conclude(&topology, &result, registry, path, &options.command_line)?;
+                analysis::conclude(topology, &result, registry, path, &options.command_line)?;
             Ok::<_, AnalysisError>(Concluded {
                 unwritten: concluded.unwritten.or(Some(error)),
                 ..concluded

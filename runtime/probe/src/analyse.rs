@@ -1,6 +1,7 @@
 //! One or two captures, drawn up: what each point saw of each flow, and what two points say of it
 //! together. Sections and JSON come from the same figures.
 
+use core::fmt::Write as _;
 use std::path::Path;
 
 use hil_capture::flow::FlowFilter;
@@ -11,7 +12,6 @@ use hil_capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_capture::pairing::join_all;
 use hil_capture::point::{PointMetrics, single_point_metrics};
 use hil_capture::watch::Unread;
-use hil_stats::histogram::Distribution;
 use hil_stats::statistics::IntervalNs;
 use serde::Serialize;
 
@@ -285,7 +285,7 @@ impl Report {
                 complaints.extend(steps.iter().map(|step| {
                     format!(
                         "{point}: its clock was set by {}: delays are unavailable",
-                        time(step.by_ns)
+                        duration(step.by_ns)
                     )
                 }));
             }
@@ -349,7 +349,7 @@ impl Report {
                 table.push([Cell::Count(count), what.into()]);
             }
         }
-        table.note = "kinds of which there are none are not listed".to_owned();
+        "kinds of which there are none are not listed".clone_into(&mut table.note);
         section.table(table);
         section
     }
@@ -463,7 +463,7 @@ fn join_section(joined: &JoinReport) -> Section {
         OrderSource::Unknown => "order unknown",
     };
     fact("order", order.to_owned());
-    let lost = match &figures.loss {
+    let loss_words = match &figures.loss {
         Loss::Counted(loss) => {
             let ratio = loss
                 .ratio
@@ -484,7 +484,7 @@ fn join_section(joined: &JoinReport) -> Section {
             )
         }
     };
-    fact("lost", lost);
+    fact("lost", loss_words);
     if let Loss::Counted(loss) = &figures.loss
         && !loss.bursts.is_empty()
     {
@@ -493,18 +493,18 @@ fn join_section(joined: &JoinReport) -> Section {
         fact("loss bursts", bursts.collect::<Vec<_>>().join(" "));
     }
     for (which, steps) in ["first", "second"].into_iter().zip(&figures.clock_steps) {
-        for step in steps {
+        for one in steps {
             fact(
                 "clock step",
-                format!("{} at the {which} point", duration(step.by_ns)),
+                format!("{} at the {which} point", duration(one.by_ns)),
             );
         }
     }
     if let Some(shift) = figures.delay_shift {
-        let by = duration(shift.by_ns);
+        let more = duration(shift.by_ns);
         fact(
             "level",
-            format!("{by} more from one datagram on: a clock set, or another way"),
+            format!("{more} more from one datagram on: a clock set, or another way"),
         );
     }
     let extent = figures.reordering_extent_max;

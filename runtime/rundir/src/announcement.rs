@@ -14,7 +14,7 @@ use crate::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage, start_t
 use crate::run_folder::{RunFolder, utc_text};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::own_folder::OwnFolder;
-use hil_topology::{Channel, Program, Topology};
+use hil_topology::{Channel, Process, Program, Topology};
 
 /// A run that is announced for as long as this lives.
 #[derive(Debug)]
@@ -163,7 +163,8 @@ const fn keeps_records(program: &Program) -> bool {
     !matches!(program, Program::Command { .. })
 }
 
-/// What the processes here note of each message of `channel`. Own programs note nothing.
+/// What the processes here note of each message of `channel`. Own programs note nothing; what carries the
+/// frames of one does.
 fn noted(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool) -> Vec<Stage> {
     let ends = [Some(channel.from.as_str()), channel.to.as_deref()];
     let [producer, consumer] = ends.map(|name| topology.process(name?));
@@ -172,14 +173,13 @@ fn noted(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool)
     };
     let crosses = producer.host != consumer.host;
     let (from_here, to_here) = (is_here(&producer.host), is_here(&consumer.host));
+    let is_recorded =
+        |process: &Process| keeps_records(&process.program) || process.inside().is_some();
     let stages = [
-        (
-            Stage::Published,
-            from_here && keeps_records(&producer.program),
-        ),
+        (Stage::Published, from_here && is_recorded(producer)),
         (Stage::Sent, from_here && crosses),
         (Stage::Received, to_here && crosses),
-        (Stage::Taken, to_here && keeps_records(&consumer.program)),
+        (Stage::Taken, to_here && is_recorded(consumer)),
     ];
     let noted = stages.into_iter().filter(|(_, is_noted)| *is_noted);
     noted.map(|(stage, _)| stage).collect()

@@ -16,6 +16,7 @@ mod egm_faces;
 mod fleet;
 mod full_disk;
 mod hardware_stamps;
+mod joined_hosts;
 mod kills;
 mod limits;
 mod many_channels;

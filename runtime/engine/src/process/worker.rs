@@ -1,5 +1,5 @@
-//! The shell of every process of a run that this binary plays: component, gateway, clock path and
-//! adapter. It hears the supervisor's orders, starts one thread for each job, tells what they count
+//! The shell of every process of a run that this binary plays: component, gateway, clock path,
+//! adapter and cable. It hears the supervisor's orders, starts one thread for each job, tells what they count
 //! and that they turn, and reports their outcome. What a job does is its own business.
 
 use std::panic::resume_unwind;
@@ -10,6 +10,7 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 use std::{io, thread};
 
+use hil_cable::InletError;
 use hil_core::endpoint::PortError;
 use hil_protocol::SettingsError;
 use hil_protocol::body::HelloStatus;
@@ -21,7 +22,7 @@ use super::component;
 use super::heartbeat::{Heartbeat, Heartbeats};
 use crate::gateway::process::GatewayWatch;
 use crate::gateway::timestamping::TimestampingSetup;
-use crate::{adapter, gateway};
+use crate::{adapter, cable, gateway};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::open_files;
 use hil_platform::realtime::{self, RealtimeGrant, RealtimeRequest, SpinAdvice};
@@ -116,6 +117,25 @@ pub enum WorkerError {
     /// The other end does not want this channel.
     #[error("the gateway at the other end refused the channel: {}", .0.label())]
     Refused(HelloStatus),
+    /// A program's frames cannot be carried.
+    #[error(transparent)]
+    Inlet(#[from] InletError),
+    /// The process that becomes a program could not be started.
+    #[error("cannot start {program}: {source}")]
+    Program {
+        /// The program.
+        program: String,
+        /// What the kernel answered.
+        source: io::Error,
+    },
+    /// A program failed.
+    #[error("{program} {end}")]
+    ProgramEnded {
+        /// The program.
+        program: String,
+        /// How.
+        end: String,
+    },
     /// A record file could not be written any more.
     #[error("cannot record: {0}; messages after that would be in no account")]
     Unrecorded(FileFault),
@@ -242,6 +262,7 @@ fn open_and_run(path: &Path, registry: &Registry) -> Result<(), WorkerError> {
         Work::Component(work) => component::open(&launch, work, registry, &mut recorder),
         Work::Gateway(work) => gateway::process::open(&launch, work, &orders, &mut recorder),
         Work::Adapter(work) => adapter::process::open(&launch, work, &mut recorder),
+        Work::Cable(work) => cable::open(&launch, work, &mut recorder),
     }?;
     let stop = Arc::clone(orders.stop_flag());
     recorder
@@ -408,6 +429,7 @@ fn add(report: &mut ProcessReport, other: ProcessReport, facts: &[(String, Strin
         arm
     });
     report.faces.extend(arms);
+    report.inlets.extend(other.inlets);
 }
 
 /// Says how many messages passed on the channels on which any did since it was said last, that the threads

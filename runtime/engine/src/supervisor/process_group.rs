@@ -235,6 +235,7 @@ impl ProcessGroup {
                 Some(Work::Gateway(work.clone()))
             }
             ProcessTask::Adapter(adapter) => Some(Work::Adapter(adapter.clone())),
+            ProcessTask::Cable(work) => Some(Work::Cable(work.clone())),
             ProcessTask::Foreign {
                 card,
                 command,
