@@ -97,7 +97,7 @@ fn notes(study: &FleetStudy) -> Vec<String> {
 const FOUND: [Field<FleetTally>; 4] = [
     Field::count("sections", "CS", FleetTally::section_count).ranked(3),
     Field::text("collisions", "Collisions", collisions).ranked(4),
-    Field::number("per_1000", "Ours/1000", 2, per_1000),
+    Field::number("per_1000", "Per 1000", 2, per_1000),
     Field::interval("per_1000", "95 %", 2, interval_per_1000),
 ];
 
@@ -113,7 +113,7 @@ const PUBLISHED: [Field<PublishedRow>; 4] = [
         |row: &PublishedRow| row.collisions,
     )
     .ranked(6),
-    Field::number("published_per_1000", "Paper/1000", 2, |row| {
+    Field::number("published_per_1000", "Paper", 2, |row| {
         Some(1e3 * row.collisions as f64 / row.sections as f64)
     }),
     Field::interval(
