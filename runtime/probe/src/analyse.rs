@@ -453,7 +453,7 @@ fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
         }
     };
     lines.push(format!(
-        "  lost        {lost}, {} duplicated, {} unexplained",
+        "  lost        {lost}, {} duplicated (RFC 5560), {} unexplained",
         figures.duplicated_count, figures.unexplained_count
     ));
     if let Loss::Counted(loss) = &figures.loss
@@ -462,7 +462,7 @@ fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
         let bursts = loss.bursts.iter();
         let bursts = bursts.map(|(length, count)| format!("{count}x{length}"));
         let words: Vec<String> = bursts.collect();
-        lines.push(format!("  loss bursts {}", words.join(" ")));
+        lines.push(format!("  loss runs   {} (RFC 3357)", words.join(" ")));
     }
     for (which, steps) in ["first", "second"].into_iter().zip(&figures.clock_steps) {
         for step in steps {
@@ -489,8 +489,12 @@ fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
         }
     }
     lines.push(format!(
-        "  variation   {} (RFC 5481)",
+        "  variation   {} (RFC 5481, PDV)",
         quantiles(&figures.variation)
+    ));
+    lines.push(format!(
+        "  successive  {} (RFC 5481, IPDV)",
+        quantiles(&figures.successive)
     ));
     if let (Some(last_ns), Some(mean_ns)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
         lines.push(format!(
@@ -501,8 +505,8 @@ fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
     }
     let interval = percent(None, figures.reordered_interval);
     lines.push(format!(
-        "  reordered   {}{interval}, extent at most {} (RFC 4737)",
-        figures.reordered_count, figures.reordering_extent_max
+        "  reordered   {}{interval}, extent at most {}, {}-reordered at most (RFC 4737)",
+        figures.reordered_count, figures.reordering_extent_max, figures.reordering_n_max
     ));
 }
 
