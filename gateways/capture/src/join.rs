@@ -3,8 +3,8 @@
 //!
 //! **Delay** is the difference of the two stamps, so it is one-way only if both points read one
 //! clock; otherwise it is off by a constant and drift that nobody here can know.
-//! **Variation** is the delay less the smallest one (PDV, RFC 5481 section 4.2) and needs only
-//! that the clocks run alike. **Jitter** is RFC 3550's running estimate, section 6.4.1.
+//! **Variation** is the delay less the smallest one (PDV, RFC 5481 section 4.2) and, of one after the
+//! other, the difference (IPDV, section 4.1); both need only that the clocks run alike. **Jitter** is RFC 3550's running estimate, section 6.4.1.
 //! **Reordering** is RFC 4737's: a datagram is late when one that left after it came before it.
 //! **Loss** counts what was seen at the first point and not at the second, without the *edges*:
 //! what left when the second point was not watched, or so near to its end that the slowest datagram
@@ -17,6 +17,7 @@ use std::collections::BTreeMap;
 
 use hil_core::random::RandomStream;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
+use hil_stats::reordering::reordered;
 use hil_stats::statistics::{CONFIDENCE, IntervalNs, block_bootstrap_quantile, wilson};
 use serde::{Deserialize, Serialize};
 
@@ -105,7 +106,8 @@ pub struct LossCount {
     pub ratio: Option<f64>,
     /// 95 % interval of it (Wilson), as if losses were independent.
     pub interval: Option<(f64, f64)>,
-    /// Runs of losses in the order of departure: length and how many.
+    /// Runs of losses in the order of departure, between arrivals: length and how many (loss periods,
+    /// RFC 3357 section 5).
     pub bursts: Vec<(u64, u64)>,
 }
 
@@ -143,7 +145,8 @@ pub struct JoinMetrics {
     pub loss: Loss,
     /// Seen at one only, when the other was not watched or not long enough.
     pub edge_count: u64,
-    /// Seen more often at the second than at the first.
+    /// Copies of datagrams seen at the second point before (RFC 5560 section 3), beyond those that had
+    /// passed the first.
     pub duplicated_count: u64,
     /// Seen at the second only: the first capture has gaps.
     pub unexplained_count: u64,
@@ -157,19 +160,24 @@ pub struct JoinMetrics {
     pub delay_p50_interval: Option<IntervalNs>,
     /// 95 % interval of its 99th percentile (block bootstrap).
     pub delay_p99_interval: Option<IntervalNs>,
-    /// Delay less the smallest delay.
+    /// Delay less the smallest delay (PDV, RFC 5481 section 4.2).
     pub variation: Distribution,
+    /// Difference of the delays of two that left one after the other and both arrived, as a magnitude
+    /// (IPDV, RFC 5481 section 4.1).
+    pub successive: Distribution,
     /// RFC 3550's estimate after the last datagram, nanoseconds.
     pub jitter_last_ns: Option<f64>,
     /// Its mean over all datagrams.
     pub jitter_mean_ns: Option<f64>,
-    /// Late ones.
+    /// Those that came after one that left later (RFC 4737 section 3.3).
     pub reordered_count: u64,
     /// 95 % interval of their ratio (Wilson).
     pub reordered_interval: Option<(f64, f64)>,
     /// Farthest that one was overtaken: positions to the earliest of those that overtook it
     /// (RFC 4737 section 4.2.2).
     pub reordering_extent_max: u64,
+    /// Largest n for which one is n-reordered (RFC 4737 section 5).
+    pub reordering_n_max: u64,
     /// Time between arrivals at the second point.
     pub arrival_interval: Distribution,
 }
@@ -686,7 +694,8 @@ fn metrics(
     // Positions of departure in the order of arrival.
     let mut arrivals: Vec<usize> = (0..pairs.len()).collect();
     arrivals.sort_by_key(|departure| second.at_ns[matches.pairs[*departure].1]);
-    let (reordered_count, reordering_extent_max) = reordering(&arrivals);
+    let (late, _) = reordered(arrivals.iter().map(|departure| *departure as u64));
+    let reordered_count = late.len() as u64;
     // Where a clock was set, no delay is known.
     let is_delay = |departure: &&usize| !is_set && pairs[**departure].is_stamped();
     let in_arrival = arrivals.iter().filter(is_delay);
@@ -708,6 +717,13 @@ fn metrics(
     };
     let fastest = delays.iter().min().copied().unwrap_or(0);
     let variation = delays.iter().map(|delay| delay.saturating_sub(fastest));
+    let neighbours = (1..pairs.len()).filter(|at| {
+        matches.pairs[at - 1].0 + 1 == matches.pairs[*at].0 && is_delay(&&(at - 1)) && is_delay(&at)
+    });
+    let successive = neighbours.map(|at| {
+        let difference = levels.delays[at].saturating_sub(levels.delays[at - 1]);
+        difference.saturating_abs()
+    });
     let gaps = second.at_ns.windows(2);
     let gaps = gaps.map(|pair| pair[1].saturating_sub(pair[0]));
     JoinMetrics {
@@ -724,30 +740,16 @@ fn metrics(
         delay_p50_interval: delay_interval(0.5, "probe delay p50"),
         delay_p99_interval: delay_interval(0.99, "probe delay p99"),
         variation: distribution(variation, unmatched),
+        successive: distribution(successive, unmatched),
         jitter_last_ns: jitter.map(|(last, _)| last),
         jitter_mean_ns: jitter.map(|(_, mean)| mean),
         reordered_count,
         reordered_interval: ratio_interval(reordered_count, matched_count),
-        reordering_extent_max,
+        reordering_extent_max: late.iter().map(|one| one.extent).max().unwrap_or(0),
+        reordering_n_max: late.iter().map(|one| one.n).max().unwrap_or(0),
         arrival_interval: distribution(gaps, "fewer than two arrivals"),
         clock_steps,
     }
-}
-
-/// How many were overtaken, and the largest extent.
-fn reordering(arrivals: &[usize]) -> (u64, u64) {
-    // Running maxima only grow, so the earliest overtaker is found by bisection.
-    let mut tops: Vec<usize> = Vec::with_capacity(arrivals.len());
-    let (mut count, mut extent_max) = (0, 0);
-    for (position, departure) in arrivals.iter().enumerate() {
-        let earliest = tops.partition_point(|top| top < departure);
-        if earliest < position {
-            count += 1;
-            extent_max = extent_max.max((position - earliest) as u64);
-        }
-        tops.push(tops.last().map_or(*departure, |top| *top.max(departure)));
-    }
-    (count, extent_max)
 }
 
 /// Lengths of runs of neighbouring positions, and how many of each.

@@ -9,6 +9,7 @@ pub mod goodness;
 pub mod histogram;
 pub mod in_order;
 pub mod metric;
+pub mod reordering;
 pub mod resampling;
 pub mod samples;
 pub mod series;

@@ -490,7 +490,7 @@ fn join_section(joined: &JoinReport) -> Section {
     {
         let bursts = loss.bursts.iter();
         let bursts = bursts.map(|(length, count)| format!("{count}x{length}"));
-        fact("loss bursts", bursts.collect::<Vec<_>>().join(" "));
+        fact("loss runs, RFC 3357", bursts.collect::<Vec<_>>().join(" "));
     }
     for (which, steps) in ["first", "second"].into_iter().zip(&figures.clock_steps) {
         for one in steps {
@@ -507,11 +507,11 @@ fn join_section(joined: &JoinReport) -> Section {
             format!("{more} more from one datagram on: a clock set, or another way"),
         );
     }
-    let extent = figures.reordering_extent_max;
+    let (extent, n) = (figures.reordering_extent_max, figures.reordering_n_max);
     let interval = wilson_words(figures.reordered_interval);
     fact(
         "reordering",
-        format!("extent at most {extent}{interval}, RFC 4737"),
+        format!("extent at most {extent}, {n}-reordered at most{interval}, RFC 4737"),
     );
     if let (Some(last), Some(mean)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
         let (last, mean) = (duration_s(last * 1e-9), duration_s(mean * 1e-9));
@@ -534,7 +534,7 @@ fn join_section(joined: &JoinReport) -> Section {
         ("second", figures.second_count),
         ("both", figures.matched_count),
         ("at an edge", figures.edge_count),
-        ("duplicated", figures.duplicated_count),
+        ("duplicated, RFC 5560", figures.duplicated_count),
         ("unexplained", figures.unexplained_count),
         ("reordered", figures.reordered_count),
     ];
@@ -543,7 +543,8 @@ fn join_section(joined: &JoinReport) -> Section {
     section.table(seen);
     section.table(quantile_table(&[
         ("delay", &figures.delay),
-        ("variation, RFC 5481", &figures.variation),
+        ("variation, RFC 5481 PDV", &figures.variation),
+        ("variation, RFC 5481 IPDV", &figures.successive),
     ]));
     section
 }

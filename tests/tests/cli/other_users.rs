@@ -177,10 +177,10 @@ fn the_account_is_written_before_anything_is_removed() {
     let root = files.domains()[0].root_path().to_owned();
     let mut had_result = None;
     while had_result.is_none() {
-        let has_result = fs::read_to_string(files.root().join("result.json"))
+        let is_written = fs::read_to_string(files.root().join("result.json"))
             .is_ok_and(|text| text.contains("outcome"));
         if !root.exists() {
-            had_result = Some(has_result);
+            had_result = Some(is_written);
         }
         thread::sleep(Duration::from_millis(1));
     }

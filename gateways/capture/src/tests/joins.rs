@@ -160,6 +160,10 @@ fn reordering_and_jitter_follow_their_definitions() {
     }
     assert!((figures.jitter_last_ns.unwrap() - jitter).abs() < 1e-9);
     assert_eq!(figures.variation.measured().unwrap().max_ns, 360);
+    // In the order of departure: 1000, 930, 810, 720, 640.
+    let successive = figures.successive.measured().unwrap();
+    assert_eq!((successive.min_ns, successive.max_ns), (70, 120));
+    assert_eq!(figures.reordering_n_max, 2);
 }
 
 #[test]

@@ -201,7 +201,7 @@ impl Work for SensorWork {
             ("changes of the robot's address", self.robot.change_count),
             ("commands taken", commands.total()),
             (
-                "commands overtaken before they were sent",
+                "commands replaced by newer ones before they were sent",
                 transmit.superseded_count,
             ),
             ("datagrams encoded", transmit.sent_count),

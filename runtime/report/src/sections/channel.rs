@@ -261,8 +261,7 @@ fn bound_words(delay: &DelayMetrics) -> (Tone, String) {
         (bound, true) => {
             let bound = unsigned_duration(bound);
             let text = format!(
-                "the clocks' alignment allows ±{bound}, wider than the median: the one-way delays say \
-                 little, take the round trip"
+                "one-way delay not resolved: the clocks' alignment allows ±{bound}, wider than the median"
             );
             (Tone::Caution, text)
         }
@@ -354,10 +353,10 @@ fn order(sources: &Sources<'_>) -> Vec<Metric> {
     let reordered = network.and_then(|one| Some(one.order.measured()?.reordered_count));
     let reordered = reordered.or_else(|| account?.reordered_count);
     let mut figures = Vec::new();
-    for (name, label, found) in [
-        ("late", "too late for the gateway", late),
-        ("duplicated", "duplicated", duplicated),
-        ("reordered", "reordered", reordered),
+    for (name, label, standard, found) in [
+        ("late", "too late for the gateway", "", late),
+        ("duplicated", "duplicated", "RFC 5560; ", duplicated),
+        ("reordered", "reordered", "RFC 4737; ", reordered),
     ] {
         let figure = Metric::maybe(name, label, "1", found.map(|found| found as f64), reason);
         let shares = found.zip(arrived).and_then(|(found, arrived)| {
@@ -365,7 +364,7 @@ fn order(sources: &Sources<'_>) -> Vec<Metric> {
             let share = percent(found as f64 / arrived as f64);
             let (low, high) = (percent(interval.low), percent(interval.high));
             Some(format!(
-                "{share} of {} that arrived; 95 % {low} to {high}, Wilson, as if independent",
+                "{standard}{share} of {} that arrived; 95 % {low} to {high}, Wilson, as if independent",
                 grouped(arrived)
             ))
         });
@@ -379,6 +378,11 @@ fn order(sources: &Sources<'_>) -> Vec<Metric> {
         ] {
             figures.push(Metric::new(name, label, "1", places as f64).by("RFC 4737, extent"));
         }
+    }
+    if let Some(n) = by.and_then(|one| one.n_max) {
+        let label = "n-reordered, largest n";
+        figures
+            .push(Metric::new("n_reordered_max", label, "1", n as f64).by("RFC 4737, section 5"));
     }
     figures
 }
