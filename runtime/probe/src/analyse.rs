@@ -9,7 +9,6 @@ use hil_capture::join::{JoinMetrics, Joined, OrderSource};
 use hil_capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_capture::pairing::join_all;
 use hil_capture::point::{PointMetrics, single_point_metrics};
-use hil_stats::histogram::Distribution;
 use hil_stats::statistics::IntervalNs;
 use serde::Serialize;
 
@@ -296,7 +295,7 @@ impl Report {
                 table.push([Cell::Count(count), what.into()]);
             }
         }
-        table.note = "kinds of which there are none are not listed".to_owned();
+        "kinds of which there are none are not listed".clone_into(&mut table.note);
         section.table(table);
         section
     }
