@@ -162,12 +162,13 @@ struct Layout {
 
 impl Layout {
     fn of(table: &Table, room: Option<usize>) -> Self {
+        let is_full = |row: &&Row| row.cells.len() == table.columns.len();
+        // Names before reasons count where nothing else stands in the column.
+        let has_full = table.rows.iter().any(|row| is_full(&row));
         let width_of = |index: usize| {
-            let cells = table
-                .rows
-                .iter()
-                .filter(|row| row.cells.len() == table.columns.len());
-            let cells = cells.map(|row| columns(&row.cells[index].text())).max();
+            let is_told = |row: &&Row| is_full(row) || !has_full && index + 1 < row.cells.len();
+            let rows = table.rows.iter().filter(is_told);
+            let cells = rows.map(|row| columns(&row.cells[index].text())).max();
             cells.unwrap_or(0).max(columns(&table.columns[index].label))
         };
         let has_value = |index: &usize| {
@@ -502,6 +503,17 @@ mod tests {
             assert!(text.lines().all(|line| columns(line) <= width), "{text}");
             assert_eq!(text.matches("unrecorded").count(), 12, "{text}");
         }
+    }
+
+    #[test]
+    fn a_name_stands_before_its_reason_where_no_row_has_values() {
+        let mut one = Table::new("", &["", "p50", "p99"]);
+        one.push(["interval".into(), "fewer than two datagrams".into()]);
+        let text = text_of(80, |canvas| table(canvas, &one));
+        assert!(
+            text.ends_with("\n  interval  fewer than two datagrams\n"),
+            "{text}"
+        );
     }
 
     #[test]
