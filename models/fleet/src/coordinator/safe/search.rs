@@ -644,16 +644,7 @@ fn search(name: &str, setting: Setting) -> usize {
     let depth = checker.max_depth();
     let taken = checker.state_count();
     assert!(count > 0, "{name}: {count} {depth} {taken}");
-    record(name, count, taken, depth);
     count
-}
-
-#[allow(
-    clippy::print_stdout,
-    reason = "the size of a search is what the long form is run for"
-)]
-fn record(name: &str, count: usize, taken: usize, depth: usize) {
-    println!("{name}: {count} states, {taken} steps, depth {depth}; frontier empty");
 }
 
 /// A fault is found: the search ends at a state in which robots or reservations are not apart.
