@@ -217,7 +217,7 @@ fn a_restarted_sender_takes_the_place_of_the_one_that_vanished() {
 }
 
 /// Eighty connections that say nothing, a part of a frame, or a datagram that nobody proves to be the peer's,
-/// while the peer goes on.
+/// while the peer sends.
 #[test]
 fn connections_without_an_authentic_datagram_cost_the_present_one_nothing() {
     let place: SocketAddr = "127.0.0.1:0".parse().unwrap();
