@@ -1,5 +1,6 @@
 //! One fold, fed in different ways, tells the same: as records become readable during a run, in small pieces,
-//! and the whole files at once. Only what the clocks are known by may differ.
+//! and the whole files at once. Only what the clocks are known by may differ, and a transmit stamp that came
+//! along too late.
 
 use core::time::Duration;
 
@@ -25,9 +26,6 @@ struct Run {
     span: RunSpan,
     has_two_clocks: bool,
     round_trips: Vec<RoundTripRecord>,
-    epoch_count: usize,
-    /// Publications of the messages whose transmit stamps were reported.
-    reported_ns: Vec<i64>,
 }
 
 fn up_to(stream: &mut RandomStream, max: u64) -> u64 {
@@ -84,7 +82,6 @@ impl Run {
             }
             now_ns += signed(up_to(&mut stream, 300)) * MS;
         }
-        let reported_ns = files.ingress.iter().map(|one| one.published_ns).collect();
         let each = files.ingress.iter().enumerate();
         let with_copies = each.flat_map(|(index, record)| {
             let copy = index.is_multiple_of(37).then(|| copy_of(record));
@@ -101,8 +98,6 @@ impl Run {
             },
             has_two_clocks: stream.chance(0.5),
             round_trips: Vec::new(),
-            epoch_count: epochs.len(),
-            reported_ns,
         };
         if run.has_two_clocks {
             run.set_consumer_ahead();
@@ -150,9 +145,12 @@ impl Run {
     /// Each kind of file is late by its own time, and each record by some more.
     fn note_events(&mut self, stream: &mut RandomStream) {
         let missing = up_to(stream, 9);
+        if missing == 4 {
+            self.files.forget_follow_ups();
+        }
         let allowed_ns = signed(up_to(stream, 1)) * duration_ns(WRITING_TIME_MAX) * 9 / 10;
         // A file is written in order.
-        let mut written_ns = [0; 5];
+        let mut written_ns = [0; 4];
         let mut note = |kind: u64, published_ns: i64, event: RecordEvent| {
             if kind == missing {
                 return;
@@ -174,9 +172,6 @@ impl Run {
         for one in &self.files.taken {
             note(3, one.published_ns, RecordEvent::Taken(*one));
         }
-        for (one, published_ns) in self.files.follow_up.iter().zip(&self.reported_ns) {
-            note(4, *published_ns, RecordEvent::FollowUp(*one));
-        }
         let is_missing = |kind: u64| kind == missing;
         let files = &mut self.files;
         if is_missing(0) {
@@ -191,9 +186,6 @@ impl Run {
         if is_missing(3) {
             files.taken.clear();
         }
-        if is_missing(4) {
-            files.follow_up.clear();
-        }
         self.events.sort_by_key(|(at_ns, _)| *at_ns);
     }
 
@@ -203,7 +195,6 @@ impl Run {
             published: all.published.filter(|one| one.count() > 0),
             egress: all.egress.filter(|one| one.count() > 0),
             ingress: all.ingress.filter(|one| one.count() > 0),
-            follow_up: all.follow_up.filter(|one| one.count() > 0),
             taken: all.taken.filter(|one| one.count() > 0),
         }
     }
@@ -289,9 +280,7 @@ impl Run {
 
     /// In the order of publication, a few records at a time.
     fn in_pieces(&self, stream: &mut RandomStream) -> Told {
-        // A transmit stamp comes with its message or later.
-        let published_ns =
-            |event: &RecordEvent| event.message().map_or(i64::MIN, |one| one.published_ns);
+        let published_ns = |event: &RecordEvent| event.message().published_ns;
         let mut events: Vec<RecordEvent> = self.events.iter().map(|(_, event)| *event).collect();
         events.sort_by_key(published_ns);
         let map = self.clock_map(i64::MAX);
@@ -306,9 +295,10 @@ impl Run {
                 fold.push(event);
             }
             rest = left;
-            let until_ns = rest
-                .first()
-                .map_or(i64::MAX, |next| published_ns(next).saturating_sub(1));
+            // A transmit stamp comes with a later message.
+            let until_ns = rest.first().map_or(i64::MAX, |next| {
+                published_ns(next).saturating_sub(200 * PERIOD_NS)
+            });
             fold.settle(&context, until_ns, &mut |one| told.add(one, context.path));
         }
         fold.finish(&context, &mut |one| told.add(one, context.path));
@@ -372,13 +362,13 @@ impl Told {
             let (here, there) = (self.messages.len(), other.messages.len());
             return Some(format!("{here} messages and {there}"));
         }
-        let plain = |one: &MessageHistory| MessageHistory {
-            // With several starts in one session, a later one makes the stamps of an earlier ambiguous.
-            handed_to_tx_ns: one.handed_to_tx_ns.filter(|_| run.epoch_count == 1),
-            ..*one
+        // A stamp that came along after its message had been told is not known there.
+        let told_by_then = |here: &MessageHistory, there: &MessageHistory| MessageHistory {
+            handed_to_tx_ns: here.handed_to_tx_ns.and(there.handed_to_tx_ns),
+            ..*here
         };
         let mut pairs = self.messages.iter().zip(&other.messages);
-        let apart = pairs.find(|(here, there)| plain(here) != plain(there));
+        let apart = pairs.find(|(here, there)| told_by_then(here, there) != **there);
         if let Some((here, there)) = apart {
             return Some(format!("{here:?}\n{there:?}"));
         }
@@ -399,6 +389,7 @@ impl Told {
 #[test]
 fn a_run_is_told_alike_live_in_pieces_and_at_once() {
     let (mut interrupted_count, mut wider_count) = (0, 0);
+    let (mut stamped_count, mut stamped_live_count) = (0, 0);
     for seed in 0..150 {
         let run = Run::random(seed);
         let at_once = run.at_once();
@@ -415,10 +406,14 @@ fn a_run_is_told_alike_live_in_pieces_and_at_once() {
             assert!(live.delay_ns.is_none() || live.delay_bound_ns >= whole.delay_bound_ns);
             wider_count += u64::from(live.delay_bound_ns > whole.delay_bound_ns);
         }
+        let is_stamped = |one: &&MessageHistory| one.handed_to_tx_ns.is_some();
+        stamped_count += at_once.messages.iter().filter(is_stamped).count();
+        stamped_live_count += live.messages.iter().filter(is_stamped).count();
         let is_interrupted = |one: &&MessageHistory| one.interruption_index.is_some();
         interrupted_count += at_once.messages.iter().filter(is_interrupted).count();
     }
     assert!(interrupted_count > 100, "{interrupted_count}");
+    assert!(stamped_live_count * 10 > stamped_count * 9);
     assert!(wider_count > 0, "the clocks are known better at the end");
 }
 
@@ -431,9 +426,6 @@ fn an_event_that_is_left_out_is_found_by_the_comparison() {
         let mut events = run.events.clone();
         let place = up_to(&mut stream, events.len() as u64 - 1);
         let (_, dropped) = events.remove(usize::try_from(place).unwrap());
-        if matches!(dropped, RecordEvent::FollowUp(_)) && run.epoch_count > 1 {
-            continue;
-        }
         let live = run.live(&events);
         assert_ne!(
             at_once.difference(&live, &run),
@@ -506,9 +498,6 @@ fn watched(count: u64, fate: impl Fn(u64) -> MessageFate) -> (usize, FateCounts)
         }
         for one in files.ingress {
             fold.push(&RecordEvent::Ingress(one));
-        }
-        for one in files.follow_up {
-            fold.push(&RecordEvent::FollowUp(one));
         }
         for one in files.taken {
             fold.push(&RecordEvent::Taken(one));

@@ -14,7 +14,7 @@ use super::follow_up::FollowUps;
 use super::history::{Key, MessageHistory};
 use super::{AccountContext, ChannelRecords, RecordSource, each};
 use hil_core::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE, stamp,
+    EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE, stamp,
 };
 use hil_stats::in_order::{InOrder, in_order};
 
@@ -27,8 +27,6 @@ pub enum RecordEvent {
     Egress(EgressRecord),
     /// The receiving gateway's.
     Ingress(IngressRecord),
-    /// A transmit stamp that the sender reported to the receiver.
-    FollowUp(FollowUpRecord),
     /// The consumer's.
     Taken(TakenRecord),
 }
@@ -45,20 +43,19 @@ pub struct MessageName {
 }
 
 impl RecordEvent {
-    /// The message; `None` of a transmit stamp, which names the sender's session instead.
-    pub const fn message(&self) -> Option<MessageName> {
+    /// The message.
+    pub const fn message(&self) -> MessageName {
         let (epoch, sequence, published_ns) = match self {
             Self::Published(one) => (one.epoch, one.sequence, one.published_ns),
             Self::Egress(one) => (one.epoch, one.sequence, one.published_ns),
             Self::Ingress(one) => (one.epoch, one.sequence, one.published_ns),
             Self::Taken(one) => (one.epoch, one.sequence, one.published_ns),
-            Self::FollowUp(_) => return None,
         };
-        Some(MessageName {
+        MessageName {
             epoch,
             sequence,
             published_ns,
-        })
+        }
     }
 
     /// True for what a gateway writes.
@@ -78,8 +75,6 @@ pub struct RecordsAtHand {
     pub egress: bool,
     /// The receiving gateway's.
     pub ingress: bool,
-    /// Transmit stamps that the sender reported.
-    pub follow_up: bool,
     /// The consumer's.
     pub taken: bool,
 }
@@ -92,7 +87,6 @@ impl RecordsAtHand {
             published: records.published.is_some(),
             egress: is_gateway && records.egress.is_some(),
             ingress: is_gateway && records.ingress.is_some(),
-            follow_up: is_gateway && records.follow_up.is_some(),
             taken: records.taken.is_some(),
         }
     }
@@ -220,7 +214,6 @@ impl Pending {
             RecordEvent::Taken(record) => {
                 message.taken.get_or_insert(*record);
             }
-            RecordEvent::FollowUp(_) => {}
         }
     }
 
@@ -265,15 +258,10 @@ impl ChannelFold {
             held_max: None,
         });
         fold.expect(RecordsAtHand::of(records, context));
-        if fold.at_hand.follow_up {
-            for record in each(records.follow_up) {
+        if fold.settings.is_gateway {
+            // A stamp comes with a later message, of which nothing is known when its own is told.
+            for record in each(records.ingress) {
                 fold.follow_ups.add(&record);
-            }
-            if !fold.follow_ups.is_empty() {
-                // What comes later in the run may make a stamp ambiguous.
-                for record in each(records.ingress) {
-                    fold.follow_ups.note_arrival(&record);
-                }
             }
         }
         fold
@@ -285,7 +273,6 @@ impl ChannelFold {
         at_hand.published |= kinds.published;
         at_hand.egress |= kinds.egress;
         at_hand.ingress |= kinds.ingress;
-        at_hand.follow_up |= kinds.follow_up;
         at_hand.taken |= kinds.taken;
     }
 
@@ -315,17 +302,11 @@ impl ChannelFold {
             RecordEvent::Egress(_) => self.at_hand.egress = true,
             RecordEvent::Ingress(record) => {
                 self.at_hand.ingress = true;
-                self.follow_ups.note_arrival(record);
-            }
-            RecordEvent::FollowUp(record) => {
-                self.at_hand.follow_up = true;
                 self.follow_ups.add(record);
             }
             RecordEvent::Taken(_) => self.at_hand.taken = true,
         }
-        if let Some(name) = event.message() {
-            self.insert(name, event);
-        }
+        self.insert(event.message(), event);
     }
 
     fn insert(&mut self, name: MessageName, event: &RecordEvent) {
@@ -343,7 +324,7 @@ impl ChannelFold {
                 epoch.consumer.offer(sequence, settings.depth);
             }
             RecordEvent::Taken(_) => epoch.consumer.take(sequence),
-            RecordEvent::Ingress(_) | RecordEvent::FollowUp(_) => {}
+            RecordEvent::Ingress(_) => {}
         }
         let has_settled = epoch.next.is_some_and(|next| sequence < next);
         if has_settled {
@@ -475,7 +456,7 @@ impl ChannelFold {
         message.fate = verdict.fate;
         message.interruption_index = verdict.interruption_index;
         if let Some(ingress) = message.ingress {
-            message.handed_to_tx_ns = self.follow_ups.take(ingress.session, sequence);
+            message.handed_to_tx_ns = self.follow_ups.take(&ingress);
         }
         let epoch = &mut self.epochs[index];
         if epoch.rank.is_none() {

@@ -1,23 +1,36 @@
-//! Transmit stamps that the sender reported in later datagrams, found by its session and the number of
-//! the message. A session numbers without holes but for losses, so they lie in a row.
+//! Transmit stamps that the sender reported in later datagrams, found by its session, the producer's start and
+//! the number of the message. Both count without holes but for losses, so they lie in a row.
 
 use std::collections::{BTreeMap, VecDeque};
 
-use hil_core::record::{FollowUpRecord, IngressRecord};
+use hil_core::record::{FollowUp, IngressRecord};
 
 /// A number that no stamp was reported for.
 const NONE: i32 = i32::MIN;
 
-/// Transmit stamps reported by the sender, found by its session.
+/// Transmit stamps reported by the sender.
 #[derive(Debug, Default)]
 pub(super) struct FollowUps {
-    sessions: BTreeMap<u32, Reported>,
-    /// The highest number of each start of the producer that came in a session: a stamp for a number
-    /// that two of them reached could belong to either message.
-    tops: BTreeMap<u32, Vec<(u32, u64)>>,
+    starts: BTreeMap<Starts, Reported>,
 }
 
-/// What was reported in one session.
+/// Of a session and of the producer, whose messages it carried.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Starts {
+    session: u32,
+    epoch: u32,
+}
+
+impl Starts {
+    const fn of(record: &IngressRecord) -> Self {
+        Self {
+            session: record.session,
+            epoch: record.epoch,
+        }
+    }
+}
+
+/// What was reported of the messages of two starts.
 #[derive(Debug, Default)]
 struct Reported {
     /// Number of the first in `row`.
@@ -89,34 +102,24 @@ impl Reported {
 }
 
 impl FollowUps {
-    /// True when no stamp was reported.
-    pub(super) fn is_empty(&self) -> bool {
-        self.sessions.is_empty()
-    }
-
-    /// Takes in a reported stamp.
-    pub(super) fn add(&mut self, record: &FollowUpRecord) {
-        let session = self.sessions.entry(record.session).or_default();
-        session.add(record.sequence, record.handed_to_tx_ns);
-    }
-
-    /// Notes which numbers of which start of the producer came in a session.
-    pub(super) fn note_arrival(&mut self, record: &IngressRecord) {
-        let tops = self.tops.entry(record.session).or_default();
-        match tops.iter_mut().find(|(epoch, _)| *epoch == record.epoch) {
-            Some((_, top)) => *top = record.sequence.max(*top),
-            None => tops.push((record.epoch, record.sequence)),
+    /// Takes in the stamp that came along with a message, if one did.
+    pub(super) fn add(&mut self, record: &IngressRecord) {
+        if let Some(FollowUp {
+            sequence,
+            handed_to_tx_ns,
+        }) = record.follow_up()
+        {
+            let reported = self.starts.entry(Starts::of(record)).or_default();
+            reported.add(sequence, handed_to_tx_ns);
         }
     }
 
-    /// The stamp of a message that came in a session; those of lower numbers are forgotten.
-    pub(super) fn take(&mut self, session: u32, sequence: u64) -> Option<i64> {
-        let reported = self.sessions.get_mut(&session)?;
-        let found = reported.find(sequence);
-        reported.forget_before(sequence);
-        let tops = self.tops.get(&session)?;
-        let reaching_count = tops.iter().filter(|(_, top)| *top >= sequence).count();
-        found.filter(|_| reaching_count < 2)
+    /// The stamp of a message that arrived; those of lower numbers are forgotten.
+    pub(super) fn take(&mut self, record: &IngressRecord) -> Option<i64> {
+        let reported = self.starts.get_mut(&Starts::of(record))?;
+        let found = reported.find(record.sequence);
+        reported.forget_before(record.sequence);
+        found
     }
 }
 

@@ -57,7 +57,7 @@ pub use outage::{
 pub use stage::{MessageFate, Side, Stage};
 
 use hil_clock::{ClockMap, ClockSettings};
-use hil_core::record::{EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord};
+use hil_core::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord};
 use hil_core::time::{Alignment, Instant, RemoteInstant};
 
 /// Largest difference between end-to-end and the sum of segments for a message that closes.
@@ -94,8 +94,6 @@ pub struct ChannelRecords<'a> {
     pub egress: Option<&'a dyn RecordSource<EgressRecord>>,
     /// The receiving gateway's.
     pub ingress: Option<&'a dyn RecordSource<IngressRecord>>,
-    /// Transmit stamps the sender reported to the receiver.
-    pub follow_up: Option<&'a dyn RecordSource<FollowUpRecord>>,
     /// The consumer's.
     pub taken: Option<&'a dyn RecordSource<TakenRecord>>,
 }

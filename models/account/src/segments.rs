@@ -146,7 +146,7 @@ impl<'a> SegmentFold<'a> {
                 residual: Distribution::unavailable("no message was taken"),
             },
             coverage: StampCoverage {
-                tx_software: covers(egress || (ingress && at_hand.follow_up)),
+                tx_software: covers(egress || ingress),
                 tx_hardware: covers(egress),
                 rx_software: covers(ingress),
                 rx_hardware: covers(ingress),

@@ -2,7 +2,7 @@
 
 use super::{AccountContext, ChannelPath, ChannelRecords, MessageFate, RunSpan};
 use hil_core::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
+    EgressRecord, FollowUp, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
 };
 use hil_core::time::{Alignment, Instant};
 
@@ -36,8 +36,6 @@ pub struct Files {
     pub egress: Vec<EgressRecord>,
     /// The receiving gateway's.
     pub ingress: Vec<IngressRecord>,
-    /// The transmit stamps reported to the receiver.
-    pub follow_up: Vec<FollowUpRecord>,
     /// The consumer's.
     pub taken: Vec<TakenRecord>,
 }
@@ -102,17 +100,18 @@ impl Files {
             Fate::Duplicate => IngressRecord::DUPLICATE,
             _ => 0,
         };
-        self.follow_up.push(FollowUpRecord {
-            sequence: message.sequence,
-            handed_to_tx_ns: TX_NS - HANDED_NS,
-            session: ingress.session,
-            reserved: 0,
-        });
         if matches!(
             fate,
             Fate::Incomplete | Fate::Late | Fate::Duplicate | Fate::RefusedAtIngress
         ) {
             ingress.forwarded_ns = UNAVAILABLE;
+        } else {
+            let before = self.ingress.last();
+            let before = before.filter(|one| one.epoch == ingress.epoch);
+            ingress = ingress.with_follow_up(before.map(|one| FollowUp {
+                sequence: one.sequence,
+                handed_to_tx_ns: TX_NS - HANDED_NS,
+            }));
         }
         self.ingress.push(ingress);
         if fate == Fate::Taken {
@@ -127,13 +126,19 @@ impl Files {
         }
     }
 
+    /// The sender reports no transmit stamp.
+    pub fn forget_follow_ups(&mut self) {
+        for record in &mut self.ingress {
+            *record = record.with_follow_up(None);
+        }
+    }
+
     /// As the account reads them.
     pub fn records(&self) -> ChannelRecords<'_> {
         ChannelRecords {
             published: Some(&self.published),
             egress: Some(&self.egress),
             ingress: Some(&self.ingress),
-            follow_up: Some(&self.follow_up),
             taken: Some(&self.taken),
         }
     }
@@ -180,6 +185,8 @@ fn arrived(message: Written) -> IngressRecord {
         realtime_offset_ns: REALTIME_NS,
         emulated_ns: UNAVAILABLE,
         due_ns: UNAVAILABLE,
+        follow_up_sequence: 0,
+        follow_up_ns: UNAVAILABLE,
         epoch: message.epoch,
         session: 41,
         flags: 0,

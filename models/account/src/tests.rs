@@ -129,7 +129,7 @@ fn a_missing_stamp_combines_its_neighbours_for_that_message_only() {
     for record in &mut files.egress[..30] {
         record.tx_software_ns = UNAVAILABLE;
     }
-    files.follow_up.clear();
+    files.forget_follow_ups();
     for record in &mut files.ingress[20..40] {
         record.rx_software_ns = UNAVAILABLE;
     }
@@ -162,7 +162,7 @@ fn stamps_that_never_came_are_unavailable_with_a_reason() {
     for record in &mut files.egress {
         record.tx_software_ns = UNAVAILABLE;
     }
-    files.follow_up.clear();
+    files.forget_follow_ups();
     let account = account(&files.records(), &same_clock(100 * PERIOD_NS));
     let Distribution::Unavailable { reason } =
         segment(&account, Stage::TxSoftware, Stage::RxSoftware)
@@ -303,7 +303,6 @@ fn without_the_peers_files_what_cannot_be_known_is_unknown() {
 
     let producer = ChannelRecords {
         ingress: None,
-        follow_up: None,
         taken: None,
         ..files.records()
     };
@@ -401,7 +400,6 @@ fn a_direct_channel_has_one_segment() {
     let records = ChannelRecords {
         egress: None,
         ingress: None,
-        follow_up: None,
         ..files.records()
     };
     let run = RunSpan {

@@ -112,6 +112,10 @@ pub struct IngressRecord {
     /// When the model of that link let it arrive, this host's monotonic clock: `received_ns` is
     /// later by what the host needed to notice. [`UNAVAILABLE`] on a real link.
     pub due_ns: i64,
+    /// Number of an earlier message of the same starts, whose transmit stamp came along with this one.
+    pub follow_up_sequence: u64,
+    /// That stamp, see [`FollowUp`]; [`UNAVAILABLE`] when none came along, and the number then says nothing.
+    pub follow_up_ns: i64,
     /// The producer's start.
     pub epoch: u32,
     /// The sending gateway's start.
@@ -122,7 +126,35 @@ pub struct IngressRecord {
     pub fragment_count: u32,
 }
 
+/// A sender's kernel transmit stamp of an earlier message, for a receiver that cannot read the sender's
+/// records.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FollowUp {
+    /// The earlier message's number, of the same epoch.
+    pub sequence: u64,
+    /// Kernel transmit stamp minus handing over, both on the sending host.
+    pub handed_to_tx_ns: i64,
+}
+
 impl IngressRecord {
+    /// The transmit stamp that came along.
+    pub fn follow_up(&self) -> Option<FollowUp> {
+        Some(FollowUp {
+            sequence: self.follow_up_sequence,
+            handed_to_tx_ns: stamp(self.follow_up_ns)?,
+        })
+    }
+
+    /// The record with the transmit stamp that came along.
+    #[must_use]
+    pub fn with_follow_up(self, follow_up: Option<FollowUp>) -> Self {
+        Self {
+            follow_up_sequence: follow_up.map_or(0, |one| one.sequence),
+            follow_up_ns: follow_up.map_or(UNAVAILABLE, |one| one.handed_to_tx_ns),
+            ..self
+        }
+    }
+
     /// It came after a message with a higher sequence number.
     pub const REORDERED: u32 = 1;
     /// Seen before; not published again.
@@ -193,19 +225,4 @@ impl FrameRecord {
             head,
         }
     }
-}
-
-/// A transmit stamp the sender reported in a later datagram, for a receiver that cannot read the
-/// sender's records.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-#[repr(C)]
-pub struct FollowUpRecord {
-    /// Sequence number the stamp belongs to.
-    pub sequence: u64,
-    /// Kernel transmit stamp minus `handed`, both on the sending host.
-    pub handed_to_tx_ns: i64,
-    /// The sending gateway's start.
-    pub session: u32,
-    /// Zero.
-    pub reserved: u32,
 }

@@ -1,7 +1,7 @@
 //! What the network did to each message, as topics: the stamps of every stage beside each other, and
 //! the verdict of the link. It judges nothing by itself: fates and bounds are those of the run.
 
-use hil_core::record::{FollowUpRecord, IngressRecord, stamp};
+use hil_core::record::{FollowUp, IngressRecord, stamp};
 use hil_rundir::live_run::Stage;
 use hil_rundir::record::{RecordFile, RecordKind};
 use hil_trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
@@ -227,7 +227,7 @@ impl MessageLatency {
 
     /// Takes a transmit stamp that came in a later datagram. It needs the sender's offset, so it is used
     /// only beside one that the sender noted.
-    pub(crate) fn note_late(&mut self, late: &FollowUpRecord) {
+    pub(crate) fn note_late(&mut self, late: FollowUp) {
         if self.tx_realtime_ns.is_none() {
             let left = self.handed_ns.zip(self.sender_realtime_offset_ns);
             self.tx_realtime_ns = left.and_then(|(handed_ns, offset_ns)| {

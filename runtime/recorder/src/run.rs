@@ -17,12 +17,11 @@ use serde_json::Value;
 use crate::failure::Failure;
 
 /// The kinds of records that end in a recording.
-const KINDS: [RecordKind; 7] = [
+const KINDS: [RecordKind; 6] = [
     RecordKind::Published,
     RecordKind::Taken,
     RecordKind::Egress,
     RecordKind::Ingress,
-    RecordKind::FollowUp,
     RecordKind::Message,
     RecordKind::LinkCondition,
 ];

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 use hil_core::message::Envelope;
-use hil_core::record::{FollowUpRecord, UNAVAILABLE};
+use hil_core::record::{IngressRecord, UNAVAILABLE};
 use hil_link::condition::LinkConditionRecord;
 use hil_rundir::live_run::Stage;
 use hil_rundir::manifest::ChannelDescription;
@@ -619,10 +619,11 @@ impl RunTopics {
                 }
             }
             What::LateStamp { file, index } => {
-                if let Some(late) = run.files[file].record::<FollowUpRecord>(index)
+                let with_late = run.files[file].record::<IngressRecord>(index);
+                if let Some(late) = with_late.and_then(|one| one.follow_up())
                     && let Some(one) = self.channels[channel].joining.waiting_with(late.sequence)
                 {
-                    one.note_late(&late);
+                    one.note_late(late);
                 }
             }
             What::Decision { trace, index } => {

@@ -4,10 +4,10 @@
 use std::collections::BTreeMap;
 
 use hil_core::message::Envelope;
-use hil_core::record::{FollowUpRecord, IngressRecord};
+use hil_core::record::IngressRecord;
 use hil_rundir::live_run::Stage;
-use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
+use hil_rundir::record::{RecordFile, RecordKind};
 use hil_watch::Record;
 
 use crate::net::{self, MessageId, Noted};
@@ -20,7 +20,7 @@ pub(crate) enum What {
     Message { file: usize, index: usize },
     /// What a process noted of a message.
     Record { file: usize, index: usize },
-    /// A transmit stamp that came later.
+    /// A transmit stamp that came with a later message, in the record of that.
     LateStamp { file: usize, index: usize },
     /// The verdict of a link.
     Decision { trace: usize, index: usize },
@@ -65,22 +65,31 @@ pub(crate) fn noted_steps(
         let Some(channel) = place(name) else {
             continue;
         };
-        let late = if *kind == RecordKind::FollowUp {
-            arrivals(run, name)
+        let arrivals = if *kind == RecordKind::Ingress {
+            arrivals(records)
         } else {
             BTreeMap::new()
         };
         for index in 0..records.record_count() {
+            let with_late = records.record::<IngressRecord>(index);
+            let with_late = with_late.filter(|_| *kind == RecordKind::Ingress);
+            let late = with_late.and_then(|one| Some((Arrival::of(&one), one.follow_up()?)));
+            let stamped = late.and_then(|(with, late)| {
+                arrivals.get(&Arrival {
+                    sequence: late.sequence,
+                    ..with
+                })
+            });
+            steps.extend(stamped.map(|noted| Step {
+                at_ns: at_ns(channel, noted),
+                channel,
+                what: What::LateStamp { file, index },
+            }));
             let (noted, what) = match kind {
                 RecordKind::Message => {
                     let message = records.message(index);
                     let noted = message.map(|(envelope, _)| published(&envelope));
                     (noted, What::Message { file, index })
-                }
-                RecordKind::FollowUp => {
-                    let stamp: Option<FollowUpRecord> = records.record(index);
-                    let noted = stamp.and_then(|one| late.get(&(one.session, one.sequence)));
-                    (noted.copied(), What::LateStamp { file, index })
                 }
                 _ => {
                     let record = net::record(records, index);
@@ -98,19 +107,32 @@ pub(crate) fn noted_steps(
     steps
 }
 
-/// What the receiving gateway noted of each message of `channel`, by session and number.
-fn arrivals(run: &Run, channel: &str) -> BTreeMap<(u32, u64), Noted> {
-    let files = run.files_of(channel, RecordKind::Ingress);
-    let records = files.flat_map(|(_, file)| file.records::<IngressRecord>());
-    let noted = records.map(|one| {
-        (
-            (one.session, one.sequence),
-            Noted::of(&Record::Ingress(one)),
-        )
+/// The arrival of a message, as the receiving gateway names it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Arrival {
+    session: u32,
+    epoch: u32,
+    sequence: u64,
+}
+
+impl Arrival {
+    const fn of(record: &IngressRecord) -> Self {
+        Self {
+            session: record.session,
+            epoch: record.epoch,
+            sequence: record.sequence,
+        }
+    }
+}
+
+/// What a receiving gateway noted of each message.
+fn arrivals(file: &RecordFile) -> BTreeMap<Arrival, Noted> {
+    let records = file.records::<IngressRecord>();
+    let noted = records.filter_map(|one| {
+        let noted = Noted::of(&Record::Ingress(one))?;
+        Some((Arrival::of(&one), noted))
     });
-    noted
-        .filter_map(|(key, noted)| Some((key, noted?)))
-        .collect()
+    noted.collect()
 }
 
 /// What a message says of its own publication.

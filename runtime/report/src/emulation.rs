@@ -89,6 +89,8 @@ mod tests {
             IngressRecord {
                 emulated_ns,
                 due_ns,
+                follow_up_sequence: 0,
+                follow_up_ns: UNAVAILABLE,
                 received_ns: due_ns + late_ns(index),
                 ..IngressRecord::zeroed()
             }

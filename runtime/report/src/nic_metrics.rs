@@ -318,6 +318,8 @@ mod tests {
             realtime_offset_ns: EPOCH_NS - 7_000_000_000,
             emulated_ns: UNAVAILABLE,
             due_ns: UNAVAILABLE,
+            follow_up_sequence: 0,
+            follow_up_ns: UNAVAILABLE,
             epoch: 1,
             session: 1,
             flags: 0,

@@ -5,7 +5,7 @@ use hil_account::RecordEvent;
 use hil_account::nic_clock::NicClockRecord;
 use hil_core::message::Envelope;
 use hil_core::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
+    EgressRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_link::condition::LinkConditionRecord;
 
@@ -76,8 +76,6 @@ pub enum Record {
     Egress(EgressRecord),
     /// A gateway received.
     Ingress(IngressRecord),
-    /// A transmit stamp that came later.
-    FollowUp(FollowUpRecord),
     /// A clock exchange.
     RoundTrip(RoundTripRecord),
     /// An adapter sent.
@@ -101,7 +99,6 @@ impl Record {
             Self::Taken(record) => Some(RecordEvent::Taken(record)),
             Self::Egress(record) => Some(RecordEvent::Egress(record)),
             Self::Ingress(record) => Some(RecordEvent::Ingress(record)),
-            Self::FollowUp(record) => Some(RecordEvent::FollowUp(record)),
             _ => None,
         }
     }
@@ -116,7 +113,6 @@ impl Record {
             RecordKind::Taken => all(batch, Self::Taken, take),
             RecordKind::Egress => all(batch, Self::Egress, take),
             RecordKind::Ingress => all(batch, Self::Ingress, take),
-            RecordKind::FollowUp => all(batch, Self::FollowUp, take),
             RecordKind::RoundTrip => all(batch, Self::RoundTrip, take),
             RecordKind::AdapterSent => all(batch, Self::AdapterSent, take),
             RecordKind::AdapterReceived => all(batch, Self::AdapterReceived, take),

@@ -40,7 +40,7 @@ impl Since {
         record: &Record,
         is_of_this_host: bool,
     ) -> bool {
-        let message = record.of_message().and_then(|event| event.message());
+        let message = record.of_message().map(|event| event.message());
         message.is_none_or(|one| self.admits(channel, one.epoch, one.sequence, is_of_this_host))
     }
 

@@ -420,6 +420,8 @@ fn ingress(sequence: u64) -> IngressRecord {
         realtime_offset_ns: 0,
         emulated_ns: UNAVAILABLE,
         due_ns: UNAVAILABLE,
+        follow_up_sequence: 0,
+        follow_up_ns: UNAVAILABLE,
         epoch: 1,
         session: 0,
         flags: 0,

@@ -7,6 +7,7 @@ use crate::counts;
 use crate::fragment::GivenUp;
 use crate::sequence::{Order, Stream};
 use crate::wire::{FollowUpField, Header};
+use hil_core::record::FollowUp;
 
 /// Who a message is and when it was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -65,15 +66,6 @@ impl Incomplete {
             heard_at: given_up.heard_at,
         }
     }
-}
-
-/// A sender's kernel transmit stamp of an earlier message.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct FollowUp {
-    /// The earlier message's number, of the same epoch.
-    pub sequence: u64,
-    /// Kernel transmit stamp minus handing over, both on the sending host.
-    pub handed_to_tx_ns: i64,
 }
 
 /// A message for the local channel.

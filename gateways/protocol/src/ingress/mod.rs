@@ -32,7 +32,7 @@ use super::stamps::ArrivalStamps;
 use super::wire::{self, Body, Header, Kind, Prefix};
 
 pub use delivery::{
-    Delivery, Disposition, FollowUp, Incomplete, IngressChannelCounts, IngressCounts, MessageInfo,
+    Delivery, Disposition, Incomplete, IngressChannelCounts, IngressCounts, MessageInfo,
 };
 pub use replies::ReplyCounts;
 

@@ -6,13 +6,13 @@ use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::time::Duration;
 
 use hil_core::link_model::ReplayTally;
-use hil_core::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
+use hil_core::record::{EgressRecord, IngressRecord, RoundTripRecord};
 use hil_core::time::duration_ns;
 use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings, SettingsError};
 use hil_transport::{ConnectionTally, Stalls};
 
 use super::egress::{Attention, Egress};
-use super::ingress::{Ingress, Output, Records};
+use super::ingress::{Ingress, Output};
 use super::inputs::Inputs;
 use super::kernel_clock::KernelClock;
 use super::line::Line;
@@ -63,7 +63,6 @@ enum Sinks {
     },
     Ingress {
         messages: SharedSink,
-        follow_ups: SharedSink,
     },
 }
 
@@ -116,7 +115,6 @@ fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks
         },
         Side::Ingress => Sinks::Ingress {
             messages: of_channels(RecordKind::Ingress, size_of::<IngressRecord>())?,
-            follow_ups: of_channels(RecordKind::FollowUp, size_of::<FollowUpRecord>())?,
         },
     })
 }
@@ -196,13 +194,7 @@ impl OpenDirection {
                 refusal_backoff: RefusalBackoff::of_replies(),
                 is_established: self.is_established,
             })),
-            (
-                SocketEnd::Receiver(receiver),
-                Sinks::Ingress {
-                    messages,
-                    follow_ups,
-                },
-            ) => {
+            (SocketEnd::Receiver(receiver), Sinks::Ingress { messages }) => {
                 let settings = IngressSettings::new(
                     GatewayContext::identity(launch),
                     around.session,
@@ -221,10 +213,7 @@ impl OpenDirection {
                     is_emulated: launch.channels.iter().any(|one| one.emulation.is_some()),
                     bridge: IngressBridge::new(settings)?,
                     outputs: outputs.collect::<Result<_, WorkerError>>()?,
-                    records: Records {
-                        messages,
-                        follow_ups,
-                    },
+                    records: messages,
                     wait: WaitStrategy::new(launch.wait),
                     peer: launch.peer,
                     stop: Arc::clone(&around.stop),

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use hil_core::message::Envelope;
-use hil_core::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
+use hil_core::record::{IngressRecord, UNAVAILABLE};
 use hil_core::time::Instant;
-use hil_protocol::ingress::{FollowUp, MessageInfo};
+use hil_protocol::ingress::MessageInfo;
 use hil_protocol::sequence::Order;
 use hil_protocol::wire::Kind;
 use hil_protocol::{Delivery, Disposition, Incomplete, IngressBridge};
@@ -32,7 +32,8 @@ pub(crate) struct Ingress {
     pub(crate) bridge: IngressBridge,
     /// Where messages go, by channel; empty on a clock path, which carries none.
     pub(crate) outputs: Box<[Output]>,
-    pub(crate) records: Records,
+    /// What became of messages, by channel.
+    pub(crate) records: SharedSink,
     pub(crate) wait: WaitStrategy,
     pub(crate) peer: SocketAddr,
     pub(crate) stop: Arc<AtomicBool>,
@@ -50,13 +51,6 @@ pub(crate) struct Ingress {
 pub(crate) struct Response {
     sequence: u64,
     handed: Instant,
-}
-
-/// Where the records of messages go.
-#[derive(Debug)]
-pub(crate) struct Records {
-    pub(crate) messages: SharedSink,
-    pub(crate) follow_ups: SharedSink,
 }
 
 /// One local channel.
@@ -89,6 +83,8 @@ impl Arrival {
             realtime_offset_ns: self.offset_ns,
             emulated_ns: emulated.map_or(UNAVAILABLE, |delay| delay.arrived.as_ns()),
             due_ns: emulated.map_or(UNAVAILABLE, |delay| delay.due.as_ns()),
+            follow_up_sequence: 0,
+            follow_up_ns: UNAVAILABLE,
             epoch: message.epoch,
             session: message.session,
             flags,
@@ -128,12 +124,14 @@ impl Ingress {
                 realtime_offset_ns: self.clock.offset_ns(),
                 emulated_ns: UNAVAILABLE,
                 due_ns: UNAVAILABLE,
+                follow_up_sequence: 0,
+                follow_up_ns: UNAVAILABLE,
                 epoch: message.epoch,
                 session: message.session,
                 flags: IngressRecord::INCOMPLETE,
                 fragment_count: u32::from(message.fragment_count),
             };
-            self.records.messages.push(message.channel, &record);
+            self.records.push(message.channel, &record);
         }
     }
 
@@ -203,7 +201,7 @@ impl Ingress {
         };
         // A refused datagram is a counter of the bridge.
         if let Ok(disposition) = bridge.on_datagram(at, stamps, bytes, &mut deliver) {
-            note_undelivered(&mut records.messages, &arrival, disposition);
+            note_undelivered(records, &arrival, disposition);
         }
         self.note_incomplete();
         failed.map_or(Ok(Some(at)), |error| Err(error.into()))
@@ -281,7 +279,7 @@ impl Output {
         &mut self,
         arrival: &Arrival,
         delivery: &Delivery<'_>,
-        records: &mut Records,
+        records: &mut SharedSink,
     ) -> Result<(), ChannelError> {
         let message = &delivery.message;
         let mut forwarded_ns = UNAVAILABLE;
@@ -302,21 +300,7 @@ impl Output {
             0
         };
         let record = arrival.record(message, forwarded_ns, flags);
-        records.messages.push(message.channel, &record);
-        if let Some(FollowUp {
-            sequence,
-            handed_to_tx_ns,
-        }) = delivery.follow_up
-        {
-            let session = message.session;
-            let record = FollowUpRecord {
-                sequence,
-                handed_to_tx_ns,
-                session,
-                reserved: 0,
-            };
-            records.follow_ups.push(message.channel, &record);
-        }
+        records.push(message.channel, &record.with_follow_up(delivery.follow_up));
         Ok(())
     }
 }

@@ -13,7 +13,7 @@ use hil_account::MessageFate;
 use hil_core::message::Envelope;
 use hil_core::random::RandomStream;
 use hil_core::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
+    EgressRecord, FollowUp, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
     UNAVAILABLE,
 };
 use hil_core::time::Instant;
@@ -124,7 +124,6 @@ struct Written<'a> {
     published: Sink,
     egress: Sink,
     ingress: Sink,
-    follow_up: Sink,
     taken: Sink,
     round_trip: Sink,
     message: Sink,
@@ -147,7 +146,6 @@ impl<'a> Written<'a> {
             published: sink(RecordKind::Published, size_of::<PublishedRecord>()),
             egress: sink(RecordKind::Egress, size_of::<EgressRecord>()),
             ingress: sink(RecordKind::Ingress, size_of::<IngressRecord>()),
-            follow_up: sink(RecordKind::FollowUp, size_of::<FollowUpRecord>()),
             taken: sink(RecordKind::Taken, size_of::<TakenRecord>()),
             round_trip: Sink::new(
                 folder,
@@ -236,6 +234,8 @@ impl<'a> Written<'a> {
             realtime_offset_ns: REALTIME_NS,
             emulated_ns: UNAVAILABLE,
             due_ns: UNAVAILABLE,
+            follow_up_sequence: 0,
+            follow_up_ns: UNAVAILABLE,
             epoch: 7,
             session: 41,
             flags: if is_displaced {
@@ -263,13 +263,12 @@ impl<'a> Written<'a> {
         self.late.sort_by_key(|one| one.0);
         let count = self.late.partition_point(|one| one.0 <= ns);
         for (_, record) in self.late.drain(..count).collect::<Vec<_>>() {
-            self.ingress.put(&record);
-            self.follow_up.put(&FollowUpRecord {
-                sequence: record.sequence,
-                handed_to_tx_ns: 4_000,
-                session: 41,
-                reserved: 0,
-            });
+            let before = record.sequence.checked_sub(1);
+            self.ingress
+                .put(&record.with_follow_up(before.map(|sequence| FollowUp {
+                    sequence,
+                    handed_to_tx_ns: 4_000,
+                })));
             // The consumer wakes for all but a few of them.
             if record.flags & IngressRecord::DUPLICATE == 0 && self.random.uniform() > 0.002 {
                 let taken_ns = record.forwarded_ns + 20_000 + self.jitter(8_000.0);

@@ -133,7 +133,6 @@ impl<'a> RunRecords<'a> {
             RecordKind::Taken => &mut channel.taken,
             RecordKind::Egress => &mut channel.egress,
             RecordKind::Ingress => &mut channel.ingress,
-            RecordKind::FollowUp => &mut channel.follow_up,
             RecordKind::AdapterSent => &mut channel.adapter_sent,
             RecordKind::AdapterReceived => &mut channel.adapter_received,
             RecordKind::Message => &mut channel.message,
@@ -288,7 +287,6 @@ impl<'a> RunRecords<'a> {
             published: files.published.as_ref().map(|files| files as _),
             egress: files.egress.as_ref().map(|files| files as _),
             ingress: files.ingress.as_ref().map(|files| files as _),
-            follow_up: files.follow_up.as_ref().map(|files| files as _),
             taken: files.taken.as_ref().map(|files| files as _),
         };
         ask(&records, &context)
@@ -351,7 +349,6 @@ pub(super) struct ChannelFiles {
     pub(super) published: Option<StoredRecords>,
     pub(super) egress: Option<StoredRecords>,
     pub(super) ingress: Option<StoredRecords>,
-    pub(super) follow_up: Option<StoredRecords>,
     pub(super) taken: Option<StoredRecords>,
     pub(super) adapter_sent: Option<StoredRecords>,
     pub(super) adapter_received: Option<StoredRecords>,

@@ -85,6 +85,8 @@ impl Files {
             realtime_offset_ns: REALTIME_NS + if sequence == 4_000 { 7_000 } else { 40 },
             emulated_ns: UNAVAILABLE,
             due_ns: UNAVAILABLE,
+            follow_up_sequence: 0,
+            follow_up_ns: UNAVAILABLE,
             epoch: 1,
             session: 9,
             flags: 0,
@@ -135,7 +137,6 @@ impl Files {
             published: Some(&self.published),
             egress: Some(&self.egress),
             ingress: Some(&self.ingress),
-            follow_up: None,
             taken: Some(&self.taken),
         };
         let context = AccountContext {

@@ -18,8 +18,7 @@ use bytemuck::{CheckedBitPattern, Pod};
 use hil_account::nic_clock::NicClockRecord;
 use hil_core::message::Envelope;
 use hil_core::record::{
-    EgressRecord, FollowUpRecord, FrameRecord, IngressRecord, PublishedRecord, RoundTripRecord,
-    TakenRecord,
+    EgressRecord, FrameRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_core::run_log::RunLog;
 use hil_link::condition::LinkConditionRecord;
@@ -44,8 +43,6 @@ pub enum RecordKind {
     Egress = 3,
     /// [`IngressRecord`]s of a receiving gateway.
     Ingress = 4,
-    /// [`FollowUpRecord`]s of a receiving gateway.
-    FollowUp = 5,
     /// Messages: an [`Envelope`] and the payload.
     Message = 6,
     /// [`RoundTripRecord`]s of a sending gateway.
@@ -73,7 +70,6 @@ impl RecordKind {
             Self::Taken => "taken",
             Self::Egress => "egress",
             Self::Ingress => "ingress",
-            Self::FollowUp => "follow-up",
             Self::Message => "message",
             Self::RoundTrip => "round-trip",
             Self::AdapterSent => "face-sent",
@@ -92,7 +88,6 @@ impl RecordKind {
             Self::Taken => Some(size_of::<TakenRecord>()),
             Self::Egress => Some(size_of::<EgressRecord>()),
             Self::Ingress => Some(size_of::<IngressRecord>()),
-            Self::FollowUp => Some(size_of::<FollowUpRecord>()),
             Self::RoundTrip => Some(size_of::<RoundTripRecord>()),
             Self::AdapterSent => Some(size_of::<AdapterSentRecord>()),
             Self::AdapterReceived => Some(size_of::<AdapterReceivedRecord>()),

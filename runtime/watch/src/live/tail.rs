@@ -71,7 +71,7 @@ impl ChannelTail {
     fn push(&mut self, event: &RecordEvent) {
         const NEVER_CAME: u32 =
             IngressRecord::DUPLICATE | IngressRecord::LATE | IngressRecord::INCOMPLETE;
-        let published_ns = event.message().and_then(|one| stamp(one.published_ns));
+        let published_ns = stamp(event.message().published_ns);
         if let RecordEvent::Ingress(record) = event
             && record.flags & NEVER_CAME == 0
         {
@@ -101,7 +101,6 @@ impl ChannelTail {
             published: kind == RecordKind::Published,
             egress: kind == RecordKind::Egress,
             ingress: kind == RecordKind::Ingress,
-            follow_up: kind == RecordKind::FollowUp,
             taken: kind == RecordKind::Taken,
         });
     }
