@@ -10,8 +10,8 @@ use hil_core::record::{EgressRecord, IngressRecord};
 use hil_core::time::Instant;
 use hil_platform::clock::MonotonicClock;
 use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, IngressBridge,
-    IngressSettings,
+    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, InMemory,
+    IngressBridge, IngressSettings,
 };
 use hil_rundir::record::RecordSink;
 use hil_shm::{Domain, RawInput, RawOutput};
@@ -77,6 +77,7 @@ pub struct Workbench {
     raw_output: RawOutput,
     egress: EgressBridge,
     ingress: IngressBridge,
+    memory: InMemory,
     sender: UdpSender,
     receiver: UdpReceiver,
     sinks: [RecordSink; 2],
@@ -111,6 +112,7 @@ impl Workbench {
             far,
             egress,
             ingress,
+            memory: InMemory::default(),
             sender,
             receiver,
             payload: vec![7; plan.size_bytes],
@@ -224,7 +226,10 @@ impl Workbench {
 
     fn decode(&mut self) -> Timed {
         let Self {
-            ingress, datagrams, ..
+            ingress,
+            memory,
+            datagrams,
+            ..
         } = self;
         let mut slots = datagrams.iter();
         let now = MonotonicClock::now();
@@ -232,7 +237,7 @@ impl Workbench {
         timed(|| {
             let mut is_delivered = false;
             if let Some(datagram) = slots.next() {
-                let mut deliver = |_: hil_protocol::Delivery<'_>| is_delivered = true;
+                let mut deliver = memory.with(|_, _| is_delivered = true);
                 ingress
                     .on_datagram(now, arrival, datagram, &mut deliver)
                     .ok();
@@ -315,7 +320,12 @@ fn bridges(
         .ok_or("no greeting")?
         .datagram
         .to_vec();
-    let greeted = ingress.on_datagram(now, arrival, &hello, &mut |_| {});
+    let greeted = ingress.on_datagram(
+        now,
+        arrival,
+        &hello,
+        &mut InMemory::default().with(|_, _| {}),
+    );
     greeted.map_err(|refusal| format!("{refusal:?}"))?;
     let answer = ingress
         .poll_transmit(now)

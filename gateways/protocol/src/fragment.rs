@@ -1,5 +1,5 @@
-//! Messages above the path MTU: how they split, and how the pieces come together again in memory
-//! that is set aside beforehand. It never trusts a length from the network.
+//! Messages above the path MTU: how they split, and where the pieces belong when they come together
+//! again. The bytes are kept by the owner; no length from the network is trusted.
 //!
 //! Splitting is balanced: a message of `total` bytes that needs `count` datagrams is cut into
 //! pieces of `ceil(total / count)` bytes, the last one shorter. A piece's place and length thus
@@ -103,11 +103,24 @@ pub struct Fragment<'a> {
     pub payload: &'a [u8],
 }
 
-/// A message put together again.
+/// Where a piece belongs; [`Reassembler::stored`] takes it once the piece is there.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Place {
+    /// The slot of its message.
+    pub slot: usize,
+    /// Its message begins: whatever the slot had before is over.
+    pub is_first: bool,
+    /// Where it begins in its message, bytes.
+    pub offset_bytes: usize,
+    index: u16,
+    handed_ns: i64,
+}
+
+/// A message of which every piece is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Assembled<'a> {
-    /// The whole message.
-    pub payload: &'a [u8],
+pub struct Assembled {
+    /// Bytes of the whole message.
+    pub length_bytes: usize,
     /// When its first piece was handed to the sender's kernel, the sender's monotonic clock.
     pub handed_ns: i64,
 }
@@ -145,11 +158,10 @@ counts! {
     }
 }
 
-/// Puts messages together in a fixed number of slots.
+/// Keeps account of the messages that come together in a fixed number of slots.
 #[derive(Debug)]
 pub struct Reassembler {
     slots: Box<[Slot]>,
-    storage: Box<[u8]>,
     size_max_bytes: usize,
     timeout: Duration,
     /// Taken by the owner after every call.
@@ -173,7 +185,7 @@ struct Slot {
 }
 
 impl Reassembler {
-    /// Sets aside `slot_count` messages of `size_max_bytes`; an incomplete one is given up `timeout` after
+    /// For `slot_count` messages of at most `size_max_bytes`; an incomplete one is given up `timeout` after
     /// its last piece.
     ///
     /// # Panics
@@ -195,7 +207,6 @@ impl Reassembler {
         };
         Self {
             slots: vec![empty; slot_count].into_boxed_slice(),
-            storage: vec![0; slot_count * size_max_bytes].into_boxed_slice(),
             size_max_bytes,
             timeout,
             given_up: Vec::with_capacity(slot_count + 1),
@@ -203,16 +214,12 @@ impl Reassembler {
         }
     }
 
-    /// Takes one piece; gives the message once it is whole.
+    /// Where one piece belongs.
     ///
     /// # Errors
     /// [`Refusal::Oversize`], [`Refusal::FragmentInconsistent`], [`Refusal::LengthMismatch`] or
     /// [`Refusal::DuplicateFragment`]; the slots are then as they were.
-    pub fn insert(
-        &mut self,
-        now: Instant,
-        fragment: &Fragment<'_>,
-    ) -> Result<Option<Assembled<'_>>, Refusal> {
+    pub fn place(&mut self, now: Instant, fragment: &Fragment<'_>) -> Result<Place, Refusal> {
         if fragment.total_len as usize > self.size_max_bytes {
             return Err(Refusal::Oversize);
         }
@@ -223,22 +230,32 @@ impl Reassembler {
             return Err(Refusal::LengthMismatch);
         }
         self.expire(now);
-        let index = self.find(fragment)?;
-        let index = index.unwrap_or_else(|| self.open(now, fragment));
-        let base = index * self.size_max_bytes;
-        self.storage[base + range.start..base + range.end].copy_from_slice(fragment.payload);
-        let slot = &mut self.slots[index];
-        slot.heard_at = now;
-        slot.receive(fragment);
+        let found = self.find(fragment)?;
+        let slot = found.unwrap_or_else(|| self.open(now, fragment));
+        self.slots[slot].heard_at = now;
+        Ok(Place {
+            slot,
+            is_first: found.is_none(),
+            offset_bytes: range.start,
+            index: fragment.index,
+            handed_ns: fragment.handed_ns,
+        })
+    }
+
+    /// Notes that the bytes of a piece are at its place; gives its message once it is whole, whose slot is then
+    /// free. Without this the piece is missing as if it had not come.
+    pub fn stored(&mut self, place: Place) -> Option<Assembled> {
+        let slot = &mut self.slots[place.slot];
+        slot.receive(&place);
         if slot.missing > 0 {
-            return Ok(None);
+            return None;
         }
         slot.message = None;
         self.counts.completed_count += 1;
-        Ok(Some(Assembled {
-            payload: &self.storage[base..base + slot.total_len as usize],
+        Some(Assembled {
+            length_bytes: slot.total_len as usize,
             handed_ns: slot.handed_ns,
-        }))
+        })
     }
 
     /// Gives up incomplete messages whose time is up.
@@ -342,12 +359,12 @@ impl Slot {
         self.received[usize::from(index) / 64] >> (index % 64) & 1 == 1
     }
 
-    fn receive(&mut self, fragment: &Fragment<'_>) {
-        let index = fragment.index;
+    fn receive(&mut self, place: &Place) {
+        let index = place.index;
         self.received[usize::from(index) / 64] |= 1 << (index % 64);
         self.missing -= 1;
         if index == 0 {
-            self.handed_ns = fragment.handed_ns;
+            self.handed_ns = place.handed_ns;
         }
     }
 }

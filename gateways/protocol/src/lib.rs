@@ -20,8 +20,8 @@
 //! ```
 //! use std::time::Duration;
 //! use hil_protocol::{
-//!     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, IngressBridge,
-//!     IngressSettings,
+//!     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, InMemory,
+//!     IngressBridge, IngressSettings,
 //! };
 //! use hil_core::message::Envelope;
 //! use hil_core::time::Instant;
@@ -40,19 +40,19 @@
 //! })?;
 //! let now = Instant::from_ns(1_000);
 //! let arrival = ArrivalStamps::application(1_000);
+//! let mut received = Vec::new();
+//! let mut memory = InMemory::default();
+//! let mut destination = memory.with(|_, payload| received.extend_from_slice(payload));
 //!
 //! let hello = egress.poll_transmit(now).expect("a greeting comes first").datagram;
-//! ingress.on_datagram(now, arrival, hello, &mut |_| {})?;
+//! ingress.on_datagram(now, arrival, hello, &mut destination)?;
 //! let answer = ingress.poll_transmit(now).expect("a greeting is answered").datagram;
 //! egress.on_datagram(now, arrival, answer)?;
 //!
 //! let envelope = Envelope { published_ns: 900, ..Envelope::default() };
 //! egress.on_local(now, 0, &envelope, &[42; 8])?;
 //! let data = egress.poll_transmit(now).expect("the message was staged").datagram;
-//! let mut received = Vec::new();
-//! ingress.on_datagram(now, arrival, data, &mut |delivery| {
-//!     received.extend_from_slice(delivery.payload);
-//! })?;
+//! ingress.on_datagram(now, arrival, data, &mut destination)?;
 //! assert_eq!(received, [42; 8]);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
@@ -77,7 +77,8 @@ pub use egress::{
     TransmitFailure,
 };
 pub use ingress::{
-    Delivery, Disposition, Incomplete, IngressBridge, IngressSettings, MessageInfo, Reply,
+    Delivery, Destination, Disposition, InMemory, Incomplete, IngressBridge, IngressSettings,
+    MessageInfo, Payload, Piece, Reply,
 };
 pub use refusal::{Refusal, RefusalCounts};
 pub use stamps::{ArrivalStamps, StampSource};

@@ -56,6 +56,8 @@ causes! {
     ImplausibleSequence => "implausible sequence", "sequence number leaps too far ahead";
     /// This fragment has arrived before.
     DuplicateFragment => "duplicate fragment", "fragment arrived before";
+    /// Its destination has no memory for its message.
+    NoMemory => "no memory for a piece", "there is no memory for the message of this fragment";
     /// A reply to nothing that was asked, or a second reply.
     Unsolicited => "unsolicited", "reply answers no open request";
 }

@@ -15,8 +15,8 @@ use hil_net::timestamping::TimestampMode;
 use hil_protocol::seal::{Association, Rotation, RunSecret, Suite};
 use hil_protocol::wire::{HEADER_BYTES, Header};
 use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, IngressBridge,
-    IngressSettings, PeerState,
+    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, InMemory,
+    IngressBridge, IngressSettings, PeerState,
 };
 
 fn association() -> Association {
@@ -53,6 +53,7 @@ struct Hop {
     egress: EgressBridge,
     sender: Box<dyn DatagramSender>,
     ingress: IngressBridge,
+    memory: InMemory,
     receiver: Box<dyn DatagramReceiver>,
     /// The machine's time, or one of its own.
     is_real: bool,
@@ -70,6 +71,7 @@ impl Hop {
             egress: EgressBridge::new(egress_settings()).unwrap(),
             sender,
             ingress: IngressBridge::new(IngressSettings::new(flow(), 200, [2; 16], 22)).unwrap(),
+            memory: InMemory::default(),
             receiver,
             is_real,
             now: Instant::from_ns(1_000_000_000),
@@ -100,8 +102,9 @@ impl Hop {
         while let Some(received) = self.receiver.receive(now, &mut buffer).unwrap() {
             let delivered = &mut self.delivered;
             let bytes = &buffer[..received.length_bytes];
-            let mut deliver =
-                |one: hil_protocol::Delivery<'_>| delivered.push(one.payload.to_vec());
+            let mut deliver = self
+                .memory
+                .with(|_, payload| delivered.push(payload.to_vec()));
             self.ingress
                 .on_datagram(now, arrival, bytes, &mut deliver)
                 .unwrap();

@@ -20,8 +20,8 @@ use hil_platform::words;
 
 /// Messages a reader may hold at a time.
 pub(crate) const BORROWED_MAX: usize = 2;
-/// Messages a writer fills at a time.
-pub(crate) const LOANED_MAX: usize = 1;
+/// Messages a writer fills at a time, beside those that it puts together from pieces.
+const NEXT_MAX: usize = 1;
 
 // How iceoryx2 0.10 lays its files out; the test beside compares.
 
@@ -125,12 +125,17 @@ impl fmt::Display for Room {
 }
 
 impl ChannelSettings {
+    /// Messages that a writer fills at a time.
+    pub(crate) const fn lent_max(&self) -> usize {
+        NEXT_MAX.saturating_add(self.assembled_max)
+    }
+
     /// Messages that a writer has memory for.
     fn sample_count(&self) -> usize {
         let waiting = self.depth_max.saturating_add(BORROWED_MAX);
         self.readers_max
             .saturating_mul(waiting)
-            .saturating_add(LOANED_MAX)
+            .saturating_add(self.lent_max())
     }
 
     /// What the channel takes before it has a writer or a reader.

@@ -136,6 +136,16 @@ pub enum ChannelError {
         /// Bytes of one message.
         expected: usize,
     },
+    /// A message in pieces of which not every byte was written once.
+    #[error("channel {channel}: {written} of the {expected} bytes of a message were written")]
+    Incomplete {
+        /// The channel's name.
+        channel: String,
+        /// Bytes written.
+        written: usize,
+        /// Bytes of the message.
+        expected: usize,
+    },
     /// A waiter without a channel.
     #[error("a waiter takes at least one channel")]
     NoChannel,

@@ -22,6 +22,8 @@ pub struct ChannelSettings {
     pub writers_max: usize,
     /// Readers at any one time, gateways and recorders included.
     pub readers_max: usize,
+    /// Messages that its writer puts together from pieces at a time; 0 unless that is a gateway.
+    pub assembled_max: usize,
 }
 
 impl ChannelSettings {
@@ -33,6 +35,7 @@ impl ChannelSettings {
             depth_max: 1,
             writers_max: 1,
             readers_max: 8,
+            assembled_max: 0,
         }
     }
 

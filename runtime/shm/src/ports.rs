@@ -32,7 +32,7 @@ impl ShmOutput {
         settings: OutputSettings,
     ) -> Result<Self, ChannelError> {
         let message = TypeInfo::of(message);
-        let output = RawOutput::open_as(domain, channel, message, settings.notifies_readers)?;
+        let output = RawOutput::open_as(domain, channel, message, settings.notifies_readers, 0)?;
         Ok(Self {
             output,
             sequencer: Sequencer::new(settings),

@@ -19,6 +19,7 @@ use iceoryx2::prelude::{
     FileDescriptorBased, MessagingPattern, PayloadHeader, Service, ServiceName, ZeroCopySend, ipc,
 };
 use iceoryx2::sample::Sample;
+use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::sample_mut_uninit::SampleMutUninit;
 use iceoryx2::service::builder::publish_subscribe::{Builder, PublishSubscribeOpenError};
 use iceoryx2::service::marker::{CustomHeaderMarker, CustomPayloadMarker};
@@ -26,7 +27,7 @@ use iceoryx2::service::port_factory::{PortFactory as _, publish_subscribe};
 use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
 use iceoryx2::service::static_config::publish_subscribe::StaticConfig;
 
-use super::capacity::{BORROWED_MAX, LOANED_MAX, check_room, take_room};
+use super::capacity::{BORROWED_MAX, check_room, take_room};
 use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
@@ -171,6 +172,7 @@ fn settings_of(config: &StaticConfig, channel: &str, message: &TypeInfo) -> Chan
         depth_max: config.subscriber_max_buffer_size(),
         writers_max: config.max_publishers(),
         readers_max: config.max_subscribers(),
+        assembled_max: 0,
     }
 }
 
@@ -235,34 +237,94 @@ pub(crate) fn descriptor(listener: &Listener<ipc::Service>) -> BorrowedFd<'_> {
 type BytePublisher = Publisher<ipc::Service, [CustomPayloadMarker], CustomHeaderMarker>;
 type ByteLoan =
     SampleMutUninit<ipc::Service, [MaybeUninit<CustomPayloadMarker>], CustomHeaderMarker>;
+type Filled = SampleMut<ipc::Service, [CustomPayloadMarker], CustomHeaderMarker>;
 
-/// Memory for one message.
-#[allow(
-    unsafe_code,
-    reason = "the hidden interface for foreign types is unsafe"
-)]
-fn loan(publisher: &BytePublisher) -> Result<ByteLoan, LoanError> {
-    // SAFETY: one element is what a fixed-size message has.
-    unsafe { publisher.loan_custom_payload(1) }
+/// Memory for one message, lent by its writer; dropped, it goes back.
+struct Lent {
+    memory: ByteLoan,
+    /// Bytes written to it.
+    written_bytes: usize,
 }
 
-/// Memory for a writer's next message, borrowed once the last one has left rather than while the
-/// next one waits: iceoryx2 0.10 collects returned chunks and allocates its own bookkeeping with
-/// every loan. None if the last attempt failed; the next message asks again.
-struct Ahead(Option<ByteLoan>);
-
-impl fmt::Debug for Ahead {
+impl fmt::Debug for Lent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let is_lent = self.0.is_some();
-        f.debug_struct("Ahead").field("is_lent", &is_lent).finish()
+        f.debug_struct("Lent")
+            .field("written_bytes", &self.written_bytes)
+            .finish_non_exhaustive()
     }
+}
+
+impl Lent {
+    #[allow(
+        unsafe_code,
+        reason = "the hidden interface for foreign types is unsafe"
+    )]
+    fn from(publisher: &BytePublisher) -> Result<Self, LoanError> {
+        // SAFETY: one element is what a fixed-size message has.
+        let memory = unsafe { publisher.loan_custom_payload(1) }?;
+        Ok(Self {
+            memory,
+            written_bytes: 0,
+        })
+    }
+
+    /// Writes `bytes` from `offset_bytes` on; false, and nothing is written, when they reach beyond the end.
+    #[allow(
+        unsafe_code,
+        reason = "writes a message whose type is known only at run time"
+    )]
+    fn write(&mut self, offset_bytes: usize, bytes: &[u8]) -> bool {
+        let Some(target) = self.memory.payload_mut().get_mut(offset_bytes..) else {
+            return false;
+        };
+        if target.len() < bytes.len() {
+            return false;
+        }
+        let target = target.as_mut_ptr().cast::<u8>();
+        // SAFETY: there is room for so many, checked above, and they do not overlap as the loan is exclusively ours.
+        unsafe { target.copy_from_nonoverlapping(bytes.as_ptr(), bytes.len()) };
+        self.written_bytes += bytes.len();
+        true
+    }
+
+    /// The message of the first `length_bytes`; what is behind them is zero.
+    #[allow(
+        unsafe_code,
+        reason = "writes a message whose type is known only at run time"
+    )]
+    fn finish(mut self, length_bytes: usize, envelope: impl FnOnce() -> Envelope) -> Filled {
+        let rest = &mut self.memory.payload_mut()[length_bytes..];
+        let is_whole = rest.is_empty();
+        // SAFETY: the marker is one byte of plain data, and the pointer is to so many of them.
+        unsafe { rest.as_mut_ptr().write_bytes(0, rest.len()) };
+        let header: *mut CustomHeaderMarker = self.memory.user_header_mut();
+        let mut envelope = envelope();
+        envelope.length_bytes = if is_whole { 0 } else { length_bytes as u64 };
+        // SAFETY: the service was opened with a user header of the envelope's size and alignment,
+        // and the marker reference is iceoryx2's pointer to that memory.
+        unsafe { header.cast::<Envelope>().write(envelope) };
+        // SAFETY: the header was written just above. Of the payload as many bytes were written as it has;
+        // one that was not, because another was written twice, has the value that the file has there.
+        unsafe { self.memory.assume_init() }
+    }
+}
+
+const GET_MEMORY: &str = "get memory";
+
+fn lend(publisher: &BytePublisher, channel: &str) -> Result<Lent, ChannelError> {
+    Lent::from(publisher).map_err(|error| ChannelError::refused(channel, GET_MEMORY, &error))
 }
 
 /// Publishes bytes with a given envelope: the far end of a gateway.
 #[derive(Debug)]
 pub struct RawOutput {
-    // Before the publisher: it goes first.
-    next: Ahead,
+    // What is lent stands before the publisher: it goes first.
+    /// For the next message: lent once the last one has left rather than while the next one waits, because
+    /// iceoryx2 0.10 collects returned chunks and allocates its own bookkeeping with every loan. `None` if
+    /// the last attempt failed; the next message asks again.
+    next: Option<Lent>,
+    /// For messages in pieces, by slot; lent when the first piece comes and then as `next`.
+    assembled: Box<[Option<Lent>]>,
     channel: String,
     message: TypeInfo,
     publisher: BytePublisher,
@@ -282,8 +344,22 @@ impl RawOutput {
         channel: &str,
         notifies_readers: bool,
     ) -> Result<Self, ChannelError> {
+        Self::open_assembling(domain, channel, notifies_readers, 0)
+    }
+
+    /// As [`RawOutput::open`], with memory for `slot_count` messages that come in pieces, see
+    /// [`RawOutput::write_piece`].
+    ///
+    /// # Errors
+    /// As [`RawOutput::open`].
+    pub fn open_assembling(
+        domain: &Domain,
+        channel: &str,
+        notifies_readers: bool,
+        slot_count: usize,
+    ) -> Result<Self, ChannelError> {
         let message = retry(domain.open_within(), || discover(domain, channel))?;
-        Self::open_as(domain, channel, message, notifies_readers)
+        Self::open_as(domain, channel, message, notifies_readers, slot_count)
     }
 
     pub(crate) fn open_as(
@@ -291,16 +367,20 @@ impl RawOutput {
         channel: &str,
         message: TypeInfo,
         notifies_readers: bool,
+        slot_count: usize,
     ) -> Result<Self, ChannelError> {
         let within = domain.open_within();
         let service = retry(within, || open_for_writing(domain, channel, &message))?;
-        let settings = settings_of(service.static_config(), channel, &message);
+        let settings = ChannelSettings {
+            assembled_max: slot_count,
+            ..settings_of(service.static_config(), channel, &message)
+        };
         check_room(channel, settings.writer_room())?;
         let failures = ConnectionFailures::default();
         let publisher = retry(within, || {
             service
                 .publisher_builder()
-                .max_loaned_samples(LOANED_MAX)
+                .max_loaned_samples(settings.lent_max())
                 .set_degradation_handler(failures.handler())
                 .create()
                 .map_err(|error| ChannelError::refused(channel, "become a writer", &error))
@@ -317,7 +397,8 @@ impl RawOutput {
         Ok(Self {
             channel: channel.to_owned(),
             message,
-            next: Ahead(loan(&publisher).ok()),
+            next: Lent::from(&publisher).ok(),
+            assembled: (0..slot_count).map(|_| None).collect(),
             publisher,
             notifier,
             failures,
@@ -347,55 +428,92 @@ impl RawOutput {
     ///
     /// # Errors
     /// As [`RawOutput::publish`].
-    #[allow(
-        unsafe_code,
-        reason = "writes a message whose type is known only at run time"
-    )]
     pub fn publish_with(
         &mut self,
         payload: &[u8],
         envelope: impl FnOnce() -> Envelope,
     ) -> Result<(), ChannelError> {
+        self.check_size(payload.len())?;
+        let lent = self.next.take();
+        let mut lent = lent.map_or_else(|| lend(&self.publisher, &self.channel), Ok)?;
+        if !lent.write(0, payload) {
+            return Err(self.wrong_size(payload.len()));
+        }
+        self.send(lent.finish(payload.len(), envelope))?;
+        self.next = Lent::from(&self.publisher).ok();
+        Ok(())
+    }
+
+    /// Writes a piece of the message in `slot`, from `offset_bytes` on, straight into the memory that
+    /// [`RawOutput::publish_pieces`] publishes.
+    ///
+    /// # Errors
+    /// When it reaches beyond the message, there is no such slot, or the channel is broken.
+    pub fn write_piece(
+        &mut self,
+        slot: usize,
+        offset_bytes: usize,
+        piece: &[u8],
+    ) -> Result<(), ChannelError> {
+        let Some(held) = self.assembled.get_mut(slot) else {
+            let error = LoanError::ExceedsMaxLoans;
+            return Err(ChannelError::refused(&self.channel, GET_MEMORY, &error));
+        };
+        let lent = match held {
+            Some(lent) => lent,
+            None => held.insert(lend(&self.publisher, &self.channel)?),
+        };
+        if lent.write(offset_bytes, piece) {
+            return Ok(());
+        }
+        Err(self.wrong_size(offset_bytes.saturating_add(piece.len())))
+    }
+
+    /// Begins another message in `slot`: what was written there is of none.
+    pub fn discard_pieces(&mut self, slot: usize) {
+        if let Some(Some(lent)) = self.assembled.get_mut(slot) {
+            lent.written_bytes = 0;
+        }
+    }
+
+    /// Publishes the message in `slot`, whose first `length_bytes` have been written, each once. As
+    /// [`RawOutput::publish_with`] otherwise.
+    ///
+    /// # Errors
+    /// As [`RawOutput::publish_with`]; and when another number of bytes was written. They then stay.
+    pub fn publish_pieces(
+        &mut self,
+        slot: usize,
+        length_bytes: usize,
+        envelope: impl FnOnce() -> Envelope,
+    ) -> Result<(), ChannelError> {
+        self.check_size(length_bytes)?;
+        let is_whole = |lent: &mut Lent| lent.written_bytes == length_bytes;
+        let held = self.assembled.get_mut(slot);
+        let whole = held.and_then(|held| held.take_if(is_whole));
+        let Some(lent) = whole else {
+            let lent = self.assembled.get(slot).and_then(Option::as_ref);
+            return Err(ChannelError::Incomplete {
+                channel: self.channel.clone(),
+                written: lent.map_or(0, |lent| lent.written_bytes),
+                expected: length_bytes,
+            });
+        };
+        self.send(lent.finish(length_bytes, envelope))?;
+        self.assembled[slot] = Lent::from(&self.publisher).ok();
+        Ok(())
+    }
+
+    fn send(&self, message: Filled) -> Result<(), ChannelError> {
         let refused = |operation, error: &dyn fmt::Debug| {
             ChannelError::refused(&self.channel, operation, error)
         };
-        self.check_size(payload.len())?;
-        let lent = self.next.0.take();
-        let mut memory = lent
-            .map_or_else(|| loan(&self.publisher), Ok)
-            .map_err(|error| refused("get memory", &error))?;
-        let target = memory.payload_mut();
-        let (target_bytes, target) = (target.len(), target.as_mut_ptr().cast::<u8>());
-        if target_bytes != self.message.size_bytes {
-            return Err(self.wrong_size(target_bytes));
-        }
-        // SAFETY: the source is at most one message long, the target exactly, both checked above, and they
-        // do not overlap as the loan is exclusively ours.
-        unsafe { target.copy_from_nonoverlapping(payload.as_ptr(), payload.len()) };
-        let rest_bytes = target_bytes - payload.len();
-        // SAFETY: the source ended so many bytes before the end of the target.
-        let rest = unsafe { target.add(payload.len()) };
-        // SAFETY: as many bytes are left of the target.
-        unsafe { rest.write_bytes(0, rest_bytes) };
-        let header: *mut CustomHeaderMarker = memory.user_header_mut();
-        let mut envelope = envelope();
-        envelope.length_bytes = if rest_bytes == 0 {
-            0
-        } else {
-            payload.len() as u64
-        };
-        // SAFETY: the service was opened with a user header of the envelope's size and alignment,
-        // and the marker reference is iceoryx2's pointer to that memory.
-        unsafe { header.cast::<Envelope>().write(envelope) };
-        // SAFETY: header and payload were written in full just above.
-        let sample = unsafe { memory.assume_init() };
-        sample.send().map_err(|error| refused("send", &error))?;
+        message.send().map_err(|error| refused("send", &error))?;
         if let Some(notifier) = &self.notifier {
             notifier
                 .notify()
                 .map_err(|error| refused("wake its readers", &error))?;
         }
-        self.next = Ahead(loan(&self.publisher).ok());
         Ok(())
     }
 

@@ -188,6 +188,7 @@ fn announced(place: &Place) -> (Domain, Vec<ChannelHolder>, LiveRun) {
             depth_max: observer_depth(8),
             writers_max: 2,
             readers_max: 6,
+            assembled_max: 0,
         };
         ChannelHolder::create(&domain, &settings).unwrap()
     });

@@ -14,8 +14,8 @@ use hil_core::message::Envelope;
 use hil_core::time::Instant;
 use hil_protocol::wire::decode;
 use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, IngressBridge,
-    IngressSettings,
+    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, InMemory,
+    IngressBridge, IngressSettings,
 };
 
 use crate::Verdict;
@@ -64,6 +64,7 @@ struct Conversation {
     now: Instant,
     egress: EgressBridge,
     ingress: IngressBridge,
+    memory: InMemory,
     forward: VecDeque<Vec<u8>>,
     backward: VecDeque<Vec<u8>>,
     session: u32,
@@ -84,6 +85,7 @@ impl Conversation {
             now: Instant::from_ns(50_000_000_000),
             egress: egress(100),
             ingress: ingress(),
+            memory: InMemory::default(),
             forward: VecDeque::new(),
             backward: VecDeque::new(),
             session: 100,
@@ -191,19 +193,20 @@ impl Conversation {
         };
         let (published, delivered) = (&self.published, &mut self.delivered);
         let is_forged = self.is_forged;
+        let mut destination = self.memory.with(|delivery, payload| {
+            assert!(payload.len() <= SIZE_MAX_BYTES as usize);
+            let message = delivery.message;
+            let key = (message.channel, message.epoch, message.sequence);
+            if is_forged {
+                return;
+            }
+            assert!(delivered.insert(key), "{key:?} was delivered twice");
+            let sent = published.get(&key).map(Vec::as_slice);
+            assert_eq!(Some(payload), sent, "{key:?} is another message");
+        });
         let taken = self
             .ingress
-            .on_datagram(self.now, arrival, bytes, &mut |delivery| {
-                assert!(delivery.payload.len() <= SIZE_MAX_BYTES as usize);
-                let message = delivery.message;
-                let key = (message.channel, message.epoch, message.sequence);
-                if is_forged {
-                    return;
-                }
-                assert!(delivered.insert(key), "{key:?} was delivered twice");
-                let sent = published.get(&key).map(Vec::as_slice);
-                assert_eq!(Some(delivery.payload), sent, "{key:?} is another message");
-            });
+            .on_datagram(self.now, arrival, bytes, &mut destination);
         // Either is counted by the bridge, which is checked at the end.
         let (Ok(_) | Err(_)) = taken;
         while let Some(reply) = self.ingress.poll_transmit(self.now) {

@@ -7,6 +7,7 @@ use std::time::Duration;
 use hil_core::time::Instant;
 use hil_net::control::ControlData;
 use hil_protocol::fragment::{Fragment, FragmentPlan, Reassembler};
+use hil_protocol::ingress::{InMemory, Piece};
 use hil_protocol::sequence::Stream;
 use hil_protocol::wire::{Body, Datagram, HEADER_BYTES, decode};
 use hil_transport::tcp::frame::{DATAGRAM_BYTES_MAX, FrameReader, PREFIX_BYTES, prefix};
@@ -68,6 +69,7 @@ pub(crate) fn reassembly(bytes: &[u8]) -> Verdict {
     let mut input = Input::new(bytes);
     let mut reassembler =
         Reassembler::new(SLOT_COUNT, MESSAGE_BYTES_MAX, Duration::from_micros(100));
+    let mut memory = InMemory::default();
     let mut now = Instant::from_ns(0);
     let mut storage = Vec::with_capacity(MESSAGE_BYTES_MAX);
     let mut completed_count = 0;
@@ -96,12 +98,23 @@ pub(crate) fn reassembly(bytes: &[u8]) -> Verdict {
             published_ns: 0,
             payload: &storage,
         };
-        if let Ok(Some(whole)) = reassembler.insert(now, &fragment) {
-            completed_count += 1;
-            assert_eq!(whole.payload.len(), total_bytes);
-            let expected = (0..total_bytes).map(|at| pattern(epoch, sequence, total_bytes, at));
-            assert!(whole.payload.iter().copied().eq(expected), "mixed pieces");
-            assert_eq!(whole.handed_ns, 0, "not the stamp of the first piece");
+        if let Ok(place) = reassembler.place(now, &fragment) {
+            let slot = place.slot;
+            memory.store(&Piece {
+                channel: 0,
+                slot,
+                is_first: place.is_first,
+                offset_bytes: place.offset_bytes,
+                payload: &storage,
+            });
+            if let Some(whole) = reassembler.stored(place) {
+                completed_count += 1;
+                assert_eq!(whole.length_bytes, total_bytes);
+                let expected = (0..total_bytes).map(|at| pattern(epoch, sequence, total_bytes, at));
+                let bytes = memory.message(0, slot).iter();
+                assert!(bytes.copied().eq(expected), "mixed pieces");
+                assert_eq!(whole.handed_ns, 0, "not the stamp of the first piece");
+            }
         }
         assert!(reassembler.open_count() <= SLOT_COUNT);
     }

@@ -15,7 +15,7 @@ use hil_core::time::{Instant, duration_ns};
 use hil_link::spec::{LinkPlace, LinkSpec};
 use hil_protocol::wire::Kind;
 use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, Delivery, EgressBridge, EgressSettings, FlowIdentity,
+    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, InMemory,
     IngressBridge, IngressSettings, PeerState,
 };
 use hil_shuttle::{Shuttle, ShuttleParameters};
@@ -46,6 +46,7 @@ struct Counts {
 struct Hop {
     egress: EgressBridge,
     ingress: IngressBridge,
+    memory: InMemory,
     link: Box<dyn LinkModel>,
     counts: Rc<RefCell<Counts>>,
 }
@@ -83,6 +84,7 @@ impl Hop {
         Self {
             egress: EgressBridge::new(egress).unwrap(),
             ingress: IngressBridge::new(ingress).unwrap(),
+            memory: InMemory::default(),
             link,
             counts: Rc::clone(counts),
         }
@@ -120,12 +122,12 @@ impl Hop {
                 _ => gateway_now,
             };
             let there = Instant::from_ns(arrival(at).received_ns);
-            let mut take = |delivery: Delivery<'_>| {
+            let mut take = self.memory.with(|delivery, payload| {
                 counts.deliveries += 1;
                 let envelope = delivery.message.envelope(there);
                 let arrived = Instant::from_ns(at.as_ns() - duration_ns(LEAD));
-                deliver(arrived, envelope, delivery.payload);
-            };
+                deliver(arrived, envelope, payload);
+            });
             let taken = self
                 .ingress
                 .on_datagram(there, arrival(at), &wire, &mut take);

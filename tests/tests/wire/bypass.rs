@@ -13,7 +13,7 @@ use hil_platform::wait::WaitMode;
 use hil_protocol::body::HelloStatus;
 use hil_protocol::{
     ArrivalStamps, ChannelIdentity, EgressBridge, EgressEvent, EgressSettings, FlowIdentity,
-    IngressBridge, IngressSettings, LocalRefusal, PeerState, Refusal,
+    InMemory, IngressBridge, IngressSettings, LocalRefusal, PeerState, Refusal,
 };
 use hil_rundir::launch::{
     ChannelLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch, Work, WorkerLaunch, write,
@@ -53,7 +53,12 @@ fn greet(domain: u8) -> (EgressBridge, IngressBridge, EgressEvent) {
     let now = Instant::from_ns(1_000);
     let arrival = ArrivalStamps::application(1_000);
     let hello = egress.poll_transmit(now).unwrap().datagram.to_vec();
-    let _refused = ingress.on_datagram(now, arrival, &hello, &mut |_| {});
+    let _refused = ingress.on_datagram(
+        now,
+        arrival,
+        &hello,
+        &mut InMemory::default().with(|_, _| {}),
+    );
     let answer = ingress.poll_transmit(now).unwrap().datagram.to_vec();
     let event = egress.on_datagram(now, arrival, &answer).unwrap();
     (egress, ingress, event)

@@ -3,6 +3,7 @@
 use hil_core::message::Envelope;
 use hil_core::time::{Instant, RemoteInstant};
 
+use super::destination::{Destination, Payload};
 use crate::counts;
 use crate::fragment::GivenUp;
 use crate::sequence::{Order, Stream};
@@ -68,13 +69,11 @@ impl Incomplete {
     }
 }
 
-/// A message for the local channel.
+/// What a message for the local channel is, beside its bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Delivery<'a> {
+pub struct Delivery {
     /// Who it is.
     pub message: MessageInfo,
-    /// Its bytes.
-    pub payload: &'a [u8],
     /// [`Order::InOrder`] or [`Order::Reordered`].
     pub order: Order,
     /// A stamp of an earlier message that came along.
@@ -178,12 +177,13 @@ impl IngressChannelCounts {
     }
 }
 
-impl Delivery<'_> {
+impl Delivery {
     /// Hands the message over unless its order forbids it.
     pub(super) fn dispose(
-        self,
+        &self,
+        payload: Payload<'_>,
         deliver_reordered: bool,
-        deliver: &mut dyn FnMut(Delivery<'_>),
+        destination: &mut dyn Destination,
     ) -> Disposition {
         let message = self.message;
         match self.order {
@@ -191,7 +191,7 @@ impl Delivery<'_> {
             Order::Late => Disposition::Late(message),
             Order::Reordered if !deliver_reordered => Disposition::Superseded(message),
             Order::InOrder { .. } | Order::Reordered => {
-                deliver(self);
+                destination.deliver(self, payload);
                 Disposition::Delivered(message)
             }
         }
@@ -217,12 +217,7 @@ pub(super) fn message_of(channel: usize, header: &Header, handed_ns: i64) -> Mes
     }
 }
 
-pub(super) fn delivery_of<'a>(
-    header: &Header,
-    message: MessageInfo,
-    payload: &'a [u8],
-    order: Order,
-) -> Delivery<'a> {
+pub(super) fn delivery_of(header: &Header, message: MessageInfo, order: Order) -> Delivery {
     let resolve = |field: FollowUpField| {
         Some(FollowUp {
             sequence: field.sequence(header.sequence)?,
@@ -231,7 +226,6 @@ pub(super) fn delivery_of<'a>(
     };
     Delivery {
         message,
-        payload,
         order,
         follow_up: header.follow_up.and_then(resolve),
     }

@@ -10,6 +10,7 @@
 //! `datagram_count = accepted_count + refusals().total()`.
 
 mod delivery;
+mod destination;
 mod replies;
 mod session;
 
@@ -34,6 +35,7 @@ use super::wire::{self, Body, Header, Kind, Prefix};
 pub use delivery::{
     Delivery, Disposition, Incomplete, IngressChannelCounts, IngressCounts, MessageInfo,
 };
+pub use destination::{Destination, InMemory, Payload, Piece, Taking};
 pub use replies::ReplyCounts;
 
 use delivery::{delivery_of, message_of, stream_of};
@@ -46,21 +48,13 @@ pub const REFUSAL_REPLY_PERIOD: Duration = Duration::from_millis(10);
 /// A message that skips more numbers than this is refused until its sender greets again.
 pub const SEQUENCE_JUMP_MAX: u64 = 1 << 20;
 
-/// Messages of a channel that may be incomplete at a time.
-const REASSEMBLY_SLOTS: usize = 4;
-/// The same of a channel with long messages.
-const REASSEMBLY_SLOTS_LONG: usize = 2;
 /// How long after its last piece a message is given up: longer than a stall of TCP of two timeouts, or of a radio.
 pub(crate) const REASSEMBLY_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Memory that is set aside to put the messages of a channel of `size_bytes` together.
-pub const fn reassembly_bytes(size_bytes: usize) -> usize {
-    let slot_count = if size_bytes > STAGED_BYTES_MAX {
-        REASSEMBLY_SLOTS_LONG
-    } else {
-        REASSEMBLY_SLOTS
-    };
-    slot_count * size_bytes
+/// Messages of a channel of `size_bytes` that may be incomplete at a time, each of which needs memory; the oldest
+/// gives way. Of long ones, of which a sender has one under way, it is the one and the remains of the one before.
+pub const fn reassembly_slots(size_bytes: usize) -> usize {
+    if size_bytes > STAGED_BYTES_MAX { 2 } else { 4 }
 }
 
 /// Settings of an [`IngressBridge`].
@@ -74,52 +68,21 @@ pub struct IngressSettings {
     pub domain: [u8; 16],
     /// Names this host's monotonic clock; equal ids on both hosts mean one clock.
     pub clock_id: u64,
-    /// Incomplete messages held at a time for each channel; the oldest gives way.
-    pub reassembly_slots: usize,
-    /// An incomplete message of which no piece came for so long is given up.
-    pub reassembly_timeout: Duration,
     /// True to deliver a message that is new but older than one already delivered; false for
     /// newest-wins.
     pub deliver_reordered: bool,
 }
 
 impl IngressSettings {
-    /// Four reassembly slots, 1 s each, reordered messages delivered.
+    /// Reordered messages are delivered.
     pub fn new(flow: FlowIdentity, session: u32, domain: [u8; 16], clock_id: u64) -> Self {
         Self {
             flow,
             session,
             domain,
             clock_id,
-            reassembly_slots: REASSEMBLY_SLOTS,
-            reassembly_timeout: REASSEMBLY_TIMEOUT,
             deliver_reordered: true,
         }
-    }
-
-    /// Messages of a channel that may be incomplete at a time. Of long ones, of which a sender has one under
-    /// way, it is the one and the remains of the one before.
-    fn slot_count(&self, size_max_bytes: usize) -> usize {
-        if size_max_bytes > STAGED_BYTES_MAX {
-            self.reassembly_slots.min(REASSEMBLY_SLOTS_LONG)
-        } else {
-            self.reassembly_slots
-        }
-    }
-
-    fn check(&self) -> Result<(), SettingsError> {
-        self.flow.check()?;
-        if self.reassembly_slots == 0 {
-            return Err(SettingsError::Zero {
-                key: "reassembly_slots",
-            });
-        }
-        if self.reassembly_timeout.is_zero() {
-            return Err(SettingsError::Zero {
-                key: "reassembly_timeout",
-            });
-        }
-        Ok(())
     }
 }
 
@@ -165,14 +128,12 @@ struct IngressChannel {
 }
 
 impl IngressChannel {
-    fn new(identity: &ChannelIdentity, settings: &IngressSettings) -> Self {
+    fn new(identity: &ChannelIdentity) -> Self {
+        let size_bytes = identity.size_max_bytes as usize;
+        let slot_count = reassembly_slots(size_bytes);
         Self {
             window: SequenceWindow::new(),
-            reassembler: Reassembler::new(
-                settings.slot_count(identity.size_max_bytes as usize),
-                identity.size_max_bytes as usize,
-                settings.reassembly_timeout,
-            ),
+            reassembler: Reassembler::new(slot_count, size_bytes, REASSEMBLY_TIMEOUT),
             is_jump_allowed: true,
             counts: IngressChannelCounts::default(),
         }
@@ -206,9 +167,11 @@ impl IngressBridge {
     /// # Errors
     /// [`SettingsError`] names the setting, its value and its bound.
     pub fn new(settings: IngressSettings) -> Result<Self, SettingsError> {
-        settings.check()?;
+        settings.flow.check()?;
         // All that can be given up between two questions of the owner.
-        let incomplete_max = settings.flow.channels.len() * (settings.reassembly_slots + 1);
+        let channels = settings.flow.channels.iter();
+        let slots = channels.map(|one| reassembly_slots(one.size_max_bytes as usize) + 1);
+        let incomplete_max: usize = slots.sum();
         Ok(Self {
             digest: settings.flow.digest(),
             numbers: ChannelNumbers::new(&settings.flow.channels),
@@ -216,7 +179,7 @@ impl IngressBridge {
                 .flow
                 .channels
                 .iter()
-                .map(|identity| IngressChannel::new(identity, &settings))
+                .map(IngressChannel::new)
                 .collect(),
             split: Vec::with_capacity(settings.flow.channels.len()),
             incomplete: VecDeque::with_capacity(incomplete_max),
@@ -228,7 +191,7 @@ impl IngressBridge {
         })
     }
 
-    /// Takes one datagram; its message, if it brings or completes one, goes to `deliver`.
+    /// Takes one datagram; its message or its piece of one goes to `destination`.
     ///
     /// # Errors
     /// The datagram is refused and counted.
@@ -237,11 +200,11 @@ impl IngressBridge {
         now: Instant,
         arrival: ArrivalStamps,
         bytes: &[u8],
-        deliver: &mut dyn FnMut(Delivery<'_>),
+        destination: &mut dyn Destination,
     ) -> Result<Disposition, Refusal> {
         self.counts.datagram_count += 1;
         self.expire(now);
-        let result = self.accept(now, arrival, bytes, deliver);
+        let result = self.accept(now, arrival, bytes, destination);
         match &result {
             Ok(disposition) => self.counts.count(disposition),
             Err(refusal) => self.refusals.count(*refusal),
@@ -362,7 +325,7 @@ impl IngressBridge {
         now: Instant,
         arrival: ArrivalStamps,
         bytes: &[u8],
-        deliver: &mut dyn FnMut(Delivery<'_>),
+        destination: &mut dyn Destination,
     ) -> Result<Disposition, Refusal> {
         let datagram = wire::decode(bytes).inspect_err(|&refusal| {
             if refusal == Refusal::UnsupportedVersion {
@@ -385,7 +348,7 @@ impl IngressBridge {
         let channel = self.check_session(request)?;
         let disposition = match (datagram.body, channel) {
             (Body::Data(payload), Some(channel)) => {
-                let result = self.on_data(request, channel, payload, deliver);
+                let result = self.on_data(request, channel, payload, destination);
                 let counts = &mut self.channels[channel].counts;
                 counts.datagram_count += 1;
                 result.inspect(|disposition| counts.count(disposition))?
@@ -532,7 +495,7 @@ impl IngressBridge {
         request: Request<'_>,
         channel: usize,
         payload: &[u8],
-        deliver: &mut dyn FnMut(Delivery<'_>),
+        destination: &mut dyn Destination,
     ) -> Result<Disposition, Refusal> {
         let header = request.header;
         let identity = &self.settings.flow.channels[channel];
@@ -561,8 +524,9 @@ impl IngressBridge {
             let message = message_of(channel, header, header.handed_ns);
             let window = &mut own.window;
             let order = window.record(stream, header.sequence, header.handed_ns);
-            let delivery = delivery_of(header, message, payload, order);
-            return Ok(delivery.dispose(deliver_reordered, deliver));
+            let delivery = delivery_of(header, message, order);
+            let payload = Payload::Datagram(payload);
+            return Ok(delivery.dispose(payload, deliver_reordered, destination));
         }
         match order {
             Order::Duplicate => return Err(Refusal::DuplicateFragment),
@@ -579,7 +543,23 @@ impl IngressBridge {
             handed_ns: header.handed_ns,
             payload,
         };
-        let inserted = own.reassembler.insert(request.now, &fragment)?;
+        let place = own.reassembler.place(request.now, &fragment)?;
+        collect(&mut self.incomplete, &mut own.reassembler, channel);
+        if place.is_first && !self.split.contains(&channel) {
+            self.split.push(channel);
+        }
+        let slot = place.slot;
+        let is_stored = destination.store(&Piece {
+            channel,
+            slot,
+            is_first: place.is_first,
+            offset_bytes: place.offset_bytes,
+            payload,
+        });
+        if !is_stored {
+            return Err(Refusal::NoMemory);
+        }
+        let whole = own.reassembler.stored(place);
         if is_acknowledged(header) {
             self.replies.acknowledge_piece(&PieceRequest {
                 now: request.now,
@@ -590,19 +570,19 @@ impl IngressBridge {
                 destination: request.arrival.peer,
             });
         }
-        let Some(assembled) = inserted else {
-            collect(&mut self.incomplete, &mut own.reassembler, channel);
-            if !self.split.contains(&channel) {
-                self.split.push(channel);
-            }
+        let Some(assembled) = whole else {
             return Ok(Disposition::FragmentStored);
         };
         own.is_jump_allowed = false;
         let message = message_of(channel, header, assembled.handed_ns);
         let window = &mut own.window;
         let order = window.record(stream, header.sequence, header.handed_ns);
-        let delivery = delivery_of(header, message, assembled.payload, order);
-        Ok(delivery.dispose(deliver_reordered, deliver))
+        let payload = Payload::Stored {
+            slot,
+            length_bytes: assembled.length_bytes,
+        };
+        let delivery = delivery_of(header, message, order);
+        Ok(delivery.dispose(payload, deliver_reordered, destination))
     }
 
     fn on_sync_request(&mut self, request: Request<'_>) -> Disposition {

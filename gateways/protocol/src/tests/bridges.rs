@@ -9,7 +9,7 @@ use super::network::{Impairment, Lab, OFFSET_NS, TX_NS, egress_settings, ingress
 use crate::body::HelloStatus;
 use crate::channel::{ChannelIdentity, FlowIdentity, SettingsError};
 use crate::egress::{EgressBridge, EgressEvent, LocalRefusal, PeerState, TransmitFailure};
-use crate::ingress::{IngressBridge, IngressSettings};
+use crate::ingress::{InMemory, IngressBridge, IngressSettings};
 use crate::refusal::Refusal;
 use crate::sequence::Order;
 use crate::stamps::{ArrivalStamps, StampSource};
@@ -249,7 +249,12 @@ fn answer_of(ingress: &IngressSettings) -> (PeerState, Refusal) {
     let now = Instant::from_ns(1_000_000);
     let arrival = ArrivalStamps::application(now.as_ns());
     let hello = egress.poll_transmit(now).unwrap().datagram.to_vec();
-    let refusal = ingress.on_datagram(now, arrival, &hello, &mut |_| panic!("no message"));
+    let refusal = ingress.on_datagram(
+        now,
+        arrival,
+        &hello,
+        &mut InMemory::default().with(|_, _| panic!("no message")),
+    );
     let reply = ingress.poll_transmit(now).unwrap().datagram.to_vec();
     assert!(reply.len() <= hello.len());
     let event = egress.on_datagram(now, arrival, &reply).unwrap();
@@ -303,7 +308,12 @@ fn another_version_is_told_so_and_understood() {
     let arrival = ArrivalStamps::application(now.as_ns());
     let mut hello = egress.poll_transmit(now).unwrap().datagram.to_vec();
     hello[4] = 3;
-    let refusal = ingress.on_datagram(now, arrival, &hello, &mut |_| panic!("no message"));
+    let refusal = ingress.on_datagram(
+        now,
+        arrival,
+        &hello,
+        &mut InMemory::default().with(|_, _| panic!("no message")),
+    );
     assert_eq!(refusal, Err(Refusal::UnsupportedVersion));
     let mut reply = ingress.poll_transmit(now).unwrap().datagram.to_vec();
     assert_eq!(reply[72], HelloStatus::VersionMismatch as u8);

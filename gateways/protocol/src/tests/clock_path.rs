@@ -8,7 +8,7 @@ use hil_core::time::Instant;
 use super::golden::bytes;
 use crate::channel::FlowIdentity;
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings, PeerState};
-use crate::ingress::{Disposition, IngressBridge, IngressSettings};
+use crate::ingress::{Disposition, InMemory, IngressBridge, IngressSettings};
 use crate::refusal::Refusal;
 use crate::stamps::{ArrivalStamps, StampSource};
 use crate::wire::{HEADER_BYTES, Header, Kind};
@@ -80,7 +80,7 @@ fn it_exchanges_clocks_every_period_with_all_four_stamps_of_the_kernel() {
                 Instant::from_ns(there_ns),
                 arrival(there_ns),
                 transmit.datagram,
-                &mut |_| panic!("no message"),
+                &mut InMemory::default().with(|_, _| panic!("no message")),
             );
             taken.unwrap();
             egress.on_transmit_stamp(kind, None, sequence, DEPARTURE_NS);
@@ -114,7 +114,12 @@ fn a_message_has_no_room_on_it() {
     let (mut egress, mut ingress) = pair();
     let now = Instant::from_ns(1_000_000);
     let hello = egress.poll_transmit(now).unwrap().datagram;
-    let greeted = ingress.on_datagram(now, arrival(1_000_000), hello, &mut |_| {});
+    let greeted = ingress.on_datagram(
+        now,
+        arrival(1_000_000),
+        hello,
+        &mut InMemory::default().with(|_, _| {}),
+    );
     assert!(matches!(greeted, Ok(Disposition::Greeted { .. })));
     let mut header = Header::new(Kind::Data, 0x0403_0201, 65_535);
     header.type_hash = flow().digest();
@@ -122,6 +127,11 @@ fn a_message_has_no_room_on_it() {
     header.total_len = 1;
     let mut datagram = vec![0; HEADER_BYTES + 1];
     header.encode(&mut datagram);
-    let refused = ingress.on_datagram(now, arrival(1_000_000), &datagram, &mut |_| panic!());
+    let refused = ingress.on_datagram(
+        now,
+        arrival(1_000_000),
+        &datagram,
+        &mut InMemory::default().with(|_, _| panic!("no message")),
+    );
     assert_eq!(refused, Err(Refusal::UnknownChannel));
 }

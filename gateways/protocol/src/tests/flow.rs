@@ -6,7 +6,9 @@ use hil_core::time::Instant;
 use super::network::{egress_settings, ingress_settings};
 use crate::channel::{ChannelIdentity, FlowIdentity};
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings};
-use crate::ingress::{Delivery, Disposition, IngressBridge, IngressSettings};
+use crate::ingress::{
+    Delivery, Destination, Disposition, InMemory, IngressBridge, IngressSettings, Payload, Piece,
+};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
 use crate::wire::{HEADER_BYTES, Header, Kind};
@@ -30,6 +32,7 @@ fn flow() -> FlowIdentity {
 struct Pair {
     egress: EgressBridge,
     ingress: IngressBridge,
+    memory: InMemory,
     now_ns: i64,
     /// Channel, epoch, sequence and first byte of each.
     delivered: Vec<(usize, u32, u64, u8)>,
@@ -53,6 +56,7 @@ impl Pair {
                 ..ingress_settings(200, 0)
             })
             .unwrap(),
+            memory: InMemory::default(),
             now_ns: 1_000_000,
             delivered: Vec::new(),
             datagrams: Vec::new(),
@@ -69,16 +73,12 @@ impl Pair {
             self.datagrams.push((header.kind, header.channel));
             let datagram = transmit.datagram.to_vec();
             let delivered = &mut self.delivered;
+            let mut destination = self.memory.with(|one, payload| {
+                let message = one.message;
+                delivered.push((message.channel, message.epoch, message.sequence, payload[0]));
+            });
             self.ingress
-                .on_datagram(now, arrival, &datagram, &mut |one| {
-                    let message = one.message;
-                    delivered.push((
-                        message.channel,
-                        message.epoch,
-                        message.sequence,
-                        one.payload[0],
-                    ));
-                })
+                .on_datagram(now, arrival, &datagram, &mut destination)
                 .unwrap();
             while let Some(reply) = self.ingress.poll_transmit(now) {
                 let reply = reply.datagram.to_vec();
@@ -221,9 +221,9 @@ fn numbers_that_are_no_channels_and_exchanges_about_channels_are_refused() {
         let mut datagram = vec![0; HEADER_BYTES];
         header.encode(&mut datagram);
         datagram.extend_from_slice(body);
-        let no_message = &mut |_: Delivery<'_>| panic!("no message");
+        let mut no_message = pair.memory.with(|_, _| panic!("no message"));
         pair.ingress
-            .on_datagram(now, arrival, &datagram, no_message)
+            .on_datagram(now, arrival, &datagram, &mut no_message)
     };
     let of_seven = flow().channels[0].type_hash;
     let digest = flow().digest();
@@ -254,7 +254,12 @@ fn the_answer_to_a_greeting_of_other_channels_is_no_acceptance() {
     let now = Instant::from_ns(pair.now_ns);
     let arrival = ArrivalStamps::application(pair.now_ns);
     let hello = pair.egress.poll_transmit(now).unwrap().datagram.to_vec();
-    let refused = pair.ingress.on_datagram(now, arrival, &hello, &mut |_| {});
+    let refused = pair.ingress.on_datagram(
+        now,
+        arrival,
+        &hello,
+        &mut InMemory::default().with(|_, _| {}),
+    );
     assert_eq!(refused, Err(Refusal::ChannelsDiffer));
     let reply = pair.ingress.poll_transmit(now).unwrap().datagram.to_vec();
     let event = pair.egress.on_datagram(now, arrival, &reply);
@@ -285,7 +290,12 @@ fn long_pair() -> (EgressBridge, IngressBridge) {
     let arrival = ArrivalStamps::application(now.as_ns());
     let hello = egress.poll_transmit(now).unwrap().datagram.to_vec();
     ingress
-        .on_datagram(now, arrival, &hello, &mut |_| {})
+        .on_datagram(
+            now,
+            arrival,
+            &hello,
+            &mut InMemory::default().with(|_, _| {}),
+        )
         .unwrap();
     let answer = ingress.poll_transmit(now).unwrap().datagram.to_vec();
     egress.on_datagram(now, arrival, &answer).unwrap();
@@ -303,9 +313,10 @@ fn send_long(
     let now = Instant::from_ns(2_000_000);
     let arrival = ArrivalStamps::application(now.as_ns());
     let mut delivered = Vec::new();
-    let mut deliver = |one: Delivery<'_>| {
-        delivered.push((one.message.channel, one.payload.to_vec()));
-    };
+    let mut memory = InMemory::default();
+    let mut deliver = memory.with(|one, payload| {
+        delivered.push((one.message.channel, payload.to_vec()));
+    });
     let envelope = Envelope::default();
     egress.begin_long(0, &envelope, image.len()).unwrap();
     let again = egress.begin_long(0, &envelope, image.len());
@@ -391,6 +402,113 @@ fn a_long_message_of_which_a_piece_is_missing_is_given_up_with_what_came() {
     assert_eq!(ingress.reassembly_counts(0).timed_out_count, 1);
 }
 
+/// A destination that notes where pieces go, with memory for so many of them.
+struct Places {
+    rest: usize,
+    /// Slot, whether its message begins, and offset of each.
+    stored: Vec<(usize, bool, usize)>,
+    /// Slot and length of each message.
+    whole: Vec<(usize, usize)>,
+}
+
+impl Destination for Places {
+    fn store(&mut self, piece: &Piece<'_>) -> bool {
+        let Some(rest) = self.rest.checked_sub(1) else {
+            return false;
+        };
+        self.rest = rest;
+        let place = (piece.slot, piece.is_first, piece.offset_bytes);
+        self.stored.push(place);
+        true
+    }
+
+    fn deliver(&mut self, delivery: &Delivery, payload: Payload<'_>) {
+        match payload {
+            Payload::Stored { slot, length_bytes } => self.whole.push((slot, length_bytes)),
+            Payload::Datagram(_) => panic!("{delivery:?} came in pieces"),
+        }
+    }
+}
+
+impl Pair {
+    /// The three datagrams of a message of the first channel, which do not arrive yet.
+    fn pieces(&mut self, sequence: u64) -> Vec<Vec<u8>> {
+        let envelope = Envelope {
+            sequence,
+            epoch: 1,
+            ..Envelope::default()
+        };
+        let now = Instant::from_ns(self.now_ns);
+        let staged = self.egress.on_local(now, 0, &envelope, &[3; 4_000]);
+        staged.unwrap();
+        let mut pieces = Vec::new();
+        while let Some(transmit) = self.egress.poll_transmit(now) {
+            pieces.push(transmit.datagram.to_vec());
+        }
+        assert_eq!(pieces.len(), 3);
+        pieces
+    }
+
+    fn offer(&mut self, datagram: &[u8], places: &mut Places) -> Result<Disposition, Refusal> {
+        let arrival = ArrivalStamps::application(self.now_ns);
+        let now = Instant::from_ns(self.now_ns);
+        self.ingress.on_datagram(now, arrival, datagram, places)
+    }
+}
+
+#[test]
+fn a_piece_without_memory_is_refused_and_its_message_is_never_whole() {
+    let mut pair = Pair::new();
+    pair.exchange();
+    let mut places = Places {
+        rest: 2,
+        stored: Vec::new(),
+        whole: Vec::new(),
+    };
+    let pieces = pair.pieces(0);
+    let outcomes = pieces.iter().map(|one| pair.offer(one, &mut places));
+    let stored = Ok(Disposition::FragmentStored);
+    let refused = Err(Refusal::NoMemory);
+    assert_eq!(outcomes.collect::<Vec<_>>(), [stored, stored, refused]);
+    assert_eq!(places.stored, [(0, true, 0), (0, false, 1_334)]);
+    assert_eq!(pair.ingress.refusals().get(Refusal::NoMemory), 1);
+    let due = pair.ingress.next_wakeup().unwrap();
+    pair.ingress.on_wakeup(due);
+    let incomplete = pair.ingress.next_incomplete().unwrap();
+    assert_eq!(incomplete.message.fragment_count, 2);
+    assert_eq!(places.whole, []);
+}
+
+#[test]
+fn a_message_of_a_new_session_begins_anew_in_the_slot_of_an_old_one() {
+    let mut pair = Pair::new();
+    pair.exchange();
+    let mut places = Places {
+        rest: usize::MAX,
+        stored: Vec::new(),
+        whole: Vec::new(),
+    };
+    for piece in &pair.pieces(0)[..2] {
+        pair.offer(piece, &mut places).unwrap();
+    }
+    let flow = flow();
+    pair.egress = EgressBridge::new(EgressSettings {
+        flow,
+        ..egress_settings(101, 0)
+    })
+    .unwrap();
+    pair.exchange();
+    assert_eq!(pair.ingress.next_incomplete().unwrap().message.session, 100);
+    let pieces = pair.pieces(0);
+    for piece in [2, 0, 1] {
+        assert_eq!(places.whole, []);
+        pair.offer(&pieces[piece], &mut places).unwrap();
+    }
+    let of_the_new = [(0, true, 2_668), (0, false, 0), (0, false, 1_334)];
+    assert_eq!(places.stored[2..], of_the_new);
+    assert_eq!(places.whole, [(0, 4_000)]);
+}
+
 #[test]
 fn a_peer_that_goes_takes_the_long_message_with_it() {
     let (mut egress, _ingress) = long_pair();
@@ -426,7 +544,7 @@ fn a_frame_arrives_as_long_as_it_is_and_another_message_only_whole() {
         let mut lengths = Vec::new();
         while let Some(transmit) = pair.egress.poll_transmit(now) {
             let datagram = transmit.datagram.to_vec();
-            let mut deliver = |one: Delivery<'_>| lengths.push(one.payload.len());
+            let mut deliver = pair.memory.with(|_, payload| lengths.push(payload.len()));
             let taken = pair
                 .ingress
                 .on_datagram(now, arrival, &datagram, &mut deliver);

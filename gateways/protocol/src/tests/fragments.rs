@@ -6,6 +6,7 @@ use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
 use crate::fragment::{FRAGMENT_COUNT_MAX, Fragment, FragmentPlan, Reassembler};
+use crate::ingress::{InMemory, Piece};
 use crate::refusal::Refusal;
 use crate::sequence::Stream;
 use crate::wire::{HEADER_BYTES, TAG_BYTES};
@@ -37,6 +38,43 @@ fn message(length: usize, seed: u64) -> Vec<u8> {
     (0..length)
         .map(|_| random.next_u64().to_le_bytes()[0])
         .collect()
+}
+
+/// A reassembler with the memory of its messages.
+struct Assembly {
+    reassembler: Reassembler,
+    memory: InMemory,
+}
+
+impl Assembly {
+    fn new(slot_count: usize, size_max_bytes: usize) -> Self {
+        Self {
+            reassembler: Reassembler::new(slot_count, size_max_bytes, TIMEOUT),
+            memory: InMemory::default(),
+        }
+    }
+
+    /// Takes one piece; gives the message once it is whole, and when it was handed over.
+    fn insert(
+        &mut self,
+        now: Instant,
+        fragment: &Fragment<'_>,
+    ) -> Result<Option<(Vec<u8>, i64)>, Refusal> {
+        let place = self.reassembler.place(now, fragment)?;
+        let slot = place.slot;
+        self.memory.store(&Piece {
+            channel: 0,
+            slot,
+            is_first: place.is_first,
+            offset_bytes: place.offset_bytes,
+            payload: fragment.payload,
+        });
+        Ok(self.reassembler.stored(place).map(|whole| {
+            let bytes = self.memory.message(0, slot);
+            assert_eq!(bytes.len(), whole.length_bytes);
+            (bytes.to_vec(), whole.handed_ns)
+        }))
+    }
 }
 
 fn shuffle<T>(random: &mut RandomStream, items: &mut [T]) {
@@ -85,7 +123,7 @@ fn a_cut_covers_every_byte_once_and_the_receiver_finds_the_same_cut() {
 fn pieces_in_any_order_and_interleaved_come_together() {
     for seed in 0..50 {
         let mut random = RandomStream::new(seed, "reassembly");
-        let mut reassembler = Reassembler::new(3, 4000, TIMEOUT);
+        let mut assembly = Assembly::new(3, 4000);
         let messages: Vec<_> = (0..3).map(|m| message(3000 + m, seed)).collect();
         let mut all: Vec<_> = (0..)
             .zip(&messages)
@@ -94,16 +132,16 @@ fn pieces_in_any_order_and_interleaved_come_together() {
         shuffle(&mut random, &mut all);
         let mut completed = 0;
         for piece in &all {
-            let whole = reassembler.insert(Instant::ZERO, piece).unwrap();
-            if let Some(assembled) = whole {
+            let whole = assembly.insert(Instant::ZERO, piece).unwrap();
+            if let Some((bytes, handed_ns)) = whole {
                 let index = usize::try_from(piece.sequence).unwrap();
-                assert_eq!(assembled.payload, messages[index], "seed {seed}");
-                assert_eq!(assembled.handed_ns, 100);
+                assert_eq!(bytes, messages[index], "seed {seed}");
+                assert_eq!(handed_ns, 100);
                 completed += 1;
             }
         }
         assert_eq!(completed, 3);
-        assert_eq!(reassembler.open_count(), 0);
+        assert_eq!(assembly.reassembler.open_count(), 0);
     }
 }
 
@@ -112,58 +150,58 @@ fn a_second_copy_of_a_piece_is_refused_and_changes_nothing() {
     let whole = message(300, 1);
     let mut forged = whole.clone();
     forged[0] ^= 0xff;
-    let mut reassembler = Reassembler::new(1, 300, TIMEOUT);
+    let mut assembly = Assembly::new(1, 300);
     let (good, bad) = (pieces(0, &whole, 100), pieces(0, &forged, 100));
-    assert_eq!(reassembler.insert(Instant::ZERO, &good[0]), Ok(None));
+    assert_eq!(assembly.insert(Instant::ZERO, &good[0]), Ok(None));
     let refused = Err(Refusal::DuplicateFragment);
-    assert_eq!(reassembler.insert(Instant::ZERO, &bad[0]), refused);
-    assert_eq!(reassembler.insert(Instant::ZERO, &good[1]), Ok(None));
-    let assembled = reassembler.insert(Instant::ZERO, &good[2]).unwrap();
-    assert_eq!(assembled.unwrap().payload, whole);
+    assert_eq!(assembly.insert(Instant::ZERO, &bad[0]), refused);
+    assert_eq!(assembly.insert(Instant::ZERO, &good[1]), Ok(None));
+    let assembled = assembly.insert(Instant::ZERO, &good[2]).unwrap();
+    assert_eq!(assembled.unwrap().0, whole);
 }
 
 #[test]
 fn pieces_that_contradict_the_first_one_or_the_bound_are_refused() {
     let whole = message(300, 1);
-    let mut reassembler = Reassembler::new(1, 300, TIMEOUT);
+    let mut assembly = Assembly::new(1, 300);
     let good = pieces(0, &whole, 100);
-    assert_eq!(reassembler.insert(Instant::ZERO, &good[0]), Ok(None));
+    assert_eq!(assembly.insert(Instant::ZERO, &good[0]), Ok(None));
     let other_cut = pieces(0, &whole, 60);
     let other_length = pieces(0, &whole[..299], 100);
     let refused = Err(Refusal::FragmentInconsistent);
-    assert_eq!(reassembler.insert(Instant::ZERO, &other_cut[1]), refused);
-    assert_eq!(reassembler.insert(Instant::ZERO, &other_length[1]), refused);
+    assert_eq!(assembly.insert(Instant::ZERO, &other_cut[1]), refused);
+    assert_eq!(assembly.insert(Instant::ZERO, &other_length[1]), refused);
     let long = message(301, 1);
     let refused = Err(Refusal::Oversize);
     assert_eq!(
-        reassembler.insert(Instant::ZERO, &pieces(1, &long, 100)[0]),
+        assembly.insert(Instant::ZERO, &pieces(1, &long, 100)[0]),
         refused
     );
     let mut short = good[1];
     short.payload = &short.payload[1..];
     assert_eq!(
-        reassembler.insert(Instant::ZERO, &short),
+        assembly.insert(Instant::ZERO, &short),
         Err(Refusal::LengthMismatch)
     );
-    assert_eq!(reassembler.counts().started_count, 1);
+    assert_eq!(assembly.reassembler.counts().started_count, 1);
 }
 
 #[test]
 fn the_oldest_incomplete_message_gives_way_and_is_counted() {
     let whole = message(200, 1);
-    let mut reassembler = Reassembler::new(2, 200, TIMEOUT);
+    let mut assembly = Assembly::new(2, 200);
     for sequence in 0..5 {
         let now = Instant::from_ns(i64::try_from(sequence).unwrap());
         let piece = pieces(sequence, &whole, 100)[0];
-        assert_eq!(reassembler.insert(now, &piece), Ok(None));
+        assert_eq!(assembly.insert(now, &piece), Ok(None));
     }
-    let counts = *reassembler.counts();
+    let counts = *assembly.reassembler.counts();
     assert_eq!((counts.started_count, counts.evicted_count), (5, 3));
     // The two newest are still there.
     for sequence in 3..5 {
         let piece = pieces(sequence, &whole, 100)[1];
         assert!(
-            reassembler
+            assembly
                 .insert(Instant::from_ns(9), &piece)
                 .unwrap()
                 .is_some()
@@ -174,14 +212,28 @@ fn the_oldest_incomplete_message_gives_way_and_is_counted() {
 #[test]
 fn an_incomplete_message_is_given_up_in_time() {
     let whole = message(200, 1);
-    let mut reassembler = Reassembler::new(2, 200, TIMEOUT);
+    let mut assembly = Assembly::new(2, 200);
     let halves = pieces(0, &whole, 100);
-    assert_eq!(reassembler.insert(Instant::ZERO, &halves[0]), Ok(None));
-    let due = reassembler.next_expiry().unwrap();
+    assert_eq!(assembly.insert(Instant::ZERO, &halves[0]), Ok(None));
+    let due = assembly.reassembler.next_expiry().unwrap();
     assert_eq!(due, Instant::ZERO + TIMEOUT);
-    reassembler.expire(Instant::from_ns(due.as_ns() - 1));
-    assert_eq!(reassembler.open_count(), 1);
-    assert_eq!(reassembler.insert(due, &halves[1]), Ok(None));
-    assert_eq!(reassembler.counts().timed_out_count, 1);
-    assert_eq!(reassembler.counts().completed_count, 0);
+    assembly
+        .reassembler
+        .expire(Instant::from_ns(due.as_ns() - 1));
+    assert_eq!(assembly.reassembler.open_count(), 1);
+    assert_eq!(assembly.insert(due, &halves[1]), Ok(None));
+    assert_eq!(assembly.reassembler.counts().timed_out_count, 1);
+    assert_eq!(assembly.reassembler.counts().completed_count, 0);
+}
+
+#[test]
+fn a_piece_that_was_not_stored_is_missing_until_it_comes_again() {
+    let whole = message(200, 1);
+    let mut assembly = Assembly::new(1, 200);
+    let halves = pieces(0, &whole, 100);
+    let place = assembly.reassembler.place(Instant::ZERO, &halves[0]);
+    assert!(place.unwrap().is_first);
+    assert_eq!(assembly.insert(Instant::ZERO, &halves[1]), Ok(None));
+    let again = assembly.insert(Instant::ZERO, &halves[0]).unwrap();
+    assert_eq!(again, Some((whole, 100)));
 }

@@ -10,7 +10,7 @@ use hil_core::time::Instant;
 
 use crate::channel::{ChannelIdentity, FlowIdentity};
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings, LocalRefusal, TransmitFailure};
-use crate::ingress::{Disposition, IngressBridge, IngressSettings, MessageInfo};
+use crate::ingress::{Disposition, InMemory, IngressBridge, IngressSettings, MessageInfo};
 use crate::refusal::Refusal;
 use crate::sequence::Order;
 use crate::stamps::{ArrivalStamps, StampSource};
@@ -124,6 +124,7 @@ pub(super) struct Lab {
     pub(super) now_ns: i64,
     pub(super) egress: EgressBridge,
     pub(super) ingress: Option<IngressBridge>,
+    memory: InMemory,
     pub(super) there: Path,
     pub(super) back: Path,
     pub(super) epoch: u32,
@@ -141,6 +142,7 @@ impl Lab {
             now_ns: 1_000_000_000,
             egress: EgressBridge::new(egress_settings(100, payload_bytes)).unwrap(),
             ingress: Some(IngressBridge::new(ingress_settings(200, payload_bytes)).unwrap()),
+            memory: InMemory::default(),
             there: Path::new(seed, "there", impairment),
             back: Path::new(seed, "back", impairment),
             epoch: 1,
@@ -215,14 +217,15 @@ impl Lab {
                 peer: Some(datagram.from),
             };
             let delivered = &mut self.delivered;
-            let disposition = ingress.on_datagram(now, arrival, &datagram.bytes, &mut |d| {
+            let mut destination = self.memory.with(|one, payload| {
                 delivered.push(Delivered {
-                    message: d.message,
-                    payload: d.payload.to_vec(),
-                    order: d.order,
-                    follow_up: d.follow_up.map(|f| (f.sequence, f.handed_to_tx_ns)),
+                    message: one.message,
+                    payload: payload.to_vec(),
+                    order: one.order,
+                    follow_up: one.follow_up.map(|f| (f.sequence, f.handed_to_tx_ns)),
                 });
             });
+            let disposition = ingress.on_datagram(now, arrival, &datagram.bytes, &mut destination);
             self.dispositions.push(disposition);
             let mut replies = 0;
             while let Some(reply) = ingress.poll_transmit(now) {

@@ -4,7 +4,7 @@ use hil_core::time::Instant;
 
 use super::network::{Impairment, Lab, egress_settings, ingress_settings};
 use crate::egress::{EgressBridge, LocalRefusal, PeerState};
-use crate::ingress::{Disposition, IngressBridge};
+use crate::ingress::{Disposition, InMemory, IngressBridge};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
 
@@ -143,7 +143,12 @@ fn a_delayed_greeting_or_message_of_an_old_session_is_stale() {
     let new_hello = new.poll_transmit(now).unwrap().datagram.to_vec();
     let mut take = |bytes: &[u8]| {
         let now = Instant::from_ns(arrival.received_ns);
-        ingress.on_datagram(now, arrival, bytes, &mut |_| {})
+        ingress.on_datagram(
+            now,
+            arrival,
+            bytes,
+            &mut InMemory::default().with(|_, _| {}),
+        )
     };
     assert_eq!(
         take(&old_hello),
@@ -178,7 +183,12 @@ fn a_session_replaced_by_mistake_comes_back() {
     };
     let now = Instant::from_ns(lab.now_ns);
     let ingress = lab.ingress.as_mut().unwrap();
-    let taken = ingress.on_datagram(now, arrival, &hello, &mut |_| {});
+    let taken = ingress.on_datagram(
+        now,
+        arrival,
+        &hello,
+        &mut InMemory::default().with(|_, _| {}),
+    );
     assert_eq!(taken, Ok(Disposition::Greeted { is_restart: true }));
     lab.publish_for_ms(50);
     assert_eq!(lab.ingress().session(), Some(100));
@@ -202,10 +212,20 @@ fn another_host_neither_takes_over_a_live_session_nor_speaks_for_it() {
         .to_vec();
     let now = Instant::from_ns(lab.now_ns);
     let ingress = lab.ingress.as_mut().unwrap();
-    let refused = ingress.on_datagram(now, stranger, &hello, &mut |_| {});
+    let refused = ingress.on_datagram(
+        now,
+        stranger,
+        &hello,
+        &mut InMemory::default().with(|_, _| {}),
+    );
     assert_eq!(refused, Err(Refusal::ForeignSource));
     let later = Instant::from_ns(lab.now_ns + 3_000_000_000);
-    let taken = ingress.on_datagram(later, stranger, &hello, &mut |_| {});
+    let taken = ingress.on_datagram(
+        later,
+        stranger,
+        &hello,
+        &mut InMemory::default().with(|_, _| {}),
+    );
     assert_eq!(taken, Ok(Disposition::Greeted { is_restart: true }));
     lab.publish().unwrap();
     lab.run_ms(1);
@@ -252,7 +272,12 @@ fn stamps_that_contradict_the_clock_are_refused_until_the_next_exchange() {
         let arrival = ArrivalStamps::application(lab.now_ns);
         let now = Instant::from_ns(lab.now_ns);
         let ingress = lab.ingress.as_mut().unwrap();
-        let result = ingress.on_datagram(now, arrival, &bytes, &mut |_| {});
+        let result = ingress.on_datagram(
+            now,
+            arrival,
+            &bytes,
+            &mut InMemory::default().with(|_, _| {}),
+        );
         result.map(|_| ())
     };
     let suspended_ns = 300_000_000_000;
@@ -267,7 +292,12 @@ fn stamps_that_contradict_the_clock_are_refused_until_the_next_exchange() {
     let now = Instant::from_ns(lab.now_ns);
     let ingress = lab.ingress.as_mut().unwrap();
     ingress
-        .on_datagram(now, arrival, &sync, &mut |_| {})
+        .on_datagram(
+            now,
+            arrival,
+            &sync,
+            &mut InMemory::default().with(|_, _| {}),
+        )
         .unwrap();
     assert_eq!(transmit(&mut lab, suspended_ns), Ok(()));
 }

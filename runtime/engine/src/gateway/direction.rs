@@ -8,6 +8,7 @@ use std::time::Duration;
 use hil_core::link_model::ReplayTally;
 use hil_core::record::{EgressRecord, IngressRecord, RoundTripRecord};
 use hil_core::time::duration_ns;
+use hil_protocol::ingress::reassembly_slots;
 use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings, SettingsError};
 use hil_transport::{ConnectionTally, Stalls};
 
@@ -203,8 +204,9 @@ impl OpenDirection {
                 );
                 let channels = launch.channels.iter().zip(self.counts);
                 let outputs = channels.map(|(one, received)| {
+                    let (domain, slots) = (&around.domain, reassembly_slots(one.size_bytes));
                     Ok(Output {
-                        port: RawOutput::open(&around.domain, &one.channel, true)?,
+                        port: RawOutput::open_assembling(domain, &one.channel, true, slots)?,
                         received,
                     })
                 });

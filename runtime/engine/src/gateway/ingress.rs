@@ -5,13 +5,12 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use hil_core::message::Envelope;
 use hil_core::record::{IngressRecord, UNAVAILABLE};
 use hil_core::time::Instant;
 use hil_protocol::ingress::MessageInfo;
 use hil_protocol::sequence::Order;
 use hil_protocol::wire::Kind;
-use hil_protocol::{Delivery, Disposition, Incomplete, IngressBridge};
+use hil_protocol::{Delivery, Destination, Disposition, Incomplete, IngressBridge, Payload, Piece};
 use hil_transport::{DatagramReceiver, Received};
 
 use super::kernel_clock::KernelClock;
@@ -191,16 +190,16 @@ impl Ingress {
             ..
         } = self;
         let bytes = &buffer[..received.length_bytes];
-        let mut failed = None;
-        let mut deliver = |delivery: Delivery<'_>| {
-            let output = &mut outputs[delivery.message.channel];
-            output.received.fetch_add(1, Ordering::Relaxed);
-            if let Err(error) = output.publish(&arrival, &delivery, records) {
-                failed = Some(error);
-            }
+        let mut destination = LocalChannels {
+            outputs,
+            records,
+            arrival: &arrival,
+            failed: None,
         };
         // A refused datagram is a counter of the bridge.
-        if let Ok(disposition) = bridge.on_datagram(at, stamps, bytes, &mut deliver) {
+        let taken = bridge.on_datagram(at, stamps, bytes, &mut destination);
+        let failed = destination.failed;
+        if let Ok(disposition) = taken {
             note_undelivered(records, &arrival, disposition);
         }
         self.note_incomplete();
@@ -274,26 +273,55 @@ impl Ingress {
     }
 }
 
+/// The channels while one datagram is taken. Its bytes are copied once, into the shared memory of its channel: only
+/// its header and its seal, which are read after it has come, tell where they belong.
+struct LocalChannels<'a> {
+    outputs: &'a mut [Output],
+    records: &'a mut SharedSink,
+    arrival: &'a Arrival,
+    failed: Option<ChannelError>,
+}
+
+impl Destination for LocalChannels<'_> {
+    fn store(&mut self, piece: &Piece<'_>) -> bool {
+        let port = &mut self.outputs[piece.channel].port;
+        if piece.is_first {
+            port.discard_pieces(piece.slot);
+        }
+        let written = port.write_piece(piece.slot, piece.offset_bytes, piece.payload);
+        self.failed = written.err();
+        self.failed.is_none()
+    }
+
+    fn deliver(&mut self, delivery: &Delivery, payload: Payload<'_>) {
+        let output = &mut self.outputs[delivery.message.channel];
+        output.received.fetch_add(1, Ordering::Relaxed);
+        let published = output.publish(self.arrival, delivery, payload, self.records);
+        self.failed = published.err();
+    }
+}
+
 impl Output {
     fn publish(
         &mut self,
         arrival: &Arrival,
-        delivery: &Delivery<'_>,
+        delivery: &Delivery,
+        payload: Payload<'_>,
         records: &mut SharedSink,
     ) -> Result<(), ChannelError> {
         let message = &delivery.message;
         let mut forwarded_ns = UNAVAILABLE;
-        self.port.publish_with(delivery.payload, || {
-            forwarded_ns = MonotonicClock::now().as_ns();
-            Envelope {
-                sequence: message.sequence,
-                published_ns: message.published.as_ns(),
-                forwarded_ns,
-                epoch: message.epoch,
-                flags: Envelope::FORWARDED,
-                ..Envelope::default()
+        let envelope = || {
+            let now = MonotonicClock::now();
+            forwarded_ns = now.as_ns();
+            message.envelope(now)
+        };
+        match payload {
+            Payload::Datagram(bytes) => self.port.publish_with(bytes, envelope),
+            Payload::Stored { slot, length_bytes } => {
+                self.port.publish_pieces(slot, length_bytes, envelope)
             }
-        })?;
+        }?;
         let flags = if delivery.order == Order::Reordered {
             IngressRecord::REORDERED
         } else {

@@ -13,6 +13,7 @@ use super::plan::{HostPlan, domain_base, domain_root};
 use crate::gateway::link_control::ORDERS_MAX;
 use hil_platform::domain_address::checked_root_path;
 use hil_platform::own_folder::OwnFolder;
+use hil_protocol::ingress::reassembly_slots;
 use hil_rundir::announcement::withdraw_abandoned;
 use hil_shm::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, observer_depth};
 use hil_topology::Channel;
@@ -248,6 +249,11 @@ pub(super) fn channel_settings(plan: &HostPlan) -> impl Iterator<Item = ChannelS
         depth_max: depth_max(channel, &plan.observed),
         writers_max: WRITERS_MAX,
         readers_max: READERS_MAX,
+        assembled_max: if plan.arriving.contains(&channel.name) {
+            reassembly_slots(channel.message.size_bytes)
+        } else {
+            0
+        },
     });
     let of_orders = plan.orders.iter().map(|name| order_settings(name));
     of_messages.chain(of_orders)
@@ -265,5 +271,6 @@ fn order_settings(name: &str) -> ChannelSettings {
         depth_max: ORDERS_MAX,
         writers_max: WRITERS_MAX,
         readers_max: WRITERS_MAX,
+        assembled_max: 0,
     }
 }

@@ -8,13 +8,12 @@ use std::path::{Path, PathBuf};
 use hil_platform::host_facts::HostFiles;
 use hil_platform::host_limits::{Headroom, locked_memory_bound, memory_headroom, thread_headroom};
 use hil_platform::{open_files, words};
-use hil_protocol::ingress::reassembly_bytes;
-use hil_rundir::launch::{AdapterSettings, GatewayWork, Side};
+use hil_rundir::launch::{AdapterSettings, GatewayWork};
 use hil_shm::{ChannelSettings, Room, SHARED_MEMORY_DIRECTORY};
 use hil_topology::{Host, RoleSpec, Topology};
 
 use super::domains::channel_settings;
-use super::plan::{Plan, ProcessPlan, ProcessTask, domain_base, plan};
+use super::plan::{HostPlan, Plan, ProcessPlan, ProcessTask, domain_base, plan};
 
 // Counted in runs of the binary; the tests of limits compare them with what runs have open.
 
@@ -253,16 +252,18 @@ fn runtime_folder(base: &Path) -> Option<(PathBuf, Room)> {
 
 impl Needs {
     pub(crate) fn of(plan: &Plan) -> Self {
-        let settings: Vec<ChannelSettings> = plan.hosts.iter().flat_map(channel_settings).collect();
+        let hosts = plan.hosts.iter();
+        let settings = hosts.flat_map(|host| channel_settings(host).map(move |one| (host, one)));
+        let settings: Vec<(&HostPlan, ChannelSettings)> = settings.collect();
         // What a writer that is started again takes while its predecessor's memory is not free yet.
-        let spare = settings.iter().map(ChannelSettings::writer_room);
+        let spare = settings.iter().map(|(_, one)| one.writer_room());
         let spare = spare.max_by_key(|room| room.bytes).unwrap_or_default();
         let domains = Room {
             bytes: 4096,
             files: 1,
         };
         let domains = domains.times(plan.hosts.len() as u64);
-        let channels = settings.iter().map(ChannelSettings::room);
+        let channels = settings.iter().map(|(_, one)| one.room());
         let shared_memory = channels.fold(spare.and(domains), Room::and);
         let supervisor = ProcessNeed {
             name: "the supervisor".to_owned(),
@@ -273,13 +274,10 @@ impl Needs {
             threads: SUPERVISOR_THREADS + plan.processes.len() as u64,
             locked_bytes: None,
         };
-        let room_of = |channel: &str| {
-            let mut all = settings.iter();
-            let found = all.find(|one| one.name == channel);
-            found.map_or(0, |one| one.writer_room().bytes)
-        };
-        let processes = plan.processes.iter();
-        let processes = processes.map(|process| process_need(process, &room_of));
+        let processes = plan.processes.iter().map(|process| {
+            let here = settings.iter().filter(|(at, _)| at.name == process.host);
+            process_need(process, here.map(|(_, one)| one))
+        });
         let members = MEMBER_ENTRIES.times(1 + plan.processes.len() as u64);
         Self {
             shared_memory,
@@ -346,7 +344,11 @@ fn narrowest(bounds: &[Headroom], need: u64) -> Option<Headroom> {
     (least.left < need).then(|| least.clone())
 }
 
-fn process_need(process: &ProcessPlan, room_of: &dyn Fn(&str) -> u64) -> ProcessNeed {
+/// The need of a process among the channels of its host.
+fn process_need<'a>(
+    process: &ProcessPlan,
+    channels: impl Iterator<Item = &'a ChannelSettings>,
+) -> ProcessNeed {
     let opened = match &process.task {
         ProcessTask::Component { card, realtime, .. } => {
             let channels = channels_of(card);
@@ -383,7 +385,8 @@ fn process_need(process: &ProcessPlan, room_of: &dyn Fn(&str) -> u64) -> Process
         ..
     } = opened;
     let locked_bytes = opened.locks_memory.then(|| {
-        let shared: u64 = opened.channels.iter().map(|one| room_of(one)).sum();
+        let joined = channels.filter(|one| opened.channels.contains(&one.name));
+        let shared: u64 = joined.map(|one| one.writer_room().bytes).sum();
         let memory = shared + opened.own_bytes;
         LOCKED_PROGRAM_BYTES + LOCKED_THREAD_BYTES * threads + memory
     });
@@ -416,14 +419,6 @@ fn gateway_content(work: &GatewayWork) -> ProcessContent {
     let mut directions = work.directions.iter();
     let channels = work.directions.iter().flat_map(|one| &one.channels);
     let channels: Vec<String> = channels.map(|one| one.channel.clone()).collect();
-    let receiving = work
-        .directions
-        .iter()
-        .filter(|one| one.side == Side::Ingress);
-    let own_bytes = receiving
-        .flat_map(|one| &one.channels)
-        .map(|one| reassembly_bytes(one.size_bytes) as u64)
-        .sum();
     ProcessContent {
         open_files: OWN_FILES
             + DIRECTION_FILES * count
@@ -432,7 +427,7 @@ fn gateway_content(work: &GatewayWork) -> ProcessContent {
         threads: OWN_THREADS + 1 + count,
         locks_memory: directions.any(|one| one.realtime.lock_memory),
         channels,
-        own_bytes,
+        own_bytes: 0,
     }
 }
 
@@ -460,6 +455,10 @@ mod tests {
     use super::*;
 
     fn needs(overrides: &[&str]) -> Needs {
+        Needs::of(&planned(overrides))
+    }
+
+    fn planned(overrides: &[&str]) -> Plan {
         let mut registry = Registry::default();
         registry.add::<Shuttle>();
         let path = Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -467,7 +466,7 @@ mod tests {
         let overrides: Vec<String> = overrides.iter().map(|&text| text.to_owned()).collect();
         let topology = hil_topology::load(&path, &overrides, registry.known()).unwrap();
         let here = topology.host("control-pc").unwrap();
-        Needs::of(&plan(&topology, &[here]))
+        plan(&topology, &[here])
     }
 
     fn headroom(bound: Bound, left: u64) -> Headroom {
@@ -528,6 +527,27 @@ mod tests {
         ] {
             assert!(told.contains(words), "{words} is not in {told}");
         }
+    }
+
+    #[test]
+    fn messages_in_pieces_come_together_in_the_memory_of_the_channel_that_a_gateway_writes() {
+        let plan = planned(&["links.hop.gateway.lock_memory=true"]);
+        let [host] = &plan.hosts[..] else {
+            panic!("one host");
+        };
+        for settings in channel_settings(host) {
+            let arrives = settings.name == "shuttle/status";
+            let assembled = if arrives { 4 } else { 0 };
+            assert_eq!(settings.assembled_max, assembled, "{}", settings.name);
+        }
+        let writers = channel_settings(host).filter(|one| one.name.starts_with("shuttle/"));
+        let channels: u64 = writers.map(|one| one.writer_room().bytes).sum();
+        let needs = Needs::of(&plan);
+        let gateway = needs.processes.iter().find(|one| one.name.contains("hop"));
+        let gateway = gateway.unwrap();
+        let threads = LOCKED_THREAD_BYTES * gateway.threads;
+        let locked = LOCKED_PROGRAM_BYTES + threads + channels;
+        assert_eq!(gateway.locked_bytes, Some(locked));
     }
 
     #[test]

@@ -47,6 +47,8 @@ pub(crate) struct HostPlan {
     pub(crate) name: String,
     /// Channels in shared memory with an end on this host.
     pub(crate) channels: Vec<Channel>,
+    /// Names of those that a gateway writes here.
+    pub(crate) arriving: BTreeSet<String>,
     /// Channels for orders to the directions of emulated links that are emulated here.
     pub(crate) orders: BTreeSet<String>,
     /// Names of those whose messages no process here records: who wants to see them looks into
@@ -152,6 +154,7 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
             name: host.name.clone(),
             observed: observed.map(|channel| channel.name.clone()).collect(),
             channels: channels.cloned().collect(),
+            arriving: arriving(topology, host),
             orders: order_channels(topology, host),
         }
     });
@@ -169,6 +172,14 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
         hosts: host_plans.collect(),
         processes,
     }
+}
+
+fn arriving(topology: &Topology, host: &Host) -> BTreeSet<String> {
+    topology
+        .crossings()
+        .filter(|crossing| crossing.to_host.name == host.name)
+        .map(|crossing| crossing.channel.name.clone())
+        .collect()
 }
 
 /// The channels for orders to what is emulated on `host`: it receives.

@@ -12,7 +12,12 @@ use hil_core::message::TypeInfo;
 const PAGE_BYTES: u64 = 4096;
 const CHANNEL: &str = "arm/pose";
 
-fn settings(size_bytes: usize, alignment_bytes: usize, depth_max: usize) -> ChannelSettings {
+fn settings(
+    size_bytes: usize,
+    alignment_bytes: usize,
+    depth_max: usize,
+    assembled_max: usize,
+) -> ChannelSettings {
     ChannelSettings {
         name: CHANNEL.to_owned(),
         message: TypeInfo {
@@ -23,6 +28,7 @@ fn settings(size_bytes: usize, alignment_bytes: usize, depth_max: usize) -> Chan
         depth_max,
         writers_max: 2,
         readers_max: 6,
+        assembled_max,
     }
 }
 
@@ -50,18 +56,19 @@ fn room(domain: &Domain) -> Room {
 
 #[test]
 fn a_channel_takes_what_it_was_reckoned_to_take_and_all_of_it_before_it_is_used() {
-    for (size, alignment, depth) in [
-        (1, 1, 1),
-        (60, 4, 8),
-        (60, 64, 1024),
-        (4096, 8, 16),
-        (65_536, 64, 40),
+    for (size, alignment, depth, assembled) in [
+        (1, 1, 1, 0),
+        (60, 4, 8, 4),
+        (60, 64, 1024, 0),
+        (4096, 8, 16, 4),
+        (65_536, 64, 40, 0),
+        (1 << 20, 8, 1, 2),
     ] {
-        let settings = settings(size, alignment, depth);
+        let settings = settings(size, alignment, depth, assembled);
         let domain = Domain::create(&root_path("capacity")).unwrap();
         let holder = ChannelHolder::create(&domain, &settings).unwrap();
         assert_eq!(room(&domain), settings.own_room(), "{settings:?}");
-        let output = RawOutput::open(&domain, CHANNEL, true).unwrap();
+        let output = RawOutput::open_assembling(&domain, CHANNEL, true, assembled).unwrap();
         let with_writer = settings.own_room().and(settings.writer_room());
         let found = room(&domain);
         let slack = Room {
@@ -97,7 +104,7 @@ fn a_channel_takes_what_it_was_reckoned_to_take_and_all_of_it_before_it_is_used(
 fn a_port_that_finds_no_room_says_what_it_takes_and_what_there_is() {
     let free = Room::free().unwrap();
     let depth = usize::try_from(free.bytes / (6 * 65_536)).unwrap() + 1;
-    let settings = settings(65_536, 64, depth);
+    let settings = settings(65_536, 64, depth, 0);
     let domain = Domain::create(&root_path("no-room")).unwrap();
     let holder = ChannelHolder::create(&domain, &settings).unwrap();
     let error = RawOutput::open(&domain, CHANNEL, true)

@@ -1,5 +1,6 @@
 //! Samples through a channel: order, overflow, types, late joiners, wake-ups.
 
+use std::collections::VecDeque;
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::thread;
 use std::time::Duration;
@@ -457,5 +458,123 @@ fn a_frame_is_read_as_long_as_it_was_written() {
         );
     }
     drop((input, output, holder));
+    assert_nothing_left(domain);
+}
+
+/// A channel of frames, and its writer, which puts two at a time together from pieces.
+fn assembling(label: &str, depth_max: usize) -> (Domain, ChannelHolder, RawOutput) {
+    let domain = Domain::create(&root_path(label)).unwrap();
+    let settings = ChannelSettings {
+        depth_max,
+        readers_max: 1,
+        ..ChannelSettings::of("a/b", &ETHERNET_FRAME)
+    };
+    let holder = ChannelHolder::create(&domain, &settings).unwrap();
+    let output = RawOutput::open_assembling(&domain, "a/b", false, 2).unwrap();
+    (domain, holder, output)
+}
+
+fn numbered(sequence: u64) -> impl FnOnce() -> Envelope {
+    move || Envelope {
+        sequence,
+        ..Envelope::default()
+    }
+}
+
+#[test]
+fn a_message_in_pieces_is_published_when_every_byte_was_written_once() {
+    let (domain, holder, mut output) = assembling("pieces", 8);
+    let reader = Domain::open(domain.address()).unwrap();
+    let mut input = RawInput::open(&reader, "a/b", 8).unwrap();
+    let mut read = || {
+        let mut all = Vec::new();
+        let mut take = |envelope: &Envelope, payload: &[u8]| {
+            all.push((envelope.sequence, payload.to_vec()));
+        };
+        while input.receive(&mut take).unwrap() {}
+        all
+    };
+    let written = |output: &mut RawOutput, slot, length| {
+        let published = output.publish_pieces(slot, length, || panic!("is not asked"));
+        match published.unwrap_err() {
+            ChannelError::Incomplete { written, .. } => written,
+            other => panic!("{other}"),
+        }
+    };
+    assert_eq!(written(&mut output, 0, 1_522), 0);
+    assert_eq!(written(&mut output, 2, 1_522), 0);
+    // Two messages at a time, and a third which comes whole in between.
+    output.write_piece(0, 1_000, &[1; 522]).unwrap();
+    output.write_piece(1, 0, &[2; 60]).unwrap();
+    assert_eq!(written(&mut output, 0, 1_522), 522);
+    output.publish_with(&[3; 14], numbered(3)).unwrap();
+    output.write_piece(0, 0, &[1; 1_000]).unwrap();
+    output.publish_pieces(0, 1_522, numbered(1)).unwrap();
+    output.publish_pieces(1, 60, numbered(2)).unwrap();
+    let expected = [(3, vec![3; 14]), (1, vec![1; 1_522]), (2, vec![2; 60])];
+    assert_eq!(read(), expected);
+    // What was begun and given up counts for nothing.
+    output.write_piece(1, 0, &[9; 1_000]).unwrap();
+    output.discard_pieces(1);
+    output.write_piece(1, 0, &[4; 522]).unwrap();
+    assert_eq!(written(&mut output, 1, 1_522), 522);
+    output.write_piece(1, 522, &[4; 1_000]).unwrap();
+    output.publish_pieces(1, 1_522, numbered(4)).unwrap();
+    assert_eq!(read(), [(4, vec![4; 1_522])]);
+    drop((output, holder));
+    drop(reader);
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_piece_that_has_no_place_is_an_error_and_writes_nothing() {
+    let (domain, holder, mut output) = assembling("no-place", 1);
+    for (offset, length) in [(0, 1_523), (1_522, 1), (1_523, 0), (usize::MAX, 1)] {
+        let refused = output.write_piece(0, offset, &vec![7; length]);
+        assert!(
+            matches!(refused, Err(ChannelError::WrongSize { .. })),
+            "{offset} {length}"
+        );
+    }
+    let refused = output.write_piece(2, 0, &[7]).unwrap_err().to_string();
+    assert_eq!(refused, "channel a/b: cannot get memory: exceeds max loans");
+    output.write_piece(0, 1_522, &[]).unwrap();
+    let refused = output.publish_pieces(0, 1_523, Envelope::default);
+    assert!(matches!(refused, Err(ChannelError::WrongSize { .. })));
+    let refused = output.publish_pieces(0, 60, Envelope::default);
+    let told = refused.unwrap_err().to_string();
+    assert_eq!(
+        told,
+        "channel a/b: 0 of the 60 bytes of a message were written"
+    );
+    drop((output, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_writer_with_all_slots_begun_has_memory_for_whatever_its_reader_holds() {
+    let (domain, holder, mut output) = assembling("slots", 4);
+    let reader = Domain::open(domain.address()).unwrap();
+    let mut input = RawInput::open(&reader, "a/b", 4).unwrap();
+    let mut held = VecDeque::new();
+    for round in 0..200_u64 {
+        let slot = usize::from(round % 2 == 1);
+        for slot in 0..2 {
+            output.discard_pieces(slot);
+            output.write_piece(slot, 0, &[7; 700]).unwrap();
+        }
+        output.publish_with(&[7; 60], numbered(round)).unwrap();
+        output.write_piece(slot, 700, &[7; 822]).unwrap();
+        output.publish_pieces(slot, 1_522, numbered(round)).unwrap();
+        if round % 5 == 4 {
+            held.extend(input.hold().unwrap());
+            if held.len() > 1 {
+                held.pop_front();
+            }
+        }
+    }
+    assert!(!held.is_empty());
+    drop((held, input, output, holder));
+    drop(reader);
     assert_nothing_left(domain);
 }

@@ -47,6 +47,7 @@ fn bytes_of_any_size_and_alignment_arrive_whole_and_aligned() {
             depth_max: 2,
             writers_max: 1,
             readers_max: 2,
+            assembled_max: 0,
         };
         let holder = ChannelHolder::create(&near, &settings).unwrap();
         let mut output = RawOutput::open(&near, &name, false).unwrap();
@@ -98,6 +99,7 @@ fn a_message_without_size_or_with_an_odd_alignment_is_refused() {
             depth_max: 1,
             writers_max: 1,
             readers_max: 1,
+            assembled_max: 0,
         };
         assert!(ChannelHolder::create(&domain, &settings).is_err());
     }

@@ -15,7 +15,7 @@ use hil_core::time::Instant;
 use hil_net::{Direction, link_type};
 use hil_protocol::body::PieceAck;
 use hil_protocol::wire::{Body, Datagram, HEADER_BYTES, Header, Kind};
-use hil_protocol::{ArrivalStamps, EgressBridge, IngressBridge};
+use hil_protocol::{ArrivalStamps, EgressBridge, InMemory, IngressBridge};
 use hil_transport::tcp::frame::prefix;
 
 use super::{behind, numbered};
@@ -65,11 +65,13 @@ fn converse(
     made: &mut Vec<Vec<u8>>,
 ) {
     let arrival = ArrivalStamps::application(now.as_ns());
+    let mut memory = InMemory::default();
+    let mut destination = memory.with(|_, _| {});
     while let Some(transmit) = sender.poll_transmit(now) {
         let (kind, channel, sequence) = (transmit.kind, transmit.channel, transmit.sequence);
         let datagram = transmit.datagram.to_vec();
         sender.on_transmit_stamp(kind, channel, sequence, 900);
-        let _counted = receiver.on_datagram(now, arrival, &datagram, &mut |_| {});
+        let _counted = receiver.on_datagram(now, arrival, &datagram, &mut destination);
         made.push(datagram);
         while let Some(reply) = receiver.poll_transmit(now) {
             let reply = reply.datagram.to_vec();
