@@ -204,6 +204,11 @@ pub struct TraceDecoder {
 }
 
 impl TraceDecoder {
+    /// The header, as soon as it was read.
+    pub fn header(&self) -> Option<&TraceHeader> {
+        self.header.as_ref()
+    }
+
     /// Takes the next bytes and hands each record to `take`.
     ///
     /// # Errors

@@ -95,6 +95,7 @@ fn a_trace_comes_back_whole_however_it_is_cut_into_pieces() {
                 .unwrap();
         }
         decoder.finish().unwrap();
+        assert_eq!(decoder.header(), Some(&trace.header));
         assert_eq!(records, trace.records);
     }
     let empty = Trace {
