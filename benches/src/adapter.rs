@@ -402,7 +402,12 @@ fn adapter(
     party(cpu, context, move |stop| {
         let domain = Domain::open(&address)?;
         let mut joined = opened.connect(&settings, &settings.arms[0], &domain)?;
-        Ok(joined.run(stop)?)
+        while !stop.load(Ordering::Acquire) {
+            if !joined.step()? {
+                joined.rest()?;
+            }
+        }
+        Ok(joined.finish()?)
     })
 }
 

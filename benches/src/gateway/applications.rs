@@ -325,7 +325,7 @@ fn gateway(berth: Berth, loose: Loose, remaining: Arc<AtomicUsize>) -> JoinHandl
         match connected {
             Ok(mut direction) => {
                 berth.ready.send(Ok(Party::myself(berth.name))).ok();
-                // What `Direction::run` does, but for as long as it is our turn.
+                // What the direction's own thread does, but for as long as it is our turn.
                 berth.live(|| {
                     if matches!(direction.step(), Ok(false)) {
                         direction.rest().ok();

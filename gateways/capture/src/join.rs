@@ -192,11 +192,6 @@ pub struct Pair {
 }
 
 impl Pair {
-    /// Second stamp minus first, nanoseconds.
-    pub const fn delay_ns(&self) -> i64 {
-        self.second.stamp_ns.saturating_sub(self.first.stamp_ns)
-    }
-
     /// Both stamps are sound.
     pub const fn is_stamped(&self) -> bool {
         self.first.is_stamp_sound && self.second.is_stamp_sound

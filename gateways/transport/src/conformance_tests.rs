@@ -14,7 +14,7 @@ use hil_core::link_model::PerfectLink;
 use hil_core::time::Instant;
 
 use super::emulated::{EmulatedReceiver, EmulatedSettings, Offer};
-use super::queue::{QueueSettings, queue_pair};
+use super::queue::queue_pair;
 use super::registry::{self, OpenReceiver, OpenSender, Transport};
 use super::socket::{SocketError, SocketSettings};
 use super::tcp::{TcpReceiver, TcpSender};
@@ -22,7 +22,7 @@ use super::udp::{UdpReceiver, UdpSender};
 use super::{DatagramReceiver, DatagramSender, Received, SendRefusal};
 use hil_net::clock_pair::monotonic_now;
 use hil_net::timestamping::TimestampMode;
-use hil_net::{KernelStamps, TransmitStamp, TxToken};
+use hil_net::{TransmitStamp, TxToken};
 use hil_protocol::seal::{Initiator, Responder};
 use hil_protocol::transport::Description;
 
@@ -184,13 +184,6 @@ pub(super) fn tcp_pair(address: &str) -> (TcpSender, TcpReceiver) {
     (sender, receiver)
 }
 
-fn made_up_stamps(token: TxToken) -> KernelStamps {
-    KernelStamps {
-        software_ns: Some(i64::from(token.0) + 1),
-        hardware_ns: None,
-    }
-}
-
 /// An address of this host that no socket has.
 fn free_address(ip: IpAddr) -> SocketAddr {
     UdpSocket::bind((ip, 0)).unwrap().local_addr().unwrap()
@@ -291,19 +284,13 @@ fn perfect(inner: Box<dyn DatagramReceiver>) -> EmulatedReceiver {
 }
 
 #[test]
-fn the_queue_keeps_the_promises_with_and_without_stamps() {
-    for transmit_stamps in [None, Some(made_up_stamps as fn(TxToken) -> KernelStamps)] {
-        let (mut sender, mut receiver) = queue_pair(&QueueSettings {
-            transmit_stamps,
-            receive_stamps: transmit_stamps,
-            ..QueueSettings::default()
-        });
-        check_conformance("queue", &mut sender, &mut receiver);
-    }
+fn the_queue_keeps_the_promises() {
+    let (mut sender, mut receiver) = queue_pair();
+    check_conformance("queue", &mut sender, &mut receiver);
 }
 
 #[test]
 fn a_perfect_emulated_link_keeps_the_promises_of_the_queue() {
-    let (mut sender, inner) = queue_pair(&QueueSettings::default());
+    let (mut sender, inner) = queue_pair();
     check_conformance("emulated queue", &mut sender, &mut perfect(Box::new(inner)));
 }

@@ -9,7 +9,7 @@ use hil_link::spec::{LinkPlace, LinkSpec};
 
 use super::*;
 use crate::DatagramSender;
-use crate::queue::{QueueSender, QueueSettings, queue_pair};
+use crate::queue::{QueueSender, queue_pair};
 
 const MS: i64 = 1_000_000;
 
@@ -30,7 +30,7 @@ fn emulated(
     link: impl LinkModel + 'static,
     capacity_count: usize,
 ) -> (QueueSender, EmulatedReceiver) {
-    let (sender, inner) = queue_pair(&QueueSettings::default());
+    let (sender, inner) = queue_pair();
     let settings = EmulatedSettings {
         capacity_count,
         datagram_bytes_max: 16,
@@ -64,7 +64,7 @@ fn take(receiver: &mut impl DatagramReceiver, now: Instant) -> Option<(u8, Recei
 
 #[test]
 fn a_caller_that_was_held_up_does_not_make_a_datagram_early() {
-    let (mut sender, inner) = queue_pair(&QueueSettings::default());
+    let (mut sender, inner) = queue_pair();
     let link = LinkSpec::fixed(Duration::from_millis(50), 0.0)
         .build(&LinkPlace::alone(1, "late caller"))
         .unwrap();
@@ -301,7 +301,7 @@ fn each_channel_meets_its_own_model_and_has_its_own_counts() {
         }
     }
     let links = ByChannel(vec![Listed(vec![-1, 30, -1]), Listed(vec![10, -1])]);
-    let (mut sender, inner) = queue_pair(&QueueSettings::default());
+    let (mut sender, inner) = queue_pair();
     let offer_of = |datagram: &[u8]| {
         let channel = u16::from(datagram[0]);
         Some(Offer {

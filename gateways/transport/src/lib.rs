@@ -141,11 +141,11 @@ impl SendRefusal {
 ///
 /// ```
 /// use hil_net::TxToken;
-/// use hil_transport::queue::{QueueSettings, queue_pair};
+/// use hil_transport::queue::queue_pair;
 /// use hil_transport::{DatagramReceiver, DatagramSender};
 /// use hil_core::time::Instant;
 ///
-/// let (mut sender, mut receiver) = queue_pair(&QueueSettings::default());
+/// let (mut sender, mut receiver) = queue_pair();
 /// assert_eq!(sender.send(b"stop"), Ok(TxToken(0)));
 /// while let Some(stamp) = sender.next_stamp() {
 ///     println!("datagram {} left at {:?}", stamp.token.0, stamp.stamps.software_ns);

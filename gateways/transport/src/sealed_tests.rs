@@ -8,7 +8,7 @@ use hil_core::time::Instant;
 
 use super::*;
 use crate::conformance_tests::opened;
-use crate::queue::{QueueSettings, queue_pair};
+use crate::queue::{self, queue_pair};
 use crate::registry;
 use hil_net::clock_pair::monotonic_now;
 use hil_net::timestamping::TimestampMode;
@@ -177,12 +177,11 @@ fn keys() -> (Initiator, Responder) {
 
 #[test]
 fn a_conversation_with_pieces_exchanges_and_farewell_goes_through_whole() {
-    let settings = QueueSettings::default();
-    let (sender, receiver) = queue_pair(&settings);
+    let (sender, receiver) = queue_pair();
     let (initiator, responder) = keys();
     check_conversation(Hop::new(
         super::sender(sender, Some(initiator)),
-        super::receiver(receiver, settings.sender_address, Some(responder)),
+        super::receiver(receiver, queue::SENDER, Some(responder)),
         false,
     ));
 }
@@ -201,8 +200,7 @@ fn every_transport_carries_a_sealed_conversation() {
 
 #[test]
 fn a_stranger_is_refused_before_the_seal_and_a_copy_before_the_bridge() {
-    let settings = QueueSettings::default();
-    let (mut sender, receiver) = queue_pair(&settings);
+    let (mut sender, receiver) = queue_pair();
     let known = association();
     let responder = Responder::new(&known, &[2; 32], Rotation::default());
     let elsewhere = "127.0.0.1:9".parse().unwrap();

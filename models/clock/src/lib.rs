@@ -32,8 +32,6 @@ mod band;
 mod exchange;
 mod map;
 #[cfg(test)]
-mod simulated;
-#[cfg(test)]
 mod tests;
 
 pub use exchange::{Exchange, Requester, StampKind};

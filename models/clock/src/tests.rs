@@ -6,7 +6,9 @@
     reason = "simulated times are far below 292 years, and mutations may wrap"
 )]
 
-use super::simulated::SimulatedRun;
+mod simulated;
+
+use self::simulated::SimulatedRun;
 use super::{BEYOND_NS_MAX, ClockMap, ClockSettings, Exchange, Localised, Requester};
 use hil_core::random::RandomStream;
 use hil_core::record::{RoundTripRecord, UNAVAILABLE};

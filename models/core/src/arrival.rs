@@ -3,7 +3,7 @@
 
 use core::time::Duration;
 
-use crate::time::{Instant, duration_ns};
+use crate::time::Instant;
 
 /// Intervals whose lower quartile chooses the period: up to two thirds of them may be multiples
 /// of it (losses) and up to a fifth fractions (bursts after a delay).
@@ -22,9 +22,6 @@ const PERIOD_SHIFT: u32 = 7;
 /// The period is tracked in 1/256 ns: a shifted error is often below one nanosecond.
 const FRACTION: i64 = 256;
 
-/// Weight of a new error in the deviation, as in RFC 6298 (beta = 1/4).
-const DEVIATION_SHIFT: u32 = 2;
-
 /// Successive arrivals far off the expected instant that prove a new phase.
 const STEP_COUNT: u32 = 3;
 
@@ -32,7 +29,6 @@ const STEP_COUNT: u32 = 3;
 /// inline, so it may be used on the measured path.
 ///
 /// ```
-/// use core::time::Duration;
 /// use hil_core::{arrival::ArrivalPredictor, time::Instant};
 ///
 /// let mut predictor = ArrivalPredictor::default();
@@ -40,8 +36,6 @@ const STEP_COUNT: u32 = 3;
 ///     predictor.arrived(Instant::from_ns(index * 1_000_000));
 /// }
 /// assert_eq!(predictor.next_expected(), Some(Instant::from_ns(10_000_000)));
-/// let spin_from = predictor.spin_from(Duration::from_micros(90));
-/// assert_eq!(spin_from, Some(Instant::from_ns(9_910_000)));
 /// ```
 #[derive(Debug, Clone, Default)]
 pub struct ArrivalPredictor {
@@ -52,7 +46,6 @@ pub struct ArrivalPredictor {
     last_ns: Option<i64>,
     /// Where the latest grid point of the learnt phase lies; follows arrivals slowly.
     phase_ns: i64,
-    deviation_ns: i64,
     far_off_count: u32,
 }
 
@@ -92,14 +85,6 @@ impl ArrivalPredictor {
         Some(Instant::from_ns(self.phase_ns.saturating_add(ahead_ns)))
     }
 
-    /// When to stop sleeping and start spinning: `lead` before [`Self::next_expected`].
-    pub fn spin_from(&self, lead: Duration) -> Option<Instant> {
-        let expected_ns = self.next_expected()?.as_ns();
-        Some(Instant::from_ns(
-            expected_ns.saturating_sub(duration_ns(lead)),
-        ))
-    }
-
     /// The first due instant at or after `now`: after a loss, the grid goes on.
     pub fn next_expected_after(&self, now: Instant) -> Option<Instant> {
         let expected = self.next_expected()?;
@@ -117,12 +102,6 @@ impl ArrivalPredictor {
     pub fn period(&self) -> Option<Duration> {
         self.next_expected()?;
         Some(Duration::from_nanos(self.period_ns().unsigned_abs()))
-    }
-
-    /// Smoothed distance of arrivals from their prediction: a lead of a few of these catches
-    /// most early messages.
-    pub fn deviation(&self) -> Duration {
-        Duration::from_nanos(self.deviation_ns.unsigned_abs())
     }
 
     fn lock(&mut self, now_ns: i64, period_ns: i64) {
@@ -154,7 +133,6 @@ impl ArrivalPredictor {
         // the largest regular error would.
         let correction_ns = error_ns.clamp(-limit_ns, limit_ns) >> PHASE_SHIFT;
         self.phase_ns = expected_ns.saturating_add(correction_ns);
-        self.deviation_ns += (error_ns.abs().min(limit_ns) - self.deviation_ns) >> DEVIATION_SHIFT;
     }
 
     const fn period_ns(&self) -> i64 {
@@ -230,7 +208,6 @@ mod tests {
             Some(Instant::from_ns(50 * PERIOD_NS))
         );
         assert_eq!(predictor.period(), Some(Duration::from_millis(1)));
-        assert_eq!(predictor.deviation(), Duration::ZERO);
         let late = Instant::from_ns(52 * PERIOD_NS + 1);
         let next = Instant::from_ns(53 * PERIOD_NS);
         assert_eq!(predictor.next_expected_after(late), Some(next));
@@ -241,7 +218,6 @@ mod tests {
         for count in 0..=3 {
             let predictor = learnt(count);
             assert_eq!(predictor.next_expected(), None, "{count} arrivals");
-            assert_eq!(predictor.spin_from(Duration::ZERO), None);
             assert_eq!(predictor.period(), None);
         }
         assert!(learnt(4).next_expected().is_some());

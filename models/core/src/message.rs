@@ -39,11 +39,6 @@ impl MessageType {
             fields: M::FIELDS,
         }
     }
-
-    /// See [`type_hash`].
-    pub const fn hash(&self) -> u64 {
-        type_hash(self.name, self.size_bytes, self.alignment_bytes)
-    }
 }
 
 impl fmt::Display for MessageType {

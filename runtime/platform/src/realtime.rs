@@ -13,10 +13,9 @@ use nix::sys::resource::Resource;
 use nix::unistd::Pid;
 use serde::{Deserialize, Serialize};
 
-pub use crate::host_facts::IsolatedCpus;
 use crate::host_facts::{
-    CAP_SYS_NICE, Fact, HostFiles, RealtimeThrottle, format_cpu_list, has_fair_server, limit,
-    online_cpus,
+    CAP_SYS_NICE, Fact, HostFiles, IsolatedCpus, RealtimeThrottle, format_cpu_list,
+    has_fair_server, limit, online_cpus,
 };
 
 /// How the kernel schedules a thread.
@@ -382,11 +381,6 @@ pub(crate) fn clock_discipline() -> Result<ClockDiscipline, Errno> {
         // The kernel counts in parts per million with 16 fraction bits.
         frequency_ppb: state.freq.saturating_mul(1000) >> 16,
     })
-}
-
-/// The isolated CPUs of this host.
-pub fn isolated_cpus() -> IsolatedCpus {
-    IsolatedCpus::read(&HostFiles::of_this_host())
 }
 
 /// Whether a busy-polling thread at real-time priority belongs on a CPU.

@@ -52,7 +52,6 @@ impl ChannelSettings {
 /// ones; with it, processes only ever open, and may be killed at any moment.
 #[derive(Debug)]
 pub struct ChannelHolder {
-    settings: ChannelSettings,
     _samples: ByteService,
     _wakeups: event::PortFactory<ipc::Service>,
 }
@@ -77,14 +76,8 @@ impl ChannelHolder {
                 ChannelError::refused(&settings.name, "create the wake-up service", &error)
             })?;
         Ok(Self {
-            settings: settings.clone(),
             _samples: samples,
             _wakeups: wakeups,
         })
-    }
-
-    /// What the channel was created with.
-    pub const fn settings(&self) -> &ChannelSettings {
-        &self.settings
     }
 }

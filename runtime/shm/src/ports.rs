@@ -39,11 +39,6 @@ impl ShmOutput {
         })
     }
 
-    /// Messages sent since the start; also the next sequence number.
-    pub const fn sent_count(&self) -> u64 {
-        self.sequencer.sent_count()
-    }
-
     /// Attempts to connect to a reader that failed. While it grows, a reader hears nothing.
     pub fn connection_failure_count(&self) -> u64 {
         self.output.connection_failure_count()

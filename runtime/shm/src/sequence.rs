@@ -61,11 +61,6 @@ impl Sequencer {
     pub fn advance(&mut self) {
         self.next += 1;
     }
-
-    /// Messages numbered so far.
-    pub const fn sent_count(&self) -> u64 {
-        self.next
-    }
 }
 
 /// What one reader has seen of its channel.

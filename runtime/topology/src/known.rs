@@ -146,11 +146,3 @@ fn faults_of_each_key<C: CaseStudy>(table: &toml::Table, first: &ReadError) -> V
         faults
     }
 }
-
-/// Parameters of a case, as a process receives them.
-///
-/// # Errors
-/// When `table` does not come from a checked topology of the same case.
-pub fn parameters_of<C: CaseStudy>(table: &toml::Table) -> Result<C::Parameters, toml::de::Error> {
-    C::Parameters::deserialize(table.clone())
-}

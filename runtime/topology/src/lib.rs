@@ -50,9 +50,7 @@ pub use check_adapter::{command_channel, feedback_channel};
 pub use clock_path::{ClockEnd, ClockPath, describe_end};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
 pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};
-pub use known::{
-    KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with, parameters_of,
-};
+pub use known::{KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with};
 pub use links::{Emulation, Gateway, Hop, Link, SocketOptions, Timestamps, Via, transport};
 pub use model::{
     AtExit, Case, Channel, Crossing, Direction, Execution, Host, LinkPorts, MessageLayout, OnExit,

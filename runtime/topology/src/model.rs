@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use hil_core::case_study::ParameterError;
-use hil_core::message::{ETHERNET_FRAME, type_hash};
+use hil_core::message::ETHERNET_FRAME;
 use hil_core::{options, words};
 use hil_link::condition::{flow_label, flow_name};
 use hil_link::spec::{LinkSpec, Way};
@@ -311,11 +311,6 @@ options! {
 }
 
 impl MessageLayout {
-    /// The hash both hosts compare; equals that of the message type of the same identity.
-    pub fn hash(&self) -> u64 {
-        type_hash(&self.name, self.size_bytes, self.alignment_bytes)
-    }
-
     /// Of Ethernet frames.
     pub(super) fn of_frames() -> Self {
         Self {

@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::model::{Channel, MessageLayout, Process, Topology};
+use super::model::{Channel, Process, Topology};
 
 /// What a process is told.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -53,15 +53,6 @@ impl RoleChannel {
             message_alignment_bytes: channel.message.alignment_bytes,
             depth: channel.depth,
             is_recorded_only: channel.is_recorded_only(),
-        }
-    }
-
-    /// Identity of its messages.
-    pub fn message(&self) -> MessageLayout {
-        MessageLayout {
-            name: self.message_name.clone(),
-            size_bytes: self.message_size_bytes,
-            alignment_bytes: self.message_alignment_bytes,
         }
     }
 }

@@ -237,7 +237,7 @@ fn what_a_file_leaves_out_has_the_documented_default() {
     assert_eq!(topology.crossings().count(), 0);
     // A parameter the file does not say is the case's own default.
     let parameters = &topology.case().unwrap().parameters;
-    let parameters = parameters_of::<Shuttle>(parameters).unwrap();
+    let parameters = ShuttleParameters::deserialize(parameters.clone()).unwrap();
     assert_eq!(parameters, ShuttleParameters::default());
 }
 
@@ -414,8 +414,6 @@ fn a_role_spec_lists_the_ports_of_its_role_in_order_and_survives_the_trip() {
     assert_eq!(inputs, ["human/frame", "arm/status"]);
     assert_eq!(card.outputs[0].name, "arm/command");
     assert_eq!(card.outputs[0].depth, 4);
-    let hash = hil_core::message::MessageType::of::<Frame>().hash();
-    assert_eq!(card.outputs[0].message().hash(), hash);
     let json = serde_json::to_string(&card).unwrap();
     assert_eq!(serde_json::from_str::<RoleSpec>(&json).unwrap(), card);
 

@@ -174,11 +174,6 @@ impl RecordFollower {
         self.files.iter().filter_map(|one| one.header.as_ref())
     }
 
-    /// Files found so far.
-    pub fn file_count(&self) -> usize {
-        self.files.len()
-    }
-
     fn look_for_files(&mut self) {
         if self.looked.is_some_and(|at| at.elapsed() < LOOK_PERIOD) {
             return;

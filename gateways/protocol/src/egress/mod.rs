@@ -607,11 +607,6 @@ impl EgressBridge {
         self.last_heard
     }
 
-    /// Both hosts read one monotonic clock, as the peer's latest greeting said; `None` before it.
-    pub fn clock_is_shared(&self) -> Option<bool> {
-        self.peer_clock_id.map(|id| id == self.settings.clock_id)
-    }
-
     /// What became of datagrams, exchanges and replies.
     pub const fn counts(&self) -> &EgressCounts {
         &self.counts

@@ -264,22 +264,11 @@ impl IngressBridge {
         self.sessions.current().map(|session| session.id)
     }
 
-    /// When the last accepted datagram came; against `now` it tells a silent peer.
-    pub fn last_heard(&self) -> Option<Instant> {
-        self.sessions.current().map(|session| session.last_heard)
-    }
-
     /// The session said farewell and nothing was heard of it since.
     pub fn has_left(&self) -> bool {
         self.sessions
             .current()
             .is_some_and(|session| session.has_left)
-    }
-
-    /// Both hosts read one monotonic clock, as the sender's greeting said; `None` before it.
-    pub fn clock_is_shared(&self) -> Option<bool> {
-        let session = self.sessions.current()?;
-        Some(session.clock_id == self.settings.clock_id)
     }
 
     /// What became of the datagrams.
@@ -298,11 +287,6 @@ impl IngressBridge {
     /// What became of its messages.
     pub fn sequence_counts(&self, channel: usize) -> &SequenceCounts {
         self.channels[channel].window.counts()
-    }
-
-    /// Its messages that are missing now and may still come.
-    pub fn outstanding_count(&self, channel: usize) -> u64 {
-        self.channels[channel].window.outstanding_count()
     }
 
     /// What became of its messages that came in pieces.
@@ -403,9 +387,9 @@ impl IngressBridge {
         if request.header.handed_ns < 0 {
             return Err(Refusal::ImplausibleStamp);
         }
-        let greeting =
-            self.sessions
-                .greet(request.now, request.arrival, request.header, hello.clock_id)?;
+        let greeting = self
+            .sessions
+            .greet(request.now, request.arrival, request.header)?;
         for channel in &mut self.channels {
             channel.is_jump_allowed = true;
         }

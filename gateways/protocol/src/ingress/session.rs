@@ -22,7 +22,6 @@ pub(super) const STAMP_DRIFT_MAX: Duration = Duration::from_mins(1);
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Session {
     pub(super) id: u32,
-    pub(super) clock_id: u64,
     pub(super) last_heard: Instant,
     pub(super) has_left: bool,
     /// Latest hand-over accepted, by the sender's clock.
@@ -67,7 +66,6 @@ impl Sessions {
         now: Instant,
         arrival: ArrivalStamps,
         header: &Header,
-        clock_id: u64,
     ) -> Result<Greeting, Refusal> {
         if self.is_over(header) {
             return Err(Refusal::Stale);
@@ -85,7 +83,6 @@ impl Sessions {
         }
         self.current = Some(Session {
             id: header.session,
-            clock_id,
             last_heard: now,
             has_left: false,
             handed_ns_max: confirmed.map_or(header.handed_ns, |current| {

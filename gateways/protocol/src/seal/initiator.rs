@@ -211,11 +211,6 @@ impl Initiator {
         self.unanswered_count = 0;
     }
 
-    /// Notes a datagram that its owner refused before it came here.
-    pub fn refuse(&mut self, cause: SealRefusal) {
-        self.counts.refused.count(cause);
-    }
-
     /// What was counted so far.
     pub fn counts(&self) -> SealCounts {
         let now = self.traffic.as_ref();

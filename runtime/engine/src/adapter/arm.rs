@@ -4,7 +4,6 @@
 use core::fmt::Debug;
 use core::time::Duration;
 use std::os::fd::BorrowedFd;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use hil_core::message::Envelope;
 use hil_core::time::Instant;
@@ -12,7 +11,6 @@ use hil_core::time::Instant;
 use super::line::Line;
 use crate::gateway::poll_descriptors;
 use crate::gateway::stamp_tracker::STAMP_PATIENCE_NS;
-use crate::process::heartbeat::Heartbeat;
 use crate::process::recording::{RecordedInput, RecordedOutput};
 use crate::process::worker::WorkerError;
 use hil_platform::clock::MonotonicClock;
@@ -41,7 +39,6 @@ pub(super) struct Arm {
     pub(super) attention: Attention,
     /// Datagrams that came before the run began, dropped.
     pub(super) early_count: u64,
-    pub(super) heartbeat: Heartbeat,
 }
 
 /// What waiting found.
@@ -71,32 +68,21 @@ pub(super) trait Work: Debug {
 }
 
 impl Arm {
-    /// Works until told to stop, then takes what still waits.
-    ///
-    /// # Errors
-    /// When a channel or the socket itself breaks.
-    pub(super) fn run(
-        &mut self,
-        work: &mut dyn Work,
-        stop: &AtomicBool,
-    ) -> Result<(), WorkerError> {
-        // A robot that was there before us has filled the socket with what is old news by now.
+    /// Drops what came before the run: a robot that was there before us has filled the socket.
+    pub(super) fn clear(&mut self) -> Result<(), WorkerError> {
         for _ in 0..CLEARING_TURNS_MAX {
             if self.line.receive(self.buffer.as_mut_slice())?.is_none() {
                 break;
             }
             self.early_count += 1;
         }
-        while !stop.load(Ordering::Acquire) {
-            let has_moved = self.turn(work)?;
-            if !has_moved {
-                self.rest(work.next_due())?;
-            }
-            self.heartbeat.beat();
-        }
-        // None of ours publishes any more, but the foreign program may go on sending.
+        Ok(())
+    }
+
+    /// Takes what still waits: none of ours publishes any more, but the foreign program may go on sending.
+    pub(super) fn finish(&mut self, work: &mut dyn Work) -> Result<(), WorkerError> {
         for _ in 0..CLEARING_TURNS_MAX {
-            if !self.turn(work)? {
+            if !self.step(work)? {
                 break;
             }
         }
@@ -105,7 +91,7 @@ impl Arm {
     }
 
     /// One look at both ends and, now and then, at the socket's reports.
-    pub(super) fn turn(&mut self, work: &mut dyn Work) -> Result<bool, WorkerError> {
+    pub(super) fn step(&mut self, work: &mut dyn Work) -> Result<bool, WorkerError> {
         let has_moved = work.turn(self)?;
         let now = MonotonicClock::now();
         let since_look = now.ns_since(self.attention.looked);
@@ -124,7 +110,7 @@ impl Arm {
     }
 
     /// Waits for a message, a datagram, a stamp or an appointment.
-    fn rest(&mut self, due: Option<Instant>) -> Result<(), WorkerError> {
+    pub(super) fn rest(&mut self, due: Option<Instant>) -> Result<(), WorkerError> {
         let now = MonotonicClock::now();
         let mut due = due;
         if self.line.awaits_stamps() {

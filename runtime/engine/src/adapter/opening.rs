@@ -3,7 +3,7 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64};
+use std::sync::atomic::AtomicU64;
 
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::message::{Envelope, MessageType};
@@ -18,7 +18,6 @@ use super::line::{Line, Socket};
 use super::robot::RobotWork;
 use super::sensor::SensorWork;
 use crate::gateway::socket::timestamp_mode;
-use crate::process::heartbeat::Heartbeat;
 use crate::process::recording::{Destination, RecordedInput, RecordedOutput, output_settings};
 use crate::process::worker::WorkerError;
 use hil_platform::wait::{WaitMode, WaitStrategy};
@@ -42,7 +41,6 @@ pub struct OpenedArm {
     /// Messages taken from and published to shared memory so far.
     pub(super) counts: [Arc<AtomicU64>; 2],
     /// The turns of the thread that will carry the messages.
-    pub(super) heartbeat: Heartbeat,
     /// What was granted, in words.
     pub(super) facts: Vec<(String, String)>,
 }
@@ -91,7 +89,6 @@ impl OpenedArm {
             published: sink(RecordKind::Published, output, size_of::<PublishedRecord>())?,
             messages: sink(RecordKind::Message, output, message_size)?,
             counts: [Arc::default(), Arc::default()],
-            heartbeat: Heartbeat::default(),
             facts: facts(&settings, granted, what),
         })
     }
@@ -167,7 +164,6 @@ impl OpenedArm {
             buffer: Box::new([0; DATAGRAM_BYTES_MAX]),
             attention: Attention::default(),
             early_count: 0,
-            heartbeat: self.heartbeat,
         })
     }
 }
@@ -181,20 +177,33 @@ pub struct JoinedArm {
 }
 
 impl JoinedArm {
-    /// Carries messages until `stop` is set, then what still waits.
-    ///
-    /// # Errors
-    /// When a channel or the socket itself breaks.
-    pub fn run(&mut self, stop: &AtomicBool) -> Result<(), WorkerError> {
-        self.arm.run(self.work.as_mut(), stop)
-    }
-
     /// Moves what waits, without waiting for more; false when nothing waited.
     ///
     /// # Errors
-    /// As [`JoinedArm::run`].
-    pub fn turn(&mut self) -> Result<bool, WorkerError> {
-        self.arm.turn(self.work.as_mut())
+    /// When a channel or the socket itself breaks.
+    pub fn step(&mut self) -> Result<bool, WorkerError> {
+        self.arm.step(self.work.as_mut())
+    }
+
+    /// Waits for the next thing to do, as its waiting strategy says.
+    ///
+    /// # Errors
+    /// When waiting itself fails.
+    pub fn rest(&mut self) -> Result<(), WorkerError> {
+        self.arm.rest(self.work.next_due())
+    }
+
+    /// Takes what still waits at the end.
+    ///
+    /// # Errors
+    /// As [`JoinedArm::step`].
+    pub fn finish(&mut self) -> Result<(), WorkerError> {
+        self.arm.finish(self.work.as_mut())
+    }
+
+    /// Drops what came before the run.
+    pub(super) fn clear(&mut self) -> Result<(), WorkerError> {
+        self.arm.clear()
     }
 
     /// Everything it counted so far.

@@ -47,7 +47,7 @@ pub(crate) fn open<'a>(
         jobs.push(Job {
             name: "spare".to_owned(),
             counters: Vec::new(),
-            heartbeat: None,
+            is_watched: false,
             connect: Box::new(move |_thread| Ok(Box::new(spare.connect(&domain)?))),
         });
     }
@@ -92,7 +92,7 @@ fn job<'a>(
             counter(&arm.input.name, "taken", taken),
             counter(&arm.output.name, "published", given),
         ],
-        heartbeat: Some(opened.heartbeat.clone()),
+        is_watched: true,
         connect: Box::new(move |thread| {
             thread.claim(&arm.realtime);
             Ok(Box::new(opened.connect(adapter, arm, &domain)?))
@@ -101,11 +101,24 @@ fn job<'a>(
 }
 
 impl JobWork for JoinedArm {
-    fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
-        if orders.wait_for_start() {
-            self.run(orders.stop_flag())?;
+    fn begin(&mut self, orders: &Orders) -> Result<bool, WorkerError> {
+        let has_started = orders.wait_for_start();
+        if has_started {
+            self.clear()?;
         }
-        Ok(())
+        Ok(has_started)
+    }
+
+    fn step(&mut self) -> Result<bool, WorkerError> {
+        Self::step(self)
+    }
+
+    fn rest(&mut self) -> Result<(), WorkerError> {
+        Self::rest(self)
+    }
+
+    fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
+        stepped.and_then(|()| Self::finish(self))
     }
 
     fn report(&mut self) -> ProcessReport {

@@ -64,17 +64,25 @@ pub(super) struct JoinedSpare {
 }
 
 impl JobWork for JoinedSpare {
-    fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
-        loop {
-            let is_last = orders.is_stopping();
-            for (input, sink) in &mut self.channels {
-                while input.receive(&mut |envelope, _| sink.push(&taken(envelope)))? {}
-            }
-            if is_last {
-                return Ok(());
-            }
-            self.waiter.wait(WAIT_MAX)?;
+    /// It takes what was published before the run, too.
+    fn begin(&mut self, _orders: &Orders) -> Result<bool, WorkerError> {
+        Ok(true)
+    }
+
+    fn step(&mut self) -> Result<bool, WorkerError> {
+        for (input, sink) in &mut self.channels {
+            while input.receive(&mut |envelope, _| sink.push(&taken(envelope)))? {}
         }
+        Ok(false)
+    }
+
+    fn rest(&mut self) -> Result<(), WorkerError> {
+        self.waiter.wait(WAIT_MAX)?;
+        Ok(())
+    }
+
+    fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
+        stepped.and_then(|()| self.step().map(|_none_left| ()))
     }
 
     /// What it took is in its records.

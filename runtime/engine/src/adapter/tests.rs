@@ -107,7 +107,7 @@ impl Bench {
     /// Lets the adapter work until `look` finds something.
     fn until<T>(&mut self, mut look: impl FnMut(&mut Self) -> Option<T>) -> T {
         for _ in 0..20_000 {
-            while self.joined.turn().unwrap() {}
+            while self.joined.step().unwrap() {}
             if let Some(found) = look(self) {
                 return found;
             }
@@ -228,7 +228,7 @@ fn each_feedback_goes_out_at_once_and_only_proper_answers_come_in() {
     let (mut buffer, mut answer) = ([0; 2048], Vec::new());
     for cycle in 0..3 {
         bench.publish(bytes_of(&feedback(cycle)));
-        while bench.joined.turn().unwrap() {}
+        while bench.joined.step().unwrap() {}
         let (length, adapter) = bench.foreign.recv_from(&mut buffer).unwrap();
         let now = MonotonicClock::now();
         let seen = sensor.decode(now, &buffer[..length]).unwrap();
@@ -341,7 +341,7 @@ fn a_sensor_falls_silent_soon_after_its_controller() {
     for _ in 0..5 {
         speak(&mut bench);
         thread::sleep(Duration::from_millis(4));
-        while bench.joined.turn().unwrap() {}
+        while bench.joined.step().unwrap() {}
     }
     assert_eq!(bench.count("socket: sent_count"), 1);
     assert_eq!(bench.count("answers withheld, no command for 50 ms"), 5);

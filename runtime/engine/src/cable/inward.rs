@@ -10,11 +10,10 @@ use hil_net::packet_ring::FrameSender;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitMode, WaitStrategy};
 use hil_rundir::launch::CableWork;
-use hil_rundir::pipe::{CountByName, CounterGroup, InletReport, Orders, ProcessReport};
+use hil_rundir::pipe::{CountByName, CounterGroup, InletReport, ProcessReport};
 use hil_rundir::record::RecordSink;
-use hil_shm::{ChannelError, Domain, ShmInput, Waiter};
+use hil_shm::{Domain, ShmInput, Waiter};
 
-use crate::process::heartbeat::Heartbeat;
 use crate::process::recording::forwarded_ns;
 use crate::process::worker::{JobWork, WorkerError};
 
@@ -25,7 +24,6 @@ pub(super) struct Ends {
     pub(super) taken: RecordSink,
     /// Frames given to the program.
     pub(super) count: Arc<AtomicU64>,
-    pub(super) heartbeat: Heartbeat,
 }
 
 /// See the module documentation.
@@ -62,9 +60,11 @@ impl Inward {
             _domain: domain,
         })
     }
+}
 
-    /// Gives the program one waiting frame; false when none waits.
-    fn deliver(&mut self) -> Result<bool, ChannelError> {
+impl JobWork for Inward {
+    /// Gives the program one waiting frame.
+    fn step(&mut self) -> Result<bool, WorkerError> {
         let Self {
             ends,
             input,
@@ -93,27 +93,12 @@ impl Inward {
         Ok(delivered.is_some())
     }
 
-    fn rest(&mut self) -> Result<(), ChannelError> {
+    fn rest(&mut self) -> Result<(), WorkerError> {
         let pause = self.wait.pause(MonotonicClock::now(), None);
         if let (Pause::Sleep(until), Some(waiter)) = (pause, &mut self.waiter) {
             waiter.wait_until(Some(until))?;
         } else {
             core::hint::spin_loop();
-        }
-        Ok(())
-    }
-}
-
-impl JobWork for Inward {
-    fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
-        if !orders.wait_for_start() {
-            return Ok(());
-        }
-        while !orders.is_stopping() {
-            if !self.deliver()? {
-                self.rest()?;
-            }
-            self.ends.heartbeat.beat();
         }
         Ok(())
     }

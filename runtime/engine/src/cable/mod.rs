@@ -17,14 +17,15 @@ use hil_core::record::{FrameRecord, PublishedRecord, TakenRecord};
 use hil_net::handover;
 use hil_platform::signals::Signals;
 use hil_rundir::launch::{CableWork, WorkerLaunch};
+use hil_rundir::pipe::Orders;
 use hil_rundir::record::{RecordKind, Recorder};
 use std::os::fd::AsFd as _;
 
 use self::inward::Inward;
 use self::outward::Outward;
 use self::program::Program;
-use crate::process::heartbeat::Heartbeat;
 use crate::process::worker::{Counter, Job, Opened, WorkerError, open_domain, warn_of_spinning};
+use crate::supervisor::Child;
 
 /// Records a ring holds: half a second at 128,000 frames a second.
 const RING_RECORDS: usize = 65_536;
@@ -36,11 +37,17 @@ const RING_RECORDS: usize = 65_536;
 pub(crate) fn open<'a>(
     launch: &'a WorkerLaunch,
     work: &'a CableWork,
+    orders: &Orders,
     recorder: &mut Recorder,
 ) -> Result<Opened<'a>, WorkerError> {
-    // The program is told to end by a signal to the group, which is not meant for this process.
     let signals = Signals::install().map_err(WorkerError::Thread)?;
-    let (program, inlet) = start(work)?;
+    let (child, inlet) = start(work)?;
+    let program = Program {
+        child,
+        name: work.command[0].clone(),
+        stop: Arc::clone(orders.stop_flag()),
+        _signals: signals,
+    };
     let sender = inlet.sender().map_err(WorkerError::Socket)?;
     let domain = Arc::new(open_domain(launch)?);
     let (input, output) = (work.input.name.as_str(), work.output.name.as_str());
@@ -56,15 +63,15 @@ pub(crate) fn open<'a>(
             what,
             count: Arc::clone(&count),
         };
-        (counter, count, Heartbeat::default())
+        (counter, count)
     };
-    let (counter, given, heartbeat) = end(output, "published");
+    let (counter, given) = end(output, "published");
     let [for_output, for_input] = &work.realtime;
     let here = Arc::clone(&domain);
     let outward = Job {
         name: "frames out".to_owned(),
         counters: vec![counter],
-        heartbeat: Some(heartbeat.clone()),
+        is_watched: true,
         connect: Box::new(move |thread| {
             thread.claim(for_output);
             let ends = outward::Ends {
@@ -72,23 +79,21 @@ pub(crate) fn open<'a>(
                 published,
                 frames,
                 given,
-                heartbeat,
             };
             Ok(Box::new(Outward::join(work, here, ends)?))
         }),
     };
-    let (counter, count, heartbeat) = end(input, "taken");
+    let (counter, count) = end(input, "taken");
     let inward = Job {
         name: "frames in".to_owned(),
         counters: vec![counter],
-        heartbeat: Some(heartbeat.clone()),
+        is_watched: true,
         connect: Box::new(move |thread| {
             thread.claim(for_input);
             let ends = inward::Ends {
                 sender,
                 taken,
                 count,
-                heartbeat,
             };
             Ok(Box::new(Inward::join(work, domain, ends)?))
         }),
@@ -96,8 +101,8 @@ pub(crate) fn open<'a>(
     let program = Job {
         name: "program".to_owned(),
         counters: Vec::new(),
-        heartbeat: None,
-        connect: Box::new(move |_thread| Ok(Box::new(program.guarded_by(signals)))),
+        is_watched: false,
+        connect: Box::new(move |_thread| Ok(Box::new(program))),
     };
     Ok(Opened {
         jobs: vec![outward, inward, program],
@@ -106,7 +111,7 @@ pub(crate) fn open<'a>(
 }
 
 /// The helper that becomes the program, and its cable.
-fn start(work: &CableWork) -> Result<(Program, Inlet), WorkerError> {
+fn start(work: &CableWork) -> Result<(Child, Inlet), WorkerError> {
     let (here, there) = handover::pair().map_err(WorkerError::Socket)?;
     let failed = |source| WorkerError::Program {
         program: work.command[0].clone(),
@@ -126,9 +131,8 @@ fn start(work: &CableWork) -> Result<(Program, Inlet), WorkerError> {
     }
     helper.arg("--").args(&work.command).envs(&work.environment);
     helper.stdin(Stdio::from(there)).stdout(Stdio::from(log));
-    let child = helper.spawn().map_err(failed)?;
+    let child = Child::spawn_beside(&mut helper).map_err(failed)?;
     // This process keeps no copy of the helper's end: the end of a helper is noticed.
     drop(helper);
-    let program = Program::new(child, &work.command[0]);
-    Ok((program, Inlet::take(here)?))
+    Ok((child, Inlet::take(here)?))
 }

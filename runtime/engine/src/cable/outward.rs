@@ -12,11 +12,10 @@ use hil_platform::wait::{Pause, WaitStrategy};
 use hil_rundir::launch::CableWork;
 use hil_rundir::pipe::{CountByName, CounterGroup, InletReport, Orders, ProcessReport};
 use hil_rundir::record::RecordSink;
-use hil_shm::{ChannelError, Domain, OutputSettings, ShmOutput};
+use hil_shm::{Domain, OutputSettings, ShmOutput};
 
 use crate::gateway::kernel_clock::KernelClock;
 use crate::gateway::poll_descriptors;
-use crate::process::heartbeat::Heartbeat;
 use crate::process::recording::output_settings;
 use crate::process::worker::{JobWork, WorkerError};
 
@@ -31,7 +30,6 @@ pub(super) struct Ends {
     pub(super) frames: RecordSink,
     /// Frames published.
     pub(super) given: Arc<AtomicU64>,
-    pub(super) heartbeat: Heartbeat,
 }
 
 /// See the module documentation.
@@ -69,9 +67,20 @@ impl Outward {
             _domain: domain,
         })
     }
+}
 
-    /// Publishes one waiting frame; false when none waits.
-    fn forward(&mut self) -> Result<bool, ChannelError> {
+impl JobWork for Outward {
+    /// What the interface said on its own before is no message of the run.
+    fn begin(&mut self, orders: &Orders) -> Result<bool, WorkerError> {
+        let has_started = orders.wait_for_start();
+        if has_started {
+            self.ends.inlet.begin().map_err(WorkerError::Socket)?;
+        }
+        Ok(has_started)
+    }
+
+    /// Publishes one waiting frame.
+    fn step(&mut self) -> Result<bool, WorkerError> {
         let Self {
             ends,
             output,
@@ -106,7 +115,8 @@ impl Outward {
                 given.fetch_add(1, Ordering::Relaxed);
             });
         });
-        outcome.map(|()| has_moved)
+        outcome?;
+        Ok(has_moved)
     }
 
     fn rest(&mut self) -> Result<(), WorkerError> {
@@ -121,23 +131,11 @@ impl Outward {
         }
         Ok(())
     }
-}
 
-impl JobWork for Outward {
-    fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
-        if !orders.wait_for_start() {
-            return Ok(());
-        }
-        // What the interface said on its own before is no message of the run.
-        self.ends.inlet.begin().map_err(WorkerError::Socket)?;
-        while !orders.is_stopping() {
-            if !self.forward()? {
-                self.rest()?;
-            }
-            self.ends.heartbeat.beat();
-        }
+    fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
+        stepped?;
         for _ in 0..CLEARING_MAX {
-            if !self.forward()? {
+            if !self.step()? {
                 break;
             }
         }

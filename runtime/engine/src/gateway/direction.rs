@@ -50,7 +50,6 @@ pub struct OpenDirection {
     sinks: Sinks,
     counts: Vec<Arc<AtomicU64>>,
     is_established: Arc<AtomicBool>,
-    heartbeat: Heartbeat,
     plan: StampPlan,
 }
 
@@ -71,7 +70,6 @@ enum Sinks {
 #[derive(Debug)]
 pub struct Direction {
     way: BridgeLoop,
-    heartbeat: Heartbeat,
     facts: Vec<(String, String)>,
     /// By channel.
     replays: Vec<Option<ReplayTally>>,
@@ -136,7 +134,6 @@ impl OpenDirection {
             sinks: open_sinks(launch, recorder)?,
             plan,
             counts: launch.channels.iter().map(|_| Arc::default()).collect(),
-            heartbeat: Heartbeat::default(),
             // A receiver has nobody to wait for: it takes what comes.
             is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
         })
@@ -155,11 +152,6 @@ impl OpenDirection {
     /// How often its connections come and go, if it is one that connects.
     pub fn tally(&self) -> Option<Arc<ConnectionTally>> {
         self.socket.tally.clone()
-    }
-
-    /// The turns of the thread that will carry the messages.
-    pub(crate) fn heartbeat(&self) -> Heartbeat {
-        self.heartbeat.clone()
     }
 
     /// True while the peer takes this direction's messages.
@@ -190,7 +182,6 @@ impl OpenDirection {
                 line: Line::new(sender, messages, round_trips, around.session, self.plan)?,
                 wait: WaitStrategy::new(launch.wait),
                 sent: self.counts.into_boxed_slice(),
-                stop: Arc::clone(&around.stop),
                 attention: Attention::default(),
                 refusal_backoff: RefusalBackoff::of_replies(),
                 is_established: self.is_established,
@@ -230,7 +221,6 @@ impl OpenDirection {
         };
         Ok(Direction {
             way,
-            heartbeat: self.heartbeat,
             facts: self.socket.facts,
             replays: self.socket.replays,
         })
@@ -258,21 +248,21 @@ pub(super) fn egress_bridge(
 }
 
 impl Direction {
-    /// Carries messages until told to stop.
-    ///
-    /// # Errors
-    /// When a channel or the socket itself breaks, or the peer refuses the flow for good.
-    pub fn run(&mut self) -> Result<(), WorkerError> {
+    /// Ends what is under way once told to stop, or after a step that failed.
+    pub(super) fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
         match &mut self.way {
-            BridgeLoop::Egress(egress) => egress.run(&self.heartbeat),
-            BridgeLoop::Ingress(ingress) => ingress.run(&self.heartbeat),
+            BridgeLoop::Egress(egress) => egress.finish(stepped),
+            // Told to stop, it takes no step more.
+            BridgeLoop::Ingress(ingress) => {
+                stepped.and_then(|()| ingress.run(&Heartbeat::default()))
+            }
         }
     }
 
     /// Does what there is to do now, without waiting; false when there was nothing.
     ///
     /// # Errors
-    /// As [`Direction::run`].
+    /// When a channel or the socket itself breaks, or the peer refuses the flow for good.
     pub fn step(&mut self) -> Result<bool, WorkerError> {
         match &mut self.way {
             BridgeLoop::Egress(egress) => egress.step(),

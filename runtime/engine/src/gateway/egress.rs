@@ -16,7 +16,6 @@ use super::long_message::LongMessage;
 use super::refusal_backoff::RefusalBackoff;
 use super::stamp_tracker::STAMP_PATIENCE_NS;
 use super::{WorkerError, poll_descriptors};
-use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy};
 use hil_shm::HeldMessage;
@@ -36,7 +35,6 @@ pub(crate) struct Egress {
     pub(crate) wait: WaitStrategy,
     /// Messages sent, by channel.
     pub(crate) sent: Box<[Arc<AtomicU64>]>,
-    pub(crate) stop: Arc<AtomicBool>,
     pub(crate) attention: Attention,
     pub(super) refusal_backoff: RefusalBackoff,
     /// Set while the peer takes messages.
@@ -60,32 +58,18 @@ const LOOK_PERIOD_NS: i64 = 500_000;
 const LOOK_PERIOD_HELD_NS: i64 = 50_000;
 
 impl Egress {
-    /// Carries the channels until told to stop, then says goodbye to the peer.
-    ///
-    /// # Errors
-    /// When the channel or the socket itself breaks, or the peer refuses the flow for good.
-    pub(crate) fn run(&mut self, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
-        let carried = self.carry(heartbeat);
+    /// Lets go of a long message that is under way, then, if no step failed, says goodbye to the peer.
+    pub(crate) fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
         if let Some(mut long) = self.long.take() {
             let now = MonotonicClock::now();
             self.bridge.on_long_failed(now, TransmitFailure::Local);
             long.end(&mut self.line);
         }
-        carried?;
+        stepped?;
         self.bridge.bye();
         self.line.transmit(&mut self.bridge);
         self.line.settle(&mut self.bridge)?;
         self.line.hand_over()
-    }
-
-    fn carry(&mut self, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
-        while !self.stop.load(Ordering::Acquire) {
-            if !self.step()? {
-                self.rest()?;
-            }
-            heartbeat.beat();
-        }
-        Ok(())
     }
 
     /// Sends one waiting message, or else looks after stamps, replies and appointments; false when

@@ -145,7 +145,7 @@ fn job(launch: &DirectionLaunch, opened: OpenDirection, around: Arc<GatewayConte
     Job {
         name: format!("{way} {}", flow_label(&launch.flow)),
         counters: counters.collect(),
-        heartbeat: Some(opened.heartbeat()),
+        is_watched: true,
         connect: Box::new(move |thread| {
             thread.claim(&launch.realtime);
             let direction = opened.connect(launch, &around)?;
@@ -162,8 +162,20 @@ struct DirectionWork<'a> {
 
 impl JobWork for DirectionWork<'_> {
     /// The peers greet each other before the run starts.
-    fn run(&mut self, _orders: &Orders) -> Result<(), WorkerError> {
-        self.direction.run()
+    fn begin(&mut self, _orders: &Orders) -> Result<bool, WorkerError> {
+        Ok(true)
+    }
+
+    fn step(&mut self) -> Result<bool, WorkerError> {
+        self.direction.step()
+    }
+
+    fn rest(&mut self) -> Result<(), WorkerError> {
+        self.direction.rest()
+    }
+
+    fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
+        self.direction.finish(stepped)
     }
 
     fn report(&mut self) -> ProcessReport {

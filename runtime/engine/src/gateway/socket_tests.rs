@@ -8,7 +8,7 @@ use hil_link::trace::{TraceLink, TraceReplay};
 use hil_protocol::wire::Header;
 use hil_topology::emulation::EmulationLaunch;
 use hil_trace::{Trace, TraceFate, TraceHeader, TraceRecord};
-use hil_transport::queue::{QueueSettings, queue_pair};
+use hil_transport::queue::queue_pair;
 
 use super::*;
 
@@ -113,7 +113,7 @@ fn traced(matching: TraceMatch) -> TraceLink {
 #[test]
 fn a_message_in_pieces_meets_one_record_whole() {
     for matching in [TraceMatch::Index, TraceMatch::Tick, TraceMatch::Time] {
-        let (mut sender, inner) = queue_pair(&QueueSettings::default());
+        let (mut sender, inner) = queue_pair();
         let link = traced(matching);
         let tally = link.tally();
         let settings = EmulatedSettings::default();

@@ -11,7 +11,6 @@ use hil_core::endpoint::{Endpoint, RoleChannels, StatedChannel};
 use hil_core::message::{Envelope, TypeInfo};
 use hil_core::record::{PublishedRecord, TakenRecord};
 
-use super::heartbeat::Heartbeat;
 use super::recording::{Destination, RecordedInput, RecordedOutput, output_settings};
 use super::worker::{
     Counter, Job, JobWork, NO_TIMER, Opened, WorkerError, open_domain, warn_of_spinning,
@@ -45,11 +44,10 @@ pub(super) fn open<'a>(
     let Opening { counters, parts } = Opening::of(&card, recorder)?;
     let skipped = Arc::new(AtomicU64::new(NO_TIMER));
     let skipped_ticks = Some(Arc::clone(&skipped));
-    let heartbeat = Heartbeat::default();
     let job = Job {
         name: "main".to_owned(),
         counters,
-        heartbeat: Some(heartbeat.clone()),
+        is_watched: true,
         connect: Box::new(move |thread| {
             let asked = MonotonicClock::now();
             let role = make_role(&card, registry)?;
@@ -65,7 +63,6 @@ pub(super) fn open<'a>(
                 waiter,
                 wait: WaitStrategy::new(work.wait),
                 skipped,
-                heartbeat,
                 report: ProcessReport {
                     preparation_s: Some(prepared_in.as_secs_f64()),
                     ..ProcessReport::default()
@@ -88,7 +85,6 @@ struct Component {
     wait: WaitStrategy,
     /// Ticks that passed without the role; [`NO_TIMER`] for one that has none.
     skipped: Arc<AtomicU64>,
-    heartbeat: Heartbeat,
     report: ProcessReport,
     /// Outlives the ports.
     _domain: Domain,
@@ -257,18 +253,40 @@ fn open_waiter(
 }
 
 impl JobWork for Component {
-    fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
-        if !orders.wait_for_start() {
-            return Ok(());
+    fn begin(&mut self, orders: &Orders) -> Result<bool, WorkerError> {
+        let has_started = orders.wait_for_start();
+        if has_started {
+            self.endpoint.start(MonotonicClock::now())?;
         }
-        self.endpoint.start(MonotonicClock::now())?;
-        while !orders.is_stopping() {
-            let ticks = self.report.ticks;
-            self.turn()?;
-            self.heartbeat.beat();
-            if self.report.ticks != ticks {
-                let skipped = self.endpoint.role().skipped_ticks();
-                self.skipped.store(skipped, Ordering::Relaxed);
+        Ok(has_started)
+    }
+
+    /// Whatever it did, the endpoint itself says when it is due next.
+    fn step(&mut self) -> Result<bool, WorkerError> {
+        let activity = self.endpoint.poll(MonotonicClock::now())?;
+        self.report.malformed_count += activity.malformed_count;
+        self.report.ticks += activity.tick_count;
+        if activity.tick_count > 0 {
+            let skipped = self.endpoint.role().skipped_ticks();
+            self.skipped.store(skipped, Ordering::Relaxed);
+        }
+        Ok(false)
+    }
+
+    fn rest(&mut self) -> Result<(), WorkerError> {
+        let now = MonotonicClock::now();
+        let mut pause = self.wait.pause(now, self.endpoint.role().next_tick());
+        for input in self.endpoint.inputs_mut() {
+            pause = pause.sooner(input.wait.pause(now, None));
+        }
+        match (pause, &mut self.waiter) {
+            (Pause::Spin, _) => core::hint::spin_loop(),
+            (Pause::Sleep(until), Some(waiter)) => {
+                waiter.wait_until(Some(until))?;
+            }
+            (Pause::Sleep(until), None) => {
+                // An interrupted sleep only means looking again a little early.
+                let (Wake::Due | Wake::Interrupted) = MonotonicClock::sleep_until(until);
             }
         }
         Ok(())
@@ -287,31 +305,6 @@ impl JobWork for Component {
             connection_failures: deaf + unheard,
             ..self.report.clone()
         }
-    }
-}
-
-impl Component {
-    /// Does what there is to do, then waits for more.
-    fn turn(&mut self) -> Result<(), ChannelError> {
-        let activity = self.endpoint.poll(MonotonicClock::now())?;
-        self.report.malformed_count += activity.malformed_count;
-        self.report.ticks += activity.tick_count;
-        let now = MonotonicClock::now();
-        let mut pause = self.wait.pause(now, self.endpoint.role().next_tick());
-        for input in self.endpoint.inputs_mut() {
-            pause = pause.sooner(input.wait.pause(now, None));
-        }
-        match (pause, &mut self.waiter) {
-            (Pause::Spin, _) => core::hint::spin_loop(),
-            (Pause::Sleep(until), Some(waiter)) => {
-                waiter.wait_until(Some(until))?;
-            }
-            (Pause::Sleep(until), None) => {
-                // An interrupted sleep only means looking again a little early.
-                let (Wake::Due | Wake::Interrupted) = MonotonicClock::sleep_until(until);
-            }
-        }
-        Ok(())
     }
 }
 

@@ -164,8 +164,8 @@ pub(crate) struct Job<'a> {
     pub(crate) name: String,
     /// What it counts for whoever watches the run.
     pub(crate) counters: Vec<Counter>,
-    /// The turns of its loop; `None` where its turns are not watched.
-    pub(crate) heartbeat: Option<Heartbeat>,
+    /// Whether it is watched that its loop turns.
+    pub(crate) is_watched: bool,
     /// Joins the channels, in the thread.
     pub(crate) connect: Connect<'a>,
 }
@@ -187,16 +187,42 @@ impl JobThread {
     }
 }
 
-/// What a connected job does.
+/// What a connected job does: its thread takes one step after another until the process is told to stop. Each
+/// fails when a channel or a socket itself breaks.
 pub(crate) trait JobWork {
-    /// Works until told to stop.
-    ///
-    /// # Errors
-    /// When a channel or a socket itself breaks.
-    fn run(&mut self, orders: &Orders) -> Result<(), WorkerError>;
+    /// What comes before the first step; false when told to stop before it.
+    fn begin(&mut self, orders: &Orders) -> Result<bool, WorkerError> {
+        Ok(orders.wait_for_start())
+    }
+
+    /// Does what there is to do now, without waiting; false when there was nothing.
+    fn step(&mut self) -> Result<bool, WorkerError>;
+
+    /// Waits for the next thing to do.
+    fn rest(&mut self) -> Result<(), WorkerError>;
+
+    /// Ends what is under way after the last step, also where a step failed, as `stepped` says.
+    fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
+        stepped
+    }
 
     /// Its part of the report of the process.
     fn report(&mut self) -> ProcessReport;
+
+    /// The loop of every thread of a worker.
+    fn run(&mut self, orders: &Orders, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
+        if !self.begin(orders)? {
+            return Ok(());
+        }
+        let mut stepped = Ok(());
+        while stepped.is_ok() && !orders.is_stopping() {
+            stepped = self
+                .step()
+                .and_then(|has_moved| if has_moved { Ok(()) } else { self.rest() });
+            heartbeat.beat();
+        }
+        self.finish(stepped)
+    }
 }
 
 /// How many messages of a channel went which way.
@@ -262,7 +288,7 @@ fn open_and_run(path: &Path, registry: &Registry) -> Result<(), WorkerError> {
         Work::Component(work) => component::open(&launch, work, registry, &mut recorder),
         Work::Gateway(work) => gateway::process::open(&launch, work, &orders, &mut recorder),
         Work::Adapter(work) => adapter::process::open(&launch, work, &mut recorder),
-        Work::Cable(work) => cable::open(&launch, work, &mut recorder),
+        Work::Cable(work) => cable::open(&launch, work, &orders, &mut recorder),
     }?;
     let stop = Arc::clone(orders.stop_flag());
     recorder
@@ -316,7 +342,10 @@ fn run_jobs(
     } = opened;
     let counters = jobs.iter().flat_map(|job| job.counters.clone());
     let mut counters: Vec<(Counter, Option<u64>)> = counters.map(|one| (one, None)).collect();
-    let mut heartbeats = Heartbeats::of(jobs.iter().filter_map(|job| job.heartbeat.clone()));
+    let jobs = jobs.into_iter().map(|job| (job, Heartbeat::default()));
+    let jobs: Vec<_> = jobs.collect();
+    let watched = jobs.iter().filter(|(job, _)| job.is_watched);
+    let mut heartbeats = Heartbeats::of(watched.map(|(_, heartbeat)| heartbeat.clone()));
     let job_count = jobs.len();
     let stop = || orders.stop_flag().store(true, Ordering::Release);
     // This end is kept: without a job the process still waits for its orders.
@@ -327,11 +356,11 @@ fn run_jobs(
     thread::scope(|scope| {
         let mut outcome = Ok(());
         let mut threads = Vec::new();
-        for job in jobs {
+        for (job, heartbeat) in jobs {
             let (name, sender) = (job.name.clone(), sender.clone());
             let spawned = thread::Builder::new()
                 .name(name.clone())
-                .spawn_scoped(scope, move || run_job(job, orders, sender));
+                .spawn_scoped(scope, move || run_job(job, orders, &heartbeat, sender));
             match spawned {
                 Ok(thread) => threads.push((name, thread)),
                 Err(error) => {
@@ -393,14 +422,14 @@ struct Ended {
     outcome: Result<(), WorkerError>,
 }
 
-fn run_job(job: Job<'_>, orders: &Orders, sender: Sender<Word>) -> Ended {
+fn run_job(job: Job<'_>, orders: &Orders, heartbeat: &Heartbeat, sender: Sender<Word>) -> Ended {
     let end = EndTeller(sender);
     let mut thread = JobThread::default();
     let mut report = ProcessReport::default();
     let outcome = (job.connect)(&mut thread).and_then(|mut work| {
         // The process waits for this word; it cannot have left.
         let _left = end.0.send(Word::Connected).is_err();
-        let outcome = work.run(orders);
+        let outcome = work.run(orders, heartbeat);
         report = work.report();
         outcome
     });
@@ -499,13 +528,19 @@ mod tests {
     }
 
     impl JobWork for Counting {
-        fn run(&mut self, orders: &Orders) -> Result<(), WorkerError> {
+        fn begin(&mut self, _orders: &Orders) -> Result<bool, WorkerError> {
             if self.panics {
                 panic_any("planted");
             }
-            while !orders.is_stopping() {
-                thread::yield_now();
-            }
+            Ok(true)
+        }
+
+        fn step(&mut self) -> Result<bool, WorkerError> {
+            Ok(false)
+        }
+
+        fn rest(&mut self) -> Result<(), WorkerError> {
+            thread::yield_now();
             Ok(())
         }
 
@@ -521,7 +556,7 @@ mod tests {
         Job {
             name: "counting".to_owned(),
             counters: Vec::new(),
-            heartbeat: None,
+            is_watched: false,
             connect: Box::new(move |_| Ok(Box::new(Counting { panics }))),
         }
     }

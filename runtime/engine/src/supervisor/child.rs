@@ -13,9 +13,9 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use nix::errno::Errno;
-use nix::sys::signal::{Signal, killpg};
+use nix::sys::signal::{Signal, kill, killpg};
 use nix::sys::wait::{Id, WaitPidFlag, WaitStatus, waitid};
-use nix::unistd::Pid;
+use nix::unistd::{Pid, getpgrp};
 use rustix::process::{PidfdFlags, pidfd_open};
 use zeroize::Zeroizing;
 
@@ -92,6 +92,8 @@ pub(crate) struct Child {
     stdin: Option<ChildStdin>,
     end: Option<ProcessEnd>,
     is_foreign: bool,
+    /// It is in the group of this process, not in one of its own.
+    shares_group: bool,
 }
 
 impl Child {
@@ -145,6 +147,7 @@ impl Child {
             stdin,
             end: None,
             is_foreign: false,
+            shares_group: false,
         })
     }
 
@@ -155,7 +158,19 @@ impl Child {
     pub(crate) fn spawn_foreign(command: Command, log: &Path) -> io::Result<Self> {
         let mut command = prepared(command, log)?;
         command.stdout(File::options().append(true).open(log)?);
-        let (process, pidfd) = started(command.stdin(Stdio::null()))?;
+        Self::foreign(command.stdin(Stdio::null()), false)
+    }
+
+    /// Starts a user's own command in the group of this process, which is told to end as a whole.
+    ///
+    /// # Errors
+    /// When the program cannot be started.
+    pub(crate) fn spawn_beside(command: &mut Command) -> io::Result<Self> {
+        Self::foreign(command, true)
+    }
+
+    fn foreign(command: &mut Command, shares_group: bool) -> io::Result<Self> {
+        let (process, pidfd) = started(command)?;
         Ok(Self {
             process,
             pidfd,
@@ -163,6 +178,7 @@ impl Child {
             stdin: None,
             end: None,
             is_foreign: true,
+            shares_group,
         })
     }
 
@@ -249,8 +265,14 @@ impl Child {
 
     fn signal_group(&self, signal: Signal) {
         if let Ok(id) = i32::try_from(self.process.id()) {
+            let own = Pid::from_raw(id);
+            let sent = match (self.shares_group, signal) {
+                (true, Signal::SIGKILL) => kill(own, signal),
+                (true, _) => killpg(getpgrp(), signal),
+                (false, _) => killpg(own, signal),
+            };
             // The group may have ended already.
-            let _gone = killpg(Pid::from_raw(id), signal).is_err();
+            let _gone = sent.is_err();
         }
     }
 }

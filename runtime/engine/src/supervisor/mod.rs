@@ -22,7 +22,7 @@ mod session;
 mod status_publisher;
 mod strangers;
 
-pub(crate) use child::ProcessEnd;
+pub(crate) use child::Child;
 pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;
 pub use needs::{HostTooSmall, Shortfall, check_host};

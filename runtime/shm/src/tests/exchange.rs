@@ -81,10 +81,7 @@ fn ports_conform() {
     let mut input = ShmInput::open(&domain, "arm/pose", &POSE, 8).unwrap();
     let mut output = output(&domain, 1);
     conforms(&mut output, &mut input, 8);
-    assert_eq!(
-        (output.sent_count(), input.counters().missed_count),
-        (81, 0)
-    );
+    assert_eq!(input.counters().missed_count, 0);
     drop((input, output, holder));
     assert_nothing_left(domain);
 }

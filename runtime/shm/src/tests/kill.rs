@@ -40,8 +40,8 @@ fn child() {
             ..OutputSettings::default()
         };
         let mut output = ShmOutput::open(&domain, "arm/pose", &POSE, settings).unwrap();
-        loop {
-            let payload = pose(output.sent_count());
+        for index in 0_u64.. {
+            let payload = pose(index);
             output
                 .send(MonotonicClock::now(), bytemuck::bytes_of(&payload))
                 .unwrap();

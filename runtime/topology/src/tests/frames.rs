@@ -1,7 +1,5 @@
 //! Programs with an address inside: their channels carry frames, one each way between two neighbours.
 
-use hil_core::message::ETHERNET_FRAME;
-
 use super::*;
 
 const JOINED: &str = r#"
@@ -34,7 +32,7 @@ fn channels_between_addresses_inside_carry_frames_and_are_written_back() {
     let topology = parse_good(JOINED);
     for channel in topology.channels() {
         assert!(channel.carries_frames() && channel.is_carried);
-        assert_eq!(channel.message.hash(), ETHERNET_FRAME.hash());
+        assert_eq!(channel.message, MessageLayout::of_frames());
         assert_eq!(channel.depth, 1024);
     }
     let robot = topology.process("robot").unwrap();

@@ -67,7 +67,6 @@ pub struct Controller {
     hold: HoldWatch,
     /// Flags of the feedback that belong to one cycle.
     cycle_flags: u32,
-    held_cycle_count: u64,
 }
 
 impl Controller {
@@ -94,7 +93,6 @@ impl Controller {
             throttle: ThrottleWatch::default(),
             hold: HoldWatch::default(),
             cycle_flags: 0,
-            held_cycle_count: 0,
         }
     }
 
@@ -280,30 +278,9 @@ impl Controller {
         self.session.phase.state()
     }
 
-    /// Cycles gone through after the first: the newest feedback's
-    /// [`cycle_index`](EgmFeedback::cycle_index).
-    pub fn cycle_index(&self) -> u64 {
-        self.cycle_index
-    }
-
     /// What became of the commands.
     pub fn command_counters(&self) -> &CommandCounters {
         self.inbox.counters()
-    }
-
-    /// Cycles in which the controller held the last command, see [`EgmFeedback::HOLDING`].
-    pub fn held_cycle_count(&self) -> u64 {
-        self.held_cycle_count
-    }
-
-    /// Which arm it is.
-    pub fn side(&self) -> Side {
-        self.side
-    }
-
-    /// The controller's own settings, before any request's.
-    pub fn settings(&self) -> &ControllerSettings {
-        &self.settings
     }
 
     /// An event of this cycle, without its numbers.

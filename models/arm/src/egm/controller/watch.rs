@@ -162,7 +162,6 @@ impl Controller {
                 ..self.event(EgmEventKind::HoldBegan)
             });
         }
-        self.held_cycle_count += u64::from(self.hold.is_holding);
     }
 
     /// Tells of each episode in which `MaxSpeedDeviation` slows the joints that it began, and what

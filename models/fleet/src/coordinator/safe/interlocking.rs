@@ -1,5 +1,5 @@
 //! The decisions of the safe mode: who may be where, and what is said to whom. Whole numbers only; it knows neither
-//! time nor motion nor merit. What runs and what is searched exhaustively (`search`) are this type.
+//! time nor motion nor merit. What runs and what is searched exhaustively (`search_tests`) are this type.
 //!
 //! **Who knows what.** A coordinator that starts, for the first time or again, knows nothing. It asks every robot; the
 //! *question* is a number that grows from start to start. A robot that hears a newer question answers it in each state

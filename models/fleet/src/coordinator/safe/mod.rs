@@ -2,7 +2,7 @@
 //! robot may be on, whatever messages are lost, late, repeated or overtaken, and only as long as
 //! every robot can still finish. It needs no clock but its own.
 //!
-//! - `interlocking`: the decisions, without time or floats; `search` searches them exhaustively.
+//! - `interlocking`: the decisions, without time or floats; `search_tests` searches them exhaustively.
 //! - `ledger`: what a robot may hold, proved from its states.
 //! - `reservation`: which poses each robot has to itself; the safety invariant.
 //! - `liveness`: why every mission ends.
@@ -22,7 +22,7 @@ pub mod ledger;
 mod liveness;
 pub mod reservation;
 #[cfg(test)]
-mod search;
+mod search_tests;
 #[cfg(test)]
 mod tests;
 

@@ -6,7 +6,7 @@
     reason = "simulated times are far below 292 years"
 )]
 
-use super::{Exchange, Requester};
+use crate::{Exchange, Requester};
 use hil_core::random::RandomStream;
 use hil_core::record::RoundTripRecord;
 use hil_core::time::{Instant, RemoteInstant};
