@@ -244,6 +244,10 @@ impl Reassembler {
 
     /// Notes that the bytes of a piece are at its place; gives its message once it is whole, whose slot is then
     /// free. Without this the piece is missing as if it had not come.
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "a place is filled once: it is neither copied nor used again"
+    )]
     pub fn stored(&mut self, place: Place) -> Option<Assembled> {
         let slot = &mut self.slots[place.slot];
         slot.receive(&place);

@@ -7,7 +7,7 @@ use std::thread;
 use std::time::Duration;
 
 use hil_core::message::MessageType;
-use hil_core::record::{EgressRecord, IngressRecord};
+use hil_core::record::{EgressRecord, IngressRecord, UNAVAILABLE};
 use hil_link::condition::{LinkChangeRequest, ORDER_TYPE_NAME};
 use hil_link::spec::{LinkSpec, Way};
 use hil_platform::clock::MonotonicClock;
@@ -210,8 +210,14 @@ fn images_of_four_megabytes_arrive_beside_commands() {
         .sent
         .iter()
         .filter(|one| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0);
+    let whole = outcome.received.iter();
+    let whole = whole.filter(|one| one.forwarded_ns != UNAVAILABLE);
+    let mut until_published: Vec<i64> = whole
+        .map(|one| (one.forwarded_ns - one.received_ns) / 1_000)
+        .collect();
+    until_published.sort_unstable();
     println!(
-        "{} images left, {} came; {} commands came",
+        "{} images left, {} came, each published {until_published:?} us after its last piece; {} commands came",
         left.count(),
         outcome.images.len(),
         outcome.command_count
