@@ -233,9 +233,10 @@ pub struct JoinArgs {
     /// one link. Without it nothing is delayed or lost on purpose.
     #[arg(long, value_name = "WORDS|FILE")]
     pub link: Option<String>,
-    /// How long the programs run, e.g. 30s, where none of them ends before.
-    #[arg(long, value_name = "TIME", default_value = "168h")]
-    pub duration: String,
+    /// How long the programs run, e.g. 30s, where none of them ends before; without it, until one of them
+    /// ends.
+    #[arg(long, value_name = "TIME")]
+    pub duration: Option<String>,
     /// Seed of the link's losses and delays.
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub seed: u64,

@@ -126,6 +126,8 @@ pub enum Hurt {
 pub enum Unresolved {
     /// The measurement is not valid.
     InvalidMeasurement,
+    /// Nothing tells whether the hosts kept up.
+    HostUnknown,
     /// Nothing happened, and too little could have.
     SampleTooSmall {
         /// What could have hurt the robot.
@@ -206,7 +208,8 @@ pub enum Clocks {
 /// Whether the measurement is valid.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Measurement {
-    /// Host and link were kept up with, and no record is missing; `None` where nothing was measured.
+    /// Host and link were kept up with, and no record is missing; `None` where nothing was measured, or nothing
+    /// tells.
     pub is_valid: Option<bool>,
     /// Whether times of two hosts compare.
     pub clocks: Clocks,
@@ -366,6 +369,7 @@ impl fmt::Display for Unresolved {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::InvalidMeasurement => formatter.write_str("the measurement is not valid"),
+            Self::HostUnknown => formatter.write_str("nothing tells whether the hosts kept up"),
             Self::SampleTooSmall {
                 what,
                 count,
@@ -419,6 +423,9 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
     };
     if is_valid(network) == Some(false) {
         return not_resolvable(Unresolved::InvalidMeasurement);
+    }
+    if *network == NetworkVerdict::HostUnknown {
+        return not_resolvable(Unresolved::HostUnknown);
     }
     if is_score_incomplete(summary) {
         return not_resolvable(Unresolved::ScoreIncomplete);
@@ -587,6 +594,7 @@ const fn unmeasured_words(network: &NetworkVerdict) -> &'static str {
     match network {
         NetworkVerdict::VirtualTime => "none: virtual time tells of link models, not of a network",
         NetworkVerdict::RunFailed => "none: the run failed",
+        NetworkVerdict::HostUnknown => "unknown: nothing that ran tells whether the hosts kept up",
         _ => "none: nothing went over a network",
     }
 }
@@ -614,6 +622,10 @@ fn invalid_words(network: &NetworkVerdict) -> Option<String> {
                 "receiving gateways were late: no room in the receive buffer of {flows}; {repeat}"
             )
         }
+        NetworkVerdict::FramesLost { channels } => {
+            let channels = named(channels, NAMED_COUNT);
+            format!("processes, queues or inlets of a host lost frames of {channels}; {repeat}")
+        }
         NetworkVerdict::TicksUnknown => "a component left no count of its ticks".to_owned(),
         NetworkVerdict::RecordsMissing { hosts } => {
             let hosts = named(hosts, NAMED_COUNT);
@@ -623,25 +635,28 @@ fn invalid_words(network: &NetworkVerdict) -> Option<String> {
         | NetworkVerdict::VirtualTime
         | NetworkVerdict::NoNetwork
         | NetworkVerdict::NoForeignProgram
+        | NetworkVerdict::HostUnknown
         | NetworkVerdict::ForeignProgram
         | NetworkVerdict::EmulatedLink
         | NetworkVerdict::NetworkResult => return None,
     })
 }
 
-/// `None` where nothing was measured.
+/// `None` where nothing was measured, or nothing tells.
 pub(crate) const fn is_valid(network: &NetworkVerdict) -> Option<bool> {
     match network {
         NetworkVerdict::RunFailed
         | NetworkVerdict::VirtualTime
         | NetworkVerdict::NoNetwork
-        | NetworkVerdict::NoForeignProgram => None,
+        | NetworkVerdict::NoForeignProgram
+        | NetworkVerdict::HostUnknown => None,
         NetworkVerdict::ForeignProgram
         | NetworkVerdict::EmulatedLink
         | NetworkVerdict::NetworkResult => Some(true),
         NetworkVerdict::EmulationNotKept { .. }
         | NetworkVerdict::HostOverran { .. }
         | NetworkVerdict::ReceiverLate { .. }
+        | NetworkVerdict::FramesLost { .. }
         | NetworkVerdict::TicksUnknown
         | NetworkVerdict::RecordsMissing { .. } => Some(false),
     }

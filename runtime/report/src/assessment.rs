@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 use super::adapter::AdapterSummary;
 use super::adapter_warnings;
 use super::summary::{
-    ChannelSummary, DirectionSummary, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary,
+    ChannelFlows, ChannelSummary, DirectionSummary, LinkKind, NO_ROOM, Outcome, ProcessSummary,
+    RunSummary,
 };
 use hil_platform::text::grouped;
 use hil_platform::words::{counted, named};
@@ -61,8 +62,17 @@ pub enum NetworkVerdict {
         /// The channels concerned.
         channels: Vec<String>,
     },
+    /// A process, a queue or an inlet of ours lost too many frames of a program: the run says nothing about the
+    /// network.
+    FramesLost {
+        /// The channels concerned.
+        channels: Vec<String>,
+    },
     /// A component left no report, so nobody can tell whether it kept its ticks.
     TicksUnknown,
+    /// Nothing that ran tells whether the host kept up: no component with a period, no gateway that left its
+    /// counters.
+    HostUnknown,
     /// Hosts lack records of others: what was lost cannot be told from what is not known.
     RecordsMissing {
         /// The hosts that lack some.
@@ -139,6 +149,8 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
     let is_silent =
         |process: &ProcessSummary| process.kind.counts_ticks() && process.cpu_time_s.is_none();
     let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
+    // A program of the user's and a component that only messages drive have none; the gateways tell then.
+    let has_evidence = !summary.directions.is_empty() || summary.processes.iter().any(has_ticks);
     if summary.run.outcome == Outcome::Failed {
         NetworkVerdict::RunFailed
     } else if summary.run.is_virtual {
@@ -162,8 +174,14 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::ReceiverLate {
             channels: received_late(summary),
         }
-    } else if summary.processes.iter().any(is_silent) || !summary.processes.iter().any(has_ticks) {
+    } else if !frames_lost(summary).is_empty() {
+        NetworkVerdict::FramesLost {
+            channels: frames_lost(summary),
+        }
+    } else if summary.processes.iter().any(is_silent) {
         NetworkVerdict::TicksUnknown
+    } else if !has_evidence {
+        NetworkVerdict::HostUnknown
     } else if has_emulation {
         NetworkVerdict::EmulatedLink
     } else if has_network {
@@ -204,6 +222,19 @@ fn received_late(summary: &RunSummary) -> Vec<String> {
     };
     let directions = summary.directions.iter().filter(is_late);
     directions.map(|one| one.label().to_owned()).collect()
+}
+
+/// The channels of which more than [`SKIPPED_TICK_RATIO_MAX`] of the frames were lost in what is ours.
+fn frames_lost(summary: &RunSummary) -> Vec<String> {
+    let is_lost = |one: &&ChannelFlows| {
+        let flows = || one.flows.iter();
+        let inlet_count = one.inlet_lost_count();
+        let frame_count = inlet_count + flows().map(|flow| flow.frame_count).sum::<u64>();
+        let lost: u64 = flows().map(|flow| flow.lost_by_harness_count).sum();
+        (inlet_count + lost) as f64 > SKIPPED_TICK_RATIO_MAX * frame_count as f64
+    };
+    let channels = summary.flows.iter().filter(is_lost);
+    channels.map(|one| one.channel.clone()).collect()
 }
 
 fn no_room_warning(summary: &RunSummary, direction: &DirectionSummary) -> Option<String> {

@@ -14,7 +14,7 @@ use crate::event::ProcessKind;
 /// Name of the file.
 pub(crate) const FILE_NAME: &str = "status.json";
 /// Version of its layout. Within one, fields are only added.
-const STATUS_VERSION: u32 = 1;
+const STATUS_VERSION: u32 = 2;
 
 /// How the run stands.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -27,8 +27,8 @@ pub struct RunStatus {
     pub written_ns: i64,
     /// When the run began, on the host's monotonic clock; `None` before.
     pub start_ns: Option<i64>,
-    /// How long it is to be.
-    pub duration_ns: u64,
+    /// How long it is to be; `None` where only its processes or a person end it.
+    pub duration_ns: Option<u64>,
     /// What runs here.
     pub processes: Vec<ProcessStatus>,
     /// What the other hosts of the run said.
@@ -125,7 +125,7 @@ pub struct ProcessStatus {
 
 impl RunStatus {
     /// The status of a run that is to last `duration_ns`.
-    pub fn new(phase: Phase, duration_ns: u64, processes: Vec<ProcessStatus>) -> Self {
+    pub fn new(phase: Phase, duration_ns: Option<u64>, processes: Vec<ProcessStatus>) -> Self {
         Self {
             schema_version: STATUS_VERSION,
             phase,
@@ -262,7 +262,7 @@ mod tests {
             restart_count: 1,
             skipped_tick_count: None,
         };
-        let mut status = RunStatus::new(Phase::Running, 5, vec![process]);
+        let mut status = RunStatus::new(Phase::Running, Some(5), vec![process]);
         status.elsewhere = ["there", "nowhere"].map(elsewhere).to_vec();
         status.elsewhere[0].heard_ns = Some(status.written_ns);
         write(&folder, &status);

@@ -157,7 +157,7 @@ mod tests {
     }
 
     fn status(duration_ns: u64) -> RunStatus {
-        RunStatus::new(Phase::Running, duration_ns, Vec::new())
+        RunStatus::new(Phase::Running, Some(duration_ns), Vec::new())
     }
 
     fn wait_until_read(folder: &Path, status: &RunStatus) {

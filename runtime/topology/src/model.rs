@@ -38,7 +38,7 @@ options! {
     #[derive(Eq)]
     pub struct Run {
         /// How long the roles run once all hosts are ready.
-        duration: Duration = Duration::from_secs(20), in Duration::from_millis(100)..=Duration::from_hours(7 * 24);
+        duration: Duration = Duration::from_secs(20), in Duration::from_millis(100)..=Run::LONGEST;
         /// Seed of every random stream of the run.
         seed: u64 = 1, in 0..=i64::MAX.unsigned_abs();
         /// Folder that receives one sub-folder per run.
@@ -48,6 +48,16 @@ options! {
         /// How long a host may be silent during the run before it counts as gone. The default lets a radio
         /// roam, and notices a host that vanished within half a minute.
         peer_timeout: Duration = Duration::from_secs(30), in Duration::from_secs(1)..=Duration::from_hours(1);
+    }
+}
+
+impl Run {
+    /// The longest duration; a run of two programs without a duration has it.
+    pub const LONGEST: Duration = Duration::from_hours(7 * 24);
+
+    /// How long it is to last; `None` where only its processes or a person end it.
+    pub fn planned(&self) -> Option<Duration> {
+        (self.duration < Self::LONGEST).then_some(self.duration)
     }
 }
 

@@ -14,6 +14,8 @@ use crate::arguments::{JoinArgs, RunArgs};
 
 /// The names of the programs, which are those of their hosts, and their addresses.
 const ENDS: [(&str, &str); 2] = [("first", "10.77.0.1"), ("second", "10.77.0.2")];
+/// [`Run::LONGEST`](hil_topology::Run::LONGEST).
+const LONGEST: &str = "168h";
 /// Both hosts are this PC, whose loopback carries a frame whole: a link model meets one datagram a frame.
 const PATH_MTU_BYTES: i64 = 9000;
 
@@ -186,7 +188,10 @@ fn topology(args: &JoinArgs, mut link: Table) -> Result<Table, String> {
         (
             "run",
             table(vec![
-                ("duration", text(&args.duration)),
+                (
+                    "duration",
+                    text(args.duration.as_deref().unwrap_or(LONGEST)),
+                ),
                 ("seed", seed.into()),
             ]),
         ),
@@ -226,7 +231,7 @@ mod tests {
     fn args(programs: &[&str]) -> JoinArgs {
         JoinArgs {
             link: None,
-            duration: "5 s".to_owned(),
+            duration: None,
             seed: 7,
             quiet: true,
             full: false,
@@ -268,6 +273,8 @@ mod tests {
         let expected = ENDS.map(|(_, address)| Some(address.parse().unwrap()));
         assert_eq!(addresses, expected);
         assert_eq!(parsed.crossings().count(), 2);
+        // Where no duration was given, none is shown.
+        assert_eq!(parsed.run().planned(), None);
         assert!(parsed.is_all_local());
     }
 

@@ -2,12 +2,21 @@
 //! came out, as far as this host knows. The console cuts it, so what matters most comes first.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use hil_rundir::pipe::ChannelProgress;
 use hil_topology::{Channel, Topology};
 
 /// Where messages are counted, in the order of their way.
 const STAGES: [&str; 5] = ["published", "sent", "received", "taken", "recorded"];
+
+/// How long it has run, and of how long where that is planned.
+pub(super) fn of_time(elapsed: Duration, planned: Option<Duration>) -> String {
+    let planned = planned.map_or_else(String::new, |planned| {
+        format!(" / {:.0}", planned.as_secs_f64())
+    });
+    format!("{:6.1}{planned} s", elapsed.as_secs_f64())
+}
 
 /// `egm/right/command 3071→3070 | …`: counted at the first and at the last stage that is told.
 pub(super) fn of_channels<'a>(
@@ -50,6 +59,14 @@ mod tests {
     use super::*;
     use hil_teleoperation::Teleoperation;
     use hil_topology::registry::Registry;
+
+    #[test]
+    fn a_run_without_a_planned_end_shows_only_how_long_it_has_run() {
+        let elapsed = Duration::from_millis(2_540);
+        let planned = Some(Duration::from_secs(20));
+        assert_eq!(of_time(elapsed, planned), "   2.5 / 20 s");
+        assert_eq!(of_time(elapsed, None), "   2.5 s");
+    }
 
     #[test]
     fn commands_come_first_with_their_first_and_last_count() {

@@ -55,9 +55,10 @@ impl StatusPublisher {
         }
         self.told = Some((phase, WallInstant::now()));
         self.tell_service(phase, process_group, console);
-        let duration = topology.run().duration;
+        let planned = topology.run().planned();
         let processes = process_group.members().iter().map(process);
-        let duration_ns = u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX);
+        let duration_ns =
+            planned.map(|planned| u64::try_from(planned.as_nanos()).unwrap_or(u64::MAX));
         let mut status = RunStatus::new(phase, duration_ns, processes.collect());
         status.elsewhere = elsewhere.status();
         status.start_ns = process_group.started.map(Instant::as_ns);
@@ -76,8 +77,8 @@ impl StatusPublisher {
             .iter()
             .flat_map(|member| &member.progress);
         let channels = progress_line::of_channels(topology, progress);
-        let (elapsed_s, total_s) = (elapsed.as_secs_f64(), duration.as_secs_f64());
-        console.progress(&format!("{elapsed_s:6.1} / {total_s:.0} s  {channels}"));
+        let time = progress_line::of_time(elapsed, planned);
+        console.progress(&format!("{time}  {channels}"));
     }
 
     /// A tick of the watchdog says that the loop of the supervisor turns, which calls this, and those

@@ -74,25 +74,9 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
 mod tests {
     use hil_present::terminal::{canvas::Style, render};
     use hil_rundir::pipe::{CountByName, CounterGroup};
-    use hil_stats::histogram::Distribution;
 
     use super::*;
-    use crate::tests::sample::full;
-
-    fn flow(name: &str, frame_count: u64, lost: [u64; 2]) -> FlowMetrics {
-        FlowMetrics {
-            name: name.to_owned(),
-            frame_count,
-            byte_count: 64 * frame_count,
-            taken_count: frame_count - lost[0] - lost[1],
-            lost_by_network_count: lost[0],
-            lost_by_either_count: 0,
-            lost_by_harness_count: lost[1],
-            unknown_count: 0,
-            reordered_count: 0,
-            delay: Distribution::of_samples(&[5_000_000], ""),
-        }
-    }
+    use crate::tests::sample::{flow, full};
 
     #[test]
     fn flows_are_listed_with_what_was_lost_by_whom() {

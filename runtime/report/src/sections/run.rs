@@ -102,8 +102,8 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
         }
         NetworkVerdict::EmulatedLink => {
             let text = format!(
-                "an emulated link: a result about the model, not about a network; no process \
-                 skipped more than {limit} of its ticks"
+                "an emulated link: a result about the model, not about a network; the hosts kept up \
+                 (limit: {limit} of ticks, datagrams and frames)"
             );
             (Tone::Good, text)
         }
@@ -119,7 +119,7 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
         NetworkVerdict::ForeignProgram => {
             let text = format!(
                 "a foreign program took part over its own protocol: its answers are its and its \
-                 network's; no process of ours skipped more than {limit} of its ticks"
+                 network's; this host kept up (limit: {limit} of ticks)"
             );
             (Tone::Plain, text)
         }
@@ -129,8 +129,9 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
             (Tone::Caution, text.to_owned())
         }
         NetworkVerdict::NetworkResult => {
-            let text =
-                format!("a network result: no process skipped more than {limit} of its ticks");
+            let text = format!(
+                "a network result: the hosts kept up (limit: {limit} of ticks, datagrams and frames)"
+            );
             (Tone::Good, text)
         }
         NetworkVerdict::HostOverran { processes } => {
@@ -152,8 +153,16 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
             let text = format!("no verdict: records of other hosts are missing on {hosts}");
             (Tone::Caution, text)
         }
+        NetworkVerdict::FramesLost { channels } => {
+            let why = ": processes, queues or inlets of a host lost frames of";
+            no_result(&format!("{why} {}", channels.join(", ")))
+        }
         NetworkVerdict::TicksUnknown => {
             let text = "no verdict: a component left no count of its ticks";
+            (Tone::Caution, text.to_owned())
+        }
+        NetworkVerdict::HostUnknown => {
+            let text = "no verdict: nothing that ran tells whether the hosts kept up";
             (Tone::Caution, text.to_owned())
         }
     }

@@ -2,13 +2,15 @@
 
 use hil_core::case_study::Severity;
 
-use super::sample::{awkward, check_golden, empty, full, link};
+use super::sample::{awkward, check_golden, empty, flow, full, link};
 use crate::answer::{Answer, Clocks, HarmCount, Hurt, OccasionCount, Unresolved, Untested};
 use crate::assessment::Assessment;
-use crate::summary::{LinkKind, Outcome, RunSummary};
+use crate::summary::{ChannelFlows, LinkKind, Outcome, RunSummary};
 use crate::terminal::{Style, brief};
 use hil_present::Tone;
 use hil_present::units::JOINT;
+use hil_rundir::event::ProcessKind;
+use hil_rundir::pipe::{CountByName, CounterGroup};
 
 fn lost_loops(count: Option<u64>, own_count: u64, sent_count: u64) -> HarmCount {
     HarmCount {
@@ -165,6 +167,60 @@ fn without_a_network_or_a_score_nothing_was_tested() {
     let because = Untested::NoNetwork;
     let direct = tested(&is_virtual(LinkKind::SharedMemory));
     assert_eq!(direct, Hurt::NotTested { because });
+}
+
+/// Two programs of the user's with an emulated or a real link between them.
+fn own_programs(link: LinkKind) -> RunSummary {
+    let mut summary = run(lost_loops(None, 0, 0));
+    summary.harms.clear();
+    for process in &mut summary.processes {
+        if process.kind == ProcessKind::Component {
+            process.kind = ProcessKind::OwnProgram;
+        }
+        (process.tick_count, process.skipped_tick_count) = (None, None);
+    }
+    for channel in &mut summary.channels {
+        channel.link = link;
+    }
+    summary
+}
+
+#[test]
+fn programs_without_ticks_are_measured_by_what_the_gateways_and_inlets_lost() {
+    let measured = |summary: &RunSummary| {
+        let found = answer(summary);
+        let because = Untested::NoScore;
+        assert_eq!(found.hurt, Hurt::NotTested { because });
+        let page = brief(summary, 100, Style::Plain);
+        let words: Vec<&str> = page.split_whitespace().collect();
+        (found.measurement.is_valid, words.join(" "))
+    };
+    for kind in [LinkKind::Emulated, link("udp")] {
+        let mut summary = own_programs(kind);
+        let (is_valid, page) = measured(&summary);
+        assert_eq!(is_valid, Some(true), "{page}");
+        let frames = |inlet_lost_count| ChannelFlows {
+            channel: "first/second".to_owned(),
+            inlet_lost: CountByName::all(CounterGroup::Own, [("ring full", inlet_lost_count)])
+                .collect(),
+            flows: vec![flow("icmp", 4_000 - inlet_lost_count, [0, 0])],
+        };
+        // 0.1 % of 4 000 frames is 4.
+        for (lost_count, expected) in [(4, true), (5, false)] {
+            summary.flows = vec![frames(lost_count)];
+            let (is_valid, page) = measured(&summary);
+            assert_eq!(is_valid, Some(expected), "{page}");
+            assert_eq!(page.contains("lost frames of first/second"), !expected);
+        }
+        summary.flows.clear();
+        summary.directions.clear();
+        let (is_valid, page) = measured(&summary);
+        assert_eq!(is_valid, None, "{page}");
+        assert!(page.contains("unknown: nothing that ran tells"), "{page}");
+        summary.harms = vec![lost_loops(Some(0), 0, 40)];
+        let because = Unresolved::HostUnknown;
+        assert_eq!(answer(&summary).hurt, Hurt::NotResolvable { because });
+    }
 }
 
 #[test]

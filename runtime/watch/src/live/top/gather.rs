@@ -202,7 +202,9 @@ fn run_view(observer: &Observer, status: Option<&RunStatus>, window: Duration) -
         hosts_here: run.hosts().map(str::to_owned).collect(),
         state,
         elapsed_s: start_ns.map(|start_ns| seconds(now_ns.saturating_sub(start_ns))),
-        duration_s: status.map(|status| Duration::from_nanos(status.duration_ns).as_secs_f64()),
+        duration_s: status
+            .and_then(|status| status.duration_ns)
+            .map(|duration_ns| Duration::from_nanos(duration_ns).as_secs_f64()),
         window_s: window.as_secs_f64(),
     }
 }
