@@ -85,17 +85,14 @@ pub(crate) fn noted_steps(
                 channel,
                 what: What::LateStamp { file, index },
             }));
-            let (noted, what) = match kind {
-                RecordKind::Message => {
-                    let message = records.message(index);
-                    let noted = message.map(|(envelope, _)| published(&envelope));
-                    (noted, What::Message { file, index })
-                }
-                _ => {
-                    let record = net::record(records, index);
-                    let noted = record.as_ref().and_then(Noted::of);
-                    (noted, What::Record { file, index })
-                }
+            let (noted, what) = if *kind == RecordKind::Message {
+                let message = records.message(index);
+                let noted = message.map(|(envelope, _)| published(&envelope));
+                (noted, What::Message { file, index })
+            } else {
+                let record = net::record(records, index);
+                let noted = record.as_ref().and_then(Noted::of);
+                (noted, What::Record { file, index })
             };
             steps.extend(noted.map(|noted| Step {
                 at_ns: at_ns(channel, &noted),
