@@ -1,43 +1,36 @@
 //! The cart: goes as fast as it was told last, and reports 100 times a second where it is.
 
-use std::time::Duration;
-
-use hil_core::component::{Component, Output, Ports};
-use hil_core::time::{Instant, Tick};
+use hil_core::prelude::*;
 
 use crate::{Command, State};
 
 const PERIOD: Duration = Duration::from_millis(10);
 
 #[derive(Debug, Default)]
-pub(crate) struct Cart {
+struct Cart {
     position_m: f64,
     speed_mps: f64,
     moved_until: Option<Instant>,
-    state: Output<State>,
 }
 
-impl Component for Cart {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.input("cart/command", Self::on_command);
-        ports.output("cart/state", |own| &mut own.state);
-        ports.every(PERIOD, Self::on_tick);
-    }
+pub(crate) fn role() -> Box<dyn Role> {
+    Component::of(Cart::default())
+        .input("cart/command", |cart, _, command: &Command| {
+            cart.speed_mps = command.speed_mps;
+        })
+        .publish("cart/state", PERIOD, Cart::advance)
+        .into_role()
 }
 
 impl Cart {
-    fn on_command(&mut self, _now: Instant, command: &Command) {
-        self.speed_mps = command.speed_mps;
-    }
-
-    fn on_tick(&mut self, now: Instant, _tick: Tick) {
+    fn advance(&mut self, now: Instant, _tick: Tick) -> State {
         // The time that passed, not the period: a late tick stands for several.
         let passed = now.saturating_duration_since(self.moved_until.unwrap_or(now));
         self.moved_until = Some(now);
         self.position_m += self.speed_mps * passed.as_secs_f64();
-        self.state.send(State {
+        State {
             position_m: self.position_m,
             speed_mps: self.speed_mps,
-        });
+        }
     }
 }

@@ -9,40 +9,27 @@ mod cart;
 
 use std::process::ExitCode;
 
-use hil_core::case_study::{CaseStudy, ChannelSpec, ParameterError};
-use hil_core::component::{Component, Output, Ports, Role, into_role};
-use hil_core::time::Instant;
+use hil_core::prelude::*;
 use hil_runtime::Runtime;
 
 hil_core::message! {
     struct Command = "example.CartCommand.v1" { speed_mps: f64 }
-}
-hil_core::message! {
     struct State = "example.CartState.v1" { position_m: f64, speed_mps: f64 }
 }
 hil_core::parameters! {
     struct CartCase { gain_per_s: f64 = 5.0, in 0.0..=100.0; }
 }
 
-#[derive(Debug)]
-struct Controller {
-    gain_per_s: f64,
-    command: Output<Command>,
-}
-
-impl Component for Controller {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.input("cart/state", Self::on_state);
-        ports.output("cart/command", |own| &mut own.command);
-    }
-}
-
-impl Controller {
-    fn on_state(&mut self, _now: Instant, state: &State) {
-        self.command.send(Command {
-            speed_mps: self.gain_per_s * (0.5 - state.position_m),
-        });
-    }
+/// Has no state but its output port: answers every state of the cart with a command.
+fn controller(gain_per_s: f64) -> Box<dyn Role> {
+    let answer = move |command: &mut Output<Command>, _now: Instant, state: &State| {
+        let speed_mps = gain_per_s * (0.5 - state.position_m);
+        command.send(Command { speed_mps });
+    };
+    Component::of(Output::default())
+        .input("cart/state", answer)
+        .output("cart/command", |command| command)
+        .into_role()
 }
 
 impl CaseStudy for CartCase {
@@ -61,11 +48,8 @@ impl CaseStudy for CartCase {
 
     fn role(&self, name: &str) -> Option<Box<dyn Role>> {
         match name {
-            "controller" => Some(into_role(Controller {
-                gain_per_s: self.gain_per_s,
-                command: Output::default(),
-            })),
-            "cart" => Some(into_role(cart::Cart::default())),
+            "controller" => Some(controller(self.gain_per_s)),
+            "cart" => Some(cart::role()),
             _ => None,
         }
     }

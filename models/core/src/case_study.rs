@@ -74,9 +74,12 @@ pub trait CaseStudy: Sized + Debug + 'static {
         None
     }
 
-    /// What the robot did, from the messages of a finished run; nothing by default.
-    fn score(&self, _log: &RunLog) -> Score {
-        Score::default()
+    /// What the robot did, from the messages of a finished run; by default the mean of each of its errors.
+    fn score(&self, log: &RunLog) -> Score {
+        Score {
+            metrics: self.errors(log).iter().map(ErrorSeries::mean).collect(),
+            ..Score::default()
+        }
     }
 
     /// The robot's errors over time, to be held against what the network did at the time; none by

@@ -1,35 +1,23 @@
 //! A component: one role of a robot's loop as a state machine. It neither waits nor sends; it is
-//! handed messages and the time, and puts its own messages into its output ports.
+//! handed messages and the time, and gives its own messages to its output ports.
 //!
 //! ```
 //! use core::time::Duration;
-//! use hil_core::component::{Component, Output, Ports};
-//! use hil_core::time::{Instant, Tick};
+//! use hil_core::component::Component;
 //!
-//! hil_core::message! { pub struct Position = "example.Position.v1" { pub position_m: f64 } }
-//! hil_core::message! { pub struct Speed = "example.Speed.v1" { pub speed_mps: f64 } }
-//!
-//! /// Drives to the origin.
-//! #[derive(Debug, Default)]
-//! struct Controller { speed: Output<Speed>, position_m: f64 }
-//!
-//! impl Component for Controller {
-//!     fn ports(&self, ports: &mut Ports<Self>) {
-//!         ports.input("cart/position", Self::on_position);
-//!         ports.output("cart/speed", |own| &mut own.speed);
-//!         ports.every(Duration::from_millis(10), Self::on_tick);
-//!     }
+//! hil_core::message! {
+//!     pub struct Position = "example.Position.v1" { pub position_m: f64 }
+//!     pub struct Speed = "example.Speed.v1" { pub speed_mps: f64 }
 //! }
 //!
-//! impl Controller {
-//!     fn on_position(&mut self, _now: Instant, position: &Position) {
-//!         self.position_m = position.position_m;
-//!     }
-//!
-//!     fn on_tick(&mut self, _now: Instant, _tick: Tick) {
-//!         self.speed.send(Speed { speed_mps: -5.0 * self.position_m });
-//!     }
-//! }
+//! // Drives to the origin: its state is where the cart is.
+//! let controller = Component::of(0.0)
+//!     .input("cart/position", |position_m, _now, heard: &Position| *position_m = heard.position_m)
+//!     .publish("cart/speed", Duration::from_millis(10), |position_m, _now, _tick| Speed {
+//!         speed_mps: -5.0 * *position_m,
+//!     })
+//!     .into_role();
+//! assert_eq!(controller.outputs()[0].name, "cart/speed");
 //! ```
 
 use core::fmt::{self, Debug};
@@ -37,31 +25,6 @@ use core::time::Duration;
 
 use crate::message::{Message, MessageType};
 use crate::time::{Instant, PeriodicTimer, Tick};
-
-/// What a user writes: a controller, a robot model, a source of motion. One body of code runs in
-/// virtual and in real time.
-pub trait Component: Debug + Sized + 'static {
-    /// Declares the ports and what is called periodically; called once, before anything else.
-    fn ports(&self, ports: &mut Ports<Self>);
-
-    /// Called once before the first message and tick; periods begin at `now` too.
-    fn start(&mut self, _now: Instant) {}
-
-    /// Called when [`Component::next_tick`] or a period is due, before what is called periodically;
-    /// when nothing of its own is due, it does nothing.
-    fn tick(&mut self, _now: Instant) {}
-
-    /// When this component wants [`Component::tick`], beside its periods; `None` for never.
-    fn next_tick(&self) -> Option<Instant> {
-        None
-    }
-
-    /// Grid points of timers of its own that passed without a tick; those of periods are counted
-    /// anyway.
-    fn skipped_ticks(&self) -> u64 {
-        0
-    }
-}
 
 /// Messages an output port takes in one call of its component: a few for each of dozens of robots.
 pub const OUTPUT_CAPACITY: usize = 256;
@@ -129,33 +92,59 @@ pub struct Port {
     pub message: MessageType,
 }
 
-/// Hands the bytes of a message to a component; false when they are no message of the port.
-type Take<C> = Box<dyn Fn(&mut C, Instant, &[u8]) -> bool>;
-/// Finds an output port in its component.
-type Find<C> = Box<dyn for<'a> Fn(&'a mut C) -> &'a mut dyn AnyOutput>;
+/// Hands the bytes of a message to a state; false when they are no message of the port.
+type Take<S> = Box<dyn Fn(&mut S, Instant, &[u8]) -> bool>;
+/// Finds an output port in its state, by the port's number.
+type Find<S> = (
+    usize,
+    Box<dyn for<'a> Fn(&'a mut S) -> &'a mut dyn AnyOutput>,
+);
 
-/// The ports and periods of a component, as [`Component::ports`] declares them.
-pub struct Ports<C> {
+/// What a user writes: a controller, a robot model, a source of motion. It is a state `S`, functions for the
+/// messages of its input ports and for its periods, and its output ports. One body of code runs in virtual
+/// and in real time.
+pub struct Component<S> {
+    state: S,
     inputs: Vec<Port>,
-    takes: Vec<Take<C>>,
+    takes: Vec<Take<S>>,
     outputs: Vec<Port>,
-    finds: Vec<Find<C>>,
-    periods: Vec<Period<C>>,
+    finds: Vec<Find<S>>,
+    periods: Vec<Period<S>>,
+    start: Option<fn(&mut S, Instant)>,
+    timer: Option<Timer<S>>,
+    dropped_count: u64,
 }
 
-struct Period<C> {
+struct Period<S> {
     timer: PeriodicTimer,
-    call: fn(&mut C, Instant, Tick),
+    call: Box<dyn Fn(&mut S, Instant, Tick, Emit<'_>)>,
 }
 
-impl<C: 'static> Ports<C> {
-    const fn new() -> Self {
+/// A timer that a state keeps itself.
+#[derive(Debug)]
+pub struct Timer<S> {
+    /// When it is due next; `None` for never.
+    pub next: fn(&S) -> Option<Instant>,
+    /// Called when it or a period is due, before what is called periodically; does nothing where nothing of
+    /// its own is due.
+    pub tick: fn(&mut S, Instant),
+    /// Its points in time that passed without a call.
+    pub skipped: fn(&S) -> u64,
+}
+
+impl<S: Debug + 'static> Component<S> {
+    /// One that has this state and no port yet.
+    pub const fn of(state: S) -> Self {
         Self {
+            state,
             inputs: Vec::new(),
             takes: Vec::new(),
             outputs: Vec::new(),
             finds: Vec::new(),
             periods: Vec::new(),
+            start: None,
+            timer: None,
+            dropped_count: 0,
         }
     }
 
@@ -164,28 +153,40 @@ impl<C: 'static> Ports<C> {
     ///
     /// # Panics
     /// When there is an input of this name already.
-    pub fn input<M: Message>(&mut self, name: &'static str, take: fn(&mut C, Instant, &M)) {
+    #[must_use]
+    pub fn input<M: Message>(
+        mut self,
+        name: &'static str,
+        take: impl Fn(&mut S, Instant, &M) + 'static,
+    ) -> Self {
         declare::<M>(&mut self.inputs, name);
-        self.takes.push(Box::new(move |component, now, payload| {
+        self.takes.push(Box::new(move |state, now, payload| {
             // In place, or as a copy where the bytes are not aligned.
             if let Ok(message) = bytemuck::try_from_bytes(payload) {
-                take(component, now, message);
+                take(state, now, message);
             } else if let Ok(message) = bytemuck::try_pod_read_unaligned(payload) {
-                take(component, now, &message);
+                take(state, now, &message);
             } else {
                 return false;
             }
             true
         }));
+        self
     }
 
     /// Messages of the port that `find` returns go to the channel `name`.
     ///
     /// # Panics
     /// When there is an output of this name already.
-    pub fn output<M: Message>(&mut self, name: &'static str, find: fn(&mut C) -> &mut Output<M>) {
-        declare::<M>(&mut self.outputs, name);
-        self.finds.push(Box::new(move |component| find(component)));
+    #[must_use]
+    pub fn output<M: Message>(
+        mut self,
+        name: &'static str,
+        find: fn(&mut S) -> &mut Output<M>,
+    ) -> Self {
+        let port = declare::<M>(&mut self.outputs, name);
+        self.finds.push((port, Box::new(move |state| find(state))));
+        self
     }
 
     /// Calls `call` on the grid `start + n * period`, the first time at the start. A late call stands
@@ -193,27 +194,78 @@ impl<C: 'static> Ports<C> {
     ///
     /// # Panics
     /// When `period` is zero.
-    pub fn every(&mut self, period: Duration, call: fn(&mut C, Instant, Tick)) {
-        let timer = PeriodicTimer::new(period);
-        self.periods.push(Period { timer, call });
+    #[must_use]
+    pub fn every(
+        mut self,
+        period: Duration,
+        call: impl Fn(&mut S, Instant, Tick) + 'static,
+    ) -> Self {
+        self.periods.push(Period {
+            timer: PeriodicTimer::new(period),
+            call: Box::new(move |state, now, tick, _emit| call(state, now, tick)),
+        });
+        self
+    }
+
+    /// Publishes on the channel `name` what `make` returns, on the grid of [`Component::every`].
+    ///
+    /// # Panics
+    /// When there is an output of this name already, or `period` is zero.
+    #[must_use]
+    pub fn publish<M: Message>(
+        mut self,
+        name: &'static str,
+        period: Duration,
+        make: impl Fn(&mut S, Instant, Tick) -> M + 'static,
+    ) -> Self {
+        let port = declare::<M>(&mut self.outputs, name);
+        self.periods.push(Period {
+            timer: PeriodicTimer::new(period),
+            call: Box::new(move |state, now, tick, emit| {
+                emit(port, bytemuck::bytes_of(&make(state, now, tick)));
+            }),
+        });
+        self
+    }
+
+    /// Calls `start` once before the first message and tick; periods begin at its time too.
+    #[must_use]
+    pub fn start(mut self, start: fn(&mut S, Instant)) -> Self {
+        self.start = Some(start);
+        self
+    }
+
+    /// Calls the timer when it is due, beside the periods.
+    #[must_use]
+    pub fn timer(mut self, timer: Timer<S>) -> Self {
+        self.timer = Some(timer);
+        self
+    }
+
+    /// Hides the types of state and messages, with room in the output ports.
+    pub fn into_role(mut self) -> Box<dyn Role> {
+        for (_, find) in &self.finds {
+            find(&mut self.state).reserve();
+        }
+        Box::new(self)
     }
 }
 
-fn declare<M: Message>(ports: &mut Vec<Port>, name: &'static str) {
+fn declare<M: Message>(ports: &mut Vec<Port>, name: &'static str) -> usize {
     let is_new = ports.iter().all(|port| port.name != name);
     assert!(is_new, "a component declares its port {name} twice");
     let message = MessageType::of::<M>();
     ports.push(Port { name, message });
+    ports.len() - 1
 }
 
-impl<C> Debug for Ports<C> {
+impl<S: Debug> Debug for Component<S> {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            inputs, outputs, ..
-        } = self;
-        let mut ports = formatter.debug_struct("Ports");
-        ports.field("inputs", inputs).field("outputs", outputs);
-        ports.finish_non_exhaustive()
+        let mut all = formatter.debug_struct("Component");
+        all.field("state", &self.state)
+            .field("inputs", &self.inputs)
+            .field("outputs", &self.outputs);
+        all.finish_non_exhaustive()
     }
 }
 
@@ -242,7 +294,7 @@ impl<M: Message> AnyOutput for Output<M> {
 pub type Emit<'a> = &'a mut dyn FnMut(usize, &[u8]);
 
 /// A component whose message types are known only at run time: what a process runs and what the
-/// simulation drives. Made from any [`Component`] by [`into_role`].
+/// simulation drives. Made by [`Component::into_role`].
 pub trait Role: Debug {
     /// The input ports.
     fn inputs(&self) -> &[Port];
@@ -250,7 +302,7 @@ pub trait Role: Debug {
     /// The output ports.
     fn outputs(&self) -> &[Port];
 
-    /// See [`Component::start`]; what it sends stays in its ports until [`Role::flush`].
+    /// See [`Component::start`]; what it gives stays in its ports until [`Role::flush`].
     fn start(&mut self, now: Instant);
 
     /// Takes out what the output ports hold.
@@ -299,85 +351,67 @@ fn index_of(ports: &[Port], name: &str) -> usize {
     index.unwrap_or_else(|| panic!("no port is called {name}"))
 }
 
-/// Hides the message types of `component` behind [`Role`], with room in its output ports.
-///
-/// # Panics
-/// When it declares two ports of one side by one name, or a period of zero.
-pub fn into_role<C: Component>(mut component: C) -> Box<dyn Role> {
-    let mut ports = Ports::new();
-    component.ports(&mut ports);
-    for find in &ports.finds {
-        find(&mut component).reserve();
-    }
-    Box::new(ErasedComponent {
-        component,
-        ports,
-        dropped_count: 0,
-    })
-}
-
-#[derive(Debug)]
-struct ErasedComponent<C> {
-    component: C,
-    ports: Ports<C>,
-    dropped_count: u64,
-}
-
-impl<C: Component> Role for ErasedComponent<C> {
+impl<S: Debug + 'static> Role for Component<S> {
     fn inputs(&self) -> &[Port] {
-        &self.ports.inputs
+        &self.inputs
     }
 
     fn outputs(&self) -> &[Port] {
-        &self.ports.outputs
+        &self.outputs
     }
 
     fn flush(&mut self, emit: Emit<'_>) {
-        for (port, find) in self.ports.finds.iter().enumerate() {
-            self.dropped_count += find(&mut self.component).flush(port, emit);
+        for (port, find) in &self.finds {
+            self.dropped_count += find(&mut self.state).flush(*port, emit);
         }
     }
 
     fn start(&mut self, now: Instant) {
-        self.component.start(now);
-        for period in &mut self.ports.periods {
+        if let Some(start) = self.start {
+            start(&mut self.state, now);
+        }
+        for period in &mut self.periods {
             period.timer.start(now);
         }
     }
 
     fn message(&mut self, now: Instant, port: usize, payload: &[u8], emit: Emit<'_>) -> bool {
-        let Self {
-            component, ports, ..
-        } = self;
-        let take = ports.takes.get(port);
-        let is_taken = take.is_some_and(|take| take(component, now, payload));
+        let take = self.takes.get(port);
+        let is_taken = take.is_some_and(|take| take(&mut self.state, now, payload));
         self.flush(emit);
         is_taken
     }
 
     fn tick(&mut self, now: Instant, emit: Emit<'_>) {
-        let Self {
-            component, ports, ..
-        } = self;
-        component.tick(now);
-        for Period { timer, call } in &mut ports.periods {
+        if let Some(timer) = &self.timer {
+            (timer.tick)(&mut self.state, now);
+        }
+        for Period { timer, call } in &mut self.periods {
             if let Some(tick) = timer.poll(now) {
-                call(component, now, tick);
+                call(&mut self.state, now, tick, emit);
             }
         }
         self.flush(emit);
     }
 
     fn next_tick(&self) -> Option<Instant> {
-        let periods = self.ports.periods.iter();
+        let periods = self.periods.iter();
         let ticks = periods.filter_map(|period| period.timer.next());
-        ticks.chain(self.component.next_tick()).min()
+        let own = self
+            .timer
+            .as_ref()
+            .and_then(|timer| (timer.next)(&self.state));
+        ticks.chain(own).min()
     }
 
     fn skipped_ticks(&self) -> u64 {
-        let periods = self.ports.periods.iter();
+        let periods = self.periods.iter();
         let skipped = periods.map(|period| period.timer.skipped_total());
-        skipped.sum::<u64>() + self.component.skipped_ticks()
+        let own = self
+            .timer
+            .as_ref()
+            .map_or(0, |timer| (timer.skipped)(&self.state));
+        skipped.sum::<u64>() + own
     }
 
     fn outbox_dropped(&self) -> u64 {
@@ -391,9 +425,6 @@ mod tests {
 
     crate::message! {
         struct Small = "test.Small.v1" { value: u32, spare: [u32; 3] }
-    }
-
-    crate::message! {
         struct Large = "test.Large.v1" { value: [f64; 3] }
     }
 
@@ -411,18 +442,18 @@ mod tests {
         large: Output<Large>,
     }
 
-    impl Component for Both {
-        fn ports(&self, ports: &mut Ports<Self>) {
-            ports.input("a/small", Self::on_small);
-            ports.input("a/large", Self::on_large);
-            ports.output("b/small", |own| &mut own.small);
-            ports.output("b/large", |own| &mut own.large);
-            ports.every(Duration::from_nanos(10), Self::on_short);
-            ports.every(Duration::from_nanos(25), Self::on_long);
-        }
-    }
-
     impl Both {
+        fn role() -> Box<dyn Role> {
+            Component::of(Self::default())
+                .input("a/small", Self::on_small)
+                .input("a/large", Self::on_large)
+                .output("b/small", |own| &mut own.small)
+                .output("b/large", |own| &mut own.large)
+                .every(Duration::from_nanos(10), Self::on_short)
+                .every(Duration::from_nanos(25), Self::on_long)
+                .into_role()
+        }
+
         fn on_small(&mut self, _: Instant, message: &Small) {
             self.small.send(*message);
         }
@@ -451,7 +482,7 @@ mod tests {
 
     #[test]
     fn a_message_goes_to_the_method_of_its_port_and_a_wrong_size_to_none() {
-        let mut role = into_role(Both::default());
+        let mut role = Both::role();
         let small = small_of(7);
         let bytes = bytemuck::bytes_of(&small);
         let said = emitted(|emit| assert!(role.message(Instant::ZERO, 0, bytes, emit)));
@@ -466,7 +497,7 @@ mod tests {
 
     #[test]
     fn a_full_port_drops_and_counts() {
-        let mut role = into_role(Both::default());
+        let mut role = Both::role();
         let large = Large { value: [1.0; 3] };
         for calls in 1..3 {
             let said = emitted(|emit| role.hear(Instant::ZERO, "a/large", &large, emit));
@@ -489,22 +520,35 @@ mod tests {
         said: Output<Small>,
     }
 
-    impl Component for Greeter {
-        fn ports(&self, ports: &mut Ports<Self>) {
-            ports.output("b/small", |own| &mut own.said);
-        }
-
-        fn start(&mut self, _now: Instant) {
-            self.said.send(small_of(1));
-        }
-    }
-
     #[test]
     fn what_a_component_sends_when_it_starts_leaves_at_once() {
-        let mut role = into_role(Greeter::default());
+        let mut role = Component::of(Greeter::default())
+            .output("b/small", |own| &mut own.said)
+            .start(|own, _| own.said.send(small_of(1)))
+            .into_role();
         role.start(Instant::ZERO);
         assert_eq!(emitted(|emit| role.flush(emit)).len(), 1);
         assert!(emitted(|emit| role.flush(emit)).is_empty());
+    }
+
+    #[test]
+    fn a_period_publishes_without_a_port_of_the_state() {
+        let mut role = Component::of(7)
+            .input("a/small", |own, _, heard: &Small| *own += heard.value)
+            .publish("b/large", Duration::from_nanos(10), |own, _, tick| Large {
+                value: [f64::from(*own), tick.index as f64, 0.0],
+            })
+            .into_role();
+        role.start(Instant::ZERO);
+        let small = small_of(3);
+        let said = emitted(|emit| role.hear(Instant::ZERO, "a/small", &small, emit));
+        assert!(said.is_empty());
+        let said = emitted(|emit| role.tick(Instant::from_ns(20), emit));
+        let large = Large {
+            value: [10.0, 2.0, 0.0],
+        };
+        assert_eq!(said, [(0, bytemuck::bytes_of(&large).to_vec())]);
+        assert_eq!(role.skipped_ticks(), 2);
     }
 
     #[test]
@@ -524,7 +568,7 @@ mod tests {
 
     #[test]
     fn periods_are_called_on_their_grids_from_the_start_and_skipped_points_counted() {
-        let mut role = into_role(Both::default());
+        let mut role = Both::role();
         assert_eq!(role.next_tick(), None);
         role.start(Instant::from_ns(100));
         assert_eq!(role.next_tick(), Some(Instant::from_ns(100)));
@@ -543,9 +587,9 @@ mod tests {
     #[test]
     #[should_panic(expected = "declares its port a/small twice")]
     fn a_port_of_one_side_is_declared_once() {
-        let mut ports = Ports::<Both>::new();
-        ports.input("a/small", Both::on_small);
-        ports.output("a/small", |own| &mut own.small);
-        ports.input("a/small", Both::on_small);
+        let _refused = Component::of(Both::default())
+            .input("a/small", Both::on_small)
+            .output("a/small", |own| &mut own.small)
+            .input("a/small", Both::on_small);
     }
 }

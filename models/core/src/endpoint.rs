@@ -295,13 +295,10 @@ fn emitter<'a, E, O: OutputPort<Error = E>>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::component::{Component, Output, Ports, into_role};
+    use crate::component::{Component, Output};
 
     crate::message! {
         struct Command = "test.Command.v1" { speed_mps: f64 }
-    }
-
-    crate::message! {
         struct Status = "test.Status.v1" { position_m: [f64; 2] }
     }
 
@@ -310,11 +307,13 @@ mod tests {
         status: Output<Status>,
     }
 
-    impl Component for Robot {
-        fn ports(&self, ports: &mut Ports<Self>) {
-            ports.input("left/command", |_, _, _: &Command| {});
-            ports.input("right/command", |_, _, _: &Command| {});
-            ports.output("robot/status", |own| &mut own.status);
+    impl Robot {
+        fn role() -> Box<dyn Role> {
+            Component::of(Self::default())
+                .input("left/command", |_, _, _: &Command| {})
+                .input("right/command", |_, _, _: &Command| {})
+                .output("robot/status", |own| &mut own.status)
+                .into_role()
         }
     }
 
@@ -337,7 +336,7 @@ mod tests {
             outputs: vec![channel::<Status>("robot/status")],
         };
         change(&mut channels);
-        let found = channels.check(into_role(Robot::default()).as_ref());
+        let found = channels.check(Robot::role().as_ref());
         let found = found.map_err(|error| error.to_string());
         assert_eq!(found, expected.map_err(str::to_owned));
     }

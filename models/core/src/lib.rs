@@ -30,6 +30,7 @@ pub mod message;
 pub mod options;
 pub mod packed;
 pub mod plot;
+pub mod prelude;
 pub mod random;
 pub mod record;
 pub mod replay;

@@ -168,9 +168,9 @@ impl Envelope {
     }
 }
 
-/// Declares a message, or without a name a structure that messages contain, from one list of fields.
+/// Declares messages, or without a name structures that messages contain, each from one list of fields.
 ///
-/// It gives the structure a fixed layout without padding, the traits of plain data, the table of its
+/// It gives each structure a fixed layout without padding, the traits of plain data, the table of its
 /// fields ([`Message::FIELDS`]) and, with a name, [`Message`]. The build fails when the name has no
 /// version, when the size is not the one stated, when the fields leave a gap, or when a field is no
 /// number, array or structure of such. The size may be left out.
@@ -206,10 +206,10 @@ impl Envelope {
 /// ```
 #[macro_export]
 macro_rules! message {
-    ($(#[$meta:meta])* $vis:vis struct $structure:ident
+    ($($(#[$meta:meta])* $vis:vis struct $structure:ident
         $(= $name:literal)? $(, $size:literal bytes)? {
         $($(#[$field_meta:meta])* $field_vis:vis $field:ident: $kind:ty),+ $(,)?
-    }) => {
+    })+) => {$(
         $(#[$meta])*
         #[derive(Debug, Clone, Copy, PartialEq, $crate::bytemuck::Pod, $crate::bytemuck::Zeroable)]
         #[bytemuck(crate = "hil_core::bytemuck")]
@@ -264,7 +264,7 @@ macro_rules! message {
                 const FIELDS: &'static [$crate::layout::Field] = Self::LAYOUT;
             }
         )?
-    };
+    )+};
 }
 
 /// Largest alignment of a message: it follows the [`Envelope`] in shared memory and in record files.

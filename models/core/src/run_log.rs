@@ -381,6 +381,28 @@ impl RunLog {
         })
     }
 
+    /// The messages of `channel`, each with the newest one of `other` whose stamp plus `shift_ns` is not later.
+    /// Without a shift, stamps of clocks that are not aligned do not compare: there is no newest one then.
+    pub fn with_newest<'a, A: Message, B: Message>(
+        &'a self,
+        channel: &str,
+        other: &str,
+        shift_ns: Option<i64>,
+    ) -> impl Iterator<Item = (Instant, A, Option<B>)> + use<'a, A, B> {
+        let shift_ns = shift_ns.or_else(|| self.has_one_clock().then_some(0));
+        let mut others = self.messages::<B>(other).peekable();
+        let mut newest = None;
+        self.messages::<A>(channel).map(move |(at, message)| {
+            let is_there = |sent: Instant| {
+                shift_ns.is_some_and(|shift_ns| sent.as_ns().saturating_add(shift_ns) <= at.as_ns())
+            };
+            while let Some((_, other)) = others.next_if(|next| is_there(next.0)) {
+                newest = Some(other);
+            }
+            (at, message, newest)
+        })
+    }
+
     /// Channel names with their message counts.
     pub fn counts(&self) -> impl Iterator<Item = (&str, usize)> {
         self.channels

@@ -132,6 +132,8 @@ pub struct MessageRef {
 /// at the time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorSeries {
+    /// Snake-case name with unit suffix, e.g. `joint_error_rad`.
+    pub name: &'static str,
     /// The words a report prints, e.g. `joint error of the right arm`.
     pub label: &'static str,
     /// SI unit.
@@ -141,6 +143,22 @@ pub struct ErrorSeries {
     pub clock_of: &'static str,
     /// Times in ascending order, and magnitudes of the error.
     pub samples: Vec<(Instant, f64)>,
+}
+
+impl ErrorSeries {
+    /// Their mean over the run.
+    pub fn mean(&self) -> Metric {
+        let count = self.samples.len();
+        let sum: f64 = self.samples.iter().map(|sample| sample.1).sum();
+        Metric {
+            name: self.name,
+            label: self.label,
+            value: (count > 0).then(|| sum / count as f64),
+            interval: None,
+            unit: self.unit,
+            method: format!("mean of {count} samples; they depend on each other: no interval"),
+        }
+    }
 }
 
 impl MessageRef {

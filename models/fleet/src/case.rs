@@ -12,7 +12,7 @@ use crate::scenario::{Scenario, Scene, WorldParameters};
 use crate::score;
 use crate::world::Vehicle;
 use hil_core::case_study::{CaseStudy, ChannelSpec, ParameterError};
-use hil_core::component::{Role, into_role};
+use hil_core::component::Role;
 use hil_core::run_log::RunLog;
 use hil_core::score::{ErrorSeries, Score};
 use hil_core::study::{Batch, into_batch};
@@ -90,14 +90,11 @@ impl CaseStudy for Fleet {
         } = &self.parameters;
         let (fleets, scene) = (*fleets, &self.scene);
         match name {
-            "controller" => Some(into_role(Controller::new(
-                scene,
-                coordinator,
-                missions,
-                fleets,
-                self.seed,
-            ))),
-            "robots" => Some(into_role(Robots::new(scene, robot, fleets, self.seed))),
+            "controller" => {
+                let controller = Controller::new(scene, coordinator, missions, fleets, self.seed);
+                Some(controller.into_role())
+            }
+            "robots" => Some(Robots::new(scene, robot, fleets, self.seed).into_role()),
             _ => None,
         }
     }

@@ -10,7 +10,7 @@ use crate::coordinator::parameters::CoordinatorParameters;
 use crate::messages::{Authority, Mission, State, ToRobot};
 use crate::mission::{MissionParameters, MissionSource};
 use crate::scenario::Scene;
-use hil_core::component::{Component, OUTPUT_CAPACITY, Output, Ports};
+use hil_core::component::{Component, OUTPUT_CAPACITY, Output, Role, Timer};
 use hil_core::random::RandomStream;
 use hil_core::time::{Instant, PeriodicTimer};
 
@@ -71,18 +71,25 @@ pub(crate) fn coordinator_of(
 }
 
 impl Controller {
+    /// The role of it.
+    pub fn into_role(self) -> Box<dyn Role> {
+        Component::of(self)
+            .input(FLEET_STATE, Self::on_state)
+            .output(FLEET_AUTHORITY, |own| &mut own.authority)
+            .output(FLEET_MISSION, |own| &mut own.mission)
+            .start(Self::start)
+            .timer(Timer {
+                next: Self::next_tick,
+                tick: Self::tick,
+                skipped: Self::skipped_ticks,
+            })
+            .into_role()
+    }
+
     fn on_state(&mut self, now: Instant, state: &State) {
         if let Some(beat) = self.fleets.get_mut(state.header.fleet_id as usize) {
             beat.coordinator.on_state(now, state);
         }
-    }
-}
-
-impl Component for Controller {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.input(FLEET_STATE, Self::on_state);
-        ports.output(FLEET_AUTHORITY, |own| &mut own.authority);
-        ports.output(FLEET_MISSION, |own| &mut own.mission);
     }
 
     fn start(&mut self, now: Instant) {

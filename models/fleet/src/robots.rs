@@ -5,7 +5,7 @@ use crate::case::{FLEET_AUTHORITY, FLEET_MISSION, FLEET_STATE, FLEET_TRUTH};
 use crate::messages::{Authority, Header, Mission, State, Truth};
 use crate::robot::{Robot, RobotParameters};
 use crate::scenario::Scene;
-use hil_core::component::{Component, Output, Ports};
+use hil_core::component::{Component, Output, Role, Timer};
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
@@ -108,12 +108,21 @@ pub fn robot_stream(seed: u64, fleet_id: u32, robot_id: u32) -> RandomStream {
     RandomStream::new(seed, &format!("fleet/{fleet_id}/robot/{robot_id}"))
 }
 
-impl Component for Robots {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.input(FLEET_AUTHORITY, Self::on_authority);
-        ports.input(FLEET_MISSION, Self::on_mission);
-        ports.output(FLEET_STATE, |own| &mut own.state);
-        ports.output(FLEET_TRUTH, |own| &mut own.truth);
+impl Robots {
+    /// The role of them.
+    pub fn into_role(self) -> Box<dyn Role> {
+        Component::of(self)
+            .input(FLEET_AUTHORITY, Self::on_authority)
+            .input(FLEET_MISSION, Self::on_mission)
+            .output(FLEET_STATE, |own| &mut own.state)
+            .output(FLEET_TRUTH, |own| &mut own.truth)
+            .start(Self::start)
+            .timer(Timer {
+                next: Self::next_tick,
+                tick: Self::tick,
+                skipped: Self::skipped_ticks,
+            })
+            .into_role()
     }
 
     fn start(&mut self, now: Instant) {

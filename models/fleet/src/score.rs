@@ -191,6 +191,7 @@ pub(crate) fn errors(case: &Fleet, log: &RunLog) -> Vec<ErrorSeries> {
         samples.push((now, referee.standing_count() as f64));
     });
     vec![ErrorSeries {
+        name: "standing_count",
         label: "robots standing still on a mission",
         unit: "1",
         clock_of: FLEET_TRUTH,

@@ -10,26 +10,17 @@
 //! integrates the speed and reports where it is. Everything a larger case has, this one has in small.
 #![forbid(unsafe_code)]
 
-mod score;
-
-use core::time::Duration;
-
-use hil_core::case_study::{CaseStudy, ChannelSpec, ErrorSeries, ParameterError, Score};
-use hil_core::component::{Component, Output, Ports, Role, into_role};
-use hil_core::run_log::RunLog;
-use hil_core::time::{Instant, Tick};
+use hil_core::prelude::*;
 
 hil_core::message! {
     /// Controller to robot: the speed to drive.
     pub struct ShuttleCommand = "hil.ShuttleCommand.v1", 16 bytes {
         /// Commanded speed along the rail.
         pub speed_mps: f64,
-        /// Where the controller wants the cart, for the score.
+        /// Where the controller wants the cart.
         pub target_m: f64,
     }
-}
 
-hil_core::message! {
     /// Robot to controller: where the cart is.
     pub struct ShuttleStatus = "hil.ShuttleStatus.v1", 8 bytes {
         /// Position along the rail.
@@ -38,8 +29,8 @@ hil_core::message! {
 }
 
 hil_core::parameters! {
-    /// `[case.parameters]` of the shuttle.
-    pub struct ShuttleParameters {
+    /// The case study, which is its parameters.
+    pub struct Shuttle {
         /// Control and reporting rate, Hz.
         rate_hz: f64 = 100.0, in 1.0..=10_000.0;
         /// Proportional gain, per second.
@@ -47,18 +38,6 @@ hil_core::parameters! {
         /// Speed limit of the cart, m/s.
         speed_max_mps: f64 = 1.0, in 0.0..=10.0;
     }
-}
-
-impl ShuttleParameters {
-    fn period(&self) -> Duration {
-        Duration::from_secs_f64(1.0 / self.rate_hz)
-    }
-}
-
-/// The case study.
-#[derive(Debug, Clone)]
-pub struct Shuttle {
-    parameters: ShuttleParameters,
 }
 
 impl CaseStudy for Shuttle {
@@ -70,115 +49,74 @@ impl CaseStudy for Shuttle {
         ChannelSpec::of::<ShuttleStatus>("shuttle/status", "robot", "controller"),
     ];
     const SCORE_CLOCK: Option<&'static str> = Some("shuttle/status");
-    type Parameters = ShuttleParameters;
+    type Parameters = Self;
 
-    fn new(parameters: Self::Parameters, _seed: u64) -> Result<Self, ParameterError> {
-        parameters.check()?;
-        Ok(Self { parameters })
+    fn new(parameters: Self, _seed: u64) -> Result<Self, ParameterError> {
+        parameters.check().map(|()| parameters)
     }
 
     fn role(&self, name: &str) -> Option<Box<dyn Role>> {
-        match name {
-            "controller" => Some(into_role(Controller {
-                parameters: self.parameters.clone(),
-                command: Output::default(),
-                position_m: 0.0,
-            })),
-            "robot" => Some(into_role(Robot {
-                period: self.parameters.period(),
-                status: Output::default(),
-                moved_until: Instant::ZERO,
-                speed_mps: 0.0,
-                position_m: 0.0,
-            })),
-            _ => None,
-        }
+        let (case, period) = (self.clone(), Duration::from_secs_f64(1.0 / self.rate_hz));
+        Some(match name {
+            // Its state is where the cart was last.
+            "controller" => Component::of(0.0)
+                .input("shuttle/status", |position_m, _, status: &ShuttleStatus| {
+                    *position_m = status.position_m;
+                })
+                .publish("shuttle/command", period, move |position_m, _, tick| {
+                    // Two seconds at one metre, two at zero.
+                    let target_m = f64::from(tick.index as f64 / case.rate_hz % 4.0 < 2.0);
+                    let speed_mps = case.gain_per_s * (target_m - *position_m);
+                    ShuttleCommand {
+                        speed_mps: speed_mps.clamp(-case.speed_max_mps, case.speed_max_mps),
+                        target_m,
+                    }
+                })
+                .into_role(),
+            "robot" => Component::of(Cart::default())
+                .input("shuttle/command", |cart, now, command: &ShuttleCommand| {
+                    cart.advance(now);
+                    cart.speed_mps = command.speed_mps;
+                })
+                .publish("shuttle/status", period, |cart, now, _| cart.advance(now))
+                .into_role(),
+            _ => return None,
+        })
     }
 
+    /// By how much the cart's speed from status to status misses the newest command sent by the former:
+    /// what a command that comes later than a period, or not at all, leaves undone.
     fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {
-        score::errors(log)
-    }
-
-    fn score(&self, log: &RunLog) -> Score {
-        score::score(log)
-    }
-}
-
-/// Half the period of the square wave the controller follows.
-const HALF_WAVE_S: f64 = 2.0;
-
-#[derive(Debug)]
-struct Controller {
-    parameters: ShuttleParameters,
-    command: Output<ShuttleCommand>,
-    position_m: f64,
-}
-
-impl Component for Controller {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.input("shuttle/status", Self::on_status);
-        ports.output("shuttle/command", |own| &mut own.command);
-        ports.every(self.parameters.period(), Self::on_tick);
-    }
-}
-
-impl Controller {
-    fn on_status(&mut self, _now: Instant, status: &ShuttleStatus) {
-        self.position_m = status.position_m;
-    }
-
-    fn on_tick(&mut self, _now: Instant, tick: Tick) {
-        let ShuttleParameters {
-            rate_hz,
-            gain_per_s,
-            speed_max_mps,
-        } = self.parameters;
-        let phase_s = (tick.index as f64 / rate_hz).rem_euclid(2.0 * HALF_WAVE_S);
-        let target_m = if phase_s < HALF_WAVE_S { 1.0 } else { 0.0 };
-        let speed_mps = gain_per_s * (target_m - self.position_m);
-        self.command.send(ShuttleCommand {
-            speed_mps: speed_mps.clamp(-speed_max_mps, speed_max_mps),
-            target_m,
+        let mut before: Option<(Instant, ShuttleStatus, Option<ShuttleCommand>)> = None;
+        let statuses = log.with_newest("shuttle/status", "shuttle/command", None);
+        let samples = statuses.filter_map(|(at, status, command)| {
+            let (from, was, told) = before.replace((at, status, command))?;
+            let driven_mps = (status.position_m - was.position_m) / at.seconds_since(from);
+            Some((at, (told?.speed_mps - driven_mps).abs())).filter(|_| at > from)
         });
+        vec![ErrorSeries {
+            name: "speed_error_mps",
+            label: "error of the cart's speed",
+            unit: "m/s",
+            clock_of: "shuttle/status",
+            samples: samples.collect(),
+        }]
     }
 }
 
-#[derive(Debug)]
-struct Robot {
-    period: Duration,
-    status: Output<ShuttleStatus>,
+#[derive(Debug, Default)]
+struct Cart {
     moved_until: Instant,
     speed_mps: f64,
     position_m: f64,
 }
 
-impl Component for Robot {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.input("shuttle/command", Self::on_command);
-        ports.output("shuttle/status", |own| &mut own.status);
-        ports.every(self.period, Self::on_tick);
-    }
-}
-
-impl Robot {
-    fn on_command(&mut self, now: Instant, command: &ShuttleCommand) {
-        self.advance(now);
-        self.speed_mps = command.speed_mps;
-    }
-
-    fn on_tick(&mut self, now: Instant, _tick: Tick) {
-        self.advance(now);
-        self.status.send(ShuttleStatus {
-            position_m: self.position_m,
-        });
-    }
-
+impl Cart {
     /// Integrates with the time that really passed, not with the nominal period.
-    fn advance(&mut self, now: Instant) {
+    fn advance(&mut self, now: Instant) -> ShuttleStatus {
         self.position_m += self.speed_mps * now.seconds_since(self.moved_until);
         self.moved_until = now;
+        let position_m = self.position_m;
+        ShuttleStatus { position_m }
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -22,7 +22,7 @@ use hil_arm::egm::parameters::GuidedArms;
 use hil_arm::yumi::arm::Arm;
 use hil_arm::yumi::inverse::Reach;
 use hil_arm::yumi::{JOINT_COUNT, Pose};
-use hil_core::component::{Component, Output, Ports};
+use hil_core::component::{Component, Output, Role, Timer};
 use hil_core::time::Instant;
 
 /// Frames farther apart than this count as one this far apart: after an outage the arm does not
@@ -250,37 +250,38 @@ impl Controller {
     }
 }
 
-impl Component for Controller {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.input(HUMAN_FRAME, Self::on_frame);
-        ports.input(EGM_RIGHT_FEEDBACK, |own, now, feedback| {
-            own.on_feedback(now, Side::Right, feedback);
-        });
-        ports.input(EGM_LEFT_FEEDBACK, |own, now, feedback| {
-            own.on_feedback(now, Side::Left, feedback);
-        });
-        ports.input(MOTION_RESPONSE, |own, _, response| {
-            own.client.on_response(response);
-        });
-        ports.output(EGM_RIGHT_COMMAND, |own| &mut own.arms[0].output);
-        ports.output(EGM_LEFT_COMMAND, |own| &mut own.arms[1].output);
-        ports.output(MOTION_REQUEST, |own| &mut own.request);
-        if self.parameters.send == SendPolicy::Free {
-            let period = Duration::from_secs_f64(1.0 / self.parameters.send_hz());
-            ports.every(period, |own, _, _| {
-                own.arms.iter_mut().for_each(ArmSender::send);
+impl Controller {
+    pub(crate) fn into_role(self) -> Box<dyn Role> {
+        let free = (self.parameters.send == SendPolicy::Free).then(|| self.parameters.send_hz());
+        let component = Component::of(self)
+            .input(HUMAN_FRAME, Self::on_frame)
+            .input(EGM_RIGHT_FEEDBACK, |own, now, feedback| {
+                own.on_feedback(now, Side::Right, feedback);
+            })
+            .input(EGM_LEFT_FEEDBACK, |own, now, feedback| {
+                own.on_feedback(now, Side::Left, feedback);
+            })
+            .input(MOTION_RESPONSE, |own, _, response| {
+                own.client.on_response(response);
+            })
+            .output(EGM_RIGHT_COMMAND, |own| &mut own.arms[0].output)
+            .output(EGM_LEFT_COMMAND, |own| &mut own.arms[1].output)
+            .output(MOTION_REQUEST, |own| &mut own.request)
+            .timer(Timer {
+                next: |own| own.client.next_ask(),
+                tick: |own, now| {
+                    if let Some(request) = own.client.ask(now) {
+                        own.request.send(request);
+                    }
+                },
+                skipped: |_| 0,
             });
-        }
-    }
-
-    fn tick(&mut self, now: Instant) {
-        if let Some(request) = self.client.ask(now) {
-            self.request.send(request);
-        }
-    }
-
-    fn next_tick(&self) -> Option<Instant> {
-        self.client.next_ask()
+        let Some(send_hz) = free else {
+            return component.into_role();
+        };
+        let period = Duration::from_secs_f64(1.0 / send_hz);
+        let send = |own: &mut Self, _, _| own.arms.iter_mut().for_each(ArmSender::send);
+        component.every(period, send).into_role()
     }
 }
 

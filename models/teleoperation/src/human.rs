@@ -6,7 +6,7 @@ use core::time::Duration;
 use crate::HUMAN_FRAME;
 use crate::messages::HumanFrame;
 use crate::motion::Player;
-use hil_core::component::{Component, Output, Ports};
+use hil_core::component::{Component, Role};
 use hil_core::time::{Instant, Tick, duration_ns};
 
 /// The role.
@@ -14,7 +14,6 @@ use hil_core::time::{Instant, Tick, duration_ns};
 pub(crate) struct Human {
     player: Player,
     frame_period: Duration,
-    frame: Output<HumanFrame>,
 }
 
 impl Human {
@@ -22,28 +21,28 @@ impl Human {
         Self {
             player,
             frame_period,
-            frame: Output::default(),
         }
     }
 
-    fn on_tick(&mut self, _now: Instant, tick: Tick) {
+    pub(crate) fn into_role(self) -> Box<dyn Role> {
+        let period = self.frame_period;
+        let component = Component::of(self);
+        component
+            .publish(HUMAN_FRAME, period, Self::frame)
+            .into_role()
+    }
+
+    fn frame(&mut self, _now: Instant, tick: Tick) -> HumanFrame {
         // The capture samples on its grid even when this process was late.
         let index = i64::try_from(tick.index).unwrap_or(i64::MAX);
         let source_time_ns = index.saturating_mul(duration_ns(self.frame_period));
         let pose = self.player.at(source_time_ns as f64 * 1e-9);
-        self.frame.send(HumanFrame {
+        HumanFrame {
             frame_index: tick.index,
             source_time_ns,
             root: pose.root.into(),
             right_hand: pose.right_hand.into(),
             left_hand: pose.left_hand.into(),
-        });
-    }
-}
-
-impl Component for Human {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.output(HUMAN_FRAME, |own| &mut own.frame);
-        ports.every(self.frame_period, Self::on_tick);
+        }
     }
 }

@@ -77,7 +77,7 @@ use hil_arm::egm::messages::{
 };
 use hil_arm::egm::parameters::ControllerSettings;
 use hil_core::case_study::{CaseStudy, ChannelSpec, ErrorSeries, ParameterError, Score};
-use hil_core::component::{Role, into_role};
+use hil_core::component::Role;
 use hil_core::plot::PlotSeries;
 use hil_core::random::RandomStream;
 use hil_core::replay::Replay;
@@ -187,12 +187,12 @@ impl CaseStudy for Teleoperation {
 
     fn role(&self, name: &str) -> Option<Box<dyn Role>> {
         match name {
-            "human" => Some(into_role(Human::new(
-                self.player(),
-                self.parameters.frame_period(),
-            ))),
-            "controller" => Some(into_role(Controller::new(self.parameters.clone()))),
-            "robot" => Some(into_role(Robot::new(self.settings))),
+            "human" => {
+                let human = Human::new(self.player(), self.parameters.frame_period());
+                Some(human.into_role())
+            }
+            "controller" => Some(Controller::new(self.parameters.clone()).into_role()),
+            "robot" => Some(Robot::new(self.settings).into_role()),
             _ => None,
         }
     }

@@ -13,7 +13,7 @@ use hil_arm::egm::messages::{
     EgmArrival, EgmCommand, EgmEvent, EgmEventKind, EgmFeedback, MotionArrival, MotionRequest, Side,
 };
 use hil_arm::egm::parameters::ControllerSettings;
-use hil_core::component::{Emit, Role, into_role};
+use hil_core::component::{Emit, Role};
 use hil_core::replay::Replay;
 use hil_core::run_log::RunLog;
 use hil_core::time::Instant;
@@ -31,7 +31,7 @@ pub(crate) fn replay(settings: ControllerSettings, log: &RunLog) -> Replay {
         return replay;
     };
     let mut recorded = Recorded::read(log, start);
-    let mut robot = into_role(Robot::new(settings));
+    let mut robot = Robot::new(settings).into_role();
     let ports = [EGM_RIGHT_FEEDBACK, EGM_LEFT_FEEDBACK].map(|name| robot.output(name));
     let end = recorded.end();
     let mut compare = |port: usize, payload: &[u8]| {

@@ -13,7 +13,7 @@ use crate::{
 };
 use hil_arm::egm::parameters::RestartPolicy;
 use hil_core::case_study::{CaseStudy, channels_of};
-use hil_core::component::{Port, into_role};
+use hil_core::component::Port;
 use hil_core::endpoint::{Endpoint, InputPort, OutputPort, PortError};
 use hil_core::message::Envelope;
 use hil_core::random::RandomStream;
@@ -259,7 +259,7 @@ fn live(case: &Teleoperation, heard: &RunLog, begin: Instant, end: Instant) -> (
             log: Rc::clone(&log),
         })
     };
-    let role = into_role(Robot::new(case.settings));
+    let role = Robot::new(case.settings).into_role();
     let stated = channels_of(Teleoperation::NAME, Teleoperation::CHANNELS, "robot");
     let mut endpoint = Endpoint::join(role, &stated, waiting, recorder).unwrap();
     match endpoint.start(begin) {

@@ -21,7 +21,7 @@ use hil_arm::egm::messages::{
 use hil_arm::egm::parameters::ControllerSettings;
 use hil_arm::yumi::Joints;
 use hil_arm::yumi::arm::{Arm, LEFT_START_RAD, RIGHT_START_RAD};
-use hil_core::component::{Component, Output, Ports};
+use hil_core::component::{Component, Output, Role};
 use hil_core::time::{Instant, Tick, duration_ns};
 
 /// Where the arms are at the robot's start, right then left.
@@ -130,27 +130,26 @@ impl Robot {
     }
 }
 
-impl Component for Robot {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.input(EGM_RIGHT_COMMAND, |own, now, command| {
-            own.on_command(now, Side::Right, command);
-        });
-        ports.input(EGM_LEFT_COMMAND, |own, now, command| {
-            own.on_command(now, Side::Left, command);
-        });
-        ports.input(MOTION_REQUEST, Self::on_request);
-        ports.output(EGM_RIGHT_FEEDBACK, |own| &mut own.feedback[0]);
-        ports.output(EGM_LEFT_FEEDBACK, |own| &mut own.feedback[1]);
-        ports.output(MOTION_RESPONSE, |own| &mut own.response);
-        ports.output(EGM_EVENT, |own| &mut own.event);
-        ports.output(EGM_RECEIVED, |own| &mut own.command_received);
-        ports.output(MOTION_RECEIVED, |own| &mut own.request_received);
-        ports.every(self.period, Self::on_tick);
-    }
-
-    fn start(&mut self, now: Instant) {
-        self.started = Some(now);
-        self.next_cycle = 0;
+impl Robot {
+    pub(crate) fn into_role(self) -> Box<dyn Role> {
+        let period = self.period;
+        Component::of(self)
+            .input(EGM_RIGHT_COMMAND, |own, now, command| {
+                own.on_command(now, Side::Right, command);
+            })
+            .input(EGM_LEFT_COMMAND, |own, now, command| {
+                own.on_command(now, Side::Left, command);
+            })
+            .input(MOTION_REQUEST, Self::on_request)
+            .output(EGM_RIGHT_FEEDBACK, |own| &mut own.feedback[0])
+            .output(EGM_LEFT_FEEDBACK, |own| &mut own.feedback[1])
+            .output(MOTION_RESPONSE, |own| &mut own.response)
+            .output(EGM_EVENT, |own| &mut own.event)
+            .output(EGM_RECEIVED, |own| &mut own.command_received)
+            .output(MOTION_RECEIVED, |own| &mut own.request_received)
+            .every(period, Self::on_tick)
+            .start(|own, now| (own.started, own.next_cycle) = (Some(now), 0))
+            .into_role()
     }
 }
 

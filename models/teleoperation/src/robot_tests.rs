@@ -9,7 +9,7 @@ use hil_arm::egm::messages::{
 use hil_arm::egm::parameters::{EgmParameters, GuidedArms, Preset, StartMode};
 use hil_arm::yumi::Pose;
 use hil_arm::yumi::arm::POSITION_MAX_RAD;
-use hil_core::component::{Role, into_role};
+use hil_core::component::Role;
 use hil_core::message::Message;
 
 const CYCLE_NS: i64 = 4_000_000;
@@ -41,7 +41,7 @@ impl Bench {
     }
 
     fn with(settings: ControllerSettings) -> Self {
-        let mut robot = into_role(Robot::new(settings));
+        let mut robot = Robot::new(settings).into_role();
         robot.start(Instant::ZERO);
         Self {
             robot,

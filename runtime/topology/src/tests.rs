@@ -26,7 +26,7 @@ use hil_fleet::Fleet;
 use hil_link::delay::DelayLaw;
 use hil_link::loss::LossLaw;
 use hil_link::spec::LinkSpec;
-use hil_shuttle::{Shuttle, ShuttleParameters};
+use hil_shuttle::Shuttle;
 use serde::{Deserialize, Serialize};
 
 use super::*;
@@ -237,8 +237,8 @@ fn what_a_file_leaves_out_has_the_documented_default() {
     assert_eq!(topology.crossings().count(), 0);
     // A parameter the file does not say is the case's own default.
     let parameters = &topology.case().unwrap().parameters;
-    let parameters = ShuttleParameters::deserialize(parameters.clone()).unwrap();
-    assert_eq!(parameters, ShuttleParameters::default());
+    let parameters = Shuttle::deserialize(parameters.clone()).unwrap();
+    assert_eq!(parameters, Shuttle::default());
 }
 
 #[test]

@@ -109,7 +109,7 @@ fn a_live_run_becomes_a_page_with_the_figures_of_its_summary() {
         published.as_str(),
         "shuttle/command",
         "completed",
-        "distance travelled",
+        "error of the cart",
         "shared memory",
     ] {
         assert!(text.contains(words), "{words}");

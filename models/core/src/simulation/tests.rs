@@ -5,32 +5,20 @@ use std::collections::BTreeMap;
 
 use super::*;
 use crate::case_study::ChannelSpec;
-use crate::component::{Component, Output, Ports, into_role};
+use crate::component::{Component, Output, Role, Timer};
 use crate::link_model::PerfectLink;
-use crate::time::Tick;
 
 crate::message! {
     struct Status = "test.Status.v1" { position_m: f64 }
 }
 
 /// Tells the record where it is, and nobody listens.
-#[derive(Debug, Default)]
-struct Diarist {
-    diary: Output<Status>,
-}
-
-impl Component for Diarist {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        ports.input("a/heard", |_, _, _: &Status| {});
-        ports.output("a/diary", |own| &mut own.diary);
-        ports.every(Duration::from_millis(100), Self::on_tick);
-    }
-}
-
-impl Diarist {
-    fn on_tick(&mut self, _now: Instant, _tick: Tick) {
-        self.diary.send(Status { position_m: 1.0 });
-    }
+fn diarist() -> Box<dyn Role> {
+    let status = |(): &mut (), _, _| Status { position_m: 1.0 };
+    Component::of(())
+        .input("a/heard", |(), _, _: &Status| {})
+        .publish("a/diary", Duration::from_millis(100), status)
+        .into_role()
 }
 
 const DIARY: &[ChannelSpec] = &[
@@ -39,7 +27,7 @@ const DIARY: &[ChannelSpec] = &[
 ];
 
 fn diary(carriers: BTreeMap<String, Box<dyn Carrier>>) -> Result<Simulation, SimulationError> {
-    let roles = vec![("diarist", into_role(Diarist::default()))];
+    let roles = vec![("diarist", diarist())];
     Simulation::of_roles("diary", DIARY, roles, carriers)
 }
 
@@ -186,26 +174,31 @@ fn messages_arrive_by_time_then_rank_then_order_and_their_slots_are_used_again()
 /// Answers at once; one that begins speaks first.
 #[derive(Debug)]
 struct Echo {
-    ports: [&'static str; 2],
     begins: bool,
     said: Output<Status>,
 }
 
-impl Component for Echo {
-    fn ports(&self, ports: &mut Ports<Self>) {
-        let [heard, said] = self.ports;
-        ports.input(heard, |own, _, heard: &Status| own.said.send(*heard));
-        ports.output(said, |own| &mut own.said);
+impl Echo {
+    fn role([heard, said]: [&'static str; 2], begins: bool) -> Box<dyn Role> {
+        let echo = Self {
+            begins,
+            said: Output::default(),
+        };
+        Component::of(echo)
+            .input(heard, |own, _, heard: &Status| own.said.send(*heard))
+            .output(said, |own| &mut own.said)
+            .timer(Timer {
+                next: |own| own.begins.then_some(Instant::ZERO),
+                tick: Self::tick,
+                skipped: |_| 0,
+            })
+            .into_role()
     }
 
     fn tick(&mut self, _: Instant) {
         if core::mem::take(&mut self.begins) {
             self.said.send(Status { position_m: 0.0 });
         }
-    }
-
-    fn next_tick(&self) -> Option<Instant> {
-        self.begins.then_some(Instant::ZERO)
     }
 }
 
@@ -216,16 +209,9 @@ fn roles_that_answer_each_other_without_delay_are_refused() {
         ChannelSpec::of::<Status>("a/back", "other", "one"),
     ];
     let run = |begins| {
-        let echo = |ports, begins| {
-            into_role(Echo {
-                ports,
-                begins,
-                said: Output::default(),
-            })
-        };
         let roles = vec![
-            ("one", echo(["a/back", "a/there"], begins)),
-            ("other", echo(["a/there", "a/back"], false)),
+            ("one", Echo::role(["a/back", "a/there"], begins)),
+            ("other", Echo::role(["a/there", "a/back"], false)),
         ];
         let simulation = Simulation::of_roles("echo", ECHOES, roles, BTreeMap::new()).unwrap();
         simulation.run(Duration::from_secs(1))
@@ -244,7 +230,7 @@ fn a_role_that_does_not_fit_its_case_does_not_start() {
         ChannelSpec::of::<Status>("a/herd", "other", "diarist"),
         ChannelSpec::recorded::<Status>("a/diary", "diarist"),
     ];
-    let roles = vec![("diarist", into_role(Diarist::default()))];
+    let roles = vec![("diarist", diarist())];
     let error = Simulation::of_roles("diary", MISSPELT, roles, BTreeMap::new()).unwrap_err();
     let expected = "input port a/heard of role diarist takes test.Status.v1 (8 bytes aligned to 8), \
                     but case diary states no such channel";

@@ -49,7 +49,8 @@ pub(crate) fn series(log: &RunLog) -> Vec<PlotSeries> {
 pub(crate) fn joint_error_over_time(log: &RunLog) -> Vec<ErrorSeries> {
     let record = Record::read(log);
     let shift = (!log.has_one_clock()).then_some(record.shift_ns);
-    let samples = paired(log, shift).filter_map(|(at, feedback, command)| {
+    let cycles = log.with_newest(EGM_RIGHT_FEEDBACK, EGM_RIGHT_COMMAND, shift);
+    let samples = cycles.filter_map(|(at, feedback, command): (_, EgmFeedback, _)| {
         let desired = desired_rad(Some(command?));
         let joints = desired.iter().zip(&feedback.measured_rad);
         let errors = joints.map(|(desired, measured)| (desired - measured).abs());
@@ -57,6 +58,7 @@ pub(crate) fn joint_error_over_time(log: &RunLog) -> Vec<ErrorSeries> {
         largest.is_finite().then_some((at, largest))
     });
     vec![ErrorSeries {
+        name: "joint_error_rad",
         label: "joint error of the right arm",
         unit: "rad",
         clock_of: EGM_RIGHT_FEEDBACK,
@@ -145,24 +147,6 @@ fn input(log: &RunLog, origin_ns: i64) -> Option<PlotSeries> {
     })
 }
 
-/// Feedback with the newest command published by then.
-fn paired(
-    log: &RunLog,
-    shift: Option<i64>,
-) -> impl Iterator<Item = (Instant, EgmFeedback, Option<EgmCommand>)> + '_ {
-    let mut commands = log.messages::<EgmCommand>(EGM_RIGHT_COMMAND).peekable();
-    let mut newest = None;
-    let shift_ns = shift.unwrap_or(0);
-    log.messages::<EgmFeedback>(EGM_RIGHT_FEEDBACK)
-        .map(move |(at, feedback)| {
-            let is_sent = |sent: &Instant| sent.as_ns().saturating_add(shift_ns) <= at.as_ns();
-            while let Some((_, command)) = commands.next_if(|next| is_sent(&next.0)) {
-                newest = Some(command);
-            }
-            (at, feedback, newest)
-        })
-}
-
 /// Series with a row for each feedback of the right arm.
 struct RobotSeries<'a> {
     log: &'a RunLog,
@@ -184,7 +168,11 @@ impl RobotSeries<'_> {
     ) -> Option<PlotSeries> {
         let every = thinning(self.log.raw(EGM_RIGHT_FEEDBACK).len());
         let mut values = Vec::new();
-        for (at, feedback, command) in paired(self.log, self.shift).step_by(every) {
+        let cycles = self
+            .log
+            .with_newest(EGM_RIGHT_FEEDBACK, EGM_RIGHT_COMMAND, self.shift);
+        for (at, feedback, command) in cycles.step_by(every) {
+            let command: Option<EgmCommand> = command;
             values.push(seconds(at, self.origin_ns));
             row(&feedback, command, &mut values);
         }

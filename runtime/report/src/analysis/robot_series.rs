@@ -124,6 +124,7 @@ mod tests {
         );
         let at = |seconds: i64, value: f64| (Instant::from_ns(seconds * 1_000_000_000), value);
         let errors = ErrorSeries {
+            name: "error_rad",
             label: "error",
             unit: "m",
             clock_of: "shuttle/status",

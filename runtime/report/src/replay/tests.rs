@@ -8,7 +8,7 @@ use hil_core::component::Role;
 use hil_core::message::Envelope;
 use hil_core::run_log::RunLog;
 use hil_core::time::Instant;
-use hil_shuttle::{Shuttle, ShuttleCommand, ShuttleParameters, ShuttleStatus};
+use hil_shuttle::{Shuttle, ShuttleCommand, ShuttleStatus};
 
 use hil_rundir::record::{RecordKind, Recorder};
 
@@ -24,9 +24,9 @@ impl CaseStudy for Doubler {
         ChannelSpec::of::<ShuttleStatus>("status", "robot", "controller"),
         ChannelSpec::recorded::<ShuttleCommand>("heard", "robot"),
     ];
-    type Parameters = ShuttleParameters;
+    type Parameters = Shuttle;
 
-    fn new(_parameters: ShuttleParameters, _seed: u64) -> Result<Self, ParameterError> {
+    fn new(_parameters: Shuttle, _seed: u64) -> Result<Self, ParameterError> {
         Ok(Self)
     }
 

@@ -128,10 +128,9 @@ impl Observe<CaseModel> for Progress<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_core::case_study::CaseStudy;
     use hil_core::link_model::Fate;
     use hil_core::simulation::Simulation;
-    use hil_shuttle::{Shuttle, ShuttleParameters};
+    use hil_shuttle::Shuttle;
 
     /// Down from 100 to 190 ms, otherwise 3 ms late, at 300 ms twice.
     #[derive(Debug)]
@@ -154,7 +153,7 @@ mod tests {
 
     #[test]
     fn accounts_see_what_the_model_loses_and_repeats_and_progress_is_told() {
-        let case = Shuttle::new(ShuttleParameters::default(), 1).unwrap();
+        let case = Shuttle::default();
         let name = "shuttle/command";
         let link: Box<dyn Carrier> = Box::new(DatagramLink(Box::new(Down)));
         let carriers = BTreeMap::from([(name.to_owned(), link)]);

@@ -5,7 +5,7 @@ use hil_core::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
 use hil_core::component::Role;
 use hil_core::run_log::RunLog;
 use hil_core::study::{Cell, Column, Study, Table, Watch, into_batch};
-use hil_shuttle::{Shuttle, ShuttleParameters};
+use hil_shuttle::Shuttle;
 
 use hil_topology;
 
@@ -21,9 +21,9 @@ impl CaseStudy for Tuned {
     const ROLES: &'static [&'static str] = &[];
     const CHANNELS: &'static [ChannelSpec] = &[];
     const CALIBRATED_FIGURES: &'static [&'static str] = &["mlr"];
-    type Parameters = ShuttleParameters;
+    type Parameters = Shuttle;
 
-    fn new(parameters: ShuttleParameters, _seed: u64) -> Result<Self, ParameterError> {
+    fn new(parameters: Shuttle, _seed: u64) -> Result<Self, ParameterError> {
         let gain_per_s = parameters.gain_per_s;
         Ok(Self { gain_per_s })
     }

@@ -65,6 +65,7 @@ fn error() -> RobotSeries {
         (Instant::from_ns(ms * MS), error_rad(ms))
     });
     let errors = ErrorSeries {
+        name: "error_rad",
         label: "joint error of the right arm",
         unit: "rad",
         clock_of: "arm/status",

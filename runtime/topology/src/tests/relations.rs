@@ -212,7 +212,7 @@ fn the_outages_of_a_link_are_those_of_both_ways() {
 
 fn check_with_refusal(table: &toml::Table, seed: u64) -> Result<toml::Table, Vec<ParameterFault>> {
     let mut refuse =
-        |_: &mut ShuttleParameters| ParameterError::check("gain_per_s", 1.0, 2.0..=3.0, "2 to 3");
+        |_: &mut Shuttle| ParameterError::check("gain_per_s", 1.0, 2.0..=3.0, "2 to 3");
     check_parameters_with::<Shuttle>(table, seed, &mut refuse)
 }
 

@@ -3,13 +3,13 @@
 use core::time::Duration;
 use std::collections::BTreeMap;
 
-use super::*;
 use hil_core::link_model::PerfectLink;
 use hil_core::simulation::{Carrier, Simulation, SimulationResult};
 use hil_link::spec::{LinkPlace, LinkSpec};
+use hil_shuttle::Shuttle;
 
 fn run(seed: u64, loss_ratio: f64, delay_ms: u64) -> SimulationResult {
-    let case = Shuttle::new(ShuttleParameters::default(), seed).unwrap();
+    let case = Shuttle::default();
     let link = LinkSpec::fixed(Duration::from_millis(delay_ms), loss_ratio)
         .build(&LinkPlace::alone(seed, "shuttle/command"))
         .unwrap();
@@ -47,7 +47,7 @@ fn every_message_is_taken_lost_or_in_flight() {
 
 #[test]
 fn an_unknown_channel_is_named() {
-    let case = Shuttle::new(ShuttleParameters::default(), 0).unwrap();
+    let case = Shuttle::default();
     let carriers = BTreeMap::from([("nope".to_owned(), Box::new(PerfectLink) as Box<dyn Carrier>)]);
     let error = Simulation::new(&case, carriers).unwrap_err();
     assert_eq!(error.to_string(), "case shuttle has no channel nope");
