@@ -22,7 +22,6 @@ use super::refusal_backoff::RefusalBackoff;
 use super::socket::{OpenSocket, SocketEnd, timestamp_mode};
 use super::stamp_plan::StampPlan;
 use super::{GatewayContext, WorkerError, counters};
-use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::WaitStrategy;
 use hil_rundir::launch::{DirectionLaunch, Side};
@@ -209,7 +208,6 @@ impl OpenDirection {
                     records: messages,
                     wait: WaitStrategy::new(launch.wait),
                     peer: launch.peer,
-                    stop: Arc::clone(&around.stop),
                     foreign_count: 0,
                     refusal_backoff: RefusalBackoff::of_messages(),
                     clock: KernelClock::read()?,
@@ -252,9 +250,9 @@ impl Direction {
     pub(super) fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
         match &mut self.way {
             BridgeLoop::Egress(egress) => egress.finish(stepped),
-            // Told to stop, it takes no step more.
             BridgeLoop::Ingress(ingress) => {
-                stepped.and_then(|()| ingress.run(&Heartbeat::default()))
+                ingress.finish();
+                stepped
             }
         }
     }

@@ -3,7 +3,7 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use hil_core::record::{IngressRecord, UNAVAILABLE};
 use hil_core::time::Instant;
@@ -16,7 +16,6 @@ use hil_transport::{DatagramReceiver, Received};
 use super::kernel_clock::KernelClock;
 use super::refusal_backoff::RefusalBackoff;
 use super::{WorkerError, poll_descriptors};
-use crate::process::heartbeat::Heartbeat;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy, release};
 use hil_rundir::record::SharedSink;
@@ -35,7 +34,6 @@ pub(crate) struct Ingress {
     pub(crate) records: SharedSink,
     pub(crate) wait: WaitStrategy,
     pub(crate) peer: SocketAddr,
-    pub(crate) stop: Arc<AtomicBool>,
     /// Datagrams from an address that is not the peer's, dropped unread.
     pub(crate) foreign_count: u64,
     pub(super) refusal_backoff: RefusalBackoff,
@@ -93,20 +91,10 @@ impl Arrival {
 }
 
 impl Ingress {
-    /// Carries the channels until told to stop.
-    ///
-    /// # Errors
-    /// When a channel or the socket itself breaks.
-    pub(crate) fn run(&mut self, heartbeat: &Heartbeat) -> Result<(), WorkerError> {
-        while !self.stop.load(Ordering::Acquire) {
-            if !self.step()? {
-                self.rest()?;
-            }
-            heartbeat.beat();
-        }
+    /// Ends the account of what is still under way.
+    pub(crate) fn finish(&mut self) {
         self.bridge.finish();
         self.note_incomplete();
-        Ok(())
     }
 
     /// Records the messages of which some pieces did not come.

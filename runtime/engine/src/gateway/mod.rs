@@ -27,8 +27,6 @@ pub(crate) mod stamp_tracker;
 pub(crate) mod timestamping;
 
 use std::os::fd::BorrowedFd;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use hil_core::time::Instant;
 use hil_protocol::{ChannelIdentity, FlowIdentity};
@@ -53,8 +51,6 @@ pub struct GatewayContext {
     pub fingerprint: [u8; 16],
     /// Which clock is read.
     pub(crate) clock_id: u64,
-    /// Set when the threads are to end.
-    pub stop: Arc<AtomicBool>,
 }
 
 impl GatewayContext {
@@ -68,7 +64,6 @@ impl GatewayContext {
             session: session.max(1),
             fingerprint: domain.fingerprint()?,
             clock_id: clock_id()?,
-            stop: Arc::new(AtomicBool::new(false)),
             domain,
         })
     }

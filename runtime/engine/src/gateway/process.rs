@@ -54,11 +54,7 @@ pub(crate) fn open<'a>(
         return Err(WorkerError::SecretMissing);
     }
     let seal = seal.flatten();
-    let stop = Arc::clone(orders.stop_flag());
-    let surroundings = Arc::new(GatewayContext {
-        stop: Arc::clone(&stop),
-        ..GatewayContext::new(open_domain(launch)?)?
-    });
+    let surroundings = Arc::new(GatewayContext::new(open_domain(launch)?)?);
     warn_of_shared_cpus(work);
     let mut away = Away::default();
     let (mut armed, sockets) = loop {
@@ -95,7 +91,7 @@ pub(crate) fn open<'a>(
             .filter_map(|(direction, one)| Some(Connection::new(direction, one.tally()?)))
             .collect(),
         control: LinkControl::open(&surroundings.domain, launch, switches)?,
-        sampler: armed.start_sampler(&launch.process, recorder, stop)?,
+        sampler: armed.start_sampler(&launch.process, recorder, Arc::clone(orders.stop_flag()))?,
     };
     let jobs = directions.into_iter().map(|(direction, opened)| {
         let spinner = format!("{}: ", flow_label(&direction.flow));
