@@ -25,16 +25,11 @@ use hil_benches::gateway::network::Network;
 use hil_benches::{HostFacts, Quantiles};
 use hil_core::message::MessageType;
 use hil_platform::clock::MonotonicClock;
-use hil_platform::realtime::RealtimeRequest;
-use hil_platform::wait::WaitMode;
-use hil_rundir::launch::{
-    ChannelLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch, Work, WorkerLaunch, write,
-};
+use hil_rundir::launch::{DirectionLaunch, Side};
 use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, ShmOutput, Waiter,
 };
-use hil_tests::worker::Worker;
-use hil_topology::SocketOptions;
+use hil_tests::worker::{self, Worker};
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::{TimeSpec, TimeValLike};
 use serde_json::json;
@@ -198,38 +193,13 @@ fn names(count: usize) -> Vec<String> {
 }
 
 fn direction(side: Side, lanes: &[Lane], addresses: [SocketAddr; 2]) -> DirectionLaunch {
-    let channel = |(index, lane): (usize, &Lane)| ChannelLaunch {
-        channel: lane.name.clone(),
-        channel_id: u16::try_from(index).unwrap(),
-        message: lane.message.name.to_owned(),
-        size_bytes: lane.message.size_bytes,
-        alignment_bytes: lane.message.alignment_bytes,
-        depth: DEPTH,
-        emulation: None,
-    };
-    let [local, peer] = match side {
-        Side::Egress => addresses,
-        Side::Ingress => [addresses[1], addresses[0]],
-    };
-    DirectionLaunch {
-        flow: "hil/link/bench/forward".to_owned(),
-        flow_number: u16::MAX,
-        side,
-        local,
-        peer,
-        socket: SocketLaunch {
-            transport: "udp".to_owned(),
-            options: BTreeMap::new(),
-            interface: None,
-            common: SocketOptions {
-                receive_buffer_bytes: 212_992.max(2 * lanes[0].message.size_bytes),
-                ..SocketOptions::TEMPLATE
-            },
-        },
-        wait: WaitMode::Block,
-        realtime: RealtimeRequest::default(),
-        channels: lanes.iter().enumerate().map(channel).collect(),
-    }
+    let channels = (0..)
+        .zip(lanes)
+        .map(|(id, lane)| worker::channel(id, &lane.name, &lane.message, DEPTH));
+    let mut direction = worker::direction(side, addresses, channels.collect());
+    let receive_buffer_bytes = 212_992.max(2 * lanes[0].message.size_bytes);
+    direction.socket.common.receive_buffer_bytes = receive_buffer_bytes;
+    direction
 }
 
 /// The service of every channel on both hosts, while it is kept.
@@ -251,21 +221,9 @@ fn hold(domains: &[Domain; 2], lanes: &[Lane]) -> Vec<ChannelHolder> {
 fn link(network: &Network, folder: &Path, lanes: &[Lane], domains: &[Domain; 2]) -> [Worker; 2] {
     let addresses = [0, 1].map(|host| network.free_address(host).unwrap());
     [(0, Side::Egress), (1, Side::Ingress)].map(|(host, side)| {
-        let records = folder.join(format!("records-{host}"));
-        fs::create_dir_all(&records).unwrap();
-        let launch = WorkerLaunch {
-            process: format!("gateway-bench-{host}"),
-            instance: 0,
-            domain: domains[host].address().to_string(),
-            records,
-            is_sealed: false,
-            work: Work::Gateway(GatewayWork {
-                directions: vec![direction(side, lanes, addresses)],
-                ready_within: None,
-            }),
-        };
-        let path = folder.join(format!("launch-{host}.json"));
-        write(&path, &launch).unwrap();
+        let name = format!("gateway-bench-{host}");
+        let direction = direction(side, lanes, addresses);
+        let path = worker::gateway(folder, &name, &domains[host], direction);
         let mut command = Worker::command(&path);
         Worker::adopt(network.on(host, move || command.spawn()).unwrap())
     })

@@ -1,12 +1,15 @@
 //! The `hil-runtime` and `hil-recorder` binaries the tests start, built in the profile of the tests themselves.
 
 use std::env;
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
+use std::time::Duration;
 
 use serde_json::Value;
+
+use crate::child::{ChildGuard, Finished};
 
 /// Names a binary to test in place of the one cargo builds.
 pub const BINARY_VARIABLE: &str = "HIL_RUNTIME_BINARY";
@@ -32,6 +35,30 @@ pub fn hil_runtime_binary() -> &'static Path {
 pub fn hil_recorder_binary() -> &'static Path {
     static BINARY: OnceLock<PathBuf> = OnceLock::new();
     BINARY.get_or_init(|| located("hil-recorder", RECORDER_VARIABLE))
+}
+
+/// No command of these tests takes so long.
+const COMMAND_LIMIT: Duration = Duration::from_mins(5);
+
+/// Runs `hil-runtime` in the workspace to its end, on a terminal of no width and on no host in particular.
+///
+/// # Panics
+/// When it does not start or does not end.
+pub fn hil_runtime(arguments: &[impl AsRef<OsStr>]) -> Finished {
+    hil_runtime_in(&workspace_folder(), arguments)
+}
+
+/// As [`hil_runtime`], in `folder`.
+///
+/// # Panics
+/// As [`hil_runtime`].
+pub fn hil_runtime_in(folder: &Path, arguments: &[impl AsRef<OsStr>]) -> Finished {
+    let mut command = Command::new(hil_runtime_binary());
+    command.args(arguments).current_dir(folder);
+    command.env_remove("COLUMNS").env_remove("HIL_HOST");
+    let child = ChildGuard::spawn(&mut command);
+    let finished = child.expect("it starts").wait_within(COMMAND_LIMIT);
+    finished.unwrap_or_else(|reason| panic!("{reason}"))
 }
 
 fn located(package: &str, variable: &str) -> PathBuf {

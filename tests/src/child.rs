@@ -42,8 +42,17 @@ impl Finished {
     /// # Panics
     /// With the whole output when it is not.
     pub fn assert_success(&self) {
-        assert!(
-            self.status.success(),
+        self.assert_code(0);
+    }
+
+    /// Checks that the exit code is `code`.
+    ///
+    /// # Panics
+    /// With the whole output when it is not.
+    pub fn assert_code(&self, code: i32) {
+        assert_eq!(
+            self.status.code(),
+            Some(code),
             "ended with {}\n--- stdout\n{}\n--- stderr\n{}",
             self.status,
             self.stdout,

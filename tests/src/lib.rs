@@ -12,6 +12,7 @@ pub mod child;
 pub mod knocker;
 pub mod lab;
 pub mod latency;
+pub mod live_server;
 pub mod machine_lock;
 pub mod mcap_file;
 pub mod ports;

@@ -9,7 +9,7 @@ use hil_core::record::TakenRecord;
 use hil_report::summary::{CounterGroup, DirectionSummary, Outcome, RunSummary};
 
 use crate::account::{account, assert_every_message_is_accounted_for, channel, describe};
-use crate::child::ChildGuard;
+use crate::child::{ChildGuard, Finished};
 use crate::lab::Lab;
 use crate::latency::Latencies;
 use crate::shuttle::{CHANNELS, records};
@@ -17,15 +17,23 @@ use crate::trial::{RunFiles, Trial, wait_until};
 
 /// Names of the hosts in the topology.
 pub const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
-const LIMIT: Duration = Duration::from_mins(1);
-const RUN_LIMIT: Duration = Duration::from_mins(3);
+/// Of an arm, to its host and back.
+pub const ARM_CHANNELS: [&str; 2] = ["egm/right/command", "egm/right/feedback"];
+const LIMIT: Duration = Duration::from_mins(3);
+const RUN_LIMIT: Duration = Duration::from_mins(6);
+/// Records of 32 bytes: half a second of commands.
+const FLOWING_BYTES: u64 = 60 * 32;
 
 /// The run, on both hosts.
 #[derive(Debug)]
 pub struct Split<'a> {
-    hosts: [ChildGuard; 2],
-    files: [RunFiles; 2],
+    /// The supervisors.
+    pub hosts: [ChildGuard; 2],
+    /// What each host leaves.
+    pub files: [RunFiles; 2],
     lab: &'a Lab,
+    /// To the robot's host and back.
+    channels: [&'static str; 2],
 }
 
 impl<'a> Split<'a> {
@@ -44,22 +52,69 @@ impl<'a> Split<'a> {
     /// When their run folders do not appear.
     pub fn of(lab: &'a Lab, trial: &Trial, hosts: [ChildGuard; 2]) -> Self {
         let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
-        Self { hosts, files, lab }
+        Self {
+            hosts,
+            files,
+            lab,
+            channels: CHANNELS,
+        }
     }
 
-    /// What host `index` leaves.
-    pub fn files(&self, index: usize) -> &RunFiles {
-        &self.files[index]
+    /// With these channels to the robot's host and back, instead of the shuttle's.
+    #[must_use]
+    pub fn carrying(self, channels: [&'static str; 2]) -> Self {
+        Self { channels, ..self }
     }
 
-    /// Waits until commands flow.
+    /// Waits until both hosts have taken half a second's messages from now on.
     ///
     /// # Panics
-    /// When none do.
-    pub fn wait_for_messages(&self) {
-        wait_until(LIMIT, "commands", || {
-            self.files[1].record_bytes("shuttle.command.taken.") > 100 * 32
+    /// When they do not.
+    pub fn wait_for_messages(&self, after: &str) {
+        let taken = || {
+            [(1, self.channels[0]), (0, self.channels[1])].map(|(index, name)| {
+                let start = format!("{}.taken.", name.replace('/', "."));
+                self.files[index].record_bytes(&start)
+            })
+        };
+        let before = taken();
+        wait_until(LIMIT, &format!("messages both ways after {after}"), || {
+            let now = taken();
+            (0..2).all(|way| now[way] >= before[way] + FLOWING_BYTES)
         });
+    }
+
+    /// Kills `process` on host `index`, and waits until it is back and messages flow.
+    ///
+    /// # Panics
+    /// When it does not come back.
+    pub fn kill(&self, index: usize, process: &str) {
+        self.files[index].kill_process(process, 0, LIMIT);
+        let back = format!("the restart of {process}");
+        wait_until(LIMIT, &back, || {
+            self.files[index].process(process, 1).is_some()
+        });
+        self.wait_for_messages(&back);
+    }
+
+    /// Waits for the end, however it comes, and checks that it left nothing behind.
+    ///
+    /// # Panics
+    /// When it does not come, or left something.
+    pub fn ended(&mut self) -> [Finished; 2] {
+        let finished = self.hosts.each_mut().map(|host| {
+            let ended = host.wait_within(RUN_LIMIT);
+            ended.unwrap_or_else(|reason| panic!("{reason}"))
+        });
+        for (index, files) in self.files.iter().enumerate() {
+            files.assert_nothing_left_on(self.lab.host(index));
+        }
+        finished
+    }
+
+    /// What both hosts report.
+    pub fn summaries(&self) -> [RunSummary; 2] {
+        self.files.each_ref().map(RunFiles::summary)
     }
 
     /// Waits for the end, and checks that it was the planned one, left nothing behind, and that every
@@ -80,19 +135,13 @@ impl<'a> Split<'a> {
     /// # Panics
     /// When it was not, or did.
     pub fn end(mut self) -> [RunSummary; 2] {
-        for host in &mut self.hosts {
-            match host.wait_within(RUN_LIMIT) {
-                Ok(finished) => finished.assert_success(),
-                Err(reason) => panic!("{reason}"),
-            }
+        for finished in self.ended() {
+            finished.assert_success();
         }
-        let summaries = [0, 1].map(|index| self.files[index].summary());
-        for (index, files) in self.files.iter().enumerate() {
-            files.assert_nothing_left_on(self.lab.host(index));
-        }
+        let summaries = self.summaries();
         for summary in &summaries {
             assert_eq!(summary.run.outcome, Outcome::Completed, "{:?}", summary.run);
-            for name in CHANNELS {
+            for name in self.channels {
                 let said = describe(name, account(summary, name));
                 println!("{}: {said}", summary.run.host);
             }

@@ -1,14 +1,91 @@
 //! A worker process of the product, started by its launch file as a supervisor would, without one.
 
+use std::collections::BTreeMap;
+use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
-use std::path::Path;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use hil_core::message::MessageType;
+use hil_platform::realtime::RealtimeRequest;
+use hil_platform::wait::WaitMode;
+use hil_rundir::launch::{
+    ChannelLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch, Work, WorkerLaunch, write,
+};
+use hil_shm::Domain;
+use hil_topology::SocketOptions;
+
 use crate::binary::hil_runtime_binary;
 use crate::trial::wait_until;
+
+/// A channel of a link.
+pub fn channel(id: u16, name: &str, message: &MessageType, depth: usize) -> ChannelLaunch {
+    ChannelLaunch {
+        channel: name.to_owned(),
+        channel_id: id,
+        message: message.name.to_owned(),
+        size_bytes: message.size_bytes,
+        alignment_bytes: message.alignment_bytes,
+        depth,
+        emulation: None,
+    }
+}
+
+/// One end of a flow over UDP, from the first of `addresses` to the second.
+pub fn direction(
+    side: Side,
+    addresses: [SocketAddr; 2],
+    channels: Vec<ChannelLaunch>,
+) -> DirectionLaunch {
+    let [sender, receiver] = addresses;
+    let (local, peer) = match side {
+        Side::Egress => (sender, receiver),
+        Side::Ingress => (receiver, sender),
+    };
+    DirectionLaunch {
+        flow: "hil/link/hop/forward".to_owned(),
+        flow_number: u16::MAX,
+        side,
+        local,
+        peer,
+        socket: SocketLaunch {
+            transport: "udp".to_owned(),
+            options: BTreeMap::new(),
+            interface: None,
+            common: SocketOptions::TEMPLATE,
+        },
+        wait: WaitMode::Block,
+        realtime: RealtimeRequest::default(),
+        channels,
+    }
+}
+
+/// Writes the launch file of a gateway called `name`; its records go below `folder`.
+///
+/// # Panics
+/// When the disk refuses it.
+pub fn gateway(folder: &Path, name: &str, domain: &Domain, direction: DirectionLaunch) -> PathBuf {
+    let records = folder.join(format!("records-{name}"));
+    fs::create_dir_all(&records).expect("a folder for records");
+    let launch = WorkerLaunch {
+        process: name.to_owned(),
+        instance: 0,
+        domain: domain.address().to_string(),
+        records,
+        is_sealed: false,
+        work: Work::Gateway(GatewayWork {
+            directions: vec![direction],
+            ready_within: None,
+        }),
+    };
+    let path = folder.join(format!("{name}.json"));
+    write(&path, &launch).expect("a launch file");
+    path
+}
 
 /// The process with its order pipe, and what it said; killed when dropped.
 #[derive(Debug)]

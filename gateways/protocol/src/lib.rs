@@ -64,6 +64,9 @@ mod counters;
 pub mod egress;
 pub mod fragment;
 pub mod ingress;
+#[cfg(any(test, feature = "lab"))]
+#[path = "tests/lab.rs"]
+pub mod lab;
 pub mod refusal;
 pub mod seal;
 pub mod sequence;

@@ -4,6 +4,7 @@ use core::sync::atomic::{AtomicU64, Ordering};
 use core::time::Duration;
 
 use hil_core::link_model::LossCauses;
+use hil_net::TxToken;
 use hil_protocol::counts;
 
 use super::{Received, SendRefusal};
@@ -116,6 +117,18 @@ counts! {
 }
 
 impl SenderCounters {
+    /// Number of the next send as the kernel counts it, modulo 2^32.
+    pub(crate) fn next_token(&self) -> TxToken {
+        let low_bits = self.sent_count & u64::from(u32::MAX);
+        TxToken(u32::try_from(low_bits).expect("masked to 32 bits"))
+    }
+
+    pub(crate) fn count_sent(&mut self) -> TxToken {
+        let token = self.next_token();
+        self.sent_count += 1;
+        token
+    }
+
     pub(crate) fn count_refusal(&mut self, refusal: SendRefusal) {
         let counter = match refusal {
             SendRefusal::PeerRefused => &mut self.peer_refused_count,

@@ -3,9 +3,9 @@
 //!
 //! - [`registry`]: the list of transports, and what each is: a name, capabilities, and how its
 //!   ends are opened.
-//! - [`udp`]: the real network, with separate sockets for sending and receiving.
+//! - [`udp`]: the real network, with separate sockets for sending and receiving, and one for both where a foreign
+//!   protocol wants that.
 //! - [`tcp`]: the real network as a stream, with what it costs in waiting.
-//! - [`udp_server`]: one socket that hears anyone and answers, for foreign protocols.
 //! - [`queue`]: an in-process pair, for tests.
 //! - [`emulated`]: any receiver behind a link model.
 //! - [`sealed`]: any sender or receiver behind encryption and authentication.
@@ -23,8 +23,9 @@ pub mod sealed;
 pub mod socket;
 pub mod tcp;
 pub mod udp;
-pub mod udp_server;
 
+#[cfg(test)]
+mod answering_tests;
 #[cfg(test)]
 mod conformance_tests;
 #[cfg(test)]
@@ -72,6 +73,21 @@ pub struct Received {
     pub stamps: KernelStamps,
     /// Set when a link model held the datagram.
     pub emulated: Option<EmulatedDelay>,
+}
+
+impl Received {
+    /// `datagram` in `buffer`, or as much of it as has room there; nothing stamped it.
+    pub(crate) fn copied(datagram: &[u8], buffer: &mut [u8], source: SocketAddr) -> Self {
+        let length_bytes = datagram.len().min(buffer.len());
+        buffer[..length_bytes].copy_from_slice(&datagram[..length_bytes]);
+        Self {
+            length_bytes,
+            is_truncated: length_bytes < datagram.len(),
+            source,
+            stamps: KernelStamps::default(),
+            emulated: None,
+        }
+    }
 }
 
 /// Why a datagram did not leave. Each is a state of the peer or of the network, to be counted

@@ -6,7 +6,7 @@ use std::os::fd::BorrowedFd;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 
 use hil_core::time::Instant;
-use hil_net::{KernelStamps, TransmitStamp, TxToken};
+use hil_net::{TransmitStamp, TxToken};
 
 use super::{
     DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
@@ -68,15 +68,7 @@ impl End {
     /// The next datagram, cut to the buffer; a partner that is gone just sends no more.
     fn pop(&self, buffer: &mut [u8]) -> Option<Received> {
         let datagram = self.into.try_recv().ok()?;
-        let length_bytes = datagram.len().min(buffer.len());
-        buffer[..length_bytes].copy_from_slice(&datagram[..length_bytes]);
-        Some(Received {
-            length_bytes,
-            is_truncated: datagram.len() > buffer.len(),
-            source: self.peer,
-            stamps: KernelStamps::default(),
-            emulated: None,
-        })
+        Some(Received::copied(&datagram, buffer, self.peer))
     }
 }
 
@@ -93,12 +85,9 @@ impl DatagramSender for QueueSender {
     }
 
     fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal> {
-        let low_bits = self.counters.sent_count & u64::from(u32::MAX);
-        let token = TxToken(u32::try_from(low_bits).expect("masked to 32 bits"));
         let sent = self.end.push([head, tail].concat());
         sent.inspect_err(|refusal| self.counters.count_refusal(*refusal))?;
-        self.counters.sent_count += 1;
-        Ok(token)
+        Ok(self.counters.count_sent())
     }
 
     fn next_stamp(&mut self) -> Option<TransmitStamp> {

@@ -1,9 +1,8 @@
 //! Two bridges behind sealed transports: the bridges notice nothing but the peer.
 
 use core::time::Duration;
-use std::net::Ipv4Addr;
+use std::net::{Ipv4Addr, SocketAddr};
 
-use hil_core::message::Envelope;
 use hil_core::time::Instant;
 
 use super::*;
@@ -12,12 +11,10 @@ use crate::queue::{self, queue_pair};
 use crate::registry;
 use hil_net::clock_pair::monotonic_now;
 use hil_net::timestamping::TimestampMode;
+use hil_protocol::lab::{Arrived, Lab, Medium, Way};
 use hil_protocol::seal::{Association, Rotation, RunSecret, Suite};
 use hil_protocol::wire::{HEADER_BYTES, Header};
-use hil_protocol::{
-    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, InMemory,
-    IngressBridge, IngressSettings, PeerState,
-};
+use hil_protocol::{ArrivalStamps, ChannelIdentity, FlowIdentity, PeerState};
 
 fn association() -> Association {
     Association {
@@ -38,132 +35,104 @@ fn flow() -> FlowIdentity {
     }
 }
 
-fn egress_settings() -> EgressSettings {
-    EgressSettings {
-        flow: flow(),
-        session: 100,
-        domain: [1; 16],
-        clock_id: 11,
-        datagram_max_bytes: 1472,
-        sync_period: Duration::from_millis(20),
-    }
-}
-
-struct Hop {
-    egress: EgressBridge,
+/// Both ends of a transport between two bridges.
+#[derive(Debug)]
+struct Ends {
     sender: Box<dyn DatagramSender>,
-    ingress: IngressBridge,
-    memory: InMemory,
     receiver: Box<dyn DatagramReceiver>,
-    /// The machine's time, or one of its own.
-    is_real: bool,
-    now: Instant,
-    delivered: Vec<Vec<u8>>,
+    source: Option<SocketAddr>,
 }
 
-impl Hop {
-    fn new(
-        sender: Box<dyn DatagramSender>,
-        receiver: Box<dyn DatagramReceiver>,
-        is_real: bool,
-    ) -> Self {
-        Self {
-            egress: EgressBridge::new(egress_settings()).unwrap(),
-            sender,
-            ingress: IngressBridge::new(IngressSettings::new(flow(), 200, [2; 16], 22)).unwrap(),
-            memory: InMemory::default(),
-            receiver,
-            is_real,
-            now: Instant::from_ns(1_000_000_000),
-            delivered: Vec::new(),
-        }
-    }
-
-    #[allow(
-        clippy::disallowed_methods,
-        reason = "a test may step aside while a datagram is on its way"
-    )]
-    fn step(&mut self) {
-        let step = Duration::from_millis(1);
-        if self.is_real {
-            std::thread::sleep(step);
-            self.now = monotonic_now().unwrap();
-            self.sender.attend(self.now);
-            self.receiver.attend(self.now);
-        } else {
-            self.now = self.now + step;
-        }
-        let (now, arrival) = (self.now, ArrivalStamps::application(self.now.as_ns()));
-        let mut buffer = [0; 2_000];
-        while let Some(transmit) = self.egress.poll_transmit(now) {
-            self.sender.send(transmit.datagram).unwrap();
-        }
-        while self.sender.next_stamp().is_some() {}
-        while let Some(received) = self.receiver.receive(now, &mut buffer).unwrap() {
-            let delivered = &mut self.delivered;
-            let bytes = &buffer[..received.length_bytes];
-            let mut deliver = self
-                .memory
-                .with(|_, payload| delivered.push(payload.to_vec()));
-            self.ingress
-                .on_datagram(now, arrival, bytes, &mut deliver)
-                .unwrap();
-            while let Some(reply) = self.ingress.poll_transmit(now) {
-                self.receiver
-                    .reply(reply.datagram, received.source)
-                    .unwrap();
+impl Medium for Ends {
+    fn send(&mut self, way: Way, _now: Instant, datagram: &[u8]) {
+        match way {
+            Way::There => {
+                self.sender.send(datagram).unwrap();
+                while self.sender.next_stamp().is_some() {}
             }
-        }
-        while let Some(received) = self.sender.receive(&mut buffer).unwrap() {
-            let bytes = &buffer[..received.length_bytes];
-            self.egress.on_datagram(now, arrival, bytes).unwrap();
+            Way::Back => self.receiver.reply(datagram, self.source.unwrap()).unwrap(),
         }
     }
 
-    /// Steps until `is_reached`, at most as often as a slow machine needs.
-    fn step_until(&mut self, is_reached: impl Fn(&Self) -> bool) {
-        let step_count_max = if self.is_real { 10_000 } else { 5 };
-        let reached = (0..step_count_max).any(|_| {
-            self.step();
-            is_reached(self)
-        });
-        assert!(reached, "{:?}", self.sender);
+    fn receive(&mut self, way: Way, now: Instant) -> Option<Arrived> {
+        let mut buffer = [0; 2_000];
+        let received = match way {
+            Way::There => self.receiver.receive(now, &mut buffer),
+            Way::Back => self.sender.receive(&mut buffer),
+        };
+        let received = received.unwrap()?;
+        if way == Way::There {
+            self.source = Some(received.source);
+        }
+        Some(Arrived {
+            stamps: ArrivalStamps::application(now.as_ns()),
+            bytes: buffer[..received.length_bytes].to_vec(),
+        })
     }
 }
 
-fn check_conversation(mut hop: Hop) {
-    hop.step_until(|hop| hop.egress.peer_state() == PeerState::Established);
+/// Steps until `is_reached`: in the machine's time, or in one of its own.
+#[allow(
+    clippy::disallowed_methods,
+    reason = "a test may step aside while a datagram is on its way"
+)]
+fn step_until(lab: &mut Lab<Ends>, is_real: bool, is_reached: impl Fn(&Lab<Ends>) -> bool) {
+    // As often as a slow machine needs.
+    let step_count_max = if is_real { 10_000 } else { 5 };
+    let reached = (0..step_count_max).any(|_| {
+        if is_real {
+            std::thread::sleep(Duration::from_millis(1));
+            let now = monotonic_now().unwrap();
+            lab.now_ns = now.as_ns();
+            lab.medium.sender.attend(now);
+            lab.medium.receiver.attend(now);
+        } else {
+            lab.now_ns += 1_000_000;
+        }
+        lab.exchange();
+        is_reached(lab)
+    });
+    assert!(reached, "{:?}", lab.medium);
+}
+
+fn check_conversation(
+    sender: Box<dyn DatagramSender>,
+    receiver: Box<dyn DatagramReceiver>,
+    is_real: bool,
+) {
+    let ends = Ends {
+        sender,
+        receiver,
+        source: None,
+    };
+    let mut lab = Lab::over(&flow(), ends);
+    lab.offset_ns = 0;
+    step_until(&mut lab, is_real, |lab| {
+        lab.egress.peer_state() == PeerState::Established
+    });
     for sequence in 0..200_u64 {
-        let envelope = Envelope {
-            sequence,
-            published_ns: hop.now.as_ns(),
-            epoch: 1,
-            ..Envelope::default()
-        };
         let (channel, size_bytes) = if sequence % 3 == 0 {
             (0, 3_000)
         } else {
             (1, 64)
         };
         let payload = vec![sequence.to_le_bytes()[0]; size_bytes];
-        hop.egress
-            .on_local(hop.now, channel, &envelope, &payload)
-            .unwrap();
-        hop.step_until(|hop| !hop.delivered.is_empty());
-        assert_eq!(hop.delivered.pop(), Some(payload));
+        lab.offer(channel, 1, sequence, &payload).unwrap();
+        step_until(&mut lab, is_real, |lab| !lab.delivered.is_empty());
+        assert_eq!(lab.delivered.pop().unwrap().payload, payload);
     }
-    hop.egress.bye();
-    hop.step_until(|hop| hop.ingress.has_left());
-    let received = [0, 1].map(|channel| hop.ingress.sequence_counts(channel).received_count);
-    assert_eq!(received, [67, 133]);
-    assert!(hop.egress.counts().round_trip_count > 5);
+    lab.egress.bye();
+    step_until(&mut lab, is_real, |lab| lab.ingress.has_left());
+    let taken_count = [0, 1].map(|channel| lab.ingress.sequence_counts(channel).received_count);
+    assert_eq!(taken_count, [67, 133]);
+    assert!(lab.egress.counts().round_trip_count > 5);
     assert_eq!(
-        hop.ingress.refusals().total() + hop.egress.refusals().total(),
+        lab.ingress.refusals().total() + lab.egress.refusals().total(),
         0
     );
-    let counts = hop.receiver.seal_counts().unwrap();
+    let counts = lab.medium.receiver.seal_counts().unwrap();
     assert_eq!(counts.refused.total(), 0);
-    assert_eq!(counts.opened_count, hop.ingress.counts().datagram_count);
+    assert_eq!(counts.opened_count, lab.ingress.counts().datagram_count);
     assert_eq!(counts.agreement_count, 1);
 }
 
@@ -179,11 +148,11 @@ fn keys() -> (Initiator, Responder) {
 fn a_conversation_with_pieces_exchanges_and_farewell_goes_through_whole() {
     let (sender, receiver) = queue_pair();
     let (initiator, responder) = keys();
-    check_conversation(Hop::new(
+    check_conversation(
         super::sender(sender, Some(initiator)),
         super::receiver(receiver, queue::SENDER, Some(responder)),
         false,
-    ));
+    );
 }
 
 #[test]
@@ -193,7 +162,7 @@ fn every_transport_carries_a_sealed_conversation() {
         let (ip, mode) = (Ipv4Addr::LOCALHOST.into(), TimestampMode::Off);
         let opened = opened(transport, ip, mode, Some(initiator), Some(responder));
         if let Some((sender, receiver)) = opened {
-            check_conversation(Hop::new(sender.sender, receiver.receiver, true));
+            check_conversation(sender.sender, receiver.receiver, true);
         }
     }
 }

@@ -125,11 +125,14 @@ pub struct PathMtu {
     pub is_assumed: bool,
 }
 
-/// The sending socket, connected to the peer.
+/// The sending socket, connected to the peer; or one that hears anyone and answers whom it is told to: what a foreign
+/// protocol needs whose client speaks first and expects answers from the very port it spoke to.
 #[derive(Debug)]
 pub struct UdpSender {
     socket: Socket,
     peer: SocketAddr,
+    /// Whom a socket answers that is connected to nobody.
+    answered: Option<SockAddr>,
     reader: MessageReader,
     counters: SenderCounters,
     /// The kernel's drop count at the newest reply, modulo 2^32.
@@ -165,8 +168,20 @@ impl UdpSender {
         Self::open_towards(settings, Some(settings.peer), true)
     }
 
-    /// As [`UdpSender::open`] or [`UdpSender::open_ignoring_reports`], connected to `peer`, or to nobody.
-    pub(super) fn open_towards(
+    /// As [`UdpSender::open_ignoring_reports`], connected to nobody: `settings.peer` is not used.
+    ///
+    /// # Errors
+    /// As [`UdpSender::open`].
+    pub fn open_answering(settings: &SocketSettings) -> Result<Self, SocketError> {
+        Self::open_towards(settings, None, true)
+    }
+
+    /// Sends to `peer` from now on; only a socket that is connected to nobody does.
+    pub fn answer_to(&mut self, peer: SocketAddr) {
+        self.answered = Some(SockAddr::from(peer));
+    }
+
+    fn open_towards(
         settings: &SocketSettings,
         peer: Option<SocketAddr>,
         ignores_reports: bool,
@@ -212,6 +227,7 @@ impl UdpSender {
             granted: granted_options(&socket, settings)?,
             socket,
             peer: settings.peer,
+            answered: None,
             reader: MessageReader::new(),
             counters: SenderCounters::default(),
             kernel_drop_count: 0,
@@ -263,7 +279,7 @@ impl UdpSender {
     /// the future shows it and names no send.
     fn token_of(&self, id: u32) -> Option<TxToken> {
         let token = self.first_token?.0.wrapping_add(id);
-        let age = sent_modulo(self.counters.sent_count).wrapping_sub(token);
+        let age = self.counters.next_token().0.wrapping_sub(token);
         (1..=u32::MAX / 2).contains(&age).then_some(TxToken(token))
     }
 
@@ -280,7 +296,7 @@ impl UdpSender {
             self.counters.unmatched_stamp_count += 1;
         }
         let restarted = restart_send_count(&self.socket, self.mode).is_ok();
-        self.first_token = restarted.then_some(TxToken(sent_modulo(self.counters.sent_count)));
+        self.first_token = restarted.then(|| self.counters.next_token());
     }
 
     /// Matches a radio's report to its send by the packet it brought back.
@@ -333,20 +349,6 @@ impl UdpSender {
 }
 
 impl UdpSender {
-    /// Sends to the connected peer, or to `to` when there is none.
-    pub(super) fn send_towards(
-        &mut self,
-        datagram: &[u8],
-        to: Option<&SockAddr>,
-    ) -> Result<TxToken, SendRefusal> {
-        let flags = libc::MSG_DONTWAIT;
-        let sent = self.offer(|socket| match to {
-            None => socket.send_with_flags(datagram, flags),
-            Some(to) => socket.send_to_with_flags(datagram, to, flags),
-        });
-        self.note_sent(sent, datagram, datagram.len())
-    }
-
     /// Sends, where reports are ignored past those that are pending.
     fn offer(&self, send: impl Fn(&Socket) -> io::Result<usize>) -> io::Result<usize> {
         let mut result = send(&self.socket);
@@ -370,8 +372,7 @@ impl UdpSender {
     ) -> Result<TxToken, SendRefusal> {
         match sent {
             Ok(_) => {
-                let token = TxToken(sent_modulo(self.counters.sent_count));
-                self.counters.sent_count += 1;
+                let token = self.counters.count_sent();
                 if let Some(radio) = &mut self.radio {
                     radio.note(head, token);
                 }
@@ -403,7 +404,12 @@ impl UdpSender {
 
 impl DatagramSender for UdpSender {
     fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
-        self.send_towards(datagram, None)
+        let flags = libc::MSG_DONTWAIT;
+        let sent = self.offer(|socket| match &self.answered {
+            None => socket.send_with_flags(datagram, flags),
+            Some(to) => socket.send_to_with_flags(datagram, to, flags),
+        });
+        self.note_sent(sent, datagram, datagram.len())
     }
 
     fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal> {
@@ -711,9 +717,4 @@ fn is_broken(error: &io::Error) -> bool {
     error
         .raw_os_error()
         .is_none_or(|errno| ours.contains(&errno))
-}
-
-/// The number of the next send as the kernel counts it, modulo 2^32.
-fn sent_modulo(sent_count: u64) -> u32 {
-    u32::try_from(sent_count & u64::from(u32::MAX)).expect("masked to 32 bits")
 }

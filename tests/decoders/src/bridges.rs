@@ -15,7 +15,7 @@ use hil_core::time::Instant;
 use hil_protocol::wire::decode;
 use hil_protocol::{
     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, InMemory,
-    IngressBridge, IngressSettings,
+    IngressBridge, IngressSettings, lab,
 };
 
 use crate::Verdict;
@@ -46,17 +46,16 @@ fn flow() -> FlowIdentity {
 pub(crate) fn egress(session: u32) -> EgressBridge {
     let settings = EgressSettings {
         flow: flow(),
-        session,
-        domain: [1; 16],
-        clock_id: 11,
-        datagram_max_bytes: 1472,
-        sync_period: Duration::from_millis(20),
+        ..lab::egress_settings(session, SIZE_MAX_BYTES)
     };
     EgressBridge::new(settings).expect("the settings are fixed")
 }
 
 pub(crate) fn ingress() -> IngressBridge {
-    let settings = IngressSettings::new(flow(), 200, [2; 16], 22);
+    let settings = IngressSettings {
+        flow: flow(),
+        ..lab::ingress_settings(200, SIZE_MAX_BYTES)
+    };
     IngressBridge::new(settings).expect("the settings are fixed")
 }
 

@@ -2,7 +2,6 @@
 //! `help.rs`.
 
 use std::net::{Ipv4Addr, TcpListener};
-use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 use std::{fs, io};
@@ -11,7 +10,9 @@ use hil_report::summary::{Outcome, RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
 use hil_teleoperation::bvh::Bvh;
 use hil_tests::account::{account, assert_accounts_close, assert_every_message_is_accounted_for};
-use hil_tests::binary::{hil_runtime_binary, workspace_folder};
+use hil_tests::binary::{
+    hil_runtime as run, hil_runtime_binary, hil_runtime_in as run_in, workspace_folder,
+};
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial, processes_mentioning, shipped_topology, wait_until};
@@ -19,23 +20,6 @@ use nix::sys::signal::Signal;
 use serde_json::Value;
 
 const LIMIT: Duration = Duration::from_mins(1);
-
-/// Runs the binary in `folder` to its end.
-fn run_in(folder: &Path, arguments: &[&str]) -> Finished {
-    let mut command = Command::new(hil_runtime_binary());
-    command.args(arguments).current_dir(folder);
-    command.env_remove("COLUMNS").env_remove("HIL_HOST");
-    let mut child = ChildGuard::spawn(&mut command).unwrap();
-    child.wait_within(LIMIT).unwrap()
-}
-
-fn run(arguments: &[&str]) -> Finished {
-    run_in(&workspace_folder(), arguments)
-}
-
-fn assert_code(finished: &Finished, code: i32) {
-    assert_eq!(finished.status.code(), Some(code), "{finished:?}");
-}
 
 /// Checks that standard error says all of `words`.
 fn assert_says(finished: &Finished, words: &[&str]) {
@@ -78,7 +62,7 @@ fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
         let text = fs::read_to_string(&path).unwrap();
         topology_count += 1;
         let checked = run_in(&folder, &["--topology", name, "--check"]);
-        assert_code(&checked, 0);
+        checked.assert_code(0);
         assert!(checked.stdout.contains("the file is valid"), "{checked:?}");
         let told = text.lines().filter_map(|line| {
             let (comment, command) = line.split_once("hil-runtime ")?;
@@ -92,7 +76,7 @@ fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
             let mut arguments: Vec<&str> = command.split_whitespace().collect();
             // Virtual time is over in a moment; a real run is only checked.
             arguments.extend((arguments[0] != "simulate").then_some("--check"));
-            assert_code(&run_in(&folder, &arguments), 0);
+            run_in(&folder, &arguments).assert_code(0);
         }
     }
     assert!(topology_count >= 5 && command_count >= 3);
@@ -101,7 +85,7 @@ fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
 #[test]
 fn a_file_that_is_not_there_is_named() {
     let finished = run(&["--topology", "no-such-file.toml"]);
-    assert_code(&finished, 2);
+    finished.assert_code(2);
     assert_says(&finished, &["no-such-file.toml", "No such file"]);
 }
 
@@ -115,7 +99,7 @@ fn a_misspelt_key_is_shown_in_its_file_with_what_was_meant() {
     let path = path.to_str().unwrap();
     for arguments in [&["--topology", path][..], &["--topology", path, "--check"]] {
         let finished = run(arguments);
-        assert_code(&finished, 2);
+        finished.assert_code(2);
         let mut lines = wrong.lines();
         let line = 1 + lines.position(|line| line.starts_with("duratoin")).unwrap();
         let place = format!("wrong.toml:{line}");
@@ -123,7 +107,7 @@ fn a_misspelt_key_is_shown_in_its_file_with_what_was_meant() {
         assert_says(&finished, &["run.duratoin", &place, hint, "start_timeout"]);
     }
     let finished = run(&["--topology", path, "--chekc"]);
-    assert_code(&finished, 2);
+    finished.assert_code(2);
     assert_says(&finished, &["--check"]);
 }
 
@@ -161,7 +145,7 @@ fn hosts_with_different_topologies_refuse_each_other() {
     ];
     for host in &mut hosts {
         let finished = host.wait_within(LIMIT).unwrap();
-        assert_code(&finished, 2);
+        finished.assert_code(2);
         assert_says(&finished, &["does not fit this run", "use the same file"]);
     }
 }
@@ -175,7 +159,7 @@ fn a_host_whose_address_is_elsewhere_says_so() {
         .set("hosts.robot-pc.address=\"203.0.113.2\"");
     for (host, address) in [("control-pc", "203.0.113.1"), ("robot-pc", "203.0.113.2")] {
         let finished = start_as(&trial, host).wait_within(LIMIT).unwrap();
-        assert_code(&finished, 75);
+        finished.assert_code(75);
         let key = format!("hosts.{host}.address cannot be used");
         let words = format!("no interface has {address}");
         assert_says(&finished, &[&key, &words, "--set"]);
@@ -191,7 +175,7 @@ fn a_host_that_never_comes_is_named_with_where_it_was_awaited() {
             .wait_for_output(&format!("waiting for {missing}"), LIMIT)
             .unwrap();
         let finished = child.wait_within(LIMIT).unwrap();
-        assert_code(&finished, 69);
+        finished.assert_code(69);
         let complaint = format!("{missing} did not appear within 2 s");
         assert_says(&finished, &[&complaint, "TCP 127.0.0.1:"]);
     }
@@ -206,7 +190,7 @@ fn waiting_for_a_host_can_be_interrupted() {
         .unwrap();
     child.signal(Signal::SIGINT).unwrap();
     let finished = child.wait_within(LIMIT).unwrap();
-    assert_code(&finished, 130);
+    finished.assert_code(130);
     assert_says(&finished, &["interrupted"]);
 }
 
@@ -230,7 +214,7 @@ fn an_interrupted_run_leaves_a_complete_report_and_nothing_else() {
         wait_for_messages(&files, "egm.right.command");
         child.signal(signal).unwrap();
         let finished = child.wait_within(LIMIT).unwrap();
-        assert_code(&finished, 130);
+        finished.assert_code(130);
         files.assert_nothing_left_here();
         let summary = files.summary();
         assert_eq!(summary.run.outcome, Outcome::Stopped);
@@ -279,7 +263,7 @@ fn end_at_once([first, second]: [Signal; 2]) {
     assert!(child.is_running());
     child.signal(second).unwrap();
     let finished = child.wait_within(LIMIT).unwrap();
-    assert_code(&finished, 131);
+    finished.assert_code(131);
     assert!(!files.has_report(), "the report would have taken time");
     wait_until(LIMIT, "the end of the own program", || {
         own_processes().is_empty()
@@ -335,7 +319,7 @@ fn a_run_in_virtual_time_depends_on_its_seed_alone() {
         "{account:?}"
     );
     let real = run(&["simulate", "--topology", "deploy/topologies/split.toml"]);
-    assert_code(&real, 2);
+    real.assert_code(2);
     assert_says(&real, &["udp", "emulated"]);
 }
 
@@ -359,7 +343,7 @@ fn the_report_of_a_finished_run_can_be_printed_again() {
     let summary: Value = serde_json::from_slice(&summary).unwrap();
     assert_eq!(summary["run"]["case"], "shuttle");
     let missing = run(&["report", record.join("nothing").to_str().unwrap()]);
-    assert_code(&missing, 2);
+    missing.assert_code(2);
     assert_says(&missing, &["nothing"]);
 }
 
@@ -460,7 +444,7 @@ fn a_written_motion_is_one_that_can_be_read_and_played() {
     played.assert_success();
     assert!(played.stdout.contains("motion loops sent"), "{played:?}");
     let refused = run(&["motion", "--period", "-1"]);
-    assert_code(&refused, 2);
+    refused.assert_code(2);
     assert!(!refused.stderr.is_empty());
 }
 
@@ -548,7 +532,7 @@ fn an_own_program_that_fails_ends_the_run_and_is_named() {
         .set("processes.robot.run=[\"sh\", \"-c\", \"sleep 1; echo no oil >&2; exit 3\"]");
     let mut child = trial.start_here();
     let finished = child.wait_within(LIMIT).unwrap();
-    assert_code(&finished, 1);
+    finished.assert_code(1);
     assert_says(&finished, &["robot: ended with exit code 3"]);
     let files = trial.folder("", LIMIT);
     files.assert_nothing_left_here();
@@ -565,7 +549,7 @@ fn a_folder_too_long_for_shared_memory_is_a_wrong_argument() {
     command.arg("--domain-root").arg(&folder);
     let finished = ChildGuard::spawn(&mut command).unwrap().wait_within(LIMIT);
     let finished = finished.unwrap();
-    assert_code(&finished, 2);
+    finished.assert_code(2);
     assert_says(&finished, &["characters, at most"]);
     let entry_count = fs::read_dir(record.path()).unwrap().count();
     assert_eq!(entry_count, 0, "a run folder of no run");
@@ -578,7 +562,7 @@ fn a_program_that_does_not_exist_is_named_before_the_run_begins() {
         .set("processes.robot.run=[\"no-such-robot\"]");
     let mut child = trial.start_here();
     let finished = child.wait_within(LIMIT).unwrap();
-    assert_code(&finished, 2);
+    finished.assert_code(2);
     assert_says(
         &finished,
         &[
@@ -593,11 +577,11 @@ fn a_program_that_does_not_exist_is_named_before_the_run_begins() {
     command.args(["--check", "--host", "local"]);
     let checked = ChildGuard::spawn(&mut command).unwrap().wait_within(LIMIT);
     let checked = checked.unwrap();
-    assert_code(&checked, 2);
+    checked.assert_code(2);
     assert_says(
         &checked,
         &["processes.robot.run cannot be used: cannot start no-such-robot"],
     );
     let checked = ChildGuard::spawn(trial.command_here().arg("--check")).unwrap();
-    assert_code(&{ checked }.wait_within(LIMIT).unwrap(), 0);
+    { checked }.wait_within(LIMIT).unwrap().assert_code(0);
 }

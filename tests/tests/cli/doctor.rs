@@ -4,8 +4,8 @@
 use std::process::Command;
 use std::time::Duration;
 
-use hil_tests::binary::hil_runtime_binary;
-use hil_tests::child::{ChildGuard, Finished};
+use hil_tests::binary::{hil_runtime as run, hil_runtime_binary};
+use hil_tests::child::ChildGuard;
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
@@ -15,14 +15,6 @@ const LIMIT: Duration = Duration::from_mins(2);
 fn start(arguments: &[&str]) -> ChildGuard {
     let mut command = Command::new(hil_runtime_binary());
     ChildGuard::spawn(command.args(arguments).env_remove("HIL_HOST")).unwrap()
-}
-
-fn run(arguments: &[&str]) -> Finished {
-    start(arguments).wait_within(LIMIT).unwrap()
-}
-
-fn assert_code(finished: &Finished, code: i32) {
-    assert_eq!(finished.status.code(), Some(code), "{finished:?}");
 }
 
 #[test]
@@ -57,7 +49,7 @@ fn the_doctor_speaks_json_and_is_strict_when_told_to() {
     let is_unfit = ["warning", "error"]
         .iter()
         .any(|word| report["counts"][word].as_u64() > Some(0));
-    assert_code(&strict, if is_unfit { 78 } else { 0 });
+    strict.assert_code(if is_unfit { 78 } else { 0 });
 }
 
 #[test]
@@ -133,7 +125,7 @@ fn wrong_arguments_of_the_doctor_are_refused_with_what_is_right() {
         (&["--with", "/dev/null"], "no report of `doctor --json`"),
     ] {
         let finished = run(&[&["doctor"], arguments].concat());
-        assert_code(&finished, 2);
+        finished.assert_code(2);
         assert!(
             finished.stderr.contains(words),
             "no `{words}` in {finished:?}"
@@ -148,7 +140,7 @@ fn an_interrupted_measurement_gives_what_there_was_so_far() {
     doctor.wait_for_output("wake-ups", LIMIT).unwrap();
     doctor.signal(Signal::SIGINT).unwrap();
     let finished = doctor.wait_within(LIMIT).unwrap();
-    assert_code(&finished, 130);
+    finished.assert_code(130);
     let report: Value = serde_json::from_str(&finished.stdout).unwrap();
     let latency = &report["latency"];
     assert_eq!(latency["is_interrupted"], true);

@@ -3,33 +3,18 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 use hil_account::MessageFate;
 use hil_report::summary::RunSummary;
 use hil_tests::account::account;
-use hil_tests::binary::{hil_runtime_binary, workspace_folder};
-use hil_tests::child::{ChildGuard, Finished};
+use hil_tests::binary::hil_runtime as run;
+use hil_tests::child::Finished;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial};
 use serde_json::Value;
 
 const LIMIT: Duration = Duration::from_mins(2);
-
-fn run(arguments: &[&str]) -> Finished {
-    let mut command = Command::new(hil_runtime_binary());
-    command
-        .args(arguments)
-        .current_dir(workspace_folder())
-        .env_remove("COLUMNS");
-    let mut child = ChildGuard::spawn(&mut command).unwrap();
-    child.wait_within(LIMIT).unwrap()
-}
-
-fn assert_code(finished: &Finished, code: i32) {
-    assert_eq!(finished.status.code(), Some(code), "{finished:?}");
-}
 
 /// A finished run behind an emulated link that loses every tenth message.
 fn finished_run(record: &RunFolder) -> RunFiles {
@@ -63,10 +48,10 @@ fn a_run_is_replayed_to_the_last_bit_and_a_flipped_bit_is_found() {
     assert_outages_and_events_are_kept(&files);
     let folder = files.root();
     let same = replay(folder);
-    assert_code(&same, 0);
+    same.assert_code(0);
     assert!(same.stdout.contains(": identical\n"), "{same:?}");
     let json = run(&["replay", folder.to_str().unwrap(), "--json"]);
-    assert_code(&json, 0);
+    json.assert_code(0);
     let document: Value = serde_json::from_str(&json.stdout).unwrap();
     assert_eq!(document["is_identical"], true, "{document}");
     assert!(document["replay"]["compared_count"].as_u64().unwrap() > 1_000);
@@ -81,23 +66,23 @@ fn a_run_is_replayed_to_the_last_bit_and_a_flipped_bit_is_found() {
     flipped[128 + count / 2 * record_bytes + 64 + 24] ^= 1;
     fs::write(&path, flipped).unwrap();
     let other = replay(folder);
-    assert_code(&other, 1);
+    other.assert_code(1);
     assert!(other.stdout.contains(": DIFFERENT\n"), "{other:?}");
     assert!(other.stdout.contains("1 differs"), "{other:?}");
     assert!(other.stdout.contains("left arm, cycle "), "{other:?}");
 
     fs::remove_file(&path).unwrap();
     let torn = replay(folder);
-    assert_code(&torn, 1);
+    torn.assert_code(1);
     assert!(
         torn.stdout
             .contains("egm/left/feedback: no record is at hand"),
         "{torn:?}"
     );
     fs::remove_dir_all(folder.join("records")).unwrap();
-    assert_code(&replay(folder), 2);
+    replay(folder).assert_code(2);
     let nowhere = replay(record.path());
-    assert_code(&nowhere, 2);
+    nowhere.assert_code(2);
     assert!(nowhere.stderr.contains("not a run's folder"), "{nowhere:?}");
 }
 
@@ -145,15 +130,15 @@ fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
         output.to_str().unwrap(),
     ];
     let simulated = run(&arguments);
-    assert_code(&simulated, 0);
+    simulated.assert_code(0);
     let again = run(&arguments);
-    assert_code(&again, 2);
+    again.assert_code(2);
     assert!(
         again.stderr.contains("out: the folder is not empty"),
         "{again:?}"
     );
     let report = run(&["report", output.to_str().unwrap(), "--full"]);
-    assert_code(&report, 0);
+    report.assert_code(0);
     assert_eq!(report.stdout.trim_end(), simulated.stdout.trim_end());
     let brief = run(&["report", output.to_str().unwrap()]);
     let printed = fs::read_to_string(output.join("report.txt")).unwrap();
@@ -182,7 +167,7 @@ fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
     );
     assert!(output.join("events.log").is_file());
     assert_series_are_those_that_the_case_lists(&output.join("series"));
-    assert_code(&replay(&output), 2);
+    replay(&output).assert_code(2);
 }
 
 fn assert_series_are_those_that_the_case_lists(folder: &Path) {
@@ -274,7 +259,7 @@ fn mistakes_in_a_calibration_are_named_with_what_would_do() {
         ),
     ] {
         let finished = run(arguments);
-        assert_code(&finished, 2);
+        finished.assert_code(2);
         for word in words {
             assert!(
                 finished.stderr.contains(word),

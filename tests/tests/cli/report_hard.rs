@@ -4,15 +4,13 @@
 
 use std::fs;
 use std::path::Path;
-use std::process::Command;
 use std::time::{Duration, Instant};
 
 use hil_account::{MessageFate, Stage};
 use hil_report::summary::RunSummary;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
-use hil_tests::binary::hil_runtime_binary;
+use hil_tests::binary::hil_runtime as run;
 use hil_tests::browser::Browser;
-use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::{CHANNELS, emulated_shuttle};
 use hil_tests::trial::{RunFiles, Trial};
@@ -24,13 +22,6 @@ const PAGE_BYTES_MAX: usize = 3_000_000;
 /// lay out.
 const MILLION_BYTES_MAX: usize = 500_000;
 const MILLION_ELEMENT_COUNT_MAX: u64 = 2_000;
-
-fn run(arguments: &[&Path]) -> Finished {
-    let mut command = Command::new(hil_runtime_binary());
-    command.args(arguments).env_remove("COLUMNS");
-    let mut child = ChildGuard::spawn(&mut command).unwrap();
-    child.wait_within(LIMIT).unwrap()
-}
 
 /// The page of the run in `folder`, with words of no break as plain ones.
 fn page(folder: &Path, output: &Path) -> String {

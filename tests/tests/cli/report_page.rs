@@ -3,26 +3,15 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
-use hil_tests::binary::hil_runtime_binary;
+use hil_tests::binary::hil_runtime as run;
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, shipped_topology};
 use serde_json::Value;
 
 const LIMIT: Duration = Duration::from_mins(2);
-
-fn run(arguments: &[&Path]) -> Finished {
-    let mut command = Command::new(hil_runtime_binary());
-    command
-        .args(arguments)
-        .env_remove("COLUMNS")
-        .env_remove("HIL_HOST");
-    let mut child = ChildGuard::spawn(&mut command).unwrap();
-    child.wait_within(LIMIT).unwrap()
-}
 
 fn report(arguments: &[&Path]) -> Finished {
     run(&[&[Path::new("report")], arguments].concat())

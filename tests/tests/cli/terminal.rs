@@ -25,10 +25,6 @@ fn run(arguments: &[&str]) -> Finished {
     start(arguments).wait_within(LIMIT).unwrap()
 }
 
-fn assert_code(finished: &Finished, code: i32) {
-    assert_eq!(finished.status.code(), Some(code), "{finished:?}");
-}
-
 /// The one JSON object that a command prints.
 fn json(arguments: &[&str]) -> Value {
     let finished = run(arguments);
@@ -50,7 +46,7 @@ fn running(trial: &Trial) -> (ChildGuard, RunFiles) {
 fn end((mut child, files): (ChildGuard, RunFiles)) {
     child.signal(Signal::SIGINT).unwrap();
     let finished = child.wait_within(LIMIT).unwrap();
-    assert_code(&finished, 130);
+    finished.assert_code(130);
     files.assert_nothing_left_here();
     for name in ["status.json", "live.json"] {
         assert!(!files.root().join(name).exists(), "{name} is left");
@@ -125,7 +121,7 @@ fn gives_totals_when_interrupted(run_folder: &str) {
     child.wait_for_output(" Hz", LIMIT).unwrap();
     child.signal(Signal::SIGINT).unwrap();
     let finished = child.wait_within(LIMIT).unwrap();
-    assert_code(&finished, 130);
+    finished.assert_code(130);
     assert!(finished.stdout.contains("in all"), "{finished:?}");
 }
 
@@ -192,7 +188,7 @@ fn messages_are_shown_by_their_fields_and_wrong_questions_say_what_there_is() {
         ),
     ] {
         let refused = run(&arguments);
-        assert_code(&refused, 2);
+        refused.assert_code(2);
         assert!(refused.stderr.contains(words), "{words}: {refused:?}");
     }
     gives_totals_when_interrupted(run_folder);

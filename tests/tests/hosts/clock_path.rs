@@ -6,76 +6,45 @@ use std::time::Duration;
 
 use hil_clock::{ClockMetrics, StampKind};
 use hil_report::clock_summary::{ClockPathSummary, ClockRung, HostPairClock};
-use hil_report::summary::{Outcome, RunEventKind, RunSummary};
+use hil_report::summary::{RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
-use hil_tests::account::assert_every_message_is_accounted_for;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::{Lab, SECOND_ADDRESSES, SECOND_INTERFACE};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::{RunFiles, Trial, shipped_topology, wait_until};
+use hil_tests::split::{HOSTS, Split};
+use hil_tests::trial::{Trial, shipped_topology, wait_until};
 
-const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 /// The processes at the ends of the clock path, by host.
 const ENDS: [&str; 2] = ["clock-robot-pc-control-pc", "clock-control-pc-robot-pc"];
 const AHEAD_S: u32 = 100_000;
 /// `robot-pc = control-pc + truth`, to the nanosecond.
 const TRUTH_NS: i64 = AHEAD_S as i64 * 1_000_000_000;
 const LIMIT: Duration = Duration::from_mins(1);
-const RUN_LIMIT: Duration = Duration::from_mins(2);
 /// Less than a channel of the link and its exchanges ask for, some 140 kbit/s, so that a queue stands,
 /// tens of milliseconds long.
 const THROTTLE: &str = "tbf rate 60kbit burst 1600 limit 1000";
 
 /// A split run whose topology has a clock path.
-struct Split {
-    hosts: [ChildGuard; 2],
-    files: [RunFiles; 2],
-    lab: Lab,
+fn start<'a>(lab: &'a Lab, record: &RunFolder, duration: &str) -> Split<'a> {
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set(&format!("run.duration=\"{duration}\""));
+    let ends = HOSTS.iter().zip(SECOND_ADDRESSES);
+    let trial = ends.fold(trial, |trial, (host, address)| {
+        trial
+            .set(&format!("hosts.{host}.clock_address=\"{address}\""))
+            .set(&format!(
+                "hosts.{host}.clock_interface=\"{SECOND_INTERFACE}\""
+            ))
+    });
+    Split::start(lab, &trial)
 }
 
-impl Split {
-    fn start(lab: Lab, record: &RunFolder, duration: &str) -> Self {
-        let trial = Trial::shipped("shuttle-split.toml", record.path())
-            .set(&format!("run.duration=\"{duration}\""));
-        let trial = HOSTS
-            .iter()
-            .zip(SECOND_ADDRESSES)
-            .fold(trial, |trial, (host, address)| {
-                trial
-                    .set(&format!("hosts.{host}.clock_address=\"{address}\""))
-                    .set(&format!(
-                        "hosts.{host}.clock_interface=\"{SECOND_INTERFACE}\""
-                    ))
-            });
-        let hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
-        let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
-        Self { hosts, files, lab }
-    }
-
-    /// Waits until the robot's host has received `count` more commands.
-    fn wait_for_messages(&self, count: u64, after: &str) {
-        let received = || self.files[1].record_bytes("shuttle.command.ingress.");
-        let wanted = received() + count * 96;
-        wait_until(LIMIT, &format!("commands after {after}"), || {
-            received() >= wanted
-        });
-    }
-
-    /// Both summaries, which must agree on the clocks.
-    fn finish(mut self) -> [RunSummary; 2] {
-        for host in &mut self.hosts {
-            host.wait_within(RUN_LIMIT).unwrap().assert_success();
-        }
-        let summaries = self.files.each_ref().map(RunFiles::summary);
-        for (index, summary) in summaries.iter().enumerate() {
-            assert_eq!(summary.run.outcome, Outcome::Completed);
-            assert_every_message_is_accounted_for(summary);
-            self.files[index].assert_nothing_left_on(self.lab.host(index));
-        }
-        assert_eq!(pair(&summaries[0]), pair(&summaries[1]));
-        summaries
-    }
+/// Both summaries, which must agree on the clocks.
+fn finish(split: Split<'_>) -> [RunSummary; 2] {
+    let summaries = split.finish();
+    assert_eq!(pair(&summaries[0]), pair(&summaries[1]));
+    summaries
 }
 
 fn pair(summary: &RunSummary) -> &HostPairClock {
@@ -123,9 +92,9 @@ fn warnings<'a>(summary: &'a RunSummary, words: &str) -> Vec<&'a String> {
     all.filter(|warning| warning.contains(words)).collect()
 }
 
-fn throttle(split: &Split, ports: [&str; 2], what: &str) {
+fn throttle(lab: &Lab, ports: [&str; 2], what: &str) {
     for port in ports {
-        let mut command: Command = split.lab.host(0).command("tc");
+        let mut command: Command = lab.host(0).command("tc");
         let words = format!("qdisc {what} dev {port} root");
         let words = if what == "add" {
             format!("{words} {THROTTLE}")
@@ -145,14 +114,14 @@ fn a_slow_data_link_leaves_the_bound_as_narrow_as_the_clock_path() {
     let record = RunFolder::new("clock-path");
     let ports = lab.put_bridge_between();
     lab.lay_second_cable();
-    let split = Split::start(lab, &record, "8 s");
-    split.wait_for_messages(10, "the begin of the run");
-    throttle(&split, ports, "add");
+    let split = start(&lab, &record, "8 s");
+    split.wait_for_messages("the begin of the run");
+    throttle(&lab, ports, "add");
     std::thread::sleep(Duration::from_secs(6));
     // The records must not go through it.
-    throttle(&split, ports, "delete");
+    throttle(&lab, ports, "delete");
     let report = split.files[0].clone();
-    for summary in &split.finish() {
+    for summary in &finish(split) {
         let pair = pair(summary);
         let path = path(pair);
         let figures = path.exchanges.as_ref().unwrap();
@@ -189,7 +158,7 @@ fn without_its_cable_a_clock_path_is_given_up_and_the_report_says_so() {
         return;
     };
     let record = RunFolder::new("clock-none");
-    let summaries = Split::start(lab, &record, "2 s").finish();
+    let summaries = finish(start(&lab, &record, "2 s"));
     for summary in &summaries {
         let pair = pair(summary);
         let path = path(pair);
@@ -223,7 +192,7 @@ fn a_cable_that_is_never_plugged_in_delays_the_run_and_does_not_stop_it() {
     let record = RunFolder::new("clock-unplugged");
     lab.lay_second_cable();
     lab.host(1).set_link(SECOND_INTERFACE, "down");
-    for summary in &Split::start(lab, &record, "2 s").finish() {
+    for summary in &finish(start(&lab, &record, "2 s")) {
         let pair = pair(summary);
         assert!(!path(pair).has_exchanges(), "{pair:?}");
         let told = warnings(summary, "gave no exchange");
@@ -243,13 +212,10 @@ fn a_killed_end_comes_back_and_a_cable_pulled_in_the_run_leaves_a_gap_that_is_to
     };
     let record = RunFolder::new("clock-killed");
     lab.lay_second_cable();
-    let split = Split::start(lab, &record, "12 s");
-    split.wait_for_messages(10, "the begin of the run");
+    let split = start(&lab, &record, "12 s");
+    split.wait_for_messages("the begin of the run");
     for (index, end) in ENDS.iter().enumerate() {
-        split.files[index].kill_process(end, 0, LIMIT);
-        wait_until(LIMIT, &format!("the restart of {end}"), || {
-            split.files[index].process(end, 1).is_some()
-        });
+        split.kill(index, end);
     }
     let exchanged =
         || split.files[0].record_bytes(&format!("clock.{}-{}.round", HOSTS[0], HOSTS[1]));
@@ -257,9 +223,9 @@ fn a_killed_end_comes_back_and_a_cable_pulled_in_the_run_leaves_a_gap_that_is_to
     wait_until(LIMIT, "exchanges after the restarts", || {
         exchanged() > before + 48 * 20
     });
-    split.lab.host(0).set_link(SECOND_INTERFACE, "down");
+    lab.host(0).set_link(SECOND_INTERFACE, "down");
     let files = split.files[0].root().join("records");
-    for summary in &split.finish() {
+    for summary in &finish(split) {
         let pair = pair(summary);
         let path = path(pair);
         assert!(path.has_exchanges(), "{path:?}");

@@ -1,33 +1,24 @@
 //! Two hosts whose monotonic clocks differ by a known time: the report's alignment is held against
 //! the truth. The offset is made by a time namespace, so no clock of this machine is touched.
 
-use std::time::Duration;
-
 use hil_clock::StampKind;
 use hil_report::clock_summary::{ClockRung, HostPairClock};
 use hil_report::network::{NetworkQuantity, TimelineSubject};
-use hil_report::summary::{LinkKind, Outcome, RunSummary};
-use hil_tests::account::{account, assert_every_message_is_accounted_for, carried};
+use hil_report::summary::{LinkKind, RunSummary};
+use hil_tests::account::{account, carried};
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
+use hil_tests::split::{ARM_CHANNELS, HOSTS, Split};
 use hil_tests::trial::Trial;
 
-const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const AHEAD_S: u32 = 100_000;
 /// `robot-pc = control-pc + truth`, to the nanosecond.
 const TRUTH_NS: i64 = AHEAD_S as i64 * 1_000_000_000;
-const START_LIMIT: Duration = Duration::from_mins(1);
-const RUN_LIMIT: Duration = Duration::from_mins(2);
 
 fn run(record: &RunFolder) -> Option<[RunSummary; 2]> {
     let lab = Lab::with_clock_ahead_or_skip(Some(AHEAD_S))?;
     let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"8 s\"");
-    let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
-    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), START_LIMIT));
-    for host in &mut hosts {
-        host.wait_within(RUN_LIMIT).unwrap().assert_success();
-    }
-    Some(files.map(|files| files.summary()))
+    Some(Split::start(&lab, &trial).carrying(ARM_CHANNELS).finish())
 }
 
 fn check_alignment(pair: &HostPairClock) {
@@ -97,35 +88,16 @@ fn check_channels(summary: &RunSummary) {
 fn check_bounds(summary: &RunSummary) {
     let network = summary.network.as_ref().unwrap();
     assert!(!network.clocks_differ && network.clock_bound_s > Some(0.0));
-    for one in &network.channels {
-        let (name, figures) = (&one.channel, &one.figures);
-        // A channel that answers requests may have had one.
-        let measured = figures.delay.measured().zip(figures.successive.measured());
-        let Some((delay, successive)) = measured else {
-            continue;
-        };
-        let (bound_ns, variation) = (delay.alignment_bound_ns, delay.variation);
-        println!(
-            "{name}: delay p50 {} ns ±{bound_ns}, variation p50 {} ns ±{}, successive p50 {} ns ±{}, \
-             jitter mean {:.0} ns ±{:.0}",
-            delay.p50.value_ns,
-            variation.p50_ns,
-            variation.bound_ns,
-            successive.p50_ns,
-            successive.bound_ns,
-            successive.jitter.mean_ns,
-            successive.jitter.bound_ns,
-        );
-        assert!(bound_ns > 0 && variation.bound_ns > 0 && successive.bound_ns > 0);
-        assert!(variation.bound_ns <= 2 * bound_ns, "{variation:?}");
-        let rows = network.timeline.rows.iter();
-        let mut rows = rows.filter(|row| {
-            let quantity = NetworkQuantity::Delay;
-            let channel = name.clone();
-            row.subject == TimelineSubject::Channel { channel, quantity }
-        });
-        assert!(rows.next().unwrap().bound.unwrap() > 0.0, "{name}");
-    }
+    let mut delays = network.timeline.rows.iter().filter(|row| {
+        matches!(
+            row.subject,
+            TimelineSubject::Channel {
+                quantity: NetworkQuantity::Delay,
+                ..
+            }
+        )
+    });
+    assert!(delays.any(|row| row.bound > Some(0.0)));
     let metric = summary
         .score
         .iter()
@@ -143,7 +115,6 @@ fn an_offset_of_a_day_is_found_within_its_bound_and_carries_the_account() {
         return;
     };
     for summary in &summaries {
-        assert_eq!(summary.run.outcome, Outcome::Completed);
         let clocks = summary.clocks.as_ref().unwrap();
         assert!(!clocks.has_one_clock);
         assert!(
@@ -157,7 +128,6 @@ fn an_offset_of_a_day_is_found_within_its_bound_and_carries_the_account() {
         check_alignment(pair);
         check_channels(summary);
         check_bounds(summary);
-        assert_every_message_is_accounted_for(summary);
         let unaligned = summary
             .warnings
             .iter()

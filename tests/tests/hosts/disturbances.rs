@@ -10,16 +10,15 @@ use std::time::Duration;
 use hil_account::MessageFate;
 use hil_report::summary::{Outcome, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
-use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::{INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::{RunFiles, Trial, load_average, wait_until};
+use hil_tests::shuttle::CHANNELS;
+use hil_tests::split::{HOSTS, Split};
+use hil_tests::trial::{Trial, load_average, wait_until};
 use nix::sys::signal::Signal;
 use nix::sys::stat::Mode;
 use nix::unistd::mkfifo;
 
-const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
-const CHANNELS: [&str; 2] = ["shuttle/command", "shuttle/status"];
 const LIMIT: Duration = Duration::from_mins(1);
 const RUN_LIMIT: Duration = Duration::from_mins(2);
 /// How long a disturbance lasts: below the least silence after which a peer counts as gone.
@@ -30,51 +29,27 @@ const TRY_AGAIN: i32 = 75;
 /// Below the length of a shuttle command's datagram, above what the kernel takes for IPv4.
 const TINY_MTU: u16 = 80;
 
-fn code(finished: &Finished) -> i32 {
-    let code = finished.status.code();
-    code.unwrap_or_else(|| panic!("{finished:?}"))
-}
-
 /// Starts `trial` on both hosts and waits until messages flow both ways.
-fn start(lab: &Lab, trial: &Trial) -> ([ChildGuard; 2], [RunFiles; 2]) {
-    let hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
-    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
-    wait_for_messages(&files, "the begin of the run");
-    (hosts, files)
-}
-
-/// Waits until either end takes messages that were not there yet.
-fn wait_for_messages(files: &[RunFiles; 2], after: &str) {
-    let taken = || {
-        let commands = files[1].record_bytes("shuttle.command.taken.");
-        let statuses = files[0].record_bytes("shuttle.status.taken.");
-        [commands, statuses]
-    };
-    let before = taken();
-    // What still lay in a queue may come at once; half a second's messages come only over the link.
-    wait_until(LIMIT, &format!("messages both ways after {after}"), || {
-        let now = taken();
-        (0..2).all(|way| now[way] >= before[way] + 50 * 32)
-    });
+fn start<'a>(lab: &'a Lab, trial: &Trial) -> Split<'a> {
+    let split = Split::start(lab, trial);
+    split.wait_for_messages("the begin of the run");
+    split
 }
 
 /// Stops the run from its first host; every message of it has a fate, and nothing is left.
-fn stopped(lab: &Lab, hosts: &mut [ChildGuard; 2], files: &[RunFiles; 2]) -> [RunSummary; 2] {
-    hosts[0].signal(Signal::SIGTERM).unwrap();
-    for host in hosts {
-        host.wait_within(RUN_LIMIT).unwrap();
-    }
-    [0, 1].map(|index| {
-        let summary = files[index].summary();
+fn stopped(mut split: Split<'_>) -> [RunSummary; 2] {
+    split.hosts[0].signal(Signal::SIGTERM).unwrap();
+    split.ended();
+    let summaries = split.summaries();
+    for summary in &summaries {
         assert_eq!(summary.run.outcome, Outcome::Stopped);
-        assert_every_message_is_accounted_for(&summary);
+        assert_every_message_is_accounted_for(summary);
         for channel in CHANNELS {
-            let said = describe(channel, account(&summary, channel));
-            println!("{}: {said}; load {}", HOSTS[index], load_average());
+            let said = describe(channel, account(summary, channel));
+            println!("{}: {said}; load {}", summary.run.host, load_average());
         }
-        files[index].assert_nothing_left_on(lab.host(index));
-        summary
-    })
+    }
+    summaries
 }
 
 /// What neither the consumer took nor a newer message replaced.
@@ -98,18 +73,18 @@ fn cable_address_and_packet_size_change_under_a_run_and_it_goes_on() {
     };
     let record = RunFolder::new("disturbed");
     let trial = Trial::shipped("shuttle-split.toml", record.path()).set("run.duration=\"10 min\"");
-    let (mut hosts, files) = start(&lab, &trial);
+    let split = start(&lab, &trial);
     let robot = lab.host(1);
 
     robot.set_link(INTERFACE, "down");
     thread::sleep(DISTURBED);
     robot.set_link(INTERFACE, "up");
-    wait_for_messages(&files, "the cable was out");
+    split.wait_for_messages("the cable was out");
 
     robot.take_address();
     thread::sleep(DISTURBED);
     robot.give_address();
-    wait_for_messages(&files, "the address was gone");
+    split.wait_for_messages("the address was gone");
 
     for index in [0, 1] {
         lab.host(index).set_mtu(TINY_MTU);
@@ -118,24 +93,24 @@ fn cable_address_and_packet_size_change_under_a_run_and_it_goes_on() {
     for index in [0, 1] {
         lab.host(index).set_mtu(1500);
     }
-    wait_for_messages(&files, "the packets were to be small");
+    split.wait_for_messages("the packets were to be small");
 
     // A second supervisor that says it is the robot's host: the run has its two hosts already.
     let second = trial.clone().set("run.start_timeout=\"1 s\"");
     let mut double = second.start_on(robot);
     let double = double.wait_within(RUN_LIMIT).unwrap();
-    assert_eq!(code(&double), TRY_AGAIN, "{double:?}");
+    double.assert_code(TRY_AGAIN);
     assert!(
         double.stderr.contains("is held by hil-runtime"),
         "{double:?}"
     );
-    wait_for_messages(&files, "a second robot-pc");
+    split.wait_for_messages("a second robot-pc");
     let mut double = second.start_on(lab.host(0));
     let double = double.wait_within(RUN_LIMIT).unwrap();
-    assert_eq!(code(&double), TRY_AGAIN, "{double:?}");
-    wait_for_messages(&files, "a second control-pc");
+    double.assert_code(TRY_AGAIN);
+    split.wait_for_messages("a second control-pc");
 
-    for summary in stopped(&lab, &mut hosts, &files) {
+    for summary in stopped(split) {
         for channel in CHANNELS {
             assert!(missing(&summary, channel) > 0, "{channel} felt nothing");
         }
@@ -152,7 +127,7 @@ fn a_gateway_that_comes_back_while_the_path_is_away_waits_for_it() {
         .set("run.duration=\"10 min\"")
         // The supervisors' connection leads over the same cable.
         .set("run.peer_timeout=\"60 s\"");
-    let (mut hosts, files) = start(&lab, &trial);
+    let split = start(&lab, &trial);
     let robot = lab.host(1);
     for instance in [0, 1] {
         let is_cable = instance == 0;
@@ -161,9 +136,9 @@ fn a_gateway_that_comes_back_while_the_path_is_away_waits_for_it() {
         } else {
             robot.set_mtu(TINY_MTU);
         }
-        files[1].kill_process("gateway-hop-robot-pc", instance, LIMIT);
+        split.files[1].kill_process("gateway-hop-robot-pc", instance, LIMIT);
         wait_until(LIMIT, "that it waits", || {
-            let told = hosts[1].stderr_so_far();
+            let told = split.hosts[1].stderr_so_far();
             told.matches("waiting for the link").count() > usize::from(!is_cable)
         });
         if is_cable {
@@ -171,9 +146,9 @@ fn a_gateway_that_comes_back_while_the_path_is_away_waits_for_it() {
         } else {
             robot.set_mtu(1500);
         }
-        wait_for_messages(&files, "a gateway came back without a path");
+        split.wait_for_messages("a gateway came back without a path");
     }
-    for summary in stopped(&lab, &mut hosts, &files) {
+    for summary in stopped(split) {
         let mut events = summary.events.iter();
         assert!(events.any(|event| event.what().contains("waiting for the link")));
     }
@@ -196,24 +171,22 @@ fn a_host_that_never_comes_and_one_that_goes_for_good_are_named() {
     for index in [0, 1] {
         let mut child = alone.start_on(lab.host(index));
         let finished = child.wait_within(RUN_LIMIT).unwrap();
-        assert_eq!(code(&finished), PEER_ABSENT, "{finished:?}");
+        finished.assert_code(PEER_ABSENT);
         let words = format!("{} did not appear within 1 s", HOSTS[1 - index]);
         assert!(finished.stderr.contains(&words), "{finished:?}");
         assert!(lab.host(index).shared_memory_leftovers().is_empty());
     }
 
-    let (mut hosts, files) = start(&lab, &trial);
+    let mut split = start(&lab, &trial);
     lab.host(1).set_link(INTERFACE, "down");
-    for index in [0, 1] {
-        let finished = hosts[index].wait_within(RUN_LIMIT).unwrap();
-        assert_eq!(code(&finished), PEER_ABSENT, "{finished:?}");
-        let summary = files[index].summary();
+    for (index, finished) in split.ended().iter().enumerate() {
+        finished.assert_code(PEER_ABSENT);
+        let summary = split.files[index].summary();
         assert_eq!(summary.run.outcome, Outcome::Failed);
         let words = format!("{} has been silent for 2 s", HOSTS[1 - index]);
         let reason = &summary.run.exit_reason;
         assert!(reason.contains(&words), "{reason}");
-        assert!(files[index].has_report());
-        files[index].assert_nothing_left_on(lab.host(index));
+        assert!(split.files[index].has_report());
     }
 }
 
@@ -228,21 +201,21 @@ fn a_disk_that_does_not_answer_makes_no_host_silent() {
     let trial = Trial::shipped("shuttle-split.toml", record.path())
         .set("run.duration=\"10 min\"")
         .set("run.peer_timeout=\"4 s\"");
-    let (mut hosts, files) = start(&lab, &trial);
-    let pipe = files[0].root().join("status.json.new");
+    let split = start(&lab, &trial);
+    let pipe = split.files[0].root().join("status.json.new");
     wait_until(LIMIT, "a moment without the file", || {
         mkfifo(&pipe, Mode::S_IRWXU).is_ok()
     });
     thread::sleep(Duration::from_secs(7));
-    wait_for_messages(&files, "more than the silence that is borne");
+    split.wait_for_messages("more than the silence that is borne");
     // The disk answers again.
     let mut held_back = String::new();
     let mut reader = File::open(&pipe).unwrap();
     reader.read_to_string(&mut held_back).unwrap();
     assert!(held_back.contains("\"phase\":\"running\""), "{held_back}");
-    let status = files[0].root().join("status.json");
+    let status = split.files[0].root().join("status.json");
     wait_until(LIMIT, "the file itself", || {
         fs::symlink_metadata(&status).is_ok_and(|data| data.is_file())
     });
-    stopped(&lab, &mut hosts, &files);
+    stopped(split);
 }

@@ -17,10 +17,10 @@ use hil_tests::account::{
 };
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
+use hil_tests::split::Split;
 use hil_tests::trial::{Trial, wait_until};
 use nix::sys::signal::Signal;
 
-const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const START_LIMIT: Duration = Duration::from_mins(3);
 const RUN_LIMIT: Duration = Duration::from_mins(6);
 
@@ -52,16 +52,12 @@ fn split(lab: &Lab, settings: &[&str]) -> [RunSummary; 2] {
     for setting in settings {
         trial = trial.set(setting);
     }
-    let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
-    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), START_LIMIT));
-    for host in &mut hosts {
-        host.wait_within(RUN_LIMIT).unwrap().assert_success();
+    let mut split = Split::start(lab, &trial);
+    for finished in split.ended() {
+        finished.assert_success();
     }
-    for (index, files) in files.iter().enumerate() {
-        files.assert_nothing_left_on(lab.host(index));
-    }
-    println!("{}", files[0].read("report-full.txt"));
-    files.map(|files| files.summary())
+    println!("{}", split.files[0].read("report-full.txt"));
+    split.summaries()
 }
 
 fn figure(summary: &RunSummary, name: &str) -> f64 {

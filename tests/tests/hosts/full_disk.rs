@@ -30,11 +30,6 @@ const NO_SPACE: &str = "No space left on device";
 /// Where each host records.
 const DISK: &str = "/run/disk";
 
-fn code(finished: &Finished) -> i32 {
-    let code = finished.status.code();
-    code.unwrap_or_else(|| panic!("{finished:?}"))
-}
-
 /// A run between two hosts, each with a disk of its own.
 struct Stage {
     lab: Lab,
@@ -137,7 +132,7 @@ fn check_unrecorded(stage: &mut Stage, host: &str) {
     assert!(fault.error.contains(NO_SPACE), "{fault}");
     assert_eq!(results[0].gaps, results[1].gaps);
     for (index, finished) in ends.iter().enumerate() {
-        assert_eq!(code(finished), FAILED);
+        finished.assert_code(FAILED);
         // The end of the run tells it; a second host that is full has its own cause.
         let full = results[0].gaps.iter().map(|gap| &gap.host);
         let others = full.filter(|name| *name != host).count();
@@ -200,7 +195,7 @@ fn a_full_disk_ends_the_run_and_says_so() {
     let mut child = ChildGuard::spawn(&mut command).unwrap();
     let finished = child.wait_within(RUN_LIMIT).unwrap();
     println!("{finished:?}");
-    assert_eq!(code(&finished), FAILED, "{finished:?}");
+    finished.assert_code(FAILED);
     assert_eq!(count(&finished.stdout), 1);
     assert!(finished.stdout.contains(DISK));
     assert!(host.shared_memory_leftovers().is_empty());
@@ -252,7 +247,7 @@ fn records_that_a_disk_cannot_take_from_another_host_leave_no_verdict_on_either(
     let ends = stage.end();
     let results = [0, 1].map(|index| stage.result(index));
     for (index, result) in results.iter().enumerate() {
-        assert_eq!(code(&ends[index]), FAILED);
+        ends[index].assert_code(FAILED);
         assert_eq!(result.outcome, RunOutcome::Completed);
         let [RecordGap { host, of, cause }] = &result.gaps[..] else {
             panic!("{:?}", result.gaps);
@@ -286,7 +281,9 @@ fn a_disk_that_is_full_before_a_run_is_told_to_the_other_host() {
     let words = format!("{} cannot write {DISK}", HOSTS[1]);
     let result = stage.result(0);
     assert!(result.outcome.reason().starts_with(&words), "{result:?}");
-    assert_eq!(ends.each_ref().map(code), [FAILED; 2]);
+    for end in &ends {
+        end.assert_code(FAILED);
+    }
     assert_eq!(count(&ends[0].stdout), 1, "{}", ends[0].stdout);
     assert!(ends[1].stderr.contains(NO_SPACE), "{}", ends[1].stderr);
     assert_eq!(stage.folder(1), None, "nothing is left on the full disk");
@@ -323,5 +320,5 @@ fn a_report_that_a_disk_does_not_take_leaves_both_hosts_their_verdict() {
         (result.gaps, Assessment::of(&summary).network)
     });
     assert_eq!(verdicts[0], verdicts[1]);
-    assert_eq!(code(&ends[1]), FAILED);
+    ends[1].assert_code(FAILED);
 }

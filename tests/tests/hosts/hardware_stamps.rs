@@ -6,12 +6,12 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use hil_report::summary::Outcome;
-use hil_tests::account::{account, assert_accounts_close, assert_every_message_is_accounted_for};
+use hil_tests::account::{account, assert_accounts_close};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
+use hil_tests::split::Split;
 use hil_tests::trial::{Trial, wait_until_it_heeds_interrupts};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -28,14 +28,9 @@ fn on_a_veth_the_missing_nic_is_said_and_software_stamps_carry_the_run() {
     let trial = Trial::shipped("shuttle-split.toml", record.path())
         .set("run.duration=\"3 s\"")
         .set("links.hop.timestamps=\"hardware\"");
-    let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
-    let files = trial.folder("-control-pc", START_LIMIT);
-    for host in &mut hosts {
-        host.wait_within(RUN_LIMIT).unwrap().assert_success();
-    }
-    let summary = files.summary();
-    assert_eq!(summary.run.outcome, Outcome::Completed, "{:?}", summary.run);
-    assert_every_message_is_accounted_for(&summary);
+    let split = Split::start(&lab, &trial);
+    let files = split.files[0].clone();
+    let [summary, _] = split.finish();
     assert_accounts_close(&summary);
 
     let stamps = summary.hardware_stamps.as_ref().unwrap();

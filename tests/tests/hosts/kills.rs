@@ -6,19 +6,17 @@ use std::time::Duration;
 use std::{fs, thread};
 
 use hil_account::{InterruptionMetrics, MessageFate};
-use hil_core::record::IngressRecord;
 use hil_report::assessment::{Assessment, NetworkVerdict};
 use hil_report::summary::{Outcome, RunEvent, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
 use hil_tests::binary::hil_runtime_binary;
-use hil_tests::child::{ChildGuard, Finished};
+use hil_tests::child::ChildGuard;
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
-use hil_tests::split::direction;
-use hil_tests::trial::{RunFiles, Trial, load_average, wait_until};
+use hil_tests::split::{ARM_CHANNELS, HOSTS, Split, direction};
+use hil_tests::trial::{Trial, load_average, wait_until};
 use nix::sys::signal::{Signal, kill};
 
-const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const LIMIT: Duration = Duration::from_mins(1);
 const RUN_LIMIT: Duration = Duration::from_mins(2);
 /// What the runtime promises of a restart.
@@ -28,65 +26,11 @@ const RECOVERY_MAX_NS: i64 = 3_000_000_000;
 /// Records of 32 bytes: half a second of commands.
 const FLOWING_BYTES: u64 = 60 * 32;
 
-/// A split run that has begun.
-struct Split {
-    hosts: [ChildGuard; 2],
-    files: [RunFiles; 2],
-    lab: Lab,
-}
-
-impl Split {
-    /// Starts `trial` on the two hosts of a lab and waits until messages flow both ways.
-    fn start(lab: Lab, trial: &Trial) -> Self {
-        let hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
-        let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
-        let split = Self { hosts, files, lab };
-        split.wait_for_messages("the begin of the run");
-        split
-    }
-
-    /// Waits until both ends have taken half a second's messages from now on.
-    fn wait_for_messages(&self, after: &str) {
-        let taken = || {
-            let commands = self.files[1].record_bytes("egm.right.command.taken.");
-            let statuses = self.files[0].record_bytes("egm.right.feedback.taken.");
-            [commands, statuses]
-        };
-        let before = taken();
-        wait_until(LIMIT, &format!("messages both ways after {after}"), || {
-            let now = taken();
-            (0..2).all(|way| now[way] >= before[way] + FLOWING_BYTES)
-        });
-    }
-
-    /// Kills `process` on host `index`, and waits until it is back and messages flow.
-    fn kill(&self, index: usize, process: &str) {
-        self.files[index].kill_process(process, 0, LIMIT);
-        wait_until(LIMIT, &format!("the restart of {process}"), || {
-            self.files[index].process(process, 1).is_some()
-        });
-        self.wait_for_messages(&format!("the restart of {process}"));
-    }
-
-    /// How both hosts ended.
-    fn finish(&mut self) -> [Finished; 2] {
-        [0, 1].map(|index| self.hosts[index].wait_within(RUN_LIMIT).unwrap())
-    }
-
-    fn summaries(&self) -> [RunSummary; 2] {
-        [0, 1].map(|index| self.files[index].summary())
-    }
-
-    fn assert_nothing_left(&self) {
-        for index in 0..2 {
-            self.files[index].assert_nothing_left_on(self.lab.host(index));
-        }
-    }
-}
-
-fn code(finished: &Finished) -> i32 {
-    let code = finished.status.code();
-    code.unwrap_or_else(|| panic!("{finished:?}"))
+/// Starts `trial` on the two hosts of `lab` and waits until messages flow both ways.
+fn start<'a>(lab: &'a Lab, trial: &Trial) -> Split<'a> {
+    let split = Split::start(lab, trial).carrying(ARM_CHANNELS);
+    split.wait_for_messages("the begin of the run");
+    split
 }
 
 fn event(summary: &RunSummary, process: &str) -> String {
@@ -116,7 +60,7 @@ fn killed_gateways_and_components_come_back_and_their_loss_is_put_down_to_them()
         .set("run.duration=\"20 s\"")
         .set("processes.controller.on_exit=\"restart\"")
         .set("processes.robot.on_exit=\"restart\"");
-    let mut split = Split::start(lab, &trial);
+    let mut split = start(&lab, &trial);
     let killed = [
         (0, "gateway-hop-control-pc"),
         (1, "gateway-hop-robot-pc"),
@@ -126,10 +70,9 @@ fn killed_gateways_and_components_come_back_and_their_loss_is_put_down_to_them()
     for (index, process) in killed {
         split.kill(index, process);
     }
-    for finished in split.finish() {
+    for finished in split.ended() {
         finished.assert_success();
     }
-    split.assert_nothing_left();
     for summary in split.summaries() {
         assert_eq!(summary.run.outcome, Outcome::Completed);
         assert_every_message_is_accounted_for(&summary);
@@ -194,13 +137,12 @@ fn a_sender_that_learns_late_of_a_killed_receiver_blames_no_wire() {
     silence.wait_within(LIMIT).unwrap().assert_success();
     let record = RunFolder::new("kills-unheard");
     let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"8 s\"");
-    let mut split = Split::start(lab, &trial);
+    let mut split = start(&lab, &trial);
     let process = "gateway-hop-robot-pc";
     split.kill(1, process);
-    for finished in split.finish() {
+    for finished in split.ended() {
         finished.assert_success();
     }
-    split.assert_nothing_left();
     for summary in split.summaries() {
         assert_every_message_is_accounted_for(&summary);
         let channel = "egm/right/command";
@@ -224,22 +166,13 @@ fn a_receiver_that_stood_still_is_no_network_result() {
     let trial = Trial::shipped("shuttle-split.toml", record.path())
         .set("run.duration=\"8 s\"")
         .set("case.parameters.rate_hz=1000.0");
-    let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
-    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
-    let received = "shuttle.command.ingress.";
-    wait_until(LIMIT, "commands over the hop", || {
-        files[1].record_bytes(received) >= 500 * size_of::<IngressRecord>() as u64
-    });
-    let gateway = files[1].process("gateway-hop-robot-pc", 0).unwrap();
+    let split = Split::start(&lab, &trial);
+    split.wait_for_messages("the begin of the run");
+    let gateway = split.files[1].process("gateway-hop-robot-pc", 0).unwrap();
     kill(gateway, Signal::SIGSTOP).unwrap();
     thread::sleep(Duration::from_millis(1500));
     kill(gateway, Signal::SIGCONT).unwrap();
-    for host in &mut hosts {
-        host.wait_within(RUN_LIMIT).unwrap().assert_success();
-    }
-    for files in &files {
-        let summary = files.summary();
-        assert_every_message_is_accounted_for(&summary);
+    for summary in split.finish() {
         let channel = "shuttle/command";
         let said = describe(channel, account(&summary, channel));
         let no_room = direction(&summary, channel, "ingress").no_room_count();
@@ -270,13 +203,12 @@ fn a_killed_robot_ends_the_run_on_both_hosts_with_a_complete_report() {
     let record = RunFolder::new("robot-killed");
     // Long, so that only the kill can end it in time.
     let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"10 min\"");
-    let mut split = Split::start(lab, &trial);
+    let mut split = start(&lab, &trial);
     split.files[1].kill_process("robot", 0, LIMIT);
-    let finished = split.finish();
+    let finished = split.ended();
     for finished in &finished {
-        assert_eq!(code(finished), 1, "{finished:?}");
+        finished.assert_code(1);
     }
-    split.assert_nothing_left();
     let [control, robot] = split.summaries();
     assert_eq!(robot.run.outcome, Outcome::Failed);
     assert_eq!(control.run.outcome, Outcome::Failed);
@@ -305,36 +237,35 @@ fn a_killed_supervisor_takes_its_processes_along_and_the_other_host_says_who_van
         return;
     };
     // First the host that joins, then the one that is joined.
-    let lab = kill_supervisor(lab, 1);
-    let lab = kill_supervisor(lab, 0);
+    kill_supervisor(&lab, 1);
+    kill_supervisor(&lab, 0);
 
     // The hosts are as good as before, and the next run sweeps what the dead one left.
     let record = RunFolder::new("after-the-kill");
     let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"2 s\"");
-    let mut next = Split::start(lab, &trial);
-    for finished in next.finish() {
+    let mut next = start(&lab, &trial);
+    for finished in next.ended() {
         finished.assert_success();
     }
-    next.assert_nothing_left();
     for summary in next.summaries() {
         assert_every_message_is_accounted_for(&summary);
     }
 }
 
 /// Starts a run, kills the supervisor of host `victim`, and checks what the other one makes of it.
-fn kill_supervisor(lab: Lab, victim: usize) -> Lab {
+fn kill_supervisor(lab: &Lab, victim: usize) {
     let other = 1 - victim;
     let record = RunFolder::new("supervisor-killed");
     let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"10 min\"");
-    let mut split = Split::start(lab, &trial);
+    let mut split = start(lab, &trial);
     assert!(split.files[victim].processes().len() >= 2);
     split.hosts[victim].signal(Signal::SIGKILL).unwrap();
     wait_until(LIMIT, "the end of the dead supervisor's processes", || {
         split.files[victim].processes().is_empty()
     });
     let survivor = split.hosts[other].wait_within(RUN_LIMIT).unwrap();
-    assert_eq!(code(&survivor), 69, "{survivor:?}");
-    split.files[other].assert_nothing_left_on(split.lab.host(other));
+    survivor.assert_code(69);
+    split.files[other].assert_nothing_left_on(lab.host(other));
     let summary = split.files[other].summary();
     assert_eq!(summary.run.outcome, Outcome::Failed);
     let vanished = format!("another host vanished: {}", HOSTS[victim]);
@@ -360,7 +291,6 @@ fn kill_supervisor(lab: Lab, victim: usize) -> Lab {
     assert!(made.status.success(), "{made:?}");
     let page = fs::read_to_string(page).unwrap();
     assert!(page.contains(&vanished) && page.len() < 3_000_000);
-    split.lab
 }
 
 #[test]
@@ -370,11 +300,11 @@ fn an_interrupted_host_ends_the_run_on_both_with_complete_reports() {
     };
     let record = RunFolder::new("one-interrupted");
     let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"10 min\"");
-    let mut split = Split::start(lab, &trial);
+    let mut split = start(&lab, &trial);
     split.hosts[1].signal(Signal::SIGINT).unwrap();
-    let [control, robot] = split.finish();
-    assert_eq!((code(&control), code(&robot)), (1, 130), "{control:?}");
-    split.assert_nothing_left();
+    let [control, robot] = split.ended();
+    control.assert_code(1);
+    robot.assert_code(130);
     let [control, robot] = split.summaries();
     assert_eq!(robot.run.exit_reason, "interrupted by Ctrl-C (SIGINT)");
     let reason = &control.run.exit_reason;
@@ -403,7 +333,7 @@ fn a_process_that_dies_too_often_ends_the_run() {
         files.kill_process("robot", instance, LIMIT);
     }
     let finished = child.wait_within(RUN_LIMIT).unwrap();
-    assert_eq!(code(&finished), 1, "{finished:?}");
+    finished.assert_code(1);
     files.assert_nothing_left_here();
     let summary = files.summary();
     let events: Vec<String> = summary.events.iter().map(RunEvent::what).collect();

@@ -9,16 +9,15 @@ use std::time::Duration;
 use hil_capture::reader::{CaptureReader, Step};
 use hil_net::filter::PacketFilter;
 use hil_net::packet_ring::{PacketRing, RingSettings, RingStamps};
-use hil_report::summary::Outcome;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::{INTERFACE, Lab, LabHost};
 use hil_tests::run_folder::RunFolder;
+use hil_tests::split::{HOSTS, Split};
 use hil_tests::trial::{RunFiles, Trial};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
-const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const START_LIMIT: Duration = Duration::from_mins(1);
 const RUN_LIMIT: Duration = Duration::from_mins(2);
 /// Farthest that the medians of both may lie apart, microseconds: what only a wrong stamp or a wrong
@@ -54,18 +53,15 @@ fn run_with_probes(lab: &Lab, record: &RunFolder, trial: &Trial) -> ([RunFiles; 
     let captures = HOSTS.map(|host| record.path().join(format!("{host}.pcapng")));
     let mut probes =
         [0, 1].map(|index| start_probe(lab.host(index), INTERFACE, &captures[index], ""));
-    let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
-    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), START_LIMIT));
-    for host in &mut hosts {
-        host.wait_within(RUN_LIMIT).unwrap().assert_success();
-    }
+    let split = Split::start(lab, trial);
+    let files = split.files.clone();
+    split.finish();
     for probe in &mut probes {
         probe.signal(Signal::SIGINT).unwrap();
         let finished = probe.wait_within(START_LIMIT).unwrap();
         finished.assert_success();
         print!("{}", finished.stdout);
     }
-    assert_eq!(files[0].summary().run.outcome, Outcome::Completed);
     (files, captures)
 }
 

@@ -33,7 +33,7 @@ fn an_ordinary_run_is_sealed_and_its_account_closes() {
     let record = RunFolder::new("sealed");
     let key = PreSharedKey::read(&hop_key(record.path())).unwrap();
     let split = Split::start(&lab, &trial(&record).set("run.duration=\"6 s\""));
-    let report = split.files(1).clone();
+    let report = split.files[1].clone();
     for summary in &split.finish() {
         assert_accounts_close(summary);
         let security = summary.run.security.as_ref().unwrap();

@@ -15,10 +15,9 @@ use hil_tests::account::{
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
-use hil_tests::split::direction;
+use hil_tests::split::{ARM_CHANNELS, Split, direction};
 use hil_tests::trial::{RunFiles, Trial, wait_until};
 
-const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 /// The channels with a message per frame or cycle; the motion server's have a few per run.
 const CROSSING: [&str; 4] = [
     "egm/right/command",
@@ -76,17 +75,9 @@ fn components(files: [&RunFiles; 2]) -> [Component; 2] {
 fn split(record: &RunFolder) -> Option<([RunSummary; 2], [Component; 2])> {
     let lab = Lab::two_hosts_or_skip()?;
     let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"12 s\"");
-    let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
-    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), START_LIMIT));
-    let components = components([&files[0], &files[1]]);
-    for host in &mut hosts {
-        let finished = host.wait_within(RUN_LIMIT).unwrap();
-        finished.assert_success();
-    }
-    for (index, files) in files.iter().enumerate() {
-        files.assert_nothing_left_on(lab.host(index));
-    }
-    Some((files.map(|files| files.summary()), components))
+    let split = Split::start(&lab, &trial).carrying(ARM_CHANNELS);
+    let components = components(split.files.each_ref());
+    Some((split.finish(), components))
 }
 
 /// Runs the arm on this machine alone.

@@ -68,7 +68,7 @@ const FOREIGN: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 66);
 /// A run on whose sending gateway of commands forged reports rain.
 fn under_reports(lab: &Lab, trial: &Trial, stranger: &Attacker) -> (Flood, [RunSummary; 2]) {
     let split = Split::start(lab, trial);
-    split.wait_for_messages();
+    split.wait_for_messages("the begin of the run");
     let quoted = ADDRESSES.map(|address| SocketAddrV4::new(address, PORT));
     let flood = stranger.forge_reports(ADDRESSES[0], quoted, REPORTS_SPAN, REPORTS_HZ);
     (flood, split.end())
@@ -128,7 +128,7 @@ fn empty_connections_from_the_peers_address_cost_a_sealed_tcp_hop_nothing() {
         .set(&format!("links.hop.port={PORT}"))
         .set("run.duration=\"8 s\"");
     let split = Split::start(&lab, &trial);
-    split.wait_for_messages();
+    split.wait_for_messages("the begin of the run");
     let made = lab.host(0).on_network(|| {
         let (mut open, began) = (Vec::new(), Instant::now());
         for number in 1..=EMPTY_COUNT {

@@ -163,13 +163,13 @@ fn play(record: &Path, lab: &Lab, stranger: &Attacker, span: Duration, attacks: 
         trial
     };
     let split = Split::start(lab, &trial);
-    split.wait_for_messages();
+    split.wait_for_messages("the begin of the run");
     let recorded = stranger.overhear(PORT, 200, LIMIT);
     assert!(recorded.len() >= 200, "the stranger hears the wire");
     let mut random = RandomStream::new(9, "attack");
     let datagrams = (0..MADE_UP).map(|number| made_up(&recorded, &mut random, number));
     let datagrams: Vec<Vec<u8>> = datagrams.collect();
-    let gateway = split.files(1).process("gateway-hop-robot-pc", 0).unwrap();
+    let gateway = split.files[1].process("gateway-hop-robot-pc", 0).unwrap();
     let (worked_ns, dropped) = (ingress_ns(gateway), backlog_drops());
     let from_ns = MonotonicClock::now().as_ns();
     let (flood, memory) = thread::scope(|scope| {
@@ -186,7 +186,7 @@ fn play(record: &Path, lab: &Lab, stranger: &Attacker, span: Duration, attacks: 
     });
     let window_ns = from_ns..MonotonicClock::now().as_ns();
     let worked_ns = ingress_ns(gateway) - worked_ns;
-    let files = [0, 1].map(|index| split.files(index).clone());
+    let files = [0, 1].map(|index| split.files[index].clone());
     let summaries = split.finish();
     Phase {
         summaries,
@@ -382,7 +382,7 @@ fn run_knocked_at(lab: &Lab, trial: &Trial, is_over: &AtomicBool) -> ([RunSummar
         thread::sleep(Duration::from_secs(2));
         assert!(listening.is_running(), "{}", listening.stderr_so_far());
         let split = Split::of(lab, trial, [listening, trial.start_on(lab.host(1))]);
-        split.wait_for_messages();
+        split.wait_for_messages("the begin of the run");
         // Nobody listens any more; the knocking goes on.
         thread::sleep(Duration::from_secs(2));
         is_over.store(true, Ordering::Release);

@@ -3,15 +3,17 @@
 
 use std::time::Duration;
 
-use hil_report::summary::LinkKind;
-use hil_tests::account::channel;
+use hil_account::MessageFate;
+use hil_protocol::transport::IpProtocol;
+use hil_report::summary::{LinkKind, RunSummary};
+use hil_tests::account::{account, channel};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split, count, direction};
-use hil_tests::trial::{Trial, wait_until};
+use hil_tests::trial::Trial;
 use hil_transport::registry;
 use serde_json::Value;
 
@@ -35,6 +37,22 @@ fn assert_doctor_is_content(lab: &Lab, trial: &Trial) {
     }
 }
 
+/// What was under way when a connection ended is lost to the gateway and not to the wire.
+fn assert_is_connected_again(summary: &RunSummary) {
+    let commands = account(summary, CHANNELS[0]);
+    let fates = &commands.fates;
+    assert!(fates.lost_count() > 0, "{fates:?}");
+    assert_eq!(fates.of(MessageFate::LostOnWire), 0, "{fates:?}");
+    let mut interruptions = commands.interruptions.iter();
+    let own = interruptions.find(|one| one.process == KILLED).unwrap();
+    assert!(own.cause.contains("SIGKILL"), "{own:?}");
+    let egress = direction(summary, CHANNELS[0], "egress");
+    assert_eq!(count(egress, "transport: reconnect_count"), 1);
+    let mut events = summary.events.iter();
+    let is_told = events.any(|event| event.what().contains("and is back (reconnect 1)"));
+    assert!(is_told, "{:?}", summary.events);
+}
+
 #[test]
 fn every_transport_carries_a_sealed_run_with_a_kill() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
@@ -45,21 +63,21 @@ fn every_transport_carries_a_sealed_run_with_a_kill() {
         let record = RunFolder::new(&format!("transport-{}", transport.name));
         let trial = Trial::shipped("shuttle-split.toml", record.path())
             .set(&format!("links.hop.via=\"{}\"", transport.name))
-            .set("run.duration=\"10 s\"");
+            .set("run.duration=\"12 s\"");
         assert_doctor_is_content(&lab, &trial);
         let split = Split::start(&lab, &trial);
-        split.wait_for_messages();
-        split.files(1).kill_process(KILLED, 0, LIMIT);
-        wait_until(LIMIT, "the restart", || {
-            split.files(1).process(KILLED, 1).is_some()
-        });
-        let files = split.files(1).clone();
+        split.wait_for_messages("the begin of the run");
+        split.kill(1, KILLED);
+        let files = split.files[1].clone();
         for summary in &split.finish() {
             for name in CHANNELS {
                 let link = channel(summary, name).link;
                 assert_eq!(link, LinkKind::Network(transport));
                 let ingress = direction(summary, name, "ingress");
                 assert!(count(ingress, "seal: opened_count") > 100, "{ingress:?}");
+            }
+            if transport.capabilities.receiver_port == Some(IpProtocol::Tcp) {
+                assert_is_connected_again(summary);
             }
         }
         let report = files.read("report-full.txt");

@@ -13,6 +13,7 @@ use hil_core::message::Envelope;
 use hil_core::simulation::{Carrier, Simulation, SimulationResult};
 use hil_core::time::{Instant, duration_ns};
 use hil_link::spec::{LinkPlace, LinkSpec};
+use hil_protocol::lab;
 use hil_protocol::wire::Kind;
 use hil_protocol::{
     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, InMemory,
@@ -72,14 +73,14 @@ impl Hop {
             name: "hil/link/hop/forward".to_owned(),
             channels: vec![channel],
         };
-        let ingress = IngressSettings::new(flow.clone(), 7, [2; 16], 22);
+        let ingress = IngressSettings {
+            flow: flow.clone(),
+            ..lab::ingress_settings(7, 0)
+        };
         let egress = EgressSettings {
             flow,
-            session: 5,
-            domain: [1; 16],
-            clock_id: 11,
             datagram_max_bytes,
-            sync_period: Duration::from_millis(100),
+            ..lab::egress_settings(5, 0)
         };
         Self {
             egress: EgressBridge::new(egress).unwrap(),

@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 use std::{fs, thread};
 
 use hil_tests::binary::hil_recorder_binary;
-use hil_tests::child::{ChildGuard, Finished, run};
+use hil_tests::child::run;
 use hil_tests::lab::{INTERFACE, Lab};
-use nix::sys::signal::Signal;
+use hil_tests::live_server::LiveServer;
 
 const LIMIT: Duration = Duration::from_mins(1);
 /// Four times as long as a viewer that says nothing keeps its seat.
@@ -20,50 +20,23 @@ const GONE_LIMIT: Duration = Duration::from_mins(2);
 const SEATS: usize = 32;
 const EVIL: &str = "https://evil.example";
 
-struct Server {
-    child: ChildGuard,
-    page: String,
-    socket: String,
+/// A server without a run.
+fn start(options: &[&str]) -> LiveServer {
+    start_by(Command::new(hil_recorder_binary()), options)
 }
 
-impl Server {
-    fn start(options: &[&str]) -> Self {
-        Self::start_by(Command::new(hil_recorder_binary()), options)
-    }
+fn start_by(command: Command, options: &[&str]) -> LiveServer {
+    let waits = ["--wait", "no-run-is-called-so"];
+    LiveServer::start_by(command, &[&waits, options].concat())
+}
 
-    fn start_by(mut command: Command, options: &[&str]) -> Self {
-        command.args(["serve", "--wait", "no-run-is-called-so"]);
-        command.args(["--port", "0", "--http-port", "0"]);
-        let mut child = ChildGuard::spawn(command.args(options)).unwrap();
-        child.wait_for_output("viewers ws://", LIMIT).unwrap();
-        let said = child.stdout_so_far();
-        let at = |begin: &str| {
-            let rest = said.split(begin).nth(1).unwrap();
-            let end = rest.find(['/', '\n']).unwrap_or(rest.len());
-            rest[..end].to_owned()
-        };
-        Self {
-            page: at("http://"),
-            socket: at("ws://"),
-            child,
-        }
-    }
+/// Asks to look on, as a browser or a program does.
+fn ask(server: &LiveServer, host: &str, origin: Option<&str>) -> Asked {
+    Asked::to_look_on(&server.socket, host, origin)
+}
 
-    /// Asks to look on, as a browser or a program does.
-    fn ask(&self, host: &str, origin: Option<&str>) -> Asked {
-        Asked::to_look_on(&self.socket, host, origin)
-    }
-
-    fn ask_as_program(&self) -> Asked {
-        self.ask(&self.socket, None)
-    }
-
-    fn end(mut self) -> Finished {
-        self.child.signal(Signal::SIGINT).unwrap();
-        let finished = self.child.wait_within(LIMIT).unwrap();
-        finished.assert_success();
-        finished
-    }
+fn ask_as_program(server: &LiveServer) -> Asked {
+    ask(server, &server.socket, None)
 }
 
 /// A request that was sent.
@@ -134,9 +107,9 @@ fn assert_refused(answer: &str, status: &str, why: &str) {
 
 #[test]
 fn pages_of_others_are_refused_named_once_and_counted() {
-    let mut server = Server::start(&[]);
+    let mut server = start(&[]);
     for _attempt in 0..5 {
-        let answer = server.ask(&server.socket, Some(EVIL)).answer();
+        let answer = ask(&server, &server.socket, Some(EVIL)).answer();
         assert_refused(
             &answer,
             "403",
@@ -144,7 +117,7 @@ fn pages_of_others_are_refused_named_once_and_counted() {
         );
     }
     // As of a page in a sandbox, which any page can show.
-    let answer = server.ask(&server.socket, Some("null")).answer();
+    let answer = ask(&server, &server.socket, Some("null")).answer();
     assert_refused(&answer, "403", "refused a page without an origin");
     server
         .child
@@ -162,14 +135,14 @@ fn pages_of_others_are_refused_named_once_and_counted() {
 
 #[test]
 fn programs_our_own_page_and_allowed_pages_look_on() {
-    let server = Server::start(&["--allow-origin", "https://app.foxglove.dev"]);
-    server.ask_as_program().is_let_in();
+    let server = start(&["--allow-origin", "https://app.foxglove.dev"]);
+    ask_as_program(&server).is_let_in();
     let own = format!("http://{}", server.page);
     let claimed = format!("http://{}", server.socket);
     for origin in [&*own, &*claimed, "https://app.foxglove.dev"] {
-        server.ask(&server.socket, Some(origin)).is_let_in();
+        ask(&server, &server.socket, Some(origin)).is_let_in();
     }
-    let file = server.ask(&server.socket, Some("file://")).answer();
+    let file = ask(&server, &server.socket, Some("file://")).answer();
     assert_refused(
         &file,
         "403",
@@ -178,20 +151,20 @@ fn programs_our_own_page_and_allowed_pages_look_on() {
     // Through a tunnel from another machine, by whatever port.
     let page_port = server.page.rsplit(':').next().unwrap();
     let tunnelled = format!("http://localhost:{page_port}");
-    server.ask("localhost:18765", Some(&tunnelled)).is_let_in();
-    let other = server.ask("localhost:18765", Some("http://localhost:3000"));
+    ask(&server, "localhost:18765", Some(&tunnelled)).is_let_in();
+    let other = ask(&server, "localhost:18765", Some("http://localhost:3000"));
     assert_refused(&other.answer(), "403", "http://localhost:3000");
     server.end();
-    let server = Server::start(&["--allow-origin", "file://"]);
-    server.ask(&server.socket, Some("file://")).is_let_in();
+    let server = start(&["--allow-origin", "file://"]);
+    ask(&server, &server.socket, Some("file://")).is_let_in();
     server.end();
 }
 
 #[test]
 fn nobody_is_told_to_paste_what_a_shell_would_run() {
-    let server = Server::start(&[]);
+    let server = start(&[]);
     let origin = "http://$(touch${IFS}pwned).example;`id`";
-    let answer = server.ask(&server.socket, Some(origin)).answer();
+    let answer = ask(&server, &server.socket, Some(origin)).answer();
     assert_refused(&answer, "403", "refused a page of http://$(touch");
     assert!(!answer.contains("--allow-origin"), "{answer}");
     let finished = server.end();
@@ -200,18 +173,22 @@ fn nobody_is_told_to_paste_what_a_shell_would_run() {
 
 #[test]
 fn names_that_may_be_anybodys_reach_neither_socket_nor_page() {
-    let server = Server::start(&["--allow-host", "robot.example.org"]);
+    let server = start(&["--allow-host", "robot.example.org"]);
     let get = |path: &str, host: &str| {
         let request = format!("GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n");
         Asked::send(&server.page, request.as_bytes()).answer()
     };
     let why = "--allow-host evil.example says that it is";
-    assert_refused(&server.ask("evil.example:8765", None).answer(), "403", why);
+    assert_refused(
+        &ask(&server, "evil.example:8765", None).answer(),
+        "403",
+        why,
+    );
     for path in ["/", "/config.json"] {
         assert_refused(&get(path, "evil.example"), "403", why);
     }
     assert!(!get("/config.json", "evil.example").contains("ws_port"));
-    server.ask("robot.example.org:8765", None).is_let_in();
+    ask(&server, "robot.example.org:8765", None).is_let_in();
     for host in ["robot.example.org:80", "localhost:8766", &server.page] {
         let answer = get("/config.json", host);
         assert!(answer.contains("ws_port"), "{host}: {answer}");
@@ -221,19 +198,19 @@ fn names_that_may_be_anybodys_reach_neither_socket_nor_page() {
 
 #[test]
 fn a_viewer_too_many_is_told_so_and_comes_in_when_another_has_gone() {
-    let server = Server::start(&[]);
+    let server = start(&[]);
     let let_in = || {
-        let mut asked = server.ask_as_program();
+        let mut asked = ask_as_program(&server);
         asked.is_let_in();
         asked
     };
     let mut viewers: Vec<Asked> = (0..SEATS).map(|_| let_in()).collect();
-    let answer = server.ask_as_program().answer();
+    let answer = ask_as_program(&server).answer();
     assert_refused(&answer, "503", &format!("{SEATS} look on already"));
     drop(viewers.pop());
     let deadline = Instant::now() + LIMIT;
     loop {
-        let mut asked = server.ask_as_program();
+        let mut asked = ask_as_program(&server);
         if asked.until("\r\n\r\n").starts_with("HTTP/1.1 101 ") {
             break;
         }
@@ -255,7 +232,7 @@ fn viewers_whose_cable_was_pulled_lose_their_seats() {
     };
     let [here, there] = [0, 1].map(|index| lab.host(index));
     let program = here.command(hil_recorder_binary());
-    let mut server = Server::start_by(program, &["--host", "0.0.0.0"]);
+    let mut server = start_by(program, &["--host", "0.0.0.0"]);
     // Where others find it, which 0.0.0.0 does not say.
     let page_port = server.page.rsplit(':').next().unwrap();
     let said = format!(
@@ -286,7 +263,7 @@ fn viewers_whose_cable_was_pulled_lose_their_seats() {
 
 #[test]
 fn bytes_that_are_no_request_are_answered_and_keep_nobody_out() {
-    let server = Server::start(&[]);
+    let server = start(&[]);
     let silent: Vec<_> = (0..20).map(|_| Asked::send(&server.socket, b"")).collect();
     let slow = Asked::send(&server.socket, b"GET / HTTP/1.1\r\nHost: local");
     let gone = Asked::send(&server.socket, b"GET / HTTP/1.1\r\n");
@@ -302,7 +279,7 @@ fn bytes_that_are_no_request_are_answered_and_keep_nobody_out() {
     let long = format!("GET / HTTP/1.1\r\nX: {}", "a".repeat(20_000));
     let answer = Asked::send(&server.socket, long.as_bytes()).answer();
     assert_refused(&answer, "431", "too long a head");
-    server.ask_as_program().is_let_in();
+    ask_as_program(&server).is_let_in();
     assert_refused(&slow.answer(), "408", "too slow to come");
     drop(silent);
     server.end();
@@ -328,7 +305,7 @@ fn listening(pid: i32) -> Vec<String> {
 
 #[test]
 fn what_is_behind_the_door_is_where_nobody_looks() {
-    let server = Server::start(&[]);
+    let server = start(&[]);
     let known = |at: &str| {
         let port: u16 = at.rsplit(':').next().unwrap().parse().unwrap();
         format!("{:08X}:{port:04X}", u32::from_ne_bytes([127, 0, 0, 1]))
@@ -348,7 +325,7 @@ fn what_is_behind_the_door_is_where_nobody_looks() {
 
 #[test]
 fn a_taken_port_is_said_to_be_taken() {
-    let server = Server::start(&[]);
+    let server = start(&[]);
     let port = server.socket.rsplit(':').next().unwrap();
     let mut command = Command::new(hil_recorder_binary());
     command.args(["serve", "--wait", "no-run-is-called-so", "--http-port", "0"]);

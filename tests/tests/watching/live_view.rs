@@ -3,13 +3,13 @@
 //! change, and changes an emulated link.
 
 use std::collections::BTreeMap;
-use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::child::ChildGuard;
+use hil_tests::live_server::LiveServer;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial};
 use nix::sys::signal::Signal;
@@ -22,58 +22,6 @@ const LIMIT: Duration = Duration::from_mins(1);
 /// Kind of a binary message of the server: data of a topic.
 const MESSAGE_DATA: u8 = 1;
 
-/// A server of the live view, and where it listens.
-struct Server {
-    child: ChildGuard,
-    page: String,
-    socket: String,
-}
-
-impl Server {
-    fn start(arguments: &[&str]) -> Self {
-        let mut command = Command::new(hil_recorder_binary());
-        command.args(["serve", "--port", "0", "--http-port", "0"]);
-        command.args(arguments);
-        let mut child = ChildGuard::spawn(&mut command).unwrap();
-        child.wait_for_output("viewers ws://", LIMIT).unwrap();
-        let said = child.stdout_so_far();
-        let at = |begin: &str| {
-            let rest = said.split(begin).nth(1).unwrap();
-            let end = rest.find(['/', '\n']).unwrap_or(rest.len());
-            rest[..end].to_owned()
-        };
-        Self {
-            page: at("http://"),
-            socket: at("ws://"),
-            child,
-        }
-    }
-
-    /// Status, headers and body of a request.
-    fn get(&self, request: &str) -> (String, String, String) {
-        let mut stream = TcpStream::connect(&self.page).unwrap();
-        stream.set_read_timeout(Some(LIMIT)).unwrap();
-        write!(
-            stream,
-            "{request} HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n",
-            self.page
-        )
-        .unwrap();
-        let mut bytes = Vec::new();
-        stream.read_to_end(&mut bytes).unwrap();
-        let text = String::from_utf8_lossy(&bytes).into_owned();
-        let (head, body) = text.split_once("\r\n\r\n").unwrap();
-        let (status, headers) = head.split_once("\r\n").unwrap();
-        let status = status.split(' ').nth(1).unwrap().to_owned();
-        (status, headers.to_lowercase(), body.to_owned())
-    }
-
-    fn end(mut self) {
-        self.child.signal(Signal::SIGINT).unwrap();
-        self.child.wait_within(LIMIT).unwrap().assert_success();
-    }
-}
-
 /// A viewer that subscribes to everything, or to topics that begin alike.
 struct Viewer {
     wanted: &'static str,
@@ -85,11 +33,11 @@ struct Viewer {
 }
 
 impl Viewer {
-    fn connect(server: &Server) -> Self {
+    fn connect(server: &LiveServer) -> Self {
         Self::of_topics(server, "/")
     }
 
-    fn of_topics(server: &Server, wanted: &'static str) -> Self {
+    fn of_topics(server: &LiveServer, wanted: &'static str) -> Self {
         let stream = TcpStream::connect(&server.socket).unwrap();
         stream
             .set_read_timeout(Some(Duration::from_secs(20)))
@@ -236,7 +184,7 @@ fn a_fleet_is_seen_driving_and_its_link_is_changed() {
     let name = name_of(&trial);
     let record = folder.path().join("live.mcap");
     let words = ["--wait", &name, "--record"];
-    let server = Server::start(&[&words[..], &[record.to_str().unwrap()]].concat());
+    let server = LiveServer::start(&[&words[..], &[record.to_str().unwrap()]].concat());
     let mut viewer = Viewer::connect(&server);
     viewer.until("robots and a map", |viewer| {
         let last = viewer.last("/live/fleet");
@@ -306,7 +254,7 @@ fn check_the_map(viewer: &Viewer) {
 }
 
 /// The last word and picture, also for who comes after the end.
-fn see_the_end(viewer: &mut Viewer, server: &Server) {
+fn see_the_end(viewer: &mut Viewer, server: &LiveServer) {
     viewer.until("the end", |viewer| {
         viewer.run_state().as_deref() == Some("ended")
     });
@@ -365,7 +313,7 @@ fn arms_are_seen_moving_and_the_page_is_served() {
     let trial = Trial::shipped("local.toml", folder.path()).set("run.duration=\"25 s\"");
     let mut child = trial.start_here();
     let name = name_of(&trial);
-    let server = Server::start(&["--wait", &name]);
+    let server = LiveServer::start(&["--wait", &name]);
     check_the_page(&server);
     let mut viewer = Viewer::connect(&server);
     let right = |picture: &Value| picture["arms"][0].clone();
@@ -409,7 +357,7 @@ fn arms_are_seen_moving_and_the_page_is_served() {
 }
 
 /// The page, its type and its policy; nothing else.
-fn check_the_page(server: &Server) {
+fn check_the_page(server: &LiveServer) {
     let (status, headers, body) = server.get("GET /");
     assert_eq!(status, "200");
     assert!(
@@ -452,7 +400,7 @@ fn check_the_page(server: &Server) {
 
 /// The same run, finished, through the same socket, again and again.
 fn play_back(run: &str) {
-    let server = Server::start(&[run, "--speed", "50", "--loop"]);
+    let server = LiveServer::start(&[run, "--speed", "50", "--loop"]);
     // All topics at such a speed are more than a test reads; the newest would crowd out the rest.
     let mut viewer = Viewer::of_topics(&server, "/live/");
     viewer.until("two rounds", |viewer| {
@@ -478,7 +426,7 @@ fn without_a_run_it_says_so_or_waits() {
     let words = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{words}");
     assert!(words.contains("--wait"), "{words}");
-    let server = Server::start(&["no-such-run", "--wait"]);
+    let server = LiveServer::start(&["no-such-run", "--wait"]);
     let mut viewer = Viewer::connect(&server);
     viewer.until("a word that it waits", |viewer| {
         viewer.run_state().as_deref() == Some("waiting")

@@ -116,7 +116,7 @@ fn a_recorder_that_stood_still_counts_what_it_missed_and_costs_the_run_nothing()
         ChildGuard::spawn(&mut command).unwrap()
     });
     let run = Split::start(&lab, &trial);
-    let files = run.files(1).clone();
+    let files = run.files[1].clone();
     wait_until(LIMIT, "commands and files", || {
         arrived(&files) > ROOM_COUNT && outputs.iter().all(|file| partial(file).is_file())
     });

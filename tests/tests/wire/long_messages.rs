@@ -1,7 +1,6 @@
 //! Messages of megabytes through two gateway processes, beside short ones on the same link: both arrive as they
 //! were sent, and one of which a piece is lost is recorded with what came of it.
 
-use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::thread;
 use std::time::Duration;
@@ -11,15 +10,11 @@ use hil_core::record::{EgressRecord, IngressRecord, UNAVAILABLE};
 use hil_link::condition::{LinkChangeRequest, ORDER_TYPE_NAME};
 use hil_link::spec::{LinkSpec, Way};
 use hil_platform::clock::MonotonicClock;
-use hil_platform::realtime::RealtimeRequest;
-use hil_platform::wait::WaitMode;
-use hil_rundir::launch::{
-    ChannelLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch, Work, WorkerLaunch, write,
-};
+use hil_rundir::launch::{ChannelLaunch, DirectionLaunch, Side};
 use hil_rundir::record::RecordFile;
 use hil_shm::{ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, ShmOutput};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::worker::Worker;
+use hil_tests::worker::{self, Worker};
 use hil_topology::SocketOptions;
 use hil_topology::emulation::EmulationLaunch;
 
@@ -55,11 +50,6 @@ fn image(number: u64) -> Vec<u8> {
 }
 
 fn direction(side: Side, addresses: [SocketAddr; 2], spec: Option<&LinkSpec>) -> DirectionLaunch {
-    let [sender, receiver] = addresses;
-    let (local, peer) = match side {
-        Side::Egress => (sender, receiver),
-        Side::Ingress => (receiver, sender),
-    };
     let emulation = spec
         .filter(|_| side == Side::Ingress)
         .map(|spec| EmulationLaunch {
@@ -71,35 +61,17 @@ fn direction(side: Side, addresses: [SocketAddr; 2], spec: Option<&LinkSpec>) ->
         });
     let channels = (0..)
         .zip(CHANNELS)
-        .map(|(channel_id, (name, message, depth))| ChannelLaunch {
-            channel: name.to_owned(),
-            channel_id,
-            message: message.name.to_owned(),
-            size_bytes: message.size_bytes,
-            alignment_bytes: message.alignment_bytes,
-            depth,
+        .map(|(id, (name, message, depth))| ChannelLaunch {
             emulation: emulation.clone(),
+            ..worker::channel(id, name, message, depth)
         });
-    DirectionLaunch {
-        flow: "hil/link/hop/forward".to_owned(),
-        flow_number: u16::MAX,
-        side,
-        local,
-        peer,
-        socket: SocketLaunch {
-            transport: "udp".to_owned(),
-            options: BTreeMap::new(),
-            interface: None,
-            common: SocketOptions {
-                send_buffer_bytes: 1 << 20,
-                receive_buffer_bytes: 8 << 20,
-                ..SocketOptions::TEMPLATE
-            },
-        },
-        wait: WaitMode::Block,
-        realtime: RealtimeRequest::default(),
-        channels: channels.collect(),
-    }
+    let mut direction = worker::direction(side, addresses, channels.collect());
+    direction.socket.common = SocketOptions {
+        send_buffer_bytes: 1 << 20,
+        receive_buffer_bytes: 8 << 20,
+        ..SocketOptions::TEMPLATE
+    };
+    direction
 }
 
 /// What came of a run in which an image was published every 50 ms and a command every millisecond.
@@ -132,21 +104,9 @@ fn play(label: &str, spec: Option<&LinkSpec>) -> Outcome {
     let addresses = sockets.each_ref().map(|one| one.local_addr().unwrap());
     drop(sockets);
     let mut workers = [(0, Side::Egress), (1, Side::Ingress)].map(|(host, side)| {
-        let records = folder.join(format!("records-{host}"));
-        std::fs::create_dir(&records).unwrap();
-        let launch = WorkerLaunch {
-            process: format!("gateway-{host}"),
-            instance: 0,
-            domain: domains[host].address().to_string(),
-            records,
-            is_sealed: false,
-            work: Work::Gateway(GatewayWork {
-                directions: vec![direction(side, addresses, spec)],
-                ready_within: None,
-            }),
-        };
-        let path = folder.join(format!("{host}.json"));
-        write(&path, &launch).unwrap();
+        let name = format!("gateway-{host}");
+        let direction = direction(side, addresses, spec);
+        let path = worker::gateway(folder.path(), &name, &domains[host], direction);
         Worker::start(&path)
     });
     let output = |name: &str, message: &MessageType| {
@@ -186,7 +146,7 @@ fn play(label: &str, spec: Option<&LinkSpec>) -> Outcome {
         assert_eq!(code, Some(0), "{words}");
     }
     let file = |host: u8, kind: &str| {
-        let name = format!("records-{host}/camera.image.{kind}.gateway-{host}.0.rec");
+        let name = format!("records-gateway-{host}/camera.image.{kind}.gateway-{host}.0.rec");
         RecordFile::read(&folder.join(name)).unwrap()
     };
     let sent = file(0, "egress").records().collect();

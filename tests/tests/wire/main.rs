@@ -13,7 +13,6 @@
 mod bypass;
 mod dissector;
 mod egm_clients;
-mod emulated_run;
 mod joined_programs;
 mod live_links;
 mod long_messages;

@@ -35,15 +35,6 @@ pub struct RoundTrip {
     pub t4_source: StampSource,
 }
 
-impl RoundTrip {
-    /// Time under way, both directions together: `(t4 - t1) - (t3 - t2)`. Slightly negative only
-    /// when stamps of different kinds are mixed.
-    pub const fn rtt_ns(&self) -> i64 {
-        let whole = self.t4_ns.saturating_sub(self.t1_ns);
-        whole.saturating_sub(self.t3_ns.saturating_sub(self.t2_ns))
-    }
-}
-
 #[derive(Debug, Clone, Copy)]
 struct Exchange {
     sequence: u64,

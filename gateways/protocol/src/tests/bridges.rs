@@ -5,11 +5,11 @@ use core::time::Duration;
 use hil_core::message::Envelope;
 use hil_core::time::{Alignment, Instant};
 
-use super::network::{Impairment, Lab, OFFSET_NS, TX_NS, egress_settings, ingress_settings};
 use crate::body::HelloStatus;
 use crate::channel::{ChannelIdentity, FlowIdentity, SettingsError};
 use crate::egress::{EgressBridge, EgressEvent, LocalRefusal, PeerState, TransmitFailure};
 use crate::ingress::{InMemory, IngressBridge, IngressSettings};
+use crate::lab::{Impairment, Lab, OFFSET_NS, TX_NS, egress_settings, ingress_settings, rtt_ns};
 use crate::refusal::Refusal;
 use crate::sequence::Order;
 use crate::stamps::{ArrivalStamps, StampSource};
@@ -46,7 +46,7 @@ fn on_a_good_network_every_message_arrives_once_in_order_with_its_stamps() {
         let expected = sequence.checked_sub(1).map(|earlier| (earlier, TX_NS));
         assert_eq!(delivered.follow_up, expected);
     }
-    assert_eq!(lab.ingress().refusals().total(), 0);
+    assert_eq!(lab.ingress.refusals().total(), 0);
     assert_eq!(lab.egress.refusals().total(), 0);
     assert_eq!(lab.egress.channel_counts(0).sent_count, 500);
 }
@@ -72,11 +72,11 @@ fn clock_exchanges_give_the_offset_and_improve_with_kernel_stamps() {
             300_000 - TX_NS
         );
         assert_eq!(round_trip.t4_ns - OFFSET_NS - round_trip.t3_ns, 300_000);
-        assert_eq!(round_trip.rtt_ns(), 600_000 - TX_NS);
+        assert_eq!(rtt_ns(round_trip), 600_000 - TX_NS);
         if let Some(earlier) = earlier {
             assert!(earlier.sequence < round_trip.sequence);
             assert_eq!(earlier.t3_source, StampSource::KernelSoftware);
-            assert_eq!(earlier.rtt_ns(), 600_000 - 2 * TX_NS);
+            assert_eq!(rtt_ns(earlier), 600_000 - 2 * TX_NS);
             earlier_count += 1;
         }
     }
@@ -106,14 +106,14 @@ fn bad_network(seed: u64, payload_bytes: u32, impairment: Impairment) -> Lab {
     // The first message must arrive for counting to start at 0.
     lab.run_ms(2);
     lab.publish_for_ms(2);
-    lab.there.impairment = impairment;
-    lab.back.impairment = impairment;
+    lab.medium.there.impairment = impairment;
+    lab.medium.back.impairment = impairment;
     lab.publish_for_ms(1500);
-    lab.there.impairment = DELAY;
+    lab.medium.there.impairment = DELAY;
     lab.publish_for_ms(2);
     lab.egress.bye();
     lab.run_ms(200);
-    lab.ingress.as_mut().unwrap().finish();
+    lab.ingress.finish();
     lab
 }
 
@@ -129,7 +129,7 @@ fn on_a_bad_network_every_message_sent_is_received_or_lost_and_none_delivered_tw
             };
             let lab = bad_network(seed, payload_bytes, impairment);
             let name = format!("seed {seed}, {payload_bytes} bytes");
-            let counts = *lab.ingress().sequence_counts(0);
+            let counts = *lab.ingress.sequence_counts(0);
             let sent = lab.egress.channel_counts(0).sent_count;
             assert_eq!(sent, lab.next_sequence, "{name}");
             assert_eq!(counts.received_count + counts.lost_count, sent, "{name}");
@@ -152,12 +152,12 @@ fn on_a_bad_network_every_message_sent_is_received_or_lost_and_none_delivered_tw
             sequences.sort_unstable();
             sequences.dedup();
             assert_eq!(sequences.len(), lab.delivered.len(), "{name}");
-            assert!(lab.ingress().has_left(), "{name}");
+            assert!(lab.ingress.has_left(), "{name}");
             if payload_bytes == 5000 {
-                let reassembly = lab.ingress().reassembly_counts(0);
+                let reassembly = lab.ingress.reassembly_counts(0);
                 assert!(reassembly.evicted_count + reassembly.timed_out_count > 0);
                 assert_eq!(reassembly.completed_count, counts.received_count);
-                assert!(lab.ingress().refusals().get(Refusal::DuplicateFragment) > 0);
+                assert!(lab.ingress.refusals().get(Refusal::DuplicateFragment) > 0);
             } else {
                 assert!(counts.duplicate_count > 0, "{name}");
             }
@@ -168,22 +168,20 @@ fn on_a_bad_network_every_message_sent_is_received_or_lost_and_none_delivered_tw
 #[test]
 fn newest_wins_never_delivers_a_message_older_than_one_delivered() {
     let mut lab = Lab::new(5, 64, DELAY);
-    lab.ingress = Some(
-        IngressBridge::new(IngressSettings {
-            deliver_reordered: false,
-            ..ingress_settings(200, 64)
-        })
-        .unwrap(),
-    );
-    lab.there.impairment.jitter_ns = 5_000_000;
+    lab.ingress = IngressBridge::new(IngressSettings {
+        deliver_reordered: false,
+        ..ingress_settings(200, 64)
+    })
+    .unwrap();
+    lab.medium.there.impairment.jitter_ns = 5_000_000;
     lab.publish_for_ms(1000);
     assert!(
         lab.delivered
             .is_sorted_by_key(|delivered| delivered.message.sequence)
     );
-    let counts = lab.ingress().channel_counts(0);
+    let counts = lab.ingress.channel_counts(0);
     assert!(counts.superseded_count > 0);
-    let received = lab.ingress().sequence_counts(0).received_count;
+    let received = lab.ingress.sequence_counts(0).received_count;
     assert_eq!(counts.delivered_count + counts.superseded_count, received);
 }
 
@@ -257,8 +255,11 @@ fn answer_of(ingress: &IngressSettings) -> (PeerState, Refusal) {
     assert!(reply.len() <= hello.len());
     let event = egress.on_datagram(now, arrival, &reply).unwrap();
     assert!(matches!(event, EgressEvent::Refused(_)));
-    // Greeting goes on, slowly.
+    // Greeting goes on, slowly, and nothing else.
     assert_eq!(egress.next_wakeup(), Some(now + Duration::from_secs(1)));
+    let staged = egress.on_local(now, 0, &Envelope::default(), &[0; 64]);
+    assert_eq!(staged, Err(LocalRefusal::ChannelRefused));
+    assert_eq!(ingress.session(), None);
     (egress.peer_state(), refusal.unwrap_err())
 }
 

@@ -9,6 +9,7 @@ use super::golden::bytes;
 use crate::channel::FlowIdentity;
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings, PeerState};
 use crate::ingress::{Disposition, InMemory, IngressBridge, IngressSettings};
+use crate::lab::rtt_ns;
 use crate::refusal::Refusal;
 use crate::stamps::{ArrivalStamps, StampSource};
 use crate::wire::{HEADER_BYTES, Header, Kind};
@@ -102,7 +103,7 @@ fn it_exchanges_clocks_every_period_with_all_four_stamps_of_the_kernel() {
     for one in &refined {
         let sources = [one.t1_source, one.t2_source, one.t3_source, one.t4_source];
         assert_eq!(sources, [StampSource::KernelSoftware; 4]);
-        assert_eq!(one.rtt_ns(), 2 * DELAY_NS);
+        assert_eq!(rtt_ns(one), 2 * DELAY_NS);
         assert_eq!(one.t1_ns - (one.t2_ns - DELAY_NS), OFFSET_NS);
     }
     assert_eq!(egress.refusals().total(), 0);

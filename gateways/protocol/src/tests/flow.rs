@@ -3,12 +3,12 @@
 use hil_core::message::{ETHERNET_FRAME, Envelope};
 use hil_core::time::Instant;
 
-use super::network::{egress_settings, ingress_settings};
 use crate::channel::{ChannelIdentity, FlowIdentity};
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings};
 use crate::ingress::{
     Delivery, Destination, Disposition, InMemory, IngressBridge, IngressSettings, Payload, Piece,
 };
+use crate::lab::{Impairment, Lab, egress_settings, ingress_settings};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
 use crate::wire::{HEADER_BYTES, Header, Kind};
@@ -29,86 +29,30 @@ fn flow() -> FlowIdentity {
     }
 }
 
-struct Pair {
-    egress: EgressBridge,
-    ingress: IngressBridge,
-    memory: InMemory,
-    now_ns: i64,
-    /// Channel, epoch, sequence and first byte of each.
-    delivered: Vec<(usize, u32, u64, u8)>,
-    datagrams: Vec<(Kind, u16)>,
+/// Of one clock, over a cable without delay.
+fn lab_of(flow: &FlowIdentity) -> Lab {
+    let mut lab = Lab::of(1, flow, Impairment::default());
+    lab.offset_ns = 0;
+    lab.run_ms(1);
+    lab
 }
 
-impl Pair {
-    fn new() -> Self {
-        Self::of(&flow())
-    }
+fn lab() -> Lab {
+    lab_of(&flow())
+}
 
-    fn of(flow: &FlowIdentity) -> Self {
-        Self {
-            egress: EgressBridge::new(EgressSettings {
-                flow: flow.clone(),
-                ..egress_settings(100, 0)
-            })
-            .unwrap(),
-            ingress: IngressBridge::new(IngressSettings {
-                flow: flow.clone(),
-                ..ingress_settings(200, 0)
-            })
-            .unwrap(),
-            memory: InMemory::default(),
-            now_ns: 1_000_000,
-            delivered: Vec::new(),
-            datagrams: Vec::new(),
-        }
-    }
-
-    /// Everything that is due goes over and is answered.
-    fn exchange(&mut self) {
-        self.now_ns += 1_000;
-        let now = Instant::from_ns(self.now_ns);
-        let arrival = ArrivalStamps::application(self.now_ns);
-        while let Some(transmit) = self.egress.poll_transmit(now) {
-            let header = Header::read(transmit.datagram).unwrap().0;
-            self.datagrams.push((header.kind, header.channel));
-            let datagram = transmit.datagram.to_vec();
-            let delivered = &mut self.delivered;
-            let mut destination = self.memory.with(|one, payload| {
-                let message = one.message;
-                delivered.push((message.channel, message.epoch, message.sequence, payload[0]));
-            });
-            self.ingress
-                .on_datagram(now, arrival, &datagram, &mut destination)
-                .unwrap();
-            while let Some(reply) = self.ingress.poll_transmit(now) {
-                let reply = reply.datagram.to_vec();
-                self.egress.on_datagram(now, arrival, &reply).unwrap();
-            }
-        }
-    }
-
-    fn publish(&mut self, channel: usize, epoch: u32, sequence: u64) {
-        let envelope = Envelope {
-            sequence,
-            epoch,
-            published_ns: self.now_ns,
-            ..Envelope::default()
-        };
-        let size_bytes = flow().channels[channel].size_max_bytes as usize;
-        let mark = u8::try_from(channel % 251).unwrap();
-        let now = Instant::from_ns(self.now_ns);
-        self.egress
-            .on_local(now, channel, &envelope, &vec![mark; size_bytes])
-            .unwrap();
-        self.exchange();
-    }
+fn publish(lab: &mut Lab, channel: usize, epoch: u32, sequence: u64) {
+    let size_bytes = flow().channels[channel].size_max_bytes as usize;
+    let mark = u8::try_from(channel % 251).unwrap();
+    lab.offer(channel, epoch, sequence, &vec![mark; size_bytes])
+        .unwrap();
+    lab.step();
 }
 
 #[test]
 fn four_hundred_channels_greet_once_and_each_counts_its_own_messages() {
-    let mut pair = Pair::new();
-    pair.exchange();
-    let kinds: Vec<Kind> = pair.datagrams.iter().map(|(kind, _)| *kind).collect();
+    let mut lab = lab();
+    let kinds: Vec<Kind> = lab.datagrams.iter().map(|(kind, _)| *kind).collect();
     assert_eq!(kinds, [Kind::Hello, Kind::SyncRequest]);
     let channels = usize::from(CHANNELS);
     let mut expected = Vec::new();
@@ -117,21 +61,30 @@ fn four_hundred_channels_greet_once_and_each_counts_its_own_messages() {
             // Each channel starts at a number of its own, and every seventh loses one in between.
             let gap = u64::from(round > 2 && channel % 7 == 0);
             let sequence = channel as u64 + round + gap;
-            pair.publish(channel, 1, sequence);
+            publish(&mut lab, channel, 1, sequence);
             expected.push((channel, 1, sequence, u8::try_from(channel % 251).unwrap()));
         }
     }
-    assert_eq!(pair.delivered, expected);
-    pair.egress.bye();
-    pair.exchange();
-    pair.ingress.finish();
+    let delivered = lab.delivered.iter().map(|one| {
+        let message = one.message;
+        (
+            message.channel,
+            message.epoch,
+            message.sequence,
+            one.payload[0],
+        )
+    });
+    assert_eq!(delivered.collect::<Vec<_>>(), expected);
+    lab.egress.bye();
+    lab.step();
+    lab.ingress.finish();
     for channel in 0..channels {
-        let counts = pair.ingress.sequence_counts(channel);
+        let counts = lab.ingress.sequence_counts(channel);
         let lost = u64::from(channel % 7 == 0);
         assert_eq!((counts.received_count, counts.lost_count), (5, lost));
-        let sent = pair.egress.channel_counts(channel);
+        let sent = lab.egress.channel_counts(channel);
         assert_eq!((sent.sent_count, sent.refused_count()), (5, 0));
-        let taken = pair.ingress.channel_counts(channel);
+        let taken = lab.ingress.channel_counts(channel);
         let is_split = channel.is_multiple_of(10);
         assert_eq!(taken.datagram_count, if is_split { 15 } else { 5 });
         assert_eq!(
@@ -139,46 +92,44 @@ fn four_hundred_channels_greet_once_and_each_counts_its_own_messages() {
             taken.datagram_count + 1,
             "the farewell"
         );
-        let pieces = pair.ingress.reassembly_counts(channel);
+        let pieces = lab.ingress.reassembly_counts(channel);
         assert_eq!(pieces.completed_count, if is_split { 5 } else { 0 });
     }
-    assert_eq!(pair.ingress.refusals().total(), 0);
-    let last = pair.datagrams.last().unwrap();
+    assert_eq!(lab.ingress.refusals().total(), 0);
+    let last = lab.datagrams.last().unwrap();
     assert_eq!(*last, (Kind::Bye, 65_534), "the flow's own comes last");
-    let byes = pair.datagrams.iter().filter(|one| one.0 == Kind::Bye);
+    let byes = lab.datagrams.iter().filter(|one| one.0 == Kind::Bye);
     assert_eq!(byes.count(), channels + 1);
-    assert!(pair.ingress.has_left());
+    assert!(lab.ingress.has_left());
 }
 
 #[test]
 fn an_idle_channel_has_nothing_due() {
-    let mut pair = Pair::new();
-    pair.exchange();
-    let started = pair.now_ns;
-    let before = pair.datagrams.len();
+    let mut lab = lab();
+    let started = lab.now_ns;
+    let before = lab.datagrams.len();
     for _ in 0..50 {
-        let due = pair.egress.next_wakeup().unwrap();
-        pair.now_ns = due.as_ns();
-        pair.exchange();
-        assert_eq!(pair.ingress.next_wakeup(), None);
+        let due = lab.egress.next_wakeup().unwrap();
+        lab.now_ns = due.as_ns();
+        lab.exchange();
+        assert_eq!(lab.ingress.next_wakeup(), None);
     }
-    assert_eq!(pair.datagrams.len() - before, 50, "the clock exchanges");
-    assert!(pair.now_ns - started >= 50 * 20_000_000 - 1_000_000);
+    assert_eq!(lab.datagrams.len() - before, 50, "the clock exchanges");
+    assert!(lab.now_ns - started >= 50 * 20_000_000 - 1_000_000);
 }
 
 #[test]
 fn a_restart_of_one_producer_leaves_the_other_channels_alone() {
-    let mut pair = Pair::new();
-    pair.exchange();
+    let mut lab = lab();
     for sequence in 0..10 {
-        pair.publish(1, 1, sequence);
-        pair.publish(2, 1, sequence);
+        publish(&mut lab, 1, 1, sequence);
+        publish(&mut lab, 2, 1, sequence);
     }
     for sequence in 0..10 {
-        pair.publish(1, 2, sequence);
-        pair.publish(2, 1, 10 + sequence);
+        publish(&mut lab, 1, 2, sequence);
+        publish(&mut lab, 2, 1, 10 + sequence);
     }
-    let counts = [1, 2].map(|channel| *pair.ingress.sequence_counts(channel));
+    let counts = [1, 2].map(|channel| *lab.ingress.sequence_counts(channel));
     assert_eq!(counts.map(|one| one.restart_count), [1, 0]);
     assert_eq!(counts.map(|one| one.received_count), [20, 20]);
     assert_eq!(counts.map(|one| one.lost_count), [0, 0]);
@@ -186,43 +137,40 @@ fn a_restart_of_one_producer_leaves_the_other_channels_alone() {
 
 #[test]
 fn a_stamp_rides_on_the_next_message_of_its_own_channel() {
-    let mut pair = Pair::new();
-    pair.exchange();
-    pair.publish(1, 1, 40);
-    pair.egress.on_transmit_stamp(Kind::Data, Some(1), 40, 700);
-    let follow_up = |pair: &mut Pair, channel: usize, sequence: u64| {
+    let mut lab = lab();
+    publish(&mut lab, 1, 1, 40);
+    let follow_up = |lab: &mut Lab, channel: usize, sequence: u64| {
         let envelope = Envelope {
             sequence,
             epoch: 1,
             ..Envelope::default()
         };
-        let now = Instant::from_ns(pair.now_ns);
-        let staged = pair.egress.on_local(now, channel, &envelope, &[0; 16]);
+        let now = lab.now();
+        let staged = lab.egress.on_local(now, channel, &envelope, &[0; 16]);
         staged.unwrap();
-        let datagram = pair.egress.poll_transmit(now).unwrap().datagram;
+        let datagram = lab.egress.poll_transmit(now).unwrap().datagram;
         Header::read(datagram).unwrap().0.follow_up
     };
-    assert_eq!(follow_up(&mut pair, 2, 0), None);
-    let field = follow_up(&mut pair, 1, 41).unwrap();
+    assert_eq!(follow_up(&mut lab, 2, 0), None);
+    let field = follow_up(&mut lab, 1, 41).unwrap();
     assert_eq!((field.sequence(41), field.handed_to_tx_ns), (Some(40), 700));
 }
 
 #[test]
 fn numbers_that_are_no_channels_and_exchanges_about_channels_are_refused() {
-    let mut pair = Pair::new();
-    pair.exchange();
-    let now = Instant::from_ns(pair.now_ns);
-    let arrival = ArrivalStamps::application(pair.now_ns);
+    let mut lab = lab();
+    let now = lab.now();
+    let arrival = ArrivalStamps::application(lab.now_ns);
     let mut offer = |kind: Kind, number: u16, type_hash: u64, body: &[u8]| {
         let mut header = Header::new(kind, 100, number);
         header.type_hash = type_hash;
-        header.handed_ns = pair.now_ns;
+        header.handed_ns = lab.now_ns;
         header.total_len = u32::try_from(body.len()).unwrap();
         let mut datagram = vec![0; HEADER_BYTES];
         header.encode(&mut datagram);
         datagram.extend_from_slice(body);
-        let mut no_message = pair.memory.with(|_, _| panic!("no message"));
-        pair.ingress
+        let mut no_message = lab.memory.with(|_, _| panic!("no message"));
+        lab.ingress
             .on_datagram(now, arrival, &datagram, &mut no_message)
     };
     let of_seven = flow().channels[0].type_hash;
@@ -243,26 +191,26 @@ fn numbers_that_are_no_channels_and_exchanges_about_channels_are_refused() {
 
 #[test]
 fn the_answer_to_a_greeting_of_other_channels_is_no_acceptance() {
-    let mut pair = Pair::new();
+    let mut lab = Lab::of(1, &flow(), Impairment::default());
     let mut fewer = flow();
     fewer.channels.pop();
-    pair.ingress = IngressBridge::new(IngressSettings {
+    lab.ingress = IngressBridge::new(IngressSettings {
         flow: fewer,
         ..ingress_settings(200, 0)
     })
     .unwrap();
-    let now = Instant::from_ns(pair.now_ns);
-    let arrival = ArrivalStamps::application(pair.now_ns);
-    let hello = pair.egress.poll_transmit(now).unwrap().datagram.to_vec();
-    let refused = pair.ingress.on_datagram(
+    let now = lab.now();
+    let arrival = ArrivalStamps::application(lab.now_ns);
+    let hello = lab.egress.poll_transmit(now).unwrap().datagram.to_vec();
+    let refused = lab.ingress.on_datagram(
         now,
         arrival,
         &hello,
         &mut InMemory::default().with(|_, _| {}),
     );
     assert_eq!(refused, Err(Refusal::ChannelsDiffer));
-    let reply = pair.ingress.poll_transmit(now).unwrap().datagram.to_vec();
-    let event = pair.egress.on_datagram(now, arrival, &reply);
+    let reply = lab.ingress.poll_transmit(now).unwrap().datagram.to_vec();
+    let event = lab.egress.on_datagram(now, arrival, &reply);
     assert!(matches!(event, Ok(EgressEvent::Refused(_))), "{event:?}");
 }
 
@@ -430,79 +378,75 @@ impl Destination for Places {
     }
 }
 
-impl Pair {
-    /// The three datagrams of a message of the first channel, which do not arrive yet.
-    fn pieces(&mut self, sequence: u64) -> Vec<Vec<u8>> {
-        let envelope = Envelope {
-            sequence,
-            epoch: 1,
-            ..Envelope::default()
-        };
-        let now = Instant::from_ns(self.now_ns);
-        let staged = self.egress.on_local(now, 0, &envelope, &[3; 4_000]);
-        staged.unwrap();
-        let mut pieces = Vec::new();
-        while let Some(transmit) = self.egress.poll_transmit(now) {
-            pieces.push(transmit.datagram.to_vec());
-        }
-        assert_eq!(pieces.len(), 3);
-        pieces
+/// The three datagrams of a message of the first channel, which do not arrive yet.
+fn pieces_of(lab: &mut Lab, sequence: u64) -> Vec<Vec<u8>> {
+    let envelope = Envelope {
+        sequence,
+        epoch: 1,
+        ..Envelope::default()
+    };
+    let now = lab.now();
+    let staged = lab.egress.on_local(now, 0, &envelope, &[3; 4_000]);
+    staged.unwrap();
+    let mut pieces = Vec::new();
+    while let Some(transmit) = lab.egress.poll_transmit(now) {
+        pieces.push(transmit.datagram.to_vec());
     }
+    assert_eq!(pieces.len(), 3);
+    pieces
+}
 
-    fn offer(&mut self, datagram: &[u8], places: &mut Places) -> Result<Disposition, Refusal> {
-        let arrival = ArrivalStamps::application(self.now_ns);
-        let now = Instant::from_ns(self.now_ns);
-        self.ingress.on_datagram(now, arrival, datagram, places)
-    }
+fn offer(lab: &mut Lab, datagram: &[u8], places: &mut Places) -> Result<Disposition, Refusal> {
+    let arrival = ArrivalStamps::application(lab.now_ns);
+    lab.ingress
+        .on_datagram(lab.now(), arrival, datagram, places)
 }
 
 #[test]
 fn a_piece_without_memory_is_refused_and_its_message_is_never_whole() {
-    let mut pair = Pair::new();
-    pair.exchange();
+    let mut lab = lab();
     let mut places = Places {
         rest: 2,
         stored: Vec::new(),
         whole: Vec::new(),
     };
-    let pieces = pair.pieces(0);
-    let outcomes = pieces.iter().map(|one| pair.offer(one, &mut places));
+    let pieces = pieces_of(&mut lab, 0);
+    let outcomes = pieces.iter().map(|one| offer(&mut lab, one, &mut places));
     let stored = Ok(Disposition::FragmentStored);
     let refused = Err(Refusal::NoMemory);
     assert_eq!(outcomes.collect::<Vec<_>>(), [stored, stored, refused]);
     assert_eq!(places.stored, [(0, true, 0), (0, false, 1_334)]);
-    assert_eq!(pair.ingress.refusals().get(Refusal::NoMemory), 1);
-    let due = pair.ingress.next_wakeup().unwrap();
-    pair.ingress.on_wakeup(due);
-    let incomplete = pair.ingress.next_incomplete().unwrap();
+    assert_eq!(lab.ingress.refusals().get(Refusal::NoMemory), 1);
+    let due = lab.ingress.next_wakeup().unwrap();
+    lab.ingress.on_wakeup(due);
+    let incomplete = lab.ingress.next_incomplete().unwrap();
     assert_eq!(incomplete.message.fragment_count, 2);
     assert_eq!(places.whole, []);
 }
 
 #[test]
 fn a_message_of_a_new_session_begins_anew_in_the_slot_of_an_old_one() {
-    let mut pair = Pair::new();
-    pair.exchange();
+    let mut lab = lab();
     let mut places = Places {
         rest: usize::MAX,
         stored: Vec::new(),
         whole: Vec::new(),
     };
-    for piece in &pair.pieces(0)[..2] {
-        pair.offer(piece, &mut places).unwrap();
+    for piece in &pieces_of(&mut lab, 0)[..2] {
+        offer(&mut lab, piece, &mut places).unwrap();
     }
     let flow = flow();
-    pair.egress = EgressBridge::new(EgressSettings {
+    lab.egress = EgressBridge::new(EgressSettings {
         flow,
         ..egress_settings(101, 0)
     })
     .unwrap();
-    pair.exchange();
-    assert_eq!(pair.ingress.next_incomplete().unwrap().message.session, 100);
-    let pieces = pair.pieces(0);
+    lab.run_ms(1);
+    assert_eq!(lab.ingress.next_incomplete().unwrap().message.session, 100);
+    let pieces = pieces_of(&mut lab, 0);
     for piece in [2, 0, 1] {
         assert_eq!(places.whole, []);
-        pair.offer(&pieces[piece], &mut places).unwrap();
+        offer(&mut lab, &pieces[piece], &mut places).unwrap();
     }
     let of_the_new = [(0, true, 2_668), (0, false, 0), (0, false, 1_334)];
     assert_eq!(places.stored[2..], of_the_new);
@@ -535,23 +479,20 @@ fn a_frame_arrives_as_long_as_it_is_and_another_message_only_whole() {
             name: "link/hop/forward".to_owned(),
             channels: vec![ChannelIdentity::new(0, "a/b", message, 1_522, 2)],
         };
-        let mut pair = Pair::of(&flow);
-        pair.exchange();
-        let now = Instant::from_ns(pair.now_ns);
-        let (envelope, payload) = (Envelope::default(), vec![7; length]);
-        pair.egress.on_local(now, 0, &envelope, &payload).unwrap();
-        let arrival = ArrivalStamps::application(pair.now_ns);
-        let mut lengths = Vec::new();
-        while let Some(transmit) = pair.egress.poll_transmit(now) {
-            let datagram = transmit.datagram.to_vec();
-            let mut deliver = pair.memory.with(|_, payload| lengths.push(payload.len()));
-            let taken = pair
-                .ingress
-                .on_datagram(now, arrival, &datagram, &mut deliver);
-            let refused = Err(Refusal::LengthMismatch);
-            assert!(is_taken == taken.is_ok() && (is_taken || taken == refused));
+        let mut lab = lab_of(&flow);
+        let (before, payload) = (lab.dispositions.len(), vec![7; length]);
+        lab.offer(0, 1, 0, &payload).unwrap();
+        lab.step();
+        let refused = Err(Refusal::LengthMismatch);
+        for taken in &lab.dispositions[before..] {
+            assert!(is_taken == taken.is_ok() && (is_taken || *taken == refused));
         }
+        let delivered = lab.delivered.iter().map(|one| one.payload.len());
         let expected: &[usize] = if is_taken { &[length] } else { &[] };
-        assert_eq!(lengths, expected, "{message} of {length} bytes");
+        assert_eq!(
+            delivered.collect::<Vec<_>>(),
+            expected,
+            "{message} of {length} bytes"
+        );
     }
 }

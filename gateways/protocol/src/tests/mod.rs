@@ -5,6 +5,5 @@ mod clock_path;
 mod flow;
 mod fragments;
 mod golden;
-pub(super) mod network;
 mod recovery;
 mod sequences;

@@ -2,9 +2,9 @@
 
 use hil_core::time::Instant;
 
-use super::network::{Impairment, Lab, egress_settings, ingress_settings};
 use crate::egress::{EgressBridge, LocalRefusal, PeerState};
 use crate::ingress::{Disposition, InMemory, IngressBridge};
+use crate::lab::{Impairment, Lab, egress_settings, ingress_settings};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
 
@@ -17,7 +17,7 @@ const DELAY: Impairment = Impairment {
 
 fn finish(lab: &mut Lab) {
     lab.run_ms(50);
-    lab.ingress.as_mut().unwrap().finish();
+    lab.ingress.finish();
 }
 
 #[test]
@@ -29,7 +29,7 @@ fn a_restarted_producer_is_a_restart_and_not_a_loss() {
     lab.next_sequence = 0;
     lab.publish_for_ms(200);
     finish(&mut lab);
-    let counts = lab.ingress().sequence_counts(0);
+    let counts = lab.ingress.sequence_counts(0);
     assert_eq!((counts.received_count, counts.lost_count), (500, 0));
     assert_eq!(counts.restart_count, 1);
     // The stamp of the old producer's last message does not ride on the new one's first.
@@ -42,17 +42,17 @@ fn a_restarted_sending_gateway_is_a_restart_and_not_a_loss() {
     lab.run_ms(2);
     lab.publish_for_ms(300);
     lab.egress = EgressBridge::new(egress_settings(101, 64)).unwrap();
-    lab.egress_address = "10.0.0.1:4001".parse().unwrap();
+    lab.medium.egress_address = "10.0.0.1:4001".parse().unwrap();
     // What the producer publishes meanwhile is refused at the gateway.
     assert_eq!(lab.publish(), Err(LocalRefusal::PeerNotGreeted));
     lab.run_ms(2);
     lab.publish_for_ms(200);
     finish(&mut lab);
-    let counts = lab.ingress().sequence_counts(0);
+    let counts = lab.ingress.sequence_counts(0);
     assert_eq!((counts.received_count, counts.lost_count), (500, 0));
     assert_eq!(counts.restart_count, 1);
-    assert_eq!(lab.ingress().counts().session_restart_count, 1);
-    assert_eq!(lab.ingress().session(), Some(101));
+    assert_eq!(lab.ingress.counts().session_restart_count, 1);
+    assert_eq!(lab.ingress.session(), Some(101));
 }
 
 #[test]
@@ -61,7 +61,7 @@ fn a_restarted_receiving_gateway_asks_for_a_greeting_and_goes_on() {
         let mut lab = Lab::new(1, payload_bytes, DELAY);
         lab.run_ms(2);
         lab.publish_for_ms(100);
-        lab.ingress = Some(IngressBridge::new(ingress_settings(201, payload_bytes)).unwrap());
+        lab.ingress = IngressBridge::new(ingress_settings(201, payload_bytes)).unwrap();
         lab.publish_for_ms(100);
         finish(&mut lab);
         assert_eq!(lab.egress.peer_state(), PeerState::Established);
@@ -70,14 +70,14 @@ fn a_restarted_receiving_gateway_asks_for_a_greeting_and_goes_on() {
             (counts.greet_again_count, counts.peer_restart_count),
             (1, 1)
         );
-        let refused = lab.ingress().refusals().get(Refusal::UnknownSession);
+        let refused = lab.ingress.refusals().get(Refusal::UnknownSession);
         // Messages of 8 bytes are too short to be answered; the next clock exchange is.
         assert!((1..=21).contains(&refused), "{refused} refused");
-        let replies = lab.ingress().reply_counts();
+        let replies = lab.ingress.reply_counts();
         assert_eq!(replies.amplifying_count > 0, payload_bytes == 8);
-        let received = lab.ingress().sequence_counts(0).received_count;
+        let received = lab.ingress.sequence_counts(0).received_count;
         assert!(received >= 75, "{received} received");
-        assert_eq!(lab.ingress().sequence_counts(0).lost_count, 0);
+        assert_eq!(lab.ingress.sequence_counts(0).lost_count, 0);
     }
 }
 
@@ -86,7 +86,7 @@ fn a_vanished_peer_is_down_until_it_greets_back() {
     let mut lab = Lab::new(1, 64, DELAY);
     lab.run_ms(2);
     lab.publish_for_ms(100);
-    let gone = lab.ingress.take();
+    lab.is_listening = false;
     lab.publish_for_ms(500);
     assert_eq!(lab.egress.peer_state(), PeerState::Down);
     let counts = *lab.egress.counts();
@@ -96,12 +96,12 @@ fn a_vanished_peer_is_down_until_it_greets_back() {
     assert_eq!(messages.refused_peer_down_count, 499);
     // Greetings go on every 50 ms.
     assert!((8..=11).contains(&(counts.hello_sent_count)), "{counts:?}");
-    lab.ingress = gone;
+    lab.is_listening = true;
     lab.run_ms(60);
     assert_eq!(lab.egress.peer_state(), PeerState::Established);
     lab.publish_for_ms(100);
     finish(&mut lab);
-    let counts = *lab.ingress().sequence_counts(0);
+    let counts = *lab.ingress.sequence_counts(0);
     assert_eq!((counts.received_count, counts.lost_count), (200, 500));
     assert_eq!(counts.loss_burst_length_max, 500);
     assert_eq!(
@@ -115,18 +115,18 @@ fn a_silent_network_does_not_stop_messages() {
     let mut lab = Lab::new(1, 64, DELAY);
     lab.run_ms(2);
     lab.publish_for_ms(100);
-    let (there, back) = (lab.there.impairment, lab.back.impairment);
-    lab.there.impairment.loss_ratio = 1.0;
-    lab.back.impairment.loss_ratio = 1.0;
+    let (there, back) = (lab.medium.there.impairment, lab.medium.back.impairment);
+    lab.medium.there.impairment.loss_ratio = 1.0;
+    lab.medium.back.impairment.loss_ratio = 1.0;
     lab.publish_for_ms(5000);
     assert_eq!(lab.egress.peer_state(), PeerState::Established);
     let silent_ns = lab.egress_now().ns_since(lab.egress.last_heard().unwrap());
     assert!(silent_ns >= 4_900_000_000);
-    lab.there.impairment = there;
-    lab.back.impairment = back;
+    lab.medium.there.impairment = there;
+    lab.medium.back.impairment = back;
     lab.publish_for_ms(100);
     finish(&mut lab);
-    let counts = *lab.ingress().sequence_counts(0);
+    let counts = *lab.ingress.sequence_counts(0);
     assert_eq!((counts.received_count, counts.lost_count), (200, 5000));
     assert_eq!(counts.loss_burst_length_max, 5000);
 }
@@ -136,7 +136,7 @@ fn a_delayed_greeting_or_message_of_an_old_session_is_stale() {
     let mut lab = Lab::new(1, 64, DELAY);
     let now = lab.egress_now();
     let arrival = ArrivalStamps::application(lab.now_ns);
-    let ingress = lab.ingress.as_mut().unwrap();
+    let ingress = &mut lab.ingress;
     let mut old = EgressBridge::new(egress_settings(100, 64)).unwrap();
     let mut new = EgressBridge::new(egress_settings(101, 64)).unwrap();
     let old_hello = old.poll_transmit(now).unwrap().datagram.to_vec();
@@ -182,7 +182,7 @@ fn a_session_replaced_by_mistake_comes_back() {
         ..ArrivalStamps::application(lab.now_ns)
     };
     let now = Instant::from_ns(lab.now_ns);
-    let ingress = lab.ingress.as_mut().unwrap();
+    let ingress = &mut lab.ingress;
     let taken = ingress.on_datagram(
         now,
         arrival,
@@ -191,8 +191,8 @@ fn a_session_replaced_by_mistake_comes_back() {
     );
     assert_eq!(taken, Ok(Disposition::Greeted { is_restart: true }));
     lab.publish_for_ms(50);
-    assert_eq!(lab.ingress().session(), Some(100));
-    let received = lab.ingress().sequence_counts(0).received_count;
+    assert_eq!(lab.ingress.session(), Some(100));
+    let received = lab.ingress.sequence_counts(0).received_count;
     assert!(received >= 95, "{received} received");
 }
 
@@ -211,7 +211,7 @@ fn another_host_neither_takes_over_a_live_session_nor_speaks_for_it() {
         .datagram
         .to_vec();
     let now = Instant::from_ns(lab.now_ns);
-    let ingress = lab.ingress.as_mut().unwrap();
+    let ingress = &mut lab.ingress;
     let refused = ingress.on_datagram(
         now,
         stranger,
@@ -240,9 +240,9 @@ fn a_leap_of_the_sequence_asks_for_a_greeting_first() {
     lab.publish_for_ms(10);
     lab.next_sequence += 1 << 30;
     lab.publish_for_ms(20);
-    let refused = lab.ingress().refusals().get(Refusal::ImplausibleSequence);
+    let refused = lab.ingress.refusals().get(Refusal::ImplausibleSequence);
     assert!(refused >= 1);
-    let received = lab.ingress().sequence_counts(0).received_count;
+    let received = lab.ingress.sequence_counts(0).received_count;
     assert_eq!(
         received + refused + lab.egress.channel_counts(0).refused_count(),
         30
@@ -271,7 +271,7 @@ fn stamps_that_contradict_the_clock_are_refused_until_the_next_exchange() {
         let bytes = lab.egress.poll_transmit(now).unwrap().datagram.to_vec();
         let arrival = ArrivalStamps::application(lab.now_ns);
         let now = Instant::from_ns(lab.now_ns);
-        let ingress = lab.ingress.as_mut().unwrap();
+        let ingress = &mut lab.ingress;
         let result = ingress.on_datagram(
             now,
             arrival,
@@ -290,7 +290,7 @@ fn stamps_that_contradict_the_clock_are_refused_until_the_next_exchange() {
     let sync = lab.egress.poll_transmit(later).unwrap().datagram.to_vec();
     let arrival = ArrivalStamps::application(lab.now_ns);
     let now = Instant::from_ns(lab.now_ns);
-    let ingress = lab.ingress.as_mut().unwrap();
+    let ingress = &mut lab.ingress;
     ingress
         .on_datagram(
             now,

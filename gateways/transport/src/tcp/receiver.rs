@@ -14,12 +14,11 @@ use super::frame::{DATAGRAM_BYTES_MAX, FRAME_BYTES_MAX, PREFIX_BYTES, prefix};
 use super::metrics::StreamMetrics;
 use super::now;
 use super::socket::{abort, listen, tune};
-use super::stream::{Ending, Stream, Taken};
+use super::stream::{Ending, Stream};
 use crate::socket::{
     GrantedOptions, SocketError, SocketSettings, granted_options, local_address, refuse,
 };
 use crate::{DatagramReceiver, EndReport, Received, ReceiverCounters, SendRefusal};
-use hil_net::KernelStamps;
 use hil_net::timestamping::set_int_option;
 
 /// Waiting connections looked at in one call: a crowd at the door must not keep the channel
@@ -46,7 +45,7 @@ struct Candidate {
 
 /// What a candidate has to read.
 enum Look {
-    Datagram(Taken),
+    Datagram(Received),
     NothingYet,
     Ended,
 }
@@ -159,16 +158,17 @@ impl TcpReceiver {
 
     /// The next datagram of a connection that has delivered nothing of the peer's yet. What is looked at
     /// stays in the kernel until it is a whole frame, so nothing is kept here of any of them.
-    fn look_at_candidates(&mut self, buffer: &mut [u8]) -> Option<Taken> {
+    fn look_at_candidates(&mut self, buffer: &mut [u8]) -> Option<Received> {
         let mut left = self.candidates.len();
         while left > 0 {
             left -= 1;
             let index = self.look_first % self.candidates.len();
-            match look(&mut self.candidates[index].stream, &mut self.frame, buffer) {
-                Look::Datagram(taken) => {
+            let stream = &mut self.candidates[index].stream;
+            match look(stream, &mut self.frame, buffer, self.settings.peer) {
+                Look::Datagram(received) => {
                     self.look_first = index + 1;
                     self.given = Some(index);
-                    return Some(taken);
+                    return Some(received);
                 }
                 Look::NothingYet => self.look_first = index + 1,
                 Look::Ended => {
@@ -198,7 +198,7 @@ impl TcpReceiver {
     }
 }
 
-fn look(stream: &mut TcpStream, frame: &mut [u8], buffer: &mut [u8]) -> Look {
+fn look(stream: &mut TcpStream, frame: &mut [u8], buffer: &mut [u8], source: SocketAddr) -> Look {
     let count = match stream.peek(frame) {
         Ok(0) => return Look::Ended,
         Ok(count) => count,
@@ -225,37 +225,29 @@ fn look(stream: &mut TcpStream, frame: &mut [u8], buffer: &mut [u8]) -> Look {
     if stream.read_exact(&mut frame[..whole]).is_err() {
         return Look::Ended;
     }
-    let length_bytes = length.min(buffer.len());
-    buffer[..length_bytes].copy_from_slice(&frame[PREFIX_BYTES..][..length_bytes]);
-    Look::Datagram(Taken {
-        length_bytes,
-        is_truncated: length_bytes < length,
-    })
+    Look::Datagram(Received::copied(
+        &frame[PREFIX_BYTES..whole],
+        buffer,
+        source,
+    ))
 }
 
 impl DatagramReceiver for TcpReceiver {
     fn receive(&mut self, _now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>> {
         self.given = None;
         // However a connection ended, the next one may come.
-        let mut taken = self.stream.receive(buffer).unwrap_or(None);
-        if taken.is_none() && !self.candidates.is_empty() {
-            taken = self.look_at_candidates(buffer);
+        let taken = self.stream.receive(buffer, self.settings.peer);
+        let mut received = taken.unwrap_or(None);
+        if received.is_none() && !self.candidates.is_empty() {
+            received = self.look_at_candidates(buffer);
             if !self.is_sealed {
                 self.promote();
             }
         }
-        let Some(taken) = taken else {
-            return Ok(None);
-        };
-        let received = Received {
-            length_bytes: taken.length_bytes,
-            is_truncated: taken.is_truncated,
-            source: self.settings.peer,
-            stamps: KernelStamps::default(),
-            emulated: None,
-        };
-        self.counters.count_received(&received);
-        Ok(Some(received))
+        if let Some(received) = &received {
+            self.counters.count_received(received);
+        }
+        Ok(received)
     }
 
     fn prove(&mut self) {

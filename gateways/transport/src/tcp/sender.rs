@@ -16,7 +16,7 @@ use super::socket::{
 use super::stream::Stream;
 use crate::socket::{GrantedOptions, SocketError, SocketSettings, granted_options};
 use crate::{ConnectionTally, DatagramSender, EndReport, Received, SendRefusal, SenderCounters};
-use hil_net::{KernelStamps, TransmitStamp, TxToken};
+use hil_net::{TransmitStamp, TxToken};
 
 /// Where the connection stands.
 #[derive(Debug)]
@@ -88,7 +88,7 @@ impl TcpSender {
 
     /// How often connections come and go.
     pub fn tally(&self) -> Arc<ConnectionTally> {
-        self.stream.tally()
+        Arc::clone(&self.stream.tally)
     }
 
     /// True while there is a connection.
@@ -108,7 +108,7 @@ impl TcpSender {
         if !matches!(self.way, Way::Up) || self.stream.socket().is_some() {
             return;
         }
-        if now.saturating_duration_since(self.stream.connected()) >= GOOD_CONNECTION {
+        if now.saturating_duration_since(self.stream.connected) >= GOOD_CONNECTION {
             self.back_off = BackOff::new();
         }
         let due = self.back_off.after(now);
@@ -167,12 +167,10 @@ impl DatagramSender for TcpSender {
     fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal> {
         match self.stream.send(head, tail) {
             Ok(()) => {
-                let low = self.counters.sent_count & u64::from(u32::MAX);
-                self.counters.sent_count += 1;
                 if self.stream.has_backlog() {
                     self.stream.update_interest();
                 }
-                Ok(TxToken(u32::try_from(low).expect("masked to 32 bits")))
+                Ok(self.counters.count_sent())
             }
             Err(refusal) => {
                 self.counters.count_refusal(refusal);
@@ -187,17 +185,10 @@ impl DatagramSender for TcpSender {
     }
 
     fn receive(&mut self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
-        match self.stream.receive(buffer) {
-            Ok(None) => Ok(None),
-            Ok(Some(taken)) => {
-                self.counters.reply_count += 1;
-                Ok(Some(Received {
-                    length_bytes: taken.length_bytes,
-                    is_truncated: taken.is_truncated,
-                    source: self.settings.peer,
-                    stamps: KernelStamps::default(),
-                    emulated: None,
-                }))
+        match self.stream.receive(buffer, self.settings.peer) {
+            Ok(received) => {
+                self.counters.reply_count += u64::from(received.is_some());
+                Ok(received)
             }
             Err(_ended) => {
                 self.notice_end(now());

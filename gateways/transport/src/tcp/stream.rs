@@ -4,6 +4,7 @@
 
 use core::time::Duration;
 use std::io::{self, IoSlice, Read};
+use std::net::SocketAddr;
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::Arc;
 
@@ -17,7 +18,7 @@ use super::now;
 use super::socket::abort;
 use super::stall::StallWatch;
 use crate::socket::{SocketError, refuse};
-use crate::{ConnectionTally, SendRefusal};
+use crate::{ConnectionTally, Received, SendRefusal};
 use hil_net::tcp_info::{ConnectionInfo, unacknowledged_bytes, unsent_bytes};
 
 /// What the kernel has not taken waits here: two of the longest frames, so that one always fits
@@ -39,18 +40,11 @@ pub(super) enum Ending {
     Replaced,
 }
 
-/// One received datagram, in the caller's buffer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Taken {
-    pub(super) length_bytes: usize,
-    pub(super) is_truncated: bool,
-}
-
 /// The connection, if there is one, and what outlives it.
 #[derive(Debug)]
 pub(super) struct Stream {
     socket: Option<Socket>,
-    connected: Instant,
+    pub(super) connected: Instant,
     reader: FrameReader,
     backlog: Backlog,
     backlogged: Option<Instant>,
@@ -60,7 +54,7 @@ pub(super) struct Stream {
     info: Option<ConnectionInfo>,
     /// Of connections that have ended, and counts of this side.
     figures: StreamMetrics,
-    tally: Arc<ConnectionTally>,
+    pub(super) tally: Arc<ConnectionTally>,
     epoll: Epoll,
     /// What the newest socket is watched for.
     interest: EpollFlags,
@@ -127,21 +121,12 @@ impl Stream {
         }
     }
 
-    pub(super) fn tally(&self) -> Arc<ConnectionTally> {
-        Arc::clone(&self.tally)
-    }
-
     pub(super) fn socket(&self) -> Option<&Socket> {
         self.socket.as_ref()
     }
 
     pub(super) fn figures_mut(&mut self) -> &mut StreamMetrics {
         &mut self.figures
-    }
-
-    /// When the present connection came about.
-    pub(super) fn connected(&self) -> Instant {
-        self.connected
     }
 
     /// Takes a connected socket.
@@ -243,17 +228,15 @@ impl Stream {
     }
 
     /// Takes the next datagram that is whole; says how the connection ended when it did.
-    pub(super) fn receive(&mut self, buffer: &mut [u8]) -> Result<Option<Taken>, Ending> {
+    pub(super) fn receive(
+        &mut self,
+        buffer: &mut [u8],
+        source: SocketAddr,
+    ) -> Result<Option<Received>, Ending> {
         loop {
             match self.reader.next_datagram() {
                 Ok(Some(datagram)) => {
-                    let length_bytes = datagram.len().min(buffer.len());
-                    buffer[..length_bytes].copy_from_slice(&datagram[..length_bytes]);
-                    let is_truncated = length_bytes < datagram.len();
-                    return Ok(Some(Taken {
-                        length_bytes,
-                        is_truncated,
-                    }));
+                    return Ok(Some(Received::copied(datagram, buffer, source)));
                 }
                 Ok(None) => {}
                 Err(_) => return self.broken(Ending::BadFrame),

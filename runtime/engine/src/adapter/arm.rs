@@ -7,6 +7,7 @@ use std::os::fd::BorrowedFd;
 
 use hil_core::message::Envelope;
 use hil_core::time::Instant;
+use hil_transport::DatagramSender;
 
 use super::line::Line;
 use crate::gateway::poll_descriptors;
@@ -122,7 +123,7 @@ impl Arm {
             Pause::Spin => core::hint::spin_loop(),
             Pause::Sleep(until) => {
                 let listeners = self.waiter.iter().map(Waiter::descriptor);
-                let socket: Option<BorrowedFd<'_>> = self.line.poll_fd();
+                let socket: Option<BorrowedFd<'_>> = self.line.socket.poll_fd();
                 let [first, second] = poll_descriptors(listeners.chain(socket), until)?;
                 let (is_announced, has_news) = match self.waiter {
                     Some(_) => (first, second),

@@ -2,14 +2,12 @@
 //! message: robot and sensor adapter do.
 
 use std::net::SocketAddr;
-use std::os::fd::BorrowedFd;
 
 use hil_core::record::UNAVAILABLE;
 use hil_core::time::Instant;
 use hil_net::TransmitStage;
 use hil_transport::udp::UdpSender;
-use hil_transport::udp_server::UdpServer;
-use hil_transport::{DatagramSender, Received, SenderCounters};
+use hil_transport::{DatagramSender, Received};
 
 use crate::gateway::kernel_clock::KernelClock;
 use crate::gateway::stamp_tracker::{STAMP_PATIENCE_NS, StampTracker};
@@ -17,45 +15,21 @@ use crate::process::worker::WorkerError;
 use hil_rundir::adapter_record::{AdapterReceivedRecord, AdapterSentRecord};
 use hil_rundir::record::RecordSink;
 
-/// Which end of the protocol's UDP the socket is.
-#[derive(Debug)]
-pub(super) enum Socket {
-    /// Connected to the foreign program: the robot speaks first, and to nobody else.
-    Client(Box<UdpSender>),
-    /// Hears anyone and answers the robot.
-    Server(Box<UdpServer>),
-}
-
-impl Socket {
-    fn sender(&self) -> &dyn DatagramSender {
-        match self {
-            Self::Client(socket) => socket.as_ref(),
-            Self::Server(socket) => socket.as_ref(),
-        }
-    }
-
-    fn sender_mut(&mut self) -> &mut dyn DatagramSender {
-        match self {
-            Self::Client(socket) => socket.as_mut(),
-            Self::Server(socket) => socket.as_mut(),
-        }
-    }
-}
-
 /// The socket, its records and the clock of its stamps.
 #[derive(Debug)]
 pub(super) struct Line {
-    socket: Socket,
+    /// Connected to the foreign program, which the robot speaks to first; or it hears anyone and answers the robot.
+    pub(super) socket: UdpSender,
     pending: StampTracker<AdapterSentRecord>,
     sent: RecordSink,
     received: RecordSink,
-    clock: KernelClock,
+    pub(super) clock: KernelClock,
     has_stamps: bool,
 }
 
 impl Line {
     pub(super) fn new(
-        socket: Socket,
+        socket: UdpSender,
         sent: RecordSink,
         received: RecordSink,
         has_stamps: bool,
@@ -70,11 +44,9 @@ impl Line {
         })
     }
 
-    /// Answers `peer` from now on; a connected socket has its peer.
+    /// Answers `peer` from now on.
     pub(super) fn answer_to(&mut self, peer: SocketAddr) {
-        if let Socket::Server(socket) = &mut self.socket {
-            socket.answer_to(peer);
-        }
+        self.socket.answer_to(peer);
     }
 
     /// Sends `datagram`, then takes the stamps that have come. A refusal is a state of the network
@@ -85,7 +57,7 @@ impl Line {
             realtime_offset_ns: self.clock.offset_ns(),
             ..record
         };
-        let sent = self.socket.sender_mut().send(datagram);
+        let sent = self.socket.send(datagram);
         match sent {
             Ok(token) if self.has_stamps => {
                 let handed = Instant::from_ns(record.handed_ns);
@@ -106,7 +78,7 @@ impl Line {
     /// Takes one stamp without blocking; false when there is none. Reports of the network come the
     /// same way and are counted by the socket.
     fn take_stamp(&mut self) -> bool {
-        let Some(stamp) = self.socket.sender_mut().next_stamp() else {
+        let Some(stamp) = self.socket.next_stamp() else {
             return false;
         };
         if let (Some(software_ns), TransmitStage::Sent) = (stamp.stamps.software_ns, stamp.stage)
@@ -132,7 +104,7 @@ impl Line {
 
     /// The next datagram, if one has come.
     pub(super) fn receive(&mut self, buffer: &mut [u8]) -> Result<Option<Received>, WorkerError> {
-        let received = self.socket.sender_mut().receive(buffer);
+        let received = self.socket.receive(buffer);
         received.map_err(WorkerError::Socket)
     }
 
@@ -151,28 +123,8 @@ impl Line {
         });
     }
 
-    /// Real-time minus monotonic clock.
-    pub(super) const fn realtime_offset_ns(&self) -> i64 {
-        self.clock.offset_ns()
-    }
-
     /// True while stamps are still to come.
     pub(super) const fn awaits_stamps(&self) -> bool {
         !self.pending.is_empty()
-    }
-
-    /// What to wait on.
-    pub(super) fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
-        self.socket.sender().poll_fd()
-    }
-
-    /// What the socket counted.
-    pub(super) fn counters(&self) -> SenderCounters {
-        self.socket.sender().counters()
-    }
-
-    /// How often the real-time clock was stepped.
-    pub(super) const fn clock_step_count(&self) -> u64 {
-        self.clock.step_count()
     }
 }

@@ -9,12 +9,12 @@ use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::message::{Envelope, MessageType};
 use hil_core::record::{PublishedRecord, TakenRecord};
 use hil_net::timestamping::TimestampMode;
+use hil_transport::DatagramSender;
 use hil_transport::socket::{GrantedOptions, SocketSettings};
 use hil_transport::udp::UdpSender;
-use hil_transport::udp_server::UdpServer;
 
 use super::arm::{Arm, Attention, DATAGRAM_BYTES_MAX, Work};
-use super::line::{Line, Socket};
+use super::line::Line;
 use super::robot::RobotWork;
 use super::sensor::SensorWork;
 use crate::gateway::socket::timestamp_mode;
@@ -57,21 +57,19 @@ impl OpenedArm {
         recorder: &mut Recorder,
     ) -> Result<Self, WorkerError> {
         let settings = socket_settings(adapter, arm);
-        let (socket, granted, what) = match adapter.egm.kind {
+        let (socket, what) = match adapter.egm.kind {
             AdapterKind::Robot => {
                 let socket = UdpSender::open_ignoring_reports(&settings)?;
                 let from = socket.local_address().map_err(WorkerError::Address)?;
                 let what = format!("from port {} to {}", from.port(), settings.peer);
-                let granted = socket.granted();
-                (Socket::Client(Box::new(socket)), granted, what)
+                (socket, what)
             }
             AdapterKind::Sensor => {
-                let socket = UdpServer::open(&settings)?;
-                let granted = socket.granted();
                 let what = format!("listens at {}", settings.local);
-                (Socket::Server(Box::new(socket)), granted, what)
+                (UdpSender::open_answering(&settings)?, what)
             }
         };
+        let granted = socket.granted();
         let mut sink = |kind, channel: &str, size| recorder.sink(kind, channel, size, RING_RECORDS);
         let (input, output) = (arm.input.name.as_str(), arm.output.name.as_str());
         let sent = sink(
@@ -209,11 +207,11 @@ impl JoinedArm {
     /// Everything it counted so far.
     pub fn report(&self) -> AdapterReport {
         let mut counters = self.work.counters();
-        let socket = self.arm.line.counters();
+        let socket = self.arm.line.socket.counters();
         counters.extend(CountByName::all(CounterGroup::Socket, socket.iter()));
         let own = [
             ("datagrams before the run, dropped", self.arm.early_count),
-            ("clock_step_count", self.arm.line.clock_step_count()),
+            ("clock_step_count", self.arm.line.clock.step_count()),
         ];
         counters.extend(CountByName::all(CounterGroup::Own, own));
         AdapterReport {

@@ -57,7 +57,7 @@ impl RobotWork {
                 self.malformed_count += 1;
                 return;
             };
-            let at = since_1970(taken, line.realtime_offset_ns());
+            let at = since_1970(taken, line.clock.offset_ns());
             if !self.adapter.encode(&feedback, at, &mut self.datagram) {
                 self.silent_count += 1;
                 return;

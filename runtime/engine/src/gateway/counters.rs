@@ -78,7 +78,7 @@ pub(super) fn mark_fact(dscp: u8, counters: &ReceiverCounters) -> Option<(String
 
 /// Everything a sending direction counted that is of no one channel.
 pub(super) fn of_egress(egress: &Egress) -> Vec<CountByName> {
-    let steps = ("clock_step_count", egress.line.clock_step_count());
+    let steps = ("clock_step_count", egress.line.clock.step_count());
     CountByName::all(CounterGroup::Own, egress.bridge.counts().iter())
         .chain(CountByName::all(
             CounterGroup::Socket,

@@ -10,14 +10,13 @@ use hil_core::record::{EgressRecord, IngressRecord, RoundTripRecord};
 use hil_core::time::duration_ns;
 use hil_protocol::ingress::reassembly_slots;
 use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings, SettingsError};
-use hil_transport::{ConnectionTally, Stalls};
+use hil_transport::Stalls;
 
 use super::egress::{Attention, Egress};
 use super::ingress::{Ingress, Output};
 use super::inputs::Inputs;
 use super::kernel_clock::KernelClock;
 use super::line::Line;
-use super::link_switch::SwitchHandle;
 use super::refusal_backoff::RefusalBackoff;
 use super::socket::{OpenSocket, SocketEnd, timestamp_mode};
 use super::stamp_plan::StampPlan;
@@ -45,10 +44,12 @@ const CLOCK_PATH_PERIOD: Duration = Duration::from_millis(10);
 /// A direction whose socket and files are open and whose ports are not.
 #[derive(Debug)]
 pub struct OpenDirection {
-    socket: OpenSocket,
+    pub(super) socket: OpenSocket,
     sinks: Sinks,
-    counts: Vec<Arc<AtomicU64>>,
-    is_established: Arc<AtomicBool>,
+    /// Messages carried so far, by channel.
+    pub(super) counts: Vec<Arc<AtomicU64>>,
+    /// True while the peer takes this direction's messages.
+    pub(super) is_established: Arc<AtomicBool>,
     plan: StampPlan,
 }
 
@@ -136,26 +137,6 @@ impl OpenDirection {
             // A receiver has nobody to wait for: it takes what comes.
             is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
         })
-    }
-
-    /// Messages carried so far, by channel.
-    pub fn counts(&self) -> &[Arc<AtomicU64>] {
-        &self.counts
-    }
-
-    /// Where the emulated link of this direction is changed, if it has one; once.
-    pub(super) fn take_switch(&mut self) -> Option<SwitchHandle> {
-        self.socket.switch.take()
-    }
-
-    /// How often its connections come and go, if it is one that connects.
-    pub fn tally(&self) -> Option<Arc<ConnectionTally>> {
-        self.socket.tally.clone()
-    }
-
-    /// True while the peer takes this direction's messages.
-    pub fn is_established(&self) -> Arc<AtomicBool> {
-        Arc::clone(&self.is_established)
     }
 
     /// Joins the local channels; call it in the thread that will carry the messages.

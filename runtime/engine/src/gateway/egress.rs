@@ -280,7 +280,7 @@ impl Egress {
         let dues = [
             self.bridge.next_wakeup(),
             self.line.sender.next_due(),
-            self.long.as_ref().map(LongMessage::due),
+            self.long.as_ref().map(|long| long.due),
         ];
         let mut due = dues.into_iter().flatten().min();
         if self.line.awaits_stamps() {

@@ -360,11 +360,6 @@ impl Line {
             poll_descriptors(self.sender.poll_fd().into_iter(), end)?;
         }
     }
-
-    /// How often the real-time clock was stepped.
-    pub(crate) fn clock_step_count(&self) -> u64 {
-        self.clock.step_count()
-    }
 }
 
 /// A departure takes the place of a stamp before the queue, in whatever order they come.

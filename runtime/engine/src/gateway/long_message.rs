@@ -28,7 +28,8 @@ pub(super) struct LongMessage {
     held: HeldMessage,
     /// Until its last piece has left.
     record: Option<EgressRecord>,
-    due: Instant,
+    /// When its next pieces may leave.
+    pub(super) due: Instant,
 }
 
 impl LongMessage {
@@ -40,11 +41,6 @@ impl LongMessage {
             record: Some(record),
             due: Instant::ZERO,
         }
-    }
-
-    /// When its next pieces may leave.
-    pub(super) const fn due(&self) -> Instant {
-        self.due
     }
 
     /// Its next pieces may leave earlier than was thought.

@@ -77,18 +77,22 @@ pub(crate) fn open<'a>(
         directions.push((direction, opened));
     }
     let switches = directions.iter_mut();
-    let switches: Vec<_> = switches.filter_map(|(_, one)| one.take_switch()).collect();
+    let switches: Vec<_> = switches
+        .filter_map(|(_, one)| one.socket.switch.take())
+        .collect();
     let gateway = GatewayWatch {
         work,
         instance: launch.instance,
         established: directions
             .iter()
-            .map(|(_, one)| one.is_established())
+            .map(|(_, one)| Arc::clone(&one.is_established))
             .collect(),
         given_up: None,
         connections: directions
             .iter()
-            .filter_map(|(direction, one)| Some(Connection::new(direction, one.tally()?)))
+            .filter_map(|(direction, one)| {
+                Some(Connection::new(direction, one.socket.tally.clone()?))
+            })
             .collect(),
         control: LinkControl::open(&surroundings.domain, launch, switches)?,
         sampler: armed.start_sampler(&launch.process, recorder, Arc::clone(orders.stop_flag()))?,
@@ -132,7 +136,7 @@ fn job(launch: &DirectionLaunch, opened: OpenDirection, around: Arc<GatewayConte
         Side::Egress => ("out", "sent"),
         Side::Ingress => ("in", "received"),
     };
-    let counters = launch.channels.iter().zip(opened.counts());
+    let counters = launch.channels.iter().zip(&opened.counts);
     let counters = counters.map(|(one, count)| Counter {
         channel: one.channel.clone(),
         what,

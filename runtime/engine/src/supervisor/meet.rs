@@ -279,7 +279,7 @@ fn welcome(
     };
     // One that is gone again by now comes back.
     peer.say(&PeerMessage::Hello(hello.clone()));
-    Ok(peer.is_open().then_some(peer))
+    Ok(peer.is_open.then_some(peer))
 }
 
 fn join(

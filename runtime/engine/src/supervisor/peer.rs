@@ -116,7 +116,8 @@ pub(crate) struct Peer {
     writer: ControlWriter,
     inbox: Receiver<PeerEvent>,
     heard: Instant,
-    is_open: bool,
+    /// False once something could not be said to it.
+    pub(super) is_open: bool,
     /// It said that its components have stopped; what it says next belongs to the exchange of
     /// records and must not be read before.
     pub(crate) is_quiet: bool,
@@ -147,11 +148,6 @@ impl Peer {
     /// Says `message`; a peer that is gone is noticed by [`Peer::receive`].
     pub(crate) fn say(&mut self, message: &PeerMessage) {
         self.is_open = self.is_open && write_message(&mut self.writer, message).is_ok();
-    }
-
-    /// False once something could not be said to it.
-    pub(super) fn is_open(&self) -> bool {
-        self.is_open
     }
 
     /// The next thing the peer said, waiting up to `timeout`.
