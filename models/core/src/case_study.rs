@@ -15,8 +15,8 @@ use crate::run_log::RunLog;
 use crate::study::Batch;
 
 pub use crate::score::{
-    EVENT_MESSAGES_MAX, EVENTS_MAX, ErrorSeries, Harm, MessageRef, Metric, Occasions, Score,
-    ScoreEvent, Severity,
+    EVENT_MESSAGES_MAX, EVENTS_MAX, ErrorSeries, Harm, LiveEvents, MessageRef, Metric, Occasions,
+    Score, ScoreEvent, Severity,
 };
 
 /// A kind of experiment that a topology file can name in `[case]`.
@@ -80,6 +80,11 @@ pub trait CaseStudy: Sized + Debug + 'static {
             metrics: self.errors(log).iter().map(ErrorSeries::mean).collect(),
             ..Score::default()
         }
+    }
+
+    /// What finds the robot's events while the run goes; nothing by default.
+    fn live_events(&self) -> Option<Box<dyn LiveEvents>> {
+        None
     }
 
     /// The robot's errors over time, to be held against what the network did at the time; none by

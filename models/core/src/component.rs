@@ -94,6 +94,8 @@ pub struct Port {
 
 /// Hands the bytes of a message to a state; false when they are no message of the port.
 type Take<S> = Box<dyn Fn(&mut S, Instant, &[u8]) -> bool>;
+/// Called each period.
+type Call<S> = Box<dyn Fn(&mut S, Instant, Tick, Emit<'_>)>;
 /// Finds an output port in its state, by the port's number.
 type Find<S> = (
     usize,
@@ -117,7 +119,7 @@ pub struct Component<S> {
 
 struct Period<S> {
     timer: PeriodicTimer,
-    call: Box<dyn Fn(&mut S, Instant, Tick, Emit<'_>)>,
+    call: Call<S>,
 }
 
 /// A timer that a state keeps itself.

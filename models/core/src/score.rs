@@ -1,6 +1,8 @@
 //! What a case says of a finished run: figures, and the events a reader will want explained. It
 //! names the messages concerned; what the network did to them is not known here.
 
+use core::fmt::Debug;
+
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ChannelSpec;
@@ -126,6 +128,18 @@ pub struct MessageRef {
     pub epoch: u32,
     /// Its number on the channel, as in [`Envelope::sequence`].
     pub sequence: u64,
+}
+
+/// Finds what happens to the robot while its run goes, from the messages of its channels.
+pub trait LiveEvents: Debug {
+    /// The channels whose messages it takes.
+    fn channels(&self) -> &'static [&'static str];
+
+    /// Takes a message of `channel` that was published at `at`; those of one channel come in order.
+    fn hear(&mut self, channel: &str, at: Instant, payload: &[u8]);
+
+    /// What happened since the last call, as far as the messages until `now` tell, on their producer's clock.
+    fn take(&mut self, now: Instant) -> Vec<ScoreEvent>;
 }
 
 /// How far the robot was from what it was to do, over time, to be held against what the network did

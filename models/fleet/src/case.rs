@@ -4,6 +4,7 @@ use crate::controller::Controller;
 use crate::coordinator::parameters::{CoordinatorMode, CoordinatorParameters};
 use crate::experiment::{FleetStudy, TableParameters};
 use crate::feasibility::{Beginning, beginning, obstruction_text};
+use crate::live::FleetEvents;
 use crate::messages::{Authority, Mission, State, Truth};
 use crate::mission::MissionParameters;
 use crate::robot::RobotParameters;
@@ -14,7 +15,7 @@ use crate::world::Vehicle;
 use hil_core::case_study::{CaseStudy, ChannelSpec, ParameterError};
 use hil_core::component::Role;
 use hil_core::run_log::RunLog;
-use hil_core::score::{ErrorSeries, Score};
+use hil_core::score::{ErrorSeries, LiveEvents, Score};
 use hil_core::study::{Batch, into_batch};
 
 /// Channel from controller to robots: how far each may go.
@@ -109,6 +110,10 @@ impl CaseStudy for Fleet {
 
     fn score(&self, log: &RunLog) -> Score {
         score::score(self, log)
+    }
+
+    fn live_events(&self) -> Option<Box<dyn LiveEvents>> {
+        Some(Box::new(FleetEvents::of(self)))
     }
 
     fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {

@@ -189,10 +189,7 @@ impl Watch {
             TruthKind::MessageStale if !orders.authority(key(truth)).is_empty() => {
                 self.heard = self.heard.max(truth.caused_by_sequence);
             }
-            TruthKind::Replaced => {
-                let what = format!("{} was put at its goal to clear a stuck fleet", name(truth));
-                found.events.push(event(Severity::Hazard, truth, what));
-            }
+            TruthKind::Replaced => found.events.push(replaced(truth)),
             TruthKind::Motion | TruthKind::MissionDone | TruthKind::MessageStale => {}
         }
     }
@@ -214,10 +211,7 @@ impl Watch {
         let since = copies.partition_point(|copy| begun.is_some_and(|begun| copy.at < begun));
         let copies = &copies[since..];
         let sent = [missed.as_slice(), copies].concat();
-        let severity = match kind {
-            TruthKind::AuthorityLate | TruthKind::AuthorityIgnored => Severity::Hazard,
-            _ => Severity::Notice,
-        };
+        let severity = severity_of(kind);
         let said = if severity == Severity::Notice && number <= before {
             None
         } else {
@@ -283,21 +277,32 @@ fn mission_held_up(truth: &Truth, orders: &Orders) -> Option<ScoreEvent> {
     Some(orders.named(notice(truth, what), copies.clone()))
 }
 
+/// What a robot's record tells without what was sent to the robot.
+pub(crate) fn told(truth: &Truth) -> Option<ScoreEvent> {
+    let kind = TruthKind::from_number(truth.kind)?;
+    if kind == TruthKind::Replaced {
+        return Some(replaced(truth));
+    }
+    let what = words(truth, kind, None, 0, false)?;
+    Some(event(severity_of(kind), truth, what))
+}
+
+fn replaced(truth: &Truth) -> ScoreEvent {
+    let what = format!("{} was put at its goal to clear a stuck fleet", name(truth));
+    event(Severity::Hazard, truth, what)
+}
+
+const fn severity_of(kind: TruthKind) -> Severity {
+    match kind {
+        TruthKind::AuthorityLate | TruthKind::AuthorityIgnored => Severity::Hazard,
+        _ => Severity::Notice,
+    }
+}
+
 /// An incident with, for each of the two robots, what led to the authority it last took and what
 /// was sent to it after that.
 fn incident(incident: &Incident, orders: &Orders, led_to: &BTreeMap<Key, Vec<Sent>>) -> ScoreEvent {
-    let manner = match incident.kind {
-        IncidentKind::Section => "collided by the section checker",
-        IncidentKind::Overlap => "overlapped in a critical section",
-        IncidentKind::Outside => "overlapped outside every critical section",
-    };
-    let [one, other] = incident.robots;
-    let [x_m, y_m] = incident.position_m;
-    let what = format!(
-        "robots {one} and {other} of fleet {} {manner}, at x {x_m:.1} m, y {y_m:.1} m",
-        incident.fleet_id
-    );
-    let event = ScoreEvent::new(Severity::Incident, incident.at, FLEET_TRUTH, what);
+    let event = collision(incident);
     let sides = incident
         .robots
         .iter()
@@ -314,6 +319,22 @@ fn incident(incident: &Incident, orders: &Orders, led_to: &BTreeMap<Key, Vec<Sen
         let event = orders.named(event, last.cloned().unwrap_or_default());
         orders.named(event, orders.between(taken, u32::MAX))
     })
+}
+
+/// An incident alone.
+pub(crate) fn collision(incident: &Incident) -> ScoreEvent {
+    let manner = match incident.kind {
+        IncidentKind::Section => "collided by the section checker",
+        IncidentKind::Overlap => "overlapped in a critical section",
+        IncidentKind::Outside => "overlapped outside every critical section",
+    };
+    let [one, other] = incident.robots;
+    let [x_m, y_m] = incident.position_m;
+    let what = format!(
+        "robots {one} and {other} of fleet {} {manner}, at x {x_m:.1} m, y {y_m:.1} m",
+        incident.fleet_id
+    );
+    ScoreEvent::new(Severity::Incident, incident.at, FLEET_TRUTH, what)
 }
 
 fn event(severity: Severity, truth: &Truth, what: String) -> ScoreEvent {

@@ -9,6 +9,7 @@ mod events;
 pub mod experiment;
 mod feasibility;
 pub mod geometry;
+mod live;
 pub mod map;
 pub mod messages;
 pub mod mission;

@@ -69,7 +69,7 @@ pub(crate) fn standstills(
 
 /// One fleet, record by record.
 #[derive(Debug)]
-struct Watch {
+pub(crate) struct Watch {
     /// Per robot its last record.
     last: BTreeMap<u32, Truth>,
     is_under_way: BTreeMap<u32, bool>,
@@ -79,7 +79,7 @@ struct Watch {
 }
 
 impl Watch {
-    fn from(start: Instant) -> Self {
+    pub(crate) fn from(start: Instant) -> Self {
         Self {
             last: BTreeMap::new(),
             is_under_way: BTreeMap::new(),
@@ -88,7 +88,7 @@ impl Watch {
         }
     }
 
-    fn see(&mut self, truth: &Truth, after: Duration) {
+    pub(crate) fn see(&mut self, truth: &Truth, after: Duration) {
         let at = Instant::from_ns(truth.at_ns);
         self.close(at, after);
         let kind = TruthKind::from_number(truth.kind);
@@ -106,8 +106,8 @@ impl Watch {
         }
     }
 
-    /// Nothing is known beyond the last records until `at`: a standstill may have been until then.
-    fn close(&mut self, at: Instant, after: Duration) {
+    /// Since when nothing moves or begins, as far as the records until `at` tell.
+    pub(crate) fn still_since(&self, at: Instant) -> Instant {
         let moves_until = |truth: &Truth| {
             let since = Instant::from_ns(truth.at_ns);
             if truth.speed_mps <= 0.0 && truth.acceleration_mps2 <= 0.0 {
@@ -123,10 +123,19 @@ impl Watch {
             .last
             .values()
             .filter(|truth| truth.speed_mps > 0.0 || truth.acceleration_mps2 > 0.0);
-        let until = moved.map(moves_until).fold(self.busy_until, Instant::max);
+        moved.map(moves_until).fold(self.busy_until, Instant::max)
+    }
+
+    /// Robots with a mission that is not done.
+    pub(crate) fn under_way_count(&self) -> usize {
+        self.is_under_way.values().filter(|is| **is).count()
+    }
+
+    /// Nothing is known beyond the last records until `at`: a standstill may have been until then.
+    fn close(&mut self, at: Instant, after: Duration) {
+        let until = self.still_since(at);
         if at > until + after {
-            let under_way_count = self.is_under_way.values().filter(|is| **is).count();
-            self.gaps.push((until, at, under_way_count));
+            self.gaps.push((until, at, self.under_way_count()));
             self.busy_until = at;
         } else {
             self.busy_until = until;

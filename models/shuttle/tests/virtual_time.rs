@@ -1,5 +1,7 @@
 //! Tests of the shuttle in virtual time, and with it of the driver.
 
+#![allow(clippy::unwrap_used, reason = "tests")]
+
 use core::time::Duration;
 use std::collections::BTreeMap;
 

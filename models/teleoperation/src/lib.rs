@@ -76,7 +76,9 @@ use hil_arm::egm::messages::{
     EgmArrival, EgmCommand, EgmEvent, EgmFeedback, MotionArrival, MotionRequest, MotionResponse,
 };
 use hil_arm::egm::parameters::ControllerSettings;
-use hil_core::case_study::{CaseStudy, ChannelSpec, ErrorSeries, ParameterError, Score};
+use hil_core::case_study::{
+    CaseStudy, ChannelSpec, ErrorSeries, LiveEvents, ParameterError, Score,
+};
 use hil_core::component::Role;
 use hil_core::plot::PlotSeries;
 use hil_core::random::RandomStream;
@@ -199,6 +201,10 @@ impl CaseStudy for Teleoperation {
 
     fn score(&self, log: &RunLog) -> Score {
         score::score(self, log)
+    }
+
+    fn live_events(&self) -> Option<Box<dyn LiveEvents>> {
+        Some(Box::<score::live::ArmEvents>::default())
     }
 
     fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {

@@ -4,7 +4,9 @@
 use core::fmt::Debug;
 use std::fs;
 
-use hil_core::case_study::{CaseStudy, ChannelSpec, ErrorSeries, ParameterError, Score};
+use hil_core::case_study::{
+    CaseStudy, ChannelSpec, ErrorSeries, LiveEvents, ParameterError, Score,
+};
 use hil_core::component::Role;
 use hil_core::plot::PlotSeries;
 use hil_core::replay::Replay;
@@ -27,6 +29,9 @@ pub trait Case: Debug {
 
     /// See [`CaseStudy::errors`].
     fn errors(&self, log: &RunLog) -> Vec<ErrorSeries>;
+
+    /// See [`CaseStudy::live_events`].
+    fn live_events(&self) -> Option<Box<dyn LiveEvents>>;
 
     /// See [`CaseStudy::series`].
     fn series(&self, log: &RunLog) -> Vec<PlotSeries>;
@@ -65,6 +70,10 @@ impl<C: CaseStudy> Case for Erased<C> {
 
     fn score(&self, log: &RunLog) -> Score {
         self.0.score(log)
+    }
+
+    fn live_events(&self) -> Option<Box<dyn LiveEvents>> {
+        self.0.live_events()
     }
 
     fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {

@@ -83,6 +83,8 @@ pub struct RecordFollower {
     problems: Vec<String>,
     /// What is in files found now was written before.
     passes_over: bool,
+    /// The only channels whose messages are given out, and nothing else; `None` for all that there is.
+    messages_of: Option<&'static [&'static str]>,
 }
 
 impl RecordFollower {
@@ -100,9 +102,17 @@ impl RecordFollower {
         follower
     }
 
+    /// The same of the messages of these channels alone.
+    #[must_use]
+    pub fn with_messages_of(mut self, channels: &'static [&'static str]) -> Self {
+        self.messages_of = Some(channels);
+        self
+    }
+
     fn of(folder: &Path, passes_over: bool) -> Self {
         Self {
             passes_over,
+            messages_of: None,
             folder: folder.to_owned(),
             files: Vec::new(),
             known: BTreeSet::new(),
@@ -126,7 +136,7 @@ impl RecordFollower {
             }
             self.next %= self.files.len();
             let file = &mut self.files[self.next];
-            match read_piece(file, &mut self.buffer, take) {
+            match read_piece(file, &mut self.buffer, self.messages_of, take) {
                 Ok(0) => quiet_count += 1,
                 Ok(count) => {
                     quiet_count = 0;
@@ -222,6 +232,7 @@ impl RecordFollower {
 fn read_piece(
     one: &mut Followed,
     buffer: &mut Vec<u8>,
+    messages_of: Option<&[&str]>,
     take: &mut dyn FnMut(&Batch<'_>),
 ) -> Result<usize, String> {
     if one.is_given_up || !has_header(one)? {
@@ -230,6 +241,13 @@ fn read_piece(
     let Some(header) = &one.header else {
         return Ok(0);
     };
+    let is_wanted = |channels: &[&str]| {
+        header.kind == RecordKind::Message && channels.contains(&header.channel.as_str())
+    };
+    if !messages_of.is_none_or(is_wanted) {
+        one.is_given_up = true;
+        return Ok(0);
+    }
     let record_bytes = header.record_bytes as usize;
     if buffer.len() < record_bytes {
         buffer.resize(record_bytes, 0);

@@ -42,7 +42,7 @@ impl Drop for Place {
     }
 }
 
-fn header(kind: RecordKind, channel: &str, record_bytes: usize) -> RecordHeader {
+pub(crate) fn header(kind: RecordKind, channel: &str, record_bytes: usize) -> RecordHeader {
     RecordHeader {
         kind,
         channel: channel.to_owned(),
@@ -51,7 +51,7 @@ fn header(kind: RecordKind, channel: &str, record_bytes: usize) -> RecordHeader 
     }
 }
 
-fn append(folder: &Path, header: &RecordHeader, writer: &str, bytes: &[u8]) {
+pub(crate) fn append(folder: &Path, header: &RecordHeader, writer: &str, bytes: &[u8]) {
     let path = folder.join(header.file_name(writer));
     let mut file = OpenOptions::new()
         .create(true)

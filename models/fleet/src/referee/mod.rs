@@ -9,6 +9,7 @@
 //! would count one collision many times: at the last poses passed, where the original's checker
 //! looks, robots that follow each other closely overlap and part with each pose.
 
+pub mod live;
 mod pairs;
 mod sections;
 #[cfg(test)]

@@ -165,7 +165,7 @@ impl Run {
 
 /// A session that ends by itself, a command that never reaches the servo and a speed limit that
 /// binds keep the robot from what it was told; the rest is worth knowing.
-fn severity_of(told: &EgmEvent) -> Severity {
+pub(super) fn severity_of(told: &EgmEvent) -> Severity {
     let is = |kind: EgmEventKind| told.kind == kind as u32;
     let ended_by_itself =
         is(EgmEventKind::Ended) && EndCause::from_number(told.cause) != Some(EndCause::Requested);

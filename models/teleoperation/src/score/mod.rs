@@ -5,6 +5,7 @@
 //! that the fastest answered command brings together; what needs better than that is unavailable.
 
 mod joint_error;
+pub(crate) mod live;
 pub(crate) mod loops;
 mod lost;
 mod path;

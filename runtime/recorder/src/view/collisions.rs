@@ -6,16 +6,13 @@ use std::collections::{BTreeSet, VecDeque};
 use hil_core::time::Instant;
 use hil_fleet::geometry::{Footprint, Pose};
 use hil_fleet::messages::Truth;
-use hil_fleet::referee::{IncidentKind, Referee, SCAN_PERIOD};
+use hil_fleet::referee::IncidentKind;
+use hil_fleet::referee::live::LiveReferee;
 use serde::Serialize;
 
 use super::ground::Ground;
 use super::{rounded, seconds};
 
-/// The referee looks at what was so long ago: by then, all that was recorded has been read.
-const BEHIND_NS: i64 = 150_000_000;
-/// Records kept until the ground is known.
-const WAITING_MAX: usize = 200_000;
 /// Collisions listed.
 const LISTED_MAX: usize = 100;
 
@@ -35,12 +32,7 @@ pub(crate) struct Collision {
 /// Finds collisions.
 #[derive(Debug, Default)]
 pub(crate) struct Collisions {
-    referee: Option<Box<Referee>>,
-    waiting: VecDeque<Truth>,
-    forgotten_count: u64,
-    /// Time of the next look, on the robots' clock.
-    next: Option<Instant>,
-    known_count: usize,
+    referee: LiveReferee,
     overlapping: BTreeSet<(u32, u32, u32)>,
     /// The last of them.
     pub(crate) listed: VecDeque<Collision>,
@@ -52,42 +44,20 @@ pub(crate) struct Collisions {
 impl Collisions {
     /// The ground is known.
     pub(crate) fn begin(&mut self, ground: &Ground) {
-        let referee = Referee::new(&ground.scene, ground.parameters.fleets);
-        self.referee = Some(Box::new(referee));
+        self.referee.begin(&ground.scene, ground.parameters.fleets);
     }
 
     /// Takes what a robot truly did.
     pub(crate) fn on_truth(&mut self, truth: Truth) {
         self.has_truth = true;
-        if self.waiting.len() == WAITING_MAX {
-            self.waiting.pop_front();
-            self.forgotten_count += 1;
-        }
-        self.waiting.push_back(truth);
+        self.referee.on_truth(truth);
     }
 
     /// Looks at all that was until shortly before `now_ns`; `origin_ns` is the run's beginning,
     /// both on the robots' clock.
     pub(crate) fn look(&mut self, now_ns: i64, origin_ns: i64) {
-        let Some(referee) = &mut self.referee else {
-            return;
-        };
-        let first = self.waiting.front();
-        let first = first.map(|truth| Instant::from_ns(truth.at_ns));
-        let Some(mut at) = self.next.or(first) else {
-            return;
-        };
-        while at.as_ns() + BEHIND_NS <= now_ns {
-            let before = |truth: &mut Truth| truth.at_ns <= at.as_ns();
-            while let Some(truth) = self.waiting.pop_front_if(before) {
-                referee.on_truth(&truth);
-            }
-            referee.scan(at);
-            at = at + SCAN_PERIOD;
-        }
-        self.next = Some(at);
-        let incidents = referee.incidents();
-        let news = incidents[self.known_count..].iter().map(|one| Collision {
+        let incidents = self.referee.look(Instant::from_ns(now_ns));
+        let news = incidents.iter().map(|one| Collision {
             at_s: seconds(one.at.as_ns() - origin_ns),
             fleet: one.fleet_id,
             robots: one.robots,
@@ -97,7 +67,6 @@ impl Collisions {
             kind: one.kind,
         });
         let news: Vec<Collision> = news.collect();
-        self.known_count = incidents.len();
         for one in news {
             self.list(one);
         }
@@ -147,6 +116,6 @@ impl Collisions {
 
     /// How many there were; a count that lacks something is not known.
     pub(crate) fn count(&self) -> Option<u64> {
-        (self.forgotten_count == 0).then_some(self.count)
+        (self.referee.forgotten_count() == 0).then_some(self.count)
     }
 }

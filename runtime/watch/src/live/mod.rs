@@ -10,5 +10,6 @@ mod hz;
 mod observer;
 mod pace;
 mod process;
+mod robot;
 mod tail;
 pub mod top;

@@ -7,7 +7,9 @@ use ratatui::style::{Modifier, Style as Look};
 use ratatui::text::Line;
 
 use super::view::{ChannelRow, ProcessRow, Quantiles, SegmentRow, View};
+use hil_core::case_study::Severity;
 use hil_platform::text::shortened;
+use hil_platform::words::counted;
 use hil_present::terminal::canvas::{Canvas, Style, bar, left};
 use hil_present::terminal::section;
 use hil_present::{Cell, Row, Section, Table, Tone, UNAVAILABLE};
@@ -132,7 +134,7 @@ fn help() -> Vec<Section> {
     vec![keys, figures]
 }
 
-/// The run, what its links do, its channels, its processes and hosts, and its clocks.
+/// The run, what its links do, its channels, its robot, its processes and hosts, and its clocks.
 fn sections(view: &View, detail: Detail) -> Vec<Section> {
     let mut problems = Section::new("problems", "", "");
     for problem in &view.problems {
@@ -142,6 +144,7 @@ fn sections(view: &View, detail: Detail) -> Vec<Section> {
         head(view),
         links(view),
         channels(view, detail),
+        robot(view),
         processes(view),
         elsewhere(view),
         clocks(view),
@@ -263,6 +266,39 @@ fn segments(channel: &ChannelRow) -> impl Iterator<Item = Row> {
         tone: Tone::Faint,
         bar: None,
     })
+}
+
+fn robot(view: &View) -> Section {
+    let Some(robot) = &view.robot else {
+        return Section::new("robot", "", "");
+    };
+    let mut table = Table::new("", &["ROBOT", "at", "what"]);
+    for one in &robot.recent {
+        let (tone, word) = match one.severity {
+            Severity::Notice => (Tone::Plain, "notice"),
+            Severity::Hazard => (Tone::Caution, "hazard"),
+            Severity::Incident => (Tone::Bad, "incident"),
+        };
+        let at = one
+            .at_s
+            .map_or(Cell::Missing, |at_s| format!("{at_s:.1} s").into());
+        let cells = vec![word.into(), at, one.what.as_str().into()];
+        let bar = None;
+        table.rows.push(Row { cells, tone, bar });
+    }
+    let mut section = tabled("robot", table);
+    let hidden_count = robot.event_count - robot.recent.len() as u64;
+    let text = match (robot.event_count, robot.is_behind) {
+        (_, true) => "ROBOT  the run so far is still being read".to_owned(),
+        (0, false) => "ROBOT  no event".to_owned(),
+        _ if hidden_count > 0 => format!(
+            "and {} before or of less weight",
+            counted(hidden_count, "event")
+        ),
+        _ => return section,
+    };
+    section.note(Tone::Faint, text);
+    section
 }
 
 fn processes(view: &View) -> Section {

@@ -7,7 +7,8 @@ use ratatui::backend::TestBackend;
 
 use super::*;
 use crate::live::top::view::{
-    ClockRow, LinkRow, LinkState, PeerStatusRow, RunState, RunView, SegmentRow,
+    ClockRow, LinkRow, LinkState, PeerStatusRow, RobotEventRow, RobotView, RunState, RunView,
+    SegmentRow,
 };
 use hil_rundir::event::ProcessKind;
 use hil_rundir::status::{HostHearing, ProcessState};
@@ -111,6 +112,22 @@ fn view() -> View {
                 history_ns: Vec::new(),
             },
         ],
+        robot: Some(RobotView {
+            recent: vec![
+                RobotEventRow {
+                    at_s: Some(12.345),
+                    severity: Severity::Hazard,
+                    what: "right arm holds for want of commands".to_owned(),
+                },
+                RobotEventRow {
+                    at_s: None,
+                    severity: Severity::Incident,
+                    what: "robots 1 and 3 of fleet 0 overlapped in a critical section".to_owned(),
+                },
+            ],
+            event_count: 5,
+            is_behind: false,
+        }),
         links: vec![LinkRow {
             name: "hop".to_owned(),
             via: "emulated".to_owned(),

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use hil_account::{ChannelAccount, MessageFate};
 use hil_clock::ClockMap;
+use hil_core::score::ScoreEvent;
 use hil_core::time::Instant;
 use hil_link::condition::LinkCondition;
 use hil_link::spec::{LinkSpec, Way};
@@ -14,12 +15,13 @@ use hil_stats::histogram::Distribution;
 
 use super::draw::HISTORY_COLUMNS;
 use super::view::{
-    ChannelRow, ClockRow, LinkRow, LinkState, PeerStatusRow, ProcessRow, Quantiles, RunState,
-    RunView, SegmentRow, View,
+    ChannelRow, ClockRow, LinkRow, LinkState, PeerStatusRow, ProcessRow, Quantiles, RobotEventRow,
+    RobotView, RunState, RunView, SegmentRow, View,
 };
 use crate::live::observer::Observer;
 use crate::live::pace::Pace;
 use crate::live::process;
+use crate::live::robot::RobotWatch;
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::status::{self, Phase, ProcessStatus, RunStatus};
 use hil_topology::{Channel, Direction, Link, Topology};
@@ -53,11 +55,21 @@ pub(crate) struct Gatherer {
     history: BTreeMap<String, Vec<Option<i64>>>,
     /// What the supervisor told last; it removes its file a moment before the run is over.
     status: Option<RunStatus>,
+    /// The events of the robot, where the case finds any.
+    robot: Option<RobotWatch>,
     /// The view while the run still ran: what is left to show when it is over.
     last: Option<View>,
 }
 
 impl Gatherer {
+    /// One that looks for events of the robot, too.
+    pub(crate) fn of(robot: Option<RobotWatch>) -> Self {
+        Self {
+            robot,
+            ..Self::default()
+        }
+    }
+
     /// Looks at the run.
     pub(crate) fn look(&mut self, observer: &Observer, window: Duration) -> View {
         let is_over = observer.is_over();
@@ -85,6 +97,7 @@ impl Gatherer {
             processes: self.processes(status.as_ref()),
             elsewhere: status.as_ref().map(elsewhere).unwrap_or_default(),
             channels: self.channels(observer, &accounts),
+            robot: self.robot(status.as_ref()),
             links: observer
                 .topology()
                 .map(|topology| links(topology, observer, &accounts))
@@ -117,6 +130,21 @@ impl Gatherer {
         let rows = rows.collect();
         self.cpu = cpu;
         rows
+    }
+
+    fn robot(&mut self, status: Option<&RunStatus>) -> Option<RobotView> {
+        let look = self.robot.as_mut()?.look(MonotonicClock::now())?;
+        let start_ns = status.and_then(|status| status.start_ns);
+        let row = |event: ScoreEvent| RobotEventRow {
+            at_s: start_ns.map(|start_ns| event.at.seconds_since(Instant::from_ns(start_ns))),
+            severity: event.severity,
+            what: event.what,
+        };
+        Some(RobotView {
+            recent: look.recent.into_iter().map(row).collect(),
+            event_count: look.count,
+            is_behind: look.is_behind,
+        })
     }
 
     fn channels(

@@ -9,6 +9,7 @@ use std::io::{self, IsTerminal};
 
 use super::cli::TopArgs;
 use super::observer::{ObserveError, Observer};
+use super::robot::RobotWatch;
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_topology::registry::Registry;
@@ -50,7 +51,13 @@ pub fn run(
     for name in names {
         observer.count_unrecorded(&name);
     }
-    let mut gatherer = gather::Gatherer::default();
+    let case = observer
+        .topology()
+        .and_then(|topology| registry.make_case(topology).ok()?);
+    let events = case.and_then(|(_, case)| case.live_events());
+    let records = observer.run().run_folder().records();
+    let robot = events.map(|events| RobotWatch::new(&records, events));
+    let mut gatherer = gather::Gatherer::of(robot);
     observer.settle(signals);
     // What processes used is a difference of two looks.
     gatherer.look(&observer, args.window);

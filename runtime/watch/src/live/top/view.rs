@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
+use hil_core::case_study::Severity;
 use serde::Serialize;
 
 use hil_rundir::event::ProcessKind;
@@ -21,6 +22,9 @@ pub(crate) struct View {
     pub(crate) elsewhere: Vec<PeerStatusRow>,
     /// The channels with an end on this host, and those that are only recorded here.
     pub(crate) channels: Vec<ChannelRow>,
+    /// What happened to the robot; `None` where its case finds no events, or none of its messages is recorded on
+    /// this host.
+    pub(crate) robot: Option<RobotView>,
     /// What carries them.
     pub(crate) links: Vec<LinkRow>,
     /// How the clocks of its hosts stand to each other.
@@ -189,6 +193,28 @@ impl LinkState {
             Self::Unknown => "unknown",
         }
     }
+}
+
+/// What happened to the robot.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct RobotView {
+    /// The gravest events, of equal ones the newest; newest first.
+    pub(crate) recent: Vec<RobotEventRow>,
+    /// All since the run began.
+    pub(crate) event_count: u64,
+    /// More of the past is still to be read: newer events are missing.
+    pub(crate) is_behind: bool,
+}
+
+/// One event of the robot.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct RobotEventRow {
+    /// Since the run began, seconds.
+    pub(crate) at_s: Option<f64>,
+    /// How much it matters.
+    pub(crate) severity: Severity,
+    /// What happened, in words.
+    pub(crate) what: String,
 }
 
 /// One link.

@@ -1,0 +1,162 @@
+//! What happens to the robots while a run goes, from their records alone: collisions, fleets that stand still, and
+//! commands that came too late. What the network did to the commands, only the finished run tells.
+
+use core::time::Duration;
+use std::collections::BTreeMap;
+
+use crate::case::{FLEET_TRUTH, Fleet};
+use crate::events::{collision, told};
+use crate::messages::Truth;
+use crate::referee::live::LiveReferee;
+use crate::standing::Watch;
+use hil_core::score::{LiveEvents, ScoreEvent, Severity};
+use hil_core::time::Instant;
+
+/// The events of the fleets of a run.
+#[derive(Debug)]
+pub(crate) struct FleetEvents {
+    referee: LiveReferee,
+    fleets: BTreeMap<u32, Standing>,
+    stuck_after: Duration,
+    /// A fleet without missions stands only where more are to come.
+    has_more_missions: bool,
+    found: Vec<ScoreEvent>,
+}
+
+#[derive(Debug)]
+struct Standing {
+    watch: Watch,
+    /// Begin of the standstill told last.
+    told: Option<Instant>,
+}
+
+impl FleetEvents {
+    /// Those of the fleets of `case`.
+    pub(crate) fn of(case: &Fleet) -> Self {
+        let parameters = case.parameters();
+        let mut referee = LiveReferee::default();
+        referee.begin(case.scene(), parameters.fleets);
+        Self {
+            referee,
+            fleets: BTreeMap::new(),
+            stuck_after: parameters.coordinator.stuck_after(),
+            has_more_missions: parameters.missions.never_end(),
+            found: Vec::new(),
+        }
+    }
+
+    fn tell_standstills(&mut self, now: Instant) {
+        for (fleet_id, one) in &mut self.fleets {
+            let since = one.watch.still_since(now);
+            let under_way_count = one.watch.under_way_count();
+            let is_stuck =
+                now > since + self.stuck_after && (under_way_count > 0 || self.has_more_missions);
+            if is_stuck && one.told != Some(since) {
+                one.told = Some(since);
+                let what = format!(
+                    "fleet {fleet_id} stands still, {under_way_count} of its robots with a mission"
+                );
+                let event = ScoreEvent::new(Severity::Hazard, since, FLEET_TRUTH, what);
+                self.found.push(event);
+            }
+        }
+    }
+}
+
+impl LiveEvents for FleetEvents {
+    fn channels(&self) -> &'static [&'static str] {
+        &[FLEET_TRUTH]
+    }
+
+    fn hear(&mut self, _channel: &str, _at: Instant, payload: &[u8]) {
+        let Ok(truth) = bytemuck::try_pod_read_unaligned::<Truth>(payload) else {
+            return;
+        };
+        self.found.extend(told(&truth));
+        let standing = self
+            .fleets
+            .entry(truth.fleet_id)
+            .or_insert_with(|| Standing {
+                watch: Watch::from(Instant::from_ns(truth.at_ns)),
+                told: None,
+            });
+        standing.watch.see(&truth, self.stuck_after);
+        self.referee.on_truth(truth);
+    }
+
+    fn take(&mut self, now: Instant) -> Vec<ScoreEvent> {
+        self.tell_standstills(now);
+        let incidents = self.referee.look(now);
+        self.found.extend(incidents.iter().map(collision));
+        core::mem::take(&mut self.found)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use core::time::Duration;
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::FLEET_AUTHORITY;
+    use crate::FleetParameters;
+    use crate::messages::TruthKind;
+    use hil_core::case_study::CaseStudy;
+    use hil_core::score::Severity;
+    use hil_core::simulation::{Carrier, Simulation};
+    use hil_link::spec::{LinkPlace, LinkSpec};
+
+    #[test]
+    fn a_run_that_goes_on_tells_of_the_collisions_of_its_score() {
+        let case = Fleet::new(FleetParameters::default(), 3).unwrap();
+        let link = LinkSpec::fixed(Duration::from_millis(20), 0.4);
+        let link = link.build(&LinkPlace::alone(3, FLEET_AUTHORITY)).unwrap();
+        let link: Box<dyn Carrier> = Box::new(link);
+        let carriers = BTreeMap::from([(FLEET_AUTHORITY.to_owned(), link)]);
+        let simulation = Simulation::new(&case, carriers).unwrap();
+        let log = simulation.run(Duration::from_mins(10)).unwrap().log;
+        let mut live = case.live_events().unwrap();
+        assert_eq!(live.channels(), [FLEET_TRUTH]);
+        let mut found = Vec::new();
+        let mut end = Instant::ZERO;
+        for message in log.raw(FLEET_TRUTH) {
+            end = Instant::from_ns(message.envelope.published_ns);
+            live.hear(FLEET_TRUTH, end, &message.payload);
+            found.extend(live.take(end));
+        }
+        found.extend(live.take(end + Duration::from_secs(1)));
+        let collisions = |events: &[ScoreEvent]| {
+            let events = events.iter();
+            events
+                .filter(|event| event.severity == Severity::Incident)
+                .count()
+        };
+        let expected = collisions(&case.score(&log).events);
+        assert!(expected > 0);
+        assert_eq!(collisions(&found), expected);
+    }
+
+    #[test]
+    fn a_fleet_that_stands_still_is_told_once() {
+        let case = Fleet::new(FleetParameters::default(), 3).unwrap();
+        let mut live = case.live_events().unwrap();
+        let begun = Truth {
+            at_ns: 5_000_000_000,
+            mission_id: 1,
+            kind: TruthKind::MissionStarted as u32,
+            ..Truth::default()
+        };
+        live.hear(FLEET_TRUTH, Instant::ZERO, bytemuck::bytes_of(&begun));
+        let mut told_at = |at_s: u64| {
+            let found = live.take(Instant::ZERO + Duration::from_secs(at_s));
+            let what = found.iter().map(|event| event.what.clone());
+            what.collect::<Vec<_>>()
+        };
+        assert!(told_at(125).is_empty());
+        assert_eq!(
+            told_at(126),
+            ["fleet 0 stands still, 1 of its robots with a mission"]
+        );
+        assert!(told_at(400).is_empty());
+    }
+}

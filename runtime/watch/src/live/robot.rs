@@ -1,0 +1,167 @@
+//! What happens to the robot of a run that goes on: events that its case finds in the messages which processes of
+//! this host record.
+
+use std::cmp::Reverse;
+use std::path::Path;
+
+use hil_core::score::{LiveEvents, ScoreEvent};
+use hil_core::time::Instant;
+
+use crate::RecordFollower;
+
+/// Events that are kept to be shown.
+const SHOWN_MAX: usize = 8;
+/// Bytes of records read at once, and how often at most per look: a run that has gone for long is caught up with in
+/// several looks.
+const ROUND_BYTES_MAX: usize = 8 << 20;
+const ROUNDS_MAX: usize = 8;
+
+/// The events of one run's robot, from its beginning on.
+#[derive(Debug)]
+pub(crate) struct RobotWatch {
+    follower: RecordFollower,
+    events: Box<dyn LiveEvents>,
+    /// Publication of the newest message read.
+    newest: Option<Instant>,
+    recent: Vec<ScoreEvent>,
+    count: u64,
+}
+
+/// The gravest events of a robot, of equal ones the newest.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct RobotLook {
+    /// Some of them, the newest first.
+    pub(crate) recent: Vec<ScoreEvent>,
+    /// All since the run began.
+    pub(crate) count: u64,
+    /// More of the past is still to be read: newer events are missing.
+    pub(crate) is_behind: bool,
+}
+
+impl RobotWatch {
+    /// Those that `events` finds in the record files of `folder`.
+    pub(crate) fn new(folder: &Path, events: Box<dyn LiveEvents>) -> Self {
+        Self {
+            follower: RecordFollower::new(folder).with_messages_of(events.channels()),
+            events,
+            newest: None,
+            recent: Vec::with_capacity(SHOWN_MAX + 1),
+            count: 0,
+        }
+    }
+
+    /// Reads what came since the last look; `None` while none of the messages is recorded on this host.
+    pub(crate) fn look(&mut self, now: Instant) -> Option<RobotLook> {
+        let mut is_behind = true;
+        for _ in 0..ROUNDS_MAX {
+            let mut newest = self.newest;
+            let events = &mut self.events;
+            is_behind = self.follower.poll(ROUND_BYTES_MAX, &mut |batch| {
+                for (envelope, payload) in batch.messages() {
+                    let at = Instant::from_ns(envelope.published_ns);
+                    newest = newest.max(Some(at));
+                    events.hear(&batch.header.channel, at, payload);
+                }
+            });
+            self.newest = newest;
+            // What is not read yet is later than what is.
+            let until = newest.filter(|_| is_behind).unwrap_or(now);
+            for event in self.events.take(until) {
+                self.count += 1;
+                self.keep(event);
+            }
+            if !is_behind {
+                break;
+            }
+        }
+        let mut recent = self.recent.clone();
+        recent.sort_by_key(|event| Reverse(event.at));
+        self.newest.map(|_| RobotLook {
+            recent,
+            count: self.count,
+            is_behind,
+        })
+    }
+
+    /// Keeps an event, in place of the oldest of the least severe ones where there is no room.
+    fn keep(&mut self, event: ScoreEvent) {
+        self.recent.push(event);
+        let events = self.recent.iter().enumerate();
+        let least = events.min_by_key(|(_, event)| (event.severity, event.at));
+        if let Some((index, _)) = least.filter(|_| self.recent.len() > SHOWN_MAX) {
+            self.recent.swap_remove(index);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use hil_core::score::Severity;
+
+    use super::*;
+    use crate::tests::{append, header};
+    use hil_core::message::Envelope;
+    use hil_rundir::record::RecordKind;
+
+    /// An event for each message but the first.
+    #[derive(Debug, Default)]
+    struct Each(Vec<ScoreEvent>, u64);
+
+    impl LiveEvents for Each {
+        fn channels(&self) -> &'static [&'static str] {
+            &["a/b"]
+        }
+
+        fn hear(&mut self, channel: &str, at: Instant, payload: &[u8]) {
+            let what = format!("{channel} {}", payload[0]);
+            let severity = match payload[0] {
+                2 => Severity::Hazard,
+                _ => Severity::Notice,
+            };
+            if self.1 > 0 {
+                self.0.push(ScoreEvent::new(severity, at, "a/b", what));
+            }
+            self.1 += 1;
+        }
+
+        fn take(&mut self, now: Instant) -> Vec<ScoreEvent> {
+            let waiting = core::mem::take(&mut self.0);
+            let (told, kept) = waiting.into_iter().partition(|event| event.at <= now);
+            self.0 = kept;
+            told
+        }
+    }
+
+    /// Messages of one byte, numbered, published a nanosecond after one another.
+    fn write_messages(folder: &Path, channel: &str, count: u8) {
+        let header = header(RecordKind::Message, channel, size_of::<Envelope>() + 1);
+        for number in 0..count {
+            let envelope = Envelope {
+                sequence: u64::from(number),
+                published_ns: i64::from(number),
+                ..Envelope::default()
+            };
+            let bytes = [bytemuck::bytes_of(&envelope), &[number]].concat();
+            append(folder, &header, "robot", &bytes);
+        }
+    }
+
+    #[test]
+    fn events_are_found_from_the_beginning_in_the_channels_of_the_case_only() {
+        let folder = std::env::temp_dir().join(format!("hil-robot-watch-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let mut watch = RobotWatch::new(&folder, Box::<Each>::default());
+        assert_eq!(watch.look(Instant::ZERO), None);
+        write_messages(&folder, "a/other", 30);
+        write_messages(&folder, "a/b", 20);
+        watch.follower.look_again();
+        let look = watch.look(Instant::from_ns(11)).unwrap();
+        assert_eq!((look.count, look.recent.len()), (11, SHOWN_MAX));
+        assert_eq!(look.recent[0].what, "a/b 11");
+        // The one of more weight stays.
+        assert_eq!(look.recent[SHOWN_MAX - 1].what, "a/b 2");
+        assert!(!look.is_behind);
+        assert_eq!(watch.look(Instant::from_ns(100)).unwrap().count, 19);
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+}
