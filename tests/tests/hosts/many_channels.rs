@@ -230,6 +230,17 @@ fn check(played: &Played, channel_count: usize, end: End, is_long: bool) {
             }
         }
     }
+    let [early, late] = &played.resident;
+    assert_eq!(early.len(), 2, "{early:?}");
+    for (name, bytes) in early {
+        let now = late[name];
+        let mib = |bytes: u64| bytes as f64 / 1_048_576.0;
+        println!("{name}: {:.1} MiB, later {:.1}", mib(*bytes), mib(now));
+        // Before, the rings of records have not been used as a whole.
+        if is_long {
+            assert!(now as f64 <= 1.05 * *bytes as f64, "{name}");
+        }
+    }
     if end == End::FullDisk {
         return;
     }
@@ -246,17 +257,6 @@ fn check(played: &Played, channel_count: usize, end: End, is_long: bool) {
         fates[&MessageFate::LostInInterruption] > 0,
         "two gateways were killed"
     );
-    let [early, late] = &played.resident;
-    assert_eq!(early.len(), 2, "{early:?}");
-    for (name, bytes) in early {
-        let now = late[name];
-        let mib = |bytes: u64| bytes as f64 / 1_048_576.0;
-        println!("{name}: {:.1} MiB, later {:.1}", mib(*bytes), mib(now));
-        // Before, the rings of records have not been used as a whole.
-        if is_long {
-            assert!(now as f64 <= 1.05 * *bytes as f64, "{name}");
-        }
-    }
 }
 
 #[test]
