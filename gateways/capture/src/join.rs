@@ -13,9 +13,10 @@
 
 use std::collections::BTreeMap;
 
-use hil_core::random::RandomStream;
+use hil_core::interval::Spread;
+use hil_stats::dependence::{Batches, Quantiles};
 use hil_stats::histogram::{Distribution, LatencyHistogram};
-use hil_stats::statistics::{CONFIDENCE, IntervalNs, block_bootstrap_quantile, wilson};
+use hil_stats::samples::Samples;
 use serde::{Deserialize, Serialize};
 
 use super::observe::{Observation, Point, Seen, Span, Stream};
@@ -55,16 +56,16 @@ pub struct JoinMetrics {
     pub unexplained_count: u64,
     /// Lost of those that were judged.
     pub loss_ratio: Option<f64>,
-    /// 95 % interval of it (Wilson), as if losses were independent.
-    pub loss_interval: Option<(f64, f64)>,
+    /// 95 % interval of it, or why there is none.
+    pub loss_interval: Option<Spread>,
     /// Runs of losses in the order of departure: length and how many.
     pub loss_bursts: Vec<(u64, u64)>,
     /// Second stamp minus first.
     pub delay: Distribution,
-    /// 95 % interval of its median (block bootstrap).
-    pub delay_p50_interval: Option<IntervalNs>,
-    /// 95 % interval of its 99th percentile (block bootstrap).
-    pub delay_p99_interval: Option<IntervalNs>,
+    /// 95 % interval of its median, nanoseconds, or why there is none.
+    pub delay_p50_interval: Option<Spread>,
+    /// The same of its 99th percentile.
+    pub delay_p99_interval: Option<Spread>,
     /// Delay less the smallest delay.
     pub variation: Distribution,
     /// RFC 3550's estimate after the last datagram, nanoseconds.
@@ -73,8 +74,6 @@ pub struct JoinMetrics {
     pub jitter_mean_ns: Option<f64>,
     /// Late ones.
     pub reordered_count: u64,
-    /// 95 % interval of their ratio (Wilson).
-    pub reordered_interval: Option<(f64, f64)>,
     /// Farthest that one was overtaken: positions to the earliest of those that overtook it
     /// (RFC 4737 section 4.2.2).
     pub reordering_extent_max: u64,
@@ -271,20 +270,20 @@ fn metrics(
     let matched_count = pairs.len() as u64;
     let lost_count = lost.len() as u64;
     let judged_count = matched_count + lost_count;
-    let ratio_interval = |count: u64, of: u64| {
-        let interval = wilson(count, of, CONFIDENCE)?;
-        Some((interval.low, interval.high))
-    };
+    // In the order of departure: matched or lost.
+    let mut judged: Vec<(usize, f64)> = matches.pairs.iter().map(|pair| (pair.0, 0.0)).collect();
+    judged.extend(lost.iter().map(|place| (*place, 1.0)));
+    judged.sort_unstable_by_key(|one| one.0);
+    let outcomes = Batches::of(judged.iter().map(|one| one.1));
     // Positions of departure in the order of arrival.
     let mut arrivals: Vec<usize> = (0..pairs.len()).collect();
     arrivals.sort_by_key(|departure| pairs[*departure].second.stamp_ns);
     let (reordered_count, reordering_extent_max) = reordering(&arrivals);
     let in_arrival = arrivals.iter().map(|departure| delays[*departure]);
     let jitter = jitter_ns(&in_arrival.collect::<Vec<_>>());
-    let delay_interval = |quantile: f64, name: &str| {
-        let mut random = RandomStream::new(0, name);
-        block_bootstrap_quantile(&delays, quantile, CONFIDENCE, &mut random)
-    };
+    let series: Samples = delays.iter().copied().collect();
+    let ascending = series.ascending();
+    let quantiles = Quantiles::of(&series, &ascending);
     let unmatched = "no datagram was seen at both points";
     let variation = delays.iter().map(|delay| delay.saturating_sub(fastest));
     let gaps = second.seen.windows(2);
@@ -299,16 +298,15 @@ fn metrics(
         duplicated_count: matches.duplicates.len() as u64,
         unexplained_count: unexplained_count as u64,
         loss_ratio: (judged_count > 0).then(|| lost_count as f64 / judged_count as f64),
-        loss_interval: ratio_interval(lost_count, judged_count),
+        loss_interval: (judged_count > 0).then(|| outcomes.share_interval()),
         loss_bursts: bursts(&lost),
         delay: distribution(delays.iter().copied(), unmatched),
-        delay_p50_interval: delay_interval(0.5, "probe delay p50"),
-        delay_p99_interval: delay_interval(0.99, "probe delay p99"),
+        delay_p50_interval: quantiles.interval(0.5),
+        delay_p99_interval: quantiles.interval(0.99),
         variation: distribution(variation, unmatched),
         jitter_last_ns: jitter.map(|(last, _)| last),
         jitter_mean_ns: jitter.map(|(_, mean)| mean),
         reordered_count,
-        reordered_interval: ratio_interval(reordered_count, matched_count),
         reordering_extent_max,
         arrival_interval: distribution(gaps, "fewer than two arrivals"),
     }

@@ -1,6 +1,7 @@
 //! How far the cart went, and by how much it missed its commands, from the messages of a run.
 
 use hil_core::case_study::{ErrorSeries, Metric, Score};
+use hil_core::interval::Spread;
 use hil_core::run_log::RunLog;
 use hil_core::time::Instant;
 use hil_stats::series::Estimate;
@@ -27,11 +28,10 @@ pub(crate) fn score(log: &RunLog) -> Score {
             name: "travelled_m",
             label: "distance travelled",
             value: travel.map(|travel| travel.whole_m),
-            interval: travel.and_then(|travel| travel.interval),
+            interval: travel.map(|travel| travel.interval),
             unit: "m",
             method: format!(
-                "sum of status steps; {command_count} commands sent; 95 % interval from the half waves of the \
-                     run, from 5 of them on"
+                "sum of status steps; {command_count} commands sent; interval from the half waves of the run"
             ),
         }],
         ..Score::default()
@@ -70,7 +70,7 @@ fn speed_error(log: &RunLog) -> ErrorSeries {
 #[derive(Debug, Clone, Copy)]
 struct Travel {
     whole_m: f64,
-    interval: Option<(f64, f64)>,
+    interval: Spread,
 }
 
 /// The whole way, and what the scatter of the half waves says of it; `None` without a status.
@@ -95,11 +95,10 @@ fn travel(log: &RunLog) -> Option<Travel> {
     let half_waves = (last.0.seconds_since(start) / HALF_WAVE_S).round();
     blocks.truncate(ceil_count(half_waves));
     let mean = Estimate::of_mean(&blocks)?;
-    let spread_m = mean
-        .interval
-        .map(|(low, high)| 0.5 * (high - low) * half_waves);
     Some(Travel {
         whole_m,
-        interval: spread_m.map(|spread_m| (whole_m - spread_m, whole_m + spread_m)),
+        interval: mean
+            .interval
+            .map(|end| whole_m + (end - mean.value) * half_waves),
     })
 }

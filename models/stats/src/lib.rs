@@ -5,11 +5,11 @@
 pub mod bounds;
 pub mod comparison;
 pub mod correlation;
+pub mod dependence;
 pub mod goodness;
 pub mod histogram;
 pub mod in_order;
 pub mod metric;
-pub mod resampling;
 pub mod samples;
 pub mod series;
 pub mod special;

@@ -9,8 +9,8 @@ use hil_capture::join::{JoinMetrics, Joined, OrderSource};
 use hil_capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_capture::pairing::join_all;
 use hil_capture::point::{PointMetrics, single_point_metrics};
+use hil_core::interval::Spread;
 use hil_stats::histogram::Distribution;
-use hil_stats::statistics::IntervalNs;
 use serde::Serialize;
 
 use super::files::{CaptureFile, FileError, read};
@@ -403,11 +403,13 @@ fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
         ("p50", figures.delay_p50_interval),
         ("p99", figures.delay_p99_interval),
     ] {
-        if let Some(IntervalNs { low_ns, high_ns }) = interval {
-            let (low, high) = (time(low_ns), time(high_ns));
-            lines.push(format!(
-                "    {name} in {low} to {high} (95 %, block bootstrap)"
-            ));
+        if let Some(spread) = interval {
+            #[expect(clippy::cast_possible_truncation, reason = "two of the delays")]
+            let ends = spread
+                .known()
+                .map(|one| [one.low, one.high].map(|ns| time(ns as i64)));
+            let words = ends.map_or_else(String::new, |[low, high]| format!("{low} to {high}; "));
+            lines.push(format!("    {name} 95 %: {words}{spread}"));
         }
     }
     lines.push(format!(
@@ -420,22 +422,27 @@ fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
             "  jitter      {last:.2} us at the end, {mean:.2} us mean (RFC 3550)"
         ));
     }
-    let interval = percent(None, figures.reordered_interval);
     lines.push(format!(
-        "  reordered   {}{interval}, extent at most {} (RFC 4737)",
+        "  reordered   {}, extent at most {} (RFC 4737)",
         figures.reordered_count, figures.reordering_extent_max
     ));
 }
 
-fn percent(ratio: Option<f64>, interval: Option<(f64, f64)>) -> String {
+fn percent(ratio: Option<f64>, interval: Option<Spread>) -> String {
     let mut text = String::new();
     if let Some(ratio) = ratio {
         // Writing to a string cannot fail.
         let _infallible = write!(text, " = {:.4} %", 100.0 * ratio).is_ok();
     }
-    if let Some((low, high)) = interval {
-        let (low, high) = (100.0 * low, 100.0 * high);
-        let _infallible = write!(text, " ({low:.4} to {high:.4} %, Wilson 95 %)").is_ok();
+    match interval {
+        Some(Spread::Known(one)) => {
+            let (low, high) = (100.0 * one.low, 100.0 * one.high);
+            let _infallible = write!(text, " ({low:.4} to {high:.4} %, 95 %)").is_ok();
+        }
+        Some(Spread::Unknown(why)) => {
+            let _infallible = write!(text, " ({why})").is_ok();
+        }
+        None => {}
     }
     text
 }

@@ -187,7 +187,6 @@ fn network(
                 payload_bytes: payload.map(|message| message.payload.len() as u64),
                 duplicated_count: Some(account.duplicated_count),
                 round_trips_ns: &[],
-                seed,
             },
         });
     }

@@ -156,14 +156,9 @@ fn assert_the_report_shows_what_preceded_what(network: &serde_json::Value, name:
     let delay_ns = figures["delay"]["p50"]["value_ns"].as_i64().unwrap();
     assert!(delay_ns >= 5_000_000, "{figures}");
     let loss = &figures["loss"];
-    let bound = |which: &str| loss["interval"][which].as_f64().unwrap();
-    let ratio = loss["ratio"].as_f64().unwrap();
-    assert!(
-        0.0 < bound("low") && bound("low") < ratio && ratio < bound("high"),
-        "{loss}"
-    );
-    // Outages are few: they tell as much as few independent messages would.
-    assert!(loss["effective_count"].as_f64().unwrap() < 200.0, "{loss}");
+    assert!(loss["ratio"].as_f64().unwrap() > 0.0, "{loss}");
+    // Outages are too few for an interval, and it says so.
+    assert!(loss["interval"]["too_few"]["needed"].is_u64(), "{loss}");
     let events = network["events"].as_array().unwrap().iter();
     let outages = events.filter(|one| one["channel"] == name && one["kind"] == "outage");
     assert!(outages.count() >= 3, "{}", network["events"]);

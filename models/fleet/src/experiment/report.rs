@@ -8,10 +8,11 @@ use crate::experiment::cells::{
 };
 use crate::experiment::study::{FleetStudy, worlds_text};
 use crate::scenario::Scenario;
+use hil_core::interval::Interval;
 use hil_core::study::{Cell, Column, Criterion, Field, StudyReport, Table};
 use hil_link::impaired::DelayLaw;
 use hil_stats::comparison::{Share, difference};
-use hil_stats::statistics::{CONFIDENCE, Interval};
+use hil_stats::statistics::CONFIDENCE;
 
 /// A cell with what came of it; `None` when it was not run.
 #[derive(Debug)]
@@ -103,7 +104,8 @@ const PUBLISHED: [Field<PublishedRow>; 4] = [
         Some(1e3 * row.collisions as f64 / row.sections as f64)
     }),
     Field::interval("published_per_1000", "95 %", 2, |row| {
-        collision_interval(row.collisions, row.sections).map(|(low, high)| (1e3 * low, 1e3 * high))
+        collision_interval(row.collisions, row.sections)
+            .map(|interval| (1e3 * interval.low, 1e3 * interval.high))
     }),
 ];
 
@@ -234,7 +236,7 @@ impl AgainstPaper {
         let paper = share(published.collisions, published.sections)?;
         let count = tally.section_count();
         let ours = share(tally.referee.section_collisions_count, count)?;
-        let Interval { low, high } = difference(paper, ours)?;
+        let Interval { low, high, .. } = difference(paper, ours)?;
         Some(if low > 0.0 || high < 0.0 {
             Self::Differs
         } else if 2 * count >= published.sections {

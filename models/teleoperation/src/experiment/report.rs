@@ -5,7 +5,7 @@ use crate::experiment::drive::Tally;
 use crate::experiment::study::MotionLossStudy;
 use crate::score::loops::LossKind;
 use hil_core::study::{Criterion, Field, StudyReport, Table};
-use hil_stats::series::Estimate;
+use hil_stats::comparison::mean_interval;
 use hil_stats::statistics::{CONFIDENCE, poisson};
 
 /// A condition with the runs of it that ended.
@@ -83,15 +83,8 @@ impl Row<'_> {
 
     /// Student's interval of the mean rate.
     fn runs_interval(&self) -> Option<(f64, f64)> {
-        let (low, high) = Estimate::of_mean(&self.rates())?.interval?;
-        Some((low.max(0.0), high))
-    }
-
-    /// The rate's interval by the count of all runs' missing loops.
-    fn poisson_interval(&self) -> Option<(f64, f64)> {
-        let missing = poisson(self.sum(Tally::missing_count), CONFIDENCE);
-        let sent = self.sent() as f64;
-        (sent > 0.0).then(|| (missing.low / sent, missing.high / sent))
+        let interval = mean_interval(&self.rates(), CONFIDENCE)?;
+        Some((interval.low.max(0.0), interval.high))
     }
 
     fn range(&self) -> Option<(f64, f64)> {
@@ -103,12 +96,11 @@ impl Row<'_> {
 }
 
 fn rates(rows: &[Row<'_>]) -> Table {
-    let fields: [Field<Row<'_>>; 7] = [
+    let fields: [Field<Row<'_>>; 6] = [
         Field::text("condition", "Condition", Row::name),
         Field::number("mlr_mean", "MLR", 5, |row| row.mean(Tally::loss_ratio)),
         Field::number("mlr_sd", "sd", 5, |row| deviation(&row.rates())),
         Field::interval("mlr_runs", "95 % of runs", 5, Row::runs_interval),
-        Field::interval("mlr_poisson", "95 % Poisson", 5, Row::poisson_interval),
         Field::number("trips_per_hour", "Trips/h", 1, |row| {
             row.mean(|run| run.trip_count as f64 / run.hours)
         }),
@@ -117,10 +109,7 @@ fn rates(rows: &[Row<'_>]) -> Table {
         }),
     ];
     Table {
-        notes: vec![
-            "95 % of runs: Student's interval of the mean; Poisson: of all runs' missing loops"
-                .to_owned(),
-        ],
+        notes: vec!["95 % of runs: Student's interval of the mean, of independent runs".to_owned()],
         ..Table::of(
             "motion-loss",
             "Motion loss rate by condition",

@@ -485,7 +485,6 @@ fn add_channel(
                 payload_bytes,
                 duplicated_count: files.ingress.map(|_| duplicated_count),
                 round_trips_ns: context.round_trips_ns,
-                seed: context.seed,
             },
         });
     });

@@ -1,8 +1,9 @@
 //! Was the robot hurt more in the new runs than in the base? What hurt it on both sides, pooled over the runs of each,
 //! and the answer that follows. Figures of the network are elsewhere.
 
+use hil_core::interval::{Interval, IntervalMethod};
 use hil_stats::comparison::{Share, difference};
-use hil_stats::statistics::{CONFIDENCE, Interval, poisson};
+use hil_stats::statistics::{CONFIDENCE, poisson};
 use serde::Serialize;
 
 use super::ComparedRun;
@@ -58,10 +59,11 @@ impl Change {
             && new_s > 0.0
         {
             let [base, new] = [base, new].map(|count| poisson(count, CONFIDENCE));
-            Some(Interval {
-                low: new.low / new_s - base.high / base_s,
-                high: new.high / new_s - base.low / base_s,
-            })
+            Some(Interval::new(
+                new.low / new_s - base.high / base_s,
+                new.high / new_s - base.low / base_s,
+                IntervalMethod::Exact,
+            ))
         } else {
             None
         };
@@ -102,6 +104,7 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
         count: Some(0),
         own_count: 0,
         occasions: None,
+        interval: None,
     };
     for run in runs {
         let Some(harm) = run.summary.harms.iter().find(|one| one.what == what) else {
@@ -110,6 +113,8 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
         };
         sum.count = sum.count.zip(harm.count).map(|(one, other)| one + other);
         sum.own_count += harm.own_count;
+        // Of several runs together there is none: their own differ.
+        sum.interval = harm.interval.filter(|_| runs.len() == 1);
         if let Some(OccasionCount { what, count }) = &harm.occasions {
             let known = sum.occasions.get_or_insert_with(|| OccasionCount {
                 what: what.clone(),
@@ -194,6 +199,7 @@ mod tests {
                 what: "motion loops sent".to_owned(),
                 count: sent_count,
             }),
+            interval: None,
         }];
         ComparedRun {
             folder: PathBuf::from("run"),
@@ -234,6 +240,7 @@ mod tests {
                 count: Some(stops),
                 own_count: 0,
                 occasions: None,
+                interval: None,
             });
             [run]
         };

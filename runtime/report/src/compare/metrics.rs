@@ -4,24 +4,22 @@
 use std::collections::BTreeMap;
 
 use hil_account::{ChannelAccount, FateCounts, MessageFate};
-use hil_stats::comparison::{
-    Estimate, Share, binned_quantile_interval, difference, mean_interval, ratio, welch,
-};
-use hil_stats::histogram::{Distribution, DurationBin, LatencySummary};
-use hil_stats::statistics::{CONFIDENCE, Interval, IntervalNs};
+use hil_core::interval::{Interval, Spread};
+use hil_stats::comparison::{Estimate, Share, difference, mean_interval, ratio, welch};
+use hil_stats::histogram::{Distribution, LatencySummary};
+use hil_stats::statistics::CONFIDENCE;
 
 use super::{ChartKind, ComparedMetric, ComparedRun, Part, Verdict};
 use crate::summary::ScoreMetric;
 
-const BOOTSTRAP: &str = "block bootstrap of each run, ratio by MOVER of the logarithms";
-const ORDER: &str = "order statistics of each run's histogram, which take messages as independent, ratio \
-                     by MOVER of the logarithms";
+const RANKS: &str = "ranks of the effective sample of each run, ratio by MOVER of the logarithms";
 const REPETITIONS: &str = "Welch's interval over the repetitions";
 const MIXED: &str = "one run's own interval and Student's over the repetitions of the other side, by \
                      MOVER";
 const NO_SPREAD: &str = "no interval: no repetition differs from another, or delays reach zero";
 const PARTIAL: &str = "not every repetition has it";
-const NO_INTERVAL: &str = "no interval: too few messages, or delays that reach zero";
+const NO_INTERVAL: &str =
+    "no interval: the sample of a run is too small, or of segments; repeat the runs";
 const NO_MAXIMUM: &str = "no interval: one run's maximum has none; repeat the runs";
 const NEWCOMBE: &str = "Newcombe's interval (method 10), which takes messages as independent";
 const OWN: &str = "MOVER of the scores' own intervals";
@@ -37,11 +35,10 @@ struct DelayKey {
     metric: usize,
 }
 
-/// A delay of one run, nanoseconds, and how its interval came about.
+/// A delay of one run, nanoseconds.
 #[derive(Debug, Clone, Copy)]
 struct RunDelay {
     estimate: Estimate,
-    method: &'static str,
 }
 
 const METRICS: [&str; 4] = ["p50", "p99", "p99.9", "max"];
@@ -121,14 +118,12 @@ fn accounts(run: &ComparedRun) -> impl Iterator<Item = (&str, &ChannelAccount)> 
     channels.filter_map(|one| Some((one.name.as_str(), one.account.as_ref()?)))
 }
 
-/// Every delay of a run, in nanoseconds, and how its interval came about.
+/// Every delay of a run, in nanoseconds.
 fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, RunDelay> {
     let mut found = BTreeMap::new();
     for (channel, account) in accounts(run) {
-        let mut add = |part, distribution: &Distribution, bins: &[DurationBin], own| {
-            let delays = distribution
-                .measured()
-                .map(|one| run_delays(one, bins, own));
+        let mut add = |part, distribution: &Distribution, own| {
+            let delays = distribution.measured().map(|one| run_delays(one, own));
             for (metric, delay) in delays.into_iter().flatten().enumerate() {
                 let channel = channel.to_owned();
                 let key = DelayKey {
@@ -141,39 +136,30 @@ fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, RunDelay> {
         };
         let whole = &account.end_to_end;
         let own = [whole.p50_interval, whole.p99_interval, None, None];
-        add(Part::EndToEnd, &whole.distribution, &whole.bins, own);
+        add(Part::EndToEnd, &whole.distribution, own);
         for segment in &account.segments {
             let (from, to) = (segment.from, segment.to);
             let part = Part::Segment { from, to };
-            add(part, &segment.distribution, &segment.bins, [None; 4]);
+            add(part, &segment.distribution, [None; 4]);
         }
     }
     found
 }
 
-/// The delays of [`METRICS`], each with its `own` interval, or that of the `bins` where it has none.
-fn run_delays(
-    figures: &LatencySummary,
-    bins: &[DurationBin],
-    own: [Option<IntervalNs>; 4],
-) -> [RunDelay; 4] {
-    let binned = |quantile| binned_quantile_interval(bins, quantile, CONFIDENCE);
-    let delay = |value_ns: i64, own: Option<IntervalNs>, quantile: Option<f64>| RunDelay {
+/// The delays of [`METRICS`], each with its `own` interval.
+fn run_delays(figures: &LatencySummary, own: [Option<Spread>; 4]) -> [RunDelay; 4] {
+    let values = [
+        figures.p50_ns,
+        figures.p99_ns,
+        figures.p999_ns,
+        figures.max_ns,
+    ];
+    core::array::from_fn(|metric| RunDelay {
         estimate: Estimate {
-            value: value_ns as f64,
-            interval: own.or_else(|| binned(quantile?)).map(|one| Interval {
-                low: one.low_ns as f64,
-                high: one.high_ns as f64,
-            }),
+            value: values[metric] as f64,
+            interval: own[metric].and_then(Spread::known),
         },
-        method: if own.is_some() { BOOTSTRAP } else { ORDER },
-    };
-    [
-        delay(figures.p50_ns, own[0], Some(0.5)),
-        delay(figures.p99_ns, own[1], Some(0.99)),
-        delay(figures.p999_ns, own[2], Some(0.999)),
-        delay(figures.max_ns, own[3], None),
-    ]
+    })
 }
 
 fn delays(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
@@ -270,11 +256,7 @@ fn delay_interval(
             (spread.and_then(exponential), REPETITIONS)
         }
         1 => (ratio(b, n), MIXED),
-        // A histogram's bins are wider than what it was made of, so say which.
-        _ => {
-            let methods = base.iter().chain(new).map(|one| one.method);
-            (ratio(b, n), methods.max().unwrap_or(ABSENT))
-        }
+        _ => (ratio(b, n), RANKS),
     };
     match (found, repeated_count) {
         (Some(_), _) => (found, method),
@@ -292,7 +274,7 @@ fn logarithms(side: &[RunDelay]) -> Vec<f64> {
 fn exponential(one: Interval) -> Option<Interval> {
     let (low, high) = (one.low.exp(), one.high.exp());
     let is_known = one.low.is_finite() && high.is_finite();
-    is_known.then_some(Interval { low, high })
+    is_known.then_some(Interval { low, high, ..one })
 }
 
 /// One run's figure as it is; of several the geometric mean, with Student's interval of the logarithms.
@@ -371,10 +353,7 @@ fn mean_share(side: &[Share]) -> (Option<Estimate>, bool) {
             let estimate = Estimate {
                 value: values.iter().sum::<f64>() / values.len() as f64,
                 // A share has no less than none and no more than all.
-                interval: Some(Interval {
-                    low: found.low.max(0.0),
-                    high: found.high.min(1.0),
-                }),
+                interval: Some(found.map(|end| end.clamp(0.0, 1.0))),
             };
             (Some(estimate), true)
         }
@@ -460,7 +439,7 @@ fn scores_of(metric: &ScoreMetric, runs: &[ComparedRun]) -> Vec<Estimate> {
         let one = all.find(|one| one.name == metric.name)?;
         Some(Estimate {
             value: one.value?,
-            interval: one.interval.map(|(low, high)| Interval { low, high }),
+            interval: one.interval.and_then(Spread::known),
         })
     });
     found.collect()

@@ -1,5 +1,6 @@
 //! A comparison as sections, for a terminal and as Markdown. It computes nothing.
 
+use hil_core::interval::Interval;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_present::template::{TemplateError, markdown as document};
@@ -8,7 +9,6 @@ use hil_present::terminal::section;
 use hil_present::units::{duration, figure, percent};
 use hil_present::{Block, Section, Table, Tone, UNAVAILABLE};
 use hil_stats::comparison::Estimate;
-use hil_stats::statistics::Interval;
 
 use super::conditions::Verdicts;
 use super::harms::{ComparedHarm, QUESTION};
@@ -167,17 +167,17 @@ fn cells(one: &ComparedMetric) -> [String; 6] {
         ChartKind::Delay => (
             one.ratio.map(|ratio| format!("{ratio:.3}x")),
             one.ratio_interval
-                .map(|Interval { low, high }| format!("{low:.3}x to {high:.3}x")),
+                .map(|Interval { low, high, .. }| format!("{low:.3}x to {high:.3}x")),
         ),
         ChartKind::Loss => (
             one.difference.map(points),
             one.difference_interval
-                .map(|Interval { low, high }| format!("{} to {}", points(low), points(high))),
+                .map(|Interval { low, high, .. }| format!("{} to {}", points(low), points(high))),
         ),
         ChartKind::Score => (
             one.difference.map(signed),
             one.difference_interval
-                .map(|Interval { low, high }| format!("{} to {}", signed(low), signed(high))),
+                .map(|Interval { low, high, .. }| format!("{} to {}", signed(low), signed(high))),
         ),
     };
     let or_none = |text: Option<String>| text.unwrap_or_else(|| UNAVAILABLE.to_owned());

@@ -6,6 +6,7 @@ use core::fmt::Write;
 
 use hil_account::network::{DelayMetrics, NetworkMetrics};
 use hil_platform::text::grouped;
+use hil_platform::words::counted;
 use hil_present::units::{duration_s, percent};
 use hil_present::{Cell, Section, Table, Tone};
 
@@ -80,7 +81,10 @@ pub(super) fn preceding(report: &NetworkReport, events: &ScoreEvents) -> Section
         Correlation::Unavailable { reason } => {
             section.note(Tone::Plain, format!("No test of correlation: {reason}."));
         }
-        Correlation::Tested(tests) => correlations(&mut section, tests),
+        Correlation::Tested(tests) => {
+            let noted = report.events.len() as u64 + report.events_dropped_count;
+            correlations(&mut section, tests, noted);
+        }
     }
     section
 }
@@ -114,7 +118,10 @@ fn preceding_words(report: &NetworkReport, events: &ScoreEvents) -> String {
     )
 }
 
-fn correlations(section: &mut Section, tests: &CorrelationTests) {
+/// Events of note on the network below which a test that finds nothing says nothing.
+const EVENTS_TESTED_MIN: u64 = 10;
+
+fn correlations(section: &mut Section, tests: &CorrelationTests, noted: u64) {
     let found = tests.significant();
     for pair in found.iter().take(PAIRS_SHOWN_COUNT) {
         let words = pair.words(tests.pairs.len(), tests.shuffle_count);
@@ -123,6 +130,11 @@ fn correlations(section: &mut Section, tests: &CorrelationTests) {
     let others = tests.pairs.len() - found.len();
     let mut text = if tests.pairs.is_empty() {
         "No pair of series to test: of each, one or both are the same all the time.".to_owned()
+    } else if found.is_empty() && (1..EVENTS_TESTED_MIN).contains(&noted) {
+        let events = counted(noted, "event");
+        format!(
+            "{events} of note on the network: too few to test whether the robot's series follow them."
+        )
     } else if found.is_empty() {
         let pairs = tests.pairs.iter();
         let best = pairs.min_by(|a, b| {
@@ -133,7 +145,8 @@ fn correlations(section: &mut Section, tests: &CorrelationTests) {
         let best = best.map(|best| best.words(tests.pairs.len(), tests.shuffle_count));
         let best = best.unwrap_or_default();
         format!(
-            "None of {others} pairs of series correlates beyond chance. The nearest to it: {best}."
+            "Over the whole run none of {others} pairs of series correlates beyond chance, which says nothing of \
+             single events. The nearest to it: {best}."
         )
     } else {
         match found.len().saturating_sub(PAIRS_SHOWN_COUNT) {

@@ -108,7 +108,6 @@ pub(crate) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
                 payload_bytes: Some(96),
                 duplicated_count: Some(2),
                 round_trips_ns: &[4_100_000, 4_900_000],
-                seed: 42,
             },
         });
     }

@@ -4,19 +4,20 @@ use super::*;
 use crate::answer::Hurt;
 use crate::compare::Comparison;
 use crate::compare::conditions::{Condition, Verdicts};
+use hil_core::interval::IntervalMethod;
 
 fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedMetric {
     let side = |all: &[f64]| -> Vec<RunDelay> {
         let estimate = |ms: &f64| Estimate {
             value: ms * 1e6,
-            interval: Some(Interval {
-                low: ms * 0.99e6,
-                high: ms * 1.01e6,
-            }),
+            interval: Some(Interval::new(
+                ms * 0.99e6,
+                ms * 1.01e6,
+                IntervalMethod::EffectiveRanks,
+            )),
         };
         let delay = |ms: &f64| RunDelay {
             estimate: estimate(ms),
-            method: BOOTSTRAP,
         };
         all.iter().map(delay).collect()
     };
@@ -121,5 +122,5 @@ fn one_run_against_repetitions_has_an_interval_of_both_kinds() {
     let lost = loss(&[1], &[10, 12, 14], [1, 3]);
     assert_eq!(lost.method, MIXED);
     assert_eq!(loss(&[1], &[10], [1, 1]).method, NEWCOMBE);
-    assert_eq!(p99(&[3.0], &[6.0], [1, 1]).method, BOOTSTRAP);
+    assert_eq!(p99(&[3.0], &[6.0], [1, 1]).method, RANKS);
 }
