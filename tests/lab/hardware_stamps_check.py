@@ -94,11 +94,11 @@ def probed_ptp(host):
     after = setting(finding(host, "doctor-ptp-after.json"))
     check("PTPv2 event" in before, f"{host}: a PTP clock has set its card up: {before}")
     check(after == before, f"{host}: a probe that asked for card stamps leaves it so: {after}")
-    told = re.search(r"(\d+) of (\d+) arrivals have the card's stamp", words_of(host, "probe.txt"))
+    told = re.search(r"([\d,]+) of ([\d,]+) arrivals have the card's stamp", words_of(host, "probe.txt"))
     check(told is not None, f"{host}: the probe says how many arrivals the card stamped")
     if told is None:
         return
-    stamped, arrived = (int(text) for text in told.groups())
+    stamped, arrived = (int(text.replace(",", "")) for text in told.groups())
     analysis = json.loads(words_of(host, "probe.json"))
     points = analysis["points"]
 

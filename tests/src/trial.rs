@@ -110,20 +110,7 @@ impl Trial {
     /// # Panics
     /// When it does not appear within `limit`, or there are several.
     pub fn folder(&self, suffix: &str, limit: Duration) -> RunFiles {
-        let mut found = Vec::new();
-        wait_until(limit, &format!("a run folder {suffix}"), || {
-            let entries = fs::read_dir(&self.record).into_iter().flatten().flatten();
-            found = entries
-                .filter(|entry| entry.path().is_dir())
-                .filter(|entry| entry.file_name().to_string_lossy().ends_with(suffix))
-                .map(|entry| entry.path())
-                .collect();
-            !found.is_empty()
-        });
-        assert_eq!(found.len(), 1, "one run folder {suffix}, not {found:?}");
-        RunFiles {
-            root: found.remove(0),
-        }
+        RunFiles::find(&self.record, &self.record, suffix, limit)
     }
 }
 
@@ -208,12 +195,39 @@ pub fn load_average() -> String {
 #[derive(Debug, Clone)]
 pub struct RunFiles {
     root: PathBuf,
+    inside: PathBuf,
 }
 
 impl RunFiles {
+    /// The one run folder below `record` whose name ends with `suffix`; the run itself has it below `inside`.
+    ///
+    /// # Panics
+    /// When there is none within `limit`, or more than one.
+    pub fn find(record: &Path, inside: &Path, suffix: &str, limit: Duration) -> Self {
+        let mut found = Vec::new();
+        wait_until(limit, &format!("a run folder {suffix}"), || {
+            let entries = fs::read_dir(record).into_iter().flatten().flatten();
+            found = entries
+                .filter(|entry| entry.path().is_dir())
+                .filter(|entry| entry.file_name().to_string_lossy().ends_with(suffix))
+                .map(|entry| entry.path())
+                .collect();
+            !found.is_empty()
+        });
+        assert_eq!(found.len(), 1, "one run folder {suffix}, not {found:?}");
+        let root = found.remove(0);
+        let inside = inside.join(root.file_name().expect("an entry of a folder has a name"));
+        Self { root, inside }
+    }
+
     /// The run folder.
     pub fn root(&self) -> &Path {
         &self.root
+    }
+
+    /// The folder as the processes of the run have it.
+    pub fn inside(&self) -> &Path {
+        &self.inside
     }
 
     /// True once the run has written its last file.
@@ -258,7 +272,7 @@ impl RunFiles {
 
     /// The process that was started from the launch file of `name` for the `instance`th time.
     pub fn process(&self, name: &str, instance: u32) -> Option<Pid> {
-        let launch = self.root.join(format!("launch/{name}.{instance}.json"));
+        let launch = self.inside.join(format!("launch/{name}.{instance}.json"));
         processes_mentioning(&launch.to_string_lossy())
             .first()
             .copied()
@@ -280,7 +294,7 @@ impl RunFiles {
 
     /// Processes that were started from any launch file of this run and have not ended.
     pub fn processes(&self) -> Vec<Pid> {
-        processes_mentioning(&self.root.join("launch").to_string_lossy())
+        processes_mentioning(&self.inside.join("launch").to_string_lossy())
     }
 
     /// The shared-memory domains of the run, as its processes were told.
@@ -403,6 +417,7 @@ mod tests {
         folder.write("there/dev/shm/h11111111_abc.data", "");
         let files = RunFiles {
             root: folder.join("run"),
+            inside: folder.join("run"),
         };
         let there = folder.join("there");
         let locate = |path: &Path| there.join(path.strip_prefix("/").unwrap());

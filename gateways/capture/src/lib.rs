@@ -3,9 +3,9 @@
 //! clock is read. The live tap is [`hil_net::packet_ring`].
 //!
 //! ```text
-//! file bytes -> CaptureReader -> packet -> esl -> link -> flow -> Observation
+//! file bytes -> CaptureReader -> packet -> esl -> link -> flow -> Observation, Watch
 //!                                                                    |
-//!                              point::single_point_figures <--- per stream ---> pairing::join_all
+//!                              point::single_point_metrics <--- per stream ---> pairing::join_all
 //! ```
 #![forbid(unsafe_code)]
 
@@ -20,6 +20,7 @@ mod pcap;
 mod pcapng;
 pub mod point;
 pub mod reader;
+pub mod watch;
 pub mod writer;
 
 #[cfg(test)]
@@ -31,6 +32,25 @@ use hil_net::Direction;
 
 /// How the description of an interface begins whose packets have the card's stamps.
 pub const CARD_CLOCK: &str = "stamps of the network card's own clock";
+
+/// A time on a point's clock, nanoseconds since 1970, both ends included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Span {
+    /// When it begins.
+    pub first_ns: i64,
+    /// When it ends.
+    pub last_ns: i64,
+}
+
+impl Span {
+    /// From the earlier beginning to the later end.
+    pub(crate) fn hull(self, other: Self) -> Self {
+        Self {
+            first_ns: self.first_ns.min(other.first_ns),
+            last_ns: self.last_ns.max(other.last_ns),
+        }
+    }
+}
 
 /// An interface that packets were captured on.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -47,13 +67,14 @@ pub struct CaptureInterface {
     pub unit_ns: (u64, u64),
     /// What to add to its stamps, nanoseconds.
     pub offset_ns: i64,
-    /// When capturing began, nanoseconds since 1970.
-    pub start_ns: Option<i64>,
-    /// When it ended, nanoseconds since 1970.
-    pub end_ns: Option<i64>,
+    /// When it was watched, as its statistics state it: taken in its own unit, and in microseconds.
+    /// Wireshark and dumpcap write microseconds whatever the unit; which was meant, the packets tell.
+    pub watch: [Option<Span>; 2],
+    /// The interface of an earlier section that this one describes again: rotated or joined files.
+    pub repeats: Option<usize>,
     /// Packets it says it received.
     pub received_count: Option<u64>,
-    /// Packets it says were dropped for want of room.
+    /// Packets it says were dropped for want of room, by the system or by the interface.
     pub dropped_count: Option<u64>,
 }
 
@@ -73,10 +94,12 @@ pub struct CapturedPacket<'a> {
     pub offset: u64,
     /// Which of [`reader::CaptureReader::interfaces`].
     pub interface_index: usize,
+    /// Number of the interface on its host, where the record says it.
+    pub interface_number: Option<u32>,
     /// That interface's [`hil_net::link_type`].
     pub link_type: u16,
     /// Nanoseconds since 1970, on the clock of the capturing host; `None` in a simple packet
-    /// block, which has none.
+    /// block, which has none, and where the fraction of a second is two seconds or more.
     pub stamp_ns: Option<i64>,
     /// Length on the wire; more than `data` when the packet was cut short.
     pub original_bytes: u32,

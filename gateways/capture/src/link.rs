@@ -1,16 +1,33 @@
-//! From a captured frame to the UDP datagram in it: Ethernet with VLAN tags, Linux cooked captures
-//! and bare IP; IPv4 with options, IPv6 with extension headers. Fragments are told apart, not put
-//! together; checksums are not checked, since a capture on the sending host sees them unfinished.
+//! From a captured frame to the UDP datagram in it. Link layers: Ethernet, Linux cooked captures, BSD
+//! loopback, PPP, 802.11 with or without radiotap, and bare IP; on top of them VLAN tags, `PPPoE`, MPLS
+//! and LLC/SNAP; IPv4 with options, IPv6 with extension headers. Fragments are told apart, not put
+//! together; checksums are not checked, since a capture on the sending host sees them unfinished. A
+//! length of 0 in an IP or UDP header (segmentation offload, jumbograms) means: up to the frame's end.
 
 use std::net::{IpAddr, SocketAddr};
 
 use super::bytes::array_at;
-use hil_net::link_type;
+use super::watch::Unread;
+use hil_net::{Direction, link_type};
 
 const UDP: u8 = 17;
 const UDP_HEADER_BYTES: usize = 8;
-/// VLAN tags and IPv6 extension headers that are followed before a frame counts as malformed.
+/// Headers that are followed before a frame counts as malformed.
 const NESTING_MAX: usize = 8;
+
+/// What the headers in front of the IP packet say of where and which way the frame passed. Frames of one
+/// interface that differ in it passed different points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+pub struct FramePlace {
+    /// By the packet type of a Linux cooked capture.
+    pub direction: Direction,
+    /// Number of the interface: a capture on `any` (SLL2).
+    pub interface_number: Option<u32>,
+    /// Innermost VLAN, 0..=4095.
+    pub vlan: Option<u16>,
+    /// Leg of an 802.11 frame: to the access point, from it, or neither (`ToDS`, `FromDS`).
+    pub radio_leg: Option<(bool, bool)>,
+}
 
 /// A UDP datagram as far as it was captured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,8 +38,14 @@ pub struct UdpDatagram<'a> {
     pub destination: SocketAddr,
     /// Differentiated services code point, 0..=63.
     pub dscp: u8,
-    /// Innermost VLAN, 0..=4095.
-    pub vlan: Option<u16>,
+    /// Time to live, or hop limit.
+    pub hop_limit: u8,
+    /// Where it passed.
+    pub place: FramePlace,
+    /// An 802.11 frame sent again for want of an acknowledgement.
+    pub is_radio_retry: bool,
+    /// Bytes of its IP packet on the wire; of the first fragment when there are several.
+    pub packet_bytes: usize,
     /// Bytes of the payload on the wire.
     pub payload_bytes: usize,
     /// What was captured of it; for the first fragment of several, what is in that fragment.
@@ -41,75 +64,302 @@ impl UdpDatagram<'_> {
 /// Why a frame holds no datagram to look at.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum NoDatagram {
-    /// A link layer that is not read.
-    UnknownLinkType,
     /// Not IP: ARP, for instance.
     NotIp,
     /// IP, but not UDP.
     NotUdp,
     /// A later fragment of a datagram, without the ports.
     LaterFragment,
-    /// Captured too short to hold the headers.
-    CutShort,
-    /// Lengths or versions that cannot be.
-    Malformed,
+    /// It may hold any datagram.
+    Unread(Unread),
 }
 
-/// Looks for a UDP datagram in a frame of the given [`link_type`].
+use NoDatagram::{LaterFragment, NotIp, NotUdp};
+
+const CUT_SHORT: NoDatagram = NoDatagram::Unread(Unread::CutShort);
+const MALFORMED: NoDatagram = NoDatagram::Unread(Unread::Malformed);
+const ENCRYPTED: NoDatagram = NoDatagram::Unread(Unread::Encrypted);
+
+/// What begins at a place in a frame.
+#[derive(Debug, Clone, Copy)]
+enum Layer {
+    /// What an `EtherType` says, or below 0x0600 the length of an LLC frame.
+    EtherType(u16),
+    Llc,
+    Ppp,
+    Mpls,
+    Ip,
+}
+
+/// A frame, and how far its headers have been read.
+struct Walk<'a> {
+    frame: &'a [u8],
+    /// Bytes on the wire.
+    original_bytes: usize,
+    at: usize,
+    place: FramePlace,
+    is_radio_retry: bool,
+}
+
+/// Looks for a UDP datagram in a frame of the given [`link_type`] that had `original_bytes` on the wire.
 ///
 /// # Errors
 /// Why there is none.
-pub fn udp_datagram(link: u16, frame: &[u8]) -> Result<UdpDatagram<'_>, NoDatagram> {
-    let net_u16 = |at| {
-        let word = array_at(frame, at).map(u16::from_be_bytes);
-        word.ok_or(NoDatagram::CutShort)
+pub fn udp_datagram(
+    link: u16,
+    frame: &[u8],
+    original_bytes: usize,
+) -> Result<UdpDatagram<'_>, NoDatagram> {
+    let mut walk = Walk {
+        frame,
+        original_bytes: original_bytes.max(frame.len()),
+        at: 0,
+        place: FramePlace::default(),
+        is_radio_retry: false,
     };
-    let (mut protocol, mut at) = match link {
-        link_type::ETHERNET => (net_u16(12)?, 14),
-        link_type::LINUX_SLL => (net_u16(14)?, 16),
-        link_type::LINUX_SLL2 => (net_u16(0)?, 20),
-        link_type::RAW | link_type::IPV4 | link_type::IPV6 => return ip(frame, None),
-        _ => return Err(NoDatagram::UnknownLinkType),
-    };
-    let mut vlan = None;
+    let mut layer = walk.link(link)?;
     for _ in 0..NESTING_MAX {
-        match protocol {
-            0x8100 | 0x88a8 | 0x9100 => {
-                vlan = Some(net_u16(at)? & 0x0fff);
-                protocol = net_u16(at + 2)?;
-                at += 4;
-            }
-            0x0800 | 0x86dd => return ip(frame.get(at..).ok_or(NoDatagram::CutShort)?, vlan),
-            _ => return Err(NoDatagram::NotIp),
-        }
+        layer = match layer {
+            Layer::EtherType(kind) => walk.ether_type(kind)?,
+            Layer::Llc => walk.llc()?,
+            Layer::Ppp => walk.ppp()?,
+            Layer::Mpls => walk.mpls()?,
+            Layer::Ip => return walk.udp(),
+        };
     }
-    Err(NoDatagram::Malformed)
+    Err(MALFORMED)
 }
 
-fn ip(packet: &[u8], vlan: Option<u16>) -> Result<UdpDatagram<'_>, NoDatagram> {
-    let network = match packet.first().map(|byte| byte >> 4) {
-        Some(4) => ipv4(packet)?,
-        Some(6) => ipv6(packet)?,
-        Some(_) => return Err(NoDatagram::Malformed),
-        None => return Err(NoDatagram::CutShort),
-    };
-    let header: [u8; 8] = array_at(network.segment, 0).ok_or(NoDatagram::CutShort)?;
-    let word = |at: usize| u16::from_be_bytes([header[at], header[at + 1]]);
-    let length_bytes = usize::from(word(4));
-    let fits = length_bytes <= network.segment_bytes || network.is_fragmented;
-    if length_bytes < UDP_HEADER_BYTES || !fits {
-        return Err(NoDatagram::Malformed);
+impl<'a> Walk<'a> {
+    /// `N` bytes from `ahead` on.
+    fn peek<const N: usize>(&self, ahead: usize) -> Result<[u8; N], NoDatagram> {
+        array_at(self.frame, self.at + ahead).ok_or_else(|| self.too_short())
     }
-    let end = length_bytes.min(network.segment.len());
-    Ok(UdpDatagram {
-        source: SocketAddr::new(network.source, word(0)),
-        destination: SocketAddr::new(network.destination, word(2)),
-        dscp: network.dscp,
-        vlan,
-        payload_bytes: length_bytes - UDP_HEADER_BYTES,
-        payload: &network.segment[UDP_HEADER_BYTES..end],
-        is_fragmented: network.is_fragmented,
-    })
+
+    fn byte(&self, ahead: usize) -> Result<u8, NoDatagram> {
+        self.peek(ahead).map(|[byte]| byte)
+    }
+
+    fn word(&self, ahead: usize) -> Result<u16, NoDatagram> {
+        self.peek(ahead).map(u16::from_be_bytes)
+    }
+
+    /// A header that is not all there: not captured, or never sent.
+    fn too_short(&self) -> NoDatagram {
+        if self.frame.len() < self.original_bytes {
+            CUT_SHORT
+        } else {
+            MALFORMED
+        }
+    }
+
+    fn link(&mut self, link: u16) -> Result<Layer, NoDatagram> {
+        let (layer, length) = match link {
+            link_type::ETHERNET => (Layer::EtherType(self.word(12)?), 14),
+            link_type::LINUX_SLL => {
+                self.place.direction = cooked_direction(self.word(0)?);
+                (Layer::EtherType(self.word(14)?), 16)
+            }
+            link_type::LINUX_SLL2 => {
+                self.place.direction = cooked_direction(self.byte(10)?.into());
+                self.place.interface_number = Some(u32::from_be_bytes(self.peek(4)?));
+                (Layer::EtherType(self.word(0)?), 20)
+            }
+            link_type::NULL | link_type::LOOP => {
+                let family: [u8; 4] = self.peek(0)?;
+                let family = u32::from_le_bytes(family).min(u32::from_be_bytes(family));
+                // IPv4, and IPv6 of Linux, NetBSD, FreeBSD and macOS.
+                if !matches!(family, 2 | 10 | 24 | 28 | 30) {
+                    return Err(NotIp);
+                }
+                (Layer::Ip, 4)
+            }
+            link_type::PPP | link_type::PPP_SERIAL => (Layer::Ppp, 0),
+            link_type::PPP_ETHER => (Layer::Ppp, 6),
+            link_type::RADIOTAP => {
+                self.radiotap()?;
+                return self.radio();
+            }
+            link_type::IEEE802_11 => return self.radio(),
+            link_type::RAW
+            | link_type::RAW_12
+            | link_type::RAW_14
+            | link_type::IPV4
+            | link_type::IPV6 => (Layer::Ip, 0),
+            link_type => return Err(NoDatagram::Unread(Unread::LinkType { link_type })),
+        };
+        self.at += length;
+        Ok(layer)
+    }
+
+    fn ether_type(&mut self, kind: u16) -> Result<Layer, NoDatagram> {
+        Ok(match kind {
+            // IPv4, IPv6.
+            0x0800 | 0x86dd => Layer::Ip,
+            // VLAN tags.
+            0x8100 | 0x88a8 | 0x9100 => {
+                self.place.vlan = Some(self.word(0)? & 0x0fff);
+                let inner = self.word(2)?;
+                self.at += 4;
+                Layer::EtherType(inner)
+            }
+            0x8847 | 0x8848 => Layer::Mpls,
+            // A PPPoE session.
+            0x8864 => {
+                self.at += 6;
+                Layer::Ppp
+            }
+            // MACsec.
+            0x88e5 => return Err(ENCRYPTED),
+            // LLC: by a length, or as Linux cooked captures number it.
+            0x0000..=0x05dc => Layer::Llc,
+            _ => return Err(NotIp),
+        })
+    }
+
+    /// LLC with SNAP: RFC 1042 or IEEE 802.1H. Anything else carries no IP.
+    fn llc(&mut self) -> Result<Layer, NoDatagram> {
+        let header: [u8; 8] = match self.peek(0) {
+            Err(MALFORMED) => return Err(NotIp),
+            other => other?,
+        };
+        let (snap, kind) = header.split_at(6);
+        if !matches!(snap, [0xaa, 0xaa, 3, 0, 0, 0 | 0xf8]) {
+            return Err(NotIp);
+        }
+        self.at += 8;
+        let kind = u16::from_be_bytes([kind[0], kind[1]]);
+        Ok(Layer::EtherType(kind.max(0x0600)))
+    }
+
+    /// RFC 1661, with address and control (RFC 1662) or without, the protocol in one or two bytes.
+    fn ppp(&mut self) -> Result<Layer, NoDatagram> {
+        if self.peek(0)? == [0xff, 0x03] {
+            self.at += 2;
+        }
+        let first = self.byte(0)?;
+        let (protocol, length) = if first & 1 == 1 {
+            (first.into(), 1)
+        } else {
+            (self.word(0)?, 2)
+        };
+        self.at += length;
+        match protocol {
+            0x21 | 0x57 => Ok(Layer::Ip),
+            0x0281 | 0x0283 => Ok(Layer::Mpls),
+            // An encrypted (RFC 1968) or compressed (RFC 1962) datagram.
+            0x53 | 0xfd => Err(ENCRYPTED),
+            _ => Err(NotIp),
+        }
+    }
+
+    /// RFC 3032: labels until the bottom of the stack; what is below shows in its first nibble.
+    fn mpls(&mut self) -> Result<Layer, NoDatagram> {
+        while self.byte(2)? & 1 == 0 {
+            self.at += 4;
+        }
+        self.at += 4;
+        match self.byte(0)? >> 4 {
+            4 | 6 => Ok(Layer::Ip),
+            _ => Err(NotIp),
+        }
+    }
+
+    /// Passes the radiotap header; its flags tell of frames whose check sequence is wrong.
+    fn radiotap(&mut self) -> Result<(), NoDatagram> {
+        let fixed: [u8; 8] = self.peek(0)?;
+        let mut flags_at = 8;
+        let mut present = u32::from_le_bytes([fixed[4], fixed[5], fixed[6], fixed[7]]);
+        let first = present;
+        while present & 1 << 31 != 0 {
+            present = u32::from_le_bytes(self.peek(flags_at)?);
+            flags_at += 4;
+        }
+        if first & 1 != 0 {
+            flags_at = flags_at.next_multiple_of(8) + 8;
+        }
+        let is_damaged = first & 2 != 0 && self.byte(flags_at)? & 0x40 != 0;
+        self.at += usize::from(u16::from_le_bytes([fixed[2], fixed[3]]));
+        if is_damaged { Err(MALFORMED) } else { Ok(()) }
+    }
+
+    /// A data frame of 802.11 (IEEE 802.11-2020, section 9.3.2).
+    fn radio(&mut self) -> Result<Layer, NoDatagram> {
+        let [control, flags] = self.peek(0)?;
+        let is_data = control & 0x0c == 0x08;
+        if !is_data || control & 0x40 != 0 {
+            // Management and control; and data frames without data.
+            return Err(NotIp);
+        }
+        let leg = (flags & 1 != 0, flags & 2 != 0);
+        self.place.radio_leg = Some(leg);
+        self.is_radio_retry = flags & 0x08 != 0;
+        if flags & 0x40 != 0 {
+            return Err(ENCRYPTED);
+        }
+        if self.word(22)? & 0x0f00 != 0 {
+            return Err(LaterFragment);
+        }
+        self.at += 24 + if leg == (true, true) { 6 } else { 0 };
+        if control & 0x80 != 0 {
+            let quality = self.byte(0)?;
+            self.at += 2 + if flags & 0x80 != 0 { 4 } else { 0 };
+            if quality & 0x80 != 0 {
+                return Err(NoDatagram::Unread(Unread::Aggregate));
+            }
+        }
+        Ok(Layer::Llc)
+    }
+
+    fn udp(&self) -> Result<UdpDatagram<'a>, NoDatagram> {
+        let packet = self.frame.get(self.at..).unwrap_or_default();
+        let original_bytes = self.original_bytes.saturating_sub(self.at);
+        let is_cut = packet.len() < original_bytes;
+        let network = match packet.first().map(|byte| byte >> 4) {
+            Some(4) => ipv4(packet, original_bytes),
+            Some(6) => ipv6(packet, original_bytes),
+            Some(_) => Err(MALFORMED),
+            None => Err(CUT_SHORT),
+        };
+        let short = |reason| match reason {
+            // All of the frame is there.
+            CUT_SHORT if !is_cut => MALFORMED,
+            other => other,
+        };
+        let network = network.map_err(short)?;
+        let header: [u8; 8] = array_at(network.segment, 0).ok_or_else(|| short(CUT_SHORT))?;
+        let word = |at: usize| u16::from_be_bytes([header[at], header[at + 1]]);
+        let length_bytes = match usize::from(word(4)) {
+            0 => network.segment_bytes,
+            length => length,
+        };
+        let fits = length_bytes <= network.segment_bytes || network.is_fragmented;
+        if length_bytes < UDP_HEADER_BYTES || !fits {
+            return Err(MALFORMED);
+        }
+        let end = length_bytes.min(network.segment.len());
+        Ok(UdpDatagram {
+            source: SocketAddr::new(network.source, word(0)),
+            destination: SocketAddr::new(network.destination, word(2)),
+            dscp: network.dscp,
+            hop_limit: network.hop_limit,
+            place: self.place,
+            is_radio_retry: self.is_radio_retry,
+            packet_bytes: network.header_bytes + network.segment_bytes,
+            payload_bytes: length_bytes - UDP_HEADER_BYTES,
+            payload: &network.segment[UDP_HEADER_BYTES..end],
+            is_fragmented: network.is_fragmented,
+        })
+    }
+}
+
+/// By the packet type of a cooked capture: 4 is sent by this host, all else came in.
+const fn cooked_direction(packet_type: u16) -> Direction {
+    match packet_type {
+        0..=3 => Direction::Inbound,
+        4 => Direction::Outbound,
+        _ => Direction::Unknown,
+    }
 }
 
 /// What the IP layer tells of the UDP part behind it.
@@ -117,6 +367,9 @@ struct Network<'a> {
     source: IpAddr,
     destination: IpAddr,
     dscp: u8,
+    hop_limit: u8,
+    /// Bytes before `segment`.
+    header_bytes: usize,
     /// The UDP header and payload, without what pads the frame.
     segment: &'a [u8],
     /// Bytes of `segment` on the wire.
@@ -129,34 +382,42 @@ fn part<const N: usize>(header: &[u8], at: usize) -> [u8; N] {
     array_at(header, at).unwrap_or([0; N])
 }
 
-fn ipv4(packet: &[u8]) -> Result<Network<'_>, NoDatagram> {
-    let fixed: [u8; 20] = array_at(packet, 0).ok_or(NoDatagram::CutShort)?;
+fn ipv4(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram> {
+    let fixed: [u8; 20] = array_at(packet, 0).ok_or(CUT_SHORT)?;
     let header_bytes = usize::from(fixed[0] & 0x0f) * 4;
-    let total_bytes = usize::from(u16::from_be_bytes([fixed[2], fixed[3]]));
+    let total_bytes = match u16::from_be_bytes([fixed[2], fixed[3]]) {
+        0 => original_bytes,
+        length => length.into(),
+    };
     if header_bytes < 20 || total_bytes < header_bytes {
-        return Err(NoDatagram::Malformed);
+        return Err(MALFORMED);
     }
     if fixed[9] != UDP {
-        return Err(NoDatagram::NotUdp);
+        return Err(NotUdp);
     }
     let fragment = u16::from_be_bytes([fixed[6], fixed[7]]);
     if fragment & 0x1fff != 0 {
-        return Err(NoDatagram::LaterFragment);
+        return Err(LaterFragment);
     }
     let end = total_bytes.min(packet.len());
     Ok(Network {
         source: part::<4>(&fixed, 12).into(),
         destination: part::<4>(&fixed, 16).into(),
         dscp: fixed[1] >> 2,
-        segment: packet.get(header_bytes..end).ok_or(NoDatagram::CutShort)?,
+        hop_limit: fixed[8],
+        header_bytes,
+        segment: packet.get(header_bytes..end).ok_or(CUT_SHORT)?,
         segment_bytes: total_bytes - header_bytes,
         is_fragmented: fragment & 0x2000 != 0,
     })
 }
 
-fn ipv6(packet: &[u8]) -> Result<Network<'_>, NoDatagram> {
-    let fixed: [u8; 40] = array_at(packet, 0).ok_or(NoDatagram::CutShort)?;
-    let total_bytes = 40 + usize::from(u16::from_be_bytes([fixed[4], fixed[5]]));
+fn ipv6(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram> {
+    let fixed: [u8; 40] = array_at(packet, 0).ok_or(CUT_SHORT)?;
+    let total_bytes = match u16::from_be_bytes([fixed[4], fixed[5]]) {
+        0 => original_bytes,
+        length => 40 + usize::from(length),
+    };
     let traffic_class = (fixed[0] & 0x0f) << 4 | fixed[1] >> 4;
     let (mut next, mut at, mut is_fragmented) = (fixed[6], 40, false);
     for _ in 0..NESTING_MAX {
@@ -166,20 +427,22 @@ fn ipv6(packet: &[u8]) -> Result<Network<'_>, NoDatagram> {
                 source: part::<16>(&fixed, 8).into(),
                 destination: part::<16>(&fixed, 24).into(),
                 dscp: traffic_class >> 2,
-                segment: packet.get(at..end).ok_or(NoDatagram::CutShort)?,
-                segment_bytes: total_bytes.checked_sub(at).ok_or(NoDatagram::Malformed)?,
+                hop_limit: fixed[7],
+                header_bytes: at,
+                segment: packet.get(at..end).ok_or(CUT_SHORT)?,
+                segment_bytes: total_bytes.checked_sub(at).ok_or(MALFORMED)?,
                 is_fragmented,
             });
         }
         if !matches!(next, 0 | 43 | 44 | 60) {
-            return Err(NoDatagram::NotUdp);
+            return Err(NotUdp);
         }
-        let header: [u8; 8] = array_at(packet, at).ok_or(NoDatagram::CutShort)?;
+        let header: [u8; 8] = array_at(packet, at).ok_or(CUT_SHORT)?;
         at += 8;
         if next == 44 {
             let field = u16::from_be_bytes([header[2], header[3]]);
             if field & 0xfff8 != 0 {
-                return Err(NoDatagram::LaterFragment);
+                return Err(LaterFragment);
             }
             is_fragmented |= field & 1 != 0;
         } else {
@@ -187,5 +450,5 @@ fn ipv6(packet: &[u8]) -> Result<Network<'_>, NoDatagram> {
         }
         next = header[0];
     }
-    Err(NoDatagram::Malformed)
+    Err(MALFORMED)
 }

@@ -1,14 +1,18 @@
 //! From packets to observations: which followed datagram was seen at which point, and when. A point
-//! is an interface of a file, a port of a switch that names ports (ET2000), and a direction. What
-//! was seen at two points is compared in [`super::join`].
+//! is a direction at an interface of a file, at a port of a switch that names ports (ET2000), and at
+//! whatever the frame's own headers tell apart: interface of a capture on `any`, VLAN, radio leg. What
+//! was seen at two points is compared in [`super::join`]; what a tap could have seen is in
+//! [`super::watch`].
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::net::SocketAddr;
 
 use serde::{Deserialize, Serialize};
 
 use super::flow::{DatagramIdentity, FlowFilter, FlowKind, Unidentified};
-use super::link::{NoDatagram, udp_datagram};
+use super::link::{FramePlace, NoDatagram, udp_datagram};
+use super::watch::{Tap, Unread, Watch};
 use super::{CaptureInterface, CapturedPacket, esl};
 use hil_net::{Direction, link_type};
 
@@ -21,8 +25,43 @@ pub struct Point {
     pub interface_index: usize,
     /// Which port of an ET2000; its stamps are on that device's clock.
     pub esl_port: Option<u8>,
+    /// Which interface of the host, where one capture is of several.
+    pub interface_number: Option<u32>,
+    /// In which VLAN, 1..=4095.
+    pub vlan: Option<u16>,
+    /// Which leg over an access point (`ToDS`, `FromDS`).
+    pub radio_leg: Option<(bool, bool)>,
     /// Which way.
     pub direction: Direction,
+}
+
+impl Point {
+    /// What captured it, on one clock.
+    pub const fn tap(&self) -> Tap {
+        Tap {
+            file_index: self.file_index,
+            interface_index: self.interface_index,
+            is_esl: self.esl_port.is_some(),
+        }
+    }
+
+    fn add(&mut self, place: &FramePlace) {
+        if self.direction == Direction::Unknown {
+            self.direction = place.direction;
+        }
+        self.interface_number = place.interface_number.or(self.interface_number);
+        // Number 0 is a priority without a VLAN.
+        self.vlan = place.vlan.filter(|vlan| *vlan != 0);
+        self.radio_leg = place.radio_leg;
+    }
+
+    /// The same place, whichever way.
+    pub(super) fn place(&self) -> Self {
+        Self {
+            direction: Direction::Unknown,
+            ..*self
+        }
+    }
 }
 
 /// Datagrams that go one way between two sockets and count together.
@@ -56,31 +95,26 @@ impl Stream {
 /// A datagram seen at a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Observation {
-    /// When, nanoseconds on the point's clock.
+    /// When, nanoseconds on the point's clock; of a neighbour in the file when it is not sound.
     pub stamp_ns: i64,
+    /// False for a stamp that lies by itself, far from all others of its tap.
+    pub is_stamp_sound: bool,
+    /// The same as if the clock had not been set meanwhile; see [`Watch::steps`].
+    pub steady_ns: i64,
+    /// Level of its tap's stamps.
+    pub(super) level: usize,
     /// Bytes of its UDP payload.
     pub payload_bytes: u32,
+    /// Bytes of its IP packet; of the first fragment when there are several.
+    pub packet_bytes: u32,
+    /// Time to live, or hop limit.
+    pub hop_limit: u8,
     /// By what it is known.
     pub identity: DatagramIdentity,
 }
 
-/// A time on a point's clock, nanoseconds, both ends included.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Span {
-    /// When it begins.
-    pub first_ns: i64,
-    /// When it ends.
-    pub last_ns: i64,
-}
-
-/// What was seen at one point.
-#[derive(Debug, Clone, Default)]
-pub struct Seen {
-    /// Stamps of the first and last packet of any kind, in time.
-    pub span: Option<Span>,
-    /// Observations by stream, in the order of the file.
-    pub streams: BTreeMap<Stream, Vec<Observation>>,
-}
+/// What was seen at one point: observations by stream, in the order of the file.
+pub type Seen = BTreeMap<Stream, Vec<Observation>>;
 
 /// What was met on the way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -103,10 +137,12 @@ pub struct PacketCounts {
     pub not_udp_count: u64,
     /// Later fragments of any datagram.
     pub later_fragment_count: u64,
-    /// Headers cut short or malformed, or of an unknown link layer.
+    /// Headers cut short or malformed, sealed, several datagrams in one, or of an unknown link layer.
     pub unreadable_count: u64,
     /// Without a time stamp.
     pub stampless_count: u64,
+    /// Sent again by a radio for want of an acknowledgement, and seen before.
+    pub radio_retry_count: u64,
     /// Earlier than the packet before it at the same point: a file out of order.
     pub backward_stamp_count: u64,
     /// With the header of an ET2000.
@@ -117,11 +153,15 @@ pub struct PacketCounts {
     pub esl_port_unclear_count: u64,
 }
 
+/// Datagrams among which one that a radio sent again is looked for.
+const RETRY_COUNT_MAX: usize = 256;
+
 /// Takes packets and keeps what is followed.
 #[derive(Debug, Default)]
 pub struct Observer {
     flows: Vec<FlowFilter>,
     seen: BTreeMap<Point, Seen>,
+    watches: BTreeMap<Tap, Watch>,
     counts: PacketCounts,
 }
 
@@ -141,9 +181,13 @@ impl Observer {
             file_index,
             interface_index: packet.interface_index,
             esl_port: None,
+            interface_number: packet.interface_number,
+            vlan: None,
+            radio_leg: None,
             direction: packet.direction,
         };
         let (mut frame, mut stamp_ns) = (packet.data, packet.stamp_ns);
+        let mut original_bytes = packet.original_bytes as usize;
         if packet.link_type == link_type::ETHERNET
             && let Some((header, inner)) = esl::split(frame)
         {
@@ -151,61 +195,81 @@ impl Observer {
             self.counts.esl_damaged_count += u64::from(header.is_damaged());
             self.counts.esl_port_unclear_count += u64::from(header.port_count() != 1);
             frame = inner;
+            original_bytes = original_bytes.saturating_sub(esl::HEADER_BYTES);
             point.esl_port = header.port();
             stamp_ns = i64::try_from(header.stamp_ns).ok();
         }
         let counts = &mut self.counts;
+        let watch = self.watches.entry(point.tap()).or_default();
         let Some(stamp_ns) = stamp_ns else {
             counts.stampless_count += 1;
+            watch.miss(Unread::NoStamp);
+            self.seen.entry(point).or_default();
             return;
         };
-        let seen = self.seen.entry(point).or_default();
-        let span = seen.span.get_or_insert(Span {
-            first_ns: stamp_ns,
-            last_ns: stamp_ns,
-        });
-        counts.backward_stamp_count += u64::from(stamp_ns < span.last_ns);
-        span.first_ns = span.first_ns.min(stamp_ns);
-        span.last_ns = span.last_ns.max(stamp_ns);
-        let datagram = match udp_datagram(packet.link_type, frame) {
+        counts.backward_stamp_count += u64::from(watch.stamp(stamp_ns));
+        let datagram = match udp_datagram(packet.link_type, frame, original_bytes) {
             Ok(datagram) => datagram,
             Err(reason) => {
                 *match reason {
                     NoDatagram::NotIp => &mut counts.not_ip_count,
                     NoDatagram::NotUdp => &mut counts.not_udp_count,
                     NoDatagram::LaterFragment => &mut counts.later_fragment_count,
-                    NoDatagram::UnknownLinkType | NoDatagram::CutShort | NoDatagram::Malformed => {
+                    NoDatagram::Unread(why) => {
+                        watch.miss(why);
                         &mut counts.unreadable_count
                     }
                 } += 1;
+                self.seen.entry(point).or_default();
                 return;
             }
         };
+        point.add(&datagram.place);
+        let seen = self.seen.entry(point).or_default();
         let mut why = None;
         for (flow_index, flow) in self.flows.iter().enumerate() {
             if !flow.has_addresses_of(&datagram) {
                 continue;
             }
+            let (source, destination) = (datagram.source, datagram.destination);
             match flow.identify(&datagram) {
                 Ok(identity) => {
-                    counts.followed_count += 1;
-                    counts.fragmented_count += u64::from(datagram.is_fragmented);
                     let stream = Stream {
                         flow_index,
-                        source: datagram.source,
-                        destination: datagram.destination,
+                        source,
+                        destination,
                         own: identity.own.map(|own| (own.channel, own.kind as u8)),
                     };
-                    seen.streams.entry(stream).or_default().push(Observation {
+                    let list = seen.entry(stream).or_default();
+                    let is_known = |one: &Observation| one.identity.key == identity.key;
+                    let mut newest = list.iter().rev().take(RETRY_COUNT_MAX);
+                    if datagram.is_radio_retry && newest.any(is_known) {
+                        counts.radio_retry_count += 1;
+                        return;
+                    }
+                    counts.followed_count += 1;
+                    counts.fragmented_count += u64::from(datagram.is_fragmented);
+                    let bytes = |count| u32::try_from(count).unwrap_or(u32::MAX);
+                    list.push(Observation {
                         stamp_ns,
-                        payload_bytes: u32::try_from(datagram.payload_bytes).unwrap_or(u32::MAX),
+                        is_stamp_sound: true,
+                        steady_ns: stamp_ns,
+                        level: watch.level(),
+                        payload_bytes: bytes(datagram.payload_bytes),
+                        packet_bytes: bytes(datagram.packet_bytes),
+                        hop_limit: datagram.hop_limit,
                         identity,
                     });
                     return;
                 }
                 // Following our own means looking at everything: what is not ours belongs to no flow.
                 Err(Unidentified::Foreign) if flow.kind == FlowKind::Hil => {}
-                Err(reason) => why = Some(reason),
+                Err(reason) => {
+                    if reason == Unidentified::CutShort {
+                        watch.miss_of(flow_index, source, destination);
+                    }
+                    why = Some(reason);
+                }
             }
         }
         *match why {
@@ -230,47 +294,112 @@ impl Observer {
         &self.seen
     }
 
-    /// Widens the time a point was watched to what its file says, after the last packet of the file;
-    /// it may have been watching longer than its packets tell.
-    /// An interface of which the file has no packet but tells how long it was watched has points too.
-    pub fn widen(&mut self, file_index: usize, interfaces: &[CaptureInterface]) {
+    /// What each tap could have seen; complete after [`Self::finish`].
+    pub const fn watches(&self) -> &BTreeMap<Tap, Watch> {
+        &self.watches
+    }
+
+    /// Settles what the taps of a file could have seen, after its last packet. An interface of which the
+    /// file has no packet but tells how long it was watched has points too; one that a later section of the
+    /// file describes again, at another time, is the same.
+    pub fn finish(&mut self, file_index: usize, interfaces: &[CaptureInterface]) {
         for (interface_index, interface) in interfaces.iter().enumerate() {
-            let (Some(start), Some(end)) = (interface.start_ns, interface.end_ns) else {
-                continue;
+            let tap = Tap {
+                file_index,
+                interface_index,
+                is_esl: false,
             };
-            // Its packets are those of another interface once more, on another clock.
-            if interface.has_nic_clock() {
-                continue;
+            let is_watched = interface.watch.iter().any(Option::is_some);
+            // A card's packets are those of another interface once more, on another clock.
+            if is_watched && !interface.has_nic_clock() {
+                self.watches.entry(tap).or_default();
+                self.add_silent_points(tap);
             }
-            let has_other_points = self.seen.keys().any(|one| {
-                (one.file_index, one.interface_index) == (file_index, interface_index)
-                    && (one.esl_port.is_some() || one.direction == Direction::Unknown)
-            });
-            if has_other_points {
-                continue;
-            }
-            for direction in [Direction::Inbound, Direction::Outbound] {
-                let point = Point {
-                    file_index,
-                    interface_index,
-                    esl_port: None,
-                    direction,
-                };
-                let seen = self.seen.entry(point).or_default();
-                seen.span.get_or_insert(Span {
-                    first_ns: start,
-                    last_ns: end,
-                });
+        }
+        for (tap, watch) in &mut self.watches {
+            if tap.file_index == file_index {
+                let interface = interfaces.get(tap.interface_index);
+                let dropped_count = interface.and_then(|one| one.dropped_count);
+                watch.dropped_count = dropped_count.unwrap_or(0);
+                // An interface's times are not of the device's clock.
+                watch.settle(interface.filter(|_| !tap.is_esl));
             }
         }
         for (point, seen) in &mut self.seen {
             if point.file_index == file_index
-                && point.esl_port.is_none()
-                && let Some(interface) = interfaces.get(point.interface_index)
-                && let Some(span) = &mut seen.span
+                && let Some(watch) = self.watches.get(&point.tap())
             {
-                span.first_ns = span.first_ns.min(interface.start_ns.unwrap_or(i64::MAX));
-                span.last_ns = span.last_ns.max(interface.end_ns.unwrap_or(i64::MIN));
+                let observations = seen.values_mut().flatten();
+                observations.for_each(|one| watch.settle_observation(one));
+            }
+        }
+        for (interface_index, interface) in interfaces.iter().enumerate() {
+            if let Some(first) = interface.repeats {
+                self.join_sections(file_index, first, interface_index);
+            }
+        }
+    }
+
+    fn add_silent_points(&mut self, tap: Tap) {
+        let mut points = self.seen.keys().filter(|point| point.tap() == tap);
+        if points.any(|one| one.interface_number.is_some() || one.direction == Direction::Unknown) {
+            return;
+        }
+        let is_esl = |one: &Point| {
+            (one.file_index, one.interface_index) == (tap.file_index, tap.interface_index)
+                && one.esl_port.is_some()
+        };
+        if self.seen.keys().any(is_esl) {
+            return;
+        }
+        for direction in [Direction::Inbound, Direction::Outbound] {
+            let point = Point {
+                file_index: tap.file_index,
+                interface_index: tap.interface_index,
+                esl_port: None,
+                interface_number: None,
+                vlan: None,
+                radio_leg: None,
+                direction,
+            };
+            self.seen.entry(point).or_default();
+        }
+    }
+
+    /// Takes a later section's interface for an earlier one's, unless both were watched at one time: then
+    /// they are of two hosts.
+    fn join_sections(&mut self, file_index: usize, first: usize, later: usize) {
+        for is_esl in [false, true] {
+            let tap = |interface_index| Tap {
+                file_index,
+                interface_index,
+                is_esl,
+            };
+            let Some(watch) = self.watches.get(&tap(later)) else {
+                continue;
+            };
+            let earlier = self.watches.get(&tap(first));
+            if earlier.is_some_and(|earlier| !earlier.is_apart_from(watch)) {
+                continue;
+            }
+            let watch = self.watches.remove(&tap(later)).unwrap_or_default();
+            match self.watches.entry(tap(first)) {
+                Entry::Occupied(mut earlier) => earlier.get_mut().absorb(watch),
+                Entry::Vacant(none) => {
+                    none.insert(watch);
+                }
+            }
+            let is_of = |point: &Point, _: &mut Seen| point.tap() == tap(later);
+            let points: Vec<(Point, Seen)> = self.seen.extract_if(.., is_of).collect();
+            for (point, seen) in points {
+                let point = Point {
+                    interface_index: first,
+                    ..point
+                };
+                let known = self.seen.entry(point).or_default();
+                for (stream, observations) in seen {
+                    known.entry(stream).or_default().extend(observations);
+                }
             }
         }
     }

@@ -7,29 +7,48 @@
 //! file that saw no followed datagram at all counts too: whoever names two captures means two points
 //! of one way.
 
-use super::join::{Joined, join};
+use super::join::{JoinSettings, Joined, Sight, join, median_difference_ns};
 use super::observe::{Observer, Point, Seen, Stream};
+use super::watch::Watch;
 use hil_net::Direction;
 
-/// Every stream at every two points it passed or should have passed. Stamps of one datagram lie at
-/// most `window_ns` apart.
-pub fn join_all(observer: &Observer, window_ns: i64) -> Vec<(Stream, Joined)> {
-    let points: Vec<(&Point, &Seen)> = observer.seen().iter().collect();
+/// Every stream at every two points it passed or should have passed.
+pub fn join_all(observer: &Observer, settings: &JoinSettings) -> Vec<(Stream, Joined)> {
+    let unwatched = Watch::default();
+    let points: Vec<Sight<'_>> = observer
+        .seen()
+        .iter()
+        .map(|(point, seen)| Sight {
+            point,
+            watch: observer.watches().get(&point.tap()).unwrap_or(&unwatched),
+            seen,
+        })
+        .collect();
     let mut found = Vec::new();
-    for (index, (a, seen_a)) in points.iter().enumerate() {
-        for stream in seen_a.streams.keys() {
-            let saw_it = |seen: &Seen| seen.streams.contains_key(stream);
+    for (index, a) in points.iter().enumerate() {
+        for stream in a.seen.keys() {
+            let saw_it = |sight: &Sight<'_>| sight.seen.contains_key(stream);
             let others = points.iter().enumerate().filter(|(at, _)| *at != index);
-            let is_elsewhere = others.clone().any(|(_, (_, seen))| saw_it(seen));
-            for (at, (b, seen_b)) in others {
+            let is_elsewhere = others.clone().any(|(_, sight)| saw_it(sight));
+            for (at, b) in others {
                 let is_wanted = if is_elsewhere {
                     // Each two once.
-                    at > index && saw_it(seen_b)
+                    at > index && saw_it(b)
                 } else {
-                    is_expected(stream, a, b, observer)
+                    is_expected(stream, a.point, b.point, observer)
                 };
-                let joined = join(stream, a, seen_a, b, seen_b, window_ns);
-                found.extend(joined.filter(|_| is_wanted).map(|joined| (*stream, joined)));
+                if !is_wanted {
+                    continue;
+                }
+                // In the order of the files.
+                let (a, b) = if at > index { (*a, *b) } else { (*b, *a) };
+                let round_trip = || comes_first(stream, a, b, settings.window_ns);
+                let is_two_clocks = !settings.is_one_clock
+                    && a.point.file_index != b.point.file_index
+                    && a.point.direction == Direction::Unknown;
+                let round_trip = is_two_clocks.then(round_trip).flatten();
+                let joined = join(stream, a, b, settings, round_trip);
+                found.extend(joined.map(|joined| (*stream, joined)));
             }
         }
     }
@@ -37,28 +56,44 @@ pub fn join_all(observer: &Observer, window_ns: i64) -> Vec<(Stream, Joined)> {
     found
 }
 
+/// Whether `b` comes before `a`, by streams the other way between the same two hosts at the same two
+/// points: there and back takes a positive time in the right order, whatever the clocks.
+fn comes_first(stream: &Stream, a: Sight<'_>, b: Sight<'_>, window_ns: i64) -> Option<bool> {
+    let there_ns = median_difference_ns(stream, a, b, window_ns)?;
+    let is_back = |one: &&Stream| {
+        (one.source.ip(), one.destination.ip()) == (stream.destination.ip(), stream.source.ip())
+    };
+    let mut back = a.seen.keys().filter(is_back);
+    let back_ns = back.find_map(|one| median_difference_ns(one, a, b, window_ns))?;
+    match there_ns.checked_sub(back_ns)? {
+        0 => None,
+        round_trip_ns => Some(round_trip_ns < 0),
+    }
+}
+
 /// True when `stream`, seen at `at`, was to be seen at the other point.
 fn is_expected(stream: &Stream, at: &Point, point: &Point, observer: &Observer) -> bool {
-    let place = |point: &Point| (point.file_index, point.interface_index, point.esl_port);
     // Out here, in there; into a host and out of it, or out of another whose capture has missed it.
     let is_on_its_way = match (at.direction, point.direction) {
         (Direction::Outbound, direction) => direction == Direction::Inbound,
         (Direction::Inbound, direction) => direction != Direction::Unknown,
         (Direction::Unknown, direction) => direction == Direction::Unknown,
     };
-    if place(at) == place(point) || !is_on_its_way {
+    if at.place() == point.place() || !is_on_its_way {
         return false;
     }
     let (source, destination) = (stream.source.ip(), stream.destination.ip());
-    let here = observer.seen().iter();
-    let here = here.filter(|(one, _)| place(one) == place(point));
-    let mut here = here.flat_map(|(_, seen)| seen.streams.keys()).peekable();
-    let has_followed = here.peek().is_some();
-    let is_between_them = here.any(|one| {
-        let (from, to) = (one.source.ip(), one.destination.ip());
-        (from == source && to == destination) || (from == destination && to == source)
-    });
-    let mut own = observer.seen()[point].streams.keys();
+    let of_tap = observer.seen().iter();
+    let mut of_tap = of_tap.filter(|(one, _)| one.tap() == point.tap());
+    let has_followed = of_tap.clone().any(|(_, seen)| !seen.is_empty());
+    let here = |one: &Seen| {
+        one.keys().any(|one| {
+            let (from, to) = (one.source.ip(), one.destination.ip());
+            (from == source && to == destination) || (from == destination && to == source)
+        })
+    };
+    let is_between_them = of_tap.any(|(one, seen)| one.place() == point.place() && here(seen));
+    let mut own = observer.seen()[point].keys();
     let has_its_target = own.any(|one| one.destination.ip() == destination);
     let is_first_of_a_file = !has_followed && at.file_index != point.file_index;
     let leaves = at.direction != Direction::Inbound;

@@ -1,5 +1,5 @@
 //! The pcap file: a header of 24 bytes, then records of 16 bytes and the packet
-//! (draft-ietf-opsawg-pcap). It has one interface, no names and no way back after a broken length.
+//! (draft-ietf-opsawg-pcap), or of 24 bytes in the modified format of old Linux distributions. It has one interface, no names and no way back after a broken length.
 
 use super::bytes::{ByteOrder, Numbers};
 use super::reader::{Found, Next, Window};
@@ -9,6 +9,8 @@ use hil_net::Direction;
 /// Largest record taken for one: the largest that libpcap writes.
 const CAPTURED_BYTES_MAX: u32 = 262_144;
 const RECORD_HEADER_BYTES: usize = 16;
+/// The same of the modified format: interface number, protocol and packet type more.
+const MODIFIED_HEADER_BYTES: usize = 24;
 
 /// What the magic number told.
 #[derive(Debug)]
@@ -16,6 +18,8 @@ pub(super) struct PcapFile {
     pub(super) order: ByteOrder,
     /// Nanoseconds to one unit of a stamp's fraction.
     pub(super) fraction_ns: i64,
+    /// Its records say on which interface and which way (Kuznetsov's libpcap).
+    pub(super) is_modified: bool,
 }
 
 impl PcapFile {
@@ -57,6 +61,11 @@ impl PcapFile {
         else {
             return window.needs("a record header", RECORD_HEADER_BYTES as u64);
         };
+        let header_bytes = if self.is_modified {
+            MODIFIED_HEADER_BYTES
+        } else {
+            RECORD_HEADER_BYTES
+        };
         if captured > CAPTURED_BYTES_MAX {
             let problem = Problem::Length {
                 what: "a record's captured length",
@@ -66,21 +75,29 @@ impl PcapFile {
             };
             return Next::Fault(problem, None);
         }
-        let fraction_ns = i64::from(fraction) * self.fraction_ns;
-        if fraction_ns >= 1_000_000_000 {
-            let problem = Problem::Malformed("a stamp's fraction is a second or more");
-            return Next::Fault(problem, None);
-        }
-        let end = RECORD_HEADER_BYTES + captured as usize;
+        let end = header_bytes + captured as usize;
         if bytes.bytes.len() < end {
             return window.needs("a record", end as u64);
         }
+        let (mut interface_number, mut direction) = (None, Direction::Unknown);
+        if self.is_modified {
+            interface_number = bytes.u32(16);
+            direction = match bytes.bytes[22] {
+                0..=3 => Direction::Inbound,
+                4 => Direction::Outbound,
+                _ => Direction::Unknown,
+            };
+        }
+        // Some writers round up to a whole second without carrying it; more than that is no fraction.
+        let fraction_ns = i64::from(fraction) * self.fraction_ns;
+        let stamp_ns = i64::from(seconds) * 1_000_000_000 + fraction_ns;
         let found = Found {
             interface_index: 0,
-            stamp_ns: Some(i64::from(seconds) * 1_000_000_000 + fraction_ns),
+            interface_number,
+            stamp_ns: (fraction_ns < 2_000_000_000).then_some(stamp_ns),
             original_bytes,
-            direction: Direction::Unknown,
-            data: RECORD_HEADER_BYTES..end,
+            direction,
+            data: header_bytes..end,
         };
         Next::Packet(found, end as u64)
     }

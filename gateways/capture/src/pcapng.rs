@@ -4,7 +4,7 @@
 
 use super::bytes::{ByteOrder, Numbers, array_at};
 use super::reader::{Found, Next, Window};
-use super::{CaptureInterface, Problem};
+use super::{CaptureInterface, Problem, Span};
 use hil_net::Direction;
 
 pub(super) const SECTION: u32 = 0x0a0d_0d0a;
@@ -79,7 +79,7 @@ impl PcapngFile {
         let base = self.interface_base;
         let outcome = match kind {
             SECTION => return self.section(window, body, interfaces.len(), length),
-            INTERFACE => describe(body, interfaces).map(|()| None),
+            INTERFACE => describe(body, interfaces, base).map(|()| None),
             ENHANCED_PACKET | OBSOLETE_PACKET | SIMPLE_PACKET => {
                 packet(kind, body, interfaces, base).map(Some)
             }
@@ -164,7 +164,11 @@ impl<'a> Numbers<'a> {
     }
 }
 
-fn describe(body: Numbers<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result<(), Problem> {
+fn describe(
+    body: Numbers<'_>,
+    interfaces: &mut Vec<CaptureInterface>,
+    base: usize,
+) -> Result<(), Problem> {
     const SHORT: Problem = Problem::Malformed("an interface block shorter than 8 bytes");
     let link_type = body.u16(0).ok_or(SHORT)?;
     let snap_bytes = body.u32(4).ok_or(SHORT)?;
@@ -194,6 +198,22 @@ fn describe(body: Numbers<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result
         }
         Ok(())
     });
+    // A rotated or joined file describes its interfaces again in each section.
+    let place = interfaces.len() - base;
+    let is_same = |(index, known): &(usize, &CaptureInterface)| {
+        known.link_type == link_type
+            && known.name == interface.name
+            && known.description == interface.description
+            && (known.name.is_some() || *index == place)
+            && interfaces[base..]
+                .iter()
+                .all(|one| one.repeats != Some(*index))
+    };
+    let mut earlier = interfaces[..base].iter().enumerate();
+    let first = earlier
+        .find(is_same)
+        .map(|(index, known)| known.repeats.unwrap_or(index));
+    interface.repeats = first;
     // The interface keeps its number also when an option is broken.
     interfaces.push(interface);
     outcome
@@ -212,12 +232,14 @@ fn unit_ns(resolution: u8) -> Result<(u64, u64), Problem> {
 
 /// Nanoseconds since 1970.
 fn in_ns(units: u64, interface: &CaptureInterface) -> Result<i64, Problem> {
-    let (numerator, denominator) = interface.unit_ns;
-    let ns = u128::from(units) * u128::from(numerator) / u128::from(denominator);
-    i64::try_from(ns)
-        .ok()
-        .and_then(|ns| ns.checked_add(interface.offset_ns))
+    let ns = scaled(units, interface.unit_ns);
+    ns.and_then(|ns| ns.checked_add(interface.offset_ns))
         .ok_or(Problem::Stamp { units })
+}
+
+fn scaled(units: u64, (numerator, denominator): (u64, u64)) -> Option<i64> {
+    let ns = u128::from(units) * u128::from(numerator) / u128::from(denominator);
+    i64::try_from(ns).ok()
 }
 
 fn packet(
@@ -274,6 +296,7 @@ fn packet(
     }
     Ok(Found {
         interface_index,
+        interface_number: None,
         stamp_ns,
         original_bytes,
         direction,
@@ -291,16 +314,33 @@ fn statistics(
     let count = interfaces.len() - base;
     let interface = interfaces[base..].get_mut(index as usize);
     let interface = interface.ok_or(Problem::UnknownInterface { index, count })?;
+    let (mut start, mut end) = (None, None);
+    let (mut by_interface, mut by_system) = (None, None);
     body.options(12, |code, value| {
-        let halves = body.part(value);
-        match (code, value.len()) {
-            (2, 8) => interface.start_ns = Some(in_ns(halves.stamp(0).unwrap_or(0), interface)?),
-            (3, 8) => interface.end_ns = Some(in_ns(halves.stamp(0).unwrap_or(0), interface)?),
-            (4, 8) => interface.received_count = halves.u64(0),
-            // isb_osdrop: no room was left; isb_ifdrop (5) is the card's.
-            (7, 8) => interface.dropped_count = halves.u64(0),
+        let value = body.part(value);
+        match (code, value.bytes.len()) {
+            (2, 8) => start = value.stamp(0),
+            (3, 8) => end = value.stamp(0),
+            (4, 8) => interface.received_count = value.u64(0),
+            // isb_ifdrop, the only one that dumpcap writes, and isb_osdrop: no room was left.
+            (5, 8) => by_interface = value.u64(0),
+            (7, 8) => by_system = value.u64(0),
             _ => {}
         }
         Ok(())
-    })
+    })?;
+    let dropped = [by_interface, by_system].into_iter().flatten();
+    if let Some(count) = dropped.reduce(u64::saturating_add) {
+        interface.dropped_count = Some(count);
+    }
+    let at = |units: u64, unit_ns| scaled(units, unit_ns)?.checked_add(interface.offset_ns);
+    let watch = |unit_ns| {
+        let first_ns = at(start?, unit_ns)?;
+        let last_ns = at(end?, unit_ns)?;
+        (first_ns <= last_ns).then_some(Span { first_ns, last_ns })
+    };
+    if start.is_some() && end.is_some() {
+        interface.watch = [watch(interface.unit_ns), watch((1000, 1))];
+    }
+    Ok(())
 }

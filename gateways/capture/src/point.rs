@@ -54,9 +54,21 @@ pub struct NumberMetrics {
     pub reordered_count: u64,
 }
 
+/// Its stamps, or, where they go back on the whole, those of a clock that was not set meanwhile.
+fn clock(observations: &[Observation]) -> fn(&Observation) -> i64 {
+    let mut neighbours = observations.windows(2);
+    if neighbours.any(|pair| pair[0].level != pair[1].level && pair[1].stamp_ns < pair[0].stamp_ns)
+    {
+        |one| one.steady_ns
+    } else {
+        |one| one.stamp_ns
+    }
+}
+
 /// Figures of a stream; `None` without observations. They are put in order of time first.
 pub fn single_point_metrics(observations: &[Observation]) -> Option<PointMetrics> {
-    let mut stamps: Vec<i64> = observations.iter().map(|one| one.stamp_ns).collect();
+    let at_ns = clock(observations);
+    let mut stamps: Vec<i64> = observations.iter().map(at_ns).collect();
     stamps.sort_unstable();
     let (first_ns, last_ns) = (*stamps.first()?, *stamps.last()?);
     let mut interval = LatencyHistogram::default();
@@ -133,7 +145,8 @@ impl Unwrapped {
 
 fn number_metrics(observations: &[Observation]) -> Option<NumberMetrics> {
     let mut in_time: Vec<&Observation> = observations.iter().collect();
-    in_time.sort_by_key(|one| one.stamp_ns);
+    let at_ns = clock(observations);
+    in_time.sort_by_key(|one| at_ns(one));
     // By what the datagrams say, and by how often the counting began anew unsaid.
     let mut series: BTreeMap<(u64, u64), Vec<u64>> = BTreeMap::new();
     let mut figures = NumberMetrics::default();

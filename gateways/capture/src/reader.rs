@@ -34,6 +34,8 @@ pub enum Format {
     PcapMicroseconds,
     /// pcap, stamps in nanoseconds.
     PcapNanoseconds,
+    /// pcap, stamps in microseconds, with interface and direction in each record.
+    PcapModified,
     /// pcapng.
     Pcapng,
 }
@@ -44,6 +46,7 @@ impl Format {
         match self {
             Self::PcapMicroseconds => "pcap (microseconds)",
             Self::PcapNanoseconds => "pcap (nanoseconds)",
+            Self::PcapModified => "pcap (modified)",
             Self::Pcapng => "pcapng",
         }
     }
@@ -103,6 +106,7 @@ impl Window {
 #[derive(Debug, Clone)]
 pub(super) struct Found {
     pub(super) interface_index: usize,
+    pub(super) interface_number: Option<u32>,
     pub(super) stamp_ns: Option<i64>,
     pub(super) original_bytes: u32,
     pub(super) direction: Direction,
@@ -171,7 +175,7 @@ impl CaptureReader {
         self.format
     }
 
-    /// The interfaces described so far, over all sections.
+    /// The interfaces described so far. One that a later section describes again is the same.
     pub fn interfaces(&self) -> &[CaptureInterface] {
         &self.interfaces
     }
@@ -197,6 +201,7 @@ impl CaptureReader {
                     return Step::Packet(CapturedPacket {
                         offset: self.window.offset,
                         interface_index: found.interface_index,
+                        interface_number: found.interface_number,
                         link_type: interface.link_type,
                         stamp_ns: found.stamp_ns,
                         original_bytes: found.original_bytes,
@@ -260,14 +265,19 @@ impl CaptureReader {
             [0xa1, 0xb2, 0xc3, 0xd4] => (Format::PcapMicroseconds, ByteOrder::Big),
             [0x4d, 0x3c, 0xb2, 0xa1] => (Format::PcapNanoseconds, ByteOrder::Little),
             [0xa1, 0xb2, 0x3c, 0x4d] => (Format::PcapNanoseconds, ByteOrder::Big),
+            [0x34, 0xcd, 0xb2, 0xa1] => (Format::PcapModified, ByteOrder::Little),
+            [0xa1, 0xb2, 0xcd, 0x34] => (Format::PcapModified, ByteOrder::Big),
             _ => return Next::Fault(Problem::Foreign(magic), None),
         };
-        let fraction_ns = if format == Format::PcapMicroseconds {
-            1000
-        } else {
-            1
+        let file = PcapFile {
+            order,
+            fraction_ns: if format == Format::PcapNanoseconds {
+                1
+            } else {
+                1000
+            },
+            is_modified: format == Format::PcapModified,
         };
-        let file = PcapFile { order, fraction_ns };
         match file.header(&self.window) {
             Ok(Some(interface)) => self.interfaces.push(interface),
             Ok(None) => return Next::NeedsMore,

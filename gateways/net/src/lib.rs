@@ -7,16 +7,20 @@
 //! - [`nic_arming`] and [`nic_clock`]: setting a card up to stamp, and reading its clock.
 //! - [`clock_pair`]: from the real-time clock of the stamps to the monotonic clock of the run.
 //! - [`radio`]: whether the peer radio acknowledged each datagram.
-//! - [`packet_ring`], [`ring_frame`] and [`filter`]: a tap of an interface.
+//! - [`packet_ring`], [`ring_frame`] and [`filter`]: a tap of an interface, and the end of a cable.
+//! - [`offload`]: what an interface leaves to hardware.
+//! - [`handover`]: descriptors from one process to another.
 //! - [`tcp_info`]: what the kernel tells of a TCP connection.
 //! - [`mod@interface`]: which interface has an address.
 
 pub mod clock_pair;
 pub mod control;
 pub mod filter;
+pub mod handover;
 pub mod interface;
 pub mod nic_arming;
 pub mod nic_clock;
+pub mod offload;
 pub mod packet_ring;
 mod packet_socket;
 pub mod radio;
@@ -63,10 +67,28 @@ pub struct TransmitStamp {
 
 /// Numbers of `https://www.tcpdump.org/linktypes.html` that a capture may have.
 pub mod link_type {
+    /// BSD loopback: the address family in the capturing host's byte order.
+    pub const NULL: u16 = 0;
     /// Ethernet.
     pub const ETHERNET: u16 = 1;
+    /// PPP, with or without address and control bytes.
+    pub const PPP: u16 = 9;
+    /// [`RAW`] as some systems number it.
+    pub const RAW_12: u16 = 12;
+    /// [`RAW`] as OpenBSD numbers it.
+    pub const RAW_14: u16 = 14;
+    /// PPP in HDLC-like framing.
+    pub const PPP_SERIAL: u16 = 50;
+    /// A `PPPoE` session without the Ethernet header.
+    pub const PPP_ETHER: u16 = 51;
     /// IPv4 or IPv6 without anything before it.
     pub const RAW: u16 = 101;
+    /// 802.11 without radio information.
+    pub const IEEE802_11: u16 = 105;
+    /// OpenBSD loopback: the address family in network byte order.
+    pub const LOOP: u16 = 108;
+    /// 802.11 behind a radiotap header.
+    pub const RADIOTAP: u16 = 127;
     /// Linux cooked capture, version 1.
     pub const LINUX_SLL: u16 = 113;
     /// IPv4.

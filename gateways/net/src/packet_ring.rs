@@ -1,6 +1,7 @@
-//! The live tap of a probe: an `AF_PACKET` socket that copies the packets that are asked for, both ways,
-//! with nanosecond stamps into memory shared with the kernel (`TPACKET_V2`). It sends nothing and takes
-//! no part in any flow; what the packets mean is for others.
+//! An `AF_PACKET` socket that copies packets with nanosecond stamps into memory shared with the kernel
+//! (`TPACKET_V2`). The live tap of a probe copies what is asked for, both ways, and takes no part in any
+//! flow. The end of a cable takes every frame that arrives and sends others. What the packets mean is for
+//! others.
 //!
 //! Version 2 of the ring, not 3: version 3 hands over blocks, and where every block times out with
 //! one packet in it, it runs out of them. Nobody is woken for a packet unless somebody waits on the
@@ -16,14 +17,15 @@ use core::ops::RangeInclusive;
 use core::ptr::NonNull;
 use core::sync::atomic::{AtomicU32, Ordering};
 use std::io;
-use std::os::fd::{AsRawFd, OwnedFd};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd};
 
 use nix::net::if_::if_nametoindex;
 use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
-use nix::sys::socket::{getsockopt, setsockopt, sockopt};
+use nix::sys::socket::{MsgFlags, getsockopt, send, setsockopt, sockopt};
 use thiserror::Error;
 
 use super::filter::{Instruction, PacketFilter, compile};
+use super::link_type;
 use super::packet_socket::{self, bind, link_of, listen_to_all, option_length, set_option};
 use super::ring_frame::RingPacket;
 
@@ -193,33 +195,50 @@ impl PacketRing {
             prefer_nic(&socket).map_err(refused("PACKET_TIMESTAMP"))?;
         }
         attach(&socket, &program).map_err(refused("SO_ATTACH_FILTER"))?;
-        let frame_bytes = (FRAME_HEADER_BYTES + settings.snap_bytes as usize).next_power_of_two();
-        let block_bytes = BLOCK_BYTES.max(frame_bytes);
-        let ring_bytes = settings.ring_bytes.next_power_of_two().max(block_bytes);
-        let frame_count = ring_bytes / frame_bytes;
-        let request = libc::tpacket_req {
-            tp_block_size: narrow(block_bytes),
-            tp_block_nr: narrow(ring_bytes / block_bytes),
-            tp_frame_size: narrow(frame_bytes),
-            tp_frame_nr: narrow(frame_count),
-        };
-        set_option(&socket, libc::SOL_PACKET, libc::PACKET_RX_RING, &request)
-            .map_err(refused("PACKET_RX_RING"))?;
-        let map = Mapping::of(&socket, ring_bytes).map_err(refused("mmap"))?;
+        let layout = Layout::of(settings);
+        layout.ask_of(&socket).map_err(refused("PACKET_RX_RING"))?;
+        let map = Mapping::of(&socket, layout.ring).map_err(refused("mmap"))?;
         let everything = EVERY_PROTOCOL.to_be();
         bind(&socket, index, everything).map_err(refused("bind"))?;
         listen_to_all(&socket, index).map_err(refused("PACKET_ADD_MEMBERSHIP"))?;
-        Ok(Self {
+        Ok(Self::new(socket, map, &layout, link))
+    }
+
+    fn new(socket: OwnedFd, map: Mapping, layout: &Layout, link_type: u16) -> Self {
+        Self {
             socket,
             map,
-            frame_bytes,
-            frame_count,
+            frame_bytes: layout.frame,
+            frame_count: layout.frame_count(),
             next_index: 0,
-            link_type: link,
+            link_type,
             counted: RingCounters::default(),
             before: RingCounters::default(),
             discarded_count: 0,
-        })
+        }
+    }
+
+    /// The ring of a socket that [`CableSocket::attach`] prepared, perhaps in another process.
+    ///
+    /// # Errors
+    /// When the kernel does not map it.
+    pub fn of_cable(socket: OwnedFd, settings: &RingSettings) -> io::Result<Self> {
+        let layout = Layout::of(settings);
+        let map = Mapping::of(&socket, layout.ring)?;
+        Ok(Self::new(socket, map, &layout, link_type::ETHERNET))
+    }
+
+    /// Sends frames out of its interface, in whatever thread.
+    ///
+    /// # Errors
+    /// When the kernel gives no more descriptors.
+    pub fn sender(&self) -> io::Result<FrameSender> {
+        self.socket.try_clone().map(FrameSender)
+    }
+
+    /// Readable while a packet waits.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
     }
 
     /// The link layer its packets begin with; see [`super::link_type`].
@@ -321,6 +340,85 @@ impl PacketRing {
     }
 }
 
+/// A packet socket of a network namespace that is to be the end of a cable there. It hears nothing yet.
+#[derive(Debug)]
+pub struct CableSocket(OwnedFd);
+
+impl CableSocket {
+    /// Opens one in the namespace of this thread.
+    ///
+    /// # Errors
+    /// What the kernel answers.
+    pub fn open() -> io::Result<Self> {
+        packet_socket::open().map(Self)
+    }
+
+    /// Binds it to the Ethernet interface with this index in its namespace, with a ring for every frame that
+    /// arrives there from now on; for [`PacketRing::of_cable`] with the same settings.
+    ///
+    /// # Errors
+    /// What the kernel answers.
+    pub fn attach(self, interface_index: c_uint, settings: &RingSettings) -> io::Result<OwnedFd> {
+        let Self(socket) = self;
+        let version = tpacket_version();
+        set_option(&socket, libc::SOL_PACKET, libc::PACKET_VERSION, &version)?;
+        setsockopt(&socket, sockopt::ReceiveTimestampns, &true)?;
+        ignore_outgoing(&socket)?;
+        Layout::of(settings).ask_of(&socket)?;
+        bind(&socket, interface_index, EVERY_PROTOCOL.to_be())?;
+        Ok(socket)
+    }
+}
+
+/// Sends frames out of the interface of a ring, which does not see them.
+#[derive(Debug)]
+pub struct FrameSender(OwnedFd);
+
+impl FrameSender {
+    /// Sends `frame`, or fails at once.
+    ///
+    /// # Errors
+    /// When the kernel does not take it.
+    pub fn send(&self, frame: &[u8]) -> io::Result<()> {
+        let descriptor = self.0.as_raw_fd();
+        Ok(send(descriptor, frame, MsgFlags::MSG_DONTWAIT).map(|_whole| ())?)
+    }
+}
+
+/// How a ring lies in memory, in bytes.
+#[derive(Debug, Clone, Copy)]
+struct Layout {
+    frame: usize,
+    block: usize,
+    ring: usize,
+}
+
+impl Layout {
+    fn of(settings: &RingSettings) -> Self {
+        let frame_bytes = (FRAME_HEADER_BYTES + settings.snap_bytes as usize).next_power_of_two();
+        let block_bytes = BLOCK_BYTES.max(frame_bytes);
+        Self {
+            frame: frame_bytes,
+            block: block_bytes,
+            ring: settings.ring_bytes.next_power_of_two().max(block_bytes),
+        }
+    }
+
+    const fn frame_count(&self) -> usize {
+        self.ring / self.frame
+    }
+
+    fn ask_of(&self, socket: &OwnedFd) -> io::Result<()> {
+        let request = libc::tpacket_req {
+            tp_block_size: narrow(self.block),
+            tp_block_nr: narrow(self.ring / self.block),
+            tp_frame_size: narrow(self.frame),
+            tp_frame_nr: narrow(self.frame_count()),
+        };
+        set_option(socket, libc::SOL_PACKET, libc::PACKET_RX_RING, &request)
+    }
+}
+
 fn check(
     what: &'static str,
     value: usize,
@@ -349,6 +447,10 @@ fn narrow(value: usize) -> c_uint {
 fn prefer_nic(socket: &OwnedFd) -> io::Result<()> {
     let hardware = libc::SOF_TIMESTAMPING_RAW_HARDWARE;
     set_option(socket, libc::SOL_PACKET, libc::PACKET_TIMESTAMP, &hardware)?;
+    ignore_outgoing(socket)
+}
+
+fn ignore_outgoing(socket: &OwnedFd) -> io::Result<()> {
     let ignore: c_int = 1;
     set_option(socket, libc::SOL_PACKET, PACKET_IGNORE_OUTGOING, &ignore)
 }

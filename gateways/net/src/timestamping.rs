@@ -438,12 +438,29 @@ impl HardwareStamping {
     }
 }
 
-/// One `ioctl` to a network interface.
+/// The largest packet that `interface` takes, bytes (`SIOCGIFMTU`): what no report of the network changes.
+///
+/// # Errors
+/// When there is no such interface.
+#[allow(unsafe_code, reason = "no crate wraps SIOCGIFMTU")]
+pub fn interface_mtu_bytes(interface: &str) -> io::Result<u32> {
+    // SAFETY: the request reads the name only and writes the number into the message.
+    let message = unsafe { device_request(interface, libc::SIOCGIFMTU, core::ptr::null_mut()) }?;
+    // SAFETY: after this request the union holds the number.
+    let mtu_bytes = unsafe { message.ifr_ifru.ifru_mtu };
+    u32::try_from(mtu_bytes).map_err(io::Error::other)
+}
+
+/// One `ioctl` to a network interface; gives what the kernel made of the message.
 ///
 /// # Safety
-/// `data` points to the live structure that `request` reads and writes.
+/// `data` points to the live structure that `request` reads and writes, or the request takes none.
 #[allow(unsafe_code, reason = "the kernel follows the pointer it is given")]
-unsafe fn device_request(interface: &str, request: c_ulong, data: *mut c_char) -> io::Result<()> {
+pub(super) unsafe fn device_request(
+    interface: &str,
+    request: c_ulong,
+    data: *mut c_char,
+) -> io::Result<libc::ifreq> {
     let mut name: [c_char; libc::IFNAMSIZ] = [0; libc::IFNAMSIZ];
     // One byte stays zero as the end of the name.
     if interface.len() >= name.len() || interface.is_empty() {
@@ -461,7 +478,7 @@ unsafe fn device_request(interface: &str, request: c_ulong, data: *mut c_char) -
     // this function.
     let result = unsafe { libc::ioctl(socket.as_raw_fd(), request as _, &raw mut message) };
     if result >= 0 {
-        Ok(())
+        Ok(message)
     } else {
         Err(io::Error::last_os_error())
     }
@@ -513,8 +530,14 @@ mod tests {
     }
 
     #[test]
+    fn loopback_takes_packets_of_64_kib() {
+        assert_eq!(interface_mtu_bytes("lo").unwrap(), 65_536);
+    }
+
+    #[test]
     fn an_impossible_interface_name_is_an_error() {
         for name in ["", "no-such-device", "a-name-longer-than-the-kernel-allows"] {
+            assert!(interface_mtu_bytes(name).is_err(), "{name}");
             assert!(TimestampCapabilities::query(name).is_err(), "{name}");
         }
     }

@@ -173,7 +173,7 @@ pub(super) fn udp_pair(address: &str, mode: TimestampMode) -> (UdpSender, UdpRec
 pub(super) fn tcp_pair(address: &str) -> (TcpSender, TcpReceiver) {
     let address = address.parse().unwrap();
     let settings = SocketSettings::new(address, address);
-    let mut receiver = TcpReceiver::open(settings).unwrap();
+    let mut receiver = TcpReceiver::open(settings, false).unwrap();
     let place = receiver.local_address().unwrap();
     let mut sender = TcpSender::open(SocketSettings::new(address, place)).unwrap();
     within_bound("connection", || {

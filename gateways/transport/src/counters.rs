@@ -87,6 +87,9 @@ counts! {
         stamp_overflow_count,
         /// Reports of the network (ICMP) about earlier datagrams, swallowed.
         network_report_count,
+        /// Reports of the network that are not believed, as anybody can send them: they cost no datagram and
+        /// decide nothing. On sealed hops and towards foreign programs.
+        ignored_report_count,
         /// Reports of this host's stack about earlier datagrams (for instance their length),
         /// swallowed.
         local_report_count,

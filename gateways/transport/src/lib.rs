@@ -238,6 +238,19 @@ pub trait DatagramReceiver: Debug + Send {
     /// The state that kept it from leaving; it is counted.
     fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal>;
 
+    /// As [`DatagramReceiver::reply`], to whoever sent the datagram that [`DatagramReceiver::receive`] gave
+    /// last, whether or not it has been proven to be the peer.
+    ///
+    /// # Errors
+    /// As [`DatagramReceiver::reply`].
+    fn answer(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal> {
+        self.reply(datagram, to)
+    }
+
+    /// Says that the datagram that [`DatagramReceiver::receive`] gave last is the peer's: of several
+    /// connections the one that it came on is the peer's from now on.
+    fn prove(&mut self) {}
+
     /// As [`DatagramReceiver::reply`], and asks for the stamp of its departure, where the
     /// transport has stamps. It is for few replies, as each costs system calls.
     ///

@@ -210,13 +210,14 @@ impl<R: DatagramReceiver> DatagramReceiver for SealedReceiver<R> {
             }
             match self.seal.open(&mut buffer[..received.length_bytes]) {
                 Ok(Opened::Datagram(length_bytes)) => {
+                    self.inner.prove();
                     return Ok(Some(Received {
                         length_bytes,
                         ..received
                     }));
                 }
                 Ok(Opened::Answer(answer)) => {
-                    let _counted = self.inner.reply(&answer, received.source).is_err();
+                    let _counted = self.inner.answer(&answer, received.source).is_err();
                 }
                 Err(_counted) => {}
             }

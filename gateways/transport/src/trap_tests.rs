@@ -1,6 +1,6 @@
 //! The traps of kernel stamps and of UDP, each reproduced on loopback.
 
-use std::net::UdpSocket;
+use std::net::{SocketAddr, UdpSocket};
 use std::os::fd::AsFd;
 use std::time::Duration;
 
@@ -146,6 +146,37 @@ fn a_dead_peer_is_a_state_that_ends_when_it_comes_back() {
     check_dead_peer("127.0.0.1:0");
     if UdpSocket::bind("[::1]:0").is_ok() {
         check_dead_peer("[::1]:0");
+    }
+}
+
+/// The kernel answers each datagram with a report, as a stranger can: a sealed hop loses no datagram to it
+/// and believes nothing of it.
+#[test]
+fn reports_of_the_network_cost_a_sealed_hop_no_datagram() {
+    for address in ["127.0.0.1:0", "[::1]:0"] {
+        let Ok(gone) = UdpSocket::bind(address) else {
+            continue;
+        };
+        let local: SocketAddr = address.parse().unwrap();
+        let settings = SocketSettings::new(local, gone.local_addr().unwrap());
+        let mut sender = UdpSender::open_ignoring_reports(&settings).unwrap();
+        drop(gone);
+        for number in 0..1_000_u32 {
+            // Undrained half of the time, so that the send itself meets the report.
+            assert_eq!(sender.send(b"message"), Ok(TxToken(number)));
+            if number % 2 == 0 {
+                take_stamps(&mut sender);
+                assert_eq!(sender.receive(&mut [0; 8]).unwrap(), None);
+            }
+        }
+        take_stamps(&mut sender);
+        let counters = sender.counters();
+        assert_eq!((counters.sent_count, counters.refused_count()), (1_000, 0));
+        assert_eq!(
+            (counters.network_report_count, counters.newest_report),
+            (0, None)
+        );
+        assert!(counters.ignored_report_count > 400, "{counters:?}");
     }
 }
 

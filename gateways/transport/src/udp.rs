@@ -19,12 +19,13 @@ use super::{
     sealed,
 };
 use hil_net::control::{ControlData, QueueEntry, SCM_WIFI_STATUS};
+use hil_net::interface::interface_with_address;
 use hil_net::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
 use hil_net::reply_stamps::ReplyStamps;
 use hil_net::tcp_info::unacknowledged_bytes;
 use hil_net::timestamping::{
-    MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, int_option, restart_send_count,
-    set_int_option,
+    MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, int_option,
+    interface_mtu_bytes, restart_send_count, set_int_option,
 };
 use hil_net::{TransmitStamp, TxToken};
 use hil_protocol::seal::{Initiator, Responder};
@@ -59,7 +60,7 @@ impl Transport for Udp {
         settings: &SocketSettings,
         seal: Option<Initiator>,
     ) -> Result<OpenSender, SocketError> {
-        let sender = UdpSender::open(settings)?;
+        let sender = UdpSender::open_towards(settings, Some(settings.peer), seal.is_some())?;
         let path = sender.path_mtu();
         let mut facts = sender.granted().facts(settings);
         if let Some(configured) = settings.path_mtu_bytes {
@@ -80,7 +81,7 @@ impl Transport for Udp {
         settings: &SocketSettings,
         seal: Option<Responder>,
     ) -> Result<OpenReceiver, SocketError> {
-        let receiver = UdpReceiver::open(settings)?;
+        let receiver = UdpReceiver::open_behind(settings, seal.is_some())?;
         Ok(OpenReceiver {
             facts: receiver.granted().facts(settings),
             receiver: sealed::receiver(receiver, settings.peer, seal),
@@ -106,6 +107,9 @@ const IPV6_MTU: i32 = 24;
 /// Entries of the error queue read in one call at most, so that a flood of reports cannot hold
 /// up the sending thread.
 const DRAIN_COUNT_MAX: u32 = 256;
+/// Reports of the network that one send passes over at most where they are ignored: each call that meets one takes
+/// it away and sends nothing, so the datagram is offered again.
+const SEND_ATTEMPT_COUNT_MAX: u32 = 8;
 /// Pending reports that one receive call passes over at most; each costs one system call.
 const RECEIVE_ATTEMPT_COUNT_MAX: u32 = 8;
 
@@ -136,6 +140,11 @@ pub struct UdpSender {
     first_token: Option<TxToken>,
     /// Where the radio is asked.
     radio: Option<Box<RadioLedger>>,
+    /// Reports of the network cost no datagram and decide nothing: on a sealed hop, where nothing is
+    /// believed that the seal did not carry, and towards a foreign program.
+    ignores_reports: bool,
+    /// Of the interface that the socket's address is on; read once where reports are ignored.
+    interface_mtu_bytes: Option<u32>,
 }
 
 impl UdpSender {
@@ -144,13 +153,23 @@ impl UdpSender {
     /// # Errors
     /// When the settings contradict themselves or the kernel refuses a step.
     pub fn open(settings: &SocketSettings) -> Result<Self, SocketError> {
-        Self::open_towards(settings, Some(settings.peer))
+        Self::open_towards(settings, Some(settings.peer), false)
     }
 
-    /// As [`UdpSender::open`], connected to `peer`, or to nobody.
+    /// As [`UdpSender::open`]; reports of the network, which anybody can send, are counted and otherwise
+    /// ignored.
+    ///
+    /// # Errors
+    /// As [`UdpSender::open`].
+    pub fn open_ignoring_reports(settings: &SocketSettings) -> Result<Self, SocketError> {
+        Self::open_towards(settings, Some(settings.peer), true)
+    }
+
+    /// As [`UdpSender::open`] or [`UdpSender::open_ignoring_reports`], connected to `peer`, or to nobody.
     pub(super) fn open_towards(
         settings: &SocketSettings,
         peer: Option<SocketAddr>,
+        ignores_reports: bool,
     ) -> Result<Self, SocketError> {
         if let Some(peer) = peer.filter(|peer| peer.is_ipv4() != settings.local.is_ipv4()) {
             return Err(SocketError::Family {
@@ -158,7 +177,7 @@ impl UdpSender {
                 peer,
             });
         }
-        let socket = open_socket(settings)?;
+        let socket = open_socket(settings, ignores_reports)?;
         let drops = setsockopt(&socket, sockopt::RxqOvfl, &1);
         refuse("SO_RXQ_OVFL", 1, drops.map_err(io::Error::from))?;
         bind(&socket, settings.local)?;
@@ -188,6 +207,8 @@ impl UdpSender {
         }
         Ok(Self {
             radio,
+            ignores_reports,
+            interface_mtu_bytes: ignores_reports.then(|| interface_mtu(settings)).flatten(),
             granted: granted_options(&socket, settings)?,
             socket,
             peer: settings.peer,
@@ -213,15 +234,20 @@ impl UdpSender {
     }
 
     /// The largest packet the path is known to take now; it can shrink when the network reports
-    /// so, which shows as [`SendRefusal::TooLong`].
+    /// so, which shows as [`SendRefusal::TooLong`]. Where reports are ignored it is what the interface takes:
+    /// the route's figure may come from a report that anybody can forge.
     pub fn path_mtu(&self) -> PathMtu {
         let (level, name, assumed, header_bytes) = if self.peer.is_ipv4() {
             (libc::SOL_IP, libc::IP_MTU, 576, 20 + 8)
         } else {
             (libc::SOL_IPV6, IPV6_MTU, 1280, 40 + 8)
         };
-        let known = int_option(&self.socket, level, name).ok();
-        let known = known.and_then(|bytes| u32::try_from(bytes).ok());
+        let known = if self.ignores_reports {
+            self.interface_mtu_bytes
+        } else {
+            let known = int_option(&self.socket, level, name).ok();
+            known.and_then(|bytes| u32::try_from(bytes).ok())
+        };
         let known = known.filter(|bytes| *bytes > header_bytes);
         let packet_bytes = known.unwrap_or(assumed);
         // The length field of UDP counts its 8 bytes header in 16 bits, that of IPv4 all.
@@ -289,6 +315,9 @@ impl UdpSender {
                     stamps: data.stamps,
                 });
             }
+            Some(QueueEntry::NetworkReport { .. }) if self.ignores_reports => {
+                self.counters.ignored_report_count += 1;
+            }
             Some(QueueEntry::NetworkReport { errno }) => {
                 self.counters.network_report_count += 1;
                 self.counters.newest_report = Some(SendRefusal::from_errno(errno, 0));
@@ -311,11 +340,25 @@ impl UdpSender {
         to: Option<&SockAddr>,
     ) -> Result<TxToken, SendRefusal> {
         let flags = libc::MSG_DONTWAIT;
-        let sent = match to {
-            None => self.socket.send_with_flags(datagram, flags),
-            Some(to) => self.socket.send_to_with_flags(datagram, to, flags),
-        };
+        let sent = self.offer(|socket| match to {
+            None => socket.send_with_flags(datagram, flags),
+            Some(to) => socket.send_to_with_flags(datagram, to, flags),
+        });
         self.note_sent(sent, datagram, datagram.len())
+    }
+
+    /// Sends, where reports are ignored past those that are pending.
+    fn offer(&self, send: impl Fn(&Socket) -> io::Result<usize>) -> io::Result<usize> {
+        let mut result = send(&self.socket);
+        if self.ignores_reports {
+            for _ in 1..SEND_ATTEMPT_COUNT_MAX {
+                if !result.as_ref().is_err_and(may_be_report) {
+                    break;
+                }
+                result = send(&self.socket);
+            }
+        }
+        result
     }
 
     /// What became of a send of `length_bytes`, which begin with `head`.
@@ -365,9 +408,7 @@ impl DatagramSender for UdpSender {
 
     fn send_parts(&mut self, head: &[u8], tail: &[u8]) -> Result<TxToken, SendRefusal> {
         let parts = [IoSlice::new(head), IoSlice::new(tail)];
-        let sent = self
-            .socket
-            .send_vectored_with_flags(&parts, libc::MSG_DONTWAIT);
+        let sent = self.offer(|socket| socket.send_vectored_with_flags(&parts, libc::MSG_DONTWAIT));
         self.note_sent(sent, head, head.len() + tail.len())
     }
 
@@ -433,6 +474,7 @@ impl DatagramSender for UdpSender {
                 // A report about an earlier datagram, handed to whichever call comes first. It
                 // stays in the error queue as well, where it is counted.
                 Err(error) if is_broken(&error) => return Err(error),
+                Err(_counted) if self.ignores_reports => {}
                 Err(error) => {
                     self.counters.newest_report = Some(SendRefusal::from_io(&error, 0));
                 }
@@ -470,7 +512,12 @@ impl UdpReceiver {
     /// # Errors
     /// When the settings contradict themselves or the kernel refuses a step.
     pub fn open(settings: &SocketSettings) -> Result<Self, SocketError> {
-        let socket = open_socket(settings)?;
+        Self::open_behind(settings, false)
+    }
+
+    /// As [`UdpReceiver::open`], behind a seal or not.
+    fn open_behind(settings: &SocketSettings, is_sealed: bool) -> Result<Self, SocketError> {
+        let socket = open_socket(settings, is_sealed)?;
         // Before the socket can receive, so that no datagram comes without.
         let armed = arm_receive(&socket, settings.timestamps);
         refuse(
@@ -606,26 +653,50 @@ impl DatagramReceiver for UdpReceiver {
 }
 
 /// A socket with everything set that both directions share.
-fn open_socket(settings: &SocketSettings) -> Result<Socket, SocketError> {
+fn open_socket(settings: &SocketSettings, ignores_reports: bool) -> Result<Socket, SocketError> {
     let socket = socket::open(settings, Type::DGRAM, Protocol::UDP, DESCRIPTION.label)?;
     // A datagram too long for the path is refused instead of sent in pieces, of which the loss
-    // of one would look like the loss of all.
-    let (option, level, name, discover) = if settings.local.is_ipv4() {
-        let name = libc::IP_MTU_DISCOVER;
-        ("IP_MTU_DISCOVER", libc::SOL_IP, name, libc::IP_PMTUDISC_DO)
+    // of one would look like the loss of all. What reports of the network say of the path is ignored
+    // with them. The values for IPv6 are those of their IPv4 twins.
+    let discover = if ignores_reports {
+        libc::IP_PMTUDISC_PROBE
     } else {
-        // IPV6_PMTUDISC_DO has the value of its IPv4 twin.
-        let level = libc::SOL_IPV6;
-        (
-            "IPV6_MTU_DISCOVER",
-            level,
-            IPV6_MTU_DISCOVER,
-            libc::IP_PMTUDISC_DO,
-        )
+        libc::IP_PMTUDISC_DO
+    };
+    let (option, level, name) = if settings.local.is_ipv4() {
+        ("IP_MTU_DISCOVER", libc::SOL_IP, libc::IP_MTU_DISCOVER)
+    } else {
+        ("IPV6_MTU_DISCOVER", libc::SOL_IPV6, IPV6_MTU_DISCOVER)
     };
     let set = set_int_option(&socket, level, name, discover);
     refuse(option, discover, set)?;
     Ok(socket)
+}
+
+/// What the interface of the settings, or the one with their address, takes; `None` when none is known.
+fn interface_mtu(settings: &SocketSettings) -> Option<u32> {
+    let named = settings.interface.clone();
+    let name = named.or_else(|| interface_with_address(settings.local.ip()).ok().flatten())?;
+    interface_mtu_bytes(&name).ok()
+}
+
+/// True for what a report of the network (ICMP of either version) becomes; some of them the call itself may answer
+/// as well, and then answers so again.
+fn may_be_report(error: &io::Error) -> bool {
+    let reports = [
+        libc::ECONNREFUSED,
+        libc::EHOSTUNREACH,
+        libc::ENETUNREACH,
+        libc::EHOSTDOWN,
+        libc::ENONET,
+        libc::EACCES,
+        libc::EPROTO,
+        libc::ENOPROTOOPT,
+        libc::EOPNOTSUPP,
+        libc::EMSGSIZE,
+    ];
+    let errno = error.raw_os_error();
+    errno.is_some_and(|errno| reports.contains(&errno))
 }
 
 /// True for errors of the call itself; every other one is a report of the network.

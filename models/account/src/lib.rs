@@ -20,6 +20,7 @@ mod account;
 mod fate;
 #[cfg(test)]
 mod feed_tests;
+pub mod flow;
 mod fold;
 mod follow_up;
 mod gaps;

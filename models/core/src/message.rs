@@ -72,6 +72,11 @@ impl TypeInfo {
             alignment_bytes: message.alignment_bytes,
         }
     }
+
+    /// See [`may_be_shorter`].
+    pub fn may_be_shorter(&self) -> bool {
+        may_be_shorter(&self.name)
+    }
 }
 
 impl fmt::Display for TypeInfo {
@@ -86,6 +91,11 @@ impl fmt::Display for TypeInfo {
             "{name} ({size_bytes} bytes aligned to {alignment_bytes})"
         )
     }
+}
+
+/// True when messages of the type called `name` may be shorter than their type.
+pub fn may_be_shorter(name: &str) -> bool {
+    name == ETHERNET_FRAME.name
 }
 
 /// True when `name` ends in a version: `.v` and digits.
@@ -136,10 +146,22 @@ crate::message! {
         pub epoch: u32,
         /// [`Envelope::FORWARDED`]; all other bits are zero.
         pub flags: u32,
+        /// Bytes of the message where its type allows fewer than [`TypeInfo::size_bytes`], see
+        /// [`ETHERNET_FRAME`]; zero otherwise.
+        pub length_bytes: u64,
         /// Zero; room to grow without a new layout.
-        pub reserved: [u64; 4],
+        pub reserved: [u64; 3],
     }
 }
+
+/// An Ethernet frame without its check sequence, from the destination address on: up to 1500 bytes of payload
+/// behind the header and two VLAN tags. The only messages that may be shorter than their type.
+pub const ETHERNET_FRAME: MessageType = MessageType {
+    name: "hil.EthernetFrame.v1",
+    size_bytes: 1522,
+    alignment_bytes: 2,
+    fields: &[],
+};
 
 impl Envelope {
     /// The sample was published by a gateway, not by the producer itself.

@@ -162,6 +162,39 @@ impl RoundTripRecord {
     }
 }
 
+/// A program behind an inlet sent an Ethernet frame, which is the message of the same epoch and sequence.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct FrameRecord {
+    /// Sequence number on the channel.
+    pub sequence: u64,
+    /// The inlet's start.
+    pub epoch: u32,
+    /// Bytes of the frame, without its check sequence.
+    pub length_bytes: u16,
+    /// Bytes of `head` that are of the frame.
+    pub head_bytes: u16,
+    /// The frame's beginning: enough for a VLAN tag, IPv6 and the ports.
+    pub head: [u8; 64],
+}
+
+impl FrameRecord {
+    /// Of the frame of a message.
+    pub fn new(sequence: u64, epoch: u32, frame: &[u8]) -> Self {
+        let mut head = [0; 64];
+        let kept = frame.len().min(head.len());
+        head[..kept].copy_from_slice(&frame[..kept]);
+        let narrow = |length: usize| u16::try_from(length).unwrap_or(u16::MAX);
+        Self {
+            sequence,
+            epoch,
+            length_bytes: narrow(frame.len()),
+            head_bytes: narrow(kept),
+            head,
+        }
+    }
+}
+
 /// A transmit stamp the sender reported in a later datagram, for a receiver that cannot read the
 /// sender's records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]

@@ -98,6 +98,85 @@ pub struct StudyReport {
     pub criteria: Vec<Criterion>,
     /// What follows from all of it, in a few lines, last on a page.
     pub summary: Vec<String>,
+    /// What this sample is too small for, and the parameters of one that is not.
+    pub larger: Vec<Larger>,
+}
+
+/// The parameters of a sample that is large enough for what this one cannot judge.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Larger {
+    /// What it judges, in the plural.
+    pub of: &'static str,
+    /// `key=value` each, the key below `case.parameters`.
+    pub parameters: Vec<String>,
+}
+
+/// How a row stands to the published one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// No difference at 5 %, in a sample of half the published one's size or more.
+    Agrees,
+    /// The interval of the difference does not hold zero.
+    Differs,
+    /// No difference at 5 %, in a smaller sample.
+    Inconclusive,
+    /// Parameters of the row were fitted to the published value.
+    Fitted,
+    /// Nothing is published of the row, or of something else.
+    NotComparable,
+}
+
+impl Verdict {
+    const ALL: [Self; 5] = [
+        Self::Agrees,
+        Self::Differs,
+        Self::Inconclusive,
+        Self::Fitted,
+        Self::NotComparable,
+    ];
+
+    /// What a table calls it.
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::Agrees => "agrees",
+            Self::Differs => "differs",
+            Self::Inconclusive => "inconclusive",
+            Self::Fitted => "fitted",
+            Self::NotComparable => "not comparable",
+        }
+    }
+}
+
+/// What the rows, each with its name, and the criteria come to: at most three lines.
+pub fn summary(rows: &[(String, Verdict)], criteria: &[Criterion]) -> Vec<String> {
+    let of = |wanted: Verdict| rows.iter().filter(move |(_, verdict)| *verdict == wanted);
+    let mut lines = Vec::new();
+    if !rows.is_empty() {
+        let counts = Verdict::ALL.map(|one| format!("{} {}", one.words(), of(one).count()));
+        let counts = counts.join(", ");
+        lines.push(format!(
+            "Against the paper, of {} rows: {counts}; one in twenty differs by chance.",
+            rows.len()
+        ));
+        let differing: Vec<&str> = of(Verdict::Differs)
+            .map(|(name, _)| name.as_str())
+            .collect();
+        if !differing.is_empty() {
+            lines.push(format!("These differ: {}.", differing.join("; ")));
+        }
+    }
+    if !criteria.is_empty() {
+        let count = |is_met| criteria.iter().filter(|one| one.is_met == is_met).count();
+        lines.push(format!(
+            "Of {} criteria: met {}, missed {}, too few to judge {}.",
+            criteria.len(),
+            count(Some(true)),
+            count(Some(false)),
+            count(None)
+        ));
+    }
+    lines
 }
 
 impl StudyReport {
@@ -121,6 +200,8 @@ pub struct Table {
     pub rows: Vec<Vec<Cell>>,
     /// What stands below it.
     pub notes: Vec<String>,
+    /// Only a page with every figure has it.
+    pub is_detail: bool,
 }
 
 impl Table {
@@ -132,7 +213,7 @@ impl Table {
             title: title.to_owned(),
             columns: Field::columns(fields).collect(),
             rows: rows.iter().map(cells).collect(),
-            notes: Vec::new(),
+            ..Self::default()
         }
     }
 }
@@ -144,12 +225,21 @@ pub struct Column {
     pub name: &'static str,
     /// The words a page prints.
     pub label: &'static str,
+    /// Zero is always shown; where there is no room, the highest goes first.
+    pub rank: u8,
 }
 
 impl Column {
     /// The column `name` under `label`.
     pub const fn new(name: &'static str, label: &'static str) -> Self {
-        Self { name, label }
+        let rank = 0;
+        Self { name, label, rank }
+    }
+
+    /// With a rank.
+    #[must_use]
+    pub const fn ranked(self, rank: u8) -> Self {
+        Self { rank, ..self }
     }
 }
 
@@ -172,13 +262,33 @@ enum Figure<T> {
         ends: fn(&T) -> Option<(f64, f64)>,
         decimals: usize,
     },
+    Verdict(fn(&T) -> Option<Verdict>),
 }
 
 impl<T> Field<T> {
+    /// With a rank, see [`Column::rank`].
+    #[must_use]
+    pub const fn ranked(mut self, rank: u8) -> Self {
+        self.column.rank = rank;
+        self
+    }
+
+    /// A column of verdicts.
+    pub const fn verdict(
+        name: &'static str,
+        label: &'static str,
+        verdict: fn(&T) -> Option<Verdict>,
+    ) -> Self {
+        Self {
+            column: Column::new(name, label),
+            figure: Figure::Verdict(verdict),
+        }
+    }
+
     /// A column of words.
     pub const fn text(name: &'static str, label: &'static str, text: fn(&T) -> String) -> Self {
         Self {
-            column: Column { name, label },
+            column: Column::new(name, label),
             figure: Figure::Text(text),
         }
     }
@@ -186,7 +296,7 @@ impl<T> Field<T> {
     /// A column of numbers of things.
     pub const fn count(name: &'static str, label: &'static str, count: fn(&T) -> u64) -> Self {
         Self {
-            column: Column { name, label },
+            column: Column::new(name, label),
             figure: Figure::Count(count),
         }
     }
@@ -199,7 +309,7 @@ impl<T> Field<T> {
         value: fn(&T) -> Option<f64>,
     ) -> Self {
         Self {
-            column: Column { name, label },
+            column: Column::new(name, label),
             figure: Figure::Number { value, decimals },
         }
     }
@@ -212,7 +322,7 @@ impl<T> Field<T> {
         ends: fn(&T) -> Option<(f64, f64)>,
     ) -> Self {
         Self {
-            column: Column { name, label },
+            column: Column::new(name, label),
             figure: Figure::Interval { ends, decimals },
         }
     }
@@ -230,6 +340,7 @@ impl<T> Field<T> {
             (Some(of), Figure::Count(count)) => Cell::Count(count(of)),
             (Some(of), Figure::Number { value, decimals }) => Cell::number(value(of), *decimals),
             (Some(of), Figure::Interval { ends, decimals }) => Cell::interval(ends(of), *decimals),
+            (Some(of), Figure::Verdict(verdict)) => Cell::verdict(verdict(of)),
         })
     }
 }
@@ -258,8 +369,8 @@ pub enum Cell {
         /// Digits behind the point on a page.
         decimals: usize,
     },
-    /// Whether a criterion is met.
-    Verdict(bool),
+    /// How the row stands to the published one.
+    Verdict(Verdict),
     /// No figure.
     Absent,
 }
@@ -290,29 +401,14 @@ impl Cell {
         }
     }
 
-    /// What a page shows.
-    pub fn shown(&self) -> String {
-        match self {
-            Self::Text(text) => text.clone(),
-            Self::Count(count) => count.to_string(),
-            Self::Number { value, decimals } => format!("{value:.decimals$}"),
-            Self::Interval {
-                low,
-                high,
-                decimals,
-            } => format!("{low:.decimals$} to {high:.decimals$}"),
-            Self::Verdict(true) => "met".to_owned(),
-            Self::Verdict(false) => "MISSED".to_owned(),
-            Self::Absent => "-".to_owned(),
-        }
+    /// True for the verdict that the row differs from the published one.
+    pub fn is_difference(&self) -> bool {
+        *self == Self::Verdict(Verdict::Differs)
     }
 
-    /// True for a number or an interval: what a page puts at the right edge of its column.
-    pub fn is_figure(&self) -> bool {
-        matches!(
-            self,
-            Self::Count(_) | Self::Number { .. } | Self::Interval { .. }
-        )
+    /// The cell of a verdict that may be missing.
+    pub fn verdict(verdict: Option<Verdict>) -> Self {
+        verdict.map_or(Self::Absent, Self::Verdict)
     }
 }
 
@@ -426,23 +522,47 @@ mod tests {
         ];
         let labels: Vec<_> = Field::columns(&FIELDS).map(|column| column.label).collect();
         assert_eq!(labels, ["Parity", "Number", "Inverse", "Around"]);
-        let shown = |of| -> Vec<String> {
-            let cells = Field::cells(&FIELDS, of);
-            cells.map(|cell| cell.shown()).collect()
-        };
-        assert_eq!(shown(Some(&4)), ["even", "4", "0.25", "3.5 to 4.5"]);
-        assert_eq!(shown(Some(&0))[2], "-");
-        assert_eq!(shown(None), ["-"; 4]);
+        let cells = |of| -> Vec<Cell> { Field::cells(&FIELDS, of).collect() };
+        let expected = [
+            Cell::text("even"),
+            Cell::Count(4),
+            Cell::number(Some(0.25), 2),
+            Cell::interval(Some((3.5, 4.5)), 1),
+        ];
+        assert_eq!(cells(Some(&4)), expected);
+        assert_eq!(cells(Some(&0))[2], Cell::Absent);
+        assert_eq!(cells(None), vec![Cell::Absent; 4]);
     }
 
     #[test]
-    fn cells_are_shown_with_their_decimals() {
-        assert_eq!(Cell::number(Some(0.499_102), 2).shown(), "0.50");
-        assert_eq!(
-            Cell::interval(Some((0.0, 0.3686)), 2).shown(),
-            "0.00 to 0.37"
-        );
+    fn a_figure_that_is_no_number_is_absent() {
         assert_eq!(Cell::number(Some(f64::NAN), 2), Cell::Absent);
-        assert_eq!(Cell::Absent.shown(), "-");
+        assert_eq!(Cell::interval(None, 2), Cell::Absent);
+    }
+
+    #[test]
+    fn a_summary_counts_verdicts_and_criteria_and_names_what_differs() {
+        let rows = [
+            ("harbor, 0 ms", Verdict::Agrees),
+            ("harbor, 100 ms", Verdict::Differs),
+            ("short-range", Verdict::Fitted),
+        ];
+        let rows = rows.map(|(name, verdict)| (name.to_owned(), verdict));
+        let criterion = |is_met| Criterion {
+            text: String::new(),
+            is_met,
+            finding: String::new(),
+        };
+        let criteria = [criterion(Some(true)), criterion(None)];
+        assert_eq!(
+            summary(&rows, &criteria),
+            [
+                "Against the paper, of 3 rows: agrees 1, differs 1, inconclusive 0, fitted 1, \
+                 not comparable 0; one in twenty differs by chance.",
+                "These differ: harbor, 100 ms.",
+                "Of 2 criteria: met 1, missed 0, too few to judge 1."
+            ]
+        );
+        assert!(summary(&[], &[]).is_empty());
     }
 }

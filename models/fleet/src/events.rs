@@ -189,7 +189,6 @@ impl Watch {
             TruthKind::MessageStale if !orders.authority(key(truth)).is_empty() => {
                 self.heard = self.heard.max(truth.caused_by_sequence);
             }
-            TruthKind::LeaseEnded => found.events.push(lease_ended(truth, orders)),
             TruthKind::Replaced => {
                 let what = format!("{} was put at its goal to clear a stuck fleet", name(truth));
                 found.events.push(event(Severity::Hazard, truth, what));
@@ -282,17 +281,6 @@ fn mission_held_up(truth: &Truth, orders: &Orders) -> Option<ScoreEvent> {
         counted(copy_count, "copy", "copies"),
     );
     Some(orders.named(notice(truth, what), copies.clone()))
-}
-
-fn lease_ended(truth: &Truth, orders: &Orders) -> ScoreEvent {
-    let unheard = orders.between(key(truth), u32::MAX);
-    let what = format!(
-        "{} braked: the lease of authority {} of mission {} ended",
-        name(truth),
-        truth.caused_by_sequence,
-        truth.mission_id
-    );
-    orders.named(event(Severity::Hazard, truth, what), unheard)
 }
 
 /// An incident with, for each of the two robots, what led to the authority it last took and what

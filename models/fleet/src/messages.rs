@@ -115,12 +115,12 @@ hil_core::message! {
         pub sequence: u32,
         /// Last pose the robot may reach; [`TO_GOAL`] for the whole path.
         pub authority_index: i32,
-        /// How long the authority holds after its receipt; 0 for ever. A robot brakes when it ends.
-        pub lease_ns: i64,
         /// `header_id` of the newest state the decision rests on; 0 if none.
         pub echo_header_id: u32,
         /// [`Authority::ACKNOWLEDGED`].
         pub flags: u32,
+        /// Zero.
+        pub reserved: [u8; 8],
     }
 }
 
@@ -206,8 +206,6 @@ hil_core::numbered! {
         AuthorityRefused = 6,
         /// An older or repeated authority or mission was passed over.
         MessageStale = 7,
-        /// The lease of the authority ended and the robot braked.
-        LeaseEnded = 8,
         /// The robot was put at its goal to clear a stuck fleet.
         Replaced = 9,
     }

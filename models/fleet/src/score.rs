@@ -63,10 +63,6 @@ fn harms(tally: Option<&Tally>) -> Vec<Harm> {
             "times past a late authority",
             count(|tally| tally.authorities_late_count),
         ),
-        Harm::new(
-            "stops for want of an authority",
-            count(|tally| tally.leases_ended_count),
-        ),
     ]
 }
 
@@ -161,10 +157,6 @@ fn commands(tally: &Tally) -> Vec<Metric> {
         label("stale_count", "commands passed over", "1").count(
             tally.stale_count,
             "older than what the robot had, or a repeat of it",
-        ),
-        label("leases_ended_count", "leases ended", "1").count(
-            tally.leases_ended_count,
-            "the robot braked because no newer authority came",
         ),
     ]
 }

@@ -6,8 +6,9 @@ use core::cmp::Ordering;
 use serde::{Deserialize, Serialize};
 
 use super::special::student_quantile;
-use super::statistics::wilson;
+use super::statistics::{CONFIDENCE, wilson};
 use hil_core::interval::{Interval, IntervalMethod};
+use hil_core::study::Verdict;
 
 /// A figure of one run, with its interval where it has one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -62,6 +63,18 @@ impl Share {
             interval: Some(interval),
         })
     }
+}
+
+/// How `ours` stands to the `published` share; `None` when either is of none.
+pub fn against_published(published: Share, ours: Share) -> Option<Verdict> {
+    let interval = difference(published.estimate(CONFIDENCE)?, ours.estimate(CONFIDENCE)?)?;
+    Some(if interval.low > 0.0 || interval.high < 0.0 {
+        Verdict::Differs
+    } else if 2 * ours.of >= published.of {
+        Verdict::Agrees
+    } else {
+        Verdict::Inconclusive
+    })
 }
 
 /// The interval of the difference of two means, `new - base`, of repetitions (Welch 1947): what the runs
@@ -141,6 +154,22 @@ impl Moments {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn no_difference_in_a_small_sample_is_no_agreement() {
+        let against = |count, of| {
+            let published = Share {
+                count: 5,
+                of: 10_018,
+            };
+            against_published(published, Share { count, of })
+        };
+        assert_eq!(against(40, 100_156), Some(Verdict::Agrees));
+        assert_eq!(against(2, 5009), Some(Verdict::Agrees));
+        assert_eq!(against(0, 420), Some(Verdict::Inconclusive));
+        assert_eq!(against(12, 420), Some(Verdict::Differs));
+        assert_eq!(against(0, 0), None);
+    }
 
     fn close(found: f64, expected: f64, tolerance: f64) {
         assert!(

@@ -591,8 +591,8 @@ mod tests {
                 .any(|(from, length)| (*from..from + length).contains(&place))
         };
         let single = Batches::of(
-            (0..10_000)
-                .map(|place| f64::from(u8::from(is_one(place as u64))))
+            (0..10_000_u32)
+                .map(|place| f64::from(u8::from(is_one(u64::from(place)))))
                 .collect::<Vec<_>>()
                 .into_iter(),
         );

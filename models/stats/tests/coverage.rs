@@ -11,12 +11,12 @@
 
 use core::f64::consts::TAU;
 
-use hil_core::interval::{Interval, IntervalMethod};
+use hil_core::interval::{Interval, IntervalMethod, Spread};
 use hil_core::random::RandomStream;
 use hil_stats::dependence::{Batches, Quantiles};
 use hil_stats::samples::Samples;
 use hil_stats::special::{
-    invert, normal_distribution, normal_quantile, place_of, student_quantile,
+    ceil_count, invert, normal_distribution, normal_quantile, place_of, student_quantile,
 };
 use hil_stats::statistics::clopper_pearson;
 use rustfft::FftPlanner;
@@ -125,7 +125,11 @@ fn loops(count: usize, outage_s: f64, apart_s: f64, random: &mut RandomStream) -
     let mut at_s = exponential(apart_s);
     while at_s < count as f64 * LOOP_S {
         let until_s = at_s + exponential(outage_s);
-        for (index, lost) in lost.iter_mut().enumerate().skip((at_s / LOOP_S) as usize) {
+        for (index, lost) in lost
+            .iter_mut()
+            .enumerate()
+            .skip(ceil_count((at_s / LOOP_S).floor()))
+        {
             let from_s = index as f64 * LOOP_S;
             if from_s >= until_s {
                 break;
@@ -212,11 +216,17 @@ const LOSSES: [LossKind; 22] = [
     }),
     losses("memory", "rate varies, 1 s", true, Some(0.02), |r| {
         let level = fading(1.0, r);
-        drawn(|s| 0.02 * (level[(s * HZ).round() as usize] - 0.5).exp(), r)
+        drawn(
+            |s| 0.02 * (level[ceil_count((s * HZ).round())] - 0.5).exp(),
+            r,
+        )
     }),
     losses("memory", "rate varies, 10 s", false, Some(0.02), |r| {
         let level = fading(10.0, r);
-        drawn(|s| 0.02 * (level[(s * HZ).round() as usize] - 0.5).exp(), r)
+        drawn(
+            |s| 0.02 * (level[ceil_count((s * HZ).round())] - 0.5).exp(),
+            r,
+        )
     }),
     losses(
         "long memory",
@@ -225,7 +235,10 @@ const LOSSES: [LossKind; 22] = [
         Some(0.02),
         |r| {
             let level = fractional(0.8, r);
-            drawn(|s| 0.02 * (level[(s * HZ).round() as usize] - 0.5).exp(), r)
+            drawn(
+                |s| 0.02 * (level[ceil_count((s * HZ).round())] - 0.5).exp(),
+                r,
+            )
         },
     ),
     losses(
@@ -331,7 +344,7 @@ const DELAYS: [DelayKind; 14] = [
         |r| {
             let spikes = bursts(10.0, 490.0, r);
             plus(white(r), |s| {
-                if spikes[(s * HZ).round() as usize] {
+                if spikes[ceil_count((s * HZ).round())] {
                     8.0
                 } else {
                     0.0
@@ -650,6 +663,7 @@ fn delay_rows(kind: &DelayKind, runs: u64) -> Vec<Row> {
         .collect();
     for seed in 0..runs {
         let mut random = RandomStream::new(seed, &format!("{} {}", kind.kind, kind.name));
+        #[expect(clippy::cast_possible_truncation, reason = "far from the ends of i64")]
         let series: Samples = (kind.run)(&mut random)
             .into_iter()
             .map(|one| ns(one) as i64)
@@ -657,7 +671,7 @@ fn delay_rows(kind: &DelayKind, runs: u64) -> Vec<Row> {
         let ascending = series.ascending();
         let quantiles = Quantiles::of(&series, &ascending);
         for ((row, (share, _)), truth) in rows.iter_mut().zip(SHARES).zip(truths) {
-            let interval = quantiles.interval(share).and_then(|spread| spread.known());
+            let interval = quantiles.interval(share).and_then(Spread::known);
             row.own.add(interval, truth);
             let count = ascending.len();
             let value = ascending.at(place_of(share, count));

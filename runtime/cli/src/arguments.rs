@@ -1,5 +1,6 @@
 //! The command line: definitions only. What a command does is elsewhere.
 
+use std::net::IpAddr;
 use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Parser, Subcommand};
@@ -24,6 +25,8 @@ Examples:
       this host's share of the loop; start the same command on the other host
   hil-runtime --topology deploy/topologies/split.toml --check
       say what is wrong with the file, start nothing
+  hil-runtime join --link 'delay 5ms loss 1%' -- ./ctrl 10.77.0.2 -- ./robot
+      two programs of your own that speak IP, and a link between them
   hil-runtime simulate --topology deploy/topologies/emulated.toml
       the same loop and link in virtual time, in a moment
   hil-runtime tables --topology deploy/topologies/tables.toml
@@ -46,6 +49,19 @@ Exit codes:
   69 a peer host was not reachable        doctor --strict: it is not fit
   70 internal error                   130 interrupted; report complete
                                       131 interrupted twice: no report";
+
+const JOIN_EXAMPLES: &str = "\
+Examples:
+  hil-runtime join -- ping -c 20 10.77.0.2 -- sleep 60
+      what a bare cable does to twenty echoes
+  hil-runtime join --link 'delay 5ms loss 1%' -- ./ctrl 10.77.0.2 -- ./robot
+      a controller and a robot with a link that hurts between them
+  hil-runtime join --link outages.toml -- iperf3 -c 10.77.0.2 -- iperf3 -s
+      over the link of a topology file
+
+Each program has a network of its own with one interface, eth0, and nothing but
+the other program in it. The run ends when one of them does. It needs no root.
+docs/two-programs.md has the rest.";
 
 const CALIBRATE_EXAMPLES: &str = "\
 Examples:
@@ -210,6 +226,30 @@ pub struct ReplayArgs {
     pub json: bool,
 }
 
+/// Arguments of a run of two programs.
+#[derive(Debug, Args)]
+pub struct JoinArgs {
+    /// The link between the programs: words as in "delay 5ms loss 1% rate 10Mbit", or a topology file with
+    /// one link. Without it nothing is delayed or lost on purpose.
+    #[arg(long, value_name = "WORDS|FILE")]
+    pub link: Option<String>,
+    /// How long the programs run, e.g. 30s, where none of them ends before.
+    #[arg(long, value_name = "TIME", default_value = "168h")]
+    pub duration: String,
+    /// Seed of the link's losses and delays.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub seed: u64,
+    /// Print no progress, only the report.
+    #[arg(long, short)]
+    pub quiet: bool,
+    /// Print every figure, not only the answer and what led to it.
+    #[arg(long)]
+    pub full: bool,
+    /// The first program, which has the address 10.77.0.1, and after another `--` the second, 10.77.0.2.
+    #[arg(last = true, required = true, value_name = "FIRST -- SECOND")]
+    pub programs: Vec<String>,
+}
+
 /// Everything but a run.
 #[derive(Debug, Subcommand)]
 pub enum Command {
@@ -231,6 +271,9 @@ pub enum Command {
         #[arg(long)]
         full: bool,
     },
+    /// Run two programs that speak IP, neither of them changed, and put a link between them, on this PC.
+    #[command(after_help = JOIN_EXAMPLES)]
+    Join(JoinArgs),
     /// Compute a case's tables in virtual time, on all processors.
     #[command(
         after_help = "Example:\n  hil-runtime tables --topology deploy/topologies/tables.toml --sections 100000\n\nEqual seeds give equal tables, whatever the number of threads. Ctrl-C prints\nwhat is complete. Exit code 1 when a criterion is missed."
@@ -315,7 +358,7 @@ pub enum Command {
         #[arg(long, default_value_t = 125.0)]
         rate: f64,
     },
-    /// Run a component, gateway, clock path or adapter; started by a run, not by hand.
+    /// Run a component, gateway, clock path, adapter or cable; started by a run, not by hand.
     #[command(hide = true)]
     Worker {
         /// Launch file written by the supervisor.
@@ -331,6 +374,9 @@ pub enum Command {
         /// Files that the program may have open, if not as many as the supervisor.
         #[arg(long)]
         open_files: Option<u64>,
+        /// Its address in a network namespace of its own, whose cable goes to standard input.
+        #[arg(long)]
+        inside: Option<IpAddr>,
         /// Program and arguments.
         #[arg(last = true, required = true)]
         program: Vec<String>,

@@ -2,6 +2,7 @@
 
 mod case_work;
 mod doctor_work;
+mod join_work;
 mod live_work;
 mod report_work;
 
@@ -26,6 +27,7 @@ use hil_engine::supervisor::{self, HostTooSmall, PeerError, RunError, RunOptions
 use hil_nic::nic_clock::guard;
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::open_files;
+use hil_platform::own_process;
 use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_report::analysis::{self, AnalysisError, Concluded};
@@ -56,6 +58,10 @@ mod exit {
 
 /// Does what the command line says.
 pub(crate) fn run(registry: &Registry) -> ExitCode {
+    if let Err(error) = own_process::begin() {
+        Console::new(false).error(&format!("cannot begin: {error}"));
+        return ExitCode::from(exit::INTERNAL);
+    }
     let cli: Cli = match documents::command_line() {
         Ok(cli) => cli,
         Err(help) => {
@@ -127,11 +133,13 @@ fn run_command(
         Command::Become {
             supervisor,
             open_files,
+            inside,
             program,
-        } => own_program::become_program(supervisor, open_files, &program)
+        } => own_program::become_program(supervisor, open_files, inside, &program)
             .map(done)
             .map_err(failed),
         Command::CardGuard(args) => guard::run(&args).map(done).map_err(failed),
+        Command::Join(args) => join_work::join(&args, registry, console),
         Command::Simulate {
             topology,
             overrides,
@@ -166,7 +174,7 @@ fn run_command(
         Command::Doctor(args) => doctor_work::doctor(&args, registry, console),
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
-        Command::Probe(args) => Ok(hil_probe::run(&args, console)),
+        Command::Probe(args) => Ok(hil_probe::run(&args, columns(), console)),
         Command::Documents { folder } => documents::write(Cli::command(), &folder)
             .and_then(|_paths| documents::write_keys(&folder))
             .and_then(|()| documents::write_robot(&folder))
@@ -245,28 +253,39 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
     if args.check && topology.processes().is_empty() {
         return show_study(path, &topology, args, registry, console);
     }
-    check_traces(path, &args.overrides, &topology, console)?;
+    carry_out(path, args, &topology, registry, console)
+}
+
+/// Runs `topology`, or checks whether it could, and prints its report.
+fn carry_out(
+    path: &Path,
+    args: &RunArgs,
+    topology: &Topology,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    check_traces(path, &args.overrides, topology, console)?;
     // Told before what may only be missing now.
-    check_file(path, &topology)?;
+    check_file(path, topology)?;
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
-        return Ok(show_check(path, &topology, None, console));
+        return Ok(show_check(path, topology, None, console));
     }
-    let hosts = hosts_here(&topology, args.host.as_deref()).map_err(usage)?;
-    let key = check_here(path, args, &topology, &hosts, console)?;
+    let hosts = hosts_here(topology, args.host.as_deref()).map_err(usage)?;
+    let key = check_here(path, args, topology, &hosts, console)?;
     if args.check {
-        return Ok(show_check(path, &topology, key, console));
+        return Ok(show_check(path, topology, key, console));
     }
     let signals = signals()?;
     let options = RunOptions {
         hosts,
         domain_root: args.domain_root.clone(),
-        topology_file: path.clone(),
+        topology_file: path.to_path_buf(),
         command_line: env::args().collect(),
-        layouts: layouts(&topology, registry),
+        layouts: layouts(topology, registry),
     };
     console.serve();
-    let result = supervisor::run(&topology, &options, &signals, console)
+    let result = supervisor::run(topology, &options, &signals, console)
         .map_err(|error| Refusal::new(exit_code_of_error(&error), error))?;
     let code = match exit_code(&result.outcome) {
         exit::RAN if result.has_gaps() => exit::FAILED,
@@ -278,7 +297,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
         // What the folder cannot give back, because its disk is full, is still in memory.
         analysed.or_else(|error| {
             let concluded =
-                analysis::conclude(&topology, &result, registry, path, &options.command_line)?;
+                analysis::conclude(topology, &result, registry, path, &options.command_line)?;
             Ok::<_, AnalysisError>(Concluded {
                 unwritten: concluded.unwritten.or(Some(error)),
                 ..concluded
@@ -479,12 +498,11 @@ fn complaint(result: &RunResult) -> String {
 /// For a run that did not come about.
 fn exit_code_of_error(error: &RunError) -> u8 {
     match error {
-        RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. })
-        | RunError::SecretMissing(_) => exit::PEER_ABSENT,
+        RunError::Peer(PeerError::Absent { .. }) | RunError::SecretMissing(_) => exit::PEER_ABSENT,
         RunError::Folder { source, .. } if source.kind() == ErrorKind::PermissionDenied => {
             exit::FORBIDDEN
         }
-        RunError::Peer(PeerError::Key { .. }) | RunError::Key(_) => exit::FORBIDDEN,
+        RunError::Key(_) => exit::FORBIDDEN,
         RunError::Peer(PeerError::Listen { source, .. } | PeerError::Own { source, .. })
             if is_passing(source) =>
         {

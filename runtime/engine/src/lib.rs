@@ -3,6 +3,7 @@
 #![forbid(unsafe_code)]
 
 pub mod adapter;
+mod cable;
 pub mod gateway;
 pub mod process;
 pub mod security;

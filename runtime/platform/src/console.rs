@@ -11,7 +11,7 @@ use anstyle::{AnsiColor, Style};
 use nix::sys::stat::fstat;
 
 use crate::systemd::ServiceManager;
-use crate::text::shortened;
+use crate::text::{clean, shortened, visible, visible_laid_out};
 
 /// Progress lines where they cannot be redrawn.
 const PLAIN_PERIOD: Duration = Duration::from_secs(5);
@@ -172,24 +172,24 @@ impl Console {
     /// Says something on the way.
     pub fn say(&mut self, text: &str) {
         if !self.is_quiet {
-            self.line(Weight::Word, text);
+            self.line(Weight::Word, &visible(text));
         }
     }
 
     /// Says something that may spoil the result.
     pub fn warn(&mut self, text: &str) {
-        self.line(Weight::Warning, &format!("warning: {text}"));
+        self.line(Weight::Warning, &format!("warning: {}", visible(text)));
     }
 
     /// Says why it cannot go on.
     pub fn error(&mut self, text: &str) {
-        self.line(Weight::Error, &format!("error: {text}"));
+        self.line(Weight::Error, &format!("error: {}", visible(text)));
     }
 
     /// Shows where a long piece of work stands.
     pub fn progress(&mut self, text: &str) {
         if let Some(service) = &mut self.service {
-            service.status(text);
+            service.status(&clean(text));
         }
         if self.is_quiet {
             return;
@@ -205,7 +205,7 @@ impl Console {
             self.has_open_line = true;
         } else if is_worth_saying(self.last_plain.as_ref(), text, period) {
             self.last_plain = Some((Instant::now(), text.to_owned()));
-            self.line(Weight::Progress, text);
+            self.line(Weight::Progress, &visible(text));
         }
     }
 
@@ -222,7 +222,7 @@ impl Console {
     /// any other is told at once and counts in [`Console::exit_code`].
     pub fn result(&mut self, text: &str) -> bool {
         self.close_line();
-        let Err(error) = write_to(&mut anstream::stdout(), text) else {
+        let Err(error) = write_to(&mut anstream::stdout(), &visible_laid_out(text)) else {
             return true;
         };
         if error.kind() != io::ErrorKind::BrokenPipe && !self.has_lost_result {
@@ -246,13 +246,13 @@ impl Console {
 
     /// Says text that is already laid out, such as an annotated piece of a file.
     pub fn rendered(&mut self, text: &str) {
-        self.line(Weight::Word, text.trim_end());
+        self.line(Weight::Word, &visible_laid_out(text.trim_end()));
     }
 
     /// Says faults that are already laid out, such as those of a file.
     pub fn faults(&mut self, text: &str) {
         match self.listener {
-            Listener::Journal => self.line(Weight::Error, text.trim_end()),
+            Listener::Journal => self.line(Weight::Error, &visible_laid_out(text.trim_end())),
             // They have colours of their own.
             Listener::Terminal | Listener::Other => self.rendered(text),
         }

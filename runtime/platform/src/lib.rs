@@ -9,6 +9,8 @@ pub mod domain_address;
 pub mod host_facts;
 pub mod host_limits;
 pub mod open_files;
+pub mod own_folder;
+pub mod own_process;
 pub mod progress;
 pub mod random;
 pub mod realtime;

@@ -1,4 +1,4 @@
-//! The descriptors of this process: how many it may have, and leaving none to a successor.
+//! The descriptors of this process: how many it may have, and leaving none to those it starts.
 //!
 //! Programs that use `select` break above 1024, so the soft limit is low by convention and ours raise
 //! it for themselves. A user's own program gets back what there was.
@@ -47,29 +47,48 @@ pub fn set_limit(soft: u64) -> io::Result<()> {
     Ok(setrlimit(Resource::RLIMIT_NOFILE, soft.min(hard), hard)?)
 }
 
-/// Closes all but the standard descriptors: what the process that started this one left open. Call it
-/// before anything is opened.
+/// Keeps all descriptors but the standard ones from whatever this process starts or becomes from here on:
+/// what its parent left open, and those of libraries that do not mark theirs (shared memory). Call it
+/// directly before.
 ///
 /// # Errors
 /// When the kernel does not list them.
-pub fn close_inherited() -> io::Result<()> {
+#[allow(unsafe_code, reason = "a descriptor of another's has no safe setter")]
+pub fn withhold() -> io::Result<()> {
     const STANDARD_MAX: i32 = 2;
-    let entries = fs::read_dir("/proc/self/fd")?;
-    let numbers = entries.flatten().filter_map(|entry| {
+    for entry in fs::read_dir("/proc/self/fd")?.flatten() {
         let name = entry.file_name();
-        name.to_str()?.parse::<i32>().ok()
-    });
-    // Collected first: the listing has a descriptor of its own, which is gone by then.
-    let numbers: Vec<i32> = numbers.filter(|number| *number > STANDARD_MAX).collect();
-    for number in numbers {
-        let _gone = nix::unistd::close(number).is_err();
+        let number = name.to_str().and_then(|name| name.parse::<i32>().ok());
+        if let Some(number) = number.filter(|number| *number > STANDARD_MAX) {
+            // SAFETY: the call closes nothing and touches no memory; a descriptor that is gone by now is an
+            // error, which leaves nothing to keep from anybody.
+            let _gone = unsafe { libc::fcntl(number, libc::F_SETFD, libc::FD_CLOEXEC) };
+        }
     }
     Ok(())
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
+    use std::process::Command;
+
+    use nix::fcntl::{FcntlArg, FdFlag, fcntl};
+
     use super::*;
+
+    #[test]
+    fn a_descriptor_that_a_library_left_open_for_all_is_not_had_by_a_child() {
+        let shared = File::open("/proc/version").unwrap();
+        fcntl(&shared, FcntlArg::F_SETFD(FdFlag::empty())).unwrap();
+        let listed = || {
+            let listing = Command::new("ls").args(["-l", "/proc/self/fd"]).output();
+            String::from_utf8(listing.unwrap().stdout).unwrap()
+        };
+        assert!(listed().contains("/proc/version"));
+        withhold().unwrap();
+        assert!(!listed().contains("/proc/version"));
+    }
 
     #[test]
     fn the_limit_is_raised_and_what_there_was_is_remembered_and_set_again() {

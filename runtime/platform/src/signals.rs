@@ -1,10 +1,12 @@
-//! Ctrl-C and SIGTERM as a flag the supervisor looks at. A second one ends the program at once.
+//! Ctrl-C and SIGTERM as a flag the supervisor looks at, and the signal state that a process inherits. A
+//! second signal ends the program at once.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
-use std::{io, process, thread};
+use std::{io, process, ptr, thread};
 
+use nix::sys::signal::SigSet;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::flag;
 
@@ -17,6 +19,35 @@ const EXIT_DROPPED: i32 = 131;
 
 /// How often a watch looks for a signal.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
+
+/// Undoes what a parent may have left that keeps a program from seeing its children end or from being
+/// stopped: an ignored SIGCHLD, with which the kernel tells nobody how a child ended and gives its number
+/// away, and blocked signals. First in `main`, before there are threads.
+///
+/// # Errors
+/// When the kernel refuses.
+#[allow(unsafe_code, reason = "the disposition of a signal has no safe setter")]
+pub fn reset_inherited() -> io::Result<()> {
+    // SAFETY: SIG_DFL installs no handler, so no code of this program can run in one.
+    let before = unsafe { libc::signal(libc::SIGCHLD, libc::SIG_DFL) };
+    if before == libc::SIG_ERR {
+        return Err(io::Error::last_os_error());
+    }
+    Ok(SigSet::empty().thread_set_mask()?)
+}
+
+#[allow(unsafe_code, reason = "the disposition of a signal has no safe getter")]
+fn is_ignored(signal: i32) -> io::Result<bool> {
+    let mut action = std::mem::MaybeUninit::<libc::sigaction>::uninit();
+    // SAFETY: without a new action the call only writes the present one to `action`, which has room for it.
+    let result = unsafe { libc::sigaction(signal, ptr::null(), action.as_mut_ptr()) };
+    if result != 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: the call succeeded, so the kernel's answer is in place.
+    let action = unsafe { action.assume_init() };
+    Ok(action.sa_sigaction == libc::SIG_IGN)
+}
 
 /// While it lives a signal ends the program; see [`Signals::end_program_unless_over`].
 #[derive(Debug)]
@@ -37,7 +68,8 @@ pub struct Signals {
 }
 
 impl Signals {
-    /// Takes over SIGINT, SIGTERM and SIGHUP.
+    /// Takes over SIGINT, SIGTERM and SIGHUP. SIGINT and SIGHUP stay ignored where this process was started
+    /// with them ignored, as by `nohup` or in the background of a script.
     ///
     /// # Errors
     /// When the system refuses a handler.
@@ -46,11 +78,15 @@ impl Signals {
     /// Never: signal numbers are positive.
     pub fn install() -> io::Result<Self> {
         let which = Arc::new(AtomicUsize::new(0));
+        // One for all: the second signal ends the program, of whatever kind either is.
+        let armed = Arc::new(AtomicBool::new(false));
         for signal in [SIGINT, SIGTERM, SIGHUP] {
-            let armed = Arc::new(AtomicBool::new(false));
+            if signal != SIGTERM && is_ignored(signal)? {
+                continue;
+            }
             // Order matters: the first signal finds the flag unset and then sets it.
             flag::register_conditional_shutdown(signal, EXIT_DROPPED, Arc::clone(&armed))?;
-            flag::register(signal, armed)?;
+            flag::register(signal, Arc::clone(&armed))?;
             let number = usize::try_from(signal).expect("signal numbers are positive");
             flag::register_usize(signal, Arc::clone(&which), number)?;
         }

@@ -4,6 +4,7 @@
 use serde::ser::SerializeStruct;
 use serde::{Serialize, Serializer};
 
+use crate::terminal::strip;
 use crate::units::{self, duration, percent};
 use hil_platform::text::grouped;
 
@@ -28,6 +29,8 @@ pub enum Tone {
     Faint,
     /// A bar.
     Bar,
+    /// Where the reader stands.
+    Chosen,
 }
 
 impl Tone {
@@ -37,7 +40,7 @@ impl Tone {
             Self::Good => "good",
             Self::Caution => "caution",
             Self::Bad => "bad",
-            Self::Plain | Self::Strong | Self::Faint | Self::Bar => "plain",
+            Self::Plain | Self::Strong | Self::Faint | Self::Bar | Self::Chosen => "plain",
         }
     }
 }
@@ -253,6 +256,8 @@ pub struct Table {
 /// A column of a table.
 #[derive(Debug, Clone, Serialize)]
 pub struct Column {
+    /// What CSV calls it.
+    pub key: String,
     /// Its head.
     pub label: String,
     /// Zero is always shown; where there is no room, the highest goes first.
@@ -290,6 +295,24 @@ pub enum Cell {
     Duration(i64),
     /// A ratio, shown in per cent.
     Share(f64),
+    /// A number without a unit.
+    Number {
+        /// The number.
+        value: f64,
+        /// Digits that are shown behind the point.
+        decimals: usize,
+    },
+    /// From one number to another.
+    Range {
+        /// Lower end.
+        low: f64,
+        /// Upper end.
+        high: f64,
+        /// Digits that are shown behind the point.
+        decimals: usize,
+    },
+    /// A series of equal steps; `None` where nothing is known.
+    Spark(Vec<Option<f64>>),
     /// There is none here.
     Missing,
 }
@@ -310,6 +333,11 @@ impl Cell {
         ratio.map_or(Self::Missing, Self::Share)
     }
 
+    /// A number shown with so many decimals, where there is one.
+    pub fn number(value: Option<f64>, decimals: usize) -> Self {
+        value.map_or(Self::Missing, |value| Self::Number { value, decimals })
+    }
+
     /// As a reader wants it.
     pub fn text(&self) -> String {
         match self {
@@ -317,29 +345,37 @@ impl Cell {
             Self::Count(count) => grouped(*count),
             Self::Duration(ns) => duration(*ns),
             Self::Share(ratio) => percent(*ratio),
+            Self::Number { value, decimals } => format!("{value:.decimals$}"),
+            Self::Range {
+                low,
+                high,
+                decimals,
+            } => format!("{low:.decimals$} to {high:.decimals$}"),
+            Self::Spark(values) => strip(values, values.len()),
             Self::Missing => "–".to_owned(),
         }
     }
 
     /// Number and unit for a program.
-    fn number(&self) -> Option<(f64, &'static str)> {
+    pub(crate) fn for_program(&self) -> Option<(f64, &'static str)> {
         match self {
-            Self::Text(_) | Self::Missing => None,
+            Self::Text(_) | Self::Range { .. } | Self::Spark(_) | Self::Missing => None,
             Self::Count(count) => Some((*count as f64, "1")),
             Self::Duration(ns) => Some((units::ns_s(*ns), "s")),
             Self::Share(ratio) => Some((*ratio, "share")),
+            Self::Number { value, .. } => Some((*value, "1")),
         }
     }
 
     /// True for what stands at the right of its column.
     pub(crate) fn is_number(&self) -> bool {
-        self.number().is_some()
+        self.for_program().is_some() || matches!(self, Self::Range { .. })
     }
 }
 
 impl Serialize for Cell {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let number = self.number();
+        let number = self.for_program();
         let mut cell = serializer.serialize_struct("Cell", 3)?;
         cell.serialize_field("text", &self.text())?;
         cell.serialize_field("value", &number.map(|(value, _)| value))?;
@@ -364,6 +400,7 @@ impl Table {
     /// An empty one, every column of which is always shown.
     pub fn new(title: &str, columns: &[&str]) -> Self {
         let column = |label: &&str| Column {
+            key: (*label).to_owned(),
             label: (*label).to_owned(),
             rank: 0,
         };

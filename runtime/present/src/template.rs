@@ -3,6 +3,8 @@
 use minijinja::{AutoEscape, Environment, ErrorKind, UndefinedBehavior, Value, context};
 use serde::Serialize;
 
+use hil_platform::text::visible;
+
 use crate::units::JOINT;
 use crate::{Section, joined_labels};
 
@@ -151,7 +153,7 @@ fn field(figure: &Value, name: &str) -> Result<Value, minijinja::Error> {
 /// `text` for XML and HTML, within elements and quoted attributes.
 pub fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
+    for c in visible(text).chars() {
         match c {
             '&' => out.push_str("&amp;"),
             '<' => out.push_str("&lt;"),
@@ -159,14 +161,7 @@ pub fn escaped(text: &str) -> String {
             '"' => out.push_str("&quot;"),
             '\'' => out.push_str("&#39;"),
             // XML has no word for these, not even escaped.
-            '\u{0}'..='\u{8}'
-            | '\u{b}'
-            | '\u{c}'
-            | '\u{e}'..='\u{1f}'
-            | '\u{fffe}'
-            | '\u{ffff}' => {
-                out.push('\u{fffd}');
-            }
+            '\u{fffe}' | '\u{ffff}' => out.push('\u{fffd}'),
             _ => out.push(c),
         }
     }
@@ -176,13 +171,13 @@ pub fn escaped(text: &str) -> String {
 /// For a cell of a GitHub table or a line of prose.
 fn markdown_escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
+    for c in visible(text).chars() {
         match c {
             '\\' | '`' | '*' | '_' | '[' | ']' | '|' | '#' | '~' => out.extend(['\\', c]),
             '<' => out.push_str("&lt;"),
             '>' => out.push_str("&gt;"),
             '&' => out.push_str("&amp;"),
-            '\n' | '\r' => out.push(' '),
+            '\n' => out.push(' '),
             _ => out.push(c),
         }
     }
@@ -192,7 +187,7 @@ fn markdown_escaped(text: &str) -> String {
 /// For text in `LaTeX`.
 fn tex_escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
+    for c in visible(text).chars() {
         match c {
             '&' | '%' | '$' | '#' | '_' | '{' | '}' => out.extend(['\\', c]),
             '\\' => out.push_str(r"\textbackslash{}"),
@@ -207,7 +202,7 @@ fn tex_escaped(text: &str) -> String {
             '±' => out.push_str(r"$\pm$"),
             '−' => out.push_str("$-$"),
             '–' => out.push_str("--"),
-            '\n' | '\r' => out.push(' '),
+            '\n' => out.push(' '),
             _ => out.push(c),
         }
     }
@@ -221,6 +216,9 @@ mod tests {
     #[test]
     fn each_language_keeps_a_text_a_text() {
         assert_eq!(markdown_escaped("a|b_<c>\n"), "a\\|b\\_&lt;c&gt; ");
+        assert_eq!(markdown_escaped("\u{1b}]0;x\u{7}"), "\\\\x1b\\]0;x\\\\x07");
+        assert_eq!(escaped("\u{9b}2J\u{202e}<b>"), "\\x9b2J\\u{202e}&lt;b&gt;");
+        assert_eq!(tex_escaped("\u{1b}"), r"\textbackslash{}x1b");
         assert_eq!(tex_escaped("5 % of a_b\\"), r"5 \% of a\_b\textbackslash{}");
     }
 

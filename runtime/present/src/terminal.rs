@@ -156,16 +156,19 @@ struct Layout {
     widths: Vec<usize>,
     are_numbers: Vec<bool>,
     bar_width: usize,
+    /// Labels of columns that there was no room for.
+    left_out: Vec<String>,
 }
 
 impl Layout {
-    fn of(table: &Table, room: usize) -> Self {
+    fn of(table: &Table, room: Option<usize>) -> Self {
+        let is_full = |row: &&Row| row.cells.len() == table.columns.len();
+        // Names before reasons count where nothing else stands in the column.
+        let has_full = table.rows.iter().any(|row| is_full(&row));
         let width_of = |index: usize| {
-            let cells = table
-                .rows
-                .iter()
-                .filter(|row| row.cells.len() == table.columns.len());
-            let cells = cells.map(|row| columns(&row.cells[index].text())).max();
+            let is_told = |row: &&Row| is_full(row) || !has_full && index + 1 < row.cells.len();
+            let rows = table.rows.iter().filter(is_told);
+            let cells = rows.map(|row| columns(&row.cells[index].text())).max();
             cells.unwrap_or(0).max(columns(&table.columns[index].label))
         };
         let has_value = |index: &usize| {
@@ -180,6 +183,8 @@ impl Layout {
             shown.iter().map(|index| widths[*index]).sum::<usize>() + gaps
         };
         let wanted = if has_bar { GAP + BAR_MIN } else { 0 };
+        let room = room.unwrap_or_else(|| total(&shown, &widths) + wanted);
+        let mut left_out = Vec::new();
         while total(&shown, &widths) + wanted > room {
             let rank = |index: &usize| table.columns[*index].rank;
             match shown
@@ -188,7 +193,10 @@ impl Layout {
                 .filter(|index| rank(index) > 0)
                 .max_by_key(rank)
             {
-                Some(least) => shown.retain(|index| *index != least),
+                Some(least) => {
+                    left_out.insert(0, table.columns[least].label.clone());
+                    shown.retain(|index| *index != least);
+                }
                 None => break,
             }
         }
@@ -221,6 +229,7 @@ impl Layout {
             bar_width: if has_bar && left >= BAR_MIN { left } else { 0 },
             shown,
             widths,
+            left_out,
         }
     }
 
@@ -239,7 +248,7 @@ pub fn table(canvas: &mut Canvas, table: &Table) {
     if !table.title.is_empty() {
         canvas.paragraph(INDENT, Tone::Faint, &table.title);
     }
-    let layout = Layout::of(table, canvas.width() - INDENT);
+    let layout = Layout::of(table, canvas.table_room());
     let gap = " ".repeat(GAP);
     let head = layout
         .shown
@@ -251,6 +260,10 @@ pub fn table(canvas: &mut Canvas, table: &Table) {
     }
     for row in &table.rows {
         table_row(canvas, table, &layout, row);
+    }
+    if !layout.left_out.is_empty() {
+        let text = format!("no room for the columns: {}", layout.left_out.join(", "));
+        canvas.paragraph(INDENT, Tone::Faint, &text);
     }
     if !table.note.is_empty() {
         canvas.paragraph(INDENT, Tone::Faint, &table.note);
@@ -376,7 +389,7 @@ fn marks(strips: &Strips, room: usize) -> String {
 }
 
 /// `width` columns, each as high as the largest value of its time.
-fn strip(values: &[Option<f64>], width: usize) -> String {
+pub(crate) fn strip(values: &[Option<f64>], width: usize) -> String {
     let largest = values.iter().flatten().copied().fold(0.0, f64::max);
     let column = |index: usize| {
         let from = index * values.len() / width;
@@ -460,6 +473,7 @@ mod tests {
     fn a_table_without_room_drops_the_column_of_highest_rank_and_keeps_reasons_whole() {
         let mut one = Table::new("", &["channel", "p50", "p99"]);
         one.columns.push(Column {
+            key: String::new(),
             label: "what a page with room has besides".to_owned(),
             rank: 1,
         });
@@ -479,15 +493,27 @@ mod tests {
         });
         let narrow = text_of(80, |canvas| table(canvas, &one));
         assert!(
-            !narrow.contains("besides") && narrow.contains("1.50 µs"),
+            narrow.contains("columns: what a page") && narrow.contains("1.50 µs"),
             "{narrow}"
         );
+        assert!(!narrow.contains("1,234"), "{narrow}");
         let wide = text_of(120, |canvas| table(canvas, &one));
         assert!(wide.contains("besides") && wide.contains("1,234"), "{wide}");
         for (text, width) in [(&narrow, 80), (&wide, 120)] {
             assert!(text.lines().all(|line| columns(line) <= width), "{text}");
             assert_eq!(text.matches("unrecorded").count(), 12, "{text}");
         }
+    }
+
+    #[test]
+    fn a_name_stands_before_its_reason_where_no_row_has_values() {
+        let mut one = Table::new("", &["", "p50", "p99"]);
+        one.push(["interval".into(), "fewer than two datagrams".into()]);
+        let text = text_of(80, |canvas| table(canvas, &one));
+        assert!(
+            text.ends_with("\n  interval  fewer than two datagrams\n"),
+            "{text}"
+        );
     }
 
     #[test]

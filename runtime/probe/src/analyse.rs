@@ -1,20 +1,26 @@
 //! One or two captures, drawn up: what each point saw of each flow, and what two points say of it
-//! together. Text and JSON come from the same figures.
+//! together. Sections and JSON come from the same figures.
 
 use core::fmt::Write as _;
 use std::path::Path;
 
 use hil_capture::flow::FlowFilter;
-use hil_capture::join::{JoinMetrics, Joined, OrderSource};
+use hil_capture::join::{
+    CountedDoubt, Doubt, JoinMetrics, JoinSettings, Joined, Loss, OrderSource,
+};
 use hil_capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_capture::pairing::join_all;
 use hil_capture::point::{PointMetrics, single_point_metrics};
+use hil_capture::watch::Unread;
 use hil_core::interval::Spread;
-use hil_stats::histogram::Distribution;
 use serde::Serialize;
 
 use super::files::{CaptureFile, FileError, read};
 use super::point_clocks::PointClocks;
+use hil_platform::text::grouped;
+use hil_present::units::{duration, duration_s, percent, seconds};
+use hil_present::{Cell, Section, Table, Tone};
+use hil_report::quantile_table;
 
 /// Captures read, and every point in them.
 #[derive(Debug)]
@@ -63,6 +69,19 @@ impl Reading {
         if let Some(port) = point.esl_port {
             let _infallible = write!(text, ":port{port}");
         }
+        for (word, number) in [
+            ("if", point.interface_number),
+            ("vlan", point.vlan.map(u32::from)),
+        ] {
+            if let Some(number) = number {
+                let _infallible = write!(text, ":{word}{number}");
+            }
+        }
+        match point.radio_leg {
+            Some((true, false)) => text.push_str(":to-ap"),
+            Some((false, true)) => text.push_str(":from-ap"),
+            _ => {}
+        }
         if point.direction != hil_net::Direction::Unknown {
             let _infallible = write!(text, " ({})", point.direction.label());
         }
@@ -73,7 +92,7 @@ impl Reading {
     fn nic_streams(&self) -> impl Iterator<Item = (&Point, &Stream, &Vec<Observation>, u64)> {
         let seen = self.of_cards.seen().iter();
         let streams = seen.flat_map(|(point, seen)| {
-            let streams = seen.streams.iter();
+            let streams = seen.iter();
             streams.map(move |(stream, list)| (point, stream, list))
         });
         streams.map(|(point, stream, list)| {
@@ -88,15 +107,15 @@ impl Reading {
             let of_kernel = self.observer.seen().iter();
             let all: usize = of_kernel
                 .filter(|(one, _)| is_same_place(one))
-                .filter_map(|(_, seen)| seen.streams.get(stream).map(Vec::len))
+                .filter_map(|(_, seen)| seen.get(stream).map(Vec::len))
                 .sum();
             (point, stream, list, all as u64)
         })
     }
 
     /// Every stream at two points, joined.
-    pub(super) fn joined(&self, window_ns: i64) -> Vec<(Stream, Joined)> {
-        join_all(&self.observer, window_ns)
+    pub(super) fn joined(&self, settings: &JoinSettings) -> Vec<(Stream, Joined)> {
+        join_all(&self.observer, settings)
     }
 
     /// True when a file has a fault or says that packets were dropped.
@@ -182,7 +201,7 @@ pub(super) struct Report {
 
 impl Report {
     /// Draws up the figures.
-    pub(super) fn of(reading: &Reading, window_ns: i64, is_one_clock: bool) -> Self {
+    pub(super) fn of(reading: &Reading, settings: &JoinSettings) -> Self {
         let stream_report = |stream: &Stream| StreamReport {
             flow: reading.observer.flows()[stream.flow_index].to_string(),
             source: stream.source.to_string(),
@@ -192,7 +211,7 @@ impl Report {
         };
         let mut points = Vec::new();
         for (point, seen) in reading.observer.seen() {
-            for (stream, observations) in &seen.streams {
+            for (stream, observations) in seen {
                 points.extend(
                     single_point_metrics(observations).map(|figures| PointReport {
                         point: reading.name(point),
@@ -216,11 +235,12 @@ impl Report {
                 },
             }));
         }
-        let joins = reading.joined(window_ns).into_iter();
-        let clocks =
-            |one: &Joined| PointClocks::of(&one.first_point, &one.second_point, is_one_clock);
+        let joins = reading.joined(settings).into_iter();
+        let clocks = |one: &Joined| {
+            PointClocks::of(&one.first_point, &one.second_point, settings.is_one_clock)
+        };
         Self {
-            schema_version: 1,
+            schema_version: 2,
             files: reading.files.iter().map(file_report).collect(),
             packets: *reading.observer.counts(),
             points,
@@ -237,24 +257,69 @@ impl Report {
         }
     }
 
+    /// True when loss is unavailable between two points, or a clock was set.
+    pub(super) fn has_doubts(&self) -> bool {
+        let is_doubtful = |one: &JoinReport| {
+            one.figures.loss.count().is_none()
+                || one
+                    .figures
+                    .clock_steps
+                    .iter()
+                    .any(|steps| !steps.is_empty())
+        };
+        self.joins.iter().any(is_doubtful)
+    }
+
+    /// What makes figures unavailable, in words.
+    pub(super) fn complaints(&self) -> Vec<String> {
+        let mut complaints = Vec::new();
+        for one in &self.joins {
+            if let Loss::Unavailable { doubts, .. } = &one.figures.loss {
+                let why = doubts_text(doubts);
+                complaints.push(format!("loss from {} to {}: {why}", one.first, one.second));
+            }
+            for (point, steps) in [&one.first, &one.second]
+                .into_iter()
+                .zip(&one.figures.clock_steps)
+            {
+                complaints.extend(steps.iter().map(|step| {
+                    format!(
+                        "{point}: its clock was set by {}: delays are unavailable",
+                        duration(step.by_ns)
+                    )
+                }));
+            }
+        }
+        complaints
+    }
+
     /// True when no packet was read at all.
     pub(super) fn is_empty(&self) -> bool {
         self.packets.packet_count == 0
     }
 
-    pub(super) fn to_text(&self) -> String {
-        let mut lines: Vec<String> = self.files.iter().map(file_line).collect();
+    pub(super) fn sections(&self) -> Vec<Section> {
+        let mut sections = vec![self.captures()];
+        sections.extend(self.points.iter().map(point_section));
+        sections.extend(self.joins.iter().map(join_section));
+        sections
+    }
+
+    /// What was read.
+    fn captures(&self) -> Section {
+        let mut section = Section::new("captures", "Captures", "");
+        for file in &self.files {
+            section.fact("file", Tone::Plain, file_words(file));
+        }
         let counts = &self.packets;
-        lines.push(format!(
-            "{} packets: {} followed, {} of other flows, {} not IP, {} not UDP, {} unreadable",
-            counts.packet_count,
-            counts.followed_count,
-            counts.other_flow_count,
-            counts.not_ip_count,
-            counts.not_udp_count,
-            counts.unreadable_count
-        ));
+        let mut table = Table::new("", &["packets", ""]);
         for (count, what) in [
+            (counts.packet_count, "read"),
+            (counts.followed_count, "followed"),
+            (counts.other_flow_count, "of other flows"),
+            (counts.not_ip_count, "not IP"),
+            (counts.not_udp_count, "not UDP"),
+            (counts.unreadable_count, "unreadable"),
             (
                 counts.foreign_count,
                 "with a flow's address but of another protocol",
@@ -269,6 +334,7 @@ impl Report {
             ),
             (counts.later_fragment_count, "later fragments, left out"),
             (counts.stampless_count, "without a time stamp, left out"),
+            (counts.radio_retry_count, "sent again by a radio, left out"),
             (
                 counts.backward_stamp_count,
                 "earlier than the one before, put in order",
@@ -279,35 +345,19 @@ impl Report {
                 "for which the ET2000 names no or several ports",
             ),
         ] {
-            if count > 0 {
-                lines.push(format!("  {count} {what}"));
+            if count > 0 || table.rows.len() < 2 {
+                table.push([Cell::Count(count), what.into()]);
             }
         }
-        for point in &self.points {
-            lines.push(String::new());
-            lines.push(format!(
-                "{}  at {}",
-                stream_line(&point.stream),
-                point.point
-            ));
-            if let Some(all) = point.kernel_stamped_count {
-                lines.push(format!("  {all} arrived, of which"));
-            }
-            point_lines(&mut lines, &point.figures);
-        }
-        for joined in &self.joins {
-            lines.push(String::new());
-            lines.push(stream_line(&joined.stream));
-            lines.push(format!("  from {} to {}", joined.first, joined.second));
-            lines.push(format!("  clock       {}", joined.clocks.words()));
-            join_lines(&mut lines, &joined.figures);
-        }
-        lines.join("\n") + "\n"
+        "kinds of which there are none are not listed".clone_into(&mut table.note);
+        section.table(table);
+        section
     }
 }
 
 fn file_report(file: &CaptureFile) -> FileReport {
     let names = file.interfaces.iter().enumerate();
+    let names = names.filter(|(_, one)| one.repeats.is_none());
     FileReport {
         path: file.path.display().to_string(),
         format: file.format,
@@ -325,147 +375,215 @@ fn file_report(file: &CaptureFile) -> FileReport {
     }
 }
 
-fn file_line(file: &FileReport) -> String {
+fn file_words(file: &FileReport) -> String {
     let format = file.format.unwrap_or("unknown format");
     let dropped = match file.dropped_count {
-        Some(count) => format!("{count} dropped by the kernel"),
+        Some(count) => format!("{} dropped", grouped(count)),
         None => "drops unknown".to_owned(),
     };
     let faults = match file.fault_count {
         0 => String::new(),
-        count => format!(", {count} faults"),
+        count => format!(", {} faults", grouped(count)),
     };
     format!(
         "{}: {format}, {} packets on {}, {dropped}{faults}",
         file.path,
-        file.packet_count,
+        grouped(file.packet_count),
         file.interfaces.join(" and ")
     )
 }
 
-fn stream_line(stream: &StreamReport) -> String {
+/// A section under the name of a stream.
+fn stream_section(id: &str, stream: &StreamReport) -> Section {
     let own = match (stream.channel, stream.kind) {
         (Some(channel), Some(kind)) => format!(" channel {channel} {kind}"),
         _ => String::new(),
     };
-    format!(
-        "{}{own}  {} -> {}",
-        stream.flow, stream.source, stream.destination
-    )
+    let ends = format!("{} -> {}", stream.source, stream.destination);
+    Section::new(id, format!("{}{own}", stream.flow), ends)
 }
 
-fn point_lines(lines: &mut Vec<String>, figures: &PointMetrics) {
-    let seconds = figures.last_ns.saturating_sub(figures.first_ns) as f64 * 1e-9;
-    lines.push(format!(
-        "  {} datagrams, {} bytes in {seconds:.3} s",
-        figures.datagram_count, figures.payload_bytes
-    ));
-    lines.push(format!("  interval    {}", quantiles(&figures.interval)));
+fn point_section(point: &PointReport) -> Section {
+    let mut section = stream_section("point", &point.stream);
+    let mut fact = |label: &str, words: String| section.fact(label, Tone::Plain, words);
+    let figures = &point.figures;
+    fact("at", point.point.clone());
+    if let Some(all) = point.kernel_stamped_count {
+        fact("arrived", format!("{}, of which", grouped(all)));
+    }
+    let length_ns = figures.last_ns.saturating_sub(figures.first_ns);
+    fact(
+        "datagrams",
+        format!(
+            "{}, {} bytes in {}",
+            grouped(figures.datagram_count),
+            grouped(figures.payload_bytes),
+            seconds(length_ns as f64 * 1e-9)
+        ),
+    );
     if let Some(gap) = figures.longest_gap {
-        let after = gap.from_ns.saturating_sub(figures.first_ns) as f64 * 1e-9;
-        let length = time(gap.length_ns);
-        lines.push(format!("  longest gap {length} after {after:.3} s"));
+        let after_ns = gap.from_ns.saturating_sub(figures.first_ns);
+        let after = seconds(after_ns as f64 * 1e-9);
+        fact(
+            "longest gap",
+            format!("{} after {after}", duration(gap.length_ns)),
+        );
     }
     if let Some(numbers) = figures.numbers {
         let repeated = numbers.repeated_count;
-        let repeated = repeated.map_or("unknown (pieces)".to_owned(), |count| count.to_string());
-        lines.push(format!(
-            "  numbers     {} series, step {}, {} skipped, {repeated} repeated, {} reordered",
-            numbers.series_count, numbers.step, numbers.skipped_count, numbers.reordered_count
-        ));
+        let repeated = repeated.map_or_else(|| "unknown (pieces)".to_owned(), grouped);
+        fact(
+            "numbers",
+            format!(
+                "{} series, step {}, {} skipped, {repeated} repeated, {} reordered",
+                grouped(numbers.series_count),
+                numbers.step,
+                grouped(numbers.skipped_count),
+                grouped(numbers.reordered_count)
+            ),
+        );
     }
+    section.table(quantile_table(&[("interval", &figures.interval)]));
+    section
 }
 
-fn join_lines(lines: &mut Vec<String>, figures: &JoinMetrics) {
+fn join_section(joined: &JoinReport) -> Section {
+    let mut section = stream_section("join", &joined.stream);
+    let mut fact = |label: &str, words: String| section.fact(label, Tone::Plain, words);
+    let figures = &joined.figures;
+    fact("from", joined.first.clone());
+    fact("to", joined.second.clone());
+    fact("clock", joined.clocks.words().to_owned());
     let order = match figures.order {
         OrderSource::PacketDirection => "by the packets' direction",
+        OrderSource::HopLimit => "by the time to live",
         OrderSource::Stamps => "by most stamps",
+        OrderSource::RoundTrip => "by the round trip",
+        OrderSource::Missing => "by what is missing",
+        OrderSource::Unknown => "order unknown",
     };
-    lines.push(format!(
-        "  seen        {} then {} ({order}), {} at both, {} at an edge",
-        figures.first_count, figures.second_count, figures.matched_count, figures.edge_count
-    ));
-    lines.push(format!(
-        "  lost        {}{}, {} duplicated, {} unexplained",
-        figures.lost_count,
-        percent(figures.loss_ratio, figures.loss_interval),
-        figures.duplicated_count,
-        figures.unexplained_count
-    ));
-    if !figures.loss_bursts.is_empty() {
-        let bursts = figures.loss_bursts.iter();
+    fact("order", order.to_owned());
+    let loss_words = match &figures.loss {
+        Loss::Counted(loss) => {
+            let ratio = loss
+                .ratio
+                .map_or_else(String::new, |ratio| format!(" = {}", percent(ratio)));
+            format!(
+                "{}{ratio}{}",
+                grouped(loss.count),
+                spread_words(loss.interval)
+            )
+        }
+        Loss::Unavailable { range, doubts } => {
+            let range =
+                range.map(|(least, most)| format!(" ({} to {})", grouped(least), grouped(most)));
+            format!(
+                "unavailable{}: {}",
+                range.unwrap_or_default(),
+                doubts_text(doubts)
+            )
+        }
+    };
+    fact("lost", loss_words);
+    if let Loss::Counted(loss) = &figures.loss
+        && !loss.bursts.is_empty()
+    {
+        let bursts = loss.bursts.iter();
         let bursts = bursts.map(|(length, count)| format!("{count}x{length}"));
-        let words: Vec<String> = bursts.collect();
-        lines.push(format!("  loss bursts {}", words.join(" ")));
+        fact("loss runs, RFC 3357", bursts.collect::<Vec<_>>().join(" "));
     }
-    lines.push(format!("  delay       {}", quantiles(&figures.delay)));
-    for (name, interval) in [
-        ("p50", figures.delay_p50_interval),
-        ("p99", figures.delay_p99_interval),
-    ] {
-        if let Some(spread) = interval {
-            #[expect(clippy::cast_possible_truncation, reason = "two of the delays")]
-            let ends = spread
-                .known()
-                .map(|one| [one.low, one.high].map(|ns| time(ns as i64)));
-            let words = ends.map_or_else(String::new, |[low, high]| format!("{low} to {high}; "));
-            lines.push(format!("    {name} 95 %: {words}{spread}"));
+    for (which, steps) in ["first", "second"].into_iter().zip(&figures.clock_steps) {
+        for one in steps {
+            fact(
+                "clock step",
+                format!("{} at the {which} point", duration(one.by_ns)),
+            );
         }
     }
-    lines.push(format!(
-        "  variation   {} (RFC 5481)",
-        quantiles(&figures.variation)
-    ));
-    if let (Some(last), Some(mean)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
-        let (last, mean) = (last * 1e-3, mean * 1e-3);
-        lines.push(format!(
-            "  jitter      {last:.2} us at the end, {mean:.2} us mean (RFC 3550)"
-        ));
+    if let Some(shift) = figures.delay_shift {
+        let more = duration(shift.by_ns);
+        fact(
+            "level",
+            format!("{more} more from one datagram on: a clock set, or another way"),
+        );
     }
-    lines.push(format!(
-        "  reordered   {}, extent at most {} (RFC 4737)",
-        figures.reordered_count, figures.reordering_extent_max
-    ));
+    let (extent, n) = (figures.reordering_extent_max, figures.reordering_n_max);
+    fact(
+        "reordering",
+        format!("extent at most {extent}, {n}-reordered at most, RFC 4737"),
+    );
+    if let (Some(last), Some(mean)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
+        let (last, mean) = (duration_s(last * 1e-9), duration_s(mean * 1e-9));
+        fact(
+            "jitter",
+            format!("{last} at the end, {mean} mean (RFC 3550)"),
+        );
+    }
+    for (label, interval) in [
+        ("delay, p50", figures.delay_p50_interval),
+        ("delay, p99", figures.delay_p99_interval),
+    ] {
+        match interval {
+            Some(Spread::Known(one)) => {
+                let (low, high) = (duration_s(one.low * 1e-9), duration_s(one.high * 1e-9));
+                let method = one.method.name();
+                fact(label, format!("{low} to {high} (95 %, {method})"));
+            }
+            Some(Spread::Unknown(why)) => fact(label, why.to_string()),
+            None => {}
+        }
+    }
+    let counts = [
+        ("first", figures.first_count),
+        ("second", figures.second_count),
+        ("both", figures.matched_count),
+        ("at an edge", figures.edge_count),
+        ("duplicated, RFC 5560", figures.duplicated_count),
+        ("unexplained", figures.unexplained_count),
+        ("reordered", figures.reordered_count),
+    ];
+    let mut seen = Table::new("", &counts.map(|(label, _)| label));
+    seen.push(counts.map(|(_, count)| Cell::Count(count)));
+    section.table(seen);
+    section.table(quantile_table(&[
+        ("delay", &figures.delay),
+        ("variation, RFC 5481 PDV", &figures.variation),
+        ("variation, RFC 5481 IPDV", &figures.successive),
+    ]));
+    section
 }
 
-fn percent(ratio: Option<f64>, interval: Option<Spread>) -> String {
-    let mut text = String::new();
-    if let Some(ratio) = ratio {
-        // Writing to a string cannot fail.
-        let _infallible = write!(text, " = {:.4} %", 100.0 * ratio).is_ok();
-    }
+/// Why loss is unavailable.
+fn doubts_text(doubts: &[CountedDoubt]) -> String {
+    let words = doubts
+        .iter()
+        .map(|CountedDoubt { doubt, count }| match doubt {
+            Doubt::Unread(Unread::LinkType { link_type }) => {
+                format!("{count} of link type {link_type}, which is not read")
+            }
+            Doubt::Unread(Unread::CutShort) => format!("{count} captured too short"),
+            Doubt::Unread(Unread::Malformed) => format!("{count} malformed"),
+            Doubt::Unread(Unread::Encrypted) => format!("{count} encrypted"),
+            Doubt::Unread(Unread::Aggregate) => {
+                format!("{count} hold several datagrams (segmentation or receive offload)")
+            }
+            Doubt::Unread(Unread::NoStamp) => format!("{count} without a time stamp"),
+            Doubt::Dropped => format!("{count} dropped by the capture"),
+            Doubt::Order => {
+                format!("{count} at one point only, and which comes first is unknown (--one-clock)")
+            }
+        });
+    words.collect::<Vec<String>>().join(", ")
+}
+
+/// An interval of a share with its method, or why there is none.
+fn spread_words(interval: Option<Spread>) -> String {
     match interval {
         Some(Spread::Known(one)) => {
-            let (low, high) = (100.0 * one.low, 100.0 * one.high);
-            let _infallible = write!(text, " ({low:.4} to {high:.4} %, 95 %)").is_ok();
+            let (low, high) = (percent(one.low), percent(one.high));
+            format!(" ({low} to {high}, 95 %, {})", one.method.name())
         }
-        Some(Spread::Unknown(why)) => {
-            let _infallible = write!(text, " ({why})").is_ok();
-        }
-        None => {}
-    }
-    text
-}
-
-/// Nanoseconds in a unit of at most four digits before the point.
-pub(super) fn time(ns: i64) -> String {
-    match ns.unsigned_abs() {
-        0..10_000_000 => format!("{:.2} us", ns as f64 * 1e-3),
-        10_000_000..10_000_000_000 => format!("{:.2} ms", ns as f64 * 1e-6),
-        _ => format!("{:.3} s", ns as f64 * 1e-9),
-    }
-}
-
-pub(super) fn quantiles(distribution: &Distribution) -> String {
-    match distribution {
-        Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
-        Distribution::Measured(one) => format!(
-            "min {}  p50 {}  p99 {}  p99.9 {}  max {}",
-            time(one.min_ns),
-            time(one.p50_ns),
-            time(one.p99_ns),
-            time(one.p999_ns),
-            time(one.max_ns)
-        ),
+        Some(Spread::Unknown(why)) => format!(" ({why})"),
+        None => String::new(),
     }
 }

@@ -32,7 +32,7 @@ commas between:
   hashed)
 
 Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a
-fault, or the figures differ; 2 wrong arguments, nothing to read, or a capture
+fault, loss is unavailable, a clock was set, or the figures differ; 2 wrong arguments, nothing to read, or a capture
 without anything of the run; 69 no such interface; 78 the right to capture is
 missing (root or CAP_NET_RAW), or the card gives no stamps; 130 interrupted
 before --duration was over, the file is complete";
@@ -115,7 +115,7 @@ pub(crate) enum ProbeWork {
     /// Delay, jitter, loss, reordering and gaps of the flows in one or two captures.
     #[command(after_help = ANALYSE_EXAMPLES)]
     Analyse {
-        /// pcap or pcapng, also of an ET2000.
+        /// pcap or pcapng, also packed with gzip, or of an ET2000.
         file: PathBuf,
         /// The capture of a second point.
         second: Option<PathBuf>,

@@ -2,14 +2,13 @@
 //! between the kernel's stamps, message by message. Neither side knows of the other: the run's come
 //! from record files and summary, the probe's from captures.
 
-use core::fmt::Write as _;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
 use hil_account::{AccountContext, ChannelPath, ChannelRecords, each_history};
 use hil_capture::flow::OwnHeader;
-use hil_capture::join::Joined;
+use hil_capture::join::{JoinSettings, Joined};
 use hil_capture::observe::{Observation, Stream};
 use hil_core::record::{EgressRecord, IngressRecord, stamp};
 use hil_net::Direction;
@@ -18,9 +17,11 @@ use hil_protocol::wire::Kind;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
 use serde::Serialize;
 
-use super::analyse::{Reading, quantiles};
+use super::analyse::Reading;
 use super::point_clocks::WireClocks;
 use hil_platform::progress::Stage;
+use hil_present::{Cell, Row, Section, Table, Tone, UNAVAILABLE};
+use hil_report::quantile_table;
 use hil_report::summary::{CounterGroup, LinkKind, RunSummary, SummaryError};
 use hil_rundir::launch::Side;
 use hil_rundir::record::{RecordFile, RecordFileError, RecordKind};
@@ -93,6 +94,53 @@ impl ChannelComparison {
                 .medians_apart_us()
                 .is_some_and(|apart| apart <= limit_us)
     }
+
+    fn section(&self, limit_us: f64) -> Section {
+        let mut section = Section::new("channel", &self.channel, "");
+        let mut counts = Table::new("", &["datagrams", "gateways", "probe", ""]);
+        for (what, both) in [
+            ("sent", self.sent),
+            ("received", self.received),
+            ("messages sent", self.data_sent),
+            ("messages received", self.data_received),
+        ] {
+            let (tone, word) = if both.is_equal() {
+                (Tone::Plain, "equal")
+            } else {
+                (Tone::Bad, "DIFFERENT")
+            };
+            let gateway = match both.gateway {
+                Some(count) => Cell::Count(count),
+                None => "unknown".into(),
+            };
+            counts.rows.push(Row {
+                cells: vec![what.into(), gateway, Cell::Count(both.probe), word.into()],
+                tone,
+                bar: None,
+            });
+        }
+        section.table(counts);
+        section.table(quantile_table(&[
+            ("wire, gateways", &self.gateway_wire),
+            ("wire, probe", &self.probe_wire),
+            ("probe - gateways", &self.difference),
+            ("  at departure", &self.departure_difference),
+            ("  at arrival", &self.arrival_difference),
+        ]));
+        let (tone, words) = match self.medians_apart_us() {
+            Some(apart) if apart <= limit_us => (
+                Tone::Plain,
+                format!("{apart:.2} µs apart, at most {limit_us} µs"),
+            ),
+            Some(apart) => (
+                Tone::Bad,
+                format!("{apart:.2} µs apart, MORE than {limit_us} µs"),
+            ),
+            None => (Tone::Caution, UNAVAILABLE.to_owned()),
+        };
+        section.fact("medians", tone, words);
+        section
+    }
 }
 
 /// The whole comparison.
@@ -112,57 +160,19 @@ impl Comparison {
         !channels.is_empty() && channels.iter().all(|one| one.agrees_within(limit_us))
     }
 
-    pub(super) fn to_text(&self, limit_us: f64) -> String {
-        let clocks = self.clocks.words();
-        let mut text = format!("{}: gateways and probe; {clocks}\n", self.run);
-        for one in &self.channels {
-            let _infallible = write!(text, "\n{}\n", one.channel);
-            for (what, counts) in [
-                ("sent", one.sent),
-                ("received", one.received),
-                ("messages sent", one.data_sent),
-                ("messages received", one.data_received),
-            ] {
-                let gateway = counts
-                    .gateway
-                    .map_or("unknown".to_owned(), |n| n.to_string());
-                let word = if counts.is_equal() {
-                    "equal"
-                } else {
-                    "DIFFERENT"
-                };
-                let _infallible = writeln!(
-                    text,
-                    "  {what:<18}{gateway:>10} {:>10}  {word}",
-                    counts.probe
-                );
-            }
-            for (what, distribution) in [
-                ("wire, gateways", &one.gateway_wire),
-                ("wire, probe", &one.probe_wire),
-                ("probe - gateways", &one.difference),
-                ("  at departure", &one.departure_difference),
-                ("  at arrival", &one.arrival_difference),
-            ] {
-                let _infallible = writeln!(text, "  {what:<18}{}", quantiles(distribution));
-            }
-            let verdict = match one.medians_apart_us() {
-                Some(apart) if apart <= limit_us => {
-                    format!("  medians {apart:.2} us apart, at most {limit_us} us\n")
-                }
-                Some(apart) => format!("  medians {apart:.2} us apart, MORE than {limit_us} us\n"),
-                None => "  medians unavailable\n".to_owned(),
-            };
-            text.push_str(&verdict);
-        }
+    pub(super) fn sections(&self, limit_us: f64) -> Vec<Section> {
+        let mut head = Section::new("run", &self.run, "gateways and probe");
+        head.note(Tone::Plain, self.clocks.words());
+        let mut sections = vec![head];
+        sections.extend(self.channels.iter().map(|one| one.section(limit_us)));
+        let mut rest = Section::new("left-out", "Not compared", "");
         if !self.left_out.is_empty() {
             let names = self.left_out.join(", ");
-            let _infallible = write!(
-                text,
-                "\nnot compared, as they go over TCP, which does not keep datagrams: {names}\n"
-            );
+            let why = "they go over TCP, which does not keep datagrams";
+            rest.note(Tone::Plain, format!("{names}: {why}"));
         }
-        text
+        sections.push(rest);
+        sections
     }
 }
 
@@ -180,7 +190,7 @@ type Message = (u32, u64);
 pub(super) fn compare(
     run: &Path,
     captures: &Reading,
-    window_ns: i64,
+    settings: &JoinSettings,
     stage: &Stage,
 ) -> Result<Comparison, CompareError> {
     let folder = RunFolder::existing(run);
@@ -194,7 +204,7 @@ pub(super) fn compare(
         return Err(CompareError::NothingOfRun { capture, run });
     }
     let summary = summary(&folder)?;
-    let joined = captures.joined(window_ns);
+    let joined = captures.joined(settings);
     let numbers = channel_numbers(&sides, captures);
     let is_read = |name: &str| {
         summary
@@ -241,7 +251,7 @@ fn file_without(sides: &BTreeMap<String, GatewaySide>, captures: &Reading) -> Op
     let has_some = |index: usize| {
         let points = captures.observer.seen().iter();
         let points = points.filter(|(point, _)| point.file_index == index);
-        let mut observations = points.flat_map(|(_, seen)| seen.streams.values().flatten());
+        let mut observations = points.flat_map(|(_, seen)| seen.values().flatten());
         observations.any(|one| own(one).is_some_and(is_of_run))
     };
     let mut files = captures.files.iter().enumerate();
@@ -339,7 +349,7 @@ fn channel_numbers(
     }
     let mut numbers = BTreeMap::new();
     let seen = captures.observer.seen().values();
-    for observation in seen.flat_map(|seen| seen.streams.values().flatten()) {
+    for observation in seen.flat_map(|seen| seen.values().flatten()) {
         let Some(own) = observation
             .identity
             .own
@@ -367,7 +377,7 @@ impl Probe<'_> {
     fn headers(&self, direction: Direction) -> impl Iterator<Item = OwnHeader> + '_ {
         let points = self.captures.observer.seen().iter();
         let points = points.filter(move |(point, _)| point.direction == direction);
-        let streams = points.flat_map(|(_, seen)| &seen.streams);
+        let streams = points.flat_map(|(_, seen)| seen);
         let ours = streams.filter(|(stream, _)| {
             self.number.is_some() && stream.own.map(|(channel, _)| channel) == self.number
         });
@@ -404,7 +414,7 @@ impl Probe<'_> {
             if self.number.is_none() || stream.own.map(|(channel, _)| channel) != self.number {
                 continue;
             }
-            for pair in &joined.pairs {
+            for pair in joined.pairs.iter().filter(|pair| pair.is_stamped()) {
                 let Some(own) = own(&pair.first).filter(|own| own.kind == Kind::Data) else {
                     continue;
                 };

@@ -11,12 +11,12 @@ mod nic_tap;
 mod output;
 mod point_clocks;
 
-use core::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
 use hil_capture::flow::FlowFilter;
+use hil_capture::join::JoinSettings;
 use hil_core::time::duration_ns;
 use hil_net::filter::FILTER_COUNT_MAX;
 use hil_net::packet_ring::{RingError, RingStamps};
@@ -27,6 +27,10 @@ use self::live::{InterfaceResult, LiveError, LiveResult, Request};
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
+use hil_platform::text::grouped;
+use hil_present::terminal::canvas::Style;
+use hil_present::terminal::render;
+use hil_present::{Section, Tone};
 
 /// Exit codes; the command's help lists them.
 mod exit {
@@ -38,12 +42,13 @@ mod exit {
     pub(crate) const HOST_UNFIT: u8 = 78;
 }
 
-/// Does what the command line says and gives the exit code.
-pub fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
+/// Does what the command line says, on a page of `columns`, and gives the exit code.
+pub fn run(args: &ProbeArgs, columns: usize, console: &mut Console) -> u8 {
+    let text = |sections: &[Section]| render(sections, columns, Style::Coloured);
     match &args.work {
         None => {
             console.set_quiet(args.live.quiet);
-            capture(&args.live, console)
+            capture(&args.live, &text, console)
         }
         Some(ProbeWork::Analyse {
             file,
@@ -52,7 +57,7 @@ pub fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
             reading,
         }) => {
             let paths = paths(file, second.as_deref());
-            analyse(&paths, reading, *one_clock, console)
+            analyse(&paths, reading, *one_clock, &text, console)
         }
         Some(ProbeWork::Compare {
             run,
@@ -70,14 +75,14 @@ pub fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
             }
             let words = "reading records of the run";
             let compared = Progress::begin().during(console, words, |stage| {
-                compare::compare(run, &captures, duration_ns(reading.window), stage)
+                compare::compare(run, &captures, &settings(reading, false), stage)
             });
             match compared {
                 Ok(comparison) => {
                     console.result(&if reading.json {
                         json(&comparison)
                     } else {
-                        comparison.to_text(*limit)
+                        text(&comparison.sections(*limit))
                     });
                     if comparison.agrees_within(*limit) && !captures.has_gaps() {
                         exit::DONE
@@ -101,6 +106,13 @@ fn paths<'a>(file: &'a Path, second: Option<&'a Path>) -> Vec<&'a Path> {
 fn json(value: &impl serde::Serialize) -> String {
     let text = serde_json::to_string_pretty(value);
     format!("{}\n", text.expect("figures are numbers and words"))
+}
+
+fn settings(reading: &ReadingArgs, is_one_clock: bool) -> JoinSettings {
+    JoinSettings {
+        window_ns: duration_ns(reading.window),
+        is_one_clock,
+    }
 }
 
 /// The flows asked for, or our own.
@@ -139,15 +151,17 @@ fn analyse(
     paths: &[&Path],
     reading: &ReadingArgs,
     is_one_clock: bool,
+    text: &dyn Fn(&[Section]) -> String,
     console: &mut Console,
 ) -> u8 {
     let Some(captures) = read(paths, reading, console) else {
         return exit::USAGE;
     };
     let report = Progress::begin().during(console, "drawing up the figures", |_| {
-        Report::of(&captures, duration_ns(reading.window), is_one_clock)
+        Report::of(&captures, &settings(reading, is_one_clock))
     });
-    let complaints = captures.complaints();
+    let mut complaints = captures.complaints();
+    complaints.extend(report.complaints());
     for complaint in &complaints {
         console.warn(complaint);
     }
@@ -157,16 +171,16 @@ fn analyse(
     console.result(&if reading.json {
         json(&report)
     } else {
-        report.to_text()
+        text(&report.sections())
     });
-    if captures.has_gaps() {
+    if captures.has_gaps() || report.has_doubts() {
         exit::GAPS
     } else {
         exit::DONE
     }
 }
 
-fn capture(args: &LiveArgs, console: &mut Console) -> u8 {
+fn capture(args: &LiveArgs, text: &dyn Fn(&[Section]) -> String, console: &mut Console) -> u8 {
     let Some(output) = &args.output else {
         console.error("no --output FILE given for the capture; try --help");
         return exit::USAGE;
@@ -217,7 +231,10 @@ fn capture(args: &LiveArgs, console: &mut Console) -> u8 {
         }
     };
     match live::capture(&request, &signals, console) {
-        Ok(result) => conclude(&request, &result, console),
+        Ok(result) => {
+            console.result(&text(&captured(&request, &result)));
+            code_of(&request, &result, console)
+        }
         Err(error) => {
             console.error(&error.to_string());
             match error {
@@ -236,57 +253,68 @@ fn capture(args: &LiveArgs, console: &mut Console) -> u8 {
     }
 }
 
-/// What came of one interface.
-fn tell(text: &mut String, one: &InterfaceResult) {
-    let _infallible = write!(
-        text,
-        "{}: {} in, {} out, {} dropped by the kernel",
-        one.name, one.inbound_count, one.outbound_count, one.counters.dropped_count
+/// What came of each interface, and of the file.
+fn captured(request: &Request, result: &LiveResult) -> Vec<Section> {
+    let mut sections: Vec<Section> = result.interfaces.iter().map(interface).collect();
+    let mut file = Section::new("file", request.output.display().to_string(), "");
+    let ended_by = result.ended_by.map(|by| format!(", ended by {by}"));
+    file.note(
+        Tone::Plain,
+        format!(
+            "{} bytes in {:.1} s{}",
+            grouped(result.file_bytes),
+            result.length.as_secs_f64(),
+            ended_by.unwrap_or_default()
+        ),
     );
-    if one.late_stamp_count > 0 {
-        let late = one.late_stamp_count;
-        let _infallible = write!(text, ", {late} stamped by the tap instead of in the stack");
-    }
-    if one.has_failed {
-        text.push_str(", interrupted");
-    }
-    text.push('\n');
-    if let Some(card) = &one.card {
-        let _infallible = writeln!(
-            text,
-            "{}: {} of {} arrivals have the card's stamp, the others the kernel's alone; {} \
-             dropped by the kernel; {}; the card {}",
-            one.name,
-            card.stamped_count,
-            card.stamped_count + card.unstamped_count,
-            card.counters.dropped_count,
-            card.granted,
-            card.restoring
-        );
-    }
+    sections.push(file);
+    sections
 }
 
-fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8 {
-    let mut text = String::new();
-    let mut dropped_count = 0;
-    for one in &result.interfaces {
-        tell(&mut text, one);
-        let of_nic = one.card.as_ref();
-        dropped_count += one.counters.dropped_count;
-        dropped_count += of_nic.map_or(0, |card| card.counters.dropped_count);
-    }
-    let _infallible = writeln!(
-        text,
-        "{}: {} bytes in {:.1} s{}",
-        request.output.display(),
-        result.file_bytes,
-        result.length.as_secs_f64(),
-        result
-            .ended_by
-            .map(|by| format!(", ended by {by}"))
-            .unwrap_or_default()
+fn interface(one: &InterfaceResult) -> Section {
+    let mut section = Section::new("interface", &one.name, "");
+    let late = match one.late_stamp_count {
+        0 => String::new(),
+        count => format!(
+            ", {} stamped by the tap instead of in the stack",
+            grouped(count)
+        ),
+    };
+    let end = if one.has_failed { ", interrupted" } else { "" };
+    section.fact(
+        "packets",
+        Tone::Plain,
+        format!(
+            "{} in, {} out, {} dropped by the kernel{late}{end}",
+            grouped(one.inbound_count),
+            grouped(one.outbound_count),
+            grouped(one.counters.dropped_count)
+        ),
     );
-    console.result(&text);
+    if let Some(card) = &one.card {
+        section.fact(
+            "card",
+            Tone::Plain,
+            format!(
+                "{} of {} arrivals have the card's stamp, the others the kernel's alone; {} dropped by \
+                 the kernel; {}; the card {}",
+                grouped(card.stamped_count),
+                grouped(card.stamped_count + card.unstamped_count),
+                grouped(card.counters.dropped_count),
+                card.granted,
+                card.restoring
+            ),
+        );
+    }
+    section
+}
+
+fn code_of(request: &Request, result: &LiveResult, console: &mut Console) -> u8 {
+    let dropped = result.interfaces.iter().map(|one| {
+        let of_nic = one.card.as_ref();
+        one.counters.dropped_count + of_nic.map_or(0, |card| card.counters.dropped_count)
+    });
+    let dropped_count: u64 = dropped.sum();
     let is_early = |planned: Duration| result.length < planned;
     if result.interfaces.iter().any(|one| one.has_failed) {
         console.warn("an interface failed while it was watched: the file has a gap from there on");

@@ -210,6 +210,7 @@ fn on_nic(system_ns: u64, pair: Option<NicPair>) -> u64 {
 
 #[cfg(test)]
 mod tests {
+    use hil_capture::join::JoinSettings;
     use hil_capture::writer::PacketToWrite;
     use hil_net::{Direction, link_type};
 
@@ -276,7 +277,11 @@ mod tests {
         std::fs::write(&path, file).unwrap();
         let flow = "udp:port=5004,id=0+2".parse().unwrap();
         let reading = Reading::of(&[path.as_path()], &[flow], &mut |_| {}).unwrap();
-        let report = serde_json::to_value(Report::of(&reading, 1_000_000, false)).unwrap();
+        let settings = JoinSettings {
+            window_ns: 1_000_000,
+            is_one_clock: false,
+        };
+        let report = serde_json::to_value(Report::of(&reading, &settings)).unwrap();
         std::fs::remove_file(path).unwrap();
         assert_eq!(report["packets"]["packet_count"], 3, "{report:#}");
         assert_eq!(report["joins"], serde_json::json!([]), "{report:#}");

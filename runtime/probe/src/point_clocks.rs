@@ -100,8 +100,11 @@ mod tests {
         let point = |file_index| Point {
             file_index,
             interface_index: 0,
-            direction: Direction::Unknown,
             esl_port: None,
+            interface_number: None,
+            vlan: None,
+            radio_leg: None,
+            direction: Direction::Unknown,
         };
         let of = |second, is_one| PointClocks::of(&point(0), &point(second), is_one);
         assert_eq!(of(0, false), PointClocks::OneFile);

@@ -6,7 +6,7 @@ import { FleetScene } from "./fleet.js";
 import { age, byId, make, palette, seconds, write } from "./format.js";
 import { Gestures } from "./gestures.js";
 import { KEPT_S, Shelf, View } from "./history.js";
-import { ChannelTable, showEvents, showFacts, showRun, showWarnings } from "./panels.js";
+import { ChannelTable, armEvents, showEvents, showFacts, showRun, showWarnings } from "./panels.js";
 import { Socket } from "./socket.js";
 import { Strips } from "./strips.js";
 
@@ -178,7 +178,7 @@ function drawPanels(moment) {
     write(byId("axis-end"), view.isPaused ? "moment shown" : document.body.dataset.state === "lost" ? "last heard" : "now");
   }
   const fleet = scene === "fleet" ? at("fleet", moment) : undefined;
-  showEvents(losses, fleet?.collisions ?? []);
+  showEvents(losses, fleet?.collisions ?? [], armEvents(shelves.arms.between(moment - KEPT_S, moment)));
   if (scene) canvas.setAttribute("aria-label", scenes[scene].summary(at(scene, moment)));
   offerFleets();
 }

@@ -144,12 +144,32 @@ function figuresOf(channel, described) {
   };
 }
 
-// Losses, silences and collisions up to the moment shown, the newest first.
-export function showEvents(losses, collisions) {
+// What happened to the arms: sessions that ended, and arms that began to hold for want of commands.
+export function armEvents(pictures) {
+  const found = [];
+  const before = new Map();
+  for (const { value } of pictures) {
+    for (const arm of value.arms) {
+      const last = before.get(arm.side);
+      const isHolding = arm.flags.includes("holding");
+      if (last?.state === "running" && arm.state !== null && arm.state !== "running") {
+        found.push({ at_s: value.at_s, tone: "bad", words: `${arm.side} arm: session ${last.session} ended, ${arm.state}` });
+      } else if (last && isHolding && !last.isHolding) {
+        found.push({ at_s: value.at_s, tone: "caution", words: `${arm.side} arm holds, no command` });
+      }
+      before.set(arm.side, { state: arm.state, session: arm.session, isHolding });
+    }
+  }
+  return found;
+}
+
+// What was lost and what happened to the robots up to the moment shown, the newest first.
+export function showEvents(losses, collisions, ofArms) {
   const list = byId("event-list");
   const rows = [
     ...losses.slice(-MOST_EVENTS).map((loss) => ({ at_s: loss.at_s, tone: "caution", words: lossWords(loss) })),
     ...collisions.map((hit) => ({ at_s: hit.at_s, tone: "bad", words: collisionWords(hit) })),
+    ...ofArms,
   ];
   rows.sort((one, other) => other.at_s - one.at_s);
   const shown = rows.slice(0, MOST_EVENTS);
@@ -157,7 +177,7 @@ export function showEvents(losses, collisions) {
   if (list.dataset.key === key) return;
   list.dataset.key = key;
   list.replaceChildren(...shown.map((row) => make("li", { class: row.tone }, make("time", {}, seconds(row.at_s, 2)), make("span", {}, row.words))));
-  write(byId("events-note"), shown.length === 0 ? "nothing lost, no collision since this page was opened" : rows.length > shown.length ? `the last ${shown.length}` : "");
+  write(byId("events-note"), shown.length === 0 ? "nothing lost, nothing happened to a robot since this page was opened" : rows.length > shown.length ? `the last ${shown.length}` : "");
 }
 
 function lossWords(loss) {

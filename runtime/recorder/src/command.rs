@@ -8,6 +8,7 @@ use std::time::Duration;
 use clap::CommandFactory as _;
 use hil_platform::console::Console;
 use hil_platform::open_files;
+use hil_platform::own_process;
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
 use hil_platform::words::counted_plainly;
@@ -27,6 +28,10 @@ const END_WITHIN: Duration = Duration::from_millis(400);
 
 /// Does what the command line of this process says, and tells the exit code.
 pub fn run() -> ExitCode {
+    if let Err(error) = own_process::begin() {
+        Console::new(false).error(&format!("cannot begin: {error}"));
+        return ExitCode::from(Exit::Internal as u8);
+    }
     let cli: Cli = match documents::command_line() {
         Ok(cli) => cli,
         Err(help) => {

@@ -58,7 +58,8 @@ fn advice(cause: AdapterRefusal, adapter: &AdapterSummary) -> Option<String> {
             "each message needs a header with its sequence number, time and type"
         }
         Cause::NotProtobuf | Cause::TooLong => "something that does not speak EGM sends there",
-        Cause::Overtaken => "the network reordered or repeated them",
+        Cause::Overtaken => "the network reordered them",
+        Cause::Repeated => "the network duplicated them",
         Cause::NoSession => return None,
     };
     Some(advice.to_owned())

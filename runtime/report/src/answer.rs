@@ -28,6 +28,9 @@ const OUTAGE_LOST_MIN: u64 = 3;
 /// Channels, processes or hosts that are named where many have the same fault.
 const NAMED_COUNT: usize = 3;
 
+/// What an answer counts as harm, beside the counts that it lists.
+pub(crate) const COUNTED_AS_HARM: &str = "these, less those by limits of the robot";
+
 /// A way in which the robot can be hurt, and how often it was; see [`hil_core::case_study::Harm`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct HarmCount {
@@ -526,8 +529,8 @@ pub(crate) fn metric_words(metric: &ScoreMetric) -> String {
         None => String::new(),
         Some(Spread::Known(one)) => format!(
             " [{}, {}]",
-            figure(scale.factor * one.low),
-            figure(scale.factor * one.high)
+            figure(scale.scaled(one.low)),
+            figure(scale.scaled(one.high))
         ),
         Some(Spread::Unknown(why)) => format!(" [{why}]"),
     };
@@ -554,9 +557,19 @@ impl<'a> UnitScale<'a> {
         Self { factor, unit }
     }
 
+    /// The unit that people think in; empty for a number.
+    pub(crate) const fn unit(self) -> &'a str {
+        self.unit
+    }
+
+    /// The value in that unit.
+    pub(crate) fn scaled(self, value: f64) -> f64 {
+        self.factor * value
+    }
+
     /// The value with its unit.
     pub(crate) fn words(self, value: f64) -> String {
-        let value = figure(self.factor * value);
+        let value = figure(self.scaled(value));
         match self.unit {
             "" => value,
             unit => format!("{value} {unit}"),

@@ -27,5 +27,7 @@ pub mod terminal;
 pub mod trace;
 pub mod trace_counts;
 
+pub use sections::quantile_table;
+
 #[cfg(test)]
 mod tests;

@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use hil_account::flow::FlowMetrics;
 use hil_account::{ChannelAccount, MessageFate, OutageMetrics};
 use hil_core::case_study::{Metric, Score};
 use hil_core::link_model::ReplayCounts;
@@ -68,6 +69,9 @@ pub struct RunSummary {
     pub link_changes: Vec<LinkChange>,
     /// The channels, in the order of the case study.
     pub channels: Vec<ChannelSummary>,
+    /// The channels of Ethernet frames by flow.
+    #[serde(default)]
+    pub flows: Vec<ChannelFlows>,
     /// The gateway threads that carried them; empty where none crossed a link.
     #[serde(default)]
     pub directions: Vec<DirectionSummary>,
@@ -115,6 +119,7 @@ impl RunSummary {
             events: Vec::new(),
             link_changes: Vec::new(),
             channels: Vec::new(),
+            flows: Vec::new(),
             directions: Vec::new(),
             faces: Vec::new(),
             hardware_stamps: None,
@@ -601,6 +606,24 @@ pub struct ChannelSummary {
     /// What each gateway that carried it counted of it alone; empty on a direct channel.
     #[serde(default)]
     pub ends: Vec<ChannelEnd>,
+}
+
+/// The frames of one channel.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ChannelFlows {
+    /// The channel.
+    pub channel: String,
+    /// Frames that were lost between a program and the channel, by where; they are in no flow.
+    pub inlet_lost: Vec<CountByName>,
+    /// Its flows, those of most frames first.
+    pub flows: Vec<FlowMetrics>,
+}
+
+impl ChannelFlows {
+    /// Frames that were lost between a program and the channel.
+    pub fn inlet_lost_count(&self) -> u64 {
+        self.inlet_lost.iter().map(|one| one.count).sum()
+    }
 }
 
 /// One channel in one gateway.

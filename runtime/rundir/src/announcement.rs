@@ -2,8 +2,9 @@
 //! when the run is over.
 
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::fs::{self, File};
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -12,7 +13,8 @@ use nix::fcntl::{Flock, FlockArg};
 use crate::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage, start_ticks};
 use crate::run_folder::{RunFolder, utc_text};
 use hil_platform::domain_address::DomainAddress;
-use hil_topology::{Channel, Program, Topology};
+use hil_platform::own_folder::OwnFolder;
+use hil_topology::{Channel, Process, Program, Topology};
 
 /// A run that is announced for as long as this lives.
 #[derive(Debug)]
@@ -85,7 +87,9 @@ impl Announcement {
         let text = serde_json::to_string_pretty(&self.run).map_err(io::Error::other)?;
         for folder in &self.folders {
             let new = folder.join(format!(".{}.new", LiveRun::FILE_NAME));
-            fs::write(&new, &text)?;
+            // One that was left by a kill between the two.
+            let _was_left = fs::remove_file(&new).is_ok();
+            File::create_new(&new)?.write_all(text.as_bytes())?;
             fs::rename(&new, path(folder))?;
         }
         Ok(())
@@ -109,18 +113,14 @@ impl Drop for Announcement {
 /// Takes back what a killed supervisor said in the domain's folder `root`; what a living one says
 /// stays. Before anybody locks the folder to clear it away: with the announcement in it, observers
 /// would take who does for its supervisor.
-pub fn withdraw_abandoned(root: &Path) {
-    let announced = path(root);
-    if !announced.exists() {
-        return;
-    }
-    let Ok(directory) = File::open(root) else {
+pub fn withdraw_abandoned(root: &OwnFolder) {
+    let Ok(descriptor) = root.descriptor() else {
         return;
     };
     // Shared, as observers ask for it: to them the domain is not held meanwhile. A living supervisor
     // has had the lock to itself since before it announced anything.
-    if let Ok(lock) = Flock::lock(directory, FlockArg::LockSharedNonblock) {
-        let _is_gone = fs::remove_file(announced).is_ok();
+    if let Ok(lock) = Flock::lock(descriptor, FlockArg::LockSharedNonblock) {
+        let _is_gone = root.remove(OsStr::new(LiveRun::FILE_NAME)).is_ok();
         drop(lock);
     }
 }
@@ -163,7 +163,8 @@ const fn keeps_records(program: &Program) -> bool {
     !matches!(program, Program::Command { .. })
 }
 
-/// What the processes here note of each message of `channel`. Own programs note nothing.
+/// What the processes here note of each message of `channel`. Own programs note nothing; what carries the
+/// frames of one does.
 fn noted(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool) -> Vec<Stage> {
     let ends = [Some(channel.from.as_str()), channel.to.as_deref()];
     let [producer, consumer] = ends.map(|name| topology.process(name?));
@@ -172,14 +173,13 @@ fn noted(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool)
     };
     let crosses = producer.host != consumer.host;
     let (from_here, to_here) = (is_here(&producer.host), is_here(&consumer.host));
+    let is_recorded =
+        |process: &Process| keeps_records(&process.program) || process.inside().is_some();
     let stages = [
-        (
-            Stage::Published,
-            from_here && keeps_records(&producer.program),
-        ),
+        (Stage::Published, from_here && is_recorded(producer)),
         (Stage::Sent, from_here && crosses),
         (Stage::Received, to_here && crosses),
-        (Stage::Taken, to_here && keeps_records(&consumer.program)),
+        (Stage::Taken, to_here && is_recorded(consumer)),
     ];
     let noted = stages.into_iter().filter(|(_, is_noted)| *is_noted);
     noted.map(|(stage, _)| stage).collect()

@@ -2,7 +2,7 @@
 //! nothing of hosts, links or gateways: its card is byte-identical in a local and a split run.
 
 use std::collections::BTreeMap;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use std::{fs, io};
@@ -45,6 +45,8 @@ pub enum Work {
     Gateway(GatewayWork),
     /// Speaks a robot maker's own protocol with a foreign program.
     Adapter(AdapterSettings),
+    /// Runs a program in a network namespace of its own and carries its Ethernet frames.
+    Cable(CableWork),
 }
 
 /// What a component is told.
@@ -209,6 +211,28 @@ pub struct ArmLaunch {
     pub output: RoleChannel,
     /// What to ask of the kernel.
     pub realtime: RealtimeRequest,
+}
+
+/// What a process is told that carries the frames of a program of the user's.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CableWork {
+    /// The program's address.
+    pub inside: IpAddr,
+    /// The program and its arguments.
+    pub command: Vec<String>,
+    /// Variables added to its environment.
+    pub environment: BTreeMap<String, String>,
+    /// Files that the program may have open, if not as many as this process.
+    pub open_files: Option<u64>,
+    /// The channel of the frames for the program.
+    pub input: RoleChannel,
+    /// The channel of the frames of the program.
+    pub output: RoleChannel,
+    /// What to ask of the kernel for the thread of the output, and for that of the input.
+    pub realtime: [RealtimeRequest; 2],
+    /// How to wait for frames.
+    pub wait: WaitMode,
 }
 
 /// A launch file or card cannot be used.

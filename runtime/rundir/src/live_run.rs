@@ -4,11 +4,12 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io;
+use std::io::{self, BufReader};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use nix::errno::Errno;
-use nix::fcntl::{Flock, FlockArg};
+use nix::fcntl::{Flock, FlockArg, OFlag};
 use serde::{Deserialize, Serialize};
 
 use crate::manifest::Manifest;
@@ -104,8 +105,17 @@ impl LiveRun {
     /// # Errors
     /// When it is not there or not what a supervisor writes.
     pub fn read(folder: &Path) -> io::Result<Self> {
-        let text = fs::read_to_string(folder.join(Self::FILE_NAME))?;
-        serde_json::from_str(&text).map_err(io::Error::other)
+        // Who looks for runs also looks into folders of others: what is no file must not make him wait.
+        let flags = (OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK).bits();
+        let mut options = File::options();
+        let file = options
+            .read(true)
+            .custom_flags(flags)
+            .open(folder.join(Self::FILE_NAME))?;
+        if !file.metadata()?.is_file() {
+            return Err(io::Error::other("not a file"));
+        }
+        serde_json::from_reader(BufReader::new(file)).map_err(io::Error::other)
     }
 
     /// The run's folder.

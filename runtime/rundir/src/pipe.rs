@@ -160,6 +160,18 @@ pub struct ProcessReport {
     /// The arms of an adapter that speaks with a foreign program.
     #[serde(default)]
     pub faces: Vec<AdapterReport>,
+    /// What an inlet lost of the frames of each of its channels.
+    #[serde(default)]
+    pub inlets: Vec<InletReport>,
+}
+
+/// Frames that were lost between a program and its channel: on this host, and in no network.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct InletReport {
+    /// The channel that they would have come to, or came from.
+    pub channel: String,
+    /// Where they were lost, and how many.
+    pub lost: Vec<CountByName>,
 }
 
 /// What of a direction or arm counted something.

@@ -208,6 +208,10 @@ impl RunResult {
             Ok(text) => text,
             Err(source) => return Err(RunResultError::Content { path, source }),
         };
+        // The room that was held is taken once.
+        if fs::read_to_string(&path).is_ok_and(|there| there == text) {
+            return Ok(());
+        }
         let new = new_file(&self.folder);
         let options = File::options()
             .write(true)

@@ -1,9 +1,12 @@
 //! The shared memory of one run on one host: an iceoryx2 domain of its own, so that runs side by
 //! side cannot see each other and everything a dead run left behind can be thrown away.
 
-use std::fs::{self, DirBuilder, File};
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::fs;
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::os::fd::OwnedFd;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -16,16 +19,20 @@ use iceoryx2::prelude::{
 };
 use nix::errno::Errno;
 use nix::fcntl::{Flock, FlockArg};
+use nix::unistd::Uid;
 
 use super::capacity::reserve;
 use super::error::{DomainError, explain};
-use super::identity::{Fnv128, SHARED_MEMORY_DIRECTORY, fingerprint};
+use super::identity::{SHARED_MEMORY_DIRECTORY, fingerprint};
 use super::members;
 use super::sequence::OPEN_WITHIN;
+use hil_core::time::Instant;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::domain_address::{
     DomainAddress, DomainAddressError, checked_root_path, is_prefix,
 };
+use hil_platform::own_folder::{OwnFolder, OwnFolderError};
+use hil_platform::random::random_bytes;
 
 /// File in the root path that says whose it is; its content is the prefix of the run.
 const MARKER: &str = "hil-domain";
@@ -44,9 +51,62 @@ pub struct Domain {
     address: DomainAddress,
     config: Config,
     node: Mutex<Option<Node<ipc::Service>>>,
-    /// The launcher's lock; `None` in a worker and after removal.
-    lock: Option<Flock<File>>,
+    /// What the launcher holds; `None` in a worker and after removal.
+    held: Option<HeldRoot>,
+    /// Files of this domain without a length, with when each was first seen so.
+    lengthless: Mutex<BTreeMap<PathBuf, (u64, Instant)>>,
     open_within: Duration,
+}
+
+/// The root path of a domain and the launcher's lock on it.
+#[derive(Debug)]
+struct HeldRoot {
+    around: OwnFolder,
+    name: OsString,
+    root: OwnFolder,
+    _lock: Flock<OwnedFd>,
+}
+
+impl HeldRoot {
+    /// Deletes what the files in the root path say is left of a run.
+    ///
+    /// # Errors
+    /// When the folder holds what is not a run's.
+    fn clear(&self) -> Result<(), DomainError> {
+        let root_path = self.root.path();
+        match self.root.read(MARKER) {
+            Ok(prefix) if is_prefix(&prefix) => delete_shared_memory(&prefix),
+            Ok(_) => {}
+            Err(_) => {
+                let names = self.root.names();
+                if !names
+                    .map_err(DomainError::io("read", root_path))?
+                    .is_empty()
+                {
+                    return Err(DomainError::ForeignDirectory {
+                        root_path: root_path.to_owned(),
+                    });
+                }
+            }
+        }
+        self.empty();
+        Ok(())
+    }
+
+    /// Empties the root path; the marker goes last, so that an interrupted removal is resumed. What refuses is
+    /// found by looking.
+    fn empty(&self) {
+        let names = self.root.names().unwrap_or_default();
+        let (marker, others): (Vec<_>, Vec<_>) = names.into_iter().partition(|name| name == MARKER);
+        for name in others.iter().chain(&marker) {
+            let _is_gone = self.root.remove(name).is_ok();
+        }
+    }
+
+    /// Removes the empty root path while the lock is held, so that the next launcher starts clean.
+    fn leave(self) {
+        let _is_gone = self.around.remove_empty(&self.name).is_ok();
+    }
 }
 
 /// What [`Domain::remove`] found and left.
@@ -79,31 +139,31 @@ impl Domain {
     /// When the path is unusable, too long, locked by a living run, or holds foreign files.
     pub fn create(root_path: &Path) -> Result<Self, DomainError> {
         let root_path = checked_root_path(root_path)?;
-        let lock = lock_directory(&root_path)?;
-        let marker = root_path.join(MARKER);
-        match fs::read_to_string(&marker) {
-            Ok(prefix) if is_prefix(&prefix) => {
-                delete_files(&DomainAddress::new(root_path.clone(), prefix));
-            }
-            Ok(_) => delete_below(&root_path),
-            Err(_) => {
-                let mut entries =
-                    fs::read_dir(&root_path).map_err(DomainError::io("read", &root_path))?;
-                if entries.next().is_some() {
-                    return Err(DomainError::ForeignDirectory { root_path });
-                }
-            }
-        }
-        let prefix = fresh_prefix(&root_path)?;
-        fs::write(&marker, &prefix).map_err(DomainError::io("write", &marker))?;
+        let held = hold(&root_path)?;
+        held.clear()?;
+        let prefix =
+            fresh_prefix().map_err(DomainError::io("name files in", SHARED_MEMORY_DIRECTORY))?;
+        let marked = held.root.write_new(MARKER, &prefix);
+        marked.map_err(DomainError::io("write", root_path.join(MARKER)))?;
         let mut domain = Self::join(DomainAddress::new(root_path, prefix), None)?;
-        domain.lock = Some(lock);
+        domain.held = Some(held);
         Ok(domain)
     }
 
-    /// True when `root_path` is, or was, the root of a domain.
-    pub fn is_at(root_path: &Path) -> bool {
-        root_path.join(MARKER).is_file()
+    /// Deletes what a dead run left at `root_path`, if it is that of a domain.
+    ///
+    /// # Errors
+    /// As [`Domain::create`].
+    pub fn clear(root_path: &Path) -> Result<(), DomainError> {
+        let held = hold(&checked_root_path(root_path)?)?;
+        held.clear()?;
+        held.leave();
+        Ok(())
+    }
+
+    /// True when `folder` is, or was, the root of a domain.
+    pub fn is_in(folder: &OwnFolder) -> bool {
+        folder.read(MARKER).is_ok()
     }
 
     /// The prefix of the domain whose root is, or was, `root_path`; `None` where there is none.
@@ -152,7 +212,8 @@ impl Domain {
             address,
             config,
             node: Mutex::new(Some(node)),
-            lock: None,
+            held: None,
+            lengthless: Mutex::default(),
             open_within: OPEN_WITHIN,
         })
     }
@@ -184,7 +245,7 @@ impl Domain {
     /// launcher calls it about ten times a second.
     pub fn cleanup_dead_nodes(&self) -> Cleanup {
         // iceoryx2 0.10 waits without end for a file to get a length.
-        if !is_clear_of_lengthless_files(self.address.prefix()) {
+        if !self.is_clear_of_lengthless_files() {
             return Cleanup {
                 is_postponed: true,
                 ..Cleanup::default()
@@ -199,11 +260,12 @@ impl Domain {
         }
     }
 
-    /// As [`Domain::cleanup_dead_nodes`], but waits, half a second at most, rather than postpone.
+    /// As [`Domain::cleanup_dead_nodes`], but waits, a second at most, rather than postpone.
     pub fn cleanup_dead_nodes_now(&self) -> Cleanup {
+        let deadline = MonotonicClock::now() + 2 * LENGTHLESS_MAX;
         loop {
             let cleanup = self.cleanup_dead_nodes();
-            if !cleanup.is_postponed {
+            if !cleanup.is_postponed || MonotonicClock::now() > deadline {
                 return cleanup;
             }
             std::thread::sleep(LENGTHLESS_MAX / 20);
@@ -224,16 +286,14 @@ impl Domain {
     fn leave(&mut self) -> Removal {
         let node = self.node.get_mut().unwrap_or_else(PoisonError::into_inner);
         drop(node.take());
-        let Some(lock) = self.lock.take() else {
+        let Some(held) = self.held.take() else {
             return Removal::default();
         };
         let live_member_count = members::living(&self.config).process_count;
-        delete_files(&self.address);
+        delete_shared_memory(self.address.prefix());
+        held.empty();
+        held.leave();
         let root_path = self.address.root_path();
-        // The directory goes while the lock is held, so that the next launcher starts clean.
-        // Failure shows in `remained`.
-        let _is_gone = fs::remove_dir(root_path).is_ok();
-        drop(lock);
         let mut remained = shared_memory_files(self.address.prefix());
         if root_path.exists() {
             remained.push(root_path.to_owned());
@@ -242,6 +302,38 @@ impl Domain {
             live_member_count,
             remained,
         }
+    }
+
+    /// Deletes files that a process was killed over before it could give them a length; false while
+    /// one is young enough that its maker may live, by the time that this process has seen it. Takes the memory
+    /// of files that another program than ours made, which does not do so itself.
+    fn is_clear_of_lengthless_files(&self) -> bool {
+        let now = MonotonicClock::now();
+        let mut known = self
+            .lengthless
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        let mut seen = BTreeMap::new();
+        for file in shared_memory_files(self.address.prefix()) {
+            let Ok(metadata) = fs::symlink_metadata(&file) else {
+                continue;
+            };
+            if metadata.len() > 0 {
+                // Where there is too little nothing can be done about it here.
+                let _is_taken = reserve(&file, &metadata).is_ok();
+                continue;
+            }
+            let first = known
+                .get(&file)
+                .filter(|(inode, _)| *inode == metadata.ino());
+            let since = first.map_or(now, |(_, since)| *since);
+            let is_old = now.saturating_duration_since(since) > LENGTHLESS_MAX;
+            if !(is_old && fs::remove_file(&file).is_ok()) {
+                seen.insert(file, (metadata.ino(), since));
+            }
+        }
+        *known = seen;
+        known.is_empty()
     }
 
     pub(crate) fn config(&self) -> &Config {
@@ -297,37 +389,43 @@ fn configuration(address: &DomainAddress) -> Result<Config, DomainError> {
     Ok(config)
 }
 
-/// Makes the directory and takes the launcher's lock on it.
-fn lock_directory(root_path: &Path) -> Result<Flock<File>, DomainError> {
+/// Makes the root path where it is missing and takes the launcher's lock on it.
+fn hold(root_path: &Path) -> Result<HeldRoot, DomainError> {
     const ATTEMPTS: usize = 16;
+    let (Some(around), Some(name)) = (root_path.parent(), root_path.file_name()) else {
+        return Err(DomainError::Address(DomainAddressError::UnusableRootPath {
+            root_path: root_path.to_owned(),
+        }));
+    };
+    let around = OwnFolder::create_around(around)?;
+    let io = |operation| DomainError::io(operation, root_path);
     for _ in 0..ATTEMPTS {
-        DirBuilder::new()
-            .recursive(true)
-            .mode(0o700)
-            .create(root_path)
-            .map_err(DomainError::io("create", root_path))?;
-        let directory = match File::open(root_path) {
-            Ok(directory) => directory,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-            Err(error) => return Err(DomainError::io("open", root_path)(error)),
+        let root = match around.enter_or_make(name) {
+            Ok(root) => root,
+            // The previous owner has deleted it in between.
+            Err(OwnFolderError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+                continue;
+            }
+            Err(error) => return Err(error.into()),
         };
-        let lock = match Flock::lock(directory, FlockArg::LockExclusiveNonblock) {
+        let descriptor = root.descriptor().map_err(io("open"))?;
+        let lock = match Flock::lock(descriptor, FlockArg::LockExclusiveNonblock) {
             Ok(lock) => lock,
             Err((_, Errno::EWOULDBLOCK)) => {
                 return Err(DomainError::Locked {
                     root_path: root_path.to_owned(),
                 });
             }
-            Err((_, errno)) => return Err(DomainError::io("lock", root_path)(errno.into())),
+            Err((_, errno)) => return Err(io("lock")(errno.into())),
         };
-        // The previous owner may have deleted the directory between our open and our lock.
-        let ours = lock
-            .metadata()
-            .map_err(DomainError::io("inspect", root_path))?;
-        if fs::metadata(root_path)
-            .is_ok_and(|there| (there.dev(), there.ino()) == (ours.dev(), ours.ino()))
-        {
-            return Ok(lock);
+        // The same between our open and our lock.
+        if around.has(name, &root) {
+            return Ok(HeldRoot {
+                name: name.to_owned(),
+                around,
+                root,
+                _lock: lock,
+            });
         }
     }
     Err(DomainError::Locked {
@@ -335,23 +433,14 @@ fn lock_directory(root_path: &Path) -> Result<Flock<File>, DomainError> {
     })
 }
 
-/// A prefix no file in `/dev/shm` has. Hosts emulated on one machine may share `/dev/shm` and use
-/// equal root paths in different mount namespaces, so the path alone does not tell runs apart.
-fn fresh_prefix(root_path: &Path) -> Result<String, DomainError> {
-    let metadata = fs::metadata(root_path).map_err(DomainError::io("inspect", root_path))?;
+/// A prefix no file in `/dev/shm` has, and that nobody can know before. Hosts emulated on one machine may
+/// share `/dev/shm`.
+fn fresh_prefix() -> io::Result<String> {
     loop {
-        let mut hash = Fnv128::default();
-        for number in [
-            metadata.dev(),
-            metadata.ino(),
-            u64::from(std::process::id()),
-        ] {
-            hash.add(&number.to_le_bytes());
-        }
-        hash.add(&MonotonicClock::now().as_ns().to_le_bytes());
-        let [a, b, c, d, ..] = hash.0.to_le_bytes();
-        let prefix = format!("h{:08x}_", u32::from_le_bytes([a, b, c, d]));
-        if shared_memory_files(&prefix).is_empty() {
+        let number = u32::from_le_bytes(random_bytes()?);
+        let prefix = format!("h{number:08x}_");
+        let is_taken = entries_with(&prefix, "").next().is_some();
+        if !is_taken {
             return Ok(prefix);
         }
     }
@@ -362,63 +451,34 @@ fn shared_memory_files(prefix: &str) -> Vec<PathBuf> {
 }
 
 /// Those whose names have `part` behind the prefix. A gateway asks for each of its ports, so a name that
-/// has not costs a look at its bytes.
+/// has not costs a look at its bytes. Others may make files of any name in a folder that is everybody's;
+/// only this user's count.
 pub(super) fn shared_memory_files_with(prefix: &str, part: &str) -> Vec<PathBuf> {
-    let Ok(entries) = fs::read_dir(SHARED_MEMORY_DIRECTORY) else {
-        return Vec::new();
-    };
-    let names = entries.flatten().filter(|entry| {
-        let name = entry.file_name();
-        let behind = name.to_str().and_then(|name| name.strip_prefix(prefix));
-        behind.is_some_and(|name| name.contains(part))
-    });
-    names.map(|entry| entry.path()).collect()
+    let own = Uid::effective().as_raw();
+    let entries = entries_with(prefix, part);
+    let is_own = |entry: &fs::DirEntry| entry.metadata().is_ok_and(|data| data.uid() == own);
+    entries.filter(is_own).map(|entry| entry.path()).collect()
+}
+
+fn entries_with(prefix: &str, part: &str) -> impl Iterator<Item = fs::DirEntry> {
+    let entries = fs::read_dir(SHARED_MEMORY_DIRECTORY);
+    entries
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter(move |entry| {
+            let name = entry.file_name();
+            let behind = name.to_str().and_then(|name| name.strip_prefix(prefix));
+            behind.is_some_and(|name| name.contains(part))
+        })
 }
 
 /// A living process gives a file its length within microseconds of making it.
 const LENGTHLESS_MAX: Duration = Duration::from_millis(500);
 
-/// Deletes files that a process was killed over before it could give them a length; false while
-/// one is young enough that its maker may live. Takes the memory of files that another program than
-/// ours made, which does not do so itself.
-fn is_clear_of_lengthless_files(prefix: &str) -> bool {
-    shared_memory_files(prefix).iter().all(|file| {
-        let Ok(metadata) = fs::metadata(file) else {
-            return true;
-        };
-        if metadata.len() > 0 {
-            // Where there is too little nothing can be done about it here.
-            let _is_taken = reserve(file, &metadata).is_ok();
-            return true;
-        }
-        let age = metadata.modified().ok().and_then(|at| at.elapsed().ok());
-        age.is_some_and(|age| age > LENGTHLESS_MAX) && fs::remove_file(file).is_ok()
-    })
-}
-
-/// Deletes a run's shared memory, then all below its root path. What refuses is found by looking.
-fn delete_files(address: &DomainAddress) {
-    for file in shared_memory_files(address.prefix()) {
+/// Deletes a run's shared memory. What refuses is found by looking.
+fn delete_shared_memory(prefix: &str) {
+    for file in shared_memory_files(prefix) {
         let _is_gone = fs::remove_file(file).is_ok();
     }
-    delete_below(address.root_path());
-}
-
-/// Empties the root path; the marker goes last, so that an interrupted removal is resumed.
-fn delete_below(root_path: &Path) {
-    let Ok(entries) = fs::read_dir(root_path) else {
-        return;
-    };
-    for entry in entries
-        .flatten()
-        .filter(|entry| entry.file_name() != MARKER)
-    {
-        let path = entry.path();
-        let _is_gone = if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-            fs::remove_dir_all(path).is_ok()
-        } else {
-            fs::remove_file(path).is_ok()
-        };
-    }
-    let _is_gone = fs::remove_file(root_path.join(MARKER)).is_ok();
 }

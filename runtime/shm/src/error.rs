@@ -9,6 +9,7 @@ use std::{io, thread};
 use super::capacity::Room;
 use super::identity::SHARED_MEMORY_DIRECTORY;
 use hil_platform::domain_address::DomainAddressError;
+use hil_platform::own_folder::OwnFolderError;
 
 /// A domain could not be created, opened or removed.
 #[derive(Debug, thiserror::Error)]
@@ -16,6 +17,9 @@ pub enum DomainError {
     /// Its address cannot be used.
     #[error(transparent)]
     Address(#[from] DomainAddressError),
+    /// The folder of domains, or of this one, is not this user's alone.
+    #[error(transparent)]
+    Folder(#[from] OwnFolderError),
     /// Another launcher holds the lock.
     #[error(
         "root path {} is in use by a run that is still alive; let it end or name this run differently",

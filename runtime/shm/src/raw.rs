@@ -337,7 +337,7 @@ impl RawOutput {
     /// Publishes `payload` under `envelope` as it is, then wakes the readers.
     ///
     /// # Errors
-    /// When the payload is not one message long, or the channel is broken.
+    /// When the payload is not one message long (longer, where it may be shorter), or the channel is broken.
     pub fn publish(&mut self, envelope: &Envelope, payload: &[u8]) -> Result<(), ChannelError> {
         self.publish_with(payload, || *envelope)
     }
@@ -365,13 +365,25 @@ impl RawOutput {
             .map_or_else(|| loan(&self.publisher), Ok)
             .map_err(|error| refused("get memory", &error))?;
         let target = memory.payload_mut();
-        self.check_size(target.len())?;
-        let target = target.as_mut_ptr().cast::<u8>();
-        // SAFETY: source and target have one message's size, checked above, and do not overlap as
-        // the loan is exclusively ours.
+        let (target_bytes, target) = (target.len(), target.as_mut_ptr().cast::<u8>());
+        if target_bytes != self.message.size_bytes {
+            return Err(self.wrong_size(target_bytes));
+        }
+        // SAFETY: the source is at most one message long, the target exactly, both checked above, and they
+        // do not overlap as the loan is exclusively ours.
         unsafe { target.copy_from_nonoverlapping(payload.as_ptr(), payload.len()) };
+        let rest_bytes = target_bytes - payload.len();
+        // SAFETY: the source ended so many bytes before the end of the target.
+        let rest = unsafe { target.add(payload.len()) };
+        // SAFETY: as many bytes are left of the target.
+        unsafe { rest.write_bytes(0, rest_bytes) };
         let header: *mut CustomHeaderMarker = memory.user_header_mut();
-        let envelope = envelope();
+        let mut envelope = envelope();
+        envelope.length_bytes = if rest_bytes == 0 {
+            0
+        } else {
+            payload.len() as u64
+        };
         // SAFETY: the service was opened with a user header of the envelope's size and alignment,
         // and the marker reference is iceoryx2's pointer to that memory.
         unsafe { header.cast::<Envelope>().write(envelope) };
@@ -388,14 +400,20 @@ impl RawOutput {
     }
 
     fn check_size(&self, given: usize) -> Result<(), ChannelError> {
-        if given == self.message.size_bytes {
+        let size_bytes = self.message.size_bytes;
+        let is_shorter = self.message.may_be_shorter() && (1..size_bytes).contains(&given);
+        if given == size_bytes || is_shorter {
             return Ok(());
         }
-        Err(ChannelError::WrongSize {
+        Err(self.wrong_size(given))
+    }
+
+    fn wrong_size(&self, given: usize) -> ChannelError {
+        ChannelError::WrongSize {
             channel: self.channel.clone(),
             given,
             expected: self.message.size_bytes,
-        })
+        }
     }
 }
 
@@ -403,6 +421,8 @@ impl RawOutput {
 #[derive(Debug)]
 pub(crate) struct ByteReader {
     channel: String,
+    /// A message may be shorter than its memory.
+    may_be_shorter: bool,
     subscriber: Subscriber<ipc::Service, [CustomPayloadMarker], SharedEnvelope>,
     failures: ConnectionFailures,
 }
@@ -434,6 +454,7 @@ impl ByteReader {
         take_room(domain, channel, subscriber.id().value(), room)?;
         Ok(Self {
             channel: channel.to_owned(),
+            may_be_shorter: message.may_be_shorter(),
             subscriber,
             failures,
         })
@@ -466,7 +487,15 @@ impl ByteReader {
             // SAFETY: the marker is one byte of plain data, so the slice is that many bytes; the
             // writer wrote them in full before it sent, and they stay while the sample is held.
             let payload = unsafe { slice::from_raw_parts(payload.as_ptr().cast(), payload.len()) };
-            take(sample.header().node_id(), &sample.user_header().0, payload)
+            let envelope = &sample.user_header().0;
+            let length = usize::try_from(envelope.length_bytes).unwrap_or(0);
+            let is_shorter = self.may_be_shorter && (1..payload.len()).contains(&length);
+            let payload = if is_shorter {
+                &payload[..length]
+            } else {
+                payload
+            };
+            take(sample.header().node_id(), envelope, payload)
         }))
     }
 }

@@ -3,7 +3,7 @@
 //! which of the two adapters it is follows from the case, see `check_adapter`.
 
 use core::fmt;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 
 use hil_arm::egm::messages::Side;
 use hil_core::case_study::ParameterError;
@@ -11,11 +11,14 @@ use hil_core::{options, words};
 use serde::{Deserialize, Serialize};
 
 use super::links::Timestamps;
-use super::tables::EGM_ADDRESS;
+use super::tables::{EGM_ADDRESS, HOST_ADDRESS};
 
 /// Why a robot adapter is not told when to send.
 pub(super) const ROBOT_SENDS: &str =
     "does not apply to a robot adapter, which sends with every cycle of the robot";
+
+/// Why a robot adapter is told no robot.
+const ROBOT_IS_HERE: &str = "does not apply to a robot adapter, which stands for the robot";
 
 options! {
     /// A role played by a foreign EGM program.
@@ -29,6 +32,10 @@ options! {
         right: Option<SocketAddr>, in EGM_ADDRESS;
         /// Left arm, as `right`.
         left: Option<SocketAddr>, in EGM_ADDRESS;
+        /// Address of the robot: a sensor adapter hears and answers no other. Without it the first that
+        /// speaks is held while it speaks.
+        robot: Option<IpAddr>, in HOST_ADDRESS,
+            needs(kind, |one| one.kind == AdapterKind::Sensor, ROBOT_IS_HERE);
         /// Joints of an arm on the wire.
         axes: u8 = 7, in 6..=7;
         /// Generation of the robot's software whose message fields we write.

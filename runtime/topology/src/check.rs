@@ -3,6 +3,7 @@
 
 use super::check_adapter::{check_adapter, check_adapters, is_dispensable};
 use super::check_channels;
+use super::check_frames;
 use super::checks::Checks;
 use super::clock_path;
 use super::errors::Fault;
@@ -61,6 +62,7 @@ pub(super) fn check(file: File, known: &KnownCases, needs: Needs, checks: &Check
     // Without the case, its channels would look like foreign ones.
     if known_case.is_some() || file.case.is_none() {
         check_channels::check(&mut topology, known_case, &file.channels.0, links, checks);
+        check_frames::check(&topology, checks);
     }
     clock_path::check(&topology, checks);
     topology
@@ -182,6 +184,7 @@ fn check_processes(
                 role,
                 command,
                 environment: table.env,
+                inside: table.inside,
             },
             (None, Some(role), Some(adapter)) => Program::Egm { role, adapter },
             (None, role, _) => Program::BuiltIn {

@@ -14,6 +14,11 @@ use super::model::{Channel, Host, LinkPorts, MessageLayout, Process, Program, To
 use super::tables::ChannelTable;
 use super::tree::join;
 
+/// Messages that the queue of a channel holds where the file does not say.
+const DEPTH: usize = 16;
+/// The same of frames: a window of TCP.
+const DEPTH_OF_FRAMES: usize = 1024;
+
 /// The links by name, each checked by itself.
 pub(super) fn routes<'a>(
     links: &'a BTreeMap<String, LinkTable>,
@@ -99,7 +104,7 @@ fn case_channels(
             }
             continue;
         };
-        let depth = table.map_or(ChannelTable::TEMPLATE.depth, |table| table.depth);
+        let depth = table.and_then(|table| table.depth).unwrap_or(DEPTH);
         channels.push(Channel {
             channel_id: 0,
             name: spec.name.to_owned(),
@@ -168,7 +173,8 @@ fn foreign_channel(
         checks.refuse(path, fault);
         return None;
     }
-    if table.message.is_none() {
+    let frames = frames_between(table, topology);
+    if frames.is_none() && table.message.is_none() {
         let hint = "a foreign channel states { name, size_bytes, alignment_bytes }";
         checks.refuse(join(&path, "message"), Fault::Missing(hint.to_owned()));
     }
@@ -181,17 +187,42 @@ fn foreign_channel(
             format!("is process `{to}`, as is `from`"),
         );
     }
+    let default_depth = if frames.is_some() {
+        DEPTH_OF_FRAMES
+    } else {
+        DEPTH
+    };
+    if let (Some(frames), Some(given)) = (&frames, &table.message)
+        && frames != given
+    {
+        let fault = format!(
+            "is `{}`, but both ends have `inside`: leave it out",
+            given.name
+        );
+        checks.refuse_because(join(&path, "message"), fault);
+    }
     Some(Channel {
         channel_id: 0,
         name: name.to_owned(),
-        message: table.message.clone()?,
+        message: frames.or_else(|| table.message.clone())?,
         from,
         to: Some(to),
-        depth: table.depth,
+        depth: table.depth.unwrap_or(default_depth),
         link: table.link.clone(),
         is_carried: false,
         is_foreign: true,
     })
+}
+
+/// The messages of a channel that both ends put Ethernet frames on; `None` of any other.
+fn frames_between(table: &ChannelTable, topology: &Topology) -> Option<MessageLayout> {
+    let ends = [&table.from, &table.to];
+    let is_inside = |end: &Option<String>| {
+        let process = topology.process(end.as_ref()?)?;
+        process.inside()
+    };
+    let are_inside = ends.into_iter().all(|end| is_inside(end).is_some());
+    are_inside.then(MessageLayout::of_frames)
 }
 
 fn check_end(

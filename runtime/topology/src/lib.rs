@@ -17,6 +17,7 @@ mod adapter;
 mod check;
 mod check_adapter;
 mod check_channels;
+mod check_frames;
 mod checks;
 mod clock_path;
 pub mod documents;

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use hil_core::case_study::ParameterError;
-use hil_core::message::type_hash;
+use hil_core::message::{ETHERNET_FRAME, type_hash};
 use hil_core::{options, words};
 use hil_link::condition::{flow_label, flow_name};
 use hil_link::spec::{LinkSpec, Way};
@@ -136,6 +136,14 @@ pub struct Process {
 }
 
 impl Process {
+    /// Its address in a network namespace of its own, if it runs in one.
+    pub const fn inside(&self) -> Option<IpAddr> {
+        match self.program {
+            Program::Command { inside, .. } => inside,
+            Program::BuiltIn { .. } | Program::Egm { .. } => None,
+        }
+    }
+
     /// The role of the case it plays, if any.
     pub fn role(&self) -> Option<&str> {
         match &self.program {
@@ -161,6 +169,8 @@ pub enum Program {
         command: Vec<String>,
         /// Variables added to its environment.
         environment: BTreeMap<String, String>,
+        /// Its address in a network namespace of its own; its channels are of frames then.
+        inside: Option<IpAddr>,
     },
     /// Nothing of the role: a foreign EGM program plays it, and this process speaks with it.
     Egm {
@@ -306,6 +316,15 @@ impl MessageLayout {
         type_hash(&self.name, self.size_bytes, self.alignment_bytes)
     }
 
+    /// Of Ethernet frames.
+    pub(super) fn of_frames() -> Self {
+        Self {
+            name: ETHERNET_FRAME.name.to_owned(),
+            size_bytes: ETHERNET_FRAME.size_bytes,
+            alignment_bytes: ETHERNET_FRAME.alignment_bytes,
+        }
+    }
+
     fn check_alignment(&self) -> Result<(), ParameterError> {
         let alignment = self.alignment_bytes;
         if !alignment.is_power_of_two() {
@@ -344,6 +363,11 @@ pub struct Channel {
 }
 
 impl Channel {
+    /// True when its messages are the Ethernet frames of a program with an address inside.
+    pub fn carries_frames(&self) -> bool {
+        self.message.name == ETHERNET_FRAME.name
+    }
+
     /// True when its messages go to the run's record only: it is in no shared memory.
     pub fn is_recorded_only(&self) -> bool {
         self.to.is_none()

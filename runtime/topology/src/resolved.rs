@@ -103,6 +103,7 @@ impl Process {
             role: self.role().map(str::to_owned),
             run,
             env,
+            inside: self.inside(),
             egm,
             execution: self.execution.clone(),
             restarts: self.restarts,
@@ -114,7 +115,7 @@ impl Channel {
     fn table(&self) -> ChannelTable {
         let foreign = self.is_foreign.then_some(self);
         ChannelTable {
-            depth: self.depth,
+            depth: Some(self.depth),
             link: self.link.clone(),
             message: foreign.map(|channel| channel.message.clone()),
             from: foreign.map(|channel| channel.from.clone()),

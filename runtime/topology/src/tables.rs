@@ -184,6 +184,10 @@ options! {
         /// Variables added to the environment of `run`.
         env: BTreeMap<String, String> = BTreeMap::new(), needs(run, |process| process.run.is_some(),
             "needs `run`: a built-in role reads no environment");
+        /// Address of `run` in a network namespace of its own, where it speaks IP and nothing of ours: its Ethernet
+        /// frames go over two channels, one each way, to another such process.
+        inside: Option<IpAddr>, in HOST_ADDRESS, needs(run, |process| process.run.is_some(),
+            "needs `run`: a built-in role speaks no IP");
         /// The role is played by a foreign program that speaks EGM.
         egm: Option<EgmAdapter>;
         /// How it is scheduled and how it waits.
@@ -198,6 +202,10 @@ impl ProcessTable {
     fn check_program(&self) -> Result<(), hil_core::case_study::ParameterError> {
         let refuse = |key, problem| Err(hil_core::case_study::ParameterError::new(key, problem));
         match (&self.role, &self.run) {
+            (Some(_), _) if self.inside.is_some() => refuse(
+                "inside",
+                "does not go with `role`: a role has the channels of its case, and `inside` those of frames",
+            ),
             (None, None) => refuse(
                 "role",
                 "is missing: write role = \"…\" for a built-in role of the case, or run = [\"…\"] for \
@@ -215,11 +223,11 @@ options! {
     /// What a file says of a channel. A foreign channel, between programs of the user's own, states
     /// message, from and to; a channel of the case has them from there.
     pub struct ChannelTable {
-        /// Messages that its queue in shared memory holds.
-        depth: usize = 16, in 1..=1_024;
+        /// Messages that its queue in shared memory holds: 16 where not given, and 1024 of frames.
+        depth: Option<usize>, in 1..=1_024;
         /// The link that carries it to another host.
         link: Option<String>;
-        /// Identity of its messages.
+        /// Identity of its messages; between processes with `inside` it is that of Ethernet frames.
         message: Option<MessageLayout>;
         /// The process that publishes.
         from: Option<String>;

@@ -6,6 +6,7 @@ mod clock_path;
 mod faulty;
 mod fitted;
 mod fleet;
+mod frames;
 mod hosts;
 mod layers;
 mod links;
@@ -256,6 +257,7 @@ fn every_key_of_a_process_reaches_the_checked_topology() {
         role,
         command,
         environment,
+        inside,
     } = &topology.process("controller").unwrap().program
     else {
         panic!("the controller is the user's own program");
@@ -263,6 +265,7 @@ fn every_key_of_a_process_reaches_the_checked_topology() {
     assert_eq!(role.as_deref(), Some("controller"));
     assert_eq!(command, &["./my-controller", "--fast"]);
     assert_eq!(environment["RUST_LOG"], "debug");
+    assert_eq!(*inside, None);
 }
 
 #[test]

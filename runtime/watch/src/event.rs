@@ -65,7 +65,7 @@ pub enum Origin {
     OtherHost,
 }
 
-/// A record of any kind but a message.
+/// A record of any kind but a message or a frame.
 #[derive(Debug, Clone, Copy)]
 pub enum Record {
     /// A producer published.
@@ -123,7 +123,7 @@ impl Record {
             RecordKind::NicClock => all(batch, Self::NicClock, take),
             RecordKind::Radio => all(batch, Self::Radio, take),
             RecordKind::LinkCondition => all(batch, Self::LinkCondition, take),
-            RecordKind::Message => {}
+            RecordKind::Message | RecordKind::Frame => {}
         }
     }
 }

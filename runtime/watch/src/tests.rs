@@ -13,6 +13,7 @@ use hil_core::record::{IngressRecord, PublishedRecord, UNAVAILABLE};
 
 use super::*;
 use hil_platform::clock::MonotonicClock;
+use hil_platform::own_folder::OwnFolder;
 use hil_rundir::announcement::withdraw_abandoned;
 use hil_rundir::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source, start_ticks};
 use hil_rundir::record::RecordKind;
@@ -278,7 +279,7 @@ fn a_run_is_found_while_its_supervisor_holds_it_and_not_when_it_was_killed() {
     assert_eq!(running_runs_below(&place.0), std::slice::from_ref(&run));
     let folder = place.run();
     assert_eq!(select(folder.to_str()).unwrap(), run);
-    withdraw_abandoned(&place.0.join("d"));
+    withdraw_abandoned(&OwnFolder::open(&place.0.join("d")).unwrap());
     assert!(run.is_announced());
     drop(holders);
     domain.remove();
@@ -290,7 +291,7 @@ fn a_run_is_found_while_its_supervisor_holds_it_and_not_when_it_was_killed() {
         select(folder.to_str()),
         Err(SelectError::Over { .. })
     ));
-    withdraw_abandoned(&place.0.join("d"));
+    withdraw_abandoned(&OwnFolder::open(&place.0.join("d")).unwrap());
     assert!(!run.is_announced());
 }
 

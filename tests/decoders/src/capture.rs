@@ -134,13 +134,21 @@ fn write_and_read_again(contents: &Contents) {
     assert_eq!(again.packets, expected, "what was written reads otherwise");
 }
 
-const LINK_TYPES: [u16; 7] = [
+const LINK_TYPES: [u16; 15] = [
     link_type::ETHERNET,
     link_type::RAW,
     link_type::LINUX_SLL,
     link_type::IPV4,
     link_type::IPV6,
     link_type::LINUX_SLL2,
+    link_type::NULL,
+    link_type::LOOP,
+    link_type::PPP,
+    link_type::PPP_ETHER,
+    link_type::IEEE802_11,
+    link_type::RADIOTAP,
+    link_type::RAW_12,
+    link_type::PPP_SERIAL,
     999,
 ];
 
@@ -164,14 +172,14 @@ pub(crate) fn frame(bytes: &[u8]) -> Verdict {
         assert_eq!(esl::split(&again), Some((header, inner)));
         inner
     });
-    let datagram = link::udp_datagram(link_type, inner);
+    let datagram = link::udp_datagram(link_type, inner, original_bytes as usize);
     if let Ok(datagram) = &datagram {
         assert!(datagram.payload.len() <= datagram.payload_bytes);
         assert!(
             datagram.payload.len() + 28 <= inner.len(),
             "no room for the headers"
         );
-        assert!(datagram.dscp < 64 && datagram.vlan.is_none_or(|vlan| vlan < 4096));
+        assert!(datagram.dscp < 64 && datagram.place.vlan.is_none_or(|vlan| vlan < 4096));
         assert_eq!(
             datagram.is_cut_short(),
             datagram.payload.len() < datagram.payload_bytes
@@ -180,6 +188,7 @@ pub(crate) fn frame(bytes: &[u8]) -> Verdict {
     let packet = CapturedPacket {
         offset: 0,
         interface_index: 0,
+        interface_number: None,
         link_type,
         stamp_ns: (original_bytes & 1 == 0).then_some(i64::from(original_bytes)),
         original_bytes,
@@ -189,6 +198,7 @@ pub(crate) fn frame(bytes: &[u8]) -> Verdict {
     };
     let mut observer = FLOWS.with(|flows| Observer::new(flows));
     observer.take(0, &packet);
+    observer.finish(0, &[CaptureInterface::default()]);
     let counts = observer.counts();
     let parts = counts.followed_count
         + counts.other_flow_count

@@ -47,6 +47,25 @@ fn assert_says(finished: &Finished, words: &[&str]) {
     }
 }
 
+/// A file's name and its contents with what would set the terminal's title, clear it and turn a line around.
+#[test]
+fn what_others_wrote_never_steers_the_terminal() {
+    let folder = RunFolder::new("escapes");
+    fs::create_dir_all(folder.path()).unwrap();
+    let name = "a\u{1b}]0;title\u{7}.toml";
+    let absent = run_in(folder.path(), &["--topology", name]);
+    let text = "[run]\nname = \"x\u{202e}\"\n# \u{9b}2J\nno = 1\n";
+    fs::write(folder.join("b.toml"), text).unwrap();
+    let faulty = run_in(folder.path(), &["--topology", "b.toml", "--check"]);
+    for finished in [&absent, &faulty] {
+        assert!(!finished.status.success(), "{finished:?}");
+        let shown = format!("{}{}", finished.stdout, finished.stderr);
+        let steers = |c: char| (c.is_control() && c != '\n') || c == '\u{202e}';
+        assert!(!shown.contains(steers), "{shown:?}");
+    }
+    assert_says(&absent, &["\\x1b]0;title\\x07"]);
+}
+
 #[test]
 fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
     let folder = workspace_folder().join("deploy/topologies");
@@ -225,7 +244,16 @@ fn an_interrupted_run_leaves_a_complete_report_and_nothing_else() {
 }
 
 #[test]
-fn a_second_ctrl_c_ends_the_program_at_once_and_its_processes_with_it() {
+fn a_second_signal_ends_the_program_at_once_and_its_processes_with_it() {
+    for signals in [
+        [Signal::SIGINT, Signal::SIGINT],
+        [Signal::SIGTERM, Signal::SIGINT],
+    ] {
+        end_at_once(signals);
+    }
+}
+
+fn end_at_once([first, second]: [Signal; 2]) {
     let record = RunFolder::new("twice");
     let mark = record.path().display().to_string();
     // A program that will not stop when asked, so that the first Ctrl-C takes its time.
@@ -244,13 +272,13 @@ fn a_second_ctrl_c_ends_the_program_at_once_and_its_processes_with_it() {
     wait_until(LIMIT, "the begin of the run", || {
         files.record_bytes("shuttle.command.published.") > 1024
     });
-    child.signal(Signal::SIGINT).unwrap();
+    child.signal(first).unwrap();
     // The controller ends when asked; then the supervisor waits for the own program alone.
     wait_until(LIMIT, "the end of the controller", || {
         files.process("controller", 0).is_none()
     });
     assert!(child.is_running());
-    child.signal(Signal::SIGINT).unwrap();
+    child.signal(second).unwrap();
     let finished = child.wait_within(LIMIT).unwrap();
     assert_code(&finished, 131);
     assert!(!files.has_report(), "the report would have taken time");

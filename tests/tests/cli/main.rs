@@ -6,6 +6,8 @@ mod command_line;
 mod compare;
 mod doctor;
 mod help;
+mod inherited;
+mod other_users;
 mod play;
 mod progress;
 mod replay;

@@ -1,7 +1,7 @@
 //! A disk that is full: before a run, while it goes, while the hosts exchange records, and when the report is
 //! written. Both hosts come to one verdict that names host and cause, and what was recorded can be read.
 
-use std::fs::{self, File};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
@@ -19,8 +19,6 @@ use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::{Lab, LabHost};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, shipped_topology, wait_until};
-use nix::fcntl::{FallocateFlags, fallocate};
-use nix::sys::statvfs::statvfs;
 
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const CHANNELS: [&str; 2] = ["shuttle/command", "shuttle/status"];
@@ -31,8 +29,6 @@ const FAILED: i32 = 1;
 const NO_SPACE: &str = "No space left on device";
 /// Where each host records.
 const DISK: &str = "/run/disk";
-/// What takes the room there.
-const FILLER: &str = ".filler";
 
 fn code(finished: &Finished) -> i32 {
     let code = finished.status.code();
@@ -87,26 +83,7 @@ impl Stage {
 
     /// Takes all of the disk of host `index` but `kept` bytes, at once.
     fn fill(&self, index: usize, kept: u64) {
-        let disk = self.host(index).locate(DISK);
-        let filler = File::options()
-            .create(true)
-            .append(true)
-            .open(disk.join(FILLER));
-        let filler = filler.unwrap();
-        let mut from = filler.metadata().unwrap().len();
-        // Others write meanwhile.
-        wait_until(LIMIT, "a full disk", || {
-            let free = statvfs(&disk).unwrap();
-            let free_bytes = free.blocks_available() * free.fragment_size();
-            let Some(rest) = free_bytes.checked_sub(kept).filter(|rest| *rest > 0) else {
-                return true;
-            };
-            let [at, length] = [from, rest].map(|bytes| i64::try_from(bytes).unwrap());
-            if fallocate(&filler, FallocateFlags::empty(), at, length).is_ok() {
-                from += rest;
-            }
-            false
-        });
+        self.host(index).fill_disk(Path::new(DISK), kept);
     }
 
     /// Waits for both ends.
@@ -130,7 +107,7 @@ impl Stage {
     fn summary(&self, index: usize) -> RunSummary {
         let host = self.host(index);
         // There is one where the test filled the disk.
-        drop(fs::remove_file(host.locate(DISK).join(FILLER)));
+        host.clear_disk(Path::new(DISK));
         let folder = self.folder(index).unwrap();
         drop(fs::remove_file(folder.join("summary.json")));
         let inside = Path::new(DISK).join(folder.file_name().unwrap());

@@ -1,5 +1,5 @@
-//! Hundreds of channels of somebody's own programs over one link, with a gateway that is killed and a cable that is
-//! pulled: both hosts come to complete and equal accounts, and no process grows.
+//! Hundreds of channels of somebody's own programs over one link, with gateways that are killed, a cable that is
+//! pulled and a disk that fills: both hosts come to complete and equal accounts, and no process grows.
 //!
 //! `HIL_MANY_MINUTES=30 cargo nextest run --workspace --profile long --run-ignored only -E
 //! 'test(four_hundred_channels)'`, two minutes of it are in `./check.sh long`.
@@ -14,6 +14,7 @@ use std::{env, thread};
 use hil_account::{ChannelAccount, MessageFate, Stage};
 use hil_report::summary::{Outcome, RunSummary};
 use hil_tests::account::{account, describe};
+use hil_tests::binary::hil_runtime_binary;
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::split::HOSTS;
@@ -80,18 +81,37 @@ fn resident(files: &[RunFiles; 2]) -> BTreeMap<String, u64> {
     found
 }
 
+/// The host whose disk fills.
+const FULL: usize = 1;
+
+/// How a run ends.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum End {
+    Planned,
+    /// The disk of [`FULL`] takes nothing more after nine tenths of the run.
+    FullDisk,
+}
+
 struct Played {
     summaries: [RunSummary; 2],
     /// At a sixth and at five sixths of the run.
     resident: [BTreeMap<String, u64>; 2],
 }
 
-fn play(lab: &Lab, label: &str, channel_count: usize, hz: u32, duration: Duration) -> Played {
-    let record = RunFolder::new(label);
+fn play(lab: &Lab, channel_count: usize, hz: u32, duration: Duration, end: End) -> Played {
+    let record = RunFolder::new("many");
     let path = topology(&record, channel_count, hz, duration);
-    let trial = Trial::of(&path, record.path());
+    // Where each host records.
+    let disk = &record.join("disk");
+    for index in 0..2 {
+        lab.host(index).mount_disk(disk, "4g");
+    }
+    let trial = Trial::of(&path, disk);
     let mut supervisors = [0, 1].map(|index| trial.start_on(lab.host(index)));
-    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
+    let files = [0, 1].map(|index| {
+        let located = lab.host(index).locate(disk);
+        RunFiles::find(&located, disk, &format!("-{}", HOSTS[index]), LIMIT)
+    });
     wait_until(LIMIT, "messages", || {
         let last = format!("there.{}.ingress.", (channel_count - 1) / 2 * 2);
         files[1].record_bytes(&last) > 256
@@ -108,8 +128,8 @@ fn play(lab: &Lab, label: &str, channel_count: usize, hz: u32, duration: Duratio
     let early = resident(&files);
     // Somebody looks on.
     let viewer = {
-        let mut command = lab.host(0).command(hil_tests::binary::hil_runtime_binary());
-        command.args(["top", "--once"]).arg(files[0].root());
+        let mut command = lab.host(0).command(hil_runtime_binary());
+        command.args(["top", "--once"]).arg(files[0].inside());
         command.stdout(std::process::Stdio::null());
         command.spawn().unwrap()
     };
@@ -122,10 +142,26 @@ fn play(lab: &Lab, label: &str, channel_count: usize, hz: u32, duration: Duratio
     let late = resident(&files);
     let mut viewer = viewer;
     assert!(viewer.wait().unwrap().success());
+    if end == End::FullDisk {
+        sleep_until(0.9);
+        lab.host(FULL).fill_disk(disk, 0);
+    }
     for supervisor in &mut supervisors {
-        match supervisor.wait_within(duration + CONCLUDE_LIMIT) {
-            Ok(finished) => finished.assert_success(),
-            Err(reason) => panic!("{reason}"),
+        match (supervisor.wait_within(duration + CONCLUDE_LIMIT), end) {
+            (Ok(finished), End::Planned) => finished.assert_success(),
+            (Ok(finished), End::FullDisk) => {
+                assert_eq!(finished.status.code(), Some(1), "{finished:?}");
+            }
+            (Err(reason), _) => panic!("{reason}"),
+        }
+    }
+    if end == End::FullDisk {
+        // A report needs room.
+        lab.host(FULL).clear_disk(disk);
+        for (index, files) in files.iter().enumerate() {
+            let mut command = lab.host(index).command(hil_runtime_binary());
+            let read = command.arg("report").arg(files.inside()).output().unwrap();
+            assert!(read.status.success(), "{read:?}");
         }
     }
     let summaries = files.each_ref().map(RunFiles::summary);
@@ -138,14 +174,23 @@ fn play(lab: &Lab, label: &str, channel_count: usize, hz: u32, duration: Duratio
     }
 }
 
-/// Every message has a fate that explains it. What these programs took is in no record: what the gateway gave them ends
-/// as "records unavailable", and nothing else does.
-fn assert_is_accounted_for(account: &ChannelAccount, name: &str) {
+/// Every message has one fate, and none is a loss that nothing explains.
+fn assert_is_named(account: &ChannelAccount, name: &str) {
     let said = describe(name, account);
     let of = |fate| account.fates.of(fate);
     assert!(account.published_count > 0, "{said}");
     assert_eq!(account.fates.total(), account.published_count, "{said}");
     assert_eq!(of(MessageFate::Unexplained), 0, "{said}");
+    assert_eq!(of(MessageFate::LostOnWire), 0, "{said}");
+}
+
+/// As [`assert_is_named`], and each message that was forwarded is known. What these programs took is in no record: what
+/// the gateway gave them ends
+/// as "records unavailable", and nothing else does.
+fn assert_is_accounted_for(account: &ChannelAccount, name: &str) {
+    assert_is_named(account, name);
+    let said = describe(name, account);
+    let of = |fate| account.fates.of(fate);
     assert_eq!(of(MessageFate::RefusedAtIngress), 0, "{said}");
     let segments = account.segments.iter();
     let forwarded: u64 = segments
@@ -161,16 +206,33 @@ fn assert_is_accounted_for(account: &ChannelAccount, name: &str) {
     );
 }
 
-fn check(played: &Played, channel_count: usize, is_long: bool) {
+fn check(played: &Played, channel_count: usize, end: End, is_long: bool) {
     let [one, other] = &played.summaries;
     let mut fates: BTreeMap<MessageFate, u64> = BTreeMap::new();
     for summary in [one, other] {
-        assert_eq!(summary.run.outcome, Outcome::Completed, "{:?}", summary.run);
+        let run = &summary.run;
+        match end {
+            End::Planned => assert_eq!(run.outcome, Outcome::Completed, "{run:?}"),
+            End::FullDisk => {
+                assert_eq!(run.outcome, Outcome::Failed, "{run:?}");
+                let cause = format!("{} cannot write /", HOSTS[FULL]);
+                assert!(run.exit_reason.starts_with(&cause), "{run:?}");
+                assert_eq!(run.exit_reason, one.run.exit_reason);
+            }
+        }
         assert_eq!(summary.channels.len(), channel_count);
         assert_eq!(summary.directions.len(), 4, "two ways, two ends");
         for channel in &summary.channels {
-            assert_is_accounted_for(account(summary, &channel.name), &channel.name);
+            let account = account(summary, &channel.name);
+            match end {
+                End::Planned => assert_is_accounted_for(account, &channel.name),
+                // The other host's records had no room here, or ours ended early there.
+                End::FullDisk => assert_is_named(account, &channel.name),
+            }
         }
+    }
+    if end == End::FullDisk {
+        return;
     }
     for channel in &one.channels {
         let of = |summary| serde_json::to_value(&account(summary, &channel.name).fates).unwrap();
@@ -203,18 +265,28 @@ fn sixty_channels_of_own_programs_are_accounted_for_through_kills_and_a_cut() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
-    let played = play(&lab, "sixty", 60, 20, Duration::from_secs(14));
-    check(&played, 60, false);
+    let played = play(&lab, 60, 20, Duration::from_secs(14), End::Planned);
+    check(&played, 60, End::Planned, false);
 }
 
-#[test]
-#[ignore = "takes HIL_MANY_MINUTES (2 by default) and more, and the machine for itself"]
-fn four_hundred_channels_end_in_two_equal_accounts() {
+fn four_hundred(end: End) {
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
     let minutes = env::var(MINUTES_VARIABLE).map_or(MINUTES_DEFAULT, |text| text.parse().unwrap());
     let duration = Duration::from_secs_f64(60.0 * minutes);
-    let played = play(&lab, "four-hundred", 400, 10, duration);
-    check(&played, 400, duration >= LONG);
+    let played = play(&lab, 400, 10, duration, end);
+    check(&played, 400, end, duration >= LONG);
+}
+
+#[test]
+#[ignore = "takes HIL_MANY_MINUTES (2 by default) and more, and the machine for itself"]
+fn four_hundred_channels_end_in_two_equal_accounts() {
+    four_hundred(End::Planned);
+}
+
+#[test]
+#[ignore = "takes HIL_MANY_MINUTES (2 by default) and more, and the machine for itself"]
+fn four_hundred_channels_and_a_full_disk_end_in_two_equal_accounts() {
+    four_hundred(End::FullDisk);
 }

@@ -249,12 +249,9 @@ fn check_analysis(captures: &[PathBuf; 2]) {
         assert_eq!(joined["delay_bound_ns"], Value::Null);
         let figures = &joined["figures"];
         assert_eq!(figures["order"], "packet_direction");
-        for count in [
-            "lost_count",
-            "duplicated_count",
-            "unexplained_count",
-            "edge_count",
-        ] {
+        assert_eq!(figures["loss"]["state"], "counted", "{joined:#}");
+        assert_eq!(figures["loss"]["count"], 0, "{joined:#}");
+        for count in ["duplicated_count", "unexplained_count", "edge_count"] {
             assert_eq!(figures[count], 0, "{count}: {joined:#}");
         }
         assert_eq!(figures["first_count"], figures["second_count"]);

@@ -54,9 +54,9 @@ const LAST_WORDS_MAX: u64 = 8;
 /// What a gateway's resident memory may differ between two moments without having grown.
 const MEMORY_MORE_MAX: u64 = 8 << 20;
 
-/// The hardware address of host 1.
-fn hardware_address(lab: &Lab) -> String {
-    let namespace = lab.host(1).namespace();
+/// The hardware address of host `index`.
+pub(super) fn hardware_address(lab: &Lab, index: usize) -> String {
+    let namespace = lab.host(index).namespace();
     let mut command = Command::new("ip");
     let file = "/sys/class/net/eth0/address";
     command.args(["netns", "exec", namespace, "cat", file]);
@@ -306,7 +306,7 @@ fn a_stranger_with_a_hosts_address_gets_nothing_in_and_stops_nothing() {
     let first = lab.host(0).namespace().to_owned();
     // The name of the lab with another host number, so that the next lab sweeps what a kill leaves.
     let name = format!("{}2", first.strip_suffix('0').unwrap());
-    let hardware = hardware_address(&lab);
+    let hardware = hardware_address(&lab, 1);
     let stranger = Attacker::join(&first, &name, ADDRESSES[0], ADDRESSES[1], &hardware);
     let span = attack_span();
     let (quiet, record) = (RunFolder::new("quiet"), RunFolder::new("attacked"));
@@ -435,7 +435,7 @@ fn connections_that_never_become_a_greeting_keep_no_run_from_its_start_or_end() 
     println!("{security}");
     for words in [
         "connections came to nothing",
-        "foreign address",
+        "from 10.77.0.66 of an address that is not awaited",
         "another key",
     ] {
         assert!(security.contains(words), "{words}: {security}");

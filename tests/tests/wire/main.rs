@@ -14,6 +14,7 @@ mod bypass;
 mod dissector;
 mod egm_clients;
 mod emulated_run;
+mod joined_programs;
 mod live_links;
 mod long_messages;
 mod outage_run;

@@ -7,6 +7,7 @@ use std::process::{Command, Output};
 use std::time::Duration;
 use std::{env, fs};
 
+use hil_core::interval::Spread;
 use hil_report::summary::{RunSummary, ScoreMetric};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
 use hil_tests::binary::hil_runtime_binary;
@@ -196,7 +197,7 @@ fn check_scores(summary: &RunSummary, virtual_time: &Value) {
         let other_value = other["value"].as_f64();
         let [low, high] = ["low", "high"].map(|end| other["interval"][end].as_f64());
         let other_interval = low.zip(high);
-        let interval = interval.and_then(|spread| spread.known());
+        let interval = interval.and_then(Spread::known);
         let interval = interval.map(|one| (one.low, one.high));
         println!("{name}: live {value:?} {interval:?}, virtual {other_value:?} {other_interval:?}");
         let (Some(live), Some(virtually)) = (*value, other_value) else {

@@ -175,7 +175,7 @@ fn simple_packets_have_no_stamp_and_statistics_reach_their_interface() {
         (None, &b"short"[..])
     );
     assert_eq!(interfaces[0].dropped_count, Some(41));
-    assert_eq!(interfaces[0].start_ns, Some(9000));
+    assert_eq!(interfaces[0].watch, [None, None], "no end is stated");
 }
 
 #[test]
@@ -347,9 +347,75 @@ fn what_the_writer_wrote_reads_the_same() {
     assert_eq!(interfaces[1].description, card.description);
     let read_back = &interfaces[0];
     assert_eq!(read_back.name, interface.name);
-    assert_eq!(read_back.end_ns, Some((stamp_ns + 5).cast_signed()));
+    let watch = read_back.watch[0].unwrap();
+    assert_eq!(watch.last_ns, (stamp_ns + 5).cast_signed());
+    assert_eq!(read_back.repeats, None);
     assert_eq!(
         (read_back.received_count, read_back.dropped_count),
         (Some(12), Some(2))
     );
+}
+
+#[test]
+fn a_whole_second_in_the_fraction_is_carried_and_more_is_no_stamp() {
+    let file = ORDERS[0].pcap(
+        0xa1b2_c3d4,
+        &[
+            (7, 1_000_000, b"carried"),
+            (7, 2_000_000, b"none"),
+            (8, 1, b"fine"),
+        ],
+    );
+    let (packets, faults, _) = read(&file, 64);
+    assert_eq!(faults, []);
+    let stamps: Vec<_> = packets.iter().map(|one| one.stamp_ns).collect();
+    assert_eq!(stamps, [Some(8_000_000_000), None, Some(8_000_001_000)]);
+}
+
+#[test]
+fn the_modified_format_names_interface_and_direction() {
+    for maker in ORDERS {
+        let mut file = maker.pcap(0xa1b2_cd34, &[]);
+        for (kind, data) in [(0, b"in"), (4, b"ex")] {
+            let words = [7, 42, 2, 2, 3].map(|one| maker.word(one)).concat();
+            file.extend([words, maker.half(0x0800), vec![kind, 0], data.to_vec()].concat());
+        }
+        let (packets, faults, _) = read(&file, 5);
+        assert_eq!(faults, []);
+        let directions: Vec<_> = packets.iter().map(|one| one.direction).collect();
+        assert_eq!(directions, [Direction::Inbound, Direction::Outbound]);
+        assert_eq!(packets[0].stamp_ns, Some(7_000_042_000));
+        assert_eq!(
+            (packets[1].data.as_slice(), packets[1].offset),
+            (&b"ex"[..], 50)
+        );
+    }
+}
+
+#[test]
+fn drops_of_system_and_interface_count_and_a_later_section_may_repeat_an_interface() {
+    let maker = ORDERS[0];
+    let counts = [
+        maker.word(0),
+        maker.word(0),
+        maker.word(0),
+        maker.option(5, &3_u64.to_le_bytes()),
+        maker.option(7, &4_u64.to_le_bytes()),
+    ]
+    .concat();
+    let interface = maker.interface(&maker.option(2, b"lan1"));
+    let file = [
+        maker.section(-1),
+        interface.clone(),
+        maker.block(5, &counts),
+        maker.section(-1),
+        maker.interface(&maker.option(2, b"lan2")),
+        interface,
+    ]
+    .concat();
+    let (_, faults, interfaces) = read(&file, 64);
+    assert_eq!(faults, []);
+    assert_eq!(interfaces[0].dropped_count, Some(7));
+    let repeats: Vec<_> = interfaces.iter().map(|one| one.repeats).collect();
+    assert_eq!(repeats, [None, None, Some(0)]);
 }

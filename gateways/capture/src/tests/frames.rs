@@ -2,9 +2,23 @@
 
 use super::super::esl::{self, EslHeader};
 use super::super::flow::{FlowError, FlowFilter, Unidentified};
-use super::super::link::{NoDatagram, udp_datagram};
+use super::super::link::{self, NoDatagram, UdpDatagram};
+use super::super::watch::Unread;
 use super::{message, udp_frame};
-use hil_net::link_type;
+use hil_net::{Direction, link_type};
+
+/// The datagram of a frame that is all there, but for what was cut off behind.
+fn udp_datagram(link_type: u16, frame: &[u8]) -> Result<UdpDatagram<'_>, NoDatagram> {
+    link::udp_datagram(link_type, frame, frame.len())
+}
+
+fn cut_datagram(frame: &[u8]) -> Result<UdpDatagram<'_>, NoDatagram> {
+    link::udp_datagram(1, frame, 1514)
+}
+
+const fn unread(why: Unread) -> NoDatagram {
+    NoDatagram::Unread(why)
+}
 
 #[test]
 fn the_same_datagram_is_found_behind_every_link_layer() {
@@ -20,23 +34,133 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
     let cooked = [&[0; 14][..], &[8, 0], bare].concat();
     let cooked_2 = [&[8, 0][..], &[0; 18], bare].concat();
     let padded = [&frame[..], &[0; 30]].concat();
+    let addresses = &frame[..12];
+    let session = [
+        addresses,
+        &[0x88, 0x64, 0x11, 0, 0, 7, 0, 37, 0, 0x21],
+        bare,
+    ]
+    .concat();
+    let labels = [addresses, &[0x88, 0x47, 0, 1, 0, 64, 0, 2, 1, 64], bare].concat();
+    let snap = [addresses, &[0, 43, 0xaa, 0xaa, 3, 0, 0, 0, 8, 0], bare].concat();
+    let loopback = |family: [u8; 4]| [&family[..], bare].concat();
+    let qos = [
+        &[0x88, 0x01][..],
+        &[0; 22],
+        &[5, 0, 0xaa, 0xaa, 3, 0, 0, 0, 8, 0],
+        bare,
+    ]
+    .concat();
+    let relayed = [
+        &[0x08, 0x03][..],
+        &[0; 28],
+        &[0xaa, 0xaa, 3, 0, 0, 0, 8, 0],
+        bare,
+    ]
+    .concat();
+    // Time, flags and rate present; flags say a check sequence follows.
+    let radiotap = [0, 0, 18, 0, 7, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1, 0x10, 2];
+    let over_air = [&radiotap[..], &qos, &[9; 4]].concat();
     for (link, bytes, vlan) in [
         (link_type::ETHERNET, frame.as_slice(), None),
         (link_type::ETHERNET, &tagged, Some(7)),
         (link_type::ETHERNET, &twice, Some(7)),
         (link_type::ETHERNET, &padded, None),
+        (link_type::ETHERNET, &session, None),
+        (link_type::ETHERNET, &labels, None),
+        (link_type::ETHERNET, &snap, None),
         (link_type::LINUX_SLL, &cooked, None),
         (link_type::LINUX_SLL2, &cooked_2, None),
         (link_type::RAW, bare, None),
+        (link_type::RAW_12, bare, None),
+        (link_type::RAW_14, bare, None),
         (link_type::IPV4, bare, None),
+        (link_type::NULL, &loopback([2, 0, 0, 0]), None),
+        (link_type::NULL, &loopback([0, 0, 0, 2]), None),
+        (link_type::LOOP, &loopback([0, 0, 0, 2]), None),
+        (link_type::PPP, &[&[0xff, 3, 0, 0x21], bare].concat(), None),
+        (link_type::PPP, &[&[0x21][..], bare].concat(), None),
+        (
+            link_type::PPP_SERIAL,
+            &[&[0xff, 3, 0, 0x21], bare].concat(),
+            None,
+        ),
+        (link_type::PPP_ETHER, &session[14..], None),
+        (link_type::IEEE802_11, &qos, None),
+        (link_type::IEEE802_11, &relayed, None),
+        (link_type::RADIOTAP, &over_air, None),
     ] {
-        let datagram = udp_datagram(link, bytes).unwrap();
+        let datagram = udp_datagram(link, bytes);
+        let datagram = datagram.unwrap_or_else(|why| panic!("link type {link}: {why:?}"));
         assert_eq!(datagram.source.to_string(), "10.77.0.1:40000");
         assert_eq!(datagram.destination.to_string(), "10.77.0.2:5004");
-        assert_eq!((datagram.payload, datagram.vlan), (&b"payload"[..], vlan));
+        assert_eq!(
+            (datagram.payload, datagram.place.vlan),
+            (&b"payload"[..], vlan)
+        );
         assert_eq!((datagram.dscp, datagram.is_cut_short()), (46, false));
+        assert_eq!(
+            (datagram.hop_limit, datagram.packet_bytes),
+            (64, bare.len())
+        );
     }
-    assert_eq!(udp_datagram(105, &frame), Err(NoDatagram::UnknownLinkType));
+    let why = Unread::LinkType { link_type: 147 };
+    assert_eq!(udp_datagram(147, &frame), Err(unread(why)));
+    let mut sealed = qos.clone();
+    sealed[1] |= 0x40;
+    let sealed = udp_datagram(link_type::IEEE802_11, &sealed);
+    assert_eq!(sealed, Err(unread(Unread::Encrypted)));
+    let mut several = qos.clone();
+    several[24] |= 0x80;
+    let several = udp_datagram(link_type::IEEE802_11, &several);
+    assert_eq!(several, Err(unread(Unread::Aggregate)));
+    let management = [&[0x80, 0][..], &[0; 40]].concat();
+    let management = udp_datagram(link_type::IEEE802_11, &management);
+    assert_eq!(management, Err(NoDatagram::NotIp));
+}
+
+#[test]
+fn a_length_of_zero_reaches_to_the_end_of_the_frame() {
+    let frame = udp_frame(40_000, 5004, b"payload");
+    let mut offloaded = frame.clone();
+    offloaded[16..18].fill(0);
+    assert_eq!(udp_datagram(1, &offloaded).unwrap().payload, b"payload");
+    offloaded[38..40].fill(0);
+    assert_eq!(udp_datagram(1, &offloaded).unwrap().payload, b"payload");
+    let cut = link::udp_datagram(1, &offloaded[..45], offloaded.len()).unwrap();
+    assert_eq!((cut.payload, cut.payload_bytes), (&b"pay"[..], 7));
+    assert!(cut.is_cut_short());
+
+    let mut six = vec![0x60, 0, 0, 0, 0, 0, 17, 64];
+    six.extend([0xfd; 32]);
+    six.extend(&frame[34..]);
+    let jumbo = udp_datagram(link_type::RAW, &six).unwrap();
+    assert_eq!(jumbo.payload, b"payload");
+}
+
+#[test]
+fn cooked_captures_say_which_way_and_on_which_interface() {
+    let frame = udp_frame(1, 2, b"payload");
+    for (kind, direction) in [
+        (0, Direction::Inbound),
+        (3, Direction::Inbound),
+        (4, Direction::Outbound),
+    ] {
+        let first = [&[0, kind][..], &[0; 12], &[8, 0], &frame[14..]].concat();
+        let place = udp_datagram(link_type::LINUX_SLL, &first).unwrap().place;
+        assert_eq!((place.direction, place.interface_number), (direction, None));
+        let second = [
+            &[8, 0, 0, 0, 0, 0, 0, 9, 0, 1, kind][..],
+            &[0; 9],
+            &frame[14..],
+        ]
+        .concat();
+        let place = udp_datagram(link_type::LINUX_SLL2, &second).unwrap().place;
+        assert_eq!(
+            (place.direction, place.interface_number),
+            (direction, Some(9))
+        );
+    }
 }
 
 #[test]
@@ -57,9 +181,14 @@ fn options_fragments_and_extension_headers_are_followed_or_told() {
     let mut other = frame.clone();
     other[23] = 6;
     assert_eq!(udp_datagram(1, &other), Err(NoDatagram::NotUdp));
-    let short = udp_datagram(1, &frame[..44]).unwrap();
+    let short = cut_datagram(&frame[..44]).unwrap();
     assert!(short.is_cut_short() && short.payload == b"pa");
-    assert_eq!(udp_datagram(1, &frame[..40]), Err(NoDatagram::CutShort));
+    assert_eq!(cut_datagram(&frame[..40]), Err(unread(Unread::CutShort)));
+    assert_eq!(
+        udp_datagram(1, &frame[..40]),
+        Err(unread(Unread::Malformed)),
+        "all of the frame is there"
+    );
 
     // IPv6 with a hop-by-hop header.
     let mut six = vec![0x6b, 0x80, 0, 0, 0, 8 + 15, 0, 64];
@@ -163,7 +292,7 @@ fn a_datagram_is_known_by_what_its_flow_says() {
     );
 
     let frame = udp_frame(7000, 2, &message(1));
-    let cut = udp_datagram(1, &frame[..60]).unwrap();
+    let cut = cut_datagram(&frame[..60]).unwrap();
     assert_eq!(flow("hil").identify(&cut), Err(Unidentified::CutShort));
     assert_eq!(
         flow("udp:port=7000").identify(&cut),

@@ -5,18 +5,24 @@ use std::collections::BTreeMap;
 use hil_core::random::RandomStream;
 
 use super::super::flow::{DatagramIdentity, Numbered};
-use super::super::join::{Joined, OrderSource, WINDOW_NS, join};
-use super::super::observe::{Observation, Observer, Point, Seen, Span, Stream};
+use super::super::join::{JoinSettings, Joined, Loss, OrderSource, Sight, WINDOW_NS, join};
+use super::super::observe::{Observation, Observer, Point, Seen, Stream};
 use super::super::pairing::join_all;
 use super::super::point::{NumberMetrics, single_point_metrics};
-use super::super::{CaptureInterface, CapturedPacket};
+use super::super::watch::Watch;
+use super::super::{CaptureInterface, CapturedPacket, Span};
 use super::udp_frame;
 use hil_net::{Direction, link_type};
 
 fn observation(stamp_ns: i64, number: u64) -> Observation {
     Observation {
         stamp_ns,
+        is_stamp_sound: true,
+        steady_ns: stamp_ns,
+        level: 0,
         payload_bytes: 80,
+        packet_bytes: 108,
+        hop_limit: 64,
         identity: DatagramIdentity {
             key: number.wrapping_mul(0x9e37_79b9_7f4a_7c15),
             number: Some(Numbered {
@@ -42,15 +48,32 @@ fn point(file_index: usize, direction: Direction) -> Point {
         file_index,
         interface_index: 0,
         esl_port: None,
+        interface_number: None,
+        vlan: None,
+        radio_leg: None,
         direction,
     }
 }
 
-fn seen(list: Vec<Observation>, span: Span) -> Seen {
-    Seen {
-        span: Some(span),
-        streams: BTreeMap::from([(STREAM(), list)]),
-    }
+fn seen(list: Vec<Observation>, span: Span) -> (Watch, Seen) {
+    let mut watch = Watch::default();
+    watch.spans.push(span);
+    (watch, BTreeMap::from([(STREAM(), list)]))
+}
+
+const ONE_CLOCK: JoinSettings = JoinSettings {
+    window_ns: WINDOW_NS,
+    is_one_clock: true,
+};
+
+/// Joins what two points saw, on one clock.
+fn join_two(points: [&Point; 2], sides: [&(Watch, Seen); 2]) -> Joined {
+    let sight = |index: usize| Sight {
+        point: points[index],
+        watch: &sides[index].0,
+        seen: &sides[index].1,
+    };
+    join(&STREAM(), sight(0), sight(1), &ONE_CLOCK, None).unwrap()
 }
 
 const ALWAYS: Span = Span {
@@ -61,7 +84,7 @@ const ALWAYS: Span = Span {
 fn joined(first: Vec<Observation>, second: Vec<Observation>) -> Joined {
     let (a, b) = (point(0, Direction::Outbound), point(1, Direction::Inbound));
     let (first, second) = (seen(first, ALWAYS), seen(second, ALWAYS));
-    join(&STREAM(), &a, &first, &b, &second, WINDOW_NS).unwrap()
+    join_two([&a, &b], [&first, &second])
 }
 
 #[test]
@@ -90,16 +113,19 @@ fn every_datagram_of_a_random_network_has_one_fate() {
             second.push(observation(left + delay, number));
         }
         let figures = joined(first.clone(), second.clone()).figures;
-        assert_eq!(figures.lost_count, lost, "seed {seed}");
+        let Loss::Counted(found) = &figures.loss else {
+            panic!("seed {seed}: {:?}", figures.loss)
+        };
+        assert_eq!(found.count, lost, "seed {seed}");
         assert_eq!(figures.duplicated_count, duplicated, "seed {seed}");
         assert_eq!(figures.unexplained_count, hidden, "seed {seed}");
         assert_eq!(figures.edge_count, 0);
         assert_eq!(figures.matched_count + lost, first.len() as u64);
-        if let Some(interval) = figures.loss_interval.unwrap().known() {
-            assert!(interval.holds(figures.loss_ratio.unwrap()));
+        if let Some(interval) = found.interval.unwrap().known() {
+            assert!(interval.holds(found.ratio.unwrap()));
         }
-        let in_bursts: u64 = figures
-            .loss_bursts
+        let in_bursts: u64 = found
+            .bursts
             .iter()
             .map(|(length, count)| length * count)
             .sum();
@@ -137,6 +163,10 @@ fn reordering_and_jitter_follow_their_definitions() {
     }
     assert!((figures.jitter_last_ns.unwrap() - jitter).abs() < 1e-9);
     assert_eq!(figures.variation.measured().unwrap().max_ns, 360);
+    // In the order of departure: 1000, 930, 810, 720, 640.
+    let successive = figures.successive.measured().unwrap();
+    assert_eq!((successive.min_ns, successive.max_ns), (70, 120));
+    assert_eq!(figures.reordering_n_max, 2);
 }
 
 #[test]
@@ -155,10 +185,8 @@ fn what_leaves_at_the_edge_of_the_other_capture_is_not_lost() {
         .collect();
     let (a, b) = (point(0, Direction::Outbound), point(1, Direction::Inbound));
     let sides = (seen(first, ALWAYS), seen(second, watched));
-    let figures = join(&STREAM(), &a, &sides.0, &b, &sides.1, WINDOW_NS)
-        .unwrap()
-        .figures;
-    assert_eq!(figures.lost_count, 1);
+    let figures = join_two([&a, &b], [&sides.0, &sides.1]).figures;
+    assert_eq!(figures.loss.count(), Some(1));
     assert_eq!(figures.edge_count, 40);
 }
 
@@ -185,7 +213,7 @@ fn the_order_of_points_comes_from_directions_or_else_from_stamps() {
     ] {
         let (a, b) = (point(0, directions.0), point(1, directions.1));
         let sides = (seen(early.clone(), ALWAYS), seen(late.clone(), ALWAYS));
-        let joined = join(&STREAM(), &a, &sides.0, &b, &sides.1, WINDOW_NS).unwrap();
+        let joined = join_two([&a, &b], [&sides.0, &sides.1]);
         assert_eq!(joined.figures.order, order);
         assert_eq!(joined.figures.delay.measured().unwrap().p50_ns, expected_ns);
     }
@@ -275,6 +303,7 @@ fn observer_of(packets: &[(usize, Direction, i64, u16)], host: u8) -> Observer {
             &CapturedPacket {
                 offset: 0,
                 interface_index: 0,
+                interface_number: None,
                 link_type: link_type::ETHERNET,
                 stamp_ns: Some(*stamp_ns),
                 original_bytes: u32::try_from(data.len()).unwrap(),
@@ -284,6 +313,8 @@ fn observer_of(packets: &[(usize, Direction, i64, u16)], host: u8) -> Observer {
             },
         );
     }
+    observer.finish(0, &[]);
+    observer.finish(1, &[]);
     observer
 }
 
@@ -296,33 +327,43 @@ fn a_stream_that_was_lost_altogether_has_its_line() {
 
     // Port 2 never came, though port 1 of the same host did.
     let seen: Vec<_> = both.iter().copied().chain(came(Inbound)).collect();
-    let joins = join_all(&observer_of(&seen, 2), WINDOW_NS);
+    let joins = join_all(&observer_of(&seen, 2), &ONE_CLOCK);
     assert_eq!(joins.len(), 2, "{joins:?}");
     let figures = &joins[1].1.figures;
     assert_eq!((figures.first_count, figures.second_count), (50, 0));
-    assert_eq!((figures.lost_count, figures.edge_count), (50, 0));
-    assert_eq!(figures.loss_ratio, Some(1.0));
+    let Loss::Counted(loss) = &figures.loss else {
+        panic!("{:?}", figures.loss)
+    };
+    assert_eq!(
+        (loss.count, loss.ratio, figures.edge_count),
+        (50, Some(1.0), 0)
+    );
     assert_eq!(joins[1].1.first_point.direction, Outbound);
-    assert_eq!(joins[0].1.figures.lost_count, 0);
+    assert_eq!(joins[0].1.figures.loss.count(), Some(0));
 
     // What came there was for another host: no stream of port 1 or 2 was to come by.
-    assert!(join_all(&observer_of(&seen, 9), WINDOW_NS).is_empty());
+    assert!(join_all(&observer_of(&seen, 9), &ONE_CLOCK).is_empty());
 
     // The second capture is empty but says how long it was watching.
     let mut observer = observer_of(&both, 2);
-    assert!(join_all(&observer, WINDOW_NS).is_empty());
+    assert!(join_all(&observer, &ONE_CLOCK).is_empty());
     let watched = CaptureInterface {
-        start_ns: Some(0),
-        end_ns: Some(4000),
+        watch: [
+            Some(Span {
+                first_ns: 0,
+                last_ns: 4000,
+            }),
+            None,
+        ],
         ..CaptureInterface::default()
     };
-    observer.widen(1, &[watched]);
-    let joins = join_all(&observer, WINDOW_NS);
+    observer.finish(1, &[watched]);
+    let joins = join_all(&observer, &ONE_CLOCK);
     assert_eq!(joins.len(), 2, "{joins:?}");
     for (_, joined) in &joins {
         assert_eq!(
-            (joined.figures.lost_count, joined.figures.edge_count),
-            (31, 19)
+            (joined.figures.loss.count(), joined.figures.edge_count),
+            (Some(31), 19)
         );
     }
 
@@ -331,9 +372,9 @@ fn a_stream_that_was_lost_altogether_has_its_line() {
     for one in &mut seen {
         one.1 = Unknown;
     }
-    let joins = join_all(&observer_of(&seen, 2), WINDOW_NS);
+    let joins = join_all(&observer_of(&seen, 2), &ONE_CLOCK);
     assert_eq!(joins.len(), 2, "{joins:?}");
-    assert_eq!(joins[1].1.figures.lost_count, 50);
+    assert_eq!(joins[1].1.figures.loss.count(), Some(50));
     assert_eq!(joins[1].1.first_point.file_index, 0);
 }
 
@@ -346,7 +387,7 @@ fn through_a_host_with_two_taps_the_stamps_tell_the_order() {
     );
     let (a, mut b) = (point(0, Direction::Inbound), point(0, Direction::Outbound));
     b.interface_index = 1;
-    let joined = join(&STREAM(), &b, &left, &a, &came, WINDOW_NS).unwrap();
+    let joined = join_two([&b, &a], [&left, &came]);
     assert_eq!(joined.figures.order, OrderSource::Stamps);
     assert_eq!(joined.figures.delay.measured().unwrap().p50_ns, 70);
 }

@@ -56,7 +56,7 @@ pub(super) fn run(program: &[Instruction], packet: &[u8]) -> u32 {
 
 /// Whether the analyser finds a packet to be of the flows.
 pub(super) fn is_of(flows: &[FlowFilter], link: u16, packet: &[u8]) -> bool {
-    let Ok(datagram) = udp_datagram(link, packet) else {
+    let Ok(datagram) = udp_datagram(link, packet, packet.len()) else {
         return false;
     };
     let is_ours = datagram.payload.starts_with(b"HILG");

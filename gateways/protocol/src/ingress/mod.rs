@@ -18,6 +18,7 @@ use core::net::SocketAddr;
 use core::time::Duration;
 use std::collections::VecDeque;
 
+use hil_core::message::may_be_shorter;
 use hil_core::time::Instant;
 
 use super::body::{Hello, HelloStatus};
@@ -534,14 +535,14 @@ impl IngressBridge {
         deliver: &mut dyn FnMut(Delivery<'_>),
     ) -> Result<Disposition, Refusal> {
         let header = request.header;
-        match header
-            .total_len
-            .cmp(&self.settings.flow.channels[channel].size_max_bytes)
-        {
+        let identity = &self.settings.flow.channels[channel];
+        match header.total_len.cmp(&identity.size_max_bytes) {
             Ordering::Greater => return Err(Refusal::Oversize),
             // Nobody could take it.
-            Ordering::Less => return Err(Refusal::LengthMismatch),
-            Ordering::Equal => {}
+            Ordering::Less if header.total_len == 0 || !may_be_shorter(&identity.type_name) => {
+                return Err(Refusal::LengthMismatch);
+            }
+            Ordering::Less | Ordering::Equal => {}
         }
         self.sessions.check_stamps(request.arrival, header)?;
         let stream = stream_of(header);

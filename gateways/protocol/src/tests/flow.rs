@@ -1,12 +1,12 @@
 //! Many channels in one flow: what is theirs stays apart, and what is the flow's happens once.
 
-use hil_core::message::Envelope;
+use hil_core::message::{ETHERNET_FRAME, Envelope};
 use hil_core::time::Instant;
 
 use super::network::{egress_settings, ingress_settings};
 use crate::channel::{ChannelIdentity, FlowIdentity};
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings};
-use crate::ingress::{Disposition, IngressBridge, IngressSettings};
+use crate::ingress::{Delivery, Disposition, IngressBridge, IngressSettings};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
 use crate::wire::{HEADER_BYTES, Header, Kind};
@@ -38,14 +38,18 @@ struct Pair {
 
 impl Pair {
     fn new() -> Self {
+        Self::of(&flow())
+    }
+
+    fn of(flow: &FlowIdentity) -> Self {
         Self {
             egress: EgressBridge::new(EgressSettings {
-                flow: flow(),
+                flow: flow.clone(),
                 ..egress_settings(100, 0)
             })
             .unwrap(),
             ingress: IngressBridge::new(IngressSettings {
-                flow: flow(),
+                flow: flow.clone(),
                 ..ingress_settings(200, 0)
             })
             .unwrap(),
@@ -217,7 +221,7 @@ fn numbers_that_are_no_channels_and_exchanges_about_channels_are_refused() {
         let mut datagram = vec![0; HEADER_BYTES];
         header.encode(&mut datagram);
         datagram.extend_from_slice(body);
-        let no_message = &mut |_: crate::Delivery<'_>| panic!("no message");
+        let no_message = &mut |_: Delivery<'_>| panic!("no message");
         pair.ingress
             .on_datagram(now, arrival, &datagram, no_message)
     };
@@ -299,7 +303,7 @@ fn send_long(
     let now = Instant::from_ns(2_000_000);
     let arrival = ArrivalStamps::application(now.as_ns());
     let mut delivered = Vec::new();
-    let mut deliver = |one: crate::Delivery<'_>| {
+    let mut deliver = |one: Delivery<'_>| {
         delivered.push((one.message.channel, one.payload.to_vec()));
     };
     let envelope = Envelope::default();
@@ -397,4 +401,39 @@ fn a_peer_that_goes_takes_the_long_message_with_it() {
     assert_eq!(egress.long_piece(now, &vec![0; 1 << 20]), None);
     let counts = egress.channel_counts(0);
     assert_eq!((counts.offered_count, counts.message_failed_count), (1, 1));
+}
+
+#[test]
+fn a_frame_arrives_as_long_as_it_is_and_another_message_only_whole() {
+    for (message, length, is_taken) in [
+        (ETHERNET_FRAME.name, 60, true),
+        (ETHERNET_FRAME.name, 1_300, true),
+        (ETHERNET_FRAME.name, 1_522, true),
+        ("test.State.v1", 60, false),
+        ("test.State.v1", 1_522, true),
+    ] {
+        let flow = FlowIdentity {
+            flow: 65_534,
+            name: "link/hop/forward".to_owned(),
+            channels: vec![ChannelIdentity::new(0, "a/b", message, 1_522, 2)],
+        };
+        let mut pair = Pair::of(&flow);
+        pair.exchange();
+        let now = Instant::from_ns(pair.now_ns);
+        let (envelope, payload) = (Envelope::default(), vec![7; length]);
+        pair.egress.on_local(now, 0, &envelope, &payload).unwrap();
+        let arrival = ArrivalStamps::application(pair.now_ns);
+        let mut lengths = Vec::new();
+        while let Some(transmit) = pair.egress.poll_transmit(now) {
+            let datagram = transmit.datagram.to_vec();
+            let mut deliver = |one: Delivery<'_>| lengths.push(one.payload.len());
+            let taken = pair
+                .ingress
+                .on_datagram(now, arrival, &datagram, &mut deliver);
+            let refused = Err(Refusal::LengthMismatch);
+            assert!(is_taken == taken.is_ok() && (is_taken || taken == refused));
+        }
+        let expected: &[usize] = if is_taken { &[length] } else { &[] };
+        assert_eq!(lengths, expected, "{message} of {length} bytes");
+    }
 }

@@ -21,6 +21,8 @@ pub(super) struct StreamMetrics {
     pub(super) newest_errno: Option<i32>,
     /// Connections of others than the peer's host, turned away.
     pub(super) foreign_connection_count: u64,
+    /// Connections from the peer's address that delivered nothing of the peer's, ended.
+    pub(super) unproven_connection_count: u64,
     /// Connections closed for a length that no frame has.
     pub(super) bad_frame_count: u64,
     /// Frames of which the end of a connection cut off the rest.
@@ -136,6 +138,7 @@ impl StreamMetrics {
             ("connection_ended_count", self.connection_ended_count),
             ("connect_failed_count", self.connect_failed_count),
             ("foreign_connection_count", foreign_count),
+            ("unproven_connection_count", self.unproven_connection_count),
             ("bad_frame_count", self.bad_frame_count),
             ("cut_frame_count", self.cut_frame_count),
             ("abandoned_bytes", self.abandoned_bytes),
@@ -177,6 +180,10 @@ fn connections(figures: &StreamMetrics) -> String {
     for (what, count) in [
         ("failed attempts", figures.connect_failed_count),
         ("strangers turned away", figures.foreign_connection_count),
+        (
+            "ended from the peer's address without a datagram of the peer's",
+            figures.unproven_connection_count,
+        ),
         ("closed for a bad frame length", figures.bad_frame_count),
         ("ended within a frame", figures.cut_frame_count),
         ("bytes given up with one", figures.abandoned_bytes),

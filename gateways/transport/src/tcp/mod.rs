@@ -7,6 +7,8 @@
 //!   lost, and the sequence accounting counts it.
 //! - Nothing blocks. What the kernel does not take waits in a bounded buffer; a message that finds
 //!   no room there is refused and counted.
+//! - A newer connection takes the place of the present one once it has delivered a datagram: under the
+//!   seal an authentic one. Until then it costs the channel nothing, and few of them are kept.
 //! - Every message leaves at once (`TCP_NODELAY`), and what it then waits for is measured: see
 //!   `metrics`.
 //! - There are no kernel stamps. The kernel stamps bytes of a stream, not messages: segments are
@@ -81,7 +83,7 @@ impl Transport for Tcp {
         settings: &SocketSettings,
         seal: Option<Responder>,
     ) -> Result<OpenReceiver, SocketError> {
-        let receiver = TcpReceiver::open(settings.clone())?;
+        let receiver = TcpReceiver::open(settings.clone(), seal.is_some())?;
         Ok(OpenReceiver {
             facts: facts(settings, receiver.granted()),
             receiver: sealed::receiver(receiver, settings.peer, seal),

@@ -23,8 +23,8 @@ pub(super) const USER_TIMEOUT: Duration = Duration::from_secs(10);
 pub(super) const CONNECT_PATIENCE: Duration = Duration::from_secs(3);
 /// Longest segment the kernel can be told of (`MAX_TCP_WINDOW`).
 const SEGMENT_BYTES_MAX: u32 = 32_767;
-/// Connections that may wait to be accepted: the peer's, and a few of others to be turned away.
-const LISTEN_BACKLOG: i32 = 8;
+/// Connections that may wait to be accepted: the peer's among those of others that are to be turned away.
+const LISTEN_BACKLOG: i32 = 128;
 
 /// A socket with everything set that has to be before it connects or listens.
 fn open(settings: &SocketSettings) -> Result<Socket, SocketError> {

@@ -97,6 +97,23 @@ impl Stream {
         Ok(self.epoll.add(socket, EpollEvent::new(interest, 0))?)
     }
 
+    /// Waits, by edge, for what comes on a connection that is not the present one.
+    pub(super) fn watch_candidate(&self, socket: &Socket) -> io::Result<()> {
+        let interest = EpollFlags::EPOLLIN | EpollFlags::EPOLLET;
+        Ok(self.epoll.add(socket, EpollEvent::new(interest, 0))?)
+    }
+
+    /// As [`Stream::watch`], of a socket that is watched as a candidate.
+    pub(super) fn watch_adopted(
+        &mut self,
+        socket: &Socket,
+        interest: EpollFlags,
+    ) -> io::Result<()> {
+        self.interest = interest;
+        let mut event = EpollEvent::new(interest, 0);
+        Ok(self.epoll.modify(socket, &mut event)?)
+    }
+
     /// Waits for room in the kernel's buffer only while something needs it.
     pub(super) fn update_interest(&mut self) {
         let mut interest = EpollFlags::EPOLLIN;

@@ -5,11 +5,12 @@
 use serde::{Deserialize, Serialize};
 
 use super::loss::{BURST_GAP_MIN, clusters, loss_runs};
-use super::order::{arrivals, extents};
+use super::order::arrivals;
 use super::{Moment, Passages};
 use crate::{AccountContext, ChannelRecords, Side, each};
 use hil_core::record::UNAVAILABLE;
 use hil_stats::in_order::in_order;
+use hil_stats::reordering::{Reordered, reordered};
 use hil_stats::samples::Samples;
 
 /// Losses in a row that last this long are an outage, shorter ones a burst of losses.
@@ -223,19 +224,19 @@ fn late(passages: &Passages) -> Vec<NetworkEvent> {
 }
 
 fn reordering(passages: &Passages) -> Vec<NetworkEvent> {
-    let (found, _) = extents(arrivals(passages).map(|(_, number)| number));
-    let near = |before: &(u64, u64), after: &(u64, u64)| after.0 - before.0 <= BURST_GAP_MIN;
+    let (found, _) = reordered(arrivals(passages).map(|(_, number)| number));
+    let near = |before: &Reordered, after: &Reordered| after.place - before.place <= BURST_GAP_MIN;
     let mut times = arrivals(passages).map(|(ns, _)| ns).zip(0_u64..);
     // Places ascend from burst to burst.
     let mut received_ns = |place: u64| times.find(|one| one.1 == place).map(|one| one.0);
-    let event = |burst: &[(u64, u64)]| {
+    let event = |burst: &[Reordered]| {
         let (first, last) = burst.first().zip(burst.last())?;
-        let extent_max = burst.iter().map(|one| one.1).max()?;
-        let from_ns = received_ns(first.0)?;
-        let until_ns = if last.0 == first.0 {
+        let extent_max = burst.iter().map(|one| one.extent).max()?;
+        let from_ns = received_ns(first.place)?;
+        let until_ns = if last.place == first.place {
             Some(from_ns)
         } else {
-            received_ns(last.0)
+            received_ns(last.place)
         };
         Some(NetworkEvent {
             kind: NetworkEventKind::Reordering {

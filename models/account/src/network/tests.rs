@@ -269,6 +269,7 @@ fn reordering_has_the_ratio_and_extent_of_rfc_4737() {
     assert_eq!((found.count, found.reordered_count), (11, 3));
     // 4 came four places after 7, 5 five, 6 six.
     assert_eq!((found.extent_p50, found.extent_max), (Some(5), Some(6)));
+    assert!(found.n_max <= found.extent_max && found.n_max > Some(0));
     let event = network_events(&packed(&all))
         .into_iter()
         .find(|one| matches!(one.kind, NetworkEventKind::Reordering { .. }));

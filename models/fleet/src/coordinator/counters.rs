@@ -69,11 +69,5 @@ hil_core::counts! {
         authorities_exceeded: u64;
         /// States that show a robot beyond its authority by more than the stop margin.
         margins_exceeded: u64;
-        /// Authorities counted as ended because their lease ran out unanswered.
-        leases_expired: u64;
-        /// States older than the delay bound a lease rests on.
-        delay_bound_violations: u64;
-        /// Cycles without grants because the delay bound was violated.
-        cycles_frozen: u64;
     }
 }

@@ -45,8 +45,6 @@ hil_core::parameters! {
         stuck_after_s: f64 = 120.0, in 1.0..=100_000.0;
         /// Reverse orders to break up cycles of waiting robots.
         break_deadlocks: bool = true;
-        /// Robots stamp states with the controller's clock, so that a state's age means something.
-        clock_is_shared: bool = true;
         /// What only the safe mode needs.
         safe: SafeParameters = SafeParameters::default();
     } check check_safe;

@@ -8,11 +8,9 @@ use crate::experiment::cells::{
 };
 use crate::experiment::study::{FleetStudy, worlds_text};
 use crate::scenario::Scenario;
-use hil_core::interval::Interval;
-use hil_core::study::{Cell, Column, Criterion, Field, StudyReport, Table};
+use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_link::impaired::DelayLaw;
-use hil_stats::comparison::{Share, difference};
-use hil_stats::statistics::CONFIDENCE;
+use hil_stats::comparison::{Share, against_published};
 
 /// A cell with what came of it; `None` when it was not run.
 #[derive(Debug)]
@@ -55,12 +53,19 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
         tables.extend(SCENARIOS.map(|scenario| mechanism_table(scenario, results)));
         tables.push(command_table(results));
     }
+    let verdicts: Vec<_> = results.iter().filter_map(verdict_against).collect();
+    let criteria = criteria(results);
+    let named = verdicts.iter();
+    let named: Vec<_> = named
+        .map(|(one, of)| (one.cell.id.to_string(), *of))
+        .collect();
     StudyReport {
         title: "Case study 1: collisions per critical section (CS), in virtual time".to_owned(),
         notes: notes(study),
         tables,
-        criteria: criteria(results),
-        summary: summary(results),
+        summary: study::summary(&named, &criteria),
+        larger: larger(study, &verdicts, &criteria),
+        criteria,
     }
 }
 
@@ -90,23 +95,37 @@ fn notes(study: &FleetStudy) -> Vec<String> {
 
 /// What Tables II and III show of ours.
 const FOUND: [Field<FleetTally>; 4] = [
-    Field::count("sections", "CS", FleetTally::section_count),
-    Field::text("collisions", "Collisions", collisions),
-    Field::number("per_1000", "P x 1000", 2, per_1000),
+    Field::count("sections", "CS", FleetTally::section_count).ranked(3),
+    Field::text("collisions", "Collisions", collisions).ranked(4),
+    Field::number("per_1000", "Per 1000", 2, per_1000),
     Field::interval("per_1000", "95 %", 2, interval_per_1000),
 ];
 
 /// What they show of the paper's.
 const PUBLISHED: [Field<PublishedRow>; 4] = [
-    Field::count("published_sections", "Paper: CS", |row| row.sections),
-    Field::count("published_collisions", "Coll.", |row| row.collisions),
-    Field::number("published_per_1000", "P x 1000", 2, |row| {
+    Field::count("published_sections", "Paper: CS", |row: &PublishedRow| {
+        row.sections
+    })
+    .ranked(5),
+    Field::count(
+        "published_collisions",
+        "Paper: coll.",
+        |row: &PublishedRow| row.collisions,
+    )
+    .ranked(6),
+    Field::number("published_per_1000", "Paper", 2, |row| {
         Some(1e3 * row.collisions as f64 / row.sections as f64)
     }),
-    Field::interval("published_per_1000", "95 %", 2, |row| {
-        collision_interval(row.collisions, row.sections)
-            .map(|interval| (1e3 * interval.low, 1e3 * interval.high))
-    }),
+    Field::interval(
+        "published_per_1000",
+        "Paper: 95 %",
+        2,
+        |row: &PublishedRow| {
+            collision_interval(row.collisions, row.sections)
+                .map(|interval| (1e3 * interval.low, 1e3 * interval.high))
+        },
+    )
+    .ranked(2),
 ];
 
 /// Table II or III.
@@ -143,7 +162,8 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
             ];
             row.extend(Field::cells(&FOUND, one.tally.as_ref()));
             row.extend(Field::cells(&PUBLISHED, None));
-            row.extend([Cell::Absent, judged(one)]);
+            let verdict = verdict_against(one).map(|(_, verdict)| verdict);
+            row.extend([Cell::verdict(verdict), judged(one)]);
             rows.push(row);
         }
     }
@@ -155,16 +175,18 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
     ];
     columns.extend(Field::columns(&FOUND));
     columns.extend(Field::columns(&PUBLISHED));
-    columns.push(Column::new("against_paper", "Against paper"));
-    columns.push(Column::new("verdict", "Accepted if"));
+    columns.push(Column::new("against_paper", "Verdict"));
+    columns.push(Column::new("verdict", "Accepted if").ranked(9));
     Table {
         name: name.to_owned(),
         title: title.to_owned(),
         columns,
         rows,
+        is_detail: false,
         notes: vec![
-            "rows measured with hardware in the loop depend on hosts and radio; ours beside them \
-             are over the Wi-Fi 6 model's presets, which are fitted to case study 2 alone"
+            "not comparable: not in the paper, or measured there with hardware in the loop, which \
+             depends on hosts and radio; ours beside these are over the Wi-Fi 6 model's presets, \
+             which are fitted to case study 2 alone"
                 .to_owned(),
             "an overlap outside every section is a graze between two path poses, which a list of \
              sections at the poses cannot hold; the safe coordinator's guarded sections do"
@@ -197,101 +219,72 @@ fn published_row(published: &PublishedRow, ours: Option<&CellResult<'_>>) -> Vec
     let tally = ours.and_then(|one| one.tally.as_ref());
     row.extend(Field::cells(&FOUND, tally));
     row.extend(Field::cells(&PUBLISHED, Some(published)));
-    let against = tally.and_then(|tally| AgainstPaper::of(published, tally));
-    row.push(against.map_or(Cell::Absent, |one| Cell::text(one.words())));
+    let is_model = matches!(published.condition, Condition::Static { .. });
+    let verdict = ours.and_then(verdict_against).map(|(_, verdict)| verdict);
+    let verdict = verdict.or((!is_model).then_some(Verdict::NotComparable));
+    row.push(Cell::verdict(verdict));
     row.push(ours.map_or(Cell::Absent, judged));
     row
 }
 
-/// How our probability of a row stands to the paper's.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum AgainstPaper {
-    /// No difference at 5 %, in a sample of half the paper's or more.
-    Agrees,
-    /// The interval of their difference (Newcombe's) does not hold zero.
-    Differs,
-    /// No difference at 5 %, in a smaller sample.
-    Inconclusive,
-    /// The paper's row is of a real network, ours of the model of another one.
-    NotComparable,
-}
-
-impl AgainstPaper {
-    const ALL: [Self; 4] = [
-        Self::Agrees,
-        Self::Differs,
-        Self::Inconclusive,
-        Self::NotComparable,
-    ];
-
-    /// `None` without an interval of both.
-    fn of(published: &PublishedRow, tally: &FleetTally) -> Option<Self> {
-        if matches!(published.condition, Condition::HardwareInTheLoop(_)) {
-            return Some(Self::NotComparable);
-        }
-        let share = |count: u64, of: u64| {
-            let count = count.min(of);
-            Share { count, of }.estimate(CONFIDENCE)
-        };
-        let paper = share(published.collisions, published.sections)?;
-        let count = tally.section_count();
-        let ours = share(tally.referee.section_collisions_count, count)?;
-        let Interval { low, high, .. } = difference(paper, ours)?;
-        Some(if low > 0.0 || high < 0.0 {
-            Self::Differs
-        } else if 2 * count >= published.sections {
-            Self::Agrees
-        } else {
-            Self::Inconclusive
-        })
-    }
-
-    const fn words(self) -> &'static str {
-        match self {
-            Self::Agrees => "agrees",
-            Self::Differs => "differs",
-            Self::Inconclusive => "inconclusive",
-            Self::NotComparable => "not comparable",
-        }
-    }
-}
-
-/// How many rows agree with the paper, which differ, and what would decide the others.
-fn summary(results: &[CellResult<'_>]) -> Vec<String> {
-    let compared: Vec<_> = results
-        .iter()
-        .filter_map(|one| {
-            let Place::Published { row, .. } = one.place() else {
-                return None;
+/// How a row of Table II or III stands to the paper's; `None` of a mechanism, and where nothing was run.
+fn verdict_against<'a>(one: &'a CellResult<'a>) -> Option<(&'a CellResult<'a>, Verdict)> {
+    let tally = one.tally.as_ref()?;
+    let verdict = match one.place() {
+        Place::Mechanism { .. } => return None,
+        Place::Published { row, .. } if matches!(row.condition, Condition::Static { .. }) => {
+            let share = |count: u64, of: u64| Share {
+                count: count.min(of),
+                of,
             };
-            let against = AgainstPaper::of(row, one.tally.as_ref()?)?;
-            Some((one.cell.id, against, row.sections))
-        })
-        .collect();
-    if compared.is_empty() {
-        return Vec::new();
+            let count = tally.referee.section_collisions_count;
+            let published = share(row.collisions, row.sections);
+            against_published(published, share(count, tally.section_count()))?
+        }
+        Place::Published { .. } | Place::Variant(_) => Verdict::NotComparable,
+    };
+    Some((one, verdict))
+}
+
+/// Cells whose names still make a short command.
+const NAMED_MAX: usize = 3;
+
+/// What more critical sections would decide.
+fn larger(
+    study: &FleetStudy,
+    verdicts: &[(&CellResult<'_>, Verdict)],
+    criteria: &[Criterion],
+) -> Vec<Larger> {
+    let sections = |count: u64| format!("tables.sections={count}");
+    let open = verdicts.iter().filter(|one| one.1 == Verdict::Inconclusive);
+    let open: Vec<_> = open.map(|(one, _)| *one).collect();
+    let needed = open.iter().filter_map(|one| match one.place() {
+        Place::Published { row, .. } => Some(row.sections.div_ceil(2)),
+        _ => None,
+    });
+    let mut larger = Vec::new();
+    if let Some(needed) = needed.max() {
+        let mut parameters = vec![sections(needed)];
+        if open.len() <= NAMED_MAX {
+            let names = open.iter().map(|one| format!("\"{}\"", one.cell.id));
+            let names = names.collect::<Vec<_>>().join(", ");
+            parameters.push(format!("tables.cells=[{names}]"));
+        } else {
+            parameters.push("tables.parts=[\"published\"]".to_owned());
+        }
+        larger.push(Larger {
+            of: "inconclusive rows",
+            parameters,
+        });
     }
-    let of = |wanted: AgainstPaper| compared.iter().filter(move |one| one.1 == wanted);
-    let counts = AgainstPaper::ALL.map(|one| format!("{} {}", one.words(), of(one).count()));
-    let mut lines = vec![format!(
-        "Against the paper, of {} cells: {}; one in twenty differs by chance.",
-        compared.len(),
-        counts.join(", ")
-    )];
-    let differing: Vec<String> = of(AgainstPaper::Differs)
-        .map(|one| one.0.to_string())
-        .collect();
-    if !differing.is_empty() {
-        lines.push(format!("These differ: {}.", differing.join("; ")));
+    let is_open = criteria.iter().any(|one| one.is_met.is_none());
+    if is_open && study.parameters().sections < DECISIVE_COUNT {
+        larger.push(Larger {
+            of: "criteria with too few",
+            parameters: vec![sections(DECISIVE_COUNT)],
+        });
     }
-    let needed = of(AgainstPaper::Inconclusive).map(|one| one.2.div_ceil(2));
-    if let Some(sections) = needed.max() {
-        lines.push(format!(
-            "The inconclusive ones have fewer than half of the paper's critical sections; --sections {sections} \
-             is enough."
-        ));
-    }
-    lines
+    larger
 }
 
 fn collisions(tally: &FleetTally) -> String {
@@ -372,6 +365,7 @@ fn motion_table(results: &[CellResult<'_>]) -> Table {
     Table {
         name: "motion".to_owned(),
         title: "Tables II and III: what the robots did".to_owned(),
+        is_detail: true,
         notes: vec![
             "past point: farthest stop beyond an order that came in time; bound: 3 v (TT + D) + v \
              TT / 2 for the stepped tracker, 0 for the exact one; late: orders too late to stop at"
@@ -406,32 +400,37 @@ fn by_cell<'a>(
 }
 
 const LEGACY: [Field<FleetTally>; 6] = [
-    Field::count("legacy_sections", "Legacy: CS", FleetTally::section_count),
-    Field::text("legacy_collisions", "Collisions", collisions),
-    Field::number("legacy_per_1000", "P x 1000", 2, per_1000),
+    Field::count("legacy_sections", "Legacy: CS", FleetTally::section_count).ranked(3),
+    Field::text("legacy_collisions", "Legacy: coll.", collisions).ranked(4),
+    Field::number("legacy_per_1000", "Legacy: P x 1000", 2, per_1000),
     Field::interval("legacy_per_1000", "95 %", 2, interval_per_1000),
-    Field::count("legacy_resets", "Resets", |t| t.coordinator.resets),
+    Field::count("legacy_resets", "Legacy: resets", |t: &FleetTally| {
+        t.coordinator.resets
+    })
+    .ranked(6),
     Field::number(
         "legacy_missions_per_hour",
-        "Missions/h",
+        "Legacy: missions/h",
         0,
         FleetTally::missions_per_hour,
-    ),
+    )
+    .ranked(5),
 ];
 
 const SAFE: [Field<FleetTally>; 5] = [
-    Field::count("safe_sections", "Safe: CS", FleetTally::section_count),
-    Field::text("safe_collisions", "Collisions", collisions),
-    Field::number("safe_per_1000_high", "P x 1000 below", 3, |t| {
+    Field::count("safe_sections", "Safe: CS", FleetTally::section_count).ranked(3),
+    Field::text("safe_collisions", "Safe: coll.", collisions).ranked(1),
+    Field::number("safe_per_1000_high", "Safe: P x 1000 below", 3, |t| {
         Some(interval_per_1000(t)?.1)
     }),
-    Field::count("safe_stuck", "Stuck", |t| t.safe.stuck),
+    Field::count("safe_stuck", "Safe: stuck", |t: &FleetTally| t.safe.stuck).ranked(2),
     Field::number(
         "safe_missions_per_hour",
-        "Missions/h",
+        "Safe: missions/h",
         0,
         FleetTally::missions_per_hour,
-    ),
+    )
+    .ranked(5),
 ];
 
 /// What each impairment does to each coordinator.
@@ -455,7 +454,7 @@ fn mechanism_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
         ),
         columns,
         rows: rows.collect(),
-        notes: Vec::new(),
+        ..Table::default()
     }
 }
 
@@ -489,6 +488,7 @@ fn command_table(results: &[CellResult<'_>]) -> Table {
     Table {
         name: "commands".to_owned(),
         title: "What causes collisions: what became of the messages".to_owned(),
+        is_detail: true,
         notes: vec![
             "late: too late to stop at; ignored: behind the robot, which drove on; refused: not \
              applied because it could not stop (safe); stale: older than one applied"

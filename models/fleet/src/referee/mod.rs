@@ -481,8 +481,6 @@ hil_core::counts! {
         authorities_refused_count: u64;
         /// Older or repeated messages passed over.
         stale_count: u64;
-        /// Leases that ended.
-        leases_ended_count: u64;
         /// Scans made.
         scans_count: u64;
         /// Truth records that name an unknown fleet, robot, path or kind, or no finite motion.
@@ -509,7 +507,6 @@ impl Tally {
             TruthKind::AuthorityIgnored => self.authorities_ignored_count += 1,
             TruthKind::AuthorityRefused => self.authorities_refused_count += 1,
             TruthKind::MessageStale => self.stale_count += 1,
-            TruthKind::LeaseEnded => self.leases_ended_count += 1,
             TruthKind::Replaced => self.replaced_count += 1,
         }
     }

@@ -2,7 +2,6 @@
 //! authority, as decisions without effect.
 
 use crate::messages::{NO_AUTHORITY, TO_GOAL, TruthKind};
-use hil_core::time::Instant;
 
 /// The authority in force and what is known of newer ones.
 #[derive(Debug, Clone, Copy)]
@@ -13,13 +12,10 @@ pub(crate) struct Grant {
     pub(crate) applied: Option<u32>,
     /// Newest sequence seen.
     pub(crate) newest: Option<u32>,
-    pub(crate) lease_end: Option<Instant>,
     /// The newest was refused.
     pub(crate) is_refused: bool,
     /// The one in force came too late to stop at.
     pub(crate) is_late: bool,
-    /// Its lease has ended: the robot brakes and stands until a newer one comes.
-    pub(crate) has_lapsed: bool,
 }
 
 impl Grant {
@@ -27,10 +23,8 @@ impl Grant {
         index: NO_AUTHORITY,
         applied: None,
         newest: None,
-        lease_end: None,
         is_refused: false,
         is_late: false,
-        has_lapsed: false,
     };
 
     pub(crate) const fn is_given(&self) -> bool {
@@ -108,7 +102,7 @@ pub(crate) fn original(grant: &Grant, proposal: &Proposal) -> Verdict {
     {
         return Verdict::Stale;
     }
-    if grant.is_given() && proposal.index == grant.index && !grant.has_lapsed {
+    if grant.is_given() && proposal.index == grant.index {
         return Verdict::Unchanged;
     }
     if proposal.index == TO_GOAL || !grant.is_given() {

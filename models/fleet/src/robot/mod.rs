@@ -120,11 +120,8 @@ impl Robot {
 
     /// When [`Robot::on_event`] is next due.
     pub fn next_event(&self) -> Instant {
-        let changes = [self.tracker.next_change(), self.grant.lease_end];
-        changes
-            .into_iter()
-            .flatten()
-            .fold(self.next_report, Instant::min)
+        let change = self.tracker.next_change();
+        change.map_or(self.next_report, |at| at.min(self.next_report))
     }
 
     /// Does what is due at `now`; may be called early and then does nothing. Gives the state to
@@ -193,25 +190,11 @@ impl Robot {
         matches!(self.phase, Phase::Driving | Phase::AtPoint)
     }
 
-    /// Brings motion and lease up to `now`, in order of time.
+    /// Brings motion up to `now`.
     fn advance(&mut self, now: Instant, truth: &mut dyn FnMut(Truth)) {
-        loop {
-            let change = self.tracker.next_change().filter(|at| *at <= now);
-            let lease_end = self.grant.lease_end.filter(|at| *at <= now);
-            match (change, lease_end) {
-                (Some(at), end) if end.is_none_or(|end| at <= end) => {
-                    self.tracker.change();
-                    self.settle(at, truth);
-                }
-                (_, Some(at)) => {
-                    self.grant.lease_end = None;
-                    self.grant.has_lapsed = true;
-                    self.tracker.brake(at);
-                    self.counters.leases_ended_count += 1;
-                    self.note(at, TruthKind::LeaseEnded, truth);
-                }
-                _ => return,
-            }
+        while let Some(at) = self.tracker.next_change().filter(|at| *at <= now) {
+            self.tracker.change();
+            self.settle(at, truth);
         }
     }
 
@@ -230,15 +213,6 @@ impl Robot {
     fn settle(&mut self, at: Instant, truth: &mut dyn FnMut(Truth)) {
         let kind = self.update_phase(at);
         truth(self.record(at, kind, self.grant.applied.unwrap_or(0)));
-    }
-
-    /// The same, with a record of `kind` for a cause other than motion itself.
-    fn note(&mut self, at: Instant, kind: TruthKind, truth: &mut dyn FnMut(Truth)) {
-        let sequence = self.grant.applied.unwrap_or(0);
-        truth(self.record(at, kind, sequence));
-        if self.update_phase(at) == TruthKind::MissionDone {
-            truth(self.record(at, TruthKind::MissionDone, sequence));
-        }
     }
 
     fn update_phase(&mut self, at: Instant) -> TruthKind {
@@ -265,7 +239,6 @@ impl Robot {
         let is_goal = self.grant.is_given() && self.grant.reach(last_index) == last_index;
         if is_goal && path.index_at(way_m) == last_index {
             self.phase = Phase::Done;
-            self.grant.lease_end = None;
             self.counters.missions_done_count += 1;
             return TruthKind::MissionDone;
         }
@@ -467,10 +440,9 @@ impl Robot {
     }
 
     /// Keeps an acknowledged authority that overtook its mission, which goes another way: the
-    /// coordinator counts it as in force from the moment it was sent. One with a lease is not
-    /// kept, as its time would begin too late. False when it is passed over.
+    /// coordinator counts it as in force from the moment it was sent. False when it is passed over.
     fn keep_early(&mut self, authority: &Authority) -> bool {
-        let is_lasting = authority.flags & Authority::ACKNOWLEDGED != 0 && authority.lease_ns == 0;
+        let is_lasting = authority.flags & Authority::ACKNOWLEDGED != 0;
         let is_newest = self.early.is_none_or(|kept| {
             let (new, old) = (&authority.header, &kept.header);
             is_newer(new.mission_id, old.mission_id)
@@ -511,9 +483,7 @@ impl Robot {
                 self.grant.index = authority.authority_index;
                 self.grant.applied = Some(authority.sequence);
                 self.grant.is_refused = false;
-                self.grant.has_lapsed = false;
                 self.grant.is_late = verdict == Verdict::ApplyLate;
-                self.grant.lease_end = lease_end(now, authority.lease_ns);
                 if let Some(path) = &self.path {
                     let reach = self.grant.reach(path.last_index());
                     self.tracker.aim(now, path.way_to_m(reach));
@@ -607,10 +577,6 @@ fn in_order(newest: &mut Option<u32>, header: &Header) -> bool {
     true
 }
 
-fn lease_end(now: Instant, lease_ns: i64) -> Option<Instant> {
-    (lease_ns > 0).then(|| Instant::from_ns(now.as_ns().saturating_add(lease_ns)))
-}
-
 /// Counted since the robot was made.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct RobotCounters {
@@ -639,8 +605,6 @@ pub struct RobotCounters {
     pub early_count: u64,
     /// Authorities and missions whose `header_id` was not newer than the newest of their kind.
     pub out_of_order_count: u64,
-    /// Leases that ended before a newer authority came.
-    pub leases_ended_count: u64,
     /// Farthest it came to rest past an authority that came in time, metres.
     pub stop_error_max_m: f64,
     /// Farthest it came to rest past an authority that came too late, metres.
@@ -669,7 +633,6 @@ impl RobotCounters {
         self.stale_count += other.stale_count;
         self.early_count += other.early_count;
         self.out_of_order_count += other.out_of_order_count;
-        self.leases_ended_count += other.leases_ended_count;
         self.stop_error_max_m = self.stop_error_max_m.max(other.stop_error_max_m);
         self.late_overshoot_max_m = self.late_overshoot_max_m.max(other.late_overshoot_max_m);
         self.travelled_m += other.travelled_m;

@@ -92,13 +92,6 @@ impl Tracker {
         }
     }
 
-    pub(crate) fn brake(&mut self, now: Instant) {
-        match self {
-            Self::Exact(tracker) => tracker.brake(now),
-            Self::Legacy(tracker) => tracker.brake(),
-        }
-    }
-
     pub(crate) fn can_stop_at(&self, now: Instant, target_m: f64) -> bool {
         match self {
             Self::Exact(tracker) => tracker.can_stop_at(now, target_m),
@@ -234,11 +227,6 @@ impl ExactTracker {
         self.rest_at(brake_s + peak / rate, target_m);
     }
 
-    /// Comes to rest as soon as it can.
-    pub(crate) fn brake(&mut self, now: Instant) {
-        self.aim(now, f64::NEG_INFINITY);
-    }
-
     /// True when it can come to rest at or before `target_m`.
     pub(crate) fn can_stop_at(&self, now: Instant, target_m: f64) -> bool {
         let motion = self.motion(now);
@@ -360,12 +348,6 @@ impl LegacyTracker {
     pub(crate) fn aim(&mut self, target_m: f64) {
         self.target_m = target_m;
         self.brake_from_m = self.braking_point_m(target_m);
-    }
-
-    /// Brakes from the next tick on.
-    pub(crate) fn brake(&mut self) {
-        self.brake_from_m = f64::NEG_INFINITY;
-        self.target_m = self.way_m;
     }
 
     /// True when it need not brake at once to stop at `target_m`.

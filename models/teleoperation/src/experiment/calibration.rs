@@ -326,12 +326,12 @@ impl Study for Calibration {
             ),
             notes: self.notes(),
             tables: vec![self.table(outcomes)],
-            summary: Vec::new(),
             criteria: vec![Criterion {
                 text: "at least one point of the curve exists".to_owned(),
                 is_met: outcomes.iter().all(Option::is_some).then_some(found > 0),
                 finding: format!("{found} of {} points have a rate", outcomes.len()),
             }],
+            ..StudyReport::default()
         }
     }
 }
@@ -375,7 +375,7 @@ impl Calibration {
             ),
             columns: COLUMNS.to_vec(),
             rows: rows.map(|(task, point)| self.row(task, *point)).collect(),
-            notes: Vec::new(),
+            ..Table::default()
         }
     }
 

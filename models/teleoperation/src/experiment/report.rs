@@ -4,8 +4,8 @@ use crate::experiment::conditions::{Condition, Expected, PUBLISHED_LOOPS};
 use crate::experiment::drive::Tally;
 use crate::experiment::study::MotionLossStudy;
 use crate::score::loops::LossKind;
-use hil_core::study::{Criterion, Field, StudyReport, Table};
-use hil_stats::comparison::mean_interval;
+use hil_core::study::{self, Criterion, Field, Larger, StudyReport, Table, Verdict};
+use hil_stats::comparison::{Share, against_published, mean_interval};
 use hil_stats::statistics::{CONFIDENCE, poisson};
 
 /// A condition with the runs of it that ended.
@@ -15,20 +15,51 @@ pub(crate) struct Row<'a> {
     pub(crate) condition: &'a Condition,
     /// The runs that ended.
     pub(crate) runs: Vec<&'a Tally>,
+    /// Motion and robot are those with which outages were fitted to the paper.
+    pub(crate) is_fitted: bool,
 }
 
 /// The whole report.
 pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
+    let criteria: Vec<_> = rows.iter().flat_map(Row::criteria).collect();
+    let verdicts = rows
+        .iter()
+        .filter_map(|row| Some((row.name(), row.verdict()?)));
+    let verdicts: Vec<_> = verdicts.collect();
     StudyReport {
         title: "Case study 2: motion loss rate (MLR) by condition, in virtual time".to_owned(),
         notes: notes(study),
         tables: vec![rates(rows), counts(rows), setups(rows)],
-        summary: Vec::new(),
-        criteria: rows
-            .iter()
-            .flat_map(|row| row.criteria(study.is_fitted))
-            .collect(),
+        summary: study::summary(&verdicts, &criteria),
+        larger: larger(study, &verdicts, &criteria),
+        criteria,
     }
+}
+
+/// What more loops or more runs would decide.
+fn larger(
+    study: &MotionLossStudy,
+    verdicts: &[(String, Verdict)],
+    criteria: &[Criterion],
+) -> Vec<Larger> {
+    let parameters = &study.parameters;
+    let mut needed = Vec::new();
+    if parameters.loops != PUBLISHED_LOOPS {
+        needed.push(format!("tables.loops={PUBLISHED_LOOPS}"));
+    }
+    if (parameters.seeds as usize) < RUNS_MIN {
+        needed.push(format!("tables.seeds={RUNS_MIN}"));
+    }
+    let is_open = verdicts
+        .iter()
+        .any(|(_, one)| *one == Verdict::Inconclusive);
+    let is_short = study.is_fitted && criteria.iter().any(|one| one.is_met.is_none());
+    let larger = Larger {
+        of: "inconclusive and too few",
+        parameters: needed,
+    };
+    let is_of_use = (is_open || is_short) && !larger.parameters.is_empty();
+    is_of_use.then_some(larger).into_iter().collect()
 }
 
 fn notes(study: &MotionLossStudy) -> Vec<String> {
@@ -81,6 +112,26 @@ impl Row<'_> {
         self.condition.name.to_owned()
     }
 
+    /// How the rate stands to the published one; `None` where nothing was run.
+    fn verdict(&self) -> Option<Verdict> {
+        if self.runs.is_empty() {
+            return None;
+        }
+        match self.condition.expected {
+            Expected::Published { .. } if self.is_fitted => Some(Verdict::Fitted),
+            Expected::Ethernet if self.is_fitted => {
+                let of = self.sent();
+                let count = self.sum(Tally::missing_count).min(of);
+                let published = Share {
+                    count: 0,
+                    of: u64::from(PUBLISHED_LOOPS),
+                };
+                against_published(published, Share { count, of })
+            }
+            _ => Some(Verdict::NotComparable),
+        }
+    }
+
     /// Student's interval of the mean rate.
     fn runs_interval(&self) -> Option<(f64, f64)> {
         let interval = mean_interval(&self.rates(), CONFIDENCE)?;
@@ -96,10 +147,10 @@ impl Row<'_> {
 }
 
 fn rates(rows: &[Row<'_>]) -> Table {
-    let fields: [Field<Row<'_>>; 6] = [
+    let fields: [Field<Row<'_>>; 7] = [
         Field::text("condition", "Condition", Row::name),
         Field::number("mlr_mean", "MLR", 5, |row| row.mean(Tally::loss_ratio)),
-        Field::number("mlr_sd", "sd", 5, |row| deviation(&row.rates())),
+        Field::number("mlr_sd", "sd", 5, |row: &Row<'_>| deviation(&row.rates())).ranked(2),
         Field::interval("mlr_runs", "95 % of runs", 5, Row::runs_interval),
         Field::number("trips_per_hour", "Trips/h", 1, |row| {
             row.mean(|run| run.trip_count as f64 / run.hours)
@@ -107,9 +158,15 @@ fn rates(rows: &[Row<'_>]) -> Table {
         Field::number("hold_ratio", "Held", 5, |row| {
             row.mean(|run| run.hold_ratio)
         }),
+        Field::verdict("against_paper", "Verdict", Row::verdict),
     ];
     Table {
-        notes: vec!["95 % of runs: Student's interval of the mean, of independent runs".to_owned()],
+        notes: vec![
+            "fitted: its outages were fitted to the published rate; not comparable: nothing is \
+             published of it, or motion or robot are not those of the fit"
+                .to_owned(),
+            "95 % of runs: Student's interval of the mean, of independent runs".to_owned(),
+        ],
         ..Table::of(
             "motion-loss",
             "Motion loss rate by condition",
@@ -144,6 +201,7 @@ fn counts(rows: &[Row<'_>]) -> Table {
     ];
     let title = "Motion loops by condition: sent, executed, lost by cause";
     Table {
+        is_detail: true,
         notes: vec![
             "lost to: Trip: no session; Held: no commands; Clip: inverse kinematics; Slow: \
              MaxSpeedDeviation; Merged: none of these"
@@ -163,7 +221,10 @@ fn setups(rows: &[Row<'_>]) -> Table {
             row.condition.text.clone()
         }),
     ];
-    Table::of("motion-loss-conditions", "The conditions", &fields, rows)
+    Table {
+        is_detail: true,
+        ..Table::of("motion-loss-conditions", "The conditions", &fields, rows)
+    }
 }
 
 /// Standard deviation of the runs.
@@ -178,8 +239,10 @@ pub(crate) fn deviation(values: &[f64]) -> Option<f64> {
 const RUNS_MIN: usize = 12;
 
 impl Row<'_> {
-    fn criteria(&self, is_fitted: bool) -> Vec<Criterion> {
+    fn criteria(&self) -> Vec<Criterion> {
+        let is_fitted = self.is_fitted;
         match self.condition.expected {
+            Expected::Ethernet => vec![self.nothing_lost(true)],
             Expected::NothingLost { nor_tripped } => vec![self.nothing_lost(nor_tripped)],
             Expected::Published {
                 lost,

@@ -117,6 +117,7 @@ impl Study for MotionLossStudy {
             .map(|(condition, runs)| Row {
                 condition,
                 runs: runs.iter().flatten().copied().collect(),
+                is_fitted: self.is_fitted,
             })
             .collect();
         report::report(self, &results)

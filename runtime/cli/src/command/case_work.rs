@@ -8,7 +8,7 @@ use hil_core::study::Batch;
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
-use hil_report::study::{self, BatchArgs, StudyError, Wanted};
+use hil_report::study::{self, BatchArgs, Invocation, StudyError, Wanted};
 use hil_report::terminal;
 use hil_report::{replay, simulate};
 use hil_rundir::run_folder::RunFolder;
@@ -68,7 +68,10 @@ pub(super) fn tables(
     let topology = hil_topology::load_case(path, overrides, registry.known());
     let topology = loaded(topology, console)?;
     let study = study::batch_of(&topology, registry, Wanted::Tables);
-    compute(study, batch, &signals, console)
+    let path = path.display().to_string();
+    let words = ["hil-runtime", "tables", "--topology", &path];
+    let invocation = invocation(&words, overrides);
+    compute(study, batch, &invocation, &signals, console)
 }
 
 /// `calibrate`.
@@ -102,7 +105,23 @@ pub(super) fn calibrate(
     }
     let wanted = Wanted::Calibration { figure, value };
     let study = study::batch_of(&topology, registry, wanted);
-    compute(study, &args.batch, &signals, console)
+    let wanted = format!("{figure}={value}");
+    let mut words = vec!["hil-runtime", "calibrate", entry.name, "--figure", &wanted];
+    let path = args
+        .topology
+        .as_ref()
+        .map(|path| path.display().to_string());
+    words.extend(path.iter().flat_map(|path| ["--topology", path]));
+    let invocation = invocation(&words, &overrides);
+    compute(study, &args.batch, &invocation, &signals, console)
+}
+
+fn invocation(words: &[&str], overrides: &[String]) -> Invocation {
+    Invocation {
+        words: words.iter().map(|word| (*word).to_owned()).collect(),
+        overrides: overrides.to_vec(),
+        columns: columns(),
+    }
 }
 
 /// The figure asked for, and its value.
@@ -131,11 +150,12 @@ fn wanted_figure(mlr: Option<f64>, figure: Option<&str>) -> Result<(&str, f64), 
 fn compute(
     study: Result<Box<dyn Batch>, StudyError>,
     args: &BatchArgs,
+    invocation: &Invocation,
     signals: &Signals,
     console: &mut Console,
 ) -> Result<u8, Refusal> {
     let study = study.map_err(usage)?;
-    match study::run(study.as_ref(), args, signals, console).map_err(failed)? {
+    match study::run(study.as_ref(), args, invocation, signals, console).map_err(failed)? {
         CommandEnd::Failed => Err(failed(
             "a criterion is missed: the lines marked MISSED at the end of the tables",
         )),

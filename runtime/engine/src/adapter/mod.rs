@@ -20,6 +20,7 @@ mod opening;
 mod peer;
 pub(crate) mod process;
 mod robot;
+mod robot_address;
 mod sensor;
 mod spare;
 #[cfg(test)]

@@ -61,7 +61,7 @@ impl OpenedArm {
         let settings = socket_settings(adapter, arm);
         let (socket, granted, what) = match adapter.egm.kind {
             AdapterKind::Robot => {
-                let socket = UdpSender::open(&settings)?;
+                let socket = UdpSender::open_ignoring_reports(&settings)?;
                 let from = socket.local_address().map_err(WorkerError::Address)?;
                 let what = format!("from port {} to {}", from.port(), settings.peer);
                 let granted = socket.granted();

@@ -2,10 +2,8 @@
 //! the feedback came from. When a command goes out the protocol's policy says; see
 //! `hil_arm::egm::adapter::SendPolicy`.
 
-use core::time::Duration;
-use std::net::SocketAddr;
-
 use bytemuck::bytes_of;
+use core::time::Duration;
 use hil_arm::egm::adapter::{SendPolicy, SensorAdapter, SensorAdapterSettings};
 use hil_arm::egm::messages::{EgmCommand, Side};
 use hil_arm::yumi::arm::{LEFT_START_RAD, RIGHT_START_RAD};
@@ -15,16 +13,14 @@ use hil_core::time::Instant;
 
 use super::arm::{Arm, DATAGRAM_BYTES_MAX, Work, published_here_ns};
 use super::peer::{Peer, refusals};
+use super::robot_address::RobotAddress;
 use crate::process::worker::WorkerError;
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::adapter_record::AdapterSentRecord;
 use hil_rundir::launch::AdapterSettings;
-use hil_rundir::pipe::{AdapterRefusal, CountByName, CounterGroup, RefusalCount};
+use hil_rundir::pipe::{AdapterRefusal, CountByName, CounterGroup, FromProcess, RefusalCount, say};
 use hil_topology::AdapterSend;
 
-/// An address that was silent for so long gives way to another one that speaks the protocol: a
-/// robot that starts anew may send from another port.
-const ADDRESS_SILENCE: Duration = Duration::from_millis(100);
 /// A command is repeated for so long after our controller's last one, then the adapter falls silent:
 /// a robot must notice that its sensor is gone. More than six frames of 125 Hz.
 const COMMAND_AGE_MAX: Duration = Duration::from_millis(50);
@@ -35,11 +31,10 @@ const J7_PLACE: usize = 2;
 #[derive(Debug)]
 pub(super) struct SensorWork {
     adapter: SensorAdapter,
+    side: Side,
     datagram: Vec<u8>,
     peer: Peer,
-    address: Option<SocketAddr>,
-    address_change_count: u64,
-    foreign_count: u64,
+    robot: RobotAddress,
     withheld_count: u64,
     malformed_count: u64,
     session: u32,
@@ -76,12 +71,11 @@ impl SensorWork {
                 held_rad: start_rad[J7_PLACE],
                 policy,
             }),
+            side,
             // Room for the longest message, so that encoding never allocates.
             datagram: Vec::with_capacity(DATAGRAM_BYTES_MAX),
             peer: Peer::default(),
-            address: None,
-            address_change_count: 0,
-            foreign_count: 0,
+            robot: RobotAddress::new(adapter.egm.robot),
             withheld_count: 0,
             malformed_count: 0,
             session: 0,
@@ -97,8 +91,8 @@ impl SensorWork {
         };
         let at = MonotonicClock::now();
         arm.wait.on_arrival(at);
-        if !self.may_speak(received.source, at) {
-            self.foreign_count += 1;
+        let heard = self.peer.last_heard();
+        if !self.robot.may_speak(received.source, heard, at) {
             return Ok(true);
         }
         let bytes = &arm.buffer[..received.length_bytes];
@@ -106,10 +100,14 @@ impl SensorWork {
             return Ok(true);
         };
         self.peer.heard(at);
-        if self.address != Some(received.source) {
-            self.address_change_count += u64::from(self.address.is_some());
-            self.address = Some(received.source);
+        if let Some(change) = self.robot.hold(received.source) {
             arm.line.answer_to(received.source);
+            if let Some(former) = change.former {
+                let (arm, now) = (self.side.word(), received.source);
+                say(&FromProcess::Warning(format!(
+                    "the robot of the {arm} arm speaks from {now} now, from {former} before"
+                )));
+            }
         }
         if feedback.session != self.session {
             self.session = feedback.session;
@@ -119,15 +117,6 @@ impl SensorWork {
         arm.line.note_received(&received, at, MonotonicClock::now());
         self.withheld_count += u64::from(self.newest.is_some() && self.is_stale(at));
         Ok(true)
-    }
-
-    /// True for the robot's address, and for any while there is no robot.
-    fn may_speak(&self, source: SocketAddr, now: Instant) -> bool {
-        let is_silent = || {
-            let heard = self.peer.last_heard();
-            heard.is_none_or(|heard| now.saturating_duration_since(heard) > ADDRESS_SILENCE)
-        };
-        self.address.is_none_or(|address| address == source) || is_silent()
     }
 
     fn is_stale(&self, now: Instant) -> bool {
@@ -203,13 +192,16 @@ impl Work for SensorWork {
         let (received, commands) = (self.adapter.received(), self.adapter.commands());
         let transmit = self.adapter.transmit();
         let own = [
-            ("datagrams received", received.total() + self.foreign_count),
+            (
+                "datagrams received",
+                received.total() + self.robot.foreign_count,
+            ),
             ("feedbacks published", received.accepted()),
             ("sessions seen", self.session_count),
-            ("changes of the robot's address", self.address_change_count),
+            ("changes of the robot's address", self.robot.change_count),
             ("commands taken", commands.total()),
             (
-                "commands overtaken before they were sent",
+                "commands replaced by newer ones before they were sent",
                 transmit.superseded_count,
             ),
             ("datagrams encoded", transmit.sent_count),
@@ -235,7 +227,7 @@ impl Work for SensorWork {
     fn refusals(&self) -> Vec<RefusalCount> {
         let foreign = RefusalCount {
             cause: AdapterRefusal::ForeignAddress,
-            count: self.foreign_count,
+            count: self.robot.foreign_count,
         };
         [foreign]
             .into_iter()
@@ -244,7 +236,7 @@ impl Work for SensorWork {
     }
 
     fn peer_state(&self) -> String {
-        match self.address {
+        match self.robot.held() {
             Some(address) => format!("robot at {address}: {}", self.peer.state()),
             None => "no robot came".to_owned(),
         }

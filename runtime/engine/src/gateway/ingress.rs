@@ -293,7 +293,7 @@ impl Output {
                 forwarded_ns,
                 epoch: message.epoch,
                 flags: Envelope::FORWARDED,
-                reserved: [0; 4],
+                ..Envelope::default()
             }
         })?;
         let flags = if delivery.order == Order::Reordered {

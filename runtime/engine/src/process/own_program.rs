@@ -1,16 +1,20 @@
 //! A user's own program as a process of the run: found before the run begins, and bound to its
 //! supervisor, so that it cannot outlive it.
 
+use std::fs::File;
+use std::net::IpAddr;
+use std::os::fd::AsFd as _;
 use std::os::unix::process::{CommandExt, parent_id};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, io};
 
+use hil_cable::{Inside, Refusal};
 use hil_platform::open_files;
 use hil_topology::{Program, Topology};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
-use nix::unistd::{AccessFlags, access};
+use nix::unistd::{AccessFlags, access, dup2_stdin};
 
 /// Why the own program could not be started.
 #[derive(Debug, thiserror::Error)]
@@ -34,6 +38,9 @@ pub enum OwnProgramError {
         /// What the kernel answered.
         source: io::Error,
     },
+    /// It cannot have a network namespace of its own.
+    #[error(transparent)]
+    Cable(#[from] Refusal),
     /// The program cannot be executed.
     #[error("cannot execute {program}: {source}")]
     Execute {
@@ -44,8 +51,9 @@ pub enum OwnProgramError {
     },
 }
 
-/// Replaces this process by `program`, which the kernel will kill when the supervisor ends.
-/// Returns only when it fails. The program inherits nothing that the supervisor has open, and may open
+/// Replaces this process by `program`, which the kernel will kill when the supervisor ends. With an address
+/// `inside` it has a network namespace of its own, and the process at the other end of standard input, which
+/// carries its frames, says when it begins. Returns only when it fails. The program inherits nothing that the supervisor has open, and may open
 /// as many files as `open_files` says: what the supervisor was started with, where it raised that.
 ///
 /// # Errors
@@ -53,26 +61,59 @@ pub enum OwnProgramError {
 pub fn become_program(
     supervisor: u32,
     open_files: Option<u64>,
+    inside: Option<IpAddr>,
     program: &[String],
 ) -> Result<(), OwnProgramError> {
     let name = program.first().cloned().unwrap_or_default();
-    set_pdeathsig(Signal::SIGKILL).map_err(|errno| OwnProgramError::Bind {
-        program: name.clone(),
-        source: errno.into(),
-    })?;
-    // The supervisor may have ended before the line above.
-    if parent_id() != supervisor {
-        return Err(OwnProgramError::Orphaned(name));
-    }
-    let restored = open_files::close_inherited()
-        .and_then(|()| open_files.map_or(Ok(()), open_files::set_limit));
+    bind_to(supervisor, &name)?;
+    let restored =
+        open_files::withhold().and_then(|()| open_files.map_or(Ok(()), open_files::set_limit));
     restored.map_err(|source| OwnProgramError::Descriptors {
         program: name.clone(),
         source,
     })?;
+    if let Some(address) = inside {
+        take_cable(Inside { address }, &name)?;
+        // A change of identity may have unbound it.
+        bind_to(supervisor, &name)?;
+    }
     let source = Command::new(&name).args(&program[1..]).exec();
     Err(OwnProgramError::Execute {
         program: name,
+        source,
+    })
+}
+
+/// Lets the kernel kill this process when the one that started it ends.
+fn bind_to(supervisor: u32, program: &str) -> Result<(), OwnProgramError> {
+    set_pdeathsig(Signal::SIGKILL).map_err(|errno| OwnProgramError::Bind {
+        program: program.to_owned(),
+        source: errno.into(),
+    })?;
+    // It may have ended before the line above.
+    if parent_id() != supervisor {
+        return Err(OwnProgramError::Orphaned(program.to_owned()));
+    }
+    Ok(())
+}
+
+/// Enters namespaces of the program's own, gives the cable's end away and waits for the start.
+fn take_cable(inside: Inside, program: &str) -> Result<(), OwnProgramError> {
+    let orphaned = |_gone: io::Error| OwnProgramError::Orphaned(program.to_owned());
+    let input = io::stdin();
+    match hil_cable::enter(&inside) {
+        Ok(end) => hil_cable::hand_over(input.as_fd(), &end).map_err(orphaned)?,
+        Err(refusal) => {
+            hil_cable::refuse(input.as_fd(), &refusal).map_err(orphaned)?;
+            return Err(refusal.into());
+        }
+    }
+    if !hil_cable::await_go(input.as_fd()).map_err(orphaned)? {
+        return Err(OwnProgramError::Orphaned(program.to_owned()));
+    }
+    let nothing = File::open("/dev/null").and_then(|nothing| Ok(dup2_stdin(nothing)?));
+    nothing.map_err(|source| OwnProgramError::Descriptors {
+        program: program.to_owned(),
         source,
     })
 }
@@ -153,7 +194,7 @@ mod tests {
 
     #[test]
     fn an_orphan_does_not_start() {
-        let error = become_program(u32::MAX, None, &["true".to_owned()]).unwrap_err();
+        let error = become_program(u32::MAX, None, None, &["true".to_owned()]).unwrap_err();
         assert!(matches!(error, OwnProgramError::Orphaned(_)));
     }
 }

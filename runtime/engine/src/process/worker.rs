@@ -1,5 +1,5 @@
-//! The shell of every process of a run that this binary plays: component, gateway, clock path and
-//! adapter. It hears the supervisor's orders, starts one thread for each job, tells what they count
+//! The shell of every process of a run that this binary plays: component, gateway, clock path,
+//! adapter and cable. It hears the supervisor's orders, starts one thread for each job, tells what they count
 //! and that they turn, and reports their outcome. What a job does is its own business.
 
 use std::panic::resume_unwind;
@@ -10,6 +10,7 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 use std::{io, thread};
 
+use hil_cable::InletError;
 use hil_core::endpoint::PortError;
 use hil_protocol::SettingsError;
 use hil_protocol::body::HelloStatus;
@@ -21,7 +22,7 @@ use super::component;
 use super::heartbeat::{Heartbeat, Heartbeats};
 use crate::gateway::process::GatewayWatch;
 use crate::gateway::timestamping::TimestampingSetup;
-use crate::{adapter, gateway};
+use crate::{adapter, cable, gateway};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::open_files;
 use hil_platform::realtime::{self, RealtimeGrant, RealtimeRequest, SpinAdvice};
@@ -104,9 +105,9 @@ pub enum WorkerError {
     /// No thread.
     #[error("cannot start a thread: {0}")]
     Thread(io::Error),
-    /// What the supervisor left open.
-    #[error("cannot close what the supervisor has open: {0}")]
-    Inherited(io::Error),
+    /// What it has open cannot be kept from processes that the role may start.
+    #[error("cannot list its open files: {0}")]
+    OpenFiles(io::Error),
     /// The run's secret, without which its hops are not opened.
     #[error("the supervisor did not give the run's secret")]
     SecretMissing,
@@ -116,6 +117,25 @@ pub enum WorkerError {
     /// The other end does not want this channel.
     #[error("the gateway at the other end refused the channel: {}", .0.label())]
     Refused(HelloStatus),
+    /// A program's frames cannot be carried.
+    #[error(transparent)]
+    Inlet(#[from] InletError),
+    /// The process that becomes a program could not be started.
+    #[error("cannot start {program}: {source}")]
+    Program {
+        /// The program.
+        program: String,
+        /// What the kernel answered.
+        source: io::Error,
+    },
+    /// A program failed.
+    #[error("{program} {end}")]
+    ProgramEnded {
+        /// The program.
+        program: String,
+        /// How.
+        end: String,
+    },
     /// A record file could not be written any more.
     #[error("cannot record: {0}; messages after that would be in no account")]
     Unrecorded(FileFault),
@@ -221,10 +241,7 @@ impl Drop for EndTeller {
 /// # Errors
 /// When something cannot be opened or breaks; the supervisor is told as well.
 pub fn run(launch: &Path, registry: &Registry) -> Result<(), WorkerError> {
-    // What the supervisor has open is not this process's.
-    let outcome = open_files::close_inherited()
-        .map_err(WorkerError::Inherited)
-        .and_then(|()| open_and_run(launch, registry));
+    let outcome = open_and_run(launch, registry);
     if let Err(error) = &outcome {
         if let WorkerError::Record(RecordFileError::Io { path, source }) = error {
             say(&FromProcess::Unwritable(FileFault::new(path, source)));
@@ -245,6 +262,7 @@ fn open_and_run(path: &Path, registry: &Registry) -> Result<(), WorkerError> {
         Work::Component(work) => component::open(&launch, work, registry, &mut recorder),
         Work::Gateway(work) => gateway::process::open(&launch, work, &orders, &mut recorder),
         Work::Adapter(work) => adapter::process::open(&launch, work, &mut recorder),
+        Work::Cable(work) => cable::open(&launch, work, &mut recorder),
     }?;
     let stop = Arc::clone(orders.stop_flag());
     recorder
@@ -330,6 +348,11 @@ fn run_jobs(
             if connected_count == job_count {
                 if !is_ready && gateway.as_mut().is_none_or(|one| one.is_ready(now)) {
                     is_ready = true;
+                    // A role may start programs, which must not get the shared memory of the run.
+                    if let Err(error) = open_files::withhold() {
+                        outcome = Err(WorkerError::OpenFiles(error));
+                        break;
+                    }
                     say(&FromProcess::Ready);
                 }
                 if let Some(gateway) = &mut gateway {
@@ -406,6 +429,7 @@ fn add(report: &mut ProcessReport, other: ProcessReport, facts: &[(String, Strin
         arm
     });
     report.faces.extend(arms);
+    report.inlets.extend(other.inlets);
 }
 
 /// Says how many messages passed on the channels on which any did since it was said last, that the threads

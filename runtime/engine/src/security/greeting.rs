@@ -8,6 +8,8 @@
 //!                or HILK 1 3 length  why not                      9 bytes
 //! ```
 //!
+//! The last is not sealed: anybody can say it, so it is a hint and ends no waiting.
+//!
 //! A first message that was recorded and is played back gets the second, which is shorter, and nothing
 //! more: the next must be sealed by keys that the recording does not give.
 
@@ -42,19 +44,17 @@ pub(crate) enum GreetingError {
     #[error("{0}")]
     Connection(#[from] io::Error),
     /// The other end refuses, and why.
-    #[error("{}", .0.words())]
+    #[error("refused without proof of the key: {0:?}")]
     Refused(Why),
 }
 
-/// Why one end turns the other away.
+/// Why one end turns the other away before either has proven the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Why {
     /// It holds another key, or none.
     AnotherKey,
     /// This end works without a key.
     PlainHere,
-    /// It says that it is somebody else, or looks for somebody else.
-    AnotherName,
 }
 
 impl Why {
@@ -62,7 +62,6 @@ impl Why {
         match self {
             Self::AnotherKey => 1,
             Self::PlainHere => 2,
-            Self::AnotherName => 3,
         }
     }
 
@@ -70,23 +69,7 @@ impl Why {
         match code {
             1 => Some(Self::AnotherKey),
             2 => Some(Self::PlainHere),
-            3 => Some(Self::AnotherName),
             _ => None,
-        }
-    }
-
-    /// As the end that was turned away says it.
-    pub(crate) const fn words(self) -> &'static str {
-        match self {
-            Self::AnotherKey => {
-                "it holds another key; compare `hil-runtime key check FILE` on both hosts"
-            }
-            Self::PlainHere => {
-                "its topology says [security] hops = \"plain\" and this one names a key; use the same file on both"
-            }
-            Self::AnotherName => {
-                "it does not await this host at this address; use the same topology on both"
-            }
         }
     }
 }
@@ -187,12 +170,13 @@ pub(crate) fn ask(
 }
 
 /// Goes on with a connection that came and began with [`MAGIC`], which has been read. `is_awaited` is
-/// told who came and whom they look for.
+/// told who came and whom they look for; what it says comes back with the connection, so that the other
+/// end hears under the key that it is not awaited.
 pub(crate) fn answer(
     mut stream: TimedStream,
     key: &PreSharedKey,
     is_awaited: impl FnOnce(&str, &str) -> bool,
-) -> Result<Secured, GreetingError> {
+) -> Result<(Secured, bool), GreetingError> {
     let mut noise = builder(key)?.build_responder().map_err(io::Error::other)?;
     let mut head = [0; HEAD_BYTES];
     head[..4].copy_from_slice(&MAGIC);
@@ -205,27 +189,21 @@ pub(crate) fn answer(
     stream.read_exact(&mut message[..length])?;
     let mut names = [0; MESSAGE_BYTES_MAX];
     let Ok(names_bytes) = noise.read_message(&message[..length], &mut names) else {
-        return refuse(&stream, Why::AnotherKey);
+        send(&stream.stream, REFUSAL, &[Why::AnotherKey.code()])?;
+        return Err(GreetingError::Refused(Why::AnotherKey));
     };
     let said = split_names(&names[..names_bytes]);
-    if !said.is_some_and(|(theirs, ours)| is_awaited(theirs, ours)) {
-        return refuse(&stream, Why::AnotherName);
-    }
+    let is_awaited = said.is_some_and(|(theirs, ours)| is_awaited(theirs, ours));
     let length = noise
         .write_message(&[], &mut message)
         .map_err(io::Error::other)?;
     send(&stream.stream, SECOND, &message[..length])?;
-    secure(stream, noise)
+    Ok((secure(stream, noise)?, is_awaited))
 }
 
 /// Turns a secured connection away where none is wanted; [`MAGIC`] has been read.
 pub(crate) fn turn_away(stream: &TimedStream) -> io::Result<()> {
     send(&stream.stream, REFUSAL, &[Why::PlainHere.code()])
-}
-
-fn refuse(stream: &TimedStream, why: Why) -> Result<Secured, GreetingError> {
-    send(&stream.stream, REFUSAL, &[why.code()])?;
-    Err(GreetingError::Refused(why))
 }
 
 fn builder(key: &PreSharedKey) -> io::Result<Builder<'_>> {

@@ -1,8 +1,10 @@
 //! One process the supervisor started: its pipes, its log, its death. When to start, restart or
 //! stop it is decided in `process_group.rs`.
 
+use std::fmt;
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read as _, Seek as _, SeekFrom, Write};
+use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
 use std::process::{ChildStdin, Command, ExitStatus, Stdio};
@@ -10,16 +12,21 @@ use std::sync::mpsc::SyncSender;
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use nix::errno::Errno;
 use nix::sys::signal::{Signal, killpg};
 use nix::sys::wait::{Id, WaitPidFlag, WaitStatus, waitid};
 use nix::unistd::Pid;
+use rustix::process::{PidfdFlags, pidfd_open};
 use zeroize::Zeroizing;
 
-use hil_platform::systemd;
+use hil_platform::{open_files, systemd};
 use hil_rundir::pipe::{FromProcess, ToProcess};
 
 /// Longest line of a process that is kept: the report of a gateway with tens of thousands of channels.
 const LINE_BYTES_MAX: usize = 1 << 28;
+
+/// How long the kernel may take to end a process that was killed.
+const KILL_PATIENCE: Duration = Duration::from_secs(5);
 
 /// A word from a process.
 #[derive(Debug)]
@@ -31,13 +38,59 @@ pub(crate) struct Word {
     pub(crate) said: FromProcess,
 }
 
+/// How a process ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum ProcessEnd {
+    /// As its status says.
+    Exited(ExitStatus),
+    /// It is gone, or a kill has no effect on it, and the kernel does not tell how it ended.
+    Lost,
+}
+
+impl ProcessEnd {
+    /// Its exit code, if it had one.
+    pub(crate) fn code(self) -> Option<i32> {
+        match self {
+            Self::Exited(status) => status.code(),
+            Self::Lost => None,
+        }
+    }
+
+    /// The signal that killed it.
+    pub(crate) fn signal(self) -> Option<i32> {
+        match self {
+            Self::Exited(status) => status.signal(),
+            Self::Lost => None,
+        }
+    }
+}
+
+impl fmt::Display for ProcessEnd {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match (self, self.code(), self.signal()) {
+            (Self::Lost, ..) => {
+                formatter.write_str("was lost: the kernel does not tell how it ended")
+            }
+            (_, Some(0), _) => formatter.write_str("ended"),
+            (_, Some(code), _) => write!(formatter, "ended with exit code {code}"),
+            (_, None, Some(number)) => {
+                let name = Signal::try_from(number).map_or("an unknown signal", Signal::as_str);
+                write!(formatter, "was killed by {name}")
+            }
+            (_, None, None) => formatter.write_str("ended for an unknown reason"),
+        }
+    }
+}
+
 /// A running (or finished) child process.
 #[derive(Debug)]
 pub(crate) struct Child {
     process: std::process::Child,
+    /// The process itself: its number may be another's once somebody has reaped it.
+    pidfd: OwnedFd,
     words: Option<JoinHandle<()>>,
     stdin: Option<ChildStdin>,
-    status: Option<ExitStatus>,
+    end: Option<ProcessEnd>,
     is_foreign: bool,
 }
 
@@ -60,10 +113,7 @@ impl Child {
         words: SyncSender<Word>,
     ) -> io::Result<Self> {
         let mut command = prepared(command, log)?;
-        let mut process = command
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()?;
+        let (mut process, pidfd) = started(command.stdin(Stdio::piped()).stdout(Stdio::piped()))?;
         let output = process
             .stdout
             .take()
@@ -90,9 +140,10 @@ impl Child {
         let stdin = process.stdin.take();
         Ok(Self {
             process,
+            pidfd,
             words: Some(words),
             stdin,
-            status: None,
+            end: None,
             is_foreign: false,
         })
     }
@@ -104,36 +155,39 @@ impl Child {
     pub(crate) fn spawn_foreign(command: Command, log: &Path) -> io::Result<Self> {
         let mut command = prepared(command, log)?;
         command.stdout(File::options().append(true).open(log)?);
-        let process = command.stdin(Stdio::null()).spawn()?;
+        let (process, pidfd) = started(command.stdin(Stdio::null()))?;
         Ok(Self {
             process,
+            pidfd,
             words: None,
             stdin: None,
-            status: None,
+            end: None,
             is_foreign: true,
         })
     }
 
     /// How it ended, once it has; does not wait.
-    pub(crate) fn poll_exit(&mut self) -> Option<ExitStatus> {
-        if self.status.is_none() && self.is_dead() {
-            // Children of its own must not outlive it. Its number still belongs to it, because
-            // it has not been reaped yet, so no stranger can be hit.
-            self.signal(Signal::SIGKILL);
-            self.status = self.process.try_wait().ok().flatten();
+    pub(crate) fn poll_end(&mut self) -> Option<ProcessEnd> {
+        if self.end.is_none() {
+            self.end = match self.look() {
+                Ok(WaitStatus::StillAlive) | Err(Errno::EINTR) => None,
+                Ok(_ended) => {
+                    // Children of its own must not outlive it. Its number still belongs to it, because
+                    // it has not been reaped yet, so no stranger can be hit.
+                    self.signal_group(Signal::SIGKILL);
+                    let status = self.process.try_wait().ok().flatten();
+                    Some(status.map_or(ProcessEnd::Lost, ProcessEnd::Exited))
+                }
+                Err(_not_ours_any_more) => Some(ProcessEnd::Lost),
+            };
         }
-        self.status
+        self.end
     }
 
-    fn is_dead(&self) -> bool {
-        let look = WaitPidFlag::WEXITED | WaitPidFlag::WNOHANG | WaitPidFlag::WNOWAIT;
-        match i32::try_from(self.process.id()) {
-            Ok(id) => !matches!(
-                waitid(Id::Pid(Pid::from_raw(id)), look),
-                Ok(WaitStatus::StillAlive)
-            ),
-            Err(_out_of_range) => true,
-        }
+    /// Whether it has ended, without reaping it; an error once somebody else has.
+    fn look(&self) -> nix::Result<WaitStatus> {
+        let flags = WaitPidFlag::WEXITED | WaitPidFlag::WNOHANG | WaitPidFlag::WNOWAIT;
+        waitid(Id::PIDFd(self.pidfd.as_fd()), flags)
     }
 
     /// True once everything the process said has been handed on. Comes soon after its end, as
@@ -166,10 +220,19 @@ impl Child {
 
     /// Waits until it ends or `deadline`; then kills it. True when it ended by itself.
     pub(crate) fn end(&mut self, deadline: Instant) -> bool {
-        while self.poll_exit().is_none() {
+        if self.ends_by(deadline) {
+            return true;
+        }
+        self.signal(Signal::SIGKILL);
+        if !self.ends_by(Instant::now() + KILL_PATIENCE) {
+            self.end = Some(ProcessEnd::Lost);
+        }
+        false
+    }
+
+    fn ends_by(&mut self, deadline: Instant) -> bool {
+        while self.poll_end().is_none() {
             if Instant::now() >= deadline {
-                self.signal(Signal::SIGKILL);
-                self.status = self.process.wait().ok();
                 return false;
             }
             thread::sleep(Duration::from_millis(2));
@@ -177,7 +240,14 @@ impl Child {
         true
     }
 
+    /// Signals its group, as long as the group's number is its own for certain.
     fn signal(&self, signal: Signal) {
+        if self.end.is_none() && self.look().is_ok() {
+            self.signal_group(signal);
+        }
+    }
+
+    fn signal_group(&self, signal: Signal) {
         if let Ok(id) = i32::try_from(self.process.id()) {
             // The group may have ended already.
             let _gone = killpg(Pid::from_raw(id), signal).is_err();
@@ -187,7 +257,7 @@ impl Child {
 
 impl Drop for Child {
     fn drop(&mut self) {
-        if self.status.is_none() {
+        if self.end.is_none() {
             self.end(Instant::now());
         }
     }
@@ -202,6 +272,24 @@ fn prepared(mut command: Command, log: &Path) -> io::Result<Command> {
         command.env_remove(variable);
     }
     Ok(command)
+}
+
+/// Starts it, with a descriptor of the process itself. It gets no other descriptor of this process.
+fn started(command: &mut Command) -> io::Result<(std::process::Child, OwnedFd)> {
+    open_files::withhold()?;
+    let mut process = command.spawn()?;
+    match pidfd_open(
+        rustix::process::Pid::from_child(&process),
+        PidfdFlags::empty(),
+    ) {
+        Ok(pidfd) => Ok((process, pidfd)),
+        Err(errno) => {
+            // It may have ended by itself; waiting afterwards is what matters.
+            let _already_ended = process.kill().is_err();
+            let _reaped = process.wait().is_ok();
+            Err(errno.into())
+        }
+    }
 }
 
 /// The next line without its end, at most `bytes_max` of it: the rest of a longer one is left out. `None` at
@@ -229,19 +317,6 @@ fn next_line(input: &mut impl BufRead, bytes_max: usize) -> io::Result<Option<Ve
         if end.is_some() {
             return Ok(Some(line));
         }
-    }
-}
-
-/// How a process ended, in words.
-pub(crate) fn describe_exit(status: ExitStatus) -> String {
-    match (status.code(), status.signal()) {
-        (Some(0), _) => "ended".to_owned(),
-        (Some(code), _) => format!("ended with exit code {code}"),
-        (None, Some(number)) => {
-            let name = Signal::try_from(number).map_or("an unknown signal", Signal::as_str);
-            format!("was killed by {name}")
-        }
-        (None, None) => "ended for an unknown reason".to_owned(),
     }
 }
 
@@ -323,6 +398,19 @@ mod tests {
     }
 
     #[test]
+    fn a_child_that_somebody_else_has_reaped_is_lost_and_gets_no_signal() {
+        let log = env::temp_dir().join(format!("hil-lost-{}.log", std::process::id()));
+        let mut child = Child::spawn_foreign(shell("exit 3"), &log).unwrap();
+        child.process.wait().unwrap();
+        // Its number may be another's from here on.
+        assert!(child.look().is_err());
+        child.signal(Signal::SIGKILL);
+        assert_eq!(child.poll_end(), Some(ProcessEnd::Lost));
+        assert!(child.end(Instant::now()));
+        fs::remove_file(log).unwrap();
+    }
+
+    #[test]
     fn a_child_that_does_not_stop_is_killed_and_its_end_is_told() {
         let log = env::temp_dir().join(format!("hil-kill-{}.log", std::process::id()));
         let script = "trap '' TERM; echo deaf; sleep 60";
@@ -336,7 +424,7 @@ mod tests {
         child.order(&ToProcess::Stop);
         assert!(!child.end(Instant::now() + Duration::from_millis(50)));
         assert_eq!(
-            describe_exit(child.poll_exit().unwrap()),
+            child.poll_end().unwrap().to_string(),
             "was killed by SIGKILL"
         );
         fs::remove_file(log).unwrap();

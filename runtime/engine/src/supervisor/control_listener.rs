@@ -12,8 +12,9 @@ use std::time::{Duration, Instant};
 
 use super::frame::{Frame, PeerHello, PeerMessage, read_frame_within, write_message};
 use super::peer::{ControlHalves, ControlReader};
+use super::strangers::{Cause, Strangers};
 use crate::security::PreSharedKey;
-use crate::security::greeting::{self, GreetingError, MAGIC, TimedStream, Why};
+use crate::security::greeting::{self, GreetingError, MAGIC, TimedStream};
 use hil_rundir::pipe::FailureKind;
 
 /// How long a greeting may take altogether.
@@ -28,66 +29,16 @@ const HELLO_BYTES_MAX: usize = 16_384;
 /// What a plain end is told where a key is needed. A stranger may hear it: it is shorter than any hello.
 pub(super) const KEY_NEEDED: &str = "this host speaks with holders of its key only";
 
-/// What a connection turned out to be.
+/// A connection whose other end said who it is, with the key where one is needed.
 #[derive(Debug)]
-pub(super) enum Arrived {
-    /// It said who it is, with the key where one is needed.
-    Peer {
-        ip: IpAddr,
-        ends: Box<ControlHalves>,
-        hello: PeerHello,
-    },
-    /// It was turned away, and why.
-    TurnedAway(IpAddr, &'static str),
-    /// It came with a key where none is used.
-    Keyed(IpAddr),
-    /// It left, was too slow, or was no host of ours.
-    Nobody,
+pub(super) struct Newcomer {
+    pub(super) ends: ControlHalves,
+    pub(super) hello: PeerHello,
 }
 
 /// Threads that greet, those of connections that had to make way and still notice it included; with more,
 /// connections wait in the kernel's queue.
 const THREADS_MAX: usize = 4 * ADMITTED_MAX;
-
-/// Connections that came to nothing, by cause.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct ConnectionCounts {
-    /// From an address that is not awaited.
-    foreign: u64,
-    /// They came with another key, or without one, or under another name.
-    turned_away: u64,
-    /// They said something else, or nothing in time, or left.
-    nobody: u64,
-    /// They made way for newer ones of their address before they said who they were.
-    crowded_out: u64,
-}
-
-impl ConnectionCounts {
-    /// In words; `None` when there were none.
-    pub(super) fn words(self) -> Option<String> {
-        let Self {
-            foreign,
-            turned_away,
-            nobody,
-            crowded_out,
-        } = self;
-        let causes = [
-            (foreign, "from a foreign address"),
-            (turned_away, "with another key or name"),
-            (nobody, "without a greeting"),
-            (crowded_out, "that made way for newer ones"),
-        ];
-        let causes = causes.into_iter().filter(|(count, _)| *count > 0);
-        let causes: Vec<String> = causes
-            .map(|(count, cause)| format!("{count} {cause}"))
-            .collect();
-        let total = foreign + turned_away + nobody + crowded_out;
-        (total > 0).then(|| {
-            let causes = causes.join(", ");
-            format!("{total} connections came to nothing while the hosts met: {causes}")
-        })
-    }
-}
 
 /// Whom the listener lets in.
 #[derive(Debug, Clone)]
@@ -132,7 +83,6 @@ pub(super) struct ControlListener {
     half_open: Vec<HalfOpen>,
     sender: Sender<Word>,
     arrived: Receiver<Word>,
-    counts: ConnectionCounts,
     /// Held by this and by every thread that greets.
     alive: Arc<()>,
 }
@@ -140,9 +90,8 @@ pub(super) struct ControlListener {
 /// What became of a connection.
 #[derive(Debug)]
 struct Word {
-    arrived: Arrived,
-    /// It had to make way.
-    is_crowded_out: bool,
+    ip: IpAddr,
+    arrived: Result<Newcomer, Cause>,
 }
 
 impl ControlListener {
@@ -156,14 +105,8 @@ impl ControlListener {
             half_open: Vec::new(),
             sender,
             arrived,
-            counts: ConnectionCounts::default(),
             alive: Arc::default(),
         })
-    }
-
-    /// What came to nothing so far.
-    pub(super) fn counts(&self) -> ConnectionCounts {
-        self.counts
     }
 
     /// Takes waiting connections, a bounded number of them; says what this host is short of where that
@@ -171,61 +114,56 @@ impl ControlListener {
     ///
     /// # Errors
     /// When the listener itself is broken.
-    pub(super) fn admit_waiting(&mut self) -> io::Result<Option<io::Error>> {
+    pub(super) fn admit_waiting(
+        &mut self,
+        strangers: &mut Strangers,
+    ) -> io::Result<Option<io::Error>> {
         let mut shortage = None;
         for _ in 0..ADMITTED_MAX {
             if Arc::strong_count(&self.alive) > THREADS_MAX {
                 break;
             }
             match self.listener.accept() {
-                Ok((stream, from)) => self.admit(stream, from.ip()),
+                Ok((stream, from)) => self.admit(stream, from.ip(), strangers),
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
-                // Connections that ended before they were taken.
-                Err(error) if error.kind() == io::ErrorKind::ConnectionAborted => {}
+                Err(error) if is_of_closed_listener(&error) => return Err(error),
                 Err(error) if FailureKind::of(&error) == FailureKind::HostTooSmall => {
                     shortage = Some(error);
                     break;
                 }
-                Err(error) => return Err(error),
+                // What the network or a filter did to a connection that was still to be taken.
+                Err(_of_one_connection) => {}
             }
         }
         self.half_open.retain(HalfOpen::is_unknown);
         Ok(shortage)
     }
 
-    /// The next connection that turned out to be something; `None` when there is none now. No more come
+    /// The next connection whose other end said who it is; `None` when there is none now. No more come
     /// than were admitted, so looking until there is none comes to an end.
-    pub(super) fn look(&mut self) -> Option<Arrived> {
+    pub(super) fn look(&mut self, strangers: &mut Strangers) -> Option<Newcomer> {
         loop {
-            let Word {
-                arrived,
-                is_crowded_out,
-            } = self.arrived.try_recv().ok()?;
+            let Word { ip, arrived } = self.arrived.try_recv().ok()?;
             match arrived {
-                Arrived::Nobody if is_crowded_out => self.counts.crowded_out += 1,
-                Arrived::Nobody => self.counts.nobody += 1,
-                Arrived::TurnedAway(..) => {
-                    self.counts.turned_away += 1;
-                    return Some(arrived);
-                }
-                Arrived::Peer { .. } | Arrived::Keyed(_) => return Some(arrived),
+                Ok(newcomer) => return Some(newcomer),
+                Err(cause) => strangers.note(ip, cause),
             }
         }
     }
 
     /// Strangers are turned away before a byte of theirs is read.
-    fn admit(&mut self, stream: TcpStream, ip: IpAddr) {
+    fn admit(&mut self, stream: TcpStream, ip: IpAddr, strangers: &mut Strangers) {
         let is_expected = self
             .admission
             .expected
             .iter()
             .any(|(_, known)| *known == ip);
         if !is_expected {
-            self.counts.foreign += 1;
+            strangers.note(ip, Cause::ForeignAddress);
             return;
         }
         let Ok(handle) = stream.try_clone() else {
-            self.counts.crowded_out += 1;
+            strangers.note(ip, Cause::CrowdedOut);
             return;
         };
         self.half_open.retain(HalfOpen::is_unknown);
@@ -244,15 +182,14 @@ impl ControlListener {
         let (known, crowded_out) = (Arc::clone(&is_known), Arc::clone(&is_crowded_out));
         let alive = Arc::clone(&self.alive);
         let greet = move || {
-            let arrived = greet(stream, ip, &admission).unwrap_or(Arrived::Nobody);
-            known.store(matches!(arrived, Arrived::Peer { .. }), Ordering::Release);
-            // Nobody listens once all hosts are here.
-            let is_crowded_out = crowded_out.load(Ordering::Acquire);
-            let word = Word {
-                arrived,
-                is_crowded_out,
+            let arrived = match greet(stream, ip, &admission) {
+                Ok(arrived) => arrived,
+                Err(_) if crowded_out.load(Ordering::Acquire) => Err(Cause::CrowdedOut),
+                Err(_) => Err(Cause::NoGreeting),
             };
-            let _late = sender.send(word).is_err();
+            known.store(arrived.is_ok(), Ordering::Release);
+            // Nobody listens once all hosts are here.
+            let _late = sender.send(Word { ip, arrived }).is_err();
             // Counted among the threads until here.
             drop(alive);
         };
@@ -268,7 +205,7 @@ impl ControlListener {
                 is_known,
                 is_crowded_out,
             }),
-            Err(_) => self.counts.crowded_out += 1,
+            Err(_) => strangers.note(ip, Cause::CrowdedOut),
         }
     }
 }
@@ -292,7 +229,19 @@ pub(super) fn prepare(stream: TcpStream) -> io::Result<TimedStream> {
     Ok(TimedStream::new(stream, Instant::now() + GREETING_TIMEOUT))
 }
 
-fn greet(stream: TcpStream, ip: IpAddr, admission: &Admission) -> io::Result<Arrived> {
+/// An error of accept that no further call can mend; any other is one connection's, or passes.
+fn is_of_closed_listener(error: &io::Error) -> bool {
+    let closed = [libc::EBADF, libc::ENOTSOCK, libc::EINVAL, libc::EOPNOTSUPP];
+    error
+        .raw_os_error()
+        .is_none_or(|errno| closed.contains(&errno))
+}
+
+fn greet(
+    stream: TcpStream,
+    ip: IpAddr,
+    admission: &Admission,
+) -> io::Result<Result<Newcomer, Cause>> {
     let mut stream = prepare(stream)?;
     let mut start = [0; 4];
     stream.read_exact(&mut start)?;
@@ -301,43 +250,29 @@ fn greet(stream: TcpStream, ip: IpAddr, admission: &Admission) -> io::Result<Arr
             let is_awaited =
                 |theirs: &str, ours: &str| ours == admission.own && admission.awaits(theirs, ip);
             match greeting::answer(stream, key, is_awaited) {
-                Ok(secured) => say_who(secured.into(), ip),
-                Err(GreetingError::Refused(why)) => Ok(Arrived::TurnedAway(ip, turned_away(why))),
+                Ok((secured, is_awaited)) => say_who(secured.into(), ip, admission, is_awaited),
+                Err(GreetingError::Refused(_)) => Ok(Err(Cause::AnotherKey)),
                 Err(GreetingError::Connection(error)) => Err(error),
             }
         }
-        (Some(_), false) => refuse_plain(stream, start, ip),
+        (Some(_), false) => refuse_plain(stream, start),
         (None, true) => {
             greeting::turn_away(&stream)?;
-            Ok(Arrived::Keyed(ip))
+            Ok(Err(Cause::WithKey))
         }
-        (None, false) => say_who(plain_ends(stream, start)?, ip),
-    }
-}
-
-/// As the end that turned somebody away says it.
-const fn turned_away(why: Why) -> &'static str {
-    match why {
-        Why::AnotherKey | Why::PlainHere => {
-            "came with another key; compare `hil-runtime key check FILE` on both hosts"
-        }
-        Why::AnotherName => "came with the key under a name that is not awaited at its address",
+        (None, false) => say_who(plain_ends(stream, start)?, ip, admission, true),
     }
 }
 
 /// A plain end that shows that it is one of ours hears why it gets no further.
-fn refuse_plain(stream: TimedStream, start: [u8; 4], ip: IpAddr) -> io::Result<Arrived> {
+fn refuse_plain(stream: TimedStream, start: [u8; 4]) -> io::Result<Result<Newcomer, Cause>> {
     let mut ends = plain_ends(stream, start)?;
     let hello = read_frame_within(&mut ends.reader, HELLO_BYTES_MAX)?;
     if matches!(hello, Frame::Message(PeerMessage::Hello(_))) {
-        let refused = PeerMessage::Refused(KEY_NEEDED.to_owned());
-        write_message(&mut ends.writer, &refused)?;
-        return Ok(Arrived::TurnedAway(
-            ip,
-            "came without a key, which this run needs",
-        ));
+        say(&mut ends, &PeerMessage::Refused(KEY_NEEDED.to_owned()))?;
+        return Ok(Err(Cause::WithoutKey));
     }
-    Ok(Arrived::Nobody)
+    Ok(Err(Cause::NoGreeting))
 }
 
 /// Both halves of a plain connection of which `start` has been read.
@@ -349,15 +284,24 @@ fn plain_ends(stream: TimedStream, start: [u8; 4]) -> io::Result<ControlHalves> 
     Ok(ends)
 }
 
-fn say_who(mut ends: ControlHalves, ip: IpAddr) -> io::Result<Arrived> {
-    Ok(match read_hello(&mut ends)? {
-        PeerMessage::Hello(hello) => Arrived::Peer {
-            ip,
-            ends: Box::new(ends),
-            hello,
-        },
-        _ => Arrived::Nobody,
-    })
+/// Hears who came. One that this host does not await at its address is told so, under the key where
+/// there is one.
+fn say_who(
+    mut ends: ControlHalves,
+    ip: IpAddr,
+    admission: &Admission,
+    is_named: bool,
+) -> io::Result<Result<Newcomer, Cause>> {
+    let PeerMessage::Hello(hello) = read_hello(&mut ends)? else {
+        return Ok(Err(Cause::NoGreeting));
+    };
+    if is_named && admission.awaits(&hello.host, ip) {
+        return Ok(Ok(Newcomer { ends, hello }));
+    }
+    let (host, own) = (&hello.host, &admission.own);
+    let text = format!("{own} does not await host {host} at {ip}; use the same topology on both");
+    say(&mut ends, &PeerMessage::Refused(text))?;
+    Ok(Err(Cause::AnotherName))
 }
 
 /// The first word of the other end.

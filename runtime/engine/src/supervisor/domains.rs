@@ -3,8 +3,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::thread;
 use std::time::{Duration, Instant as WallInstant};
-use std::{fs, thread};
 
 use hil_core::message::TypeInfo;
 use hil_link::condition::{LinkChangeRequest, ORDER_TYPE_NAME};
@@ -12,6 +12,7 @@ use hil_link::condition::{LinkChangeRequest, ORDER_TYPE_NAME};
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::gateway::link_control::ORDERS_MAX;
 use hil_platform::domain_address::checked_root_path;
+use hil_platform::own_folder::OwnFolder;
 use hil_rundir::announcement::withdraw_abandoned;
 use hil_shm::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, observer_depth};
 use hil_topology::Channel;
@@ -176,25 +177,23 @@ pub fn sweep() {
 }
 
 /// Removes the domains of supervisors that were killed: nobody holds their lock any more. A run
-/// that is just starting has taken the lock before its folder can be told for a domain's.
+/// that is just starting has taken the lock before its folder can be told for a domain's. Of folders that
+/// others could change nothing is removed.
 pub(super) fn sweep_below(base: &Path) {
-    let Ok(entries) = fs::read_dir(base) else {
+    let Ok(base) = OwnFolder::open(base) else {
         return;
     };
-    let paths = entries.flatten().map(|entry| entry.path());
-    let roots: Vec<PathBuf> = paths.filter(|path| Domain::is_at(path)).collect();
+    let names = base.names().unwrap_or_default().into_iter();
+    let roots = names.filter_map(|name| base.enter(&name).ok());
+    let roots: Vec<OwnFolder> = roots.filter(Domain::is_in).collect();
     // All of them first: a run is announced in the domain of each of its hosts, and goes on for
     // observers while any of these is locked.
     for root in &roots {
         withdraw_abandoned(root);
     }
-    for root in &roots {
-        // A domain in use is locked and refuses; anything else there is not a domain's folder.
-        if Domain::is_at(root)
-            && let Ok(domain) = Domain::create(root)
-        {
-            domain.remove();
-        }
+    for root in roots {
+        // One in use is locked and refuses.
+        let _is_gone = Domain::clear(root.path()).is_ok();
     }
 }
 

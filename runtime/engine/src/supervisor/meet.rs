@@ -8,12 +8,13 @@ use std::{io, thread};
 use socket2::{Domain, Socket, Type};
 
 use super::control_listener::{
-    Admission, Arrived, ControlListener, KEY_NEEDED, knock, read_hello, say,
+    Admission, ControlListener, KEY_NEEDED, Newcomer, knock, read_hello, say,
 };
 use super::frame::{PeerHello, PeerMessage};
 use super::peer::{ControlHalves, Peer};
+use super::strangers::{Cause, Strangers};
 use crate::security::PreSharedKey;
-use crate::security::greeting::GreetingError;
+use crate::security::greeting::{GreetingError, Why};
 use hil_rundir::pipe::FailureKind;
 
 /// How often a host that cannot connect yet tries again.
@@ -26,7 +27,8 @@ const TELL_PERIOD: Duration = Duration::from_millis(200);
 pub enum PeerError {
     /// A peer did not appear in time.
     #[error(
-        "{missing} did not appear within {waited_s} s; is the same topology started there, and is TCP {address} reachable?"
+        "{missing} did not appear within {waited_s} s; is the same topology started there, and is TCP {address} reachable?{}",
+        strangers.as_ref().map_or_else(String::new, |words| format!(" {words}"))
     )]
     Absent {
         /// Host names.
@@ -35,6 +37,8 @@ pub enum PeerError {
         waited_s: u64,
         /// Where the hosts meet.
         address: SocketAddr,
+        /// Who else came, or answered in their place, in words.
+        strangers: Option<String>,
     },
     /// The meeting address cannot be used.
     #[error(
@@ -54,14 +58,6 @@ pub enum PeerError {
         /// What the system said.
         source: io::Error,
     },
-    /// One end holds another key, or none.
-    #[error("no connection with {host}: {reason}")]
-    Key {
-        /// The other host.
-        host: String,
-        /// What does not fit, and what to do.
-        reason: String,
-    },
     /// The ends do not fit.
     #[error("{host} does not fit this run: {reason}")]
     Mismatch {
@@ -75,14 +71,6 @@ pub enum PeerError {
     Interrupted {
         /// Host names.
         missing: String,
-    },
-    /// The connection broke.
-    #[error("connection to {host}: {source}")]
-    Connection {
-        /// The other host.
-        host: String,
-        /// What the system said.
-        source: io::Error,
     },
 }
 
@@ -132,7 +120,12 @@ pub(crate) struct Met {
 #[derive(Debug)]
 pub(crate) enum Waiting<'a> {
     /// Whom it waits for, and for how long already: a few times a second.
-    For { missing: &'a str, waited: Duration },
+    For {
+        missing: &'a str,
+        waited: Duration,
+        /// Connections that came to nothing so far, in words.
+        strangers: Option<String>,
+    },
     /// That it cannot take or make a connection for want of descriptors, threads or memory, and goes on
     /// trying: once.
     ShortOf(&'a io::Error),
@@ -152,18 +145,16 @@ pub(crate) fn meet(
         waiting,
         began: Instant::now(),
         told: None,
-        turned_away: None,
+        strangers: Strangers::default(),
         is_short: false,
     };
-    if meeting.is_here {
+    let peers = if meeting.is_here {
         host(meeting, hello, &mut patience)
     } else {
-        let peers = join(meeting, hello, &mut patience)?;
-        Ok(Met {
-            peers,
-            strangers: None,
-        })
-    }
+        join(meeting, hello, &mut patience)
+    }?;
+    let strangers = patience.strangers();
+    Ok(Met { peers, strangers })
 }
 
 struct Patience<'a> {
@@ -171,17 +162,16 @@ struct Patience<'a> {
     waiting: &'a mut dyn FnMut(&Waiting<'_>) -> bool,
     began: Instant,
     told: Option<Instant>,
-    /// Whoever came last without this run's key, and what it did.
-    turned_away: Option<(String, &'static str)>,
+    /// Those who did not prove the key. They end no waiting: whoever takes a host's address could end a
+    /// run so, and the right one may still come.
+    strangers: Strangers,
     /// It was said that this host is short of something.
     is_short: bool,
 }
 
 impl Patience<'_> {
-    /// Remembers one that was turned away. It ends no waiting: whoever takes a host's address could
-    /// end a run with it, and the right one may still come.
-    fn note(&mut self, meeting: &Meeting, ip: IpAddr, why: &'static str) {
-        self.turned_away = Some((meeting.name_of(ip), why));
+    fn strangers(&self) -> Option<String> {
+        self.strangers.words(|ip| self.meeting.name_of(ip))
     }
 
     /// Says once what this host is short of. It ends no waiting: others may give it back.
@@ -196,11 +186,8 @@ impl Patience<'_> {
     fn wait(&mut self, missing: &str) -> Result<bool, PeerError> {
         let waited = self.began.elapsed();
         if waited > self.meeting.timeout {
-            if let Some((host, reason)) = self.turned_away.take() {
-                let reason = format!("it {reason}");
-                return Err(PeerError::Key { host, reason });
-            }
             return Err(PeerError::Absent {
+                strangers: self.strangers(),
                 missing: missing.to_owned(),
                 waited_s: waited.as_secs(),
                 address: self.meeting.address,
@@ -209,13 +196,10 @@ impl Patience<'_> {
         let is_time = self.told.is_none_or(|told| told.elapsed() >= TELL_PERIOD);
         if is_time {
             self.told = Some(Instant::now());
-            let who = match &self.turned_away {
-                Some((host, why)) => format!("{missing}; {host} {why}"),
-                None => missing.to_owned(),
-            };
             let missing_now = Waiting::For {
-                missing: &who,
+                missing,
                 waited,
+                strangers: self.strangers(),
             };
             if !(self.waiting)(&missing_now) {
                 return Err(PeerError::Interrupted {
@@ -232,7 +216,7 @@ fn host(
     meeting: &Meeting,
     hello: &PeerHello,
     patience: &mut Patience<'_>,
-) -> Result<Met, PeerError> {
+) -> Result<Vec<Peer>, PeerError> {
     let address = meeting.address;
     let listen = |source| PeerError::Listen { address, source };
     let admission = Admission {
@@ -243,37 +227,19 @@ fn host(
     let mut control_listener = ControlListener::open(address, admission).map_err(listen)?;
     let mut peers: Vec<Peer> = Vec::new();
     loop {
-        if let Some(shortage) = control_listener.admit_waiting().map_err(listen)? {
+        let admitted = control_listener.admit_waiting(&mut patience.strangers);
+        if let Some(shortage) = admitted.map_err(listen)? {
             patience.note_shortage(&shortage);
         }
-        while let Some(arrived) = control_listener.look() {
-            match arrived {
-                Arrived::Peer {
-                    ip,
-                    ends,
-                    hello: theirs,
-                } => {
-                    if let Some(peer) = welcome(*ends, ip, theirs, hello, patience)? {
-                        // One that gave up and came again: its first connection is a dead one.
-                        peers.retain(|known| known.hello.host != peer.hello.host);
-                        peers.push(peer);
-                    }
-                }
-                Arrived::TurnedAway(ip, why) => patience.note(meeting, ip, why),
-                Arrived::Keyed(ip) => {
-                    return Err(PeerError::Key {
-                        host: meeting.name_of(ip),
-                        reason: "it came with a key and this topology says [security] hops = \
-                                 \"plain\"; use the same file on both"
-                            .to_owned(),
-                    });
-                }
-                Arrived::Nobody => {}
+        while let Some(newcomer) = control_listener.look(&mut patience.strangers) {
+            if let Some(peer) = welcome(newcomer, hello, patience)? {
+                // One that gave up and came again: its first connection is a dead one.
+                peers.retain(|known| known.hello.host != peer.hello.host);
+                peers.push(peer);
             }
         }
         if peers.len() == meeting.expected.len() {
-            let strangers = control_listener.counts().words();
-            return Ok(Met { peers, strangers });
+            return Ok(peers);
         }
         // Whatever came: strangers must not keep this host from its deadline and its signals.
         let missing = meeting.missing(&peers);
@@ -286,41 +252,30 @@ fn host(
     }
 }
 
-/// Greets one that said who it is; `None` when it is nobody of this run, or not at its own address.
+/// Greets one that said who it is; `None` when it has to come again.
 fn welcome(
-    mut ends: ControlHalves,
-    ip: IpAddr,
-    theirs: PeerHello,
+    newcomer: Newcomer,
     hello: &PeerHello,
     patience: &mut Patience<'_>,
 ) -> Result<Option<Peer>, PeerError> {
-    let meeting = patience.meeting;
-    let mut expected = meeting.expected.iter();
-    if !expected.any(|(name, from)| *name == theirs.host && *from == ip) {
-        let text = format!("host {} is not awaited here at {ip}", theirs.host);
-        let _left = say(&mut ends, &PeerMessage::Refused(text)).is_err();
-        return Ok(None);
-    }
-    let reason = misfit(hello, &theirs);
-    let connection = |source| PeerError::Connection {
-        host: theirs.host.clone(),
-        source,
-    };
-    if let Some(reason) = reason {
-        say(&mut ends, &PeerMessage::Refused(reason.clone())).map_err(connection)?;
+    let Newcomer {
+        mut ends,
+        hello: theirs,
+    } = newcomer;
+    if let Some(reason) = misfit(hello, &theirs) {
+        let _left = say(&mut ends, &PeerMessage::Refused(reason.clone())).is_err();
         return Err(PeerError::Mismatch {
             host: theirs.host,
             reason,
         });
     }
-    let mut peer = match Peer::new(ends, theirs.clone()) {
+    let mut peer = match Peer::new(ends, theirs) {
         Ok(peer) => peer,
         // It was not answered, so it comes again.
-        Err(error) if FailureKind::of(&error) == FailureKind::HostTooSmall => {
+        Err(error) => {
             patience.note_shortage(&error);
             return Ok(None);
         }
-        Err(error) => return Err(connection(error)),
     };
     // One that is gone again by now comes back.
     peer.say(&PeerMessage::Hello(hello.clone()));
@@ -334,6 +289,7 @@ fn join(
 ) -> Result<Vec<Peer>, PeerError> {
     let first = meeting.expected.first();
     let name = first.map_or("the first host", |(name, _)| name).to_owned();
+    let there = meeting.address.ip();
     loop {
         let stream = match connect(meeting) {
             Ok(Ok(stream)) => stream,
@@ -358,29 +314,31 @@ fn join(
                         reason,
                     });
                 }
-                let connection = |source| PeerError::Connection { host: name, source };
-                return Ok(vec![Peer::new(ends, theirs).map_err(connection)?]);
+                match Peer::new(ends, theirs) {
+                    Ok(peer) => return Ok(vec![peer]),
+                    Err(error) => patience.note_shortage(&error),
+                }
             }
+            // Only a host without a key hears it, and from one that has proven nothing.
             Ok((_, PeerMessage::Refused(reason))) if reason == KEY_NEEDED => {
-                return Err(PeerError::Key {
-                    host: name,
-                    reason: "it speaks with holders of its key only, and this topology says \
-                             [security] hops = \"plain\"; use the same file on both"
-                        .to_owned(),
-                });
+                patience.strangers.note(there, Cause::SaysKeyNeeded);
             }
             Ok((_, PeerMessage::Refused(reason))) => {
                 return Err(PeerError::Mismatch { host: name, reason });
             }
             Err(GreetingError::Refused(why)) => {
-                let reason = why.words().to_owned();
-                return Err(PeerError::Key { host: name, reason });
+                let cause = match why {
+                    Why::AnotherKey => Cause::SaysAnotherKey,
+                    Why::PlainHere => Cause::SaysPlain,
+                };
+                patience.strangers.note(there, cause);
             }
             // Somebody else's service, or a peer that is just going away.
             Ok(_) | Err(GreetingError::Connection(_)) => {
-                patience.wait(&name)?;
+                patience.strangers.note(there, Cause::SaysNothing);
             }
         }
+        patience.wait(&name)?;
     }
 }
 

@@ -70,7 +70,7 @@ fn key(name: &str) -> PreSharedKey {
 }
 
 #[test]
-fn with_one_key_two_hosts_meet_and_with_two_or_one_alone_both_say_why() {
+fn with_one_key_two_hosts_meet_and_with_two_or_one_alone_both_say_why_in_the_end() {
     let (a, b) = (hello("a", 1, 1), hello("b", 1, 2));
     let (one, other) = (key("one"), key("other"));
     let [left, right] = pair_with(&a, Some(one.clone()), &b, Some(one.clone()));
@@ -87,11 +87,79 @@ fn with_one_key_two_hosts_meet_and_with_two_or_one_alone_both_say_why() {
         (None, Some(one), "plain"),
     ] {
         for outcome in pair_with(&a, ours.clone(), &b, theirs.clone()) {
+            // Neither has proven anything to the other: both wait for the right one to the end.
             let error = outcome.map(|_| ()).unwrap_err();
-            assert!(matches!(error, PeerError::Key { .. }), "{error}");
-            assert!(error.to_string().contains(word), "{error}");
+            assert!(matches!(error, PeerError::Absent { .. }), "{error}");
+            let text = error.to_string();
+            assert!(
+                text.contains(word) && text.contains("(127.0.0.1)"),
+                "{text}"
+            );
         }
     }
+}
+
+/// A refusal of nine made-up bytes, and one by somebody who holds another key, before the right host is there.
+#[test]
+fn refusals_without_proof_of_the_key_are_counted_and_the_right_host_is_met_after_them() {
+    let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = probe.local_addr().unwrap();
+    let (one, other) = (key("refused-one"), key("refused-other"));
+    let meeting = |is_here, host: &str, key: &PreSharedKey| Meeting {
+        address,
+        is_here,
+        own: address.ip(),
+        expected: vec![(host.to_owned(), address.ip())],
+        timeout: Duration::from_secs(20),
+        key: Some(key.clone()),
+    };
+    let there = meeting(false, "a", &one);
+    let joining = thread::spawn(move || meet(&there, &hello("b", 1, 2), &mut |_| true));
+    for code in [1, 2, 3] {
+        let (mut stranger, _) = probe.accept().unwrap();
+        let refusal = [b'H', b'I', b'L', b'K', 1, 3, 1, 0, code];
+        io::Write::write_all(&mut stranger, &refusal).unwrap();
+    }
+    drop(probe);
+    let wrong = Meeting {
+        timeout: Duration::from_secs(1),
+        ..meeting(true, "b", &other)
+    };
+    let error = meet(&wrong, &hello("a", 1, 1), &mut |_| true).unwrap_err();
+    assert!(matches!(error, PeerError::Absent { .. }), "{error}");
+    let hosting = meet(&meeting(true, "b", &one), &hello("a", 1, 1), &mut |_| true);
+    assert_eq!(hosting.unwrap().peers.len(), 1);
+    let strangers = joining.join().unwrap().unwrap().strangers.unwrap();
+    for words in ["another key", "plain", "without a greeting"] {
+        assert!(strangers.contains(words), "{strangers}");
+    }
+}
+
+/// The other end hears under the key that it is not awaited, so it may believe it.
+#[test]
+fn a_host_of_another_name_is_told_at_once_under_the_key() {
+    let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = probe.local_addr().unwrap();
+    drop(probe);
+    let key = key("misnamed");
+    let meeting = |is_here, host: &str, seconds| Meeting {
+        address,
+        is_here,
+        own: address.ip(),
+        expected: vec![(host.to_owned(), address.ip())],
+        timeout: Duration::from_secs(seconds),
+        key: Some(key.clone()),
+    };
+    let there = meeting(false, "a", 20);
+    let joining = thread::spawn(move || meet(&there, &hello("c", 1, 2), &mut |_| true));
+    let hosting = meet(&meeting(true, "b", 2), &hello("a", 1, 1), &mut |_| true);
+    let error = joining.join().unwrap().unwrap_err();
+    assert!(matches!(error, PeerError::Mismatch { .. }), "{error}");
+    let error = hosting.unwrap_err();
+    assert!(
+        error.to_string().contains("not awaited at its address"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -20,7 +20,9 @@ mod progress_line;
 mod rendezvous;
 mod session;
 mod status_publisher;
+mod strangers;
 
+pub(crate) use child::ProcessEnd;
 pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;
 pub use needs::{HostTooSmall, Shortfall, check_host};

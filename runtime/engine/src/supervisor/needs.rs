@@ -360,6 +360,14 @@ fn process_need(process: &ProcessPlan, room_of: &dyn Fn(&str) -> u64) -> Process
         }
         ProcessTask::Gateway(work) | ProcessTask::ClockPath(work) => gateway_content(work),
         ProcessTask::Adapter(adapter) => adapter_content(adapter),
+        ProcessTask::Cable(work) => ProcessContent {
+            open_files: OWN_FILES + 2 * COMPONENT_CHANNEL_FILES,
+            // Frames out, frames in, the end of the program; and the program.
+            threads: OWN_THREADS + 4,
+            locks_memory: work.realtime.iter().any(|one| one.lock_memory),
+            channels: vec![work.input.name.clone(), work.output.name.clone()],
+            own_bytes: hil_cable::RING_BYTES as u64,
+        },
         // What it opens is its own, under its own limit.
         ProcessTask::Foreign { .. } => ProcessContent {
             open_files: 0,

@@ -10,16 +10,18 @@ use hil_arm::egm::messages::Side as ArmSide;
 use hil_arm::egm::parameters::{ControllerSettings, EgmParameters};
 use hil_core::message::{FNV_OFFSET, fnv1a};
 use hil_link::condition::flow_name;
-use nix::unistd::{AccessFlags, access};
 
 use super::clock_path;
 use hil_platform::domain_address::domain_base_candidates;
+use hil_platform::open_files;
+use hil_platform::own_folder::OwnFolder;
 use hil_platform::realtime::{RealtimeRequest, SchedulingPolicy};
 use hil_platform::wait::WaitMode;
 use hil_rundir::announcement;
 use hil_rundir::event::ProcessKind;
 use hil_rundir::launch::{
-    AdapterSettings, ArmLaunch, ChannelLaunch, DirectionLaunch, GatewayWork, Side, SocketLaunch,
+    AdapterSettings, ArmLaunch, CableWork, ChannelLaunch, DirectionLaunch, GatewayWork, Side,
+    SocketLaunch,
 };
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
@@ -76,6 +78,8 @@ pub(crate) enum ProcessTask {
     ClockPath(GatewayWork),
     /// What speaks with a foreign program, in this binary.
     Adapter(AdapterSettings),
+    /// What carries the frames of a program of the user's, in this binary.
+    Cable(CableWork),
     /// The user's own program.
     Foreign {
         card: RoleSpec,
@@ -112,7 +116,7 @@ impl ProcessPlan {
             ProcessTask::Gateway(_) => ProcessKind::Gateway,
             ProcessTask::ClockPath(_) => ProcessKind::ClockPath,
             ProcessTask::Adapter(_) => ProcessKind::Adapter,
-            ProcessTask::Foreign { .. } => ProcessKind::OwnProgram,
+            ProcessTask::Foreign { .. } | ProcessTask::Cable(_) => ProcessKind::OwnProgram,
         }
     }
 
@@ -123,7 +127,7 @@ impl ProcessPlan {
                 card.role.clone()
             }
             ProcessTask::Adapter(adapter) => Some(adapter.role.clone()),
-            ProcessTask::Gateway(_) | ProcessTask::ClockPath(_) => None,
+            ProcessTask::Gateway(_) | ProcessTask::ClockPath(_) | ProcessTask::Cable(_) => None,
         }
     }
 }
@@ -191,11 +195,24 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
         Program::Command {
             command,
             environment,
+            inside,
             ..
-        } => ProcessTask::Foreign {
-            card,
-            command: command.clone(),
-            environment: environment.clone(),
+        } => match cable_ends(&card).zip(*inside) {
+            Some(([input, output], inside)) => ProcessTask::Cable(CableWork {
+                inside,
+                command: command.clone(),
+                environment: environment.clone(),
+                open_files: open_files::inherited_limit(),
+                input,
+                output,
+                realtime: [0, 1].map(|index| realtime(&process.execution, index)),
+                wait: wait_mode(process.execution.wait),
+            }),
+            None => ProcessTask::Foreign {
+                card,
+                command: command.clone(),
+                environment: environment.clone(),
+            },
         },
         Program::Egm { role, adapter } => {
             let host = topology.host(&process.host);
@@ -209,6 +226,12 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
         task,
         on_exit: process.restarts.on_exit(),
     }
+}
+
+/// The channels of a program with an address inside, of which the topology has one each way.
+fn cable_ends(card: &RoleSpec) -> Option<[RoleChannel; 2]> {
+    let (input, output) = (card.inputs.first()?, card.outputs.first()?);
+    Some([input.clone(), output.clone()])
 }
 
 fn adapter_settings(
@@ -402,14 +425,12 @@ pub(crate) fn domain_base(base: Option<&PathBuf>) -> PathBuf {
     base.cloned().unwrap_or_else(default_domain_base)
 }
 
-/// The first candidate that this user may use; the last one is the user's own.
+/// The first candidate that is this user's alone, or can be made so; the last one is tried by who uses it.
 fn default_domain_base() -> PathBuf {
-    let is_usable = |folder: &PathBuf| {
-        std::fs::create_dir_all(folder).is_ok() && access(folder, AccessFlags::W_OK).is_ok()
-    };
     let mut candidates = domain_base_candidates();
     let last = candidates.pop().unwrap_or_default();
-    candidates.into_iter().find(is_usable).unwrap_or(last)
+    let is_own = |folder: &PathBuf| OwnFolder::create(folder).is_ok();
+    candidates.into_iter().find(is_own).unwrap_or(last)
 }
 
 #[cfg(test)]

@@ -2,20 +2,18 @@
 //! by policy, stopped in order. Each single one is a [`Child`].
 
 use std::collections::BTreeMap;
-use std::os::unix::process::ExitStatusExt;
-use std::path::PathBuf;
-use std::process::{Command, ExitStatus};
+use std::io;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
-use std::{env, io};
 
 use hil_core::time::{Instant, duration_ns};
 
-use super::child::{Child, Word, describe_exit, last_line};
+use super::child::{Child, ProcessEnd, Word, last_line};
 use super::output_log::{LogKeeper, cut_middle};
 use super::plan::{ProcessPlan, ProcessTask};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::open_files;
+use hil_platform::own_process;
 use hil_platform::text::shortened;
 use hil_rundir::event::{Event, EventKind, Interruption};
 use hil_rundir::file_fault::FileFault;
@@ -53,8 +51,6 @@ pub(crate) enum ProcessGroupError {
         program: String,
         source: io::Error,
     },
-    #[error("cannot find this program's own file: {0}")]
-    OwnPath(io::Error),
     #[error("cannot start a thread: {0}")]
     Thread(io::Error),
 }
@@ -63,9 +59,7 @@ impl ProcessGroupError {
     /// What it means for whoever would try again.
     fn kind(&self) -> FailureKind {
         match self {
-            Self::Spawn { source, .. } | Self::OwnPath(source) | Self::Thread(source) => {
-                FailureKind::of(source)
-            }
+            Self::Spawn { source, .. } | Self::Thread(source) => FailureKind::of(source),
             Self::Launch(_) => FailureKind::Fault,
         }
     }
@@ -131,7 +125,6 @@ pub(crate) struct ProcessGroup {
     members: Vec<ManagedProcess>,
     places: BTreeMap<String, String>,
     folder: RunFolder,
-    own_program: PathBuf,
     /// The run's secret, for its gateways; `None` when its hops are plain.
     seal: Option<RunSeal>,
     sender: SyncSender<Word>,
@@ -153,7 +146,7 @@ impl ProcessGroup {
         places: BTreeMap<String, String>,
         folder: &RunFolder,
         seal: Option<RunSeal>,
-    ) -> Result<Self, ProcessGroupError> {
+    ) -> Self {
         let (sender, words) = sync_channel(WORDS_MAX);
         let members = plans.into_iter().map(|plan| ManagedProcess {
             plan,
@@ -169,12 +162,11 @@ impl ProcessGroup {
             complaint: None,
             left_out_count: 0,
         });
-        Ok(Self {
+        Self {
             members: members.collect(),
             places,
             folder: folder.clone(),
             seal,
-            own_program: env::current_exe().map_err(ProcessGroupError::OwnPath)?,
             sender,
             words,
             started: None,
@@ -182,7 +174,7 @@ impl ProcessGroup {
             warning_count: 0,
             unwritten: None,
             log_keeper: None,
-        })
+        }
     }
 
     /// Starts every process; they wait for [`ProcessGroup::begin`].
@@ -224,7 +216,7 @@ impl ProcessGroup {
         let (name, instance) = (member.plan.name.clone(), member.restart_count);
         let log = self.folder.log(&name);
         let domain = self.places[&member.plan.host].clone();
-        let mut program = Command::new(&self.own_program);
+        let mut program = own_process::again();
         let work = match &member.plan.task {
             ProcessTask::Component {
                 card,
@@ -243,6 +235,7 @@ impl ProcessGroup {
                 Some(Work::Gateway(work.clone()))
             }
             ProcessTask::Adapter(adapter) => Some(Work::Adapter(adapter.clone())),
+            ProcessTask::Cable(work) => Some(Work::Cable(work.clone())),
             ProcessTask::Foreign {
                 card,
                 command,
@@ -287,7 +280,7 @@ impl ProcessGroup {
             process: name,
             program: match &member.plan.task {
                 ProcessTask::Foreign { command, .. } => command[0].clone(),
-                _ => self.own_program.display().to_string(),
+                _ => own_process::RUNNING_FILE.to_owned(),
             },
             source,
         })?;
@@ -344,7 +337,7 @@ impl ProcessGroup {
             let Some(child) = &mut member.child else {
                 continue;
             };
-            let Some(status) = child.poll_exit() else {
+            let Some(end) = child.poll_end() else {
                 member.seen_alive = now;
                 continue;
             };
@@ -353,12 +346,12 @@ impl ProcessGroup {
                 continue;
             }
             member.child = None;
-            member.end = Some(describe_exit(status));
+            member.end = Some(end.to_string());
             self.listen();
             if let Some(verdict) = self.unwritable() {
                 return verdict;
             }
-            let judged = self.judge(index, status, now);
+            let judged = self.judge(index, end, now);
             // A failure is not overridden by an orderly end seen in the same turn.
             let has_failed = matches!(verdict, Verdict::Failed(_) | Verdict::Unwritable { .. });
             if !has_failed && judged != Verdict::Running {
@@ -379,19 +372,19 @@ impl ProcessGroup {
     }
 
     /// What the end of a process means: it is started again, or the run ends.
-    fn judge(&mut self, index: usize, status: ExitStatus, now: Instant) -> Verdict {
+    fn judge(&mut self, index: usize, end: ProcessEnd, now: Instant) -> Verdict {
         let member = &mut self.members[index];
-        let mut what = describe_exit(status);
+        let mut what = end.to_string();
         let log = self.folder.log(&member.plan.name);
         let complaint = member.complaint.as_ref();
         let failure_kind = complaint.map_or(FailureKind::Fault, |failure| failure.kind);
         if let Some(failure) = complaint {
             what = format!("{what}: {}", failure.text);
-        } else if status.signal() == Some(libc::SIGBUS)
+        } else if end.signal() == Some(libc::SIGBUS)
             && let Ok(free) = Room::free()
         {
             what = format!("{what}; {SHARED_MEMORY_DIRECTORY} has {free} free");
-        } else if status.code().is_some_and(|code| code != 0)
+        } else if end.code().is_some_and(|code| code != 0)
             && let Some(last) = last_line(&log)
         {
             what = format!("{what}, after it said \"{last}\"");
@@ -402,7 +395,7 @@ impl ProcessGroup {
             OnExit::Restart { limit } => limit,
         };
         let name = member.plan.name.clone();
-        let is_orderly = status.success() && member.complaint.is_none();
+        let is_orderly = end.code() == Some(0) && member.complaint.is_none();
         let interruption = self.interruption(index);
         let member = &mut self.members[index];
         if self.started.is_some() && member.restart_count < limit && member.complaint.is_none() {
@@ -567,10 +560,10 @@ impl ProcessGroup {
                 self.listen();
                 std::thread::sleep(Duration::from_millis(1));
             }
-            let end = match child.poll_exit() {
+            let end = match child.poll_end() {
                 // What a program of the user's does when it is told to stop.
-                Some(status) if status.signal() == Some(libc::SIGTERM) => "stopped".to_owned(),
-                Some(status) => describe_exit(status),
+                Some(end) if end.signal() == Some(libc::SIGTERM) => "stopped".to_owned(),
+                Some(end) => end.to_string(),
                 None => "ended".to_owned(),
             };
             if !ended_by_itself {
@@ -629,7 +622,9 @@ impl ProcessGroup {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::process::ExitStatusExt;
     use std::path::Path;
+    use std::process::ExitStatus;
 
     use hil_topology::RoleSpec;
 
@@ -658,7 +653,7 @@ mod tests {
         };
         let places = BTreeMap::from([("pc".to_owned(), String::new())]);
         let folder = RunFolder::existing(Path::new("/proc/no-run"));
-        ProcessGroup::new(vec![plan], places, &folder, None).unwrap()
+        ProcessGroup::new(vec![plan], places, &folder, None)
     }
 
     #[test]
@@ -673,13 +668,14 @@ mod tests {
         check(group(OnExit::EndRun).start().unwrap_err());
         let mut group = group(OnExit::Restart { limit: 1 });
         group.started = Some(MonotonicClock::now());
-        check(group.judge(0, ExitStatus::from_raw(0), MonotonicClock::now()));
+        let ended = ProcessEnd::Exited(ExitStatus::from_raw(0));
+        check(group.judge(0, ended, MonotonicClock::now()));
     }
 
     #[test]
     fn a_failure_keeps_the_kind_that_its_process_gave_it() {
         let mut group = group(OnExit::EndRun);
-        let failed = ExitStatus::from_raw(1 << 8);
+        let failed = ProcessEnd::Exited(ExitStatus::from_raw(1 << 8));
         for kind in [FailureKind::NotThereYet, FailureKind::HostTooSmall] {
             let text = "cannot go on".to_owned();
             group.members[0].complaint = Some(Failure { kind, text });

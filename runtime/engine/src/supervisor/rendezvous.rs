@@ -88,8 +88,12 @@ pub(super) fn gather(
         mut peers,
         strangers,
     } = meet(&meeting, &hello, &mut |waiting| {
-        let (missing, waited) = match waiting {
-            Waiting::For { missing, waited } => (missing, waited),
+        let (missing, waited, strangers) = match waiting {
+            Waiting::For {
+                missing,
+                waited,
+                strangers,
+            } => (missing, waited, strangers),
             Waiting::ShortOf(error) => {
                 console.warn(&format!(
                     "cannot take a connection of another host for now: {error}; going on as soon as there \
@@ -104,10 +108,11 @@ pub(super) fn gather(
         } else {
             "to answer at"
         };
-        // Behind the names may stand who came and was turned away.
-        let (names, turned_away) = missing.split_at(missing.find(';').unwrap_or(missing.len()));
+        let strangers = strangers
+            .as_ref()
+            .map_or_else(String::new, |words| format!("; {words}"));
         console.progress(&format!(
-            "waiting for {names} {role} {address} ({waited_s} s){turned_away}"
+            "waiting for {missing} {role} {address} ({waited_s} s){strangers}"
         ));
         console.announce_up();
         signals.received().is_none()

@@ -116,7 +116,7 @@ pub fn run(
     let peers = gathered.peers;
     let here = clock_id()?;
     let process_group =
-        ProcessGroup::new(plan.processes, domains.addresses(), &folder, gathered.seal)?;
+        ProcessGroup::new(plan.processes, domains.addresses(), &folder, gathered.seal);
     let announcement = Announcement::make(
         topology,
         &folder,
@@ -546,16 +546,6 @@ impl Session<'_> {
             gaps = received.gaps;
             stories.extend(received.stories);
         }
-        let has_one_clock = self.has_one_clock;
-        drop(self.process_group);
-        drop(self.status_publisher);
-        self.announcement.withdraw();
-        self.domains.let_observers_leave();
-        let left = self.domains.remove();
-        problems.extend(
-            left.into_iter()
-                .map(|what| format!("left in shared memory: {what}")),
-        );
         // The same on every host.
         let place = |story: &HostHistory| {
             let hosts = self.topology.hosts().iter();
@@ -576,7 +566,7 @@ impl Session<'_> {
         events.sort_by_key(since_start);
         let cards = stories.iter().flat_map(|one| one.cards.clone()).collect();
         let processes = stories.into_iter().flat_map(|one| one.processes).collect();
-        RunResult {
+        let mut result = RunResult {
             folder,
             outcome,
             spans,
@@ -584,7 +574,7 @@ impl Session<'_> {
             events,
             processes,
             cards,
-            has_one_clock,
+            has_one_clock: self.has_one_clock,
             security: self.security,
             disciplines,
             own_hosts,
@@ -592,7 +582,18 @@ impl Session<'_> {
             problems,
             facts,
             trace_delays: trace_delays(self.topology),
-        }
+        };
+        // Before anything is removed: whatever becomes of that, the run has its account. Who cannot write it
+        // here is told when it is written with what is left.
+        let _is_written = result.write().is_ok();
+        drop(self.process_group);
+        drop(self.status_publisher);
+        self.announcement.withdraw();
+        self.domains.let_observers_leave();
+        let left = self.domains.remove().into_iter();
+        let left = left.map(|what| format!("left in shared memory: {what}"));
+        result.problems.extend(left);
+        result
     }
 
     /// Who steered this host's system clock, before and after.

@@ -19,6 +19,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::flag;
 
 use hil_platform::console::Console;
+use hil_platform::{open_files, own_process};
 
 /// What the guard says once no signal ends it any more.
 const READY: &str = "ready";
@@ -90,6 +91,7 @@ struct Guard {
 impl Guard {
     /// Starts the guard and waits until no signal ends it any more.
     fn start(mut command: Command) -> io::Result<Self> {
+        open_files::withhold()?;
         let mut process = command
             .process_group(0)
             .current_dir("/")
@@ -119,10 +121,9 @@ impl Drop for Guard {
     }
 }
 
-/// This very program, also where a newer build has taken its place meanwhile.
 fn guard_command(interface: &str, former: HardwareStamping) -> Command {
-    let mut command = Command::new("/proc/self/exe");
-    command.arg0("hil-runtime").arg("card-guard");
+    let mut command = own_process::again();
+    command.arg("card-guard");
     for (name, value) in [
         ("interface", interface.to_owned()),
         ("flags", former.flags.to_string()),

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use super::{ChronyTracking, NtpVariables, PtpStatus};
 use crate::host_facts::HostFiles;
+use crate::open_files;
 
 /// How long a tool may take; a daemon on this host answers within milliseconds, but `ntpq` of ntpsec
 /// alone takes a third of a second to start on a busy machine.
@@ -42,6 +43,7 @@ fn answer(program: &str, arguments: &[&str]) -> Result<String, String> {
 }
 
 fn answer_within(patience: Duration, program: &str, arguments: &[&str]) -> Result<String, String> {
+    open_files::withhold().map_err(|error| format!("{program}: {error}"))?;
     let mut child = Command::new(program)
         .args(arguments)
         .stdin(Stdio::null())

@@ -5,6 +5,7 @@ use std::fs::File;
 use std::process::{Command, Stdio};
 
 use super::{Fact, HostFiles};
+use crate::open_files;
 
 /// The kernel's release, such as `6.12.1-amd64`.
 pub fn kernel_release(files: &HostFiles) -> Fact<String> {
@@ -61,11 +62,13 @@ fn unpacked(files: &HostFiles, path: &str) -> Fact<String> {
         Ok(file) => file,
         Err(error) => return Fact::Unavailable(format!("no /boot/config-* and {path}: {error}")),
     };
-    let output = Command::new("gzip")
-        .arg("-dc")
-        .stdin(Stdio::from(file))
-        .stderr(Stdio::null())
-        .output();
+    let output = open_files::withhold().and_then(|()| {
+        Command::new("gzip")
+            .arg("-dc")
+            .stdin(Stdio::from(file))
+            .stderr(Stdio::null())
+            .output()
+    });
     match output {
         Ok(output) if output.status.success() => {
             Fact::Available(String::from_utf8_lossy(&output.stdout).into_owned())

@@ -31,6 +31,7 @@ const EIGHTHS: [char; 8] = ['▏', '▎', '▍', '▌', '▋', '▊', '▉', '�
 pub struct Canvas {
     text: String,
     width: usize,
+    has_whole_tables: bool,
     style: Style,
 }
 
@@ -40,7 +41,24 @@ impl Canvas {
         Self {
             text: String::new(),
             width: width.clamp(WIDTH_MIN, WIDTH_MAX),
+            has_whole_tables: false,
             style,
+        }
+    }
+
+    /// With tables as wide as they need to be.
+    #[must_use]
+    pub const fn with_whole_tables(mut self) -> Self {
+        self.has_whole_tables = true;
+        self
+    }
+
+    /// Columns that a table may take; `None` where it may take as many as it needs.
+    pub(crate) const fn table_room(&self) -> Option<usize> {
+        if self.has_whole_tables {
+            None
+        } else {
+            Some(self.width - INDENT)
         }
     }
 
@@ -66,6 +84,7 @@ impl Canvas {
             Tone::Caution => Ansi::new().fg_color(Some(AnsiColor::Yellow.into())),
             Tone::Bad => Ansi::new().bold().fg_color(Some(AnsiColor::Red.into())),
             Tone::Faint => Ansi::new().dimmed(),
+            Tone::Chosen => Ansi::new().invert(),
             Tone::Bar => Ansi::new().fg_color(Some(AnsiColor::Cyan.into())),
         };
         format!("{}{shown}{}{padding}", ansi.render(), ansi.render_reset())

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use hil_account::flow::{FlowFold, FlowMetrics};
 use hil_account::radio::{RadioFold, RadioMetrics};
 use hil_account::{AccountFold, ChannelAccount, Outage, OutageFinder, RecordsAtHand, each_history};
 use hil_core::record::IngressRecord;
@@ -174,6 +175,8 @@ pub(super) struct ChannelReading {
     pub(super) account: ChannelAccount,
     pub(super) outages: Vec<Outage>,
     pub(super) acknowledgements: Option<RadioMetrics>,
+    /// Of a channel of frames.
+    pub(super) flows: Vec<FlowMetrics>,
 }
 
 impl ChannelReading {
@@ -187,15 +190,20 @@ impl ChannelReading {
             let mut account = AccountFold::new(at_hand, context);
             let mut outages = OutageFinder::default();
             let mut radio = RadioFold::new(at_hand);
+            let mut flows = FlowFold::default();
+            let frames = records.of_kind(&channel.name, |files| files.frame.as_ref());
+            frames.for_each(|frame| flows.add_frame(&frame));
             each_history(files, context, |message| {
                 account.add(message);
                 outages.add(message);
                 radio.add(message);
+                flows.add(message, context.path);
             });
             Self {
                 account: account.finish(),
                 outages: outages.finish(),
                 acknowledgements: radio.finish(),
+                flows: flows.finish(),
             }
         }))
     }

@@ -25,6 +25,7 @@ use std::path::{Path, PathBuf};
 use std::{fs, io};
 
 use hil_account::MessageFate;
+use hil_account::flow::FlowMetrics;
 use hil_account::radio::RadioMetrics;
 use hil_core::case_study::Score;
 use hil_core::plot::PlotSeries;
@@ -38,9 +39,10 @@ use outages::OutageHistory;
 use records::RunRecords;
 
 use crate::event_log;
-use crate::summary::{Fact, RunSummary, SummaryError};
+use crate::summary::{ChannelFlows, CountByName, Fact, RunSummary, SummaryError};
 use crate::terminal;
 use crate::trace::capture;
+use hil_platform::text::grouped;
 use hil_rundir::file_fault::FileFault;
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
 use hil_rundir::run_folder::RunFolder;
@@ -159,7 +161,9 @@ pub fn conclude(
         .map(|channel| channel_summary(&records, channel))
         .collect();
     let found = read_channels(&mut summary, &records, &axis);
+    summary.flows = found.flows;
     summary.directions = metrics::directions(result);
+    doubt_losses(&mut summary);
     let mut unwritten_files = capture::write(&mut summary, &records);
     summary.faces = adapters::adapter_summaries(&records);
     summary.hardware_stamps = nics::hardware_stamps(&records);
@@ -230,6 +234,8 @@ struct MessageFindings {
     outages: Vec<OutageHistory>,
     /// What radios acknowledged, by channel.
     acknowledgements: BTreeMap<String, RadioMetrics>,
+    /// Of the channels of frames.
+    flows: Vec<ChannelFlows>,
 }
 
 /// Reads the messages of every channel and puts its account and its outages into the summary.
@@ -241,6 +247,7 @@ fn read_channels(
     let mut found = MessageFindings {
         outages: Vec::new(),
         acknowledgements: BTreeMap::new(),
+        flows: Vec::new(),
     };
     for (summary, channel) in summary.channels.iter_mut().zip(records.topology.channels()) {
         let Some(reading) = ChannelReading::of(records, channel) else {
@@ -249,6 +256,13 @@ fn read_channels(
         let unknown = MessageFate::UnknownPeerRecordsUnavailable;
         let is_partial = reading.account.fates.of(unknown) > 0;
         summary.account = Some(reading.account);
+        if channel.carries_frames() {
+            found.flows.push(ChannelFlows {
+                channel: channel.name.clone(),
+                inlet_lost: inlet_lost(records.result, &channel.name),
+                flows: reading.flows,
+            });
+        }
         let history = OutageHistory::of(records, axis, channel, reading.outages, is_partial);
         summary.outages = history.as_ref().and_then(OutageHistory::metrics);
         found.outages.extend(history);
@@ -258,6 +272,35 @@ fn read_channels(
             .extend(radio.map(|radio| (channel.name.clone(), radio)));
     }
     found
+}
+
+/// Where the receiving host had no room for some datagrams, nobody knows which frames these were.
+fn doubt_losses(summary: &mut RunSummary) {
+    for one in &mut summary.flows {
+        let mut directions = summary.directions.iter();
+        let had_no_room = directions.any(|direction| {
+            direction.channels.contains(&one.channel) && direction.no_room_count() > 0
+        });
+        let mut channels = summary.channels.iter();
+        let emulation = channels
+            .find(|channel| channel.name == one.channel)
+            .and_then(|channel| channel.emulation.as_ref()?.overflow_count);
+        if had_no_room || emulation.unwrap_or(0) > 0 {
+            one.flows.iter_mut().for_each(FlowMetrics::doubt_network);
+        }
+    }
+}
+
+/// What the inlets lost of the frames of `channel`.
+fn inlet_lost(result: &RunResult, channel: &str) -> Vec<CountByName> {
+    let reports = result
+        .processes
+        .iter()
+        .filter_map(|one| one.report.as_ref());
+    let inlets = reports.flat_map(|report| &report.inlets);
+    let inlets = inlets.filter(|inlet| inlet.channel == channel);
+    let lost = inlets.flat_map(|inlet| &inlet.lost);
+    lost.filter(|one| one.count > 0).cloned().collect()
 }
 
 /// Writes what the case and the network have to plot; gives the file that could not be written. A run whose
@@ -303,6 +346,17 @@ fn add_warnings(summary: &mut RunSummary, records: &RunRecords<'_>) {
             summary.warnings.push(format!(
                 "{name} failed {unconnected} times to connect to the other end of a channel; do \
                  all processes run as one user?"
+            ));
+        }
+    }
+    for one in &summary.flows {
+        if one.inlet_lost_count() > 0 {
+            let lost = one.inlet_lost.iter();
+            let lost = lost.map(|one| format!("{} {}", grouped(one.count), one.name));
+            let lost = lost.collect::<Vec<_>>().join(", ");
+            summary.warnings.push(format!(
+                "{}: frames were lost on this host and in no network, beside those of the account: {lost}",
+                one.channel
             ));
         }
     }

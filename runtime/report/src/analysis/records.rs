@@ -137,6 +137,7 @@ impl<'a> RunRecords<'a> {
             RecordKind::AdapterSent => &mut channel.adapter_sent,
             RecordKind::AdapterReceived => &mut channel.adapter_received,
             RecordKind::Message => &mut channel.message,
+            RecordKind::Frame => &mut channel.frame,
             // They belong to no channel, see above.
             RecordKind::RoundTrip
             | RecordKind::NicClock
@@ -354,6 +355,7 @@ pub(super) struct ChannelFiles {
     pub(super) adapter_sent: Option<StoredRecords>,
     pub(super) adapter_received: Option<StoredRecords>,
     pub(super) message: Option<StoredRecords>,
+    pub(super) frame: Option<StoredRecords>,
     pub(super) signs: Signs,
 }
 

@@ -38,6 +38,8 @@ fn comparison() -> Comparison {
     maximum.ratio_interval = None;
     Comparison {
         harms: Vec::new(),
+        measurements: Vec::new(),
+        first_harm: None,
         hurt: Hurt::No,
         headline: Vec::new(),
         base: Vec::new(),

@@ -24,6 +24,19 @@ pub(crate) struct ComparedHarm {
     pub(crate) new: HarmCount,
     /// Whether there was more of it in the new runs.
     pub(crate) change: Change,
+    /// New less base; `None` without counts, and of fewer occasions than a rate takes.
+    pub(crate) difference: Option<HarmDifference>,
+}
+
+/// By how much more a harm happened in the new runs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub(crate) struct HarmDifference {
+    /// Of the shares of the occasions, or of the rates per second of harms without occasions.
+    pub(crate) value: f64,
+    /// 95 %: Newcombe's of the shares; of the rates, between the ends of both (Poisson).
+    pub(crate) interval: Interval,
+    /// It is of shares.
+    pub(crate) is_share: bool,
 }
 
 /// How a harm stands to that of the base.
@@ -46,28 +59,40 @@ struct Side {
     length_s: f64,
 }
 
-impl Change {
-    fn of(base: &Side, new: &Side) -> Self {
+impl HarmDifference {
+    fn of(base: &Side, new: &Side) -> Option<Self> {
         let (base_s, new_s) = (base.length_s, new.length_s);
         let (base, new) = (&base.harm, &new.harm);
-        let interval = if let Some((base, new)) = share(base).zip(share(new)) {
-            base.estimate(CONFIDENCE)
-                .zip(new.estimate(CONFIDENCE))
-                .and_then(|(base, new)| difference(base, new))
-        } else if let Some((base, new)) = base.count.zip(new.count)
-            && base_s > 0.0
-            && new_s > 0.0
-        {
-            let [base, new] = [base, new].map(|count| poisson(count, CONFIDENCE));
-            Some(Interval::new(
+        if let Some((base, new)) = share(base).zip(share(new)) {
+            let base = base.estimate(CONFIDENCE)?;
+            let new = new.estimate(CONFIDENCE)?;
+            return Some(Self {
+                value: new.value - base.value,
+                interval: difference(base, new)?,
+                is_share: true,
+            });
+        }
+        let (base, new) = base.count.zip(new.count)?;
+        if base_s <= 0.0 || new_s <= 0.0 {
+            return None;
+        }
+        let value = new as f64 / new_s - base as f64 / base_s;
+        let [base, new] = [base, new].map(|count| poisson(count, CONFIDENCE));
+        Some(Self {
+            value,
+            interval: Interval::new(
                 new.low / new_s - base.high / base_s,
                 new.high / new_s - base.low / base_s,
                 IntervalMethod::Exact,
-            ))
-        } else {
-            None
-        };
-        match interval {
+            ),
+            is_share: false,
+        })
+    }
+}
+
+impl Change {
+    fn of(difference: Option<HarmDifference>) -> Self {
+        match difference.map(|one| one.interval) {
             Some(interval) if interval.low > 0.0 => Self::More,
             Some(interval) if interval.high < 0.0 => Self::Less,
             _ => Self::NotShown,
@@ -88,8 +113,14 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedHarm>
             harm: pooled(what, runs),
             length_s: runs.iter().map(|run| run.summary.run.duration_s).sum(),
         });
+        let difference = HarmDifference::of(&base, &new);
+        let has_few = |side: &Side| {
+            let occasions = side.harm.occasions.as_ref();
+            occasions.is_some_and(|one| one.count < OCCASIONS_MIN)
+        };
         ComparedHarm {
-            change: Change::of(&base, &new),
+            change: Change::of(difference),
+            difference: difference.filter(|_| !has_few(&base) && !has_few(&new)),
             base: base.harm,
             new: new.harm,
         }
@@ -221,6 +252,18 @@ mod tests {
         let because = Unresolved::WithinChance;
         let chance = compared(&clean, &[run(Some(1), 60)]);
         assert_eq!(chance, Hurt::NotResolvable { because });
+        let more = of(&clean, &[run(Some(9), 60)])[0].difference.unwrap();
+        let Interval { low, high, .. } = more.interval;
+        assert!(more.is_share && (more.value - 0.15).abs() < 1e-12);
+        assert!(
+            (0.05..0.08).contains(&low) && (0.25..0.27).contains(&high),
+            "{more:?}"
+        );
+        assert_eq!(
+            of(&clean, &[run(Some(4), 9)])[0].difference,
+            None,
+            "no rate of nine"
+        );
         // Repetitions are pooled.
         let repeated: Vec<_> = (0..8).map(|_| run(Some(1), 60)).collect();
         let clean: Vec<_> = (0..8).map(|_| run(Some(0), 60)).collect();

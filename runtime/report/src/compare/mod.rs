@@ -19,6 +19,7 @@ use hil_stats::comparison::Estimate;
 use serde::Serialize;
 
 use crate::answer::Hurt;
+use crate::sections::events::first_harm;
 use crate::summary::{RunSummary, SummaryError};
 use harms::ComparedHarm;
 use hil_rundir::run_folder::RunFolder;
@@ -174,6 +175,17 @@ pub(crate) struct ComparedMetric {
     pub(crate) method: String,
 }
 
+/// Runs of whose measurement the same is to be said.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Measurements {
+    /// Their folders.
+    pub(crate) runs: Vec<PathBuf>,
+    /// `None` where nothing was measured.
+    pub(crate) is_valid: Option<bool>,
+    /// Why, in words.
+    pub(crate) words: String,
+}
+
 /// All of it.
 #[derive(Debug, Clone, Serialize)]
 pub(crate) struct Comparison {
@@ -191,6 +203,10 @@ pub(crate) struct Comparison {
     pub(crate) harms: Vec<ComparedHarm>,
     /// Was the robot hurt more in the new runs?
     pub(crate) hurt: Hurt,
+    /// Whether the runs measured what they were to measure.
+    pub(crate) measurements: Vec<Measurements>,
+    /// The gravest event of the new runs that the network explains, and what the network did before.
+    pub(crate) first_harm: Option<String>,
     /// Names of the scores to see first.
     pub(crate) headline: Vec<String>,
     pub(crate) figures: Vec<ComparedMetric>,
@@ -206,6 +222,7 @@ impl Comparison {
         cautions.extend(metrics::cautions(&figures, [base.len(), new.len()]));
         let harms = harms::of(base, new);
         let hurt = harms::hurt(&harms, base, new);
+        let mut first_harms = new.iter().filter_map(|run| first_harm(&run.summary));
         let headline = new.first().map(|run| run.summary.headline.clone());
         Self {
             base: folders(base),
@@ -215,6 +232,8 @@ impl Comparison {
             cautions,
             harms,
             hurt,
+            measurements: origin::measurements(base, new),
+            first_harm: first_harms.next(),
             headline: headline.unwrap_or_default(),
             figures,
         }

@@ -2,8 +2,9 @@
 
 use std::collections::BTreeSet;
 
-use super::ComparedRun;
-use crate::assessment::{Assessment, NetworkVerdict};
+use super::{ComparedRun, Measurements};
+use crate::answer::Answer;
+use crate::assessment::Assessment;
 use crate::summary::{Outcome, RunSummary};
 use hil_platform::host_facts::Fact;
 
@@ -69,7 +70,7 @@ fn links(summary: &RunSummary) -> String {
     kinds.into_iter().collect::<Vec<_>>().join(", ")
 }
 
-/// What spoils a run, or changes what it is about.
+/// What changes what a run is about.
 pub(super) fn cautions(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<String> {
     let mut found = Vec::new();
     for run in base.iter().chain(new) {
@@ -77,9 +78,6 @@ pub(super) fn cautions(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<String>
         if summary.run.outcome != Outcome::Completed {
             let reason = &summary.run.exit_reason;
             found.push(format!("{name} did not run its length: {reason}"));
-        }
-        if let Some(words) = spoilt(summary) {
-            found.push(format!("{name}: {words}"));
         }
         let changes = summary.link_changes.iter().filter(|one| one.is_in_force());
         let count = changes.count();
@@ -100,23 +98,21 @@ pub(super) fn cautions(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<String>
     found
 }
 
-fn spoilt(summary: &RunSummary) -> Option<&'static str> {
-    match Assessment::of(summary).network {
-        NetworkVerdict::EmulationNotKept { .. } => {
-            Some("the host could not keep the emulated link")
+/// Whether the runs measured what they were to measure; those of which the same is to be said, together.
+pub(super) fn measurements(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<Measurements> {
+    let mut found: Vec<Measurements> = Vec::new();
+    for run in base.iter().chain(new) {
+        let assessment = Assessment::of(&run.summary);
+        let answer = Answer::of(&run.summary, &assessment);
+        let (_, words) = answer.measurement_words(&assessment.network);
+        match found.iter_mut().find(|one| one.words == words) {
+            Some(known) => known.runs.push(run.folder.clone()),
+            None => found.push(Measurements {
+                runs: vec![run.folder.clone()],
+                is_valid: answer.measurement.is_valid,
+                words,
+            }),
         }
-        NetworkVerdict::HostOverran { .. } => Some("the host overran: no network result"),
-        NetworkVerdict::ReceiverLate { .. } => {
-            Some("a receiving gateway was late: no network result")
-        }
-        NetworkVerdict::RunFailed => Some("the run failed"),
-        NetworkVerdict::RecordsMissing { .. } => Some("records of a host are missing"),
-        NetworkVerdict::EmulatedLink
-        | NetworkVerdict::VirtualTime
-        | NetworkVerdict::NoNetwork
-        | NetworkVerdict::ForeignProgram
-        | NetworkVerdict::NoForeignProgram
-        | NetworkVerdict::NetworkResult
-        | NetworkVerdict::TicksUnknown => None,
     }
+    found
 }

@@ -1,5 +1,7 @@
 //! A comparison as sections, for a terminal and as Markdown. It computes nothing.
 
+use std::path::PathBuf;
+
 use hil_core::interval::Interval;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
@@ -11,9 +13,9 @@ use hil_present::{Block, Section, Table, Tone, UNAVAILABLE};
 use hil_stats::comparison::Estimate;
 
 use super::conditions::Verdicts;
-use super::harms::{ComparedHarm, QUESTION};
+use super::harms::{HarmDifference, QUESTION};
 use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict};
-use crate::answer::UnitScale;
+use crate::answer::{Hurt, UnitScale};
 
 const COLUMNS: [&str; 7] = [
     "of",
@@ -95,12 +97,13 @@ fn list(section: &mut Section, tone: Tone, items: &[String]) {
     }
 }
 
+fn folders(runs: &[PathBuf]) -> String {
+    let names = runs.iter().map(|run| run.display().to_string());
+    names.collect::<Vec<_>>().join(", ")
+}
+
 /// The runs, and whether they may be compared.
 fn runs(comparison: &Comparison) -> Section {
-    let folders = |runs: &[std::path::PathBuf]| {
-        let names = runs.iter().map(|run| run.display().to_string());
-        names.collect::<Vec<_>>().join(", ")
-    };
     let mut section = Section::new("runs", "Runs", "");
     section.fact("base", Tone::Plain, folders(&comparison.base));
     section.fact("new", Tone::Plain, folders(&comparison.new));
@@ -121,19 +124,78 @@ fn runs(comparison: &Comparison) -> Section {
     section
 }
 
-/// What hurt the robot on both sides.
+/// What hurt the robot on both sides, by what, whether that is valid, and what it leaves open.
 fn harms(comparison: &Comparison) -> Section {
     let mut section = Section::new("harms", "", "");
-    if comparison.base.len().min(comparison.new.len()) == 1 {
-        let text = "one run on a side: how much runs differ by themselves is not known";
-        section.note(Tone::Caution, text);
+    for one in &comparison.harms {
+        section.note(Tone::Strong, &one.base.what);
+        section.fact("base", Tone::Plain, one.base.words());
+        section.fact("new", Tone::Plain, one.new.words());
+        if let Some(difference) = &one.difference {
+            section.fact("new less base", Tone::Plain, difference_words(difference));
+        }
     }
-    for ComparedHarm { base, new, .. } in &comparison.harms {
-        section.note(Tone::Strong, &base.what);
-        section.fact("base", Tone::Plain, base.words());
-        section.fact("new", Tone::Plain, new.words());
+    section.note(Tone::Strong, "cause, validity and what is left open");
+    if let Some(words) = &comparison.first_harm {
+        section.fact("first harm, new", Tone::Plain, words);
+    }
+    for one in &comparison.measurements {
+        let words = match one.runs.as_slice() {
+            _ if comparison.measurements.len() == 1 => one.words.clone(),
+            runs => format!("{}: {}", folders(runs), one.words),
+        };
+        let tone = match one.is_valid {
+            Some(false) => Tone::Bad,
+            _ => Tone::Plain,
+        };
+        section.fact("measurement", tone, words);
+    }
+    for (index, words) in left_open(comparison).into_iter().enumerate() {
+        let label = if index == 0 { "left open" } else { "" };
+        section.fact(label, Tone::Plain, words);
     }
     section
+}
+
+fn difference_words(of: &HarmDifference) -> String {
+    let Interval { low, high, .. } = of.interval;
+    let [value, low, high] = [of.value, low, high].map(|value| more_words(of, value));
+    format!("{value} [{low}, {high}]")
+}
+
+fn more_words(of: &HarmDifference, value: f64) -> String {
+    if of.is_share {
+        format!("{:+.2} pp", 100.0 * value)
+    } else {
+        format!("{:+.1} per hour", 3600.0 * value)
+    }
+}
+
+/// What the runs do not tell.
+fn left_open(comparison: &Comparison) -> Vec<String> {
+    let mut open = Vec::new();
+    if comparison.hurt == Hurt::No {
+        for one in &comparison.harms {
+            let difference = one.difference.as_ref();
+            if let Some(of) = difference.filter(|one| one.interval.high > 0.0) {
+                let most = more_words(of, of.interval.high);
+                open.push(format!("{}: up to {most} would not show", one.base.what));
+            }
+        }
+    }
+    if comparison.base.len().min(comparison.new.len()) == 1 {
+        open.push("how much runs differ by themselves: one run on a side".to_owned());
+    }
+    let differing = comparison.differences.iter();
+    let differing = differing.filter_map(|words| words.split(':').next());
+    let differing: Vec<&str> = differing.collect();
+    if !differing.is_empty() {
+        let differing = differing.join(", ");
+        open.push(format!(
+            "which of these made the difference: the runs differ in {differing}"
+        ));
+    }
+    open
 }
 
 /// Conditions that were asked for.

@@ -171,7 +171,7 @@ mod tests {
     fn whatever_a_text_holds_stays_text() {
         assert_eq!(
             escaped("<b a='1'>\"&\u{0}\u{1b}µ"),
-            "&lt;b a=&#39;1&#39;&gt;&quot;&amp;\u{fffd}\u{fffd}µ"
+            "&lt;b a=&#39;1&#39;&gt;&quot;&amp;\\x00\\x1bµ"
         );
         let mut svg = Svg::new(10.0, 20.0);
         svg.text("x", 1.0, 2.04, Anchor::Middle, "</text><script>");

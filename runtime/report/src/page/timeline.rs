@@ -8,6 +8,7 @@ use hil_core::case_study::Severity;
 use super::charts::time::{Mark, MarkClass, over_time};
 use super::drawings::name_of;
 use super::series::{Plot, PlotPanel, Series, Thinned, thinned};
+use crate::answer::UnitScale;
 use crate::link_change::LinkChange;
 use crate::network::{NetworkQuantity, NetworkReport, TimelineRow, TimelineSubject};
 use crate::score_event::{ExplainedEvent, ScoreEvents};
@@ -40,15 +41,20 @@ pub(super) fn over_run(
         let TimelineSubject::Robot { label } = &row.subject else {
             continue;
         };
+        let scale = UnitScale::of(&row.unit);
         // A number of events has no unit; an error has.
-        let (title, unit) = match row.unit.as_str() {
-            "1" => (format!("Robot: {label}"), "count"),
+        let (title, unit) = match scale.unit() {
+            "" => (format!("Robot: {label}"), "count"),
             unit => (format!("Robot: {label} ({unit})"), unit),
         };
+        let mut series = of_row(label, row);
+        for value in series.high.iter_mut().flatten() {
+            *value = scale.scaled(*value);
+        }
         panels.push(PlotPanel {
             title,
             unit: unit.to_owned(),
-            series: vec![of_row(label, row)],
+            series: vec![series],
         });
     }
     let bands = bands(report);

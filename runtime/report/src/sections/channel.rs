@@ -258,8 +258,7 @@ fn bound_words(delay: &DelayMetrics) -> (Tone, String) {
         (bound, true) => {
             let bound = unsigned_duration(bound);
             let text = format!(
-                "the clocks' alignment allows ±{bound}, wider than the median: the one-way delays say \
-                 little, take the round trip"
+                "one-way delay not resolved: the clocks' alignment allows ±{bound}, wider than the median"
             );
             (Tone::Caution, text)
         }
@@ -355,15 +354,16 @@ fn order(sources: &Sources<'_>) -> Vec<Metric> {
     let reordered = network.and_then(|one| Some(one.order.measured()?.reordered_count));
     let reordered = reordered.or_else(|| account?.reordered_count);
     let mut figures = Vec::new();
-    for (name, label, found) in [
-        ("late", "too late for the gateway", late),
-        ("duplicated", "duplicated", duplicated),
-        ("reordered", "reordered", reordered),
+    for (name, label, standard, found) in [
+        ("late", "too late for the gateway", "", late),
+        ("duplicated", "duplicated", "RFC 5560; ", duplicated),
+        ("reordered", "reordered", "RFC 4737; ", reordered),
     ] {
         let figure = Metric::maybe(name, label, "1", found.map(|found| found as f64), reason);
         let shares = found.zip(arrived).and_then(|(found, arrived)| {
             let share = (arrived > 0).then(|| percent(found as f64 / arrived as f64))?;
-            Some(format!("{share} of {} that arrived", grouped(arrived)))
+            let of = grouped(arrived);
+            Some(format!("{standard}{share} of {of} that arrived"))
         });
         figures.push(figure.by(&shares.unwrap_or_default()));
     }
@@ -375,6 +375,11 @@ fn order(sources: &Sources<'_>) -> Vec<Metric> {
         ] {
             figures.push(Metric::new(name, label, "1", places as f64).by("RFC 4737, extent"));
         }
+    }
+    if let Some(n) = by.and_then(|one| one.n_max) {
+        let label = "n-reordered, largest n";
+        figures
+            .push(Metric::new("n_reordered_max", label, "1", n as f64).by("RFC 4737, section 5"));
     }
     figures
 }
@@ -711,6 +716,24 @@ fn segment_row(name: &str, distribution: &Distribution, bound: Option<u64>) -> R
         cells,
         ..Row::default()
     }
+}
+
+/// A row for each distribution: its quantiles, or why there are none.
+pub fn quantile_table(rows: &[(&str, &Distribution)]) -> Table {
+    let mut table = Table::new("", &["", "min", "p50", "p99", "p99.9", "max"]);
+    for (name, distribution) in rows {
+        let mut cells = vec![Cell::from(*name)];
+        match distribution {
+            Distribution::Unavailable { reason } => {
+                cells.push(format!("{UNAVAILABLE}: {reason}").into());
+            }
+            Distribution::Measured(one) => cells.extend(
+                [one.min_ns, one.p50_ns, one.p99_ns, one.p999_ns, one.max_ns].map(Cell::Duration),
+            ),
+        }
+        table.push(cells);
+    }
+    table
 }
 
 /// The segments one after the other with their medians as bars, then the whole, then what a missing stamp

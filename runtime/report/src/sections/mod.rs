@@ -5,6 +5,7 @@ mod adapter;
 pub(crate) mod channel;
 mod clocks;
 pub(crate) mod events;
+mod flows;
 mod network;
 mod nics;
 mod paper;
@@ -13,6 +14,8 @@ mod run;
 mod timeline;
 
 pub(crate) use channel::Sources;
+pub use channel::quantile_table;
+pub(crate) use flows::flows;
 pub(crate) use run::{outcome_words, repeat};
 pub(crate) use timeline::strips;
 
@@ -20,6 +23,9 @@ use hil_present::{Block, Section};
 
 use crate::assessment::Assessment;
 use crate::summary::RunSummary;
+
+/// Flows of a report in full; `summary.json` has all.
+const FLOWS_SHOWN: usize = 100;
 
 /// Every section of a run that has something to say, in the order of reading.
 pub(crate) fn of_run(summary: &RunSummary, assessment: &Assessment) -> Vec<Section> {
@@ -43,6 +49,7 @@ pub(crate) fn of_run(summary: &RunSummary, assessment: &Assessment) -> Vec<Secti
         sections.push(network::network(report));
         sections.push(events::network(report));
     }
+    sections.push(flows(summary, FLOWS_SHOWN));
     sections.push(channel::channels(summary));
     sections.push(run::links(&summary.directions));
     sections.push(adapter::adapters(&summary.faces));

@@ -3,7 +3,7 @@
 //! tasks alone, whatever the number of threads.
 
 mod pool;
-mod render;
+mod sections;
 
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
@@ -15,10 +15,13 @@ use hil_core::study::{Batch, StudyReport};
 use clap::Args;
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
+use hil_present::csv;
+use hil_present::terminal::canvas::Style;
 use hil_topology::Topology;
 use hil_topology::registry::Registry;
 
 use self::pool::Pool;
+use self::sections::Extent;
 
 /// How a batch of virtual-time tasks is computed, and where its tables go.
 #[derive(Debug, Args)]
@@ -26,6 +29,9 @@ pub struct BatchArgs {
     /// Threads; all processors if left out.
     #[arg(long, short, value_name = "N")]
     pub jobs: Option<NonZeroUsize>,
+    /// Print every table with all of its columns, and every criterion.
+    #[arg(long, conflicts_with = "json")]
+    pub full: bool,
     /// Print JSON instead of tables.
     #[arg(long)]
     pub json: bool,
@@ -35,6 +41,17 @@ pub struct BatchArgs {
     /// Print no progress, only the tables.
     #[arg(long, short)]
     pub quiet: bool,
+}
+
+/// How the command was called, to be shown with other values, and where it is shown.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Invocation {
+    /// Without what follows `--set`.
+    pub words: Vec<String>,
+    /// `KEY=VALUE` each.
+    pub overrides: Vec<String>,
+    /// Columns of the page.
+    pub columns: usize,
 }
 
 /// What a study cost this machine.
@@ -139,6 +156,7 @@ pub fn batch_of(
 pub fn run(
     batch: &dyn Batch,
     args: &BatchArgs,
+    invocation: &Invocation,
     signals: &Signals,
     console: &mut Console,
 ) -> Result<CommandEnd, StudyError> {
@@ -150,14 +168,17 @@ pub fn run(
     let pool = Pool::new(batch, jobs);
     let (outcomes, cost) = pool.run(signals, console);
     let report = batch.report(&outcomes);
-    let text = if args.json {
-        render::json(&report, &cost)
+    let text = |extent, style| sections::text(&report, &cost, invocation, extent, style);
+    console.result(&if args.json {
+        sections::json(&report, &cost)
+    } else if args.full {
+        text(Extent::Full, Style::Coloured)
     } else {
-        render::text(&report, &cost)
-    };
-    console.result(&text);
+        text(Extent::Brief, Style::Coloured)
+    });
     if let Some(folder) = &args.output {
-        write_files(folder, &report, &cost)?;
+        let text = text(Extent::Full, Style::Plain);
+        write_files(folder, &report, &cost, text)?;
         console.say(&format!("wrote the tables to {}", folder.display()));
     }
     if let Some(signal) = signals.received() {
@@ -174,7 +195,12 @@ pub fn run(
     })
 }
 
-fn write_files(folder: &Path, report: &StudyReport, cost: &Cost) -> Result<(), StudyError> {
+fn write_files(
+    folder: &Path,
+    report: &StudyReport,
+    cost: &Cost,
+    text: String,
+) -> Result<(), StudyError> {
     let at = |path: &Path| {
         let path = path.to_owned();
         move |source| StudyError::Output { path, source }
@@ -185,10 +211,11 @@ fn write_files(folder: &Path, report: &StudyReport, cost: &Cost) -> Result<(), S
         fs::write(&path, text).map_err(at(&path))
     };
     for table in &report.tables {
-        write(format!("{}.csv", table.name), render::csv(table))?;
+        let rows = csv::table(&sections::table(table));
+        write(format!("{}.csv", table.name), rows)?;
     }
-    write("report.json".to_owned(), render::json(report, cost))?;
-    write("report.txt".to_owned(), render::text(report, cost))
+    write("report.json".to_owned(), sections::json(report, cost))?;
+    write("report.txt".to_owned(), text)
 }
 
 #[cfg(test)]

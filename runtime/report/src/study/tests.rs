@@ -74,10 +74,7 @@ impl Study for Curve {
         StudyReport {
             tables: vec![Table {
                 name: "curve".to_owned(),
-                columns: vec![Column {
-                    name: "outages_per_h",
-                    label: "Outages per hour",
-                }],
+                columns: vec![Column::new("outages_per_h", "Outages per hour")],
                 rows: outcomes.iter().map(|one| cell(one.copied())).collect(),
                 ..Table::default()
             }],
@@ -111,12 +108,19 @@ fn a_calibration_is_computed_and_written_like_tables() {
     let folder = std::env::temp_dir().join(format!("hil-calibration-{}", std::process::id()));
     let args = BatchArgs {
         jobs: NonZeroUsize::new(2),
+        full: false,
         json: true,
         output: Some(folder.clone()),
         quiet: true,
     };
     let signals = Signals::install().unwrap();
-    let end = run(batch.as_ref(), &args, &signals, &mut Console::new(true)).unwrap();
+    let invocation = Invocation {
+        words: vec!["hil-runtime".to_owned()],
+        overrides: Vec::new(),
+        columns: 100,
+    };
+    let mut console = Console::new(true);
+    let end = run(batch.as_ref(), &args, &invocation, &signals, &mut console).unwrap();
     assert_eq!(end, CommandEnd::Done);
     let curve = fs::read_to_string(folder.join("curve.csv")).unwrap();
     assert_eq!(curve, "outages_per_h\r\n0\r\n1\r\n2\r\n3\r\n");

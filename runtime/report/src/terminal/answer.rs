@@ -1,6 +1,6 @@
 //! The answer of a run as the last lines of a report, where a reader looks first. It draws no conclusions.
 
-use crate::answer::{Answer, Hurt, metric_words};
+use crate::answer::{Answer, COUNTED_AS_HARM, Hurt, metric_words};
 use crate::assessment::Assessment;
 use crate::sections::events::first_harm;
 use crate::summary::RunSummary;
@@ -36,6 +36,10 @@ pub(super) fn answer(canvas: &mut Canvas, summary: &RunSummary, assessment: &Ass
     for harm in &summary.harms {
         canvas.field_of(LABEL_WIDTH, &harm.what, Tone::Plain, &harm.words());
     }
+    if !summary.harms.is_empty() {
+        let label = "counted as harm";
+        canvas.field_of(LABEL_WIDTH, label, Tone::Plain, COUNTED_AS_HARM);
+    }
     for name in &summary.headline {
         let metric = summary.score.iter().find(|one| one.name == *name);
         if let Some(metric) = metric.filter(|one| one.value.is_some()) {
@@ -47,5 +51,4 @@ pub(super) fn answer(canvas: &mut Canvas, summary: &RunSummary, assessment: &Ass
     canvas.field_of(LABEL_WIDTH, "measurement", tone, &words);
     let sample = format!("{}; brackets are 95 % intervals", answer.sample_words());
     canvas.field_of(LABEL_WIDTH, "sample", Tone::Plain, &sample);
-    canvas.rule(Tone::Faint);
 }

@@ -19,13 +19,14 @@ use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
 use crate::sections::events::{cause, gravest_first, severity_counts, severity_tone};
-use crate::sections::{outcome_words, strips};
+use crate::sections::{flows, outcome_words, strips};
 use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
 
 /// Events of the robot and channels on the page.
 const CAUSES_SHOWN: usize = 3;
 const CHANNELS_SHOWN: usize = 6;
+const FLOWS_SHOWN: usize = 6;
 /// Lines of a page, and of these what warnings take beside their text.
 const LINES_MAX: usize = 50;
 const WARNINGS_FRAME: usize = 3;
@@ -49,6 +50,7 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
     for one in [
         causes(summary, width),
         channels(summary),
+        flows(summary, FLOWS_SHOWN),
         over_time(summary),
     ] {
         section(&mut canvas, &one);

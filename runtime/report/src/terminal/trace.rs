@@ -73,7 +73,7 @@ pub(crate) fn render_trace(
     field(
         "order",
         &format!(
-            "{} came after a later one, {} came twice",
+            "{} reordered (RFC 4737), {} duplicated (RFC 5560)",
             grouped(counts.reordered_count),
             grouped(counts.duplicated_count)
         ),

@@ -18,7 +18,8 @@ use bytemuck::{CheckedBitPattern, Pod};
 use hil_account::nic_clock::NicClockRecord;
 use hil_core::message::Envelope;
 use hil_core::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
+    EgressRecord, FollowUpRecord, FrameRecord, IngressRecord, PublishedRecord, RoundTripRecord,
+    TakenRecord,
 };
 use hil_core::run_log::RunLog;
 use hil_link::condition::LinkConditionRecord;
@@ -60,6 +61,8 @@ pub enum RecordKind {
     /// [`LinkConditionRecord`]s of a gateway that emulates a link; the channel is that of the orders,
     /// `hil/link/<link>/<direction>`.
     LinkCondition = 16,
+    /// [`FrameRecord`]s of an inlet.
+    Frame = 17,
 }
 
 impl RecordKind {
@@ -78,6 +81,7 @@ impl RecordKind {
             Self::NicClock => "card-clock",
             Self::Radio => "radio",
             Self::LinkCondition => "link-condition",
+            Self::Frame => "frame",
         }
     }
 
@@ -95,6 +99,7 @@ impl RecordKind {
             Self::NicClock => Some(size_of::<NicClockRecord>()),
             Self::Radio => Some(size_of::<RadioRecord>()),
             Self::LinkCondition => Some(size_of::<LinkConditionRecord>()),
+            Self::Frame => Some(size_of::<FrameRecord>()),
             Self::Message => None,
         }
     }

@@ -5,7 +5,7 @@ use std::thread;
 use std::time::Duration;
 
 use hil_core::endpoint::{InputPort, OutputPort};
-use hil_core::message::{Envelope, MessageType};
+use hil_core::message::{ETHERNET_FRAME, Envelope, MessageType};
 use hil_core::time::Instant;
 use hil_shuttle::ShuttleStatus;
 
@@ -13,7 +13,7 @@ use super::super::{
     ChannelError, ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, RawOutput,
     ShmInput, ShmOutput, TypedInput, TypedOutput, Waiter, Wake,
 };
-use super::{POSE, Pose, assert_nothing_left, launch, pose};
+use super::{POSE, Pose, assert_nothing_left, launch, pose, root_path};
 use hil_platform::clock::MonotonicClock;
 
 fn output(domain: &Domain, epoch: u32) -> ShmOutput {
@@ -278,7 +278,7 @@ fn the_stamp_is_read_at_publication() {
 
 #[test]
 fn a_second_writer_beyond_the_limit_is_refused_in_words() {
-    let domain = Domain::create(&super::root_path("writers")).unwrap();
+    let domain = Domain::create(&root_path("writers")).unwrap();
     let holder = ChannelHolder::create(&domain, &ChannelSettings::of("arm/pose", &POSE)).unwrap();
     let first = output(&domain, 1);
     let member = Domain::open(domain.address())
@@ -429,6 +429,33 @@ fn a_writer_whose_memory_cannot_be_mapped_is_counted() {
     send(&mut output, 0..1);
     assert!(drain(&mut input).is_empty());
     assert!(input.counters().connection_failure_count > 0);
+    drop((input, output, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_frame_is_read_as_long_as_it_was_written() {
+    let domain = Domain::create(&root_path("frames")).unwrap();
+    let settings = ChannelSettings {
+        depth_max: 8,
+        ..ChannelSettings::of("a/b", &ETHERNET_FRAME)
+    };
+    let holder = ChannelHolder::create(&domain, &settings).unwrap();
+    let mut input = ShmInput::open(&domain, "a/b", &ETHERNET_FRAME, 8).unwrap();
+    let mut output =
+        ShmOutput::open(&domain, "a/b", &ETHERNET_FRAME, OutputSettings::default()).unwrap();
+    for length in [1522, 14, 1522, 1000] {
+        output.publish(Instant::ZERO, &vec![7; length]).unwrap();
+        let read = input.take(|_, frame| (frame.len(), frame.iter().all(|byte| *byte == 7)));
+        assert_eq!(read.unwrap(), Some((length, true)));
+    }
+    for length in [0, 1523] {
+        let refused = output.publish(Instant::ZERO, &vec![7; length]);
+        assert!(
+            matches!(refused, Err(ChannelError::WrongSize { .. })),
+            "{length}"
+        );
+    }
     drop((input, output, holder));
     assert_nothing_left(domain);
 }

@@ -62,7 +62,8 @@ fn bytes_of_any_size_and_alignment_arrive_whole_and_aligned() {
                 forwarded_ns: i64::MIN,
                 epoch: u32::MAX,
                 flags: Envelope::FORWARDED,
-                reserved: [1, 2, 3, u64::MAX],
+                length_bytes: 0,
+                reserved: [1, 2, u64::MAX],
             };
             output.publish(&sent, &payload).unwrap();
             let mut take = |envelope: &Envelope, bytes: &[u8]| {

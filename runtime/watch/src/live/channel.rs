@@ -1,6 +1,5 @@
 //! `hil-runtime channel`: which question is asked of which run, and the list of its channels.
 
-use core::fmt::Write as _;
 use std::time::Duration;
 
 use serde::Serialize;
@@ -12,6 +11,8 @@ use super::top::via;
 use super::{delay, echo, hz};
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
+use hil_present::terminal::canvas::{Canvas, Style};
+use hil_present::{Cell, Table, terminal};
 use hil_rundir::layout::PathFault;
 use hil_rundir::manifest::ChannelDescription;
 use hil_shm::Census;
@@ -225,42 +226,38 @@ fn ends(observer: &mut Observer, channel: &ChannelDescription) -> Vec<HostEnds> 
 }
 
 fn table(rows: &[Row]) -> String {
-    let columns = |of: &dyn Fn(&Row) -> usize, least: usize| {
-        rows.iter().map(of).max().unwrap_or(0).max(least)
-    };
-    let name = columns(&|row| row.name.chars().count(), "channel".len());
-    let message = columns(&|row| row.message.chars().count(), "message".len());
-    let way = columns(&|row| way(row).chars().count(), "way".len());
-    let via = columns(&|row| row.via.chars().count(), "via".len());
-    let mut text = format!(
-        "{:name$}  {:message$}  {:>8}  {:way$}  {:via$}  {:>9}  writers/readers\n",
-        "channel", "message", "size", "way", "via", "rate"
-    );
+    let columns = [
+        "channel",
+        "message",
+        "bytes",
+        "way",
+        "via",
+        "rate, Hz",
+        "writers/readers",
+    ];
+    let mut table = Table::new("", &columns);
     for row in rows {
-        let rate = row
-            .rate_hz
-            .map_or_else(|| "-".to_owned(), |rate| format!("{rate:.1} Hz"));
-        let counts = row.ends.iter();
-        let counts: Vec<String> = counts
-            .map(|end| format!("{}/{} on {}", end.writer_count, end.reader_count, end.host))
-            .collect();
-        let counts = if counts.is_empty() {
-            "-".to_owned()
-        } else {
-            counts.join(", ")
-        };
-        writeln!(
-            text,
-            "{:name$}  {:message$}  {:>6} B  {:way$}  {:via$}  {rate:>9}  {counts}",
-            row.name,
-            row.message,
-            row.size_bytes,
-            self::way(row),
-            row.via,
-        )
-        .expect("writing to a string cannot fail");
+        let ends = row.ends.iter();
+        let ends =
+            ends.map(|end| format!("{}/{} on {}", end.writer_count, end.reader_count, end.host));
+        let ends = ends.collect::<Vec<_>>().join(", ");
+        table.push([
+            row.name.as_str().into(),
+            row.message.as_str().into(),
+            Cell::Count(row.size_bytes as u64),
+            way(row).into(),
+            row.via.as_str().into(),
+            Cell::number(row.rate_hz, 1),
+            if ends.is_empty() {
+                Cell::Missing
+            } else {
+                ends.into()
+            },
+        ]);
     }
-    text
+    let mut canvas = Canvas::new(0, Style::Plain).with_whole_tables();
+    terminal::table(&mut canvas, &table);
+    canvas.finish()
 }
 
 fn way(row: &Row) -> String {
@@ -298,9 +295,9 @@ mod tests {
         let rows = [row("x/command", Some("b")), row("truth", None)];
         assert_eq!(
             table(&rows),
-            "channel    message       size  way         via       rate  writers/readers\n\
-             x/command  hil.X.v1      16 B  a → b       hop   250.0 Hz  1/2 on b\n\
-             truth      hil.X.v1      16 B  a → record  hop          -  -\n"
+            "  channel    message   bytes  way         via  rate, Hz  writers/readers\n  \
+             x/command  hil.X.v1     16  a → b       hop     250.0  1/2 on b\n  \
+             truth      hil.X.v1     16  a → record  hop         –  –\n"
         );
     }
 }

@@ -1,13 +1,12 @@
 //! `channel delay`: the latency account of a channel, window by window, as far as the records of
 //! this host go.
 
-use core::fmt::Write as _;
 use std::time::Duration;
 
-use hil_account::{ChannelAccount, Closing, MessageFate};
+use hil_account::{ChannelAccount, Closing, MessageFate, SegmentMetrics};
 use hil_clock::ClockMap;
 use hil_core::time::duration_ns;
-use hil_stats::histogram::{Distribution, LatencySummary};
+use hil_stats::histogram::Distribution;
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -18,12 +17,17 @@ use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
-use hil_present::units::{JOINT, duration, unsigned_duration};
+use hil_present::terminal::canvas::Style;
+use hil_present::terminal::render;
+use hil_present::units::{duration, unsigned_duration};
+use hil_present::{Section, Tone};
+use hil_report::quantile_table;
 
 /// The totals reach back no further: they are of messages that are kept in memory.
 const TOTAL_MAX: Duration = Duration::from_mins(10);
 
-const NEVER_FAILS: &str = "writing to a string cannot fail";
+/// Width of an answer.
+const COLUMNS: usize = 100;
 
 pub(super) fn run(
     mut observer: Observer,
@@ -200,69 +204,57 @@ fn quantiles(distribution: &Distribution) -> Value {
 }
 
 fn text(head: &str, account: &ChannelAccount, clock: &Clock) -> String {
-    let mut text = format!("{head}: {}", counted(account.published_count, "message"));
-    for (fate, count) in account.fates.iter() {
+    let mut section = Section::new("delay", head, counted(account.published_count, "message"));
+    let fates = account.fates.iter().filter_map(|(fate, count)| {
         let words = match fate {
-            MessageFate::Taken => continue,
+            MessageFate::Taken => return None,
             // The account speaks of runs that are over.
             MessageFate::InFlight => "still under way",
             fate => fate.label(),
         };
-        write!(text, ", {} {words}", grouped(count)).expect(NEVER_FAILS);
-    }
-    let mut add = |row: String| {
-        write!(text, "\n  {row}").expect(NEVER_FAILS);
-    };
-    add(format!(
-        "{:42} {:>9} {:>9} {:>9} {:>9}",
-        "segment", "p50", "p99", "p99.9", "max"
-    ));
-    for segment in &account.segments {
-        add(row(&segment.name(), &segment.distribution));
+        Some(format!("{} {words}", grouped(count)))
+    });
+    let fates: Vec<String> = fates.collect();
+    if !fates.is_empty() {
+        section.fact("not taken", Tone::Plain, fates.join(", "));
     }
     let end_to_end = &account.end_to_end;
-    add(row(
+    section.fact(
+        "clock",
+        Tone::Plain,
+        match (clock.relation, end_to_end.alignment_bound_ns) {
+            (ClockRelation::OneClock, _) => "both ends read one clock".to_owned(),
+            (_, Some(bound_ns)) => {
+                let bound = unsigned_duration(bound_ns);
+                let count = clock.exchange_count.unwrap_or(0);
+                format!("within ±{bound}, by the {count} exchanges so far")
+            }
+            _ => "not aligned".to_owned(),
+        },
+    );
+    section.fact(
+        "closing",
+        Tone::Plain,
+        match &account.closing {
+            Closing::Checked(closing) => format!(
+                "{} of {} messages add up",
+                grouped(closing.closed_count),
+                grouped(closing.checked_count)
+            ),
+            Closing::Unavailable { reason } => format!("unavailable ({reason})"),
+        },
+    );
+    let names: Vec<String> = account.segments.iter().map(SegmentMetrics::name).collect();
+    let segments = names.iter().zip(&account.segments);
+    let mut rows: Vec<_> = segments
+        .map(|(name, one)| (name.as_str(), &one.distribution))
+        .collect();
+    rows.push((
         "published → taken by consumer, whole",
         &end_to_end.distribution,
     ));
-    let relation = match (clock.relation, end_to_end.alignment_bound_ns) {
-        (ClockRelation::OneClock, _) => "clock: both ends read one clock".to_owned(),
-        (_, Some(bound_ns)) => {
-            let (bound, count) = (
-                unsigned_duration(bound_ns),
-                clock.exchange_count.unwrap_or(0),
-            );
-            format!("clock: within ±{bound}, by the {count} exchanges so far")
-        }
-        _ => "clock: not aligned".to_owned(),
-    };
-    add(relation);
-    add(match &account.closing {
-        Closing::Checked(closing) => format!(
-            "closing: {} of {} messages add up",
-            grouped(closing.closed_count),
-            grouped(closing.checked_count)
-        ),
-        Closing::Unavailable { reason } => format!("closing: unavailable ({reason})"),
-    });
-    text.push('\n');
-    text.replace(JOINT, " ")
-}
-
-fn row(name: &str, distribution: &Distribution) -> String {
-    match distribution {
-        Distribution::Measured(LatencySummary {
-            p50_ns,
-            p99_ns,
-            p999_ns,
-            max_ns,
-            ..
-        }) => {
-            let [p50, p99, p999, max] = [p50_ns, p99_ns, p999_ns, max_ns].map(|ns| duration(*ns));
-            format!("{name:42} {p50:>9} {p99:>9} {p999:>9} {max:>9}")
-        }
-        Distribution::Unavailable { reason } => format!("{name:42} unavailable: {reason}"),
-    }
+    section.table(quantile_table(&rows));
+    render(&[section], COLUMNS, Style::Plain)
 }
 
 #[cfg(test)]
@@ -316,15 +308,18 @@ mod tests {
             &ONE_CLOCK,
             false,
         );
-        assert_eq!(
-            text.unwrap(),
-            "x, the last 1.00 s: 10 messages, 1 superseded at the consumer\n  \
-             segment                                          p50       p99     p99.9       max\n  \
-             published → taken by consumer                20.0 µs   20.0 µs   20.0 µs   20.0 µs\n  \
-             published → taken by consumer, whole         20.0 µs   20.0 µs   20.0 µs   20.0 µs\n  \
-             clock: both ends read one clock\n  \
-             closing: 9 of 9 messages add up\n"
-        );
+        let text = text.unwrap().replace('\u{a0}', " ");
+        for words in [
+            "x, the last 1.00 s  10 messages",
+            "not taken     1 superseded at the consumer",
+            "clock         both ends read one clock",
+            "closing       9 of 9 messages add up",
+            "p50      p99    p99.9      max",
+            "published → taken by consumer         20.0 µs  20.0 µs  20.0 µs  20.0 µs  20.0 µs",
+            "published → taken by consumer, whole  20.0 µs  20.0 µs  20.0 µs  20.0 µs  20.0 µs",
+        ] {
+            assert!(text.contains(words), "{words}: {text}");
+        }
     }
 
     #[test]

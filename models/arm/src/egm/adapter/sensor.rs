@@ -74,6 +74,8 @@ struct Session {
     start_tm: u32,
     newest_seqno: u32,
     newest_tm: u32,
+    /// Which of the newest number and those before it have come, the newest in the lowest bit.
+    seen: u128,
     has_run: bool,
 }
 
@@ -81,6 +83,22 @@ impl Session {
     fn cycle_index(&self) -> u64 {
         let since_first = self.newest_seqno.saturating_sub(self.first_seqno);
         self.first_cycle_index + u64::from(since_first)
+    }
+
+    /// What became of a message behind the newest: of an earlier session, late, or come before.
+    fn late(&mut self, seqno: u32) -> Refusal {
+        let behind = self.newest_seqno.checked_sub(seqno);
+        let bit = behind
+            .and_then(|behind| 1_u128.checked_shl(behind))
+            .unwrap_or(0);
+        if self.seen & bit != 0 {
+            return Refusal::Repeated { seqno };
+        }
+        self.seen |= bit;
+        Refusal::Overtaken {
+            seqno,
+            newest: self.newest_seqno,
+        }
     }
 
     /// Whether a datagram of this number and clock is of a later session.
@@ -192,15 +210,16 @@ impl SensorAdapter {
         let known = self.session;
         let is_new = known.is_none_or(|session| session.is_over(seqno, tm));
         let mut session = match known {
-            Some(session) if !is_new => {
+            Some(mut session) if !is_new => {
                 let behind_ms = session.newest_tm.wrapping_sub(tm).cast_signed();
                 let is_older = (1..=REORDERING_MAX_MS).contains(&behind_ms);
                 if is_older || seqno <= session.newest_seqno {
-                    return Err(Refusal::Overtaken {
-                        seqno,
-                        newest: session.newest_seqno,
-                    });
+                    let refusal = session.late(seqno);
+                    self.session = Some(session);
+                    return Err(refusal);
                 }
+                let ahead = seqno - session.newest_seqno;
+                session.seen = session.seen.checked_shl(ahead).unwrap_or(0) | 1;
                 session
             }
             _ => self.open(seqno, tm),
@@ -226,6 +245,7 @@ impl SensorAdapter {
             start_tm: tm,
             newest_seqno: seqno,
             newest_tm: tm,
+            seen: 1,
             has_run: false,
         }
     }

@@ -99,7 +99,9 @@ fn a_new_session_is_told_from_a_lost_and_from_a_late_datagram() {
     assert_eq!(see(1, 1004), Ok((1, 1)));
     assert_eq!(see(4, 1016), Ok((1, 4)), "two were lost");
     assert_eq!(see(3, 1012), overtaken(3, 4));
-    assert_eq!(see(4, 1016), overtaken(4, 4));
+    assert_eq!(see(4, 1016), Err(Refusal::Repeated { seqno: 4 }));
+    assert_eq!(see(3, 1012), Err(Refusal::Repeated { seqno: 3 }));
+    assert_eq!(see(2, 1008), overtaken(2, 4));
     assert_eq!(see(0, 1020), Ok((2, 5)), "the robot starts anew");
     assert_eq!(see(5, 1019), overtaken(5, 0));
     assert_eq!(see(3, 1032), Ok((2, 8)));
@@ -111,7 +113,8 @@ fn a_new_session_is_told_from_a_lost_and_from_a_late_datagram() {
     );
     assert_eq!(see(1, u32::MAX - 40), overtaken(1, 0));
     assert_eq!(adapter.received().refused(Cause::Overtaken), 4);
-    assert_eq!(adapter.received().total(), 11);
+    assert_eq!(adapter.received().refused(Cause::Repeated), 2);
+    assert_eq!(adapter.received().total(), 13);
 }
 
 #[test]

@@ -30,7 +30,7 @@ pub struct CommandCounters {
     /// [`CommandRefusal::NoSession`].
     pub refused_no_session: u64,
     /// Passed over for a newer one ([`QueuePolicy::Latest`]).
-    pub overtaken: u64,
+    pub superseded: u64,
     /// Found no room.
     pub dropped: u64,
     /// Emptied from the queue when a session began.
@@ -226,7 +226,7 @@ impl Inbox {
             QueuePolicy::Fifo1 => self.queue.discard_front(),
             QueuePolicy::Latest => {
                 self.queue.clear();
-                self.counters.overtaken += waiting as u64 - 1;
+                self.counters.superseded += waiting as u64 - 1;
             }
         }
         self.counters.taken += 1;

@@ -77,7 +77,13 @@ pub enum Refusal {
     /// A command before the robot has sent anything.
     #[error("the robot has not opened a session yet")]
     NoSession,
-    /// A message older than one already taken: the network reordered or repeated it.
+    /// A message that came before: the network duplicated it (RFC 5560).
+    #[error("message {seqno} came before")]
+    Repeated {
+        /// Its number.
+        seqno: u32,
+    },
+    /// A message older than one already taken: the network reordered it (RFC 4737).
     #[error("message {seqno} came after {newest}")]
     Overtaken {
         /// Its number.
@@ -144,7 +150,8 @@ causes! {
     OutsideLimits: "outside joint limits",
     TooFast: "too fast",
     NoSession: "no session",
-    Overtaken: "overtaken",
+    Overtaken: "reordered",
+    Repeated: "duplicated",
 }
 
 impl Refusal {

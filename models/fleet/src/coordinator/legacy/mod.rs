@@ -233,9 +233,8 @@ impl LegacyRules {
                     },
                     sequence: commanded.sequence,
                     authority_index: authority,
-                    lease_ns: 0,
                     echo_header_id: state.header.header_id,
-                    flags: 0,
+                    ..Authority::default()
                 }));
             }
         }

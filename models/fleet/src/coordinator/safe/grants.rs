@@ -34,10 +34,6 @@ const SPARED: Duration = Duration::from_secs(30);
 impl SafeRules {
     /// Extends authorities in the policy's order.
     pub(crate) fn grant_all(&mut self, cycle: &mut Cycle<'_>) {
-        if self.lease.is_frozen(cycle.now) {
-            self.counts.cycles_frozen += 1;
-            return;
-        }
         let may_reorder = !self.is_anyone_starving(cycle.now);
         self.admit_all(cycle.now, may_reorder);
         let mut order = core::mem::take(&mut self.order);
@@ -257,7 +253,6 @@ impl SafeRules {
         if view.ledger.send(end).is_some() {
             view.spared_until = cycle.now + SPARED;
             view.waiting_since = view.waited_since.or(view.waiting_since);
-            view.retracted = cycle.now;
         }
     }
 

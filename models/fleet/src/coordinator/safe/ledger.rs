@@ -13,8 +13,7 @@
 //! late; loss only leaves the bound where it was. Of two states the one with the larger `q` gives
 //! the lower bound, because its `a` is one of the values over which the other takes its maximum.
 //! So keeping the state with the largest `q` loses nothing, and no stale, repeated or reordered
-//! state can lower the bound wrongly. For equal `q` the authority held can only have gone down
-//! (at the end of a lease), so the smaller one is kept.
+//! state can lower the bound wrongly. States of equal `q` show the same authority.
 
 use crate::messages::{NO_AUTHORITY, Phase, State, TO_GOAL};
 
@@ -50,9 +49,8 @@ pub struct Ledger {
     open_count: usize,
     newest: Entry,
     newest_header_id: u32,
-    /// Largest index sent; after a lease ran out, what it can still reach and what was sent since.
+    /// Largest index sent.
     ceiling: usize,
-    has_expired: bool,
     is_done: bool,
 }
 
@@ -75,7 +73,6 @@ impl Ledger {
             newest: Entry::default(),
             newest_header_id: 0,
             ceiling: 0,
-            has_expired: false,
             is_done: false,
         }
     }
@@ -155,12 +152,6 @@ impl Ledger {
             return StateEffect::Impossible;
         }
         self.newest_header_id = self.newest_header_id.max(state.header.header_id);
-        // An authority whose lease ran out still stands in the robot's states.
-        let held = if self.has_expired {
-            held.min(self.ceiling)
-        } else {
-            held
-        };
         let was = (self.lower, self.acknowledged, self.is_done);
         let shown = Entry {
             sequence: state.applied_sequence,
@@ -170,8 +161,6 @@ impl Ledger {
         let exceeds = is_first_answer && held > self.ceiling;
         if is_first_answer {
             self.acknowledge(shown);
-        } else if shown.sequence == self.acknowledged.sequence {
-            self.acknowledged.index = self.acknowledged.index.min(held);
         }
         self.lower = self.lower.max(passed);
         self.is_done |= state.phase == Phase::Done as u8 && passed == self.last_index;
@@ -185,23 +174,6 @@ impl Ledger {
             StateEffect::Nothing
         } else {
             StateEffect::News
-        }
-    }
-
-    /// Lowers the bound without acknowledgement; only a lease that ran out allows it.
-    pub(crate) fn expire_to(&mut self, index: usize) {
-        self.has_expired = true;
-        self.ceiling = index;
-        self.acknowledged.index = self.acknowledged.index.min(index);
-        for entry in &mut self.open[..self.open_count] {
-            entry.index = entry.index.min(index);
-        }
-        // Equal indices: the newest stands for all, as any of them may still be applied.
-        while self.open_count > 1
-            && self.open[self.open_count - 2].index <= self.open[self.open_count - 1].index
-        {
-            self.open[self.open_count - 2] = self.open[self.open_count - 1];
-            self.open_count -= 1;
         }
     }
 

@@ -7,7 +7,6 @@
 //! - `liveness`: why every mission ends.
 //! - `grants`: who gets how much in a control cycle.
 //! - `RoundTrip`, `CycleTime`: how much a robot needs so as not to brake for want of a message.
-//! - `LeaseWatch`: authorities that end by themselves, where delays have a measured bound.
 //!
 //! **Safety.** Let `G` be the ledger's bound of a robot and `l` the furthest pose it is known to
 //! have passed. The robot never passes its authority by more than the stop margin `m`, so it is
@@ -37,7 +36,6 @@ use crate::messages::{Authority, Header, State, TO_GOAL, ToRobot};
 use crate::path::PathId;
 use crate::section::Span;
 use crate::world::{Vehicle, World};
-use hil_core::case_study::ParameterError;
 use hil_core::time::Instant;
 
 /// The rules of the safe mode.
@@ -55,7 +53,6 @@ pub(crate) struct SafeRules {
     traffic: Traffic,
     plan: Plan,
     robots: Vec<SafeRobot>,
-    lease: LeaseWatch,
     counts: SafeCounts,
     order: Vec<grants::Candidate>,
     /// Per robot its place in `order`.
@@ -89,10 +86,6 @@ struct SafeRobot {
     stopped_by: Option<usize>,
     /// Authority was taken back from it; not again before.
     spared_until: Instant,
-    /// When authority was last taken back.
-    retracted: Instant,
-    /// When the state that shows it furthest arrived.
-    heard: Instant,
 }
 
 impl SafeRules {
@@ -117,8 +110,6 @@ impl SafeRules {
             held_up_count: 0,
             stopped_by: None,
             spared_until: Instant::ZERO,
-            retracted: Instant::ZERO,
-            heard: Instant::ZERO,
         };
         let traffic = Traffic::new(world, starts);
         Self {
@@ -134,7 +125,6 @@ impl SafeRules {
             traffic,
             plan: Plan::new(margin, starts.len()),
             robots: vec![robot; starts.len()],
-            lease: LeaseWatch::new(&parameters.safe, parameters.clock_is_shared),
             counts: SafeCounts::default(),
             order: Vec::with_capacity(starts.len()),
             places: vec![None; starts.len()],
@@ -174,17 +164,6 @@ impl SafeRules {
 
     fn send_all(&mut self, cycle: &mut Cycle<'_>) {
         for robot in 0..self.robots.len() {
-            let renews = self.lease.renews(&self.robots[robot].ledger);
-            if renews {
-                let ledger = &mut self.robots[robot].ledger;
-                // What was refused is not asked again; robots renew only what they apply.
-                let index = if ledger.is_acknowledged() {
-                    ledger.bound()
-                } else {
-                    ledger.newest().1
-                };
-                ledger.send(index);
-            }
             let view = &mut self.robots[robot];
             let (sequence, index) = view.ledger.newest();
             if sequence == 0 || view.ledger.is_acknowledged() || view.ledger.is_done() {
@@ -204,9 +183,9 @@ impl SafeRules {
                 },
                 sequence,
                 authority_index: if is_goal { TO_GOAL } else { to },
-                lease_ns: self.lease.lease_ns(),
                 echo_header_id: view.ledger.newest_header_id(),
                 flags: Authority::ACKNOWLEDGED,
+                ..Authority::default()
             }));
         }
     }
@@ -247,17 +226,10 @@ impl Rules for SafeRules {
         if robot >= self.robots.len() || header.fleet_id != self.fleet_id || !state.is_sound() {
             return;
         }
-        self.lease.on_state(now, state, &mut self.counts);
         let view = &mut self.robots[robot];
         let was_lower = view.ledger.lower();
-        let tells_place = state.path_index >= i32::try_from(was_lower).unwrap_or(i32::MAX)
-            && header.mission_id == view.ledger.mission_id();
         let is_newest = header.header_id >= view.ledger.newest_header_id();
         let effect = view.ledger.on_state(state);
-        // An impossible state raises no lower end, so it must not make the robot look nearer.
-        if tells_place && effect != StateEffect::Impossible {
-            view.heard = now;
-        }
         match effect {
             StateEffect::Nothing => return,
             StateEffect::Impossible => {
@@ -290,7 +262,6 @@ impl Rules for SafeRules {
     fn decide(&mut self, cycle: &mut Cycle<'_>) {
         self.cycles.begin(cycle.now);
         self.follow_roster(cycle);
-        self.expire_leases(cycle.now);
         self.grant_all(cycle);
         self.send_all(cycle);
         self.count_stuck(cycle.now);
@@ -309,118 +280,6 @@ impl Rules for SafeRules {
     fn resets_stuck_robots(&self) -> bool {
         false
     }
-}
-
-/// The lease and what watches its assumption.
-///
-/// Authorities that end by themselves: with a measured bound on delays, way can be taken back
-/// from a robot that does not answer. Off unless a lease is set; without one nothing here acts.
-///
-/// Let the retraction be first sent at `t`, the lease be `L`, the bound `D`. What was sent before
-/// arrives by `t + D` and ends by `t + D + L`; from then the robot brakes. A state received at `r`
-/// was sampled at `r - D` or later, so the robot's way is at most
-/// `s + v max(0, t + D + L - (r - D)) + v^2 / 2a`, where `s` is the way in that state and `v`, `a`
-/// its largest speed and deceleration. Beyond that, and beyond what the retraction leaves, it
-/// will not come; so after `t + D + L + v/a` that is the bound on its authority.
-///
-/// The bound is an assumption about the network. Where both ends share a clock each state's age
-/// checks it; one above the bound freezes all grants for as long as a lease may run on it. Only
-/// states are watched: a command that takes longer than the bound while states do not is not seen,
-/// and the lease is then no safer than the assumption. Without a lease nothing rests on it.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct LeaseWatch {
-    lease_ns: i64,
-    delay_max_ns: i64,
-    clock_is_shared: bool,
-    frozen_until: Instant,
-}
-
-impl LeaseWatch {
-    pub(crate) fn new(parameters: &SafeParameters, clock_is_shared: bool) -> Self {
-        Self {
-            lease_ns: nanoseconds(parameters.lease_ms),
-            delay_max_ns: nanoseconds(parameters.delay_bound_ms),
-            clock_is_shared,
-            frozen_until: Instant::ZERO,
-        }
-    }
-
-    /// 0 without lease.
-    pub(crate) fn lease_ns(&self) -> i64 {
-        self.lease_ns
-    }
-
-    /// True when the robot's authority has to be sent anew so that it does not end.
-    pub(crate) fn renews(&self, ledger: &Ledger) -> bool {
-        self.lease_ns > 0 && ledger.newest().0 > 0 && !ledger.is_done()
-    }
-
-    /// Checks the age of a state against the bound.
-    pub(crate) fn on_state(&mut self, now: Instant, state: &State, counts: &mut SafeCounts) {
-        if self.lease_ns == 0 || !self.clock_is_shared {
-            return;
-        }
-        if now.as_ns().saturating_sub(state.sampled_ns) > self.delay_max_ns {
-            counts.delay_bound_violations += 1;
-            let pause_ns = self.lease_ns.saturating_add(self.delay_max_ns);
-            self.frozen_until = Instant::from_ns(now.as_ns().saturating_add(pause_ns));
-        }
-    }
-
-    pub(crate) fn is_frozen(&self, now: Instant) -> bool {
-        now < self.frozen_until
-    }
-}
-
-impl SafeRules {
-    /// Lowers the bounds of robots whose retracted authority has ended by itself.
-    pub(crate) fn expire_leases(&mut self, now: Instant) {
-        if self.lease.lease_ns == 0 || self.lease.is_frozen(now) {
-            return;
-        }
-        let vehicle = self.world.vehicle;
-        let braking_s = vehicle.speed_max_mps / vehicle.acceleration_mps2;
-        for robot in 0..self.robots.len() {
-            let view = &self.robots[robot];
-            let Some(path) = self
-                .traffic
-                .path(robot)
-                .filter(|_| view.ledger.is_shrinking())
-            else {
-                continue;
-            };
-            let ended_ns = view
-                .retracted
-                .as_ns()
-                .saturating_add(self.lease.delay_max_ns)
-                .saturating_add(self.lease.lease_ns);
-            let since_ended_s = now.seconds_since(Instant::from_ns(ended_ns));
-            if since_ended_s < braking_s {
-                continue;
-            }
-            let sampled_ns = view.heard.as_ns().saturating_sub(self.lease.delay_max_ns);
-            let driving_s = Instant::from_ns(ended_ns)
-                .seconds_since(Instant::from_ns(sampled_ns))
-                .max(0.0);
-            let spacing_m = self.world.path(path).spacing_m();
-            let way_m = spacing_m * (view.ledger.lower() + 1) as f64
-                + vehicle.speed_max_mps * driving_s
-                + 0.5 * vehicle.speed_max_mps * braking_s;
-            let furthest = floor_index((way_m / spacing_m).ceil());
-            let (_, asked) = view.ledger.newest();
-            let bound = furthest.max(asked);
-            if bound < view.ledger.bound() {
-                self.robots[robot].ledger.expire_to(bound);
-                self.counts.leases_expired += 1;
-                self.update_span(robot);
-            }
-        }
-    }
-}
-
-fn nanoseconds(milliseconds: f64) -> i64 {
-    let duration = Duration::from_secs_f64(milliseconds * 1e-3);
-    hil_core::time::duration_ns(duration)
 }
 
 /// Time from sending an authority to the first state that shows it, as seen by the sender alone,
@@ -522,26 +381,10 @@ hil_core::parameters! {
         patience_s: f64 = 60.0, in 1.0..=100_000.0;
         /// Take authority back, by acknowledged shrinks, where the policy prefers another robot.
         takes_back: bool = true;
-        /// How long an authority holds after its receipt, ms; 0 for ever. Needs
-        /// `delay_bound_ms`.
-        lease_ms: f64 = 0.0, in 0.0..=3_600_000.0;
-        /// Measured largest delay of a message either way, its error included, ms. Only
-        /// with a lease; with a shared clock it is watched.
-        delay_bound_ms: f64 = 0.0, in 0.0..=3_600_000.0;
-    } check check_lease;
+    }
 }
 
 impl SafeParameters {
-    fn check_lease(&self) -> Result<(), ParameterError> {
-        if self.lease_ms > 0.0 && self.delay_bound_ms <= 0.0 {
-            return Err(ParameterError::new(
-                "coordinator.safe.delay_bound_ms",
-                "0 is no bound; a lease needs the largest delay, in ms",
-            ));
-        }
-        Ok(())
-    }
-
     /// See [`SafeParameters::patience_s`].
     pub fn patience(&self) -> Duration {
         Duration::from_secs_f64(self.patience_s)

@@ -44,6 +44,8 @@ fn loss(base: &[u64], new: &[u64], of: Counts) -> ComparedMetric {
 fn judged(condition: &str, figure: &ComparedMetric) -> Result<bool, String> {
     let comparison = Comparison {
         harms: Vec::new(),
+        measurements: Vec::new(),
+        first_harm: None,
         hurt: Hurt::No,
         headline: Vec::new(),
         base: Vec::new(),

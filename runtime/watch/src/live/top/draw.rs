@@ -1,14 +1,16 @@
-//! A [`View`] drawn on a page of characters. It asks nobody: equal views give equal pages.
+//! A [`View`] as sections, and these on a page of characters. It asks nobody: equal views give equal pages.
 
-use core::fmt::Write as _;
-
+use ansi_to_tui::IntoText;
 use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
-use ratatui::style::{Color, Modifier, Style};
+use ratatui::style::{Modifier, Style as Look};
+use ratatui::text::Line;
 
-use super::view::{ChannelRow, ProcessRow, Quantiles, View};
+use super::view::{ChannelRow, ProcessRow, Quantiles, SegmentRow, View};
 use hil_platform::text::shortened;
-use hil_present::units::{JOINT, duration, percent, unsigned_duration};
+use hil_present::terminal::canvas::{Canvas, Style, bar, left};
+use hil_present::terminal::section;
+use hil_present::{Cell, Row, Section, Table, Tone, UNAVAILABLE};
 
 /// Longest bar of the run's progress, columns.
 const BAR_COLUMNS: usize = 30;
@@ -16,16 +18,6 @@ const BAR_COLUMNS: usize = 30;
 pub(crate) const HISTORY_COLUMNS: usize = 16;
 /// Rows that say which run it is and how far it is.
 const HEAD_ROWS: usize = 2;
-/// Narrowest page with the sparkline beside each channel.
-const SPARKLINE_FROM: usize = 90;
-/// Longest names of processes, channels and segments, columns.
-const NAME_COLUMNS: usize = 28;
-
-const TITLE: Style = Style::new().add_modifier(Modifier::BOLD);
-const QUIET: Style = Style::new().fg(Color::DarkGray);
-const BAD: Style = Style::new().fg(Color::Red);
-const CHOSEN: Style = Style::new().add_modifier(Modifier::REVERSED);
-const NORMAL: Style = Style::new();
 
 /// What the person at the terminal wants to see.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -47,32 +39,11 @@ pub(crate) struct Frame {
     pub(crate) shows_help: bool,
 }
 
-/// One row of the page.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Line {
-    text: String,
-    style: Style,
-}
-
-fn line(text: impl AsRef<str>, style: Style) -> Line {
-    // No line breaks here, so a blank that forbids it is a blank.
-    let text = text.as_ref().replace(JOINT, " ");
-    Line { text, style }
-}
-
 /// The page as plain text, at most `columns` wide.
 pub(crate) fn plain(view: &View, columns: usize) -> String {
-    let frame = Frame {
-        detail: Detail::All,
-        is_paused: false,
-        shows_help: false,
-    };
-    let mut text = String::new();
-    for line in body(view, frame, columns) {
-        let row = shortened(&line.text, columns);
-        writeln!(text, "{}", row.trim_end()).expect("writing to a string cannot fail");
-    }
-    text
+    let page = page(&sections(view, Detail::All), columns, Style::Plain);
+    let rows = page.lines().map(|row| shortened(row, columns) + "\n");
+    rows.collect()
 }
 
 /// The page in `area` of a terminal; the last row tells of the keys. What does not fit is left out,
@@ -83,30 +54,36 @@ pub(crate) fn draw(view: &View, frame: Frame, area: Rect, buffer: &mut Buffer) {
     let Some(body_rows) = rows.checked_sub(1) else {
         return;
     };
-    let mut lines = if frame.shows_help {
+    let sections = if frame.shows_help {
         help()
     } else {
-        body(view, frame, columns)
+        sections(view, frame.detail)
     };
+    let text = page(&sections, columns, Style::Coloured);
+    let text = text.into_text();
+    let mut lines = text.expect("the sequences are our own").lines;
     if lines.len() > body_rows {
         cut(&mut lines, body_rows);
     }
-    lines.truncate(body_rows);
-    for (line, y) in lines.iter().zip(area.y..) {
-        buffer.set_stringn(area.x, y, &line.text, columns, line.style);
+    for (line, y) in lines.iter().take(body_rows).zip(area.y..) {
+        buffer.set_line(area.x, y, line, area.width);
     }
     let pause = if frame.is_paused { "PAUSED  " } else { "" };
     let keys = format!("{pause}q end  ↑↓ channel  space pause  ? help");
     let last = area.y + area.height - 1;
-    buffer.set_stringn(area.x, last, keys, columns, QUIET);
+    let look = Look::new().add_modifier(Modifier::DIM);
+    buffer.set_stringn(area.x, last, keys, columns, look);
 }
 
 /// Leaves `rows` of `lines`: the head, the chosen channel and what is around it.
-fn cut(lines: &mut Vec<Line>, rows: usize) {
+fn cut(lines: &mut Vec<Line<'_>>, rows: usize) {
     let kept_count = rows.saturating_sub(1);
     let hidden_count = lines.len() - kept_count.min(lines.len());
-    let chosen = lines.iter().position(|line| line.style == CHOSEN);
-    if let Some(chosen) = chosen
+    let is_chosen = |line: &Line<'_>| {
+        let mut spans = line.spans.iter();
+        spans.any(|span| span.style.add_modifier.contains(Modifier::REVERSED))
+    };
+    if let Some(chosen) = lines.iter().position(is_chosen)
         && chosen >= kept_count
     {
         let passed_count = chosen + 1 - kept_count;
@@ -116,53 +93,67 @@ fn cut(lines: &mut Vec<Line>, rows: usize) {
     }
     lines.truncate(kept_count);
     let text = format!("… {hidden_count} more rows; a higher window shows them");
-    lines.push(line(text, QUIET));
+    lines.push(Line::raw(text));
 }
 
-fn help() -> Vec<Line> {
-    let text = "\
-KEYS
-  q, Esc, Ctrl-C   end; the run goes on
-  ↑ ↓, k j         choose the channel whose segments are shown
-  space            hold the figures, and let them go again
-  ?                this page, and back
-
-FIGURES
-  rate, lost and delays are of the last window only, of what this host recorded.
-  \"-\" stands for what this host cannot know; the run's report may, with the other
-  host's records. Overruns are ticks of a role's timer that passed without it.
-  The little bars are the 99th percentiles of the delay in the windows before.";
-    let rows = text.lines().map(|row| {
-        let is_title = !row.starts_with(' ') && !row.is_empty();
-        line(row, if is_title { TITLE } else { NORMAL })
-    });
-    rows.collect()
-}
-
-fn body(view: &View, frame: Frame, columns: usize) -> Vec<Line> {
-    let mut lines = head(view);
-    processes(view, &mut lines);
-    elsewhere(view, &mut lines);
-    channels(view, frame, columns, &mut lines);
-    links(view, &mut lines);
-    clocks(view, &mut lines);
-    for problem in &view.problems {
-        lines.push(line(format!("! {problem}"), BAD));
+/// Sections with an empty row between them.
+fn page(sections: &[Section], columns: usize, style: Style) -> String {
+    let mut canvas = Canvas::new(columns, style);
+    let sections = sections.iter().filter(|one| !one.is_empty());
+    for (index, one) in sections.enumerate() {
+        if index > 0 && one.title.is_empty() {
+            canvas.blank();
+        }
+        section(&mut canvas, one);
     }
-    lines
+    let text = canvas.finish();
+    text.trim_start_matches('\n').to_owned()
 }
 
-fn head(view: &View) -> Vec<Line> {
+fn help() -> Vec<Section> {
+    let mut keys = Section::new("keys", "Keys", "");
+    for (key, what) in [
+        ("q, Esc, Ctrl-C", "end; the run goes on"),
+        ("↑ ↓, k j", "choose the channel whose segments are shown"),
+        ("space", "hold the figures, and let them go again"),
+        ("?", "this page, and back"),
+    ] {
+        keys.fact(key, Tone::Plain, what);
+    }
+    let mut figures = Section::new("figures", "Figures", "");
+    for text in [
+        "Rate, lost and delays are of the last window only, of what this host recorded.",
+        "\"–\" stands for what this host cannot know; the run's report may, with the other host's \
+         records. Overruns are ticks of a role's timer that passed without it.",
+        "The little bars are the 99th percentiles of the delay in the windows before.",
+    ] {
+        figures.note(Tone::Plain, text);
+    }
+    vec![keys, figures]
+}
+
+/// The run, what its links do, its channels, its processes and hosts, and its clocks.
+fn sections(view: &View, detail: Detail) -> Vec<Section> {
+    let mut problems = Section::new("problems", "", "");
+    for problem in &view.problems {
+        problems.note(Tone::Bad, format!("! {problem}"));
+    }
+    vec![
+        head(view),
+        links(view),
+        channels(view, detail),
+        processes(view),
+        elsewhere(view),
+        clocks(view),
+        problems,
+    ]
+}
+
+fn head(view: &View) -> Section {
     let run = &view.run;
-    let mut lines = vec![line(
-        format!(
-            "{}  {}  on {}",
-            run.name,
-            run.state,
-            run.hosts_here.join(", ")
-        ),
-        TITLE,
-    )];
+    let hosts = run.hosts_here.join(", ");
+    let title = format!("{}  {}  on {hosts}", run.name, run.state);
+    let mut section = Section::new("run", title, "");
     let time = |seconds: f64| format!("{seconds:.1} s");
     let seen = if run.elapsed_s.is_some() {
         "; the figures are the last ones from while it ran"
@@ -172,66 +163,151 @@ fn head(view: &View) -> Vec<Line> {
     let text = match (run.elapsed_s, run.duration_s, view.progress_ratio()) {
         _ if view.is_over() => format!("over{seen}"),
         (Some(elapsed_s), Some(duration_s), Some(ratio)) => {
-            let left = time((duration_s - elapsed_s).max(0.0));
+            let bar = left(&bar(0.0, ratio, BAR_COLUMNS), BAR_COLUMNS);
+            let rest = time((duration_s - elapsed_s).max(0.0));
             let (whole, of) = (time(elapsed_s), time(duration_s));
-            format!("{} {whole} of {of}, {left} left", bar(ratio))
+            // A blank that a line may break at would end the bar.
+            let bar = bar.replace(' ', "·");
+            format!("{bar} {whole} of {of}, {rest} left")
         }
         (Some(elapsed_s), ..) => format!("{} so far", time(elapsed_s)),
         _ => "not begun".to_owned(),
     };
-    lines.push(line(text, NORMAL));
-    lines
+    section.note(Tone::Plain, text);
+    section
 }
 
-#[allow(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "a ratio of 0 to 1 of a few columns"
-)]
-fn bar(ratio: f64) -> String {
-    let full = (ratio * BAR_COLUMNS as f64).floor() as usize;
-    let rest = BAR_COLUMNS - full.min(BAR_COLUMNS);
-    format!(
-        "[{}{}]",
-        "█".repeat(full.min(BAR_COLUMNS)),
-        "·".repeat(rest)
-    )
-}
-
-fn title(text: String, lines: &mut Vec<Line>) {
-    lines.push(line(String::new(), NORMAL));
-    lines.push(line(text, TITLE));
-}
-
-fn processes(view: &View, lines: &mut Vec<Line>) {
-    let name_columns = width(view.processes.iter().map(|one| one.name.as_str()), 9);
-    title(
-        format!(
-            "{:name_columns$} {:>7} {:>6} {:>8} {:>9} {:>8} {:>8}  state",
-            "PROCESSES", "pid", "cpu", "on cpus", "sched", "overruns", "restarts"
-        ),
-        lines,
-    );
-    for one in &view.processes {
-        let cpu = one.cpu_ratio.map(|ratio| format!("{:.1}%", 100.0 * ratio));
-        let text = format!(
-            "{:name_columns$} {:>7} {:>6} {:>8} {:>9} {:>8} {:>8}  {}",
-            shortened(&one.name, name_columns),
-            known(one.pid.map(|pid| pid.to_string())),
-            known(cpu),
-            known(one.cpus.clone()),
-            known(one.scheduling.clone()),
-            known(one.overrun_count.map(|count| count.to_string())),
-            one.restart_count,
-            state_of(one),
-        );
-        let style = if one.state.is_alive() { NORMAL } else { BAD };
-        lines.push(line(text, style));
+/// A section of one table; nothing without rows.
+fn tabled(id: &str, table: Table) -> Section {
+    let mut section = Section::new(id, "", "");
+    if !table.rows.is_empty() {
+        section.table(table);
     }
+    section
+}
+
+fn links(view: &View) -> Section {
+    let mut table = Table::new("", &["LINKS", "via", "state", "loss", "condition"]);
+    for one in &view.links {
+        table.push([
+            one.name.as_str().into(),
+            one.via.as_str().into(),
+            one.state.label().into(),
+            Cell::share(one.loss_ratio),
+            one.condition.as_deref().map_or(Cell::Missing, Cell::from),
+        ]);
+    }
+    tabled("links", table)
+}
+
+fn channels(view: &View, detail: Detail) -> Section {
+    let columns = [
+        "CHANNELS",
+        "rate, Hz",
+        "lost",
+        "p50",
+        "p99",
+        "± clocks",
+        "via",
+        "p99 before",
+    ];
+    let mut table = Table::new("", &columns).ranked("p99 before", 1);
+    for (index, one) in view.channels.iter().enumerate() {
+        let is_chosen = detail == Detail::Chosen(index);
+        let tone = match one.lost_count {
+            _ if is_chosen => Tone::Chosen,
+            Some(1..) => Tone::Bad,
+            _ => Tone::Plain,
+        };
+        let [p50, p99] = quantiles(one.delay);
+        let bound_ns = one.bound_ns.map(|ns| i64::try_from(ns).unwrap_or(i64::MAX));
+        let history = one.history_ns.iter();
+        let history = history.map(|ns| ns.map(|ns| ns as f64)).collect();
+        let cells = vec![
+            one.name.as_str().into(),
+            Cell::number(one.rate_hz, 1),
+            Cell::count(one.lost_count),
+            p50,
+            p99,
+            Cell::duration(bound_ns),
+            one.via.as_str().into(),
+            Cell::Spark(history),
+        ];
+        let bar = None;
+        table.rows.push(Row { cells, tone, bar });
+        if is_chosen || detail == Detail::All {
+            table.rows.extend(segments(one));
+        }
+    }
+    tabled("channels", table)
+}
+
+/// The parts of a channel's way below it, or why there is no delay.
+fn segments(channel: &ChannelRow) -> impl Iterator<Item = Row> {
+    let why = channel.why_no_delay.iter().map(|why| {
+        let text = format!("delay {UNAVAILABLE}: {why}");
+        vec![Cell::from(""), text.into()]
+    });
+    let segment = |one: &SegmentRow| {
+        let [p50, p99] = quantiles(one.time);
+        let name = format!("  {}", one.name).into();
+        let nothing = || Cell::from("");
+        let rest = [nothing(), nothing(), nothing()];
+        let mut cells = vec![name, nothing(), nothing(), p50, p99];
+        cells.extend(rest);
+        cells
+    };
+    let rows = why.chain(channel.segments.iter().map(segment));
+    rows.map(|cells| Row {
+        cells,
+        tone: Tone::Faint,
+        bar: None,
+    })
+}
+
+fn processes(view: &View) -> Section {
+    let columns = [
+        "PROCESSES",
+        "pid",
+        "cpu",
+        "on cpus",
+        "sched",
+        "overruns",
+        "restarts",
+        "state",
+    ];
+    let mut table = Table::new("", &columns);
+    for one in &view.processes {
+        let text = |text: Option<String>| text.map_or(Cell::Missing, Cell::Text);
+        let cells = vec![
+            one.name.as_str().into(),
+            text(one.pid.map(|pid| pid.to_string())),
+            Cell::share(one.cpu_ratio),
+            text(one.cpus.clone()),
+            text(one.scheduling.clone()),
+            Cell::count(one.overrun_count),
+            Cell::Count(u64::from(one.restart_count)),
+            state_of(one).into(),
+        ];
+        let tone = if one.state.is_alive() {
+            Tone::Plain
+        } else {
+            Tone::Bad
+        };
+        let bar = None;
+        table.rows.push(Row { cells, tone, bar });
+    }
+    tabled("processes", table)
+}
+
+fn state_of(process: &ProcessRow) -> String {
+    let label = process.kind.label(process.role.as_deref());
+    format!("{} ({label} on {})", process.state, process.host)
 }
 
 /// Whether other hosts keep up: what passed without their processes is no delay of the network.
-fn elsewhere(view: &View, lines: &mut Vec<Line>) {
+fn elsewhere(view: &View) -> Section {
+    let mut section = Section::new("elsewhere", "", "");
     for one in &view.elsewhere {
         let mut each: Vec<String> = one
             .overruns
@@ -242,180 +318,46 @@ fn elsewhere(view: &View, lines: &mut Vec<Line>) {
             each.push(format!("{} more", one.hearing.left_out_count));
         }
         let each = each.join(", ");
-        let host = &one.hearing.host;
-        let (text, style) = match (one.hearing.is_heard, each.as_str()) {
-            (true, "") => (format!("{host}: no overruns"), NORMAL),
-            (true, each) => (format!("{host}: overruns {each}"), BAD),
+        let (tone, text) = match (one.hearing.is_heard, each.as_str()) {
+            (true, "") => (Tone::Plain, "no overruns".to_owned()),
+            (true, each) => (Tone::Bad, format!("overruns {each}")),
             (false, each) => {
                 let silence = one.hearing.silent_s.map_or_else(
                     || "not heard yet".to_owned(),
                     |silent_s| format!("not heard for {silent_s:.0} s"),
                 );
                 let last = if each.is_empty() { "" } else { "; last told: " };
-                let text = format!("{host}: overruns unavailable, {silence}{last}{each}");
-                (text, BAD)
+                let text = format!("overruns {UNAVAILABLE}, {silence}{last}{each}");
+                (Tone::Bad, text)
             }
         };
-        lines.push(line(text, style));
+        section.fact(&one.hearing.host, tone, text);
     }
+    section
 }
 
-fn state_of(process: &ProcessRow) -> String {
-    let label = process.kind.label(process.role.as_deref());
-    format!("{} ({label} on {})", process.state, process.host)
-}
-
-fn channels(view: &View, frame: Frame, columns: usize, lines: &mut Vec<Line>) {
-    let names = view.channels.iter().map(|one| one.name.as_str());
-    let name_columns = width(names, 8);
-    let has_sparkline = columns >= SPARKLINE_FROM;
-    let spark = if has_sparkline { "  p99 before" } else { "" };
-    title(
-        format!(
-            "{:name_columns$} {:>9} {:>7} {:>9} {:>9} {:>9}  {:14}{spark}",
-            "CHANNELS", "rate", "lost", "p50", "p99", "bound", "via"
-        ),
-        lines,
-    );
-    for (index, one) in view.channels.iter().enumerate() {
-        let [p50, p99] = quantiles(one.delay);
-        let spark = if has_sparkline {
-            format!("  {}", sparkline(&one.history_ns))
-        } else {
-            String::new()
-        };
-        let text = format!(
-            "{:name_columns$} {:>9} {:>7} {p50:>9} {p99:>9} {:>9}  {:14}{spark}",
-            shortened(&one.name, name_columns),
-            known(one.rate_hz.map(rate)),
-            known(one.lost_count.map(|count| count.to_string())),
-            known(one.bound_ns.map(bound)),
-            shortened(&one.via, 14),
-        );
-        let is_chosen = frame.detail == Detail::Chosen(index);
-        let has_losses = one.lost_count.is_some_and(|count| count > 0);
-        let style = if has_losses { BAD } else { NORMAL };
-        lines.push(line(text, if is_chosen { CHOSEN } else { style }));
-        if is_chosen || frame.detail == Detail::All {
-            segments(one, lines);
-        }
-    }
-}
-
-fn segments(channel: &ChannelRow, lines: &mut Vec<Line>) {
-    if let Some(why) = &channel.why_no_delay {
-        lines.push(line(format!("    delay unavailable: {why}"), QUIET));
-    }
-    for segment in &channel.segments {
-        let [p50, p99] = quantiles(segment.time);
-        let text = format!("    {:40} {p50:>9} {p99:>9}", segment.name);
-        lines.push(line(text, QUIET));
-    }
-}
-
-fn links(view: &View, lines: &mut Vec<Line>) {
-    if view.links.is_empty() {
-        return;
-    }
-    let name_columns = width(view.links.iter().map(|one| one.name.as_str()), 8);
-    title(
-        format!(
-            "{:name_columns$} {:13} {:8} {:>8}  condition",
-            "LINKS", "via", "state", "loss"
-        ),
-        lines,
-    );
-    for one in &view.links {
-        let text = format!(
-            "{:name_columns$} {:13} {:8} {:>8}  {}",
-            shortened(&one.name, name_columns),
-            one.via,
-            one.state.label(),
-            known(one.loss_ratio.map(percent)),
-            one.condition.as_deref().unwrap_or("-"),
-        );
-        lines.push(line(text, NORMAL));
-    }
-}
-
-fn clocks(view: &View, lines: &mut Vec<Line>) {
-    if view.clocks.is_empty() {
-        return;
-    }
-    let pair = |from: &str, to: &str| format!("{from} → {to}");
-    let pairs: Vec<String> = view
-        .clocks
-        .iter()
-        .map(|one| pair(&one.from, &one.to))
-        .collect();
-    let name_columns = width(pairs.iter().map(String::as_str), 8);
-    title(
-        format!(
-            "{:name_columns$} {:>12} {:>9}  rung",
-            "CLOCKS", "offset", "bound"
-        ),
-        lines,
-    );
-    for (one, pair) in view.clocks.iter().zip(pairs) {
+fn clocks(view: &View) -> Section {
+    let mut table = Table::new("", &["CLOCKS", "offset", "±", "rung"]);
+    for one in &view.clocks {
         let count = one
             .exchange_count
             .map_or_else(String::new, |count| format!(", {count} in half a minute"));
-        let text = format!(
-            "{:name_columns$} {:>12} {:>9}  {}{count}",
-            shortened(&pair, name_columns),
-            known(one.offset_ns.map(duration)),
-            known(one.bound_ns.map(bound)),
-            one.rung,
-        );
-        lines.push(line(text, NORMAL));
+        let bound_ns = one.bound_ns.map(|ns| i64::try_from(ns).unwrap_or(i64::MAX));
+        table.push([
+            format!("{} → {}", one.from, one.to).into(),
+            Cell::duration(one.offset_ns),
+            Cell::duration(bound_ns),
+            format!("{}{count}", one.rung).into(),
+        ]);
     }
+    tabled("clocks", table)
 }
 
-/// Columns of the longest name, within bounds.
-fn width<'a>(names: impl Iterator<Item = &'a str>, least: usize) -> usize {
-    let longest = names.map(|name| name.chars().count()).max();
-    longest.unwrap_or(0).clamp(least, NAME_COLUMNS)
-}
-
-fn known(value: Option<String>) -> String {
-    value.unwrap_or_else(|| "-".to_owned())
-}
-
-fn quantiles(time: Option<Quantiles>) -> [String; 2] {
-    [
-        known(time.map(|time| duration(time.p50_ns))),
-        known(time.map(|time| duration(time.p99_ns))),
-    ]
-}
-
-fn rate(rate_hz: f64) -> String {
-    format!("{rate_hz:.1} Hz")
-}
-
-fn bound(bound_ns: u64) -> String {
-    let text = unsigned_duration(bound_ns);
-    if bound_ns == 0 {
-        text
-    } else {
-        format!("±{text}")
-    }
-}
-
-/// A column per window, as high as its figure against the highest one shown; a blank where there
-/// was none.
-fn sparkline(history_ns: &[Option<i64>]) -> String {
-    const STEPS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
-    let shown = &history_ns[history_ns.len().saturating_sub(HISTORY_COLUMNS)..];
-    let highest = shown.iter().flatten().copied().max().unwrap_or(0).max(1);
-    let column = |value: &Option<i64>| {
-        let Some(value) = value else {
-            return ' ';
-        };
-        let value = i128::from((*value).clamp(0, highest));
-        let step = value * 8 / i128::from(highest);
-        STEPS[usize::try_from(step).unwrap_or(0).min(7)]
-    };
-    shown.iter().map(column).collect()
+fn quantiles(time: Option<Quantiles>) -> [Cell; 2] {
+    let each = time.map(|time| [time.p50_ns, time.p99_ns]);
+    each.map_or([Cell::Missing, Cell::Missing], |both| {
+        both.map(Cell::Duration)
+    })
 }
 
 #[cfg(test)]

@@ -76,7 +76,7 @@ fn taking_the_newest_forgets_a_stall_at_once() {
     let highest = highest.map(|(_, age)| *age).fold(0.0, f64::max);
     assert!(highest <= 2.0 * CYCLE_S, "{highest}");
     let counters = rig.controller.command_counters();
-    assert!((245..=250).contains(&counters.overtaken), "{counters:?}");
+    assert!((245..=250).contains(&counters.superseded), "{counters:?}");
 }
 
 #[test]
@@ -151,7 +151,7 @@ fn the_queue_is_bounded_and_every_command_is_accounted_for() {
         }
         let counters = rig.controller.command_counters();
         let settled = counters.taken
-            + counters.overtaken
+            + counters.superseded
             + counters.dropped
             + counters.cleared
             + u64::from(rig.feedback().queue_count);

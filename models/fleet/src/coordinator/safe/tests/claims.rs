@@ -121,69 +121,6 @@ fn a_coarse_tracker_keeps_within_the_margin_of_its_stop_error() {
 }
 
 #[test]
-fn leases_that_run_out_unanswered_give_way_free_and_stay_safe() {
-    let mut expired_count = 0;
-    for seed in 0..6_u64 {
-        let scene = random_scene(6, &mut RandomStream::new(seed, "world"));
-        let setup = RigSetup {
-            coordinator: CoordinatorParameters {
-                safe: SafeParameters {
-                    lease_ms: 3000.0,
-                    delay_bound_ms: 1000.0,
-                    ..SafeParameters::default()
-                },
-                ..safe_parameters()
-            },
-            missions_per_robot: 4,
-            ..setup(Chaos {
-                loss_ratio: 0.6,
-                delay_max_s: 1.0,
-                ..Chaos::default()
-            })
-        };
-        let mut rig = Rig::new(&scene, &setup, seed);
-        let wanted = u64::from(setup.missions_per_robot) * scene.starts.len() as u64;
-        rig.run(seconds(20_000), |rig| {
-            rig.coordinator.counters().counts.missions_done == wanted
-        });
-        let (counters, tally) = (rig.coordinator.counters(), rig.referee.tally());
-        let context = format!("seed {seed}: {:?} {tally:?}", counters.safe);
-        assert_eq!(counters.counts.missions_done, wanted, "{context}");
-        assert_eq!(
-            tally.overlaps_count + tally.section_collisions_count,
-            0,
-            "{context}"
-        );
-        assert_eq!(counters.safe.delay_bound_violations, 0, "{context}");
-        expired_count += counters.safe.leases_expired;
-    }
-    assert!(expired_count > 0);
-}
-
-#[test]
-fn a_delay_above_the_bound_of_the_lease_freezes_grants() {
-    let scene = random_scene(3, &mut RandomStream::new(1, "world"));
-    let setup = RigSetup {
-        coordinator: CoordinatorParameters {
-            safe: SafeParameters {
-                lease_ms: 3000.0,
-                delay_bound_ms: 500.0,
-                ..SafeParameters::default()
-            },
-            ..safe_parameters()
-        },
-        ..setup(Chaos {
-            delay_max_s: 1.0,
-            ..Chaos::default()
-        })
-    };
-    let mut rig = Rig::new(&scene, &setup, 1);
-    rig.run(seconds(200), |_| false);
-    let safe = &rig.coordinator.counters().safe;
-    assert!(safe.delay_bound_violations > 100 && safe.cycles_frozen > 150);
-}
-
-#[test]
 fn equal_seeds_give_equal_runs() {
     let run = || {
         let scene = random_scene(5, &mut RandomStream::new(3, "world"));

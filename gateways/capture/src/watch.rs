@@ -1,0 +1,341 @@
+//! What a tap could have seen: when it was watched, on which clock, and which frames it could not read
+//! or did not keep. Only what it would have seen and did not see is lost.
+//!
+//! A tap's stamps are taken in the order of the file. Where they jump back, or on by more than a day, a
+//! new *level* begins. A level of one or two stamps is a fault of single stamps: it is no time of
+//! watching. Between longer levels the clock was set, or parts of the file are out of order; two points
+//! together tell which (see [`super::join`]).
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+
+use serde::{Deserialize, Serialize};
+
+use super::observe::Observation;
+use super::{CaptureInterface, Span};
+
+/// Farthest that a stamp may lie behind the one before it without being of another level: packets that
+/// several queues of a card brought.
+const DISORDER_MAX_NS: i64 = 100_000_000;
+/// Longest silence of a tap.
+const SILENCE_MAX_NS: i64 = 86_400_000_000_000;
+/// Stamps that are no level of their own.
+const ISOLATED_MAX: u64 = 2;
+/// Levels whose clock another point's is compared with.
+const ANCHOR_COUNT_MAX: usize = 4;
+/// How far the stated times of watching may leave out a packet.
+const STATED_SLACK_NS: i64 = 1_000_000_000;
+
+/// What captures on one clock: an interface of a file, or the ET2000 behind it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Tap {
+    /// Which file.
+    pub file_index: usize,
+    /// Which interface of it.
+    pub interface_index: usize,
+    /// On the clock of an ET2000.
+    pub is_esl: bool,
+}
+
+/// Why it is unknown which datagrams a frame holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "why")]
+pub enum Unread {
+    /// A link layer that is not read.
+    LinkType {
+        /// Its number.
+        link_type: u16,
+    },
+    /// Captured too short (snap length).
+    CutShort,
+    /// Lengths or versions that cannot be.
+    Malformed,
+    /// Sealed by 802.11, `MACsec` or PPP.
+    Encrypted,
+    /// Several datagrams in one frame: a super-frame of segmentation or receive offload, or an A-MSDU.
+    Aggregate,
+    /// Without a time stamp.
+    NoStamp,
+}
+
+/// A clock that was set while it stamped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClockStep {
+    /// The last stamp before.
+    pub before_ns: i64,
+    /// From it to the next, which came later.
+    pub by_ns: i64,
+}
+
+/// Stamps that go on from one another.
+#[derive(Debug, Clone, Copy)]
+struct Level {
+    first_ns: i64,
+    last_ns: i64,
+    min_ns: i64,
+    max_ns: i64,
+    /// Last and largest stamp before the newest.
+    before_ns: Option<(i64, i64)>,
+    count: u64,
+    /// The level before it.
+    previous: Option<usize>,
+    /// What takes its stamps to a clock that was not set; `None` for isolated ones.
+    shift_ns: Option<i64>,
+}
+
+/// See the module documentation.
+#[derive(Debug, Clone, Default)]
+pub struct Watch {
+    levels: Vec<Level>,
+    current: usize,
+    /// Single stamps ahead of all around them, by level, and the one before each.
+    ahead: BTreeMap<(usize, i64), i64>,
+    /// When it was watched, by its stamps.
+    pub spans: Vec<Span>,
+    /// The same as if its clock had not been set.
+    pub steady_spans: Vec<Span>,
+    /// Where its clock was set, if its file is in order.
+    pub steps: Vec<ClockStep>,
+    /// What takes the clock that was not set to each level's own, the longest level first.
+    pub(super) anchors_ns: Vec<i64>,
+    /// Frames that may hold any datagram.
+    pub unread: BTreeMap<Unread, u64>,
+    /// Datagrams of a flow and two sockets that are captured too short to be known again.
+    cut: BTreeMap<(usize, SocketAddr, SocketAddr), u64>,
+    /// Frames that it did not keep, as its file says.
+    pub dropped_count: u64,
+    /// The file says when it was watched.
+    is_stated: bool,
+}
+
+impl Watch {
+    pub(super) fn miss(&mut self, why: Unread) {
+        *self.unread.entry(why).or_default() += 1;
+    }
+
+    pub(super) fn miss_of(&mut self, flow_index: usize, source: SocketAddr, to: SocketAddr) {
+        *self.cut.entry((flow_index, source, to)).or_default() += 1;
+    }
+
+    /// Frames that may be of a flow between two sockets, and why they cannot be told.
+    pub fn unread_of(
+        &self,
+        flow_index: usize,
+        source: SocketAddr,
+        destination: SocketAddr,
+    ) -> BTreeMap<Unread, u64> {
+        let mut unread = self.unread.clone();
+        if let Some(count) = self.cut.get(&(flow_index, source, destination)) {
+            *unread.entry(Unread::CutShort).or_default() += count;
+        }
+        unread
+    }
+
+    /// Takes the stamp of the next packet; true when it lies before the one before.
+    pub(super) fn stamp(&mut self, at_ns: i64) -> bool {
+        let fits = |level: &Level| {
+            let on_ns = at_ns.saturating_sub(level.last_ns);
+            (-DISORDER_MAX_NS..=SILENCE_MAX_NS).contains(&on_ns)
+        };
+        let is_nearer =
+            |a: &Level, b: &Level| at_ns.abs_diff(a.last_ns) < at_ns.abs_diff(b.last_ns);
+        let is_backward = self
+            .levels
+            .get(self.current)
+            .is_some_and(|level| at_ns < level.last_ns);
+        self.pass_over_one_ahead(at_ns);
+        let current = self.levels.get(self.current);
+        let next = current.and_then(|level| {
+            let previous = level.previous.filter(|_| level.count <= ISOLATED_MAX);
+            let returns = previous.filter(|index| {
+                let before = &self.levels[*index];
+                fits(before) && (!fits(level) || is_nearer(before, level))
+            });
+            returns.or_else(|| fits(level).then_some(self.current))
+        });
+        if let Some(index) = next {
+            self.current = index;
+            let level = &mut self.levels[index];
+            level.before_ns = Some((level.last_ns, level.max_ns));
+            level.last_ns = at_ns;
+            level.min_ns = level.min_ns.min(at_ns);
+            level.max_ns = level.max_ns.max(at_ns);
+            level.count += 1;
+        } else {
+            let previous = current.map(|_| self.current);
+            self.current = self.levels.len();
+            self.levels.push(Level {
+                first_ns: at_ns,
+                last_ns: at_ns,
+                min_ns: at_ns,
+                max_ns: at_ns,
+                before_ns: None,
+                count: 1,
+                previous,
+                shift_ns: None,
+            });
+        }
+        is_backward
+    }
+
+    /// The newest stamp was a single one ahead, if the next goes on from the one before it.
+    fn pass_over_one_ahead(&mut self, at_ns: i64) {
+        let Some(level) = self.levels.get_mut(self.current) else {
+            return;
+        };
+        let Some((last_ns, max_ns)) = level.before_ns else {
+            return;
+        };
+        let goes_on = last_ns.saturating_sub(DISORDER_MAX_NS) <= at_ns;
+        if goes_on && at_ns < level.last_ns.saturating_sub(DISORDER_MAX_NS) {
+            self.ahead.insert((self.current, level.last_ns), last_ns);
+            (level.last_ns, level.max_ns, level.before_ns) = (last_ns, max_ns, None);
+        }
+    }
+
+    /// The level of the newest stamp.
+    pub(super) const fn level(&self) -> usize {
+        self.current
+    }
+
+    /// Settles levels and times of watching, after the last packet of the file.
+    pub(super) fn settle(&mut self, interface: Option<&CaptureInterface>) {
+        let most = self.levels.iter().map(|level| level.count).max();
+        let least = if most > Some(ISOLATED_MAX) {
+            ISOLATED_MAX + 1
+        } else {
+            1
+        };
+        let sound: Vec<usize> = (0..self.levels.len())
+            .filter(|index| self.levels[*index].count >= least)
+            .collect();
+        // The level of most packets keeps its stamps; the others are put next to it.
+        let main = sound
+            .iter()
+            .position(|index| Some(self.levels[*index].count) == most);
+        let main = main.unwrap_or(0);
+        for at in (0..sound.len()).skip(main) {
+            let shift_ns = match at.checked_sub(1).filter(|_| at > main) {
+                Some(before) => self.behind(sound[before], sound[at]),
+                None => 0,
+            };
+            self.levels[sound[at]].shift_ns = Some(shift_ns);
+        }
+        for at in (0..main).rev() {
+            let (here, next) = (self.levels[sound[at]], self.levels[sound[at + 1]]);
+            let next_ns = next.first_ns.saturating_add(next.shift_ns.unwrap_or(0));
+            self.levels[sound[at]].shift_ns = Some(next_ns.saturating_sub(here.last_ns));
+        }
+        for pair in sound.windows(2) {
+            let (before, after) = (self.levels[pair[0]], self.levels[pair[1]]);
+            self.steps.push(ClockStep {
+                before_ns: before.last_ns,
+                by_ns: after.first_ns.saturating_sub(before.last_ns),
+            });
+        }
+        let mut longest: Vec<Level> = sound.iter().map(|index| self.levels[*index]).collect();
+        longest.sort_by_key(|level| core::cmp::Reverse(level.count));
+        longest.truncate(ANCHOR_COUNT_MAX);
+        let shifts = longest.iter().filter_map(|level| level.shift_ns);
+        self.anchors_ns = shifts.map(i64::saturating_neg).collect();
+        let levels = || sound.iter().map(|index| self.levels[*index]);
+        let stamps = hull(levels().map(|level| (level, 0)));
+        let steady = hull(levels().map(|level| (level, level.shift_ns.unwrap_or(0))));
+        let stated = interface.and_then(|one| stated(one, stamps));
+        self.is_stated = stated.is_some();
+        let widen = |span: Option<Span>| match (span, stated) {
+            (Some(a), Some(b)) => Some(a.hull(b)),
+            (a, b) => a.or(b),
+        };
+        self.spans = widen(stamps).into_iter().collect();
+        self.steady_spans = if self.steps.is_empty() {
+            self.spans.clone()
+        } else {
+            steady.into_iter().collect()
+        };
+    }
+
+    /// What puts level `index` right behind level `before`.
+    fn behind(&self, before: usize, index: usize) -> i64 {
+        let before = self.levels[before];
+        let end_ns = before.last_ns.saturating_add(before.shift_ns.unwrap_or(0));
+        end_ns.saturating_sub(self.levels[index].first_ns)
+    }
+
+    /// Gives an observation of this tap its steady stamp, and an isolated one a neighbour's.
+    pub(super) fn settle_observation(&self, one: &mut Observation) {
+        let Some(mut level) = self.levels.get(one.level) else {
+            return;
+        };
+        one.is_stamp_sound = level.shift_ns.is_some();
+        if let Some(before_ns) = self.ahead.get(&(one.level, one.stamp_ns)) {
+            one.stamp_ns = *before_ns;
+            one.is_stamp_sound = false;
+        }
+        if level.shift_ns.is_none() {
+            while let (None, Some(previous)) = (level.shift_ns, level.previous) {
+                level = &self.levels[previous];
+                one.stamp_ns = level.last_ns;
+            }
+            if level.shift_ns.is_none()
+                && let Some(next) = self.levels.iter().find(|level| level.shift_ns.is_some())
+            {
+                level = next;
+                one.stamp_ns = next.first_ns;
+            }
+        }
+        one.steady_ns = one.stamp_ns.saturating_add(level.shift_ns.unwrap_or(0));
+    }
+
+    /// True when nothing was seen here while something was seen there.
+    pub(super) fn is_apart_from(&self, other: &Self) -> bool {
+        let mut pairs = self
+            .spans
+            .iter()
+            .flat_map(|a| other.spans.iter().map(move |b| (a, b)));
+        pairs.all(|(a, b)| a.last_ns <= b.first_ns || b.last_ns <= a.first_ns)
+    }
+
+    /// Takes what a later section of the file tells of the same interface.
+    pub(super) fn absorb(&mut self, other: Self) {
+        self.is_stated &= other.is_stated;
+        self.spans.extend(other.spans);
+        self.steady_spans.extend(other.steady_spans);
+        if !self.is_stated {
+            // Nothing says that there was a time between the sections.
+            for spans in [&mut self.spans, &mut self.steady_spans] {
+                *spans = spans.drain(..).reduce(Span::hull).into_iter().collect();
+            }
+        }
+        self.steps.extend(other.steps);
+        for (why, count) in other.unread {
+            *self.unread.entry(why).or_default() += count;
+        }
+        for (of, count) in other.cut {
+            *self.cut.entry(of).or_default() += count;
+        }
+        self.dropped_count += other.dropped_count;
+    }
+}
+
+/// From the first stamp to the last.
+fn hull(levels: impl Iterator<Item = (Level, i64)>) -> Option<Span> {
+    let spans = levels.map(|(level, shift_ns)| Span {
+        first_ns: level.min_ns.saturating_add(shift_ns),
+        last_ns: level.max_ns.saturating_add(shift_ns),
+    });
+    spans.reduce(Span::hull)
+}
+
+/// The stated time of watching, in the unit in which it holds the packets.
+fn stated(interface: &CaptureInterface, stamps: Option<Span>) -> Option<Span> {
+    let mut stated = interface.watch.iter().flatten();
+    let Some(stamps) = stamps else {
+        return stated.next().copied();
+    };
+    let holds = |span: &&Span| {
+        span.first_ns.saturating_sub(STATED_SLACK_NS) <= stamps.first_ns
+            && stamps.last_ns <= span.last_ns.saturating_add(STATED_SLACK_NS)
+    };
+    stated.find(holds).copied()
+}

@@ -1,0 +1,96 @@
+//! Descriptors from one process to another, with a few bytes beside them, over a socket pair.
+//!
+//! `unsafe` is allowed here because a received descriptor is a bare number.
+
+use std::io::{self, IoSlice, IoSliceMut};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
+
+use nix::sys::socket::{
+    AddressFamily, ControlMessage, ControlMessageOwned, MsgFlags, SockFlag, SockType, recvmsg,
+    sendmsg, socketpair,
+};
+
+/// Descriptors of one message.
+const DESCRIPTORS_MAX: usize = 4;
+
+/// Two sockets that keep messages apart and know when the other end is gone.
+///
+/// # Errors
+/// When the kernel gives none.
+pub fn pair() -> io::Result<(OwnedFd, OwnedFd)> {
+    let flags = SockFlag::SOCK_CLOEXEC;
+    Ok(socketpair(
+        AddressFamily::Unix,
+        SockType::SeqPacket,
+        None,
+        flags,
+    )?)
+}
+
+/// Sends `bytes` and copies of `descriptors`, four at most.
+///
+/// # Errors
+/// When the other end is gone.
+pub fn give(socket: impl AsFd, bytes: &[u8], descriptors: &[BorrowedFd<'_>]) -> io::Result<()> {
+    let numbers: Vec<RawFd> = descriptors.iter().map(AsRawFd::as_raw_fd).collect();
+    let rights = [ControlMessage::ScmRights(&numbers)];
+    let control = if numbers.is_empty() { &[] } else { &rights[..] };
+    let slices = [IoSlice::new(bytes)];
+    let flags = MsgFlags::MSG_NOSIGNAL;
+    sendmsg::<()>(socket.as_fd().as_raw_fd(), &slices, control, flags, None)?;
+    Ok(())
+}
+
+/// Waits for a message: its bytes, cut to 4096, and its descriptors. No bytes once the other end is gone.
+///
+/// # Errors
+/// When receiving fails.
+#[allow(unsafe_code, reason = "a received descriptor is a bare number")]
+pub fn take(socket: impl AsFd) -> io::Result<(Vec<u8>, Vec<OwnedFd>)> {
+    let mut bytes = vec![0; 4096];
+    let mut control = nix::cmsg_space!([RawFd; DESCRIPTORS_MAX]);
+    let mut slices = [IoSliceMut::new(&mut bytes)];
+    let flags = MsgFlags::MSG_CMSG_CLOEXEC;
+    let descriptor = socket.as_fd().as_raw_fd();
+    let message = recvmsg::<()>(descriptor, &mut slices, Some(&mut control), flags)?;
+    let length = message.bytes;
+    let mut descriptors = Vec::new();
+    for one in message.cmsgs()? {
+        if let ControlMessageOwned::ScmRights(numbers) = one {
+            // SAFETY: the kernel has just put these descriptors into this process, and nobody else knows them.
+            descriptors.extend(
+                numbers
+                    .iter()
+                    .map(|&number| unsafe { OwnedFd::from_raw_fd(number) }),
+            );
+        }
+    }
+    bytes.truncate(length);
+    Ok((bytes, descriptors))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+    use std::io::{Read as _, Write as _};
+
+    use super::*;
+
+    #[test]
+    fn a_descriptor_goes_over_with_its_bytes_and_an_end_that_is_gone_says_nothing() {
+        let (here, there) = pair().unwrap();
+        let (read, write) = nix::unistd::pipe().unwrap();
+        give(&here, b"ready", &[write.as_fd()]).unwrap();
+        give(&here, b"word", &[]).unwrap();
+        drop((here, write));
+        let (bytes, mut descriptors) = take(&there).unwrap();
+        assert_eq!((bytes.as_slice(), descriptors.len()), (&b"ready"[..], 1));
+        File::from(descriptors.remove(0)).write_all(b"x").unwrap();
+        let (bytes, descriptors) = take(&there).unwrap();
+        assert_eq!((bytes.as_slice(), descriptors.len()), (&b"word"[..], 0));
+        let mut text = String::new();
+        File::from(read).read_to_string(&mut text).unwrap();
+        assert_eq!(text, "x");
+        assert!(take(&there).unwrap().0.is_empty());
+    }
+}

@@ -1,0 +1,435 @@
+//! The frames of a channel by flow: which program spoke with which, counted, lost and delayed. A flow is what the
+//! head of a frame says: addresses and ports of TCP and UDP, addresses of any other protocol over IP, and the
+//! protocol of anything else. It appears by itself, one way at a time. Frames are not put together.
+
+use core::fmt;
+use core::net::IpAddr;
+use std::collections::BTreeMap;
+
+use hil_core::record::FrameRecord;
+use hil_stats::histogram::Distribution;
+use serde::{Deserialize, Serialize};
+
+use super::ChannelPath;
+use super::history::MessageHistory;
+use super::stage::MessageFate;
+
+/// Flows of a channel that are told apart; what comes later is one.
+pub const FLOWS_MAX: usize = 10_000;
+
+/// VLAN tags that are passed over.
+const TAGS_MAX: usize = 2;
+const TCP: u8 = 6;
+const UDP: u8 = 17;
+const UNKNOWN: u32 = u32::MAX;
+
+/// What a frame belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum FlowKey {
+    /// IP.
+    Ip {
+        /// Number of the protocol in it.
+        protocol: u8,
+        /// Where from.
+        source: IpAddr,
+        /// Where to.
+        destination: IpAddr,
+        /// Source and destination port; `None` of a protocol without them, and of the later fragments of a
+        /// datagram.
+        ports: Option<[u16; 2]>,
+    },
+    /// Anything else, by its type.
+    Other(u16),
+    /// A frame too short to say what it is.
+    TooShort,
+    /// Of a flow beyond [`FLOWS_MAX`].
+    Rest,
+}
+
+impl FlowKey {
+    /// Of a frame.
+    pub fn of(record: &FrameRecord) -> Self {
+        let head = record.head.get(..usize::from(record.head_bytes));
+        Self::read(head.unwrap_or(&record.head)).unwrap_or(Self::TooShort)
+    }
+
+    fn read(frame: &[u8]) -> Option<Self> {
+        let mut at = 12;
+        let mut kind = u16_at(frame, at)?;
+        for _ in 0..TAGS_MAX {
+            if matches!(kind, 0x8100 | 0x88a8 | 0x9100) {
+                at += 4;
+                kind = u16_at(frame, at)?;
+            }
+        }
+        let packet = frame.get(at + 2..)?;
+        match kind {
+            0x0800 => ipv4(packet),
+            0x86dd => ipv6(packet),
+            _ => Some(Self::Other(kind)),
+        }
+    }
+}
+
+fn u16_at(bytes: &[u8], at: usize) -> Option<u16> {
+    Some(u16::from_be_bytes(array_at(bytes, at)?))
+}
+
+fn array_at<const N: usize>(bytes: &[u8], at: usize) -> Option<[u8; N]> {
+    bytes.get(at..at.checked_add(N)?)?.try_into().ok()
+}
+
+fn ipv4(packet: &[u8]) -> Option<FlowKey> {
+    let header_bytes = usize::from(packet.first()? & 0x0f) * 4;
+    let (protocol, is_later) = (*packet.get(9)?, u16_at(packet, 6)? & 0x1fff != 0);
+    Some(FlowKey::Ip {
+        protocol,
+        source: array_at::<4>(packet, 12)?.into(),
+        destination: array_at::<4>(packet, 16)?.into(),
+        ports: ports(protocol, packet.get(header_bytes..)).filter(|_| !is_later),
+    })
+}
+
+fn ipv6(packet: &[u8]) -> Option<FlowKey> {
+    let (mut protocol, mut at, mut is_later) = (*packet.get(6)?, 40, false);
+    // Hop-by-hop options, routing, fragment, destination options.
+    while let (0 | 43 | 44 | 60, Some(header)) = (protocol, array_at::<4>(packet, at)) {
+        if protocol == 44 {
+            is_later = u16::from_be_bytes([header[2], header[3]]) & 0xfff8 != 0;
+            at += 8;
+        } else {
+            at += 8 * (1 + usize::from(header[1]));
+        }
+        protocol = header[0];
+    }
+    Some(FlowKey::Ip {
+        protocol,
+        source: array_at::<16>(packet, 8)?.into(),
+        destination: array_at::<16>(packet, 24)?.into(),
+        ports: ports(protocol, packet.get(at..)).filter(|_| !is_later),
+    })
+}
+
+fn ports(protocol: u8, segment: Option<&[u8]>) -> Option<[u16; 2]> {
+    let segment = segment.filter(|_| matches!(protocol, TCP | UDP))?;
+    Some([u16_at(segment, 0)?, u16_at(segment, 2)?])
+}
+
+impl fmt::Display for FlowKey {
+    /// `udp 10.77.0.1:5000 → 10.77.0.2:6510`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Ip {
+                protocol,
+                source,
+                destination,
+                ports,
+            } => {
+                match protocol {
+                    1 => f.write_str("icmp"),
+                    2 => f.write_str("igmp"),
+                    TCP => f.write_str("tcp"),
+                    UDP => f.write_str("udp"),
+                    58 => f.write_str("icmpv6"),
+                    other => write!(f, "ip protocol {other}"),
+                }?;
+                match (ports, source) {
+                    (Some([from, to]), IpAddr::V4(_)) => {
+                        write!(f, " {source}:{from} → {destination}:{to}")
+                    }
+                    (Some([from, to]), IpAddr::V6(_)) => {
+                        write!(f, " [{source}]:{from} → [{destination}]:{to}")
+                    }
+                    (None, _) => write!(f, " {source} → {destination}"),
+                }?;
+                if ports.is_none() && matches!(protocol, TCP | UDP) {
+                    f.write_str(" (fragments without ports)")?;
+                }
+                Ok(())
+            }
+            Self::Other(0x0806) => f.write_str("arp"),
+            Self::Other(kind) => write!(f, "ethernet type {kind:#06x}"),
+            Self::TooShort => f.write_str("too short to tell"),
+            Self::Rest => f.write_str("all other flows"),
+        }
+    }
+}
+
+/// One flow of a channel.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FlowMetrics {
+    /// What it is, in words.
+    pub name: String,
+    /// Frames that the program sent.
+    pub frame_count: u64,
+    /// Their bytes.
+    pub byte_count: u64,
+    /// Frames that the other program's interface was given.
+    pub taken_count: u64,
+    /// Frames that got lost between the gateways.
+    pub lost_by_network_count: u64,
+    /// Frames that got lost between the gateways, on the link or in a socket or model of the receiving host that
+    /// had no room: which of these, no record of the frame says.
+    #[serde(default)]
+    pub lost_by_either_count: u64,
+    /// Frames that got lost on a host: in a queue, a socket or a process of this program.
+    pub lost_by_harness_count: u64,
+    /// Frames of which nobody can say what became, those under way at the end included.
+    pub unknown_count: u64,
+    /// Frames that came after a later one of the channel.
+    pub reordered_count: u64,
+    /// From leaving the program's interface until the other's was given it.
+    pub delay: Distribution,
+}
+
+impl FlowMetrics {
+    /// What got lost between the gateways may have been lost by the receiving host.
+    pub fn doubt_network(&mut self) {
+        self.lost_by_either_count += core::mem::take(&mut self.lost_by_network_count);
+    }
+}
+
+/// Sums frames up by flow. Memory grows by twelve bytes a frame.
+#[derive(Debug, Default)]
+pub struct FlowFold {
+    indices: BTreeMap<FlowKey, u32>,
+    /// The flow of each frame, by the start of its inlet and its number.
+    frames: BTreeMap<u32, Vec<u32>>,
+    flows: Vec<Flow>,
+}
+
+#[derive(Debug, Default)]
+struct Flow {
+    key: Option<FlowKey>,
+    counts: [u64; 4],
+    byte_count: u64,
+    reordered_count: u64,
+    delays_ns: Vec<i64>,
+}
+
+/// What became of a frame, by its place among [`Flow::counts`].
+const TAKEN: usize = 0;
+const BY_NETWORK: usize = 1;
+const BY_HARNESS: usize = 2;
+const NOT_KNOWN: usize = 3;
+
+const fn place_of(fate: MessageFate) -> usize {
+    match fate {
+        MessageFate::Taken => TAKEN,
+        MessageFate::LostOnWire | MessageFate::Incomplete => BY_NETWORK,
+        MessageFate::InFlight
+        | MessageFate::Unexplained
+        | MessageFate::UnknownPeerRecordsUnavailable => NOT_KNOWN,
+        MessageFate::SupersededAtInput
+        | MessageFate::RefusedByKernel
+        | MessageFate::RefusedAtIngress
+        | MessageFate::Late
+        | MessageFate::Duplicate
+        | MessageFate::SupersededAtConsumer
+        | MessageFate::LostInInterruption => BY_HARNESS,
+    }
+}
+
+impl FlowFold {
+    /// Takes what is known of a frame itself; before [`FlowFold::add`] of its message.
+    pub fn add_frame(&mut self, record: &FrameRecord) {
+        let index = self.index_of(FlowKey::of(record));
+        let Ok(sequence) = usize::try_from(record.sequence) else {
+            return;
+        };
+        let frames = self.frames.entry(record.epoch).or_default();
+        // Numbers follow one another; a hole is of records that are lost.
+        if frames.len() <= sequence {
+            frames.resize(sequence + 1, UNKNOWN);
+        }
+        frames[sequence] = index;
+        self.flow(index).byte_count += u64::from(record.length_bytes);
+    }
+
+    fn index_of(&mut self, key: FlowKey) -> u32 {
+        let is_known = self.indices.contains_key(&key);
+        let key = if is_known || self.indices.len() < FLOWS_MAX {
+            key
+        } else {
+            FlowKey::Rest
+        };
+        let next = u32::try_from(self.flows.len()).unwrap_or(UNKNOWN);
+        let index = *self.indices.entry(key).or_insert(next);
+        if index == next {
+            self.flows.push(Flow {
+                key: Some(key),
+                ..Flow::default()
+            });
+        }
+        index
+    }
+
+    fn flow(&mut self, index: u32) -> &mut Flow {
+        &mut self.flows[index as usize]
+    }
+
+    /// Takes what became of a frame; one without a record is of no flow.
+    pub fn add(&mut self, message: &MessageHistory, path: ChannelPath<'_>) {
+        let frames = self.frames.get(&message.epoch);
+        let index = usize::try_from(message.key.sequence)
+            .ok()
+            .and_then(|sequence| frames?.get(sequence).copied());
+        let Some(index) = index.filter(|index| *index != UNKNOWN) else {
+            return;
+        };
+        let flow = self.flow(index);
+        flow.counts[place_of(message.fate)] += 1;
+        flow.reordered_count += u64::from(message.is_overtaken());
+        let delay = message.delay_ns(path);
+        flow.delays_ns
+            .extend(delay.map(|(delay_ns, _bound_ns)| delay_ns));
+    }
+
+    /// The flows, those of most frames first.
+    pub fn finish(self) -> Vec<FlowMetrics> {
+        let metrics = |flow: Flow| {
+            let [taken, by_network, by_harness, unknown] = flow.counts;
+            let reason = if taken == 0 {
+                "no frame was taken"
+            } else {
+                "the clocks of the hosts are not aligned"
+            };
+            FlowMetrics {
+                name: flow.key.unwrap_or(FlowKey::Rest).to_string(),
+                frame_count: flow.counts.iter().sum(),
+                byte_count: flow.byte_count,
+                taken_count: taken,
+                lost_by_network_count: by_network,
+                lost_by_either_count: 0,
+                lost_by_harness_count: by_harness,
+                unknown_count: unknown,
+                reordered_count: flow.reordered_count,
+                delay: Distribution::of_samples(&flow.delays_ns, reason),
+            }
+        };
+        let mut flows: Vec<FlowMetrics> = self.flows.into_iter().map(metrics).collect();
+        flows.sort_by(|one, other| {
+            let order = other.frame_count.cmp(&one.frame_count);
+            order.then_with(|| one.name.cmp(&other.name))
+        });
+        flows
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::each_history;
+    use crate::synthetic::{Files, TAKEN_NS, at, same_clock};
+
+    /// An Ethernet frame of this type with this packet in it.
+    fn frame(kind: &[u8], packet: &[u8]) -> Vec<u8> {
+        [&[0xff; 12], kind, packet].concat()
+    }
+
+    /// An IPv4 packet from 10.77.0.1 to 10.77.0.2.
+    fn packet(protocol: u8, fragment: u16, segment: &[u8]) -> Vec<u8> {
+        let mut header = vec![0x45, 0, 0, 40, 0, 1];
+        header.extend(fragment.to_be_bytes());
+        header.extend([64, protocol, 0, 0, 10, 77, 0, 1, 10, 77, 0, 2]);
+        [header.as_slice(), segment].concat()
+    }
+
+    fn name(frame: &[u8]) -> String {
+        FlowKey::of(&FrameRecord::new(0, 1, frame)).to_string()
+    }
+
+    #[test]
+    fn the_head_of_a_frame_says_its_flow() {
+        let ports = [0x13, 0x88, 0x19, 0x6e, 0, 0, 0, 0];
+        let ip = [8, 0];
+        let udp = "udp 10.77.0.1:5000 → 10.77.0.2:6510";
+        assert_eq!(name(&frame(&ip, &packet(17, 0, &ports))), udp);
+        assert_eq!(name(&frame(&ip, &packet(17, 0x2000, &ports))), udp);
+        let tagged = [0x81, 0, 0, 7, 0x88, 0xa8, 0, 8, 8, 0];
+        assert_eq!(name(&frame(&tagged, &packet(17, 0, &ports))), udp);
+        assert_eq!(
+            name(&frame(&ip, &packet(17, 0x0100, &ports))),
+            "udp 10.77.0.1 → 10.77.0.2 (fragments without ports)"
+        );
+        assert_eq!(
+            name(&frame(&ip, &packet(1, 0x0100, &ports))),
+            "icmp 10.77.0.1 → 10.77.0.2"
+        );
+        assert_eq!(
+            name(&frame(&ip, &packet(132, 0, &ports))),
+            "ip protocol 132 10.77.0.1 → 10.77.0.2"
+        );
+        assert_eq!(name(&frame(&[8, 6], &[0; 28])), "arp");
+        assert_eq!(name(&frame(&[0x88, 0xcc], &[])), "ethernet type 0x88cc");
+        assert_eq!(name(&[0; 5]), "too short to tell");
+        assert_eq!(name(&frame(&ip, &[0x45])), "too short to tell");
+        let mut six = vec![0x60, 0, 0, 0, 0, 8, 6, 64];
+        six.extend([0; 15].into_iter().chain([1]).chain([0; 15]).chain([2]));
+        six.extend(ports);
+        assert_eq!(
+            name(&frame(&[0x86, 0xdd], &six)),
+            "tcp [::1]:5000 → [::2]:6510"
+        );
+        six[6] = 0;
+        six.splice(40..40, [58, 0, 5, 2, 0, 0, 0, 0]);
+        assert_eq!(name(&frame(&[0x86, 0xdd], &six)), "icmpv6 ::1 → ::2");
+    }
+
+    #[test]
+    fn every_frame_is_counted_once_in_its_flow_and_a_host_is_not_the_network() {
+        use MessageFate as Fate;
+        let fates = [
+            Fate::Taken,
+            Fate::Taken,
+            Fate::LostOnWire,
+            Fate::SupersededAtInput,
+            Fate::SupersededAtConsumer,
+            Fate::RefusedByKernel,
+            Fate::Taken,
+        ];
+        let mut files = Files::default();
+        let mut fold = FlowFold::default();
+        for (sequence, fate) in (0_u64..).zip(fates) {
+            files.write(at(7, sequence), fate);
+            // The first frame is of another flow.
+            let kind = if sequence == 0 { [8, 6] } else { [8, 0] };
+            let bytes = frame(&kind, &packet(1, 0, &[0; 20]));
+            fold.add_frame(&FrameRecord::new(sequence, at(7, sequence).epoch, &bytes));
+        }
+        let context = same_clock(1_000_000_000);
+        each_history(&files.records(), &context, |one| {
+            fold.add(one, context.path);
+        });
+        let flows = fold.finish();
+        assert_eq!(flows.len(), 2);
+        let [echoes, arp] = &flows[..] else {
+            panic!("two flows");
+        };
+        assert_eq!(
+            (arp.name.as_str(), arp.frame_count, arp.taken_count),
+            ("arp", 1, 1)
+        );
+        assert_eq!((echoes.frame_count, echoes.byte_count), (6, 6 * 54));
+        let counts = [
+            echoes.taken_count,
+            echoes.lost_by_network_count,
+            echoes.lost_by_harness_count,
+            echoes.unknown_count,
+        ];
+        assert_eq!(counts, [2, 1, 3, 0]);
+        assert_eq!(echoes.delay.measured().unwrap().p50_ns, TAKEN_NS);
+    }
+
+    #[test]
+    fn flows_beyond_the_bound_are_one() {
+        let mut fold = FlowFold::default();
+        for sequence in 0..FLOWS_MAX as u64 + 100 {
+            let ports = [&sequence.to_be_bytes()[6..], &[0; 6]].concat();
+            let bytes = frame(&[8, 0], &packet(17, 0, &ports));
+            fold.add_frame(&FrameRecord::new(sequence, 1, &bytes));
+        }
+        assert_eq!(fold.flows.len(), FLOWS_MAX + 1);
+        assert_eq!(fold.flows.last().unwrap().key, Some(FlowKey::Rest));
+    }
+}

@@ -1,0 +1,282 @@
+//! Two programs that speak IP with a link between them: the topology that says so, made of the command line.
+
+use std::io;
+use std::net::{Ipv4Addr, UdpSocket};
+use std::path::{Path, PathBuf};
+
+use hil_platform::console::Console;
+use hil_topology::LinkPorts;
+use hil_topology::registry::Registry;
+use toml::{Table, Value};
+
+use super::{Refusal, carry_out, failed, loaded, usage};
+use crate::arguments::{JoinArgs, RunArgs};
+
+/// The names of the programs, which are those of their hosts, and their addresses.
+const ENDS: [(&str, &str); 2] = [("first", "10.77.0.1"), ("second", "10.77.0.2")];
+/// Both hosts are this PC, whose loopback carries a frame whole: a link model meets one datagram a frame.
+const PATH_MTU_BYTES: i64 = 9000;
+
+/// Runs two programs until one of them ends.
+pub(super) fn join(
+    args: &JoinArgs,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    let mut link = link(args.link.as_deref(), registry, console)?;
+    let port = free_ports().map_err(|error| failed(format!("no free UDP port: {error}")))?;
+    link.insert("port".to_owned(), i64::from(port).into());
+    let table = topology(args, link).map_err(usage)?;
+    let text = table.to_string();
+    let topology = hil_topology::parse("join", &text, &[], registry.known());
+    let topology = loaded(topology, console)?;
+    let run = RunArgs {
+        topology: None,
+        host: None,
+        overrides: Vec::new(),
+        check: false,
+        quiet: args.quiet,
+        full: args.full,
+        domain_root: None,
+    };
+    carry_out(Path::new("join"), &run, &topology, registry, console)
+}
+
+/// The first of as many UDP ports in a row as a link takes on one PC, none of which is in use.
+fn free_ports() -> io::Result<u16> {
+    const ATTEMPTS: u32 = 100;
+    let bind = |port| UdpSocket::bind((Ipv4Addr::LOCALHOST, port));
+    let mut outcome = Err(io::ErrorKind::AddrInUse.into());
+    for _ in 0..ATTEMPTS {
+        let first = bind(0)?;
+        let port = first.local_addr()?.port();
+        let others =
+            (1..LinkPorts::count(true)).map(|next| bind(port.checked_add(next).unwrap_or(0)));
+        // Held until all are known to be free.
+        match others.collect::<io::Result<Vec<_>>>() {
+            Ok(_free) => return Ok(port),
+            Err(error) => outcome = Err(error),
+        }
+    }
+    outcome
+}
+
+/// The link of a file or of words; without either one that hurts nothing.
+fn link(said: Option<&str>, registry: &Registry, console: &mut Console) -> Result<Table, Refusal> {
+    match said {
+        Some(path) if Path::new(path).is_file() => {
+            let path = PathBuf::from(path);
+            let topology = hil_topology::load_case(&path, &[], registry.known());
+            let resolved = loaded(topology, console)?.resolved();
+            only_link(&resolved).map_err(|why| usage(format!("{}: {why}", path.display())))
+        }
+        Some(words) => link_of_words(words).map_err(usage),
+        None => Ok(Table::from_iter([via("udp")])),
+    }
+}
+
+fn via(word: &str) -> (String, Value) {
+    ("via".to_owned(), word.into())
+}
+
+/// The one link of a topology.
+fn only_link(topology: &Table) -> Result<Table, String> {
+    let links = topology.get("links").and_then(Value::as_table);
+    let mut links = links.into_iter().flat_map(Table::values);
+    match (links.next().and_then(Value::as_table), links.next()) {
+        (Some(link), None) => Ok(link.clone()),
+        (None, _) => Err("has no link".to_owned()),
+        (Some(_), Some(_)) => Err("has several links, and two programs have one".to_owned()),
+    }
+}
+
+/// `delay 5ms loss 1% rate 10Mbit`, any of them.
+fn link_of_words(text: &str) -> Result<Table, String> {
+    let mut link = Table::from_iter([via("emulated")]);
+    let words: Vec<&str> = text.split_whitespace().collect();
+    if words.is_empty() {
+        return Err("--link is empty: say delay, loss or rate, or name a topology file".to_owned());
+    }
+    for pair in words.chunks(2) {
+        let [key, value] = pair else {
+            return Err(format!("--link: `{}` has no value", pair[0]));
+        };
+        let wrong = |expected: &str| format!("--link: {key} is `{value}`, expected {expected}");
+        let (key, value): (&str, Value) = match *key {
+            "delay" => ("delay", (*value).into()),
+            "loss" => {
+                let ratio = per_cent(value).ok_or_else(|| wrong("0% to 100%"))?;
+                ("loss_ratio", ratio.into())
+            }
+            "rate" => {
+                let bits = bits_per_second(value).ok_or_else(|| wrong("a rate such as 10Mbit"))?;
+                let rate = Table::from_iter([("bits_per_second".to_owned(), bits.into())]);
+                ("rate", rate.into())
+            }
+            other => {
+                return Err(format!(
+                    "--link: `{other}` is neither delay, loss nor rate, and `{text}` no file"
+                ));
+            }
+        };
+        if link.insert(key.to_owned(), value).is_some() {
+            return Err(format!("--link: {key} is said twice"));
+        }
+    }
+    Ok(link)
+}
+
+fn per_cent(text: &str) -> Option<f64> {
+    let share: f64 = text.strip_suffix('%')?.parse().ok()?;
+    (0.0..=100.0).contains(&share).then_some(share / 100.0)
+}
+
+fn bits_per_second(text: &str) -> Option<i64> {
+    let number = text.strip_suffix("bit")?;
+    let (number, unit) = match number.strip_suffix(['k', 'M', 'G']) {
+        Some(rest) if number.ends_with('k') => (rest, 1_000),
+        Some(rest) if number.ends_with('M') => (rest, 1_000_000),
+        Some(rest) => (rest, 1_000_000_000),
+        None => (number, 1),
+    };
+    number.parse::<i64>().ok()?.checked_mul(unit)
+}
+
+/// The file that runs both programs with `link` between them.
+fn topology(args: &JoinArgs, mut link: Table) -> Result<Table, String> {
+    let programs: Vec<&[String]> = args.programs.splitn(2, |word| word == "--").collect();
+    let [first, second] = programs[..] else {
+        return Err("one program only: say -- FIRST -- SECOND".to_owned());
+    };
+    if first.is_empty() || second.is_empty() {
+        return Err("a program is missing: say -- FIRST -- SECOND".to_owned());
+    }
+    let text = |text: &str| Value::from(text);
+    let table = |pairs: Vec<(&str, Value)>| -> Value {
+        let pairs = pairs
+            .into_iter()
+            .map(|(key, value)| (key.to_owned(), value));
+        Value::Table(pairs.collect())
+    };
+    let process = |(name, address): (&str, &str), command: &[String]| {
+        let command = command.iter().map(|word| text(word)).collect::<Vec<_>>();
+        table(vec![
+            ("host", text(name)),
+            ("run", command.into()),
+            ("inside", text(address)),
+        ])
+    };
+    let channel = |from: &str, to: &str| {
+        let value = table(vec![
+            ("from", text(from)),
+            ("to", text(to)),
+            ("link", text("link")),
+        ]);
+        (format!("{from}/{to}"), value)
+    };
+    let [(one, _), (other, _)] = ENDS;
+    let hosts = [text(one), text(other)];
+    link.insert("between".to_owned(), Value::Array(hosts.to_vec()));
+    link.insert("path_mtu_bytes".to_owned(), PATH_MTU_BYTES.into());
+    let seed =
+        i64::try_from(args.seed).map_err(|_large| format!("--seed {} is too large", args.seed))?;
+    let whole = table(vec![
+        ("version", 1.into()),
+        ("name", text("join")),
+        (
+            "run",
+            table(vec![
+                ("duration", text(&args.duration)),
+                ("seed", seed.into()),
+            ]),
+        ),
+        (
+            "hosts",
+            table(vec![(one, table(Vec::new())), (other, table(Vec::new()))]),
+        ),
+        (
+            "processes",
+            table(vec![
+                (one, process(ENDS[0], first)),
+                (other, process(ENDS[1], second)),
+            ]),
+        ),
+        (
+            "channels",
+            Value::Table(
+                [channel(one, other), channel(other, one)]
+                    .into_iter()
+                    .collect(),
+            ),
+        ),
+        ("links", table(vec![("link", link.into())])),
+    ]);
+    match whole {
+        Value::Table(whole) => Ok(whole),
+        _ => unreachable!("made as a table just above"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use hil_topology::Process;
+
+    use super::*;
+
+    fn args(programs: &[&str]) -> JoinArgs {
+        JoinArgs {
+            link: None,
+            duration: "5 s".to_owned(),
+            seed: 7,
+            quiet: true,
+            full: false,
+            programs: programs.iter().map(|&word| word.to_owned()).collect(),
+        }
+    }
+
+    #[test]
+    fn words_become_a_link_and_wrong_ones_are_named() {
+        let link = link_of_words("delay 5ms loss 1% rate 10Mbit").unwrap();
+        assert_eq!(link["delay"].as_str(), Some("5ms"));
+        assert_eq!(link["loss_ratio"].as_float(), Some(0.01));
+        assert_eq!(
+            link["rate"]["bits_per_second"].as_integer(),
+            Some(10_000_000)
+        );
+        for (words, says) in [
+            ("", "empty"),
+            ("delay", "no value"),
+            ("loss 2", "0% to 100%"),
+            ("loss 101%", "0% to 100%"),
+            ("rate 10M", "such as 10Mbit"),
+            ("jitter 1ms", "no file"),
+            ("loss 1% loss 2%", "twice"),
+        ] {
+            let why = link_of_words(words).unwrap_err();
+            assert!(why.contains(says), "{words}: {why}");
+        }
+    }
+
+    #[test]
+    fn two_programs_become_a_topology_with_a_channel_each_way() {
+        let registry = Registry::default();
+        let link = link_of_words("delay 5ms loss 1%").unwrap();
+        let table = topology(&args(&["sh", "-c", "true", "--", "sleep", "1"]), link).unwrap();
+        let text = table.to_string();
+        let parsed = hil_topology::parse("join", &text, &[], registry.known()).unwrap();
+        let addresses: Vec<_> = parsed.processes().iter().map(Process::inside).collect();
+        let expected = ENDS.map(|(_, address)| Some(address.parse().unwrap()));
+        assert_eq!(addresses, expected);
+        assert_eq!(parsed.crossings().count(), 2);
+        assert!(parsed.is_all_local());
+    }
+
+    #[test]
+    fn a_program_too_few_is_refused() {
+        let link = || Table::from_iter([via("udp")]);
+        for programs in [&["sleep", "1"][..], &["sleep", "--"], &["--", "sleep"]] {
+            let why = topology(&args(programs), link()).unwrap_err();
+            assert!(why.contains("-- FIRST -- SECOND"), "{why}");
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! The process of a program with an address inside: it starts the program in namespaces of its own and carries
+//! its Ethernet frames to and from two channels, one message each. One thread for what the program sends, one for
+//! what it receives, and one that waits for its end. What the frames are, a report finds out.
+
+mod inward;
+mod outward;
+mod program;
+
+use std::env;
+use std::net::IpAddr;
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+
+use hil_cable::Inlet;
+use hil_core::record::{FrameRecord, PublishedRecord, TakenRecord};
+use hil_net::handover;
+use hil_platform::signals::Signals;
+use hil_rundir::launch::{CableWork, WorkerLaunch};
+use hil_rundir::record::{RecordKind, Recorder};
+use std::os::fd::AsFd as _;
+
+use self::inward::Inward;
+use self::outward::Outward;
+use self::program::Program;
+use crate::process::heartbeat::Heartbeat;
+use crate::process::worker::{Counter, Job, Opened, WorkerError, open_domain, warn_of_spinning};
+
+/// Records a ring holds: half a second at 128,000 frames a second.
+const RING_RECORDS: usize = 65_536;
+
+/// Starts the program, which waits for the run, and opens the record files of its frames.
+///
+/// # Errors
+/// When the program cannot have a cable, or a file cannot be made.
+pub(crate) fn open<'a>(
+    launch: &'a WorkerLaunch,
+    work: &'a CableWork,
+    recorder: &mut Recorder,
+) -> Result<Opened<'a>, WorkerError> {
+    // The program is told to end by a signal to the group, which is not meant for this process.
+    let signals = Signals::install().map_err(WorkerError::Thread)?;
+    let (program, inlet) = start(work)?;
+    let sender = inlet.sender().map_err(WorkerError::Socket)?;
+    let domain = Arc::new(open_domain(launch)?);
+    let (input, output) = (work.input.name.as_str(), work.output.name.as_str());
+    let mut sink = |kind, channel, size| recorder.sink(kind, channel, size, RING_RECORDS);
+    let published = sink(RecordKind::Published, output, size_of::<PublishedRecord>())?;
+    let frames = sink(RecordKind::Frame, output, size_of::<FrameRecord>())?;
+    let taken = sink(RecordKind::Taken, input, size_of::<TakenRecord>())?;
+    warn_of_spinning("", work.wait, work.realtime[0].cpu);
+    let end = |channel: &str, what| {
+        let count = Arc::new(AtomicU64::new(0));
+        let counter = Counter {
+            channel: channel.to_owned(),
+            what,
+            count: Arc::clone(&count),
+        };
+        (counter, count, Heartbeat::default())
+    };
+    let (counter, given, heartbeat) = end(output, "published");
+    let [for_output, for_input] = &work.realtime;
+    let here = Arc::clone(&domain);
+    let outward = Job {
+        name: "frames out".to_owned(),
+        counters: vec![counter],
+        heartbeat: Some(heartbeat.clone()),
+        connect: Box::new(move |thread| {
+            thread.claim(for_output);
+            let ends = outward::Ends {
+                inlet,
+                published,
+                frames,
+                given,
+                heartbeat,
+            };
+            Ok(Box::new(Outward::join(work, here, ends)?))
+        }),
+    };
+    let (counter, count, heartbeat) = end(input, "taken");
+    let inward = Job {
+        name: "frames in".to_owned(),
+        counters: vec![counter],
+        heartbeat: Some(heartbeat.clone()),
+        connect: Box::new(move |thread| {
+            thread.claim(for_input);
+            let ends = inward::Ends {
+                sender,
+                taken,
+                count,
+                heartbeat,
+            };
+            Ok(Box::new(Inward::join(work, domain, ends)?))
+        }),
+    };
+    let program = Job {
+        name: "program".to_owned(),
+        counters: Vec::new(),
+        heartbeat: None,
+        connect: Box::new(move |_thread| Ok(Box::new(program.guarded_by(signals)))),
+    };
+    Ok(Opened {
+        jobs: vec![outward, inward, program],
+        ..Opened::default()
+    })
+}
+
+/// The helper that becomes the program, and its cable.
+fn start(work: &CableWork) -> Result<(Program, Inlet), WorkerError> {
+    let (here, there) = handover::pair().map_err(WorkerError::Socket)?;
+    let failed = |source| WorkerError::Program {
+        program: work.command[0].clone(),
+        source,
+    };
+    // Both outputs go where this process's own words go; its standard output is the supervisor's.
+    let log = std::io::stderr()
+        .as_fd()
+        .try_clone_to_owned()
+        .map_err(failed)?;
+    let mut helper = Command::new(env::current_exe().map_err(failed)?);
+    helper.args(["become", "--supervisor", &std::process::id().to_string()]);
+    let inside: IpAddr = work.inside;
+    helper.args(["--inside", &inside.to_string()]);
+    if let Some(limit) = work.open_files {
+        helper.args(["--open-files", &limit.to_string()]);
+    }
+    helper.arg("--").args(&work.command).envs(&work.environment);
+    helper.stdin(Stdio::from(there)).stdout(Stdio::from(log));
+    let child = helper.spawn().map_err(failed)?;
+    // This process keeps no copy of the helper's end: a helper that dies is heard.
+    drop(helper);
+    let program = Program::new(child, &work.command[0]);
+    Ok((program, Inlet::take(here)?))
+}

@@ -1,0 +1,119 @@
+//! The frames of programs that speak IP, by flow: counted, lost by whom, delayed. Nothing is computed here.
+
+use hil_account::flow::FlowMetrics;
+use hil_platform::text::grouped;
+use hil_platform::words::counted;
+use hil_present::{Cell, Row, Section, Table, Tone};
+
+use crate::summary::{ChannelFlows, RunSummary};
+
+/// The flows of the run, at most `shown_count` of them, those of most frames first.
+pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
+    let aside = "one way each, from the program's interface to the other's";
+    let mut section = Section::new("flows", "Flows", aside);
+    let channels = summary.flows.iter();
+    let mut flows: Vec<&FlowMetrics> = channels.flat_map(|one| &one.flows).collect();
+    if flows.is_empty() {
+        return section;
+    }
+    flows.sort_by_key(|flow| core::cmp::Reverse(flow.frame_count));
+    let columns = [
+        "flow", "frames", "network", "either", "harness", "unknown", "p50", "p99", "max",
+    ];
+    let mut table = Table::new("", &columns)
+        .ranked("unknown", 2)
+        .ranked("max", 1);
+    for flow in flows.iter().take(shown_count) {
+        let delay = flow.delay.measured();
+        let cells = [
+            flow.name.clone().into(),
+            Cell::Count(flow.frame_count),
+            Cell::Count(flow.lost_by_network_count),
+            Cell::Count(flow.lost_by_either_count),
+            Cell::Count(flow.lost_by_harness_count),
+            Cell::Count(flow.unknown_count),
+            Cell::duration(delay.map(|one| one.p50_ns)),
+            Cell::duration(delay.map(|one| one.p99_ns)),
+            Cell::duration(delay.map(|one| one.max_ns)),
+        ];
+        let is_hurt = flow.lost_by_network_count > 0;
+        table.rows.push(Row {
+            cells: cells.into(),
+            tone: if is_hurt { Tone::Caution } else { Tone::Plain },
+            bar: None,
+        });
+    }
+    section.table(table);
+    let hidden = flows.len().saturating_sub(shown_count) as u64;
+    if hidden > 0 {
+        section.note(
+            Tone::Faint,
+            format!("and {} of fewer frames", counted(hidden, "flow")),
+        );
+    }
+    let inlets = summary.flows.iter().map(ChannelFlows::inlet_lost_count);
+    let inlets: u64 = inlets.sum();
+    let inlets = match inlets {
+        0 => "none beside these was lost at an inlet".to_owned(),
+        count => format!(
+            "{} more were lost at inlets, which is the harness, too",
+            grouped(count)
+        ),
+    };
+    section.note(
+        Tone::Faint,
+        format!(
+            "lost by the network; by either: on the link or for want of room on the receiving host; by the \
+             harness: in a process, queue or socket of ours; {inlets}"
+        ),
+    );
+    section
+}
+
+#[cfg(test)]
+mod tests {
+    use hil_present::terminal::{canvas::Style, render};
+    use hil_rundir::pipe::{CountByName, CounterGroup};
+    use hil_stats::histogram::Distribution;
+
+    use super::*;
+    use crate::tests::sample::full;
+
+    fn flow(name: &str, frame_count: u64, lost: [u64; 2]) -> FlowMetrics {
+        FlowMetrics {
+            name: name.to_owned(),
+            frame_count,
+            byte_count: 64 * frame_count,
+            taken_count: frame_count - lost[0] - lost[1],
+            lost_by_network_count: lost[0],
+            lost_by_either_count: 0,
+            lost_by_harness_count: lost[1],
+            unknown_count: 0,
+            reordered_count: 0,
+            delay: Distribution::of_samples(&[5_000_000], ""),
+        }
+    }
+
+    #[test]
+    fn flows_are_listed_with_what_was_lost_by_whom() {
+        let mut summary = full();
+        assert!(flows(&summary, 9).is_empty());
+        let lost = CountByName::all(CounterGroup::Own, [("ring of the inlet full", 7)]);
+        summary.flows = vec![ChannelFlows {
+            channel: "a/b".to_owned(),
+            inlet_lost: lost.collect(),
+            flows: vec![flow("arp", 2, [0, 0]), flow("icmp a → b", 100, [3, 1])],
+        }];
+        let text = render(&[flows(&summary, 1)], 100, Style::Plain);
+        for words in [
+            "icmp a → b",
+            "100",
+            "1 flow of fewer",
+            "7 more were lost at inlets",
+            "5.00",
+        ] {
+            assert!(text.contains(words), "{words}:\n{text}");
+        }
+        assert!(!text.contains("arp"), "{text}");
+    }
+}

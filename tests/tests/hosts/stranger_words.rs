@@ -1,0 +1,156 @@
+//! What a stranger can say to the supervisors and gateways of a sealed run in a host's place, and what it costs.
+
+use std::io::Write;
+use std::net::{Ipv4Addr, SocketAddrV4, TcpListener, TcpStream};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use hil_report::summary::RunSummary;
+use hil_tests::account::{account, assert_accounts_close};
+use hil_tests::attacker::{Attacker, Flood};
+use hil_tests::knocker::CONTROL_PORT;
+use hil_tests::lab::{ADDRESSES, Lab};
+use hil_tests::run_folder::RunFolder;
+use hil_tests::shuttle::CHANNELS;
+use hil_tests::split::{Split, count, direction};
+use hil_tests::trial::Trial;
+
+use super::strangers::hardware_address;
+
+const LIMIT: Duration = Duration::from_mins(1);
+/// No other file of tests uses these ports.
+const PORT: u16 = 7860;
+/// A refusal as the listening end of a handshake words it: nine bytes that anybody can send.
+const REFUSAL: [u8; 9] = [b'H', b'I', b'L', b'K', 1, 3, 1, 0, 1];
+/// Connections that the stranger at the first host's address answers with it.
+const REFUSED_COUNT: usize = 5;
+
+#[test]
+fn made_up_refusals_at_a_hosts_address_end_no_waiting_and_are_told() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("refused");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set(&format!("links.hop.port={PORT}"))
+        .set("run.duration=\"3 s\"");
+    let (mut joining, listener) = lab.host(0).on_network(|| {
+        let listener = TcpListener::bind((ADDRESSES[0], CONTROL_PORT)).unwrap();
+        (trial.start_on(lab.host(1)), listener)
+    });
+    for _ in 0..REFUSED_COUNT {
+        let (mut stream, _) = listener.accept().unwrap();
+        stream.write_all(&REFUSAL).unwrap();
+    }
+    drop(listener);
+    // Longer than it takes to end: before, it ended within a tenth of this.
+    thread::sleep(Duration::from_millis(700));
+    assert!(joining.is_running(), "{}", joining.stderr_so_far());
+    joining.wait_for_output("came to nothing", LIMIT).unwrap();
+    let split = Split::of(&lab, &trial, [trial.start_on(lab.host(0)), joining]);
+    let summaries = split.finish();
+    let security = summaries[1].run.security.as_ref().unwrap().to_string();
+    println!("{security}");
+    let told = format!("{REFUSED_COUNT} to control-pc (10.77.0.1) which answered without proof");
+    assert!(security.contains(&told), "{security}");
+    for summary in &summaries {
+        assert_accounts_close(summary);
+    }
+}
+
+/// Forged reports of the network in a second.
+const REPORTS_HZ: u32 = 2_000;
+/// How long.
+const REPORTS_SPAN: Duration = Duration::from_secs(5);
+/// An address of the hosts' network that is in no topology.
+const FOREIGN: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 66);
+
+/// A run on whose sending gateway of commands forged reports rain.
+fn under_reports(lab: &Lab, trial: &Trial, stranger: &Attacker) -> (Flood, [RunSummary; 2]) {
+    let split = Split::start(lab, trial);
+    split.wait_for_messages();
+    let quoted = ADDRESSES.map(|address| SocketAddrV4::new(address, PORT));
+    let flood = stranger.forge_reports(ADDRESSES[0], quoted, REPORTS_SPAN, REPORTS_HZ);
+    (flood, split.end())
+}
+
+#[test]
+fn forged_reports_of_the_network_cost_a_sealed_run_nothing_and_are_counted() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    lab.put_bridge_between();
+    let first = lab.host(0).namespace().to_owned();
+    let name = format!("{}2", first.strip_suffix('0').unwrap());
+    let hardware = hardware_address(&lab, 0);
+    let stranger = Attacker::join(&first, &name, FOREIGN, ADDRESSES[0], &hardware);
+    for is_sealed in [false, true] {
+        let record = RunFolder::new("reports");
+        let trial = Trial::shipped("shuttle-split.toml", record.path())
+            .set(&format!("links.hop.port={PORT}"))
+            .set("case.parameters.rate_hz=1000.0")
+            .set("run.duration=\"9 s\"");
+        let trial = if is_sealed { trial } else { trial.plain() };
+        let (flood, summaries) = under_reports(&lab, &trial, &stranger);
+        let commands = account(&summaries[1], CHANNELS[0]);
+        let sender = direction(&summaries[0], CHANNELS[0], "egress");
+        let ignored = count(sender, "socket: ignored_report_count");
+        println!(
+            "sealed {is_sealed}: {} forged reports; {} commands published, {:?}; the sender counted {ignored} \
+             reports it ignored and {} it believed",
+            flood.sent_count,
+            commands.published_count,
+            commands.fates.iter().collect::<Vec<_>>(),
+            count(sender, "socket: network_report_count")
+        );
+        if is_sealed {
+            assert_eq!(commands.fates.lost_count(), 0);
+            let refused = ["peer_refused", "unreachable", "too_long", "other_refusal"];
+            for name in refused {
+                assert_eq!(count(sender, &format!("socket: {name}_count")), 0, "{name}");
+            }
+            assert!(ignored > 1_000, "{:?}", sender.counters);
+        }
+    }
+}
+
+/// Connections that say nothing, from the address of the peer of a TCP hop, and their spacing.
+const EMPTY_COUNT: u64 = 80;
+const EMPTY_EVERY: Duration = Duration::from_millis(50);
+
+#[test]
+fn empty_connections_from_the_peers_address_cost_a_sealed_tcp_hop_nothing() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("empty");
+    let trial = Trial::shipped("shuttle-tcp.toml", record.path())
+        .set(&format!("links.hop.port={PORT}"))
+        .set("run.duration=\"8 s\"");
+    let split = Split::start(&lab, &trial);
+    split.wait_for_messages();
+    let made = lab.host(0).on_network(|| {
+        let (mut open, began) = (Vec::new(), Instant::now());
+        for number in 1..=EMPTY_COUNT {
+            open.extend(TcpStream::connect((ADDRESSES[1], PORT)));
+            let due = EMPTY_EVERY * u32::try_from(number).unwrap();
+            thread::sleep(due.saturating_sub(began.elapsed()));
+        }
+        open.len()
+    });
+    let summaries = split.finish();
+    let commands = account(&summaries[1], CHANNELS[0]);
+    let ingress = direction(&summaries[1], CHANNELS[0], "ingress");
+    let unproven = count(ingress, "transport: unproven_connection_count");
+    println!(
+        "{made} empty connections; {} commands published, {} lost; {unproven} connections ended unproven",
+        commands.published_count,
+        commands.fates.lost_count()
+    );
+    assert_eq!(commands.fates.lost_count(), 0);
+    assert_eq!(count(ingress, "transport: reconnect_count"), 0);
+    assert!(unproven > EMPTY_COUNT / 2, "{:?}", ingress.counters);
+    for summary in &summaries {
+        assert_accounts_close(summary);
+    }
+}

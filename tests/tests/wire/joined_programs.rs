@@ -1,0 +1,343 @@
+//! Two programs that know nothing of us, joined by `hil-runtime join` as a user without any right: what they count
+//! themselves and what the account says of their flows is the same.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use hil_account::flow::FlowMetrics;
+use hil_report::summary::RunSummary;
+use hil_tests::binary::hil_runtime_binary;
+use hil_tests::child::{ChildGuard, Finished};
+use hil_tests::run_folder::RunFolder;
+use hil_tests::trial::{processes_mentioning, wait_until};
+use nix::sys::signal::Signal;
+use serde_json::Value;
+
+const LIMIT: Duration = Duration::from_mins(2);
+/// Who runs it where the tests run as root: `nobody`, without a capability.
+const NOBODY: [&str; 5] = [
+    "--reuid=65534",
+    "--regid=65534",
+    "--clear-groups",
+    "--no-new-privs",
+    "--bounding-set=-all",
+];
+
+/// Says why a test is skipped that needs `program`; in CI it fails.
+fn lacks(program: &str, package: &str) -> bool {
+    let path = std::env::var("PATH").unwrap_or_default();
+    let is_there = path
+        .split(':')
+        .any(|one| Path::new(one).join(program).is_file());
+    if !is_there {
+        let reason = format!("`{program}` is not in PATH (Debian: apt-get install {package})");
+        let is_ci = std::env::var("CI").is_ok_and(|value| !value.is_empty() && value != "false");
+        assert!(!is_ci, "CI has every program, but {reason}");
+        eprintln!("skipped: {reason}");
+    }
+    !is_there
+}
+
+/// A folder of a user without rights, with a program of its own.
+struct Place {
+    folder: RunFolder,
+    binary: PathBuf,
+}
+
+impl Place {
+    fn new(label: &str) -> Self {
+        let folder = RunFolder::new(label);
+        let binary = folder.join("hil-runtime");
+        fs::copy(hil_runtime_binary(), &binary).unwrap();
+        for path in [folder.path(), &binary] {
+            fs::set_permissions(path, fs::Permissions::from_mode(0o777)).unwrap();
+        }
+        Self { folder, binary }
+    }
+
+    /// `hil-runtime join` with these arguments, run by a user without rights.
+    fn join(&self, arguments: &[&str]) -> ChildGuard {
+        self.start(
+            &[self.binary.to_str().unwrap(), "join", "--quiet"],
+            arguments,
+        )
+    }
+
+    fn start(&self, program: &[&str], arguments: &[&str]) -> ChildGuard {
+        let mut command = if nix::unistd::geteuid().is_root() {
+            let mut command = Command::new("setpriv");
+            command.args(NOBODY).args(program);
+            command
+        } else {
+            let mut command = Command::new(program[0]);
+            command.args(&program[1..]);
+            command
+        };
+        command.args(arguments).current_dir(self.folder.path());
+        ChildGuard::spawn(&mut command).unwrap()
+    }
+
+    /// Runs it to its end; nothing of it is left.
+    fn run(&self, arguments: &[&str]) -> Finished {
+        let finished = self.join(arguments).wait_within(LIMIT).unwrap();
+        self.assert_nothing_left();
+        finished
+    }
+
+    fn assert_nothing_left(&self) {
+        let path = self.binary.to_str().unwrap().to_owned();
+        wait_until(LIMIT, "every process of the run has ended", || {
+            processes_mentioning(&path).is_empty()
+        });
+    }
+
+    fn run_folder(&self) -> PathBuf {
+        let mut runs = fs::read_dir(self.folder.join("runs")).unwrap();
+        runs.next().unwrap().unwrap().path()
+    }
+
+    fn summary(&self) -> RunSummary {
+        let text = fs::read_to_string(self.run_folder().join("summary.json")).unwrap();
+        RunSummary::from_json(&text).unwrap()
+    }
+
+    fn said_by_first(&self) -> String {
+        fs::read_to_string(self.run_folder().join("logs/first.log")).unwrap()
+    }
+}
+
+/// The flow that `begin` begins the name of, from one program or the other.
+fn flow<'a>(summary: &'a RunSummary, begin: &str) -> &'a FlowMetrics {
+    let mut flows = summary.flows.iter().flat_map(|one| &one.flows);
+    let found = flows.find(|one| one.name.starts_with(begin));
+    found.unwrap_or_else(|| panic!("no flow {begin} in {:#?}", summary.flows))
+}
+
+/// Every frame has one fate, and no inlet lost any.
+fn assert_closed(summary: &RunSummary) {
+    assert_eq!(summary.flows.len(), 2);
+    for channel in &summary.flows {
+        assert_eq!(channel.inlet_lost, [], "{}", channel.channel);
+        let mut all_count = 0;
+        for flow in &channel.flows {
+            println!("{flow:?}");
+            let fates = [
+                flow.taken_count,
+                flow.lost_by_network_count,
+                flow.lost_by_either_count,
+                flow.lost_by_harness_count,
+                flow.unknown_count,
+            ];
+            assert_eq!(fates.iter().sum::<u64>(), flow.frame_count, "{flow:?}");
+            all_count += flow.frame_count;
+        }
+        let mut accounts = summary.channels.iter();
+        let account = accounts.find(|one| one.name == channel.channel).unwrap();
+        let account = account.account.as_ref().unwrap();
+        assert_eq!(all_count, account.published_count, "{}", channel.channel);
+    }
+}
+
+/// The number in front of `words`.
+fn number_before(text: &str, words: &str) -> u64 {
+    let before = text.split(words).next().unwrap();
+    let digits = before
+        .rsplit(|letter: char| !letter.is_ascii_digit())
+        .next();
+    digits
+        .unwrap()
+        .parse()
+        .unwrap_or_else(|_none| panic!("no number before {words}: {text}"))
+}
+
+#[test]
+fn ping_and_the_account_count_the_same_echoes_over_a_link_that_loses_and_delays() {
+    if lacks("ping", "iputils-ping") {
+        return;
+    }
+    let place = Place::new("join-ping");
+    let link = ["--link", "delay 5ms loss 5%"];
+    let ping = [
+        "--",
+        "ping",
+        "-c",
+        "300",
+        "-i",
+        "0.01",
+        "-W",
+        "1",
+        "10.77.0.2",
+    ];
+    let finished = place.run(&[&link[..], &ping, &["--", "sleep", "60"]].concat());
+    finished.assert_success();
+    assert!(finished.stdout.contains("Flows"), "{}", finished.stdout);
+    let (summary, said) = (place.summary(), place.said_by_first());
+    assert_closed(&summary);
+    let requests = flow(&summary, "icmp 10.77.0.1 → 10.77.0.2");
+    let replies = flow(&summary, "icmp 10.77.0.2 → 10.77.0.1");
+    assert_eq!(
+        requests.frame_count,
+        number_before(&said, " packets transmitted")
+    );
+    assert_eq!(replies.frame_count, requests.taken_count);
+    assert_eq!(replies.taken_count, number_before(&said, " received"));
+    assert!(requests.lost_by_network_count + replies.lost_by_network_count > 0);
+    for one in [requests, replies] {
+        assert_eq!(one.lost_by_harness_count, 0, "{one:?}");
+        assert!(one.delay.measured().unwrap().min_ns >= 5_000_000, "{one:?}");
+    }
+}
+
+#[test]
+fn datagrams_longer_than_a_frame_pass_and_one_that_may_not_be_cut_is_refused_inside() {
+    if lacks("ping", "iputils-ping") {
+        return;
+    }
+    let place = Place::new("join-large");
+    let script = "ping -c 3 -i 0.2 -s 6000 10.77.0.2 && ping -c 2 -i 0.2 -M do -s 1472 10.77.0.2 && \
+                  ! ping -c 1 -M do -s 1473 10.77.0.2";
+    let finished = place.run(&["--", "sh", "-c", script, "--", "sleep", "60"]);
+    finished.assert_success();
+    let (summary, said) = (place.summary(), place.said_by_first());
+    assert_closed(&summary);
+    assert!(
+        said.contains("3 received") && said.contains("2 received"),
+        "{said}"
+    );
+    assert!(said.contains("mtu=1500"), "{said}");
+    // Five frames an echo of 6000 bytes, one of 1472.
+    assert_eq!(flow(&summary, "icmp 10.77.0.1").frame_count, 3 * 5 + 2);
+}
+
+#[test]
+fn iperf3_and_the_account_lose_the_same_datagrams() {
+    if lacks("iperf3", "iperf3") {
+        return;
+    }
+    let place = Place::new("join-iperf");
+    let client =
+        "sleep 1; exec iperf3 --udp --bitrate 4M --length 1000 --time 3 --json --client 10.77.0.2";
+    let link = ["--link", "delay 1ms loss 3%", "--seed", "5"];
+    let programs = ["--", "sh", "-c", client, "--", "iperf3", "--server"];
+    place.run(&[&link[..], &programs].concat()).assert_success();
+    let (summary, said) = (place.summary(), place.said_by_first());
+    assert_closed(&summary);
+    let said: Value = serde_json::from_str(&said[said.find('{').unwrap()..]).unwrap();
+    let sum = &said["end"]["sum"];
+    let [packets, lost] = ["packets", "lost_packets"].map(|key| sum[key].as_u64().unwrap());
+    let datagrams = flow(&summary, "udp 10.77.0.1");
+    println!("iperf3: {lost} of {packets} lost");
+    // Beside its datagrams it sends one that opens the stream; the last ones it does not count as lost.
+    assert!((packets..=packets + 2).contains(&datagrams.frame_count));
+    assert!(
+        datagrams.lost_by_network_count.abs_diff(lost) <= 3,
+        "{lost}: {datagrams:?}"
+    );
+    assert!(
+        lost > 0 && datagrams.lost_by_harness_count == 0,
+        "{datagrams:?}"
+    );
+    assert!(flow(&summary, "tcp 10.77.0.1").taken_count > 0);
+}
+
+#[test]
+fn ctrl_c_leaves_a_report_and_nothing_else_and_a_program_that_fails_is_named_with_its_exit_code() {
+    let place = Place::new("join-end");
+    let mut child = place.join(&[
+        "--",
+        "sleep",
+        "100",
+        "--",
+        "sh",
+        "-c",
+        "sleep 100 & sleep 100",
+    ]);
+    let records = place.folder.join("runs");
+    wait_until(LIMIT, "a frame is recorded", || {
+        let Ok(mut runs) = fs::read_dir(&records) else {
+            return false;
+        };
+        let run = runs
+            .next()
+            .and_then(Result::ok)
+            .map(|run| run.path().join("records"));
+        let files = run.and_then(|run| fs::read_dir(run).ok());
+        files.is_some_and(|mut files| {
+            files.any(|file| {
+                let file = file.unwrap();
+                let name = file.file_name().into_string().unwrap();
+                name.contains(".frame.") && file.metadata().unwrap().len() > 128
+            })
+        })
+    });
+    child.signal(Signal::SIGINT).unwrap();
+    let finished = child.wait_within(LIMIT).unwrap();
+    assert_eq!(finished.status.code(), Some(130), "{}", finished.stderr);
+    place.assert_nothing_left();
+    assert_closed(&place.summary());
+
+    let place = Place::new("join-failed");
+    let finished = place.run(&["--", "sh", "-c", "exit 7", "--", "sleep", "100"]);
+    assert_eq!(finished.status.code(), Some(1));
+    assert!(
+        finished.stderr.contains("sh ended with exit code 7"),
+        "{}",
+        finished.stderr
+    );
+}
+
+#[test]
+fn a_refusal_of_the_kernel_is_told_with_its_cure() {
+    let place = Place::new("join-refused");
+    let binary = place.binary.to_str().unwrap();
+    let script = format!(
+        "echo 0 > /proc/sys/user/max_net_namespaces && exec {binary} join --quiet -- true -- true"
+    );
+    let unshare = ["unshare", "--user", "--map-root-user", "sh", "-c"];
+    let mut child = place.start(&unshare, &[&script]);
+    let finished = child.wait_within(LIMIT).unwrap();
+    assert_eq!(finished.status.code(), Some(1), "{}", finished.stderr);
+    let cure = "max_net_namespaces is 0: raise the one that is used up with sysctl";
+    assert!(finished.stderr.contains(cure), "{}", finished.stderr);
+    place.assert_nothing_left();
+}
+
+#[test]
+fn what_a_stopped_process_of_ours_loses_is_the_harness_and_not_the_network() {
+    if lacks("python3", "python3") {
+        return;
+    }
+    let place = Place::new("join-stopped");
+    let client = "import socket, time\n\
+                  one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n\
+                  one.sendto(b'x', ('10.77.0.2', 5000))\n\
+                  time.sleep(1)\n\
+                  for number in range(4000):\n    one.sendto(b'x' * 64, ('10.77.0.2', 5000))\n    time.sleep(0.0005)\n\
+                  time.sleep(30)\n";
+    let mut child = place.join(&["--", "python3", "-c", client, "--", "sleep", "100"]);
+    let own = |text: &str| {
+        let of_place = processes_mentioning(place.folder.path().to_str().unwrap());
+        let worker = processes_mentioning(text);
+        worker.into_iter().find(|pid| of_place.contains(pid))
+    };
+    wait_until(LIMIT, "the cable of the second program is there", || {
+        own("/second.0.json").is_some()
+    });
+    let cable = own("/second.0.json").unwrap();
+    std::thread::sleep(Duration::from_secs(1));
+    nix::sys::signal::kill(cable, Signal::SIGSTOP).unwrap();
+    std::thread::sleep(Duration::from_secs(8));
+    nix::sys::signal::kill(cable, Signal::SIGCONT).unwrap();
+    std::thread::sleep(Duration::from_secs(1));
+    child.signal(Signal::SIGINT).unwrap();
+    child.wait_within(LIMIT).unwrap();
+    place.assert_nothing_left();
+    let summary = place.summary();
+    assert_closed(&summary);
+    let datagrams = flow(&summary, "udp 10.77.0.1");
+    assert!(datagrams.lost_by_harness_count > 1_000, "{datagrams:?}");
+    assert_eq!(datagrams.lost_by_network_count, 0, "{datagrams:?}");
+}
