@@ -69,6 +69,11 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// A fresh instance of the role called `name`; `None` if the case has no such role.
     fn role(&self, name: &str) -> Option<Box<dyn Role>>;
 
+    /// What the check of these parameters leaves open, in words without full stop; nothing by default.
+    fn undecided(&self) -> Option<String> {
+        None
+    }
+
     /// What the robot did, from the messages of a finished run; nothing by default.
     fn score(&self, _log: &RunLog) -> Score {
         Score::default()

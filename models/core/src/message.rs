@@ -296,7 +296,7 @@ macro_rules! numbered {
         $($(#[$variant_meta:meta])* $variant:ident = $value:literal),+ $(,)?
     }) => {
         $(#[$meta])*
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[repr($number)]
         $vis enum $name {
             $($(#[$variant_meta])* $variant = $value,)+

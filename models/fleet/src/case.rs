@@ -3,11 +3,12 @@
 use crate::controller::Controller;
 use crate::coordinator::parameters::{CoordinatorMode, CoordinatorParameters};
 use crate::experiment::{FleetStudy, TableParameters};
+use crate::feasibility::{Beginning, beginning, obstruction_text};
 use crate::messages::{Authority, Mission, State, Truth};
 use crate::mission::MissionParameters;
 use crate::robot::RobotParameters;
 use crate::robots::Robots;
-use crate::scenario::{Scene, WorldParameters};
+use crate::scenario::{Scenario, Scene, WorldParameters};
 use crate::score;
 use crate::world::Vehicle;
 use hil_core::case_study::{CaseStudy, ChannelSpec, ParameterError};
@@ -61,7 +62,7 @@ impl CaseStudy for Fleet {
         ChannelSpec::of::<State>(FLEET_STATE, "robots", "controller"),
         ChannelSpec::recorded::<Truth>(FLEET_TRUTH, "robots"),
     ];
-    /// A coordinator started anew would believe all robots in their first bays, and robots
+    /// A legacy coordinator started anew would believe all robots in their first bays, and robots
     /// started anew would be there while the coordinator believes them under way.
     const MAY_RESTART: bool = false;
     const SCORE_CLOCK: Option<&'static str> = Some(FLEET_TRUTH);
@@ -71,6 +72,7 @@ impl CaseStudy for Fleet {
         parameters.check()?;
         let scene = parameters.world.build()?;
         parameters.check_stop_error(&scene.world.vehicle)?;
+        parameters.check_beginning(&scene)?;
         Ok(Self {
             parameters,
             scene,
@@ -98,6 +100,14 @@ impl CaseStudy for Fleet {
             "robots" => Some(into_role(Robots::new(scene, robot, fleets, self.seed))),
             _ => None,
         }
+    }
+
+    fn undecided(&self) -> Option<String> {
+        let is_safe = self.parameters.coordinator.mode == CoordinatorMode::Safe;
+        let beginning = beginning(&self.scene, self.parameters.missions.mode, is_safe);
+        (beginning == Beginning::Undecided).then(|| {
+            "whether an order exists in which every robot can go on, as ways lead past where others park".to_owned()
+        })
     }
 
     fn score(&self, log: &RunLog) -> Score {
@@ -141,6 +151,21 @@ impl FleetParameters {
         self.coordinator.check()?;
         self.missions.check()?;
         self.tables.check()
+    }
+
+    /// Checks that some order lets every robot set out.
+    fn check_beginning(&self, scene: &Scene) -> Result<(), ParameterError> {
+        let is_safe = self.coordinator.mode == CoordinatorMode::Safe;
+        match beginning(scene, self.missions.mode, is_safe) {
+            Beginning::Free | Beginning::Undecided => Ok(()),
+            Beginning::Never(chain) => {
+                let key = match self.world.scenario {
+                    Scenario::Custom => "world.bays",
+                    _ => "world.scenario",
+                };
+                Err(ParameterError::new(key, obstruction_text(&chain)))
+            }
+        }
     }
 
     /// Checks that the safe coordinator leaves at least the room that the robots may overshoot.

@@ -7,6 +7,7 @@ pub mod controller;
 pub mod coordinator;
 mod events;
 pub mod experiment;
+mod feasibility;
 pub mod geometry;
 pub mod map;
 pub mod messages;
@@ -20,6 +21,7 @@ pub mod scenario;
 mod scene;
 mod score;
 pub mod section;
+mod standing;
 pub mod world;
 
 pub use case::{FLEET_AUTHORITY, FLEET_MISSION, FLEET_STATE, FLEET_TRUTH, Fleet, FleetParameters};

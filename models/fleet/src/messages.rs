@@ -2,17 +2,19 @@
 //! Names and meanings follow VDA 5050 (order = mission, base = authority, state); the encoding is
 //! our own fixed-size one. Nothing here decides anything.
 
+use hil_core::time::Instant;
 use serde::{Deserialize, Serialize};
 
 hil_core::message! {
     /// What the three messages between controller and robot begin with, 24 bytes.
-    #[derive(Eq, Default)]
+    #[derive(Eq, Hash, Default)]
     pub struct Header, 24 bytes {
         /// Which of the independent fleets that share the channel.
         pub fleet_id: u32,
         /// Robot within its fleet, from 0.
         pub robot_id: u32,
-        /// Counts the sender's messages of this kind to or from this robot, from 1 (`headerId`).
+        /// Counts the sender's messages of this kind to or from this robot (`headerId`), from the
+        /// milliseconds on its clock when it started, so that it grows across restarts.
         pub header_id: u32,
         /// The mission meant (`orderId`); 0 is none.
         pub mission_id: u32,
@@ -49,7 +51,7 @@ hil_core::numbered! {
 hil_core::message! {
     /// Robot to controller, every tracking period (VDA 5050 `state`), 96 bytes.
     #[derive(Default)]
-    pub struct State = "hil.FleetState.v1", 96 bytes {
+    pub struct State = "hil.FleetState.v2", 96 bytes {
         /// Who, which mission, when.
         pub header: Header,
         /// When the robot sampled its motion, nanoseconds on its clock.
@@ -64,8 +66,8 @@ hil_core::message! {
         pub travelled_m: f64,
         /// Speed along the path.
         pub speed_mps: f32,
-        /// Acceleration along the path.
-        pub acceleration_mps2: f32,
+        /// The newest question of a coordinator ([`Authority::QUESTION`]) heard since the robot started; 0 if none.
+        pub answered: u32,
         /// Last path pose passed (`lastNodeSequenceId`); -1 without a mission.
         pub path_index: i32,
         /// Authority in force: last pose the robot may reach; [`TO_GOAL`] for the whole path,
@@ -75,13 +77,22 @@ hil_core::message! {
         pub applied_sequence: u32,
         /// First pose at which the robot could still stop, were it told now.
         pub stop_index: i32,
+        /// The path `path_index` refers to; of a robot without a mission, one that begins or ends where it stands.
+        pub path_id: u32,
         /// A [`Phase`].
         pub phase: u8,
         /// [`State::REFUSED`].
         pub flags: u8,
         /// Zero.
-        pub reserved: [u8; 6],
+        pub reserved: [u8; 2],
     }
+}
+
+/// First `header_id`, and question, of a sender that starts at `now` on its clock: newer than any it gave before
+/// it restarted, as long as it gives fewer than one a millisecond.
+pub(crate) fn first_id(now: Instant) -> u32 {
+    let ms = now.as_ns().max(0) / 1_000_000;
+    u32::try_from(ms & i64::from(u32::MAX)).expect("masked")
 }
 
 /// `authority_index`: the whole path.
@@ -99,15 +110,14 @@ impl State {
         let reals = [self.x_m, self.y_m, self.heading_rad, self.travelled_m];
         reals.iter().all(|value| value.is_finite())
             && self.speed_mps.is_finite()
-            && self.acceleration_mps2.is_finite()
             && Phase::from_number(self.phase).is_some()
     }
 }
 
 hil_core::message! {
     /// Controller to robot: how far it may go (the end of VDA 5050's *base*), 48 bytes.
-    #[derive(Eq, Default)]
-    pub struct Authority = "hil.FleetAuthority.v1", 48 bytes {
+    #[derive(Eq, Hash, Default)]
+    pub struct Authority = "hil.FleetAuthority.v2", 48 bytes {
         /// To whom, for which mission.
         pub header: Header,
         /// Grows with every change of this mission's authority, from 1 (`orderUpdateId`); a repeat
@@ -117,7 +127,7 @@ hil_core::message! {
         pub authority_index: i32,
         /// `header_id` of the newest state the decision rests on; 0 if none.
         pub echo_header_id: u32,
-        /// [`Authority::ACKNOWLEDGED`].
+        /// [`Authority::ACKNOWLEDGED`], [`Authority::QUESTION`].
         pub flags: u32,
         /// Zero.
         pub reserved: [u8; 8],
@@ -128,22 +138,25 @@ impl Authority {
     /// Flag: acknowledged movement authority. The robot applies only newer sequences and never
     /// shortens below where it can stop. Without the flag it follows the original's rules.
     pub const ACKNOWLEDGED: u32 = 1;
+    /// Flag: a coordinator that started asks what the robot holds; `sequence` is the question, newer
+    /// from start to start. It gives no way, and commands that rest on states of before are void.
+    pub const QUESTION: u32 = 2;
 }
 
 hil_core::message! {
     /// Controller to robot: the path to drive (VDA 5050 `order`), repeated until a state shows the
     /// mission, 48 bytes. Path geometry is not sent: both ends make it, and compare by hash.
-    #[derive(Eq, Default)]
-    pub struct Mission = "hil.FleetMission.v1", 48 bytes {
+    #[derive(Eq, Hash, Default)]
+    pub struct Mission = "hil.FleetMission.v2", 48 bytes {
         /// To whom; `mission_id` is the new mission.
         pub header: Header,
         /// Which path, as [`PathId`](crate::path::PathId) numbers them.
         pub path_id: u32,
-        /// Pose to start from; 0.
-        pub start_index: u32,
+        /// As [`Authority::echo_header_id`], with [`Mission::ACKNOWLEDGED`].
+        pub echo_header_id: u32,
         /// Pose to end at; the path's last.
         pub end_index: u32,
-        /// [`Mission::REPLACE`].
+        /// [`Mission::REPLACE`], [`Mission::ACKNOWLEDGED`].
         pub flags: u32,
         /// [`Path::hash`](crate::path::Path::hash) as the controller knows it.
         pub path_hash: u64,
@@ -153,6 +166,8 @@ hil_core::message! {
 impl Mission {
     /// Flag: a stuck fleet is being cleared; the robot is put at the path's end at once.
     pub const REPLACE: u32 = 1;
+    /// Flag: it counts only if it rests on a state of the robot's present time; see [`Authority::QUESTION`].
+    pub const ACKNOWLEDGED: u32 = 2;
 }
 
 hil_core::message! {

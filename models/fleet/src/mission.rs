@@ -36,6 +36,13 @@ hil_core::parameters! {
     }
 }
 
+impl MissionParameters {
+    /// True when a robot that is parked is always sent on, sooner or later.
+    pub(crate) fn never_end(&self) -> bool {
+        self.missions_per_robot == 0 && self.mode != MissionMode::Once
+    }
+}
+
 /// Gives out missions.
 #[derive(Debug, Clone)]
 pub struct MissionSource {
@@ -65,6 +72,11 @@ impl MissionSource {
             scene: scene.clone(),
             random,
         }
+    }
+
+    /// `robot` has had `count` missions already.
+    pub(crate) fn resume(&mut self, robot: usize, count: u32) {
+        self.left_counts[robot] = self.left_counts[robot].saturating_sub(count);
     }
 
     /// The next way for `robot`, which stands in bay `at`; `None` when it has had all its missions

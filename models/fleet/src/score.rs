@@ -4,11 +4,12 @@
 
 use std::collections::BTreeMap;
 
-use crate::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet};
+use crate::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet, FleetParameters};
 use crate::events::events;
 use crate::experiment::collision_interval;
 use crate::messages::{Authority, State, Truth};
 use crate::referee::{Referee, SCAN_PERIOD, Tally};
+use crate::standing::{Standstill, standstills};
 use hil_core::case_study::{ErrorSeries, Harm, Metric, Score};
 use hil_core::interval::Spread;
 use hil_core::run_log::RunLog;
@@ -26,9 +27,17 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
             ..Score::default()
         };
     };
+    let run_end = run_end(log, end);
+    let FleetParameters {
+        coordinator,
+        missions,
+        ..
+    } = case.parameters();
+    let stuck_after = coordinator.stuck_after();
+    let standing = standstills(log, &truths, run_end, stuck_after, missions.never_end());
     let mut referee = Referee::new(case.scene(), case.parameters().fleets);
     referee.replay(&mut truths.into_iter(), start, end);
-    let run_s = end.seconds_since(start);
+    let run_s = run_end.seconds_since(start);
     let tally = referee.tally();
     let mut score = Score {
         harms: harms(Some(tally)),
@@ -40,7 +49,16 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
     score.metrics.extend(commands(tally));
     score.metrics.extend(ages(log));
     score.metrics.extend(work(tally, run_s));
-    for event in events(log, referee.incidents()) {
+    let standing_s: f64 = standing.iter().map(Standstill::duration_s).sum();
+    let method = format!(
+        "no robot of a fleet moved for more than {} s; all fleets together",
+        stuck_after.as_secs_f64()
+    );
+    score.metrics.push(STANDING.known(standing_s, method));
+    let mut found = events(log, referee.incidents());
+    found.extend(standing.iter().map(Standstill::event));
+    found.sort_by_key(|event| event.at);
+    for event in found {
         score.add_event(event);
     }
     score
@@ -71,6 +89,8 @@ const COLLISIONS: Label = label(
     "collisions, section checker",
     "1",
 );
+
+const STANDING: Label = label("standing_s", "time a whole fleet stood", "s");
 
 fn collisions(tally: &Tally) -> Vec<Metric> {
     let passed = tally.sections_passed_count;
@@ -196,6 +216,13 @@ fn span(truths: &[Truth]) -> Option<(Instant, Instant)> {
     Some((Instant::from_ns(first.at_ns), end))
 }
 
+/// The end of the run: robots that stand leave no record of motion but go on to report.
+fn run_end(log: &RunLog, end: Instant) -> Instant {
+    let states = log.messages::<State>(FLEET_STATE);
+    let sampled = states.map(|(_, state)| Instant::from_ns(state.sampled_ns));
+    sampled.fold(end, Instant::max)
+}
+
 /// How old the newest state was on which each authority rests.
 fn ages(log: &RunLog) -> Vec<Metric> {
     let labels = [
@@ -253,7 +280,7 @@ fn work(tally: &Tally, run_s: f64) -> Vec<Metric> {
         ),
         label("missions_per_hour", "missions per hour", "1").known(
             per_hour,
-            format!("all fleets together, over {run_s:.1} s; missions under way do not count"),
+            format!("all fleets together, over the whole run of {run_s:.1} s; missions under way do not count"),
         ),
         label("travelled_km", "way driven", "km")
             .known(tally.travelled_m * 1e-3, "by all robots of all fleets"),
@@ -274,7 +301,6 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
-    use crate::FleetParameters;
     use crate::scenario::Scenario;
     use hil_core::case_study::CaseStudy;
     use hil_core::link_model::{Fate, LinkModel};
@@ -347,6 +373,52 @@ mod tests {
         let whole_s = standing_s(BTreeMap::new());
         assert!(silent_s > whole_s + 10.0, "{silent_s} s, {whole_s} s");
         assert!(case.errors(&RunLog::default()).is_empty());
+    }
+
+    /// Lets nothing through from 30 s on.
+    #[derive(Debug)]
+    struct End;
+
+    impl LinkModel for End {
+        fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+            if now.seconds_since(Instant::ZERO) < 30.0 {
+                Fate::Delivered(now)
+            } else {
+                Fate::Lost
+            }
+        }
+    }
+
+    #[test]
+    fn a_fleet_that_stands_has_the_rate_of_the_whole_run_and_an_event_with_its_cause() {
+        let mut parameters = FleetParameters::default();
+        parameters.world.scenario = Scenario::Crossing;
+        parameters.missions.parking_s = 1.0;
+        let case = Fleet::new(parameters, 3).unwrap();
+        let links: BTreeMap<String, Box<dyn Carrier>> = [FLEET_AUTHORITY, crate::FLEET_MISSION]
+            .into_iter()
+            .map(|channel| (channel.to_owned(), Box::new(End) as Box<dyn Carrier>))
+            .collect();
+        let result = Simulation::new(&case, links).unwrap();
+        let result = result.run(Duration::from_hours(1)).unwrap();
+        let score = case.score(&result.log);
+        let value = |name: &str| score.get(name).and_then(|metric| metric.value).unwrap();
+        // One hour: as many an hour as there were.
+        let missions = value("missions_count");
+        assert!(
+            (value("missions_per_hour") - missions).abs() < 0.01 * missions.max(1.0),
+            "{score:?}"
+        );
+        assert!(value("standing_s") > 3300.0, "{score:?}");
+        let told = score
+            .events
+            .iter()
+            .filter(|event| event.what.contains("stood for"));
+        let told: Vec<_> = told.map(|event| event.what.as_str()).collect();
+        assert!(
+            told.len() == 1 && told[0].contains("reached a robot"),
+            "{told:?}"
+        );
     }
 
     #[test]

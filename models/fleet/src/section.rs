@@ -32,7 +32,7 @@ impl Side {
 }
 
 /// A range of poses of a path, both ends included.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Span {
     /// First pose.
     pub lower: usize,

@@ -240,11 +240,11 @@ mod tests {
     fn numbers_are_positions_and_reserved_fields_are_left_out() {
         let fields = describe_fields(State::FIELDS);
         let schema = of_layout(State::NAME, &fields, size_of::<State>()).unwrap();
-        assert_eq!(schema.name, "hil.FleetState.v1");
+        assert_eq!(schema.name, "hil.FleetState.v2");
         let proto = descriptor(&schema);
         let last = proto.field.last().unwrap();
-        assert_eq!((last.name(), last.number()), ("flags", 14));
-        assert_eq!(proto.field[0].type_name(), ".hil.FleetState.v1.Header");
+        assert_eq!((last.name(), last.number()), ("flags", 15));
+        assert_eq!(proto.field[0].type_name(), ".hil.FleetState.v2.Header");
         assert!(proto.field.iter().all(|field| field.name() != "reserved"));
     }
 

@@ -19,6 +19,9 @@ pub trait Case: Debug {
     /// A fresh instance of a role; `None` if the case has no such role.
     fn role(&self, name: &str) -> Option<Box<dyn Role>>;
 
+    /// See [`CaseStudy::undecided`].
+    fn undecided(&self) -> Option<String>;
+
     /// See [`CaseStudy::score`].
     fn score(&self, log: &RunLog) -> Score;
 
@@ -54,6 +57,10 @@ struct Erased<C>(C);
 impl<C: CaseStudy> Case for Erased<C> {
     fn role(&self, name: &str) -> Option<Box<dyn Role>> {
         self.0.role(name)
+    }
+
+    fn undecided(&self) -> Option<String> {
+        self.0.undecided()
     }
 
     fn score(&self, log: &RunLog) -> Score {

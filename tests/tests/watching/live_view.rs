@@ -297,7 +297,7 @@ fn check_the_map(viewer: &Viewer) {
     assert!(!map["conflict_areas"].as_array().unwrap().is_empty());
     let kind = |topic: &str| viewer.schemas[topic].clone();
     let protobuf = |name: &str| ("protobuf".to_owned(), name.to_owned());
-    assert_eq!(kind("/fleet/state"), protobuf("hil.FleetState.v1"));
+    assert_eq!(kind("/fleet/state"), protobuf("hil.FleetState.v2"));
     assert_eq!(
         kind("/net/fleet/state/latency"),
         protobuf("hil.MessageLatency.v1")

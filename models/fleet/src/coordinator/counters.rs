@@ -65,6 +65,10 @@ hil_core::counts! {
         stuck: u64;
         /// States that say what cannot be.
         states_impossible: u64;
+        /// Robots that have forgotten what they had told: they restarted, and stand.
+        robots_restarted: u64;
+        /// Answers of robots that stand outside every bay without a mission, or name none they could be on.
+        answers_unplaced: u64;
         /// States that show an authority that was never given.
         authorities_exceeded: u64;
         /// States that show a robot beyond its authority by more than the stop margin.

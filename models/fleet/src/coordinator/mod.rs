@@ -20,7 +20,7 @@ use crate::coordinator::policy::OrderingPolicy;
 use crate::coordinator::roster::Roster;
 use crate::coordinator::safe::SafeRules;
 use crate::coordinator::safe::reservation::Traffic;
-use crate::messages::{State, ToRobot};
+use crate::messages::{Mission, State, ToRobot};
 use crate::mission::MissionSource;
 use crate::scenario::Scene;
 use hil_core::time::Instant;
@@ -39,6 +39,19 @@ pub(crate) trait Rules: Debug {
     /// Decides and sends authorities. The roster is settled: missions that ended, and sections
     /// that were passed, are gone from it; missions that begin are in it.
     fn decide(&mut self, cycle: &mut Cycle<'_>);
+
+    /// Whether missions may be given out yet; before, what robots have told is put into the roster.
+    fn prepare(
+        &mut self,
+        _now: Instant,
+        _roster: &mut Roster,
+        _missions: &mut MissionSource,
+    ) -> bool {
+        true
+    }
+
+    /// Makes a mission one of these rules.
+    fn address(&self, _mission: &mut Mission) {}
 
     /// Sees every state as it arrives, also those the roster does not take.
     fn on_state(&mut self, _now: Instant, _state: &State) {}
@@ -76,8 +89,13 @@ impl Coordinator {
         let rules: Box<dyn Rules> = match parameters.mode {
             CoordinatorMode::Legacy => Box::new(LegacyRules::new(scene, parameters)),
             CoordinatorMode::Safe => {
-                let starts = &scene.starts;
-                Box::new(SafeRules::new(&scene.world, starts, parameters, fleet_id))
+                let robot_count = scene.starts.len();
+                Box::new(SafeRules::new(
+                    &scene.world,
+                    robot_count,
+                    parameters,
+                    fleet_id,
+                ))
             }
         };
         Self {
@@ -105,7 +123,19 @@ impl Coordinator {
     /// One control cycle; gives each message to `send`.
     pub fn on_cycle(&mut self, now: Instant, send: &mut dyn FnMut(ToRobot)) {
         self.roster.settle(&mut self.counters.counts);
-        self.roster.dispatch(now, &mut self.missions, send);
+        let is_ready = self
+            .rules
+            .prepare(now, &mut self.roster, &mut self.missions);
+        if is_ready {
+            let rules = &self.rules;
+            self.roster
+                .dispatch(now, &mut self.missions, &mut |mut message| {
+                    if let ToRobot::Mission(mission) = &mut message {
+                        rules.address(mission);
+                    }
+                    send(message);
+                });
+        }
         self.rules.decide(&mut Cycle {
             now,
             roster: &mut self.roster,

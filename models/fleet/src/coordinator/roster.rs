@@ -9,9 +9,9 @@ use crate::coordinator::counters::CoordinatorCounts;
 use crate::coordinator::parameters::CoordinatorParameters;
 use crate::coordinator::policy::Contender;
 use crate::coordinator::sections::SectionBook;
-use crate::messages::{Header, MessageOrder, Mission, Phase, State, ToRobot};
+use crate::messages::{Header, MessageOrder, Mission, Phase, State, ToRobot, first_id};
 use crate::mission::MissionSource;
-use crate::path::Path;
+use crate::path::{Path, PathId};
 use crate::scenario::Scene;
 use crate::world::{BayIndex, Route, World};
 use hil_core::time::Instant;
@@ -66,6 +66,52 @@ impl Roster {
             world: Arc::clone(&scene.world),
             next_reset: Instant::ZERO,
         }
+    }
+
+    /// Takes over what the robots have told a coordinator that knew nothing: per robot its state, and the bay it stands
+    /// in if it had no mission. What they do not tell, when they began and how long they parked, counts from `now`.
+    pub(crate) fn resume(
+        &mut self,
+        now: Instant,
+        told: impl Iterator<Item = (Option<State>, Option<BayIndex>)>,
+        missions: &mut MissionSource,
+    ) {
+        let world = Arc::clone(&self.world);
+        self.bay_users.fill(0);
+        self.parked.clear();
+        for (robot, (state, bay)) in told.enumerate() {
+            let Some(state) = state else {
+                continue;
+            };
+            let mission_id = state.header.mission_id;
+            let path = PathId(state.path_id);
+            let route = world.routes.iter().find(|route| route.path == path);
+            let view = &mut self.robots[robot];
+            view.newest_mission_id = mission_id;
+            view.mission_header_id = first_id(now);
+            missions.resume(robot, mission_id);
+            let bay = match (mission_id, route) {
+                (1.., Some(route)) if state.phase != Phase::Done as u8 => {
+                    self.resume_mission(now, robot, mission_id, *route, &state);
+                    continue;
+                }
+                (1.., Some(route)) => {
+                    view.parked_since = Some(now);
+                    route.to
+                }
+                _ => bay.unwrap_or(view.bay),
+            };
+            view.bay = bay;
+            self.bay_users[bay] += 1;
+            self.parked.push_back(robot);
+        }
+    }
+
+    fn resume_mission(&mut self, now: Instant, robot: usize, id: u32, route: Route, state: &State) {
+        self.bay_users[route.from] += 1;
+        self.robots[robot].bay = route.from;
+        self.set_out(now, robot, id, route);
+        self.robots[robot].take(now, state);
     }
 
     /// Every robot, by number.
@@ -208,15 +254,21 @@ impl Roster {
     }
 
     fn begin(&mut self, now: Instant, robot: usize, route: Route) {
+        let view = &mut self.robots[robot];
+        view.newest_mission_id += 1;
+        let id = view.newest_mission_id;
+        self.set_out(now, robot, id, route);
+    }
+
+    fn set_out(&mut self, now: Instant, robot: usize, id: u32, route: Route) {
         let world = Arc::clone(&self.world);
         let path = world.path(route.path);
         let view = &mut self.robots[robot];
-        view.newest_mission_id += 1;
         view.state = None;
         view.waiting_since = None;
         view.has_moved = false;
         view.mission = Some(ActiveMission {
-            id: view.newest_mission_id,
+            id,
             route,
             path: Arc::clone(path),
             started: now,

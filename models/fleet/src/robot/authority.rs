@@ -1,10 +1,207 @@
-//! What a robot makes of an authority: the original's rules and those of acknowledged movement
-//! authority, as decisions without effect.
+//! What a robot obeys: which missions and authorities count, by the original's rules and by those of acknowledged
+//! movement authority. Whole numbers only; it knows neither motion nor time. What runs and what is searched
+//! exhaustively (`coordinator::safe::search`) are this code.
 
-use crate::messages::{NO_AUTHORITY, TO_GOAL, TruthKind};
+use crate::messages::{Authority, Mission, NO_AUTHORITY, Phase, State, TO_GOAL, TruthKind};
+
+/// What a robot is about, and holds.
+///
+/// **Void commands.** A command of the safe mode names the state it rests on. It is void when the robot sent that
+/// state before it started, or before it heard the newest question of a coordinator; a coordinator that restarted, or
+/// a robot that did, never meets what was under way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) struct Holder {
+    pub(crate) mission_id: u32,
+    pub(crate) path_id: u32,
+    pub(crate) phase: Phase,
+    pub(crate) grant: Grant,
+    /// An authority that overtook its mission.
+    early: Option<Authority>,
+    /// Of the newest state.
+    pub(crate) header_id: u32,
+    /// Of the first state that commands may rest on.
+    valid_from: u32,
+    /// The newest question heard.
+    answered: u32,
+}
+
+/// What is to become of a mission.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum MissionVerdict {
+    /// It may begin, where it fits map and place.
+    Begin,
+    /// The robot is to be put at its end.
+    Replace,
+    /// The present one again, an older one, or void.
+    Stale,
+    /// Another is under way.
+    Busy,
+}
+
+/// What became of an authority.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Heard {
+    /// It is a question.
+    Question,
+    /// It overtook its mission and is kept for it.
+    Kept,
+    /// It overtook its mission and is passed over.
+    Early,
+    /// Void, or of a mission that is over.
+    Stale,
+    /// Its index has no meaning.
+    Meaningless,
+    /// It was judged.
+    Judged(Verdict),
+}
+
+/// Where a robot is when an authority reaches it.
+#[derive(Clone, Copy)]
+pub(crate) struct Standing<'a> {
+    /// Last pose of its path.
+    pub(crate) last_index: usize,
+    /// Last pose passed.
+    pub(crate) passed: usize,
+    /// Whether it can still stop at a pose.
+    pub(crate) can_stop_at: &'a dyn Fn(usize) -> bool,
+}
+
+impl Holder {
+    /// A robot that starts, parked, with states from `first_id + 1` on.
+    pub(crate) fn new(path_id: u32, first_id: u32) -> Self {
+        Self {
+            mission_id: 0,
+            path_id,
+            phase: Phase::Parked,
+            grant: Grant::NONE,
+            early: None,
+            header_id: first_id,
+            valid_from: first_id.wrapping_add(1),
+            answered: 0,
+        }
+    }
+
+    pub(crate) fn is_under_way(&self) -> bool {
+        matches!(self.phase, Phase::Driving | Phase::AtPoint)
+    }
+
+    /// Fills in what a state tells of it.
+    pub(crate) fn describe(&self, state: &mut State) {
+        state.header.header_id = self.header_id;
+        state.header.mission_id = self.mission_id;
+        state.path_id = self.path_id;
+        state.authority_index = self.grant.index;
+        state.applied_sequence = self.grant.applied.unwrap_or(0);
+        state.answered = self.answered;
+        state.phase = self.phase as u8;
+        state.flags = u8::from(self.grant.is_refused) * State::REFUSED;
+    }
+
+    /// Draws the conclusion from where it is: under way, at its authority or at its goal. True when it has reached
+    /// its goal.
+    pub(crate) fn settle(&mut self, is_at_rest: bool, passed: usize, last_index: usize) -> bool {
+        if !is_at_rest {
+            self.phase = Phase::Driving;
+            return false;
+        }
+        let is_goal = self.grant.is_given() && self.grant.reach(last_index) == last_index;
+        let is_done = is_goal && passed == last_index;
+        self.phase = if is_done { Phase::Done } else { Phase::AtPoint };
+        is_done
+    }
+
+    fn is_void(&self, echo_header_id: u32) -> bool {
+        is_newer(self.valid_from, echo_header_id)
+    }
+
+    pub(crate) fn judge_mission(&self, mission: &Mission) -> MissionVerdict {
+        let is_replacing = mission.flags & Mission::REPLACE != 0;
+        let is_present = mission.header.mission_id == self.mission_id;
+        let may_replace = is_replacing && is_present && self.is_under_way();
+        let is_void =
+            mission.flags & Mission::ACKNOWLEDGED != 0 && self.is_void(mission.echo_header_id);
+        let is_new = is_newer(mission.header.mission_id, self.mission_id);
+        if is_void || !(is_new || may_replace) {
+            MissionVerdict::Stale
+        } else if is_replacing {
+            MissionVerdict::Replace
+        } else if self.is_under_way() {
+            MissionVerdict::Busy
+        } else {
+            MissionVerdict::Begin
+        }
+    }
+
+    /// The mission begins. Gives the authority that came before it, which is to be heard now.
+    pub(crate) fn begin(&mut self, mission: &Mission) -> Option<Authority> {
+        self.mission_id = mission.header.mission_id;
+        self.path_id = mission.path_id;
+        self.grant = Grant::NONE;
+        self.phase = Phase::AtPoint;
+        let kept = self.early.take();
+        kept.filter(|kept| kept.header.mission_id == self.mission_id)
+    }
+
+    pub(crate) fn on_authority(&mut self, authority: &Authority, at: &Standing<'_>) -> Heard {
+        let is_acknowledged = authority.flags & Authority::ACKNOWLEDGED != 0;
+        if authority.flags & Authority::QUESTION != 0 {
+            if self.answered == 0 || is_newer(authority.sequence, self.answered) {
+                self.answered = authority.sequence;
+                self.valid_from = self.header_id.wrapping_add(1);
+                self.early = None;
+            }
+            return Heard::Question;
+        }
+        if is_acknowledged && self.is_void(authority.echo_header_id) {
+            return Heard::Stale;
+        }
+        let mission_id = authority.header.mission_id;
+        if !self.is_under_way() || mission_id != self.mission_id {
+            return if !is_newer(mission_id, self.mission_id) {
+                Heard::Stale
+            } else if is_acknowledged && self.keep_early(authority) {
+                Heard::Kept
+            } else {
+                Heard::Early
+            };
+        }
+        let Some(reach) = reach_of(authority.authority_index, at.last_index) else {
+            return Heard::Meaningless;
+        };
+        let proposal = Proposal {
+            index: authority.authority_index,
+            sequence: authority.sequence,
+            reach,
+            reach_now: self.grant.reach(at.last_index),
+            passed: at.passed,
+            can_stop: (at.can_stop_at)(reach),
+        };
+        let verdict = if is_acknowledged {
+            acknowledged(&self.grant, &proposal)
+        } else {
+            original(&self.grant, &proposal)
+        };
+        self.grant.carry_out(authority, verdict);
+        Heard::Judged(verdict)
+    }
+
+    /// Keeps an acknowledged authority that overtook its mission, which goes another way: the
+    /// coordinator counts it as in force from the moment it was sent. False when it is passed over.
+    fn keep_early(&mut self, authority: &Authority) -> bool {
+        let is_newest = self.early.is_none_or(|kept| {
+            let (new, old) = (&authority.header, &kept.header);
+            is_newer(new.mission_id, old.mission_id)
+                || (new.mission_id == old.mission_id && is_newer(authority.sequence, kept.sequence))
+        });
+        if is_newest {
+            self.early = Some(*authority);
+        }
+        is_newest
+    }
+}
 
 /// The authority in force and what is known of newer ones.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) struct Grant {
     /// As received; [`NO_AUTHORITY`] before the first.
     pub(crate) index: i32,
@@ -29,6 +226,27 @@ impl Grant {
 
     pub(crate) const fn is_given(&self) -> bool {
         self.index != NO_AUTHORITY
+    }
+
+    fn carry_out(&mut self, authority: &Authority, verdict: Verdict) {
+        if verdict == Verdict::Stale {
+            return;
+        }
+        self.newest = Some(authority.sequence);
+        match verdict {
+            Verdict::Apply | Verdict::ApplyLate => {
+                self.index = authority.authority_index;
+                self.applied = Some(authority.sequence);
+                self.is_refused = false;
+                self.is_late = verdict == Verdict::ApplyLate;
+            }
+            Verdict::Unchanged => self.applied = Some(authority.sequence),
+            Verdict::Refuse => {
+                self.applied = Some(authority.sequence);
+                self.is_refused = true;
+            }
+            Verdict::Ignore | Verdict::Stale => {}
+        }
     }
 
     /// Last pose the robot may reach, of a path that ends at `last_index`; 0 before the first.
@@ -132,6 +350,26 @@ pub(crate) fn acknowledged(grant: &Grant, proposal: &Proposal) -> Verdict {
         Verdict::Apply
     } else {
         Verdict::Refuse
+    }
+}
+
+#[cfg(test)]
+impl Holder {
+    /// The header ids it keeps, that of its newest state last.
+    pub(crate) fn header_ids(&mut self) -> [&mut u32; 2] {
+        [&mut self.valid_from, &mut self.header_id]
+    }
+
+    /// Every sequence it keeps.
+    pub(crate) fn sequences(&mut self) -> impl Iterator<Item = &mut u32> {
+        let early = self.early.as_mut().map(|early| &mut early.sequence);
+        let grant = [self.grant.applied.as_mut(), self.grant.newest.as_mut()];
+        grant.into_iter().chain([early]).flatten()
+    }
+
+    /// The authority it keeps for a mission to come rests on nothing any more.
+    pub(crate) fn early(&mut self) -> Option<&mut Authority> {
+        self.early.as_mut()
     }
 }
 

@@ -2,7 +2,7 @@
 //! authority goes, reports its state, and tells the recorder what truly happens. It knows nothing
 //! of other robots and reads no clock.
 
-mod authority;
+pub(crate) mod authority;
 #[cfg(test)]
 mod exact_tests;
 #[cfg(test)]
@@ -17,9 +17,11 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Pose, floor_index};
-use crate::messages::{Authority, Header, MessageOrder, Mission, Phase, State, Truth, TruthKind};
+use crate::messages::{
+    Authority, Header, MessageOrder, Mission, Phase, State, Truth, TruthKind, first_id,
+};
 use crate::path::{Path, PathId};
-use crate::robot::authority::{Grant, Proposal, Verdict, is_newer, reach_of};
+use crate::robot::authority::{Heard, Holder, MissionVerdict, Standing, Verdict, is_newer};
 use crate::robot::tracker::{Limits, Tracker};
 use crate::scenario::Scene;
 use crate::world::{BayIndex, Vehicle, World};
@@ -42,18 +44,12 @@ pub struct Robot {
     random: RandomStream,
     stand: Pose,
     path: Option<Arc<Path>>,
-    path_id: u32,
-    mission_id: u32,
-    phase: Phase,
     tracker: Tracker,
-    grant: Grant,
+    holder: Holder,
     /// Where the robot last stood or was accounted for, metres along its path.
     accounted_m: f64,
-    /// An authority that overtook its mission.
-    early: Option<Authority>,
     newest_authority_header: Option<u32>,
     newest_mission_header: Option<u32>,
-    header_id: u32,
     next_report: Instant,
     counters: RobotCounters,
 }
@@ -91,16 +87,11 @@ impl Robot {
             random,
             stand: world.bays[bay].pose,
             path,
-            path_id,
-            mission_id: 0,
-            phase: Phase::Parked,
             tracker,
-            grant: Grant::NONE,
+            holder: Holder::new(path_id, 0),
             accounted_m: way_m,
-            early: None,
             newest_authority_header: None,
             newest_mission_header: None,
-            header_id: 0,
             next_report: Instant::ZERO,
             counters: RobotCounters::default(),
             world,
@@ -112,6 +103,7 @@ impl Robot {
     pub fn start(&mut self, now: Instant, truth: &mut dyn FnMut(Truth)) {
         let phase_ns = self.random.uniform() * self.tracking_period_ns as f64;
         self.next_report = after(now, whole_ns(phase_ns));
+        self.holder = Holder::new(self.holder.path_id, first_id(now));
         let way_m = self.tracker.motion(now).way_m;
         let end_m = self.path.as_ref().map_or(0.0, |path| path.length_m());
         self.tracker.place(now, way_m, end_m);
@@ -133,7 +125,7 @@ impl Robot {
         }
         self.tick(now, truth);
         self.schedule(now);
-        self.header_id = self.header_id.wrapping_add(1);
+        self.holder.header_id = self.holder.header_id.wrapping_add(1);
         self.counters.states_count += 1;
         Some(self.state(now))
     }
@@ -151,14 +143,13 @@ impl Robot {
                 stop_index: 0,
             },
         };
-        let has_mission = self.mission_id != 0;
-        State {
+        let has_mission = self.holder.mission_id != 0;
+        let mut state = State {
             header: Header {
                 fleet_id: self.fleet_id,
                 robot_id: self.number,
-                header_id: self.header_id,
-                mission_id: self.mission_id,
                 sent_ns: now.as_ns(),
+                ..Header::default()
             },
             sampled_ns: now.as_ns(),
             x_m: place.pose.x_m,
@@ -166,28 +157,17 @@ impl Robot {
             heading_rad: place.pose.heading_rad,
             travelled_m: if has_mission { motion.way_m } else { 0.0 },
             speed_mps: single(motion.speed_mps),
-            acceleration_mps2: single(motion.acceleration_mps2),
             path_index: if has_mission { place.index } else { -1 },
-            authority_index: self.grant.index,
-            applied_sequence: self.grant.applied.unwrap_or(0),
             stop_index: if has_mission { place.stop_index } else { -1 },
-            phase: self.phase as u8,
-            flags: if self.grant.is_refused {
-                State::REFUSED
-            } else {
-                0
-            },
-            reserved: [0; 6],
-        }
+            ..State::default()
+        };
+        self.holder.describe(&mut state);
+        state
     }
 
     /// What it has counted.
     pub fn counters(&self) -> &RobotCounters {
         &self.counters
-    }
-
-    fn is_under_way(&self) -> bool {
-        matches!(self.phase, Phase::Driving | Phase::AtPoint)
     }
 
     /// Brings motion up to `now`.
@@ -203,7 +183,7 @@ impl Robot {
         let was_at_rest = self.tracker.is_at_rest();
         if let Tracker::Legacy(tracker) = &mut self.tracker {
             tracker.tick(now);
-            if self.is_under_way() && !was_at_rest {
+            if self.holder.is_under_way() && !was_at_rest {
                 self.settle(now, truth);
             }
         }
@@ -212,7 +192,7 @@ impl Robot {
     /// Draws the conclusions from a change of motion: under way, at its authority or at its goal.
     fn settle(&mut self, at: Instant, truth: &mut dyn FnMut(Truth)) {
         let kind = self.update_phase(at);
-        truth(self.record(at, kind, self.grant.applied.unwrap_or(0)));
+        truth(self.record(at, kind, self.holder.grant.applied.unwrap_or(0)));
     }
 
     fn update_phase(&mut self, at: Instant) -> TruthKind {
@@ -221,28 +201,22 @@ impl Robot {
         let Some(path) = &self.path else {
             return TruthKind::Motion;
         };
-        if !self.tracker.is_at_rest() {
-            self.phase = Phase::Driving;
-            return TruthKind::Motion;
-        }
-        if self.phase == Phase::Driving {
-            let reach_m = path.way_to_m(self.grant.reach(path.last_index()));
-            let error_m = way_m - reach_m;
-            let worst_m = if self.grant.is_late {
+        let is_at_rest = self.tracker.is_at_rest();
+        let last_index = path.last_index();
+        if is_at_rest && self.holder.phase == Phase::Driving {
+            let error_m = way_m - path.way_to_m(self.holder.grant.reach(last_index));
+            let worst_m = if self.holder.grant.is_late {
                 &mut self.counters.late_overshoot_max_m
             } else {
                 &mut self.counters.stop_error_max_m
             };
             *worst_m = worst_m.max(error_m);
         }
-        let last_index = path.last_index();
-        let is_goal = self.grant.is_given() && self.grant.reach(last_index) == last_index;
-        if is_goal && path.index_at(way_m) == last_index {
-            self.phase = Phase::Done;
+        let passed = path.index_at(way_m);
+        if self.holder.settle(is_at_rest, passed, last_index) {
             self.counters.missions_done_count += 1;
             return TruthKind::MissionDone;
         }
-        self.phase = Phase::AtPoint;
         TruthKind::Motion
     }
 
@@ -257,12 +231,12 @@ impl Robot {
             at_ns: at.as_ns(),
             fleet_id: self.fleet_id,
             robot_id: self.number,
-            mission_id: self.mission_id,
-            path_id: self.path_id,
+            mission_id: self.holder.mission_id,
+            path_id: self.holder.path_id,
             travelled_m: motion.way_m,
             speed_mps: motion.speed_mps,
             acceleration_mps2: motion.acceleration_mps2,
-            authority_index: self.grant.index,
+            authority_index: self.holder.grant.index,
             caused_by_sequence,
             kind: kind as u32,
             reserved: 0,
@@ -272,7 +246,7 @@ impl Robot {
     /// Sets the next tick: on the grid of the robot's own phase, but for the legacy tracker under
     /// way, which waits a period from whenever it has done.
     fn schedule(&mut self, now: Instant) {
-        if self.is_under_way() && matches!(self.tracker, Tracker::Legacy(_)) {
+        if self.holder.is_under_way() && matches!(self.tracker, Tracker::Legacy(_)) {
             let extra_ns = if self.inflation_ns > 0.0 {
                 whole_ns(self.random.uniform() * self.inflation_ns)
             } else {
@@ -281,7 +255,7 @@ impl Robot {
             self.next_report = after(now, self.tracking_period_ns + extra_ns);
             return;
         }
-        let period_ns = if self.is_under_way() {
+        let period_ns = if self.holder.is_under_way() {
             self.tracking_period_ns
         } else {
             self.parked_period_ns
@@ -372,40 +346,40 @@ impl Robot {
         if !is_in_order {
             self.counters.out_of_order_count += 1;
         }
-        let is_replacing = mission.flags & Mission::REPLACE != 0;
-        let is_present = mission.header.mission_id == self.mission_id;
-        let may_replace = is_replacing && is_present && self.is_under_way();
-        let is_new = is_newer(mission.header.mission_id, self.mission_id);
         let is_passed_over = !is_in_order && self.order == MessageOrder::Strict;
-        if is_passed_over || !(is_new || may_replace) {
-            self.counters.missions_repeated_count += 1;
-            truth(self.record(now, TruthKind::MessageStale, 0));
-            return;
+        let verdict = match self.holder.judge_mission(mission) {
+            _ if is_passed_over => MissionVerdict::Stale,
+            verdict => verdict,
+        };
+        match verdict {
+            MissionVerdict::Stale => {
+                self.counters.missions_repeated_count += 1;
+                truth(self.record(now, TruthKind::MessageStale, 0));
+                return;
+            }
+            MissionVerdict::Busy => {
+                self.counters.missions_busy_count += 1;
+                return;
+            }
+            MissionVerdict::Begin | MissionVerdict::Replace => {}
         }
-        if self.is_under_way() && !is_replacing {
-            self.counters.missions_busy_count += 1;
-            return;
-        }
-        let Some(path) = self.path_of(mission) else {
+        let path = self.path_of(mission).filter(|path| {
+            verdict == MissionVerdict::Replace || self.stands_at_start_of(now, path)
+        });
+        let Some(path) = path else {
             self.counters.missions_refused_count += 1;
             return;
         };
-        if is_replacing {
+        if verdict == MissionVerdict::Replace {
             self.replace(now, mission, path, truth);
             return;
         }
-        if !self.stands_at_start_of(now, &path) {
-            self.counters.missions_refused_count += 1;
-            return;
-        }
-        self.begin(now, mission, path);
+        let kept = self.begin(now, mission, path);
         self.hasten(now);
         self.counters.missions_started_count += 1;
         truth(self.record(now, TruthKind::MissionStarted, 0));
-        let mission_id = self.mission_id;
-        let kept = self.early.take();
-        if let Some(authority) = kept.filter(|kept| kept.header.mission_id == mission_id) {
-            self.judge(now, &authority, truth);
+        if let Some(authority) = kept {
+            self.hear(now, &authority, truth);
         }
     }
 
@@ -421,95 +395,53 @@ impl Robot {
         if !is_in_order {
             self.counters.out_of_order_count += 1;
         }
-        let is_passed_over = !is_in_order && self.order == MessageOrder::Strict;
-        let is_of_mission = self.is_under_way() && authority.header.mission_id == self.mission_id;
-        if is_passed_over || !is_of_mission {
-            let is_early = is_newer(authority.header.mission_id, self.mission_id);
-            if is_early && !is_passed_over {
+        if !is_in_order && self.order == MessageOrder::Strict {
+            self.counters.stale_count += 1;
+            truth(self.record(now, TruthKind::MessageStale, authority.sequence));
+            return;
+        }
+        self.hear(now, authority, truth);
+    }
+
+    fn hear(&mut self, now: Instant, authority: &Authority, truth: &mut dyn FnMut(Truth)) {
+        let (path, tracker) = (&self.path, &self.tracker);
+        let path_m = |index: usize| path.as_ref().map_or(0.0, |path| path.way_to_m(index));
+        let standing = Standing {
+            last_index: path.as_ref().map_or(0, |path| path.last_index()),
+            passed: (path.as_ref()).map_or(0, |path| path.index_at(tracker.motion(now).way_m)),
+            can_stop_at: &|index| tracker.can_stop_at(now, path_m(index)),
+        };
+        let last_index = standing.last_index;
+        let heard = self.holder.on_authority(authority, &standing);
+        let kind = match heard {
+            Heard::Question => return,
+            Heard::Kept => {
                 self.counters.early_count += 1;
-                if self.keep_early(authority) {
-                    return;
-                }
-            } else {
-                self.counters.stale_count += 1;
+                return;
             }
-            truth(self.record(now, TruthKind::MessageStale, authority.sequence));
-            return;
-        }
-        self.judge(now, authority, truth);
-    }
-
-    /// Keeps an acknowledged authority that overtook its mission, which goes another way: the
-    /// coordinator counts it as in force from the moment it was sent. False when it is passed over.
-    fn keep_early(&mut self, authority: &Authority) -> bool {
-        let is_lasting = authority.flags & Authority::ACKNOWLEDGED != 0;
-        let is_newest = self.early.is_none_or(|kept| {
-            let (new, old) = (&authority.header, &kept.header);
-            is_newer(new.mission_id, old.mission_id)
-                || (new.mission_id == old.mission_id && is_newer(authority.sequence, kept.sequence))
-        });
-        if is_lasting && is_newest {
-            self.early = Some(*authority);
-        }
-        is_lasting && is_newest
-    }
-
-    /// Judges an authority of the mission under way.
-    fn judge(&mut self, now: Instant, authority: &Authority, truth: &mut dyn FnMut(Truth)) {
-        let Some(proposal) = self.proposal(now, authority) else {
-            truth(self.record(now, TruthKind::MessageStale, authority.sequence));
-            return;
+            Heard::Early => {
+                self.counters.early_count += 1;
+                TruthKind::MessageStale
+            }
+            Heard::Stale => {
+                self.counters.stale_count += 1;
+                TruthKind::MessageStale
+            }
+            Heard::Meaningless => TruthKind::MessageStale,
+            Heard::Judged(verdict) => {
+                self.count(verdict);
+                verdict.kind()
+            }
         };
-        let verdict = if authority.flags & Authority::ACKNOWLEDGED == 0 {
-            authority::original(&self.grant, &proposal)
-        } else {
-            authority::acknowledged(&self.grant, &proposal)
-        };
-        self.count(verdict);
-        if verdict != Verdict::Stale {
-            self.grant.newest = Some(authority.sequence);
-            self.carry_out(now, authority, verdict);
+        let is_taken = matches!(heard, Heard::Judged(Verdict::Apply | Verdict::ApplyLate));
+        if is_taken && let Some(path) = &self.path {
+            let reach_m = path.way_to_m(self.holder.grant.reach(last_index));
+            self.tracker.aim(now, reach_m);
         }
-        truth(self.record(now, verdict.kind(), authority.sequence));
-        let is_taken = matches!(verdict, Verdict::Apply | Verdict::ApplyLate);
+        truth(self.record(now, kind, authority.sequence));
         if is_taken && self.update_phase(now) == TruthKind::MissionDone {
             truth(self.record(now, TruthKind::MissionDone, authority.sequence));
         }
-    }
-
-    fn carry_out(&mut self, now: Instant, authority: &Authority, verdict: Verdict) {
-        match verdict {
-            Verdict::Apply | Verdict::ApplyLate => {
-                self.grant.index = authority.authority_index;
-                self.grant.applied = Some(authority.sequence);
-                self.grant.is_refused = false;
-                self.grant.is_late = verdict == Verdict::ApplyLate;
-                if let Some(path) = &self.path {
-                    let reach = self.grant.reach(path.last_index());
-                    self.tracker.aim(now, path.way_to_m(reach));
-                }
-            }
-            Verdict::Unchanged => self.grant.applied = Some(authority.sequence),
-            Verdict::Refuse => {
-                self.grant.applied = Some(authority.sequence);
-                self.grant.is_refused = true;
-            }
-            Verdict::Ignore | Verdict::Stale => {}
-        }
-    }
-
-    fn proposal(&self, now: Instant, authority: &Authority) -> Option<Proposal> {
-        let path = self.path.as_ref()?;
-        let reach = reach_of(authority.authority_index, path.last_index())?;
-        let motion = self.tracker.motion(now);
-        Some(Proposal {
-            index: authority.authority_index,
-            sequence: authority.sequence,
-            reach,
-            reach_now: self.grant.reach(path.last_index()),
-            passed: path.index_at(motion.way_m),
-            can_stop: self.tracker.can_stop_at(now, path.way_to_m(reach)),
-        })
     }
 
     fn count(&mut self, verdict: Verdict) {
@@ -527,7 +459,7 @@ impl Robot {
     /// The path a mission names, if this robot's map agrees with it.
     fn path_of(&self, mission: &Mission) -> Option<Arc<Path>> {
         let path = self.world.paths.get(PathId(mission.path_id))?;
-        let is_whole = mission.start_index == 0 && mission.end_index as usize == path.last_index();
+        let is_whole = mission.end_index as usize == path.last_index();
         (is_whole && mission.path_hash == path.hash()).then(|| Arc::clone(path))
     }
 
@@ -540,14 +472,11 @@ impl Robot {
         here.distance_m(&path.poses()[0]) <= path.spacing_m()
     }
 
-    fn begin(&mut self, now: Instant, mission: &Mission, path: Arc<Path>) {
-        self.mission_id = mission.header.mission_id;
-        self.path_id = mission.path_id;
+    fn begin(&mut self, now: Instant, mission: &Mission, path: Arc<Path>) -> Option<Authority> {
         self.tracker.place(now, 0.0, path.length_m());
         self.path = Some(path);
         self.accounted_m = 0.0;
-        self.grant = Grant::NONE;
-        self.phase = Phase::AtPoint;
+        self.holder.begin(mission)
     }
 
     fn replace(
@@ -562,7 +491,7 @@ impl Robot {
         self.begin(now, mission, path);
         self.tracker.place(now, length_m, length_m);
         self.accounted_m = length_m;
-        self.phase = Phase::Done;
+        self.holder.phase = Phase::Done;
         self.hasten(now);
         truth(self.record(now, TruthKind::Replaced, 0));
     }

@@ -43,7 +43,7 @@ pub(crate) fn mission(scene: &Scene, robot: u32, mission_id: u32, path_id: u32) 
             ..Header::default()
         },
         path_id,
-        start_index: 0,
+        echo_header_id: 1,
         end_index: u32::try_from(path.last_index()).unwrap(),
         flags: 0,
         path_hash: path.hash(),
@@ -60,6 +60,8 @@ pub(crate) fn authority(mission_id: u32, sequence: u32, index: i32, flags: u32) 
         sequence,
         authority_index: index,
         flags,
+        // Any state will do.
+        echo_header_id: 1,
         ..Authority::default()
     }
 }

@@ -8,7 +8,6 @@ use core::time::Duration;
 use crate::coordinator::Cycle;
 use crate::coordinator::policy::Contest;
 use crate::coordinator::roster::Roster;
-use crate::coordinator::safe::liveness::section_start;
 use crate::coordinator::safe::reservation::Contact;
 use crate::coordinator::safe::{SafeRules, lookahead_s, reach_m};
 use crate::section::{Side, Span};
@@ -24,8 +23,6 @@ pub(crate) struct Candidate {
     rivals_before: u32,
 }
 
-/// Ends that are tried for one extension, each nearer than the one before.
-const ENDS_MAX: usize = 4;
 /// Robots that are looked at along one queue.
 const QUEUE_MAX: usize = 16;
 /// A robot from which authority was taken back keeps what it then gets for this long.
@@ -44,9 +41,13 @@ impl SafeRules {
             view.stopped_by = None;
         }
         for candidate in &order {
-            let is_given = self.extend(candidate, may_reorder);
+            let extension = self
+                .core
+                .extend(candidate.robot, candidate.want, may_reorder);
+            self.counts.grants_withheld += extension.withheld_count;
             let view = &mut self.robots[candidate.robot];
-            if is_given {
+            view.stopped_by = extension.stopped_by;
+            if extension.is_given {
                 view.waited_since = view.waiting_since.take().or(view.waited_since);
             } else {
                 view.waiting_since = view.waiting_since.or(Some(cycle.now));
@@ -67,32 +68,24 @@ impl SafeRules {
     }
 
     fn admit_all(&mut self, now: Instant, may_reorder: bool) {
-        for robot in 0..self.robots.len() {
-            let view = &self.robots[robot];
-            if view.is_admitted || view.ledger.mission_id() == 0 || view.ledger.is_done() {
-                continue;
-            }
-            let is_admitted = self.plan.admit(&self.traffic, robot, may_reorder);
-            let view = &mut self.robots[robot];
-            view.is_admitted = is_admitted;
-            if !is_admitted {
-                view.waiting_since = view.waiting_since.or(Some(now));
-            }
-            self.counts.admissions_deferred += u64::from(!is_admitted);
-        }
+        let (robots, counts) = (&mut self.robots, &mut self.counts);
+        self.core.admit_all(may_reorder, |robot| {
+            let view = &mut robots[robot];
+            view.waiting_since = view.waiting_since.or(Some(now));
+            counts.admissions_deferred += 1;
+        });
     }
 
     fn candidate(&self, robot: usize) -> Option<Candidate> {
         let view = &self.robots[robot];
-        let (ledger, last) = (&view.ledger, self.traffic.last(robot));
-        let is_open = view.is_admitted
-            && !ledger.is_done()
-            && !ledger.is_shrinking()
-            && ledger.bound() < last;
-        if !is_open {
+        if !self.core.is_open(robot) {
             return None;
         }
-        let path = self.world.path(self.traffic.path(robot)?);
+        let (ledger, last) = (
+            &self.core.members[robot].ledger,
+            self.core.traffic.last(robot),
+        );
+        let path = self.world.path(self.core.traffic.path(robot)?);
         let time_s = lookahead_s(
             self.cycles.expected_s(self.control_period),
             view.round_trip.estimate_s,
@@ -102,7 +95,7 @@ impl SafeRules {
         let way_m = path.way_to_m(ledger.lower() + 1)
             + reach_m(&self.world.vehicle, view.speed_mps, time_s);
         // One that came to stand short of the end of its authority still needs more to go on.
-        let needed = ledger.lower() + self.margin.below + 2;
+        let needed = ledger.lower() + self.core.margin.below + 2;
         let want = (path.index_at(way_m) + 1).max(needed).min(last);
         (want > ledger.bound()).then_some(Candidate {
             robot,
@@ -126,8 +119,8 @@ impl SafeRules {
                     continue;
                 };
                 let second = order[rival];
-                if contact.others.lower > self.margin.upper(second.want, usize::MAX)
-                    || contact.others.upper <= self.traffic.span(second.robot).upper
+                if contact.others.lower > self.core.margin.upper(second.want, usize::MAX)
+                    || contact.others.upper <= self.core.traffic.span(second.robot).upper
                 {
                     continue;
                 }
@@ -143,9 +136,9 @@ impl SafeRules {
 
     /// The sections of which the candidate wants poses it does not have.
     fn wanted(&self, candidate: &Candidate) -> impl Iterator<Item = &Contact> {
-        let from = self.traffic.span(candidate.robot).upper;
-        let to = self.margin.upper(candidate.want, usize::MAX);
-        let contacts = self.traffic.contacts(candidate.robot).iter();
+        let from = self.core.traffic.span(candidate.robot).upper;
+        let to = self.core.margin.upper(candidate.want, usize::MAX);
+        let contacts = self.core.traffic.contacts(candidate.robot).iter();
         contacts.filter(move |contact| contact.own.upper > from && contact.own.lower <= to)
     }
 
@@ -164,71 +157,25 @@ impl SafeRules {
         cycle.policy.compare(&contest).then_with(by_number)
     }
 
-    /// Gives the candidate as much as it may have; false when that is nothing.
-    fn extend(&mut self, candidate: &Candidate, may_reorder: bool) -> bool {
-        let robot = candidate.robot;
-        let (last, margin) = (self.traffic.last(robot), self.margin);
-        let bound = self.robots[robot].ledger.bound();
-        let from = self.traffic.span(robot).upper + 1;
-        let to = margin.upper(candidate.want, last);
-        let conflict = self
-            .traffic
-            .first_conflict(robot, from, to, &self.traffic.spans);
-        let mut end = candidate.want;
-        if let Some((index, other)) = conflict {
-            self.robots[robot].stopped_by = Some(other);
-            end = (index - 1).saturating_sub(margin.above);
-        }
-        let free_end = end;
-        for _ in 0..ENDS_MAX {
-            if end <= bound {
-                break;
-            }
-            let upper = margin.upper(end, last);
-            if self.plan.extend(&self.traffic, robot, upper, may_reorder) {
-                return self.give(robot, end);
-            }
-            self.counts.grants_withheld += 1;
-            let start = section_start(self.traffic.contacts(robot), upper);
-            end = start.saturating_sub(margin.above + 1);
-        }
-        // What the plan itself foresees next is always possible.
-        let planned = self.plan.next_end(robot).map_or(0, |end| end.min(free_end));
-        if planned > bound {
-            let upper = margin.upper(planned, last);
-            if self.plan.extend(&self.traffic, robot, upper, false) {
-                return self.give(robot, planned);
-            }
-        }
-        false
-    }
-
-    fn give(&mut self, robot: usize, end: usize) -> bool {
-        let is_given = self.robots[robot].ledger.send(end).is_some();
-        if is_given {
-            self.update_span(robot);
-        }
-        is_given
-    }
-
     /// Asks way back from the robot that stops `robot`, where the policy prefers the latter and
     /// the former has not yet come so far that it must enter.
     fn take_back(&mut self, cycle: &Cycle<'_>, robot: usize) {
         let Some(holder) = self.robots[robot].stopped_by else {
             return;
         };
-        let from = self.traffic.span(robot).upper + 1;
-        let span = self.traffic.span(holder);
-        let view = &self.robots[holder];
-        if view.ledger.is_done() || view.ledger.is_shrinking() || cycle.now < view.spared_until {
+        let from = self.core.traffic.span(robot).upper + 1;
+        let span = self.core.traffic.span(holder);
+        let ledger = &self.core.members[holder].ledger;
+        let is_spared = cycle.now < self.robots[holder].spared_until;
+        if ledger.is_done() || ledger.is_shrinking() || is_spared {
             return;
         }
         let Some(state) = cycle.roster.robots()[holder].state else {
             return;
         };
         let may_stop = usize::try_from(state.stop_index).unwrap_or(usize::MAX);
-        let earliest = may_stop.max(view.ledger.lower()) + 1;
-        let contacts = self.traffic.contacts(robot).iter();
+        let earliest = may_stop.max(ledger.lower()) + 1;
+        let contacts = self.core.traffic.contacts(robot).iter();
         let end = contacts
             .filter(|contact| contact.other == holder && contact.own.upper >= from)
             .filter_map(|contact| {
@@ -240,17 +187,17 @@ impl SafeRules {
                         upper: contact.own.upper,
                     },
                 )?;
-                let end = entry.checked_sub(self.margin.above + 1)?;
+                let end = entry.checked_sub(self.core.margin.above + 1)?;
                 let is_useful = end >= earliest && entry <= span.upper;
                 let prefers = || self.compare(cycle, robot, contact) == Ordering::Less;
                 (is_useful && prefers()).then_some(end)
             })
             .min();
-        let Some(end) = end.filter(|end| *end < view.ledger.bound()) else {
+        let Some(end) = end.filter(|end| *end < ledger.bound()) else {
             return;
         };
-        let view = &mut self.robots[holder];
-        if view.ledger.send(end).is_some() {
+        if self.core.shrink(holder, end) {
+            let view = &mut self.robots[holder];
             view.spared_until = cycle.now + SPARED;
             view.waiting_since = view.waited_since.or(view.waiting_since);
         }

@@ -37,7 +37,7 @@ pub enum StateEffect {
 }
 
 /// One robot's account during one mission.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Ledger {
     mission_id: u32,
     last_index: usize,
@@ -48,13 +48,12 @@ pub struct Ledger {
     open: [Entry; UNACKNOWLEDGED_MAX],
     open_count: usize,
     newest: Entry,
-    newest_header_id: u32,
     /// Largest index sent.
     ceiling: usize,
     is_done: bool,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 struct Entry {
     sequence: u32,
     index: usize,
@@ -71,10 +70,25 @@ impl Ledger {
             open: [Entry::default(); UNACKNOWLEDGED_MAX],
             open_count: 0,
             newest: Entry::default(),
-            newest_header_id: 0,
             ceiling: 0,
             is_done: false,
         }
+    }
+
+    /// The account of a mission under way of which nothing is known but `state`, and that nothing sent before can
+    /// change what it shows. `None` when it says what cannot be.
+    pub(crate) fn shown(last_index: usize, state: &State) -> Option<Self> {
+        let mut ledger = Self::new(state.header.mission_id, last_index);
+        let (index, sequence) = (ledger.held(state)?, state.applied_sequence);
+        ledger.lower = ledger.passed(state)?;
+        ledger.acknowledged = Entry { sequence, index };
+        (ledger.newest, ledger.ceiling) = (ledger.acknowledged, index);
+        ledger.is_done = ledger.shows_goal(state);
+        Some(ledger)
+    }
+
+    fn shows_goal(&self, state: &State) -> bool {
+        state.phase == Phase::Done as u8 && self.passed(state) == Some(self.last_index)
     }
 
     /// The mission.
@@ -106,11 +120,6 @@ impl Ledger {
         (self.newest.sequence, self.newest.index)
     }
 
-    /// `header_id` of the newest state; 0 before the first.
-    pub fn newest_header_id(&self) -> u32 {
-        self.newest_header_id
-    }
-
     /// True when a state showed the newest authority applied or refused.
     pub fn is_acknowledged(&self) -> bool {
         self.acknowledged.sequence == self.newest.sequence
@@ -137,6 +146,7 @@ impl Ledger {
         self.ceiling = self.ceiling.max(index);
         self.open[kept] = self.newest;
         self.open_count = kept + 1;
+        self.open[self.open_count..].fill(Entry::default());
         Some(sequence)
     }
 
@@ -151,7 +161,6 @@ impl Ledger {
         if state.applied_sequence > self.newest.sequence {
             return StateEffect::Impossible;
         }
-        self.newest_header_id = self.newest_header_id.max(state.header.header_id);
         let was = (self.lower, self.acknowledged, self.is_done);
         let shown = Entry {
             sequence: state.applied_sequence,
@@ -163,7 +172,7 @@ impl Ledger {
             self.acknowledge(shown);
         }
         self.lower = self.lower.max(passed);
-        self.is_done |= state.phase == Phase::Done as u8 && passed == self.last_index;
+        self.is_done |= self.shows_goal(state);
         if exceeds {
             return StateEffect::Exceeded;
         }
@@ -185,6 +194,7 @@ impl Ledger {
             .count();
         self.open.copy_within(superseded..self.open_count, 0);
         self.open_count -= superseded;
+        self.open[self.open_count..].fill(Entry::default());
     }
 
     fn held(&self, state: &State) -> Option<usize> {
@@ -203,6 +213,31 @@ impl Ledger {
         usize::try_from(index)
             .ok()
             .filter(|index| *index <= self.last_index)
+    }
+}
+
+#[cfg(test)]
+impl Ledger {
+    /// Every sequence it keeps.
+    pub(crate) fn sequences(&mut self) -> impl Iterator<Item = &mut u32> {
+        let open = self.open[..self.open_count].iter_mut();
+        let kept = [&mut self.acknowledged, &mut self.newest].into_iter();
+        kept.chain(open).map(|entry| &mut entry.sequence)
+    }
+
+    pub(crate) fn acknowledged_sequence(&self) -> u32 {
+        self.acknowledged.sequence
+    }
+
+    /// Forgets what only a count rests on.
+    pub(crate) fn forget_ceiling(&mut self) {
+        self.ceiling = self.last_index;
+    }
+
+    /// A planted fault: what was sent last counts as acknowledged.
+    pub(crate) fn plant_lost_acknowledgement(&mut self) {
+        self.acknowledged = self.newest;
+        (self.open, self.open_count) = (Default::default(), 0);
     }
 }
 

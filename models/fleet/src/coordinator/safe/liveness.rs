@@ -28,6 +28,8 @@
 //! The search is a heuristic, as the question itself is NP-hard: failing to find a plan withholds
 //! an extension that might have been harmless, and costs time but neither safety nor liveness.
 
+use std::hash::{Hash, Hasher};
+
 use crate::coordinator::safe::reservation::{Contact, Traffic};
 use crate::section::{Side, Span};
 
@@ -58,7 +60,7 @@ impl StopMargin {
     }
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 struct Move {
     robot: usize,
     /// Authority index at which it ends.
@@ -66,7 +68,7 @@ struct Move {
 }
 
 /// The plan a coordinator keeps, and room for looking for another.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Plan {
     margin: StopMargin,
     moves: Vec<Move>,
@@ -137,6 +139,27 @@ impl Plan {
             self.pending.rotate_left(1);
             self.search(traffic)
         }
+    }
+
+    /// Takes in `robots`, which are under way and not in the plan. False, and nothing changes, when no plan was found.
+    pub(crate) fn admit_together(&mut self, traffic: &Traffic, robots: &[usize]) -> bool {
+        robots.iter().any(|&first| {
+            self.begin_search(traffic, first);
+            self.is_member.fill(true);
+            for step in &self.moves {
+                if step.to >= traffic.last(step.robot) && !self.is_pending[step.robot] {
+                    self.pending.push(step.robot);
+                    self.is_pending[step.robot] = true;
+                }
+            }
+            for &robot in robots {
+                if !self.is_pending[robot] {
+                    self.pending.push(robot);
+                    self.is_pending[robot] = true;
+                }
+            }
+            self.search(traffic)
+        })
     }
 
     /// Whether `robot` may reserve up to `upper`, which is free of all reservations now: the plan
@@ -340,6 +363,21 @@ impl Plan {
             stopped_by(span)
                 .is_none_or(|there| stopped_by(present).is_some_and(|here| here <= there))
         })
+    }
+}
+
+/// Scratch space says nothing.
+impl PartialEq for Plan {
+    fn eq(&self, other: &Self) -> bool {
+        self.moves == other.moves
+    }
+}
+
+impl Eq for Plan {}
+
+impl Hash for Plan {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.moves.hash(state);
     }
 }
 

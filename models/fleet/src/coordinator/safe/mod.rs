@@ -2,6 +2,7 @@
 //! robot may be on, whatever messages are lost, late, repeated or overtaken, and only as long as
 //! every robot can still finish. It needs no clock but its own.
 //!
+//! - `interlocking`: the decisions, without time or floats; `search` searches them exhaustively.
 //! - `ledger`: what a robot may hold, proved from its states.
 //! - `reservation`: which poses each robot has to itself; the safety invariant.
 //! - `liveness`: why every mission ends.
@@ -16,9 +17,12 @@
 //! each pair of overlapping poses at most one is ever granted.
 
 mod grants;
+mod interlocking;
 pub mod ledger;
 mod liveness;
 pub mod reservation;
+#[cfg(test)]
+mod search;
 #[cfg(test)]
 mod tests;
 
@@ -27,15 +31,16 @@ use std::sync::Arc;
 
 use crate::coordinator::counters::SafeCounts;
 use crate::coordinator::parameters::CoordinatorParameters;
-use crate::coordinator::safe::ledger::{Ledger, StateEffect};
-use crate::coordinator::safe::liveness::{Plan, StopMargin};
+use crate::coordinator::roster::Roster;
+use crate::coordinator::safe::interlocking::{Heard, Interlocking};
+use crate::coordinator::safe::ledger::StateEffect;
+use crate::coordinator::safe::liveness::StopMargin;
 use crate::coordinator::safe::reservation::Traffic;
 use crate::coordinator::{Cycle, Rules};
 use crate::geometry::floor_index;
-use crate::messages::{Authority, Header, State, TO_GOAL, ToRobot};
-use crate::path::PathId;
-use crate::section::Span;
-use crate::world::{Vehicle, World};
+use crate::messages::{Mission, State, ToRobot, first_id};
+use crate::mission::MissionSource;
+use crate::world::{BayIndex, Vehicle, World};
 use hil_core::time::Instant;
 
 /// The rules of the safe mode.
@@ -49,26 +54,25 @@ pub(crate) struct SafeRules {
     stuck_after: Duration,
     reserve_ms: f64,
     takes_back: bool,
-    margin: StopMargin,
-    traffic: Traffic,
-    plan: Plan,
+    core: Interlocking,
+    /// It has begun to ask the robots.
+    is_asking: bool,
+    /// Missions are given out: the roster knows what the robots have told.
+    is_ready: bool,
     robots: Vec<SafeRobot>,
     counts: SafeCounts,
     order: Vec<grants::Candidate>,
     /// Per robot its place in `order`.
     places: Vec<Option<usize>>,
-    /// The robots were parked apart at their guarded footprints. Where not, no plan holds for a
-    /// mission of theirs, and none is admitted.
-    starts_apart: bool,
 }
 
 /// What the safe rules know of a robot beyond its reservation.
 #[derive(Debug, Clone)]
 struct SafeRobot {
-    /// The account of its mission; of the last one when it is parked.
-    ledger: Ledger,
-    /// The plan has its mission.
-    is_admitted: bool,
+    /// As it last told when it had not told before; for the roster.
+    told: Option<State>,
+    /// The bay it stood in then without a mission.
+    told_bay: Option<BayIndex>,
     round_trip: RoundTrip,
     speed_mps: f64,
     header_id: u32,
@@ -80,6 +84,7 @@ struct SafeRobot {
     /// Last time it was seen further on, or its mission given.
     moved: Instant,
     is_counted_stuck: bool,
+    is_counted_restarted: bool,
     /// Robots that wait for this one, as of the last cycle.
     held_up_count: u32,
     /// Who stops it, as of the last cycle.
@@ -89,17 +94,17 @@ struct SafeRobot {
 }
 
 impl SafeRules {
-    /// Rules for the robots of fleet `fleet_id` that stand in bays `starts`.
+    /// Rules for the robots of fleet `fleet_id`, of which nothing is known until they tell.
     pub(crate) fn new(
         world: &Arc<World>,
-        starts: &[usize],
+        robot_count: usize,
         parameters: &CoordinatorParameters,
         fleet_id: u32,
     ) -> Self {
         let margin = parameters.safe.stop_margin(world);
         let robot = SafeRobot {
-            ledger: Ledger::new(0, 0),
-            is_admitted: false,
+            told: None,
+            told_bay: None,
             round_trip: RoundTrip::default(),
             speed_mps: 0.0,
             header_id: 0,
@@ -107,86 +112,44 @@ impl SafeRules {
             waited_since: None,
             moved: Instant::ZERO,
             is_counted_stuck: false,
+            is_counted_restarted: false,
             held_up_count: 0,
             stopped_by: None,
             spared_until: Instant::ZERO,
         };
-        let traffic = Traffic::new(world, starts);
         Self {
             fleet_id,
-            starts_apart: traffic.first_overlap().is_none(),
+            core: Interlocking::new(world, margin, robot_count, 0),
+            is_asking: false,
+            is_ready: false,
             control_period: parameters.control_period(),
             cycles: CycleTime::default(),
             patience: parameters.safe.patience(),
             stuck_after: parameters.stuck_after(),
             reserve_ms: parameters.safe.reserve_ms,
             takes_back: parameters.safe.takes_back,
-            margin,
-            traffic,
-            plan: Plan::new(margin, starts.len()),
-            robots: vec![robot; starts.len()],
+            robots: vec![robot; robot_count],
             counts: SafeCounts::default(),
-            order: Vec::with_capacity(starts.len()),
-            places: vec![None; starts.len()],
+            order: Vec::with_capacity(robot_count),
+            places: vec![None; robot_count],
             world: Arc::clone(world),
         }
     }
 
-    /// `robot` is given the mission `mission_id` along `path`.
-    fn begin(&mut self, now: Instant, robot: usize, mission_id: u32, path: PathId) {
-        let last = self.world.path(path).last_index();
-        let view = &mut self.robots[robot];
-        view.ledger = Ledger::new(mission_id, last);
-        view.is_admitted = false;
-        view.round_trip.forget_question();
-        view.speed_mps = 0.0;
-        (view.waiting_since, view.waited_since) = (None, None);
-        view.moved = now;
-        view.is_counted_stuck = false;
-        self.plan.finish(robot);
-        self.traffic.put(robot, path, Span::at(0));
-    }
-
-    /// Brings the reservation of `robot` in line with its account.
-    fn update_span(&mut self, robot: usize) {
-        let view = &self.robots[robot];
-        let last = self.traffic.last(robot);
-        let (lower, bound) = (view.ledger.lower(), view.ledger.bound());
-        // A robot without authority stands on the pose it parked at, to the dot.
-        let upper = if bound == 0 && lower == 0 {
-            0
-        } else {
-            // One that went too far is at least between its last pose and the next.
-            self.margin.upper(bound, last).max((lower + 1).min(last))
-        };
-        self.traffic.reserve(robot, Span { lower, upper });
-    }
-
     fn send_all(&mut self, cycle: &mut Cycle<'_>) {
-        for robot in 0..self.robots.len() {
-            let view = &mut self.robots[robot];
-            let (sequence, index) = view.ledger.newest();
-            if sequence == 0 || view.ledger.is_acknowledged() || view.ledger.is_done() {
+        for (robot, view) in self.robots.iter_mut().enumerate() {
+            let question = self.core.question(robot);
+            let Some(mut authority) = question.or_else(|| self.core.command(robot)) else {
                 continue;
-            }
+            };
             view.header_id = view.header_id.wrapping_add(1);
-            view.round_trip.sent(cycle.now, sequence);
-            let is_goal = index == self.traffic.last(robot);
-            let to = i32::try_from(index).expect("paths have fewer than 2^31 poses");
-            (cycle.send)(ToRobot::Authority(Authority {
-                header: Header {
-                    fleet_id: self.fleet_id,
-                    robot_id: u32::try_from(robot).expect("fewer than 2^32 robots"),
-                    header_id: view.header_id,
-                    mission_id: view.ledger.mission_id(),
-                    sent_ns: cycle.now.as_ns(),
-                },
-                sequence,
-                authority_index: if is_goal { TO_GOAL } else { to },
-                echo_header_id: view.ledger.newest_header_id(),
-                flags: Authority::ACKNOWLEDGED,
-                ..Authority::default()
-            }));
+            if question.is_none() {
+                view.round_trip.sent(cycle.now, authority.sequence);
+            }
+            authority.header.fleet_id = self.fleet_id;
+            authority.header.header_id = view.header_id;
+            authority.header.sent_ns = cycle.now.as_ns();
+            (cycle.send)(ToRobot::Authority(authority));
         }
     }
 
@@ -196,20 +159,36 @@ impl SafeRules {
             let Some(mission) = &known.mission else {
                 continue;
             };
-            if mission.id != self.robots[robot].ledger.mission_id() {
-                self.begin(cycle.now, robot, mission.id, mission.route.path);
+            if mission.id == self.core.members[robot].ledger.mission_id() {
+                continue;
             }
+            self.core.begin(robot, mission.id, mission.route.path);
+            let view = &mut self.robots[robot];
+            view.round_trip.forget_question();
+            view.speed_mps = 0.0;
+            (view.waiting_since, view.waited_since) = (None, None);
+            view.moved = cycle.now;
+            view.is_counted_stuck = false;
         }
-        for robot in 0..self.robots.len() {
-            self.traffic.forget_passed(robot);
-        }
-        self.plan.drop_done(&self.traffic);
+        self.core.forget_passed();
+    }
+
+    /// The bay a robot stands in that says so, within a pose.
+    fn bay_at(world: &World, state: &State) -> Option<BayIndex> {
+        let spacing_m = spacing_min_m(world);
+        let distance_m = |bay: BayIndex| {
+            let pose = &world.bays[bay].pose;
+            (pose.x_m - state.x_m).hypot(pose.y_m - state.y_m)
+        };
+        let nearest =
+            (0..world.bays.len()).min_by(|a, b| distance_m(*a).total_cmp(&distance_m(*b)));
+        nearest.filter(|bay| distance_m(*bay) <= spacing_m)
     }
 
     fn count_stuck(&mut self, now: Instant) {
-        for view in &mut self.robots {
-            let is_stuck = view.ledger.mission_id() != 0
-                && !view.ledger.is_done()
+        for (view, member) in self.robots.iter_mut().zip(&self.core.members) {
+            let is_stuck = member.ledger.mission_id() != 0
+                && !member.ledger.is_done()
                 && now > view.moved + self.stuck_after;
             if is_stuck && !view.is_counted_stuck {
                 view.is_counted_stuck = true;
@@ -223,40 +202,83 @@ impl Rules for SafeRules {
     fn on_state(&mut self, now: Instant, state: &State) {
         let header = &state.header;
         let robot = header.robot_id as usize;
-        if robot >= self.robots.len() || header.fleet_id != self.fleet_id || !state.is_sound() {
+        let is_ours = robot < self.robots.len() && header.fleet_id == self.fleet_id;
+        if !self.is_asking || !is_ours || !state.is_sound() {
             return;
         }
+        let was_lower = self.core.members[robot].ledger.lower();
+        let was_newest = self.core.members[robot].newest_header_id;
+        let world = &self.world;
+        let bay = core::cell::Cell::new(None);
+        let heard = self.core.on_state(robot, state, || {
+            bay.set(Self::bay_at(world, state));
+            bay.get()
+        });
+        let member = &self.core.members[robot];
         let view = &mut self.robots[robot];
-        let was_lower = view.ledger.lower();
-        let is_newest = header.header_id >= view.ledger.newest_header_id();
-        let effect = view.ledger.on_state(state);
-        match effect {
-            StateEffect::Nothing => return,
-            StateEffect::Impossible => {
+        match heard {
+            Heard::Known(StateEffect::Nothing) | Heard::PassedOver => return,
+            Heard::Known(StateEffect::Impossible) => {
                 self.counts.states_impossible += 1;
                 return;
             }
-            StateEffect::Exceeded => self.counts.authorities_exceeded += 1,
-            StateEffect::Refused | StateEffect::News => {}
+            Heard::Restarted => {
+                self.counts.robots_restarted += u64::from(!view.is_counted_restarted);
+                view.is_counted_restarted = true;
+                return;
+            }
+            Heard::Unplaced => {
+                self.counts.answers_unplaced += 1;
+                return;
+            }
+            Heard::Answered => {
+                view.told = Some(*state);
+                view.told_bay = bay.get();
+                view.moved = now;
+                return;
+            }
+            Heard::Known(StateEffect::Exceeded) => self.counts.authorities_exceeded += 1,
+            Heard::Known(StateEffect::Refused | StateEffect::News) => {}
         }
         view.round_trip.shown(now, state.applied_sequence);
-        if is_newest {
+        if member.newest_header_id == header.header_id || was_newest == header.header_id {
             view.speed_mps = f64::from(state.speed_mps);
         }
-        if view.ledger.lower() > was_lower {
+        if member.ledger.lower() > was_lower {
             view.moved = now;
             view.waited_since = None;
             view.is_counted_stuck = false;
         }
-        let (lower, bound) = (view.ledger.lower(), view.ledger.bound());
-        if lower >= bound + self.margin.above && lower < self.traffic.last(robot) {
+        let (lower, bound) = (member.ledger.lower(), member.ledger.bound());
+        if lower >= bound + self.core.margin.above && lower < self.core.traffic.last(robot) {
             self.counts.margins_exceeded += 1;
         }
-        let is_done = view.ledger.is_done();
-        self.update_span(robot);
-        if is_done {
-            self.plan.finish(robot);
+    }
+
+    fn prepare(&mut self, now: Instant, roster: &mut Roster, missions: &mut MissionSource) -> bool {
+        if !self.is_asking {
+            self.is_asking = true;
+            let (margin, count) = (self.core.margin, self.robots.len());
+            let first = first_id(now);
+            // 0 is no question.
+            self.core = Interlocking::new(&self.world, margin, count, first.max(1));
+            for view in &mut self.robots {
+                view.header_id = first;
+            }
         }
+        if !self.is_ready && self.core.is_complete() {
+            self.is_ready = true;
+            let told = self
+                .robots
+                .iter_mut()
+                .map(|view| (view.told.take(), view.told_bay));
+            roster.resume(now, told, missions);
+        }
+        self.is_ready
+    }
+
+    fn address(&self, mission: &mut Mission) {
+        self.core.address(mission);
     }
 
     fn decide(&mut self, cycle: &mut Cycle<'_>) {
@@ -267,14 +289,14 @@ impl Rules for SafeRules {
         self.count_stuck(cycle.now);
         cycle.counters.safe = self.counts;
         debug_assert!(
-            !self.starts_apart || self.traffic.first_overlap().is_none(),
+            !self.core.stands_apart || self.core.traffic.first_overlap().is_none(),
             "reservations overlap: {:?}",
-            self.traffic.first_overlap()
+            self.core.traffic.first_overlap()
         );
     }
 
     fn reservations(&self) -> Option<&Traffic> {
-        Some(&self.traffic)
+        Some(&self.core.traffic)
     }
 
     fn resets_stuck_robots(&self) -> bool {
@@ -367,6 +389,13 @@ pub(crate) fn lookahead_s(cycle_s: f64, round_trip_s: f64, reserve_ms: f64) -> f
     cycle_s + round_trip_s + 1e-3 * reserve_ms
 }
 
+fn spacing_min_m(world: &World) -> f64 {
+    let paths = world.paths.ids().filter_map(|id| world.paths.get(id));
+    paths
+        .map(|path| path.spacing_m())
+        .fold(f64::INFINITY, f64::min)
+}
+
 hil_core::parameters! {
     /// `[case.parameters.coordinator.safe]`.
     #[derive(Copy)]
@@ -392,12 +421,7 @@ impl SafeParameters {
 
     /// The stop error in poses of `world`'s paths, one pose for rounding added.
     pub(crate) fn stop_margin(&self, world: &World) -> StopMargin {
-        let spacing_m = world
-            .paths
-            .ids()
-            .filter_map(|id| world.paths.get(id))
-            .map(|path| path.spacing_m())
-            .fold(f64::INFINITY, f64::min);
+        let spacing_m = spacing_min_m(world);
         let poses = floor_index((self.stop_error_m / spacing_m).ceil()) + 1;
         StopMargin {
             below: poses,

@@ -6,6 +6,7 @@
 //! whose footprint is grown so that a vehicle between two poses lies within what it covers at
 //! the two. So as long as each robot is within its reservation and all are apart, none collide.
 
+use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
 use crate::path::PathId;
@@ -42,14 +43,14 @@ impl Contact {
     }
 }
 
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 struct Way {
     path: PathId,
     last: usize,
 }
 
 /// The reservations of a fleet.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Traffic {
     world: Arc<World>,
     ways: Vec<Option<Way>>,
@@ -60,33 +61,30 @@ pub struct Traffic {
 }
 
 impl Traffic {
-    /// All robots stand in their bays.
-    pub fn new(world: &Arc<World>, starts: &[BayIndex]) -> Self {
-        let count = starts.len();
-        let mut traffic = Self {
+    /// Of `robot_count` robots nothing is known.
+    pub(crate) fn new(world: &Arc<World>, robot_count: usize) -> Self {
+        Self {
             world: Arc::clone(world),
-            ways: vec![None; count],
-            spans: vec![Span::at(0); count],
-            contacts: vec![Vec::new(); count],
-        };
-        for (robot, &bay) in starts.iter().enumerate() {
-            // Any path that begins or ends in the bay has the pose a robot parks at.
-            let leaving = world
-                .routes_from(bay)
-                .first()
-                .map(|route| (route.path, true));
-            let arriving = || {
-                let mut routes = world.routes.iter();
-                routes
-                    .find(|route| route.to == bay)
-                    .map(|route| (route.path, false))
-            };
-            if let Some((path, leaves)) = leaving.or_else(arriving) {
-                let last = world.path(path).last_index();
-                traffic.put(robot, path, Span::at(if leaves { 0 } else { last }));
-            }
+            ways: vec![None; robot_count],
+            spans: vec![Span::at(0); robot_count],
+            contacts: vec![Vec::new(); robot_count],
         }
-        traffic
+    }
+
+    /// `robot` stands in `bay`.
+    pub(crate) fn park(&mut self, robot: usize, bay: BayIndex) {
+        // Any path that begins or ends in the bay has the pose a robot parks at.
+        let leaving = self.world.routes_from(bay).first();
+        let leaving = leaving.map(|route| (route.path, true));
+        let arriving = || {
+            let mut routes = self.world.routes.iter();
+            let route = routes.find(|route| route.to == bay);
+            route.map(|route| (route.path, false))
+        };
+        if let Some((path, leaves)) = leaving.or_else(arriving) {
+            let last = self.world.path(path).last_index();
+            self.put(robot, path, Span::at(if leaves { 0 } else { last }));
+        }
     }
 
     /// Number of robots.
@@ -216,9 +214,25 @@ impl Traffic {
     }
 }
 
+/// The contacts follow from these, once those passed are forgotten.
+impl PartialEq for Traffic {
+    fn eq(&self, other: &Self) -> bool {
+        self.ways == other.ways && self.spans == other.spans
+    }
+}
+
+impl Eq for Traffic {}
+
+impl Hash for Traffic {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.ways.hash(state);
+        self.spans.hash(state);
+    }
+}
+
 /// A pose of `own` and one of `taken` that overlap, if any. Each side of a section knows of a
 /// pose only the first and the last partner; a pair that both sides know is meant.
-fn common_pair(section: &Section, own: Span, taken: Span) -> Option<(usize, usize)> {
+pub(crate) fn common_pair(section: &Section, own: Span, taken: Span) -> Option<(usize, usize)> {
     let from = own.lower.max(section.start(Side::First));
     let to = own.upper.min(section.end(Side::First));
     (from..=to).find_map(|index| {

@@ -8,6 +8,7 @@ use crate::coordinator::safe::SafeParameters;
 use crate::mission::MissionMode;
 use crate::robot::{RobotParameters, TrackerKind};
 use crate::scenario::{Scenario, Scene, WorldParameters};
+use core::time::Duration;
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
@@ -22,6 +23,7 @@ fn setup(chaos: Chaos) -> RigSetup {
         missions_per_robot: 0,
         mode: MissionMode::Random,
         chaos,
+        restart_every: None,
     }
 }
 
@@ -116,6 +118,28 @@ fn a_coarse_tracker_keeps_within_the_margin_of_its_stop_error() {
                 ..setup(chaos)
             };
             check_run(name, &scene, &setup, seed);
+        }
+    }
+}
+
+#[test]
+fn a_coordinator_that_restarts_again_and_again_keeps_every_robot_safe_and_the_fleet_going() {
+    for (name, chaos) in CONDITIONS {
+        for seed in 0..4_u64 {
+            let scene = random_scene(5, &mut RandomStream::new(seed, "world"));
+            let setup = RigSetup {
+                restart_every: Some(Duration::from_secs(47)),
+                ..setup(chaos)
+            };
+            let mut rig = Rig::new(&scene, &setup, seed);
+            rig.run(seconds(1_500), |_| false);
+            let tally = rig.referee.tally();
+            let context = format!("{name}, seed {seed}: {tally:?}");
+            assert!(rig.restart_count > 25, "{context}");
+            assert_eq!(tally.section_collisions_count, 0, "{context}");
+            assert_eq!(tally.overlaps_count + tally.outside_count, 0, "{context}");
+            assert!(tally.missions_done_count > 50, "{context}");
+            assert!(tally.sections_passed_count > 20, "{context}");
         }
     }
 }

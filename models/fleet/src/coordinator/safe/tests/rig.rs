@@ -95,6 +95,12 @@ pub(super) struct Rig {
     queue: BinaryHeap<Reverse<(Instant, u64)>>,
     letters: Vec<Option<Letter>>,
     free: Vec<usize>,
+    scene: Scene,
+    parameters: CoordinatorParameters,
+    missions: MissionParameters,
+    seed: u64,
+    restart_every: Option<Duration>,
+    pub(super) restart_count: u64,
 }
 
 pub(super) struct RigSetup {
@@ -103,6 +109,8 @@ pub(super) struct RigSetup {
     pub(super) missions_per_robot: u32,
     pub(super) mode: MissionMode,
     pub(super) chaos: Chaos,
+    /// The coordinator restarts so often; it takes five seconds.
+    pub(super) restart_every: Option<Duration>,
 }
 
 pub(super) fn safe_parameters() -> CoordinatorParameters {
@@ -113,6 +121,18 @@ pub(super) fn safe_parameters() -> CoordinatorParameters {
 }
 
 const CYCLE: Duration = Duration::from_secs(1);
+const RESTART: Duration = Duration::from_secs(5);
+
+fn coordinator(
+    scene: &Scene,
+    parameters: &CoordinatorParameters,
+    missions: &MissionParameters,
+    seed: u64,
+) -> Coordinator {
+    let random = RandomStream::new(seed, "missions");
+    let source = MissionSource::new(missions, scene, random);
+    Coordinator::new(scene, parameters, 0, source)
+}
 
 impl Rig {
     pub(super) fn new(scene: &Scene, setup: &RigSetup, seed: u64) -> Self {
@@ -122,7 +142,6 @@ impl Rig {
             missions_per_robot: setup.missions_per_robot,
             ..MissionParameters::default()
         };
-        let source = MissionSource::new(&missions, scene, stream("missions"));
         let robot = |number: u32| {
             let random = stream(&format!("robot {number}"));
             Robot::new(scene, &setup.robot, 0, number, random)
@@ -130,7 +149,7 @@ impl Rig {
         let count = u32::try_from(scene.starts.len()).unwrap();
         Self {
             now: Instant::ZERO,
-            coordinator: Coordinator::new(scene, &setup.coordinator, 0, source),
+            coordinator: coordinator(scene, &setup.coordinator, &missions, seed),
             robots: (0..count).map(robot).collect(),
             referee: Referee::new(scene, 1),
             chaos: setup.chaos,
@@ -138,6 +157,12 @@ impl Rig {
             queue: BinaryHeap::new(),
             letters: Vec::new(),
             free: Vec::new(),
+            scene: scene.clone(),
+            parameters: setup.coordinator.clone(),
+            missions,
+            seed,
+            restart_every: setup.restart_every,
+            restart_count: 0,
         }
     }
 
@@ -166,6 +191,7 @@ impl Rig {
     /// Runs until `end`, or until `is_over` says so at a cycle; gives the time.
     pub(super) fn run(&mut self, end: Instant, mut is_over: impl FnMut(&Self) -> bool) -> Instant {
         let (mut next_cycle, mut next_scan) = (Instant::ZERO, Instant::ZERO);
+        let mut next_restart = self.restart_every.map(|every| Instant::ZERO + every);
         for robot in &mut self.robots {
             let referee = &mut self.referee;
             robot.start(Instant::ZERO, &mut |truth| referee.on_truth(&truth));
@@ -191,6 +217,12 @@ impl Rig {
                 if let Some(state) = state {
                     self.post(|| Letter::State(state));
                 }
+            } else if next_cycle == at && next_restart.is_some_and(|restart| restart <= at) {
+                self.restart_count += 1;
+                let seed = self.seed + self.restart_count;
+                self.coordinator = coordinator(&self.scene, &self.parameters, &self.missions, seed);
+                next_restart = self.restart_every.map(|every| at + every);
+                next_cycle = at + RESTART;
             } else if next_cycle == at {
                 let mut out = Vec::new();
                 self.coordinator
