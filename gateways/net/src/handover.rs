@@ -57,7 +57,7 @@ pub fn take(socket: impl AsFd) -> io::Result<(Vec<u8>, Vec<OwnedFd>)> {
     let mut descriptors = Vec::new();
     for one in message.cmsgs()? {
         if let ControlMessageOwned::ScmRights(numbers) = one {
-            // SAFETY: the kernel has just put these descriptors into this process, and nobody else knows them.
+            // SAFETY: the kernel has just put these descriptors into this process, and no other owner has them.
             descriptors.extend(
                 numbers
                     .iter()

@@ -340,7 +340,7 @@ impl PacketRing {
     }
 }
 
-/// A packet socket of a network namespace that is to be the end of a cable there. It hears nothing yet.
+/// A packet socket of a network namespace that is to be the end of a cable there. It receives nothing yet.
 #[derive(Debug)]
 pub struct CableSocket(OwnedFd);
 

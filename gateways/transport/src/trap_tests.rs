@@ -150,7 +150,7 @@ fn a_dead_peer_is_a_state_that_ends_when_it_comes_back() {
 }
 
 /// The kernel answers each datagram with a report, as a stranger can: a sealed hop loses no datagram to it
-/// and believes nothing of it.
+/// and uses nothing of it.
 #[test]
 fn reports_of_the_network_cost_a_sealed_hop_no_datagram() {
     for address in ["127.0.0.1:0", "[::1]:0"] {

@@ -174,7 +174,7 @@ pub struct FlowMetrics {
     pub lost_by_either_count: u64,
     /// Frames that got lost on a host: in a queue, a socket or a process of this program.
     pub lost_by_harness_count: u64,
-    /// Frames of which nobody can say what became, those under way at the end included.
+    /// Frames whose fate is unknown, those under way at the end included.
     pub unknown_count: u64,
     /// Frames that came after a later one of the channel.
     pub reordered_count: u64,
@@ -207,7 +207,7 @@ struct Flow {
     delays_ns: Vec<i64>,
 }
 
-/// What became of a frame, by its place among [`Flow::counts`].
+/// Fate of a frame, by its place among [`Flow::counts`].
 const TAKEN: usize = 0;
 const BY_NETWORK: usize = 1;
 const BY_HARNESS: usize = 2;
@@ -268,7 +268,7 @@ impl FlowFold {
         &mut self.flows[index as usize]
     }
 
-    /// Takes what became of a frame; one without a record is of no flow.
+    /// Takes the fate of a frame; one without a record is of no flow.
     pub fn add(&mut self, message: &MessageHistory, path: ChannelPath<'_>) {
         let frames = self.frames.get(&message.epoch);
         let index = usize::try_from(message.key.sequence)

@@ -132,8 +132,10 @@ pub fn is_prefix(text: &str) -> bool {
 /// Where domains lie by default: `/run/hil`, else the user's own runtime folder, else a folder of
 /// the user's own among the temporary ones.
 pub fn domain_base_candidates() -> Vec<PathBuf> {
-    let runtime_folder =
-        std::env::var_os("XDG_RUNTIME_DIR").map(|path| PathBuf::from(path).join("hil"));
+    // One that is not absolute is to be ignored (XDG Base Directory Specification); an empty one often stands for none.
+    let runtime_folder = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from);
+    let runtime_folder = runtime_folder.filter(|path| path.is_absolute());
+    let runtime_folder = runtime_folder.map(|path| path.join("hil"));
     let own = std::env::temp_dir().join(format!("hil-{}", Uid::current()));
     let candidates = [Some(PathBuf::from("/run/hil")), runtime_folder, Some(own)];
     candidates.into_iter().flatten().collect()

@@ -32,10 +32,11 @@ commas between:
   hashed)
 
 Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a
-fault, loss is unavailable, a clock was set, or the figures differ; 2 wrong arguments, nothing to read, or a capture
-without anything of the run; 69 no such interface; 78 the right to capture is
-missing (root or CAP_NET_RAW), or the card gives no stamps; 130 interrupted
-before --duration was over, the file is complete";
+fault, loss is unavailable, a clock was set, or the figures differ; 2 wrong
+arguments, nothing to read, or a capture without anything of the run; 69 no
+such interface; 78 the right to capture is missing (root or CAP_NET_RAW), or
+the card gives no stamps; 130 interrupted before --duration was over, the file
+is complete";
 
 const ANALYSE_EXAMPLES: &str = "\
 Examples:

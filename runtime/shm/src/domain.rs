@@ -150,7 +150,7 @@ impl Domain {
         Ok(domain)
     }
 
-    /// Deletes what a dead run left at `root_path`, if it is that of a domain.
+    /// Deletes what a run that was killed left at `root_path`, if it is that of a domain.
     ///
     /// # Errors
     /// As [`Domain::create`].

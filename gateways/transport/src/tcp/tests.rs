@@ -217,7 +217,7 @@ fn a_restarted_sender_takes_the_place_of_the_one_that_vanished() {
 }
 
 /// Eighty connections that say nothing, a part of a frame, or a datagram that nobody proves to be the peer's,
-/// while the peer goes on.
+/// while the peer sends.
 #[test]
 fn connections_without_an_authentic_datagram_cost_the_present_one_nothing() {
     let place: SocketAddr = "127.0.0.1:0".parse().unwrap();
@@ -249,12 +249,17 @@ fn connections_without_an_authentic_datagram_cost_the_present_one_nothing() {
         receiver.answer(b"heard", place).unwrap();
         within_bound("answer", || sender.receive(&mut buffer).unwrap());
     }
-    let figures = receiver.metrics(now());
+    let figures = within_bound("all but the candidates", || {
+        receiver.attend(now());
+        // What a candidate sent is given, and proves nothing.
+        let _made_up = receiver.receive(now(), &mut [0; 64]).unwrap();
+        let figures = receiver.metrics(now());
+        (figures.unproven_connection_count >= 72).then_some(figures)
+    });
     assert_eq!(
         (figures.connection_count, figures.connection_ended_count),
         (1, 0)
     );
-    assert!(figures.unproven_connection_count >= 72, "{figures:?}");
     assert_eq!(sender.metrics(now()).connection_count, 1);
 }
 

@@ -38,7 +38,7 @@ pub(crate) enum MissionVerdict {
     Busy,
 }
 
-/// What became of an authority.
+/// Result of an authority.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Heard {
     /// It is a question.

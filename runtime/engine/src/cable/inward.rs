@@ -38,7 +38,7 @@ pub(super) struct Inward {
     waiter: Option<Waiter>,
     wait: WaitStrategy,
     refused_count: u64,
-    /// Outlives the ports.
+    /// Dropped after the ports.
     _domain: Arc<Domain>,
 }
 

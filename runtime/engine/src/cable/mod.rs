@@ -127,7 +127,7 @@ fn start(work: &CableWork) -> Result<(Program, Inlet), WorkerError> {
     helper.arg("--").args(&work.command).envs(&work.environment);
     helper.stdin(Stdio::from(there)).stdout(Stdio::from(log));
     let child = helper.spawn().map_err(failed)?;
-    // This process keeps no copy of the helper's end: a helper that dies is heard.
+    // This process keeps no copy of the helper's end: the end of a helper is noticed.
     drop(helper);
     let program = Program::new(child, &work.command[0]);
     Ok((program, Inlet::take(here)?))

@@ -20,7 +20,7 @@ use crate::process::heartbeat::Heartbeat;
 use crate::process::recording::output_settings;
 use crate::process::worker::{JobWork, WorkerError};
 
-/// Frames that are taken at the end at most: a program that does not end goes on sending.
+/// Frames that are taken at the end at most: a program that does not end keeps sending.
 const CLEARING_MAX: usize = 65_536;
 
 /// What is open before the thread begins.
@@ -44,7 +44,7 @@ pub(super) struct Outward {
     wait: WaitStrategy,
     /// Longer than a message may be.
     too_long_count: u64,
-    /// Outlives the port.
+    /// Dropped after the port.
     _domain: Arc<Domain>,
 }
 

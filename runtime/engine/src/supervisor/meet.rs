@@ -233,7 +233,7 @@ fn host(
         }
         while let Some(newcomer) = control_listener.look(&mut patience.strangers) {
             if let Some(peer) = welcome(newcomer, hello, patience)? {
-                // One that gave up and came again: its first connection is a dead one.
+                // One that gave up and came again: its first connection has ended.
                 peers.retain(|known| known.hello.host != peer.hello.host);
                 peers.push(peer);
             }

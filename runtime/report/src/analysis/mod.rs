@@ -274,7 +274,7 @@ fn read_channels(
     found
 }
 
-/// Where the receiving host had no room for some datagrams, nobody knows which frames these were.
+/// Where the receiving host had no room for some datagrams, it is unknown which frames these were.
 fn doubt_losses(summary: &mut RunSummary) {
     for one in &mut summary.flows {
         let mut directions = summary.directions.iter();

@@ -85,7 +85,7 @@ impl Session {
         self.first_cycle_index + u64::from(since_first)
     }
 
-    /// What became of a message behind the newest: of an earlier session, late, or come before.
+    /// Fate of a message behind the newest: of an earlier session, late, or come before.
     fn late(&mut self, seqno: u32) -> Refusal {
         let behind = self.newest_seqno.checked_sub(seqno);
         let bit = behind

@@ -66,7 +66,7 @@ pub(crate) enum Heard {
     Known(StateEffect),
 }
 
-/// What became of an extension.
+/// Result of an extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct Extension {
     pub(crate) is_given: bool,
