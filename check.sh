@@ -69,9 +69,9 @@ if [[ "$mode" == long ]]; then
     export HIL_CHAOS_EPISODES="${HIL_CHAOS_EPISODES:-200}" HIL_CHAOS_SEED="${HIL_CHAOS_SEED:-1000}"
     export HIL_SOAK_MINUTES="${HIL_SOAK_MINUTES:-10}"
     step tests nextest --workspace --profile long --run-ignored all \
-        --filterset 'not (binary(coverage) and test(intervals_cover))'
+        --filterset 'not (package(hil-stats) & (binary(coverage) | binary(connection)))'
     # Many runs of many messages: optimised.
-    step coverage cargo test --release -p hil-stats --test coverage -- --ignored --nocapture
+    step coverage cargo test --release -p hil-stats --test coverage --test connection -- --ignored --nocapture
 else
     step format cargo fmt --all --check
     # All targets: the benches are checked here and not built with optimisation.

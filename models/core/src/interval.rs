@@ -46,7 +46,7 @@ impl IntervalMethod {
     pub const fn assumption(self) -> &'static str {
         match self {
             Self::EffectiveShare | Self::EffectiveRanks | Self::EffectiveMean => {
-                "memory fades within a hundredth of the run, as tested on the data"
+                "the run is stationary; its memory, fading or long, is weighed by the data"
             }
             Self::Exact | Self::Score => "trials are independent",
             Self::Student | Self::Welch => "repetitions are independent",
@@ -84,34 +84,17 @@ impl Interval {
     }
 }
 
-/// Why a sample has no interval.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, thiserror::Error)]
-pub enum TooSmall {
-    /// It is worth too few independent observations.
-    #[error(
-        "sample too small: {effective} effective observation{}, {needed} needed",
-        if *.effective == 1 { "" } else { "s" }
-    )]
-    #[serde(rename = "too_few")]
-    Few {
-        /// What it is worth.
-        effective: u64,
-        /// What it takes.
-        needed: u64,
-    },
-    /// Its memory does not fade within the run, however long it is taken to be.
-    #[error(
-        "sample too small: its memory does not fade within the run (d = {memory:.2}), {effective} \
-         effective observation{}",
-        if *.effective == 1 { "" } else { "s" }
-    )]
-    #[serde(rename = "memory_does_not_fade")]
-    Memory {
-        /// Memory parameter d of long memory, 0 for none, below 0.5.
-        memory: f64,
-        /// What it would be worth with it.
-        effective: u64,
-    },
+/// Why a sample has no interval: it is worth too few independent observations.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
+#[error(
+    "sample too small: {effective} effective observation{}, {needed} needed",
+    if *.effective == 1 { "" } else { "s" }
+)]
+pub struct TooSmall {
+    /// What it is worth.
+    pub effective: u64,
+    /// What it takes.
+    pub needed: u64,
 }
 
 /// An interval, or why the sample has none.

@@ -1,15 +1,16 @@
-//! How many independent observations a dependent series is worth, and whether that can be told.
+//! How many independent observations a dependent series is worth.
 //!
 //! Losses come in bursts, and delays of successive messages are correlated. The variance of a mean is then
-//! the spectral density at frequency zero over the count (Heidelberger and Welch 1981). It is taken from the
-//! lowest [`LOW_COUNT`] ordinates of the periodogram of batch means, with equal weights, which gives Student
-//! quantiles (Müller 2014; Lazarus, Lewis, Stock and Watson 2018). That holds when memory fades well within the
-//! run, which is tested on the series: by Whittle's likelihood (1953) a memory that fades within a hundredth of
-//! the run is held against a slower one, and against long memory (fractional noise, Beran 1994). Long memory
-//! that is not ruled out enters the variance with the weight of its likelihood (Buckland, Burnham and Augustin
-//! 1997), as the estimate for long memory has it (Robinson 2005; Abadir, Distaso and Giraitis 2009).
+//! the spectral density at frequency zero over the count (Heidelberger and Welch 1981), which no run shows: it is
+//! extrapolated from its lowest frequencies. The periodogram of batch means is held against models by Whittle's
+//! likelihood (1953): white noise; memory that fades exponentially, in white noise; and long memory (fractional noise, Beran
+//! 1994), also fading at high frequencies and in white noise. Each says what the variance of the mean is; the interval is
+//! that of all models, each with the weight of its likelihood (Bayesian model averaging; Hoeting, Madigan, Raftery and Volinsky
+//! 1999), and never narrower than that of the [`LOW_COUNT`] lowest ordinates with equal weights and
+//! Student's quantile (Lazarus, Lewis, Stock and Watson 2018), which assumes no model.
 //!
-//! `tests/coverage.rs` measures what the intervals cover; `docs/intervals.md` has the table.
+//! What is worth too few observations for that has no interval. `tests/coverage.rs` measures what the intervals
+//! cover; `docs/intervals.md` has the table.
 
 use core::f64::consts::{PI, TAU};
 
@@ -20,47 +21,36 @@ use statrs::function::gamma::gamma;
 
 use crate::samples::Samples;
 use crate::special::{
-    ceil_count, incomplete_beta, invert, normal_quantile, place_of, student_quantile,
+    ceil_count, incomplete_beta, invert, normal_distribution, normal_quantile, place_of,
+    student_quantile,
 };
 
 /// Batches that a series is cut into, at most.
 const BATCHES_MAX: u64 = 2_048;
 
-/// Ordinates of the periodogram that the variance of a mean is taken from.
-const LOW_COUNT: usize = 16;
+/// Ordinates of the periodogram that bound the variance of a mean from below.
+const LOW_COUNT: usize = 8;
+
+/// Neighbouring ordinates from this place on are taken together.
+const SINGLE_COUNT: usize = 16;
 
 /// Values that a series must have: a quarter of them are ordinates.
-const COUNT_MIN: u64 = 4 * LOW_COUNT as u64;
+const COUNT_MIN: u64 = 4 * SINGLE_COUNT as u64;
 
-/// Cycles in the run of the frequency below which a memory that fades in time has a flat spectrum: the run is
-/// `TAU` times as many correlation times long.
-const CORNER_MIN: f64 = LOW_COUNT as f64;
-
-/// By how much the logarithm of the likelihood of a slower memory may exceed that of one that fades in time.
-const SLOW_GAIN_MAX: f64 = 1.0;
-
-/// The same of long memory.
-const LONG_GAIN_MAX: f64 = 4.0;
-
-/// What long memory is given in advance, as a logarithm of its odds.
-const LONG_PRIOR: f64 = 1.0;
-
-/// Added to the estimate of the memory parameter, for its error.
-const MEMORY_ALLOWANCE: f64 = 0.05;
-
-/// Largest memory parameter that is worked with; 0.5 has no finite variance.
-const MEMORY_MAX: f64 = 0.47;
-
-/// The same of a slower memory.
-const SLOW_PRIOR: f64 = -1.0;
+/// What white noise and long memory are given in advance; fading memory has the rest.
+const WHITE_PRIOR: f64 = 0.3;
+const LONG_PRIOR: f64 = 0.35;
 
 /// Effective observations that the rarer outcome of a share must have.
 const RARE_MIN: f64 = 5.0;
 
-/// Effective observations that must lie beyond a quantile, and how many of the series itself there must be for each
-/// rank beyond it: outcomes far out seem to forget sooner than the series does.
-const BEYOND_MIN: f64 = 2.5;
-const BEYOND_SERIES_MIN: f64 = 1.2;
+/// Effective observations that must lie beyond a quantile.
+const BEYOND_MIN: f64 = 1.4;
+
+/// How much nearer to the middle the quantile is that a quantile far out is compared with, and effective observations that
+/// must lie beyond that one for each rank beyond it. Few clusters far out do not show how long clusters are, those nearer by do.
+const NEARER: f64 = 10.0;
+const NEARER_MIN: f64 = 0.9;
 
 /// Probability outside an interval on either side.
 const TAIL: f64 = 0.025;
@@ -138,34 +128,31 @@ impl Batches {
         (self.square / self.count as f64 - mean * mean).max(0.0)
     }
 
-    /// The series' memory, or that it is too short for any to be found.
-    fn memory(&self) -> Result<Memory, TooSmall> {
+    /// What the spectrum says of the mean, or that the series is too short to have one.
+    fn at_zero(&self) -> Result<AtZero, TooSmall> {
         if self.count < COUNT_MIN {
-            return Err(TooSmall::Few {
+            return Err(TooSmall {
                 effective: self.count,
                 needed: COUNT_MIN,
             });
         }
-        Ok(Memory::of(self))
+        Ok(AtZero::of(self))
     }
 
-    /// How many independent values would have a mean of the same variance, at most all; or why that
-    /// cannot be told.
+    /// How many independent values would have a mean of the same variance, at most all.
     ///
     /// # Errors
-    /// When the series is too short, or its memory does not fade in time.
+    /// When the series is too short.
     pub fn effective_count(&self) -> Result<f64, TooSmall> {
-        let memory = self.memory()?;
-        memory.fades()?;
-        Ok(self.effective_by(&memory, &memory))
+        let own = self.at_zero()?;
+        Ok(self.effective_by(own, own.ratio))
     }
 
-    /// By the long memory of `other` where that is the stronger one.
-    fn effective_by(&self, own: &Memory, other: &Memory) -> f64 {
+    /// With the ratio of another series where that is larger.
+    fn effective_by(&self, own: AtZero, other_ratio: f64) -> f64 {
         let variance = self.variance();
-        let of_mean = own
-            .variance_of_mean(other)
-            .max(variance / self.count as f64);
+        let of_mean = own.low * own.ratio.max(other_ratio);
+        let of_mean = of_mean.max(variance / self.count as f64);
         if of_mean > 0.0 {
             variance / of_mean
         } else {
@@ -220,7 +207,7 @@ impl Batches {
 }
 
 fn too_few(effective: f64, needed: f64) -> TooSmall {
-    TooSmall::Few {
+    TooSmall {
         effective: ceil_count(effective.floor()) as u64,
         needed: ceil_count(needed) as u64,
     }
@@ -258,21 +245,13 @@ fn selected_end(share: f64, worth: f64, least: f64) -> f64 {
     })
 }
 
-/// What the spectrum of a series says of its memory.
-#[derive(Debug)]
-struct Memory {
-    batch_count: f64,
-    /// The lowest ordinates: variance of a batch mean at this frequency.
-    low: Vec<f64>,
-    /// Variance of the mean by the short memory that fits best.
-    short: f64,
-    /// Cycles in the run where the best of all short memories has its corner, and the gain of that one over those
-    /// that fade in time.
-    corner: f64,
-    slow_gain: f64,
-    /// Gain of long memory over short, and its parameter.
-    long_gain: f64,
-    parameter: f64,
+/// The spectrum at frequency zero.
+#[derive(Debug, Clone, Copy)]
+struct AtZero {
+    /// Variance of the mean by the lowest ordinates.
+    low: f64,
+    /// Variance of the mean that all models give, over that; at least 1.
+    ratio: f64,
 }
 
 /// Neighbouring ordinates taken together: mean frequency, mean ordinate, how many.
@@ -282,26 +261,14 @@ struct Band {
     weight: f64,
 }
 
-/// A spectrum that fits.
-#[derive(Clone, Copy)]
-struct Fit {
-    /// Minus the logarithm of its likelihood.
-    misfit: f64,
-    /// Its value at frequency zero.
-    at_zero: f64,
-    /// Corner in cycles, or the memory parameter.
-    parameter: f64,
-}
+/// Models of one kind: minus the logarithm of the likelihood, and variance of the mean, of each.
+#[derive(Debug, Default)]
+struct Models(Vec<[f64; 2]>);
 
-impl Fit {
-    const NONE: Self = Self {
-        misfit: f64::INFINITY,
-        at_zero: 0.0,
-        parameter: 0.0,
-    };
-
-    /// Whittle's likelihood of the shape `values` over the bands, its scale fitted.
-    fn of(bands: &[Band], values: &[f64], at_zero: f64, parameter: f64) -> Self {
+impl Models {
+    /// One more, of the shape `values` over the bands; its scale is fitted. `of_mean` is the variance of the mean where the
+    /// scale is 1.
+    fn push(&mut self, bands: &[Band], values: impl Iterator<Item = f64>, of_mean: f64) {
         let (mut total, mut scale, mut logarithm) = (0.0, 0.0, 0.0);
         for (band, value) in bands.iter().zip(values) {
             total += band.weight;
@@ -309,19 +276,15 @@ impl Fit {
             logarithm += band.weight * value.ln();
         }
         let scale = (scale / total).max(f64::MIN_POSITIVE);
-        Self {
-            misfit: total * scale.ln() + logarithm,
-            at_zero: scale * at_zero,
-            parameter,
-        }
+        self.0
+            .push([total * scale.ln() + logarithm, scale * of_mean]);
     }
 
-    fn better(self, other: Self) -> Self {
-        if other.misfit < self.misfit {
-            other
-        } else {
-            self
-        }
+    fn least(&self) -> f64 {
+        self.0
+            .iter()
+            .map(|[misfit, _]| *misfit)
+            .fold(f64::INFINITY, f64::min)
     }
 }
 
@@ -341,122 +304,118 @@ fn ratios(from: f64, to: f64, count: i32) -> impl Iterator<Item = f64> {
     (0..count).map(move |index| from * step.powi(index))
 }
 
-/// Weight of a model against another, by the gain in the logarithm of its likelihood and what it is given in advance.
-fn weight(gain: f64, prior: f64) -> f64 {
-    1.0 / (1.0 + (-gain - prior).exp())
+/// White noise beside memory: over the spectrum of fading memory at zero, and of long memory at its lowest ordinate.
+const WHITE: [f64; 7] = [0.0, 1e-3, 0.01, 0.03, 0.1, 0.3, 1.0];
+
+/// Variance of the mean of `count` values with a spectrum of `frequency.powf(-2 * memory)` (Beran 1994).
+fn long_variance(memory: f64, count: f64) -> f64 {
+    let factor = 2.0 * gamma(1.0 - 2.0 * memory) * (PI * memory).sin()
+        / (memory * (1.0 + 2.0 * memory))
+        / TAU;
+    factor * count.powf(2.0 * memory - 1.0)
 }
 
-/// Share of white noise in the spectrum at zero of a fading part.
-const WHITE: [f64; 8] = [0.0, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3];
-
-impl Memory {
+impl AtZero {
     fn of(batches: &Batches) -> Self {
         let ordinates = periodogram(batches);
-        let batch_count = batches.sums.len() as f64;
-        let all = ordinates.len() as f64;
-        let bands = bands(&ordinates, batch_count);
-        let mut values = vec![0.0; bands.len()];
-        let shape = |values: &mut Vec<f64>, of: &dyn Fn(f64) -> f64| {
-            for (value, band) in values.iter_mut().zip(&bands) {
-                *value = of(band.frequency);
-            }
-        };
-        shape(&mut values, &|_| 1.0);
-        let (mut in_time, mut slow) = (Fit::of(&bands, &values, 1.0, batch_count), Fit::NONE);
-        for corner in ratios(4.0, all, 16) {
-            let theta = TAU * corner / batch_count;
-            let at_zero = fading(0.0, theta);
-            let mut faded = vec![0.0; bands.len()];
-            shape(&mut faded, &|frequency| fading(frequency, theta));
-            for white in WHITE {
-                for (value, faded) in values.iter_mut().zip(&faded) {
-                    *value = faded + white * at_zero;
-                }
-                let fit = Fit::of(&bands, &values, at_zero * (1.0 + white), corner);
-                if corner >= CORNER_MIN {
-                    in_time = in_time.better(fit);
-                } else {
-                    slow = slow.better(fit);
-                }
-            }
-        }
-        let mut long = Fit::NONE;
-        for corner in ratios(8.0, 2.0 * all, 8).map(Some).chain([None]) {
-            let mut faded = vec![1.0; bands.len()];
-            if let Some(corner) = corner {
-                let theta = TAU * corner / batch_count;
-                shape(&mut faded, &|frequency| fading(frequency, theta));
-            }
-            for tenth in 1..10 {
-                let memory = 0.05 * f64::from(tenth);
-                shape(&mut values, &|frequency| {
-                    (2.0 * (0.5 * frequency).sin()).powf(-2.0 * memory)
-                });
-                for (value, faded) in values.iter_mut().zip(&faded) {
-                    *value *= faded;
-                }
-                long = long.better(Fit::of(&bands, &values, 1.0, memory));
-            }
-        }
+        let count = batches.sums.len() as f64;
+        let bands = bands(&ordinates, count);
+        let low = ordinates[..LOW_COUNT].iter().sum::<f64>() / LOW_COUNT as f64 / count;
+        let mut flat = Models::default();
+        flat.push(&bands, bands.iter().map(|_| 1.0), 1.0 / count);
+        let highest = ordinates.len() as f64;
+        let kinds = [
+            (WHITE_PRIOR, flat),
+            (
+                1.0 - WHITE_PRIOR - LONG_PRIOR,
+                fading_models(&bands, highest, count),
+            ),
+            (LONG_PRIOR, long_models(&bands, highest, count)),
+        ];
+        let of_mean = averaged(&kinds);
         Self {
-            batch_count,
-            low: ordinates[..LOW_COUNT].to_vec(),
-            short: in_time.at_zero.max(
-                in_time.at_zero
-                    + weight(in_time.misfit - slow.misfit, SLOW_PRIOR)
-                        * (slow.at_zero - in_time.at_zero),
-            ) / batch_count,
-            corner: in_time.better(slow).parameter,
-            slow_gain: in_time.misfit - slow.misfit,
-            long_gain: in_time.misfit - long.misfit,
-            parameter: long.parameter,
+            low,
+            ratio: if low > 0.0 {
+                (of_mean / low).max(1.0)
+            } else {
+                1.0
+            },
         }
     }
+}
 
-    /// An error when memory does not fade in time.
-    fn fades(&self) -> Result<(), TooSmall> {
-        if self.slow_gain > SLOW_GAIN_MAX {
-            // Two correlation times are worth one observation.
-            return Err(too_few(PI * self.corner, PI * CORNER_MIN));
+/// Memory that fades with a corner at one and a half cycles in the run, or more.
+fn fading_models(bands: &[Band], highest: f64, count: f64) -> Models {
+    let mut models = Models::default();
+    for corner in ratios(1.5, highest, 16) {
+        let theta = TAU * corner / count;
+        let at_zero = fading(0.0, theta);
+        let faded: Vec<f64> = bands
+            .iter()
+            .map(|band| fading(band.frequency, theta))
+            .collect();
+        for white in WHITE {
+            let values = faded.iter().map(|faded| faded + white * at_zero);
+            models.push(bands, values, at_zero * (1.0 + white) / count);
         }
-        if self.long_gain > LONG_GAIN_MAX {
-            let by_long = self.by_long(self.parameter);
-            let single = self.low.iter().sum::<f64>() / LOW_COUNT as f64;
-            return Err(TooSmall::Memory {
-                memory: self.parameter,
-                effective: ceil_count((single / by_long).floor()).max(1) as u64,
-            });
-        }
-        Ok(())
     }
+    models
+}
 
-    /// Variance of the mean, long memory weighed by its likelihood; by that of `other` where it is the stronger.
-    fn variance_of_mean(&self, other: &Self) -> f64 {
-        let low = self.low.iter().sum::<f64>() / LOW_COUNT as f64 / self.batch_count;
-        let short = low.max(self.short);
-        let gain = self.long_gain.max(other.long_gain);
-        let parameter = if other.long_gain > self.long_gain {
-            other.parameter
-        } else {
-            self.parameter.max(other.parameter)
+/// Long memory, Hurst's exponent from 0.55 to 0.95.
+fn long_models(bands: &[Band], highest: f64, count: f64) -> Models {
+    let mut models = Models::default();
+    for corner in [None, Some(0.1 * highest), Some(0.5 * highest)] {
+        let fades = |frequency| {
+            corner.map_or(1.0, |corner| {
+                let theta = TAU * corner / count;
+                fading(frequency, theta) / fading(0.0, theta)
+            })
         };
-        let long = self.by_long(parameter + MEMORY_ALLOWANCE).max(short);
-        short + weight(gain, LONG_PRIOR) * (long - short)
+        for twentieth in 1..10 {
+            let memory = 0.05 * f64::from(twentieth);
+            let power = |band: &Band| {
+                fades(band.frequency) * (2.0 * (0.5 * band.frequency).sin()).powf(-2.0 * memory)
+            };
+            let powers: Vec<f64> = bands.iter().map(power).collect();
+            for white in WHITE {
+                let white = white * powers[0];
+                let values = powers.iter().map(|power| power + white);
+                models.push(bands, values, long_variance(memory, count) + white / count);
+            }
+        }
     }
+    models
+}
 
-    /// Variance of the mean with this memory parameter.
-    fn by_long(&self, memory: f64) -> f64 {
-        let memory = memory.min(MEMORY_MAX);
-        let scale = self.low.iter().zip(1..).map(|(ordinate, cycle)| {
-            let frequency = TAU * f64::from(cycle) / self.batch_count;
-            ordinate * frequency.powf(2.0 * memory)
-        });
-        let scale = scale.sum::<f64>() / LOW_COUNT as f64;
-        let factor = 2.0 * gamma(1.0 - 2.0 * memory) * (PI * memory).sin()
-            / (memory * (1.0 + 2.0 * memory))
-            / TAU;
-        factor * scale * self.batch_count.powf(2.0 * memory - 1.0)
-    }
+/// The variance of a normal distribution as wide, between the ends of an interval, as the mixture of all models: each kind with
+/// its prior weight, and within it each model with the same.
+fn averaged(kinds: &[(f64, Models)]) -> f64 {
+    let least = kinds
+        .iter()
+        .map(|(_, models)| models.least())
+        .fold(f64::INFINITY, f64::min);
+    let weighed = kinds.iter().flat_map(|(prior, models)| {
+        let each = prior / models.0.len() as f64;
+        models
+            .0
+            .iter()
+            .map(move |[misfit, of_mean]| (each * (least - misfit).exp(), of_mean.sqrt()))
+    });
+    // Whatever weighs less does not move the ends.
+    let weighed: Vec<(f64, f64)> = weighed.filter(|(weight, _)| *weight > 1e-7).collect();
+    let total: f64 = weighed.iter().map(|(weight, _)| weight).sum();
+    let widest = weighed
+        .iter()
+        .map(|(_, deviation)| *deviation)
+        .fold(0.0, f64::max);
+    let reach = invert(1.0 - TAIL, 0.0, 3.0 * widest, |reach| {
+        let inside = weighed
+            .iter()
+            .map(|(weight, deviation)| weight * normal_distribution(reach / deviation));
+        inside.sum::<f64>() / total
+    });
+    (reach / normal_quantile(1.0 - TAIL)).powi(2)
 }
 
 /// The lower quarter of the frequencies, from one cycle in the run on; white noise has its variance there.
@@ -473,13 +432,13 @@ fn periodogram(batches: &Batches) -> Vec<f64> {
     ordinates.map(|one| one.norm_sqr() / count as f64).collect()
 }
 
-/// Single ordinates up to twice [`LOW_COUNT`], then bands of a sixteenth of their frequency.
+/// Single ordinates up to twice [`SINGLE_COUNT`], then bands of a sixteenth of their frequency.
 fn bands(ordinates: &[f64], batch_count: f64) -> Vec<Band> {
     let mut bands = Vec::new();
     let mut from = 0;
     while from < ordinates.len() {
-        let width = (from / LOW_COUNT).max(1);
-        let until = (from + if from < 2 * LOW_COUNT { 1 } else { width }).min(ordinates.len());
+        let width = (from / SINGLE_COUNT).max(1);
+        let until = (from + if from < 2 * SINGLE_COUNT { 1 } else { width }).min(ordinates.len());
         let weight = (until - from) as f64;
         bands.push(Band {
             frequency: TAU * 0.5 * (from + 1 + until) as f64 / batch_count,
@@ -497,7 +456,7 @@ pub struct Quantiles<'a> {
     series: &'a Samples,
     ascending: &'a Samples,
     /// Of the ranks: the memory of the series itself, which an outcome far out hides.
-    ranks: Result<(Memory, f64), TooSmall>,
+    ratio: Result<f64, TooSmall>,
 }
 
 impl<'a> Quantiles<'a> {
@@ -507,15 +466,10 @@ impl<'a> Quantiles<'a> {
         for value in series.iter() {
             ranks.push(ascending.count_below(value) as f64, 1);
         }
-        let memory = ranks.memory().and_then(|memory| {
-            memory.fades()?;
-            let worth = ranks.effective_by(&memory, &memory) * student_loss();
-            Ok((memory, worth))
-        });
         Self {
             series,
             ascending,
-            ranks: memory,
+            ratio: ranks.at_zero().map(|at_zero| at_zero.ratio),
         }
     }
 
@@ -527,7 +481,7 @@ impl<'a> Quantiles<'a> {
             return None;
         }
         Some(
-            self.ranks(share)
+            self.places(share)
                 .map_or_else(Spread::Unknown, |(low, high)| {
                     let [low, high] = [low, high].map(|place| self.ascending.at(place) as f64);
                     Spread::Known(Interval::new(low, high, IntervalMethod::EffectiveRanks))
@@ -535,16 +489,9 @@ impl<'a> Quantiles<'a> {
         )
     }
 
-    /// Places of both ends.
-    fn ranks(&self, share: f64) -> Result<(usize, usize), TooSmall> {
-        let (series, series_worth) = match &self.ranks {
-            Ok((memory, worth)) => (memory, *worth),
-            Err(why) => return Err(*why),
-        };
-        let rare = share.min(1.0 - share);
-        if rare * series_worth < BEYOND_SERIES_MIN {
-            return Err(too_few(series_worth, BEYOND_SERIES_MIN / rare));
-        }
+    /// Effective observations, as far as the outcome is to lie beyond this quantile or not.
+    fn worth(&self, share: f64) -> Result<f64, TooSmall> {
+        let ratio = self.ratio?;
         let count = self.ascending.len();
         let value = self.ascending.at(place_of(share, count));
         // Of equal values some lie beyond the quantile: whichever outcome is nearer to it.
@@ -552,20 +499,35 @@ impl<'a> Quantiles<'a> {
         let upto = self.ascending.count_below(value.saturating_add(1)) as f64 / count as f64;
         let is_nearer = (below - share).abs() < (upto - share).abs();
         let is_below = below > 0.0 && (is_nearer || upto >= 1.0);
-        let outcomes = self
-            .series
-            .iter()
-            .map(|one| one < value || (one == value && !is_below));
-        let mut batches = Batches::of_count(count as u64);
-        for is_inside in outcomes {
-            batches.push(f64::from(u8::from(is_inside)), 1);
+        let mut outcomes = Batches::of_count(count as u64);
+        for one in self.series.iter() {
+            let is_inside = one < value || (one == value && !is_below);
+            outcomes.push(f64::from(u8::from(is_inside)), 1);
         }
-        let memory = batches.memory()?;
-        memory.fades()?;
-        let worth = batches.effective_by(&memory, series) * student_loss();
+        let at_zero = outcomes.at_zero()?;
+        Ok(outcomes.effective_by(at_zero, ratio) * student_loss())
+    }
+
+    /// Places of both ends.
+    fn places(&self, share: f64) -> Result<(usize, usize), TooSmall> {
+        let rare = share.min(1.0 - share);
+        let mut worth = self.worth(share)?;
+        if NEARER * rare <= 0.5 {
+            let nearer = if share <= 0.5 {
+                NEARER * share
+            } else {
+                1.0 - NEARER * rare
+            };
+            let of_nearer = self.worth(nearer)?;
+            if rare * of_nearer < NEARER_MIN {
+                return Err(too_few(of_nearer, NEARER_MIN / rare));
+            }
+            worth = worth.min((worth * of_nearer).sqrt());
+        }
         if rare * worth < BEYOND_MIN {
             return Err(too_few(worth, BEYOND_MIN / rare));
         }
+        let count = self.ascending.len();
         let (near, far) = (selected_end(rare, worth, BEYOND_MIN), far_end(rare, worth));
         let (low, high) = if share <= 0.5 {
             (near, far)
@@ -573,8 +535,7 @@ impl<'a> Quantiles<'a> {
             (1.0 - far, 1.0 - near)
         };
         let place = |end: f64| ceil_count(end * count as f64);
-        let (low, high) = (place(low).max(1) - 1, place(high).min(count - 1));
-        Ok((low, high))
+        Ok((place(low).max(1) - 1, place(high).min(count - 1)))
     }
 }
 
@@ -602,7 +563,7 @@ mod tests {
     }
 
     #[test]
-    fn independent_outcomes_keep_their_count_and_a_walk_has_none() {
+    fn independent_outcomes_keep_their_count_and_a_walk_is_worth_next_to_nothing() {
         let mut random = RandomStream::new(1, "dependence");
         let white = Batches::of(vec![0.0; 20_000].into_iter().map(|_| random.normal()));
         let effective = white.effective_count().unwrap();
@@ -612,7 +573,9 @@ mod tests {
             at += random.normal();
             at
         }));
-        assert!(walk.effective_count().is_err());
+        let effective = walk.effective_count().unwrap();
+        assert!(effective < 5.0, "{effective}");
+        assert_eq!(walk.mean_interval().known(), None);
     }
 
     #[test]
@@ -620,7 +583,7 @@ mod tests {
         let none = Batches::of_runs(60_000, []).share_interval();
         assert_eq!(
             none,
-            Spread::Unknown(TooSmall::Few {
+            Spread::Unknown(TooSmall {
                 effective: 0,
                 needed: 5
             })

@@ -21,7 +21,8 @@ const PARTIAL: &str = "not every repetition has it";
 const NO_INTERVAL: &str =
     "no interval: the sample of a run is too small, or of segments; repeat the runs";
 const NO_MAXIMUM: &str = "no interval: one run's maximum has none; repeat the runs";
-const NEWCOMBE: &str = "Newcombe's interval (method 10), which takes messages as independent";
+const EFFECTIVE: &str = "MOVER of each run's interval on its effective sample; of runs without losses \
+                         Wilson's, for independent ones";
 const OWN: &str = "MOVER of the scores' own intervals";
 const NO_OWN: &str = "no interval: the score has none of its own; repeat the runs";
 const ABSENT: &str = "unavailable on one side";
@@ -302,23 +303,52 @@ fn verdict(interval: Option<Interval>, none: f64, [below, above]: [Verdict; 2]) 
     }
 }
 
-/// Lost among those whose fate is known and final.
-fn share(fates: &FateCounts) -> Share {
-    let open =
-        fates.of(MessageFate::InFlight) + fates.of(MessageFate::UnknownPeerRecordsUnavailable);
-    Share {
-        count: fates.lost_count(),
-        of: fates.total().saturating_sub(open),
+/// The share lost in a run.
+#[derive(Debug, Clone, Copy)]
+struct RunLoss {
+    /// Lost among those whose fate is known and final.
+    share: Share,
+    /// On the effective sample. Without a loss nothing is known of how they would come together: then Wilson's.
+    interval: Option<Interval>,
+}
+
+impl RunLoss {
+    /// `None` of no messages.
+    fn of(run: &ComparedRun, channel: &str, fates: &FateCounts) -> Option<Self> {
+        let open =
+            fates.of(MessageFate::InFlight) + fates.of(MessageFate::UnknownPeerRecordsUnavailable);
+        let share = Share {
+            count: fates.lost_count(),
+            of: fates.total().saturating_sub(open),
+        };
+        let independent = share.estimate(CONFIDENCE)?;
+        let networks = run.summary.network.iter().flat_map(|one| &one.channels);
+        let of_network = networks
+            .filter(|one| one.channel == channel)
+            .find_map(|one| one.figures.loss.measured());
+        // Of the same messages: the harness may lose some too.
+        let same = of_network.filter(|loss| loss.lost_count == share.count);
+        Some(Self {
+            share,
+            interval: if share.count == 0 {
+                independent.interval
+            } else {
+                same.and_then(|loss| loss.interval.known())
+            },
+        })
+    }
+
+    fn value(self) -> f64 {
+        self.share.count as f64 / self.share.of as f64
     }
 }
 
 fn losses(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
     let collect = |runs: &[ComparedRun]| {
-        let mut all: BTreeMap<String, Vec<Share>> = BTreeMap::new();
+        let mut all: BTreeMap<String, Vec<RunLoss>> = BTreeMap::new();
         for run in runs {
             for (channel, account) in accounts(run) {
-                let one = share(&account.fates);
-                if one.of > 0 {
+                if let Some(one) = RunLoss::of(run, channel, &account.fates) {
                     all.entry(channel.to_owned()).or_default().push(one);
                 }
             }
@@ -336,48 +366,43 @@ fn losses(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
         .collect()
 }
 
-fn pooled(shares: &[Share]) -> Share {
-    Share {
-        count: shares.iter().map(|one| one.count).sum(),
-        of: shares.iter().map(|one| one.of).sum(),
-    }
-}
-
-/// One run's share with Wilson's interval; of several their mean with Student's, and then true. Where no
-/// run differs from another it is Wilson's of all messages together.
-fn mean_share(side: &[Share]) -> (Option<Estimate>, bool) {
+/// One run's share as it is; of several their mean with Student's interval. Runs without any loss are one.
+fn mean_share(side: &[RunLoss]) -> Option<Estimate> {
     let values = values_of(side);
-    match mean_interval(&values, CONFIDENCE) {
-        None => (pooled(side).estimate(CONFIDENCE), false),
-        Some(found) => {
-            let estimate = Estimate {
-                value: values.iter().sum::<f64>() / values.len() as f64,
-                // A share has no less than none and no more than all.
-                interval: Some(found.map(|end| end.clamp(0.0, 1.0))),
-            };
-            (Some(estimate), true)
-        }
-    }
+    let (first, count) = (side.first()?, side.iter().map(|one| one.share.count).sum());
+    let of = side.iter().map(|one| one.share.of).sum();
+    let interval = match (side.len(), count) {
+        (1, _) => first.interval,
+        (_, 0) => Share { count, of }.estimate(CONFIDENCE)?.interval,
+        // A share has no less than none and no more than all.
+        _ => mean_interval(&values, CONFIDENCE).map(|found| found.map(|end| end.clamp(0.0, 1.0))),
+    };
+    Some(Estimate {
+        value: values.iter().sum::<f64>() / values.len() as f64,
+        interval,
+    })
 }
 
-fn values_of(side: &[Share]) -> Vec<f64> {
-    let shares = side.iter();
-    shares.map(|one| one.count as f64 / one.of as f64).collect()
+fn values_of(side: &[RunLoss]) -> Vec<f64> {
+    side.iter().map(|one| one.value()).collect()
 }
 
-fn loss_figure(channel: &str, base: &[Share], new: &[Share], of: Counts) -> ComparedMetric {
-    let ((be, is_base_spread), (ne, is_new_spread)) = (mean_share(base), mean_share(new));
-    let be = of_all(be, base.len(), of[0]);
-    let ne = of_all(ne, new.len(), of[1]);
+fn loss_figure(channel: &str, base: &[RunLoss], new: &[RunLoss], of: Counts) -> ComparedMetric {
+    let have = [base.len(), new.len()];
+    let be = of_all(mean_share(base), have[0], of[0]);
+    let ne = of_all(mean_share(new), have[1], of[1]);
     let both = be.zip(ne);
     let repeated = welch(&values_of(base), &values_of(new), CONFIDENCE);
-    let (interval, method) = match (both, repeated) {
-        (None, _) => (None, ABSENT),
-        (Some(_), _) if is_partial([base.len(), new.len()], of) => (None, PARTIAL),
-        (Some(_), Some(interval)) => (Some(interval), REPETITIONS),
-        (Some((b, n)), None) if is_base_spread || is_new_spread => (difference(b, n), MIXED),
-        // Of Wilson's intervals on both sides: that is Newcombe's.
-        (Some((b, n)), None) => (difference(b, n), NEWCOMBE),
+    let own = both.and_then(|(b, n)| difference(b, n));
+    let is_lossless = base.iter().chain(new).all(|one| one.share.count == 0);
+    let (interval, method) = match (both, repeated, own) {
+        (None, ..) => (None, ABSENT),
+        (Some(_), ..) if is_partial(have, of) => (None, PARTIAL),
+        (_, Some(found), _) => (Some(found), REPETITIONS),
+        (_, None, Some(found)) if have == [1, 1] || is_lossless => (Some(found), EFFECTIVE),
+        (_, None, Some(found)) => (Some(found), MIXED),
+        (_, None, None) if have.iter().all(|count| *count > 1) => (None, NO_SPREAD),
+        (_, None, None) => (None, NO_INTERVAL),
     };
     ComparedMetric {
         channel: Some(channel.to_owned()),

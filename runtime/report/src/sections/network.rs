@@ -10,6 +10,8 @@ use hil_platform::words::counted;
 use hil_present::units::{duration_s, percent};
 use hil_present::{Cell, Section, Table, Tone};
 
+use hil_stats::correlation::SPELL_COUNT_MIN;
+
 use crate::network::{Correlation, CorrelationTests, NetworkReport, TestedPair};
 use crate::score_event::ScoreEvents;
 
@@ -124,12 +126,13 @@ const EVENTS_TESTED_MIN: u64 = 10;
 fn correlations(section: &mut Section, tests: &CorrelationTests, noted: u64) {
     let found = tests.significant();
     for pair in found.iter().take(PAIRS_SHOWN_COUNT) {
-        let words = pair.words(tests.pairs.len(), tests.shuffle_count);
+        let words = pair.words(tests.pairs.len(), tests.shift_count);
         section.note(Tone::Caution, words);
     }
     let others = tests.pairs.len() - found.len();
     let mut text = if tests.pairs.is_empty() {
-        "No pair of series to test: of each, one or both are the same all the time.".to_owned()
+        "No pair of series to test: of each, one or both are the same all the time or nearly so."
+            .to_owned()
     } else if found.is_empty() && (1..EVENTS_TESTED_MIN).contains(&noted) {
         let events = counted(noted, "event");
         format!(
@@ -142,7 +145,7 @@ fn correlations(section: &mut Section, tests: &CorrelationTests, noted: u64) {
                 |pair: &TestedPair| (pair.correlation.p_family, -pair.correlation.coefficient);
             key(a).partial_cmp(&key(b)).unwrap_or(Ordering::Equal)
         });
-        let best = best.map(|best| best.words(tests.pairs.len(), tests.shuffle_count));
+        let best = best.map(|best| best.words(tests.pairs.len(), tests.shift_count));
         let best = best.unwrap_or_default();
         format!(
             "Over the whole run none of {others} pairs of series correlates beyond chance, which says nothing of \
@@ -164,14 +167,25 @@ fn correlations(section: &mut Section, tests: &CorrelationTests, noted: u64) {
             first.join(", ")
         );
     }
+    if !tests.seldom.is_empty() {
+        let named = tests.seldom.iter().take(3).map(|one| {
+            let times = counted(one.spell_count, "spell");
+            format!("{times} of {}", one.series)
+        });
+        let named = named.collect::<Vec<_>>().join(", ");
+        let more = if tests.seldom.len() > 3 { ", …" } else { "" };
+        let _infallible = write!(
+            text,
+            " Too few to test: {named}{more} ({SPELL_COUNT_MIN} needed)."
+        );
+    }
     let _infallible = write!(
         text,
-        " Bins of {}, lags from -{} to {}; {} block shuffles, seed {}.",
+        " Bins of {}, lags from -{} to {}; {} shifts.",
         duration_s(tests.bin_s),
         duration_s(tests.lead_max_s),
         duration_s(tests.lag_max_s),
-        grouped(tests.shuffle_count),
-        tests.seed
+        grouped(tests.shift_count)
     );
     section.note(Tone::Faint, text);
 }
