@@ -68,7 +68,10 @@ if [[ "$mode" == long ]]; then
     # The chaos of one more hour, and ten minutes of soak, unless the caller says otherwise.
     export HIL_CHAOS_EPISODES="${HIL_CHAOS_EPISODES:-200}" HIL_CHAOS_SEED="${HIL_CHAOS_SEED:-1000}"
     export HIL_SOAK_MINUTES="${HIL_SOAK_MINUTES:-10}"
-    step tests nextest --workspace --profile long --run-ignored all
+    step tests nextest --workspace --profile long --run-ignored all \
+        --filterset 'not (package(hil-stats) & (binary(coverage) | binary(connection)))'
+    # Many runs of many messages: optimised.
+    step coverage cargo test --release -p hil-stats --test coverage --test connection -- --ignored --nocapture
 else
     step format cargo fmt --all --check
     # All targets: the benches are checked here and not built with optimisation.

@@ -80,7 +80,7 @@ pub fn assert_account_closes(summary: &RunSummary, name: &str) {
     assert_eq!(RESIDUAL_LIMIT_NS, 1_000);
     let taken_count = account.fates.of(MessageFate::Taken);
     assert_eq!(closing.checked_count, taken_count, "{said}");
-    let ratio = closing.closed_ratio().map_or(0.0, |(ratio, _)| ratio);
+    let ratio = closing.closed_ratio().unwrap_or(0.0);
     assert!(ratio >= CLOSED_RATIO_MIN, "{ratio} closed in {said}");
 }
 

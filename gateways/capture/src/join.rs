@@ -15,10 +15,11 @@
 use core::cmp::Reverse;
 use std::collections::BTreeMap;
 
-use hil_core::random::RandomStream;
+use hil_core::interval::Spread;
+use hil_stats::dependence::{Batches, Quantiles};
 use hil_stats::histogram::{Distribution, LatencyHistogram};
 use hil_stats::reordering::reordered;
-use hil_stats::statistics::{CONFIDENCE, IntervalNs, block_bootstrap_quantile, wilson};
+use hil_stats::samples::Samples;
 use serde::{Deserialize, Serialize};
 
 use super::observe::{Observation, Point, Seen, Stream};
@@ -104,8 +105,8 @@ pub struct LossCount {
     pub count: u64,
     /// Lost of those that were judged.
     pub ratio: Option<f64>,
-    /// 95 % interval of it (Wilson), as if losses were independent.
-    pub interval: Option<(f64, f64)>,
+    /// 95 % interval of it, or why there is none.
+    pub interval: Option<Spread>,
     /// Runs of losses in the order of departure, between arrivals: length and how many (loss periods,
     /// RFC 3357 section 5).
     pub bursts: Vec<(u64, u64)>,
@@ -156,10 +157,10 @@ pub struct JoinMetrics {
     pub delay_shift: Option<DelayShift>,
     /// Second stamp minus first; unavailable when a clock was set meanwhile.
     pub delay: Distribution,
-    /// 95 % interval of its median (block bootstrap).
-    pub delay_p50_interval: Option<IntervalNs>,
-    /// 95 % interval of its 99th percentile (block bootstrap).
-    pub delay_p99_interval: Option<IntervalNs>,
+    /// 95 % interval of its median, nanoseconds, or why there is none.
+    pub delay_p50_interval: Option<Spread>,
+    /// The same of its 99th percentile.
+    pub delay_p99_interval: Option<Spread>,
     /// Delay less the smallest delay (PDV, RFC 5481 section 4.2).
     pub variation: Distribution,
     /// Difference of the delays of two that left one after the other and both arrived, as a magnitude
@@ -171,8 +172,6 @@ pub struct JoinMetrics {
     pub jitter_mean_ns: Option<f64>,
     /// Those that came after one that left later (RFC 4737 section 3.3).
     pub reordered_count: u64,
-    /// 95 % interval of their ratio (Wilson).
-    pub reordered_interval: Option<(f64, f64)>,
     /// Farthest that one was overtaken: positions to the earliest of those that overtook it
     /// (RFC 4737 section 4.2.2).
     pub reordering_extent_max: u64,
@@ -624,19 +623,19 @@ fn doubts(
     doubts
 }
 
-fn ratio_interval(count: u64, of: u64) -> Option<(f64, f64)> {
-    let interval = wilson(count, of, CONFIDENCE)?;
-    Some((interval.low, interval.high))
-}
-
-fn loss(lost: &[usize], matched_count: u64, doubts: Vec<CountedDoubt>) -> Loss {
+fn loss(lost: &[usize], matches: &Matches, doubts: Vec<CountedDoubt>) -> Loss {
     let count = lost.len() as u64;
     if doubts.is_empty() {
-        let judged_count = matched_count + count;
+        // In the order of departure: matched or lost.
+        let arrived = matches.pairs.iter().map(|pair| (pair.0, 0.0));
+        let mut judged: Vec<(usize, f64)> = arrived.collect();
+        judged.extend(lost.iter().map(|place| (*place, 1.0)));
+        judged.sort_unstable_by_key(|one| one.0);
+        let outcomes = Batches::of(judged.iter().map(|one| one.1));
         return Loss::Counted(LossCount {
             count,
-            ratio: (judged_count > 0).then(|| count as f64 / judged_count as f64),
-            interval: ratio_interval(count, judged_count),
+            ratio: (!judged.is_empty()).then(|| count as f64 / judged.len() as f64),
+            interval: (!judged.is_empty()).then(|| outcomes.share_interval()),
             bursts: bursts(lost),
         });
     }
@@ -701,10 +700,9 @@ fn metrics(
     let delays = in_departure.iter().filter(is_delay);
     let delays: Vec<i64> = delays.map(|departure| levels.delays[*departure]).collect();
     let jitter = jitter_ns(&in_arrival);
-    let delay_interval = |quantile: f64, name: &str| {
-        let mut random = RandomStream::new(0, name);
-        block_bootstrap_quantile(&delays, quantile, CONFIDENCE, &mut random)
-    };
+    let series: Samples = delays.iter().copied().collect();
+    let ascending = series.ascending();
+    let quantiles = Quantiles::of(&series, &ascending);
     let unmatched = if is_set {
         "a clock was set while it stamped"
     } else {
@@ -727,19 +725,18 @@ fn metrics(
         second_count: second.seen.len() as u64,
         matched_count,
         edge_count: (only_count - lost.len() - unexplained.len()) as u64,
-        loss: loss(&lost, matched_count, doubts),
+        loss: loss(&lost, matches, doubts),
         duplicated_count: matches.duplicates.len() as u64,
         unexplained_count: unexplained.len() as u64,
         delay_shift: levels.shift.filter(|_| !is_set),
         delay: distribution(delays.iter().copied(), unmatched),
-        delay_p50_interval: delay_interval(0.5, "probe delay p50"),
-        delay_p99_interval: delay_interval(0.99, "probe delay p99"),
+        delay_p50_interval: quantiles.interval(0.5),
+        delay_p99_interval: quantiles.interval(0.99),
         variation: distribution(variation, unmatched),
         successive: distribution(successive, unmatched),
         jitter_last_ns: jitter.map(|(last, _)| last),
         jitter_mean_ns: jitter.map(|(_, mean)| mean),
         reordered_count,
-        reordered_interval: ratio_interval(reordered_count, matched_count),
         reordering_extent_max: late.iter().map(|one| one.extent).max().unwrap_or(0),
         reordering_n_max: late.iter().map(|one| one.n).max().unwrap_or(0),
         arrival_interval: distribution(gaps, "fewer than two arrivals"),

@@ -9,7 +9,6 @@ use super::history::{Copies, MessageHistory};
 use super::metrics::{ChannelAccount, FateCounts, InterruptionMetrics};
 use super::segments::SegmentFold;
 use super::{AccountContext, ChannelRecords};
-use hil_core::random::RandomStream;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
 
 /// Sums messages up to the account of a channel. Memory grows by the few bytes a message that exact
@@ -84,7 +83,6 @@ impl<'a> AccountFold<'a> {
         let (gaps, gap_of_interruption) = self.gaps.finish(at_hand.taken);
         let costs = self.lost_counts.iter().zip(gap_of_interruption);
         let interruptions = context.interruptions.iter().zip(costs);
-        let mut random = RandomStream::new(context.seed, "measure.account.bootstrap");
         ChannelAccount {
             published_count: self.published_count,
             published_unrecorded_count: at_hand.published.then_some(self.unrecorded_count),
@@ -95,7 +93,7 @@ impl<'a> AccountFold<'a> {
             late_count: at_hand.ingress.then_some(self.copies.late_count),
             segments: self.segments.segments(),
             hardware_wire: self.segments.hardware_wire(),
-            end_to_end: self.segments.end_to_end(&mut random),
+            end_to_end: self.segments.end_to_end(),
             closing: self.segments.closing(),
             coverage: self.segments.coverage,
             round_trip: round_trip(context),

@@ -571,8 +571,7 @@ impl Epoch {
 }
 
 /// Hands every message of the record files of a finished run to `take`, in the order of the producer's
-/// starts and numbers. It reads the files two times, those of arrivals three times if there are transmit
-/// stamps that belong to them, and holds few records.
+/// starts and numbers. It reads the files two times, those of arrivals three times, and holds few records.
 pub fn each_history(
     records: &ChannelRecords<'_>,
     context: &AccountContext<'_>,

@@ -279,8 +279,6 @@ pub struct AccountContext<'a> {
     pub cards_share_clock: bool,
     /// Round trips of the gateways' clock exchange, nanoseconds.
     pub round_trips_ns: &'a [i64],
-    /// Seed of the run, for the bootstrap intervals.
-    pub seed: u64,
 }
 
 impl<'a> AccountContext<'a> {
@@ -295,7 +293,6 @@ impl<'a> AccountContext<'a> {
             depth: None,
             cards_share_clock: false,
             round_trips_ns: &[],
-            seed: 0,
         }
     }
 

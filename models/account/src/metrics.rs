@@ -6,9 +6,9 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::stage::{MessageFate, Stage};
+use hil_core::interval::Spread;
 use hil_stats::bounds::BoundMetrics;
 use hil_stats::histogram::{Distribution, DurationBin};
-use hil_stats::statistics::{CONFIDENCE, Interval, IntervalNs, wilson};
 
 /// The latency account of one channel.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -122,10 +122,10 @@ pub struct EndToEnd {
     /// The same durations as a histogram; empty where none was measured.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub bins: Vec<DurationBin>,
-    /// 95 % interval of the median by block bootstrap; `None` below 100 messages.
-    pub p50_interval: Option<IntervalNs>,
-    /// 95 % interval of the 99th percentile by block bootstrap.
-    pub p99_interval: Option<IntervalNs>,
+    /// 95 % interval of the median, nanoseconds, or why there is none; `None` when no duration differs.
+    pub p50_interval: Option<Spread>,
+    /// The same of the 99th percentile.
+    pub p99_interval: Option<Spread>,
     /// Largest error from clock alignment, nanoseconds; 0 on one clock.
     pub alignment_bound_ns: Option<u64>,
     /// Errors from clock alignment over all messages; zero on one clock.
@@ -186,13 +186,9 @@ pub struct ClosingMetrics {
 }
 
 impl ClosingMetrics {
-    /// Share of checked messages that closed, with its 95 % Wilson interval.
-    pub fn closed_ratio(&self) -> Option<(f64, Interval)> {
-        let interval = wilson(self.closed_count, self.checked_count, CONFIDENCE)?;
-        Some((
-            self.closed_count as f64 / self.checked_count as f64,
-            interval,
-        ))
+    /// Share of checked messages that closed: of all of them, so that it has no interval.
+    pub fn closed_ratio(&self) -> Option<f64> {
+        (self.checked_count > 0).then(|| self.closed_count as f64 / self.checked_count as f64)
     }
 }
 

@@ -12,10 +12,6 @@ use serde::{Deserialize, Serialize};
 use crate::stage::MessageFate;
 use crate::{MessageHistory, RecordSource, RecordsAtHand};
 use hil_core::record::{EgressRecord, UNAVAILABLE, stamp};
-use hil_stats::statistics::{Interval, wilson};
-
-/// Confidence of every interval here.
-const CONFIDENCE: f64 = 0.95;
 
 /// What became of the messages a gateway sent, by the radio's report of their last datagram. Every
 /// message handed to the kernel is in exactly one row, and there in exactly one class.
@@ -86,7 +82,7 @@ impl RadioRow {
     }
 }
 
-/// A share with its interval (Wilson 1927, 95 %).
+/// A share of all messages of a kind.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Share {
     /// Of how many.
@@ -95,22 +91,15 @@ pub struct Share {
     pub success_count: u64,
     /// The share, 0..=1.
     pub ratio: f64,
-    /// Lower end of the interval.
-    pub low: f64,
-    /// Upper end of the interval.
-    pub high: f64,
 }
 
 impl Share {
     /// `success_count` of `trial_count`; `None` without trials.
     pub fn of(success_count: u64, trial_count: u64) -> Option<Self> {
-        let Interval { low, high } = wilson(success_count, trial_count, CONFIDENCE)?;
-        Some(Self {
+        (trial_count > 0).then(|| Self {
             trial_count,
             success_count,
             ratio: success_count as f64 / trial_count as f64,
-            low,
-            high,
         })
     }
 }
@@ -308,7 +297,6 @@ mod tests {
         assert_eq!(counts(figures.unreported), [1, 1, 0, 0]);
         let known = figures.known_loss_ratio.unwrap();
         assert_eq!((known.success_count, known.trial_count), (2, 4));
-        assert!(known.low < 0.5 && known.high > 0.5);
         let unheard = figures.unacknowledged_ratio.unwrap();
         assert_eq!((unheard.success_count, unheard.trial_count), (3, 5));
         assert_eq!(figures.lost_ratio.unwrap().success_count, 4);

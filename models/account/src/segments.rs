@@ -6,14 +6,12 @@ use super::history::MessageHistory;
 use super::metrics::{Closing, ClosingMetrics, Coverage, EndToEnd, SegmentMetrics, StampCoverage};
 use super::stage::{Side, Stage};
 use super::{AccountContext, ChannelPath, ORDER_TOLERANCE_NS, RESIDUAL_LIMIT_NS};
-use hil_core::random::RandomStream;
 use hil_core::record::{EgressRecord, stamp};
 use hil_core::time::RemoteInstant;
 use hil_stats::bounds::Bounds;
+use hil_stats::dependence::Quantiles;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
-use hil_stats::resampling::BlockResampling;
 use hil_stats::samples::Samples;
-use hil_stats::statistics::CONFIDENCE;
 
 pub(super) const NOT_ALIGNED: &str = "clocks not aligned";
 const NO_CONSUMER: &str = "the consumer's records are not at hand";
@@ -383,7 +381,7 @@ impl<'a> SegmentFold<'a> {
         self.is_gateway.then(|| self.hardware.distribution(reason))
     }
 
-    pub(super) fn end_to_end(&self, random: &mut RandomStream) -> EndToEnd {
+    pub(super) fn end_to_end(&self) -> EndToEnd {
         let reason = match (self.path.is_aligned(), self.at_hand.taken) {
             (false, _) => NOT_ALIGNED,
             (_, false) => NO_CONSUMER,
@@ -391,14 +389,9 @@ impl<'a> SegmentFold<'a> {
         };
         let bound = self.end_to_end_bounds_ns.metrics();
         let exact = self.path.has_one_clock().then_some(0);
-        let resampling = BlockResampling::of(&self.end_to_end_ns);
-        let mut interval = |quantile| {
-            let resampling = resampling.as_ref()?;
-            Some(resampling.interval(quantile, CONFIDENCE, random))
-        };
-        let [p50_interval, p99_interval] = [0.5, 0.99].map(&mut interval);
-        // As large as the samples.
-        drop(resampling);
+        let ascending = self.end_to_end_ns.ascending();
+        let quantiles = Quantiles::of(&self.end_to_end_ns, &ascending);
+        let [p50_interval, p99_interval] = [0.5, 0.99].map(|share| quantiles.interval(share));
         EndToEnd {
             p50_interval,
             p99_interval,

@@ -52,13 +52,12 @@ fn a_flawless_run_closes_completely() {
     );
     assert_eq!(closing.closed_combined_count, 0);
     assert_eq!(closing.residual.measured().unwrap().max_ns, 0);
-    assert!(closing.closed_ratio().unwrap().1.low > 0.996);
+    assert!(closing.closed_ratio().unwrap() > 0.996);
     assert_eq!(account.segments.len(), 7);
     let wire = segment(&account, Stage::TxSoftware, Stage::RxSoftware);
     assert_near(median(wire), RX_NS - TX_NS);
     assert_near(median(&account.end_to_end.distribution), TAKEN_NS);
-    let interval = account.end_to_end.p50_interval.unwrap();
-    assert_eq!((interval.low_ns, interval.high_ns), (TAKEN_NS, TAKEN_NS));
+    assert_eq!(account.end_to_end.p50_interval, None, "no duration differs");
     let sum: f64 = account
         .segments
         .iter()

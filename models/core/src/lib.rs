@@ -24,6 +24,7 @@ pub mod case_study;
 pub mod component;
 pub mod counts;
 pub mod endpoint;
+pub mod interval;
 pub mod layout;
 pub mod link_model;
 pub mod message;

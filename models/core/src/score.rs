@@ -6,6 +6,7 @@ use core::fmt::Debug;
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ChannelSpec;
+use crate::interval::Spread;
 use crate::message::Envelope;
 use crate::time::Instant;
 
@@ -31,7 +32,7 @@ pub struct Score {
 }
 
 /// A way in which the robot can be hurt, and how often it was.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Harm {
     /// What happened to it, in the plural, e.g. `motion loops lost`.
     pub what: &'static str,
@@ -41,6 +42,8 @@ pub struct Harm {
     pub own_count: u64,
     /// How often it could have happened; `None` where that cannot be counted.
     pub occasions: Option<Occasions>,
+    /// 95 % interval of its share of the occasions, or why there is none.
+    pub interval: Option<Spread>,
 }
 
 /// What could have hurt the robot.
@@ -60,6 +63,7 @@ impl Harm {
             count,
             own_count: 0,
             occasions: None,
+            interval: None,
         }
     }
 
@@ -80,8 +84,8 @@ pub struct Metric {
     pub label: &'static str,
     /// The figure; `None` when the run did not allow it, with the reason in `method`.
     pub value: Option<f64>,
-    /// 95 % interval, when the figure is a statistic.
-    pub interval: Option<(f64, f64)>,
+    /// 95 % interval, or why there is none, when the figure is a statistic.
+    pub interval: Option<Spread>,
     /// SI unit, or `1` for a pure number.
     pub unit: &'static str,
     /// How it was obtained, or why it was not.

@@ -11,6 +11,7 @@ use crate::messages::{Authority, State, Truth};
 use crate::referee::{Referee, SCAN_PERIOD, Tally};
 use crate::standing::{Standstill, standstills};
 use hil_core::case_study::{ErrorSeries, Harm, Metric, Score};
+use hil_core::interval::Spread;
 use hil_core::run_log::RunLog;
 use hil_core::time::Instant;
 use hil_stats::histogram::{LatencyHistogram, LatencySummary};
@@ -101,7 +102,9 @@ fn collisions(tally: &Tally) -> Vec<Metric> {
         let method = "section checker over sections passed; interval of Clopper and Pearson";
         named.known(collided as f64 / passed as f64, method)
     };
-    ratio.interval = collision_interval(collided, passed).filter(|_| ratio.value.is_some());
+    ratio.interval = collision_interval(collided, passed)
+        .filter(|_| ratio.value.is_some())
+        .map(Spread::Known);
     vec![
         COLLISIONS.count(
             collided,

@@ -5,9 +5,9 @@ use core::cmp::Ordering;
 
 use serde::{Deserialize, Serialize};
 
-use super::histogram::DurationBin;
 use super::special::student_quantile;
-use super::statistics::{CONFIDENCE, Interval, IntervalNs, quantile_ranks, wilson};
+use super::statistics::{CONFIDENCE, wilson};
+use hil_core::interval::{Interval, IntervalMethod};
 use hil_core::study::Verdict;
 
 /// A figure of one run, with its interval where it has one.
@@ -26,10 +26,7 @@ pub fn difference(base: Estimate, new: Estimate) -> Option<Interval> {
     let d = new.value - base.value;
     let below = (new.value - n.low).hypot(b.high - base.value);
     let above = (n.high - new.value).hypot(base.value - b.low);
-    Some(Interval {
-        low: d - below,
-        high: d + above,
-    })
+    Some(Interval::new(d - below, d + above, IntervalMethod::Mover))
 }
 
 /// The interval of `new / base`, by [`difference`] of the logarithms. `None` when either has none, or
@@ -39,17 +36,10 @@ pub fn ratio(base: Estimate, new: Estimate) -> Option<Interval> {
         let interval = one.interval?;
         (interval.low > 0.0 && one.value > 0.0).then(|| Estimate {
             value: one.value.ln(),
-            interval: Some(Interval {
-                low: interval.low.ln(),
-                high: interval.high.ln(),
-            }),
+            interval: Some(interval.map(f64::ln)),
         })
     };
-    let found = difference(logarithm(base)?, logarithm(new)?)?;
-    Some(Interval {
-        low: found.low.exp(),
-        high: found.high.exp(),
-    })
+    Some(difference(logarithm(base)?, logarithm(new)?)?.map(f64::exp))
 }
 
 /// So many of so many.
@@ -104,10 +94,7 @@ pub fn welch(base: &[f64], new: &[f64], confidence: f64) -> Option<Interval> {
         (b + n).powi(2) / (b.powi(2) / (base.count - 1.0) + n.powi(2) / (new.count - 1.0));
     let reach = student_quantile(0.5 + 0.5 * confidence, freedom) * error;
     let d = new.mean - base.mean;
-    Some(Interval {
-        low: d - reach,
-        high: d + reach,
-    })
+    Some(Interval::new(d - reach, d + reach, IntervalMethod::Welch))
 }
 
 /// The interval of the mean of repetitions (Student 1908). `None` below two, when none differs at all,
@@ -127,10 +114,11 @@ pub fn mean_interval(values: &[f64], confidence: f64) -> Option<Interval> {
         return None;
     }
     let reach = student_quantile(0.5 + 0.5 * confidence, count - 1.0) * error;
-    Some(Interval {
-        low: mean - reach,
-        high: mean + reach,
-    })
+    Some(Interval::new(
+        mean - reach,
+        mean + reach,
+        IntervalMethod::Student,
+    ))
 }
 
 fn assert_inside(confidence: f64) {
@@ -163,32 +151,6 @@ impl Moments {
     }
 }
 
-/// The order-statistics interval of a quantile from a histogram, as wide as its bins make it. It takes
-/// values as independent, so it is too narrow where successive ones are correlated. `None` when there
-/// are too few.
-///
-/// # Panics
-/// When `quantile` or `confidence` is not inside 0..1.
-pub fn binned_quantile_interval(
-    bins: &[DurationBin],
-    quantile: f64,
-    confidence: f64,
-) -> Option<IntervalNs> {
-    let count = bins.iter().map(|bin| bin.count).sum();
-    let (low, high) = quantile_ranks(count, quantile, confidence)?;
-    let bin_of = |rank: u64| {
-        let mut below = 0;
-        bins.iter().find(|bin| {
-            below += bin.count;
-            below >= rank
-        })
-    };
-    Some(IntervalNs {
-        low_ns: bin_of(low)?.from_ns(),
-        high_ns: bin_of(high)?.until_ns,
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -208,8 +170,6 @@ mod tests {
         assert_eq!(against(12, 420), Some(Verdict::Differs));
         assert_eq!(against(0, 0), None);
     }
-    use crate::histogram::LatencyHistogram;
-    use hil_core::random::RandomStream;
 
     fn close(found: f64, expected: f64, tolerance: f64) {
         assert!(
@@ -266,37 +226,23 @@ mod tests {
     }
 
     #[test]
-    fn a_ratio_covers_one_as_often_as_it_claims() {
-        // Two samples of one law: the ratio of their medians is 1 within 95 % of the intervals, by
-        // independent order statistics, and a doubled law is found.
-        let mut stream = RandomStream::new(7, "ratios");
-        let mut sample = |scale: f64| {
-            let mut histogram = LatencyHistogram::default();
-            for _ in 0..400 {
-                #[expect(clippy::cast_possible_truncation, reason = "nanoseconds below 1e8")]
-                histogram.record((scale * (1.0 + stream.uniform()) * 1e6) as i64);
-            }
-            let interval = binned_quantile_interval(&histogram.bins(), 0.5, 0.95).unwrap();
-            Estimate {
-                value: histogram.quantile(0.5).unwrap() as f64,
-                interval: Some(Interval {
-                    low: interval.low_ns as f64,
-                    high: interval.high_ns as f64,
-                }),
-            }
+    fn a_ratio_has_the_interval_of_the_difference_of_logarithms() {
+        let of = |value: f64, reach: f64| Estimate {
+            value,
+            interval: Some(Interval::new(
+                value / reach,
+                value * reach,
+                IntervalMethod::EffectiveRanks,
+            )),
         };
-        let mut covered = 0;
-        for _ in 0..200 {
-            let found = ratio(sample(1.0), sample(1.0)).unwrap();
-            covered += i32::from(found.low <= 1.0 && found.high >= 1.0);
-        }
-        assert!(covered >= 180, "{covered} of 200");
-        let doubled = ratio(sample(1.0), sample(2.0)).unwrap();
-        assert!(doubled.low > 1.5 && doubled.high < 2.7, "{doubled:?}");
+        let found = ratio(of(10.0, 1.1), of(20.0, 1.1)).unwrap();
+        let reach = (2.0_f64.sqrt() * 1.1_f64.ln()).exp();
+        close(found.low, 2.0 / reach, 1e-9);
+        close(found.high, 2.0 * reach, 1e-9);
         let without = Estimate {
             value: 1.0,
             interval: None,
         };
-        assert_eq!(ratio(without, sample(1.0)), None);
+        assert_eq!(ratio(without, of(10.0, 1.1)), None);
     }
 }

@@ -5,12 +5,12 @@
 pub mod bounds;
 pub mod comparison;
 pub mod correlation;
+pub mod dependence;
 pub mod goodness;
 pub mod histogram;
 pub mod in_order;
 pub mod metric;
 pub mod reordering;
-pub mod resampling;
 pub mod samples;
 pub mod series;
 pub mod special;

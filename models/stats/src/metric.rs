@@ -56,7 +56,7 @@ impl Label {
         missing: &str,
     ) -> Metric {
         Metric {
-            interval: estimate.and_then(|known| known.interval),
+            interval: estimate.map(|known| known.interval),
             ..self.measured(estimate.map(|known| known.value), method, missing)
         }
     }

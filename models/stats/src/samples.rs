@@ -109,6 +109,16 @@ impl Samples {
         self.at(place_of(share, self.len()))
     }
 
+    /// Of values in ascending order, how many are smaller than `value`.
+    pub fn count_below(&self, value: i64) -> usize {
+        match self {
+            Self::Near { base, above } => {
+                above.partition_point(|above| base + i64::from(*above) < value)
+            }
+            Self::Far(values) => values.partition_point(|one| *one < value),
+        }
+    }
+
     /// The value at this place.
     ///
     /// # Panics

@@ -1,7 +1,8 @@
 //! Sampled signals: peaks by prominence, lag by cross-correlation, and the intervals of the
 //! figures made from them. It knows nothing of robots.
 
-use super::special::student_quantile;
+use super::dependence::Batches;
+use hil_core::interval::Spread;
 
 /// One sample: time in nanoseconds and value.
 pub type Sample = (i64, f64);
@@ -57,40 +58,28 @@ pub fn peak_to_peak(samples: &[Sample], period_ns: i64) -> Option<Estimate> {
     Estimate::of_mean(&spans)
 }
 
-/// A figure and its 95 % interval, where there were enough blocks to tell.
+/// A figure with its interval of 95 %, or why it has none.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
     /// The figure.
     pub value: f64,
-    /// From, to.
-    pub interval: Option<(f64, f64)>,
+    /// Its interval.
+    pub interval: Spread,
 }
-
-/// Fewer blocks than this say little about their scatter.
-const BLOCKS_MIN: usize = 5;
 
 impl Estimate {
-    /// The mean of `blocks`, each taken as one independent observation.
+    /// The mean of successive `blocks` of a run; `None` without any.
     pub fn of_mean(blocks: &[f64]) -> Option<Self> {
-        if blocks.is_empty() {
-            return None;
-        }
-        let value = blocks.iter().sum::<f64>() / blocks.len() as f64;
-        Some(Self::around(value, blocks))
-    }
-
-    /// `value` with the half width that the scatter of `blocks` gives their mean.
-    fn around(value: f64, blocks: &[f64]) -> Self {
-        let n = blocks.len() as f64;
-        let mean = blocks.iter().sum::<f64>() / n;
-        let squares: f64 = blocks.iter().map(|block| (block - mean).powi(2)).sum();
-        let interval = (blocks.len() >= BLOCKS_MIN).then(|| {
-            let half_width = student_quantile(0.975, n - 1.0) * (squares / (n - 1.0) / n).sqrt();
-            (value - half_width, value + half_width)
-        });
-        Self { value, interval }
+        let batches = Batches::of(blocks.iter().copied());
+        (!blocks.is_empty()).then(|| Self {
+            value: batches.mean(),
+            interval: batches.mean_interval(),
+        })
     }
 }
+
+/// Blocks that a lag's interval comes from, at most.
+const BLOCKS_MAX: usize = 200;
 
 /// Time from sample to sample when two signals are compared.
 pub const GRID_NS: i64 = 4_000_000;
@@ -100,7 +89,7 @@ pub const GRID_NS: i64 = 4_000_000;
 ///
 /// Both are put on a 4 ms grid by straight lines; the lag with the highest correlation
 /// coefficient is found in steps of 32 ms, then of 4 ms, then refined by a parabola. The interval
-/// comes from up to 30 blocks of the run.
+/// comes from the blocks of the run, each long enough for a lag of its own.
 pub fn lag_s(leading: &[Sample], delayed: &[Sample], lag_max_s: f64) -> Option<Estimate> {
     let start = leading.first()?.0.max(delayed.first()?.0);
     let end = leading.last()?.0.min(delayed.last()?.0);
@@ -119,14 +108,20 @@ pub fn lag_s(leading: &[Sample], delayed: &[Sample], lag_max_s: f64) -> Option<E
     let delayed = resampled(delayed, start, GRID_NS, count);
     let step_s = GRID_NS as f64 * 1e-9;
     let value = best_lag(&leading, &delayed, lag_max)? * step_s;
-    let block_length = block_min.max(count.div_ceil(30));
+    let block_length = block_min.max(count.div_ceil(BLOCKS_MAX));
     let blocks: Vec<f64> = leading
         .chunks_exact(block_length)
         .zip(delayed.chunks_exact(block_length))
         .filter_map(|(leading, delayed)| best_lag(leading, delayed, lag_max))
         .map(|lag| lag * step_s)
         .collect();
-    Some(Estimate::around(value, &blocks))
+    let of_blocks = Batches::of(blocks.into_iter());
+    // As wide as that of the blocks' mean, about the lag of the whole.
+    let shift = value - of_blocks.mean();
+    Some(Estimate {
+        value,
+        interval: of_blocks.mean_interval().map(|end| end + shift),
+    })
 }
 
 /// Steps by which the "delayed" signal may run ahead: clocks and straight lines are not exact.
@@ -301,7 +296,11 @@ mod tests {
     fn peak_to_peak_counts_full_periods_only() {
         let estimate = peak_to_peak(&sine(12_000, 4_000_000, 0.0, 0.0), 4_033_000_000).unwrap();
         assert!((estimate.value - 2.0).abs() < 1e-4, "{estimate:?}");
-        assert!(estimate.interval.is_some());
+        assert_eq!(
+            estimate.interval.known(),
+            None,
+            "eleven periods are too few"
+        );
         assert_eq!(
             peak_to_peak(&sine(500, 4_000_000, 0.0, 0.0), 4_033_000_000),
             None

@@ -7,12 +7,10 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS};
-use hil_core::random::RandomStream;
+use hil_core::interval::Spread;
+use hil_stats::dependence::{Batches, Quantiles};
 use hil_stats::histogram::Distribution;
-use hil_stats::special::place_of;
-use hil_stats::statistics::{
-    CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, has_tail, wilson,
-};
+use hil_stats::samples::Samples;
 
 /// Quantiles with an interval of their own.
 pub const QUANTILES: [f64; 6] = [0.01, 0.1, 0.5, 0.9, 0.99, 0.999];
@@ -35,9 +33,8 @@ pub struct QuantileMetric {
     pub quantile: f64,
     /// Its value.
     pub value_ns: i64,
-    /// 95 % interval, by resampling blocks; `None` below 100 delays or with fewer than ten beyond
-    /// the quantile.
-    pub interval: Option<IntervalNs>,
+    /// 95 % interval, nanoseconds, or why there is none; `None` when no delay differs.
+    pub interval: Option<Spread>,
 }
 
 /// A time without any delivery.
@@ -69,8 +66,8 @@ pub struct TraceMetrics {
     pub counts: TraceCounts,
     /// Lost ones among those whose fate is known.
     pub loss_ratio: Option<f64>,
-    /// Its 95 % interval (Wilson 1927), as if losses were independent; bursts make it wider.
-    pub loss_ratio_interval: Option<Interval>,
+    /// Its 95 % interval, or why there is none.
+    pub loss_ratio_interval: Option<Spread>,
     /// Losses in a row, by length. A message of unknown fate ends a row.
     pub loss_bursts: Vec<RunCount>,
     /// Deliveries in a row, by length.
@@ -97,13 +94,11 @@ pub struct TraceMetrics {
     pub rate_hz: Option<f64>,
     /// Payload per second over that time.
     pub rate_bytes_per_s: Option<f64>,
-    /// Seed of the resampling.
-    pub seed: u64,
 }
 
 impl TraceMetrics {
-    /// The figures of `trace`; `seed` is that of the resampling.
-    pub fn of(trace: &Trace, seed: u64) -> Self {
+    /// The figures of `trace`.
+    pub fn of(trace: &Trace) -> Self {
         let counts = trace.counts();
         let known_count = counts.message_count - counts.unknown_count;
         let delays_ns = trace.delays_ns();
@@ -122,7 +117,8 @@ impl TraceMetrics {
         Self {
             counts,
             loss_ratio: (known_count > 0).then(|| counts.lost_count() as f64 / known_count as f64),
-            loss_ratio_interval: wilson(counts.lost_count(), known_count, CONFIDENCE),
+            loss_ratio_interval: (known_count > 0)
+                .then(|| Batches::of(as_numbers.iter().copied()).share_interval()),
             loss_bursts: runs(true),
             delivery_runs: runs(false),
             loss_memory: memory(&as_numbers),
@@ -132,13 +128,12 @@ impl TraceMetrics {
                 &trace.late_delays_ns(),
                 "no message is known to have come too late",
             ),
-            quantiles: quantiles(&delays_ns, seed),
+            quantiles: quantiles(&delays_ns),
             bound_max_ns: trace.delay_bound_ns(),
             longest_outage: longest_outage(&trace.records),
             period_ns: trace.period_ns(),
             rate_hz,
             rate_bytes_per_s,
-            seed,
         }
     }
 }
@@ -198,19 +193,17 @@ fn memory(series: &[f64]) -> Option<Memory> {
     })
 }
 
-fn quantiles(delays_ns: &[i64], seed: u64) -> Vec<QuantileMetric> {
-    let mut ascending = delays_ns.to_vec();
-    ascending.sort_unstable();
-    if ascending.is_empty() {
+fn quantiles(delays_ns: &[i64]) -> Vec<QuantileMetric> {
+    if delays_ns.is_empty() {
         return Vec::new();
     }
-    let mut random = RandomStream::new(seed, "trace.figures.bootstrap");
+    let series: Samples = delays_ns.iter().copied().collect();
+    let ascending = series.ascending();
+    let intervals = Quantiles::of(&series, &ascending);
     let of = |quantile: f64| QuantileMetric {
         quantile,
-        value_ns: ascending[place_of(quantile, ascending.len())],
-        interval: has_tail(ascending.len(), quantile)
-            .then(|| block_bootstrap_quantile(delays_ns, quantile, CONFIDENCE, &mut random))
-            .flatten(),
+        value_ns: ascending.at_share(quantile),
+        interval: intervals.interval(quantile),
     };
     QUANTILES.into_iter().map(of).collect()
 }
@@ -269,6 +262,7 @@ fn rates(records: &[TraceRecord]) -> (Option<f64>, Option<f64>) {
 mod tests {
     use super::*;
     use crate::TraceHeader;
+    use hil_core::random::RandomStream;
 
     const MS: i64 = 1_000_000;
 
@@ -292,13 +286,13 @@ mod tests {
 
     #[test]
     fn ratio_bursts_gaps_and_outage_are_those_of_the_fates() {
-        let figures = TraceMetrics::of(&trace("11xx2?x11xxx3x?"), 1);
+        let figures = TraceMetrics::of(&trace("11xx2?x11xxx3x?"));
         assert_eq!(figures.counts.lost_count(), 7);
         assert_eq!(figures.counts.unknown_count, 2);
         let ratio = figures.loss_ratio.unwrap();
         assert!((ratio - 7.0 / 13.0).abs() < 1e-12);
         let interval = figures.loss_ratio_interval.unwrap();
-        assert!(interval.low < ratio && ratio < interval.high);
+        assert_eq!(interval.known(), None, "13 messages are too few");
         let pairs = |runs: &[RunCount]| -> Vec<(u64, u64)> {
             let runs = runs.iter();
             runs.map(|run| (run.length_messages, run.count)).collect()
@@ -319,22 +313,22 @@ mod tests {
     fn a_bound_that_one_delay_does_not_have_is_known_of_none() {
         let mut traced = trace("1122");
         traced.records[2].bound_ns = 90;
-        assert_eq!(TraceMetrics::of(&traced, 1).bound_max_ns, Some(90));
+        assert_eq!(TraceMetrics::of(&traced).bound_max_ns, Some(90));
         traced.records[0].bound_ns = crate::UNBOUNDED_NS;
-        assert_eq!(TraceMetrics::of(&traced, 1).bound_max_ns, None);
-        assert_eq!(TraceMetrics::of(&trace("xx"), 1).bound_max_ns, None);
+        assert_eq!(TraceMetrics::of(&traced).bound_max_ns, None);
+        assert_eq!(TraceMetrics::of(&trace("xx")).bound_max_ns, None);
     }
 
     #[test]
     fn what_came_too_late_has_its_delay_in_a_figure_of_its_own() {
         let mut traced = trace("11911");
         traced.records[2].fate = TraceFate::LostAfterLink;
-        let figures = TraceMetrics::of(&traced, 1);
+        let figures = TraceMetrics::of(&traced);
         assert_eq!(figures.delay.measured().unwrap().max_ns, MS);
         let late = figures.late_delay.measured().unwrap();
         assert_eq!((late.count, late.max_ns), (1, 9 * MS));
         assert!(
-            TraceMetrics::of(&trace("1x"), 1)
+            TraceMetrics::of(&trace("1x"))
                 .late_delay
                 .measured()
                 .is_none()
@@ -355,7 +349,7 @@ mod tests {
             bursty.push(if is_bad { 'x' } else { '3' });
             single.push(if random.chance(0.2) { 'x' } else { '3' });
         }
-        let of = |fates: &str| TraceMetrics::of(&trace(fates), 1).loss_memory.unwrap();
+        let of = |fates: &str| TraceMetrics::of(&trace(fates)).loss_memory.unwrap();
         // A two-state chain has 1 - 0.05 - 0.2 at lag 1 and its powers after that.
         let bursty = of(&bursty).coefficients;
         assert!((bursty[0] - 0.75).abs() < 0.03, "{}", bursty[0]);
@@ -367,27 +361,26 @@ mod tests {
     }
 
     #[test]
-    fn a_quantile_with_fewer_than_ten_delays_beyond_it_has_no_interval() {
+    fn a_quantile_with_too_few_delays_beyond_it_has_no_interval() {
         let delays = |count: i64| (0..count).map(|at| at * 7_919 % 9_973).collect::<Vec<_>>();
         let with = |count| -> Vec<f64> {
-            let figures = quantiles(&delays(count), 1).into_iter();
-            let told = figures.filter(|figure| figure.interval.is_some());
+            let figures = quantiles(&delays(count)).into_iter();
+            let told = figures.filter(|one| one.interval.is_some_and(|one| one.known().is_some()));
             told.map(|figure| figure.quantile).collect()
         };
-        assert_eq!(with(150), [0.1, 0.5, 0.9]);
-        assert_eq!(with(2_000), [0.01, 0.1, 0.5, 0.9, 0.99]);
-        assert_eq!(with(10_000), QUANTILES);
+        assert_eq!(with(50), [0.0; 0]);
+        assert!(!with(1_000).contains(&0.999));
     }
 
     #[test]
     fn an_empty_or_lossless_trace_makes_up_nothing() {
-        let empty = TraceMetrics::of(&trace(""), 1);
+        let empty = TraceMetrics::of(&trace(""));
         assert_eq!((empty.loss_ratio, empty.rate_hz), (None, None));
         assert!(empty.quantiles.is_empty() && empty.longest_outage.is_none());
-        let lossless = TraceMetrics::of(&trace("555"), 1);
+        let lossless = TraceMetrics::of(&trace("555"));
         assert_eq!(lossless.loss_ratio, Some(0.0));
         assert_eq!(lossless.loss_memory, None);
-        let open = TraceMetrics::of(&trace("5xx"), 1).longest_outage.unwrap();
+        let open = TraceMetrics::of(&trace("5xx")).longest_outage.unwrap();
         assert_eq!((open.length_ns, open.is_open), (10 * MS, true));
     }
 }

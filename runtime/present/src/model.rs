@@ -161,7 +161,7 @@ pub struct Metric {
     pub low: Option<f64>,
     /// Upper end of the interval of 95 %.
     pub high: Option<f64>,
-    /// The interval as text; empty without one.
+    /// The interval as text, or why the sample has none; empty for what needs none.
     pub interval: String,
     /// How it was obtained, or why it was not.
     pub method: String,
@@ -208,6 +208,15 @@ impl Metric {
     pub fn by(mut self, method: &str) -> Self {
         if self.value.is_some() {
             method.clone_into(&mut self.method);
+        }
+        self
+    }
+
+    /// Without an interval, and why; a number that there is none of has no interval either.
+    #[must_use]
+    pub fn without_interval(mut self, why: &str) -> Self {
+        if self.value.is_some() {
+            why.clone_into(&mut self.interval);
         }
         self
     }

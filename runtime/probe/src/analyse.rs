@@ -12,7 +12,7 @@ use hil_capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_capture::pairing::join_all;
 use hil_capture::point::{PointMetrics, single_point_metrics};
 use hil_capture::watch::Unread;
-use hil_stats::statistics::IntervalNs;
+use hil_core::interval::Spread;
 use serde::Serialize;
 
 use super::files::{CaptureFile, FileError, read};
@@ -471,7 +471,7 @@ fn join_section(joined: &JoinReport) -> Section {
             format!(
                 "{}{ratio}{}",
                 grouped(loss.count),
-                wilson_words(loss.interval)
+                spread_words(loss.interval)
             )
         }
         Loss::Unavailable { range, doubts } => {
@@ -508,10 +508,9 @@ fn join_section(joined: &JoinReport) -> Section {
         );
     }
     let (extent, n) = (figures.reordering_extent_max, figures.reordering_n_max);
-    let interval = wilson_words(figures.reordered_interval);
     fact(
         "reordering",
-        format!("extent at most {extent}, {n}-reordered at most{interval}, RFC 4737"),
+        format!("extent at most {extent}, {n}-reordered at most, RFC 4737"),
     );
     if let (Some(last), Some(mean)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
         let (last, mean) = (duration_s(last * 1e-9), duration_s(mean * 1e-9));
@@ -524,9 +523,14 @@ fn join_section(joined: &JoinReport) -> Section {
         ("delay, p50", figures.delay_p50_interval),
         ("delay, p99", figures.delay_p99_interval),
     ] {
-        if let Some(IntervalNs { low_ns, high_ns }) = interval {
-            let (low, high) = (duration(low_ns), duration(high_ns));
-            fact(label, format!("{low} to {high} (95 %, block bootstrap)"));
+        match interval {
+            Some(Spread::Known(one)) => {
+                let (low, high) = (duration_s(one.low * 1e-9), duration_s(one.high * 1e-9));
+                let method = one.method.name();
+                fact(label, format!("{low} to {high} (95 %, {method})"));
+            }
+            Some(Spread::Unknown(why)) => fact(label, why.to_string()),
+            None => {}
         }
     }
     let counts = [
@@ -572,9 +576,14 @@ fn doubts_text(doubts: &[CountedDoubt]) -> String {
     words.collect::<Vec<String>>().join(", ")
 }
 
-/// An interval of a share.
-fn wilson_words(interval: Option<(f64, f64)>) -> String {
-    interval.map_or_else(String::new, |(low, high)| {
-        format!(" ({} to {}, Wilson 95 %)", percent(low), percent(high))
-    })
+/// An interval of a share with its method, or why there is none.
+fn spread_words(interval: Option<Spread>) -> String {
+    match interval {
+        Some(Spread::Known(one)) => {
+            let (low, high) = (percent(one.low), percent(one.high));
+            format!(" ({low} to {high}, 95 %, {})", one.method.name())
+        }
+        Some(Spread::Unknown(why)) => format!(" ({why})"),
+        None => String::new(),
+    }
 }

@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use hil_core::message::Envelope;
 use hil_core::record::IngressRecord;
 use hil_rundir::live_run::Stage;
+use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
-use hil_rundir::record::{RecordFile, RecordKind};
 use hil_watch::Record;
 
 use crate::net::{self, MessageId, Noted};
@@ -66,7 +66,7 @@ pub(crate) fn noted_steps(
             continue;
         };
         let arrivals = if *kind == RecordKind::Ingress {
-            arrivals(records)
+            arrivals(run, name)
         } else {
             BTreeMap::new()
         };
@@ -122,9 +122,10 @@ impl Arrival {
     }
 }
 
-/// What a receiving gateway noted of each message.
-fn arrivals(file: &RecordFile) -> BTreeMap<Arrival, Noted> {
-    let records = file.records::<IngressRecord>();
+/// What the receiving gateway noted of each message of `channel`.
+fn arrivals(run: &Run, channel: &str) -> BTreeMap<Arrival, Noted> {
+    let files = run.files_of(channel, RecordKind::Ingress);
+    let records = files.flat_map(|(_, file)| file.records::<IngressRecord>());
     let noted = records.filter_map(|one| {
         let noted = Noted::of(&Record::Ingress(one))?;
         Some((Arrival::of(&one), noted))

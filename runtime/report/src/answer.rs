@@ -6,9 +6,10 @@ use core::fmt;
 use hil_account::network::NetworkEventKind;
 use hil_account::{MessageFate, Standing};
 use hil_core::case_study::{Occasions, Severity};
+use hil_core::interval::{Interval, Spread};
 use hil_platform::text::grouped;
 use hil_platform::words::{counted, named};
-use hil_stats::statistics::{Interval, clopper_pearson};
+use hil_stats::statistics::{CONFIDENCE, poisson};
 use serde::{Deserialize, Serialize};
 
 use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
@@ -26,14 +27,12 @@ const CHANCE_MAX: f64 = 0.5;
 const OUTAGE_LOST_MIN: u64 = 3;
 /// Channels, processes or hosts that are named where many have the same fault.
 const NAMED_COUNT: usize = 3;
-/// Confidence of intervals.
-const CONFIDENCE: f64 = 0.95;
 
 /// What an answer counts as harm, beside the counts that it lists.
 pub(crate) const COUNTED_AS_HARM: &str = "these, less those by limits of the robot";
 
 /// A way in which the robot can be hurt, and how often it was; see [`hil_core::case_study::Harm`].
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct HarmCount {
     /// What happened to it.
     pub what: String,
@@ -43,6 +42,9 @@ pub struct HarmCount {
     pub own_count: u64,
     /// What could have hurt it.
     pub occasions: Option<OccasionCount>,
+    /// 95 % interval of its share of them, or why there is none.
+    #[serde(default)]
+    pub interval: Option<Spread>,
 }
 
 /// What could have hurt the robot; see [`Occasions`].
@@ -64,6 +66,7 @@ impl From<&hil_core::case_study::Harm> for HarmCount {
                 let what = what.to_owned();
                 OccasionCount { what, count }
             }),
+            interval: harm.interval,
         }
     }
 }
@@ -82,14 +85,14 @@ impl HarmCount {
         let mut text = grouped(count);
         if let Some(occasions) = &self.occasions {
             text = format!("{text} of {} {}", grouped(occasions.count), occasions.what);
-            let interval = clopper_pearson(count.min(occasions.count), occasions.count, CONFIDENCE);
-            if occasions.count >= OCCASIONS_MIN
-                && count <= occasions.count
-                && let Some(Interval { low, high }) = interval
-            {
+            if occasions.count >= OCCASIONS_MIN && count <= occasions.count {
                 let share = percent(count as f64 / occasions.count as f64);
-                let (low, high) = (percent(low), percent(high));
-                text = format!("{text}: {share} [{low}, {high}]");
+                let interval = self.interval.and_then(Spread::known);
+                let interval = interval
+                    .map_or_else(String::new, |Interval { low, high, .. }| {
+                        format!(" [{}, {}]", percent(low), percent(high))
+                    });
+                text = format!("{text}: {share}{interval}");
             }
         }
         if self.own_count > 0 {
@@ -277,11 +280,13 @@ impl Answer {
     pub fn words(&self) -> String {
         match (&self.hurt, &self.sample.occasions) {
             (Hurt::No, Some(OccasionCount { what, count })) => {
-                let most = clopper_pearson(0, *count, CONFIDENCE);
-                let most = most.map_or_else(String::new, |one| {
-                    format!(", which leaves open up to {} of them", percent(one.high))
-                });
-                format!("{} in {} {what}{most}", self.hurt, grouped(*count))
+                // Of how long one lasts nothing is known, so it is counted as one event.
+                let most = poisson(0, CONFIDENCE).high;
+                format!(
+                    "{} in {} {what}, which leaves open up to {most:.1} independent events in as long a run",
+                    self.hurt,
+                    grouped(*count)
+                )
             }
             _ => self.hurt.to_string(),
         }
@@ -527,13 +532,15 @@ pub(crate) fn metric_words(metric: &ScoreMetric) -> String {
     let value = metric
         .value
         .map_or_else(|| "unavailable".to_owned(), |value| scale.words(value));
-    let interval = metric.interval.map_or_else(String::new, |(low, high)| {
-        format!(
+    let interval = match metric.interval {
+        None => String::new(),
+        Some(Spread::Known(one)) => format!(
             " [{}, {}]",
-            figure(scale.scaled(low)),
-            figure(scale.scaled(high))
-        )
-    });
+            figure(scale.scaled(one.low)),
+            figure(scale.scaled(one.high))
+        ),
+        Some(Spread::Unknown(why)) => format!(" [{why}]"),
+    };
     format!("{value}{interval}")
 }
 

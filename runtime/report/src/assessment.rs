@@ -358,7 +358,7 @@ fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
         let count = counted(unexplained, "message");
         warnings.push(format!("{name}: {count} vanished without explanation"));
     }
-    if let Some((ratio, _)) = account
+    if let Some(ratio) = account
         .closing
         .checked()
         .and_then(ClosingMetrics::closed_ratio)

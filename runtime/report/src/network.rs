@@ -339,14 +339,23 @@ pub struct CorrelationTests {
     pub lead_max_s: f64,
     /// The robot later by so much, seconds.
     pub lag_max_s: f64,
-    /// Shuffles of the robot's series that p-values rest on.
-    pub shuffle_count: u64,
-    /// Seed of the shuffles.
-    pub seed: u64,
+    /// Shifts of the robot's series that p-values rest on.
+    pub shift_count: u64,
     /// The pairs.
     pub pairs: Vec<TestedPair>,
     /// Series that are the same all the time, so that nothing can follow them.
     pub constant: Vec<String>,
+    /// Series that leave their usual value too few times for a test.
+    pub seldom: Vec<SeldomSeries>,
+}
+
+/// A series that leaves its usual value a few times.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SeldomSeries {
+    /// What it is.
+    pub series: String,
+    /// How many times.
+    pub spell_count: u64,
 }
 
 /// One pair.
@@ -385,8 +394,8 @@ impl CorrelationTests {
 }
 
 impl TestedPair {
-    /// The pair in words, of `count` pairs and `shuffle_count` turns.
-    pub fn words(&self, count: usize, shuffle_count: u64) -> String {
+    /// The pair in words, of `count` pairs and `shift_count` shifts.
+    pub fn words(&self, count: usize, shift_count: u64) -> String {
         let (robot, network, channel) = (&self.robot, &self.network, &self.channel);
         let by = duration_s(self.lag_s.abs());
         let how = match self.correlation.lag_bins {
@@ -400,10 +409,10 @@ impl TestedPair {
             p_family,
             ..
         } = self.correlation;
-        let shuffles = grouped(shuffle_count);
+        let shifts = grouped(shift_count);
         format!(
             "{robot} {how}: r{JOINT}={JOINT}{coefficient:.2}, p{JOINT}={JOINT}{p_value:.3} of \
-             {shuffles} block shuffles, {p_family:.3} in view of all {count} pairs"
+             {shifts} shifts, {p_family:.3} in view of all {count} pairs"
         )
     }
 }
@@ -505,7 +514,7 @@ mod tests {
         assert_eq!(
             words(11),
             "joint error follows the silence on shuttle/command by 1.10 s: r = 0.62, p = 0.002 of \
-             499 block shuffles, 0.004 in view of all 12 pairs"
+             499 shifts, 0.004 in view of all 12 pairs"
         );
         assert!(
             words(-4).starts_with("joint error precedes the silence on shuttle/command by 400 ms")

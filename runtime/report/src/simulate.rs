@@ -167,7 +167,6 @@ fn network(
     errors: Vec<ErrorSeries>,
     events: &mut ScoreEvents,
 ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
-    let seed = topology.run().seed;
     let length_ns = duration_ns(topology.run().duration);
     let mut builder = NetworkBuilder::default();
     for (name, account) in accounts {
@@ -187,13 +186,12 @@ fn network(
                 payload_bytes: payload.map(|message| message.payload.len() as u64),
                 duplicated_count: Some(account.duplicated_count),
                 round_trips_ns: &[],
-                seed,
             },
         });
     }
     let errors = errors.into_iter();
     let errors = errors.map(|one| RobotSeries::of(one, |at| Some(at.seconds_since(Instant::ZERO))));
-    builder.finish(events, errors.collect(), seed, AxisClocks::ONE)
+    builder.finish(events, errors.collect(), AxisClocks::ONE)
 }
 
 fn run_facts(topology: &Topology, file: &Path) -> RunFacts {

@@ -6,6 +6,7 @@
 //! not know. Units are part of the names.
 
 use core::fmt;
+use hil_core::interval::Spread;
 use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -726,8 +727,8 @@ pub struct ScoreMetric {
     pub label: String,
     /// The figure; `None` when the run did not allow it.
     pub value: Option<f64>,
-    /// 95 % interval, when the figure is a statistic.
-    pub interval: Option<(f64, f64)>,
+    /// 95 % interval, or why there is none, when the figure is a statistic.
+    pub interval: Option<Spread>,
     /// SI unit, or `1` for a pure number.
     pub unit: String,
     /// How it was obtained, or why it was not.
@@ -748,9 +749,7 @@ impl From<&Metric> for ScoreMetric {
             label: metric.label.to_owned(),
             // JSON has no word for infinity and NaN: both mean that there is no figure.
             value: metric.value.filter(|value| value.is_finite()),
-            interval: metric
-                .interval
-                .filter(|(low, high)| low.is_finite() && high.is_finite()),
+            interval: metric.interval,
             unit: metric.unit.to_owned(),
             method: metric.method.clone(),
         }

@@ -158,8 +158,7 @@ pub enum ProcessKind {
 }
 
 impl ProcessKind {
-    /// True for what runs by a timer whose ticks this program counts. Without that count nobody can tell
-    /// the host's delays from the network's.
+    /// True for what runs by a timer whose ticks this program counts.
     pub const fn counts_ticks(self) -> bool {
         matches!(self, Self::Component)
     }

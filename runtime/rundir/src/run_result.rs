@@ -24,7 +24,7 @@ use hil_platform::host_facts::HostFacts;
 /// What `result.json` says it is.
 pub const RUN_RESULT_FORMAT: &str = "hil-run-result";
 /// Version of the layout of `result.json`. Within one, fields are only added.
-pub const RUN_RESULT_VERSION: u32 = 2;
+pub const RUN_RESULT_VERSION: u32 = 3;
 
 /// How a run ended.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

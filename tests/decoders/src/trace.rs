@@ -123,7 +123,7 @@ fn check_trace(trace: &Trace) {
     assert_eq!(again.trace.records.len(), trace.records.len());
     assert_eq!(csv::encode(&again.trace), text, "the text changes");
     if trace.records.len() <= FIGURED_RECORDS_MAX {
-        let figures = TraceMetrics::of(trace, 1);
+        let figures = TraceMetrics::of(trace);
         assert!(
             figures.rate_hz.is_none_or(|rate| rate >= 0.0),
             "{figures:?}"

@@ -110,7 +110,7 @@ fn check_conditions(near: &Path, again: &Path, far: &Path) {
         ("loss > 5pp", [near, far], 1),
         ("loss > 5pp", [near, again], 0),
         ("shuttle/command:loss > 5%", [near, far], 1),
-        ("shuttle/command:p99 > 10s", [near, far], 0),
+        ("shuttle/command:p50 > 10s", [near, far], 0),
         ("p49 > 1.2x", [near, far], 2),
         ("nowhere:p50 > 1.2x", [near, far], 2),
         ("p50 > 3%", [near, far], 2),

@@ -88,16 +88,22 @@ fn check_channels(summary: &RunSummary) {
 fn check_bounds(summary: &RunSummary) {
     let network = summary.network.as_ref().unwrap();
     assert!(!network.clocks_differ && network.clock_bound_s > Some(0.0));
-    let mut delays = network.timeline.rows.iter().filter(|row| {
-        matches!(
-            row.subject,
-            TimelineSubject::Channel {
-                quantity: NetworkQuantity::Delay,
-                ..
-            }
-        )
-    });
-    assert!(delays.any(|row| row.bound > Some(0.0)));
+    for one in &network.channels {
+        let (name, figures) = (&one.channel, &one.figures);
+        // A channel that answers requests may have had one.
+        let measured = figures.delay.measured().zip(figures.successive.measured());
+        let Some((delay, successive)) = measured else {
+            continue;
+        };
+        let (bound_ns, variation) = (delay.alignment_bound_ns, delay.variation);
+        assert!(bound_ns > 0 && variation.bound_ns > 0 && successive.bound_ns > 0);
+        assert!(variation.bound_ns <= 2 * bound_ns, "{variation:?}");
+        let row = network.timeline.rows.iter().find(|row| {
+            let (channel, quantity) = (name.clone(), NetworkQuantity::Delay);
+            row.subject == TimelineSubject::Channel { channel, quantity }
+        });
+        assert!(row.unwrap().bound > Some(0.0), "{name}");
+    }
     let metric = summary
         .score
         .iter()

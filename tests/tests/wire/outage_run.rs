@@ -3,6 +3,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
+use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
@@ -68,19 +69,16 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
     assert_every_message_is_accounted_for(&summary);
     let outages = outages(Instant::from_ns(11_500_000_000));
     assert!(outages.len() >= 4, "{outages:?}");
-    let mut simulated = Command::new(hil_runtime_binary());
-    simulated.arg("simulate").args(trial.arguments());
-    let folder = record.join("simulated");
-    let output = simulated.arg("--output").arg(&folder).output().unwrap();
-    assert!(output.status.success(), "{output:?}");
-    let text = fs::read_to_string(folder.join("summary.json")).unwrap();
-    let virtual_time = RunSummary::from_json(&text).unwrap();
-    let simulated = serde_json::to_value(virtual_time.network.as_ref().unwrap()).unwrap();
+    let virtual_time = simulated(&trial, &record.join("simulated"), &[]);
+    let simulated_network = serde_json::to_value(virtual_time.network.as_ref().unwrap()).unwrap();
+    // Twelve seconds are too short to look for lags.
+    let longer = ["--set", "run.duration=\"200 s\""];
+    let longer = simulated(&trial, &record.join("longer"), &longer);
+    assert_the_error_follows_the_silence(&longer);
     let live = serde_json::to_value(summary.network.as_ref().unwrap()).unwrap();
-    assert_the_error_follows_the_silence(&live, &simulated);
     for name in CHANNELS {
         assert_the_report_shows_what_preceded_what(&live, name);
-        assert_the_report_shows_what_preceded_what(&simulated, name);
+        assert_the_report_shows_what_preceded_what(&simulated_network, name);
         let file = format!("series/network-{}.csv", name.replace('/', "-"));
         let table = fs::read_to_string(files.root().join(file)).unwrap();
         assert!(table.lines().count() > 100, "{table}");
@@ -129,18 +127,31 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
     }
 }
 
-fn assert_the_error_follows_the_silence(live: &serde_json::Value, simulated: &serde_json::Value) {
-    for (name, network) in [("live", live), ("virtual", simulated)] {
-        let pair = pair_of(network, "shuttle/command");
-        println!("{name}: {pair}");
-        let of = |key: &str| pair[key].as_f64().unwrap();
-        // The cart drives on as it was told last until the silence is over.
-        assert!((0.0..=1.0).contains(&of("lag_s")), "{pair}");
-        assert!(of("coefficient") > 0.15, "{pair}");
-    }
+/// The run in virtual time.
+fn simulated(trial: &Trial, folder: &Path, settings: &[&str]) -> RunSummary {
+    let mut command = Command::new(hil_runtime_binary());
+    command.arg("simulate").args(trial.arguments());
+    let output = command
+        .args(settings)
+        .arg("--output")
+        .arg(folder)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let text = fs::read_to_string(folder.join("summary.json")).unwrap();
+    RunSummary::from_json(&text).unwrap()
+}
+
+fn assert_the_error_follows_the_silence(summary: &RunSummary) {
+    let network = serde_json::to_value(summary.network.as_ref().unwrap()).unwrap();
+    let pair = pair_of(&network, "shuttle/command");
+    println!("{pair}");
+    let of = |key: &str| pair[key].as_f64().unwrap();
+    // The cart drives on as it was told last until the silence is over.
+    assert!((0.0..=1.0).contains(&of("lag_s")), "{pair}");
+    assert!(of("coefficient") > 0.15, "{pair}");
     // The same figure each time: virtual time depends on nothing but the seed.
-    let pair = pair_of(simulated, "shuttle/command");
-    assert!(pair["p_family"].as_f64().unwrap() <= 0.05, "{pair}");
+    assert!(of("p_family") <= 0.05, "{pair}");
 }
 
 /// `account` closes; what is shown here is what the report makes of it: which outage went before
@@ -156,14 +167,9 @@ fn assert_the_report_shows_what_preceded_what(network: &serde_json::Value, name:
     let delay_ns = figures["delay"]["p50"]["value_ns"].as_i64().unwrap();
     assert!(delay_ns >= 5_000_000, "{figures}");
     let loss = &figures["loss"];
-    let bound = |which: &str| loss["interval"][which].as_f64().unwrap();
-    let ratio = loss["ratio"].as_f64().unwrap();
-    assert!(
-        0.0 < bound("low") && bound("low") < ratio && ratio < bound("high"),
-        "{loss}"
-    );
-    // Outages are few: they tell as much as few independent messages would.
-    assert!(loss["effective_count"].as_f64().unwrap() < 200.0, "{loss}");
+    assert!(loss["ratio"].as_f64().unwrap() > 0.0, "{loss}");
+    // Outages are too few for an interval, and it says so.
+    assert!(loss["interval"]["needed"].is_u64(), "{loss}");
     let events = network["events"].as_array().unwrap().iter();
     let outages = events.filter(|one| one["channel"] == name && one["kind"] == "outage");
     assert!(outages.count() >= 3, "{}", network["events"]);

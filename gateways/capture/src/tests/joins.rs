@@ -121,8 +121,9 @@ fn every_datagram_of_a_random_network_has_one_fate() {
         assert_eq!(figures.unexplained_count, hidden, "seed {seed}");
         assert_eq!(figures.edge_count, 0);
         assert_eq!(figures.matched_count + lost, first.len() as u64);
-        let (low, high) = found.interval.unwrap();
-        assert!(low < found.ratio.unwrap() && found.ratio.unwrap() < high);
+        if let Some(interval) = found.interval.unwrap().known() {
+            assert!(interval.holds(found.ratio.unwrap()));
+        }
         let in_bursts: u64 = found
             .bursts
             .iter()
@@ -132,8 +133,10 @@ fn every_datagram_of_a_random_network_has_one_fate() {
         let delay = figures.delay.measured().unwrap();
         assert!(delay.min_ns >= 200_000 && delay.max_ns <= 2_200_000);
         assert!(figures.reordered_count > 0);
-        let interval = figures.delay_p50_interval.unwrap();
-        assert!(interval.low_ns <= delay.p50_ns && delay.p50_ns <= interval.high_ns + 2_000);
+        if let Some(interval) = figures.delay_p50_interval.unwrap().known() {
+            let p50_ns = delay.p50_ns as f64;
+            assert!(interval.low <= p50_ns && p50_ns <= interval.high + 2_000.0);
+        }
     }
 }
 

@@ -6,28 +6,27 @@ use serde::{Deserialize, Serialize};
 
 use super::{Metric, Passage, Passages, is_arrived};
 use crate::ChannelPath;
-use hil_core::random::RandomStream;
+use hil_core::interval::Spread;
 use hil_core::time::RemoteInstant;
+use hil_stats::dependence::Quantiles;
 use hil_stats::histogram::{DurationBin, LatencyHistogram};
 use hil_stats::in_order::in_order;
-use hil_stats::resampling::BlockResampling;
 use hil_stats::samples::Samples;
 use hil_stats::special::place_of;
-use hil_stats::statistics::{CONFIDENCE, IntervalNs, has_tail};
 
 /// A quantile of the delay with its 95 % interval.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DelayQuantile {
     /// The smallest delay that at least this share of messages did not exceed.
     pub value_ns: i64,
-    /// By resampling blocks of successive messages; `None` when fewer than ten messages lie
-    /// beyond the quantile. The error of the clocks' alignment is not in it.
-    pub interval: Option<IntervalNs>,
+    /// In nanoseconds, or why there is none; `None` when no delay differs. The error of the clocks'
+    /// alignment is not in it.
+    pub interval: Option<Spread>,
 }
 
 /// One-way delay, handed to the kernel until received by the other gateway (RFC 7679), of the
 /// messages that arrived.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DelayMetrics {
     /// Messages.
     pub count: u64,
@@ -112,11 +111,7 @@ pub struct InterarrivalJitter {
     pub bound_ns: f64,
 }
 
-pub(super) fn delays(
-    passages: &Passages,
-    path: ChannelPath<'_>,
-    random: &mut RandomStream,
-) -> Metric<DelayMetrics> {
+pub(super) fn delays(passages: &Passages, path: ChannelPath<'_>) -> Metric<DelayMetrics> {
     let arrived = || passages.each().filter(is_arrived);
     let delays_ns: Samples = arrived().filter_map(|one| one.delay_ns).collect();
     let Some(last) = delays_ns.len().checked_sub(1) else {
@@ -131,15 +126,11 @@ pub(super) fn delays(
     };
     let ascending = delays_ns.ascending();
     let (min_ns, max_ns) = (ascending.at(0), ascending.at(last));
-    let resampling = BlockResampling::of(&delays_ns);
-    drop(delays_ns);
-    let mut quantile = |share: f64| DelayQuantile {
+    let quantiles = Quantiles::of(&delays_ns, &ascending);
+    let [p50, p95, p99, p999] = [0.5, 0.95, 0.99, 0.999].map(|share| DelayQuantile {
         value_ns: ascending.at_share(share),
-        interval: has_tail(ascending.len(), share)
-            .then(|| Some(resampling.as_ref()?.interval(share, CONFIDENCE, random)))
-            .flatten(),
-    };
-    let [p50, p95, p99, p999] = [0.5, 0.95, 0.99, 0.999].map(&mut quantile);
+        interval: quantiles.interval(share),
+    });
     let alignment_bound_ns = arrived().map(|one| one.delay_bound_ns).max().unwrap_or(0);
     let above_min = |ns: i64| ns.saturating_sub(min_ns);
     let bound_ns = variation_bound_ns(arrived(), path, alignment_bound_ns);

@@ -8,13 +8,11 @@ use serde::{Deserialize, Serialize};
 
 use super::{Crossing, Metric, Passages};
 use crate::BurstCount;
-use hil_stats::statistics::{CONFIDENCE, Interval, wilson, wilson_of};
+use hil_core::interval::Spread;
+use hil_stats::dependence::Batches;
 
 /// Messages received in a row that end a burst (`Gmin` of RFC 3611, section 4.7.2).
 pub const BURST_GAP_MIN: u64 = 16;
-
-/// Fewer runs of losses than this, or blocks, say too little about their own scatter.
-const RUN_COUNT_MIN: usize = 10;
 
 /// Losses of the network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -25,16 +23,8 @@ pub struct LossMetrics {
     pub of_count: u64,
     /// Their share.
     pub ratio: f64,
-    /// 95 % interval of the share: Wilson's on [`LossMetrics::effective_count`].
-    pub interval: Interval,
-    /// How many independent messages would scatter as much as these did: all of them when losses
-    /// are independent, far fewer when they come in bursts. The variance is the larger one of two
-    /// estimates: between blocks of the square root of the count, and between cycles of a run of
-    /// losses and the run of arrivals after it; with fewer than ten runs, the second one takes
-    /// each run as one event of a Poisson process.
-    pub effective_count: f64,
-    /// 95 % interval if losses were independent (Wilson): too narrow when they come in bursts.
-    pub independent_interval: Interval,
+    /// 95 % interval of the share, or why there is none.
+    pub interval: Spread,
     /// How often how many were lost in a row.
     pub runs: Vec<BurstCount>,
     /// Bursts of losses and the gaps between them; `None` without a burst.
@@ -133,11 +123,10 @@ pub(super) fn losses(passages: &Passages, run_ns: Option<(i64, i64)>) -> Metric<
     let lost_count = runs
         .iter()
         .fold(0_u64, |sum, run| sum.saturating_add(run.lost_count));
-    let Some(independent_interval) = wilson(lost_count, of_count, CONFIDENCE) else {
+    if of_count == 0 {
         return Metric::unavailable("no message is known to have been lost or to have arrived");
-    };
-    let ratio = lost_count as f64 / of_count as f64;
-    let effective_count = effective_count(&runs, of_count, ratio);
+    }
+    let of_runs = runs.iter().map(|run| (run.place, run.lost_count));
     let mut lengths: BTreeMap<u64, u64> = BTreeMap::new();
     for run in &runs {
         *lengths.entry(run.lost_count).or_insert(0) += 1;
@@ -146,14 +135,8 @@ pub(super) fn losses(passages: &Passages, run_ns: Option<(i64, i64)>) -> Metric<
     Metric::Measured(LossMetrics {
         lost_count,
         of_count,
-        ratio,
-        interval: if lost_count == 0 {
-            independent_interval
-        } else {
-            wilson_of(ratio, effective_count, CONFIDENCE)
-        },
-        effective_count,
-        independent_interval,
+        ratio: lost_count as f64 / of_count as f64,
+        interval: Batches::of_runs(of_count, of_runs).share_interval(),
         runs: lengths
             .map(|(length_messages, count)| BurstCount {
                 length_messages,
@@ -163,67 +146,6 @@ pub(super) fn losses(passages: &Passages, run_ns: Option<(i64, i64)>) -> Metric<
         bursts: bursts(&runs, of_count, lost_count),
         longest: longest(&runs, run_ns),
     })
-}
-
-/// See [`LossMetrics::effective_count`].
-fn effective_count(runs: &[LossRun], of_count: u64, ratio: f64) -> f64 {
-    let n = of_count as f64;
-    if runs.is_empty() {
-        return n;
-    }
-    let variance =
-        variance_between_runs(runs, n, ratio).max(variance_between_blocks(runs, of_count));
-    (n * n * ratio * (1.0 - ratio) / variance).clamp(1.0, n.max(1.0))
-}
-
-/// Variance of the number of losses, from the scatter of cycles (renewal reward: Cox 1962, section
-/// 8.2): a run of losses of length L and arrivals G after it contribute `L - p (L + G)`.
-fn variance_between_runs(runs: &[LossRun], n: f64, ratio: f64) -> f64 {
-    let length = |run: &LossRun| run.lost_count as f64;
-    if runs.len() < RUN_COUNT_MIN {
-        return runs.iter().map(|run| length(run).powi(2)).sum();
-    }
-    let cycles = runs.windows(2).map(|pair| {
-        let whole = pair[1].place.saturating_sub(pair[0].place) as f64;
-        (length(&pair[0]) - ratio * whole).powi(2)
-    });
-    let count = (runs.len() - 1) as f64;
-    let per_cycle = cycles.sum::<f64>() / count;
-    // What lies before the first and after the last run belongs to no cycle.
-    let covered = runs.last().map_or(0, |run| run.place) - runs[0].place;
-    per_cycle * count * (n / (covered as f64).max(1.0))
-}
-
-/// Variance of the number of losses, from the scatter of their numbers in equal blocks.
-fn variance_between_blocks(runs: &[LossRun], of_count: u64) -> f64 {
-    let length = of_count.isqrt().max(1);
-    let block_count = of_count / length;
-    let Ok(size) = usize::try_from(block_count) else {
-        return 0.0;
-    };
-    if size < RUN_COUNT_MIN {
-        return 0.0;
-    }
-    let mut sums = vec![0.0_f64; size];
-    for run in runs {
-        let (mut at, mut left) = (run.place, run.lost_count);
-        while left > 0 {
-            let index = at / length;
-            let here = left.min((index + 1) * length - at);
-            if let Some(sum) = usize::try_from(index)
-                .ok()
-                .and_then(|index| sums.get_mut(index))
-            {
-                *sum += here as f64;
-            }
-            at += here;
-            left -= here;
-        }
-    }
-    let m = block_count as f64;
-    let mean = sums.iter().sum::<f64>() / m;
-    let scatter = sums.iter().map(|sum| (sum - mean).powi(2)).sum::<f64>() / (m - 1.0);
-    scatter * of_count as f64 / length as f64
 }
 
 fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstMetrics> {

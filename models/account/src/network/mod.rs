@@ -35,7 +35,6 @@ pub use loss::{BURST_GAP_MIN, BurstMetrics, LongestLoss, LossMetrics};
 pub use order::OrderMetrics;
 
 use crate::{ChannelPath, Side};
-use hil_core::random::RandomStream;
 use hil_stats::histogram::{Distribution, DurationBin, LatencyHistogram};
 
 /// What the network did to one message.
@@ -123,8 +122,6 @@ pub struct NetworkContext<'a> {
     pub duplicated_count: Option<u64>,
     /// Round trips of the gateways' clock exchange.
     pub round_trips_ns: &'a [i64],
-    /// Seed of the run, for the bootstrap.
-    pub seed: u64,
 }
 
 /// The network's figures of one channel, which is one direction.
@@ -176,7 +173,6 @@ impl NetworkMetrics {
         let offered = passages.each().filter(on_network);
         let arrived = passages.each().filter(is_arrived);
         let arrived_per_s = rate(arrived.filter_map(|one| Some((one.received_ns?, one.count))));
-        let mut random = RandomStream::new(context.seed, "measure.network.bootstrap");
         let mut round_trip = LatencyHistogram::default();
         for round_trip_ns in context.round_trips_ns {
             round_trip.record(*round_trip_ns);
@@ -195,7 +191,7 @@ impl NetworkMetrics {
                 .zip(arrived_per_s)
                 .map(|(bytes, per_s)| bytes as f64 * per_s),
             delay_bins: delay::delay_bins(passages),
-            delay: delay::delays(passages, context.path, &mut random),
+            delay: delay::delays(passages, context.path),
             successive: delay::successive(passages, context.path),
             loss: loss::losses(passages, context.run_ns),
             order: order::order(passages),

@@ -8,6 +8,7 @@ use crate::messages::MessageOrder;
 use crate::referee::Tally;
 use crate::robot::TrackerKind;
 use crate::scenario::Scenario;
+use hil_core::interval::Interval;
 use hil_core::time::Instant;
 use hil_link::impaired::{DelayLaw, Impairments, LinkCounts};
 use hil_link::wifi::WifiPreset;
@@ -512,6 +513,7 @@ impl FleetTally {
     /// The 95 % interval of [`FleetTally::collision_ratio`]; `None` without sections.
     pub fn collision_interval(&self) -> Option<(f64, f64)> {
         collision_interval(self.collision_count(), self.section_count())
+            .map(|interval| (interval.low, interval.high))
     }
 
     /// Missions driven to their end per hour of the fleet; `None` before it ran.
@@ -521,12 +523,12 @@ impl FleetTally {
 }
 
 /// The exact interval (Clopper and Pearson 1934) of collisions per critical section, 95 %.
-pub(crate) fn collision_interval(collisions: u64, sections: u64) -> Option<(f64, f64)> {
+pub(crate) fn collision_interval(collisions: u64, sections: u64) -> Option<Interval> {
     // One section can see two collisions; more collisions than sections are no proportion.
     if collisions > sections {
         return None;
     }
-    clopper_pearson(collisions, sections, 0.95).map(|interval| (interval.low, interval.high))
+    clopper_pearson(collisions, sections, 0.95)
 }
 
 /// One row.

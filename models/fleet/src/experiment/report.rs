@@ -122,7 +122,7 @@ const PUBLISHED: [Field<PublishedRow>; 4] = [
         2,
         |row: &PublishedRow| {
             collision_interval(row.collisions, row.sections)
-                .map(|(low, high)| (1e3 * low, 1e3 * high))
+                .map(|interval| (1e3 * interval.low, 1e3 * interval.high))
         },
     )
     .ranked(2),

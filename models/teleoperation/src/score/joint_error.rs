@@ -228,8 +228,7 @@ impl ErrorSums {
         let values = self.count * JOINT_COUNT as f64;
         let rms = (self.count > 0.0).then(|| (self.square / values).sqrt());
         let interval = Estimate::of_mean(&self.blocks)
-            .and_then(|estimate| estimate.interval)
-            .map(|(low, high)| (low.max(0.0).sqrt(), high.max(0.0).sqrt()));
+            .map(|estimate| estimate.interval.map(|end| end.max(0.0).sqrt()));
         let method = format!(
             "{what}, all seven joints, {} messages; interval from whole motion periods",
             self.count

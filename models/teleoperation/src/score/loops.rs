@@ -2,6 +2,8 @@
 //! equation 1). It counts on sampled signals and knows no messages; virtual-time tables use it too.
 
 use hil_arm::egm::messages::EndCause;
+use hil_core::interval::Spread;
+use hil_stats::dependence::Batches;
 use hil_stats::series::{Sample, peaks};
 
 /// A motion loop counts when the tool falls back by this share of the nominal peak-to-peak.
@@ -148,6 +150,17 @@ impl Loops {
     pub(crate) fn loss_ratio(&self) -> f64 {
         let sent = self.sent_count() as f64;
         (sent - self.executed_count as f64) / sent
+    }
+
+    /// The interval of the motion loss rate, of the loops that no executed one answers, in their order; an extra
+    /// loop moves it as it moves the rate.
+    pub(crate) fn loss_interval(&self) -> Spread {
+        let lost = self.lost.iter().map(|lost| (lost.index as u64, 1));
+        let batches = Batches::of_runs(self.sent_count() as u64, lost);
+        let shift = self.loss_ratio() - batches.mean();
+        batches
+            .share_interval()
+            .map(|end| (end + shift).clamp(0.0, 1.0))
     }
 
     /// Loops missing from the executed ones; `None` when there were more than were sent.

@@ -28,7 +28,6 @@ use hil_core::run_log::RunLog;
 use hil_core::score::Metric;
 use hil_stats::metric::label;
 use hil_stats::series::{Estimate, Sample, lag_s, peak_to_peak};
-use hil_stats::statistics::{CONFIDENCE, poisson};
 
 /// Everything a plot of the run shows.
 pub(crate) fn series(case: &Teleoperation, log: &RunLog) -> Vec<PlotSeries> {
@@ -175,14 +174,10 @@ impl Run {
         let executed = loops.map(|loops| loops.executed_count as f64);
         let ratio = label("motion_loss_ratio", "motion loss rate", "1").measured(
             loops.map(Loops::loss_ratio),
-            format!("(sent - executed) / sent, {counter}; interval of a Poisson count"),
+            format!("(sent - executed) / sent, {counter}"),
             missing,
         );
-        let interval = loops.and_then(|loops| {
-            let lost = poisson(loops.missing_count()?, CONFIDENCE);
-            let sent = loops.sent_count() as f64;
-            Some((lost.low / sent, (lost.high / sent).min(1.0)))
-        });
+        let interval = loops.map(Loops::loss_interval);
         let mut metrics = vec![
             label("motion_loops_sent_count", "motion loops sent", "1").measured(
                 sent,
@@ -216,6 +211,7 @@ impl Run {
         let count = harm.count.unwrap_or(0);
         Harm {
             own_count: count - count.min(others),
+            interval: Some(loops.loss_interval()),
             ..harm.of(loops.sent_count() as u64, "motion loops sent")
         }
     }
@@ -281,7 +277,7 @@ impl Run {
         let lag = lag_s(&self.record.sent_y(), &self.moved, 0.5 * self.period_s);
         let in_ms = |lag: Estimate| Estimate {
             value: lag.value * 1e3,
-            interval: lag.interval.map(|(low, high)| (low * 1e3, high * 1e3)),
+            interval: lag.interval.map(|end| end * 1e3),
         };
         let clock = log.clock_words(lag.map(|lag| lag.value));
         label.estimated(lag.map(in_ms), format!(

@@ -143,7 +143,7 @@ pub struct TraceFit {
 impl TraceFit {
     /// Fits every law to `trace`; `seed` is that of the bootstrap.
     pub fn of(trace: &Trace, seed: u64) -> Self {
-        let figures = TraceMetrics::of(trace, seed);
+        let figures = TraceMetrics::of(trace);
         let losses = known_losses(trace);
         let measured = trace.delays_ns();
         let delays_s = measured.iter().map(|ns| (*ns).max(0) as f64 * 1e-9);

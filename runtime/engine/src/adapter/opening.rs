@@ -40,7 +40,6 @@ pub struct OpenedArm {
     messages: RecordSink,
     /// Messages taken from and published to shared memory so far.
     pub(super) counts: [Arc<AtomicU64>; 2],
-    /// The turns of the thread that will carry the messages.
     /// What was granted, in words.
     pub(super) facts: Vec<(String, String)>,
 }

@@ -187,8 +187,8 @@ impl JobThread {
     }
 }
 
-/// What a connected job does: its thread takes one step after another until the process is told to stop. Each
-/// fails when a channel or a socket itself breaks.
+/// What a connected job does: its thread takes one step after another until the process is told to stop. A
+/// step fails when a channel or a socket itself breaks.
 pub(crate) trait JobWork {
     /// What comes before the first step; false when told to stop before it.
     fn begin(&mut self, orders: &Orders) -> Result<bool, WorkerError> {

@@ -11,9 +11,8 @@ use hil_account::network::{
 use hil_account::{Side, each_history};
 use hil_core::case_study::ErrorSeries;
 use hil_core::plot::PlotSeries;
-use hil_core::random::RandomStream;
 use hil_core::time::Instant;
-use hil_stats::correlation::{self, LagWindow};
+use hil_stats::correlation::{self, LagWindow, Untested};
 
 use super::axis::RunAxis;
 use super::clocks::HostClocks;
@@ -22,7 +21,7 @@ pub(crate) use super::robot_series::RobotSeries;
 use super::robot_series::{index_of, without_holes};
 use crate::network::{
     ChannelNetwork, Correlation, CorrelationTests, NetworkQuantity, NetworkReport, PRECEDING_S,
-    PrecedingEvent, PrecedingNetwork, TestedPair, TimedEvent, Timeline, TimelineRow,
+    PrecedingEvent, PrecedingNetwork, SeldomSeries, TestedPair, TimedEvent, Timeline, TimelineRow,
     TimelineSubject,
 };
 use crate::score_event::ScoreEvents;
@@ -162,7 +161,6 @@ impl NetworkBuilder {
         mut self,
         score: &mut ScoreEvents,
         errors: Vec<RobotSeries>,
-        seed: u64,
         axis: AxisClocks,
     ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
         let (_, first) = self.bins.first()?;
@@ -190,7 +188,7 @@ impl NetworkBuilder {
             clocks_differ: axis.bound_s.is_none(),
             clock_bound_s: axis.bound_s,
             timeline: timeline(&self.bins, &robot, width_s),
-            correlation: correlate(&self.bins, &robot, width_s, seed),
+            correlation: correlate(&self.bins, &robot, width_s),
             events: TimedEvent::kept(self.events, EVENTS_MAX),
             events_dropped_count: dropped as u64,
             channels: self.channels,
@@ -315,12 +313,7 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
     }
 }
 
-fn correlate(
-    all: &[(String, NetworkBins)],
-    robot: &RobotBins,
-    width_s: f64,
-    seed: u64,
-) -> Correlation {
+fn correlate(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> Correlation {
     let mut names = Vec::new();
     let mut causes = Vec::new();
     for (channel, bins) in all {
@@ -339,8 +332,7 @@ fn correlate(
         lead_max: in_bins(LEAD_MAX_S),
         lag_max: in_bins(LAG_MAX_S),
     };
-    let mut random = RandomStream::new(seed, "measure.correlation.shuffles");
-    let tested = match correlation::family(&causes, &effects, window, &mut random) {
+    let tested = match correlation::family(&causes, &effects, window) {
         Ok(tested) => tested,
         Err(error) => {
             return Correlation::Unavailable {
@@ -360,26 +352,31 @@ fn correlate(
             }));
         }
     }
-    let is_constant = |values: &[f64]| {
-        values
-            .windows(2)
-            .all(|pair| pair[0].total_cmp(&pair[1]).is_eq())
-    };
-    let of_network = names.iter().zip(&causes);
-    let constant_causes = of_network
-        .filter(|(_, values)| is_constant(values))
-        .map(|((channel, network), _)| format!("{network} on {channel}"));
-    let constant_effects = robot
+    let of_robot = robot.iter().map(|(one, _)| one.label().to_owned());
+    let of_network = names
         .iter()
-        .filter(|(_, values)| is_constant(values))
-        .map(|(one, _)| one.label().to_owned());
+        .map(|(channel, network)| format!("{network} on {channel}"));
+    let untested = of_robot
+        .zip(&tested.untested_effects)
+        .chain(of_network.zip(&tested.untested_causes));
+    let (mut constant, mut seldom) = (Vec::new(), Vec::new());
+    for (series, why) in untested {
+        match why {
+            Some(Untested::Constant) => constant.push(series),
+            Some(Untested::TooFew { spell_count }) => seldom.push(SeldomSeries {
+                series,
+                spell_count: *spell_count as u64,
+            }),
+            Some(Untested::NoNumber) | None => {}
+        }
+    }
     Correlation::Tested(CorrelationTests {
         bin_s: width_s,
         lead_max_s: tested.window.lead_max as f64 * width_s,
         lag_max_s: tested.window.lag_max as f64 * width_s,
-        shuffle_count: correlation::SHUFFLE_COUNT as u64,
-        seed,
-        constant: constant_effects.chain(constant_causes).collect(),
+        shift_count: tested.shift_count as u64,
+        constant,
+        seldom,
         pairs,
     })
 }
@@ -416,7 +413,7 @@ pub(super) fn of_run(
     let clocks = AxisClocks {
         bound_s: axis.bound_ns().map(|ns| ns as f64 * 1e-9),
     };
-    builder.finish(score, errors, topology.run().seed, clocks)
+    builder.finish(score, errors, clocks)
 }
 
 /// Start of the run on the clock of `host`. Hosts begin milliseconds apart; where their clocks are
@@ -485,7 +482,6 @@ fn add_channel(
                 payload_bytes,
                 duplicated_count: files.ingress.map(|_| duplicated_count),
                 round_trips_ns: context.round_trips_ns,
-                seed: context.seed,
             },
         });
     });

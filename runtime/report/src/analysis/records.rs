@@ -280,7 +280,6 @@ impl<'a> RunRecords<'a> {
             depth: Some(channel.depth),
             cards_share_clock,
             round_trips_ns: &round_trips_ns,
-            seed: topology.run().seed,
             ..AccountContext::new(path)
         };
         let records = ChannelRecords {

@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use hil_stats::statistics::Interval;
+use hil_core::interval::Interval;
 use serde::Serialize;
 
 use super::{ChartKind, ComparedMetric, Comparison, Part};
@@ -280,10 +280,7 @@ impl Condition {
         figure: &ComparedMetric,
     ) -> Result<(Option<f64>, Option<Interval>), ConditionError> {
         let scaled = |(value, interval): (Option<f64>, Option<Interval>), by: f64| {
-            let interval = interval.map(|one| Interval {
-                low: one.low * by,
-                high: one.high * by,
-            });
+            let interval = interval.map(|one| one.map(|end| end * by));
             (value.map(|value| value * by), interval)
         };
         let new = (

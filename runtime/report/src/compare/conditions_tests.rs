@@ -1,5 +1,6 @@
 //! Conditions on made-up figures.
 
+use hil_core::interval::IntervalMethod;
 use hil_stats::comparison::Estimate;
 
 use super::*;
@@ -7,7 +8,7 @@ use crate::answer::Hurt;
 use crate::compare::Verdict;
 
 fn figure(metric: &str, kind: ChartKind, [low, value, high]: [f64; 3]) -> ComparedMetric {
-    let interval = Some(Interval { low, high });
+    let interval = Some(Interval::new(low, high, IntervalMethod::EffectiveRanks));
     let estimate = |value: f64| Some(Estimate { value, interval });
     ComparedMetric {
         channel: (kind != ChartKind::Score).then(|| "a/b".to_owned()),

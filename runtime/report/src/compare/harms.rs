@@ -1,8 +1,9 @@
 //! Was the robot hurt more in the new runs than in the base? What hurt it on both sides, pooled over the runs of each,
 //! and the answer that follows. Figures of the network are elsewhere.
 
+use hil_core::interval::{Interval, IntervalMethod};
 use hil_stats::comparison::{Share, difference};
-use hil_stats::statistics::{CONFIDENCE, Interval, poisson};
+use hil_stats::statistics::{CONFIDENCE, poisson};
 use serde::Serialize;
 
 use super::ComparedRun;
@@ -79,10 +80,11 @@ impl HarmDifference {
         let [base, new] = [base, new].map(|count| poisson(count, CONFIDENCE));
         Some(Self {
             value,
-            interval: Interval {
-                low: new.low / new_s - base.high / base_s,
-                high: new.high / new_s - base.low / base_s,
-            },
+            interval: Interval::new(
+                new.low / new_s - base.high / base_s,
+                new.high / new_s - base.low / base_s,
+                IntervalMethod::Exact,
+            ),
             is_share: false,
         })
     }
@@ -133,6 +135,7 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
         count: Some(0),
         own_count: 0,
         occasions: None,
+        interval: None,
     };
     for run in runs {
         let Some(harm) = run.summary.harms.iter().find(|one| one.what == what) else {
@@ -141,6 +144,8 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
         };
         sum.count = sum.count.zip(harm.count).map(|(one, other)| one + other);
         sum.own_count += harm.own_count;
+        // Of several runs together there is none: their own differ.
+        sum.interval = harm.interval.filter(|_| runs.len() == 1);
         if let Some(OccasionCount { what, count }) = &harm.occasions {
             let known = sum.occasions.get_or_insert_with(|| OccasionCount {
                 what: what.clone(),
@@ -225,6 +230,7 @@ mod tests {
                 what: "motion loops sent".to_owned(),
                 count: sent_count,
             }),
+            interval: None,
         }];
         ComparedRun {
             folder: PathBuf::from("run"),
@@ -247,7 +253,7 @@ mod tests {
         let chance = compared(&clean, &[run(Some(1), 60)]);
         assert_eq!(chance, Hurt::NotResolvable { because });
         let more = of(&clean, &[run(Some(9), 60)])[0].difference.unwrap();
-        let Interval { low, high } = more.interval;
+        let Interval { low, high, .. } = more.interval;
         assert!(more.is_share && (more.value - 0.15).abs() < 1e-12);
         assert!(
             (0.05..0.08).contains(&low) && (0.25..0.27).contains(&high),
@@ -277,6 +283,7 @@ mod tests {
                 count: Some(stops),
                 own_count: 0,
                 occasions: None,
+                interval: None,
             });
             [run]
         };

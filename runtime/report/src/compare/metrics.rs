@@ -4,26 +4,25 @@
 use std::collections::BTreeMap;
 
 use hil_account::{ChannelAccount, FateCounts, MessageFate};
-use hil_stats::comparison::{
-    Estimate, Share, binned_quantile_interval, difference, mean_interval, ratio, welch,
-};
-use hil_stats::histogram::{Distribution, DurationBin, LatencySummary};
-use hil_stats::statistics::{CONFIDENCE, Interval, IntervalNs};
+use hil_core::interval::{Interval, Spread};
+use hil_stats::comparison::{Estimate, Share, difference, mean_interval, ratio, welch};
+use hil_stats::histogram::{Distribution, LatencySummary};
+use hil_stats::statistics::CONFIDENCE;
 
 use super::{ChartKind, ComparedMetric, ComparedRun, Part, Verdict};
 use crate::summary::ScoreMetric;
 
-const BOOTSTRAP: &str = "block bootstrap of each run, ratio by MOVER of the logarithms";
-const ORDER: &str = "order statistics of each run's histogram, which take messages as independent, ratio \
-                     by MOVER of the logarithms";
+const RANKS: &str = "ranks of the effective sample of each run, ratio by MOVER of the logarithms";
 const REPETITIONS: &str = "Welch's interval over the repetitions";
 const MIXED: &str = "one run's own interval and Student's over the repetitions of the other side, by \
                      MOVER";
 const NO_SPREAD: &str = "no interval: no repetition differs from another, or delays reach zero";
 const PARTIAL: &str = "not every repetition has it";
-const NO_INTERVAL: &str = "no interval: too few messages, or delays that reach zero";
+const NO_INTERVAL: &str =
+    "no interval: the sample of a run is too small, or of segments; repeat the runs";
 const NO_MAXIMUM: &str = "no interval: one run's maximum has none; repeat the runs";
-const NEWCOMBE: &str = "Newcombe's interval (method 10), which takes messages as independent";
+const EFFECTIVE: &str = "MOVER of each run's interval on its effective sample; of runs without losses \
+                         Wilson's, for independent ones";
 const OWN: &str = "MOVER of the scores' own intervals";
 const NO_OWN: &str = "no interval: the score has none of its own; repeat the runs";
 const ABSENT: &str = "unavailable on one side";
@@ -37,11 +36,10 @@ struct DelayKey {
     metric: usize,
 }
 
-/// A delay of one run, nanoseconds, and how its interval came about.
+/// A delay of one run, nanoseconds.
 #[derive(Debug, Clone, Copy)]
 struct RunDelay {
     estimate: Estimate,
-    method: &'static str,
 }
 
 const METRICS: [&str; 4] = ["p50", "p99", "p99.9", "max"];
@@ -121,14 +119,12 @@ fn accounts(run: &ComparedRun) -> impl Iterator<Item = (&str, &ChannelAccount)> 
     channels.filter_map(|one| Some((one.name.as_str(), one.account.as_ref()?)))
 }
 
-/// Every delay of a run, in nanoseconds, and how its interval came about.
+/// Every delay of a run, in nanoseconds.
 fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, RunDelay> {
     let mut found = BTreeMap::new();
     for (channel, account) in accounts(run) {
-        let mut add = |part, distribution: &Distribution, bins: &[DurationBin], own| {
-            let delays = distribution
-                .measured()
-                .map(|one| run_delays(one, bins, own));
+        let mut add = |part, distribution: &Distribution, own| {
+            let delays = distribution.measured().map(|one| run_delays(one, own));
             for (metric, delay) in delays.into_iter().flatten().enumerate() {
                 let channel = channel.to_owned();
                 let key = DelayKey {
@@ -141,39 +137,30 @@ fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, RunDelay> {
         };
         let whole = &account.end_to_end;
         let own = [whole.p50_interval, whole.p99_interval, None, None];
-        add(Part::EndToEnd, &whole.distribution, &whole.bins, own);
+        add(Part::EndToEnd, &whole.distribution, own);
         for segment in &account.segments {
             let (from, to) = (segment.from, segment.to);
             let part = Part::Segment { from, to };
-            add(part, &segment.distribution, &segment.bins, [None; 4]);
+            add(part, &segment.distribution, [None; 4]);
         }
     }
     found
 }
 
-/// The delays of [`METRICS`], each with its `own` interval, or that of the `bins` where it has none.
-fn run_delays(
-    figures: &LatencySummary,
-    bins: &[DurationBin],
-    own: [Option<IntervalNs>; 4],
-) -> [RunDelay; 4] {
-    let binned = |quantile| binned_quantile_interval(bins, quantile, CONFIDENCE);
-    let delay = |value_ns: i64, own: Option<IntervalNs>, quantile: Option<f64>| RunDelay {
+/// The delays of [`METRICS`], each with its `own` interval.
+fn run_delays(figures: &LatencySummary, own: [Option<Spread>; 4]) -> [RunDelay; 4] {
+    let values = [
+        figures.p50_ns,
+        figures.p99_ns,
+        figures.p999_ns,
+        figures.max_ns,
+    ];
+    core::array::from_fn(|metric| RunDelay {
         estimate: Estimate {
-            value: value_ns as f64,
-            interval: own.or_else(|| binned(quantile?)).map(|one| Interval {
-                low: one.low_ns as f64,
-                high: one.high_ns as f64,
-            }),
+            value: values[metric] as f64,
+            interval: own[metric].and_then(Spread::known),
         },
-        method: if own.is_some() { BOOTSTRAP } else { ORDER },
-    };
-    [
-        delay(figures.p50_ns, own[0], Some(0.5)),
-        delay(figures.p99_ns, own[1], Some(0.99)),
-        delay(figures.p999_ns, own[2], Some(0.999)),
-        delay(figures.max_ns, own[3], None),
-    ]
+    })
 }
 
 fn delays(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
@@ -270,11 +257,7 @@ fn delay_interval(
             (spread.and_then(exponential), REPETITIONS)
         }
         1 => (ratio(b, n), MIXED),
-        // A histogram's bins are wider than what it was made of, so say which.
-        _ => {
-            let methods = base.iter().chain(new).map(|one| one.method);
-            (ratio(b, n), methods.max().unwrap_or(ABSENT))
-        }
+        _ => (ratio(b, n), RANKS),
     };
     match (found, repeated_count) {
         (Some(_), _) => (found, method),
@@ -292,7 +275,7 @@ fn logarithms(side: &[RunDelay]) -> Vec<f64> {
 fn exponential(one: Interval) -> Option<Interval> {
     let (low, high) = (one.low.exp(), one.high.exp());
     let is_known = one.low.is_finite() && high.is_finite();
-    is_known.then_some(Interval { low, high })
+    is_known.then_some(Interval { low, high, ..one })
 }
 
 /// One run's figure as it is; of several the geometric mean, with Student's interval of the logarithms.
@@ -320,23 +303,52 @@ fn verdict(interval: Option<Interval>, none: f64, [below, above]: [Verdict; 2]) 
     }
 }
 
-/// Lost among those whose fate is known and final.
-fn share(fates: &FateCounts) -> Share {
-    let open =
-        fates.of(MessageFate::InFlight) + fates.of(MessageFate::UnknownPeerRecordsUnavailable);
-    Share {
-        count: fates.lost_count(),
-        of: fates.total().saturating_sub(open),
+/// The share lost in a run.
+#[derive(Debug, Clone, Copy)]
+struct RunLoss {
+    /// Lost among those whose fate is known and final.
+    share: Share,
+    /// On the effective sample. Without a loss nothing is known of how they would come together: then Wilson's.
+    interval: Option<Interval>,
+}
+
+impl RunLoss {
+    /// `None` of no messages.
+    fn of(run: &ComparedRun, channel: &str, fates: &FateCounts) -> Option<Self> {
+        let open =
+            fates.of(MessageFate::InFlight) + fates.of(MessageFate::UnknownPeerRecordsUnavailable);
+        let share = Share {
+            count: fates.lost_count(),
+            of: fates.total().saturating_sub(open),
+        };
+        let independent = share.estimate(CONFIDENCE)?;
+        let networks = run.summary.network.iter().flat_map(|one| &one.channels);
+        let of_network = networks
+            .filter(|one| one.channel == channel)
+            .find_map(|one| one.figures.loss.measured());
+        // Of the same messages: the harness may lose some too.
+        let same = of_network.filter(|loss| loss.lost_count == share.count);
+        Some(Self {
+            share,
+            interval: if share.count == 0 {
+                independent.interval
+            } else {
+                same.and_then(|loss| loss.interval.known())
+            },
+        })
+    }
+
+    fn value(self) -> f64 {
+        self.share.count as f64 / self.share.of as f64
     }
 }
 
 fn losses(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
     let collect = |runs: &[ComparedRun]| {
-        let mut all: BTreeMap<String, Vec<Share>> = BTreeMap::new();
+        let mut all: BTreeMap<String, Vec<RunLoss>> = BTreeMap::new();
         for run in runs {
             for (channel, account) in accounts(run) {
-                let one = share(&account.fates);
-                if one.of > 0 {
+                if let Some(one) = RunLoss::of(run, channel, &account.fates) {
                     all.entry(channel.to_owned()).or_default().push(one);
                 }
             }
@@ -354,51 +366,43 @@ fn losses(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
         .collect()
 }
 
-fn pooled(shares: &[Share]) -> Share {
-    Share {
-        count: shares.iter().map(|one| one.count).sum(),
-        of: shares.iter().map(|one| one.of).sum(),
-    }
-}
-
-/// One run's share with Wilson's interval; of several their mean with Student's, and then true. Where no
-/// run differs from another it is Wilson's of all messages together.
-fn mean_share(side: &[Share]) -> (Option<Estimate>, bool) {
+/// One run's share as it is; of several their mean with Student's interval. Runs without any loss are one.
+fn mean_share(side: &[RunLoss]) -> Option<Estimate> {
     let values = values_of(side);
-    match mean_interval(&values, CONFIDENCE) {
-        None => (pooled(side).estimate(CONFIDENCE), false),
-        Some(found) => {
-            let estimate = Estimate {
-                value: values.iter().sum::<f64>() / values.len() as f64,
-                // A share has no less than none and no more than all.
-                interval: Some(Interval {
-                    low: found.low.max(0.0),
-                    high: found.high.min(1.0),
-                }),
-            };
-            (Some(estimate), true)
-        }
-    }
+    let (first, count) = (side.first()?, side.iter().map(|one| one.share.count).sum());
+    let of = side.iter().map(|one| one.share.of).sum();
+    let interval = match (side.len(), count) {
+        (1, _) => first.interval,
+        (_, 0) => Share { count, of }.estimate(CONFIDENCE)?.interval,
+        // A share has no less than none and no more than all.
+        _ => mean_interval(&values, CONFIDENCE).map(|found| found.map(|end| end.clamp(0.0, 1.0))),
+    };
+    Some(Estimate {
+        value: values.iter().sum::<f64>() / values.len() as f64,
+        interval,
+    })
 }
 
-fn values_of(side: &[Share]) -> Vec<f64> {
-    let shares = side.iter();
-    shares.map(|one| one.count as f64 / one.of as f64).collect()
+fn values_of(side: &[RunLoss]) -> Vec<f64> {
+    side.iter().map(|one| one.value()).collect()
 }
 
-fn loss_figure(channel: &str, base: &[Share], new: &[Share], of: Counts) -> ComparedMetric {
-    let ((be, is_base_spread), (ne, is_new_spread)) = (mean_share(base), mean_share(new));
-    let be = of_all(be, base.len(), of[0]);
-    let ne = of_all(ne, new.len(), of[1]);
+fn loss_figure(channel: &str, base: &[RunLoss], new: &[RunLoss], of: Counts) -> ComparedMetric {
+    let have = [base.len(), new.len()];
+    let be = of_all(mean_share(base), have[0], of[0]);
+    let ne = of_all(mean_share(new), have[1], of[1]);
     let both = be.zip(ne);
     let repeated = welch(&values_of(base), &values_of(new), CONFIDENCE);
-    let (interval, method) = match (both, repeated) {
-        (None, _) => (None, ABSENT),
-        (Some(_), _) if is_partial([base.len(), new.len()], of) => (None, PARTIAL),
-        (Some(_), Some(interval)) => (Some(interval), REPETITIONS),
-        (Some((b, n)), None) if is_base_spread || is_new_spread => (difference(b, n), MIXED),
-        // Of Wilson's intervals on both sides: that is Newcombe's.
-        (Some((b, n)), None) => (difference(b, n), NEWCOMBE),
+    let own = both.and_then(|(b, n)| difference(b, n));
+    let is_lossless = base.iter().chain(new).all(|one| one.share.count == 0);
+    let (interval, method) = match (both, repeated, own) {
+        (None, ..) => (None, ABSENT),
+        (Some(_), ..) if is_partial(have, of) => (None, PARTIAL),
+        (_, Some(found), _) => (Some(found), REPETITIONS),
+        (_, None, Some(found)) if have == [1, 1] || is_lossless => (Some(found), EFFECTIVE),
+        (_, None, Some(found)) => (Some(found), MIXED),
+        (_, None, None) if have.iter().all(|count| *count > 1) => (None, NO_SPREAD),
+        (_, None, None) => (None, NO_INTERVAL),
     };
     ComparedMetric {
         channel: Some(channel.to_owned()),
@@ -460,7 +464,7 @@ fn scores_of(metric: &ScoreMetric, runs: &[ComparedRun]) -> Vec<Estimate> {
         let one = all.find(|one| one.name == metric.name)?;
         Some(Estimate {
             value: one.value?,
-            interval: one.interval.map(|(low, high)| Interval { low, high }),
+            interval: one.interval.and_then(Spread::known),
         })
     });
     found.collect()

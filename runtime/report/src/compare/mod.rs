@@ -14,8 +14,8 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 
 use hil_account::Stage;
+use hil_core::interval::Interval;
 use hil_stats::comparison::Estimate;
-use hil_stats::statistics::Interval;
 use serde::Serialize;
 
 use crate::answer::Hurt;

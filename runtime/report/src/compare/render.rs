@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use hil_core::interval::Interval;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_present::template::{TemplateError, markdown as document};
@@ -10,7 +11,6 @@ use hil_present::terminal::section;
 use hil_present::units::{duration, figure, percent};
 use hil_present::{Block, Section, Table, Tone, UNAVAILABLE};
 use hil_stats::comparison::Estimate;
-use hil_stats::statistics::Interval;
 
 use super::conditions::Verdicts;
 use super::harms::{HarmDifference, QUESTION};
@@ -158,7 +158,7 @@ fn harms(comparison: &Comparison) -> Section {
 }
 
 fn difference_words(of: &HarmDifference) -> String {
-    let Interval { low, high } = of.interval;
+    let Interval { low, high, .. } = of.interval;
     let [value, low, high] = [of.value, low, high].map(|value| more_words(of, value));
     format!("{value} [{low}, {high}]")
 }
@@ -229,17 +229,17 @@ fn cells(one: &ComparedMetric) -> [String; 6] {
         ChartKind::Delay => (
             one.ratio.map(|ratio| format!("{ratio:.3}x")),
             one.ratio_interval
-                .map(|Interval { low, high }| format!("{low:.3}x to {high:.3}x")),
+                .map(|Interval { low, high, .. }| format!("{low:.3}x to {high:.3}x")),
         ),
         ChartKind::Loss => (
             one.difference.map(points),
             one.difference_interval
-                .map(|Interval { low, high }| format!("{} to {}", points(low), points(high))),
+                .map(|Interval { low, high, .. }| format!("{} to {}", points(low), points(high))),
         ),
         ChartKind::Score => (
             one.difference.map(signed),
             one.difference_interval
-                .map(|Interval { low, high }| format!("{} to {}", signed(low), signed(high))),
+                .map(|Interval { low, high, .. }| format!("{} to {}", signed(low), signed(high))),
         ),
     };
     let or_none = |text: Option<String>| text.unwrap_or_else(|| UNAVAILABLE.to_owned());

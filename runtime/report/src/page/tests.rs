@@ -82,8 +82,7 @@ fn a_full_page_is_well_formed_and_has_the_figures_of_the_summary() {
         "spin: core 1 is not isolated",
         "hil-runtime --topology deploy/topologies/split.toml --seed 42",
         "clocks not aligned",
-        "block bootstrap",
-        "Wilson",
+        "effective sample",
     ] {
         assert!(text.contains(words), "{words}");
     }

@@ -11,14 +11,12 @@ use hil_account::{
     BurstCount, ChannelAccount, Closing, ClosingMetrics, Coverage, Gap, LongestOutage, MessageFate,
     OutageClass, OutageMetrics, SegmentMetrics,
 };
+use hil_core::interval::Spread;
 use hil_stats::histogram::Distribution;
-use hil_stats::statistics::{CONFIDENCE, IntervalNs, wilson};
 
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
-use hil_present::units::{
-    duration, duration_s, figure, ns_s, number, percent, seconds, unsigned_duration,
-};
+use hil_present::units::{duration, duration_s, figure, ns_s, percent, seconds, unsigned_duration};
 use hil_present::{Bar, Cell, Metric, Row, Section, Table, Tone, UNAVAILABLE};
 use hil_rundir::pipe::StallMetrics;
 
@@ -39,7 +37,6 @@ pub(crate) struct Sources<'a> {
     pub(crate) outages: Option<&'a OutageMetrics>,
 }
 
-const BOOTSTRAP: &str = "95 % by block bootstrap, as successive delays are correlated";
 const NO_ACCOUNT: &str = "no records of this channel";
 const NO_NETWORK: &str = "no figures of a network under this channel";
 
@@ -321,20 +318,24 @@ fn loss_ratio(network: Option<&NetworkMetrics>) -> Metric {
     };
     match &network.loss {
         Measured::Measured(loss) => {
-            let interval = (loss.interval.low, loss.interval.high);
-            let independent = loss.independent_interval;
-            Metric::new("loss_ratio", "lost by the network", "share", loss.ratio)
-                .within(Some(interval))
-                .by(&format!(
-                    "{} of {}; 95 %, Wilson on {} independent messages' worth of them, as losses come in \
-                     bursts; as if independent {} to {}",
-                    grouped(loss.lost_count),
-                    grouped(loss.of_count),
-                    number(loss.effective_count.max(0.0).round()),
-                    percent(independent.low),
-                    percent(independent.high)))
+            let metric = Metric::new("loss_ratio", "lost by the network", "share", loss.ratio);
+            with_spread(metric, Some(loss.interval)).by(&format!(
+                "{} of {}; {}",
+                grouped(loss.lost_count),
+                grouped(loss.of_count),
+                loss.interval
+            ))
         }
         Measured::Unavailable { reason } => unavailable(reason),
+    }
+}
+
+/// With its interval, or why there is none.
+pub(super) fn with_spread(metric: Metric, spread: Option<Spread>) -> Metric {
+    match spread {
+        None => metric,
+        Some(Spread::Known(one)) => metric.within(Some((one.low, one.high))),
+        Some(Spread::Unknown(why)) => metric.without_interval(&why.to_string()),
     }
 }
 
@@ -360,13 +361,9 @@ fn order(sources: &Sources<'_>) -> Vec<Metric> {
     ] {
         let figure = Metric::maybe(name, label, "1", found.map(|found| found as f64), reason);
         let shares = found.zip(arrived).and_then(|(found, arrived)| {
-            let interval = wilson(found.min(arrived), arrived, CONFIDENCE)?;
-            let share = percent(found as f64 / arrived as f64);
-            let (low, high) = (percent(interval.low), percent(interval.high));
-            Some(format!(
-                "{standard}{share} of {} that arrived; 95 % {low} to {high}, Wilson, as if independent",
-                grouped(arrived)
-            ))
+            let share = (arrived > 0).then(|| percent(found as f64 / arrived as f64))?;
+            let of = grouped(arrived);
+            Some(format!("{standard}{share} of {of} that arrived"))
         });
         figures.push(figure.by(&shares.unwrap_or_default()));
     }
@@ -404,13 +401,14 @@ const ONE_WAY: DelayKind = DelayKind {
 };
 
 impl DelayKind {
-    fn figure(self, name: &str, label: &str, ns: i64, interval: Option<IntervalNs>) -> Metric {
+    fn figure(self, name: &str, label: &str, ns: i64, interval: Option<Spread>) -> Metric {
         let (name, label) = self.names(name, label);
-        let method = if interval.is_some() { BOOTSTRAP } else { "" };
-        let interval = interval.map(|one| (ns_s(one.low_ns), ns_s(one.high_ns)));
-        Metric::new(&name, &label, "s", ns_s(ns))
-            .within(interval)
-            .by(method)
+        let method = interval
+            .and_then(Spread::known)
+            .map(|one| one.method.name());
+        let interval = interval.map(|spread| spread.map(|ns| ns * 1e-9));
+        with_spread(Metric::new(&name, &label, "s", ns_s(ns)), interval)
+            .by(method.unwrap_or_default())
     }
 
     fn names(self, name: &str, label: &str) -> (String, String) {
@@ -892,14 +890,12 @@ fn emulation(section: &mut Section, emulation: &EmulationMetrics) {
 }
 
 fn closing_words(figures: &ClosingMetrics) -> Option<(Tone, String)> {
-    let (ratio, interval) = figures.closed_ratio()?;
+    let ratio = figures.closed_ratio()?;
     let mut text = format!(
-        "closes for {} of {} messages: {} [{}, {}]",
+        "closes for {} of {} messages: {}",
         grouped(figures.closed_count),
         grouped(figures.checked_count),
         percent(ratio),
-        percent(interval.low),
-        percent(interval.high),
     );
     if let Some(residual) = figures.residual.measured() {
         let words = format!(

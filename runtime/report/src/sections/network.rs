@@ -6,8 +6,11 @@ use core::fmt::Write;
 
 use hil_account::network::{DelayMetrics, NetworkMetrics};
 use hil_platform::text::grouped;
+use hil_platform::words::counted;
 use hil_present::units::{duration_s, percent};
 use hil_present::{Cell, Section, Table, Tone};
+
+use hil_stats::correlation::SPELL_COUNT_MIN;
 
 use crate::network::{Correlation, CorrelationTests, NetworkReport, TestedPair};
 use crate::score_event::ScoreEvents;
@@ -80,7 +83,10 @@ pub(super) fn preceding(report: &NetworkReport, events: &ScoreEvents) -> Section
         Correlation::Unavailable { reason } => {
             section.note(Tone::Plain, format!("No test of correlation: {reason}."));
         }
-        Correlation::Tested(tests) => correlations(&mut section, tests),
+        Correlation::Tested(tests) => {
+            let noted = report.events.len() as u64 + report.events_dropped_count;
+            correlations(&mut section, tests, noted);
+        }
     }
     section
 }
@@ -114,15 +120,24 @@ fn preceding_words(report: &NetworkReport, events: &ScoreEvents) -> String {
     )
 }
 
-fn correlations(section: &mut Section, tests: &CorrelationTests) {
+/// Events of note on the network below which a test that finds nothing says nothing.
+const EVENTS_TESTED_MIN: u64 = 10;
+
+fn correlations(section: &mut Section, tests: &CorrelationTests, noted: u64) {
     let found = tests.significant();
     for pair in found.iter().take(PAIRS_SHOWN_COUNT) {
-        let words = pair.words(tests.pairs.len(), tests.shuffle_count);
+        let words = pair.words(tests.pairs.len(), tests.shift_count);
         section.note(Tone::Caution, words);
     }
     let others = tests.pairs.len() - found.len();
     let mut text = if tests.pairs.is_empty() {
-        "No pair of series to test: of each, one or both are the same all the time.".to_owned()
+        "No pair of series to test: of each, one or both are the same all the time or nearly so."
+            .to_owned()
+    } else if found.is_empty() && (1..EVENTS_TESTED_MIN).contains(&noted) {
+        let events = counted(noted, "event");
+        format!(
+            "{events} of note on the network: too few to test whether the robot's series follow them."
+        )
     } else if found.is_empty() {
         let pairs = tests.pairs.iter();
         let best = pairs.min_by(|a, b| {
@@ -130,10 +145,11 @@ fn correlations(section: &mut Section, tests: &CorrelationTests) {
                 |pair: &TestedPair| (pair.correlation.p_family, -pair.correlation.coefficient);
             key(a).partial_cmp(&key(b)).unwrap_or(Ordering::Equal)
         });
-        let best = best.map(|best| best.words(tests.pairs.len(), tests.shuffle_count));
+        let best = best.map(|best| best.words(tests.pairs.len(), tests.shift_count));
         let best = best.unwrap_or_default();
         format!(
-            "None of {others} pairs of series correlates beyond chance. The nearest to it: {best}."
+            "Over the whole run none of {others} pairs of series correlates beyond chance, which says nothing of \
+             single events. The nearest to it: {best}."
         )
     } else {
         match found.len().saturating_sub(PAIRS_SHOWN_COUNT) {
@@ -151,14 +167,25 @@ fn correlations(section: &mut Section, tests: &CorrelationTests) {
             first.join(", ")
         );
     }
+    if !tests.seldom.is_empty() {
+        let named = tests.seldom.iter().take(3).map(|one| {
+            let times = counted(one.spell_count, "spell");
+            format!("{times} of {}", one.series)
+        });
+        let named = named.collect::<Vec<_>>().join(", ");
+        let more = if tests.seldom.len() > 3 { ", …" } else { "" };
+        let _infallible = write!(
+            text,
+            " Too few to test: {named}{more} ({SPELL_COUNT_MIN} needed)."
+        );
+    }
     let _infallible = write!(
         text,
-        " Bins of {}, lags from -{} to {}; {} block shuffles, seed {}.",
+        " Bins of {}, lags from -{} to {}; {} shifts.",
         duration_s(tests.bin_s),
         duration_s(tests.lead_max_s),
         duration_s(tests.lag_max_s),
-        grouped(tests.shuffle_count),
-        tests.seed
+        grouped(tests.shift_count)
     );
     section.note(Tone::Faint, text);
 }

@@ -3,6 +3,7 @@
 
 use crate::network::NetworkReport;
 use crate::summary::ScoreMetric;
+use hil_core::interval::Spread;
 use hil_present::units::{JOINT, duration_s, figure, ns_s};
 use hil_present::{Table, UNAVAILABLE};
 
@@ -29,10 +30,17 @@ fn value(metric: Option<&ScoreMetric>, scale: f64) -> String {
 }
 
 fn interval(metric: &ScoreMetric, scale: f64) -> String {
-    metric.interval.map_or_else(
-        || UNAVAILABLE.to_owned(),
-        |(low, high)| format!("{} to {}", figure(low * scale), figure(high * scale)),
-    )
+    match metric.interval {
+        None => UNAVAILABLE.to_owned(),
+        Some(Spread::Known(one)) => {
+            format!(
+                "{} to {}",
+                figure(one.low * scale),
+                figure(one.high * scale)
+            )
+        }
+        Some(Spread::Unknown(why)) => why.to_string(),
+    }
 }
 
 /// Least to most of the channels' values.
@@ -133,13 +141,15 @@ fn capitalised(words: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hil_core::interval::{Interval, IntervalMethod};
 
     fn metric(name: &str, value: Option<f64>, interval: Option<(f64, f64)>) -> ScoreMetric {
         ScoreMetric {
             name: name.to_owned(),
             label: name.to_owned(),
             value,
-            interval,
+            interval: interval
+                .map(|(low, high)| Spread::Known(Interval::new(low, high, IntervalMethod::Exact))),
             unit: "1".to_owned(),
             method: "interval of Clopper and Pearson".to_owned(),
         }

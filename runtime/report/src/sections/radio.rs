@@ -104,10 +104,8 @@ fn acknowledgement_words(figures: &RadioMetrics) -> String {
 
 fn share_words(share: &Share) -> String {
     format!(
-        "{} (95 % {} to {}, {} of {})",
+        "{} ({} of {})",
         percent(share.ratio),
-        percent(share.low),
-        percent(share.high),
         grouped(share.success_count),
         grouped(share.trial_count)
     )

@@ -1,5 +1,6 @@
 //! The parts of a report that are not about one channel: how the run ended, score, links, processes, host.
 
+use super::channel::with_spread;
 use hil_present::units::{duration_s, percent, seconds};
 use hil_present::{Block, Cell, Event, EventList, Metric, Row, Section, Table, Tone, UNAVAILABLE};
 
@@ -28,9 +29,9 @@ const METHOD: [&str; 3] = [
      closes when every stage is recorded, in order, and the segments add up to published → taken \
      within 1 µs; on one clock the wire is the difference of raw kernel stamps.",
     "Quantiles are from histograms with three digits, of messages that were taken; of the network, of \
-     messages that arrived. Intervals are 95 %: Wilson for shares, Clopper and Pearson where a score \
-     says so, block bootstrap for quantiles, because successive delays are correlated. The error of \
-     the clocks' alignment is in no interval; it stands beside the metrics as a bound.",
+     messages that arrived. Intervals are 95 %, on the effective sample, as losses come in bursts and \
+     successive delays are correlated; Clopper and Pearson where a score says so. None is given where \
+     that sample is too small: docs/intervals.md. The error of the clocks' alignment is in no interval; it stands beside the metrics as a bound.",
     "The network begins where the sending gateway hands a message to the kernel and ends where the \
      receiving gateway's receive call returned. What a host lost is not among its losses. That an \
      event stands beside an outage or follows a series is a matter of time, not of cause.",
@@ -199,7 +200,7 @@ pub(super) fn score(summary: &RunSummary) -> Section {
         let is_ratio = one.unit == "1" && one.name.ends_with("_ratio");
         let unit = if is_ratio { "share" } else { &one.unit };
         let metric = Metric::maybe(&one.name, &one.label, unit, one.value, &one.method);
-        section.metric(metric.within(one.interval).by(&one.method));
+        section.metric(with_spread(metric, one.interval).by(&one.method));
     }
     section
 }

@@ -2,6 +2,7 @@
 //! computed elsewhere.
 
 use core::fmt::Write as _;
+use hil_core::interval::Spread;
 
 use hil_stats::histogram::Distribution;
 use hil_trace::fit::{Fit, Ranking, TraceFit};
@@ -50,13 +51,15 @@ pub(crate) fn render_trace(
     field("longest outage", &outage_words(figures));
     field("delay", &delay_words(figures));
     for quantile in &figures.quantiles {
-        let interval = quantile.interval.map_or_else(String::new, |interval| {
-            format!(
-                "  [{}, {}]",
-                duration(interval.low_ns),
-                duration(interval.high_ns)
-            )
-        });
+        #[expect(clippy::cast_possible_truncation, reason = "two of the delays")]
+        let interval = match quantile.interval {
+            None => String::new(),
+            Some(Spread::Known(one)) => {
+                let [low, high] = [one.low, one.high].map(|ns| duration(ns as i64));
+                format!("  [{low}, {high}]")
+            }
+            Some(Spread::Unknown(why)) => format!("  [{why}]"),
+        };
         let name = format!("p{}", quantile.quantile * 100.0);
         field(&name, &format!("{}{interval}", duration(quantile.value_ns)));
     }
@@ -77,11 +80,8 @@ pub(crate) fn render_trace(
     );
     section.note(
         Tone::Faint,
-        format!(
-            "Loss ratio with Wilson's 95 % interval over messages of known fate; quantiles with 95 % \
-             intervals by resampling blocks, seed {}; memory is the autocorrelation over messages.",
-            figures.seed
-        ),
+        "Intervals are 95 %, on the effective number of messages of known fate; memory is the autocorrelation \
+         over messages.",
     );
     render(&[section], width_columns, style)
 }
@@ -134,13 +134,15 @@ fn loss_words(figures: &TraceMetrics) -> String {
     let Some((ratio, interval)) = figures.loss_ratio.zip(figures.loss_ratio_interval) else {
         return "unavailable: no message has a known fate".to_owned();
     };
+    let interval = match interval {
+        Spread::Known(one) => format!("{}, {}", percent(one.low), percent(one.high)),
+        Spread::Unknown(why) => why.to_string(),
+    };
     let mut text = format!(
-        "{} of {}, {} [{}, {}]: {} in the network, {} before the link, {} after it",
+        "{} of {}, {} [{interval}]: {} in the network, {} before the link, {} after it",
         grouped(counts.lost_count()),
         grouped(counts.message_count - counts.unknown_count),
         percent(ratio),
-        percent(interval.low),
-        percent(interval.high),
         grouped(counts.lost_in_network_count),
         grouped(counts.lost_before_link_count),
         grouped(counts.lost_after_link_count)
@@ -408,7 +410,7 @@ mod tests {
     #[test]
     fn a_page_says_what_was_measured_and_never_grows_too_wide() {
         let trace = sample();
-        let figures = TraceMetrics::of(&trace, 1);
+        let figures = TraceMetrics::of(&trace);
         let fit = TraceFit::of(&trace, 1);
         let pages = [
             render_trace(&trace, &figures, 90, Style::Plain),

@@ -7,6 +7,7 @@ use crate::answer::{Answer, Clocks, HarmCount, Hurt, OccasionCount, Unresolved, 
 use crate::assessment::Assessment;
 use crate::summary::{ChannelFlows, LinkKind, Outcome, RunSummary};
 use crate::terminal::{Style, brief};
+use hil_core::interval::{Interval, IntervalMethod, Spread};
 use hil_present::Tone;
 use hil_present::units::JOINT;
 use hil_rundir::event::ProcessKind;
@@ -21,6 +22,11 @@ fn lost_loops(count: Option<u64>, own_count: u64, sent_count: u64) -> HarmCount 
             what: "motion loops sent".to_owned(),
             count: sent_count,
         }),
+        interval: Some(Spread::Known(Interval::new(
+            0.01,
+            0.15,
+            IntervalMethod::EffectiveShare,
+        ))),
     }
 }
 
@@ -43,7 +49,7 @@ fn a_hurt_robot_is_put_down_to_a_network_that_misbehaved_before() {
     assert_eq!(found.hurt, Hurt::Yes);
     assert_eq!(found.sentence(), "YES, the network hurt the robot");
     assert_eq!(found.tone(), Tone::Bad);
-    let words = "2 of 40 motion loops sent: 5.00 % [0.61 %, 16.92 %]";
+    let words = "2 of 40 motion loops sent: 5.00 % [1.00 %, 15.00 %]";
     assert_eq!(summary.harms[0].words().replace(JOINT, " "), words);
     // Nothing happened on the network, or to a message, before it.
     let mut alone = summary.clone();

@@ -2,6 +2,7 @@
 //! them after a deliberate change: `HIL_BLESS=1 cargo test -p hil-report`, then read the
 //! difference.
 
+use hil_core::interval::{Interval, IntervalMethod, Spread};
 use std::collections::BTreeMap;
 
 use hil_account::flow::FlowMetrics;
@@ -81,7 +82,10 @@ fn metric(label: &str, value: Option<f64>, unit: &str, method: &str) -> ScoreMet
         name: label.replace(' ', "_"),
         label: label.to_owned(),
         value,
-        interval: value.map(|value| (0.9 * value, 1.1 * value)),
+        interval: value.map(|value| {
+            let method = IntervalMethod::EffectiveMean;
+            Spread::Known(Interval::new(0.9 * value, 1.1 * value, method))
+        }),
         unit: unit.to_owned(),
         method: method.to_owned(),
     }

@@ -10,7 +10,7 @@ use hil_core::random::RandomStream;
 use hil_core::time::{Alignment, Instant};
 
 use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
-use crate::network::{Correlation, NetworkQuantity, NetworkReport};
+use crate::network::{Correlation, NetworkReport};
 use crate::score_event::ScoreEvents;
 
 const MS: i64 = 1_000_000;
@@ -109,32 +109,30 @@ pub(crate) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
                 payload_bytes: Some(96),
                 duplicated_count: Some(2),
                 round_trips_ns: &[4_100_000, 4_900_000],
-                seed: 42,
             },
         });
     }
     let axis = AxisClocks {
         bound_s: (!events.clocks_differ).then_some(0.0),
     };
-    let (report, series) = builder.finish(events, vec![error()], 42, axis).unwrap();
+    let (report, series) = builder.finish(events, vec![error()], axis).unwrap();
     assert_eq!(series.len(), 2);
     report
 }
 
 #[test]
-fn the_robots_error_is_found_to_follow_the_silence_by_what_was_put_in() {
+fn two_outages_are_too_few_to_test_and_a_process_is_down_once() {
     let report = network(["arm/command", "arm/status"], &mut ScoreEvents::default());
     let Correlation::Tested(tests) = &report.correlation else {
         panic!("{:?}", report.correlation);
     };
-    let pair = tests.pairs.iter().find(|pair| {
-        pair.channel == "arm/command"
-            && pair.network == NetworkQuantity::Loss
-            && pair.robot.contains("joint")
-    });
-    let pair = pair.unwrap();
-    assert!((0.25..=0.75).contains(&pair.lag_s), "{pair:?}");
-    assert!(pair.correlation.p_value <= 0.05, "{pair:?}");
+    assert!(
+        tests.pairs.iter().all(|pair| !pair.robot.contains("joint")),
+        "{tests:?}"
+    );
+    let seldom = tests.seldom.iter();
+    let error = seldom.filter(|one| one.series.contains("joint"));
+    assert_eq!(error.map(|one| one.spell_count).collect::<Vec<_>>(), [2]);
     // A process is down once, however many channels it carries.
     let is_down = |kind: &NetworkEventKind| matches!(kind, NetworkEventKind::ProcessDown { .. });
     let down_count = report

@@ -22,9 +22,6 @@ use hil_platform::progress::Progress;
 use hil_rundir::series;
 use hil_topology::trace_source::TraceFileError;
 
-/// Seed of the intervals where the user gives none.
-const SEED: u64 = 1;
-
 /// Does what the command line says, on a page of `columns`.
 pub fn work(command: TraceCommand, columns: usize, console: &mut Console) -> CommandEnd {
     match command {
@@ -237,7 +234,7 @@ impl<'a> ProgressReporter<'a> {
 
     fn figures_of(&mut self, opened: &Opened) -> TraceMetrics {
         let words = format!("computing the figures of {}", opened.path.display());
-        self.during(&words, || TraceMetrics::of(&opened.trace, SEED))
+        self.during(&words, || TraceMetrics::of(&opened.trace))
     }
 }
 

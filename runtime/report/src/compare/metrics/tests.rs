@@ -4,19 +4,20 @@ use super::*;
 use crate::answer::Hurt;
 use crate::compare::Comparison;
 use crate::compare::conditions::{Condition, Verdicts};
+use hil_core::interval::IntervalMethod;
 
 fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedMetric {
     let side = |all: &[f64]| -> Vec<RunDelay> {
         let estimate = |ms: &f64| Estimate {
             value: ms * 1e6,
-            interval: Some(Interval {
-                low: ms * 0.99e6,
-                high: ms * 1.01e6,
-            }),
+            interval: Some(Interval::new(
+                ms * 0.99e6,
+                ms * 1.01e6,
+                IntervalMethod::EffectiveRanks,
+            )),
         };
         let delay = |ms: &f64| RunDelay {
             estimate: estimate(ms),
-            method: BOOTSTRAP,
         };
         all.iter().map(delay).collect()
     };
@@ -29,12 +30,16 @@ fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedMetric {
 }
 
 fn loss(base: &[u64], new: &[u64], of: Counts) -> ComparedMetric {
-    let side = |all: &[u64]| -> Vec<Share> {
+    let side = |all: &[u64]| -> Vec<RunLoss> {
         let share = |count: &u64| Share {
             count: *count,
             of: 1000,
         };
-        all.iter().map(share).collect()
+        let run = |count: &u64| RunLoss {
+            share: share(count),
+            interval: share(count).estimate(CONFIDENCE).unwrap().interval,
+        };
+        all.iter().map(run).collect()
     };
     loss_figure("a/b", &side(base), &side(new), of)
 }
@@ -76,9 +81,9 @@ fn conditions_on_the_new_runs_are_judged_by_how_repetitions_differ() {
     let lost = loss(&[1, 2, 3], &[10, 12, 14], [3, 3]);
     assert_eq!(judged("loss > 0.5%", &lost), Ok(true));
     assert_eq!(judged("loss > 0.8%", &lost), Ok(false));
-    // Where no run differs from another, all messages together.
+    // Where none was lost, all messages together.
     let none = loss(&[0, 0], &[0, 0], [2, 2]);
-    assert_eq!(none.method, NEWCOMBE);
+    assert_eq!(none.method, EFFECTIVE);
     assert_eq!(judged("loss > 0.5%", &none), Ok(false));
     let alike = p99(&[3.0, 3.0], &[6.0, 6.0], [2, 2]);
     let why = judged("p99 > 5ms", &alike).unwrap_err();
@@ -122,6 +127,7 @@ fn one_run_against_repetitions_has_an_interval_of_both_kinds() {
     );
     let lost = loss(&[1], &[10, 12, 14], [1, 3]);
     assert_eq!(lost.method, MIXED);
-    assert_eq!(loss(&[1], &[10], [1, 1]).method, NEWCOMBE);
-    assert_eq!(p99(&[3.0], &[6.0], [1, 1]).method, BOOTSTRAP);
+    assert_eq!(loss(&[1], &[10], [1, 1]).method, EFFECTIVE);
+    assert_eq!(loss(&[5, 5], &[10, 10], [2, 2]).method, NO_SPREAD);
+    assert_eq!(p99(&[3.0], &[6.0], [1, 1]).method, RANKS);
 }
