@@ -219,11 +219,7 @@ impl Reassembler {
     /// # Errors
     /// [`Refusal::Oversize`], [`Refusal::FragmentInconsistent`], [`Refusal::LengthMismatch`] or
     /// [`Refusal::DuplicateFragment`]; the slots are then as they were.
-    pub(crate) fn place(
-        &mut self,
-        now: Instant,
-        fragment: &Fragment<'_>,
-    ) -> Result<Place, Refusal> {
+    pub fn place(&mut self, now: Instant, fragment: &Fragment<'_>) -> Result<Place, Refusal> {
         if fragment.total_len as usize > self.size_max_bytes {
             return Err(Refusal::Oversize);
         }

@@ -449,9 +449,9 @@ mod tests {
         let mut random = RandomStream::new(7, "constant");
         let moving = series(400, 0.5, &mut random);
         let mut seldom = vec![0.0; 400];
-        [60, 61, 200, 320]
-            .into_iter()
-            .for_each(|bin| seldom[bin] = 1.0);
+        for bin in [60, 61, 200, 320] {
+            seldom[bin] = 1.0;
+        }
         let causes = [vec![0.1; 400], moving.clone(), seldom];
         let mut broken = series(400, 0.5, &mut random);
         broken[17] = f64::NAN;

@@ -10,6 +10,7 @@
 //! ```sh
 //! cargo test --release -p hil-stats --test coverage -- --ignored --nocapture
 //! ```
+#![allow(clippy::print_stdout, reason = "a study prints its tables")]
 
 use core::f64::consts::TAU;
 
