@@ -5,7 +5,7 @@ use core::time::Duration;
 use std::collections::BTreeMap;
 
 use crate::case::{FLEET_TRUTH, Fleet};
-use crate::events::{collision, told};
+use crate::events::{Robots, collision};
 use crate::messages::Truth;
 use crate::referee::live::LiveReferee;
 use crate::standing::Watch;
@@ -15,6 +15,8 @@ use hil_core::time::Instant;
 /// The events of the fleets of a run.
 #[derive(Debug)]
 pub(crate) struct FleetEvents {
+    /// What was sent to them is not known here.
+    robots: Robots,
     referee: LiveReferee,
     fleets: BTreeMap<u32, Standing>,
     stuck_after: Duration,
@@ -37,6 +39,7 @@ impl FleetEvents {
         let mut referee = LiveReferee::default();
         referee.begin(case.scene(), parameters.fleets);
         Self {
+            robots: Robots::default(),
             referee,
             fleets: BTreeMap::new(),
             stuck_after: parameters.coordinator.stuck_after(),
@@ -72,7 +75,7 @@ impl LiveEvents for FleetEvents {
         let Ok(truth) = bytemuck::try_pod_read_unaligned::<Truth>(payload) else {
             return;
         };
-        self.found.extend(told(&truth));
+        self.found.extend(self.robots.told(&truth));
         let standing = self
             .fleets
             .entry(truth.fleet_id)
@@ -134,6 +137,27 @@ mod tests {
         let expected = collisions(&case.score(&log).events);
         assert!(expected > 0);
         assert_eq!(collisions(&found), expected);
+    }
+
+    #[test]
+    fn an_authority_that_is_refused_again_is_told_once_per_mission() {
+        let case = Fleet::new(FleetParameters::default(), 3).unwrap();
+        let mut live = case.live_events().unwrap();
+        for (at_ns, mission_id, caused_by_sequence) in
+            [(1, 1, 4), (2, 1, 4), (3, 1, 3), (4, 1, 5), (5, 2, 4)]
+        {
+            let refused = Truth {
+                at_ns,
+                mission_id,
+                caused_by_sequence,
+                kind: TruthKind::AuthorityRefused as u32,
+                ..Truth::default()
+            };
+            live.hear(FLEET_TRUTH, Instant::ZERO, bytemuck::bytes_of(&refused));
+        }
+        let found = live.take(Instant::ZERO);
+        let told: Vec<_> = found.iter().map(|event| event.at.as_ns()).collect();
+        assert_eq!(told, [1, 4, 5]);
     }
 
     #[test]
