@@ -220,11 +220,21 @@ impl RecordFollower {
                 return;
             }
         };
+        let starts = self.messages_of.map(|channels| {
+            let channels = channels.iter();
+            let starts = channels.map(|channel| RecordKind::Message.file_name_start(channel));
+            starts.collect::<Vec<_>>()
+        });
+        let is_wanted = |name: &OsString| {
+            let name = name.as_encoded_bytes();
+            let begins = |start: &String| name.starts_with(start.as_bytes());
+            let starts = starts.as_ref();
+            name.ends_with(b".rec") && starts.is_none_or(|starts| starts.iter().any(begins))
+        };
         let new: Vec<OsString> = entries
             .flatten()
             .map(|entry| entry.file_name())
-            .filter(|name| name.as_encoded_bytes().ends_with(b".rec"))
-            .filter(|name| !self.known.contains(name))
+            .filter(|name| is_wanted(name) && !self.known.contains(name))
             .collect();
         let has_new = !new.is_empty();
         for name in new {
