@@ -31,6 +31,7 @@ pub(crate) struct RobotWatch {
     is_behind: bool,
     recent: Vec<ScoreEvent>,
     count: u64,
+    problems: Vec<String>,
 }
 
 /// The gravest events of a robot, of equal ones the newest.
@@ -56,6 +57,7 @@ impl RobotWatch {
             is_behind: true,
             recent: Vec::with_capacity(SHOWN_MAX + 1),
             count: 0,
+            problems: Vec::new(),
         }
     }
 
@@ -96,6 +98,12 @@ impl RobotWatch {
                 events.hear(&batch.header.channel, at, payload);
             }
         });
+        self.problems.extend(self.follower.take_problems());
+    }
+
+    /// Record files that cannot be read, and why.
+    pub(crate) fn problems(&self) -> &[String] {
+        &self.problems
     }
 
     /// What was found; `None` while none of the messages is recorded on this host.
@@ -191,15 +199,17 @@ mod tests {
         assert!(!look.is_behind);
         watch.step(Instant::from_ns(100));
         assert_eq!(watch.look().unwrap().count, 19);
+        assert!(watch.problems().is_empty());
         std::fs::remove_dir_all(&folder).unwrap();
     }
 
     #[test]
-    fn a_long_past_is_caught_up_with_in_steps() {
+    fn a_long_past_is_caught_up_with_in_steps_and_a_foreign_file_is_a_problem() {
         let name = format!("hil-robot-watch-steps-{}", std::process::id());
         let folder = std::env::temp_dir().join(name);
         std::fs::create_dir_all(&folder).unwrap();
         write_messages(&folder, "a/b", 20);
+        std::fs::write(folder.join("a.b.message.robot.1.rec"), [7; 200]).unwrap();
         let mut watch = RobotWatch::new(&folder, Box::<Each>::default());
         let now = Instant::ZERO + 3 * STEP_SPAN;
         let mut steps = [0; 4].map(|_| {
@@ -207,6 +217,7 @@ mod tests {
             watch.look().unwrap().is_behind
         });
         assert_eq!(steps, [true, true, false, false]);
+        assert_eq!(watch.problems().len(), 1);
         // What is written faster than it is read leaves it behind.
         let record_bytes = size_of::<Envelope>() + 1;
         let header = header(RecordKind::Message, "a/b", record_bytes);

@@ -86,6 +86,13 @@ impl Gatherer {
         }
         let status = RunStatus::read(&observer.run().folder);
         let mut problems = observer.problems().to_vec();
+        // Both read the same folder.
+        let of_robot = self.robot.iter().flat_map(RobotWatch::problems);
+        for problem in of_robot {
+            if !problems.contains(problem) {
+                problems.push(problem.clone());
+            }
+        }
         if !is_over {
             problems.extend(status_problem(status.as_ref()));
         }
