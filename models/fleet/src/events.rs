@@ -50,17 +50,46 @@ impl Key {
 
 /// The events of a run, in order of time. The log must hold the truth in its own order.
 pub(crate) fn events(log: &RunLog, incidents: &[Incident]) -> Vec<ScoreEvent> {
-    let orders = Orders::of(log);
-    let mut watches: BTreeMap<(u32, u32), Watch> = BTreeMap::new();
+    let mut robots = Robots::new(Orders::of(log));
     let mut found = Found::default();
     for (_, truth) in log.messages::<Truth>(FLEET_TRUTH) {
-        let watch = watches.entry((truth.fleet_id, truth.robot_id)).or_default();
-        watch.see(&truth, &orders, &mut found);
+        robots.see(&truth, &mut found);
     }
+    let orders = robots.orders;
     let Found { mut events, led_to } = found;
     events.extend(incidents.iter().map(|one| incident(one, &orders, &led_to)));
     events.sort_by_key(|event| event.at);
     events
+}
+
+/// What the robots' records tell beside what was sent to them.
+#[derive(Debug, Default)]
+pub(crate) struct Robots {
+    orders: Orders,
+    /// By fleet and robot.
+    watches: BTreeMap<(u32, u32), Watch>,
+}
+
+impl Robots {
+    const fn new(orders: Orders) -> Self {
+        Self {
+            orders,
+            watches: BTreeMap::new(),
+        }
+    }
+
+    fn see(&mut self, truth: &Truth, found: &mut Found) {
+        let robot = (truth.fleet_id, truth.robot_id);
+        let watch = self.watches.entry(robot).or_default();
+        watch.see(truth, &self.orders, found);
+    }
+
+    /// The events of one more record.
+    pub(crate) fn told(&mut self, truth: &Truth) -> Vec<ScoreEvent> {
+        let mut found = Found::default();
+        self.see(truth, &mut found);
+        found.events
+    }
 }
 
 /// What came of the robots' records.
@@ -275,16 +304,6 @@ fn mission_held_up(truth: &Truth, orders: &Orders) -> Option<ScoreEvent> {
         counted(copy_count, "copy", "copies"),
     );
     Some(orders.named(notice(truth, what), copies.clone()))
-}
-
-/// What a robot's record tells without what was sent to the robot.
-pub(crate) fn told(truth: &Truth) -> Option<ScoreEvent> {
-    let kind = TruthKind::from_number(truth.kind)?;
-    if kind == TruthKind::Replaced {
-        return Some(replaced(truth));
-    }
-    let what = words(truth, kind, None, 0, false)?;
-    Some(event(severity_of(kind), truth, what))
 }
 
 fn replaced(truth: &Truth) -> ScoreEvent {

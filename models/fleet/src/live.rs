@@ -5,7 +5,7 @@ use core::time::Duration;
 use std::collections::BTreeMap;
 
 use crate::case::{FLEET_TRUTH, Fleet};
-use crate::events::{collision, told};
+use crate::events::{Robots, collision};
 use crate::messages::Truth;
 use crate::referee::live::LiveReferee;
 use crate::standing::Watch;
@@ -15,6 +15,8 @@ use hil_core::time::Instant;
 /// The events of the fleets of a run.
 #[derive(Debug)]
 pub(crate) struct FleetEvents {
+    /// What was sent to them is not known here.
+    robots: Robots,
     referee: LiveReferee,
     fleets: BTreeMap<u32, Standing>,
     stuck_after: Duration,
@@ -37,6 +39,7 @@ impl FleetEvents {
         let mut referee = LiveReferee::default();
         referee.begin(case.scene(), parameters.fleets);
         Self {
+            robots: Robots::default(),
             referee,
             fleets: BTreeMap::new(),
             stuck_after: parameters.coordinator.stuck_after(),
@@ -48,18 +51,31 @@ impl FleetEvents {
     fn tell_standstills(&mut self, now: Instant) {
         for (fleet_id, one) in &mut self.fleets {
             let since = one.watch.still_since(now);
-            let under_way_count = one.watch.under_way_count();
-            let is_stuck =
-                now > since + self.stuck_after && (under_way_count > 0 || self.has_more_missions);
-            if is_stuck && one.told != Some(since) {
-                one.told = Some(since);
-                let what = format!(
-                    "fleet {fleet_id} stands still, {under_way_count} of its robots with a mission"
-                );
-                let event = ScoreEvent::new(Severity::Hazard, since, FLEET_TRUTH, what);
-                self.found.push(event);
+            if now > since + self.stuck_after {
+                let under_way_count = one.watch.under_way_count();
+                let is_told = under_way_count > 0 || self.has_more_missions;
+                let event = is_told.then(|| one.tell(*fleet_id, since, under_way_count));
+                self.found.extend(event.flatten());
             }
         }
+    }
+}
+
+impl Standing {
+    /// A standstill, unless it was told already.
+    fn tell(
+        &mut self,
+        fleet_id: u32,
+        since: Instant,
+        under_way_count: usize,
+    ) -> Option<ScoreEvent> {
+        if self.told.replace(since) == Some(since) {
+            return None;
+        }
+        let what = format!(
+            "fleet {fleet_id} stands still, {under_way_count} of its robots with a mission"
+        );
+        Some(ScoreEvent::new(Severity::Hazard, since, FLEET_TRUTH, what))
     }
 }
 
@@ -72,7 +88,7 @@ impl LiveEvents for FleetEvents {
         let Ok(truth) = bytemuck::try_pod_read_unaligned::<Truth>(payload) else {
             return;
         };
-        self.found.extend(told(&truth));
+        self.found.extend(self.robots.told(&truth));
         let standing = self
             .fleets
             .entry(truth.fleet_id)
@@ -81,6 +97,13 @@ impl LiveEvents for FleetEvents {
                 told: None,
             });
         standing.watch.see(&truth, self.stuck_after);
+        // Those that were over before they could be told: many records come at once.
+        for (since, _, under_way_count) in standing.watch.take_gaps() {
+            if under_way_count > 0 || self.has_more_missions {
+                let event = standing.tell(truth.fleet_id, since, under_way_count);
+                self.found.extend(event);
+            }
+        }
         self.referee.on_truth(truth);
     }
 
@@ -137,6 +160,27 @@ mod tests {
     }
 
     #[test]
+    fn an_authority_that_is_refused_again_is_told_once_per_mission() {
+        let case = Fleet::new(FleetParameters::default(), 3).unwrap();
+        let mut live = case.live_events().unwrap();
+        for (at_ns, mission_id, caused_by_sequence) in
+            [(1, 1, 4), (2, 1, 4), (3, 1, 3), (4, 1, 5), (5, 2, 4)]
+        {
+            let refused = Truth {
+                at_ns,
+                mission_id,
+                caused_by_sequence,
+                kind: TruthKind::AuthorityRefused as u32,
+                ..Truth::default()
+            };
+            live.hear(FLEET_TRUTH, Instant::ZERO, bytemuck::bytes_of(&refused));
+        }
+        let found = live.take(Instant::ZERO);
+        let told: Vec<_> = found.iter().map(|event| event.at.as_ns()).collect();
+        assert_eq!(told, [1, 4, 5]);
+    }
+
+    #[test]
     fn a_fleet_that_stands_still_is_told_once() {
         let case = Fleet::new(FleetParameters::default(), 3).unwrap();
         let mut live = case.live_events().unwrap();
@@ -158,5 +202,23 @@ mod tests {
             ["fleet 0 stands still, 1 of its robots with a mission"]
         );
         assert!(told_at(400).is_empty());
+    }
+
+    #[test]
+    fn a_standstill_that_is_over_when_its_records_are_read_is_told_once_too() {
+        let case = Fleet::new(FleetParameters::default(), 3).unwrap();
+        let mut live = case.live_events().unwrap();
+        for at_s in [5, 200, 400, 401] {
+            let begun = Truth {
+                at_ns: at_s * 1_000_000_000,
+                mission_id: 1,
+                kind: TruthKind::MissionStarted as u32,
+                ..Truth::default()
+            };
+            live.hear(FLEET_TRUTH, Instant::ZERO, bytemuck::bytes_of(&begun));
+        }
+        let found = live.take(Instant::from_ns(402_000_000_000));
+        let at_s = |event: &ScoreEvent| event.at.as_ns() / 1_000_000_000;
+        assert_eq!(found.iter().map(at_s).collect::<Vec<_>>(), [5, 200]);
     }
 }

@@ -126,6 +126,11 @@ impl Watch {
         moved.map(moves_until).fold(self.busy_until, Instant::max)
     }
 
+    /// The standstills that are over, each with its begin, its end and the robots under way in it.
+    pub(crate) fn take_gaps(&mut self) -> Vec<(Instant, Instant, usize)> {
+        core::mem::take(&mut self.gaps)
+    }
+
     /// Robots with a mission that is not done.
     pub(crate) fn under_way_count(&self) -> usize {
         self.is_under_way.values().filter(|is| **is).count()

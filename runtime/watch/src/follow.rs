@@ -63,6 +63,12 @@ struct Followed {
     /// `None` until the file is as long as its header.
     header: Option<RecordHeader>,
     path: PathBuf,
+    /// The file's name up to the instance: those of one process's starts have it in common.
+    series: String,
+    /// Which start of the process wrote it; 0 when the file's name does not tell.
+    instance: u32,
+    /// The poll that goes on found its end.
+    is_read: bool,
     /// Of the first byte that was not given out.
     offset: u64,
     /// Whole records before this many bytes are passed over.
@@ -74,6 +80,7 @@ struct Followed {
 #[derive(Debug)]
 pub struct RecordFollower {
     folder: PathBuf,
+    /// Those of one series next to one another, by instance.
     files: Vec<Followed>,
     known: BTreeSet<OsString>,
     looked: Option<WallInstant>,
@@ -124,20 +131,34 @@ impl RecordFollower {
     }
 
     /// Gives out what came since the last look, `bytes_max` of it or little more; true when more
-    /// may be waiting. Files that cannot be read are left out from then on, see
-    /// [`Self::take_problems`].
+    /// may be waiting. The files take turns, but what a process wrote after it was started again
+    /// comes after all that it wrote before. Files that cannot be read are left out from then on,
+    /// see [`Self::take_problems`].
     pub fn poll(&mut self, bytes_max: usize, take: &mut dyn FnMut(&Batch<'_>)) -> bool {
         self.look_for_files();
         let mut left = bytes_max;
         let mut quiet_count = 0;
+        for file in &mut self.files {
+            file.is_read = false;
+        }
         while quiet_count < self.files.len() {
             if left == 0 {
                 return true;
             }
             self.next %= self.files.len();
-            let file = &mut self.files[self.next];
+            let index = self.next;
+            self.next += 1;
+            let (before, from) = self.files.split_at_mut(index);
+            let file = &mut from[0];
+            let waits = |earlier: &Followed| earlier.series == file.series && !earlier.is_read;
+            if before.last().is_some_and(waits) {
+                continue;
+            }
             match read_piece(file, &mut self.buffer, self.messages_of, take) {
-                Ok(0) => quiet_count += 1,
+                Ok(0) => {
+                    file.is_read = true;
+                    quiet_count += 1;
+                }
                 Ok(count) => {
                     quiet_count = 0;
                     left = left.saturating_sub(count);
@@ -145,10 +166,10 @@ impl RecordFollower {
                 Err(text) => {
                     self.problems.push(text);
                     file.is_given_up = true;
+                    file.is_read = true;
                     quiet_count += 1;
                 }
             }
-            self.next += 1;
         }
         false
     }
@@ -199,15 +220,26 @@ impl RecordFollower {
                 return;
             }
         };
-        let mut new: Vec<OsString> = entries
+        let starts = self.messages_of.map(|channels| {
+            let channels = channels.iter();
+            let starts = channels.map(|channel| RecordKind::Message.file_name_start(channel));
+            starts.collect::<Vec<_>>()
+        });
+        let is_wanted = |name: &OsString| {
+            let name = name.as_encoded_bytes();
+            let begins = |start: &String| name.starts_with(start.as_bytes());
+            let starts = starts.as_ref();
+            name.ends_with(b".rec") && starts.is_none_or(|starts| starts.iter().any(begins))
+        };
+        let new: Vec<OsString> = entries
             .flatten()
             .map(|entry| entry.file_name())
-            .filter(|name| name.as_encoded_bytes().ends_with(b".rec"))
-            .filter(|name| !self.known.contains(name))
+            .filter(|name| is_wanted(name) && !self.known.contains(name))
             .collect();
-        new.sort();
+        let has_new = !new.is_empty();
         for name in new {
             let path = self.folder.join(&name);
+            let (series, instance) = series_of(&name.to_string_lossy());
             self.known.insert(name);
             match File::open(&path) {
                 Ok(file) => self.files.push(Followed {
@@ -219,13 +251,31 @@ impl RecordFollower {
                     writer: String::new(),
                     header: None,
                     path,
+                    series,
+                    instance,
+                    is_read: false,
                     offset: 0,
                     is_given_up: false,
                 }),
                 Err(error) => self.problems.push(format!("{}: {error}", path.display())),
             }
         }
+        if has_new {
+            let order = |one: &Followed| (one.series.clone(), one.instance);
+            self.files.sort_by_cached_key(order);
+        }
     }
+}
+
+/// What the names of the files of one process's starts have in common, and which start `name` is of.
+fn series_of(name: &str) -> (String, u32) {
+    let stem = name.strip_suffix(".rec").unwrap_or(name);
+    let parts = stem.rsplit_once('.');
+    let found = parts.and_then(|(series, instance)| Some((series, instance.parse().ok()?)));
+    found.map_or_else(
+        || (name.to_owned(), 0),
+        |(series, instance)| (series.to_owned(), instance),
+    )
 }
 
 /// Gives out the next piece of one file; its length in bytes, 0 when nothing whole waits.

@@ -171,6 +171,28 @@ fn files_of_larger_and_smaller_records_are_caught_up_with_abreast() {
     assert_eq!((small_count, large_count), (COUNT, COUNT));
 }
 
+#[test]
+fn what_a_process_wrote_before_it_was_started_again_comes_first() {
+    const COUNT: u64 = 1500;
+    let place = Place::new("instances");
+    let folder = place.run().join("records");
+    let mut file = header(RecordKind::Published, "c", size_of::<PublishedRecord>());
+    for instance in [10, 0, 2] {
+        file.instance = instance;
+        let first = u64::from(instance) * COUNT;
+        let all: Vec<PublishedRecord> = (first..first + COUNT).map(published).collect();
+        append(&folder, &file, "robot", bytemuck::cast_slice(&all));
+    }
+    let mut follower = RecordFollower::new(&folder);
+    let mut found = Vec::new();
+    // One piece at a time.
+    while follower.poll(1, &mut |batch| {
+        found.extend(batch.records::<PublishedRecord>().map(|one| one.sequence));
+    }) {}
+    assert_eq!(found.len() as u64, 3 * COUNT);
+    assert!(found.is_sorted());
+}
+
 const CHANNELS: [&str; 3] = ["own", "forwarded", "elsewhere"];
 
 /// A domain and a run's folder that announce a run with one channel of each source.

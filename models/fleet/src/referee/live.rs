@@ -20,7 +20,8 @@ pub struct LiveReferee {
     forgotten_count: u64,
     /// Time of the next look, on the robots' clock.
     next: Option<Instant>,
-    known_count: usize,
+    /// By the last look.
+    found: Vec<Incident>,
 }
 
 impl LiveReferee {
@@ -40,6 +41,7 @@ impl LiveReferee {
 
     /// Looks at all that was until shortly before `now`, on the robots' clock; the incidents since the last call.
     pub fn look(&mut self, now: Instant) -> &[Incident] {
+        self.found.clear();
         let Some(referee) = &mut self.referee else {
             return &[];
         };
@@ -54,12 +56,12 @@ impl LiveReferee {
                 referee.on_truth(&truth);
             }
             referee.scan(at);
+            // However many there are in a run, none is left out for want of room.
+            self.found.append(&mut referee.incidents);
             at = at + SCAN_PERIOD;
         }
         self.next = Some(at);
-        let incidents = referee.incidents();
-        let known_count = core::mem::replace(&mut self.known_count, incidents.len());
-        &incidents[known_count..]
+        &self.found
     }
 
     /// Records that found no room, as before the ground was known: incidents may be missing.

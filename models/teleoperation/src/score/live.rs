@@ -2,7 +2,7 @@
 
 use super::lost::severity_of;
 use crate::{EGM_EVENT, EGM_LEFT_FEEDBACK, EGM_RIGHT_FEEDBACK};
-use hil_arm::egm::messages::{EgmEvent, EgmFeedback};
+use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EgmFeedback};
 use hil_core::score::{LiveEvents, ScoreEvent, Severity};
 use hil_core::time::Instant;
 
@@ -48,6 +48,11 @@ impl LiveEvents for ArmEvents {
                 self.feedback(usize::from(channel == EGM_LEFT_FEEDBACK), at, &feedback);
             }
         } else if let Ok(told) = bytemuck::try_pod_read_unaligned::<EgmEvent>(payload) {
+            let kind = EgmEventKind::from_number(told.kind);
+            // The feedback tells of holds, also of an arm behind an adapter.
+            if let Some(EgmEventKind::HoldBegan | EgmEventKind::HoldEnded) = kind {
+                return;
+            }
             let (at, what) = (Instant::from_ns(told.at_ns), told.describe());
             let event = ScoreEvent::new(severity_of(&told), at, EGM_EVENT, what);
             self.found.push(event);
@@ -62,7 +67,7 @@ impl LiveEvents for ArmEvents {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_arm::egm::messages::{EgmEventKind, EndCause};
+    use hil_arm::egm::messages::EndCause;
 
     #[test]
     fn holds_are_told_when_they_begin_and_end_and_sessions_as_their_events_say() {
@@ -79,6 +84,11 @@ mod tests {
             events.hear(EGM_LEFT_FEEDBACK, ms(at_ms), bytemuck::bytes_of(&feedback));
         }
         let mut ended: EgmEvent = bytemuck::Zeroable::zeroed();
+        for (at_ms, kind) in [(4, EgmEventKind::HoldBegan), (16, EgmEventKind::HoldEnded)] {
+            ended.kind = kind as u32;
+            ended.at_ns = ms(at_ms).as_ns();
+            events.hear(EGM_EVENT, ms(at_ms), bytemuck::bytes_of(&ended));
+        }
         ended.kind = EgmEventKind::Ended as u32;
         ended.cause = EndCause::CommTimeout as u32;
         ended.at_ns = 20_000_000;

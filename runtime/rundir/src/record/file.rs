@@ -63,6 +63,11 @@ pub enum RecordKind {
 }
 
 impl RecordKind {
+    /// How the names of all files begin that hold such records of `channel`.
+    pub fn file_name_start(self, channel: &str) -> String {
+        format!("{}.{}.", channel.replace('/', "."), self.name())
+    }
+
     /// In file names.
     const fn name(self) -> &'static str {
         match self {
@@ -154,12 +159,8 @@ pub struct RecordHeader {
 impl RecordHeader {
     /// File name below the run's `records` folder: unique per channel, kind, writer, instance.
     pub fn file_name(&self, writer: &str) -> String {
-        let channel = self.channel.replace('/', ".");
-        format!(
-            "{channel}.{}.{writer}.{}.rec",
-            self.kind.name(),
-            self.instance
-        )
+        let start = self.kind.file_name_start(&self.channel);
+        format!("{start}{writer}.{}.rec", self.instance)
     }
 
     /// The header's bytes.
@@ -205,7 +206,7 @@ impl RecordHeader {
     /// The name of the process that wrote the file called `name`, which has this header; `None`
     /// when the name is not made as [`RecordHeader::file_name`] makes it.
     pub fn writer<'a>(&self, name: &'a str) -> Option<&'a str> {
-        let start = format!("{}.{}.", self.channel.replace('/', "."), self.kind.name());
+        let start = self.kind.file_name_start(&self.channel);
         let end = format!(".{}.rec", self.instance);
         name.strip_prefix(&start)?.strip_suffix(&end)
     }

@@ -335,10 +335,21 @@ impl Observer {
 
     /// Polls for `window`; false when a signal came before it was over.
     pub(crate) fn poll_for(&mut self, window: Duration, signals: &Signals) -> bool {
+        self.poll_for_beside(window, signals, &mut || {})
+    }
+
+    /// The same, and does `work` after each poll: a part of it that is short against [`POLL_PERIOD`].
+    pub(crate) fn poll_for_beside(
+        &mut self,
+        window: Duration,
+        signals: &Signals,
+        work: &mut dyn FnMut(),
+    ) -> bool {
         let began = WallInstant::now();
         let mut is_whole = true;
         while is_whole && began.elapsed() < window {
             self.poll();
+            work();
             thread::sleep(POLL_PERIOD.min(window.saturating_sub(began.elapsed())));
             is_whole = signals.received().is_none();
         }
@@ -444,13 +455,13 @@ impl Observer {
         self.conditions.now(link, way)
     }
 
-    /// Polls for as long as the first messages of the first window need to be written down by all
-    /// who meet them; false when a signal came before.
+    /// Polls for [`Self::longest_settling`]; false when a signal came before.
     pub(crate) fn settle(&mut self, signals: &Signals) -> bool {
         self.poll_for(self.longest_settling(), signals)
     }
 
-    fn longest_settling(&self) -> Duration {
+    /// How long the first messages of the first window need to be written down by all who meet them.
+    pub(crate) fn longest_settling(&self) -> Duration {
         settling(self.conditions.longest_flight_time())
     }
 

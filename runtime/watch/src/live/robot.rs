@@ -3,6 +3,7 @@
 
 use std::cmp::Reverse;
 use std::path::Path;
+use std::time::Duration;
 
 use hil_core::score::{LiveEvents, ScoreEvent};
 use hil_core::time::Instant;
@@ -11,10 +12,10 @@ use crate::RecordFollower;
 
 /// Events that are kept to be shown.
 const SHOWN_MAX: usize = 8;
-/// Bytes of records read at once, and how often at most per look: a run that has gone for long is caught up with in
-/// several looks.
-const ROUND_BYTES_MAX: usize = 8 << 20;
-const ROUNDS_MAX: usize = 8;
+/// Bytes of records read at once, and the span of the run judged at once: a run that has gone for long is caught up
+/// with step by step, between which other things are done.
+const STEP_BYTES_MAX: usize = 1 << 20;
+const STEP_SPAN: Duration = Duration::from_secs(10);
 
 /// The events of one run's robot, from its beginning on.
 #[derive(Debug)]
@@ -23,8 +24,14 @@ pub(crate) struct RobotWatch {
     events: Box<dyn LiveEvents>,
     /// Publication of the newest message read.
     newest: Option<Instant>,
+    /// Until when the events were taken.
+    judged_until: Option<Instant>,
+    /// More is written than was read.
+    has_unread: bool,
+    is_behind: bool,
     recent: Vec<ScoreEvent>,
     count: u64,
+    problems: Vec<String>,
 }
 
 /// The gravest events of a robot, of equal ones the newest.
@@ -45,41 +52,68 @@ impl RobotWatch {
             follower: RecordFollower::new(folder).with_messages_of(events.channels()),
             events,
             newest: None,
+            judged_until: None,
+            has_unread: true,
+            is_behind: true,
             recent: Vec::with_capacity(SHOWN_MAX + 1),
             count: 0,
+            problems: Vec::new(),
         }
     }
 
-    /// Reads what came since the last look; `None` while none of the messages is recorded on this host.
-    pub(crate) fn look(&mut self, now: Instant) -> Option<RobotLook> {
-        let mut is_behind = true;
-        for _ in 0..ROUNDS_MAX {
-            let mut newest = self.newest;
-            let events = &mut self.events;
-            is_behind = self.follower.poll(ROUND_BYTES_MAX, &mut |batch| {
-                for (envelope, payload) in batch.messages() {
-                    let at = Instant::from_ns(envelope.published_ns);
-                    newest = newest.max(Some(at));
-                    events.hear(&batch.header.channel, at, payload);
-                }
-            });
-            self.newest = newest;
-            // What is not read yet is later than what is.
-            let until = newest.filter(|_| is_behind).unwrap_or(now);
-            for event in self.events.take(until) {
-                self.count += 1;
-                self.keep(event);
-            }
-            if !is_behind {
-                break;
-            }
+    /// Takes a step towards `now`.
+    pub(crate) fn step(&mut self, now: Instant) {
+        // What was read is judged before more is.
+        if self.judged_until >= self.newest.map(|newest| newest.min(now)) {
+            self.read();
         }
+        let Some((newest, judged_until)) = self.newest.zip(self.judged_until) else {
+            self.is_behind = self.has_unread;
+            return;
+        };
+        // What is not read yet is later than what is.
+        let known_until = if self.has_unread { newest } else { now };
+        let until = known_until.min(judged_until + STEP_SPAN);
+        self.is_behind = self.has_unread || until < known_until;
+        self.judged_until = Some(until.max(judged_until));
+        for event in self.events.take(until) {
+            self.count += 1;
+            self.keep(event);
+        }
+    }
+
+    fn read(&mut self) {
+        let Self {
+            follower,
+            events,
+            newest,
+            judged_until,
+            ..
+        } = self;
+        self.has_unread = follower.poll(STEP_BYTES_MAX, &mut |batch| {
+            for (envelope, payload) in batch.messages() {
+                let at = Instant::from_ns(envelope.published_ns);
+                *newest = (*newest).max(Some(at));
+                judged_until.get_or_insert(at);
+                events.hear(&batch.header.channel, at, payload);
+            }
+        });
+        self.problems.extend(self.follower.take_problems());
+    }
+
+    /// Record files that cannot be read, and why.
+    pub(crate) fn problems(&self) -> &[String] {
+        &self.problems
+    }
+
+    /// What was found; `None` while none of the messages is recorded on this host.
+    pub(crate) fn look(&self) -> Option<RobotLook> {
         let mut recent = self.recent.clone();
         recent.sort_by_key(|event| Reverse(event.at));
         self.newest.map(|_| RobotLook {
             recent,
             count: self.count,
-            is_behind,
+            is_behind: self.is_behind,
         })
     }
 
@@ -151,17 +185,50 @@ mod tests {
         let folder = std::env::temp_dir().join(format!("hil-robot-watch-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
         let mut watch = RobotWatch::new(&folder, Box::<Each>::default());
-        assert_eq!(watch.look(Instant::ZERO), None);
+        watch.step(Instant::ZERO);
+        assert_eq!(watch.look(), None);
         write_messages(&folder, "a/other", 30);
         write_messages(&folder, "a/b", 20);
         watch.follower.look_again();
-        let look = watch.look(Instant::from_ns(11)).unwrap();
+        watch.step(Instant::from_ns(11));
+        let look = watch.look().unwrap();
         assert_eq!((look.count, look.recent.len()), (11, SHOWN_MAX));
         assert_eq!(look.recent[0].what, "a/b 11");
         // The one of more weight stays.
         assert_eq!(look.recent[SHOWN_MAX - 1].what, "a/b 2");
         assert!(!look.is_behind);
-        assert_eq!(watch.look(Instant::from_ns(100)).unwrap().count, 19);
+        watch.step(Instant::from_ns(100));
+        assert_eq!(watch.look().unwrap().count, 19);
+        assert!(watch.problems().is_empty());
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_long_past_is_caught_up_with_in_steps_and_a_foreign_file_is_a_problem() {
+        let name = format!("hil-robot-watch-steps-{}", std::process::id());
+        let folder = std::env::temp_dir().join(name);
+        std::fs::create_dir_all(&folder).unwrap();
+        write_messages(&folder, "a/b", 20);
+        std::fs::write(folder.join("a.b.message.robot.1.rec"), [7; 200]).unwrap();
+        let mut watch = RobotWatch::new(&folder, Box::<Each>::default());
+        let now = Instant::ZERO + 3 * STEP_SPAN;
+        let mut steps = [0; 4].map(|_| {
+            watch.step(now);
+            watch.look().unwrap().is_behind
+        });
+        assert_eq!(steps, [true, true, false, false]);
+        assert_eq!(watch.problems().len(), 1);
+        // What is written faster than it is read leaves it behind.
+        let record_bytes = size_of::<Envelope>() + 1;
+        let header = header(RecordKind::Message, "a/b", record_bytes);
+        let later = vec![0; 2 * STEP_BYTES_MAX / record_bytes * record_bytes];
+        append(&folder, &header, "robot", &later);
+        steps = [0; 4].map(|_| {
+            watch.step(now);
+            watch.look().unwrap().is_behind
+        });
+        assert!(steps[0]);
+        assert!(!steps[3]);
         std::fs::remove_dir_all(&folder).unwrap();
     }
 }

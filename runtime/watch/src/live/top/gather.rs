@@ -70,6 +70,13 @@ impl Gatherer {
         }
     }
 
+    /// Goes on reading what happened to the robot, without waiting.
+    pub(crate) fn read(&mut self) {
+        if let Some(robot) = &mut self.robot {
+            robot.step(MonotonicClock::now());
+        }
+    }
+
     /// Looks at the run.
     pub(crate) fn look(&mut self, observer: &Observer, window: Duration) -> View {
         let is_over = observer.is_over();
@@ -79,6 +86,13 @@ impl Gatherer {
         }
         let status = RunStatus::read(&observer.run().folder);
         let mut problems = observer.problems().to_vec();
+        // Both read the same folder.
+        let of_robot = self.robot.iter().flat_map(RobotWatch::problems);
+        for problem in of_robot {
+            if !problems.contains(problem) {
+                problems.push(problem.clone());
+            }
+        }
         if !is_over {
             problems.extend(status_problem(status.as_ref()));
         }
@@ -132,8 +146,8 @@ impl Gatherer {
         rows
     }
 
-    fn robot(&mut self, status: Option<&RunStatus>) -> Option<RobotView> {
-        let look = self.robot.as_mut()?.look(MonotonicClock::now())?;
+    fn robot(&self, status: Option<&RunStatus>) -> Option<RobotView> {
+        let look = self.robot.as_ref()?.look()?;
         let start_ns = status.and_then(|status| status.start_ns);
         let row = |event: ScoreEvent| RobotEventRow {
             at_s: start_ns.map(|start_ns| event.at.seconds_since(Instant::from_ns(start_ns))),

@@ -58,14 +58,15 @@ pub fn run(
     let records = observer.run().run_folder().records();
     let robot = events.map(|events| RobotWatch::new(&records, events));
     let mut gatherer = gather::Gatherer::of(robot);
-    observer.settle(signals);
+    let settling = observer.longest_settling();
+    observer.poll_for_beside(settling, signals, &mut || gatherer.read());
     // What processes used is a difference of two looks.
     gatherer.look(&observer, args.window);
     if !args.json && !args.once && io::stdout().is_terminal() {
         return screen::run(observer, gatherer, args.window, signals).map_err(TopError::Terminal);
     }
     loop {
-        let is_whole = observer.poll_for(args.window, signals);
+        let is_whole = observer.poll_for_beside(args.window, signals, &mut || gatherer.read());
         observer.trim(args.window);
         let view = gatherer.look(&observer, args.window);
         let text = if args.json {

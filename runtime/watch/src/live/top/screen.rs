@@ -95,6 +95,7 @@ impl Screen {
                 return Ok(CommandEnd::Interrupted);
             }
             self.observer.poll();
+            self.gatherer.read();
             let is_due = looked.elapsed() >= self.window || self.view.is_none();
             if is_due && !self.is_paused {
                 looked = WallInstant::now();
