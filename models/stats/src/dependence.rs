@@ -6,7 +6,7 @@
 //! likelihood (1953): white noise; memory that fades exponentially, in white noise; and long memory (fractional noise, Beran
 //! 1994), also fading at high frequencies and in white noise. Each says what the variance of the mean is; the interval is
 //! that of all models, each with the weight of its likelihood (Bayesian model averaging; Hoeting, Madigan, Raftery and Volinsky
-//! 1999), and never narrower than that of the [`LOW_COUNT`] lowest ordinates with equal weights and
+//! 1999), and never narrower than that of the eight lowest ordinates with equal weights and
 //! Student's quantile (Lazarus, Lewis, Stock and Watson 2018), which assumes no model.
 //!
 //! What is worth too few observations for that has no interval. `tests/coverage.rs` measures what the intervals
@@ -181,7 +181,7 @@ impl Batches {
     /// The interval of the share of ones, in a series of zeros and ones.
     ///
     /// Its end towards the nearer one of none and all is that of a sample of which it is known that it had
-    /// [`RARE_MIN`] of the rarer outcome (Cohen and Sackrowitz 1989): others have no interval.
+    /// five of the rarer outcome (Cohen and Sackrowitz 1989): others have no interval.
     pub fn share_interval(&self) -> Spread {
         let share = self.mean();
         if self.count == 0 || !(share > 0.0 && share < 1.0) {

@@ -341,8 +341,15 @@ fn unusable(
     code: u8,
     console: &mut Console,
 ) -> Refusal {
-    let errors = hil_topology::unusable(path, overrides, found);
-    console.faults(&errors.render(io::stderr().is_terminal()));
+    // What `join` makes of its arguments is in no file.
+    if path.is_file() {
+        let errors = hil_topology::unusable(path, overrides, found);
+        console.faults(&errors.render(io::stderr().is_terminal()));
+    } else {
+        for (key, why) in found {
+            console.error(&format!("{key}: {why}"));
+        }
+    }
     Refusal { code, text: None }
 }
 

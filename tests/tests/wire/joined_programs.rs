@@ -279,6 +279,13 @@ fn ctrl_c_leaves_a_report_and_nothing_else_and_a_program_that_fails_is_named_wit
     place.assert_nothing_left();
     assert_closed(&place.summary());
 
+    let place = Place::new("join-missing");
+    let finished = place.run(&["--", "sleep", "1", "--", "no-such-program"]);
+    assert_eq!(finished.status.code(), Some(2));
+    let said = "error: processes.second.run: cannot start no-such-program: ";
+    assert!(finished.stderr.starts_with(said), "{}", finished.stderr);
+    assert_eq!(finished.stderr.lines().count(), 1, "{}", finished.stderr);
+
     let place = Place::new("join-failed");
     let finished = place.run(&["--", "sh", "-c", "exit 7", "--", "sleep", "100"]);
     assert_eq!(finished.status.code(), Some(1));
