@@ -506,10 +506,10 @@ fn raised(by: f64, spells: Vec<bool>, random: &mut RandomStream) -> Vec<f64> {
     series
 }
 
-/// Sum of two independent series with weights.
-fn sum(first: (f64, Vec<f64>), second: (f64, Vec<f64>)) -> Vec<f64> {
-    let both = first.1.into_iter().zip(second.1);
-    both.map(|(a, b)| first.0 * a + second.0 * b).collect()
+/// Weighted sum of two independent series of unit variance, of unit variance itself.
+fn mixed(first: Vec<f64>, second: Vec<f64>) -> Vec<f64> {
+    let both = first.into_iter().zip(second);
+    both.map(|(a, b)| 0.8 * a + 0.6 * b).collect()
 }
 
 const GRID: i32 = 2_000;
@@ -585,10 +585,10 @@ fn delays() -> Vec<DelayKind> {
             |r| queue(0.95, None, r),
         ),
         kind(Judged, "memories 0.05 s and 1 s", true, NORMAL, |r| {
-            sum((0.8, fading(0.05, r)), (0.6, fading(1.0, r)))
+            mixed(fading(0.05, r), fading(1.0, r))
         }),
         kind(Judged, "memory 3 s in noise", false, NORMAL, |r| {
-            sum((0.8, white(r)), (0.6, fading(3.0, r)))
+            mixed(white(r), fading(3.0, r))
         }),
         kind(Judged, "long memory H 0.7", false, NORMAL, |r| {
             fractional(0.7, r)
@@ -597,7 +597,7 @@ fn delays() -> Vec<DelayKind> {
             fractional(0.8, r)
         }),
         kind(Judged, "long memory H 0.8 in noise", false, NORMAL, |r| {
-            sum((0.8, white(r)), (0.6, fractional(0.8, r)))
+            mixed(white(r), fractional(0.8, r))
         }),
         kind(Judged, "stalls of 0.1 s each second", false, None, |r| {
             let stall = stall(1.003_7, 0.1, r.uniform());

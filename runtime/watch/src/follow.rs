@@ -67,7 +67,7 @@ struct Followed {
     series: String,
     /// Which start of the process wrote it; 0 when the file's name does not tell.
     instance: u32,
-    /// The poll that goes on found its end.
+    /// The present poll has read it to its end.
     is_read: bool,
     /// Of the first byte that was not given out.
     offset: u64,

@@ -255,7 +255,7 @@ fn answer_of(ingress: &IngressSettings) -> (PeerState, Refusal) {
     assert!(reply.len() <= hello.len());
     let event = egress.on_datagram(now, arrival, &reply).unwrap();
     assert!(matches!(event, EgressEvent::Refused(_)));
-    // Greeting goes on, slowly, and nothing else.
+    // Greetings are repeated, slowly, and nothing else is sent.
     assert_eq!(egress.next_wakeup(), Some(now + Duration::from_secs(1)));
     let staged = egress.on_local(now, 0, &Envelope::default(), &[0; 64]);
     assert_eq!(staged, Err(LocalRefusal::ChannelRefused));

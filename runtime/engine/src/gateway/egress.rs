@@ -58,7 +58,7 @@ const LOOK_PERIOD_NS: i64 = 500_000;
 const LOOK_PERIOD_HELD_NS: i64 = 50_000;
 
 impl Egress {
-    /// Lets go of a long message that is under way, then, if no step failed, says goodbye to the peer.
+    /// Gives up a long message that is under way, then, if no step failed, sends the peer a farewell.
     pub(crate) fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
         if let Some(mut long) = self.long.take() {
             let now = MonotonicClock::now();

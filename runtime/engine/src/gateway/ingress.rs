@@ -30,7 +30,7 @@ pub(crate) struct Ingress {
     pub(crate) bridge: IngressBridge,
     /// Where messages go, by channel; empty on a clock path, which carries none.
     pub(crate) outputs: Box<[Output]>,
-    /// What became of messages, by channel.
+    /// Records of messages, by channel.
     pub(crate) records: SharedSink,
     pub(crate) wait: WaitStrategy,
     pub(crate) peer: SocketAddr,

@@ -1,4 +1,4 @@
-//! What happens to the robot of a run that goes on: events that its case finds in the messages which processes of
+//! What happens to the robot of a live run: events that its case finds in the messages which processes of
 //! this host record.
 
 use std::cmp::Reverse;

@@ -70,7 +70,7 @@ impl Gatherer {
         }
     }
 
-    /// Goes on reading what happened to the robot, without waiting.
+    /// Reads more of what happened to the robot, without waiting.
     pub(crate) fn read(&mut self) {
         if let Some(robot) = &mut self.robot {
             robot.step(MonotonicClock::now());
