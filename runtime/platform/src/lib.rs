@@ -6,6 +6,7 @@ pub mod clock;
 pub mod clock_discipline;
 pub mod console;
 pub mod domain_address;
+pub mod file_window;
 pub mod host_facts;
 pub mod host_limits;
 pub mod open_files;

@@ -13,7 +13,7 @@ use bytemuck::Pod;
 use hil_core::message::Envelope;
 
 use hil_rundir::record::RecordKind;
-use hil_rundir::record::file::{HEADER_BYTES, RecordHeader};
+use hil_rundir::record::file::{HEADER_BYTES, RecordHeader, written_bytes};
 
 /// How often it looks for new files: processes that start again write new ones.
 const LOOK_PERIOD: Duration = Duration::from_millis(100);
@@ -180,11 +180,11 @@ impl RecordFollower {
         self.look_for_files();
         for file in &mut self.files {
             // A file without a header holds nothing yet; one that cannot be read says so at the poll.
-            if let (Ok(true), Ok(data)) = (has_header(file), file.file.metadata())
+            if let (Ok(true), Ok(written)) = (has_header(file), written_bytes(&file.file))
                 && let Some(header) = &file.header
             {
                 let record_bytes = u64::from(header.record_bytes);
-                let written = data.len().saturating_sub(HEADER_BYTES as u64);
+                let written = written.saturating_sub(HEADER_BYTES as u64);
                 file.offset = HEADER_BYTES as u64 + written - written % record_bytes;
             }
         }
@@ -243,9 +243,10 @@ impl RecordFollower {
             self.known.insert(name);
             match File::open(&path) {
                 Ok(file) => self.files.push(Followed {
-                    passed_bytes: match file.metadata() {
-                        Ok(metadata) if self.passes_over => metadata.len(),
-                        _ => 0,
+                    passed_bytes: if self.passes_over {
+                        written_bytes(&file).unwrap_or(0)
+                    } else {
+                        0
                     },
                     file,
                     writer: String::new(),
@@ -302,8 +303,11 @@ fn read_piece(
     if buffer.len() < record_bytes {
         buffer.resize(record_bytes, 0);
     }
-    let whole = (buffer.len() / record_bytes).clamp(1, PIECE_RECORDS) * record_bytes;
     let failed = |error: io::Error| format!("{}: {error}", one.path.display());
+    let written = written_bytes(&one.file).map_err(failed)?;
+    let left = usize::try_from(written.saturating_sub(one.offset)).unwrap_or(usize::MAX);
+    let count = (buffer.len() / record_bytes).clamp(1, PIECE_RECORDS);
+    let whole = count.min(left / record_bytes) * record_bytes;
     let count = read_up_to(&one.file, &mut buffer[..whole], one.offset).map_err(failed)?;
     let count = count - count % record_bytes;
     if count > 0 {

@@ -9,6 +9,7 @@ use hil_platform::host_facts::HostFiles;
 use hil_platform::host_limits::{Headroom, locked_memory_bound, memory_headroom, thread_headroom};
 use hil_platform::{open_files, words};
 use hil_rundir::launch::{AdapterSettings, GatewayWork};
+use hil_rundir::record::GROWING_FILE_BYTES;
 use hil_shm::{ChannelSettings, Room, SHARED_MEMORY_DIRECTORY};
 use hil_topology::{Host, RoleSpec, Topology};
 
@@ -405,7 +406,7 @@ struct ProcessContent {
     locks_memory: bool,
     /// Names of the channels it joins.
     channels: Vec<String>,
-    /// Memory set aside for messages outside of shared memory.
+    /// Memory set aside for messages and records outside of shared memory.
     own_bytes: u64,
 }
 
@@ -426,8 +427,8 @@ fn gateway_content(work: &GatewayWork) -> ProcessContent {
         // One more samples a radio.
         threads: OWN_THREADS + 1 + count,
         locks_memory: directions.any(|one| one.realtime.lock_memory),
+        own_bytes: GROWING_FILE_BYTES * channels.len() as u64,
         channels,
-        own_bytes: 0,
     }
 }
 
@@ -546,7 +547,8 @@ mod tests {
         let gateway = needs.processes.iter().find(|one| one.name.contains("hop"));
         let gateway = gateway.unwrap();
         let threads = LOCKED_THREAD_BYTES * gateway.threads;
-        let locked = LOCKED_PROGRAM_BYTES + threads + channels;
+        let records = 2 * GROWING_FILE_BYTES;
+        let locked = LOCKED_PROGRAM_BYTES + threads + channels + records;
         assert_eq!(gateway.locked_bytes, Some(locked));
     }
 

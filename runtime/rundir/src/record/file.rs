@@ -12,6 +12,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, Write};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use bytemuck::{CheckedBitPattern, Pod};
@@ -30,6 +31,9 @@ use hil_topology::CHANNEL_NAME_BYTES_MAX;
 const MAGIC: &[u8; 8] = b"HILREC01";
 /// Size of the file header.
 pub const HEADER_BYTES: usize = 128;
+/// Where in the header it says at which byte the records end, in eight bytes. It says 0 where they end with the
+/// file: a file that grows by the page is longer than its records, and so is one whose writer was killed.
+pub(super) const END_AT: usize = 24;
 
 /// What a record file holds; its number stands for it in the header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
@@ -270,6 +274,30 @@ fn malformed(path: &Path, offset: usize, problem: &'static str) -> RecordFileErr
     }
 }
 
+/// How many bytes of `file` are header and whole or begun records, as it says now.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn written_bytes(file: &File) -> io::Result<u64> {
+    let mut end = [0; 8];
+    match file.read_exact_at(&mut end, END_AT as u64) {
+        Ok(()) => {}
+        Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => end = [0; 8],
+        Err(error) => return Err(error),
+    }
+    // The writer cuts off what is behind the records before it says 0.
+    let file_bytes = file.metadata()?.len();
+    Ok(end_of(u64::from_le_bytes(end), file_bytes))
+}
+
+fn end_of(said: u64, file_bytes: u64) -> u64 {
+    if said == 0 {
+        file_bytes
+    } else {
+        said.min(file_bytes)
+    }
+}
+
 /// A record file in memory.
 #[derive(Debug)]
 pub struct RecordFile {
@@ -297,8 +325,12 @@ impl RecordFile {
     ///
     /// # Errors
     /// When its header is not that of a record file.
-    pub fn from_bytes(path: &Path, bytes: Vec<u8>) -> Result<Self, RecordFileError> {
+    pub fn from_bytes(path: &Path, mut bytes: Vec<u8>) -> Result<Self, RecordFileError> {
         let header = RecordHeader::decode(path, &bytes)?;
+        let said: [u8; 8] = core::array::from_fn(|byte| bytes[END_AT + byte]);
+        let written = end_of(u64::from_le_bytes(said), bytes.len() as u64);
+        let written = usize::try_from(written).unwrap_or(usize::MAX);
+        bytes.truncate(written.max(HEADER_BYTES));
         let truncated_bytes = (bytes.len() - HEADER_BYTES) % header.record_bytes as usize;
         Ok(Self {
             header,

@@ -2,8 +2,10 @@
 //! What the records mean is in `hil_core::record`; nothing here computes a figure.
 
 pub mod file;
+mod growing;
 pub mod ring;
 pub mod stored;
 
 pub use file::{RecordFile, RecordFileError, RecordKind};
+pub use growing::GROWING_FILE_BYTES;
 pub use ring::{RecordSink, Recorder, SharedSink};

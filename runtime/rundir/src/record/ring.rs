@@ -13,6 +13,7 @@ use bytemuck::Pod;
 use hil_core::message::Envelope;
 
 use super::file::{RecordFileError, RecordHeader, RecordKind};
+use super::growing::GrowingFile;
 use crate::file_fault::FileFault;
 
 /// How often the writer empties the rings: what a kill of the process can lose at most.
@@ -81,19 +82,6 @@ impl SharedSink {
 /// Bytes of a channel's index before each record of a shared ring.
 const INDEX_BYTES: usize = size_of::<u64>();
 
-#[derive(Debug)]
-struct Target {
-    file: File,
-    path: PathBuf,
-}
-
-impl Target {
-    fn write(&mut self, bytes: &[u8]) -> Result<(), FileFault> {
-        let written = self.file.write_all(bytes);
-        written.map_err(|error| FileFault::new(&self.path, &error))
-    }
-}
-
 /// The writer's end of a ring.
 #[derive(Debug)]
 enum Drain {
@@ -115,12 +103,13 @@ impl Drain {
 #[derive(Debug)]
 struct SingleDrain {
     ring: rtrb::Consumer<u8>,
-    target: Option<Target>,
+    file: Option<File>,
+    path: PathBuf,
 }
 
 impl SingleDrain {
     fn flush(&mut self, fail: &mut dyn FnMut(FileFault)) {
-        let Some(target) = &mut self.target else {
+        let Some(file) = &mut self.file else {
             return;
         };
         let waiting = self.ring.slots();
@@ -128,11 +117,11 @@ impl SingleDrain {
             return;
         };
         let (first, second) = chunk.as_slices();
-        match target.write(first).and_then(|()| target.write(second)) {
+        match file.write_all(first).and_then(|()| file.write_all(second)) {
             Ok(()) => chunk.commit_all(),
-            Err(fault) => {
-                self.target = None;
-                fail(fault);
+            Err(error) => {
+                self.file = None;
+                fail(FileFault::new(&self.path, &error));
             }
         }
     }
@@ -143,20 +132,9 @@ impl SingleDrain {
 struct SharedDrain {
     ring: rtrb::Consumer<u8>,
     record_bytes: usize,
-    shares: Vec<Share>,
-    /// What was taken from the ring last.
-    taken: Vec<u8>,
-    /// Channels of which records were among that.
-    touched: Vec<usize>,
+    /// One for each channel that can still be written.
+    files: Vec<Option<GrowingFile>>,
     dropped: Arc<AtomicU64>,
-}
-
-/// What is a channel's.
-#[derive(Debug)]
-struct Share {
-    target: Option<Target>,
-    /// Records on their way to it.
-    staged: Vec<u8>,
 }
 
 impl SharedDrain {
@@ -166,34 +144,23 @@ impl SharedDrain {
         let Ok(chunk) = self.ring.read_chunk(waiting) else {
             return;
         };
+        // The ring is some whole entries long, so none lies across its end.
         let (first, second) = chunk.as_slices();
-        self.taken.clear();
-        self.taken.extend_from_slice(first);
-        self.taken.extend_from_slice(second);
-        chunk.commit_all();
-        for entry in self.taken.chunks_exact(entry_bytes) {
+        let entries = [first, second].into_iter();
+        for entry in entries.flat_map(|part| part.chunks_exact(entry_bytes)) {
             let (index, record) = entry.split_at(INDEX_BYTES);
             let index = u64::from_le_bytes(index.try_into().expect("it was split there"));
-            let index = usize::try_from(index).expect("it was one");
-            let staged = &mut self.shares[index].staged;
-            if staged.is_empty() {
-                self.touched.push(index);
-            }
-            staged.extend_from_slice(record);
-        }
-        for index in self.touched.drain(..) {
-            let Share { target, staged } = &mut self.shares[index];
-            let is_written = target.as_mut().is_some_and(|target| {
-                let written = target.write(staged);
-                written.map_err(&mut *fail).is_ok()
+            let file = &mut self.files[usize::try_from(index).expect("it was one")];
+            let is_written = file.as_mut().is_some_and(|file| {
+                let appended = file.append(record);
+                appended.map_err(&mut *fail).is_ok()
             });
             if !is_written {
-                *target = None;
-                let count = staged.len() / self.record_bytes;
-                self.dropped.fetch_add(count as u64, Ordering::Relaxed);
+                *file = None;
+                self.dropped.fetch_add(1, Ordering::Relaxed);
             }
-            staged.clear();
         }
+        chunk.commit_all();
     }
 }
 
@@ -261,11 +228,12 @@ impl Recorder {
         record_bytes: usize,
         capacity_records: usize,
     ) -> Result<RecordSink, RecordFileError> {
-        let target = self.create(kind, channel, record_bytes)?;
+        let (path, file) = self.create(kind, channel, record_bytes)?;
         let (producer, ring) = rtrb::RingBuffer::new(ring_bytes(record_bytes, capacity_records));
         self.drains.push(Drain::Single(SingleDrain {
             ring,
-            target: Some(target),
+            file: Some(file),
+            path,
         }));
         Ok(RecordSink {
             ring: producer,
@@ -287,21 +255,17 @@ impl Recorder {
         record_bytes: usize,
         capacity_records: usize,
     ) -> Result<SharedSink, RecordFileError> {
-        let mut shares = Vec::new();
+        let mut files = Vec::new();
         for channel in channels {
-            shares.push(Share {
-                target: Some(self.create(kind, channel, record_bytes)?),
-                staged: Vec::new(),
-            });
+            let (path, file) = self.create(kind, channel, record_bytes)?;
+            files.push(Some(GrowingFile::new(path, file)?));
         }
         let entry_bytes = INDEX_BYTES + record_bytes;
         let (producer, ring) = in_memory(ring_bytes(entry_bytes, capacity_records));
         self.drains.push(Drain::Shared(SharedDrain {
             ring,
             record_bytes,
-            shares,
-            taken: Vec::new(),
-            touched: Vec::new(),
+            files,
             dropped: Arc::clone(&self.dropped),
         }));
         Ok(SharedSink {
@@ -315,15 +279,14 @@ impl Recorder {
         kind: RecordKind,
         channel: &str,
         record_bytes: usize,
-    ) -> Result<Target, RecordFileError> {
+    ) -> Result<(PathBuf, File), RecordFileError> {
         let header = RecordHeader {
             kind,
             channel: channel.to_owned(),
             record_bytes: u32::try_from(record_bytes).expect("records are small"),
             instance: self.instance,
         };
-        let (path, file) = header.create(&self.folder, &self.writer)?;
-        Ok(Target { file, path })
+        header.create(&self.folder, &self.writer)
     }
 
     /// Starts the writer thread. Call from a thread of normal priority: the writer inherits it.
@@ -442,7 +405,8 @@ mod tests {
         let mut recorder = Recorder::new(&env::temp_dir(), "robot", 0);
         recorder.drains.push(Drain::Single(SingleDrain {
             ring: drained,
-            target: Some(Target { file, path }),
+            file: Some(file),
+            path,
         }));
         let (teller, told) = std::sync::mpsc::channel();
         let tell = move |fault: &FileFault| teller.send(fault.clone()).unwrap();
@@ -470,11 +434,7 @@ mod tests {
         let Some(Drain::Shared(drain)) = recorder.drains.last_mut() else {
             panic!("it was made last");
         };
-        let full = PathBuf::from("/dev/full");
-        drain.shares[2].target = Some(Target {
-            file: File::options().write(true).open(&full).unwrap(),
-            path: full,
-        });
+        drain.files[2] = Some(GrowingFile::full());
         // Over the end of the ring more than once, and each time more than it holds.
         let mut fail_count = 0;
         for round in 0..5 {

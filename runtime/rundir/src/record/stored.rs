@@ -12,7 +12,7 @@ use hil_account::RecordSource;
 use hil_core::message::Envelope;
 use hil_core::run_log::{MessageReader, StoredMessages};
 
-use super::file::{HEADER_BYTES, RecordFileError, RecordHeader};
+use super::file::{HEADER_BYTES, RecordFileError, RecordHeader, written_bytes};
 
 /// Bytes read at a time.
 const PIECE_BYTES: usize = 1 << 16;
@@ -57,7 +57,7 @@ impl StoredFile {
         let read = || -> io::Result<(Vec<u8>, u64)> {
             let mut start = Vec::new();
             let file = File::open(path)?;
-            let bytes = file.metadata()?.len();
+            let bytes = written_bytes(&file)?;
             file.take(HEADER_BYTES as u64).read_to_end(&mut start)?;
             Ok((start, bytes))
         };
@@ -72,6 +72,12 @@ impl StoredFile {
             count: payload_bytes / u64::from(header.record_bytes),
             header,
         })
+    }
+
+    /// Whole records in it.
+    #[cfg(test)]
+    pub(super) fn record_count(&self) -> u64 {
+        self.count
     }
 
     /// Past the header.
