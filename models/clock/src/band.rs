@@ -1,6 +1,8 @@
 //! The guaranteed interval of the offset over one stretch without a noticed step, and the search
 //! for steps. Only causality and the drift allowance are used here.
 
+use core::ops::RangeInclusive;
+
 use super::exchange::{Constraint, Edge};
 use super::{BEYOND_NS_MAX, ClockSettings};
 
@@ -129,13 +131,22 @@ pub(super) struct Stretch {
     pub(super) until_ns: i64,
 }
 
+/// What no drifting offset explains as a whole, cut into what one does.
+#[derive(Debug, Default)]
+pub(super) struct Cut {
+    pub(super) stretches: Vec<Stretch>,
+    /// Indices of exchanges that contradict each other, with all between them.
+    pub(super) contradictions: Vec<RangeInclusive<usize>>,
+}
+
 /// Cuts exchanges, in order of time, wherever no drifting offset explains both sides.
 ///
 /// A contradiction between an earlier and a later exchange proves a step between the beginning of
 /// the last exchange that contradicts what follows and the end of the first that contradicts what
 /// went before. Whatever was under way then is not used.
-pub(super) fn stretches(constraints: &[Constraint], settings: &ClockSettings) -> Vec<Stretch> {
-    let mut found = Vec::new();
+pub(super) fn cut(constraints: &[Constraint], settings: &ClockSettings) -> Cut {
+    let mut cut = Cut::default();
+    let found = &mut cut.stretches;
     let (mut start, mut from_ns) = (0, i64::MIN);
     while start < constraints.len() {
         let Some(after) = contradiction(constraints[start..].iter().enumerate(), settings) else {
@@ -145,6 +156,7 @@ pub(super) fn stretches(constraints: &[Constraint], settings: &ClockSettings) ->
         let after = start + after;
         let until = constraints[start..=after].iter().enumerate().rev();
         let before = contradiction(until, settings).map_or(start, |index| start + index);
+        cut.contradictions.push(before..=after);
         let zone = (constraints[before].first_ns, constraints[after].last_ns);
         found.push(stretch(&constraints[start..before], from_ns, zone.0));
         from_ns = zone.1;
@@ -153,7 +165,7 @@ pub(super) fn stretches(constraints: &[Constraint], settings: &ClockSettings) ->
         start = after + 1 + under_way.count();
     }
     found.retain(|one| !one.constraints.is_empty());
-    found
+    cut
 }
 
 /// Those of `constraints` that lie wholly in the span.

@@ -15,7 +15,8 @@
 //!
 //! What the guarantee assumes: stamps err by at most [`ClockSettings::stamp_error_ns`], and the two
 //! clocks' rates differ by at most [`ClockSettings::drift_ppb`], except where one of them is
-//! stepped. What was learnt before an instant and what was learnt after it are kept apart, and the
+//! stepped. Exchanges that contradict the limit withdraw the guarantee: then nothing converts, and
+//! [`ClockMetrics::drift_contradiction`] says why. What was learnt before an instant and what was learnt after it are kept apart, and the
 //! interval is the hull of both. So one step of any size cannot spoil it, be it noticed or not:
 //! either all that went before or all that came after is of the same side of the step. A
 //! step that no constant offset explains is noticed, and instants around it have no alignment at
@@ -29,11 +30,13 @@
 
 mod anchors;
 mod band;
+mod drift;
 mod exchange;
 mod map;
 #[cfg(test)]
 mod tests;
 
+pub use drift::DriftContradiction;
 pub use exchange::{Exchange, Requester, StampKind};
 
 pub use map::{ClockMap, ClockMetrics, ClockStep, Localised, OffsetMetrics};

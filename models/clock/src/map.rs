@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::ClockSettings;
 use crate::anchors::Anchors;
-use crate::band::{Band, Stretch, stretches};
+use crate::band::{Band, Cut, Stretch, cut};
+use crate::drift::{self, DriftContradiction};
 use crate::exchange::{Constraint, Exchange, StampKind};
 use hil_core::time::{Instant, RemoteInstant};
 use hil_stats::bounds::BoundMetrics;
@@ -54,7 +55,10 @@ impl ClockMap {
         let usable = exchanges.iter().filter_map(|one| one.constraint(&settings));
         let mut constraints: Vec<Constraint> = usable.collect();
         constraints.sort_by_key(|one| one.middle().at_ns);
-        let stretches = stretches(&constraints, &settings);
+        let Cut {
+            stretches,
+            contradictions,
+        } = cut(&constraints, &settings);
         let used_count: usize = stretches.iter().map(|one| one.constraints.len()).sum();
         let pieces = stretches.iter().map(|stretch| Piece {
             from_ns: stretch.from_ns,
@@ -69,10 +73,25 @@ impl ClockMap {
         };
         map.figures.unused_count = (exchanges.len() - used_count) as u64;
         map.add_metrics(&constraints, &stretches);
+        let estimates = map.pieces.iter().map(|piece| &piece.anchors);
+        let found = drift::contradiction(&constraints, &contradictions, estimates, &settings);
+        if found.is_some() {
+            map.withdraw();
+        }
+        map.figures.drift_contradiction = found;
         map
     }
 
-    /// `remote` on this host's clock; `None` around a step, more than
+    /// Takes back all that rests on the drift limit.
+    fn withdraw(&mut self) {
+        self.pieces.clear();
+        self.figures.offset = None;
+        self.figures.stretch_offsets.clear();
+        self.figures.bound = None;
+        self.figures.steps.clear();
+    }
+
+    /// `remote` on this host's clock; `None` when the exchanges contradict the drift limit, around a step, more than
     /// [`BEYOND_NS_MAX`](super::BEYOND_NS_MAX) outside the exchanges and without any.
     pub fn localise(&self, remote: RemoteInstant) -> Option<Localised> {
         let at_ns = remote.as_ns();
@@ -274,6 +293,7 @@ fn no_metrics(exchanges: &[Exchange], settings: &ClockSettings) -> ClockMetrics 
         bound: None,
         steps: Vec::new(),
         drift_ppb: settings.drift_ppb,
+        drift_contradiction: None,
     }
 }
 
@@ -308,6 +328,10 @@ pub struct ClockMetrics {
     pub steps: Vec<ClockStep>,
     /// Drift allowance, parts per billion.
     pub drift_ppb: u32,
+    /// The exchanges contradict that allowance: then there is no offset and no bound, and nothing
+    /// converts.
+    #[serde(default)]
+    pub drift_contradiction: Option<DriftContradiction>,
 }
 
 /// The offset at one instant: `local = remote + offset`.

@@ -180,6 +180,15 @@ fn choose(
         return;
     }
     let figures = map.metrics();
+    if let Some(found) = figures.drift_contradiction {
+        pair.contradiction = Some(format!(
+            "the exchanges show that the clocks run {:+.0} ppm apart, more than the {:.0} ppm for \
+             which the bound holds: it is withdrawn, and one-way delay is not resolved",
+            found.rate_ppm, found.limit_ppm
+        ));
+        "the exchanges contradict the drift limit of their bound".clone_into(&mut pair.basis);
+        return;
+    }
     match disciplined {
         Ok(offset) => {
             pair.contradiction = contradiction(offset, figures);
@@ -354,6 +363,25 @@ mod tests {
         assert_eq!(
             (pair.rung, pair.contradiction),
             (ClockRung::Exchanges, None)
+        );
+    }
+
+    #[test]
+    fn clocks_that_run_apart_beyond_the_limit_have_no_bound_and_the_reason() {
+        let map = ClockMap::new(
+            &exchanges(0, |index| index * 10_000),
+            ClockSettings::default(),
+        );
+        let claimed = DisciplinedOffset {
+            offset_ns: 0,
+            bound_ns: 1_000,
+        };
+        let pair = chosen(&map, claimed);
+        assert_eq!(pair.rung, ClockRung::None, "{pair:?}");
+        let why = pair.contradiction.unwrap();
+        assert!(
+            why.contains("200 ppm") && why.contains("not resolved"),
+            "{why}"
         );
     }
 

@@ -178,7 +178,8 @@ fn bound_words(bound: BoundMetrics) -> String {
     )
 }
 
-/// The bounds of a channel's one-way figures; the round trip where a bound is wider than its figure.
+/// The bounds of a channel's one-way figures; where one is wider than its figure, that the delay is not
+/// resolved.
 pub(super) fn one_way(section: &mut Section, account: &ChannelAccount) {
     let segments = account
         .segments
@@ -206,13 +207,16 @@ pub(super) fn one_way(section: &mut Section, account: &ChannelAccount) {
     }
     let text = match &account.round_trip {
         Distribution::Measured(round_trip) => format!(
-            "a bound is wider than its figure: take the round trip instead, both ways together p50 \
-             {}, p99 {}",
+            "one-way delay not resolved: a bound is wider than its figure. The round trip, which is \
+             both ways together, is p50 {}, p99 {}",
             duration(round_trip.p50_ns),
             duration(round_trip.p99_ns)
         ),
         Distribution::Unavailable { reason } => {
-            format!("a bound is wider than its figure, and the round trip is unavailable: {reason}")
+            format!(
+                "one-way delay not resolved: a bound is wider than its figure, and the round trip is \
+                 unavailable: {reason}"
+            )
         }
     };
     section.fact("", Tone::Caution, text);
