@@ -30,12 +30,11 @@ pub(super) fn join(
     let mut link = link(args.link.as_deref(), registry, console)?;
     let port = free_ports().map_err(|error| failed(format!("no free UDP port: {error}")))?;
     link.insert("port".to_owned(), i64::from(port).into());
-    let seed = match args.seed {
-        Some(seed) => seed,
-        None => {
-            let bytes = random_bytes().map_err(|error| failed(format!("no seed: {error}")))?;
-            u64::from(u32::from_ne_bytes(bytes))
-        }
+    let seed = if let Some(seed) = args.seed {
+        seed
+    } else {
+        let bytes = random_bytes().map_err(|error| failed(format!("no seed: {error}")))?;
+        u64::from(u32::from_ne_bytes(bytes))
     };
     let text = topology(args, seed, link).map_err(usage)?.to_string();
     let topology = hil_topology::parse("join", &text, &[], registry.known());
@@ -53,8 +52,7 @@ pub(super) fn join(
     if args.seed.is_none()
         && let Some(at) = command_line.iter().position(|word| word == "join")
     {
-        let words = ["--seed".to_owned(), seed.to_string()];
-        command_line.splice(at + 1..at + 1, words);
+        command_line.insert(at + 1, format!("--seed={seed}"));
     }
     carry_out(
         Path::new("join"),
