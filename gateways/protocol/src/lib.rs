@@ -77,7 +77,7 @@ pub mod wire;
 pub use channel::{ChannelIdentity, FlowIdentity, SettingsError};
 pub use egress::{
     EgressBridge, EgressEvent, EgressSettings, LocalRefusal, LongPiece, PeerState, Transmit,
-    TransmitFailure,
+    TransmitFailure, TransmitKey,
 };
 pub use ingress::{
     Delivery, Destination, Disposition, InMemory, Incomplete, IngressBridge, IngressSettings,

@@ -60,6 +60,8 @@ struct TakenAt {
     taken_ns: i64,
     published_ns: i64,
     sequence: u64,
+    /// When the next message of the same start was published, whatever became of it; `None` where that is unknown.
+    next_published_ns: Option<i64>,
 }
 
 /// Collects the silences between taken messages, and for each interruption the longest it overlaps.
@@ -67,6 +69,8 @@ struct TakenAt {
 pub(super) struct GapFold<'a> {
     interruptions: &'a [Interruption],
     run: Option<RunSpan>,
+    /// The newest one and the rank of its start, until the message after it is seen.
+    held: Option<(u32, TakenAt)>,
     window: BinaryHeap<Reverse<TakenAt>>,
     last: Option<TakenAt>,
     histogram: LatencyHistogram,
@@ -80,6 +84,7 @@ impl<'a> GapFold<'a> {
         Self {
             interruptions: context.interruptions,
             run: context.consumer_run,
+            held: None,
             window: BinaryHeap::new(),
             last: None,
             histogram: LatencyHistogram::default(),
@@ -90,14 +95,20 @@ impl<'a> GapFold<'a> {
     }
 
     pub(super) fn count(&mut self, message: &MessageHistory) {
+        let epoch_rank = message.key.epoch_rank;
+        if let Some((held_rank, mut held)) = self.held.take() {
+            held.next_published_ns = message.published_ns().filter(|_| held_rank == epoch_rank);
+            self.window.push(Reverse(held));
+        }
         let taken = message.taken.and_then(|record| {
             Some(TakenAt {
                 taken_ns: stamp(record.taken_ns)?,
                 published_ns: record.published_ns,
                 sequence: record.sequence,
+                next_published_ns: None,
             })
         });
-        self.window.extend(taken.map(Reverse));
+        self.held = taken.map(|taken| (epoch_rank, taken));
         if self.window.len() > WINDOW {
             self.close_next();
         }
@@ -114,9 +125,12 @@ impl<'a> GapFold<'a> {
         let length_ns = after.taken_ns.saturating_sub(before.taken_ns);
         self.histogram.record(length_ns);
         let start_ns = self.run.map_or(0, |run| run.start.as_ns());
+        let next_ns = before.next_published_ns.unwrap_or(before.published_ns);
+        let idle_ns = next_ns.saturating_sub(before.published_ns).max(0);
+        let due_ns = before.taken_ns.saturating_add(idle_ns);
         let mut gap = Gap {
-            start_ns: before.taken_ns.saturating_sub(start_ns),
-            length_ns,
+            start_ns: due_ns.saturating_sub(start_ns),
+            length_ns: after.taken_ns.saturating_sub(due_ns).max(0),
             after_sequence: before.sequence,
             interruption_index: None,
         };
@@ -135,6 +149,8 @@ impl<'a> GapFold<'a> {
 
     /// The silences, and by interruption the longest it overlaps.
     pub(super) fn finish(mut self, has_records: bool) -> (Gaps, Vec<Option<Gap>>) {
+        self.window
+            .extend(self.held.take().map(|(_, held)| Reverse(held)));
         while self.close_next() {}
         let run = self.run;
         let tail_ns = |last: TakenAt| Some(run?.end.as_ns().saturating_sub(last.taken_ns));

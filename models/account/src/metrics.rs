@@ -242,7 +242,7 @@ pub struct BurstCount {
 pub struct Gaps {
     /// All of them.
     pub between_taken: Distribution,
-    /// The longest; `None` below two taken messages.
+    /// The longest time in which one was due; `None` below two taken messages.
     pub longest: Option<Gap>,
     /// The longest that overlaps no interruption.
     pub longest_unattributed: Option<Gap>,
@@ -251,7 +251,8 @@ pub struct Gaps {
     pub last_taken_to_run_end_ns: Option<i64>,
 }
 
-/// One silence at the consumer.
+/// A time at the consumer in which a message was due: from when the one after the last would have come with the
+/// delay of the last, until one came. What its producer was idle is not in it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Gap {
     /// Start, nanoseconds after the start of the run, or on the consumer's clock when that is

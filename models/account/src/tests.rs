@@ -67,7 +67,7 @@ fn a_flawless_run_closes_completely() {
     assert_eq!(account.coverage.tx_software.unwrap().ratio(), Some(1.0));
     assert_eq!(account.coverage.rx_hardware.unwrap().ratio(), Some(0.0));
     assert_eq!(account.published_unrecorded_count, Some(0));
-    assert_eq!(account.gaps.longest.unwrap().length_ns, PERIOD_NS);
+    assert_eq!(account.gaps.longest.unwrap().length_ns, 0);
     assert!(account.loss_bursts.is_empty());
 }
 
@@ -205,6 +205,31 @@ fn a_restart_of_the_producer_is_not_a_loss() {
     assert_eq!(account.producer_restart_count, 2);
     assert_eq!(account.gaps.longest.unwrap().length_ns, 21 * MS);
     assert_eq!(account.closing.checked().unwrap().closed_count, 75);
+}
+
+#[test]
+fn a_gap_begins_when_a_message_was_due_and_not_while_its_producer_was_idle() {
+    let mut files = Files::default();
+    for (sequence, at_ms, fate) in [
+        (0, 0, MessageFate::Taken),
+        (1, 10, MessageFate::Taken),
+        (2, 5_000, MessageFate::Taken),
+        (3, 9_000, MessageFate::LostOnWire),
+        (4, 9_030, MessageFate::Taken),
+    ] {
+        let written = Written {
+            epoch: 1,
+            sequence,
+            published_ns: at_ms * MS,
+        };
+        files.write(written, fate);
+    }
+    let gaps = account(&files.records(), &same_clock(10_000 * MS)).gaps;
+    let longest = gaps.longest.unwrap();
+    assert_eq!((longest.length_ns, longest.after_sequence), (30 * MS, 2));
+    // The time between messages is that of all of them.
+    let between = gaps.between_taken.measured().unwrap();
+    assert!(between.max_ns > 4_900 * MS, "{between:?}");
 }
 
 #[test]

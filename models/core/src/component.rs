@@ -231,15 +231,23 @@ impl<S: Debug + 'static> Component<S> {
     }
 
     /// Calls `start` once before the first message and tick; periods begin at its time too.
+    ///
+    /// # Panics
+    /// When there is a start already.
     #[must_use]
     pub fn start(mut self, start: fn(&mut S, Instant)) -> Self {
+        assert!(self.start.is_none(), "a component declares its start twice");
         self.start = Some(start);
         self
     }
 
     /// Calls the timer when it is due, beside the periods.
+    ///
+    /// # Panics
+    /// When there is a timer already.
     #[must_use]
     pub fn timer(mut self, timer: Timer<S>) -> Self {
+        assert!(self.timer.is_none(), "a component declares its timer twice");
         self.timer = Some(timer);
         self
     }
@@ -593,5 +601,22 @@ mod tests {
             .input("a/small", Both::on_small)
             .output("a/small", |own| &mut own.small)
             .input("a/small", Both::on_small);
+    }
+
+    #[test]
+    #[should_panic(expected = "declares its start twice")]
+    fn a_start_is_declared_once() {
+        let _refused = Component::of(0.0).start(|_, _| {}).start(|_, _| {});
+    }
+
+    #[test]
+    #[should_panic(expected = "declares its timer twice")]
+    fn a_timer_is_declared_once() {
+        let timer = || Timer {
+            next: |_| None,
+            tick: |_, _| {},
+            skipped: |_| 0,
+        };
+        let _refused = Component::of(0.0).timer(timer()).timer(timer());
     }
 }

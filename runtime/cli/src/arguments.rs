@@ -237,9 +237,10 @@ pub struct JoinArgs {
     /// ends.
     #[arg(long, value_name = "TIME")]
     pub duration: Option<String>,
-    /// Seed of the link's losses and delays.
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    pub seed: u64,
+    /// Seed of the link's losses and delays. Without it each run has one of its own, which its report states, so
+    /// that repetitions are independent.
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
     /// Print no progress, only the report.
     #[arg(long, short)]
     pub quiet: bool,

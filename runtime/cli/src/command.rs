@@ -253,14 +253,16 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
     if args.check && topology.processes().is_empty() {
         return show_study(path, &topology, args, registry, console);
     }
-    carry_out(path, args, &topology, registry, console)
+    let command_line = env::args().collect();
+    carry_out(path, args, &topology, command_line, registry, console)
 }
 
-/// Runs `topology`, or checks whether it could, and prints its report.
+/// Runs `topology`, or checks whether it could, and prints its report; `command_line` repeats the run.
 fn carry_out(
     path: &Path,
     args: &RunArgs,
     topology: &Topology,
+    command_line: Vec<String>,
     registry: &Registry,
     console: &mut Console,
 ) -> Result<u8, Refusal> {
@@ -281,7 +283,7 @@ fn carry_out(
         hosts,
         domain_root: args.domain_root.clone(),
         topology_file: path.to_path_buf(),
-        command_line: env::args().collect(),
+        command_line,
         layouts: layouts(topology, registry),
     };
     console.serve();

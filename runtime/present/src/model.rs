@@ -251,6 +251,9 @@ pub struct Table {
     pub rows: Vec<Row>,
     /// Below it; may be empty.
     pub note: String,
+    /// A text of the first column that has no room stands on a line of its own, before a column is left out.
+    #[serde(skip)]
+    pub has_long_names: bool,
 }
 
 /// A column of a table.
@@ -418,6 +421,13 @@ impl Table {
         if let Some(column) = columns.find(|one| one.label == label) {
             column.rank = rank;
         }
+        self
+    }
+
+    /// Of rows with long names, see [`Table::has_long_names`].
+    #[must_use]
+    pub const fn with_long_names(mut self) -> Self {
+        self.has_long_names = true;
         self
     }
 

@@ -184,6 +184,13 @@ impl Layout {
         };
         let wanted = if has_bar { GAP + BAR_MIN } else { 0 };
         let room = room.unwrap_or_else(|| total(&shown, &widths) + wanted);
+        if table.has_long_names
+            && let Some(first) = shown.first()
+        {
+            let excess = (total(&shown, &widths) + wanted).saturating_sub(room);
+            let least = NAME_MIN.min(widths[*first]);
+            widths[*first] = widths[*first].saturating_sub(excess).max(least);
+        }
         let mut left_out = Vec::new();
         while total(&shown, &widths) + wanted > room {
             let rank = |index: &usize| table.columns[*index].rank;
@@ -288,10 +295,21 @@ fn table_row(canvas: &mut Canvas, table: &Table, layout: &Layout, row: &Row) {
         canvas.behind(&lead, columns(&lead), Tone::Faint, reason);
         return;
     }
-    let cells = layout
-        .shown
-        .iter()
-        .map(|index| layout.padded(*index, &row.cells[*index].text()));
+    let name = layout.shown.first().map(|first| row.cells[*first].text());
+    let name =
+        name.filter(|name| table.has_long_names && columns(name) > layout.widths[layout.shown[0]]);
+    if let Some(name) = &name {
+        canvas.paragraph(INDENT, row.tone, name);
+    }
+    let cells = layout.shown.iter().map(|index| {
+        let is_told = name.is_some() && *index == layout.shown[0];
+        let text = if is_told {
+            String::new()
+        } else {
+            row.cells[*index].text()
+        };
+        layout.padded(*index, &text)
+    });
     let cells = cells.collect::<Vec<_>>().join(&gap);
     let drawn = row.bar.filter(|_| layout.bar_width > 0);
     let drawn = drawn.map_or_else(String::new, |one| bar(one.start, one.end, layout.bar_width));
@@ -503,6 +521,25 @@ mod tests {
             assert!(text.lines().all(|line| columns(line) <= width), "{text}");
             assert_eq!(text.matches("unrecorded").count(), 12, "{text}");
         }
+    }
+
+    #[test]
+    fn a_long_name_stands_on_a_line_of_its_own_before_a_column_is_left_out() {
+        let mut one = Table::new("", &["flow", "frames", "what a page has besides"])
+            .ranked("what a page has besides", 1)
+            .with_long_names();
+        let name = "tcp [fe80::858:44ff:fe4d:1]:40001 → [fe80::858:44ff:fe4d:2]:5201";
+        one.push([name.into(), Cell::Count(12), Cell::Count(1_234)]);
+        one.push(["arp".into(), Cell::Count(7), Cell::Count(5_678)]);
+        let narrow = text_of(80, |canvas| table(canvas, &one));
+        let line = |words: &str| narrow.lines().find(|line| line.contains(words)).unwrap();
+        assert_eq!(line(name).trim(), name);
+        assert!(line("1,234").contains("12"), "{narrow}");
+        assert!(line("5,678").contains("arp"), "{narrow}");
+        assert!(narrow.lines().all(|line| columns(line) <= 80), "{narrow}");
+        let wide = text_of(120, |canvas| table(canvas, &one));
+        let line = wide.lines().find(|line| line.contains(name)).unwrap();
+        assert!(line.contains("1,234"), "{wide}");
     }
 
     #[test]

@@ -150,10 +150,10 @@ impl Conversation {
             let Some(transmit) = self.egress.poll_transmit(self.now) else {
                 break;
             };
-            let (kind, channel, sequence) = (transmit.kind, transmit.channel, transmit.sequence);
+            let key = transmit.key();
             let bytes = transmit.datagram.to_vec();
             assert!(decode(&bytes).is_ok(), "a gateway sends what is refused");
-            self.egress.on_transmit_stamp(kind, channel, sequence, 700);
+            self.egress.on_transmit_stamp(key, 700);
             if self.forward.len() < PATH_LENGTH {
                 self.forward.push_back(bytes);
             }

@@ -152,13 +152,40 @@ pub struct Transmit<'a> {
     pub kind: Kind,
     /// Index of the channel whose message it carries.
     pub channel: Option<usize>,
-    /// The header's sequence number; with `kind` and `channel` the key for
-    /// [`EgressBridge::on_transmit_stamp`].
+    /// The header's sequence number.
     pub sequence: u64,
     /// Epoch and sequence of the message it carries.
     pub message: Option<(u32, u64)>,
     /// No further datagram of the same message follows.
     pub is_last_fragment: bool,
+}
+
+/// Which of the datagrams given earlier a transmit stamp is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TransmitKey {
+    /// What it is.
+    pub kind: Kind,
+    /// Index of the channel whose message it carries.
+    pub channel: Option<usize>,
+    /// The producer's start of that message: numbers begin anew with each.
+    pub epoch: Option<u32>,
+    /// The header's sequence number.
+    pub sequence: u64,
+}
+
+impl Transmit<'_> {
+    /// What its stamp is given back with.
+    pub const fn key(&self) -> TransmitKey {
+        TransmitKey {
+            kind: self.kind,
+            channel: self.channel,
+            epoch: match self.message {
+                Some((epoch, _)) => Some(epoch),
+                None => None,
+            },
+            sequence: self.sequence,
+        }
+    }
 }
 
 /// What a reply said.
@@ -523,28 +550,27 @@ impl EgressBridge {
 
     /// The kernel's transmit stamp of a datagram given earlier: `handed_to_tx_ns` is that stamp
     /// minus the `now` it was polled with; for a fragmented message, the stamp of the last
-    /// fragment minus the `now` of the first. It rides on the next message, or refines t1.
-    pub fn on_transmit_stamp(
-        &mut self,
-        kind: Kind,
-        channel: Option<usize>,
-        sequence: u64,
-        handed_to_tx_ns: i64,
-    ) {
+    /// fragment minus the `now` of the first. It rides on the next message of the same start of its producer, or
+    /// refines t1.
+    pub fn on_transmit_stamp(&mut self, of: TransmitKey, handed_to_tx_ns: i64) {
         let delta = u32::try_from(handed_to_tx_ns).unwrap_or(u32::MAX);
         if delta == u32::MAX {
             self.counts.transmit_stamp_implausible_count += 1;
             return;
         }
-        match (channel, kind) {
+        match (of.channel, of.kind) {
             (Some(channel), _) => {
                 let own = &mut self.channels[channel];
-                if own.last_message.is_some_and(|(_, last)| sequence <= last) {
-                    own.follow_up = Some(FollowUpField::new(sequence, delta));
+                let is_of_last_start = own
+                    .last_message
+                    .is_some_and(|(epoch, last)| of.epoch == Some(epoch) && of.sequence <= last);
+                if is_of_last_start {
+                    own.follow_up = Some(FollowUpField::new(of.sequence, delta));
                 }
             }
             (None, Kind::SyncRequest) => {
-                self.exchanges.set_transmit_stamp(sequence, handed_to_tx_ns);
+                let exchanges = &mut self.exchanges;
+                exchanges.set_transmit_stamp(of.sequence, handed_to_tx_ns);
             }
             (None, _) => {}
         }

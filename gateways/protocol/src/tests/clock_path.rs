@@ -74,8 +74,8 @@ fn it_exchanges_clocks_every_period_with_all_four_stamps_of_the_kernel() {
         let now_ns = 1_000_000_000 + step * 1_000_000;
         let now = Instant::from_ns(now_ns + OFFSET_NS);
         while let Some(transmit) = egress.poll_transmit(now) {
-            let (kind, sequence) = (transmit.kind, transmit.sequence);
-            assert_ne!(kind, Kind::Data);
+            let key = transmit.key();
+            assert_ne!(key.kind, Kind::Data);
             let there_ns = now_ns + DEPARTURE_NS + DELAY_NS;
             let taken = ingress.on_datagram(
                 Instant::from_ns(there_ns),
@@ -84,7 +84,7 @@ fn it_exchanges_clocks_every_period_with_all_four_stamps_of_the_kernel() {
                 &mut InMemory::default().with(|_, _| panic!("no message")),
             );
             taken.unwrap();
-            egress.on_transmit_stamp(kind, None, sequence, DEPARTURE_NS);
+            egress.on_transmit_stamp(key, DEPARTURE_NS);
             let reply = ingress.poll_transmit(Instant::from_ns(there_ns)).unwrap();
             let (kind, sequence) = (reply.kind, reply.sequence);
             let back_ns = there_ns + DEPARTURE_NS + DELAY_NS + OFFSET_NS;

@@ -328,7 +328,7 @@ impl<M: Medium> Lab<M> {
     pub fn drain_egress(&mut self) {
         let (now, egress_now) = (self.now(), self.egress_now());
         while let Some(transmit) = self.egress.poll_transmit(egress_now) {
-            let (kind, channel, sequence) = (transmit.kind, transmit.channel, transmit.sequence);
+            let (kind, key) = (transmit.kind, transmit.key());
             assert!(transmit.datagram.len() + 16 <= 1472);
             let is_last = transmit.is_last_fragment;
             if !self.is_listening {
@@ -340,8 +340,7 @@ impl<M: Medium> Lab<M> {
             self.datagrams.push((kind, header.channel));
             self.medium.send(Way::There, now, transmit.datagram);
             if is_last {
-                self.egress
-                    .on_transmit_stamp(kind, channel, sequence, TX_NS);
+                self.egress.on_transmit_stamp(key, TX_NS);
             }
         }
     }

@@ -2,11 +2,12 @@
 
 use hil_core::time::Instant;
 
-use crate::egress::{EgressBridge, LocalRefusal, PeerState};
+use crate::egress::{EgressBridge, LocalRefusal, PeerState, TransmitKey};
 use crate::ingress::{Disposition, InMemory, IngressBridge};
-use crate::lab::{Impairment, Lab, egress_settings, ingress_settings};
+use crate::lab::{Impairment, Lab, TX_NS, egress_settings, ingress_settings};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
+use crate::wire::Kind;
 
 const DELAY: Impairment = Impairment {
     delay_ns: 300_000,
@@ -34,6 +35,29 @@ fn a_restarted_producer_is_a_restart_and_not_a_loss() {
     assert_eq!(counts.restart_count, 1);
     // The stamp of the old producer's last message does not ride on the new one's first.
     assert_eq!(lab.delivered[300].follow_up, None);
+}
+
+#[test]
+fn a_late_stamp_of_the_old_producer_rides_on_no_message_of_the_new_one() {
+    let mut lab = Lab::new(1, 64, DELAY);
+    lab.run_ms(2);
+    lab.publish_for_ms(10);
+    lab.epoch = 2;
+    lab.next_sequence = 0;
+    lab.publish_for_ms(5);
+    let late = |epoch| TransmitKey {
+        kind: Kind::Data,
+        channel: Some(0),
+        epoch: Some(epoch),
+        sequence: 4,
+    };
+    lab.egress.on_transmit_stamp(late(1), 7 * TX_NS);
+    lab.publish_for_ms(1);
+    lab.egress.on_transmit_stamp(late(2), 7 * TX_NS);
+    lab.publish_for_ms(1);
+    finish(&mut lab);
+    let ridden = |index: usize| lab.delivered[index].follow_up.map(|(_, delta_ns)| delta_ns);
+    assert_eq!([ridden(15), ridden(16)], [Some(TX_NS), Some(7 * TX_NS)]);
 }
 
 #[test]

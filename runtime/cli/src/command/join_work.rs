@@ -1,12 +1,14 @@
 //! Two programs that speak IP with a link between them: the topology that says so, made of the command line.
 
+use std::env;
 use std::io;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::{Path, PathBuf};
 
 use hil_platform::console::Console;
-use hil_topology::LinkPorts;
+use hil_platform::random::random_bytes;
 use hil_topology::registry::Registry;
+use hil_topology::{LinkPorts, TopologyError, TopologyErrors};
 use toml::{Table, Value};
 
 use super::{Refusal, carry_out, failed, loaded, usage};
@@ -28,10 +30,15 @@ pub(super) fn join(
     let mut link = link(args.link.as_deref(), registry, console)?;
     let port = free_ports().map_err(|error| failed(format!("no free UDP port: {error}")))?;
     link.insert("port".to_owned(), i64::from(port).into());
-    let table = topology(args, link).map_err(usage)?;
-    let text = table.to_string();
+    let seed = if let Some(seed) = args.seed {
+        seed
+    } else {
+        let bytes = random_bytes().map_err(|error| failed(format!("no seed: {error}")))?;
+        u64::from(u32::from_ne_bytes(bytes))
+    };
+    let text = topology(args, seed, link).map_err(usage)?.to_string();
     let topology = hil_topology::parse("join", &text, &[], registry.known());
-    let topology = loaded(topology, console)?;
+    let topology = topology.map_err(|errors| usage(as_typed(args, &errors)))?;
     let run = RunArgs {
         topology: None,
         host: None,
@@ -41,7 +48,38 @@ pub(super) fn join(
         full: args.full,
         domain_root: None,
     };
-    carry_out(Path::new("join"), &run, &topology, registry, console)
+    let mut command_line: Vec<String> = env::args().collect();
+    if args.seed.is_none()
+        && let Some(at) = command_line.iter().position(|word| word == "join")
+    {
+        command_line.insert(at + 1, format!("--seed={seed}"));
+    }
+    carry_out(
+        Path::new("join"),
+        &run,
+        &topology,
+        command_line,
+        registry,
+        console,
+    )
+}
+
+/// The faults of the topology that was made of the command line, each by what was typed.
+fn as_typed(args: &JoinArgs, errors: &TopologyErrors) -> String {
+    let typed = |error: &TopologyError| {
+        let TopologyError { key, fault, .. } = error;
+        if let Some(key) = key.strip_prefix("links.link.") {
+            let link = args.link.as_deref().unwrap_or_default();
+            return format!("--link '{link}': {key} {fault}");
+        }
+        match key.as_str() {
+            "run.duration" => format!("--duration {fault}"),
+            "run.seed" => format!("--seed {fault}"),
+            _ => format!("{key} {fault}"),
+        }
+    };
+    let typed: Vec<String> = errors.errors().iter().map(typed).collect();
+    typed.join("\n")
 }
 
 /// The first of as many UDP ports in a row as a link takes on one PC, none of which is in use.
@@ -145,7 +183,7 @@ fn bits_per_second(text: &str) -> Option<i64> {
 }
 
 /// The file that runs both programs with `link` between them.
-fn topology(args: &JoinArgs, mut link: Table) -> Result<Table, String> {
+fn topology(args: &JoinArgs, seed: u64, mut link: Table) -> Result<Table, String> {
     let programs: Vec<&[String]> = args.programs.splitn(2, |word| word == "--").collect();
     let [first, second] = programs[..] else {
         return Err("one program only: say -- FIRST -- SECOND".to_owned());
@@ -180,8 +218,7 @@ fn topology(args: &JoinArgs, mut link: Table) -> Result<Table, String> {
     let hosts = [text(one), text(other)];
     link.insert("between".to_owned(), Value::Array(hosts.to_vec()));
     link.insert("path_mtu_bytes".to_owned(), PATH_MTU_BYTES.into());
-    let seed =
-        i64::try_from(args.seed).map_err(|_large| format!("--seed {} is too large", args.seed))?;
+    let seed = i64::try_from(seed).map_err(|_large| format!("--seed {seed} is too large"))?;
     let whole = table(vec![
         ("version", 1.into()),
         ("name", text("join")),
@@ -232,7 +269,7 @@ mod tests {
         JoinArgs {
             link: None,
             duration: None,
-            seed: 7,
+            seed: None,
             quiet: true,
             full: false,
             programs: programs.iter().map(|&word| word.to_owned()).collect(),
@@ -266,7 +303,7 @@ mod tests {
     fn two_programs_become_a_topology_with_a_channel_each_way() {
         let registry = Registry::default();
         let link = link_of_words("delay 5ms loss 1%").unwrap();
-        let table = topology(&args(&["sh", "-c", "true", "--", "sleep", "1"]), link).unwrap();
+        let table = topology(&args(&["sh", "-c", "true", "--", "sleep", "1"]), 7, link).unwrap();
         let text = table.to_string();
         let parsed = hil_topology::parse("join", &text, &[], registry.known()).unwrap();
         let addresses: Vec<_> = parsed.processes().iter().map(Process::inside).collect();
@@ -279,10 +316,39 @@ mod tests {
     }
 
     #[test]
+    fn a_fault_points_at_what_was_typed() {
+        let registry = Registry::default();
+        for (words, duration, says) in [
+            ("delay 5", None, "--link 'delay 5': delay \"5\" "),
+            (
+                "rate 1bit",
+                None,
+                "--link 'rate 1bit': rate.bits_per_second ",
+            ),
+            ("delay 5ms", Some("9"), "--duration \"9\" "),
+        ] {
+            let args = JoinArgs {
+                link: Some(words.to_owned()),
+                duration: duration.map(str::to_owned),
+                ..args(&["sleep", "1", "--", "sleep", "1"])
+            };
+            let link = link_of_words(words).unwrap();
+            let text = topology(&args, 7, link).unwrap().to_string();
+            let errors = hil_topology::parse("join", &text, &[], registry.known()).unwrap_err();
+            let typed = as_typed(&args, &errors);
+            assert!(
+                typed.starts_with(says) && typed.contains("expected")
+                    || typed.starts_with(says) && typed.contains("outside"),
+                "{typed}"
+            );
+        }
+    }
+
+    #[test]
     fn a_program_too_few_is_refused() {
         let link = || Table::from_iter([via("udp")]);
         for programs in [&["sleep", "1"][..], &["sleep", "--"], &["--", "sleep"]] {
-            let why = topology(&args(programs), link()).unwrap_err();
+            let why = topology(&args(programs), 7, link()).unwrap_err();
             assert!(why.contains("-- FIRST -- SECOND"), "{why}");
         }
     }

@@ -10,7 +10,7 @@ use hil_net::radio::RadioReport;
 use hil_net::{TransmitStage, TransmitStamp, TxToken};
 use hil_protocol::egress::TransmitFailure;
 use hil_protocol::wire::Kind;
-use hil_protocol::{EgressBridge, LongPiece, PeerState};
+use hil_protocol::{EgressBridge, LongPiece, PeerState, TransmitKey};
 use hil_transport::{DatagramSender, SendRefusal};
 
 use super::kernel_clock::KernelClock;
@@ -43,10 +43,7 @@ pub(crate) struct Line {
 
 #[derive(Debug, Clone, Copy)]
 struct Pending {
-    kind: Kind,
-    /// Whose message it carries.
-    channel: Option<usize>,
-    sequence: u64,
+    key: TransmitKey,
     handed: Instant,
     /// Of a message's last piece.
     record: Option<EgressRecord>,
@@ -98,9 +95,9 @@ impl Line {
                 break;
             };
             self.newest_handed = handed;
-            let (kind, channel, sequence) = (transmit.kind, transmit.channel, transmit.sequence);
+            let key = transmit.key();
             let is_last = transmit.is_last_fragment;
-            if kind == Kind::Data
+            if key.kind == Kind::Data
                 && let Some(record) = &mut self.message
             {
                 record.fragment_count += 1;
@@ -109,7 +106,7 @@ impl Line {
                 }
             }
             let sent = self.sender.send(transmit.datagram);
-            let is_message_end = kind == Kind::Data && (is_last || sent.is_err());
+            let is_message_end = key.kind == Kind::Data && (is_last || sent.is_err());
             let record = if is_message_end {
                 self.message.take()
             } else {
@@ -118,9 +115,7 @@ impl Line {
             match sent {
                 Ok(token) => {
                     let pending = Pending {
-                        kind,
-                        channel,
-                        sequence,
+                        key,
                         handed,
                         record,
                         is_stamped: false,
@@ -132,7 +127,7 @@ impl Line {
                 Err(refusal) => {
                     let is_established = bridge.peer_state() == PeerState::Established;
                     bridge.on_transmit_failed(handed, failure(refusal, is_established));
-                    if let Some((channel, record)) = channel.zip(record) {
+                    if let Some((channel, record)) = key.channel.zip(record) {
                         self.finish_refused(channel, record);
                     }
                 }
@@ -192,18 +187,13 @@ impl Line {
             return;
         };
         // Of a message in pieces only the last piece's stamp is the message's.
-        let is_whole = pending.kind != Kind::Data || pending.record.is_some();
+        let is_whole = pending.key.kind != Kind::Data || pending.record.is_some();
         if let Some(software_ns) = stamp.stamps.software_ns {
             if is_whole && counts {
                 let first_handed = pending
                     .record
                     .map_or(pending.handed.as_ns(), |record| record.handed_ns);
-                bridge.on_transmit_stamp(
-                    pending.kind,
-                    pending.channel,
-                    pending.sequence,
-                    software_ns - offset - first_handed,
-                );
+                bridge.on_transmit_stamp(pending.key, software_ns - offset - first_handed);
             }
             pending.is_stamped |= counts;
             if let Some(record) = &mut pending.record {
@@ -257,7 +247,7 @@ impl Line {
     }
 
     fn retire(&mut self, pending: Option<Pending>) {
-        if let Some((channel, record)) = pending.and_then(|one| one.channel.zip(one.record)) {
+        if let Some((channel, record)) = pending.and_then(|one| one.key.channel.zip(one.record)) {
             self.finish(channel, record);
         }
     }
@@ -303,9 +293,12 @@ impl Line {
             return Ok(());
         }
         let pending = Pending {
-            kind: Kind::Data,
-            channel: Some(piece.channel),
-            sequence: piece.sequence,
+            key: TransmitKey {
+                kind: Kind::Data,
+                channel: Some(piece.channel),
+                epoch: record.map(|record| record.epoch),
+                sequence: piece.sequence,
+            },
             handed,
             record,
             is_stamped: false,
@@ -414,9 +407,12 @@ mod tests {
                 let [is_stamped, is_nic_stamped, is_reported] =
                     [1, 2, 4].map(|bit| come & bit != 0);
                 let pending = Pending {
-                    kind: Kind::Data,
-                    channel: Some(0),
-                    sequence: 0,
+                    key: TransmitKey {
+                        kind: Kind::Data,
+                        channel: Some(0),
+                        epoch: Some(1),
+                        sequence: 0,
+                    },
                     handed: Instant::ZERO,
                     record: None,
                     is_stamped,

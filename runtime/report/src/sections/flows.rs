@@ -22,7 +22,8 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
     ];
     let mut table = Table::new("", &columns)
         .ranked("unknown", 2)
-        .ranked("max", 1);
+        .ranked("max", 1)
+        .with_long_names();
     for flow in flows.iter().take(shown_count) {
         let delay = flow.delay.measured();
         let cells = [
@@ -99,5 +100,15 @@ mod tests {
             assert!(text.contains(words), "{words}:\n{text}");
         }
         assert!(!text.contains("arp"), "{text}");
+        let name = "udp 10.77.0.1:40001 → 10.77.0.2:6510";
+        summary.flows[0]
+            .flows
+            .push(flow(name, 1_000_000, [30_000, 12]));
+        for width in [80, 100] {
+            let text = render(&[flows(&summary, 3)], width, Style::Plain);
+            for words in [name, "unknown", "max"] {
+                assert!(text.contains(words), "{words}:\n{text}");
+            }
+        }
     }
 }

@@ -68,9 +68,9 @@ fn converse(
     let mut memory = InMemory::default();
     let mut destination = memory.with(|_, _| {});
     while let Some(transmit) = sender.poll_transmit(now) {
-        let (kind, channel, sequence) = (transmit.kind, transmit.channel, transmit.sequence);
+        let key = transmit.key();
         let datagram = transmit.datagram.to_vec();
-        sender.on_transmit_stamp(kind, channel, sequence, 900);
+        sender.on_transmit_stamp(key, 900);
         let _counted = receiver.on_datagram(now, arrival, &datagram, &mut destination);
         made.push(datagram);
         while let Some(reply) = receiver.poll_transmit(now) {

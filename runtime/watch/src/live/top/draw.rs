@@ -190,7 +190,8 @@ fn tabled(id: &str, table: Table) -> Section {
 }
 
 fn links(view: &View) -> Section {
-    let mut table = Table::new("", &["LINKS", "via", "state", "loss", "condition"]);
+    let loss = format!("loss, {}", window(view));
+    let mut table = Table::new("", &["LINKS", "via", "state", &loss, "condition"]);
     for one in &view.links {
         table.push([
             one.name.as_str().into(),
@@ -203,11 +204,17 @@ fn links(view: &View) -> Section {
     tabled("links", table)
 }
 
+/// How far the figures reach back.
+fn window(view: &View) -> String {
+    format!("{} s", view.run.window_s)
+}
+
 fn channels(view: &View, detail: Detail) -> Section {
+    let [rate, lost] = ["Hz", "lost"].map(|what| format!("{what}, {}", window(view)));
     let columns = [
         "CHANNELS",
-        "rate, Hz",
-        "lost",
+        &rate,
+        &lost,
         "p50",
         "p99",
         "± clocks",
