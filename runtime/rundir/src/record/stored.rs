@@ -11,6 +11,7 @@ use bytemuck::Pod;
 use hil_account::RecordSource;
 use hil_core::message::Envelope;
 use hil_core::run_log::{MessageReader, StoredMessages};
+use hil_platform::plain_file;
 
 use super::file::{HEADER_BYTES, RecordFileError, RecordHeader};
 
@@ -56,7 +57,7 @@ impl StoredFile {
     pub fn open(path: &Path) -> Result<Self, RecordFileError> {
         let read = || -> io::Result<(Vec<u8>, u64)> {
             let mut start = Vec::new();
-            let file = File::open(path)?;
+            let file = plain_file::open(path)?;
             let bytes = file.metadata()?.len();
             file.take(HEADER_BYTES as u64).read_to_end(&mut start)?;
             Ok((start, bytes))
@@ -76,7 +77,7 @@ impl StoredFile {
 
     /// Past the header.
     fn records(&self) -> io::Result<BufReader<File>> {
-        let mut file = BufReader::with_capacity(PIECE_BYTES, File::open(&self.path)?);
+        let mut file = BufReader::with_capacity(PIECE_BYTES, plain_file::open(&self.path)?);
         file.read_exact(&mut [0; HEADER_BYTES])?;
         Ok(file)
     }
