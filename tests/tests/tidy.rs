@@ -44,6 +44,23 @@ const UNSAFE_FILES: [&str; 12] = [
     "runtime/platform/src/signals.rs",
     "runtime/shm/src/raw.rs",
 ];
+/// What tells the wall clock's time or a file's by it. Somebody may set that clock, so nothing is awaited or
+/// judged by it: these files name a run, or stamp what people or other programs read.
+const WALL_CLOCK_WORDS: [&str; 5] = [
+    "SystemTime",
+    "modified()",
+    "created()",
+    "accessed()",
+    "st_mtime",
+];
+const WALL_CLOCK_FILES: [&str; 6] = [
+    "runtime/engine/src/supervisor/session.rs",
+    "runtime/probe/src/live.rs",
+    "runtime/recorder/src/serve/engine.rs",
+    "runtime/rundir/src/announcement.rs",
+    "runtime/rundir/src/manifest.rs",
+    "runtime/rundir/src/run_folder.rs",
+];
 
 type Rule = fn(&SourceFile) -> Vec<String>;
 
@@ -94,6 +111,21 @@ fn unsafe_only_where_listed(file: &SourceFile) -> Vec<String> {
         .collect()
 }
 
+fn wall_clock_only_where_listed(file: &SourceFile) -> Vec<String> {
+    let path = Path::new(&file.path);
+    let is_ours = ["gateways", "runtime"]
+        .iter()
+        .any(|top| path.starts_with(top));
+    if !is_ours || WALL_CLOCK_FILES.contains(&file.path.as_str()) {
+        return Vec::new();
+    }
+    let found = WALL_CLOCK_WORDS.iter().flat_map(|word| {
+        let lines = lines_with_word(&file.code, word).into_iter();
+        lines.map(move |line| format!("line {line}: `{word}` in an unlisted file"))
+    });
+    found.collect()
+}
+
 fn check_tree(rule: Rule) {
     let complain = |file: SourceFile| {
         let complaints = rule(&file);
@@ -135,6 +167,20 @@ fn pure_code_touches_nothing() {
     check_snippet(purity, "models/core/src/a.rs", "use std::{fs, thread};", 2);
     let words = "// no std::fs here\nlet a = \"std::fs\";";
     check_snippet(purity, "models/core/src/a.rs", words, 0);
+}
+
+#[test]
+fn nothing_waits_or_judges_by_the_wall_clock() {
+    check_tree(wall_clock_only_where_listed);
+    let text = "let age = SystemTime::now();\nlet other = data.modified()?;\n";
+    for (path, fault_count) in [
+        ("runtime/shm/src/domain.rs", 2),
+        ("gateways/net/src/a.rs", 2),
+        ("runtime/rundir/src/manifest.rs", 0),
+        ("tests/src/child.rs", 0),
+    ] {
+        check_snippet(wall_clock_only_where_listed, path, text, fault_count);
+    }
 }
 
 #[test]

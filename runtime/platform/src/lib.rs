@@ -12,6 +12,7 @@ pub mod host_limits;
 pub mod open_files;
 pub mod own_folder;
 pub mod own_process;
+pub mod plain_file;
 pub mod progress;
 pub mod random;
 pub mod realtime;

@@ -3,9 +3,9 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
-use std::fs;
 
 use hil_arm::yumi::description::Urdf;
+use hil_platform::plain_file;
 use hil_rundir::manifest::Manifest;
 use hil_rundir::run_folder::RunFolder;
 use serde_json::json;
@@ -187,7 +187,9 @@ pub(crate) fn attach(recording: &mut Recording, folder: &RunFolder) -> Result<()
         (folder.events(), "text/plain"),
     ] {
         // A killed run lacks some of them, which the metadata say.
-        let Ok(data) = fs::read(&path) else { continue };
+        let Ok(data) = plain_file::read(&path) else {
+            continue;
+        };
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         recording.attach_file(&name, media_type, data)?;
     }

@@ -33,6 +33,8 @@ const WAIT_PAUSE: Duration = Duration::from_millis(50);
 const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 /// What the processes of a run have in their rings is in their files after this time.
 const RINGS_EMPTY_WITHIN: Duration = Duration::from_millis(60);
+/// How long what waits is read after a signal: a run that goes on may write faster than it is read.
+const CATCH_UP_WITHIN: Duration = Duration::from_secs(30);
 /// How long the ground of a fleet is waited for at the end, and how often it is asked for.
 const GROUND_WITHIN: Duration = Duration::from_secs(30);
 const GROUND_PAUSE: Duration = Duration::from_millis(20);
@@ -256,9 +258,12 @@ impl LiveRecording {
     /// What was published before the signal is to be in the file; what the last poll came to.
     fn catch_up(&mut self) -> Result<Poll, WriteError> {
         thread::sleep(RINGS_EMPTY_WITHIN);
-        let mut polled = self.poll()?;
-        while polled == Poll::Busy {
-            polled = self.poll()?;
+        let polled = read_up(Instant::now() + CATCH_UP_WITHIN, || self.poll())?;
+        if polled == Poll::Busy {
+            let within_s = CATCH_UP_WITHIN.as_secs();
+            self.problems.note(&format!(
+                "more than could be read in {within_s} s after the signal was there; the rest is not in the file"
+            ));
         }
         self.topics.flush_joins(&mut self.files)?;
         Ok(polled)
@@ -373,5 +378,34 @@ impl LiveRecording {
         }
         file.describe("hil.channels", channels)?;
         file.describe("hil.recording", words)
+    }
+}
+
+/// Polls until nothing waits, or until `deadline`; what the last poll came to.
+fn read_up<E>(deadline: Instant, mut poll: impl FnMut() -> Result<Poll, E>) -> Result<Poll, E> {
+    loop {
+        let polled = poll()?;
+        if polled != Poll::Busy || Instant::now() >= deadline {
+            return Ok(polled);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_never_ceases_to_come_is_read_until_a_deadline() {
+        let deadline = Instant::now() + Duration::from_millis(20);
+        let polled = read_up(deadline, || Ok::<_, ()>(Poll::Busy));
+        assert_eq!(polled, Ok(Poll::Busy));
+        assert!(Instant::now() >= deadline);
+        let mut left = 3;
+        let polled = read_up(Instant::now() + Duration::from_mins(1), || {
+            left -= 1;
+            Ok::<_, ()>(if left > 0 { Poll::Busy } else { Poll::Idle })
+        });
+        assert_eq!((polled, left), (Ok(Poll::Idle), 0));
     }
 }

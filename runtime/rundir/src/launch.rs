@@ -12,6 +12,7 @@ use hil_arm::egm::messages::Side as ArmSide;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use hil_platform::plain_file;
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;
 use hil_topology::emulation::EmulationLaunch;
@@ -261,7 +262,7 @@ pub enum LaunchError {
 /// # Errors
 /// When it cannot be read or does not fit `T`.
 pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, LaunchError> {
-    let text = fs::read(path).map_err(|source| LaunchError::Io {
+    let text = plain_file::read(path).map_err(|source| LaunchError::Io {
         path: path.to_owned(),
         source,
     })?;

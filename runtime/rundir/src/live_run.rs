@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::manifest::Manifest;
 use crate::run_folder::RunFolder;
 use hil_platform::domain_address::{DomainAddress, DomainAddressError};
+use hil_platform::plain_file;
 
 /// Version of the layout of `live.json`. Within one, fields are only added.
 pub const LIVE_VERSION: u32 = 1;
@@ -105,16 +106,12 @@ impl LiveRun {
     /// # Errors
     /// When it is not there or not what a supervisor writes.
     pub fn read(folder: &Path) -> io::Result<Self> {
-        // Who looks for runs also looks into folders of others: what is no file must not make him wait.
-        let flags = (OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK).bits();
-        let mut options = File::options();
-        let file = options
-            .read(true)
-            .custom_flags(flags)
-            .open(folder.join(Self::FILE_NAME))?;
-        if !file.metadata()?.is_file() {
-            return Err(io::Error::other("not a file"));
+        let path = folder.join(Self::FILE_NAME);
+        // Who looks for runs also looks into folders of others.
+        if fs::symlink_metadata(&path)?.is_symlink() {
+            return Err(io::Error::other("a link"));
         }
+        let file = plain_file::open(&path)?;
         serde_json::from_reader(BufReader::new(file)).map_err(io::Error::other)
     }
 
@@ -173,7 +170,10 @@ impl LiveRun {
 /// True while another process has the launcher's lock on a domain's folder. Asked only of folders
 /// with an announcement, whose lock was taken before: a launcher never meets the question.
 fn is_locked(root: &Path) -> bool {
-    let Ok(directory) = File::open(root) else {
+    // Others may announce a pipe.
+    let flags = (OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW).bits();
+    let mut options = File::options();
+    let Ok(directory) = options.read(true).custom_flags(flags).open(root) else {
         return false;
     };
     matches!(

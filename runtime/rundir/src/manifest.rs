@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 
 use crate::run_folder::{RunFolder, utc_text};
 use hil_platform::host_facts::HostFacts;
+use hil_platform::plain_file;
 use hil_topology::{KnownCases, Topology, TopologyErrors};
 
 /// Version of the layout of `manifest.json`. Within one, fields are only added.
@@ -125,7 +126,7 @@ impl Manifest {
     /// # Errors
     /// When the file cannot be read.
     pub fn read(folder: &RunFolder) -> io::Result<Self> {
-        let text = fs::read_to_string(folder.manifest())?;
+        let text = plain_file::read_to_string(&folder.manifest())?;
         serde_json::from_str(&text).map_err(io::Error::other)
     }
 

@@ -4,9 +4,10 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::Duration;
-use std::{fmt, fs, io};
+use std::{fmt, io};
 
 use hil_core::time::Instant;
+use hil_platform::plain_file;
 use serde::{Deserialize, Serialize};
 
 use crate::event::ProcessKind;
@@ -142,7 +143,7 @@ impl RunStatus {
     /// # Errors
     /// When there is none, or not one that this program can read.
     pub fn read(folder: &Path) -> io::Result<Self> {
-        let text = fs::read_to_string(folder.join(FILE_NAME))?;
+        let text = plain_file::read_to_string(&folder.join(FILE_NAME))?;
         serde_json::from_str(&text).map_err(io::Error::other)
     }
 }
@@ -246,6 +247,8 @@ pub fn overruns(folder: &Path, now: Instant) -> io::Result<Overruns> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

@@ -32,6 +32,7 @@ use hil_platform::domain_address::{
     DomainAddress, DomainAddressError, checked_root_path, is_prefix,
 };
 use hil_platform::own_folder::{OwnFolder, OwnFolderError};
+use hil_platform::plain_file;
 use hil_platform::random::random_bytes;
 
 /// File in the root path that says whose it is; its content is the prefix of the run.
@@ -168,7 +169,7 @@ impl Domain {
 
     /// The prefix of the domain whose root is, or was, `root_path`; `None` where there is none.
     pub fn prefix_at(root_path: &Path) -> Option<String> {
-        let prefix = fs::read_to_string(root_path.join(MARKER)).ok()?;
+        let prefix = plain_file::read_to_string(&root_path.join(MARKER)).ok()?;
         is_prefix(&prefix).then_some(prefix)
     }
 

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant as WallInstant};
 
 use bytemuck::Pod;
 use hil_core::message::Envelope;
+use hil_platform::plain_file;
 
 use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::{HEADER_BYTES, RecordHeader, written_bytes};
@@ -241,7 +242,7 @@ impl RecordFollower {
             let path = self.folder.join(&name);
             let (series, instance) = series_of(&name.to_string_lossy());
             self.known.insert(name);
-            match File::open(&path) {
+            match plain_file::open(&path) {
                 Ok(file) => self.files.push(Followed {
                     passed_bytes: if self.passes_over {
                         written_bytes(&file).unwrap_or(0)

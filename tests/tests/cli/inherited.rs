@@ -2,7 +2,7 @@
 //! neither changes how it goes or ends.
 
 use std::os::unix::fs::PermissionsExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 use std::{env, fs};
@@ -12,7 +12,7 @@ use hil_tests::account::assert_every_message_is_accounted_for;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::{RunFiles, Trial, wait_until};
+use hil_tests::trial::{RunFiles, Trial, shipped_topology, wait_until};
 use nix::sys::signal::Signal;
 
 const LIMIT: Duration = Duration::from_mins(1);
@@ -86,6 +86,21 @@ fn write_program(path: &Path, script: &str) {
     fs::set_permissions(path, fs::Permissions::from_mode(0o755)).unwrap();
 }
 
+/// All that is in `folder`, and itself.
+fn written(folder: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().path());
+    let inner = entries.flat_map(|path| {
+        if path.is_dir() {
+            written(&path)
+        } else {
+            vec![path]
+        }
+    });
+    inner.chain([folder.to_owned()]).collect()
+}
+
 /// The clock's daemon is asked at the end of a run, whose shared memory is there then, and by a program that
 /// is not ours.
 #[test]
@@ -100,13 +115,13 @@ fn no_program_that_a_run_starts_gets_its_shared_memory_or_what_its_parent_had_op
     fs::copy("/bin/sleep", tools.join("chronyd")).unwrap();
     let daemon = ChildGuard::spawn(Command::new(tools.join("chronyd")).arg("600")).unwrap();
     let own = format!("{list}; sleep 600");
-    let trial = Trial::shipped("shuttle-local.toml", record.path())
+    let trial = Trial::shipped("shuttle-local.toml", &record.join("runs"))
         .set("run.duration=\"1 s\"")
         .set(&format!("processes.robot.run=[\"sh\", \"-c\", \"{own}\"]"));
     let left_open = record.write("left-open", "");
-    // A shell that has a file open when it starts the run.
+    // A shell that has a file open, and no mask for new ones, when it starts the run.
     let mut command = Command::new("sh");
-    let script = format!("exec 7<{}; exec \"$@\"", left_open.display());
+    let script = format!("umask 0; exec 7<{}; exec \"$@\"", left_open.display());
     command.args(["-c", &script, "sh"]);
     command.arg(hil_runtime_binary()).args(trial.arguments());
     let path = env::var("PATH").unwrap();
@@ -117,6 +132,10 @@ fn no_program_that_a_run_starts_gets_its_shared_memory_or_what_its_parent_had_op
         .unwrap();
     finished.assert_success();
     drop(daemon);
+    for entry in written(trial.folder("", LIMIT).root()) {
+        let mode = fs::symlink_metadata(&entry).unwrap().permissions().mode();
+        assert_eq!(mode & 0o002, 0, "{}: {mode:o}", entry.display());
+    }
     let seen = fs::read_to_string(&seen).unwrap();
     // Before the run, at its end, and the user's own program.
     assert_eq!(seen.matches("total 0").count(), 3, "{seen}");
@@ -127,8 +146,8 @@ fn no_program_that_a_run_starts_gets_its_shared_memory_or_what_its_parent_had_op
     }
 }
 
-/// The file of the program is replaced, or removed, as an upgrade does it: the processes of a run that goes on
-/// are of one build.
+/// The file of the program is replaced, or removed, as an upgrade does it, and that of the topology is written
+/// over: the processes of a run that goes on are of one build and one topology.
 #[test]
 fn a_process_that_is_started_again_is_of_the_build_that_runs() {
     for becomes in [Some("#!/bin/sh\nexit 42\n"), None] {
@@ -136,7 +155,9 @@ fn a_process_that_is_started_again_is_of_the_build_that_runs() {
         let program = record.path().join("installed");
         fs::create_dir_all(record.path()).unwrap();
         fs::copy(hil_runtime_binary(), &program).unwrap();
-        let trial = Trial::shipped("local.toml", &record.path().join("runs"))
+        let topology = record.path().join("topology.toml");
+        fs::copy(shipped_topology("local.toml"), &topology).unwrap();
+        let trial = Trial::of(&topology, &record.path().join("runs"))
             .set("run.duration=\"10 min\"")
             .set("processes.controller.on_exit=\"restart\"");
         let mut command = Command::new(&program);
@@ -144,6 +165,7 @@ fn a_process_that_is_started_again_is_of_the_build_that_runs() {
         let files = trial.folder("", LIMIT);
         wait_for_messages(&files);
         fs::remove_file(&program).unwrap();
+        fs::write(&topology, "of another version").unwrap();
         if let Some(script) = becomes {
             write_program(&program, script);
         }

@@ -13,12 +13,15 @@ use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished, run};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
+use nix::fcntl::{Flock, FlockArg};
 use nix::sys::stat::Mode;
 use nix::unistd::{Gid, Uid, chown, mkfifo};
 
 const LIMIT: Duration = Duration::from_mins(1);
 /// Nobody else on this machine has it.
 const STRANGER: u32 = 45_678;
+/// Nor this one, for runs of a user who is not root.
+const USER: u32 = 45_679;
 
 fn as_stranger(script: &str) {
     let id = STRANGER.to_string();
@@ -110,6 +113,18 @@ fn give_back(path: &Path) {
     chown(path, Some(Uid::from_raw(0)), Some(Gid::from_raw(0))).unwrap();
 }
 
+/// What `hil-runtime channel list` says where `folder` is the base of domains.
+fn listed(folder: &RunFolder) -> Finished {
+    let mut command = Command::new(hil_runtime_binary());
+    command
+        .args(["channel", "list"])
+        .env("TMPDIR", folder.path());
+    let began = Instant::now();
+    let finished = ChildGuard::spawn(&mut command).unwrap().wait_within(LIMIT);
+    println!("{:.2} s", began.elapsed().as_secs_f64());
+    finished.unwrap()
+}
+
 #[test]
 fn looking_for_runs_does_not_wait_for_another_users_pipe() {
     let record = RunFolder::new("pipe");
@@ -117,14 +132,34 @@ fn looking_for_runs_does_not_wait_for_another_users_pipe() {
     fs::create_dir_all(base.join("x")).unwrap();
     mkfifo(&base.join("x/live.json"), Mode::from_bits_truncate(0o644)).unwrap();
     give_away(&base);
-    let mut command = Command::new(hil_runtime_binary());
-    command
-        .args(["channel", "list"])
-        .env("TMPDIR", record.path());
-    let began = Instant::now();
-    let finished = ChildGuard::spawn(&mut command).unwrap().wait_within(LIMIT);
-    println!("{:?} s", began.elapsed().as_secs_f64());
-    assert!(finished.is_ok());
+    listed(&record);
+}
+
+/// Of a run whose shared memory lies at a pipe, and of one that is held and whose files are pipes.
+#[test]
+fn looking_at_a_run_that_another_user_announces_does_not_wait_for_his_pipes() {
+    let record = RunFolder::new("announced");
+    let base = record.join("hil-0");
+    let run = record.join("run");
+    fs::create_dir_all(base.join("x")).unwrap();
+    fs::create_dir_all(&run).unwrap();
+    let [pipe, held] = ["pipe", "held"].map(|name| base.join(name));
+    fs::create_dir(&held).unwrap();
+    for path in [&pipe, &run.join("manifest.json"), &run.join("status.json")] {
+        mkfifo(path, Mode::from_bits_truncate(0o644)).unwrap();
+    }
+    let lock = fs::File::open(&held).unwrap();
+    let _held = Flock::lock(lock, FlockArg::LockExclusiveNonblock).unwrap();
+    give_away(&base);
+    for (root, said) in [(&pipe, "no run"), (&held, "not a regular file")] {
+        let announced = serde_json::json!({
+            "schema_version": 1, "name": "x-1", "topology": "x", "folder": run, "pid": 1,
+            "since": "today", "domains": { "a": format!("h0123abcd_@{}", root.display()) },
+        });
+        record.write("hil-0/x/live.json", &announced.to_string());
+        let finished = listed(&record);
+        assert!(finished.stderr.contains(said), "{said}: {finished:?}");
+    }
 }
 
 #[test]
@@ -133,7 +168,17 @@ fn an_empty_file_of_another_user_in_shared_memory_costs_a_run_nothing() {
     let trial = Trial::shipped("local.toml", record.path())
         .set("run.duration=\"4 s\"")
         .set("processes.controller.on_exit=\"restart\"");
-    let mut child = trial.start_here();
+    // Root could remove the stranger's files; a user cannot.
+    let id = USER.to_string();
+    fs::create_dir_all(record.path()).unwrap();
+    chown(record.path(), Some(Uid::from_raw(USER)), None).unwrap();
+    let mut command = Command::new("setpriv");
+    command.args(["--reuid", &id, "--regid", &id, "--clear-groups"]);
+    command.arg(hil_runtime_binary()).args(trial.arguments());
+    command
+        .env("TMPDIR", record.path())
+        .env_remove("XDG_RUNTIME_DIR");
+    let mut child = ChildGuard::spawn(&mut command).unwrap();
     let files = trial.folder("", LIMIT);
     wait_until(LIMIT, "messages", || {
         files.record_bytes("egm.right.command.taken.robot.") > 2048
@@ -152,7 +197,8 @@ fn an_empty_file_of_another_user_in_shared_memory_costs_a_run_nothing() {
         began.elapsed().as_secs_f64()
     );
     for name in &planted {
-        fs::remove_file(Path::new("/dev/shm").join(name)).unwrap();
+        // Gone where the run was root's, which could remove them.
+        let _was_there = fs::remove_file(Path::new("/dev/shm").join(name)).is_ok();
     }
     finished.unwrap().assert_success();
     let summary = files.summary();

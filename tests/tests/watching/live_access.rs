@@ -13,7 +13,7 @@ use hil_tests::child::run;
 use hil_tests::lab::{INTERFACE, Lab};
 use hil_tests::live_server::LiveServer;
 
-const LIMIT: Duration = Duration::from_mins(1);
+pub(super) const LIMIT: Duration = Duration::from_mins(1);
 /// Four times as long as a viewer that says nothing keeps its seat.
 const GONE_LIMIT: Duration = Duration::from_mins(2);
 /// Viewers at once, as docs/live-view.md says.
@@ -35,13 +35,14 @@ fn ask(server: &LiveServer, host: &str, origin: Option<&str>) -> Asked {
     Asked::to_look_on(&server.socket, host, origin)
 }
 
-fn ask_as_program(server: &LiveServer) -> Asked {
-    ask(server, &server.socket, None)
+/// The same at the socket with this address.
+pub(super) fn ask_as_program(socket: &str) -> Asked {
+    Asked::to_look_on(socket, socket, None)
 }
 
 /// A request that was sent.
-struct Asked {
-    stream: TcpStream,
+pub(super) struct Asked {
+    pub(super) stream: TcpStream,
 }
 
 impl Asked {
@@ -56,7 +57,7 @@ impl Asked {
         Self::send(address, request.as_bytes())
     }
 
-    fn send(address: &str, bytes: &[u8]) -> Self {
+    pub(super) fn send(address: &str, bytes: &[u8]) -> Self {
         let mut stream = TcpStream::connect(address).unwrap();
         stream.set_read_timeout(Some(LIMIT)).unwrap();
         stream.write_all(bytes).unwrap();
@@ -64,7 +65,7 @@ impl Asked {
     }
 
     /// Reads until these words have come.
-    fn until(&mut self, words: &str) -> String {
+    pub(super) fn until(&mut self, words: &str) -> String {
         let mut seen = Vec::new();
         let mut bytes = [0; 4096];
         loop {
@@ -86,7 +87,7 @@ impl Asked {
     }
 
     /// It may look on: the server has said who it is, in its own protocol.
-    fn is_let_in(&mut self) {
+    pub(super) fn is_let_in(&mut self) {
         let text = self.until("\"op\":\"serverInfo\"");
         assert!(text.starts_with("HTTP/1.1 101 "), "{text}");
     }
@@ -136,7 +137,7 @@ fn pages_of_others_are_refused_named_once_and_counted() {
 #[test]
 fn programs_our_own_page_and_allowed_pages_look_on() {
     let server = start(&["--allow-origin", "https://app.foxglove.dev"]);
-    ask_as_program(&server).is_let_in();
+    ask_as_program(&server.socket).is_let_in();
     let own = format!("http://{}", server.page);
     let claimed = format!("http://{}", server.socket);
     for origin in [&*own, &*claimed, "https://app.foxglove.dev"] {
@@ -200,17 +201,17 @@ fn names_that_may_be_anybodys_reach_neither_socket_nor_page() {
 fn a_viewer_too_many_is_told_so_and_comes_in_when_another_has_gone() {
     let server = start(&[]);
     let let_in = || {
-        let mut asked = ask_as_program(&server);
+        let mut asked = ask_as_program(&server.socket);
         asked.is_let_in();
         asked
     };
     let mut viewers: Vec<Asked> = (0..SEATS).map(|_| let_in()).collect();
-    let answer = ask_as_program(&server).answer();
+    let answer = ask_as_program(&server.socket).answer();
     assert_refused(&answer, "503", &format!("{SEATS} look on already"));
     drop(viewers.pop());
     let deadline = Instant::now() + LIMIT;
     loop {
-        let mut asked = ask_as_program(&server);
+        let mut asked = ask_as_program(&server.socket);
         if asked.until("\r\n\r\n").starts_with("HTTP/1.1 101 ") {
             break;
         }
@@ -279,7 +280,7 @@ fn bytes_that_are_no_request_are_answered_and_keep_nobody_out() {
     let long = format!("GET / HTTP/1.1\r\nX: {}", "a".repeat(20_000));
     let answer = Asked::send(&server.socket, long.as_bytes()).answer();
     assert_refused(&answer, "431", "too long a head");
-    ask_as_program(&server).is_let_in();
+    ask_as_program(&server.socket).is_let_in();
     assert_refused(&slow.answer(), "408", "too slow to come");
     drop(silent);
     server.end();

@@ -12,6 +12,7 @@ use std::net::{Ipv4Addr, Ipv6Addr};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::head::{Head, only};
+use super::passage::Excess;
 
 use hil_platform::words::counted_plainly;
 
@@ -45,6 +46,10 @@ pub(crate) enum Refusal {
     ForeignOrigin(String),
     /// As many look on as may.
     Full(usize),
+    /// It said nothing while as many others came.
+    Crowded(usize),
+    /// One that was let in did not keep to the limits.
+    Excess(Excess),
     /// What shows the run cannot be reached, and why.
     NoServer(String),
 }
@@ -54,9 +59,10 @@ impl Refusal {
     pub(crate) const fn status(&self) -> (u16, &'static str) {
         match self {
             Self::Malformed | Self::NoHost => (400, "Bad Request"),
-            Self::TooSlow => (408, "Request Timeout"),
+            Self::TooSlow | Self::Crowded(_) => (408, "Request Timeout"),
             Self::TooLong => (431, "Request Header Fields Too Large"),
             Self::ForeignHost(_) | Self::ForeignOrigin(_) => (403, "Forbidden"),
+            Self::Excess(_) => (429, "Too Many Requests"),
             Self::Full(_) | Self::NoServer(_) => (503, "Service Unavailable"),
         }
     }
@@ -105,6 +111,10 @@ impl fmt::Display for Refusal {
             }
             Self::ForeignOrigin(origin) => write!(f, "a page of {origin}"),
             Self::Full(seats) => write!(f, "a viewer, as {seats} look on already"),
+            Self::Crowded(others) => {
+                write!(f, "a connection that said nothing while {others} more came")
+            }
+            Self::Excess(excess) => write!(f, "a viewer that {excess}"),
             Self::NoServer(why) => {
                 write!(
                     f,

@@ -1,32 +1,33 @@
-//! The door of the socket: reads the head of each request, lets pass who may look on, and hands
-//! bytes on both ways between viewers and the library's server.
+//! The door of the socket: reads the head of each request and lets pass who may look on;
+//! [`super::passage`] hands their messages on.
 //!
 //! That server can only be had on a TCP port and asks nobody who they are. It listens on loopback, at
 //! an address that is drawn by lot out of the sixteen million there, and at any free port: a page that
 //! would go around this door has to guess both.
 
+use std::collections::VecDeque;
 use std::io;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::fd::AsFd;
 use std::sync::Arc;
 use std::time::Duration;
 
 use hil_platform::random::random_bytes;
 use nix::sys::socket::{setsockopt, sockopt};
-use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, BufReader};
-use tokio::net::tcp::{ReadHalf, WriteHalf};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::runtime::Handle;
-use tokio::sync::{Semaphore, oneshot};
-use tokio::task::{JoinHandle, JoinSet};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
+use tokio::task::{AbortHandle, JoinHandle, JoinSet};
 use tokio::time::{sleep, timeout};
 
 use super::access::{Access, Refusal};
-use super::head::{Head, Parsed, parse};
+use super::head::{Head, Parsed, head_bytes, parse};
+use super::passage::{AllViewers, End, GONE_AFTER, pass};
 
 /// Viewers at once.
 const SEATS: usize = 32;
-/// Connections at once that have not said yet what they want; more wait.
+/// Connections at once that have not said yet what they want; for a further one an old one goes.
 const ENTERING_MAX: usize = 64;
 /// A browser's head has a few hundred bytes, and what it adds of its own.
 const HEAD_BYTES_MAX: usize = 16 * 1024;
@@ -38,15 +39,10 @@ const SERVER_WITHIN: Duration = Duration::from_secs(5);
 const CLOSE_WITHIN: Duration = Duration::from_secs(1);
 /// As much of what a refused viewer sends on is read away: a connection that is closed with unread
 /// bytes in it is reset, and the answer lost.
-const UNREAD_BYTES_MAX: u64 = 64 * 1024;
-/// Bytes on their way in this process, per viewer and way.
-const BUFFER_BYTES: usize = 32 * 1024;
+const UNREAD_BYTES_MAX: u64 = 512 * 1024;
 /// Bytes that the kernel keeps for a slow viewer, at either end of our part of the way. Without a
 /// bound it would keep megabytes, and what a viewer sees would be as old as they are.
 const KERNEL_BYTES: u32 = 128 * 1024;
-/// How long a viewer may neither acknowledge nor have room for what it is sent: one whose cable was
-/// pulled says no goodbye, and would keep its seat for the kernel's two hours.
-const GONE_AFTER: Duration = Duration::from_secs(30);
 /// Out of file descriptors, mostly: others must close first.
 const PAUSE: Duration = Duration::from_millis(50);
 
@@ -83,7 +79,7 @@ fn let_go_after(socket: &impl AsFd, time: Duration) -> io::Result<()> {
 }
 
 /// Listens at `address`. Connections that take nothing for `gone_after` are closed, and the kernel keeps
-/// `kernel_bytes` for each.
+/// `kernel_bytes` for each way of each.
 ///
 /// # Errors
 /// When the address cannot be had.
@@ -102,6 +98,7 @@ pub(super) fn listen(
     // Handed down to the connections.
     let_go_after(&socket, gone_after)?;
     socket.set_send_buffer_size(kernel_bytes)?;
+    socket.set_recv_buffer_size(kernel_bytes)?;
     socket.bind(address)?;
     socket.listen(1024)
 }
@@ -119,6 +116,7 @@ pub(super) fn viewer_listener(runtime: &Handle, address: SocketAddr) -> io::Resu
 pub(super) struct Front {
     close: oneshot::Sender<()>,
     task: JoinHandle<()>,
+    context: Arc<ServerContext>,
 }
 
 impl Front {
@@ -136,10 +134,20 @@ impl Front {
             page_port,
             server,
             seats: Arc::new(Semaphore::new(SEATS)),
+            all: AllViewers::default(),
         });
         let (close, closed) = oneshot::channel();
-        let task = runtime.spawn(attend(listener, context, closed));
-        Self { close, task }
+        let task = runtime.spawn(attend(listener, Arc::clone(&context), closed));
+        Self {
+            close,
+            task,
+            context,
+        }
+    }
+
+    /// The library is about to say goodbye to all viewers.
+    pub(super) fn announce_end(&self) {
+        self.context.all.end();
     }
 
     /// Lets nobody in any more, and closes all connections: those of polite viewers, who have heard
@@ -162,6 +170,47 @@ struct ServerContext {
     page_port: u16,
     server: SocketAddr,
     seats: Arc<Semaphore>,
+    all: AllViewers,
+}
+
+/// One that may look on, and the library's server for it.
+#[derive(Debug)]
+struct Admitted {
+    viewer: End,
+    server: TcpStream,
+    _seat: OwnedSemaphorePermit,
+}
+
+/// Tasks of connections of which at most so many go on.
+#[derive(Debug)]
+pub(super) struct Newest {
+    max: usize,
+    tasks: VecDeque<(IpAddr, AbortHandle)>,
+}
+
+impl Newest {
+    pub(super) const fn new(max: usize) -> Self {
+        Self {
+            max,
+            tasks: VecDeque::new(),
+        }
+    }
+
+    /// Adds one; whether another was ended for it: the oldest of the address that has most of them.
+    pub(super) fn admit(&mut self, address: IpAddr, task: AbortHandle) -> bool {
+        self.tasks.retain(|(_, task)| !task.is_finished());
+        let is_full = self.tasks.len() >= self.max;
+        if is_full {
+            let of = |address: IpAddr| self.tasks.iter().filter(|one| one.0 == address).count();
+            let most = self.tasks.iter().map(|one| of(one.0)).max().unwrap_or(0);
+            let oldest = self.tasks.iter().position(|one| of(one.0) == most);
+            if let Some((_, task)) = oldest.and_then(|oldest| self.tasks.remove(oldest)) {
+                task.abort();
+            }
+        }
+        self.tasks.push_back((address, task));
+        is_full
+    }
 }
 
 /// Takes connections until it is told to end, then waits for those that are there.
@@ -170,44 +219,47 @@ async fn attend(
     context: Arc<ServerContext>,
     mut closed: oneshot::Receiver<()>,
 ) {
-    // Dropped with this, and all connections with it.
-    let mut connections = JoinSet::new();
-    let entering = Arc::new(Semaphore::new(ENTERING_MAX));
+    // Dropped with this, and all connections with them.
+    let mut entering = JoinSet::new();
+    let mut admitted = JoinSet::new();
+    let mut newest = Newest::new(ENTERING_MAX);
     loop {
-        let next = async {
-            let place = Arc::clone(&entering).acquire_owned().await;
-            (place, listener.accept().await)
-        };
         tokio::select! {
             _ = &mut closed => break,
-            Some(_) = connections.join_next() => {}
-            (place, accepted) = next => match accepted {
-                Ok((viewer, _)) => {
-                    let context = Arc::clone(&context);
-                    connections.spawn(async move {
-                        // Whoever goes away in the middle is nobody's fault.
-                        let _is_served = serve(viewer, &context, place).await.is_ok();
-                    });
+            Some(entered) = entering.join_next() => {
+                // Whoever goes away in the middle is nobody's fault.
+                if let Ok(Ok(Some(one))) = entered {
+                    admitted.spawn(hand_on(one, Arc::clone(&context)));
+                }
+            }
+            Some(_) = admitted.join_next() => {}
+            accepted = listener.accept() => match accepted {
+                Ok((viewer, from)) => {
+                    let task = entering.spawn(enter(viewer, Arc::clone(&context)));
+                    if newest.admit(from.ip(), task) {
+                        context.access.count(&Refusal::Crowded(ENTERING_MAX));
+                    }
                 }
                 Err(_) => sleep(PAUSE).await,
             },
         }
     }
     drop(listener);
-    while connections.join_next().await.is_some() {}
+    drop(entering);
+    while admitted.join_next().await.is_some() {}
 }
 
-/// One connection; `place` is its place among those that enter.
-async fn serve<P>(mut viewer: TcpStream, context: &ServerContext, place: P) -> io::Result<()> {
+/// Judges one connection; `None` where it is refused.
+async fn enter(mut viewer: TcpStream, context: Arc<ServerContext>) -> io::Result<Option<Admitted>> {
     viewer.set_nodelay(true)?;
     let mut bytes = Vec::new();
     let head = match timeout(HEAD_WITHIN, read_head(&mut viewer, &mut bytes)).await {
         // Browsers open connections that they may need, and say nothing.
-        Err(_) if bytes.is_empty() => return Ok(()),
+        Err(_) if bytes.is_empty() => return Ok(None),
         Err(_) => Err(Refusal::TooSlow),
         Ok(head) => match head? {
             Some(head) => head,
-            None => return Ok(()),
+            None => return Ok(None),
         },
     };
     let judged = head.and_then(|head| context.access.judge(&head, context.page_port));
@@ -220,15 +272,20 @@ async fn serve<P>(mut viewer: TcpStream, context: &ServerContext, place: P) -> i
         Err(refusal) => Err(refusal),
     };
     match server {
-        Ok((mut server, _seat)) => {
-            drop(place);
-            server.write_all(&bytes).await?;
-            drop(bytes);
-            hand_on(&mut viewer, &mut server).await
+        Ok((server, seat)) => {
+            let viewer = End {
+                stream: viewer,
+                read: bytes,
+            };
+            Ok(Some(Admitted {
+                viewer,
+                server,
+                _seat: seat,
+            }))
         }
         Err(refusal) => {
             context.access.count(&refusal);
-            refuse(&mut viewer, &refusal).await
+            refuse(&mut viewer, &refusal).await.map(|()| None)
         }
     }
 }
@@ -283,8 +340,13 @@ async fn refuse(viewer: &mut TcpStream, refusal: &Refusal) -> io::Result<()> {
          X-Content-Type-Options: nosniff\r\nContent-Length: {}\r\nConnection: close\r\n\r\n{words}\n",
         words.len() + 1
     );
+    timeout(CLOSE_WITHIN, viewer.write_all(answer.as_bytes())).await??;
+    close(viewer).await
+}
+
+/// Closes a connection so that the last that was said arrives.
+async fn close(viewer: &mut TcpStream) -> io::Result<()> {
     let goodbye = async {
-        viewer.write_all(answer.as_bytes()).await?;
         viewer.shutdown().await?;
         tokio::io::copy(&mut viewer.take(UNREAD_BYTES_MAX), &mut tokio::io::sink()).await
     };
@@ -293,32 +355,47 @@ async fn refuse(viewer: &mut TcpStream, refusal: &Refusal) -> io::Result<()> {
         .map_or(Ok(()), |done| done.map(drop))
 }
 
-/// Hands bytes on both ways until both sides have ended, or one has failed.
-async fn hand_on(viewer: &mut TcpStream, server: &mut TcpStream) -> io::Result<()> {
-    let (from_viewer, to_viewer) = viewer.split();
-    let (from_server, to_server) = server.split();
-    let up = pass(from_viewer, to_server);
-    let down = pass(from_server, to_viewer);
-    tokio::pin!(up, down);
-    tokio::select! {
-        // The server ends when it hears the end, and what it still says is the viewer's.
-        done = &mut up => {
-            done?;
-            down.await
+/// Hands the request on, and after it messages, until a side closes.
+async fn hand_on(admitted: Admitted, context: Arc<ServerContext>) -> io::Result<()> {
+    let Admitted {
+        mut viewer,
+        mut server,
+        _seat,
+    } = admitted;
+    let messages = viewer.read.split_off(head_bytes(&viewer.read).unwrap_or(0));
+    let request = std::mem::replace(&mut viewer.read, messages);
+    server.write_all(&request).await?;
+    let mut answer = Vec::new();
+    let head = timeout(SERVER_WITHIN, async {
+        loop {
+            let is_end = (&mut server).take(4096).read_buf(&mut answer).await? == 0;
+            let head = head_bytes(&answer);
+            if is_end || head.is_some() || answer.len() >= HEAD_BYTES_MAX {
+                return Ok::<_, io::Error>(head);
+            }
         }
-        // A viewer that hangs would keep its place for ever.
-        done = &mut down => {
-            done?;
-            timeout(CLOSE_WITHIN, up).await.unwrap_or(Ok(()))
-        }
+    });
+    let head = head.await??;
+    let is_agreed = |head: &usize| *head > 0 && answer.starts_with(b"HTTP/1.1 101 ");
+    let Some(head) = head.filter(is_agreed) else {
+        // The library says what is wrong with the request, and closes.
+        viewer.stream.write_all(&answer).await?;
+        let mut rest = server.take(UNREAD_BYTES_MAX);
+        let rest = tokio::io::copy(&mut rest, &mut viewer.stream);
+        timeout(SERVER_WITHIN, rest).await??;
+        return close(&mut viewer.stream).await;
+    };
+    let read = answer.split_off(head);
+    viewer.stream.write_all(&answer).await?;
+    let server = End {
+        stream: server,
+        read,
+    };
+    let (mut stream, done) = pass(viewer, server, &context.all).await;
+    if let Err(excess) = done {
+        context.access.count(&Refusal::Excess(excess));
     }
-}
-
-/// Hands bytes on one way, and their end.
-async fn pass(from: ReadHalf<'_>, mut to: WriteHalf<'_>) -> io::Result<()> {
-    let mut from = BufReader::with_capacity(BUFFER_BYTES, from);
-    tokio::io::copy_buf(&mut from, &mut to).await?;
-    to.shutdown().await
+    close(&mut stream).await
 }
 
 #[cfg(test)]
@@ -328,10 +405,13 @@ mod tests {
     use std::thread;
 
     use tokio::runtime::{Builder, Runtime};
+    use tokio_tungstenite::tungstenite::protocol::Role;
+    use tokio_tungstenite::tungstenite::{Message, WebSocket};
 
     use super::*;
 
     const REQUEST: &[u8] = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n";
+    const AGREED: &[u8] = b"HTTP/1.1 101 Switching Protocols\r\n\r\n";
     /// Nothing here takes a tenth of this on an overloaded machine.
     const LIMIT: Duration = Duration::from_mins(1);
 
@@ -389,33 +469,79 @@ mod tests {
         (listener, address)
     }
 
+    /// The server's end of a way whose request has come.
+    fn agreed(mut stream: StdStream) -> WebSocket<StdStream> {
+        let mut request = vec![0; REQUEST.len()];
+        stream.read_exact(&mut request).unwrap();
+        assert_eq!(request, REQUEST);
+        stream.write_all(AGREED).unwrap();
+        WebSocket::from_raw_socket(stream, Role::Server, None)
+    }
+
     #[test]
-    fn all_bytes_and_their_end_get_through_both_ways() {
-        const BYTES: usize = 3_000_000;
+    fn messages_and_their_end_get_through_both_ways() {
         let (listener, server) = listener();
         let answering = thread::spawn(move || {
-            let mut stream = accepted(&listener);
-            let mut bytes = Vec::new();
-            stream.read_to_end(&mut bytes).unwrap();
-            // Only now, when the other way is closed already.
-            stream.write_all(&bytes).unwrap();
+            let mut inside = agreed(accepted(&listener));
+            for _ in 0..3 {
+                let message = inside.read().unwrap();
+                // Many times as long, in one.
+                let answer: String = message.to_text().unwrap().repeat(100);
+                inside.send(Message::text(answer)).unwrap();
+            }
+            assert!(inside.read().unwrap().is_close());
         });
         let (address, front, runtime) = door(server);
         let mut stream = viewer(address);
-        let body: Vec<u8> = (0..=250).cycle().take(BYTES).collect();
-        stream.write_all(&body).unwrap();
-        let sent = [REQUEST, &body].concat();
-        stream.shutdown(std::net::Shutdown::Write).unwrap();
-        let mut received = Vec::new();
-        stream.read_to_end(&mut received).unwrap();
-        assert!(
-            received == sent,
-            "{} of {} bytes",
-            received.len(),
-            sent.len()
-        );
+        let mut head = vec![0; AGREED.len()];
+        stream.read_exact(&mut head).unwrap();
+        assert_eq!(head, AGREED);
+        let mut outside = WebSocket::from_raw_socket(stream, Role::Client, None);
+        for length in [0, 1, 100_000] {
+            let text = "x".repeat(length);
+            outside.send(Message::text(text.clone())).unwrap();
+            assert_eq!(outside.read().unwrap(), Message::text(text.repeat(100)));
+            // Answered by the door.
+            outside.send(Message::Ping("now".into())).unwrap();
+            assert_eq!(outside.read().unwrap(), Message::Pong("now".into()));
+        }
+        outside.close(None).unwrap();
+        assert!(outside.read().unwrap().is_close());
         answering.join().unwrap();
         front.end(runtime.handle());
+    }
+
+    #[test]
+    fn what_is_wrong_with_a_request_is_the_librarys_to_say() {
+        const NO: &[u8] = b"HTTP/1.1 400 Bad Request\r\n\r\nno";
+        let (listener, server) = listener();
+        let answering = thread::spawn(move || accepted(&listener).write_all(NO).unwrap());
+        let (address, front, runtime) = door(server);
+        let mut answer = Vec::new();
+        viewer(address).read_to_end(&mut answer).unwrap();
+        assert_eq!(answer, NO);
+        answering.join().unwrap();
+        front.end(runtime.handle());
+    }
+
+    #[test]
+    fn a_further_connection_ends_the_oldest_of_the_address_with_most() {
+        let mut builder = Builder::new_multi_thread();
+        let runtime = builder.worker_threads(1).enable_all().build().unwrap();
+        let mut newest = Newest::new(3);
+        let [many, one] = [1, 2].map(|last| IpAddr::from([10, 0, 0, last]));
+        let mut admit = |address| {
+            let task = runtime.spawn(async { sleep(LIMIT).await });
+            let is_full = newest.admit(address, task.abort_handle());
+            (task, is_full)
+        };
+        let first = [one, many, many].map(&mut admit);
+        assert!(first.iter().all(|(_, is_full)| !is_full));
+        let (_last, is_full) = admit(one);
+        assert!(is_full);
+        let [(one, _), (many, _), (other, _)] = first;
+        assert!(runtime.block_on(many).unwrap_err().is_cancelled());
+        assert!(!one.is_finished() && !other.is_finished());
     }
 
     #[test]
@@ -459,10 +585,18 @@ mod tests {
         front.end(runtime.handle());
     }
 
-    /// Writes to the next connection, until that fails, more than there is room for on the way.
+    /// Sends to the next connection until that fails.
     fn writing_on(listener: &StdListener) -> thread::JoinHandle<io::Result<()>> {
-        let mut inside = accepted(listener);
-        thread::spawn(move || inside.write_all(&vec![0; 50_000_000]))
+        let mut inside = agreed(accepted(listener)).into_inner();
+        // One of a topic, of 126 bytes.
+        let message = [&[0x82, 126, 0, 126, 1][..], &[0; 125]]
+            .concat()
+            .repeat(500);
+        thread::spawn(move || {
+            loop {
+                inside.write_all(&message)?;
+            }
+        })
     }
 
     /// Our part of the way has ended: its other end did not only wait in vain.

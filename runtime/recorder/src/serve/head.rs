@@ -1,7 +1,7 @@
 //! The head of a request as bytes come in: where it ends, which host it names, and which page it is
 //! from. What may be is decided in [`super::access`].
 
-use httparse::{Request, Status};
+use httparse::{Request, Response, Status};
 
 /// Header fields of a request at most; a browser sends about fifteen.
 const FIELDS_MAX: usize = 96;
@@ -45,6 +45,17 @@ pub(super) fn parse(bytes: &[u8]) -> Parsed {
             }
         }
         Err(_) => Parsed::Broken,
+    }
+}
+
+/// Bytes of the head that `bytes` begin with, of a request or of an answer; `None` while it is not whole.
+pub(super) fn head_bytes(bytes: &[u8]) -> Option<usize> {
+    let mut fields = [httparse::EMPTY_HEADER; FIELDS_MAX];
+    let request = Request::new(&mut fields).parse(bytes);
+    let head = request.or_else(|_no_request| Response::new(&mut fields).parse(bytes));
+    match head {
+        Ok(Status::Complete(count)) => Some(count),
+        Ok(Status::Partial) | Err(_) => None,
     }
 }
 

@@ -8,6 +8,7 @@ mod front;
 mod head;
 mod page;
 mod parameters;
+mod passage;
 mod recording;
 mod source;
 mod viewers;
@@ -98,6 +99,7 @@ pub(crate) fn serve(
         thread::sleep(engine.rest());
     }
     let (viewers, is_recorded) = engine.into_viewers(console);
+    front.announce_end();
     viewers.end(runtime.handle());
     front.end(runtime.handle());
     runtime.shutdown_timeout(Duration::from_secs(1));

@@ -21,7 +21,7 @@ use tokio::runtime::Handle;
 use tokio::time::timeout;
 
 use super::access::{Access, Refusal};
-use super::front::listen;
+use super::front::{Newest, listen};
 
 /// The page with its style and scripts, made of the folder `page` by the build script.
 const PAGE: &str = include_str!(concat!(env!("OUT_DIR"), "/page.html"));
@@ -37,11 +37,13 @@ const POLICY: &str = concat!(
      form-action 'none'"
 );
 
-/// Connections at once; more wait.
+/// Connections at once; for a further one an old one goes.
 const CONNECTIONS_MAX: usize = 64;
 /// How long a browser may take to say what it wants; one that says nothing would keep its place
 /// from the others.
 const REQUEST_WITHIN: Duration = Duration::from_secs(5);
+/// A browser's head has a few hundred bytes, and what it adds of its own.
+const HEAD_BYTES_MAX: usize = 16 * 1024;
 /// How long a connection may last: the page is small, and one that never reads it would keep its
 /// place as well.
 const SERVED_WITHIN: Duration = Duration::from_secs(30);
@@ -70,22 +72,19 @@ pub(crate) fn serve(
 
 /// Takes connections, and gives each at most `within` for all of it.
 async fn attend(listener: TcpListener, config: Bytes, access: Arc<Access>, within: Duration) {
-    let room = Arc::new(tokio::sync::Semaphore::new(CONNECTIONS_MAX));
+    let mut newest = Newest::new(CONNECTIONS_MAX);
     loop {
-        let Ok(place) = Arc::clone(&room).acquire_owned().await else {
-            return;
-        };
-        let Ok((stream, _)) = listener.accept().await else {
+        let Ok((stream, from)) = listener.accept().await else {
             // Out of file descriptors, mostly: others must close first.
             tokio::time::sleep(Duration::from_millis(50)).await;
             continue;
         };
-        let (config, access) = (config.clone(), Arc::clone(&access));
-        tokio::spawn(async move {
-            // A browser that goes away in the middle, or is too slow, is nobody's fault.
-            let _is_served = timeout(within, serve_one(stream, config, access)).await;
-            drop(place);
-        });
+        let served = serve_one(stream, config.clone(), Arc::clone(&access));
+        // A browser that goes away in the middle, or is too slow, is nobody's fault.
+        let task = tokio::spawn(async move { timeout(within, served).await.is_ok() });
+        if newest.admit(from.ip(), task.abort_handle()) {
+            access.count(&Refusal::Crowded(CONNECTIONS_MAX));
+        }
     }
 }
 
@@ -102,6 +101,7 @@ async fn serve_one(stream: TcpStream, config: Bytes, access: Arc<Access>) -> hyp
         .timer(TokioTimer::new())
         .header_read_timeout(REQUEST_WITHIN)
         .keep_alive(false)
+        .max_buf_size(HEAD_BYTES_MAX)
         .serve_connection(TokioIo::new(stream), service);
     connection.await
 }

@@ -2,7 +2,7 @@
 //! live run, as its feed tells of it.
 
 use std::collections::BTreeSet;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use hil_core::record::stamp;
 use hil_core::time::duration_ns;
 use hil_platform::clock::MonotonicClock;
+use hil_platform::plain_file;
 use hil_report::assessment::Assessment;
 use hil_report::summary::RunSummary;
 use hil_rundir::live_run::{LiveRun, Stage};
@@ -308,7 +309,9 @@ impl Running {
     /// What the account at the end says of how it ended.
     fn how(&self, has_summary: bool) -> String {
         let path = self.feed.run().run_folder().summary();
-        let text = fs::read_to_string(path).ok().filter(|_| has_summary);
+        let text = plain_file::read_to_string(&path)
+            .ok()
+            .filter(|_| has_summary);
         let summary = text.and_then(|text| RunSummary::from_json(&text).ok());
         summary.map_or_else(
             || "its supervisor was killed".to_owned(),
@@ -438,7 +441,7 @@ impl Source for Running {
 
 /// The last lines of the log at `path`, whatever bytes a program wrote there.
 fn end_of(path: &Path) -> io::Result<String> {
-    let mut file = File::open(path)?;
+    let mut file = plain_file::open(path)?;
     let begin = file.metadata()?.len().saturating_sub(LOG_END_BYTES);
     file.seek(SeekFrom::Start(begin))?;
     let mut bytes = Vec::new();

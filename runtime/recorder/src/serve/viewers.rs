@@ -2,10 +2,9 @@
 //! that is too slow loses its oldest messages; nobody waits for it. What a topic says is decided in
 //! [`crate::view`].
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
-use std::sync::Arc;
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use foxglove::websocket::{ChannelView, Client, ParameterHandler, ServerListener};
@@ -25,7 +24,8 @@ use crate::topics::Names;
 use crate::view::facts::RunFacts;
 use crate::writer::Stamp;
 
-/// Messages that wait for one viewer at most; then its oldest go.
+/// Messages that the library keeps for one viewer at most; the door takes them at once, and bounds what waits
+/// by bytes.
 const WAITING_MAX: usize = 512;
 
 /// How long a viewer may take to hear that it is over.
@@ -44,16 +44,21 @@ pub(crate) const LIVE_TOPICS: [&str; 6] = [
 /// The only one whose last message is not sent to each new subscriber.
 const LOSSES: &str = "/live/losses";
 
-/// Subscriptions, as they happen.
-struct Listener {
-    tell: Sender<(SinkId, String)>,
+/// New subscribers of live topics; however often one subscribes, it is there once.
+#[derive(Debug, Clone, Default)]
+struct Newcomers(Arc<Mutex<BTreeSet<(SinkId, &'static str)>>>);
+
+impl Newcomers {
+    fn set(&self) -> MutexGuard<'_, BTreeSet<(SinkId, &'static str)>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
-impl ServerListener for Listener {
+impl ServerListener for Newcomers {
     fn on_subscribe(&self, client: Client, channel: ChannelView<'_>) {
-        if let Some(sink) = client.sink_id() {
-            // The engine may be gone already, at the end.
-            let _is_heard = self.tell.send((sink, channel.topic().to_owned())).is_ok();
+        let topic = LIVE_TOPICS.iter().find(|topic| **topic == channel.topic());
+        if let (Some(sink), Some(topic)) = (client.sink_id(), topic) {
+            self.set().insert((sink, topic));
         }
     }
 }
@@ -113,7 +118,7 @@ pub(crate) struct Viewers {
     live: BTreeMap<&'static str, Live>,
     channels: Vec<ChannelTopics>,
     offered: Offered,
-    subscribed: Receiver<(SinkId, String)>,
+    newcomers: Newcomers,
 }
 
 impl Viewers {
@@ -140,13 +145,13 @@ impl Viewers {
             };
             live.insert(topic, one);
         }
-        let (tell, subscribed) = channel();
+        let newcomers = Newcomers::default();
         let ip = hidden_address().map_err(FoxgloveError::Bind)?;
         let server = WebSocketServer::new()
             .name(concat!("hil-recorder ", env!("CARGO_PKG_VERSION")))
             .bind(ip.to_string(), 0)
             .message_backlog_size(WAITING_MAX)
-            .listener(Arc::new(Listener { tell }))
+            .listener(Arc::new(newcomers.clone()))
             .parameter_handler(parameters)
             .tokio_runtime(runtime)
             .context(&context);
@@ -160,7 +165,7 @@ impl Viewers {
                 context,
                 topics: Vec::new(),
             },
-            subscribed,
+            newcomers,
         })
     }
 
@@ -240,8 +245,9 @@ impl Viewers {
     /// Tells those who came since the last call what the others know already.
     pub(crate) fn welcome(&mut self, at_ns: i64) {
         let stamp = PartialMetadata::with_log_time(u64::try_from(at_ns).unwrap_or(0));
-        while let Ok((sink, topic)) = self.subscribed.try_recv() {
-            let live = self.live.get(topic.as_str());
+        let newcomers = core::mem::take(&mut *self.newcomers.set());
+        for (sink, topic) in newcomers {
+            let live = self.live.get(topic);
             if let Some((live, last)) = live.and_then(|live| Some((live, live.last.as_ref()?))) {
                 live.channel.log_with_meta_to_sink(last, stamp, Some(sink));
             }

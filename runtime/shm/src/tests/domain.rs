@@ -45,6 +45,20 @@ fn a_living_run_locks_its_root_path() {
 }
 
 #[test]
+fn a_pipe_in_place_of_a_domains_marker_is_not_waited_for() {
+    let root_path = root_path("pipe");
+    fs::create_dir_all(&root_path).unwrap();
+    let marker = root_path.join("hil-domain");
+    nix::unistd::mkfifo(&marker, nix::sys::stat::Mode::S_IRWXU).unwrap();
+    let prefix = Domain::prefix_at(&root_path);
+    fs::remove_file(&marker).unwrap();
+    assert_eq!(prefix, None);
+    fs::write(&marker, "h00c0ffee_").unwrap();
+    assert_eq!(Domain::prefix_at(&root_path).as_deref(), Some("h00c0ffee_"));
+    fs::remove_dir_all(root_path).unwrap();
+}
+
+#[test]
 fn remains_of_a_dead_run_are_removed_by_the_next() {
     let root_path = root_path("stale");
     fs::create_dir_all(root_path.join("services")).unwrap();

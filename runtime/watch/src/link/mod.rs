@@ -210,9 +210,7 @@ impl RunLinks {
             source,
         };
         let run = RunFolder::existing(folder);
-        let text = fs::read_to_string(run.manifest()).map_err(failed)?;
-        let manifest: Manifest =
-            serde_json::from_str(&text).map_err(|error| failed(io::Error::other(error)))?;
+        let manifest = Manifest::read(&run).map_err(failed)?;
         let mut directions: Vec<LinkDirection> = Vec::new();
         for launch in newest_launches(folder).map_err(failed)? {
             if let Work::Gateway(work) = &launch.work {

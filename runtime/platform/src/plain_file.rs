@@ -1,0 +1,65 @@
+//! Files that another user may have made: a pipe or a device in their place would make their reader wait.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+
+use nix::fcntl::OFlag;
+
+/// Opens the file at `path` to be read.
+///
+/// # Errors
+/// When it cannot be opened or is no regular file.
+pub fn open(path: &Path) -> io::Result<File> {
+    let mut options = File::options();
+    let file = options
+        .read(true)
+        .custom_flags(OFlag::O_NONBLOCK.bits())
+        .open(path)?;
+    if !file.metadata()?.is_file() {
+        return Err(io::Error::other("not a regular file"));
+    }
+    Ok(file)
+}
+
+/// All of the file at `path`.
+///
+/// # Errors
+/// As [`open`], or when it cannot be read.
+pub fn read(path: &Path) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?.read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// The text of the file at `path`.
+///
+/// # Errors
+/// As [`read`], or when it is no text.
+pub fn read_to_string(path: &Path) -> io::Result<String> {
+    let mut text = String::new();
+    open(path)?.read_to_string(&mut text)?;
+    Ok(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use nix::sys::stat::Mode;
+    use nix::unistd::mkfifo;
+
+    use super::*;
+
+    #[test]
+    fn a_pipe_is_refused_and_not_waited_for() {
+        let name = format!("hil-plain-file-{}", std::process::id());
+        let path = std::env::temp_dir().join(name);
+        mkfifo(&path, Mode::S_IRWXU).unwrap();
+        let refused = read_to_string(&path).unwrap_err();
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(refused.to_string(), "not a regular file");
+        std::fs::write(&path, "x").unwrap();
+        assert_eq!(read(&path).unwrap(), b"x");
+        std::fs::remove_file(path).unwrap();
+    }
+}
