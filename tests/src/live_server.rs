@@ -21,6 +21,8 @@ pub struct LiveServer {
     pub page: String,
     /// Address of the socket for viewers.
     pub socket: String,
+    /// What lets others than this user look on.
+    pub token: String,
 }
 
 impl LiveServer {
@@ -40,7 +42,7 @@ impl LiveServer {
         command.args(["serve", "--port", "0", "--http-port", "0"]);
         let child = ChildGuard::spawn(command.args(arguments));
         let mut child = child.expect("a recorder starts");
-        let listens = child.wait_for_output("viewers ws://", LIMIT);
+        let listens = child.wait_for_output("for other users", LIMIT);
         listens.unwrap_or_else(|reason| panic!("{reason}"));
         let said = child.stdout_so_far();
         let at = |begin: &str| {
@@ -48,7 +50,10 @@ impl LiveServer {
             let end = rest.find(['/', '\n']).unwrap_or(rest.len());
             rest[..end].to_owned()
         };
+        let token = said.split("/?token=").nth(1).expect("a token");
+        let token = token.split(' ').next().unwrap_or_default().to_owned();
         Self {
+            token,
             page: at("http://"),
             socket: at("ws://"),
             child,

@@ -23,7 +23,10 @@ use crate::cases;
 use hil_doctor::{Effect, Plan, obstacles};
 use hil_engine::process::{own_program, worker};
 use hil_engine::security::{KeyFileError, PreSharedKey};
-use hil_engine::supervisor::{self, HostTooSmall, PeerError, RunError, RunOptions, Shortfall};
+use hil_engine::supervisor::{
+    self, ClaimError, Claims, DomainsError, HostTooSmall, PeerError, RunError, RunOptions,
+    Shortfall,
+};
 use hil_nic::nic_clock::guard;
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::open_files;
@@ -274,7 +277,7 @@ fn carry_out(
         return Ok(show_check(path, topology, None, console));
     }
     let hosts = hosts_here(topology, args.host.as_deref()).map_err(usage)?;
-    let key = check_here(path, args, topology, &hosts, console)?;
+    let (key, claims) = check_here(path, args, topology, &hosts, console)?;
     if args.check {
         return Ok(show_check(path, topology, key, console));
     }
@@ -287,7 +290,7 @@ fn carry_out(
         layouts: layouts(topology, registry),
     };
     console.serve();
-    let result = supervisor::run(topology, &options, &signals, console)
+    let result = supervisor::run(topology, &options, claims, &signals, console)
         .map_err(|error| Refusal::new(exit_code_of_error(&error), error))?;
     let code = match exit_code(&result.outcome) {
         exit::RAN if result.has_gaps() => exit::FAILED,
@@ -415,14 +418,15 @@ fn check_file(path: &Path, topology: &Topology) -> Result<(), Refusal> {
 }
 
 /// Refuses what cannot run on these hosts, which are this machine, and warns of what it would run without;
-/// gives the key that it would hold in a run with others. A check also refuses what a run would wait for.
+/// gives the key that it would hold in a run with others, and what the run has for itself from here on. A
+/// check claims nothing, and also refuses what a run would wait for.
 fn check_here(
     path: &Path,
     args: &RunArgs,
     topology: &Topology,
     hosts: &[String],
     console: &mut Console,
-) -> Result<Option<(PathBuf, PreSharedKey)>, Refusal> {
+) -> Result<(Option<(PathBuf, PreSharedKey)>, Claims), Refusal> {
     own_program::find_all(topology, hosts)
         .map_err(|missing| unusable(path, &args.overrides, missing.0, exit::USAGE, console))?;
     let key = key_here(topology, hosts);
@@ -441,6 +445,24 @@ fn check_here(
             return Err(Refusal::new(exit::HOST_UNFIT, HostTooSmall(of_host)));
         }
     }
+    // Before ports are tried: another run may be about to bind them.
+    let claims = if args.check {
+        Claims::look(topology, hosts).map(|()| Claims::default())
+    } else {
+        Claims::take(topology, hosts)
+    };
+    let claims = claims.map_err(|error| match error {
+        ClaimError::Taken(taken) => {
+            unusable(path, &args.overrides, taken, exit::TRY_AGAIN, console)
+        }
+        ClaimError::Io(ref source) => {
+            let code = match FailureKind::of(source) {
+                FailureKind::HostTooSmall => exit::HOST_UNFIT,
+                FailureKind::NotThereYet | FailureKind::Fault => exit::INTERNAL,
+            };
+            Refusal::new(code, error)
+        }
+    })?;
     let (mut refused, mut told) = (Vec::new(), Vec::new());
     for obstacle in obstacles(&Plan::of(topology, hosts)) {
         let is_refused = match obstacle.effect {
@@ -455,7 +477,7 @@ fn check_here(
         console.warn(&format!("{key}: {words}"));
     }
     if refused.is_empty() {
-        Ok(key)
+        Ok((key, claims))
     } else {
         Err(unusable(
             path,
@@ -519,6 +541,7 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         }
         RunError::HostTooSmall(_) => exit::HOST_UNFIT,
         RunError::Domains(error) if error.is_of_path() => exit::USAGE,
+        RunError::Domains(DomainsError::Taken { .. }) => exit::TRY_AGAIN,
         RunError::Folder { source, .. } if is_of_full_disk(source) => exit::FAILED,
         RunError::Folder { .. }
         | RunError::Programs(_)

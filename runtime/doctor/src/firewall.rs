@@ -4,11 +4,11 @@
 use nix::sys::socket::SockProtocol;
 
 use super::finding::{Answer, Checked, Finding};
-use super::plan::WantedPort;
 use super::ports::by_protocol;
 use hil_nic::radio::conversation::Conversation;
 use hil_nic::radio::netlink::{Attributes, u32_at};
 use hil_platform::host_facts::HostFiles;
+use hil_topology::WantedPort;
 
 /// `NFNL_SUBSYS_NFTABLES` and `NFT_MSG_GETCHAIN` of `linux/netfilter`.
 const GET_CHAINS: u16 = (10 << 8) | 4;

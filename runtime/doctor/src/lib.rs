@@ -42,7 +42,7 @@ pub use self::finding::{Finding, Severity};
 use self::latency::LatencyReport;
 use self::network::StampQuery;
 pub use self::obstacles::{Effect, Obstacle, Trouble, obstacles};
-pub use self::plan::{LinkLoad, Peer, Pin, Plan, WantedInterface, WantedPort};
+pub use self::plan::{LinkLoad, Peer, Pin, Plan, WantedInterface};
 use hil_nic::nic_clock::probing::probe_nic;
 use hil_platform::clock_discipline::HostDiscipline;
 use hil_platform::domain_address::domain_base_candidates;

@@ -12,10 +12,11 @@ use nix::errno::Errno;
 
 use super::finding::Finding;
 use super::network::{Interfaces, interfaces};
-use super::plan::{Pin, Plan, WantedInterface, WantedPort};
+use super::plan::{Pin, Plan, WantedInterface};
 use super::ports::holder_of;
 use hil_platform::host_facts::{HostFiles, format_cpu_list};
 use hil_platform::realtime::allowed_cpus;
+use hil_topology::WantedPort;
 
 /// Something that is in a run's way.
 #[derive(Debug)]

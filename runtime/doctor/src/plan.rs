@@ -1,15 +1,13 @@
 //! What a topology wants of this host, as far as the doctor looks at it: pinned CPUs, addresses,
 //! ports, message sizes, the folder of the run. It examines nothing.
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::IpAddr;
 use std::path::PathBuf;
 
-use hil_arm::egm::messages::Side;
 use hil_net::interface::own_name;
-use hil_protocol::transport::IpProtocol;
 use hil_protocol::wire;
 
-use hil_topology::{AdapterKind, ClockEnd, Crossing, Execution, Host, Program, Topology, Wait};
+use hil_topology::{ClockEnd, Crossing, Execution, Host, Topology, Wait, WantedPort};
 
 /// A CPU that something is pinned to.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -22,40 +20,6 @@ pub struct Pin {
     pub of: String,
     /// It polls without pause (`wait = "spin"`).
     pub spins: bool,
-}
-
-/// A port that a run binds on this host.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub struct WantedPort {
-    /// Its protocol.
-    pub protocol: IpProtocol,
-    /// Where.
-    pub address: SocketAddr,
-    /// What for.
-    pub of: String,
-    /// The key that says so.
-    pub key: String,
-    /// The key of its address.
-    pub address_key: String,
-    /// The interface that it is bound to.
-    pub interface: Option<String>,
-    /// A run does without it.
-    pub is_dispensable: bool,
-}
-
-impl WantedPort {
-    /// For `of`, at the address of `host`.
-    fn new(protocol: IpProtocol, host: &Host, address: SocketAddr, of: &str, key: String) -> Self {
-        Self {
-            protocol,
-            address,
-            of: of.to_owned(),
-            key,
-            address_key: format!("hosts.{}.address", host.name),
-            interface: None,
-            is_dispensable: false,
-        }
-    }
 }
 
 /// A host that this one talks to.
@@ -144,6 +108,7 @@ impl Plan {
         let is_here = |host: &Host| here.contains(&host.name);
         let mut plan = Self {
             record_folder: PathBuf::from(topology.run().record.as_ref()),
+            ports: topology.ports_on(here),
             ..Self::default()
         };
         for host in topology.hosts().iter().filter(|host| is_here(host)) {
@@ -167,49 +132,12 @@ impl Plan {
             for process in topology.processes_on(&host.name) {
                 let key = format!("processes.{}", process.name);
                 plan.pin(&process.name, &key, &process.execution);
-                // A sensor adapter listens; a robot adapter sends from a port of the kernel's choice.
-                if let Program::Egm { adapter, .. } = &process.program
-                    && adapter.kind == AdapterKind::Sensor
-                {
-                    let sides = [Side::Right, Side::Left].into_iter();
-                    let addresses = sides.filter_map(|side| Some((side, adapter.address(side)?)));
-                    for (side, address) in addresses {
-                        let key = format!("{key}.egm.{}", side.word());
-                        plan.ports.push(WantedPort {
-                            interface: host.interface.clone(),
-                            address_key: key.clone(),
-                            ..WantedPort::new(IpProtocol::Udp, host, address, &process.name, key)
-                        });
-                    }
-                }
             }
         }
         for crossing in topology.crossings() {
             plan.cross(&crossing, &is_here);
         }
-        // The supervisors meet at the first host; clock paths have ports of their own.
-        let first = topology.hosts().first().filter(|host| is_here(host));
-        if let Some((host, address)) = first.and_then(|host| Some((host, host.control_address()?)))
-        {
-            let key = format!("hosts.{}.control_port", host.name);
-            let port = WantedPort::new(IpProtocol::Tcp, host, address, "control_port", key);
-            plan.ports.push(port);
-        }
-        for path in topology.clock_paths() {
-            for (host, address) in [(path.from, path.asking), (path.to, path.answering)] {
-                if is_here(host) {
-                    let key = format!("hosts.{}.clock_port", host.name);
-                    plan.ports.push(WantedPort {
-                        interface: host.clock_interface.clone(),
-                        is_dispensable: true,
-                        address_key: format!("hosts.{}.clock_address", host.name),
-                        ..WantedPort::new(IpProtocol::Udp, host, address, &path.name(), key)
-                    });
-                }
-            }
-        }
         sort_unique(&mut plan.pins);
-        sort_unique(&mut plan.ports);
         sort_unique(&mut plan.interfaces);
         sort_unique(&mut plan.addresses);
         sort_unique(&mut plan.peers);
@@ -267,20 +195,7 @@ impl Plan {
             let table = format!("links.{}.gateway", crossing.link.name);
             self.pin(&name, &table, &crossing.hop.gateway.execution);
         }
-        let flow = format!("link {}", crossing.flow_label());
-        let port_of = |protocol, host: &Host, port| {
-            let address = SocketAddr::new(host.gateway_address(), port);
-            let key = format!("links.{}.port", crossing.link.name);
-            WantedPort {
-                interface: host.interface.clone(),
-                ..WantedPort::new(protocol, host, address, &flow, key)
-            }
-        };
         if is_here(from) {
-            if let Some(protocol) = capabilities.sender_port {
-                let port = port_of(protocol, from, crossing.ports.sender);
-                self.ports.push(port);
-            }
             self.loads.push(LinkLoad {
                 link: crossing.link.name.clone(),
                 channel: channel.name.clone(),
@@ -293,10 +208,6 @@ impl Plan {
             self.adapter(from, to);
         }
         if is_here(to) {
-            if let Some(protocol) = capabilities.receiver_port {
-                let port = port_of(protocol, to, crossing.ports.receiver);
-                self.ports.push(port);
-            }
             self.adapter(to, from);
         }
     }

@@ -2,23 +2,13 @@
 //! It binds none itself: a port tried a moment before a run would be in the run's way.
 
 use std::collections::BTreeSet;
-use std::net::{IpAddr, SocketAddr};
 
 use hil_protocol::transport::IpProtocol;
 
 use super::finding::{Answer, Checked, Finding, settled};
-use super::plan::WantedPort;
 use hil_platform::host_facts::{Fact, HostFiles, format_cpu_list};
-
-/// `TCP_LISTEN` in the socket tables.
-const LISTENING: &str = "0A";
-
-/// A bound socket.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Bound {
-    address: SocketAddr,
-    inode: u64,
-}
+use hil_platform::socket_table::{self, IpSocket, LISTENING};
+use hil_topology::{WantedPort, collide};
 
 /// `None` when the topology needs no ports.
 pub(super) fn examine(files: &HostFiles, wanted: &[WantedPort]) -> Option<Finding> {
@@ -33,7 +23,7 @@ fn check(files: &HostFiles, wanted: &[WantedPort]) -> Checked {
         let bound = bound(files, protocol).told(id)?;
         for one in wanted.iter().filter(|one| one.protocol == protocol) {
             let (address, of, key) = (one.address, &one.of, &one.key);
-            if let Some(other) = bound.iter().find(|bound| collide(bound.address, address)) {
+            if let Some(other) = bound.iter().find(|bound| collide(bound.local, address)) {
                 let holder = holder(files, other.inode);
                 taken.push(format!(
                     "{word} {address} of {of} ({key}) is held by {holder}"
@@ -61,52 +51,18 @@ pub(super) fn by_protocol(wanted: &[WantedPort]) -> Vec<(IpProtocol, BTreeSet<u1
     ports.into_iter().filter(has_some).collect()
 }
 
-/// Two sockets cannot have both, unless they agreed to.
-fn collide(one: SocketAddr, other: SocketAddr) -> bool {
-    let is_any = one.ip().is_unspecified() || other.ip().is_unspecified();
-    one.port() == other.port() && (is_any || one.ip() == other.ip())
-}
-
-fn bound(files: &HostFiles, protocol: IpProtocol) -> Result<Vec<Bound>, String> {
+/// Sockets that have a port: of TCP those that listen.
+fn bound(files: &HostFiles, protocol: IpProtocol) -> Result<Vec<IpSocket>, String> {
     let first = format!("/proc/net/{}", protocol.word());
     let second = format!("{first}6");
-    let mut found = parse(&files.read(&first).known()?, protocol);
+    let mut tables = vec![files.read(&first).known()?];
     // A kernel without IPv6 has no such file.
     if files.locate(&second).exists() {
-        found.extend(parse(&files.read(&second).known()?, protocol));
+        tables.push(files.read(&second).known()?);
     }
-    Ok(found)
-}
-
-fn parse(text: &str, protocol: IpProtocol) -> Vec<Bound> {
-    let lines = text.lines().skip(1).filter_map(|line| {
-        let words: Vec<&str> = line.split_whitespace().collect();
-        if protocol == IpProtocol::Tcp && *words.get(3)? != LISTENING {
-            return None;
-        }
-        Some(Bound {
-            address: address(words.get(1)?)?,
-            inode: words.get(9)?.parse().ok()?,
-        })
-    });
-    lines.collect()
-}
-
-/// `0100007F:1CE8`: words of 32 bits in this host's order, then the port.
-fn address(text: &str) -> Option<SocketAddr> {
-    let (address, port) = text.split_once(':')?;
-    let port = u16::from_str_radix(port, 16).ok()?;
-    let mut bytes = Vec::new();
-    for index in (0..address.len()).step_by(8) {
-        let word = u32::from_str_radix(address.get(index..index + 8)?, 16).ok()?;
-        bytes.extend(word.to_ne_bytes());
-    }
-    let ip = match bytes.len() {
-        4 => IpAddr::V4(<[u8; 4]>::try_from(bytes).ok()?.into()),
-        16 => IpAddr::V6(<[u8; 16]>::try_from(bytes).ok()?.into()).to_canonical(),
-        _ => return None,
-    };
-    Some(SocketAddr::new(ip, port))
+    let sockets = tables.iter().flat_map(|table| socket_table::parse(table));
+    let has_port = |one: &IpSocket| protocol == IpProtocol::Udp || one.state == LISTENING;
+    Ok(sockets.filter(has_port).collect())
 }
 
 /// Who holds a port that a run wants, as far as this user may see.
@@ -114,7 +70,7 @@ pub(super) fn holder_of(files: &HostFiles, wanted: &WantedPort) -> String {
     let bound = bound(files, wanted.protocol).unwrap_or_default();
     let mut colliding = bound
         .iter()
-        .filter(|one| collide(one.address, wanted.address));
+        .filter(|one| collide(one.local, wanted.address));
     colliding.next().map_or_else(
         || "a process this user cannot see".to_owned(),
         |one| holder(files, one.inode),
@@ -166,18 +122,6 @@ mod tests {
     /// 7400 in the kernel's order, at `ip`.
     fn local(ip: [u8; 4]) -> String {
         format!("{:08X}:1CE8", u32::from_ne_bytes(ip))
-    }
-
-    #[test]
-    fn addresses_are_read_as_the_kernel_writes_them() {
-        assert_eq!(
-            address(&local([127, 0, 0, 1])),
-            "127.0.0.1:7400".parse().ok()
-        );
-        let any = format!("{}:1CE8", "0".repeat(32));
-        assert_eq!(address(&any), "[::]:7400".parse().ok());
-        assert_eq!(address("0100"), None);
-        assert_eq!(address("01:1CE8"), None);
     }
 
     #[test]

@@ -17,6 +17,7 @@ pub mod progress;
 pub mod random;
 pub mod realtime;
 pub mod signals;
+pub mod socket_table;
 pub mod systemd;
 pub mod text;
 pub mod wait;

@@ -1,12 +1,16 @@
-//! The descriptors of this process: how many it may have, and leaving none to those it starts.
+//! The descriptors of this process: how many it may have, leaving none to those it starts, and finding one
+//! that a library keeps to itself.
 //!
 //! Programs that use `select` break above 1024, so the soft limit is low by convention and ours raise
 //! it for themselves. A user's own program gets back what there was.
 
+use std::net::SocketAddr;
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
 use std::sync::OnceLock;
 use std::{fs, io};
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
+use nix::sys::socket::{SockaddrStorage, getsockname, getsockopt, sockopt};
 
 /// The soft limit before [`raise_limit`].
 static INHERITED: OnceLock<u64> = OnceLock::new();
@@ -56,16 +60,48 @@ pub fn set_limit(soft: u64) -> io::Result<()> {
 #[allow(unsafe_code, reason = "a descriptor of another's has no safe setter")]
 pub fn withhold() -> io::Result<()> {
     const STANDARD_MAX: i32 = 2;
-    for entry in fs::read_dir("/proc/self/fd")?.flatten() {
-        let name = entry.file_name();
-        let number = name.to_str().and_then(|name| name.parse::<i32>().ok());
-        if let Some(number) = number.filter(|number| *number > STANDARD_MAX) {
-            // SAFETY: the call closes nothing and touches no memory; a descriptor that is gone by now is an
-            // error, which leaves nothing to keep from anybody.
-            let _gone = unsafe { libc::fcntl(number, libc::F_SETFD, libc::FD_CLOEXEC) };
-        }
+    for number in numbers()?.filter(|number| *number > STANDARD_MAX) {
+        // SAFETY: the call closes nothing and touches no memory; a descriptor that is gone by now is an
+        // error, which leaves nothing to keep from anybody.
+        let _gone = unsafe { libc::fcntl(number, libc::F_SETFD, libc::FD_CLOEXEC) };
     }
     Ok(())
+}
+
+/// Another descriptor of the socket of this process that takes TCP connections at `address`.
+///
+/// # Errors
+/// When there is none, or the kernel does not list them.
+#[allow(
+    unsafe_code,
+    reason = "a descriptor of another's cannot be borrowed safely"
+)]
+pub fn listener_at(address: SocketAddr) -> io::Result<OwnedFd> {
+    for number in numbers()? {
+        // SAFETY: the call touches no memory and leaves `number` as it is; one that is gone by now is an error.
+        let copy = unsafe { libc::fcntl(number, libc::F_DUPFD_CLOEXEC, 0) };
+        if copy < 0 {
+            continue;
+        }
+        // SAFETY: the kernel made `copy` just now, for nobody else.
+        let copy = unsafe { OwnedFd::from_raw_fd(copy) };
+        let at = getsockname::<SockaddrStorage>(copy.as_raw_fd()).ok();
+        let v4 = at.and_then(|at| at.as_sockaddr_in().map(|at| SocketAddr::V4((*at).into())));
+        let v6 = at.and_then(|at| at.as_sockaddr_in6().map(|at| SocketAddr::V6((*at).into())));
+        if v4.or(v6) == Some(address) && getsockopt(&copy, sockopt::AcceptConn) == Ok(true) {
+            return Ok(copy);
+        }
+    }
+    Err(io::Error::other(format!(
+        "nothing of this process listens at {address}"
+    )))
+}
+
+fn numbers() -> io::Result<impl Iterator<Item = i32>> {
+    // All of them first: the listing has one of its own.
+    let listed: Vec<_> = fs::read_dir("/proc/self/fd")?.flatten().collect();
+    let number = |entry: fs::DirEntry| entry.file_name().to_str()?.parse().ok();
+    Ok(listed.into_iter().filter_map(number))
 }
 
 #[cfg(test)]
@@ -88,6 +124,18 @@ mod tests {
         assert!(listed().contains("/proc/version"));
         withhold().unwrap();
         assert!(!listed().contains("/proc/version"));
+    }
+
+    #[test]
+    fn a_listener_is_found_by_its_address_and_a_connection_is_none() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        let stream = std::net::TcpStream::connect(address).unwrap();
+        assert!(listener_at(stream.local_addr().unwrap()).is_err());
+        let found = std::net::TcpListener::from(listener_at(address).unwrap());
+        assert_eq!(found.accept().unwrap().1, stream.local_addr().unwrap());
+        drop((listener, found));
+        assert!(listener_at(address).is_err());
     }
 
     #[test]

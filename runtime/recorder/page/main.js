@@ -319,7 +319,7 @@ async function start() {
   for (;;) {
     try {
       const config = await (await fetch("config.json", { cache: "no-store" })).json();
-      socket = new Socket(`ws://${location.hostname}:${config.ws_port}`, (topic) => topic.startsWith("/live/") && topic.slice(6) in shelves, handlers);
+      socket = new Socket(`ws://${location.hostname}:${config.ws_port}/${location.search}`, (topic) => topic.startsWith("/live/") && topic.slice(6) in shelves, handlers);
       return;
     } catch {
       setState("connecting", "no recorder yet, retrying");

@@ -31,6 +31,7 @@ mod links;
 mod model;
 mod names;
 mod parameter_reader;
+mod ports;
 mod reader;
 pub mod registry;
 mod resolved;
@@ -57,6 +58,7 @@ pub use model::{
     Process, Program, Restarts, Run, Scheduling, SchedulingClass, Topology, Wait,
 };
 pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
+pub use ports::{WantedPort, collide, control_key};
 pub use role_spec::{RoleChannel, RoleSpec};
 pub use security::{Hops, Security};
 

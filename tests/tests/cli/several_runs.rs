@@ -5,6 +5,7 @@ use std::time::Duration;
 use hil_report::summary::Outcome;
 use hil_tests::account::{account, assert_accounts_close, assert_every_message_is_accounted_for};
 use hil_tests::run_folder::RunFolder;
+use hil_tests::shuttle::emulated_shuttle;
 use hil_tests::trial::{RunFiles, Trial};
 
 const LIMIT: Duration = Duration::from_mins(1);
@@ -53,4 +54,45 @@ fn runs_side_by_side_do_not_see_each_other() {
         }
         files.assert_nothing_left_here();
     }
+}
+
+#[test]
+fn of_two_topologies_with_one_port_the_second_is_refused_with_the_key_to_change() {
+    let record = RunFolder::new("one-port");
+    let text = emulated_shuttle("first", "").replace("12 s", "4 s");
+    let files = [text.clone(), text.replace("first", "second")];
+    let [first, second] = files.map(|text| {
+        let name = if text.contains("first") {
+            "first"
+        } else {
+            "second"
+        };
+        let topology = record.write(&format!("{name}.toml"), &text);
+        Trial::of(&topology, &record.join(name))
+    });
+    let mut running = first.start_here();
+    let files = first.folder("", LIMIT);
+    for trial in [&second, &first] {
+        let refused = trial.start_here().wait_within(LIMIT).unwrap();
+        println!("{}", refused.stderr);
+        refused.assert_code(75);
+        let (root, process) = (files.root().display(), running.pid());
+        let told = format!("is held by hil-runtime (process {process}), the run in {root};");
+        assert!(
+            refused.stderr.contains("links.hop.port"),
+            "{}",
+            refused.stderr
+        );
+        assert!(refused.stderr.contains(&told), "{}", refused.stderr);
+    }
+    running.wait_within(LIMIT).unwrap().assert_success();
+    let summary = files.summary();
+    assert_eq!(summary.run.outcome, Outcome::Completed);
+    assert_every_message_is_accounted_for(&summary);
+    assert!(!record.join("second").exists());
+    let own = second.set("links.hop.port=24999");
+    own.start_here()
+        .wait_within(LIMIT)
+        .unwrap()
+        .assert_success();
 }

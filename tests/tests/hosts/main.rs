@@ -9,6 +9,7 @@
 )]
 
 mod chaos;
+mod claims;
 mod clock_path;
 mod clock_run;
 mod disturbances;

@@ -3,7 +3,7 @@
 //! that.
 
 use std::io::{Read, Write};
-use std::net::{Ipv4Addr, Shutdown, TcpStream};
+use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpStream};
 use std::process::Command;
 use std::time::{Duration, Instant};
 use std::{fs, thread};
@@ -47,9 +47,14 @@ pub(super) struct Asked {
 
 impl Asked {
     fn to_look_on(address: &str, host: &str, origin: Option<&str>) -> Self {
+        Self::with_token(address, host, origin, None)
+    }
+
+    fn with_token(address: &str, host: &str, origin: Option<&str>, token: Option<&str>) -> Self {
         let origin = origin.map_or_else(String::new, |origin| format!("Origin: {origin}\r\n"));
+        let query = token.map_or_else(String::new, |token| format!("?token={token}"));
         let request = format!(
-            "GET / HTTP/1.1\r\nHost: {host}\r\n{origin}Upgrade: websocket\r\n\
+            "GET /{query} HTTP/1.1\r\nHost: {host}\r\n{origin}Upgrade: websocket\r\n\
              Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n\
              Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\
              Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
@@ -161,6 +166,44 @@ fn programs_our_own_page_and_allowed_pages_look_on() {
     server.end();
 }
 
+/// Nobody else on this machine has it.
+const STRANGER: u32 = 45_678;
+
+/// The first line that a program of another user of this machine hears that asks to look on.
+fn ask_as_stranger(server: &LiveServer, query: &str) -> String {
+    let script = r#"exec 3<>"/dev/tcp/$1/$2" || exit
+        printf 'GET /%s HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n' "$3" >&3
+        printf 'Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n' >&3
+        printf 'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n' >&3
+        read -r line <&3 && printf '%s' "$line""#;
+    let id = STRANGER.to_string();
+    let (host, port) = server.socket.rsplit_once(':').unwrap();
+    let mut command = Command::new("setpriv");
+    command.args(["--reuid", &id, "--regid", &id, "--clear-groups"]);
+    command.args(["bash", "-c", script, "bash", host, port, query]);
+    run(&mut command, LIMIT).unwrap().stdout
+}
+
+#[test]
+fn another_user_of_this_machine_looks_on_with_the_token_and_is_refused_and_counted_without() {
+    let server = start(&[]);
+    let right = format!("?token={}", server.token);
+    let wrong = format!("?token={}", "0".repeat(server.token.len()));
+    for query in ["", "?token=", &wrong] {
+        let answer = ask_as_stranger(&server, query);
+        assert!(answer.starts_with("HTTP/1.1 403 "), "{query}: {answer}");
+    }
+    let answer = ask_as_stranger(&server, &right);
+    assert!(answer.starts_with("HTTP/1.1 101 "), "{answer}");
+    // This user's own need none.
+    ask_as_program(&server.socket).is_let_in();
+    let finished = server.end();
+    let account =
+        "refused 3 requests: 3 × a viewer of another user or another machine without the token";
+    println!("{}", finished.stderr);
+    assert!(finished.stderr.contains(account), "{}", finished.stderr);
+}
+
 #[test]
 fn nobody_is_told_to_paste_what_a_shell_would_run() {
     let server = start(&[]);
@@ -237,17 +280,24 @@ fn viewers_whose_cable_was_pulled_lose_their_seats() {
     // Where others find it, which 0.0.0.0 does not say.
     let page_port = server.page.rsplit(':').next().unwrap();
     let said = format!(
-        "from other machines  http://{}:{page_port}/\n",
-        here.address()
+        "from other machines  http://{}:{page_port}/?token={}\n",
+        here.address(),
+        server.token
     );
     server.child.wait_for_output(&said, LIMIT).unwrap();
     let port = server.socket.rsplit(':').next().unwrap();
     let [local, remote] = [Ipv4Addr::LOCALHOST, here.address()].map(|one| format!("{one}:{port}"));
     let look_on = || {
-        let mut asked = Asked::to_look_on(&remote, &remote, None);
+        let mut asked = Asked::with_token(&remote, &remote, None, Some(&server.token));
         asked.is_let_in();
         asked
     };
+    let stranger = there.on_network(|| Asked::to_look_on(&remote, &remote, None));
+    assert_refused(
+        &stranger.answer(),
+        "403",
+        "another machine without the token",
+    );
     let viewers: Vec<Asked> = there.on_network(|| (0..SEATS).map(|_| look_on()).collect());
     let ask = || here.on_network(|| Asked::to_look_on(&local, &local, None));
     let full = format!("{SEATS} look on already");
@@ -317,10 +367,21 @@ fn what_is_behind_the_door_is_where_nobody_looks() {
     let [hidden] = &listening[..] else {
         panic!("{listening:?}");
     };
-    let hidden = u32::from_str_radix(hidden.split(':').next().unwrap(), 16).unwrap();
-    let [first, rest @ ..] = hidden.to_ne_bytes();
+    let (hidden, port) = hidden.split_once(':').unwrap();
+    let hidden = u32::from_str_radix(hidden, 16).unwrap().to_ne_bytes();
+    let [first, rest @ ..] = hidden;
     assert_eq!(first, 127);
     assert_ne!(rest, [0, 0, 1]);
+    // Nor has anybody a way in there who read this in the kernel's tables: while nobody looks on, when one
+    // comes, and while it looks on.
+    let port = u16::from_str_radix(port, 16).unwrap();
+    let hidden = SocketAddr::new(Ipv4Addr::from(hidden).into(), port);
+    let refused = || TcpStream::connect_timeout(&hidden, Duration::from_millis(500)).is_err();
+    assert!(refused());
+    let mut viewer = ask_as_program(&server.socket);
+    assert!(refused());
+    viewer.is_let_in();
+    assert!(refused());
     server.end();
 }
 

@@ -15,6 +15,7 @@ use hil_platform::domain_address::checked_root_path;
 use hil_platform::own_folder::OwnFolder;
 use hil_protocol::ingress::reassembly_slots;
 use hil_rundir::announcement::withdraw_abandoned;
+use hil_rundir::live_run::LiveRun;
 use hil_shm::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, observer_depth};
 use hil_topology::Channel;
 
@@ -37,6 +38,20 @@ pub enum DomainsError {
         host: String,
         /// Why.
         source: DomainError,
+    },
+    /// Another run has its folder, as one in a container that shares only that.
+    #[error(
+        "shared memory of host {host} would be that of the run in {}, process {pid}; end that one, or name \
+         another folder with --domain-root",
+        .folder.display()
+    )]
+    Taken {
+        /// The host.
+        host: String,
+        /// Folder of the other run.
+        folder: PathBuf,
+        /// Its supervisor.
+        pid: u32,
     },
     /// One of its channels.
     #[error("shared memory of host {host}: {source}")]
@@ -217,9 +232,14 @@ fn create_host(
 ) -> Result<HostDomain, DomainsError> {
     let host = plan.name.clone();
     let root = domain_root(base, run, &host);
-    let domain = Domain::create(&root).map_err(|source| DomainsError::Domain {
-        host: host.clone(),
-        source,
+    let domain = Domain::create(&root).map_err(|source| {
+        let host = host.clone();
+        match (source, LiveRun::read(&root)) {
+            (DomainError::Locked { .. }, Ok(LiveRun { folder, pid, .. })) => {
+                DomainsError::Taken { host, folder, pid }
+            }
+            (source, _) => DomainsError::Domain { host, source },
+        }
     })?;
     let mut holders = Vec::new();
     for settings in channel_settings(plan) {

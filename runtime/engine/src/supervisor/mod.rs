@@ -2,6 +2,7 @@
 //! everything in order and leaves a complete report, whatever happened. It carries no message.
 
 pub(crate) mod child;
+mod claims;
 pub(crate) mod clock_path;
 mod control_listener;
 pub(crate) mod domains;
@@ -23,6 +24,7 @@ mod status_publisher;
 mod strangers;
 
 pub(crate) use child::Child;
+pub use claims::{ClaimError, Claims};
 pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;
 pub use needs::{HostTooSmall, Shortfall, check_host};

@@ -10,6 +10,7 @@ use std::{fs, thread};
 use hil_core::time::Instant;
 use hil_net::clock_pair::ClockPair;
 
+use super::claims::Claims;
 use super::domains::{self, Domains};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
@@ -62,13 +63,14 @@ const RESULT_BYTES: u64 = 32 << 10;
 const RESULT_PROCESS_BYTES: u64 = 4 << 10;
 const RESULT_CHANNEL_BYTES: u64 = 32 << 10;
 
-/// Runs `topology` here.
+/// Runs `topology` here; `claims` are what it needs for itself, and are given up at its end.
 ///
 /// # Errors
 /// When the run did not come about. Once it has begun, every end is an [`Outcome`].
 pub fn run(
     topology: &Topology,
     options: &RunOptions,
+    claims: Claims,
     signals: &Signals,
     console: &mut Console,
 ) -> Result<RunResult, RunError> {
@@ -109,6 +111,7 @@ pub fn run(
         folder: folder.root().to_owned(),
         source,
     };
+    claims.tell(folder.root());
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, base, &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
@@ -155,7 +158,9 @@ pub fn run(
     };
     let end = MonotonicClock::now();
     let outcome = session.stop(outcome);
-    Ok(session.conclude(folder, outcome, start, end, started, facts))
+    let result = session.conclude(folder, outcome, start, end, started, facts);
+    drop(claims);
+    Ok(result)
 }
 
 /// The longest delay of each trace that a link of `topology` replays, by channel: known since before

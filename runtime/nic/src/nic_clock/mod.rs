@@ -16,7 +16,7 @@ use std::time::Duration;
 
 use hil_account::nic_clock::NicClockRecord;
 use hil_net::clock_pair::ClockPair;
-use hil_net::interface::interface_with_address;
+use hil_net::interface::{interface_with_address, own_name};
 use hil_net::nic_clock::NicClock;
 use hil_net::timestamping::TimestampCapabilities;
 
@@ -189,6 +189,13 @@ fn wants_cards(topology: &Topology, host: &Host) -> bool {
         matches!(&process.program, Program::Egm { adapter, .. } if adapter.timestamps == Timestamps::Hardware)
     });
     of_hops || of_faces
+}
+
+/// The interface of the card that a run of `topology` sets up on `host`, as the kernel calls it.
+pub fn card_of(topology: &Topology, host: &Host) -> Option<String> {
+    let interface = wants_cards(topology, host).then(|| interface_of(host));
+    let interface = interface?.ok()?;
+    Some(own_name(&interface).unwrap_or(interface))
 }
 
 /// The interface that the datagrams of `host` pass: the one it names, else that of its address.

@@ -3,8 +3,8 @@
 //! A browser lets any page open a socket to any address, this machine's own included, and only says
 //! whose page it is, in `Origin`. So a page that is not ours is refused. A page can also come under a
 //! name whose owner makes it mean another address while it is shown; such a page is of one origin with
-//! us, and is known by the name in `Host`. Programs send no `Origin`, and are let in as anybody is who
-//! reaches the address.
+//! us, and is known by the name in `Host`. Programs send no `Origin`. Whoever asks, and is not a program of
+//! this user on this machine, needs the token that was printed with the address.
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Write as _};
@@ -13,6 +13,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::head::{Head, only};
 use super::passage::Excess;
+use super::token::Token;
 
 use hil_platform::words::counted_plainly;
 
@@ -44,6 +45,8 @@ pub(crate) enum Refusal {
     ForeignHost(String),
     /// It is from a page of somebody else's.
     ForeignOrigin(String),
+    /// It is of another user, or from another machine, and has not the token.
+    NoToken,
     /// As many look on as may.
     Full(usize),
     /// It said nothing while as many others came.
@@ -61,7 +64,7 @@ impl Refusal {
             Self::Malformed | Self::NoHost => (400, "Bad Request"),
             Self::TooSlow | Self::Crowded(_) => (408, "Request Timeout"),
             Self::TooLong => (431, "Request Header Fields Too Large"),
-            Self::ForeignHost(_) | Self::ForeignOrigin(_) => (403, "Forbidden"),
+            Self::ForeignHost(_) | Self::ForeignOrigin(_) | Self::NoToken => (403, "Forbidden"),
             Self::Excess(_) => (429, "Too Many Requests"),
             Self::Full(_) | Self::NoServer(_) => (503, "Service Unavailable"),
         }
@@ -91,6 +94,10 @@ impl Refusal {
                 let cure = cure.map(|origin| format!("; --allow-origin {origin} {lets}"));
                 cure.unwrap_or_default()
             }
+            Self::NoToken => {
+                "; the address that hil-recorder printed for other users ends in it: ?token=..."
+                    .to_owned()
+            }
             _ => String::new(),
         };
         format!("refused {self}{advice}")
@@ -110,6 +117,9 @@ impl fmt::Display for Refusal {
                 f.write_str("a page without an origin, such as a file opened in a browser")
             }
             Self::ForeignOrigin(origin) => write!(f, "a page of {origin}"),
+            Self::NoToken => {
+                f.write_str("a viewer of another user or another machine without the token")
+            }
             Self::Full(seats) => write!(f, "a viewer, as {seats} look on already"),
             Self::Crowded(others) => {
                 write!(f, "a connection that said nothing while {others} more came")
@@ -130,6 +140,7 @@ impl fmt::Display for Refusal {
 pub(crate) struct Access {
     hosts: Vec<String>,
     origins: Vec<String>,
+    token: Option<Token>,
     refused: Mutex<Refused>,
 }
 
@@ -152,11 +163,48 @@ impl Access {
         Self {
             hosts: hosts.map(str::to_ascii_lowercase).collect(),
             origins: origins.map(|one| one.to_ascii_lowercase()).collect(),
+            token: None,
             refused: Mutex::default(),
         }
     }
 
-    /// Whether a request to the socket may pass. `page_port` is that of our own page.
+    /// The same, where those who have `token` may look on as well as this user's own programs.
+    #[must_use]
+    pub(crate) fn with_token(self, token: Token) -> Self {
+        Self {
+            token: Some(token),
+            ..self
+        }
+    }
+
+    /// What the printed addresses end in.
+    pub(crate) fn query(&self) -> String {
+        self.token
+            .as_ref()
+            .map_or_else(String::new, Token::to_string)
+    }
+
+    /// Whether a request to the socket may look on; `is_own` says of one without the token whether it is of a
+    /// program of this user on this machine.
+    ///
+    /// # Errors
+    /// Why not.
+    pub(super) fn admit(
+        &self,
+        head: &Head,
+        page_port: u16,
+        is_own: impl FnOnce() -> bool,
+    ) -> Result<(), Refusal> {
+        self.judge(head, page_port)?;
+        let told = self.token.as_ref().zip(head.token.as_deref());
+        if told.is_some_and(|(token, told)| token.is(told)) || is_own() {
+            Ok(())
+        } else {
+            Err(Refusal::NoToken)
+        }
+    }
+
+    /// Whether a request to the socket may pass by what it says of itself. `page_port` is that of our own page.
     ///
     /// # Errors
     /// Why not.

@@ -1,18 +1,15 @@
 //! The door of the socket: reads the head of each request and lets pass who may look on;
 //! [`super::passage`] hands their messages on.
 //!
-//! That server can only be had on a TCP port and asks nobody who they are. It listens on loopback, at
-//! an address that is drawn by lot out of the sixteen million there, and at any free port: a page that
-//! would go around this door has to guess both.
+//! That server can only be had on a TCP port and asks nobody who they are: it is behind a [`Gate`].
 
 use std::collections::VecDeque;
 use std::io;
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, SocketAddr};
 use std::os::fd::AsFd;
 use std::sync::Arc;
 use std::time::Duration;
 
-use hil_platform::random::random_bytes;
 use nix::sys::socket::{setsockopt, sockopt};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
@@ -22,8 +19,10 @@ use tokio::task::{AbortHandle, JoinHandle, JoinSet};
 use tokio::time::{sleep, timeout};
 
 use super::access::{Access, Refusal};
+use super::gate::Gate;
 use super::head::{Head, Parsed, head_bytes, parse};
 use super::passage::{AllViewers, End, GONE_AFTER, pass};
+use super::token;
 
 /// Viewers at once.
 const SEATS: usize = 32;
@@ -45,23 +44,6 @@ const UNREAD_BYTES_MAX: u64 = 512 * 1024;
 const KERNEL_BYTES: u32 = 128 * 1024;
 /// Out of file descriptors, mostly: others must close first.
 const PAUSE: Duration = Duration::from_millis(50);
-
-/// An address of this machine's own that nobody knows.
-///
-/// # Errors
-/// When the kernel has no random numbers.
-pub(super) fn hidden_address() -> io::Result<Ipv4Addr> {
-    random_bytes().map(hidden)
-}
-
-fn hidden([a, b, c]: [u8; 3]) -> Ipv4Addr {
-    // The first is everybody's first guess, and those of the network and of all hosts are none.
-    match (a, b, c) {
-        (0, 0, 0 | 1) => Ipv4Addr::new(127, 0, 0, 2),
-        (255, 255, 255) => Ipv4Addr::new(127, 255, 255, 254),
-        _ => Ipv4Addr::new(127, a, b, c),
-    }
-}
 
 /// Has the kernel close a connection of `socket`, and of those that it accepts, when the other side has
 /// acknowledged nothing, or had no room for anything, for so long. It is asked when there is nothing to send.
@@ -120,12 +102,12 @@ pub(super) struct Front {
 }
 
 impl Front {
-    /// Lets those who come to `listener` in to the library's server at `server`, if `access` does.
+    /// Lets those who come to `listener` in to the library's server behind `server`, if `access` does.
     /// `page_port` is that of our own page.
     pub(super) fn open(
         runtime: &Handle,
         listener: TcpListener,
-        server: SocketAddr,
+        server: Gate,
         access: Arc<Access>,
         page_port: u16,
     ) -> Self {
@@ -168,7 +150,7 @@ impl Front {
 struct ServerContext {
     access: Arc<Access>,
     page_port: u16,
-    server: SocketAddr,
+    server: Gate,
     seats: Arc<Semaphore>,
     all: AllViewers,
 }
@@ -262,13 +244,16 @@ async fn enter(mut viewer: TcpStream, context: Arc<ServerContext>) -> io::Result
             None => return Ok(None),
         },
     };
-    let judged = head.and_then(|head| context.access.judge(&head, context.page_port));
+    let judged = head.and_then(|head| {
+        let is_own = || token::is_own(&viewer);
+        context.access.admit(&head, context.page_port, is_own)
+    });
     let seat = judged.and_then(|()| {
         let seat = Arc::clone(&context.seats).try_acquire_owned();
         seat.map_err(|_none| Refusal::Full(SEATS))
     });
     let server = match seat {
-        Ok(seat) => connect(context.server).await.map(|server| (server, seat)),
+        Ok(seat) => connect(&context.server).await.map(|server| (server, seat)),
         Err(refusal) => Err(refusal),
     };
     match server {
@@ -315,14 +300,14 @@ async fn read_head(
     }
 }
 
-async fn connect(server: SocketAddr) -> Result<TcpStream, Refusal> {
+async fn connect(server: &Gate) -> Result<TcpStream, Refusal> {
     let connect = async {
         // The library stops listening for good when it has no descriptor for a connection.
         let spare = TcpSocket::new_v4()?;
         let socket = TcpSocket::new_v4()?;
         drop(spare);
         socket.set_recv_buffer_size(KERNEL_BYTES)?;
-        let stream = socket.connect(server).await?;
+        let stream = server.connect(socket).await?;
         stream.set_nodelay(true)?;
         Ok::<_, io::Error>(stream)
     };
@@ -401,7 +386,7 @@ async fn hand_on(admitted: Admitted, context: Arc<ServerContext>) -> io::Result<
 #[cfg(test)]
 mod tests {
     use std::io::{Read as _, Write as _};
-    use std::net::{TcpListener as StdListener, TcpStream as StdStream};
+    use std::net::{Ipv4Addr, TcpListener as StdListener, TcpStream as StdStream};
     use std::thread;
 
     use tokio::runtime::{Builder, Runtime};
@@ -409,6 +394,7 @@ mod tests {
     use tokio_tungstenite::tungstenite::{Message, WebSocket};
 
     use super::*;
+    use crate::serve::gate::hidden_address;
 
     const REQUEST: &[u8] = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n";
     const AGREED: &[u8] = b"HTTP/1.1 101 Switching Protocols\r\n\r\n";
@@ -427,6 +413,7 @@ mod tests {
         let listener = listen(runtime.handle(), loopback, gone_after, KERNEL_BYTES).unwrap();
         let address = listener.local_addr().unwrap();
         let access = Arc::new(Access::new(&[], &[], None));
+        let server = Gate::shut(server).unwrap();
         let front = Front::open(runtime.handle(), listener, server, access, 80);
         (address, front, runtime)
     }
@@ -547,14 +534,14 @@ mod tests {
     #[test]
     fn a_viewer_hears_that_there_is_nothing_to_see() {
         let (listener, server) = listener();
-        drop(listener);
         let (address, front, runtime) = door(server);
+        drop(listener);
         let mut stream = viewer(address);
         let mut answer = String::new();
         stream.read_to_string(&mut answer).unwrap();
         assert!(answer.starts_with("HTTP/1.1 503 "), "{answer}");
         assert!(
-            answer.contains("cannot be reached: Connection refused"),
+            answer.contains("cannot be reached: nothing of this process listens"),
             "{answer}"
         );
         front.end(runtime.handle());
@@ -604,16 +591,5 @@ mod tests {
         let kind = writing.join().unwrap().unwrap_err().kind();
         let in_vain = [io::ErrorKind::WouldBlock, io::ErrorKind::TimedOut];
         assert!(!in_vain.contains(&kind), "{kind}");
-    }
-
-    #[test]
-    fn the_hidden_address_is_on_loopback_and_not_the_one_everybody_tries() {
-        assert_eq!(hidden([0, 0, 0]), Ipv4Addr::new(127, 0, 0, 2));
-        assert_eq!(hidden([0, 0, 1]), Ipv4Addr::new(127, 0, 0, 2));
-        assert_eq!(hidden([255, 255, 255]), Ipv4Addr::new(127, 255, 255, 254));
-        assert_eq!(hidden([1, 2, 3]), Ipv4Addr::new(127, 1, 2, 3));
-        let drawn: Vec<_> = (0..4).map(|_| hidden_address().unwrap()).collect();
-        assert!(drawn.iter().all(Ipv4Addr::is_loopback));
-        assert!(drawn[1..].iter().any(|one| *one != drawn[0]), "{drawn:?}");
     }
 }

@@ -7,13 +7,15 @@ use httparse::{Request, Response, Status};
 const FIELDS_MAX: usize = 96;
 
 /// What a request says of itself.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Head {
     /// The field `Host`: the name in the address bar, with its port.
     pub(super) host: Option<String>,
     /// The field `Origin`: whose page asks. Browsers always send it with a socket and let no page
     /// change it.
     pub(super) origin: Option<String>,
+    /// `token` of the address that is asked for.
+    pub(super) token: Option<String>,
 }
 
 /// How far the head of a request has come.
@@ -40,7 +42,11 @@ pub(super) fn parse(bytes: &[u8]) -> Parsed {
                 named.map(|field| field.value)
             };
             match (only(values("host")), only(values("origin"))) {
-                (Ok(host), Ok(origin)) => Parsed::Whole(Head { host, origin }),
+                (Ok(host), Ok(origin)) => Parsed::Whole(Head {
+                    host,
+                    origin,
+                    token: request.path.and_then(token).map(str::to_owned),
+                }),
                 _ => Parsed::Broken,
             }
         }
@@ -57,6 +63,14 @@ pub(super) fn head_bytes(bytes: &[u8]) -> Option<usize> {
         Ok(Status::Complete(count)) => Some(count),
         Ok(Status::Partial) | Err(_) => None,
     }
+}
+
+/// The first `token` in the query of an address, which holds no character that is written in another way there.
+fn token(path: &str) -> Option<&str> {
+    let (_, query) = path.split_once('?')?;
+    query
+        .split('&')
+        .find_map(|part| part.strip_prefix("token="))
 }
 
 /// More than one value, or one that is no text: readers of it could disagree.
@@ -92,14 +106,28 @@ mod tests {
         let head = Head {
             host: Some("localhost:8765".to_owned()),
             origin: Some("http://x".to_owned()),
+            token: None,
         };
         assert_eq!(parsed, Parsed::Whole(head));
         let parsed = parse(&request("X-Host: a"));
-        let head = Head {
-            host: None,
-            origin: None,
-        };
+        let head = Head::default();
         assert_eq!(parsed, Parsed::Whole(head));
+    }
+
+    #[test]
+    fn the_token_is_read_from_the_address() {
+        for (path, expected) in [
+            ("/?token=0a1b", Some("0a1b")),
+            ("/any/path?x=1&token=0a1b&token=2", Some("0a1b")),
+            ("/?token=", Some("")),
+            ("/?tokens=1&atoken=2", None),
+            ("/token=1", None),
+            ("/", None),
+        ] {
+            assert_eq!(token(path), expected, "{path}");
+        }
+        let parsed = parse(b"GET /?token=7 HTTP/1.1\r\n\r\n");
+        assert!(matches!(parsed, Parsed::Whole(head) if head.token.as_deref() == Some("7")));
     }
 
     #[test]

@@ -5,12 +5,14 @@
 mod access;
 mod engine;
 mod front;
+mod gate;
 mod head;
 mod page;
 mod parameters;
 mod passage;
 mod recording;
 mod source;
+mod token;
 mod viewers;
 
 pub(crate) use access::{host, origin};
@@ -38,6 +40,7 @@ use engine::{Engine, Showing, Shown};
 use front::{Front, viewer_listener};
 use parameters::{Links, RunWithLinks};
 use source::{Playback, Running};
+use token::Token;
 use viewers::Viewers;
 
 /// What a kill may lose at most of a recording.
@@ -72,7 +75,10 @@ pub(crate) fn serve(
         .enable_all()
         .build()
         .map_err(|error| Failure::failed(format!("cannot begin: {error}")))?;
-    let access = Arc::new(admitted(options));
+    let token = Token::draw();
+    let token =
+        token.map_err(|error| Failure::failed(format!("no token can be drawn: {error}")))?;
+    let access = Arc::new(admitted(options).with_token(token));
     let (viewers, front) = open(options, &runtime, &links, &access, console)?;
     let target = options.record.clone().map(|output| RecordOptions {
         output,
@@ -270,12 +276,14 @@ fn open(
                  free"
         ))
     })?;
+    let query = access.query();
     let access = Arc::clone(access);
-    let front = Front::open(runtime, listener, viewers.address, access, page.port());
+    let gate = viewers.gate.clone();
+    let front = Front::open(runtime, listener, gate, access, page.port());
     if !options.host.is_loopback() {
         console.warn(
-            "anybody who can reach this address sees the run and may change its emulated links; \
-             without --host only this machine can",
+            "other machines reach this address, and what is sent crosses the network in the clear, the token \
+             too: who has it sees the run and may change its emulated links",
         );
     }
     if options
@@ -286,11 +294,14 @@ fn open(
         console
             .warn("--allow-origin null lets any page in: every page can show one of that origin");
     }
-    console.result(&format!("page    http://{page}/\nviewers ws://{socket}\n"));
+    console.result(&format!(
+        "page    http://{page}/\nviewers ws://{socket}\n\
+         for other users  http://{page}/{query}  ws://{socket}/{query}\n"
+    ));
     if options.host.is_unspecified() {
         for address in own_addresses(options.host) {
             let page = SocketAddr::new(address, page.port());
-            console.result(&format!("from other machines  http://{page}/\n"));
+            console.result(&format!("from other machines  http://{page}/{query}\n"));
         }
     }
     Ok((viewers, front))

@@ -15,7 +15,7 @@ use foxglove::{
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
-use super::front::hidden_address;
+use super::gate::{Gate, hidden_address};
 use crate::net::MessageLatency;
 use crate::run_topics::{ChannelTopics, Wanted};
 use crate::schema::Schema;
@@ -114,7 +114,7 @@ pub(crate) struct Viewers {
     /// The socket, to tell viewers of changed parameters.
     pub(crate) server: WebSocketServerHandle,
     /// Where the library listens, to nobody but the door.
-    pub(crate) address: SocketAddr,
+    pub(crate) gate: Gate,
     live: BTreeMap<&'static str, Live>,
     channels: Vec<ChannelTopics>,
     offered: Offered,
@@ -122,7 +122,7 @@ pub(crate) struct Viewers {
 }
 
 impl Viewers {
-    /// Offers the live topics at an address that nobody knows; links are changed through
+    /// Offers the live topics behind a gate, to nobody yet; links are changed through
     /// `parameters`.
     ///
     /// # Errors
@@ -156,8 +156,9 @@ impl Viewers {
             .tokio_runtime(runtime)
             .context(&context);
         let server = runtime.block_on(server.start())?;
+        let address = SocketAddr::new(ip.into(), server.port());
         Ok(Self {
-            address: SocketAddr::new(ip.into(), server.port()),
+            gate: Gate::shut(address).map_err(FoxgloveError::Bind)?,
             server,
             live,
             channels: Vec::new(),

@@ -13,6 +13,7 @@ fn judged(host: &str, origin: Option<&str>) -> Result<(), Refusal> {
     let head = Head {
         host: Some(host.to_owned()),
         origin: origin.map(str::to_owned),
+        token: None,
     };
     access.judge(&head, PAGE)
 }
@@ -96,7 +97,14 @@ fn names_that_may_be_anybodys_are_refused_whoever_asks() {
     let access = Access::new(&[], &[], None);
     let (host, origin) = (None, None);
     assert_eq!(
-        access.judge(&Head { host, origin }, PAGE),
+        access.judge(
+            &Head {
+                host,
+                origin,
+                token: None
+            },
+            PAGE
+        ),
         Err(Refusal::NoHost)
     );
 }
@@ -107,6 +115,7 @@ fn a_page_on_the_port_of_the_web_has_none_in_its_origin() {
     let head = |origin: &str| Head {
         host: Some("127.0.0.1:8765".to_owned()),
         origin: Some(origin.to_owned()),
+        token: None,
     };
     assert_eq!(access.judge(&head("http://127.0.0.1"), 80), Ok(()));
     assert!(access.judge(&head("http://127.0.0.1:80"), 80).is_err());
@@ -184,6 +193,7 @@ fn a_file_looks_on_only_where_that_was_asked_for() {
     let head = Head {
         host: Some("localhost:8765".to_owned()),
         origin: Some("file://".to_owned()),
+        token: None,
     };
     let refusal = Access::new(&[], &[], None).judge(&head, PAGE).unwrap_err();
     let words = refusal.words();
@@ -224,4 +234,50 @@ fn no_command_is_offered_that_would_do_more_than_let_somebody_in() {
         assert!(!words.contains("--allow-host"), "{words}");
         assert!(words.contains("not this machine's name"), "{words}");
     }
+}
+
+#[test]
+fn who_is_not_this_user_needs_the_token_and_who_has_it_is_no_page_of_others() {
+    let token = Token::draw().unwrap();
+    let right = token.to_string().replace("?token=", "");
+    assert_eq!(right.len(), 32);
+    assert_ne!(
+        right,
+        Token::draw().unwrap().to_string().replace("?token=", "")
+    );
+    let access = Access::new(&[], &[], None).with_token(token);
+    let admitted = |token: Option<&str>, origin: Option<&str>, is_own: bool| {
+        let head = Head {
+            host: Some("localhost:8765".to_owned()),
+            origin: origin.map(str::to_owned),
+            token: token.map(str::to_owned),
+        };
+        access.admit(&head, PAGE, || is_own)
+    };
+    assert_eq!(admitted(Some(&right), None, false), Ok(()));
+    assert_eq!(admitted(None, None, true), Ok(()));
+    let longer = format!("{right}0");
+    for wrong in [None, Some(""), Some("0"), Some(&right[1..]), Some(&longer)] {
+        assert_eq!(
+            admitted(wrong, None, false),
+            Err(Refusal::NoToken),
+            "{wrong:?}"
+        );
+        assert_eq!(admitted(wrong, None, true), Ok(()));
+    }
+    let evil = Some("https://evil.example");
+    assert!(matches!(
+        admitted(Some(&right), evil, true),
+        Err(Refusal::ForeignOrigin(_))
+    ));
+    let said = format!("{access:?} {}", Refusal::NoToken.words());
+    assert!(!said.contains(&right), "{said}");
+    // Without one, only this user.
+    let access = Access::new(&[], &[], None);
+    let head = Head {
+        host: Some("localhost".to_owned()),
+        token: Some(String::new()),
+        ..Head::default()
+    };
+    assert_eq!(access.admit(&head, PAGE, || false), Err(Refusal::NoToken));
 }
