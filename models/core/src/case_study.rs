@@ -77,7 +77,11 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// What the robot did, from the messages of a finished run; by default the mean of each of its errors.
     fn score(&self, log: &RunLog) -> Score {
         Score {
-            metrics: self.errors(log).iter().map(ErrorSeries::mean).collect(),
+            metrics: self
+                .errors(log)
+                .iter()
+                .map(|error| error.mean(log))
+                .collect(),
             ..Score::default()
         }
     }

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::case_study::ChannelSpec;
 use crate::interval::Spread;
 use crate::message::Envelope;
+use crate::run_log::RunLog;
 use crate::time::Instant;
 
 /// Events a score keeps at most.
@@ -164,8 +165,8 @@ pub struct ErrorSeries {
 }
 
 impl ErrorSeries {
-    /// Their mean over the run.
-    pub fn mean(&self) -> Metric {
+    /// Their mean over the run of `log`.
+    pub fn mean(&self, log: &RunLog) -> Metric {
         let count = self.samples.len();
         let sum: f64 = self.samples.iter().map(|sample| sample.1).sum();
         Metric {
@@ -174,7 +175,11 @@ impl ErrorSeries {
             value: (count > 0).then(|| sum / count as f64),
             interval: None,
             unit: self.unit,
-            method: format!("mean of {count} samples; they depend on each other: no interval"),
+            method: match count {
+                0 if !log.has_one_clock() => "the hosts' clocks are not aligned".to_owned(),
+                0 => "the run has no sample of it".to_owned(),
+                _ => format!("mean of {count} samples; they depend on each other: no interval"),
+            },
         }
     }
 }
@@ -271,6 +276,29 @@ mod tests {
 
     fn event(severity: Severity, at_ns: i64) -> ScoreEvent {
         ScoreEvent::new(severity, Instant::from_ns(at_ns), "a/b", "something")
+    }
+
+    #[test]
+    fn a_mean_of_no_samples_says_why_there_are_none() {
+        let errors = |samples| ErrorSeries {
+            name: "error_m",
+            label: "error",
+            unit: "m",
+            clock_of: "a/b",
+            samples,
+        };
+        let mut log = RunLog::default();
+        let mean = errors(vec![(Instant::ZERO, 1.0), (Instant::ZERO, 2.0)]).mean(&log);
+        assert_eq!(mean.value, Some(1.5));
+        assert!(mean.method.starts_with("mean of 2 samples"), "{mean:?}");
+        let none = errors(Vec::new()).mean(&log);
+        assert_eq!(
+            (none.value, none.method.as_str()),
+            (None, "the run has no sample of it")
+        );
+        log.set_clocks_differ();
+        let none = errors(Vec::new()).mean(&log);
+        assert_eq!(none.method, "the hosts' clocks are not aligned");
     }
 
     #[test]

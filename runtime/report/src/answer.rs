@@ -12,7 +12,9 @@ use hil_platform::words::{counted, named};
 use hil_stats::statistics::{CONFIDENCE, poisson};
 use serde::{Deserialize, Serialize};
 
-use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
+use super::assessment::{
+    Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX, uncounted_start_count,
+};
 use super::clock_summary::ClockSection;
 use super::score_event::ExplainedEvent;
 use super::summary::{LinkKind, RunSummary, ScoreMetric};
@@ -191,6 +193,36 @@ impl fmt::Display for Subject {
     }
 }
 
+/// What the network may have hurt.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Object {
+    /// The robot of a case.
+    Robot,
+    /// Programs of the user's, of which nothing is known but their messages or frames.
+    Programs,
+}
+
+impl Object {
+    /// Of a run: one without a case has no robot.
+    pub(crate) const fn of(summary: &RunSummary) -> Self {
+        if summary.run.case.is_empty() {
+            Self::Programs
+        } else {
+            Self::Robot
+        }
+    }
+}
+
+impl fmt::Display for Object {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Self::Robot => "the robot",
+            Self::Programs => "the programs",
+        })
+    }
+}
+
 /// Whether times of two hosts compare.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(tag = "state", rename_all = "snake_case")]
@@ -216,6 +248,8 @@ pub struct Measurement {
     pub is_valid: Option<bool>,
     /// Whether times of two hosts compare.
     pub clocks: Clocks,
+    /// Starts of processes that left no counters: what these lost or skipped is unknown.
+    pub uncounted_start_count: u64,
 }
 
 /// How much the answer rests on.
@@ -239,6 +273,8 @@ pub struct Answer {
     pub hurt: Hurt,
     /// What was put to the test.
     pub subject: Subject,
+    /// What it may have hurt.
+    pub object: Object,
     /// Is the measurement valid?
     pub measurement: Measurement,
     /// How large is the sample?
@@ -258,9 +294,11 @@ impl Answer {
         Self {
             hurt: hurt(summary, &assessment.network),
             subject: subject(summary, &assessment.network),
+            object: Object::of(summary),
             measurement: Measurement {
                 is_valid: is_valid(&assessment.network),
                 clocks: clocks(summary),
+                uncounted_start_count: uncounted_start_count(summary),
             },
             sample: Sample {
                 duration_s: summary.run.duration_s,
@@ -273,7 +311,7 @@ impl Answer {
 
     /// What is asked.
     pub fn question(&self) -> String {
-        format!("Did {} hurt the robot?", self.subject)
+        format!("Did {} hurt {}?", self.subject, self.object)
     }
 
     /// The answer to it.
@@ -288,16 +326,16 @@ impl Answer {
                     grouped(*count)
                 )
             }
-            _ => self.hurt.to_string(),
+            _ => self.hurt.words(self.object),
         }
     }
 
     /// The same as a sentence of its own.
     pub fn sentence(&self) -> String {
-        let subject = self.subject;
+        let (subject, object) = (self.subject, self.object);
         match &self.hurt {
-            Hurt::Yes => format!("YES, {subject} hurt the robot"),
-            Hurt::No => format!("NO, {subject} did not hurt the robot"),
+            Hurt::Yes => format!("YES, {subject} hurt {object}"),
+            Hurt::No => format!("NO, {subject} did not hurt {object}"),
             Hurt::NotResolvable { .. } | Hurt::NotTested { .. } => self.words(),
         }
     }
@@ -306,7 +344,7 @@ impl Answer {
     pub(crate) const fn tone(&self) -> Tone {
         match (&self.hurt, self.measurement.is_valid) {
             (Hurt::Yes, _) => Tone::Bad,
-            (Hurt::No, Some(true)) => Tone::Good,
+            (Hurt::No, Some(true)) if self.measurement.uncounted_start_count == 0 => Tone::Good,
             (Hurt::No | Hurt::NotResolvable { .. } | Hurt::NotTested { .. }, _) => Tone::Caution,
         }
     }
@@ -326,11 +364,26 @@ impl Answer {
                 "; clocks are not aligned: one-way delays are unavailable".to_owned()
             }
         };
+        let uncounted_count = self.measurement.uncounted_start_count;
+        let uncounted = uncounted_words(uncounted_count);
         match invalid_words(network) {
             Some(why) => (Tone::Bad, format!("NOT VALID: {why}")),
             None if self.measurement.is_valid.is_none() => {
-                (Tone::Plain, unmeasured_words(network).to_owned())
+                let uncounted = match network {
+                    NetworkVerdict::HostUnknown => uncounted,
+                    _ => String::new(),
+                };
+                (
+                    Tone::Plain,
+                    format!("{}{uncounted}", unmeasured_words(network)),
+                )
             }
+            None if uncounted_count > 0 => (
+                Tone::Caution,
+                format!(
+                    "valid as far as is known: hosts and links were kept up with{clocks}{uncounted}"
+                ),
+            ),
             None => (
                 Tone::Plain,
                 format!("valid: hosts and links were kept up with{clocks}"),
@@ -355,6 +408,19 @@ impl Answer {
             }
             Some(OccasionCount { what, count }) => format!("{text}, {} {what}", grouped(*count)),
             None => text,
+        }
+    }
+}
+
+impl Hurt {
+    /// The answer for an object of this kind.
+    pub(crate) fn words(&self, object: Object) -> String {
+        let because = Untested::NoScore;
+        if object == Object::Programs && *self == (Self::NotTested { because }) {
+            "NOT TESTED: what hurts these programs is not known; what became of their messages is above"
+                .to_owned()
+        } else {
+            self.to_string()
         }
     }
 }
@@ -606,6 +672,14 @@ const fn unmeasured_words(network: &NetworkVerdict) -> &'static str {
     }
 }
 
+/// What the judgement of a measurement cannot rest on; empty where everything was counted.
+pub(crate) fn uncounted_words(uncounted_start_count: u64) -> String {
+    match uncounted_start_count {
+        0 => String::new(),
+        count => format!("; {} left no counters", counted(count, "process start")),
+    }
+}
+
 /// Why a measurement is not valid, in words.
 fn invalid_words(network: &NetworkVerdict) -> Option<String> {
     let repeat = "repeat on an idle host or at a lower rate";
@@ -623,15 +697,23 @@ fn invalid_words(network: &NetworkVerdict) -> Option<String> {
             let ticks = format!("{} of {} ticks", grouped(skipped), grouped(due));
             format!("the host overran: {names} skipped {ticks} ({share}); {repeat}")
         }
-        NetworkVerdict::ReceiverLate { channels } => {
+        NetworkVerdict::ReceiverLate { channels, loss } => {
             let flows = named(channels, NAMED_COUNT);
             format!(
-                "receiving gateways were late: no room in the receive buffer of {flows}; {repeat}"
+                "receiving gateways were late: no room in the receive buffer of {flows} for {}, so the network lost \
+                 up to {} less than is shown; {repeat}",
+                loss.words("datagrams"),
+                loss.share()
             )
         }
-        NetworkVerdict::FramesLost { channels } => {
+        NetworkVerdict::FramesLost { channels, loss } => {
             let channels = named(channels, NAMED_COUNT);
-            format!("processes, queues or inlets of a host lost frames of {channels}; {repeat}")
+            format!(
+                "processes, queues or inlets of a host lost {} of {channels}, of which the network might have lost \
+                 some: its loss is known to +{} only; {repeat}",
+                loss.words("frames"),
+                loss.share()
+            )
         }
         NetworkVerdict::TicksUnknown => "a component left no count of its ticks".to_owned(),
         NetworkVerdict::RecordsMissing { hosts } => {

@@ -9,12 +9,12 @@ use serde::{Deserialize, Serialize};
 use super::adapter::AdapterSummary;
 use super::adapter_warnings;
 use super::summary::{
-    ChannelFlows, ChannelSummary, DirectionSummary, LinkKind, NO_ROOM, Outcome, ProcessSummary,
-    RunSummary,
+    ChannelSummary, DirectionSummary, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary,
 };
 use hil_platform::text::grouped;
 use hil_platform::words::{counted, named};
 use hil_present::units::{JOINT, percent};
+use hil_rundir::event::ProcessKind;
 
 /// Share of skipped ticks above which the host, not the network, shaped the run.
 pub const SKIPPED_TICK_RATIO_MAX: f64 = 0.001;
@@ -61,17 +61,23 @@ pub enum NetworkVerdict {
     ReceiverLate {
         /// The channels concerned.
         channels: Vec<String>,
+        /// Datagrams without room, of the messages published.
+        #[serde(flatten)]
+        loss: HostLoss,
     },
     /// A process, a queue or an inlet of ours lost too many frames of a program: the run says nothing about the
     /// network.
     FramesLost {
         /// The channels concerned.
         channels: Vec<String>,
+        /// Frames lost so, of those that the programs sent.
+        #[serde(flatten)]
+        loss: HostLoss,
     },
     /// A component left no report, so nobody can tell whether it kept its ticks.
     TicksUnknown,
-    /// Nothing that ran tells whether the host kept up: no component with a period, no gateway that left its
-    /// counters.
+    /// Nothing that ran tells whether the host kept up: no component with a period, and no gateways that left
+    /// the counters of all their starts.
     HostUnknown,
     /// Hosts lack records of others: what was lost cannot be told from what is not known.
     RecordsMissing {
@@ -91,6 +97,45 @@ pub struct Overrun {
     pub skipped_tick_count: u64,
     /// Ticks it should have run.
     pub due_tick_count: u64,
+}
+
+/// What hosts, and no network, lost or may have lost.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HostLoss {
+    /// How many.
+    pub lost_count: u64,
+    /// Of so many.
+    pub of_count: u64,
+}
+
+impl HostLoss {
+    fn is_beyond_limit(self) -> bool {
+        self.lost_count as f64 > SKIPPED_TICK_RATIO_MAX * self.of_count as f64
+    }
+
+    /// Their share, in more digits than the limit has.
+    pub(crate) fn share(self) -> String {
+        let share = self.lost_count as f64 / self.of_count.max(1) as f64;
+        format!("{:.3}{JOINT}%", 100.0 * share)
+    }
+
+    /// The two counts, their share and what is allowed; `of` what there were.
+    pub(crate) fn words(self, of: &str) -> String {
+        let [lost, all] = [self.lost_count, self.of_count].map(grouped);
+        let limit = percent(SKIPPED_TICK_RATIO_MAX);
+        format!("{lost} of {all} {of} ({}, limit {limit})", self.share())
+    }
+
+    /// Those of `all` that are beyond the limit, by name, and what they lost together; `None` without any.
+    fn beyond_limit<'a>(all: impl Iterator<Item = (&'a str, Self)>) -> Option<(Vec<String>, Self)> {
+        let (mut names, mut sum) = (Vec::new(), Self::default());
+        for (name, one) in all.filter(|(_, one)| one.is_beyond_limit()) {
+            names.push(name.to_owned());
+            sum.lost_count += one.lost_count;
+            sum.of_count += one.of_count;
+        }
+        (!names.is_empty()).then_some((names, sum))
+    }
 }
 
 /// What follows from a summary's figures.
@@ -121,6 +166,7 @@ impl Assessment {
                 .iter()
                 .flat_map(adapter_warnings::adapter_warnings),
         );
+        warnings.extend(uncounted(summary).map(uncounted_warning));
         warnings.extend(summary.processes.iter().flat_map(process_warnings));
         warnings.extend(unrecorded_warning(&summary.channels));
         warnings.extend(summary.channels.iter().flat_map(channel_warnings));
@@ -150,7 +196,8 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         |process: &ProcessSummary| process.kind.counts_ticks() && process.cpu_time_s.is_none();
     let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
     // A program of the user's and a component that only messages drive have none; the gateways tell then.
-    let has_evidence = !summary.directions.is_empty() || summary.processes.iter().any(has_ticks);
+    let has_counters = !summary.directions.is_empty() && uncounted(summary).next().is_none();
+    let has_evidence = has_counters || summary.processes.iter().any(has_ticks);
     if summary.run.outcome == Outcome::Failed {
         NetworkVerdict::RunFailed
     } else if summary.run.is_virtual {
@@ -170,14 +217,10 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::EmulationNotKept {
             channels: unkept(summary),
         }
-    } else if !received_late(summary).is_empty() {
-        NetworkVerdict::ReceiverLate {
-            channels: received_late(summary),
-        }
-    } else if !frames_lost(summary).is_empty() {
-        NetworkVerdict::FramesLost {
-            channels: frames_lost(summary),
-        }
+    } else if let Some((channels, loss)) = received_late(summary) {
+        NetworkVerdict::ReceiverLate { channels, loss }
+    } else if let Some((channels, loss)) = frames_lost(summary) {
+        NetworkVerdict::FramesLost { channels, loss }
     } else if summary.processes.iter().any(is_silent) {
         NetworkVerdict::TicksUnknown
     } else if !has_evidence {
@@ -214,27 +257,66 @@ fn carried<'a>(
 
 /// The ways of links on which more than [`SKIPPED_TICK_RATIO_MAX`] of the messages may have been lost to the
 /// receiver's host: a gateway keeps no ticks that would tell that it was late.
-fn received_late(summary: &RunSummary) -> Vec<String> {
-    let is_late = |direction: &&DirectionSummary| {
+fn received_late(summary: &RunSummary) -> Option<(Vec<String>, HostLoss)> {
+    HostLoss::beyond_limit(summary.directions.iter().map(|direction| {
         let accounts = carried(summary, direction).filter_map(|one| one.account.as_ref());
-        let published_count: u64 = accounts.map(|account| account.published_count).sum();
-        direction.no_room_count() as f64 > SKIPPED_TICK_RATIO_MAX * published_count as f64
-    };
-    let directions = summary.directions.iter().filter(is_late);
-    directions.map(|one| one.label().to_owned()).collect()
+        let loss = HostLoss {
+            lost_count: direction.no_room_count(),
+            of_count: accounts.map(|account| account.published_count).sum(),
+        };
+        (direction.label(), loss)
+    }))
 }
 
 /// The channels of which more than [`SKIPPED_TICK_RATIO_MAX`] of the frames were lost in what is ours.
-fn frames_lost(summary: &RunSummary) -> Vec<String> {
-    let is_lost = |one: &&ChannelFlows| {
-        let flows = || one.flows.iter();
+fn frames_lost(summary: &RunSummary) -> Option<(Vec<String>, HostLoss)> {
+    HostLoss::beyond_limit(summary.flows.iter().map(|one| {
         let inlet_count = one.inlet_lost_count();
-        let frame_count = inlet_count + flows().map(|flow| flow.frame_count).sum::<u64>();
-        let lost: u64 = flows().map(|flow| flow.lost_by_harness_count).sum();
-        (inlet_count + lost) as f64 > SKIPPED_TICK_RATIO_MAX * frame_count as f64
+        let flows = || one.flows.iter();
+        let in_flows_count: u64 = flows().map(|flow| flow.lost_by_harness_count).sum();
+        let loss = HostLoss {
+            lost_count: inlet_count + in_flows_count,
+            of_count: inlet_count + flows().map(|flow| flow.frame_count).sum::<u64>(),
+        };
+        (one.channel.as_str(), loss)
+    }))
+}
+
+/// Processes some of whose starts left no counters. A process tells its counters as it ends in order, and those
+/// of its last start are kept.
+fn uncounted(summary: &RunSummary) -> impl Iterator<Item = &ProcessSummary> {
+    let carries_frames = |process: &ProcessSummary| {
+        let mut channels = summary.channels.iter().filter(|channel| {
+            let name = Some(process.name.as_str());
+            Some(channel.from.as_str()) == name || channel.to.as_deref() == name
+        });
+        channels.any(|channel| summary.flows.iter().any(|one| one.channel == channel.name))
     };
-    let channels = summary.flows.iter().filter(is_lost);
-    channels.map(|one| one.channel.clone()).collect()
+    summary.processes.iter().filter(move |process| {
+        let has_counters = match process.kind {
+            ProcessKind::Component | ProcessKind::Gateway | ProcessKind::Adapter => true,
+            // It carries no message.
+            ProcessKind::ClockPath => false,
+            ProcessKind::OwnProgram => carries_frames(process),
+        };
+        has_counters && process.uncounted_start_count() > 0
+    })
+}
+
+/// Starts of processes that left no counters.
+pub(crate) fn uncounted_start_count(summary: &RunSummary) -> u64 {
+    uncounted(summary)
+        .map(ProcessSummary::uncounted_start_count)
+        .sum()
+}
+
+fn uncounted_warning(process: &ProcessSummary) -> String {
+    format!(
+        "{}: the counters of {} of its {} are unavailable; what it dropped, lost or skipped then is unknown",
+        process.name,
+        grouped(process.uncounted_start_count()),
+        counted(process.restart_count + 1, "start"),
+    )
 }
 
 fn no_room_warning(summary: &RunSummary, direction: &DirectionSummary) -> Option<String> {

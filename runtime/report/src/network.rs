@@ -240,6 +240,23 @@ pub struct Timeline {
     pub rows: Vec<TimelineRow>,
 }
 
+impl Timeline {
+    /// False of a run of programs alone.
+    pub(crate) fn has_robot(&self) -> bool {
+        let mut rows = self.rows.iter();
+        rows.any(|row| matches!(row.subject, TimelineSubject::Robot { .. }))
+    }
+
+    /// What it shows.
+    pub(crate) fn title(&self) -> &'static str {
+        if self.has_robot() {
+            "Network and robot over time"
+        } else {
+            "Network over time"
+        }
+    }
+}
+
 /// What is bad about a network, as one number over time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

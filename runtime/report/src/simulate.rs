@@ -29,7 +29,7 @@ use crate::network::NetworkReport;
 use crate::score_event::ScoreEvents;
 use crate::summary::{
     ChannelEnd, ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome,
-    RecordedMetrics, RunFacts, RunSummary,
+    RecordedMetrics, RunFacts, RunSummary, emulated_links,
 };
 use crate::terminal;
 use hil_present::units::percent;
@@ -145,7 +145,6 @@ pub fn simulate(
     let (network, network_series) = network(
         topology,
         accounts,
-        &result.log,
         case.errors(&result.log),
         &mut summary.score_events,
     )
@@ -163,7 +162,6 @@ pub fn simulate(
 fn network(
     topology: &Topology,
     accounts: BTreeMap<String, LinkAccount>,
-    log: &RunLog,
     errors: Vec<ErrorSeries>,
     events: &mut ScoreEvents,
 ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
@@ -171,7 +169,6 @@ fn network(
     let mut builder = NetworkBuilder::default();
     for (name, account) in accounts {
         let crossing = topology.crossings().find(|one| one.channel.name == name)?;
-        let payload = log.raw(&name).first();
         builder.add(ChannelPassages {
             channel: &name,
             hosts: [&crossing.from_host.name, &crossing.to_host.name],
@@ -183,7 +180,7 @@ fn network(
             context: NetworkContext {
                 path: ChannelPath::SharedMemory,
                 run_ns: Some((0, length_ns)),
-                payload_bytes: payload.map(|message| message.payload.len() as u64),
+                payload_bytes: Some(crossing.channel.message.size_bytes as f64),
                 duplicated_count: Some(account.duplicated_count),
                 round_trips_ns: &[],
             },
@@ -202,6 +199,7 @@ fn run_facts(topology: &Topology, file: &Path) -> RunFacts {
         case: case.unwrap_or_default(),
         topology_file: file.display().to_string(),
         topology_hash: format!("{:016x}", topology.hash()),
+        links: emulated_links(topology),
         seed: topology.run().seed,
         security: None,
         is_virtual: true,

@@ -7,7 +7,7 @@
 
 use core::fmt;
 use hil_core::interval::Spread;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -16,6 +16,7 @@ use hil_account::{ChannelAccount, MessageFate, OutageMetrics};
 use hil_core::case_study::{Metric, Score};
 use hil_core::link_model::ReplayCounts;
 use hil_link::condition::flow_label;
+use hil_link::spec::Way;
 use hil_protocol::transport::Description;
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +39,7 @@ use hil_rundir::launch::Side;
 use hil_rundir::pipe::StallMetrics;
 pub use hil_rundir::pipe::{CountByName, CounterGroup};
 use hil_rundir::protection::RunSecurity;
+use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{Channel, Topology, Via};
 
 /// Version of the `summary.json` layout.
@@ -248,6 +250,9 @@ pub struct RunFacts {
     pub topology_file: String,
     /// Hash of the topology's text.
     pub topology_hash: String,
+    /// The emulated links and what they do, in words.
+    #[serde(default)]
+    pub links: Vec<Fact>,
     /// Seed of every random stream.
     pub seed: u64,
     /// How the hops between hosts were protected; `None` when there were none.
@@ -317,6 +322,41 @@ impl fmt::Display for Fact {
     }
 }
 
+/// The emulated links of `topology`: each once, or once a way where the ways differ, and once a trace.
+pub(crate) fn emulated_links(topology: &Topology) -> Vec<Fact> {
+    let mut by_link: BTreeMap<String, [BTreeSet<String>; 2]> = BTreeMap::new();
+    for crossing in topology.crossings() {
+        if let Some(emulation) = EmulationLaunch::of(&crossing, topology.run().seed) {
+            let words = emulation.describe();
+            let [forward, backward] = by_link.entry(emulation.link).or_default();
+            match emulation.way {
+                Way::Forward => forward.insert(words),
+                Way::Backward => backward.insert(words),
+            };
+        }
+    }
+    let mut facts = Vec::new();
+    for (link, [forward, backward]) in by_link {
+        let facts_of = |label: String, all: BTreeSet<String>| {
+            all.into_iter()
+                .map(move |words| Fact::new(label.clone(), words))
+        };
+        if forward == backward {
+            facts.extend(facts_of(link, forward));
+        } else {
+            facts.extend(facts_of(
+                format!("{link}, {}", Way::Forward.word()),
+                forward,
+            ));
+            facts.extend(facts_of(
+                format!("{link}, {}", Way::Backward.word()),
+                backward,
+            ));
+        }
+    }
+    facts
+}
+
 /// The facts of a host, for a reader.
 pub(crate) fn host_words(host: &HostFacts) -> Vec<Fact> {
     let facts = host.facts.iter();
@@ -373,6 +413,11 @@ impl ProcessSummary {
     /// What a report calls it.
     pub(crate) fn label(&self) -> String {
         self.kind.label(self.role.as_deref())
+    }
+
+    /// Its starts of which nothing was counted: all but the last, and that one if it did not end in order.
+    pub(crate) fn uncounted_start_count(&self) -> u64 {
+        self.restart_count + u64::from(self.cpu_time_s.is_none())
     }
 }
 
@@ -753,5 +798,59 @@ impl From<&Metric> for ScoreMetric {
             unit: metric.unit.to_owned(),
             method: metric.method.clone(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use hil_topology::registry::Registry;
+
+    use super::*;
+
+    #[test]
+    fn the_emulated_links_are_told_once_or_once_a_way() {
+        let text = |link: &str| {
+            format!(
+                r#"
+version = 1
+name = "two"
+[hosts.a]
+[hosts.b]
+[processes.one]
+host = "a"
+run = ["true"]
+inside = "10.77.0.1"
+[processes.two]
+host = "b"
+run = ["true"]
+inside = "10.77.0.2"
+[channels]
+out = {{ from = "one", to = "two", link = "hop" }}
+back = {{ from = "two", to = "one", link = "hop" }}
+[links.hop]
+via = "emulated"
+between = ["a", "b"]
+path_mtu_bytes = 9000
+{link}
+"#
+            )
+        };
+        let links = |link: &str| {
+            let registry = Registry::default();
+            let topology = hil_topology::parse("two", &text(link), &[], registry.known());
+            emulated_links(&topology.unwrap())
+        };
+        let both = links("delay = \"5 ms\"\nloss_ratio = 0.01");
+        let [both] = &both[..] else {
+            panic!("{both:?}");
+        };
+        assert_eq!(both.label, "hop");
+        assert!(
+            both.value.contains('5') && both.value.contains("ms"),
+            "{both}"
+        );
+        let ways = links("delay = \"5 ms\"\n[links.hop.backward]\ndelay = \"9 ms\"");
+        let labels: Vec<&str> = ways.iter().map(|one| one.label.as_str()).collect();
+        assert_eq!(labels, ["hop, forward", "hop, backward"]);
     }
 }

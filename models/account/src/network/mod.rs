@@ -116,8 +116,8 @@ pub struct NetworkContext<'a> {
     pub path: ChannelPath<'a>,
     /// Start and end of the run on the producer's clock, nanoseconds, where known.
     pub run_ns: Option<(i64, i64)>,
-    /// Payload of one message.
-    pub payload_bytes: Option<u64>,
+    /// Payload of a message that arrived, the mean where they differ in length.
+    pub payload_bytes: Option<f64>,
     /// Copies that the receiving gateway had seen before; `None` without its records.
     pub duplicated_count: Option<u64>,
     /// Round trips of the gateways' clock exchange.
@@ -189,7 +189,7 @@ impl NetworkMetrics {
             arrived_bytes_per_s: context
                 .payload_bytes
                 .zip(arrived_per_s)
-                .map(|(bytes, per_s)| bytes as f64 * per_s),
+                .map(|(bytes, per_s)| bytes * per_s),
             delay_bins: delay::delay_bins(passages),
             delay: delay::delays(passages, context.path),
             successive: delay::successive(passages, context.path),

@@ -54,7 +54,7 @@ pub(super) fn figures_on(path: ChannelPath<'_>, passages: &[Passage]) -> Network
     let context = NetworkContext {
         path,
         run_ns: Some((0, i64::try_from(passages.len()).unwrap() * PERIOD_NS)),
-        payload_bytes: Some(64),
+        payload_bytes: Some(64.0),
         duplicated_count: Some(0),
         round_trips_ns: &[4_000_000],
     };

@@ -14,7 +14,7 @@ use super::records::RunRecords;
 use crate::emulation::EmulationMetrics;
 use crate::summary::{
     Absence, ChannelEnd, ChannelSummary, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
-    ProcessSummary, RealtimeFacts, RunEvent, RunEventKind, RunFacts,
+    ProcessSummary, RealtimeFacts, RunEvent, RunEventKind, RunFacts, emulated_links,
 };
 use hil_platform::realtime::GrantOutcome;
 use hil_rundir::event::{Event, ProcessHistory};
@@ -50,7 +50,7 @@ pub(super) fn run_facts(
         ("logs/", "what each process said on standard error"),
         (
             "events.log",
-            "what happened to the robot, one line each, with the outage before it",
+            "events of the score with the outage before each, and changes of links, one line each",
         ),
     ];
     // The run on the clock of this supervisor.
@@ -64,6 +64,7 @@ pub(super) fn run_facts(
             .unwrap_or_default(),
         topology_file: topology_file.display().to_string(),
         topology_hash: format!("{:016x}", topology.hash()),
+        links: emulated_links(topology),
         seed: topology.run().seed,
         security: result.security.clone(),
         is_virtual: false,

@@ -6,6 +6,7 @@ mod axis;
 mod clock_path;
 mod clocks;
 mod events;
+mod frame_lengths;
 mod interruptions;
 pub(crate) mod link_changes;
 #[cfg(test)]

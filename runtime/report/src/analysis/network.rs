@@ -16,6 +16,7 @@ use hil_stats::correlation::{self, LagWindow, Untested};
 
 use super::axis::RunAxis;
 use super::clocks::HostClocks;
+use super::frame_lengths::FrameLengths;
 use super::records::RunRecords;
 pub(crate) use super::robot_series::RobotSeries;
 use super::robot_series::{index_of, without_holes};
@@ -171,7 +172,10 @@ impl NetworkBuilder {
         for event in &mut score.events {
             event.network = event.at_s.map(|at_s| self.before(at_s, bound_s));
         }
-        let mut robot = vec![(RobotSeries::of_events(score), true)];
+        // A run of programs alone has no robot.
+        let has_robot = !errors.is_empty() || !score.events.is_empty();
+        let mut robot: Vec<(RobotSeries, bool)> = Vec::new();
+        robot.extend(has_robot.then(|| (RobotSeries::of_events(score), true)));
         robot.extend(errors.into_iter().map(|one| (one, false)));
         let robot: Vec<(RobotSeries, Vec<f64>)> = robot
             .into_iter()
@@ -303,7 +307,8 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
         }
     }
     for (one, bins) in robot {
-        let values = bins.iter().map(|value| Some(*value)).collect();
+        let known = |value: &f64| one.is_known().then_some(*value);
+        let values = bins.iter().map(known).collect();
         let label = one.label().to_owned();
         rows.push(row(TimelineSubject::Robot { label }, one.unit(), values));
     }
@@ -451,8 +456,10 @@ fn add_channel(
     let ((producer_end, one_ns), (_, other_ns)) = (producer_end?, consumer_end?);
     let producer_start =
         start_on(result, hosts[0], &records.clocks).ok_or_else(|| missing(hosts[0]))?;
-    let payload_bytes = records.log.raw(&channel.name).first();
-    let payload_bytes = payload_bytes.map(|message| message.payload.len() as u64);
+    let mut frames = channel
+        .carries_frames()
+        .then(|| records.of_kind(&channel.name, |files| files.frame.as_ref()))
+        .map(FrameLengths::of);
     let place = |at: Moment| {
         let host = match at.side {
             Side::Producer => hosts[0],
@@ -466,7 +473,14 @@ fn add_channel(
         each_history(files, context, |message| {
             ways.push(&message.passage(context.path));
             duplicated_count += message.copies.duplicated_count;
+            if let Some(frames) = &mut frames {
+                frames.note(message);
+            }
         });
+        let payload_bytes = match &frames {
+            Some(frames) => frames.arrived_mean(),
+            None => Some(channel.message.size_bytes as f64),
+        };
         let mut other_events = interruptions(context);
         other_events.extend(clock_steps(files));
         builder.add(ChannelPassages {

@@ -11,6 +11,8 @@ use crate::score_event::ScoreEvents;
 pub(crate) struct RobotSeries {
     label: String,
     unit: &'static str,
+    /// Its samples are of errors, of which none is no value; not of events, of which none is none.
+    is_error: bool,
     /// Seconds after the start of the run, and magnitude; in order of time.
     samples: Vec<(f64, f64)>,
 }
@@ -23,6 +25,7 @@ impl RobotSeries {
         Self {
             label: errors.label.to_owned(),
             unit: errors.unit,
+            is_error: true,
             samples: samples
                 .filter_map(|(at, value)| Some((place_s(at)?, value)))
                 .collect(),
@@ -49,6 +52,7 @@ impl RobotSeries {
         Self {
             label: label.to_owned(),
             unit: "1",
+            is_error: false,
             samples,
         }
     }
@@ -56,6 +60,11 @@ impl RobotSeries {
     /// The words of a report.
     pub(super) fn label(&self) -> &str {
         &self.label
+    }
+
+    /// False for errors of which no sample has a place.
+    pub(super) const fn is_known(&self) -> bool {
+        !self.is_error || !self.samples.is_empty()
     }
 
     /// `1` for a number, else the unit.
@@ -134,6 +143,22 @@ mod tests {
             .binned(1.0, 5, false);
         let expected = vec![0.25, 0.25, 0.25, 0.75, 0.75];
         assert_eq!(bins.map_bits(), expected.map_bits());
+    }
+
+    #[test]
+    fn errors_without_a_sample_are_unknown_and_events_without_one_are_none() {
+        let errors = |samples| ErrorSeries {
+            name: "error_rad",
+            label: "error",
+            unit: "m",
+            clock_of: "shuttle/status",
+            samples,
+        };
+        let sample = (Instant::ZERO, 0.5);
+        let known = |samples| RobotSeries::of(errors(samples), |_| Some(0.0)).is_known();
+        assert!(known(vec![sample]) && !known(Vec::new()));
+        assert!(!RobotSeries::of(errors(vec![sample]), |_| None).is_known());
+        assert!(RobotSeries::of_events(&ScoreEvents::default()).is_known());
     }
 
     /// Floats compare exactly here: nothing was computed of them.

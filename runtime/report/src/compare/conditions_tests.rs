@@ -4,7 +4,7 @@ use hil_core::interval::IntervalMethod;
 use hil_stats::comparison::Estimate;
 
 use super::*;
-use crate::answer::Hurt;
+use crate::answer::{Hurt, Object};
 use crate::compare::Verdict;
 
 fn figure(metric: &str, kind: ChartKind, [low, value, high]: [f64; 3]) -> ComparedMetric {
@@ -40,6 +40,7 @@ fn comparison() -> Comparison {
         harms: Vec::new(),
         measurements: Vec::new(),
         first_harm: None,
+        object: Object::Robot,
         hurt: Hurt::No,
         headline: Vec::new(),
         base: Vec::new(),

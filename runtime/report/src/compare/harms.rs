@@ -12,9 +12,6 @@ use crate::answer::{
 };
 use crate::assessment::{Assessment, NetworkVerdict};
 
-/// What a comparison asks.
-pub(super) const QUESTION: &str = "Was the robot hurt more in the new runs?";
-
 /// A harm on both sides.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct ComparedHarm {
@@ -234,6 +231,7 @@ mod tests {
         }];
         ComparedRun {
             folder: PathBuf::from("run"),
+            topology: serde_json::Value::Null,
             summary,
         }
     }

@@ -1,6 +1,6 @@
 //! Two runs, or two sets of repetitions, side by side: every delay, loss and score with the ratio or
 //! difference of the two and its interval, and whether the runs may be compared at all. It reads
-//! `summary.json` only.
+//! `summary.json`, and the topology of `manifest.json`.
 
 pub mod cli;
 mod conditions;
@@ -11,6 +11,7 @@ mod render;
 pub mod work;
 
 use std::fmt;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use hil_account::Stage;
@@ -18,11 +19,13 @@ use hil_core::interval::Interval;
 use hil_stats::comparison::Estimate;
 use serde::Serialize;
 
-use crate::answer::Hurt;
+use crate::answer::{Hurt, Object};
 use crate::sections::events::first_harm;
 use crate::summary::{RunSummary, SummaryError};
 use harms::ComparedHarm;
+use hil_rundir::manifest::Manifest;
 use hil_rundir::run_folder::RunFolder;
+use serde_json::Value;
 
 /// Why runs cannot be compared.
 #[derive(Debug, thiserror::Error)]
@@ -44,6 +47,8 @@ pub(crate) struct ComparedRun {
     /// As it was named.
     pub(crate) folder: PathBuf,
     pub(crate) summary: RunSummary,
+    /// The topology with every default spelled out; null for a folder without a manifest.
+    pub(crate) topology: Value,
 }
 
 impl ComparedRun {
@@ -52,16 +57,26 @@ impl ComparedRun {
     /// # Errors
     /// When it is not there or not a summary.
     pub(crate) fn read(folder: &Path) -> Result<Self, CompareError> {
-        let path = RunFolder::existing(folder).summary();
+        let run_folder = RunFolder::existing(folder);
+        let path = run_folder.summary();
         let text = std::fs::read_to_string(&path).map_err(|source| CompareError::Read {
             path: path.clone(),
             source,
         })?;
         let summary = RunSummary::from_json(&text)
             .map_err(|source| CompareError::Summary { path, source })?;
+        let topology = match Manifest::read(&run_folder) {
+            Ok(manifest) => manifest.topology,
+            Err(error) if error.kind() == ErrorKind::NotFound => Value::Null,
+            Err(source) => {
+                let path = run_folder.manifest();
+                return Err(CompareError::Read { path, source });
+            }
+        };
         Ok(Self {
             folder: folder.to_owned(),
             summary,
+            topology,
         })
     }
 }
@@ -199,6 +214,8 @@ pub(crate) struct Comparison {
     pub(crate) differences: Vec<String>,
     /// Why figures must be read with care.
     pub(crate) cautions: Vec<String>,
+    /// What was to be hurt: programs where no run has a robot.
+    pub(crate) object: Object,
     /// What hurt the robots.
     pub(crate) harms: Vec<ComparedHarm>,
     /// Was the robot hurt more in the new runs?
@@ -230,6 +247,12 @@ impl Comparison {
             same,
             differences,
             cautions,
+            object: base
+                .iter()
+                .chain(new)
+                .map(|run| Object::of(&run.summary))
+                .find(|object| *object == Object::Robot)
+                .unwrap_or(Object::Programs),
             harms,
             hurt,
             measurements: origin::measurements(base, new),

@@ -13,9 +13,9 @@ use hil_present::{Block, Section, Table, Tone, UNAVAILABLE};
 use hil_stats::comparison::Estimate;
 
 use super::conditions::Verdicts;
-use super::harms::{HarmDifference, QUESTION};
+use super::harms::HarmDifference;
 use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict};
-use crate::answer::{Hurt, UnitScale};
+use crate::answer::{Hurt, Object, UnitScale};
 
 const COLUMNS: [&str; 7] = [
     "of",
@@ -56,6 +56,14 @@ pub(super) fn full(comparison: &Comparison, verdicts: &Verdicts, width: usize) -
     text(&sections, comparison, width)
 }
 
+/// What a comparison asks.
+const fn question(comparison: &Comparison) -> &'static str {
+    match comparison.object {
+        Object::Robot => "Was the robot hurt more in the new runs?",
+        Object::Programs => "Were the programs hurt more in the new runs?",
+    }
+}
+
 fn text(sections: &[Section], comparison: &Comparison, width: usize) -> String {
     let mut canvas = Canvas::new(width, Style::Plain);
     for one in sections {
@@ -63,7 +71,12 @@ fn text(sections: &[Section], comparison: &Comparison, width: usize) -> String {
     }
     canvas.blank();
     canvas.rule(Tone::Faint);
-    canvas.paragraph(0, Tone::Strong, &format!("{QUESTION}  {}", comparison.hurt));
+    let hurt = comparison.hurt.words(comparison.object);
+    canvas.paragraph(
+        0,
+        Tone::Strong,
+        &format!("{}  {}", question(comparison), hurt),
+    );
     section(&mut canvas, &harms(comparison));
     canvas.rule(Tone::Faint);
     canvas.finish()
@@ -78,7 +91,8 @@ pub(super) fn markdown(
     verdicts: &Verdicts,
 ) -> Result<String, TemplateError> {
     let mut answer = Section::new("answer", "", "");
-    answer.note(Tone::Strong, format!("{QUESTION} {}", comparison.hurt));
+    let hurt = comparison.hurt.words(comparison.object);
+    answer.note(Tone::Strong, format!("{} {}", question(comparison), hurt));
     answer.blocks.extend(harms(comparison).blocks);
     let sections = [
         answer,

@@ -81,6 +81,8 @@ pub(crate) struct AnswerView {
     pub(crate) cause: Option<String>,
     /// What hurt the robot.
     pub(crate) harms: Vec<Field>,
+    /// The emulated links and what they do.
+    pub(crate) links: Vec<Field>,
 }
 
 /// A judgement.

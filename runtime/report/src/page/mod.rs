@@ -99,7 +99,7 @@ pub(crate) fn page_of(materials: &[Material], clean: Option<&Material>, steps: u
 
 /// One row per run.
 fn overview(runs: &[Run]) -> Table {
-    let mut columns = vec!["run", "outcome", "did the network hurt the robot"];
+    let mut columns = vec!["run", "outcome", "did the network hurt"];
     let mut names: Vec<(&str, &str)> = Vec::new();
     for tile in runs.iter().flat_map(|run| &run.headline) {
         let metric = &tile.metric;

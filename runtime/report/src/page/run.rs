@@ -135,10 +135,7 @@ fn draw(
             );
             run.plots.insert(drawing.name.clone(), plot);
             let index = find(sections, "over-time").unwrap_or_else(|| {
-                sections.insert(
-                    0,
-                    Section::new("over-time", "Network and robot over time", ""),
-                );
+                sections.insert(0, Section::new("over-time", report.timeline.title(), ""));
                 0
             });
             sections[index].blocks.insert(0, Block::Drawing(drawing));
@@ -161,6 +158,7 @@ fn draw(
             run.plots.insert(drawing.name.clone(), plot);
             figures.blocks.push(Block::Drawing(drawing));
         }
+        None if summary.run.case.is_empty() => {}
         None => lacks
             .push("The robot over time: the case left no series, or they are empty.".to_owned()),
     }
@@ -208,6 +206,12 @@ fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
             .iter()
             .map(|harm| Field::new(&harm.what, plain(harm.words())))
             .chain((!summary.harms.is_empty()).then_some(rule))
+            .collect(),
+        links: summary
+            .run
+            .links
+            .iter()
+            .map(|link| Field::new(&link.label, &link.value))
             .collect(),
     }
 }

@@ -6,7 +6,7 @@ use super::read::{Found, Manifest, Material};
 use super::series::{Series, parse};
 use super::{Format, PAGE_BYTES_MAX, figure_files, page_of, render};
 use crate::network::TimelineSubject;
-use crate::summary::RunSummary;
+use crate::summary::{Fact, RunSummary};
 use crate::terminal::Style;
 use crate::tests::sample::{awkward, empty, full};
 use hil_present::units::JOINT;
@@ -288,6 +288,23 @@ fn markdown_says_the_name_of_its_only_run_once() {
     };
     assert_eq!(headings(std::slice::from_ref(&one)).len(), 1);
     assert_eq!(headings(&[one, material(full())]).len(), 3);
+}
+
+#[test]
+fn page_and_markdown_name_the_emulated_links_at_their_head() {
+    let mut summary = full();
+    summary.run.links = vec![Fact::new("hop", "fixed delay of 5 ms")];
+    let one = [material(summary)];
+    for (format, words, after) in [
+        (Format::Html, "hop: fixed delay of 5 ms", "<section"),
+        (Format::Md, "emulated link hop: fixed delay of 5 ms", "## "),
+    ] {
+        let page = render(&one, None, format, None).unwrap();
+        assert!(
+            page.find(words).unwrap() < page.find(after).unwrap(),
+            "{page}"
+        );
+    }
 }
 
 #[test]

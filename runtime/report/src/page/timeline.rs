@@ -69,7 +69,7 @@ pub(super) fn over_run(
         panels,
     };
     let name = name_of(&[key, "timeline"]);
-    let title = "Network and robot over time";
+    let title = report.timeline.title();
     let drawing = Drawing {
         svg: over_time(&name, title, &plot, &bands, &moments),
         name,
@@ -101,11 +101,16 @@ fn bands(report: &NetworkReport) -> Vec<Mark> {
 }
 
 fn run_caption(report: &NetworkReport, robot_s: f64, width_s: f64, is_cut: bool) -> String {
+    let [above, robot] = if report.timeline.has_robot() {
+        let robot = format!("; the robot's for {}", duration_s(robot_s));
+        ["Above the network, below the robot. ".to_owned(), robot]
+    } else {
+        Default::default()
+    };
     let mut caption = format!(
-        "Above the network, below the robot. Each point stands for up to {} and has the smallest and \
-         largest value within; the robot's for {}. Figures are from all messages. Shaded: outages{}.",
+        "{above}Each point stands for up to {} and has the smallest and largest value within{robot}. Figures are \
+         from all messages. Shaded: outages{}.",
         duration_s(width_s),
-        duration_s(robot_s),
         if is_cut { ", the longest 300" } else { "" }
     );
     if report.clocks_differ {

@@ -39,13 +39,15 @@ pub(crate) fn of_run(summary: &RunSummary, assessment: &Assessment) -> Vec<Secti
     if let Some(report) = network {
         let mut over_time = Section::new(
             "over-time",
-            "Network and robot over time",
+            report.timeline.title(),
             "largest value a column, own scale a row, · unknown",
         );
         let strips = strips(&report.timeline, &summary.link_changes);
         over_time.blocks.extend(strips.map(Block::Strips));
         sections.push(over_time);
-        sections.push(network::preceding(report, &summary.score_events));
+        if report.timeline.has_robot() {
+            sections.push(network::preceding(report, &summary.score_events));
+        }
         sections.push(network::network(report));
         sections.push(events::network(report));
     }

@@ -6,7 +6,10 @@ use hil_present::{Block, Cell, Event, EventList, Metric, Row, Section, Table, To
 
 use super::channel::stall_words;
 use super::paper;
-use crate::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
+use crate::answer::uncounted_words;
+use crate::assessment::{
+    Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX, uncounted_start_count,
+};
 use crate::summary::{
     DirectionSummary, Outcome, ProcessSummary, RunEvent, RunEventKind, RunFacts, RunSummary,
     host_words,
@@ -47,7 +50,13 @@ pub(super) fn outcome(summary: &RunSummary, assessment: &Assessment) -> Section 
         format!("{word}: {}", summary.run.exit_reason),
     );
     let (tone, text) = network_words(&assessment.network);
-    section.fact("network", tone, text);
+    let uncounted = uncounted_words(uncounted_start_count(summary));
+    let tone = if uncounted.is_empty() || tone != Tone::Good {
+        tone
+    } else {
+        Tone::Caution
+    };
+    section.fact("network", tone, text + &uncounted);
     if let Some(security) = &summary.run.security {
         let tone = match security.hops {
             HopProtection::Plain => Tone::Caution,
@@ -145,18 +154,20 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
                 ": the host overran ({skipped} skipped ticks, more than {limit})"
             ))
         }
-        NetworkVerdict::ReceiverLate { channels } => {
-            let why = ": datagrams had no room in the receive buffer, their gateway was late with";
-            no_result(&format!("{why} {}", channels.join(", ")))
+        NetworkVerdict::ReceiverLate { channels, loss } => {
+            let why = "had no room in the receive buffer, their gateway was late with";
+            let count = loss.words("datagrams");
+            no_result(&format!(": {count} {why} {}", channels.join(", ")))
         }
         NetworkVerdict::RecordsMissing { hosts } => {
             let hosts = hosts.join(", ");
             let text = format!("no verdict: records of other hosts are missing on {hosts}");
             (Tone::Caution, text)
         }
-        NetworkVerdict::FramesLost { channels } => {
-            let why = ": processes, queues or inlets of a host lost frames of";
-            no_result(&format!("{why} {}", channels.join(", ")))
+        NetworkVerdict::FramesLost { channels, loss } => {
+            let why = ": processes, queues or inlets of a host lost";
+            let count = loss.words("frames");
+            no_result(&format!("{why} {count} of {}", channels.join(", ")))
         }
         NetworkVerdict::TicksUnknown => {
             let text = "no verdict: a component left no count of its ticks";
@@ -183,6 +194,9 @@ pub(super) fn warnings(assessment: &Assessment) -> Section {
 /// What the robot did, and the run as a row of the seed paper's tables.
 pub(super) fn score(summary: &RunSummary) -> Section {
     let mut section = Section::new("score", "Score", "what the robot did");
+    if summary.run.case.is_empty() {
+        return section;
+    }
     if summary.score.is_empty() {
         section.note(Tone::Faint, "unavailable: the case gave no score");
         return section;

@@ -13,7 +13,7 @@ use hil_present::terminal::section;
 use hil_present::units::seconds;
 use hil_present::{Block, Cell, Event, EventList, Row, Section, Table, Tone, UNAVAILABLE};
 
-use super::answer;
+use super::{LINKS_SHOWN, answer, case_lead, links};
 use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested};
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
@@ -49,7 +49,11 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
     let width = canvas.width();
     for one in [
         causes(summary, width),
-        channels(summary),
+        // A line for each link is one less for channels.
+        channels(
+            summary,
+            CHANNELS_SHOWN - summary.run.links.len().min(LINKS_SHOWN + 1),
+        ),
         flows(summary, FLOWS_SHOWN),
         over_time(summary),
     ] {
@@ -68,11 +72,16 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
     let run = &summary.run;
     let facts = format!(
-        "{} · {} · {} · seed {} · host {}",
-        run.case, run.name, run.started, run.seed, run.host
+        "{}{} · {} · seed {} · host {}",
+        case_lead(run),
+        run.name,
+        run.started,
+        run.seed,
+        run.host
     );
     let facts = shortened(&facts, canvas.width());
     canvas.painted_line(Tone::Strong, &facts);
+    links(canvas, summary, 1);
     if run.outcome != Outcome::Completed {
         let (tone, word) = outcome_words(run.outcome);
         let text = shortened(&format!("{word}: {}", run.exit_reason), 2 * canvas.width());
@@ -87,6 +96,9 @@ fn causes(summary: &RunSummary, width: usize) -> Section {
     let grave = gravest_first(all);
     let title = "Robot, and the network before it";
     let mut section = Section::new("robot", title, severity_counts(all));
+    if summary.run.case.is_empty() {
+        return section;
+    }
     if grave.is_empty() {
         section.note(Tone::Plain, "no incident and no hazard");
         return section;
@@ -246,8 +258,9 @@ fn groups<'a>(channels: &[&'a ChannelSummary], network: &[ChannelNetwork]) -> Ve
 }
 
 /// One line a channel, alike ones together, those that lost most first.
-fn channels(summary: &RunSummary) -> Section {
-    let mut section = Section::new("channels", "Channels", "from publication to the consumer");
+fn channels(summary: &RunSummary, shown_count: usize) -> Section {
+    let aside = "from publication to the consumer; gap: no message while one was due";
+    let mut section = Section::new("channels", "Channels", aside);
     let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
     let shown: Vec<&ChannelSummary> = summary
         .channels
@@ -265,7 +278,7 @@ fn channels(summary: &RunSummary) -> Section {
         "",
         &["channel", "p50", "p99", "max", "lost", "%", "longest gap"],
     );
-    for group in groups.iter().take(CHANNELS_SHOWN) {
+    for group in groups.iter().take(shown_count) {
         let line = &group.line;
         let delay = |index: usize| Cell::duration(line.delay.map(|all| all[index]));
         table.rows.push(Row {
@@ -291,7 +304,7 @@ fn channels(summary: &RunSummary) -> Section {
             bar: None,
         });
     }
-    let hidden = groups.iter().skip(CHANNELS_SHOWN);
+    let hidden = groups.iter().skip(shown_count);
     let hidden: usize = hidden.map(|group| group.names.len()).sum();
     if hidden > 0 {
         let hidden = counted(hidden as u64, "channel");
@@ -303,14 +316,11 @@ fn channels(summary: &RunSummary) -> Section {
 
 /// The network above, the robot below, on one axis.
 fn over_time(summary: &RunSummary) -> Section {
-    let mut section = Section::new(
-        "over-time",
-        "Network and robot over time",
-        "largest value a column, own scale a row, · unknown",
-    );
+    let aside = "largest value a column, own scale a row, · unknown";
     let Some(report) = &summary.network else {
-        return section;
+        return Section::new("over-time", "", aside);
     };
+    let mut section = Section::new("over-time", report.timeline.title(), aside);
     let mut rows = Vec::new();
     for quantity in [NetworkQuantity::Loss, NetworkQuantity::Delay] {
         rows.extend(worst_of(&report.timeline.rows, quantity));

@@ -9,6 +9,7 @@ use std::path::PathBuf;
 
 pub use brief::brief;
 use hil_platform::text::shortened;
+use hil_platform::words::counted;
 use hil_present::Tone;
 use hil_present::terminal::canvas::Canvas;
 pub use hil_present::terminal::canvas::Style;
@@ -19,7 +20,7 @@ pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
 
 use crate::assessment::Assessment;
 use crate::sections;
-use crate::summary::RunSummary;
+use crate::summary::{RunFacts, RunSummary};
 
 /// Width of the files.
 const FILE_WIDTH: usize = 100;
@@ -57,7 +58,8 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
     let run = &summary.run;
     canvas.rule(Tone::Faint);
-    let title = shortened(&format!("{} · {}", run.case, run.name), canvas.width());
+    let title = format!("{}{}", case_lead(run), run.name);
+    let title = shortened(&title, canvas.width());
     canvas.painted_line(Tone::Strong, &title);
     let facts = format!(
         "{} · {} long · seed {} · host {} · topology {} ({})",
@@ -69,5 +71,35 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
         run.topology_hash,
     );
     canvas.paragraph(0, Tone::Faint, &facts);
+    links(canvas, summary, 2);
     canvas.rule(Tone::Faint);
+}
+
+/// The case before the run's name; nothing of a run without one.
+fn case_lead(run: &RunFacts) -> String {
+    match run.case.as_str() {
+        "" => String::new(),
+        case => format!("{case} · "),
+    }
+}
+
+/// Emulated links that are named at the head; all are in `summary.json`.
+const LINKS_SHOWN: usize = 3;
+
+/// The emulated links and what they do, each in at most so many lines.
+fn links(canvas: &mut Canvas, summary: &RunSummary, line_count: usize) {
+    let all = &summary.run.links;
+    for link in all.iter().take(LINKS_SHOWN) {
+        let text = format!("emulated link {link}");
+        canvas.paragraph(
+            0,
+            Tone::Plain,
+            &shortened(&text, line_count * canvas.width()),
+        );
+    }
+    let hidden = all.len().saturating_sub(LINKS_SHOWN) as u64;
+    if hidden > 0 {
+        let text = format!("and {} in summary.json", counted(hidden, "emulated link"));
+        canvas.paragraph(0, Tone::Plain, &text);
+    }
 }

@@ -5,8 +5,10 @@ use hil_core::case_study::Severity;
 use super::sample::{awkward, check_golden, empty, flow, full, link};
 use crate::answer::{Answer, Clocks, HarmCount, Hurt, OccasionCount, Unresolved, Untested};
 use crate::assessment::Assessment;
-use crate::summary::{ChannelFlows, LinkKind, Outcome, RunSummary};
-use crate::terminal::{Style, brief};
+use crate::network::{TimelineRow, TimelineSubject};
+use crate::score_event::ScoreEvents;
+use crate::summary::{ChannelFlows, Fact, LinkKind, Outcome, RunSummary};
+use crate::terminal::{Style, brief, render};
 use hil_core::interval::{Interval, IntervalMethod, Spread};
 use hil_present::Tone;
 use hil_present::units::JOINT;
@@ -109,7 +111,9 @@ fn a_sample_that_is_too_small_shows_no_absence_of_harm() {
     };
     assert_eq!(small.harms[0].words(), "0 of 9 motion loops sent");
     assert!(brief(&small, 100, Style::Plain).contains("too small"));
-    let enough = answer(&run(lost_loops(Some(0), 0, 10)));
+    let mut enough = run(lost_loops(Some(0), 0, 10));
+    count_all(&mut enough);
+    let enough = answer(&enough);
     assert_eq!((enough.hurt.clone(), enough.tone()), (Hurt::No, Tone::Good));
     // Harm is harm, however small the sample.
     assert_eq!(answer(&run(lost_loops(Some(1), 0, 3))).hurt, Hurt::Yes);
@@ -175,6 +179,99 @@ fn without_a_network_or_a_score_nothing_was_tested() {
     assert_eq!(direct, Hurt::NotTested { because });
 }
 
+/// Every process ended in order and was never started again.
+fn count_all(summary: &mut RunSummary) {
+    for process in &mut summary.processes {
+        process.restart_count = 0;
+        process.cpu_time_s = Some(1.0);
+    }
+}
+
+#[test]
+fn counters_that_a_start_did_not_leave_are_unknown_and_not_zero() {
+    // Of the robot's gateway neither start left any.
+    let mut summary = run(lost_loops(Some(0), 0, 40));
+    let found = answer(&summary);
+    let assessment = Assessment::of(&summary);
+    assert_eq!(found.measurement.is_valid, Some(true));
+    assert_eq!(found.measurement.uncounted_start_count, 2);
+    assert_eq!(found.tone(), Tone::Caution);
+    let (_, words) = found.measurement_words(&assessment.network);
+    assert!(words.starts_with("valid as far as is known: "), "{words}");
+    assert!(
+        words.contains("; 2 process starts left no counters"),
+        "{words}"
+    );
+    let named = "robot gateway: the counters of 2 of its 2 starts are unavailable";
+    let named = |one: &String| one.replace(JOINT, " ").starts_with(named);
+    assert!(assessment.warnings.iter().any(named), "{assessment:?}");
+    // Its second start left its own, and where no component has ticks nothing else tells.
+    summary.processes[2].cpu_time_s = Some(1.0);
+    assert_eq!(answer(&summary).measurement.uncounted_start_count, 1);
+    for process in &mut summary.processes {
+        (process.tick_count, process.skipped_tick_count) = (None, None);
+    }
+    let found = answer(&summary);
+    assert_eq!(found.measurement.is_valid, None);
+    let because = Unresolved::HostUnknown;
+    assert_eq!(found.hurt, Hurt::NotResolvable { because });
+    let (_, words) = found.measurement_words(&Assessment::of(&summary).network);
+    assert!(
+        words.contains("; 1 process start left no counters"),
+        "{words}"
+    );
+    count_all(&mut summary);
+    let found = answer(&summary);
+    assert_eq!(found.measurement.is_valid, Some(true));
+    assert_eq!((found.hurt.clone(), found.tone()), (Hurt::No, Tone::Good));
+    // A program without a channel of frames never leaves counters.
+    summary.processes[0].kind = ProcessKind::OwnProgram;
+    summary.processes[0].cpu_time_s = None;
+    assert_eq!(answer(&summary).measurement.uncounted_start_count, 0);
+    summary.flows = vec![ChannelFlows {
+        channel: "arm/command".to_owned(),
+        inlet_lost: Vec::new(),
+        flows: vec![flow("arp", 2, [0, 0])],
+    }];
+    assert_eq!(answer(&summary).measurement.uncounted_start_count, 1);
+}
+
+#[test]
+fn a_run_of_programs_alone_speaks_of_no_robot() {
+    let mut summary = own_programs(LinkKind::Emulated);
+    summary.run.case.clear();
+    summary.score.clear();
+    summary.score_events = ScoreEvents::default();
+    let timeline = &mut summary.network.as_mut().unwrap().timeline;
+    let is_robot = |row: &TimelineRow| matches!(row.subject, TimelineSubject::Robot { .. });
+    timeline.rows.retain(|row| !is_robot(row));
+    let answer = answer(&summary);
+    assert_eq!(
+        answer.question(),
+        "Did the emulated link hurt the programs?"
+    );
+    let page = brief(&summary, 100, Style::Plain);
+    // A process and a channel of the sample are called so.
+    let page = page.replace("robot gateway", "").replace("robot-", "");
+    assert!(!page.to_lowercase().contains("robot"), "{page}");
+    assert!(page.contains("Network over time"), "{page}");
+}
+
+#[test]
+fn every_form_names_the_emulated_links_at_its_head() {
+    let mut summary = run(lost_loops(Some(2), 0, 40));
+    summary.run.links = vec![Fact::new("hop", "fixed delay of 5 ms, 1 % lost")];
+    let words = "hop: fixed delay of 5 ms, 1 % lost";
+    for page in [
+        brief(&summary, 100, Style::Plain),
+        render(&summary, 100, Style::Plain),
+    ] {
+        let head: Vec<&str> = page.lines().take(6).collect();
+        let line = format!("emulated link {words}");
+        assert!(head.iter().any(|one| one.contains(&line)), "{head:?}");
+    }
+}
+
 /// Two programs of the user's with an emulated or a real link between them.
 fn own_programs(link: LinkKind) -> RunSummary {
     let mut summary = run(lost_loops(None, 0, 0));
@@ -203,6 +300,7 @@ fn programs_without_ticks_are_measured_by_what_the_gateways_and_inlets_lost() {
     };
     for kind in [LinkKind::Emulated, link("udp")] {
         let mut summary = own_programs(kind);
+        count_all(&mut summary);
         let (is_valid, page) = measured(&summary);
         assert_eq!(is_valid, Some(true), "{page}");
         let frames = |inlet_lost_count| ChannelFlows {
@@ -216,7 +314,12 @@ fn programs_without_ticks_are_measured_by_what_the_gateways_and_inlets_lost() {
             summary.flows = vec![frames(lost_count)];
             let (is_valid, page) = measured(&summary);
             assert_eq!(is_valid, Some(expected), "{page}");
-            assert_eq!(page.contains("lost frames of first/second"), !expected);
+            let words = "a host lost 5 of 4,000 frames (0.125 %, limit 0.10 %) of first/second";
+            assert_eq!(
+                page.replace(JOINT, " ").contains(words),
+                !expected,
+                "{page}"
+            );
         }
         summary.flows.clear();
         summary.directions.clear();
@@ -278,6 +381,9 @@ fn the_printed_report_is_a_page_and_ends_in_the_answer() {
         one.link = link("udp");
         many.channels.push(one);
     }
+    many.run.links = (0..5)
+        .map(|index| Fact::new(format!("hop-{index}"), "5 ms delay, ".repeat(20)))
+        .collect();
     many.warnings = (0..50).map(|index| format!("warning {index}")).collect();
     for summary in [many, full(), awkward(), empty()] {
         for width in [80, 100, 120] {

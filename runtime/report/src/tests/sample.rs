@@ -17,7 +17,7 @@ use super::sample_events::{few_events, many_events, recorded_channel};
 use super::sample_network::network;
 use super::sample_records::Files;
 use crate::adapter::{AdapterSummary, Answers};
-use crate::assessment::{Assessment, NetworkVerdict};
+use crate::assessment::{Assessment, HostLoss, NetworkVerdict};
 use crate::summary::{
     Absence, ChannelSummary, CountByName, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
     ProcessSummary, RadioChange, RealtimeFacts, RunEvent, RunEventKind, RunFacts, RunSummary,
@@ -38,6 +38,7 @@ fn run_facts() -> RunFacts {
         case: "teleoperation".to_owned(),
         topology_file: "deploy/topologies/split.toml".to_owned(),
         topology_hash: "5d1c9a70e2b34f18".to_owned(),
+        links: Vec::new(),
         seed: 42,
         security: None,
         host: "operator".to_owned(),
@@ -463,7 +464,13 @@ fn a_host_that_overran_is_not_a_network_result() {
         process.tick_count = None;
         process.skipped_tick_count = None;
     }
-    // Without a count of ticks the gateways' counters are left.
+    // Without a count of ticks the gateways' counters are left, where every start of theirs left some.
+    assert_eq!(
+        Assessment::of(&summary).network,
+        NetworkVerdict::HostUnknown
+    );
+    summary.processes[2].restart_count = 0;
+    summary.processes[2].cpu_time_s = Some(1.0);
     assert_eq!(
         Assessment::of(&summary).network,
         NetworkVerdict::NetworkResult
@@ -539,6 +546,10 @@ fn what_had_no_room_in_a_receive_buffer_is_not_put_down_to_the_network() {
         } else {
             NetworkVerdict::ReceiverLate {
                 channels: vec!["hop/forward".to_owned()],
+                loss: HostLoss {
+                    lost_count: count,
+                    of_count: 5_000,
+                },
             }
         };
         assert_eq!(assessment.network, expected, "{count}");

@@ -136,6 +136,7 @@ pub(crate) fn summary(channel: ChannelSummary) -> RunSummary {
         case: "fleet".to_owned(),
         topology_file: "fleet-split.toml".to_owned(),
         topology_hash: String::new(),
+        links: Vec::new(),
         seed: 1,
         security: None,
         host: "control-pc".to_owned(),

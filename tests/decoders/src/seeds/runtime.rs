@@ -184,6 +184,7 @@ pub(crate) fn summaries() -> Vec<Seed> {
         case: "shuttle".to_owned(),
         topology_file: "shuttle-split.toml".to_owned(),
         topology_hash: "0123456789abcdef".to_owned(),
+        links: Vec::new(),
         seed: 1,
         host: "control-pc".to_owned(),
         security: None,

@@ -1,7 +1,7 @@
 //! What repetitions say together, and what they do not when some of them lack a figure.
 
 use super::*;
-use crate::answer::Hurt;
+use crate::answer::{Hurt, Object};
 use crate::compare::Comparison;
 use crate::compare::conditions::{Condition, Verdicts};
 use hil_core::interval::IntervalMethod;
@@ -50,6 +50,7 @@ fn judged(condition: &str, figure: &ComparedMetric) -> Result<bool, String> {
         harms: Vec::new(),
         measurements: Vec::new(),
         first_harm: None,
+        object: Object::Robot,
         hurt: Hurt::No,
         headline: Vec::new(),
         base: Vec::new(),
