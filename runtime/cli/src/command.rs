@@ -11,7 +11,8 @@ use std::collections::BTreeMap;
 use std::io::{self, ErrorKind, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::{env, fs};
+use std::time::{Duration, Instant};
+use std::{env, fs, thread};
 
 use clap::CommandFactory as _;
 use hil_core::case_study::ParameterError;
@@ -20,7 +21,7 @@ use hil_teleoperation::swing::swing_bvh;
 
 use crate::arguments::{Cli, Command, RunArgs};
 use crate::cases;
-use hil_doctor::{Effect, Plan, obstacles};
+use hil_doctor::{Effect, Obstacle, Plan, Trouble, obstacles};
 use hil_engine::process::{own_program, worker};
 use hil_engine::security::{KeyFileError, PreSharedKey};
 use hil_engine::supervisor::{
@@ -417,6 +418,24 @@ fn check_file(path: &Path, topology: &Topology) -> Result<(), Refusal> {
     }
 }
 
+/// The processes of a run whose supervisor was killed notice at once, and end.
+const PORTS_FREED_WITHIN: Duration = Duration::from_secs(1);
+const PORTS_FREED_PERIOD: Duration = Duration::from_millis(20);
+
+/// What is in the way of a run, also a moment later where it is a port: no other run claims it, and one that
+/// was killed may be about to free it. A check does not wait.
+fn lasting_obstacles(plan: &Plan, is_check: bool) -> Vec<Obstacle> {
+    let deadline = Instant::now() + PORTS_FREED_WITHIN;
+    loop {
+        let found = obstacles(plan);
+        let is_taken = |one: &Obstacle| matches!(one.trouble, Trouble::Taken { .. });
+        if is_check || !found.iter().any(is_taken) || Instant::now() >= deadline {
+            return found;
+        }
+        thread::sleep(PORTS_FREED_PERIOD);
+    }
+}
+
 /// Refuses what cannot run on these hosts, which are this machine, and warns of what it would run without;
 /// gives the key that it would hold in a run with others, and what the run has for itself from here on. A
 /// check claims nothing, and also refuses what a run would wait for.
@@ -464,7 +483,7 @@ fn check_here(
         }
     })?;
     let (mut refused, mut told) = (Vec::new(), Vec::new());
-    for obstacle in obstacles(&Plan::of(topology, hosts)) {
+    for obstacle in lasting_obstacles(&Plan::of(topology, hosts), args.check) {
         let is_refused = match obstacle.effect {
             Effect::Prevents => true,
             Effect::HoldsUp => args.check,

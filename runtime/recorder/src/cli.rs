@@ -47,7 +47,8 @@ Examples:
 
 Web pages of others are refused, and named here once. Programs and our own page
 need no option, and of another user or machine the token in the address that is
-printed. Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and fields are in docs/live-view.md. It ends with Ctrl-C; the exit code is 0
+printed. Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and
+fields are in docs/live-view.md. It ends with Ctrl-C; the exit code is 0
 then, or 1 when --record could not write a file.";
 
 const CONVERT_EXAMPLES: &str = "\

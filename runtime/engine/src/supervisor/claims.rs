@@ -349,7 +349,8 @@ fn untaken(wanted: &[Wanted], own: &str) -> Result<(), ClaimError> {
     if wanted.is_empty() {
         return Ok(());
     }
-    let sockets = fs::read(SOCKETS)?;
+    let named = |error: io::Error| io::Error::new(error.kind(), format!("{SOCKETS}: {error}"));
+    let sockets = fs::read(SOCKETS).map_err(named)?;
     let sockets = String::from_utf8_lossy(&sockets);
     let deadline = Instant::now() + TOLD_WITHIN;
     // One line a key.
