@@ -165,7 +165,7 @@ fn looking_at_a_run_that_another_user_announces_does_not_wait_for_his_pipes() {
 #[test]
 fn an_empty_file_of_another_user_in_shared_memory_costs_a_run_nothing() {
     let record = RunFolder::new("empty-file");
-    let trial = Trial::shipped("local.toml", record.path())
+    let trial = Trial::shipped("local.toml", &record.join("runs"))
         .set("run.duration=\"4 s\"")
         .set("processes.controller.on_exit=\"restart\"");
     // Root could remove the stranger's files; a user cannot.
