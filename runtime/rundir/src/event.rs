@@ -19,7 +19,7 @@ pub struct Event {
     pub at: Instant,
     /// The host it happened on.
     pub host: String,
-    /// The process concerned; empty for the host as a whole.
+    /// The process concerned; the host's name for the host as a whole.
     pub process: String,
     /// What happened.
     pub kind: EventKind,
@@ -82,6 +82,15 @@ pub enum EventKind {
         /// How many of its warnings are not told.
         count: u64,
     },
+    /// The supervisor's connection to another host was cut and came back; what was said was said once, in order.
+    Reconnected {
+        /// The other host.
+        peer: String,
+        /// How long there was no connection, milliseconds.
+        away_ms: u64,
+        /// How it was cut.
+        cause: String,
+    },
     /// It complained.
     Warning {
         /// What it said.
@@ -126,6 +135,14 @@ impl fmt::Display for EventKind {
             Self::WarningsLeftOut { count } => write!(
                 formatter,
                 "{count} more warnings of it found no room among the events"
+            ),
+            Self::Reconnected {
+                peer,
+                away_ms,
+                cause,
+            } => write!(
+                formatter,
+                "the connection to {peer} was cut ({cause}) and is back after {away_ms} ms, with nothing missing"
             ),
             Self::Warning { text } => formatter.write_str(text),
         }

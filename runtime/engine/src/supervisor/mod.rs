@@ -4,6 +4,7 @@
 pub(crate) mod child;
 pub(crate) mod clock_path;
 mod control_listener;
+mod conversation;
 pub(crate) mod domains;
 pub(crate) mod exchange;
 pub mod frame;
@@ -17,6 +18,7 @@ pub mod peer_status;
 pub(crate) mod plan;
 pub(crate) mod process_group;
 mod progress_line;
+mod reconnect;
 mod rendezvous;
 mod session;
 mod status_publisher;

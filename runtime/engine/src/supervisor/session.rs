@@ -29,7 +29,7 @@ use hil_platform::console::Console;
 use hil_platform::host_facts::HostFacts;
 use hil_platform::signals::Signals;
 use hil_rundir::announcement::Announcement;
-use hil_rundir::event::{Event, HostHistory, ProcessHistory, disciplines};
+use hil_rundir::event::{Event, EventKind, HostHistory, ProcessHistory, disciplines};
 use hil_rundir::file_fault::{FileFault, is_of_full_disk};
 use hil_rundir::manifest::{self, ManifestContent};
 use hil_rundir::pipe::Failure;
@@ -448,7 +448,24 @@ impl Session<'_> {
                 )));
             }
         }
+        self.note_cuts();
         heard
+    }
+
+    /// Notes when connections to other hosts were cut and came back.
+    fn note_cuts(&mut self) {
+        let own = self.own_hosts().into_iter().next().unwrap_or_default();
+        for peer in &mut self.peers {
+            for cut in peer.take_cuts() {
+                let kind = EventKind::Reconnected {
+                    peer: peer.hello.host.clone(),
+                    away_ms: u64::try_from(cut.length.as_millis()).unwrap_or(u64::MAX),
+                    cause: cut.cause,
+                };
+                self.console.warn(&format!("{own}: {kind}"));
+                self.process_group.note_of_host(cut.since, &own, kind);
+            }
+        }
     }
 
     fn tell(&mut self, phase: Phase) {
@@ -545,6 +562,9 @@ impl Session<'_> {
             problems.extend(received.problems);
             gaps = received.gaps;
             stories.extend(received.stories);
+            self.note_cuts();
+            // The other hosts have this one's up to the exchange.
+            stories[0].events = self.process_group.events().to_vec();
         }
         // The same on every host.
         let place = |story: &HostHistory| {
