@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::net::IpAddr;
 
 use hil_core::time::Instant;
 use serde::{Deserialize, Serialize};
@@ -91,6 +92,19 @@ pub enum EventKind {
         /// How it was cut.
         cause: String,
     },
+    /// Another link address answers for another host on the network, and gets what is sent to it.
+    NeighbourChanged {
+        /// The other host.
+        peer: String,
+        /// Its address.
+        address: IpAddr,
+        /// The interface by which it is reached.
+        interface: String,
+        /// Its link address so far.
+        before: String,
+        /// The one from now on.
+        now: String,
+    },
     /// It complained.
     Warning {
         /// What it said.
@@ -143,6 +157,16 @@ impl fmt::Display for EventKind {
             } => write!(
                 formatter,
                 "the connection to {peer} was cut ({cause}) and is back after {away_ms} ms, with nothing missing"
+            ),
+            Self::NeighbourChanged {
+                peer,
+                address,
+                interface,
+                before,
+                now,
+            } => write!(
+                formatter,
+                "{peer} ({address}) is at {now} on {interface}, no longer at {before}: what is sent to it goes there"
             ),
             Self::Warning { text } => formatter.write_str(text),
         }

@@ -11,6 +11,7 @@ pub mod frame;
 mod heartbeat;
 pub(crate) mod meet;
 pub(crate) mod needs;
+mod neighbours;
 mod outcome;
 mod output_log;
 pub(crate) mod peer;

@@ -14,6 +14,7 @@ use super::domains::{self, Domains};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
 use super::needs;
+use super::neighbours::Neighbours;
 use super::outcome::{Heard, RunError, RunOptions};
 use super::peer::{Peer, PeerEvent};
 use super::peer_status::{PeerStatus, greeting, own_ticks};
@@ -132,6 +133,7 @@ pub fn run(
         topology,
         announcement,
         cards,
+        neighbours: Neighbours::of(topology, &hosts),
         is_first_host: is_here(&topology.hosts()[0], &hosts),
         has_one_clock: peers.iter().all(|peer| peer.hello.clock_id == here),
         process_group,
@@ -257,6 +259,7 @@ struct Session<'a> {
     // Before the domains: its files lie beside theirs.
     announcement: Announcement,
     cards: NicWatch,
+    neighbours: Neighbours,
     is_first_host: bool,
     /// All hosts of the run read one clock.
     has_one_clock: bool,
@@ -376,6 +379,9 @@ impl Session<'_> {
         if self.cleaned.elapsed() >= CLEANUP_PERIOD {
             self.domains.free_what_the_dead_held();
             self.cleaned = WallInstant::now();
+            for change in self.neighbours.changes() {
+                self.note(MonotonicClock::now(), change);
+            }
         }
         if self.greeted.elapsed() >= ALIVE_PERIOD {
             self.greet();
@@ -454,18 +460,28 @@ impl Session<'_> {
 
     /// Notes when connections to other hosts were cut and came back.
     fn note_cuts(&mut self) {
-        let own = self.own_hosts().into_iter().next().unwrap_or_default();
-        for peer in &mut self.peers {
-            for cut in peer.take_cuts() {
+        let cuts = self.peers.iter_mut().flat_map(|peer| {
+            let host = peer.hello.host.clone();
+            let cuts = peer.take_cuts().into_iter();
+            cuts.map(move |cut| {
                 let kind = EventKind::Reconnected {
-                    peer: peer.hello.host.clone(),
+                    peer: host.clone(),
                     away_ms: u64::try_from(cut.length.as_millis()).unwrap_or(u64::MAX),
                     cause: cut.cause,
                 };
-                self.console.warn(&format!("{own}: {kind}"));
-                self.process_group.note_of_host(cut.since, &own, kind);
-            }
+                (cut.since, kind)
+            })
+        });
+        for (since, kind) in cuts.collect::<Vec<_>>() {
+            self.note(since, kind);
         }
+    }
+
+    /// Notes and says what happened to this host.
+    fn note(&mut self, at: Instant, kind: EventKind) {
+        let own = self.own_hosts().into_iter().next().unwrap_or_default();
+        self.console.warn(&format!("{own}: {kind}"));
+        self.process_group.note_of_host(at, &own, kind);
     }
 
     fn tell(&mut self, phase: Phase) {
