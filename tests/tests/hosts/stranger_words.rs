@@ -5,14 +5,15 @@ use std::net::{Ipv4Addr, SocketAddrV4, TcpListener, TcpStream};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_report::summary::RunSummary;
+use hil_report::summary::{RunEvent, RunEventKind, RunSummary};
+use hil_rundir::event::EventKind;
 use hil_tests::account::{account, assert_accounts_close};
 use hil_tests::attacker::{Attacker, Flood};
 use hil_tests::knocker::CONTROL_PORT;
-use hil_tests::lab::{ADDRESSES, Lab};
+use hil_tests::lab::{ADDRESSES, INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
-use hil_tests::split::{Split, count, direction};
+use hil_tests::split::{HOSTS, Split, count, direction};
 use hil_tests::trial::Trial;
 
 use super::strangers::hardware_address;
@@ -152,5 +153,128 @@ fn empty_connections_from_the_peers_address_cost_a_sealed_tcp_hop_nothing() {
     assert!(unproven > EMPTY_COUNT / 2, "{:?}", ingress.counters);
     for summary in &summaries {
         assert_accounts_close(summary);
+    }
+}
+
+/// Length of the run whose supervisors' connection is reset, seconds.
+const RESET_RUN_S: u32 = 10;
+/// What the hosts' network is slowed to while they exchange records, which then takes seconds.
+const SLOW: &str = "tbf rate 16mbit burst 64kb limit 1mb";
+
+/// When the connection to `peer` was cut by `summary`, seconds.
+fn cuts(summary: &RunSummary, peer: &str) -> Vec<f64> {
+    let cuts = summary.events.iter().filter_map(|event| match &event.kind {
+        RunEventKind::Process(EventKind::Reconnected { peer: of, .. }) if of == peer => {
+            println!(
+                "{}: at {:?} s, {}",
+                summary.run.host,
+                event.at_s,
+                event.what()
+            );
+            event.at_s
+        }
+        _ => None,
+    });
+    cuts.collect()
+}
+
+/// An exact reset at either end of the supervisors' connection, twice in the run and twice in the exchange of records.
+#[test]
+fn exact_resets_of_the_supervisors_connection_cost_reconnects_that_are_told() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let ports = lab.put_bridge_between();
+    let first = lab.host(0).namespace().to_owned();
+    let name = format!("{}2", first.strip_suffix('0').unwrap());
+    let hardware = [0, 1].map(|index| hardware_address(&lab, index));
+    let stranger = Attacker::join(&first, &name, FOREIGN, ADDRESSES[0], &hardware[0]);
+    let reset_both = |phase: &str| {
+        for (host, hardware) in ADDRESSES.into_iter().zip(&hardware) {
+            let sent_count = stranger.reset(CONTROL_PORT, host, hardware, LIMIT);
+            println!("{phase}: {sent_count} resets at {host}");
+            thread::sleep(Duration::from_millis(700));
+        }
+    };
+    let record = RunFolder::new("resets");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set(&format!("links.hop.port={PORT}"))
+        .set("case.parameters.rate_hz=1000.0")
+        .set(&format!("run.duration=\"{RESET_RUN_S} s\""));
+    let mut split = Split::start(&lab, &trial);
+    split.wait_for_messages("the begin of the run");
+    reset_both("run");
+    let exchanged = split.hosts[0].wait_for_output("exchanging records", LIMIT);
+    exchanged.unwrap_or_else(|reason| panic!("{reason}"));
+    for port in ports {
+        let mut command = lab.host(0).command("tc");
+        let words = format!("qdisc add dev {port} root {SLOW}");
+        let status = command.args(words.split(' ')).status().unwrap();
+        assert!(status.success(), "tc {words}");
+    }
+    reset_both("exchange");
+    let summaries = split.finish();
+    for (summary, peer) in summaries.iter().zip([HOSTS[1], HOSTS[0]]) {
+        let (early, late): (Vec<f64>, Vec<f64>) = cuts(summary, peer)
+            .into_iter()
+            .partition(|at_s| *at_s < f64::from(RESET_RUN_S));
+        assert!(early.len() >= 2 && late.len() >= 2, "{early:?} {late:?}");
+        assert!(summary.record_gaps.is_empty(), "{:?}", summary.record_gaps);
+        for name in CHANNELS {
+            let account = account(summary, name);
+            println!(
+                "{name}: {} published, {} lost",
+                account.published_count,
+                account.fates.lost_count()
+            );
+            assert!(account.fates.lost_count() * 1_000 <= account.published_count);
+        }
+        assert_accounts_close(summary);
+    }
+}
+
+/// Link addresses of a stranger that takes a host's address, and how long it does.
+const CLAIMED_AT: [&str; 2] = ["02:00:00:00:00:66", "02:00:00:00:00:67"];
+const CLAIMED_FOR: Duration = Duration::from_secs(1);
+
+/// It gets what is sent to that host. No seal sees that; the messages are lost on the wire, and the change is told.
+#[test]
+fn a_stranger_that_answers_for_a_hosts_address_is_told_with_both_link_addresses() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    lab.put_bridge_between();
+    let first = lab.host(0).namespace().to_owned();
+    let name = format!("{}2", first.strip_suffix('0').unwrap());
+    let hardware = [0, 1].map(|index| hardware_address(&lab, index));
+    let stranger = Attacker::join(&first, &name, FOREIGN, ADDRESSES[0], &hardware[0]);
+    for (is_pinned, claimed_at) in [(false, CLAIMED_AT[0]), (true, CLAIMED_AT[1])] {
+        let record = RunFolder::new("claimed");
+        let trial = Trial::shipped("shuttle-split.toml", record.path())
+            .set(&format!("links.hop.port={PORT}"))
+            .set("run.duration=\"8 s\"");
+        let split = Split::start(&lab, &trial);
+        split.wait_for_messages("the begin of the run");
+        stranger.claim(ADDRESSES[1], claimed_at);
+        thread::sleep(CLAIMED_FOR);
+        // It mends the first run, and is there from the start of the second.
+        lab.host(0).pin_neighbour(ADDRESSES[1], &hardware[1]);
+        let summaries = split.finish();
+        let told = |event: &RunEvent| match &event.kind {
+            RunEventKind::Process(EventKind::NeighbourChanged { interface, now, .. }) => {
+                // The bridge of the lab is on that host as well, and believes what it hears.
+                interface == INTERFACE && now == claimed_at
+            }
+            _ => false,
+        };
+        let commands = account(&summaries[1], CHANNELS[0]);
+        let (published, lost) = (commands.published_count, commands.fates.lost_count());
+        println!("pinned {is_pinned}: {lost} of {published} commands lost");
+        for event in &summaries[0].events {
+            println!("at {:?} s: {}", event.at_s, event.what());
+        }
+        assert_eq!(summaries[0].events.iter().any(told), !is_pinned);
+        assert_eq!(lost == 0, is_pinned, "{lost}");
+        assert!(summaries[0].record_gaps.is_empty());
     }
 }

@@ -5,7 +5,6 @@
 use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
-use std::net::Shutdown;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
@@ -221,7 +220,7 @@ fn give_and_take(
 ) {
     let host = peer.hello.host.clone();
     let own_history = std::slice::from_ref(own_history);
-    let handle = peer.handle().ok();
+    let conversation = peer.conversation();
     let (writer, inbox) = peer.halves();
     let is_taken = AtomicBool::new(false);
     let (received, sent) = thread::scope(|scope| {
@@ -240,9 +239,9 @@ fn give_and_take(
         });
         let received = take_from(&own_history[0].hosts[0], &host, inbox, records);
         is_taken.store(true, Ordering::Release);
-        if let Some(stream) = handle.filter(|_| received.is_broken()) {
+        if received.is_broken() {
             // What is being sent would wait for as long again.
-            let _already_closed = stream.shutdown(Shutdown::Both).is_err();
+            conversation.leave();
         }
         (received, join_sending(sending))
     });

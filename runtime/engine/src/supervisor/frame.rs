@@ -34,6 +34,17 @@ pub struct PeerHello {
     pub domain: [u8; 16],
     /// Its processor has instructions for AES.
     pub has_fast_aes: bool,
+    /// It goes on with a connection that was cut.
+    pub resumed: Option<Resumed>,
+}
+
+/// Where a connection that was cut goes on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Resumed {
+    /// Fingerprint of the other end's shared-memory domain, of which each start has another one.
+    pub of: [u8; 16],
+    /// Frames taken from the other end.
+    pub taken_count: u64,
 }
 
 /// What supervisors tell each other.
@@ -55,6 +66,10 @@ pub enum PeerMessage {
     },
     /// Nothing new; sent so that silence means something.
     Alive,
+    /// So many frames were taken. It is none itself.
+    Acknowledged(u64),
+    /// The sender ends the connection for good. It is no frame that counts.
+    Leaving,
     /// How many ticks passed without the processes of the hosts that the sender knows of. Sent in
     /// place of [`PeerMessage::Alive`] while a run goes on.
     Ticks(Vec<HostTicks>),

@@ -2,6 +2,7 @@
 //! to it, and both ends check that they fit. What they say to each other afterwards is not here.
 
 use std::net::{IpAddr, SocketAddr, TcpStream};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use std::{io, thread};
 
@@ -12,6 +13,7 @@ use super::control_listener::{
 };
 use super::frame::{PeerHello, PeerMessage};
 use super::peer::{ControlHalves, Peer};
+use super::reconnect::{Door, Reconnect, lock};
 use super::strangers::{Cause, Strangers};
 use crate::security::PreSharedKey;
 use crate::security::greeting::{GreetingError, Why};
@@ -92,6 +94,15 @@ pub(crate) struct Meeting {
 }
 
 impl Meeting {
+    /// Whom the first host lets in.
+    pub(super) fn admission(&self, own: &str) -> Admission {
+        Admission {
+            own: own.to_owned(),
+            expected: self.expected.clone(),
+            key: self.key.clone(),
+        }
+    }
+
     /// Who is at `ip` by the topology.
     fn name_of(&self, ip: IpAddr) -> String {
         let mut expected = self.expected.iter();
@@ -219,12 +230,9 @@ fn host(
 ) -> Result<Vec<Peer>, PeerError> {
     let address = meeting.address;
     let listen = |source| PeerError::Listen { address, source };
-    let admission = Admission {
-        own: hello.host.clone(),
-        expected: meeting.expected.clone(),
-        key: meeting.key.clone(),
-    };
+    let admission = meeting.admission(&hello.host);
     let mut control_listener = ControlListener::open(address, admission).map_err(listen)?;
+    let door = Arc::new(Mutex::new(Door::default()));
     let mut peers: Vec<Peer> = Vec::new();
     loop {
         let admitted = control_listener.admit_waiting(&mut patience.strangers);
@@ -232,9 +240,17 @@ fn host(
             patience.note_shortage(&shortage);
         }
         while let Some(newcomer) = control_listener.look(&mut patience.strangers) {
-            if let Some(peer) = welcome(newcomer, hello, patience)? {
-                // One that gave up and came again: its first connection has ended.
-                peers.retain(|known| known.hello.host != peer.hello.host);
+            if newcomer.hello.resumed.is_some() {
+                lock(&door).take(newcomer, hello);
+            } else if let Some(peer) = welcome(newcomer, hello, &door, patience)? {
+                // One that gave up and came again: nobody waits for its first connection.
+                peers.retain_mut(|known| {
+                    let is_other = known.hello.host != peer.hello.host;
+                    if !is_other {
+                        known.hang_up();
+                    }
+                    is_other
+                });
                 peers.push(peer);
             }
         }
@@ -256,6 +272,7 @@ fn host(
 fn welcome(
     newcomer: Newcomer,
     hello: &PeerHello,
+    door: &Arc<Mutex<Door>>,
     patience: &mut Patience<'_>,
 ) -> Result<Option<Peer>, PeerError> {
     let Newcomer {
@@ -269,7 +286,13 @@ fn welcome(
             reason,
         });
     }
-    let mut peer = match Peer::new(ends, theirs) {
+    let reconnect = Reconnect {
+        meeting: patience.meeting.clone(),
+        own: hello.clone(),
+        theirs,
+        door: Arc::clone(door),
+    };
+    let mut peer = match Peer::new(ends, reconnect) {
         Ok(peer) => peer,
         // It was not answered, so it comes again.
         Err(error) => {
@@ -279,7 +302,7 @@ fn welcome(
     };
     // One that is gone again by now comes back.
     peer.say(&PeerMessage::Hello(hello.clone()));
-    Ok(peer.is_open.then_some(peer))
+    Ok(Some(peer))
 }
 
 fn join(
@@ -314,7 +337,13 @@ fn join(
                         reason,
                     });
                 }
-                match Peer::new(ends, theirs) {
+                let reconnect = Reconnect {
+                    meeting: meeting.clone(),
+                    own: hello.clone(),
+                    theirs,
+                    door: Arc::default(),
+                };
+                match Peer::new(ends, reconnect) {
                     Ok(peer) => return Ok(vec![peer]),
                     Err(error) => patience.note_shortage(&error),
                 }
@@ -343,7 +372,7 @@ fn join(
 }
 
 /// What the first host answers to this one's name.
-fn greet(
+pub(super) fn greet(
     stream: TcpStream,
     hello: &PeerHello,
     other: &str,
@@ -357,7 +386,7 @@ fn greet(
 
 /// One attempt to reach the first host, from this host's own address: the kernel would choose the
 /// sender's address by the route, and the first host turns strangers away.
-fn connect(meeting: &Meeting) -> Result<io::Result<TcpStream>, PeerError> {
+pub(super) fn connect(meeting: &Meeting) -> Result<io::Result<TcpStream>, PeerError> {
     let own = meeting.own;
     let prepare = || {
         let domain = Domain::for_address(meeting.address);

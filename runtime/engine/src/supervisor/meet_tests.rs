@@ -1,9 +1,10 @@
 //! Two ends of a meeting on loopback: who meets, and who is told why not.
 
 use super::*;
-use crate::supervisor::frame::Frame;
+use crate::supervisor::frame::{Frame, write_message};
 use crate::supervisor::peer::PeerEvent;
-use std::net::{Ipv4Addr, TcpListener};
+use std::net::{Ipv4Addr, Shutdown, TcpListener};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 fn hello(host: &str, hash: u64, domain: u8) -> PeerHello {
     PeerHello {
@@ -13,6 +14,7 @@ fn hello(host: &str, hash: u64, domain: u8) -> PeerHello {
         clock_id: 1,
         domain: [domain; 16],
         has_fast_aes: true,
+        resumed: None,
     }
 }
 
@@ -227,12 +229,12 @@ fn connections_that_say_nothing_keep_a_host_neither_from_its_deadline_nor_from_i
         timeout: Duration::from_secs(1),
         key: Some(key("knocked")),
     };
-    let is_over = std::sync::atomic::AtomicBool::new(false);
+    let is_over = AtomicBool::new(false);
     let (mut told_count, mut tried_count) = (0, 0);
     let outcome = thread::scope(|scope| {
         let knocking = scope.spawn(|| {
             let mut open = std::collections::VecDeque::new();
-            while !is_over.load(std::sync::atomic::Ordering::Acquire) {
+            while !is_over.load(Ordering::Acquire) {
                 open.extend(TcpStream::connect_timeout(&address, RETRY_PERIOD));
                 tried_count += 1;
                 if open.len() > 100 {
@@ -244,7 +246,7 @@ fn connections_that_say_nothing_keep_a_host_neither_from_its_deadline_nor_from_i
             told_count += 1;
             true
         });
-        is_over.store(true, std::sync::atomic::Ordering::Release);
+        is_over.store(true, Ordering::Release);
         knocking.join().unwrap();
         outcome
     });
@@ -254,4 +256,160 @@ fn connections_that_say_nothing_keep_a_host_neither_from_its_deadline_nor_from_i
         told_count > 1 && tried_count > 1,
         "{told_count} {tried_count}"
     );
+}
+
+/// Passes connections on to `to`, and cuts those it has.
+struct Cable {
+    address: SocketAddr,
+    ends: Arc<Mutex<Vec<TcpStream>>>,
+    is_away: Arc<AtomicBool>,
+}
+
+impl Cable {
+    fn lay(to: SocketAddr) -> Self {
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        let cable = Self {
+            address: listener.local_addr().unwrap(),
+            ends: Arc::default(),
+            is_away: Arc::default(),
+        };
+        let (ends, is_away) = (Arc::clone(&cable.ends), Arc::clone(&cable.is_away));
+        thread::spawn(move || {
+            for near in listener.incoming() {
+                let near = near.unwrap();
+                if is_away.load(Ordering::Acquire) {
+                    continue;
+                }
+                let Ok(far) = TcpStream::connect(to) else {
+                    continue;
+                };
+                for (from, into) in [(&near, &far), (&far, &near)] {
+                    let (mut from, mut into) =
+                        (from.try_clone().unwrap(), into.try_clone().unwrap());
+                    thread::spawn(move || {
+                        let _cut = io::copy(&mut from, &mut into).is_err();
+                        let _gone = into.shutdown(Shutdown::Both).is_err();
+                    });
+                }
+                ends.lock().unwrap().extend([near, far]);
+            }
+        });
+        cable
+    }
+
+    /// One end notices at once, the other when it hears of it.
+    fn cut(&self) {
+        for end in self.ends.lock().unwrap().drain(..) {
+            let _gone = end.shutdown(Shutdown::Both).is_err();
+        }
+    }
+
+    /// Cuts them, and passes no more on.
+    fn take_away(&self) {
+        self.is_away.store(true, Ordering::Release);
+        self.cut();
+    }
+}
+
+const SENT_COUNT: u64 = 20_000;
+
+/// Sends numbered frames and takes the other end's.
+fn talk(peer: &mut Peer) {
+    let numbered = |size_bytes| PeerMessage::File {
+        name: "n".repeat(500),
+        size_bytes,
+    };
+    peer.allow_writes_to_take(Duration::from_secs(20)).unwrap();
+    let (writer, inbox) = peer.halves();
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            for number in 0..SENT_COUNT {
+                write_message(writer, &numbered(number)).unwrap();
+            }
+        });
+        for number in 0..SENT_COUNT {
+            match inbox.recv_timeout(Duration::from_secs(20)).unwrap() {
+                PeerEvent::Frame(Frame::Message(message)) => assert_eq!(message, numbered(number)),
+                other => panic!("{number}: {other:?}"),
+            }
+        }
+    });
+}
+
+/// Two hosts that met over a cable.
+fn met_over_a_cable(name: &str) -> (Cable, [Peer; 2]) {
+    let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = probe.local_addr().unwrap();
+    drop(probe);
+    let cable = Cable::lay(address);
+    let key = key(name);
+    let meeting = |address, is_here, host: &str| Meeting {
+        address,
+        is_here,
+        own: Ipv4Addr::LOCALHOST.into(),
+        expected: vec![(host.to_owned(), Ipv4Addr::LOCALHOST.into())],
+        timeout: Duration::from_secs(20),
+        key: Some(key.clone()),
+    };
+    let there = meeting(cable.address, false, "a");
+    let here = meeting(address, true, "b");
+    let joining = thread::spawn(move || meet(&there, &hello("b", 1, 2), &mut |_| true));
+    let here = meet(&here, &hello("a", 1, 1), &mut |_| true).unwrap();
+    let there = joining.join().unwrap().unwrap();
+    let peers = [here, there].map(|met| met.peers.into_iter().next().unwrap());
+    (cable, peers)
+}
+
+#[test]
+fn a_connection_that_is_cut_goes_on_with_every_frame_once_and_in_order() {
+    let (cable, mut ends) = met_over_a_cable("cut");
+    let is_over = AtomicBool::new(false);
+    let cut_count = thread::scope(|scope| {
+        let talking = ends.each_mut().map(|peer| scope.spawn(|| talk(peer)));
+        let cutting = scope.spawn(|| {
+            let mut cut_count = 0;
+            while !is_over.load(Ordering::Acquire) && cut_count < 20 {
+                thread::sleep(Duration::from_millis(150));
+                cable.cut();
+                cut_count += 1;
+            }
+            cut_count
+        });
+        let talked = talking.map(thread::ScopedJoinHandle::join);
+        is_over.store(true, Ordering::Release);
+        for talked in talked {
+            talked.unwrap();
+        }
+        cutting.join().unwrap()
+    });
+    for peer in &mut ends {
+        let cuts = peer.take_cuts();
+        println!("{cut_count} cuts: {cuts:?}");
+        assert!(!cuts.is_empty());
+    }
+}
+
+/// Waits for the end of the conversation and its reason.
+fn closed(peer: &mut Peer) -> String {
+    loop {
+        match peer.receive(Duration::from_secs(20)) {
+            Some(PeerEvent::Closed(reason)) => return reason,
+            Some(PeerEvent::Frame(_)) => {}
+            None => panic!("no end"),
+        }
+    }
+}
+
+#[test]
+fn an_end_that_leaves_is_not_waited_for_and_one_that_does_not_come_back_is() {
+    let (_cable, [here, mut there]) = met_over_a_cable("left");
+    drop(here);
+    assert_eq!(closed(&mut there), "it closed the connection");
+
+    let (cable, mut ends) = met_over_a_cable("gone");
+    cable.take_away();
+    for peer in &mut ends {
+        let reason = closed(peer);
+        assert!(reason.contains("no new one within 5 s"), "{reason}");
+    }
 }

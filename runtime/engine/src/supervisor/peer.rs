@@ -1,13 +1,17 @@
-//! One connected peer: another host's supervisor at the other end of a TCP connection. How hosts
-//! find each other is in `meet.rs`.
+//! One connected peer: another host's supervisor. How hosts find each other is in `meet.rs`, and how what they
+//! say outlives a connection in `conversation.rs`.
 
 use std::io::{self, BufReader, BufWriter, Read, Write};
-use std::net::{Shutdown, TcpStream};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::thread;
+use std::net::TcpStream;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
-use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
+use zeroize::Zeroizing;
+
+use super::conversation::{Conversation, Cut};
+use super::frame::{Frame, PeerHello, PeerMessage, write_message};
+use super::reconnect::Reconnect;
 use crate::security::greeting::{Secured, TimedStream};
 use crate::security::{SecureReader, SecureWriter};
 
@@ -19,7 +23,7 @@ const INBOX_FRAMES: usize = 256;
 pub(crate) enum PeerEvent {
     /// A frame.
     Frame(Frame),
-    /// The connection ended, and why.
+    /// The conversation ended, and why.
     Closed(String),
 }
 
@@ -32,7 +36,7 @@ pub(super) enum ControlReader {
 
 impl ControlReader {
     /// From now on a read waits for as long as it takes.
-    fn wait_for_ever(&mut self) -> io::Result<()> {
+    pub(super) fn wait_for_ever(&mut self) -> io::Result<()> {
         match self {
             Self::Plain(reader) => reader.get_mut().wait_for_ever(),
             Self::Secured(reader) => reader.wait_for_ever(),
@@ -57,7 +61,7 @@ pub(super) enum ControlWriter {
 }
 
 impl ControlWriter {
-    fn stream(&self) -> &TcpStream {
+    pub(super) fn stream(&self) -> &TcpStream {
         match self {
             Self::Plain(writer) => writer.get_ref(),
             Self::Secured(writer) => writer.stream(),
@@ -108,36 +112,50 @@ impl From<Secured> for ControlHalves {
     }
 }
 
+/// The sending half: a flush ends a frame.
+#[derive(Debug)]
+struct PeerWriter {
+    conversation: Arc<Conversation>,
+    frame: Zeroizing<Vec<u8>>,
+}
+
+impl Write for PeerWriter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.frame.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.conversation.send(core::mem::take(&mut self.frame))
+    }
+}
+
 /// One connected peer.
 #[derive(Debug)]
 pub(crate) struct Peer {
     /// What it said of itself.
     pub(crate) hello: PeerHello,
-    writer: ControlWriter,
+    writer: PeerWriter,
     inbox: Receiver<PeerEvent>,
     heard: Instant,
     /// False once something could not be said to it.
-    pub(super) is_open: bool,
+    is_open: bool,
     /// It said that its components have stopped; what it says next belongs to the exchange of
     /// records and must not be read before.
     pub(crate) is_quiet: bool,
 }
 
 impl Peer {
-    /// Listens to the connection in a thread of its own.
-    pub(super) fn new(ends: ControlHalves, hello: PeerHello) -> io::Result<Self> {
-        let ControlHalves {
-            reader: mut input,
-            writer,
-        } = ends;
-        input.wait_for_ever()?;
+    /// Listens to the connection, and to what `reconnect` finds after it, in threads of its own.
+    pub(super) fn new(ends: ControlHalves, reconnect: Reconnect) -> io::Result<Self> {
         let (sender, inbox) = sync_channel(INBOX_FRAMES);
-        thread::Builder::new()
-            .name(format!("peer {}", hello.host))
-            .spawn(move || forward(input, &sender))?;
+        let hello = reconnect.theirs.clone();
         Ok(Self {
             hello,
-            writer,
+            writer: PeerWriter {
+                conversation: Conversation::begin(ends, reconnect, sender)?,
+                frame: Zeroizing::default(),
+            },
             inbox,
             heard: Instant::now(),
             is_open: true,
@@ -171,21 +189,23 @@ impl Peer {
 
     /// Records are larger than greetings: a write may take up to `limit`.
     pub(crate) fn allow_writes_to_take(&mut self, limit: Duration) -> io::Result<()> {
-        self.writer.stream().set_write_timeout(Some(limit))
+        self.writer.conversation.limit_writes(limit)
     }
 
-    /// Ends the connection both ways: whoever waits for it, here or there, notices at once.
+    /// Times without a connection since the last call that are over.
+    pub(super) fn take_cuts(&mut self) -> Vec<Cut> {
+        self.writer.conversation.take_cuts()
+    }
+
+    /// Ends the conversation: whoever waits for it, here or there, notices at once.
     pub(crate) fn hang_up(&mut self) {
         self.is_open = false;
-        let _already_closed = self.writer.stream().shutdown(Shutdown::Both).is_err();
+        self.writer.conversation.leave();
     }
 
-    /// A second handle of the connection, to end it while the halves are in use.
-    ///
-    /// # Errors
-    /// When the system gives none.
-    pub(crate) fn handle(&self) -> io::Result<TcpStream> {
-        self.writer.stream().try_clone()
+    /// The conversation, to end it while the halves are in use.
+    pub(super) fn conversation(&self) -> Arc<Conversation> {
+        Arc::clone(&self.writer.conversation)
     }
 
     /// The sending half by itself, so that a thread can send while another receives.
@@ -197,24 +217,8 @@ impl Peer {
 }
 
 impl Drop for Peer {
-    /// Ends the connection both ways, so that the reader thread and the other end notice.
+    /// Ends the conversation, so that the threads and the other end notice.
     fn drop(&mut self) {
-        self.hang_up();
-    }
-}
-
-fn forward(mut input: ControlReader, out: &SyncSender<PeerEvent>) {
-    loop {
-        let event = match read_frame(&mut input) {
-            Ok(frame) => PeerEvent::Frame(frame),
-            Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
-                PeerEvent::Closed("it closed the connection".to_owned())
-            }
-            Err(error) => PeerEvent::Closed(error.to_string()),
-        };
-        let is_last = matches!(event, PeerEvent::Closed(_));
-        if out.send(event).is_err() || is_last {
-            return;
-        }
+        self.writer.conversation.leave_in_order();
     }
 }

@@ -132,7 +132,7 @@ pub(crate) struct ProcessGroup {
     /// When the run began.
     pub(super) started: Option<Instant>,
     events: Vec<Event>,
-    /// How many of them are warnings.
+    /// How many of them are warnings, or of a host.
     warning_count: usize,
     /// The first file that a process could not write, and the host of it.
     unwritten: Option<(String, FileFault)>,
@@ -534,6 +534,30 @@ impl ProcessGroup {
             process: plan.name.clone(),
             kind,
             interruption,
+        });
+    }
+
+    /// Notes what happened to `host` as a whole.
+    pub(super) fn note_of_host(&mut self, at: Instant, host: &str, kind: EventKind) {
+        let is_full = self.warning_count >= WARNINGS_MAX;
+        let mut own = self.events.iter_mut().rev();
+        let last = own.find(|event| event.process == host);
+        if is_full && let Some(EventKind::WarningsLeftOut { count }) = last.map(|one| &mut one.kind)
+        {
+            *count += 1;
+            return;
+        }
+        self.warning_count += 1;
+        self.events.push(Event {
+            at,
+            host: host.to_owned(),
+            process: host.to_owned(),
+            kind: if is_full {
+                EventKind::WarningsLeftOut { count: 1 }
+            } else {
+                kind
+            },
+            interruption: None,
         });
     }
 

@@ -83,6 +83,7 @@ pub(super) fn gather(
         clock_id: clock_id()?,
         domain: domains.fingerprint()?,
         has_fast_aes: has_fast_aes(),
+        resumed: None,
     };
     let Met {
         mut peers,

@@ -15,6 +15,7 @@ use super::domains::{self, Domains};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
 use super::needs;
+use super::neighbours::Neighbours;
 use super::outcome::{Heard, RunError, RunOptions};
 use super::peer::{Peer, PeerEvent};
 use super::peer_status::{PeerStatus, greeting, own_ticks};
@@ -30,7 +31,7 @@ use hil_platform::console::Console;
 use hil_platform::host_facts::HostFacts;
 use hil_platform::signals::Signals;
 use hil_rundir::announcement::Announcement;
-use hil_rundir::event::{Event, HostHistory, ProcessHistory, disciplines};
+use hil_rundir::event::{Event, EventKind, HostHistory, ProcessHistory, disciplines};
 use hil_rundir::file_fault::{FileFault, is_of_full_disk};
 use hil_rundir::manifest::{self, ManifestContent};
 use hil_rundir::pipe::Failure;
@@ -135,6 +136,7 @@ pub fn run(
         topology,
         announcement,
         cards,
+        neighbours: Neighbours::of(topology, &hosts),
         is_first_host: is_here(&topology.hosts()[0], &hosts),
         has_one_clock: peers.iter().all(|peer| peer.hello.clock_id == here),
         process_group,
@@ -262,6 +264,7 @@ struct Session<'a> {
     // Before the domains: its files lie beside theirs.
     announcement: Announcement,
     cards: NicWatch,
+    neighbours: Neighbours,
     is_first_host: bool,
     /// All hosts of the run read one clock.
     has_one_clock: bool,
@@ -381,6 +384,9 @@ impl Session<'_> {
         if self.cleaned.elapsed() >= CLEANUP_PERIOD {
             self.domains.free_what_the_dead_held();
             self.cleaned = WallInstant::now();
+            for change in self.neighbours.changes() {
+                self.note(MonotonicClock::now(), change);
+            }
         }
         if self.greeted.elapsed() >= ALIVE_PERIOD {
             self.greet();
@@ -453,7 +459,34 @@ impl Session<'_> {
                 )));
             }
         }
+        self.note_cuts();
         heard
+    }
+
+    /// Notes when connections to other hosts were cut and came back.
+    fn note_cuts(&mut self) {
+        let cuts = self.peers.iter_mut().flat_map(|peer| {
+            let host = peer.hello.host.clone();
+            let cuts = peer.take_cuts().into_iter();
+            cuts.map(move |cut| {
+                let kind = EventKind::Reconnected {
+                    peer: host.clone(),
+                    away_ms: u64::try_from(cut.length.as_millis()).unwrap_or(u64::MAX),
+                    cause: cut.cause,
+                };
+                (cut.since, kind)
+            })
+        });
+        for (since, kind) in cuts.collect::<Vec<_>>() {
+            self.note(since, kind);
+        }
+    }
+
+    /// Notes and says what happened to this host.
+    fn note(&mut self, at: Instant, kind: EventKind) {
+        let own = self.own_hosts().into_iter().next().unwrap_or_default();
+        self.console.warn(&format!("{own}: {kind}"));
+        self.process_group.note_of_host(at, &own, kind);
     }
 
     fn tell(&mut self, phase: Phase) {
@@ -550,6 +583,9 @@ impl Session<'_> {
             problems.extend(received.problems);
             gaps = received.gaps;
             stories.extend(received.stories);
+            self.note_cuts();
+            // The other hosts have this one's up to the exchange.
+            stories[0].events = self.process_group.events().to_vec();
         }
         // The same on every host.
         let place = |story: &HostHistory| {

@@ -7,7 +7,7 @@ use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::layout::Field;
 use hil_core::message::Message;
 use hil_core::time::Instant;
-use hil_engine::supervisor::frame::{PeerHello, PeerMessage, write_chunk, write_message};
+use hil_engine::supervisor::frame::{PeerHello, PeerMessage, Resumed, write_chunk, write_message};
 use hil_engine::supervisor::peer_status::HostTicks;
 use hil_report::summary::{Fact, Outcome, RunFacts, RunSummary};
 use hil_rundir::event::{Event, EventKind, HostHistory, Interruption, ProcessHistory, ProcessKind};
@@ -123,6 +123,10 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
         clock_id: 9,
         domain: [3; 16],
         has_fast_aes: true,
+        resumed: Some(Resumed {
+            of: [6; 16],
+            taken_count: 7,
+        }),
     };
     let messages = [
         PeerMessage::Hello(hello),
@@ -132,6 +136,8 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
             has_one_clock: true,
         },
         PeerMessage::Alive,
+        PeerMessage::Acknowledged(9),
+        PeerMessage::Leaving,
         PeerMessage::Stop(RunOutcome::Interrupted("Ctrl-C".to_owned())),
         PeerMessage::Taken(vec![RecordGap {
             host: "robot-pc".to_owned(),
