@@ -67,7 +67,7 @@ fn of_two_topologies_with_one_port_the_second_is_refused_with_the_key_to_change(
         } else {
             "second"
         };
-        let topology = record.write(&format!("{name}.toml"), &text);
+        let topology = record.write(format!("{name}.toml"), &text);
         Trial::of(&topology, &record.join(name))
     });
     let mut running = first.start_here();
