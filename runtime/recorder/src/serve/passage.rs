@@ -227,7 +227,10 @@ async fn hand_up(
                 if let Message::Text(text) = &message {
                     names.note(text)?;
                 }
-                to_server.send(message).await.map_err(|_| Broken::Gone)?;
+                to_server
+                    .send(message)
+                    .await
+                    .map_err(|_gone| Broken::Gone)?;
             }
         }
     }
