@@ -70,7 +70,7 @@ impl Asked {
     }
 
     /// Reads until these words have come.
-    pub(super) fn until(&mut self, words: &str) -> String {
+    fn until(&mut self, words: &str) -> String {
         let mut seen = Vec::new();
         let mut bytes = [0; 4096];
         loop {

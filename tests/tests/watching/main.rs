@@ -11,6 +11,7 @@ mod browser;
 mod browser_fleet;
 mod browser_split;
 mod live_access;
+mod live_floods;
 mod live_view;
 mod mcap;
 mod record_kills;

@@ -88,6 +88,9 @@ impl Excess {
 #[derive(Debug)]
 enum Broken {
     Excess(Excess),
+    /// By the library, which keeps so many answers for a viewer and no more.
+    Refused,
+    /// By the viewer.
     Gone,
 }
 
@@ -186,7 +189,7 @@ pub(super) async fn pass(
             if expected.iter().any(|one| one.load(Ordering::Acquire)) {
                 Ok(outbox.push(Message::Close(close))?)
             } else {
-                Err(Broken::Excess(Excess::Answers))
+                Err(Broken::Refused)
             }
         };
         let down = async { tokio::try_join!(filled, empty(&outbox, &to_viewer)).map(drop) };
@@ -196,17 +199,18 @@ pub(super) async fn pass(
         }
     };
     let mut to_viewer = to_viewer.into_inner();
-    let excess = match done {
-        Err(Broken::Excess(excess)) => {
-            let close = Message::Close(Some(excess.close_frame()));
-            // One that takes nothing does not hear it.
-            let _is_heard = timeout(REASON_WITHIN, to_viewer.send(close)).await.is_ok();
-            Err(excess)
-        }
-        Ok(()) | Err(Broken::Gone) => Ok(()),
+    let kept = match done {
+        Err(Broken::Excess(excess)) => Err(excess),
+        Err(Broken::Refused) if !all.is_over.load(Ordering::Acquire) => Err(Excess::Answers),
+        Ok(()) | Err(Broken::Refused | Broken::Gone) => Ok(()),
     };
+    if let Err(excess) = kept {
+        let close = Message::Close(Some(excess.close_frame()));
+        // One that takes nothing does not hear it.
+        let _is_heard = timeout(REASON_WITHIN, to_viewer.send(close)).await.is_ok();
+    }
     let stream = to_viewer.reunite(from_viewer).expect("two halves of one");
-    (stream.into_inner().stream, excess)
+    (stream.into_inner().stream, kept)
 }
 
 type ToViewer = SplitSink<WebSocketStream<Metered>, Message>;
@@ -227,7 +231,10 @@ async fn hand_up(
                 if let Message::Text(text) = &message {
                     names.note(text)?;
                 }
-                to_server.send(message).await.map_err(|_| Broken::Gone)?;
+                to_server
+                    .send(message)
+                    .await
+                    .map_err(|_closed| Broken::Refused)?;
             }
         }
     }
