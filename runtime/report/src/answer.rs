@@ -381,7 +381,8 @@ impl Answer {
             None if uncounted_count > 0 => (
                 Tone::Caution,
                 format!(
-                    "valid as far as is known: hosts and links were kept up with{clocks}{uncounted}"
+                    "valid as far as known ({} left no counters){clocks}",
+                    counted(uncounted_count, "process start")
                 ),
             ),
             None => (

@@ -197,9 +197,9 @@ fn counters_that_a_start_did_not_leave_are_unknown_and_not_zero() {
     assert_eq!(found.measurement.uncounted_start_count, 2);
     assert_eq!(found.tone(), Tone::Caution);
     let (_, words) = found.measurement_words(&assessment.network);
-    assert!(words.starts_with("valid as far as is known: "), "{words}");
+    assert!(words.starts_with("valid as far as known ("), "{words}");
     assert!(
-        words.contains("; 2 process starts left no counters"),
+        words.contains("(2 process starts left no counters)"),
         "{words}"
     );
     let named = "robot gateway: the counters of 2 of its 2 starts are unavailable";
