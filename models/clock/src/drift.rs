@@ -14,14 +14,13 @@ use super::exchange::Constraint;
 
 /// Steepest line that is looked for: far beyond any oscillator, and beyond how the kernel steers one.
 const SLOPE_MAX: f64 = 1e-2;
-/// Exchanges at least that are on either side of a contradiction where a rate is told from a step, and of
-/// those that a line is to meet, where there are as many.
-const SIDE_COUNT_MIN: usize = 3;
+/// Exchanges at least that are on either side of a contradiction where a rate is told from a step: fewer have a
+/// line over any step.
 const SIDE_COUNT: usize = 10;
 /// Points of the estimate whose slope counts, and standard errors by which it is beyond the limit.
 const POINT_COUNT_MIN: usize = 10;
 const ERROR_FACTOR: f64 = 4.0;
-/// Halvings of the range of slopes: to far below a part per billion.
+/// Thirds that the range of slopes loses, one after the other: to far below a part per billion.
 const SEARCH_COUNT: usize = 60;
 
 /// The clocks' rates differ by more than the drift limit.
@@ -55,8 +54,7 @@ pub(super) fn contradiction<'a>(
             .max(between.end() + 1 + SIDE_COUNT)
             .min(constraints.len());
         let sides = [between.start() + 1 - from, until - between.end()];
-        // Too few on a side have a line over any step.
-        if sides.into_iter().any(|count| count < SIDE_COUNT_MIN) {
+        if sides.into_iter().any(|count| count < SIDE_COUNT) {
             return None;
         }
         common_slope(&constraints[from..until]).filter(|slope| slope.abs() > limit)
@@ -221,6 +219,26 @@ mod tests {
                 });
                 assert_eq!(map.metrics().drift_contradiction, None, "{seed} {step_ns}");
                 assert_eq!(map.metrics().steps.len(), 1, "{seed} {step_ns}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_step_beside_an_end_is_no_rate_either() {
+        for seed in 0..20 {
+            for at_s in [0.35, 0.55, 1.05, 2.5, 57.0, 59.0, 59.5, 59.7] {
+                for step_ns in [-20_000_000, 8_000_000, 1_000_000_000] {
+                    let map = map(seed, 3e6, |at_ns| {
+                        rate(50)(at_ns)
+                            + if at_ns < rounded(at_s * 1e9) {
+                                0
+                            } else {
+                                step_ns
+                            }
+                    });
+                    let found = map.metrics().drift_contradiction;
+                    assert_eq!(found, None, "{seed} {at_s} {step_ns}");
+                }
             }
         }
     }

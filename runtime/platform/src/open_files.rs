@@ -5,7 +5,7 @@
 //! it for themselves. A user's own program gets back what there was.
 
 use std::net::SocketAddr;
-use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd, RawFd};
 use std::sync::OnceLock;
 use std::{fs, io};
 
@@ -78,6 +78,11 @@ pub fn withhold() -> io::Result<()> {
 )]
 pub fn listener_at(address: SocketAddr) -> io::Result<OwnedFd> {
     for number in numbers()? {
+        // Nothing else is copied: closing a copy of a file drops the record locks that this process has on it, by
+        // which others know that it is alive.
+        if !is_at(number, address) {
+            continue;
+        }
         // SAFETY: the call touches no memory and leaves `number` as it is; one that is gone by now is an error.
         let copy = unsafe { libc::fcntl(number, libc::F_DUPFD_CLOEXEC, 0) };
         if copy < 0 {
@@ -85,16 +90,23 @@ pub fn listener_at(address: SocketAddr) -> io::Result<OwnedFd> {
         }
         // SAFETY: the kernel made `copy` just now, for nobody else.
         let copy = unsafe { OwnedFd::from_raw_fd(copy) };
-        let at = getsockname::<SockaddrStorage>(copy.as_raw_fd()).ok();
-        let v4 = at.and_then(|at| at.as_sockaddr_in().map(|at| SocketAddr::V4((*at).into())));
-        let v6 = at.and_then(|at| at.as_sockaddr_in6().map(|at| SocketAddr::V6((*at).into())));
-        if v4.or(v6) == Some(address) && getsockopt(&copy, sockopt::AcceptConn) == Ok(true) {
+        // It may be another's by now.
+        let is_listener = getsockopt(&copy, sockopt::AcceptConn) == Ok(true);
+        if is_listener && is_at(copy.as_raw_fd(), address) {
             return Ok(copy);
         }
     }
     Err(io::Error::other(format!(
         "nothing of this process listens at {address}"
     )))
+}
+
+/// Whether `number` is a socket with this address here.
+fn is_at(number: RawFd, address: SocketAddr) -> bool {
+    let at = getsockname::<SockaddrStorage>(number).ok();
+    let v4 = at.and_then(|at| at.as_sockaddr_in().map(|at| SocketAddr::V4((*at).into())));
+    let v6 = at.and_then(|at| at.as_sockaddr_in6().map(|at| SocketAddr::V6((*at).into())));
+    v4.or(v6) == Some(address)
 }
 
 fn numbers() -> io::Result<impl Iterator<Item = i32>> {
@@ -136,6 +148,31 @@ mod tests {
         assert_eq!(found.accept().unwrap().1, stream.local_addr().unwrap());
         drop((listener, found));
         assert!(listener_at(address).is_err());
+    }
+
+    #[test]
+    fn looking_for_a_listener_leaves_the_locks_of_this_process_alone() {
+        let path = std::env::temp_dir().join(format!("hil-locked-{}", std::process::id()));
+        let file = File::create_new(&path).unwrap();
+        let whole = libc::flock {
+            l_type: i16::try_from(libc::F_WRLCK).unwrap(),
+            l_whence: i16::try_from(libc::SEEK_SET).unwrap(),
+            l_start: 0,
+            l_len: 0,
+            l_pid: 0,
+        };
+        fcntl(&file, FcntlArg::F_SETLK(&whole)).unwrap();
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        listener_at(listener.local_addr().unwrap()).unwrap();
+        let own = format!(" {} ", std::process::id());
+        let locks = fs::read_to_string("/proc/locks").unwrap();
+        fs::remove_file(&path).unwrap();
+        assert!(
+            locks
+                .lines()
+                .any(|lock| lock.contains("POSIX") && lock.contains(&own)),
+            "{locks}"
+        );
     }
 
     #[test]

@@ -12,11 +12,21 @@ use nix::fcntl::OFlag;
 /// # Errors
 /// When it cannot be opened or is no regular file.
 pub fn open(path: &Path) -> io::Result<File> {
+    open_with(path, OFlag::empty())
+}
+
+/// As [`open`], where `path` is not a link either: one into the folder of another user, say.
+///
+/// # Errors
+/// As [`open`], and when it is a link.
+pub fn open_unlinked(path: &Path) -> io::Result<File> {
+    open_with(path, OFlag::O_NOFOLLOW)
+}
+
+fn open_with(path: &Path, more: OFlag) -> io::Result<File> {
+    let flags = OFlag::O_NONBLOCK | OFlag::O_NOCTTY | more;
     let mut options = File::options();
-    let file = options
-        .read(true)
-        .custom_flags(OFlag::O_NONBLOCK.bits())
-        .open(path)?;
+    let file = options.read(true).custom_flags(flags.bits()).open(path)?;
     if !file.metadata()?.is_file() {
         return Err(io::Error::other("not a regular file"));
     }

@@ -115,7 +115,7 @@ impl HostLoss {
 
     /// Their share, in more digits than the limit has.
     pub(crate) fn share(self) -> String {
-        let share = self.lost_count as f64 / self.of_count.max(1) as f64;
+        let share = self.lost_count as f64 / self.of_count.max(self.lost_count).max(1) as f64;
         format!("{:.3}{JOINT}%", 100.0 * share)
     }
 

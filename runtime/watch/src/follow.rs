@@ -181,7 +181,7 @@ impl RecordFollower {
         self.look_for_files();
         for file in &mut self.files {
             // A file without a header holds nothing yet; one that cannot be read says so at the poll.
-            if let (Ok(true), Ok(written)) = (has_header(file), written_bytes(&file.file))
+            if let (Ok(true), Ok(written)) = (has_header(file), written_bytes(&file.file, 0))
                 && let Some(header) = &file.header
             {
                 let record_bytes = u64::from(header.record_bytes);
@@ -245,7 +245,7 @@ impl RecordFollower {
             match plain_file::open(&path) {
                 Ok(file) => self.files.push(Followed {
                     passed_bytes: if self.passes_over {
-                        written_bytes(&file).unwrap_or(0)
+                        written_bytes(&file, 0).unwrap_or(0)
                     } else {
                         0
                     },
@@ -305,10 +305,13 @@ fn read_piece(
         buffer.resize(record_bytes, 0);
     }
     let failed = |error: io::Error| format!("{}: {error}", one.path.display());
-    let written = written_bytes(&one.file).map_err(failed)?;
+    let written = written_bytes(&one.file, one.offset).map_err(failed)?;
     let left = usize::try_from(written.saturating_sub(one.offset)).unwrap_or(usize::MAX);
     let count = (buffer.len() / record_bytes).clamp(1, PIECE_RECORDS);
     let whole = count.min(left / record_bytes) * record_bytes;
+    if whole == 0 {
+        return Ok(0);
+    }
     let count = read_up_to(&one.file, &mut buffer[..whole], one.offset).map_err(failed)?;
     let count = count - count % record_bytes;
     if count > 0 {

@@ -59,7 +59,7 @@ fn runs_side_by_side_do_not_see_each_other() {
 #[test]
 fn of_two_topologies_with_one_port_the_second_is_refused_with_the_key_to_change() {
     let record = RunFolder::new("one-port");
-    let text = emulated_shuttle("first", "").replace("12 s", "4 s");
+    let text = emulated_shuttle("first", "").replace("12 s", "8 s");
     let files = [text.clone(), text.replace("first", "second")];
     let [first, second] = files.map(|text| {
         let name = if text.contains("first") {

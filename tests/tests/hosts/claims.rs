@@ -17,7 +17,7 @@ use nix::sys::signal::Signal;
 
 const LIMIT: Duration = Duration::from_mins(1);
 /// Second starts on each host while messages flow.
-const STARTS: usize = 3;
+const STARTS: usize = 2;
 
 fn ended(child: &mut ChildGuard) -> Finished {
     let ended = child.wait_within(LIMIT);
@@ -53,7 +53,7 @@ fn a_second_start_is_refused_and_costs_the_first_run_no_message_and_no_connectio
     for topology in ["shuttle-tcp.toml", "shuttle-split.toml"] {
         let record = RunFolder::new("again");
         let trial = Trial::shipped(topology, record.path())
-            .set("run.duration=\"8 s\"")
+            .set("run.duration=\"14 s\"")
             .set("channels.\"shuttle/command\".depth=256")
             .set("channels.\"shuttle/status\".depth=256");
         // It waits for the other host and has bound no port.

@@ -50,9 +50,9 @@ pub(super) fn join(
     };
     let mut command_line: Vec<String> = env::args().collect();
     if args.seed.is_none()
-        && let Some(at) = command_line.iter().position(|word| word == "join")
+        && let Some(at) = command_line.iter().skip(1).position(|word| word == "join")
     {
-        command_line.insert(at + 1, format!("--seed={seed}"));
+        command_line.insert(at + 2, format!("--seed={seed}"));
     }
     carry_out(
         Path::new("join"),

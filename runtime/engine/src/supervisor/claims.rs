@@ -26,6 +26,7 @@ use std::time::Instant;
 use hil_core::message::{FNV_OFFSET, fnv1a};
 use hil_nic::nic_clock::card_of;
 use hil_platform::random::random_bytes;
+use hil_platform::text::visible;
 use hil_protocol::transport::IpProtocol;
 use hil_topology::{Topology, collide, control_key};
 use nix::errno::Errno;
@@ -45,7 +46,7 @@ const ATTEMPTS: u32 = 3;
 /// Bound of the time in between, drawn at random.
 const PAUSE_MS_MAX: u64 = 64;
 /// How long holders together may take to say which folder is theirs.
-const TOLD_WITHIN: Duration = Duration::from_secs(1);
+const TOLD_WITHIN: Duration = Duration::from_secs(3);
 /// Longest path.
 const FOLDER_BYTES_MAX: usize = 4096;
 /// After an error of accept, such as having no descriptor left.
@@ -364,11 +365,22 @@ fn untaken(wanted: &[Wanted], own: &str) -> Result<(), ClaimError> {
         if colliding.is_empty() {
             continue;
         }
-        // One that is not there any more claims nothing.
-        let Ok(holder) = Holder::ask(name, deadline) else {
-            continue;
+        let holder = match Holder::ask(name, deadline) {
+            Ok(holder) => Some(holder),
+            // One that is not there any more claims nothing.
+            Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => continue,
+            Err(_unanswered) => None,
         };
-        if resource.is_believed_of(&holder.credentials) {
+        let is_believed = holder
+            .as_ref()
+            .map_or(!matches!(resource, Resource::Card(_)), |holder| {
+                resource.is_believed_of(&holder.credentials)
+            });
+        if is_believed {
+            let holder = holder.map_or_else(
+                || "a run that does not answer".to_owned(),
+                |holder| holder.to_string(),
+            );
             for one in colliding {
                 let words = format!(
                     "{} is held by {holder}; give this run another, or end that one",
@@ -444,8 +456,8 @@ impl fmt::Display for Holder {
             0 => f.write_str("a process of another container")?,
             pid => {
                 let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
-                let name = name.trim_end();
-                let name = if name.is_empty() { "a program" } else { name };
+                let name = one_line(name.trim_end());
+                let name = if name.is_empty() { "a program" } else { &name };
                 write!(f, "{name} (process {pid}")?;
                 if uid != Uid::effective().as_raw() {
                     write!(f, " of user {uid}")?;
@@ -456,8 +468,14 @@ impl fmt::Display for Holder {
         if self.folder.as_os_str().is_empty() {
             return Ok(());
         }
-        write!(f, ", the run in {}", self.folder.display())
+        let folder = one_line(&self.folder.to_string_lossy());
+        write!(f, ", the run in {folder}")
     }
+}
+
+/// What another process says, as part of a line.
+fn one_line(text: &str) -> String {
+    visible(text).replace('\n', "\\n")
 }
 
 #[cfg(test)]

@@ -5,29 +5,32 @@ use std::collections::BTreeMap;
 use hil_account::MessageHistory;
 use hil_core::record::FrameRecord;
 
+/// Numbers of a block: numbers follow one another, and one out of the way costs no more than its block.
+const BLOCK: usize = 256;
+
 /// The lengths of the frames of one channel, by the inlet's start and the frame's number.
 pub(super) struct FrameLengths {
-    by_epoch: BTreeMap<u32, Vec<u16>>,
+    /// By start and block; 0 where no record tells.
+    blocks: BTreeMap<(u32, u64), Box<[u16]>>,
     arrived_bytes: u64,
     arrived_count: u64,
 }
 
+fn place(sequence: u64) -> (u64, usize) {
+    let within = usize::try_from(sequence % BLOCK as u64).expect("it is below 256");
+    (sequence / BLOCK as u64, within)
+}
+
 impl FrameLengths {
     pub(super) fn of(frames: impl Iterator<Item = FrameRecord>) -> Self {
-        let mut by_epoch: BTreeMap<u32, Vec<u16>> = BTreeMap::new();
+        let mut blocks: BTreeMap<(u32, u64), Box<[u16]>> = BTreeMap::new();
         for frame in frames {
-            let Ok(sequence) = usize::try_from(frame.sequence) else {
-                continue;
-            };
-            let lengths = by_epoch.entry(frame.epoch).or_default();
-            // Numbers follow one another; a hole is of records that are lost.
-            if lengths.len() <= sequence {
-                lengths.resize(sequence + 1, 0);
-            }
-            lengths[sequence] = frame.length_bytes;
+            let (block, within) = place(frame.sequence);
+            let lengths = blocks.entry((frame.epoch, block));
+            lengths.or_insert_with(|| vec![0; BLOCK].into())[within] = frame.length_bytes;
         }
         Self {
-            by_epoch,
+            blocks,
             arrived_bytes: 0,
             arrived_count: 0,
         }
@@ -35,9 +38,9 @@ impl FrameLengths {
 
     /// Counts a frame that arrived and whose length is on record.
     pub(super) fn note(&mut self, message: &MessageHistory) {
-        let sequence = usize::try_from(message.key.sequence).ok();
-        let lengths = self.by_epoch.get(&message.epoch);
-        let length = sequence.and_then(|sequence| lengths?.get(sequence).copied());
+        let (block, within) = place(message.key.sequence);
+        let lengths = self.blocks.get(&(message.epoch, block));
+        let length = lengths.map(|lengths| lengths[within]);
         if let Some(length) = length.filter(|length| *length > 0 && message.arrived().is_some()) {
             self.arrived_bytes += u64::from(length);
             self.arrived_count += 1;
@@ -62,6 +65,8 @@ mod tests {
     #[test]
     fn the_mean_is_of_the_frames_that_arrived() {
         let frames = [100, 300, 1_400].into_iter().zip(0..);
+        // One number is what only a damaged file has.
+        let frames = frames.chain([(60, u64::MAX)]);
         let frames =
             frames.map(|(length, sequence)| FrameRecord::new(sequence, 7, &vec![0; length]));
         let mut lengths = FrameLengths::of(frames);

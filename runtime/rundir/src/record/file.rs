@@ -7,7 +7,8 @@
 //! | 8 | 4 | kind, see [`RecordKind`] |
 //! | 12 | 4 | size of one record in bytes |
 //! | 16 | 4 | instance: 0 for a process's first start, counting its restarts |
-//! | 20 | 12 | zero |
+//! | 20 | 4 | zero |
+//! | 24 | 8 | at which byte the records end; 0: with the file |
 //! | 32 | 96 | channel name, UTF-8, padded with zeros |
 
 use std::fs::{self, File};
@@ -23,6 +24,7 @@ use hil_core::record::{
 };
 use hil_core::run_log::RunLog;
 use hil_link::condition::LinkConditionRecord;
+use hil_platform::plain_file;
 
 use crate::adapter_record::{AdapterReceivedRecord, AdapterSentRecord};
 use crate::radio_record::RadioRecord;
@@ -274,20 +276,35 @@ fn malformed(path: &Path, offset: usize, problem: &'static str) -> RecordFileErr
     }
 }
 
-/// How many bytes of `file` are header and whole or begun records, as it says now.
+/// How many bytes of `file` are header and whole or begun records, as it says now; `known` is what it said before,
+/// or 0.
 ///
 /// # Errors
 /// When it cannot be read.
-pub fn written_bytes(file: &File) -> io::Result<u64> {
-    let mut end = [0; 8];
-    match file.read_exact_at(&mut end, END_AT as u64) {
-        Ok(()) => {}
-        Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => end = [0; 8],
-        Err(error) => return Err(error),
+pub fn written_bytes(file: &File, known: u64) -> io::Result<u64> {
+    let read = || {
+        let mut end = [0; 8];
+        match file.read_exact_at(&mut end, END_AT as u64) {
+            Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => Ok(0),
+            read => read.map(|()| u64::from_le_bytes(end)),
+        }
+    };
+    let before = file.metadata()?.len();
+    let mut said = read()?;
+    // Its writer stores it at once, and who reads it by the kernel may yet find a half of it.
+    while said != 0 && said != known {
+        let again = read()?;
+        if again == said {
+            break;
+        }
+        said = again;
     }
-    // The writer cuts off what is behind the records before it says 0.
-    let file_bytes = file.metadata()?.len();
-    Ok(end_of(u64::from_le_bytes(end), file_bytes))
+    // The writer says where they end before it makes room behind them, and 0 again after it has cut that off.
+    let file_bytes = match said {
+        0 => before.min(file.metadata()?.len()),
+        _ => before,
+    };
+    Ok(end_of(said, file_bytes))
 }
 
 fn end_of(said: u64, file_bytes: u64) -> u64 {
@@ -314,7 +331,7 @@ impl RecordFile {
     /// # Errors
     /// When it cannot be read or its header is not that of a record file.
     pub fn read(path: &Path) -> Result<Self, RecordFileError> {
-        let bytes = fs::read(path).map_err(|source| RecordFileError::Io {
+        let bytes = plain_file::read(path).map_err(|source| RecordFileError::Io {
             path: path.to_owned(),
             source,
         })?;

@@ -178,7 +178,7 @@ mod tests {
         for count in 0..2_000 {
             let read = fs::read(&file.path).unwrap();
             let end = HEADER_BYTES as u64 + count * size_of::<PublishedRecord>() as u64;
-            assert_eq!(written_bytes(&file.file).unwrap(), end);
+            assert_eq!(written_bytes(&file.file, 0).unwrap(), end);
             // As long as a file that a kill of its writer leaves.
             assert!(read.len() as u64 >= end && read.len() as u64 <= end + WINDOW_BYTES);
             if count % 97 == 0 {

@@ -79,6 +79,8 @@ impl SharedSink {
     }
 }
 
+/// Entries of a shared ring whose room is freed together.
+const ENTRIES_AT_ONCE: usize = 64;
 /// Bytes of a channel's index before each record of a shared ring.
 const INDEX_BYTES: usize = size_of::<u64>();
 
@@ -140,8 +142,18 @@ struct SharedDrain {
 impl SharedDrain {
     fn flush(&mut self, fail: &mut dyn FnMut(FileFault)) {
         let entry_bytes = INDEX_BYTES + self.record_bytes;
-        let waiting = self.ring.slots() / entry_bytes * entry_bytes;
-        let Ok(chunk) = self.ring.read_chunk(waiting) else {
+        let mut waiting_count = self.ring.slots() / entry_bytes;
+        while waiting_count > 0 {
+            // Their room is free again before the next are written, which a slow disk may hold up.
+            let count = waiting_count.min(ENTRIES_AT_ONCE);
+            waiting_count -= count;
+            self.write(count * entry_bytes, fail);
+        }
+    }
+
+    fn write(&mut self, bytes: usize, fail: &mut dyn FnMut(FileFault)) {
+        let entry_bytes = INDEX_BYTES + self.record_bytes;
+        let Ok(chunk) = self.ring.read_chunk(bytes) else {
             return;
         };
         // The ring is some whole entries long, so none lies across its end.

@@ -57,7 +57,7 @@ impl StoredFile {
         let read = || -> io::Result<(Vec<u8>, u64)> {
             let mut start = Vec::new();
             let file = File::open(path)?;
-            let bytes = written_bytes(&file)?;
+            let bytes = written_bytes(&file, 0)?;
             file.take(HEADER_BYTES as u64).read_to_end(&mut start)?;
             Ok((start, bytes))
         };
