@@ -29,7 +29,7 @@ const ACKNOWLEDGED_AT: u64 = 2;
 /// How long the end of a conversation waits for the peer to take what it was sent last: longer than a cut.
 const LAST_WORDS_PATIENCE: Duration = Duration::from_secs(1);
 /// How long an end that leaves tries to say so.
-const FAREWELL_PATIENCE: Duration = Duration::from_millis(50);
+const FAREWELL_PATIENCE: Duration = Duration::from_millis(500);
 
 /// A time without a connection, after which nothing was missing.
 #[derive(Debug, Clone)]
@@ -205,7 +205,8 @@ impl Conversation {
     pub(super) fn leave(&self) {
         let deadline = WallInstant::now() + FAREWELL_PATIENCE;
         let is_over = core::mem::replace(&mut self.state().is_over, true);
-        while !is_over && WallInstant::now() < deadline {
+        // At least once, however late this thread gets its turn.
+        while !is_over {
             if let Ok(mut writer) = self.writer.try_lock() {
                 if let Some(out) = writer.as_mut() {
                     let limited = out.stream().set_write_timeout(Some(FAREWELL_PATIENCE));
@@ -213,6 +214,9 @@ impl Conversation {
                         .and_then(|()| write_message(out, &PeerMessage::Leaving))
                         .is_err();
                 }
+                break;
+            }
+            if WallInstant::now() >= deadline {
                 break;
             }
             thread::sleep(Duration::from_millis(1));
