@@ -307,13 +307,13 @@ impl Conversation {
 
     /// Tells the peer what was taken, and gets a connection again whenever one was cut.
     fn keep(self: &Arc<Self>, reconnect: &Reconnect, inbox: &SyncSender<PeerEvent>) {
-        while let Some((since, cause)) = self.acknowledge_until_cut() {
+        while let Some(cause) = self.acknowledge_until_cut() {
             *self.writer() = None;
             // What came over the connection that was cut comes first.
             let reader = self.state().reader.take();
             let _panicked = reader.map(|reader| reader.join().is_err());
             let taken_count = self.state().taken_count;
-            let made = reconnect.make(since, taken_count, || !self.state().is_over);
+            let made = reconnect.make(taken_count, || !self.state().is_over);
             let resumed = made.and_then(|(ends, given_count)| {
                 let resumed = self.go_on(ends, given_count, inbox);
                 resumed.map_err(|error| error.to_string())
@@ -327,8 +327,8 @@ impl Conversation {
         }
     }
 
-    /// Gives when the connection was cut and why, `None` at the end of the conversation.
-    fn acknowledge_until_cut(&self) -> Option<(Instant, String)> {
+    /// Gives why the connection was cut, `None` at the end of the conversation.
+    fn acknowledge_until_cut(&self) -> Option<String> {
         let mut told_count = self.state().taken_count;
         loop {
             let state = self.wait_until(ACKNOWLEDGE_PERIOD, |state| {
@@ -337,8 +337,8 @@ impl Conversation {
             if state.is_over {
                 return None;
             }
-            if state.down.is_some() {
-                return state.down.clone();
+            if let Some((_, cause)) = &state.down {
+                return Some(cause.clone());
             }
             told_count = state.taken_count;
             drop(state);
