@@ -126,7 +126,8 @@ impl Conversation {
     /// Sends a frame, now or as soon as there is a connection again.
     ///
     /// # Errors
-    /// When there is no room for it within the time that a write may take, or the conversation is over.
+    /// When the conversation is over. It ends when there is no room for a frame within the time that a write may
+    /// take: without that frame the peer would miss one.
     pub(super) fn send(&self, frame: Zeroizing<Vec<u8>>) -> io::Result<()> {
         let length = frame.len();
         let has_room =
@@ -137,6 +138,8 @@ impl Conversation {
             return Err(io::ErrorKind::BrokenPipe.into());
         }
         if !has_room(&state) {
+            drop(state);
+            self.end();
             return Err(io::ErrorKind::TimedOut.into());
         }
         drop(state);

@@ -400,6 +400,21 @@ fn closed(peer: &mut Peer) -> String {
     }
 }
 
+/// The other end reads nothing, so nothing is acknowledged.
+#[test]
+fn a_frame_that_finds_no_room_in_time_ends_the_conversation_at_both_ends() {
+    let (_cable, [mut here, mut there]) = met_over_a_cable("full");
+    here.allow_writes_to_take(Duration::from_millis(200))
+        .unwrap();
+    let large = PeerMessage::Refused("n".repeat(100_000));
+    let (writer, _) = here.halves();
+    let refused = (0..1_000).find_map(|_| write_message(writer, &large).err());
+    assert_eq!(refused.unwrap().kind(), io::ErrorKind::TimedOut);
+    for peer in [&mut here, &mut there] {
+        println!("{}", closed(peer));
+    }
+}
+
 #[test]
 fn an_end_that_leaves_is_not_waited_for_and_one_that_does_not_come_back_is() {
     let (_cable, [here, mut there]) = met_over_a_cable("left");
