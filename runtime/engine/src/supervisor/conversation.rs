@@ -22,7 +22,9 @@ use super::reconnect::Reconnect;
 /// Bytes of frames that are kept until the peer has taken them; then a sender waits.
 const KEPT_BYTES_MAX: usize = 4 << 20;
 /// How often the peer is told at least what was taken. A cut that only one end has noticed lasts this long at
-/// most: the other end's kernel answers what is said over it with a reset.
+/// most where a reset comes back: the kernel of the end that noticed it answers what is said over it with one.
+/// Where the path drops that without a word, the first host, if it has not noticed, does not listen, and the other
+/// end's calls are refused until its patience is over.
 const ACKNOWLEDGE_PERIOD: Duration = Duration::from_millis(100);
 /// Frames after which the peer is told at once.
 const ACKNOWLEDGED_AT: u64 = 2;
