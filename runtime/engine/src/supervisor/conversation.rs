@@ -208,10 +208,17 @@ impl Conversation {
 
     /// Ends it and says so: an end that is gone without a word is waited for.
     pub(super) fn leave(&self) {
-        let deadline = WallInstant::now() + FAREWELL_PATIENCE;
         let is_over = core::mem::replace(&mut self.state().is_over, true);
+        if !is_over {
+            self.say_leaving();
+        }
+        self.end();
+    }
+
+    fn say_leaving(&self) {
+        let deadline = WallInstant::now() + FAREWELL_PATIENCE;
         // At least once, however late this thread gets its turn.
-        while !is_over {
+        loop {
             if let Ok(mut writer) = self.writer.try_lock() {
                 if let Some(out) = writer.as_mut() {
                     let limited = out.stream().set_write_timeout(Some(FAREWELL_PATIENCE));
@@ -219,14 +226,13 @@ impl Conversation {
                         .and_then(|()| write_message(out, &PeerMessage::Leaving))
                         .is_err();
                 }
-                break;
+                return;
             }
             if WallInstant::now() >= deadline {
-                break;
+                return;
             }
             thread::sleep(Duration::from_millis(1));
         }
-        self.end();
     }
 
     /// Leaves once the peer has taken what it was sent, if it does so soon.

@@ -318,7 +318,7 @@ const TAKEN_PER_CUT: u64 = 1_000;
 const SENT_COUNT: u64 = (CUT_COUNT + 1) * SENT_PER_CUT;
 
 fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
-    let began = std::time::Instant::now();
+    let began = Instant::now();
     while !is_so() {
         assert!(began.elapsed() < Duration::from_secs(20), "{what}");
         thread::sleep(Duration::from_millis(1));
