@@ -22,14 +22,16 @@ use super::reconnect::Reconnect;
 /// Bytes of frames that are kept until the peer has taken them; then a sender waits.
 const KEPT_BYTES_MAX: usize = 4 << 20;
 /// How often the peer is told at least what was taken. A cut that only one end has noticed lasts this long at
-/// most: the other end's kernel answers what is said over it with a reset.
+/// most where a reset comes back: the kernel of the end that noticed it answers what is said over it with one.
+/// Where the path drops that without a word, the first host, if it has not noticed, does not listen, and the other
+/// end's calls are refused until its patience is over.
 const ACKNOWLEDGE_PERIOD: Duration = Duration::from_millis(100);
 /// Frames after which the peer is told at once.
 const ACKNOWLEDGED_AT: u64 = 2;
 /// How long the end of a conversation waits for the peer to take what it was sent last: longer than a cut.
 const LAST_WORDS_PATIENCE: Duration = Duration::from_secs(1);
 /// How long an end that leaves tries to say so.
-const FAREWELL_PATIENCE: Duration = Duration::from_millis(50);
+const FAREWELL_PATIENCE: Duration = Duration::from_millis(500);
 
 /// A time without a connection, after which nothing was missing.
 #[derive(Debug, Clone)]
@@ -126,7 +128,8 @@ impl Conversation {
     /// Sends a frame, now or as soon as there is a connection again.
     ///
     /// # Errors
-    /// When there is no room for it within the time that a write may take, or the conversation is over.
+    /// When the conversation is over. It ends when there is no room for a frame within the time that a write may
+    /// take: without that frame the peer would miss one.
     pub(super) fn send(&self, frame: Zeroizing<Vec<u8>>) -> io::Result<()> {
         let length = frame.len();
         let has_room =
@@ -137,6 +140,8 @@ impl Conversation {
             return Err(io::ErrorKind::BrokenPipe.into());
         }
         if !has_room(&state) {
+            drop(state);
+            self.end();
             return Err(io::ErrorKind::TimedOut.into());
         }
         drop(state);
@@ -203,9 +208,17 @@ impl Conversation {
 
     /// Ends it and says so: an end that is gone without a word is waited for.
     pub(super) fn leave(&self) {
-        let deadline = WallInstant::now() + FAREWELL_PATIENCE;
         let is_over = core::mem::replace(&mut self.state().is_over, true);
-        while !is_over && WallInstant::now() < deadline {
+        if !is_over {
+            self.say_leaving();
+        }
+        self.end();
+    }
+
+    fn say_leaving(&self) {
+        let deadline = WallInstant::now() + FAREWELL_PATIENCE;
+        // At least once, however late this thread gets its turn.
+        loop {
             if let Ok(mut writer) = self.writer.try_lock() {
                 if let Some(out) = writer.as_mut() {
                     let limited = out.stream().set_write_timeout(Some(FAREWELL_PATIENCE));
@@ -213,11 +226,13 @@ impl Conversation {
                         .and_then(|()| write_message(out, &PeerMessage::Leaving))
                         .is_err();
                 }
-                break;
+                return;
+            }
+            if WallInstant::now() >= deadline {
+                return;
             }
             thread::sleep(Duration::from_millis(1));
         }
-        self.end();
     }
 
     /// Leaves once the peer has taken what it was sent, if it does so soon.
@@ -303,13 +318,13 @@ impl Conversation {
 
     /// Tells the peer what was taken, and gets a connection again whenever one was cut.
     fn keep(self: &Arc<Self>, reconnect: &Reconnect, inbox: &SyncSender<PeerEvent>) {
-        while let Some((since, cause)) = self.acknowledge_until_cut() {
+        while let Some(cause) = self.acknowledge_until_cut() {
             *self.writer() = None;
             // What came over the connection that was cut comes first.
             let reader = self.state().reader.take();
             let _panicked = reader.map(|reader| reader.join().is_err());
             let taken_count = self.state().taken_count;
-            let made = reconnect.make(since, taken_count, || !self.state().is_over);
+            let made = reconnect.make(taken_count, || !self.state().is_over);
             let resumed = made.and_then(|(ends, given_count)| {
                 let resumed = self.go_on(ends, given_count, inbox);
                 resumed.map_err(|error| error.to_string())
@@ -323,8 +338,8 @@ impl Conversation {
         }
     }
 
-    /// Gives when the connection was cut and why, `None` at the end of the conversation.
-    fn acknowledge_until_cut(&self) -> Option<(Instant, String)> {
+    /// Gives why the connection was cut, `None` at the end of the conversation.
+    fn acknowledge_until_cut(&self) -> Option<String> {
         let mut told_count = self.state().taken_count;
         loop {
             let state = self.wait_until(ACKNOWLEDGE_PERIOD, |state| {
@@ -333,8 +348,8 @@ impl Conversation {
             if state.is_over {
                 return None;
             }
-            if state.down.is_some() {
-                return state.down.clone();
+            if let Some((_, cause)) = &state.down {
+                return Some(cause.clone());
             }
             told_count = state.taken_count;
             drop(state);

@@ -4,7 +4,7 @@ use super::*;
 use crate::supervisor::frame::{Frame, write_message};
 use crate::supervisor::peer::PeerEvent;
 use std::net::{Ipv4Addr, Shutdown, TcpListener};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 fn hello(host: &str, hash: u64, domain: u8) -> PeerHello {
     PeerHello {
@@ -311,10 +311,22 @@ impl Cable {
     }
 }
 
-const SENT_COUNT: u64 = 20_000;
+const CUT_COUNT: u64 = 5;
+/// Frames that each end may send after each cut, and those of them that it takes before the next one.
+const SENT_PER_CUT: u64 = 4_000;
+const TAKEN_PER_CUT: u64 = 1_000;
+const SENT_COUNT: u64 = (CUT_COUNT + 1) * SENT_PER_CUT;
 
-/// Sends numbered frames and takes the other end's.
-fn talk(peer: &mut Peer) {
+fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
+    let began = Instant::now();
+    while !is_so() {
+        assert!(began.elapsed() < Duration::from_secs(20), "{what}");
+        thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// Sends numbered frames, as many as `allowed`, and takes the other end's, which it counts in `taken`.
+fn talk(peer: &mut Peer, allowed: &AtomicU64, taken: &AtomicU64) {
     let numbered = |size_bytes| PeerMessage::File {
         name: "n".repeat(500),
         size_bytes,
@@ -324,6 +336,7 @@ fn talk(peer: &mut Peer) {
     thread::scope(|scope| {
         scope.spawn(|| {
             for number in 0..SENT_COUNT {
+                wait_until("the next cut", || number < allowed.load(Ordering::Acquire));
                 write_message(writer, &numbered(number)).unwrap();
             }
         });
@@ -332,6 +345,7 @@ fn talk(peer: &mut Peer) {
                 PeerEvent::Frame(Frame::Message(message)) => assert_eq!(message, numbered(number)),
                 other => panic!("{number}: {other:?}"),
             }
+            taken.store(number + 1, Ordering::Release);
         }
     });
 }
@@ -340,8 +354,9 @@ fn talk(peer: &mut Peer) {
 fn met_over_a_cable(name: &str) -> (Cable, [Peer; 2]) {
     let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
     let address = probe.local_addr().unwrap();
-    drop(probe);
     let cable = Cable::lay(address);
+    // Until now, so that the cable's own end is at another port.
+    drop(probe);
     let key = key(name);
     let meeting = |address, is_here, host: &str| Meeting {
         address,
@@ -363,30 +378,31 @@ fn met_over_a_cable(name: &str) -> (Cable, [Peer; 2]) {
 #[test]
 fn a_connection_that_is_cut_goes_on_with_every_frame_once_and_in_order() {
     let (cable, mut ends) = met_over_a_cable("cut");
-    let is_over = AtomicBool::new(false);
-    let cut_count = thread::scope(|scope| {
-        let talking = ends.each_mut().map(|peer| scope.spawn(|| talk(peer)));
-        let cutting = scope.spawn(|| {
-            let mut cut_count = 0;
-            while !is_over.load(Ordering::Acquire) && cut_count < 20 {
-                thread::sleep(Duration::from_millis(150));
-                cable.cut();
-                cut_count += 1;
-            }
-            cut_count
-        });
-        let talked = talking.map(thread::ScopedJoinHandle::join);
-        is_over.store(true, Ordering::Release);
-        for talked in talked {
-            talked.unwrap();
+    let conversations = ends.each_ref().map(Peer::conversation);
+    let allowed = AtomicU64::new(SENT_PER_CUT);
+    let taken = [AtomicU64::new(0), AtomicU64::new(0)];
+    thread::scope(|scope| {
+        for (peer, taken) in ends.iter_mut().zip(&taken) {
+            let allowed = &allowed;
+            scope.spawn(move || talk(peer, allowed, taken));
         }
-        cutting.join().unwrap()
+        for number in 1..=CUT_COUNT {
+            let due = (number - 1) * SENT_PER_CUT + TAKEN_PER_CUT;
+            wait_until("frames before a cut", || {
+                taken.iter().all(|one| one.load(Ordering::Acquire) >= due)
+            });
+            cable.cut();
+            for conversation in &conversations {
+                let mut cuts = Vec::new();
+                wait_until("the connection after a cut", || {
+                    cuts = conversation.take_cuts();
+                    !cuts.is_empty()
+                });
+                println!("{number}: {cuts:?}");
+            }
+            allowed.fetch_add(SENT_PER_CUT, Ordering::AcqRel);
+        }
     });
-    for peer in &mut ends {
-        let cuts = peer.take_cuts();
-        println!("{cut_count} cuts: {cuts:?}");
-        assert!(!cuts.is_empty());
-    }
 }
 
 /// Waits for the end of the conversation and its reason.
@@ -397,6 +413,21 @@ fn closed(peer: &mut Peer) -> String {
             Some(PeerEvent::Frame(_)) => {}
             None => panic!("no end"),
         }
+    }
+}
+
+/// The other end reads nothing, so nothing is acknowledged.
+#[test]
+fn a_frame_that_finds_no_room_in_time_ends_the_conversation_at_both_ends() {
+    let (_cable, [mut here, mut there]) = met_over_a_cable("full");
+    here.allow_writes_to_take(Duration::from_millis(200))
+        .unwrap();
+    let large = PeerMessage::Refused("n".repeat(100_000));
+    let (writer, _) = here.halves();
+    let refused = (0..1_000).find_map(|_| write_message(writer, &large).err());
+    assert_eq!(refused.unwrap().kind(), io::ErrorKind::TimedOut);
+    for peer in [&mut here, &mut there] {
+        println!("{}", closed(peer));
     }
 }
 

@@ -1,5 +1,6 @@
 //! At which link addresses this host reaches the others on its own network. Whoever answers there for the
 //! address of another takes what is sent to it, and no seal sees that: so a change is told.
+//! Of IPv4 only: changes of IPv6 neighbours are not seen.
 
 use std::collections::BTreeMap;
 use std::fs;

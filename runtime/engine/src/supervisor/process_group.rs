@@ -39,6 +39,8 @@ const LAST_WORDS_PATIENCE: Duration = Duration::from_secs(1);
 const TEXT_CHARS_MAX: usize = 500;
 /// Warnings that are kept of the processes of a supervisor; more are counted.
 const WARNINGS_MAX: usize = 100_000;
+/// Events of the hosts themselves that are kept beside them; more are counted.
+const HOST_EVENTS_MAX: usize = 1_000;
 
 /// Why the processes could not be started.
 #[derive(Debug, thiserror::Error)]
@@ -132,8 +134,10 @@ pub(crate) struct ProcessGroup {
     /// When the run began.
     pub(super) started: Option<Instant>,
     events: Vec<Event>,
-    /// How many of them are warnings, or of a host.
+    /// How many of them are warnings of processes.
     warning_count: usize,
+    /// How many of them are of a host.
+    host_event_count: usize,
     /// The first file that a process could not write, and the host of it.
     unwritten: Option<(String, FileFault)>,
     log_keeper: Option<LogKeeper>,
@@ -172,6 +176,7 @@ impl ProcessGroup {
             started: None,
             events: Vec::new(),
             warning_count: 0,
+            host_event_count: 0,
             unwritten: None,
             log_keeper: None,
         }
@@ -539,7 +544,7 @@ impl ProcessGroup {
 
     /// Notes what happened to `host` as a whole.
     pub(super) fn note_of_host(&mut self, at: Instant, host: &str, kind: EventKind) {
-        let is_full = self.warning_count >= WARNINGS_MAX;
+        let is_full = self.host_event_count >= HOST_EVENTS_MAX;
         let mut own = self.events.iter_mut().rev();
         let last = own.find(|event| event.process == host);
         if is_full && let Some(EventKind::WarningsLeftOut { count }) = last.map(|one| &mut one.kind)
@@ -547,7 +552,7 @@ impl ProcessGroup {
             *count += 1;
             return;
         }
-        self.warning_count += 1;
+        self.host_event_count += 1;
         self.events.push(Event {
             at,
             host: host.to_owned(),
@@ -713,6 +718,27 @@ mod tests {
         group.members[0].complaint = None;
         let verdict = group.judge(0, failed, MonotonicClock::now());
         assert!(matches!(verdict, Verdict::Failed(failure) if failure.kind == FailureKind::Fault));
+    }
+
+    #[test]
+    fn events_of_a_host_are_kept_beside_warnings_of_processes_and_bounded() {
+        let mut group = group(OnExit::EndRun);
+        group.warning_count = WARNINGS_MAX;
+        let told = |cause: usize| EventKind::Reconnected {
+            peer: "robot-pc".to_owned(),
+            away_ms: 1,
+            cause: cause.to_string(),
+        };
+        for cause in 0..HOST_EVENTS_MAX + 3 {
+            group.note_of_host(MonotonicClock::now(), "pc", told(cause));
+        }
+        let kinds: Vec<&EventKind> = group.events().iter().map(|event| &event.kind).collect();
+        assert_eq!(kinds.len(), HOST_EVENTS_MAX + 1);
+        assert_eq!(*kinds[0], told(0));
+        assert_eq!(
+            *kinds[HOST_EVENTS_MAX],
+            EventKind::WarningsLeftOut { count: 3 }
+        );
     }
 
     #[test]

@@ -4,10 +4,7 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
-use std::time::Duration;
-
-use hil_core::time::Instant;
-use hil_platform::clock::MonotonicClock;
+use std::time::{Duration, Instant as WallInstant};
 
 use super::control_listener::{ControlListener, Newcomer, say};
 use super::frame::{PeerHello, PeerMessage, Resumed};
@@ -17,7 +14,7 @@ use super::strangers::Strangers;
 
 /// How often an end that lacks a connection tries.
 const PERIOD: Duration = Duration::from_millis(10);
-/// How long it does.
+/// How long it does, from its first attempt on: at the first host this is the time for which the door is open.
 pub(super) const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Where the first host lets those in again that it has met.
@@ -96,7 +93,6 @@ impl Reconnect {
     /// Why there is none.
     pub(super) fn make(
         &self,
-        since: Instant,
         taken_count: u64,
         is_wanted: impl Fn() -> bool,
     ) -> Result<(ControlHalves, u64), String> {
@@ -108,6 +104,7 @@ impl Reconnect {
             ..self.own.clone()
         };
         lock(&self.door).missing_count += 1;
+        let mut first_tried = None;
         let made = loop {
             let found = if self.is_called() {
                 self.look(&hello)
@@ -117,8 +114,8 @@ impl Reconnect {
             if let Some(made) = found.transpose() {
                 break made;
             }
-            let waited = MonotonicClock::now().saturating_duration_since(since);
-            if waited >= PATIENCE || !is_wanted() {
+            let first_tried = *first_tried.get_or_insert_with(WallInstant::now);
+            if first_tried.elapsed() >= PATIENCE || !is_wanted() {
                 let limit_s = PATIENCE.as_secs();
                 break Err(format!("there was no new one within {limit_s} s"));
             }
