@@ -10,6 +10,7 @@ use std::{fs, thread};
 use hil_engine::security::PreSharedKey;
 use hil_platform::domain_address::DomainAddress;
 use hil_report::summary::RunSummary;
+use hil_rundir::record::file::written_bytes;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
@@ -259,15 +260,13 @@ impl RunFiles {
         }
     }
 
-    /// Bytes in the record files whose names begin with `start`, of all instances.
+    /// Bytes written in the record files whose names begin with `start`, of all instances.
     pub fn record_bytes(&self, start: &str) -> u64 {
         let entries = fs::read_dir(self.root.join("records"));
         let files = entries.into_iter().flatten().flatten();
         let chosen = files.filter(|file| file.file_name().to_string_lossy().starts_with(start));
-        chosen
-            .filter_map(|file| file.metadata().ok())
-            .map(|data| data.len())
-            .sum()
+        let opened = chosen.filter_map(|file| fs::File::open(file.path()).ok());
+        opened.filter_map(|file| written_bytes(&file, 0).ok()).sum()
     }
 
     /// The process that was started from the launch file of `name` for the `instance`th time.
