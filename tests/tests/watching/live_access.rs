@@ -205,6 +205,23 @@ fn another_user_of_this_machine_looks_on_with_the_token_and_is_refused_and_count
 }
 
 #[test]
+fn root_needs_the_token_where_the_server_has_another_user() {
+    let id = STRANGER.to_string();
+    let mut command = Command::new("setpriv");
+    command.args(["--reuid", &id, "--regid", &id, "--clear-groups"]);
+    // Some kernels take the packet filter with it only.
+    command.args(["--inh-caps", "+net_admin", "--ambient-caps", "+net_admin"]);
+    command.arg(hil_recorder_binary());
+    let server = start_by(command, &[]);
+    let answer = ask_as_program(&server.socket).answer();
+    assert_refused(&answer, "403", "without the token");
+    let socket = &server.socket;
+    Asked::with_token(socket, socket, None, Some(&server.token)).is_let_in();
+    assert!(ask_as_stranger(&server, "").starts_with("HTTP/1.1 101 "));
+    server.end();
+}
+
+#[test]
 fn nobody_is_told_to_paste_what_a_shell_would_run() {
     let server = start(&[]);
     let origin = "http://$(touch${IFS}pwned).example;`id`";
@@ -243,12 +260,10 @@ fn names_that_may_be_anybodys_reach_neither_socket_nor_page() {
 #[test]
 fn a_viewer_too_many_is_told_so_and_comes_in_when_another_has_gone() {
     let server = start(&[]);
-    let let_in = || {
-        let mut asked = ask_as_program(&server.socket);
-        asked.is_let_in();
-        asked
-    };
-    let mut viewers: Vec<Asked> = (0..SEATS).map(|_| let_in()).collect();
+    // All at once.
+    let asked = (0..SEATS).map(|_| ask_as_program(&server.socket));
+    let mut viewers: Vec<Asked> = asked.collect();
+    viewers.iter_mut().for_each(Asked::is_let_in);
     let answer = ask_as_program(&server.socket).answer();
     assert_refused(&answer, "503", &format!("{SEATS} look on already"));
     drop(viewers.pop());
@@ -260,7 +275,7 @@ fn a_viewer_too_many_is_told_so_and_comes_in_when_another_has_gone() {
         }
         assert!(Instant::now() < deadline, "the place stays taken");
     }
-    // One that does not read keeps nobody from ending; the others hear a goodbye.
+    // One that does not read keeps nobody from ending; the others get the closing frame.
     let finished = server.end();
     assert!(finished.stderr.contains("ended"), "{}", finished.stderr);
     for mut viewer in viewers {
@@ -278,14 +293,15 @@ fn viewers_whose_cable_was_pulled_lose_their_seats() {
     let program = here.command(hil_recorder_binary());
     let mut server = start_by(program, &["--host", "0.0.0.0"]);
     // Where others find it, which 0.0.0.0 does not say.
-    let page_port = server.page.rsplit(':').next().unwrap();
+    let (here_at, page_port) = server.page.rsplit_once(':').unwrap();
+    assert_eq!(here_at, "127.0.0.1");
+    let port = server.socket.rsplit(':').next().unwrap();
+    let (address, token) = (here.address(), &server.token);
     let said = format!(
-        "from other machines  http://{}:{page_port}/?token={}\n",
-        here.address(),
-        server.token
+        "from other machines  http://{address}:{page_port}/?token={token}  \
+         ws://{address}:{port}/?token={token}\n"
     );
     server.child.wait_for_output(&said, LIMIT).unwrap();
-    let port = server.socket.rsplit(':').next().unwrap();
     let [local, remote] = [Ipv4Addr::LOCALHOST, here.address()].map(|one| format!("{one}:{port}"));
     let look_on = || {
         let mut asked = Asked::with_token(&remote, &remote, None, Some(&server.token));

@@ -1,7 +1,7 @@
 //! The door of the socket: reads the head of each request and lets pass who may look on;
 //! [`super::passage`] hands their messages on.
 //!
-//! That server can only be had on a TCP port and asks nobody who they are: it is behind a [`Gate`].
+//! That server can only be had on a TCP port and checks no identity: it is behind a [`Gate`].
 
 use std::collections::VecDeque;
 use std::io;
@@ -25,7 +25,7 @@ use super::passage::{AllViewers, End, GONE_AFTER, pass};
 use super::token;
 
 /// Viewers at once.
-const SEATS: usize = 32;
+pub(super) const SEATS: usize = 32;
 /// Connections at once that have not said yet what they want; for a further one an old one goes.
 const ENTERING_MAX: usize = 64;
 /// A browser's head has a few hundred bytes, and what it adds of its own.
@@ -127,13 +127,13 @@ impl Front {
         }
     }
 
-    /// The library is about to say goodbye to all viewers.
+    /// The library is about to send all viewers its closing frame.
     pub(super) fn announce_end(&self) {
         self.context.all.end();
     }
 
-    /// Lets nobody in any more, and closes all connections: those of polite viewers, who have heard
-    /// the server's goodbye, are at their end already.
+    /// Lets nobody in any more, and closes all connections: those of viewers that have closed, after the
+    /// server's closing frame, are at their end already.
     pub(super) fn end(self, runtime: &Handle) {
         // It fails where there is nobody to hear it, which is as well.
         let _is_heard = self.close.send(()).is_ok();
@@ -331,11 +331,11 @@ async fn refuse(viewer: &mut TcpStream, refusal: &Refusal) -> io::Result<()> {
 
 /// Closes a connection so that the last that was said arrives.
 async fn close(viewer: &mut TcpStream) -> io::Result<()> {
-    let goodbye = async {
+    let closing = async {
         viewer.shutdown().await?;
         tokio::io::copy(&mut viewer.take(UNREAD_BYTES_MAX), &mut tokio::io::sink()).await
     };
-    timeout(CLOSE_WITHIN, goodbye)
+    timeout(CLOSE_WITHIN, closing)
         .await
         .map_or(Ok(()), |done| done.map(drop))
 }
@@ -496,6 +496,28 @@ mod tests {
         assert!(outside.read().unwrap().is_close());
         answering.join().unwrap();
         front.end(runtime.handle());
+    }
+
+    #[test]
+    fn a_viewer_is_told_whether_the_library_closed_or_its_connection_ended() {
+        for (closes, words) in [
+            (true, "asked for more answers than could be sent"),
+            (false, "the server ended the connection"),
+        ] {
+            let (listener, server) = listener();
+            let (address, front, runtime) = door(server);
+            let mut stream = viewer(address);
+            let mut inside = agreed(accepted(&listener));
+            if closes {
+                inside.close(None).unwrap();
+            }
+            drop(inside);
+            stream.read_exact(&mut [0; AGREED.len()]).unwrap();
+            let mut outside = WebSocket::from_raw_socket(stream, Role::Client, None);
+            let closed = outside.read().unwrap();
+            assert!(closed.to_text().unwrap().contains(words), "{closed}");
+            front.end(runtime.handle());
+        }
     }
 
     #[test]

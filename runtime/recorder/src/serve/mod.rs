@@ -17,7 +17,7 @@ mod viewers;
 
 pub(crate) use access::{host, origin};
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -294,17 +294,30 @@ fn open(
         console
             .warn("--allow-origin null lets any page in: every page can show one of that origin");
     }
+    let [page_here, socket_here] = [page, socket].map(here);
     console.result(&format!(
-        "page    http://{page}/\nviewers ws://{socket}\n\
-         for other users  http://{page}/{query}  ws://{socket}/{query}\n"
+        "page    http://{page_here}/\nviewers ws://{socket_here}\n\
+         for other users  http://{page_here}/{query}  ws://{socket_here}/{query}\n"
     ));
     if options.host.is_unspecified() {
         for address in own_addresses(options.host) {
-            let page = SocketAddr::new(address, page.port());
-            console.result(&format!("from other machines  http://{page}/{query}\n"));
+            let [page, socket] = [page, socket].map(|at| SocketAddr::new(address, at.port()));
+            console.result(&format!(
+                "from other machines  http://{page}/{query}  ws://{socket}/{query}\n"
+            ));
         }
     }
     Ok((viewers, front))
+}
+
+/// Where this machine's own programs find what listens at `at`: on loopback, if it is at all addresses.
+fn here(at: SocketAddr) -> SocketAddr {
+    let address = match at.ip() {
+        IpAddr::V4(any) if any.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+        IpAddr::V6(any) if any.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
+        one => one,
+    };
+    SocketAddr::new(address, at.port())
 }
 
 /// The addresses at which others find this machine, of the family of `any`; IPv6 takes both in. Those of

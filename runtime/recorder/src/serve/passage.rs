@@ -1,8 +1,9 @@
 //! Messages of a viewer on their way to the library's server and back, within limits per viewer. The library
 //! bounds its queues by messages, not by bytes, and neither the answers to pings nor the names of parameters
-//! that a viewer wants to hear of.
+//! to whose updates a viewer subscribes.
 
 use std::collections::{HashSet, VecDeque};
+use std::future::pending;
 use std::io;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -42,7 +43,7 @@ const READ_BYTES: usize = 16 * 1024;
 /// How long a viewer may take to hear why it is disconnected.
 const REASON_WITHIN: Duration = Duration::from_secs(1);
 /// How long a viewer may neither acknowledge nor have room for what it is sent: one whose cable was
-/// pulled says no goodbye, and would keep its seat for the kernel's two hours.
+/// pulled sends no closing frame, and would keep its seat for the kernel's two hours.
 pub(super) const GONE_AFTER: Duration = Duration::from_secs(30);
 /// First byte of a message of a topic.
 const MESSAGE_DATA: u8 = 1;
@@ -60,8 +61,8 @@ pub(crate) enum Excess {
         RATE_BYTES_PER_S / 1024
     )]
     Rate,
-    /// It wants to hear of too many parameters.
-    #[error("wants to hear of more than {NAMES_MAX} parameters, or of names of more than {} KiB", NAME_BYTES_MAX / 1024)]
+    /// It subscribes to updates of too many parameters.
+    #[error("subscribes to updates of more than {NAMES_MAX} parameters, or of names of more than {} KiB", NAME_BYTES_MAX / 1024)]
     Names,
     /// It asks for more than it takes, or than the library keeps.
     #[error("asked for more answers than could be sent")]
@@ -69,12 +70,16 @@ pub(crate) enum Excess {
     /// It acknowledged nothing, or took nothing, for this long.
     #[error("took nothing for {} s", GONE_AFTER.as_secs())]
     Stalled,
+    /// The library's side ended without a closing frame.
+    #[error("was cut off: the server ended the connection")]
+    Ended,
 }
 
 impl Excess {
     fn close_frame(self) -> CloseFrame {
         let code = match self {
             Self::Message => CloseCode::Size,
+            Self::Ended => CloseCode::Error,
             _ => CloseCode::Policy,
         };
         CloseFrame {
@@ -88,8 +93,8 @@ impl Excess {
 #[derive(Debug)]
 enum Broken {
     Excess(Excess),
-    /// By the library, which keeps so many answers for a viewer and no more.
-    Refused,
+    /// By the library, and why.
+    Refused(Excess),
     /// By the viewer.
     Gone,
 }
@@ -133,7 +138,7 @@ pub(super) struct AllViewers {
 }
 
 impl AllViewers {
-    /// From now on the library says goodbye because the server ends.
+    /// From now on the library sends its closing frame because the server ends.
     pub(super) fn end(&self) {
         self.is_over.store(true, Ordering::Release);
     }
@@ -187,9 +192,12 @@ pub(super) async fn pass(
             let close = fill(from_server, &outbox).await?;
             let expected = [&is_leaving, &all.is_over];
             if expected.iter().any(|one| one.load(Ordering::Acquire)) {
-                Ok(outbox.push(Message::Close(close))?)
+                Ok(outbox.push(close.unwrap_or(Message::Close(None)))?)
             } else {
-                Err(Broken::Refused)
+                // It keeps so many answers for a viewer and no more.
+                Err(Broken::Refused(
+                    close.map_or(Excess::Ended, |_close| Excess::Answers),
+                ))
             }
         };
         let down = async { tokio::try_join!(filled, empty(&outbox, &to_viewer)).map(drop) };
@@ -201,8 +209,8 @@ pub(super) async fn pass(
     let mut to_viewer = to_viewer.into_inner();
     let kept = match done {
         Err(Broken::Excess(excess)) => Err(excess),
-        Err(Broken::Refused) if !all.is_over.load(Ordering::Acquire) => Err(Excess::Answers),
-        Ok(()) | Err(Broken::Refused | Broken::Gone) => Ok(()),
+        Err(Broken::Refused(excess)) if !all.is_over.load(Ordering::Acquire) => Err(excess),
+        Ok(()) | Err(Broken::Refused(_) | Broken::Gone) => Ok(()),
     };
     if let Err(excess) = kept {
         let close = Message::Close(Some(excess.close_frame()));
@@ -231,28 +239,28 @@ async fn hand_up(
                 if let Message::Text(text) = &message {
                     names.note(text)?;
                 }
-                to_server
-                    .send(message)
-                    .await
-                    .map_err(|_closed| Broken::Refused)?;
+                if to_server.send(message).await.is_err() {
+                    // What was read of the other way tells how the library ended it.
+                    return pending().await;
+                }
             }
         }
     }
     Ok(())
 }
 
-/// Takes all that the server says, at once, so that its queues stay empty, until it closes: at the end, or when
-/// a viewer asks for more answers at once than it keeps.
+/// Takes all that the server says, at once, so that its queues stay empty, until its closing frame, which it sends
+/// at the end, or when a viewer asks for more answers at once than it keeps; `None` when it ends without one.
 async fn fill(
     mut from_server: SplitStream<WebSocketStream<TcpStream>>,
     outbox: &Outbox<'_>,
-) -> Result<Option<CloseFrame>, Excess> {
+) -> Result<Option<Message>, Excess> {
     while let Some(Ok(message)) = from_server.next().await {
         // Copied, as a part would keep the whole of what was read at once.
         match message {
             Message::Text(text) => outbox.push(Message::text(text.as_str().to_owned()))?,
             Message::Binary(bytes) => outbox.push(Message::binary(bytes.to_vec()))?,
-            Message::Close(frame) => return Ok(frame),
+            Message::Close(_) => return Ok(Some(message)),
             Message::Ping(_) | Message::Pong(_) | Message::Frame(_) => {}
         }
     }
@@ -518,16 +526,16 @@ mod tests {
     fn one_that_does_not_take_its_answers_is_sent_away_and_others_are_not() {
         let all = AtomicUsize::new(0);
         let answer = || Message::text("x".repeat(100_000));
-        let (greedy, modest) = (Outbox::new(&all), Outbox::new(&all));
-        let kept = (0..1000).take_while(|_| greedy.push(answer()).is_ok());
+        let (first, second) = (Outbox::new(&all), Outbox::new(&all));
+        let kept = (0..1000).take_while(|_| first.push(answer()).is_ok());
         let kept = kept.count() * 100_000;
         let is_kept = (ALL_ANSWER_BYTES_MAX * 9 / 10..ALL_ANSWER_BYTES_MAX).contains(&kept);
         assert!(is_kept, "{kept}");
-        assert_eq!(greedy.push(answer()), Err(Excess::Answers));
+        assert_eq!(first.push(answer()), Err(Excess::Answers));
         for _ in 0..10 {
-            assert_eq!(modest.push(answer()), Ok(()));
+            assert_eq!(second.push(answer()), Ok(()));
         }
-        drop((greedy, modest));
+        drop((first, second));
         assert_eq!(all.load(Ordering::Relaxed), 0);
     }
 

@@ -29,7 +29,7 @@ use crate::writer::Stamp;
 const WAITING_MAX: usize = 512;
 
 /// How long a viewer may take to hear that it is over.
-const GOODBYE_WITHIN: Duration = Duration::from_secs(1);
+const CLOSED_WITHIN: Duration = Duration::from_secs(1);
 
 /// Topics of JSON, all of them offered from the beginning.
 pub(crate) const LIVE_TOPICS: [&str; 6] = [
@@ -255,11 +255,11 @@ impl Viewers {
         }
     }
 
-    /// Says goodbye to all.
+    /// Sends all of them the closing frame.
     pub(crate) fn end(self, runtime: &Handle) {
         let stopped = self.server.stop();
         // One that does not read would keep it for ever.
-        let goodbye = async { tokio::time::timeout(GOODBYE_WITHIN, stopped.wait()).await };
-        let _is_polite = runtime.block_on(goodbye).is_ok();
+        let closed = async { tokio::time::timeout(CLOSED_WITHIN, stopped.wait()).await };
+        let _is_closed = runtime.block_on(closed).is_ok();
     }
 }
