@@ -27,25 +27,33 @@ pub(crate) struct Gate(Arc<Shared>);
 #[derive(Debug)]
 struct Shared {
     address: SocketAddr,
+    /// The kernel takes the filter; Linux 6.18 does so with `CAP_NET_ADMIN` only.
+    is_shut: bool,
     /// Where connections of ours come from that may not be made yet, and since when; the oldest first.
     let_in: Mutex<VecDeque<(Instant, SocketAddrV4)>>,
 }
 
 impl Gate {
-    /// Shuts what listens in this process at `address`.
+    /// Shuts what listens in this process at `address`, where this process may; see [`Gate::is_shut`].
     ///
     /// # Errors
-    /// When nothing does, or the kernel takes no filter.
+    /// When nothing does, or the kernel takes no filter for another reason.
     pub(crate) fn shut(address: SocketAddr) -> io::Result<Self> {
-        let let_in = Mutex::default();
-        let gate = Self(Arc::new(Shared { address, let_in }));
-        match gate.0.let_in(None) {
-            Err(why) if why.kind() == io::ErrorKind::PermissionDenied => {
-                let words = "the kernel has a listener shut to other users only with CAP_NET_ADMIN";
-                Err(io::Error::new(why.kind(), format!("{why}: {words}")))
-            }
-            done => done.map(|()| gate),
+        let mut shared = Shared {
+            address,
+            is_shut: true,
+            let_in: Mutex::default(),
+        };
+        match shared.let_in(None) {
+            Err(why) if why.kind() == io::ErrorKind::PermissionDenied => shared.is_shut = false,
+            done => done?,
         }
+        Ok(Self(Arc::new(shared)))
+    }
+
+    /// False where every user of this machine can connect.
+    pub(super) fn is_shut(&self) -> bool {
+        self.0.is_shut
     }
 
     /// Connects `socket`, which must not be bound.
@@ -53,6 +61,9 @@ impl Gate {
     /// # Errors
     /// What the kernel answers.
     pub(super) async fn connect(&self, socket: TcpSocket) -> io::Result<TcpStream> {
+        if !self.is_shut() {
+            return socket.connect(self.0.address).await;
+        }
         self.0.let_in(Some(bind(&socket)?))?;
         let shared = Arc::clone(&self.0);
         tokio::spawn(async move {

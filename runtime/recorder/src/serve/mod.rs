@@ -279,6 +279,12 @@ fn open(
     let query = access.query();
     let access = Arc::clone(access);
     let gate = viewers.gate.clone();
+    if !gate.is_shut() {
+        console.warn(
+            "other users of this machine can look on without the token: this kernel lets only a process with \
+             CAP_NET_ADMIN keep them from the socket behind the check",
+        );
+    }
     let front = Front::open(runtime, listener, gate, access, page.port());
     if !options.host.is_loopback() {
         console.warn(
