@@ -43,7 +43,7 @@ pub(super) fn contradiction<'a>(
     let limit = f64::from(settings.drift_ppb) * 1e-9;
     let across = (0..contradictions.len()).find_map(|index| {
         let between = &contradictions[index];
-        // A step has long and level sides, which no line meets; a rate goes on into the next contradiction.
+        // A step has long and level sides, which no line meets; a rate lasts into the next contradiction.
         let before = index
             .checked_sub(1)
             .map_or(0, |one| *contradictions[one].start());

@@ -29,9 +29,9 @@ const ACKNOWLEDGE_PERIOD: Duration = Duration::from_millis(100);
 /// Frames after which the peer is told at once.
 const ACKNOWLEDGED_AT: u64 = 2;
 /// How long the end of a conversation waits for the peer to take what it was sent last: longer than a cut.
-const LAST_WORDS_PATIENCE: Duration = Duration::from_secs(1);
+const LAST_FRAMES_PATIENCE: Duration = Duration::from_secs(1);
 /// How long an end that leaves tries to say so.
-const FAREWELL_PATIENCE: Duration = Duration::from_millis(500);
+const LEAVING_PATIENCE: Duration = Duration::from_millis(500);
 
 /// A time without a connection, after which nothing was missing.
 #[derive(Debug, Clone)]
@@ -216,12 +216,12 @@ impl Conversation {
     }
 
     fn say_leaving(&self) {
-        let deadline = WallInstant::now() + FAREWELL_PATIENCE;
+        let deadline = WallInstant::now() + LEAVING_PATIENCE;
         // At least once, however late this thread gets its turn.
         loop {
             if let Ok(mut writer) = self.writer.try_lock() {
                 if let Some(out) = writer.as_mut() {
-                    let limited = out.stream().set_write_timeout(Some(FAREWELL_PATIENCE));
+                    let limited = out.stream().set_write_timeout(Some(LEAVING_PATIENCE));
                     let _unsaid = limited
                         .and_then(|()| write_message(out, &PeerMessage::Leaving))
                         .is_err();
@@ -237,7 +237,7 @@ impl Conversation {
 
     /// Leaves once the peer has taken what it was sent, if it does so soon.
     pub(super) fn leave_in_order(&self) {
-        drop(self.wait_until(LAST_WORDS_PATIENCE, |state| state.kept.is_empty()));
+        drop(self.wait_until(LAST_FRAMES_PATIENCE, |state| state.kept.is_empty()));
         self.leave();
     }
 

@@ -75,7 +75,7 @@ impl Gate {
     }
 }
 
-/// Binds `socket` to an address that nobody knows.
+/// Binds `socket` to a random address of this machine.
 fn bind(socket: &TcpSocket) -> io::Result<SocketAddrV4> {
     socket.bind(SocketAddr::new(hidden_address()?.into(), 0))?;
     match socket.local_addr()? {
@@ -130,7 +130,7 @@ fn program(sources: impl Iterator<Item = SocketAddrV4>) -> Vec<SockFilter> {
         .collect()
 }
 
-/// An address of this machine's own that nobody knows.
+/// A random address of this machine.
 ///
 /// # Errors
 /// When the kernel has no random numbers.
