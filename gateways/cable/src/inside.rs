@@ -13,7 +13,7 @@ use nix::mount::{MsFlags, mount};
 use nix::sched::{CloneFlags, unshare};
 use nix::unistd::{Gid, Uid, getgid, getuid};
 
-use crate::netlink::{INDEX, LOOPBACK, Netlink, PairEnd};
+use crate::netlink::{INDEX, LOOPBACK, Netlink, Network, PairEnd};
 use crate::refusal::{Refusal, Step};
 use crate::{INTERFACE, RING};
 
@@ -95,7 +95,10 @@ pub fn enter(inside: &Inside) -> Result<CableEnd, Refusal> {
         .bring_up(LOOPBACK)
         .and_then(|()| netlink.bring_up(INDEX))
         .and_then(|()| {
-            let network = (inside.address, inside.prefix_length());
+            let network = Network {
+                address: inside.address,
+                prefix_length: inside.prefix_length(),
+            };
             netlink.give_address(INDEX, inside.address, network)
         })
         .and_then(|()| match inside.address {

@@ -27,6 +27,15 @@ pub(crate) const LOOPBACK: u32 = 1;
 /// Of both ends of the cable, each in a namespace with nothing but `lo`, and what a kernel adds on its own.
 pub(crate) const INDEX: u32 = 1000;
 
+/// Addresses that have their first bits in common.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Network {
+    /// One of them.
+    pub(crate) address: IpAddr,
+    /// How many bits.
+    pub(crate) prefix_length: u8,
+}
+
 /// One interface of a pair.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PairEnd<'a> {
@@ -83,17 +92,16 @@ impl Netlink {
         self.ask(RouteNetlinkMessage::SetLink(link), 0)
     }
 
-    /// An address of an interface here, usable at once, with a route to `neighbours`: an address and the length
-    /// of its network.
+    /// An address of an interface here, usable at once, with a route to the network behind it.
     pub(crate) fn give_address(
         &self,
         index: u32,
         address: IpAddr,
-        neighbours: (IpAddr, u8),
+        behind: Network,
     ) -> io::Result<()> {
         let mut message = AddressMessage::default();
         message.header.index = index;
-        message.header.prefix_len = neighbours.1;
+        message.header.prefix_len = behind.prefix_length;
         message.header.family = match address {
             IpAddr::V4(_) => AddressFamily::Inet,
             IpAddr::V6(_) => AddressFamily::Inet6,
@@ -101,7 +109,7 @@ impl Netlink {
         message.attributes.push(AddressAttribute::Local(address));
         message
             .attributes
-            .push(AddressAttribute::Address(neighbours.0));
+            .push(AddressAttribute::Address(behind.address));
         if address.is_ipv6() {
             message
                 .attributes

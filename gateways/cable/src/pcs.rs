@@ -15,7 +15,7 @@ use nix::sched::{CloneFlags, setns};
 
 use crate::inlet::InletError;
 use crate::inside::{ENTERED, let_ping, make_namespaces, mount_own};
-use crate::netlink::{INDEX, LOOPBACK, Netlink, PairEnd};
+use crate::netlink::{INDEX, LOOPBACK, Netlink, Network, PairEnd};
 use crate::refusal::{Refusal, Step};
 
 /// A wire between two hosts.
@@ -132,10 +132,13 @@ pub fn join(pcs: &[Pc], wires: &[Wire]) -> Result<(), Refusal> {
                 [other, one] if one.host == host => (one, other),
                 _ => continue,
             };
-            let single = if far.address.is_ipv4() { 32 } else { 128 };
+            let other_end = Network {
+                address: far.address,
+                prefix_length: if far.address.is_ipv4() { 32 } else { 128 },
+            };
             netlink
                 .bring_up(index)
-                .and_then(|()| netlink.give_address(index, near.address, (far.address, single)))
+                .and_then(|()| netlink.give_address(index, near.address, other_end))
                 .map_err(refused(Step::Addresses))?;
         }
     }
