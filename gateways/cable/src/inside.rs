@@ -13,7 +13,7 @@ use nix::mount::{MsFlags, mount};
 use nix::sched::{CloneFlags, unshare};
 use nix::unistd::{Gid, Uid, getgid, getuid};
 
-use crate::netlink::{INDEX, LOOPBACK, Netlink};
+use crate::netlink::{INDEX, LOOPBACK, Netlink, Network, PairEnd};
 use crate::refusal::{Refusal, Step};
 use crate::{INTERFACE, RING};
 
@@ -71,8 +71,20 @@ pub fn enter(inside: &Inside) -> Result<CableEnd, Refusal> {
     let end = Netlink::open().map_err(refused(Step::Interfaces))?;
     unshare(CloneFlags::CLONE_NEWNET).map_err(errno(Step::Namespaces))?;
     let netlink = Netlink::open().map_err(refused(Step::Interfaces))?;
+    let program = PairEnd {
+        index: INDEX,
+        name: INTERFACE,
+        hardware_address: Some(inside.hardware_address()),
+        namespace: None,
+    };
+    let cable = PairEnd {
+        index: INDEX,
+        name: "cable",
+        hardware_address: None,
+        namespace: Some(there.as_fd()),
+    };
     netlink
-        .make_cable(inside, &there)
+        .make_pair([program, cable])
         .and_then(|()| end.bring_up(INDEX))
         .map_err(refused(Step::Interfaces))?;
     let socket = socket
@@ -82,18 +94,32 @@ pub fn enter(inside: &Inside) -> Result<CableEnd, Refusal> {
     netlink
         .bring_up(LOOPBACK)
         .and_then(|()| netlink.bring_up(INDEX))
-        .and_then(|()| netlink.give_address(inside))
+        .and_then(|()| {
+            let network = Network {
+                address: inside.address,
+                prefix_length: inside.prefix_length(),
+            };
+            netlink.give_address(INDEX, inside.address, network)
+        })
+        .and_then(|()| match inside.address {
+            IpAddr::V4(_) => netlink.route_multicast(INDEX),
+            IpAddr::V6(_) => Ok(()),
+        })
         .map_err(refused(Step::Addresses))?;
-    let gid = getgid();
-    write_if_there("net/ipv4/ping_group_range", &format!("{gid} {gid}"))
-        .map_err(refused(Step::Addresses))?;
+    let_ping().map_err(refused(Step::Addresses))?;
     mount_own()?;
     let devices = File::open("/proc/self/net/dev").map_err(refused(Step::Mounts))?;
     Ok(CableEnd { socket, devices })
 }
 
+/// Lets this user's programs send ICMP echo requests without a right.
+pub(crate) fn let_ping() -> io::Result<()> {
+    let gid = getgid();
+    write_if_there("net/ipv4/ping_group_range", &format!("{gid} {gid}"))
+}
+
 /// Network and mount namespaces, in a user namespace where the user may not make them otherwise.
-fn make_namespaces() -> Result<(), Refusal> {
+pub(crate) fn make_namespaces() -> Result<(), Refusal> {
     let (uid, gid) = (getuid(), getgid());
     let wanted = CloneFlags::CLONE_NEWNET | CloneFlags::CLONE_NEWNS;
     match unshare(wanted) {
@@ -120,7 +146,7 @@ fn write_if_there(key: &str, value: &str) -> io::Result<()> {
 }
 
 /// `/sys` of its own interfaces, and shared memory that leads past no cable.
-fn mount_own() -> Result<(), Refusal> {
+pub(crate) fn mount_own() -> Result<(), Refusal> {
     let refused = |errno: Errno| Refusal::new(Step::Mounts, errno.into());
     let nothing: Option<&str> = None;
     let privately = MsFlags::MS_REC | MsFlags::MS_PRIVATE;

@@ -11,11 +11,14 @@
 //! A helper process [`enter`]s both namespaces, [`hand_over`]s the socket of the cable's end and becomes the
 //! program; the process that started it takes the socket as an [`Inlet`]. What becomes of the frames between two
 //! inlets is for others: nothing here knows a channel, a link or a datagram.
+//!
+//! [`pcs`] are whole hosts made in the same way, with a plain pair of interfaces between each two.
 #![forbid(unsafe_code)]
 
 mod inlet;
 mod inside;
 mod netlink;
+pub mod pcs;
 mod refusal;
 
 pub use inlet::{Inlet, InletCounters, InletError};

@@ -1,10 +1,9 @@
 //! Requests to the kernel's route netlink in the network namespace of this thread, each answered before the
-//! next: the pair of interfaces, addresses, routes.
+//! next: pairs of interfaces, addresses, routes.
 
-use std::fs::File;
 use std::io;
 use std::net::IpAddr;
-use std::os::fd::AsRawFd;
+use std::os::fd::{AsRawFd, BorrowedFd};
 
 use netlink_packet_core::{
     NLM_F_ACK, NLM_F_CREATE, NLM_F_EXCL, NLM_F_REQUEST, NetlinkHeader, NetlinkMessage,
@@ -21,12 +20,32 @@ use netlink_packet_route::{AddressFamily, RouteNetlinkMessage};
 use netlink_sys::protocols::NETLINK_ROUTE;
 use netlink_sys::{Socket, SocketAddr};
 
-use crate::{INTERFACE, Inside, MTU_BYTES};
+use crate::MTU_BYTES;
 
 /// `lo` of a new namespace.
 pub(crate) const LOOPBACK: u32 = 1;
 /// Of both ends of the cable, each in a namespace with nothing but `lo`, and what a kernel adds on its own.
 pub(crate) const INDEX: u32 = 1000;
+
+/// Addresses that have their first bits in common.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Network {
+    /// One of them.
+    pub(crate) address: IpAddr,
+    /// How many bits.
+    pub(crate) prefix_length: u8,
+}
+
+/// One interface of a pair.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct PairEnd<'a> {
+    pub(crate) index: u32,
+    pub(crate) name: &'a str,
+    /// The kernel draws one where none is given.
+    pub(crate) hardware_address: Option<[u8; 6]>,
+    /// This thread's where none is given.
+    pub(crate) namespace: Option<BorrowedFd<'a>>,
+}
 
 /// A conversation with the kernel.
 #[derive(Debug)]
@@ -39,21 +58,21 @@ impl Netlink {
         Ok(Self(socket))
     }
 
-    /// The program's interface here, and the cable's end in the namespace `there`, both down.
-    pub(crate) fn make_cable(&self, inside: &Inside, there: &File) -> io::Result<()> {
-        let end = |name: &str| {
-            let mut end = LinkMessage::default();
-            end.header.index = INDEX;
-            end.attributes.push(LinkAttribute::IfName(name.to_owned()));
-            end.attributes.push(LinkAttribute::Mtu(MTU_BYTES));
-            end
-        };
-        let mut far = end("cable");
-        far.attributes
-            .push(LinkAttribute::NetNsFd(there.as_raw_fd()));
-        let mut near = end(INTERFACE);
-        near.attributes
-            .push(LinkAttribute::Address(inside.hardware_address().to_vec()));
+    /// A pair of interfaces, each in its namespace, both down.
+    pub(crate) fn make_pair(&self, ends: [PairEnd<'_>; 2]) -> io::Result<()> {
+        let [mut near, far] = ends.map(|end| {
+            let mut link = LinkMessage::default();
+            link.header.index = end.index;
+            link.attributes
+                .push(LinkAttribute::IfName(end.name.to_owned()));
+            link.attributes.push(LinkAttribute::Mtu(MTU_BYTES));
+            let hardware_address = end.hardware_address.map(|octets| octets.to_vec());
+            link.attributes
+                .extend(hardware_address.map(LinkAttribute::Address));
+            let there = end.namespace.map(|namespace| namespace.as_raw_fd());
+            link.attributes.extend(there.map(LinkAttribute::NetNsFd));
+            link
+        });
         near.attributes.push(LinkAttribute::LinkInfo(vec![
             LinkInfo::Kind(InfoKind::Veth),
             LinkInfo::Data(InfoData::Veth(InfoVeth::Peer(far))),
@@ -73,30 +92,34 @@ impl Netlink {
         self.ask(RouteNetlinkMessage::SetLink(link), 0)
     }
 
-    /// The program's address, usable at once, and for IPv4 a way for multicast.
-    pub(crate) fn give_address(&self, inside: &Inside) -> io::Result<()> {
+    /// An address of an interface here, usable at once, with a route to the network behind it.
+    pub(crate) fn give_address(
+        &self,
+        index: u32,
+        address: IpAddr,
+        behind: Network,
+    ) -> io::Result<()> {
         let mut message = AddressMessage::default();
-        message.header.index = INDEX;
-        message.header.prefix_len = inside.prefix_length();
-        message.header.family = match inside.address {
+        message.header.index = index;
+        message.header.prefix_len = behind.prefix_length;
+        message.header.family = match address {
             IpAddr::V4(_) => AddressFamily::Inet,
             IpAddr::V6(_) => AddressFamily::Inet6,
         };
+        message.attributes.push(AddressAttribute::Local(address));
         message
             .attributes
-            .push(AddressAttribute::Local(inside.address));
-        message
-            .attributes
-            .push(AddressAttribute::Address(inside.address));
-        if inside.address.is_ipv6() {
+            .push(AddressAttribute::Address(behind.address));
+        if address.is_ipv6() {
             message
                 .attributes
                 .push(AddressAttribute::Flags(AddressFlags::Nodad));
         }
-        self.ask(RouteNetlinkMessage::NewAddress(message), NLM_F_CREATE)?;
-        if inside.address.is_ipv6() {
-            return Ok(());
-        }
+        self.ask(RouteNetlinkMessage::NewAddress(message), NLM_F_CREATE)
+    }
+
+    /// A way for IPv4 multicast by an interface here.
+    pub(crate) fn route_multicast(&self, index: u32) -> io::Result<()> {
         let mut route = RouteMessage::default();
         route.header = RouteHeader {
             address_family: AddressFamily::Inet,
@@ -111,7 +134,7 @@ impl Netlink {
         route
             .attributes
             .push(RouteAttribute::Destination(multicast));
-        route.attributes.push(RouteAttribute::Oif(INDEX));
+        route.attributes.push(RouteAttribute::Oif(index));
         self.ask(RouteNetlinkMessage::NewRoute(route), NLM_F_CREATE)
     }
 

@@ -23,6 +23,8 @@ Examples:
       the whole loop on this PC, over shared memory
   hil-runtime --topology deploy/topologies/split.toml
       this host's share of the loop; start the same command on the other host
+  hil-runtime --topology deploy/topologies/split.toml --on-one-pc
+      both hosts on this PC, each with a network of its own and a virtual cable between them
   hil-runtime --topology deploy/topologies/split.toml --check
       say what is wrong with the file, start nothing
   hil-runtime join --link 'delay 5ms loss 1%' -- ./ctrl 10.77.0.2 -- ./robot
@@ -127,6 +129,10 @@ pub struct Cli {
 
 /// Arguments of a run.
 #[derive(Debug, Args)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "switches are independent of each other"
+)]
 pub struct RunArgs {
     /// The topology file (TOML).
     #[arg(long, short, value_name = "FILE")]
@@ -136,6 +142,15 @@ pub struct RunArgs {
     /// addresses.
     #[arg(long, value_name = "NAME")]
     pub host: Option<String>,
+
+    /// Run all hosts of the file on this PC, each with a network and shared memory of its own, joined by virtual
+    /// Ethernet; needs neither root nor a key.
+    #[arg(long, conflicts_with = "host")]
+    pub on_one_pc: bool,
+
+    /// The host among those of --on-one-pc that this process is; not for use by hand.
+    #[arg(long, value_name = "NAME", hide = true, conflicts_with_all = ["host", "on_one_pc"])]
+    pub on_one_pc_as: Option<String>,
 
     /// Change one value of the file, e.g. --set run.duration='"5 s"'; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -366,6 +381,16 @@ pub enum Command {
         /// Launch file written by the supervisor.
         #[arg(long)]
         launch: PathBuf,
+    },
+    /// Become the supervisor of a host of --on-one-pc; not for use by hand.
+    #[command(hide = true)]
+    BecomeHost {
+        /// Process id of what started it.
+        #[arg(long)]
+        starter: u32,
+        /// Arguments of the supervisor.
+        #[arg(last = true, required = true)]
+        arguments: Vec<String>,
     },
     /// Become a user's own program that ends with its supervisor; not for use by hand.
     #[command(hide = true)]

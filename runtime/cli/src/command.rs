@@ -22,7 +22,9 @@ use hil_teleoperation::swing::swing_bvh;
 use crate::arguments::{Cli, Command, RunArgs};
 use crate::cases;
 use hil_doctor::{Effect, Obstacle, Plan, Trouble, obstacles};
-use hil_engine::process::{own_program, worker};
+use hil_engine::process::host::{self, HostsError};
+use hil_engine::process::own_program::{self, OwnProgramError};
+use hil_engine::process::worker;
 use hil_engine::security::{KeyFileError, PreSharedKey};
 use hil_engine::supervisor::{
     self, ClaimError, Claims, DomainsError, HostTooSmall, PeerError, RunError, RunOptions,
@@ -66,7 +68,7 @@ pub(crate) fn run(registry: &Registry) -> ExitCode {
         Console::new(false).error(&format!("cannot begin: {error}"));
         return ExitCode::from(exit::INTERNAL);
     }
-    let cli: Cli = match documents::command_line() {
+    let mut cli: Cli = match documents::command_line() {
         Ok(cli) => cli,
         Err(help) => {
             let mut console = Console::new(false);
@@ -79,7 +81,7 @@ pub(crate) fn run(registry: &Registry) -> ExitCode {
     // the limit stays, which a run compares with what it needs.
     let _is_raised = open_files::raise_limit().is_ok();
     let outcome = match cli.command {
-        None => run_topology(&cli.run, registry, &mut console),
+        None => run_topology(&mut cli.run, registry, &mut console),
         Some(command) => run_command(command, registry, &mut console),
     };
     let code = outcome.unwrap_or_else(|refusal| {
@@ -142,6 +144,18 @@ fn run_command(
         } => own_program::become_program(supervisor, open_files, inside, &program)
             .map(done)
             .map_err(failed),
+        Command::BecomeHost { starter, arguments } => {
+            host::become_host(starter, &arguments)
+                .map(done)
+                .map_err(|error| match error {
+                    // Its starter was told, and says so.
+                    OwnProgramError::Cable(_) => Refusal {
+                        code: exit::FAILED,
+                        text: None,
+                    },
+                    other => failed(other),
+                })
+        }
         Command::CardGuard(args) => guard::run(&args).map(done).map_err(failed),
         Command::Join(args) => join_work::join(&args, registry, console),
         Command::Simulate {
@@ -243,7 +257,17 @@ fn loaded(
     })
 }
 
-fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> Result<u8, Refusal> {
+fn run_topology(
+    args: &mut RunArgs,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<u8, Refusal> {
+    if let Some(host) = args.on_one_pc_as.take() {
+        args.host = Some(host);
+        args.domain_root = Some(host::DOMAIN_ROOT.into());
+        args.overrides
+            .push(format!("security.key='{}'", host::KEY_FILE));
+    }
     let Some(path) = &args.topology else {
         let hint = "no topology given; try --topology deploy/topologies/local.toml or --help";
         return Err(usage(hint));
@@ -257,8 +281,21 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
     if args.check && topology.processes().is_empty() {
         return show_study(path, &topology, args, registry, console);
     }
-    let command_line = env::args().collect();
+    let command_line = host::as_typed(env::args());
+    if args.on_one_pc && !args.check {
+        return on_one_pc(path, &topology, console);
+    }
     carry_out(path, args, &topology, command_line, registry, console)
+}
+
+/// Runs all hosts of `topology` here, each under a supervisor of its own.
+fn on_one_pc(path: &Path, topology: &Topology, console: &mut Console) -> Result<u8, Refusal> {
+    host::run_all(topology, console).map_err(|error| match error {
+        HostsError::WithoutAddress | HostsError::OneInterface { .. } => {
+            usage(format!("{}: {error}", path.display()))
+        }
+        other => Refusal::new(exit::HOST_UNFIT, other),
+    })
 }
 
 /// Runs `topology`, or checks whether it could, and prints its report; `command_line` repeats the run.

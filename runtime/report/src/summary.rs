@@ -11,7 +11,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use hil_account::flow::FlowMetrics;
+use hil_account::flow::{DeadlineMetrics, FlowMetrics};
 use hil_account::{ChannelAccount, MessageFate, OutageMetrics};
 use hil_core::case_study::{Metric, Score};
 use hil_core::link_model::ReplayCounts;
@@ -74,6 +74,9 @@ pub struct RunSummary {
     /// The channels of Ethernet frames by flow.
     #[serde(default)]
     pub flows: Vec<ChannelFlows>,
+    /// How the requests of flows with a deadline were answered.
+    #[serde(default)]
+    pub deadlines: Vec<DeadlineMetrics>,
     /// The gateway threads that carried them; empty where none crossed a link.
     #[serde(default)]
     pub directions: Vec<DirectionSummary>,
@@ -122,6 +125,7 @@ impl RunSummary {
             link_changes: Vec::new(),
             channels: Vec::new(),
             flows: Vec::new(),
+            deadlines: Vec::new(),
             directions: Vec::new(),
             faces: Vec::new(),
             hardware_stamps: None,

@@ -7,6 +7,7 @@ use super::check_frames;
 use super::checks::Checks;
 use super::clock_path;
 use super::errors::Fault;
+use super::flows::{self, Flow};
 use super::known::{KnownCase, KnownCases, ParameterFault};
 use super::model::{Case, Host, OnExit, Process, Program, Topology};
 use super::tables::{CaseTable, File, ProcessTable};
@@ -56,6 +57,9 @@ pub(super) fn check(file: File, known: &KnownCases, needs: Needs, checks: &Check
         processes,
         channels: Vec::new(),
         links: Vec::new(),
+        flows: (file.flows.0.into_iter())
+            .map(|(name, flow)| Flow { name, ..flow })
+            .collect(),
         security: file.security.resolve(),
     };
     let links = check_channels::routes(&file.links.0, checks);
@@ -63,6 +67,7 @@ pub(super) fn check(file: File, known: &KnownCases, needs: Needs, checks: &Check
     if known_case.is_some() || file.case.is_none() {
         check_channels::check(&mut topology, known_case, &file.channels.0, links, checks);
         check_frames::check(&topology, checks);
+        flows::check(&topology, checks);
     }
     clock_path::check(&topology, checks);
     topology

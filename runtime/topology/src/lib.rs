@@ -24,6 +24,7 @@ pub mod documents;
 pub mod emulation;
 pub mod emulation_room;
 mod errors;
+mod flows;
 mod host;
 mod known;
 mod layers;

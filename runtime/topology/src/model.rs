@@ -15,6 +15,7 @@ use hil_link::spec::{LinkSpec, Way};
 
 use super::adapter::EgmAdapter;
 use super::clock_path::ClockEnd;
+use super::flows::Flow;
 use super::links::{Hop, Link};
 use super::security::Security;
 use super::tables::{FOLDER, HOST_ADDRESS, INTERFACE, NAME};
@@ -30,6 +31,7 @@ pub struct Topology {
     pub(super) processes: Vec<Process>,
     pub(super) channels: Vec<Channel>,
     pub(super) links: Vec<Link>,
+    pub(super) flows: Vec<Flow>,
     pub(super) security: Security,
 }
 

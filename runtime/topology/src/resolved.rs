@@ -53,6 +53,9 @@ impl Topology {
         let links = self.links.iter();
         let links = links.map(|link| (link.name.clone(), link.resolved()));
         put_named(&mut table, "links", links);
+        let flows = self.flows.iter();
+        let flows = flows.map(|flow| (flow.name.clone(), written(&mut flow.clone())));
+        put_named(&mut table, "flows", flows);
         if self.security.hops.is_some() {
             let mut security = written(&mut self.security.clone());
             if !key_path {

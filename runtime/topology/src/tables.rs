@@ -9,6 +9,7 @@ use hil_core::options;
 use hil_core::options::{Free, Named, TextRule};
 
 use crate::adapter::EgmAdapter;
+use crate::flows::Flow;
 use crate::links::LinkTable;
 use crate::model::{Execution, Host, MessageLayout, Restarts, Run};
 use crate::security::Security;
@@ -156,6 +157,8 @@ options! {
         channels: Named<ChannelTable>, in true;
         /// The links, by name.
         links: Named<LinkTable>, in false;
+        /// Flows of frames that have a name.
+        flows: Named<Flow>, in false;
         /// Whether the hops of the run are sealed, and with which key.
         security: Security;
     }

@@ -21,6 +21,7 @@ mod joined_hosts;
 mod kills;
 mod limits;
 mod many_channels;
+mod one_pc;
 mod probe_run;
 mod secured_run;
 mod soak;

@@ -42,6 +42,8 @@ pub(super) fn join(
     let run = RunArgs {
         topology: None,
         host: None,
+        on_one_pc: false,
+        on_one_pc_as: None,
         overrides: Vec::new(),
         check: false,
         quiet: args.quiet,

@@ -6,15 +6,15 @@ mod inward;
 mod outward;
 mod program;
 
-use std::env;
 use std::net::IpAddr;
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 
 use hil_cable::Inlet;
 use hil_core::record::{FrameRecord, PublishedRecord, TakenRecord};
 use hil_net::handover;
+use hil_platform::own_process;
 use hil_platform::signals::Signals;
 use hil_rundir::launch::{CableWork, WorkerLaunch};
 use hil_rundir::pipe::Orders;
@@ -122,7 +122,7 @@ fn start(work: &CableWork) -> Result<(Child, Inlet), WorkerError> {
         .as_fd()
         .try_clone_to_owned()
         .map_err(failed)?;
-    let mut helper = Command::new(env::current_exe().map_err(failed)?);
+    let mut helper = own_process::again();
     helper.args(["become", "--supervisor", &std::process::id().to_string()]);
     let inside: IpAddr = work.inside;
     helper.args(["--inside", &inside.to_string()]);

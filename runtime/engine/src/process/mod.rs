@@ -3,6 +3,7 @@
 
 mod component;
 pub(crate) mod heartbeat;
+pub mod host;
 pub mod own_program;
 pub(crate) mod recording;
 pub mod worker;

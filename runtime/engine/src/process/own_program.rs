@@ -16,6 +16,8 @@ use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
 use nix::unistd::{AccessFlags, access, dup2_stdin};
 
+use crate::security::KeyFileError;
+
 /// Why the own program could not be started.
 #[derive(Debug, thiserror::Error)]
 pub enum OwnProgramError {
@@ -41,6 +43,9 @@ pub enum OwnProgramError {
     /// It cannot have a network namespace of its own.
     #[error(transparent)]
     Cable(#[from] Refusal),
+    /// The key of a host cannot be put where it looks for it.
+    #[error(transparent)]
+    Key(#[from] KeyFileError),
     /// The program cannot be executed.
     #[error("cannot execute {program}: {source}")]
     Execute {
@@ -65,7 +70,7 @@ pub fn become_program(
     program: &[String],
 ) -> Result<(), OwnProgramError> {
     let name = program.first().cloned().unwrap_or_default();
-    bind_to(supervisor, &name)?;
+    bind_to(supervisor, &name, Signal::SIGKILL)?;
     let restored =
         open_files::withhold().and_then(|()| open_files.map_or(Ok(()), open_files::set_limit));
     restored.map_err(|source| OwnProgramError::Descriptors {
@@ -75,7 +80,7 @@ pub fn become_program(
     if let Some(address) = inside {
         take_cable(Inside { address }, &name)?;
         // A change of identity may have unbound it.
-        bind_to(supervisor, &name)?;
+        bind_to(supervisor, &name, Signal::SIGKILL)?;
     }
     let source = Command::new(&name).args(&program[1..]).exec();
     Err(OwnProgramError::Execute {
@@ -84,9 +89,13 @@ pub fn become_program(
     })
 }
 
-/// Lets the kernel kill this process when the one that started it ends.
-fn bind_to(supervisor: u32, program: &str) -> Result<(), OwnProgramError> {
-    set_pdeathsig(Signal::SIGKILL).map_err(|errno| OwnProgramError::Bind {
+/// Lets the kernel send this process a signal when the one that started it ends.
+pub(super) fn bind_to(
+    supervisor: u32,
+    program: &str,
+    signal: Signal,
+) -> Result<(), OwnProgramError> {
+    set_pdeathsig(signal).map_err(|errno| OwnProgramError::Bind {
         program: program.to_owned(),
         source: errno.into(),
     })?;

@@ -173,6 +173,35 @@ impl PreSharedKey {
     /// # Errors
     /// When there is a file already, or it cannot be written.
     pub fn create(path: &Path) -> Result<Self, KeyFileError> {
+        let key = Self::random().map_err(|source| KeyFileError::Io {
+            path: path.to_owned(),
+            source,
+        })?;
+        key.write(path)?;
+        Ok(key)
+    }
+
+    /// A new key.
+    ///
+    /// # Errors
+    /// When the kernel gives no random bytes.
+    pub(crate) fn random() -> io::Result<Self> {
+        let mut bytes = random_bytes::<KEY_BYTES>()?;
+        let key = Self(Zeroizing::new(bytes));
+        bytes.zeroize();
+        Ok(key)
+    }
+
+    /// The key of these bytes, unless their number is not that of a key.
+    pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
+        Some(Self(Zeroizing::new(bytes.try_into().ok()?)))
+    }
+
+    /// Makes the file `path` with this key, for its owner alone.
+    ///
+    /// # Errors
+    /// When there is a file already, or it cannot be written.
+    pub(crate) fn write(&self, path: &Path) -> Result<(), KeyFileError> {
         let failed = |source: io::Error| match source.kind() {
             io::ErrorKind::AlreadyExists => KeyFileError::Exists {
                 path: path.to_owned(),
@@ -190,18 +219,14 @@ impl PreSharedKey {
                 source,
             },
         };
-        let mut bytes = random_bytes::<KEY_BYTES>().map_err(failed)?;
-        let key = Self(Zeroizing::new(bytes));
-        bytes.zeroize();
         let mut options = OpenOptions::new();
         options.write(true).create_new(true).mode(0o600);
         let mut file = options.open(path).map_err(failed)?;
-        let encoded = Zeroizing::new(STANDARD.encode(*key.0));
+        let encoded = Zeroizing::new(STANDARD.encode(*self.0));
         let line = Zeroizing::new(format!("{PREFIX}{}\n", &*encoded));
         file.write_all(line.as_bytes())
             .and_then(|()| file.sync_all())
-            .map_err(failed)?;
-        Ok(key)
+            .map_err(failed)
     }
 
     /// A short name of the key that tells nothing of it: equal on hosts that have the same one.

@@ -169,6 +169,14 @@ impl Child {
         Self::foreign(command, true)
     }
 
+    /// Starts a command in the group that it was given, with the outputs that it was given.
+    ///
+    /// # Errors
+    /// When the program cannot be started.
+    pub(crate) fn spawn_apart(command: &mut Command) -> io::Result<Self> {
+        Self::foreign(command, false)
+    }
+
     fn foreign(command: &mut Command, shares_group: bool) -> io::Result<Self> {
         let (process, pidfd) = started(command)?;
         Ok(Self {

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use hil_account::flow::{FlowFold, FlowMetrics};
+use hil_account::flow::{FlowFold, FlowMetrics, FlowPassages, NamedFlow};
 use hil_account::radio::{RadioFold, RadioMetrics};
 use hil_account::{AccountFold, ChannelAccount, Outage, OutageFinder, RecordsAtHand, each_history};
 use hil_core::record::IngressRecord;
@@ -178,11 +178,17 @@ pub(super) struct ChannelReading {
     pub(super) acknowledgements: Option<RadioMetrics>,
     /// Of a channel of frames.
     pub(super) flows: Vec<FlowMetrics>,
+    /// Its frames that deadlines are about.
+    pub(super) passages: FlowPassages,
 }
 
 impl ChannelReading {
     /// Reads the messages of `channel`; `None` when it leaves none, or only for the record.
-    pub(super) fn of(records: &RunRecords<'_>, channel: &Channel) -> Option<Self> {
+    pub(super) fn of(
+        records: &RunRecords<'_>,
+        channel: &Channel,
+        named: &[NamedFlow],
+    ) -> Option<Self> {
         if channel.is_recorded_only() || !records.has(&channel.name) {
             return None;
         }
@@ -191,7 +197,7 @@ impl ChannelReading {
             let mut account = AccountFold::new(at_hand, context);
             let mut outages = OutageFinder::default();
             let mut radio = RadioFold::new(at_hand);
-            let mut flows = FlowFold::default();
+            let mut flows = FlowFold::new(named);
             let frames = records.of_kind(&channel.name, |files| files.frame.as_ref());
             frames.for_each(|frame| flows.add_frame(&frame));
             each_history(files, context, |message| {
@@ -200,11 +206,13 @@ impl ChannelReading {
                 radio.add(message);
                 flows.add(message, context.path);
             });
+            let (flows, passages) = flows.finish();
             Self {
                 account: account.finish(),
                 outages: outages.finish(),
                 acknowledgements: radio.finish(),
-                flows: flows.finish(),
+                flows,
+                passages,
             }
         }))
     }

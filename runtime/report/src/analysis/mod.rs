@@ -26,7 +26,7 @@ use std::path::{Path, PathBuf};
 use std::{fs, io};
 
 use hil_account::MessageFate;
-use hil_account::flow::FlowMetrics;
+use hil_account::flow::{DeadlineFold, DeadlineMetrics, FlowMetrics, FlowPassages, NamedFlow};
 use hil_account::radio::RadioMetrics;
 use hil_core::case_study::Score;
 use hil_core::plot::PlotSeries;
@@ -163,6 +163,7 @@ pub fn conclude(
         .collect();
     let found = read_channels(&mut summary, &records, &axis);
     summary.flows = found.flows;
+    summary.deadlines = found.deadlines;
     summary.directions = metrics::directions(result);
     doubt_losses(&mut summary);
     let mut unwritten_files = capture::write(&mut summary, &records);
@@ -237,6 +238,8 @@ struct MessageFindings {
     acknowledgements: BTreeMap<String, RadioMetrics>,
     /// Of the channels of frames.
     flows: Vec<ChannelFlows>,
+    /// Of the flows that have one.
+    deadlines: Vec<DeadlineMetrics>,
 }
 
 /// Reads the messages of every channel and puts its account and its outages into the summary.
@@ -249,14 +252,20 @@ fn read_channels(
         outages: Vec::new(),
         acknowledgements: BTreeMap::new(),
         flows: Vec::new(),
+        deadlines: Vec::new(),
     };
+    let named = records.topology.named_flows();
+    let mut passages = FlowPassages::new();
     for (summary, channel) in summary.channels.iter_mut().zip(records.topology.channels()) {
-        let Some(reading) = ChannelReading::of(records, channel) else {
+        let Some(reading) = ChannelReading::of(records, channel, &named) else {
             continue;
         };
         let unknown = MessageFate::UnknownPeerRecordsUnavailable;
         let is_partial = reading.account.fates.of(unknown) > 0;
         summary.account = Some(reading.account);
+        for (key, frames) in reading.passages {
+            passages.entry(key).or_default().extend(frames);
+        }
         if channel.carries_frames() {
             found.flows.push(ChannelFlows {
                 channel: channel.name.clone(),
@@ -272,7 +281,23 @@ fn read_channels(
             .acknowledgements
             .extend(radio.map(|radio| (channel.name.clone(), radio)));
     }
+    found.deadlines = deadlines(&named, &passages);
     found
+}
+
+/// How the requests of the flows with a deadline were answered.
+fn deadlines(named: &[NamedFlow], passages: &FlowPassages) -> Vec<DeadlineMetrics> {
+    let timed = named.iter().filter_map(|one| Some((one, one.deadline_ns?)));
+    timed
+        .map(|(flow, limit_ns)| {
+            let mut fold = DeadlineFold::new(&flow.name, limit_ns);
+            for (key, requests) in passages.iter().filter(|(key, _)| flow.filter.takes(key)) {
+                let back = key.reversed().and_then(|back| passages.get(&back));
+                fold.add(requests, back.map_or(&[], Vec::as_slice));
+            }
+            fold.finish()
+        })
+        .collect()
 }
 
 /// Where the receiving host had no room for some datagrams, it is unknown which frames these were.
@@ -288,6 +313,11 @@ fn doubt_losses(summary: &mut RunSummary) {
             .and_then(|channel| channel.emulation.as_ref()?.overflow_count);
         if had_no_room || emulation.unwrap_or(0) > 0 {
             one.flows.iter_mut().for_each(FlowMetrics::doubt_network);
+            // Of whichever way they are, an answer or its request may have been among these.
+            summary
+                .deadlines
+                .iter_mut()
+                .for_each(DeadlineMetrics::doubt_network);
         }
     }
 }

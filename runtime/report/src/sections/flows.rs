@@ -3,6 +3,7 @@
 use hil_account::flow::FlowMetrics;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
+use hil_present::units::duration_s;
 use hil_present::{Cell, Row, Section, Table, Tone};
 
 use crate::summary::{ChannelFlows, RunSummary};
@@ -18,9 +19,21 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
     }
     flows.sort_by_key(|flow| core::cmp::Reverse(flow.frame_count));
     let columns = [
-        "flow", "frames", "network", "either", "harness", "unknown", "p50", "p99", "max",
+        "flow",
+        "frames",
+        "network",
+        "either",
+        "harness",
+        "unknown",
+        "reordered",
+        "sent again",
+        "p50",
+        "p99",
+        "max",
     ];
     let mut table = Table::new("", &columns)
+        .ranked("sent again", 4)
+        .ranked("reordered", 3)
         .ranked("unknown", 2)
         .ranked("max", 1)
         .with_long_names();
@@ -33,6 +46,8 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
             Cell::Count(flow.lost_by_either_count),
             Cell::Count(flow.lost_by_harness_count),
             Cell::Count(flow.unknown_count),
+            Cell::Count(flow.reordered_count),
+            Cell::count(flow.retransmitted_count),
             Cell::duration(delay.map(|one| one.p50_ns)),
             Cell::duration(delay.map(|one| one.p99_ns)),
             Cell::duration(delay.map(|one| one.max_ns)),
@@ -69,6 +84,69 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
         ),
     );
     section
+}
+
+/// How the requests of flows with a deadline were answered.
+pub(crate) fn deadlines(summary: &RunSummary) -> Section {
+    let aside =
+        "from sending a request until the first frame that was sent back after it came was given";
+    let mut section = Section::new("deadlines", "Deadlines", aside);
+    if summary.deadlines.is_empty() {
+        return section;
+    }
+    let columns = [
+        "requests", "count", "in time", "late", "missing", "unknown", "p50", "p99", "max",
+    ];
+    let mut table = Table::new("", &columns)
+        .ranked("p50", 1)
+        .ranked("unknown", 2)
+        .with_long_names();
+    for one in &summary.deadlines {
+        let response = one.response.measured();
+        let limit = duration_s(one.limit_ns as f64 * 1e-9);
+        let late = [
+            ("network", one.late_by_network_count),
+            ("program", one.late_by_program_count),
+            ("both", one.late_by_both_count),
+        ];
+        let missing = [
+            ("network", one.missing_by_network_count),
+            ("program", one.missing_by_program_count),
+            ("harness", one.missing_by_harness_count),
+        ];
+        let cells = [
+            format!("{} within {limit}", one.name).into(),
+            Cell::Count(one.request_count),
+            Cell::Count(one.in_time_count),
+            by_cause(late).into(),
+            by_cause(missing).into(),
+            Cell::Count(one.unknown_count),
+            Cell::duration(response.map(|one| one.p50_ns)),
+            Cell::duration(response.map(|one| one.p99_ns)),
+            Cell::duration(response.map(|one| one.max_ns)),
+        ];
+        let is_hurt = one.in_time_count + one.unknown_count < one.request_count;
+        table.rows.push(Row {
+            cells: cells.into(),
+            tone: if is_hurt { Tone::Caution } else { Tone::Plain },
+            bar: None,
+        });
+    }
+    section.table(table);
+    section
+}
+
+/// `3 network, 1 program`.
+fn by_cause(counts: [(&str, u64); 3]) -> String {
+    let counts = counts.iter().filter(|(_, count)| *count > 0);
+    let words: Vec<String> = counts
+        .map(|(cause, count)| format!("{} {cause}", grouped(*count)))
+        .collect();
+    if words.is_empty() {
+        "0".to_owned()
+    } else {
+        words.join(", ")
+    }
 }
 
 #[cfg(test)]

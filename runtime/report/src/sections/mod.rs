@@ -15,7 +15,7 @@ mod timeline;
 
 pub(crate) use channel::Sources;
 pub use channel::quantile_table;
-pub(crate) use flows::flows;
+pub(crate) use flows::{deadlines, flows};
 pub(crate) use run::{outcome_words, repeat};
 pub(crate) use timeline::strips;
 
@@ -52,6 +52,7 @@ pub(crate) fn of_run(summary: &RunSummary, assessment: &Assessment) -> Vec<Secti
         sections.push(events::network(report));
     }
     sections.push(flows(summary, FLOWS_SHOWN));
+    sections.push(deadlines(summary));
     sections.push(channel::channels(summary));
     sections.push(run::links(&summary.directions));
     sections.push(adapter::adapters(&summary.faces));

@@ -19,7 +19,7 @@ use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
 use crate::sections::events::{cause, gravest_first, severity_counts, severity_tone};
-use crate::sections::{flows, outcome_words, strips};
+use crate::sections::{deadlines, flows, outcome_words, strips};
 use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
 
@@ -55,6 +55,7 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
             CHANNELS_SHOWN - summary.run.links.len().min(LINKS_SHOWN + 1),
         ),
         flows(summary, FLOWS_SHOWN),
+        deadlines(summary),
         over_time(summary),
     ] {
         section(&mut canvas, &one);

@@ -1,18 +1,26 @@
 //! The frames of a channel by flow: which program spoke with which, counted, lost and delayed. A flow is what the
 //! head of a frame says: addresses and ports of TCP and UDP, addresses of any other protocol over IP, and the
-//! protocol of anything else. It appears by itself, one way at a time. Frames are not put together.
+//! protocol of anything else. It appears by itself, one way at a time; a filter gives several of them a name.
+//! Frames are not put together.
+
+mod deadline;
+mod filter;
+
+pub use deadline::{DeadlineFold, DeadlineMetrics, FrameEnd, FramePassage};
+pub use filter::{FilterError, FlowFilter};
 
 use core::fmt;
 use core::net::IpAddr;
 use std::collections::BTreeMap;
 
-use hil_core::record::FrameRecord;
+use hil_core::record::{FrameRecord, stamp};
 use hil_stats::histogram::Distribution;
+use hil_stats::reordering::reordered;
 use serde::{Deserialize, Serialize};
 
-use super::ChannelPath;
-use super::history::MessageHistory;
-use super::stage::MessageFate;
+use crate::ChannelPath;
+use crate::history::MessageHistory;
+use crate::stage::MessageFate;
 
 /// Flows of a channel that are told apart; what comes later is one.
 pub const FLOWS_MAX: usize = 10_000;
@@ -46,6 +54,17 @@ pub enum FlowKey {
     Rest,
 }
 
+/// A flow that has a name.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NamedFlow {
+    /// It.
+    pub name: String,
+    /// Which frames it has.
+    pub filter: FlowFilter,
+    /// Within what time of each an answer must come back, nanoseconds.
+    pub deadline_ns: Option<i64>,
+}
+
 impl FlowKey {
     /// Of a frame.
     pub fn of(record: &FrameRecord) -> Self {
@@ -53,22 +72,64 @@ impl FlowKey {
         Self::read(head.unwrap_or(&record.head)).unwrap_or(Self::TooShort)
     }
 
-    fn read(frame: &[u8]) -> Option<Self> {
-        let mut at = 12;
-        let mut kind = u16_at(frame, at)?;
-        for _ in 0..TAGS_MAX {
-            if matches!(kind, 0x8100 | 0x88a8 | 0x9100) {
-                at += 4;
-                kind = u16_at(frame, at)?;
-            }
+    /// Of the frames that go back; `None` where these have no ends.
+    pub fn reversed(self) -> Option<Self> {
+        match self {
+            Self::Ip {
+                protocol,
+                source,
+                destination,
+                ports,
+            } => Some(Self::Ip {
+                protocol,
+                source: destination,
+                destination: source,
+                ports: ports.map(|[from, to]| [to, from]),
+            }),
+            Self::Other(_) | Self::TooShort | Self::Rest => None,
         }
-        let packet = frame.get(at + 2..)?;
+    }
+
+    fn read(frame: &[u8]) -> Option<Self> {
+        let (kind, packet) = packet_of(frame)?;
         match kind {
             0x0800 => ipv4(packet),
             0x86dd => ipv6(packet),
             _ => Some(Self::Other(kind)),
         }
     }
+}
+
+/// Type and content of a frame behind its tags.
+fn packet_of(frame: &[u8]) -> Option<(u16, &[u8])> {
+    let mut at = 12;
+    let mut kind = u16_at(frame, at)?;
+    for _ in 0..TAGS_MAX {
+        if matches!(kind, 0x8100 | 0x88a8 | 0x9100) {
+            at += 4;
+            kind = u16_at(frame, at)?;
+        }
+    }
+    Some((kind, frame.get(at + 2..)?))
+}
+
+/// What a TCP segment brings: from which number of the stream, how many bytes (RFC 9293, section 3.1). `None` of
+/// anything else, and behind options of IPv6.
+fn tcp_bytes(frame: &[u8]) -> Option<(u32, u32)> {
+    let (kind, packet) = packet_of(frame)?;
+    let (header_bytes, packet_bytes) = match (kind, packet.first()? >> 4) {
+        (0x0800, 4) if packet.get(9) == Some(&TCP) => (
+            usize::from(packet[0] & 0x0f) * 4,
+            usize::from(u16_at(packet, 2)?),
+        ),
+        (0x86dd, 6) if packet.get(6) == Some(&TCP) => (40, 40 + usize::from(u16_at(packet, 4)?)),
+        _ => return None,
+    };
+    let segment = packet.get(header_bytes..)?;
+    let number = u32::from_be_bytes(array_at(segment, 4)?);
+    let data_at = header_bytes + usize::from(*segment.get(12)? >> 4) * 4;
+    let length = u32::try_from(packet_bytes.checked_sub(data_at)?).ok()?;
+    Some((number, length))
 }
 
 fn u16_at(bytes: &[u8], at: usize) -> Option<u16> {
@@ -176,8 +237,15 @@ pub struct FlowMetrics {
     pub lost_by_harness_count: u64,
     /// Frames whose fate is unknown, those under way at the end included.
     pub unknown_count: u64,
-    /// Frames that came after a later one of the channel.
+    /// Frames that came after a later one of the flow (RFC 4737, section 3.3).
     pub reordered_count: u64,
+    /// Largest extent of these: the places that a buffer needs to restore the order (section 4.2).
+    #[serde(default)]
+    pub reordered_extent_max: u64,
+    /// Of TCP: frames with bytes of the stream that one before had brought, so that the program's kernel sent them
+    /// again.
+    #[serde(default)]
+    pub retransmitted_count: Option<u64>,
     /// From leaving the program's interface until the other's was given it.
     pub delay: Distribution,
 }
@@ -189,21 +257,40 @@ impl FlowMetrics {
     }
 }
 
-/// Sums frames up by flow. Memory grows by twelve bytes a frame.
+/// Sums frames up by flow. Memory grows by twenty bytes a frame, and by thirty of flows with a deadline.
 #[derive(Debug, Default)]
-pub struct FlowFold {
+pub struct FlowFold<'a> {
+    named: &'a [NamedFlow],
     indices: BTreeMap<FlowKey, u32>,
-    /// The flow of each frame, by the start of its inlet and its number.
+    keyed: Vec<Keyed>,
+    /// The key of each frame, by the start of its inlet and its number.
     frames: BTreeMap<u32, Vec<u32>>,
     flows: Vec<Flow>,
 }
 
+/// The frames of flows with a deadline and of those that go back.
+pub type FlowPassages = BTreeMap<FlowKey, Vec<FramePassage>>;
+
+/// Frames of one key.
+#[derive(Debug)]
+struct Keyed {
+    key: FlowKey,
+    /// Their flow; one with a name may have several keys.
+    flow: usize,
+    /// Where a deadline is about them.
+    passages: Option<Vec<FramePassage>>,
+    /// Of a TCP stream: the number after the last byte that was sent.
+    next_byte: Option<u32>,
+}
+
 #[derive(Debug, Default)]
 struct Flow {
-    key: Option<FlowKey>,
+    name: String,
     counts: [u64; 4],
     byte_count: u64,
-    reordered_count: u64,
+    retransmitted_count: Option<u64>,
+    /// When its frames came to the receiving gateway, in the order in which they were sent.
+    arrivals_ns: Vec<i64>,
     delays_ns: Vec<i64>,
 }
 
@@ -230,7 +317,15 @@ const fn place_of(fate: MessageFate) -> usize {
     }
 }
 
-impl FlowFold {
+impl<'a> FlowFold<'a> {
+    /// Of a channel; the first of `named` that takes a frame gives its flow the name.
+    pub fn new(named: &'a [NamedFlow]) -> Self {
+        Self {
+            named,
+            ..Self::default()
+        }
+    }
+
     /// Takes what is known of a frame itself; before [`FlowFold::add`] of its message.
     pub fn add_frame(&mut self, record: &FrameRecord) {
         let index = self.index_of(FlowKey::of(record));
@@ -243,29 +338,61 @@ impl FlowFold {
             frames.resize(sequence + 1, UNKNOWN);
         }
         frames[sequence] = index;
-        self.flow(index).byte_count += u64::from(record.length_bytes);
+        let keyed = &mut self.keyed[index as usize];
+        let flow = &mut self.flows[keyed.flow];
+        flow.byte_count += u64::from(record.length_bytes);
+        let head = record.head.get(..usize::from(record.head_bytes));
+        if let Some((number, length)) = head.and_then(tcp_bytes) {
+            let count = flow.retransmitted_count.get_or_insert(0);
+            // Numbers come round.
+            let is_before = |next: u32| number.wrapping_sub(next).cast_signed() < 0;
+            if length > 0 && keyed.next_byte.is_some_and(is_before) {
+                *count += 1;
+            } else if length > 0 {
+                keyed.next_byte = Some(number.wrapping_add(length));
+            }
+        }
     }
 
     fn index_of(&mut self, key: FlowKey) -> u32 {
-        let is_known = self.indices.contains_key(&key);
-        let key = if is_known || self.indices.len() < FLOWS_MAX {
+        if let Some(index) = self.indices.get(&key) {
+            return *index;
+        }
+        let key = if self.indices.len() < FLOWS_MAX {
             key
         } else {
             FlowKey::Rest
         };
-        let next = u32::try_from(self.flows.len()).unwrap_or(UNKNOWN);
+        let next = u32::try_from(self.keyed.len()).unwrap_or(UNKNOWN);
         let index = *self.indices.entry(key).or_insert(next);
         if index == next {
-            self.flows.push(Flow {
-                key: Some(key),
-                ..Flow::default()
+            let named = self.named.iter().find(|one| one.filter.takes(&key));
+            let name = named.map_or_else(|| key.to_string(), |one| one.name.clone());
+            let known = named.and(self.flows.iter().position(|flow| flow.name == name));
+            let flow = known.unwrap_or_else(|| {
+                self.flows.push(Flow {
+                    name,
+                    ..Flow::default()
+                });
+                self.flows.len() - 1
+            });
+            self.keyed.push(Keyed {
+                key,
+                flow,
+                passages: self.is_timed(key).then(Vec::new),
+                next_byte: None,
             });
         }
         index
     }
 
-    fn flow(&mut self, index: u32) -> &mut Flow {
-        &mut self.flows[index as usize]
+    /// Whether a deadline is about frames of `key`, or about those that they may answer.
+    fn is_timed(&self, key: FlowKey) -> bool {
+        let mut timed = self.named.iter().filter(|one| one.deadline_ns.is_some());
+        timed.any(|one| {
+            let back = key.reversed();
+            one.filter.takes(&key) || back.is_some_and(|back| one.filter.takes(&back))
+        })
     }
 
     /// Takes the fate of a frame; one without a record is of no flow.
@@ -277,16 +404,29 @@ impl FlowFold {
         let Some(index) = index.filter(|index| *index != UNKNOWN) else {
             return;
         };
-        let flow = self.flow(index);
-        flow.counts[place_of(message.fate)] += 1;
-        flow.reordered_count += u64::from(message.is_overtaken());
+        let place = place_of(message.fate);
+        let keyed = &mut self.keyed[index as usize];
+        if let (Some(passages), Some(sent_ns)) = (&mut keyed.passages, message.published_ns()) {
+            let given_ns = message.taken.and_then(|record| stamp(record.taken_ns));
+            let end = match (place, given_ns) {
+                (TAKEN, Some(given_ns)) => FrameEnd::Given(given_ns),
+                (BY_NETWORK, _) => FrameEnd::LostByNetwork,
+                (BY_HARNESS, _) => FrameEnd::LostByHarness,
+                _ => FrameEnd::Unknown,
+            };
+            passages.push(FramePassage { sent_ns, end });
+        }
+        let flow = &mut self.flows[keyed.flow];
+        flow.counts[place] += 1;
+        flow.arrivals_ns
+            .extend(message.arrived().map(|record| record.received_ns));
         let delay = message.delay_ns(path);
         flow.delays_ns
             .extend(delay.map(|(delay_ns, _bound_ns)| delay_ns));
     }
 
-    /// The flows, those of most frames first.
-    pub fn finish(self) -> Vec<FlowMetrics> {
+    /// The flows, those of most frames first, and the frames of those that deadlines are about.
+    pub fn finish(self) -> (Vec<FlowMetrics>, FlowPassages) {
         let metrics = |flow: Flow| {
             let [taken, by_network, by_harness, unknown] = flow.counts;
             let reason = if taken == 0 {
@@ -294,8 +434,11 @@ impl FlowFold {
             } else {
                 "the clocks of the hosts are not aligned"
             };
+            let mut arrivals: Vec<(i64, u64)> = flow.arrivals_ns.into_iter().zip(0..).collect();
+            arrivals.sort_unstable();
+            let (reordered, _) = reordered(arrivals.into_iter().map(|(_, number)| number));
             FlowMetrics {
-                name: flow.key.unwrap_or(FlowKey::Rest).to_string(),
+                name: flow.name,
                 frame_count: flow.counts.iter().sum(),
                 byte_count: flow.byte_count,
                 taken_count: taken,
@@ -303,7 +446,9 @@ impl FlowFold {
                 lost_by_either_count: 0,
                 lost_by_harness_count: by_harness,
                 unknown_count: unknown,
-                reordered_count: flow.reordered_count,
+                reordered_count: reordered.len() as u64,
+                reordered_extent_max: reordered.iter().map(|one| one.extent).max().unwrap_or(0),
+                retransmitted_count: flow.retransmitted_count,
                 delay: Distribution::of_samples(&flow.delays_ns, reason),
             }
         };
@@ -312,7 +457,9 @@ impl FlowFold {
             let order = other.frame_count.cmp(&one.frame_count);
             order.then_with(|| one.name.cmp(&other.name))
         });
-        flows
+        let timed = self.keyed.into_iter();
+        let timed = timed.filter_map(|one| Some((one.key, one.passages?)));
+        (flows, timed.collect())
     }
 }
 
@@ -401,7 +548,7 @@ mod tests {
         each_history(&files.records(), &context, |one| {
             fold.add(one, context.path);
         });
-        let flows = fold.finish();
+        let (flows, _) = fold.finish();
         assert_eq!(flows.len(), 2);
         let [echoes, arp] = &flows[..] else {
             panic!("two flows");
@@ -422,6 +569,102 @@ mod tests {
     }
 
     #[test]
+    fn order_is_that_of_the_flow_and_not_of_the_channel() {
+        let mut fold = FlowFold::default();
+        let mut files = Files::default();
+        for sequence in 0..6_u64 {
+            files.write(at(7, sequence), MessageFate::Taken);
+            let kind = if sequence % 2 == 0 { [8, 6] } else { [8, 0] };
+            let bytes = frame(&kind, &packet(1, 0, &[0; 20]));
+            fold.add_frame(&FrameRecord::new(sequence, at(7, sequence).epoch, &bytes));
+        }
+        // The frames of 0 and 1 change places, which are of two flows; 5 comes before 1 and 3.
+        let arrivals = [1, 3, 2, 4, 5, 0].map(|place| 1_000 * place);
+        for (record, arrival) in files.ingress.iter_mut().zip(arrivals) {
+            record.received_ns = arrival;
+        }
+        let context = same_clock(1_000_000_000);
+        each_history(&files.records(), &context, |one| {
+            fold.add(one, context.path);
+        });
+        let (flows, _) = fold.finish();
+        let counts = |name: &str| {
+            let flow = flows.iter().find(|flow| flow.name == name).unwrap();
+            (flow.reordered_count, flow.reordered_extent_max)
+        };
+        assert_eq!(counts("arp"), (0, 0));
+        assert_eq!(counts("icmp 10.77.0.1 → 10.77.0.2"), (2, 2));
+    }
+
+    #[test]
+    fn bytes_of_a_stream_that_are_sent_again_are_counted() {
+        let mut fold = FlowFold::default();
+        let mut files = Files::default();
+        let segments = [
+            (u32::MAX - 9, 20_u16),
+            (10, 30),
+            // An acknowledgement alone, of an old number.
+            (5, 0),
+            (10, 30),
+            (40, 5),
+            (42, 8),
+        ];
+        for (sequence, (number, length)) in (0..).zip(segments) {
+            files.write(at(7, sequence), MessageFate::Taken);
+            let segment = [
+                &[0, 1, 0, 2][..],
+                &number.to_be_bytes(),
+                &[0; 4],
+                &[0x50, 0, 0, 0],
+            ]
+            .concat();
+            let mut packet = packet(6, 0, &segment);
+            packet[2..4].copy_from_slice(&(40 + length).to_be_bytes());
+            let bytes = frame(&[8, 0], &packet);
+            fold.add_frame(&FrameRecord::new(sequence, at(7, sequence).epoch, &bytes));
+        }
+        let context = same_clock(1_000_000_000);
+        each_history(&files.records(), &context, |one| {
+            fold.add(one, context.path);
+        });
+        let (flows, _) = fold.finish();
+        assert_eq!((flows.len(), flows[0].retransmitted_count), (1, Some(2)));
+    }
+
+    #[test]
+    fn a_name_joins_flows_and_its_deadline_has_their_frames_and_those_that_go_back() {
+        let named = [NamedFlow {
+            name: "command".to_owned(),
+            filter: "udp dst port 6510".parse().unwrap(),
+            deadline_ns: Some(1),
+        }];
+        let mut fold = FlowFold::new(&named);
+        let mut files = Files::default();
+        let ports = [
+            [0x13, 0x88, 0x19, 0x6e],
+            [0x13, 0x89, 0x19, 0x6e],
+            [0x19, 0x6e, 0x13, 0x88],
+            [0, 1, 0, 2],
+        ];
+        for (sequence, ports) in (0..).zip(ports) {
+            files.write(at(7, sequence), MessageFate::Taken);
+            let bytes = frame(&[8, 0], &packet(17, 0, &[&ports[..], &[0; 4]].concat()));
+            fold.add_frame(&FrameRecord::new(sequence, at(7, sequence).epoch, &bytes));
+        }
+        let context = same_clock(1_000_000_000);
+        each_history(&files.records(), &context, |one| {
+            fold.add(one, context.path);
+        });
+        let (flows, passages) = fold.finish();
+        let command = flows.iter().find(|flow| flow.name == "command").unwrap();
+        assert_eq!((flows.len(), command.taken_count), (3, 2));
+        let counts: Vec<usize> = passages.values().map(Vec::len).collect();
+        assert_eq!(counts, [1, 1, 1]);
+        let given = |one: &FramePassage| matches!(one.end, FrameEnd::Given(_));
+        assert!(passages.values().flatten().all(given));
+    }
+
+    #[test]
     fn flows_beyond_the_bound_are_one() {
         let mut fold = FlowFold::default();
         for sequence in 0..FLOWS_MAX as u64 + 100 {
@@ -430,6 +673,6 @@ mod tests {
             fold.add_frame(&FrameRecord::new(sequence, 1, &bytes));
         }
         assert_eq!(fold.flows.len(), FLOWS_MAX + 1);
-        assert_eq!(fold.flows.last().unwrap().key, Some(FlowKey::Rest));
+        assert_eq!(fold.keyed.last().unwrap().key, FlowKey::Rest);
     }
 }

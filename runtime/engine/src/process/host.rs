@@ -1,0 +1,338 @@
+//! The hosts of a topology as namespaces of this PC: one starts a supervisor a host, as if each were a PC of
+//! its own, and waits for their ends.
+
+use std::ffi::OsString;
+use std::fs::{DirBuilder, File};
+use std::io::{self, BufRead as _, BufReader, pipe};
+use std::net::IpAddr;
+use std::os::fd::AsFd as _;
+use std::os::unix::fs::DirBuilderExt as _;
+use std::os::unix::process::CommandExt as _;
+use std::path::Path;
+use std::process::Stdio;
+use std::sync::mpsc::sync_channel;
+use std::time::{Duration, Instant};
+use std::{env, thread};
+
+use hil_cable::pcs::{self, Pc, Wire, WireEnd};
+use hil_cable::{InletError, Refusal};
+use hil_net::handover;
+use hil_platform::console::Console;
+use hil_platform::signals::Signals;
+use hil_platform::{own_process, systemd};
+use hil_rundir::pipe::ToProcess;
+use hil_topology::{Host, Topology};
+use nix::sys::signal::Signal;
+use nix::unistd::dup2_stdin;
+
+use super::own_program::{OwnProgramError, bind_to};
+use crate::security::PreSharedKey;
+use crate::supervisor::Child;
+
+/// The argument that asks for it.
+pub const ALL: &str = "--on-one-pc";
+/// In its place, for the supervisor of the host that follows.
+const ONE: &str = "--on-one-pc-as=";
+/// The key of the run's hops, in the shared memory that each host has for itself.
+pub const KEY_FILE: &str = "/dev/shm/hop.key";
+/// Folder of a host's domains, likewise.
+pub const DOMAIN_ROOT: &str = "/dev/shm/hil";
+/// Interfaces of a host, where the topology names none.
+const INTERFACES: &str = "eth";
+
+/// Lines of other hosts that wait to be said.
+const LINES: usize = 64;
+/// How often it is looked whether a host has ended.
+const LOOK_PERIOD: Duration = Duration::from_millis(20);
+/// How long the others may go on once a host has failed.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// The last words of a host come at once when it has ended.
+const LAST_WORDS_WITHIN: Duration = Duration::from_secs(1);
+/// Exit code for a host that was killed.
+const FAILED: u8 = 1;
+
+/// Why hosts cannot be on one PC.
+#[derive(Debug, thiserror::Error)]
+pub enum HostsError {
+    /// They are on one PC anyway.
+    #[error("its hosts have no `address`, so that it runs on one PC without --on-one-pc")]
+    WithoutAddress,
+    /// A wire goes between two hosts.
+    #[error(
+        "hosts.{host}.{key} names one interface, and on one PC each of the {count} hosts has one to each other; \
+         leave it out"
+    )]
+    OneInterface {
+        /// The host.
+        host: String,
+        /// `interface` or `clock_interface`.
+        key: &'static str,
+        /// Of hosts.
+        count: usize,
+    },
+    /// The kernel refuses something here.
+    #[error(transparent)]
+    Refused(#[from] Refusal),
+    /// It refuses something to a host.
+    #[error("host {host}: {source}")]
+    Host {
+        /// The host.
+        host: String,
+        /// Why.
+        source: InletError,
+    },
+    /// A process cannot be started, or told to begin.
+    #[error("cannot start host {host}: {source}")]
+    Start {
+        /// The host.
+        host: String,
+        /// Why.
+        source: io::Error,
+    },
+    /// There are no random bytes for a key, or no handlers of signals.
+    #[error("{0}")]
+    Io(#[from] io::Error),
+}
+
+/// What a supervisor of [`run_all`] was started by, as its user typed it.
+pub fn as_typed(arguments: impl Iterator<Item = String>) -> Vec<String> {
+    arguments
+        .map(|one| {
+            if one.starts_with(ONE) {
+                ALL.to_owned()
+            } else {
+                one
+            }
+        })
+        .collect()
+}
+
+/// Runs all hosts of `topology`, each by the arguments of this process, and gives the exit code of the first one
+/// that did not end with 0. The first host has this process's outputs; of others the warnings and errors are
+/// said, each with the host's name. This process must have one thread.
+///
+/// # Errors
+/// When a host cannot be made.
+pub fn run_all(topology: &Topology, console: &mut Console) -> Result<u8, HostsError> {
+    let arguments: Vec<OsString> = env::args_os().skip(1).collect();
+    let hosts = topology.hosts();
+    let wires = wires(hosts)?;
+    pcs::begin()?;
+    let signals = Signals::install()?;
+    let (lines, said) = sync_channel(LINES);
+    let mut running = Vec::new();
+    let mut entered = Vec::new();
+    for (index, host) in hosts.iter().enumerate() {
+        let failed = |source| HostsError::Start {
+            host: host.name.clone(),
+            source,
+        };
+        let (here, there) = handover::pair().map_err(failed)?;
+        let mut helper = own_process::again();
+        helper.args(["become-host", "--starter", &std::process::id().to_string()]);
+        let as_host = OsString::from(format!("{ONE}{}", host.name));
+        let all = OsString::from(ALL);
+        let arguments_of_it = arguments
+            .iter()
+            .map(|one| if *one == all { &as_host } else { one });
+        helper.arg("--").args(arguments_of_it);
+        // Told by this process when to end, and once.
+        helper.stdin(Stdio::from(there)).process_group(0);
+        for variable in systemd::VARIABLES {
+            helper.env_remove(variable);
+        }
+        if index > 0 {
+            let (read, write) = pipe().map_err(failed)?;
+            if !arguments.iter().any(|one| one == "--quiet" || one == "-q") {
+                helper.arg("--quiet");
+            }
+            helper.stdout(Stdio::null()).stderr(write);
+            let (lines, name) = (lines.clone(), host.name.clone());
+            thread::spawn(move || {
+                for line in BufReader::new(read).lines().map_while(Result::ok) {
+                    if lines.send(format!("{name}: {line}")).is_err() {
+                        return;
+                    }
+                }
+            });
+        }
+        running.push(Child::spawn_apart(&mut helper).map_err(failed)?);
+        // This process keeps no copy of the helper's ends.
+        drop(helper);
+        entered.push(Pc::take(here).map_err(|source| HostsError::Host {
+            host: host.name.clone(),
+            source,
+        })?);
+    }
+    pcs::join(&entered, &wires)?;
+    let key = PreSharedKey::random()?;
+    for (host, pc) in hosts.iter().zip(entered) {
+        pc.go(key.expose()).map_err(|source| HostsError::Start {
+            host: host.name.clone(),
+            source,
+        })?;
+    }
+    drop(lines);
+    let code = wait_for_all(&mut running, &signals, || {
+        for line in said.try_iter() {
+            console.rendered(&line);
+        }
+    });
+    while let Ok(line) = said.recv_timeout(LAST_WORDS_WITHIN) {
+        console.rendered(&line);
+    }
+    Ok(code)
+}
+
+/// Waits until all hosts have ended, and tells them once to end when this process is told to, or when one of
+/// them failed; `meanwhile` is called at each look. Gives the exit code of the first one that ended with another
+/// than 0.
+fn wait_for_all(hosts: &mut [Child], signals: &Signals, mut meanwhile: impl FnMut()) -> u8 {
+    let (mut code, mut stop_at, mut is_told) = (0, None, false);
+    loop {
+        meanwhile();
+        let ends: Vec<_> = hosts.iter_mut().map(Child::poll_end).collect();
+        let now = Instant::now();
+        let mut failures = ends.iter().flatten().filter(|end| end.code() != Some(0));
+        if code == 0
+            && let Some(end) = failures.next()
+        {
+            code = end
+                .code()
+                .and_then(|code| code.try_into().ok())
+                .unwrap_or(FAILED);
+            stop_at = stop_at.or(Some(now + PATIENCE));
+        }
+        if ends.iter().all(Option::is_some) {
+            return code;
+        }
+        if signals.received().is_some() {
+            stop_at = Some(now);
+        }
+        if !is_told && stop_at.is_some_and(|at| now >= at) {
+            is_told = true;
+            for host in &mut *hosts {
+                host.order(&ToProcess::Stop);
+            }
+        }
+        thread::sleep(LOOK_PERIOD);
+    }
+}
+
+/// The wires between `hosts`, and those of their clock paths.
+fn wires(hosts: &[Host]) -> Result<Vec<Wire>, HostsError> {
+    if hosts.iter().any(|host| host.address.is_none()) {
+        return Err(HostsError::WithoutAddress);
+    }
+    let mut next = vec![0; hosts.len()];
+    let mut end = |index: usize, key: &'static str, address: IpAddr, named: &Option<String>| {
+        let host: &Host = &hosts[index];
+        let drawn = format!("{INTERFACES}{}", next[index]);
+        next[index] += 1;
+        if named.is_some() && hosts.len() > 2 {
+            return Err(HostsError::OneInterface {
+                host: host.name.clone(),
+                key,
+                count: hosts.len(),
+            });
+        }
+        Ok(WireEnd {
+            host: index,
+            interface: named.clone().unwrap_or(drawn),
+            address,
+        })
+    };
+    let mut wires = Vec::new();
+    for (near, one) in hosts.iter().enumerate() {
+        for (far, other) in hosts.iter().enumerate().skip(near + 1) {
+            let [here, there] = [one, other].map(Host::gateway_address);
+            wires.push(Wire {
+                ends: [
+                    end(near, "interface", here, &one.interface)?,
+                    end(far, "interface", there, &other.interface)?,
+                ],
+            });
+            if let (Some(here), Some(there)) = (one.clock(), other.clock()) {
+                wires.push(Wire {
+                    ends: [
+                        end(near, "clock_interface", here.address, &here.interface)?,
+                        end(far, "clock_interface", there.address, &there.interface)?,
+                    ],
+                });
+            }
+        }
+    }
+    Ok(wires)
+}
+
+/// Enters a host's namespaces at the wish of the process at the other end of standard input, and becomes this
+/// program with `arguments`, which ends when that process does. Returns only when it fails.
+///
+/// # Errors
+/// When the starter is gone, or the kernel refuses something.
+pub fn become_host(starter: u32, arguments: &[String]) -> Result<(), OwnProgramError> {
+    const NAME: &str = "the supervisor of a host";
+    bind_to(starter, NAME, Signal::SIGTERM)?;
+    let Some(key) = pcs::enter(io::stdin().as_fd())? else {
+        return Err(OwnProgramError::Orphaned(NAME.to_owned()));
+    };
+    if let Some(key) = PreSharedKey::of(&key) {
+        key.write(Path::new(KEY_FILE))?;
+    }
+    let nothing = File::open("/dev/null").and_then(|nothing| Ok(dup2_stdin(nothing)?));
+    nothing
+        .and_then(|()| DirBuilder::new().mode(0o700).create(DOMAIN_ROOT))
+        .map_err(|source| OwnProgramError::Descriptors {
+            program: NAME.to_owned(),
+            source,
+        })?;
+    // A change of identity may have unbound it.
+    bind_to(starter, NAME, Signal::SIGTERM)?;
+    let source = own_process::again().args(arguments).exec();
+    Err(OwnProgramError::Execute {
+        program: own_process::RUNNING_FILE.to_owned(),
+        source,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use hil_topology::registry::Registry;
+
+    use super::*;
+
+    #[test]
+    fn each_two_hosts_have_a_wire_and_clock_paths_have_one_of_their_own() {
+        let hosts = |hosts: &[&str]| {
+            let head = "version = 1\nname = \"wires\"\n[hosts]\n";
+            let process = "\n[processes.one]\nhost = \"a\"\nrun = [\"true\"]\n";
+            let text = format!("{head}{}{process}", hosts.join("\n"));
+            let topology = hil_topology::parse("wires", &text, &[], Registry::default().known());
+            topology.unwrap().hosts().to_vec()
+        };
+        let names = |wires: &[Wire]| -> Vec<[String; 2]> {
+            let names = |wire: &Wire| wire.ends.each_ref().map(|end| end.interface.clone());
+            wires.iter().map(names).collect()
+        };
+        let first =
+            "a = { address = \"10.0.0.1\", interface = \"lan\", clock_address = \"fd00::1\" }";
+        let other = "b = { address = \"192.168.1.2\", clock_address = \"fd00::2\" }";
+        let third = "c.address = \"10.0.0.3\"";
+        let made = wires(&hosts(&[first, other])).unwrap();
+        assert_eq!(names(&made), [["lan", "eth0"], ["eth1", "eth1"]]);
+        let error = wires(&hosts(&[first, other, third])).unwrap_err();
+        assert!(
+            error.to_string().starts_with("hosts.a.interface "),
+            "{error}"
+        );
+        let made = wires(&hosts(&[
+            "a.address = \"10.0.0.1\"",
+            "b.address = \"10.0.0.2\"",
+            third,
+        ]));
+        let expected = [["eth0", "eth0"], ["eth1", "eth0"], ["eth1", "eth1"]];
+        assert_eq!(names(&made.unwrap()), expected);
+        let local = wires(&hosts(&["a = {}", "b = {}"]));
+        assert!(matches!(local, Err(HostsError::WithoutAddress)));
+    }
+}

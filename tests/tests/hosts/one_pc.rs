@@ -1,0 +1,124 @@
+//! Both hosts of a topology on this PC by one command, as any user.
+
+use std::fs::{self, Permissions};
+use std::os::unix::fs::PermissionsExt as _;
+use std::process::Command;
+use std::time::Duration;
+
+use hil_tests::account::assert_every_message_is_accounted_for;
+use hil_tests::binary::hil_runtime_binary;
+use hil_tests::child::ChildGuard;
+use hil_tests::run_folder::RunFolder;
+use hil_tests::trial::{RunFiles, Trial, processes_mentioning, wait_until};
+use nix::sys::signal::Signal;
+
+const LIMIT: Duration = Duration::from_mins(1);
+const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
+/// Nobody on this machine has it.
+const USER: &str = "45679";
+
+/// A folder that the user may write to.
+fn open_folder(label: &str) -> RunFolder {
+    let record = RunFolder::new(label);
+    fs::set_permissions(record.path(), Permissions::from_mode(0o777)).unwrap();
+    record
+}
+
+/// Starts a run of both hosts by a user without rights. The key that the topology names is root's.
+fn start(record: &RunFolder, settings: &[&str]) -> (Trial, ChildGuard) {
+    let trial = Trial::shipped("shuttle-split.toml", record.path());
+    let trial = settings.iter().fold(trial, |trial, one| trial.set(one));
+    let mut command = Command::new("setpriv");
+    command.args(["--reuid", USER, "--regid", USER, "--clear-groups"]);
+    command.args(["--inh-caps=-all", "--bounding-set=-all"]);
+    command.arg(hil_runtime_binary()).args(trial.arguments());
+    command.arg("--on-one-pc").env_remove("XDG_RUNTIME_DIR");
+    (trial, ChildGuard::spawn(&mut command).unwrap())
+}
+
+fn is_root() -> bool {
+    nix::unistd::geteuid().is_root()
+}
+
+fn folders(trial: &Trial) -> [RunFiles; 2] {
+    HOSTS.map(|host| trial.folder(host, LIMIT))
+}
+
+fn assert_nobody_left(record: &RunFolder) {
+    wait_until(LIMIT, "the end of all processes", || {
+        processes_mentioning(&record.path().to_string_lossy()).is_empty()
+    });
+}
+
+#[test]
+fn a_user_without_rights_runs_both_hosts_over_a_hop_with_kernel_stamps() {
+    if !is_root() {
+        return;
+    }
+    let record = open_folder("one-pc");
+    let (trial, mut child) = start(&record, &["run.duration='3 s'"]);
+    let finished = child.wait_within(LIMIT).unwrap();
+    finished.assert_success();
+    assert!(
+        finished.stdout.contains("Did the network hurt"),
+        "{}",
+        finished.stdout
+    );
+    for files in folders(&trial) {
+        let summary = files.summary();
+        assert_every_message_is_accounted_for(&summary);
+        let full = files.read("report-full.txt");
+        assert!(full.contains("TX stamp → RX stamp"), "{full}");
+        assert!(full.contains("--on-one-pc"), "{full}");
+        assert!(
+            full.contains("sealed (AES-256-GCM)") || full.contains("sealed (ChaCha20"),
+            "{full}"
+        );
+    }
+    assert_nobody_left(&record);
+}
+
+#[test]
+fn a_stop_of_the_one_command_ends_both_hosts_with_their_reports() {
+    if !is_root() {
+        return;
+    }
+    for signal in [Signal::SIGTERM, Signal::SIGKILL] {
+        let record = open_folder("one-pc-stop");
+        let (trial, mut child) = start(&record, &["run.duration='10 min'"]);
+        let folders = folders(&trial);
+        wait_until(LIMIT, "the start of both", || {
+            folders.iter().all(|one| {
+                one.process("robot", 0).is_some() || one.process("controller", 0).is_some()
+            })
+        });
+        child.signal(signal).unwrap();
+        let finished = child.wait_within(LIMIT).unwrap();
+        if signal == Signal::SIGTERM {
+            finished.assert_code(130);
+        }
+        assert_nobody_left(&record);
+        for files in folders {
+            assert!(files.has_report(), "{signal}: {}", files.root().display());
+        }
+    }
+}
+
+#[test]
+fn a_host_that_cannot_begin_is_named_and_the_other_does_not_wait_for_it() {
+    if !is_root() {
+        return;
+    }
+    let record = open_folder("one-pc-refused");
+    let missing = "processes.robot.run=['/none']";
+    let (_trial, mut child) = start(&record, &[missing, "run.start_timeout='1 h'"]);
+    let finished = child.wait_within(LIMIT).unwrap();
+    finished.assert_code(2);
+    assert!(
+        finished.stderr.contains("robot-pc: "),
+        "{}",
+        finished.stderr
+    );
+    assert!(finished.stderr.contains("/none"), "{}", finished.stderr);
+    assert_nobody_left(&record);
+}
