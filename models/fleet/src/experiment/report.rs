@@ -7,6 +7,7 @@ use crate::experiment::cells::{
     SCENARIOS, collision_interval, mode_name, published_rows, scenario_name,
 };
 use crate::experiment::study::{FleetStudy, worlds_text};
+use crate::geometry::floor_index;
 use crate::scenario::Scenario;
 use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_link::impaired::DelayLaw;
@@ -128,7 +129,7 @@ impl Judge {
 
     /// The interval of collisions per 1000 critical sections.
     fn per_1000(&self, tally: &FleetTally, confidence: f64) -> Option<(f64, f64)> {
-        let divided = |count: u64| (count as f64 / self.scatter).round() as u64;
+        let divided = |count: u64| floor_index(count as f64 / self.scatter + 0.5) as u64;
         let (collisions, sections) = (tally.collision_count(), tally.section_count());
         if collisions > sections {
             return None;
