@@ -72,6 +72,8 @@ if [[ "$mode" == long ]]; then
         --filterset 'not (package(hil-stats) & (binary(coverage) | binary(connection)))'
     # Many runs of many messages: optimised.
     step coverage cargo test --release -p hil-stats --test coverage --test connection -- --ignored --nocapture
+    # The exhaustive searches of the safe coordinator, and its robots under the worst mixes of impairments.
+    step fleet cargo test --release -p hil-fleet -- --ignored --nocapture --test-threads 1
 else
     step format cargo fmt --all --check
     # All targets: the benches are checked here and not built with optimisation.

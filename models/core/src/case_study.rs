@@ -32,9 +32,6 @@ pub trait CaseStudy: Sized + Debug + 'static {
     const ROLES: &'static [&'static str];
     /// The channels between the roles; each role has the ports of its channels' names.
     const CHANNELS: &'static [ChannelSpec];
-    /// False when a role keeps what the others rely on, so that one started anew in the midst of
-    /// a run would be wrong about the world: a topology may not ask for its restart then.
-    const MAY_RESTART: bool = true;
     /// The channel on whose producer's clock the score is kept: events and errors have their times on
     /// it, and so have stamps that messages carry as payload. Where hosts have clocks of their own and
     /// these are aligned, the log has the stamps of all channels on this clock, with the bound
@@ -65,6 +62,12 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// # Errors
     /// Names the parameter, its value and its allowed range.
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError>;
+
+    /// False when `role` keeps what the others rely on, so that one started anew in the midst of
+    /// a run would be wrong about the world: a topology may not ask for its restart then.
+    fn may_restart(_parameters: &Self::Parameters, _role: &str) -> bool {
+        true
+    }
 
     /// A fresh instance of the role called `name`; `None` if the case has no such role.
     fn role(&self, name: &str) -> Option<Box<dyn Role>>;

@@ -3,7 +3,7 @@
 use crate::controller::Controller;
 use crate::coordinator::parameters::{CoordinatorMode, CoordinatorParameters};
 use crate::experiment::{FleetStudy, TableParameters};
-use crate::feasibility::{Beginning, beginning, obstruction_text};
+use crate::feasibility::{Beginning, beginning, obstruction_text, undecided_because};
 use crate::live::FleetEvents;
 use crate::messages::{Authority, Mission, State, Truth};
 use crate::mission::MissionParameters;
@@ -63,9 +63,6 @@ impl CaseStudy for Fleet {
         ChannelSpec::of::<State>(FLEET_STATE, "robots", "controller"),
         ChannelSpec::recorded::<Truth>(FLEET_TRUTH, "robots"),
     ];
-    /// A legacy coordinator started anew would believe all robots in their first bays, and robots
-    /// started anew would be there while the coordinator believes them under way.
-    const MAY_RESTART: bool = false;
     const SCORE_CLOCK: Option<&'static str> = Some(FLEET_TRUTH);
     type Parameters = FleetParameters;
 
@@ -79,6 +76,12 @@ impl CaseStudy for Fleet {
             scene,
             seed,
         })
+    }
+
+    /// A legacy coordinator started anew would believe all robots in their first bays, and robots
+    /// started anew would be there while the coordinator believes them under way. A safe one asks.
+    fn may_restart(parameters: &FleetParameters, role: &str) -> bool {
+        role == "controller" && parameters.coordinator.mode == CoordinatorMode::Safe
     }
 
     fn role(&self, name: &str) -> Option<Box<dyn Role>> {
@@ -102,10 +105,10 @@ impl CaseStudy for Fleet {
 
     fn undecided(&self) -> Option<String> {
         let is_safe = self.parameters.coordinator.mode == CoordinatorMode::Safe;
-        let beginning = beginning(&self.scene, self.parameters.missions.mode, is_safe);
-        (beginning == Beginning::Undecided).then(|| {
-            "whether an order exists in which every robot can go on, as ways lead past where others park".to_owned()
-        })
+        let reason = undecided_because(&self.scene, self.parameters.missions.mode, is_safe)?;
+        Some(format!(
+            "feasibility of the start: not decided, because {reason}"
+        ))
     }
 
     fn score(&self, log: &RunLog) -> Score {
@@ -159,7 +162,7 @@ impl FleetParameters {
     fn check_beginning(&self, scene: &Scene) -> Result<(), ParameterError> {
         let is_safe = self.coordinator.mode == CoordinatorMode::Safe;
         match beginning(scene, self.missions.mode, is_safe) {
-            Beginning::Free | Beginning::Undecided => Ok(()),
+            Beginning::Free | Beginning::Undecided(_) => Ok(()),
             Beginning::Never(chain) => {
                 let key = match self.world.scenario {
                     Scenario::Custom => "world.bays",

@@ -1,19 +1,19 @@
 //! Whether a fleet can begin: from where the robots start, some order lets each of them set out. It looks at places
 //! alone, and decides both ways only where it can; between lies what nobody has decided.
 
-use core::fmt::Write as _;
+use core::fmt;
 
 use crate::mission::MissionMode;
 use crate::scenario::Scene;
-use crate::world::{BayIndex, Route};
+use crate::world::{BayIndex, Route, World};
 
 /// What is known of a fleet's beginning.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Beginning {
-    /// No way touches a vehicle in a third bay: whoever has a free bay to go to can set out at any time.
+    /// No robot that starts stands in the way of another: each can set out at any time.
     Free,
-    /// Ways touch vehicles in third bays, but each robot can set out once others have.
-    Undecided,
+    /// Each robot can set out once others have; one of those that cannot before.
+    Undecided(Obstruction),
     /// Robots each of which waits for the next, and the last for the first, whatever the others do.
     Never(Vec<Obstruction>),
 }
@@ -66,12 +66,12 @@ pub(crate) fn beginning(scene: &Scene, mode: MissionMode, is_safe: bool) -> Begi
         is_waiting[robot] = false;
     }
     let Some(first) = is_waiting.iter().position(|waits| *waits) else {
-        let is_free = blocked.iter().flatten().all(|(_, by)| by.is_empty());
-        return if is_free {
-            Beginning::Free
-        } else {
-            Beginning::Undecided
-        };
+        let found = blocked.iter().enumerate().find_map(|(robot, ways)| {
+            let bay = starts[robot];
+            let found = ways.iter().find_map(|(to, by)| Some((*to, *by.first()?)));
+            found.map(|(to, by)| Obstruction { robot, bay, to, by })
+        });
+        return found.map_or(Beginning::Free, Beginning::Undecided);
     };
     let mut chain: Vec<Obstruction> = Vec::new();
     let mut robot = first;
@@ -95,39 +95,63 @@ pub(crate) fn beginning(scene: &Scene, mode: MissionMode, is_safe: bool) -> Begi
 
 /// Who stands where `robot` would come along `route`, or in its bay.
 fn blockers(scene: &Scene, robot: usize, route: &Route, is_safe: bool) -> Vec<usize> {
-    let world = &scene.world;
-    let footprint = world.guarded_sections.footprint();
-    let path = world.path(route.path);
-    let reach_m = 2.0 * footprint.radius_m();
     let is_in_the_way = |other: usize| {
         let bay = scene.starts[other];
-        if bay == route.to {
-            return true;
-        }
-        let parked = world.bays[bay].pose;
-        let covered = footprint.at(&parked);
-        is_safe
-            && path.poses()[1..].iter().any(|pose| {
-                pose.distance_m(&parked) < reach_m && footprint.at(pose).overlaps(&covered)
-            })
+        bay == route.to || (is_safe && passes(&scene.world, route, bay))
     };
     let others = (0..scene.starts.len()).filter(|other| *other != robot);
     others.filter(|other| is_in_the_way(*other)).collect()
 }
 
+/// Whether a vehicle on `route` comes where one in `bay` stands.
+fn passes(world: &World, route: &Route, bay: BayIndex) -> bool {
+    let footprint = world.guarded_sections.footprint();
+    let reach_m = 2.0 * footprint.radius_m();
+    let parked = world.bays[bay].pose;
+    let covered = footprint.at(&parked);
+    world.path(route.path).poses()[1..]
+        .iter()
+        .any(|pose| pose.distance_m(&parked) < reach_m && footprint.at(pose).overlaps(&covered))
+}
+
+/// A route that passes a third bay: a world without is *well-formed* (Čáp, Vokřínek and Kleiner 2015), and whoever
+/// has a free bay to go to gets there while the others stand in theirs.
+fn way_past_a_bay(world: &World) -> Option<(&Route, BayIndex)> {
+    world.routes.iter().find_map(|route| {
+        let mut third = (0..world.bays.len()).filter(|bay| ![route.from, route.to].contains(bay));
+        let passed = third.find(|bay| passes(world, route, *bay));
+        passed.map(|bay| (route, bay))
+    })
+}
+
+/// Why it is not decided whether each robot of `scene` can always go on; `None` where it is.
+pub(crate) fn undecided_because(scene: &Scene, mode: MissionMode, is_safe: bool) -> Option<String> {
+    match beginning(scene, mode, is_safe) {
+        Beginning::Undecided(one) => Some(format!("{one}, unless that one sets out first")),
+        Beginning::Free if is_safe => way_past_a_bay(&scene.world).map(|(route, bay)| {
+            let Route { from, to, .. } = route;
+            format!(
+                "the way from bay {from} to bay {to} leads past bay {bay}, where another may stand"
+            )
+        }),
+        Beginning::Free | Beginning::Never(_) => None,
+    }
+}
+
+impl fmt::Display for Obstruction {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { robot, bay, to, by } = self;
+        write!(
+            f,
+            "robot {robot} in bay {bay} cannot go to bay {to} for robot {by}"
+        )
+    }
+}
+
 /// The words for robots that can never set out.
 pub(crate) fn obstruction_text(chain: &[Obstruction]) -> String {
-    let mut text = "no order lets the fleet begin:".to_owned();
-    for (position, link) in chain.iter().enumerate() {
-        let separator = if position == 0 { "" } else { ";" };
-        let Obstruction { robot, bay, to, by } = link;
-        // Writing to a string cannot fail.
-        _ = write!(
-            text,
-            "{separator} robot {robot} in bay {bay} cannot go to bay {to} for robot {by}"
-        );
-    }
-    text
+    let links: Vec<_> = chain.iter().map(Obstruction::to_string).collect();
+    format!("no order lets the fleet begin: {}", links.join("; "))
 }
 
 #[cfg(test)]
@@ -211,8 +235,23 @@ mod tests {
 
     #[test]
     fn with_a_way_out_it_is_not_decided() {
-        let beginning = beginning(&ring(5, true), MissionMode::Random, true);
-        assert_eq!(beginning, Beginning::Undecided);
+        let scene = ring(5, true);
+        let reason = undecided_because(&scene, MissionMode::Random, true).unwrap();
+        assert_eq!(
+            reason,
+            "robot 0 in bay 0 cannot go to bay 5 for robot 1, unless that one sets out first"
+        );
+        // Nobody starts in the way, but who parks there later will stand in it.
+        let one = Scene {
+            starts: vec![0],
+            ..scene
+        };
+        assert_eq!(beginning(&one, MissionMode::Random, true), Beginning::Free);
+        let reason = undecided_because(&one, MissionMode::Random, true).unwrap();
+        assert!(
+            reason.ends_with("leads past bay 1, where another may stand"),
+            "{reason}"
+        );
     }
 
     #[test]
@@ -230,11 +269,8 @@ mod tests {
             };
             let scene = parameters.build().unwrap();
             for mode in [MissionMode::Random, MissionMode::Shuttle] {
-                assert_eq!(
-                    beginning(&scene, mode, true),
-                    Beginning::Free,
-                    "{scenario:?}"
-                );
+                let reason = undecided_because(&scene, mode, true);
+                assert_eq!(reason, None, "{scenario:?}");
             }
         }
     }

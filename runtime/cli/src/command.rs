@@ -312,12 +312,12 @@ fn carry_out(
     check_file(path, topology)?;
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
-        return Ok(show_check(path, topology, None, console));
+        return Ok(show_check(path, topology, None, registry, console));
     }
     let hosts = hosts_here(topology, args.host.as_deref()).map_err(usage)?;
     let (key, claims) = check_here(path, args, topology, &hosts, console)?;
     if args.check {
-        return Ok(show_check(path, topology, key, console));
+        return Ok(show_check(path, topology, key, registry, console));
     }
     let signals = signals()?;
     let options = RunOptions {
@@ -433,11 +433,20 @@ fn show_study(
     }
     console.result(&format!(
         "# {}: the file is valid; it names no processes, so it is for `simulate`, `tables` and\n\
-         # `calibrate`; it comes to\n\n{}",
+         # `calibrate`; it comes to\n\n{}{}",
         path.display(),
-        topology.to_toml()
+        topology.to_toml(),
+        undecided(topology, registry)
     ));
     Ok(exit::RAN)
+}
+
+/// What the check of the case leaves open, as a comment.
+fn undecided(topology: &Topology, registry: &Registry) -> String {
+    // A case that cannot be made has been refused before.
+    let made = registry.make_case(topology).ok().flatten();
+    let left_open = made.and_then(|(_, case)| case.undecided());
+    left_open.map_or_else(String::new, |text| format!("\n# {text}\n"))
 }
 
 /// Refuses a file of which no run can be what it says, on whatever hosts.
@@ -550,6 +559,7 @@ fn show_check(
     path: &Path,
     topology: &Topology,
     key: Option<(PathBuf, PreSharedKey)>,
+    registry: &Registry,
     console: &mut Console,
 ) -> u8 {
     // As comments, so that what is printed is a topology as a whole.
@@ -563,9 +573,10 @@ fn show_check(
         format!("\n# {file}: the key {fingerprint}, which the other hosts must have as well\n")
     });
     console.result(&format!(
-        "# {}: the file is valid; it comes to\n\n{}{}{}",
+        "# {}: the file is valid; it comes to\n\n{}{}{}{}",
         path.display(),
         topology.to_toml(),
+        undecided(topology, registry),
         clock_paths.collect::<Vec<_>>().concat(),
         key.unwrap_or_default()
     ));

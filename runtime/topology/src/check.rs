@@ -39,6 +39,7 @@ pub(super) fn check(file: File, known: &KnownCases, needs: Needs, checks: &Check
     let roles = Roles {
         known: known_case,
         has_case: file.case.is_some(),
+        checked: case.as_ref(),
     };
     if file.processes.0.is_empty() && !runs_nothing {
         let hint = "a topology has at least one [processes.<name>]";
@@ -168,6 +169,8 @@ fn check_hosts(tables: impl Iterator<Item = (String, Host)>, checks: &Checks<'_>
 struct Roles<'k> {
     known: Option<&'k KnownCase>,
     has_case: bool,
+    /// The case, unless its parameters were refused.
+    checked: Option<&'k Case>,
 }
 
 fn check_processes(
@@ -233,9 +236,13 @@ fn check_role(
     }
     // An adapter knows nothing of the world that it could be wrong about.
     let has_memory = table.egm.is_none();
-    if !case.may_restart && has_memory && table.restarts.on_exit() != OnExit::EndRun {
+    let may_restart = roles
+        .checked
+        .is_none_or(|checked| (case.may_restart)(&checked.parameters, role));
+    if !may_restart && has_memory && table.restarts.on_exit() != OnExit::EndRun {
         let problem = format!(
-            "a role of case {} started anew would be wrong about the world; use \"end-run\"",
+            "`{role}` of case {} with these parameters, started anew, would be wrong about the \
+             world; use \"end-run\"",
             case.name
         );
         checks.refuse_because(join(path, "on_exit"), problem);

@@ -23,8 +23,8 @@ pub struct KnownCase {
     pub roles: &'static [&'static str],
     /// Its channels, in port order.
     pub channels: &'static [ChannelSpec],
-    /// False when no role of it may be started anew in the midst of a run.
-    pub may_restart: bool,
+    /// Whether a role may be started anew in the midst of a run with these, checked, parameters.
+    pub may_restart: fn(&toml::Table, &str) -> bool,
     /// Checks `[case.parameters]` with a seed and gives them back with every default filled in.
     pub check_parameters: ParameterCheck,
 }
@@ -82,10 +82,15 @@ impl KnownCase {
             name: C::NAME,
             roles: C::ROLES,
             channels: C::CHANNELS,
-            may_restart: C::MAY_RESTART,
+            may_restart: may_restart::<C>,
             check_parameters: check_parameters::<C>,
         }
     }
+}
+
+fn may_restart<C: CaseStudy>(checked: &toml::Table, role: &str) -> bool {
+    C::Parameters::deserialize(read(checked))
+        .is_ok_and(|parameters| C::may_restart(&parameters, role))
 }
 
 fn check_parameters<C: CaseStudy>(

@@ -189,6 +189,70 @@ fn assert_losses_are_explained(summary: &RunSummary) {
     );
 }
 
+/// Kills of the coordinator in one run.
+const KILLS: u32 = 3;
+/// What an authority takes in a record file, at least.
+const AUTHORITY_BYTES: u64 = 48;
+
+#[test]
+fn a_safe_coordinator_killed_again_and_again_on_a_lossy_link_keeps_all_robots_apart() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("fleet-kills");
+    let mut trial = Trial::shipped("fleet-split.toml", record.path());
+    for setting in [
+        mode("safe").as_str(),
+        "run.duration=\"40 s\"",
+        "processes.controller.on_exit=\"restart\"",
+        "links.commands.via=\"emulated\"",
+        "links.commands.loss_ratio=0.1",
+        "links.states.via=\"emulated\"",
+        "links.states.loss_ratio=0.1",
+    ] {
+        trial = trial.set(setting);
+    }
+    let mut split = Split::start(&lab, &trial);
+    for kill in 0..=KILLS {
+        // Robots have been given way since the coordinator was there (again), so that it is killed in the midst.
+        let files = &split.files;
+        let given = |before: u64| {
+            let bytes = files[1].record_bytes("fleet.authority.taken.");
+            (bytes >= before + 50 * AUTHORITY_BYTES).then_some(bytes)
+        };
+        let before = given(0).unwrap_or(0);
+        wait_until(
+            START_LIMIT,
+            &format!("authorities after kill {kill}"),
+            || given(before).is_some(),
+        );
+        if kill < KILLS {
+            files[0].kill_process("controller", kill, START_LIMIT);
+        }
+    }
+    for finished in split.ended() {
+        finished.assert_success();
+    }
+    println!("{}", split.files[0].read("report-full.txt"));
+    for summary in split.summaries() {
+        assert_eq!(summary.run.outcome, Outcome::Completed, "{:?}", summary.run);
+        assert_nobody_collided(&summary);
+        assert!(figure(&summary, "critical_sections_count") > 0.0);
+        let mut known = summary.processes.iter();
+        let controller = known.find(|one| one.name == "controller").unwrap();
+        assert_eq!(controller.restart_count, u64::from(KILLS), "{controller:?}");
+        for kill in 1..=KILLS {
+            let told = format!("was killed by SIGKILL; restart {kill} of at most 3");
+            let mut events = summary.events.iter();
+            assert!(
+                events.any(|one| one.process == "controller" && one.what().contains(&told)),
+                "{told}: {:?}",
+                summary.events
+            );
+        }
+    }
+}
+
 #[test]
 fn an_interrupted_fleet_leaves_its_report() {
     let record = RunFolder::new("fleet-stop");

@@ -72,10 +72,8 @@ pub(crate) enum Demand {
     None,
     /// The interval's upper end lies below.
     Below(f64),
-    /// More than none, and within.
+    /// The interval lies within.
     Within(f64, f64),
-    /// None by the original's checker, which the probability is of.
-    NoneSeen,
     /// None at all, by each checker.
     NoneAtAll,
 }
@@ -277,7 +275,7 @@ impl Variant {
             setup,
             demand: match self {
                 Self::DelayedStatus => Demand::None,
-                _ => Demand::NoneSeen,
+                _ => Demand::Below(0.2),
             },
         }
     }
@@ -455,6 +453,19 @@ pub struct FleetTally {
     pub stand_count: u64,
     /// Runs with a collision.
     pub collided: Vec<CollidedRun>,
+    /// Its runs one by one, for what they differ by among themselves.
+    pub runs: Vec<RunFigures>,
+}
+
+/// One run of a cell.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RunFigures {
+    /// See [`FleetTally::section_count`].
+    pub sections: u64,
+    /// See [`FleetTally::collision_count`].
+    pub collisions: u64,
+    /// See [`FleetTally::missions_per_hour`].
+    pub missions_per_hour: f64,
 }
 
 /// Where to see a collision again.
@@ -486,6 +497,7 @@ impl FleetTally {
         self.stand_count += other.stand_count;
         let room = COLLIDED_MAX.saturating_sub(self.collided.len());
         self.collided.extend(other.collided.iter().take(room));
+        self.runs.extend(&other.runs);
     }
 
     /// Critical sections that a robot passed.

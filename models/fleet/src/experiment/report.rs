@@ -7,10 +7,12 @@ use crate::experiment::cells::{
     SCENARIOS, collision_interval, mode_name, published_rows, scenario_name,
 };
 use crate::experiment::study::{FleetStudy, worlds_text};
+use crate::geometry::floor_index;
 use crate::scenario::Scenario;
 use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_link::impaired::DelayLaw;
-use hil_stats::comparison::{Share, against_published};
+use hil_stats::comparison::{Share, against_published, welch};
+use hil_stats::statistics::{CONFIDENCE, clopper_pearson};
 
 /// A cell with what came of it; `None` when it was not run.
 #[derive(Debug)]
@@ -61,7 +63,7 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
         .collect();
     StudyReport {
         title: "Case study 1: collisions per critical section (CS), in virtual time".to_owned(),
-        notes: notes(study),
+        notes: notes(study, results),
         tables,
         summary: study::summary(&named, &criteria),
         larger: larger(study, &verdicts, &criteria),
@@ -69,7 +71,7 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
     }
 }
 
-fn notes(study: &FleetStudy) -> Vec<String> {
+fn notes(study: &FleetStudy, results: &[CellResult<'_>]) -> Vec<String> {
     let parameters = study.parameters();
     let law = match parameters.delay_law {
         DelayLaw::Constant => "constant",
@@ -90,7 +92,94 @@ fn notes(study: &FleetStudy) -> Vec<String> {
         "collisions: by the original's checker / true overlaps / of these outside every section; \
          the probability is of the first"
             .to_owned(),
+        format!(
+            "error rate: if all {} criteria on rates hold, at most {:.0} of 100 tables of other seeds miss one \
+             (Bonferroni); a criterion that does not hold is met in at most 1 of 40; counts are divided by the \
+             scatter among runs over that of independent sections, {} (Rao and Scott 1992); what the safe mode's \
+             proof rules out has no error rate: once is a miss",
+            test_count(results),
+            100.0 * ERROR_RATE,
+            scatter(results).map_or_else(
+                || "unavailable with single runs".to_owned(),
+                |ratio| format!("{ratio:.2}")
+            ),
+        ),
     ]
+}
+
+/// By chance, at most this share of tables miss a criterion on rates, if all of them hold.
+const ERROR_RATE: f64 = 0.05;
+
+/// How the criteria on rates are judged: each by an interval of the sample.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Judge {
+    /// What a miss must leave no doubt of.
+    miss: f64,
+    /// By which counts are divided.
+    scatter: f64,
+}
+
+impl Judge {
+    fn of(results: &[CellResult<'_>]) -> Self {
+        Self {
+            miss: 1.0 - ERROR_RATE / test_count(results).max(1) as f64,
+            scatter: scatter(results).unwrap_or(1.0).max(1.0),
+        }
+    }
+
+    /// The interval of collisions per 1000 critical sections.
+    fn per_1000(&self, tally: &FleetTally, confidence: f64) -> Option<(f64, f64)> {
+        let divided = |count: u64| floor_index(count as f64 / self.scatter + 0.5) as u64;
+        let (collisions, sections) = (tally.collision_count(), tally.section_count());
+        if collisions > sections {
+            return None;
+        }
+        let interval = clopper_pearson(divided(collisions), divided(sections), confidence)?;
+        Some((1e3 * interval.low, 1e3 * interval.high))
+    }
+
+    /// True when the interval of `figure` lies as `holds` says, at the usual confidence; false when it lies as
+    /// `fails` says, at that of a miss; `None` between.
+    fn verdict<T>(
+        &self,
+        interval: impl Fn(f64) -> Option<T>,
+        holds: impl Fn(&T) -> bool,
+        fails: impl Fn(&T) -> bool,
+    ) -> Option<bool> {
+        if holds(&interval(CONFIDENCE)?) {
+            Some(true)
+        } else {
+            fails(&interval(self.miss)?).then_some(false)
+        }
+    }
+}
+
+/// Criteria that are tests of a rate.
+fn test_count(results: &[CellResult<'_>]) -> usize {
+    let of_rows = results
+        .iter()
+        .filter(|one| !one.is_mechanism() && !matches!(one.cell.demand, Demand::None));
+    let of_mechanisms =
+        2 * SCENARIOS.len() * usize::from(results.iter().any(CellResult::is_mechanism));
+    of_rows.count() + of_mechanisms
+}
+
+/// Variance of the collisions among a cell's runs over that of independent sections, pooled over the cells
+/// (Pearson's chi-squared per degree of freedom): above 1 where collisions come together. `None` where no cell with
+/// collisions has two runs.
+fn scatter(results: &[CellResult<'_>]) -> Option<f64> {
+    let (mut sum, mut freedom) = (0.0, 0.0);
+    for tally in results.iter().filter_map(|one| one.tally.as_ref()) {
+        let Some(ratio) = tally.collision_ratio().filter(|ratio| *ratio > 0.0) else {
+            continue;
+        };
+        for run in tally.runs.iter().filter(|run| run.sections > 0) {
+            let expected = ratio * run.sections as f64;
+            sum += (run.collisions as f64 - expected).powi(2) / expected;
+        }
+        freedom += tally.runs.len().saturating_sub(1) as f64;
+    }
+    (freedom > 0.0).then(|| sum / freedom)
 }
 
 /// What Tables II and III show of ours.
@@ -134,6 +223,7 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
         Scenario::Harbor => ("table-2-harbor", "Table II, harbor"),
         _ => ("table-3-warehouse", "Table III, warehouse"),
     };
+    let judge = Judge::of(results);
     let mut rows = Vec::new();
     let ours = || {
         let of_scenario = |one: &&CellResult<'_>| one.cell.id.scenario == scenario;
@@ -145,11 +235,11 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
             if let Place::Published { row, .. } = one.place()
                 && row == published
             {
-                rows.push(published_row(published, Some(one)));
+                rows.push(published_row(published, Some(one), judge));
             }
         }
         if rows.len() == before {
-            rows.push(published_row(published, None));
+            rows.push(published_row(published, None, judge));
         }
     }
     for one in ours() {
@@ -163,7 +253,7 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
             row.extend(Field::cells(&FOUND, one.tally.as_ref()));
             row.extend(Field::cells(&PUBLISHED, None));
             let verdict = verdict_against(one).map(|(_, verdict)| verdict);
-            row.extend([Cell::verdict(verdict), judged(one)]);
+            row.extend([Cell::verdict(verdict), judged(one, judge)]);
             rows.push(row);
         }
     }
@@ -196,7 +286,11 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
 }
 
 /// A published row beside ours, if there is one.
-fn published_row(published: &PublishedRow, ours: Option<&CellResult<'_>>) -> Vec<Cell> {
+fn published_row(
+    published: &PublishedRow,
+    ours: Option<&CellResult<'_>>,
+    judge: Judge,
+) -> Vec<Cell> {
     let mut row = match published.condition {
         Condition::Static {
             loss_ratio,
@@ -223,7 +317,7 @@ fn published_row(published: &PublishedRow, ours: Option<&CellResult<'_>>) -> Vec
     let verdict = ours.and_then(verdict_against).map(|(_, verdict)| verdict);
     let verdict = verdict.or((!is_model).then_some(Verdict::NotComparable));
     row.push(Cell::verdict(verdict));
-    row.push(ours.map_or(Cell::Absent, judged));
+    row.push(ours.map_or(Cell::Absent, |one| judged(one, judge)));
     row
 }
 
@@ -306,14 +400,14 @@ fn interval_per_1000(tally: &FleetTally) -> Option<(f64, f64)> {
 }
 
 /// What a cell is held against, and whether it holds.
-fn judged(one: &CellResult<'_>) -> Cell {
+fn judged(one: &CellResult<'_>, judge: Judge) -> Cell {
     let demand = one.cell.demand;
     let text = demand_text(demand);
     if demand == Demand::None {
         return Cell::text(text);
     }
     let tally = one.tally.as_ref();
-    let verdict = match tally.and_then(|tally| verdict_of(demand, tally)) {
+    let verdict = match tally.and_then(|tally| verdict_of(demand, tally, judge)) {
         Some(true) => "met",
         Some(false) => "MISSED",
         None => "too few",
@@ -502,7 +596,7 @@ fn command_table(results: &[CellResult<'_>]) -> Table {
     }
 }
 
-/// Critical sections from which a demand is judged whatever its interval.
+/// Critical sections from which the demands on rates can be judged.
 const DECISIVE_COUNT: u64 = 100_000;
 /// Critical sections from which "none at all" is said to be met.
 const TELLING_COUNT: u64 = 10_000;
@@ -516,35 +610,28 @@ pub(crate) fn demand_text(demand: Demand) -> String {
     match demand {
         Demand::None => "reported only".to_owned(),
         Demand::Below(high) => format!("95 % < {high}"),
-        Demand::Within(low, high) => format!("> 0 and {low} to {high}"),
-        Demand::NoneSeen => "none by the original's checker".to_owned(),
+        Demand::Within(low, high) => format!("95 % in {low} to {high}"),
         Demand::NoneAtAll => "none by any checker".to_owned(),
     }
 }
 
-/// Whether a demand is met; `None` when there are too few critical sections to say. With few of
-/// them, a demand is missed only if its whole interval is, and met only if its whole interval is.
-pub(crate) fn verdict_of(demand: Demand, tally: &FleetTally) -> Option<bool> {
-    let is_decisive = tally.section_count() >= DECISIVE_COUNT;
-    // Without an interval there are no sections, or more collisions than sections.
-    let Some((low, high)) = interval_per_1000(tally) else {
-        return (tally.any_collision_count() > 0 && demand != Demand::None).then_some(false);
-    };
-    let per_1000 = per_1000(tally)?;
+/// Whether a demand is met; `None` when there are too few critical sections to say.
+pub(crate) fn verdict_of(demand: Demand, tally: &FleetTally, judge: Judge) -> Option<bool> {
+    let interval = |confidence| judge.per_1000(tally, confidence);
     match demand {
         Demand::None => None,
-        Demand::Below(bound) if high < bound => Some(true),
-        Demand::Below(bound) => (is_decisive || low >= bound).then_some(false),
-        Demand::Within(least, most) if is_decisive => {
-            Some(low > 0.0 && (least..=most).contains(&per_1000))
-        }
-        Demand::Within(least, most) if high < least || low > most => Some(false),
-        Demand::Within(least, most) => (low >= least && high <= most).then_some(true),
-        Demand::NoneSeen if tally.collision_count() > 0 => Some(false),
+        Demand::Below(bound) => judge.verdict(
+            interval,
+            |(_, high)| *high < bound,
+            |(low, _)| *low >= bound,
+        ),
+        Demand::Within(least, most) => judge.verdict(
+            interval,
+            |(low, high)| *low >= least && *high <= most,
+            |(low, high)| *high < least || *low > most,
+        ),
         Demand::NoneAtAll if tally.any_collision_count() > 0 => Some(false),
-        Demand::NoneSeen | Demand::NoneAtAll => {
-            (tally.section_count() >= TELLING_COUNT).then_some(true)
-        }
+        Demand::NoneAtAll => (tally.section_count() >= TELLING_COUNT).then_some(true),
     }
 }
 
@@ -562,29 +649,31 @@ const NOT_RUN: &str = "not run to its end";
 
 /// Everything the study is held against.
 pub(crate) fn criteria(results: &[CellResult<'_>]) -> Vec<Criterion> {
+    let judge = Judge::of(results);
     let published = results.iter().filter(|one| !one.is_mechanism());
     let mut criteria: Vec<_> = published
         .filter(|one| one.cell.demand != Demand::None)
         .map(|one| {
             let CellSpec { id, demand, .. } = one.cell;
             let known = one.tally.as_ref().map(|tally| {
-                let is_met = verdict_of(*demand, tally);
-                (is_met, collisions_text(tally))
+                let is_met = verdict_of(*demand, tally, judge);
+                (is_met, collisions_text(tally, judge))
             });
             criterion(format!("{id}: {}", demand_text(*demand)), known, NOT_RUN)
         })
         .collect();
     if results.iter().any(CellResult::is_mechanism) {
         criteria.extend(safe_criteria(results));
-        criteria.extend(SCENARIOS.map(|scenario| throughput(scenario, results)));
-        criteria.extend(SCENARIOS.map(|scenario| loss_exceeds_delay(scenario, results)));
+        criteria.extend(SCENARIOS.map(|scenario| throughput(scenario, results, judge)));
+        criteria.extend(SCENARIOS.map(|scenario| loss_exceeds_delay(scenario, results, judge)));
     }
     criteria
 }
 
-fn collisions_text(tally: &FleetTally) -> String {
+fn collisions_text(tally: &FleetTally, judge: Judge) -> String {
     let seen = &tally.referee;
-    let per_1000 = interval_per_1000(tally).map_or_else(String::new, |(low, high)| {
+    let interval = judge.per_1000(tally, CONFIDENCE);
+    let per_1000 = interval.map_or_else(String::new, |(low, high)| {
         format!(", {low:.2} to {high:.2} per 1000")
     });
     format!(
@@ -654,45 +743,66 @@ fn safe_criteria(results: &[CellResult<'_>]) -> [Criterion; 3] {
     ]
 }
 
-/// Safety costs little where nothing is wrong.
-fn throughput(scenario: Scenario, results: &[CellResult<'_>]) -> Criterion {
-    let rate = |mode| {
+/// Safety costs little where nothing is wrong: by the logarithms of the runs' rates (Welch 1947).
+fn throughput(scenario: Scenario, results: &[CellResult<'_>], judge: Judge) -> Criterion {
+    let rates = |mode| {
         let tally = mechanism_tally(results, scenario, Mechanism::Clean, mode);
         let is_telling = |tally: &&FleetTally| tally.section_count() >= RATE_SECTIONS_MIN;
-        tally.filter(is_telling)?.missions_per_hour()
+        let runs = &tally.filter(is_telling)?.runs;
+        let rates: Vec<f64> = runs.iter().map(|run| run.missions_per_hour.ln()).collect();
+        rates.iter().all(|rate| rate.is_finite()).then_some(rates)
     };
-    let rates = rate(CoordinatorMode::Legacy).zip(rate(CoordinatorMode::Safe));
-    let known = rates.map(|(legacy, safe)| {
-        let ratio = safe / legacy;
-        let finding = format!("{safe:.0} of {legacy:.0} per hour, {:.1} %", 100.0 * ratio);
-        (Some(ratio >= THROUGHPUT_RATIO_MIN), finding)
+    let both = rates(CoordinatorMode::Legacy).zip(rates(CoordinatorMode::Safe));
+    let known = both.and_then(|(legacy, safe)| {
+        let interval = |confidence| {
+            let difference = welch(&legacy, &safe, confidence)?;
+            Some(difference.map(f64::exp))
+        };
+        let is_met = judge.verdict(
+            interval,
+            |ratio| ratio.low >= THROUGHPUT_RATIO_MIN,
+            |ratio| ratio.high < THROUGHPUT_RATIO_MIN,
+        );
+        let ratio = interval(CONFIDENCE)?;
+        let finding = format!(
+            "{:.1} to {:.1} % (95 %) of legacy's, {} and {} runs",
+            100.0 * ratio.low,
+            100.0 * ratio.high,
+            safe.len(),
+            legacy.len()
+        );
+        Some((is_met, finding))
     });
     let scenario = scenario_name(scenario);
     criterion(
         format!("{scenario}: safe keeps 90 % of legacy's missions per hour when clean"),
         known,
-        &format!("{NOT_RUN}, or with fewer than {RATE_SECTIONS_MIN} CS"),
+        &format!("{NOT_RUN}, in a single run, or with fewer than {RATE_SECTIONS_MIN} CS"),
     )
 }
 
 /// Losing commands causes collisions where delaying them does not.
-fn loss_exceeds_delay(scenario: Scenario, results: &[CellResult<'_>]) -> Criterion {
-    let ends = |mechanism| {
-        let tally = mechanism_tally(results, scenario, mechanism, CoordinatorMode::Legacy);
-        tally.and_then(interval_per_1000)
-    };
-    let both = ends(Mechanism::CommandLoss10).zip(ends(Mechanism::Delay300Ms));
-    let known = both.map(|(loss, delay)| {
-        let is_met = if loss.0 > delay.1 {
-            Some(true)
-        } else {
-            (loss.1 < delay.0).then_some(false)
+fn loss_exceeds_delay(scenario: Scenario, results: &[CellResult<'_>], judge: Judge) -> Criterion {
+    let tally = |mechanism| mechanism_tally(results, scenario, mechanism, CoordinatorMode::Legacy);
+    let both = tally(Mechanism::CommandLoss10).zip(tally(Mechanism::Delay300Ms));
+    let known = both.and_then(|(loss, delay)| {
+        let interval = |confidence| {
+            Some((
+                judge.per_1000(loss, confidence)?,
+                judge.per_1000(delay, confidence)?,
+            ))
         };
+        let is_met = judge.verdict(
+            interval,
+            |(loss, delay)| loss.0 > delay.1,
+            |(loss, delay)| loss.1 < delay.0,
+        );
+        let (loss, delay) = interval(CONFIDENCE)?;
         let finding = format!(
             "{:.2} to {:.2} against {:.2} to {:.2} per 1000",
             loss.0, loss.1, delay.0, delay.1
         );
-        (is_met, finding)
+        Some((is_met, finding))
     });
     let scenario = scenario_name(scenario);
     let text = format!("{scenario}, legacy: losing 10 % of the commands is worse than 300 ms");
@@ -703,6 +813,11 @@ fn loss_exceeds_delay(scenario: Scenario, results: &[CellResult<'_>]) -> Criteri
 mod judgement_tests {
     use super::*;
 
+    const JUDGE: Judge = Judge {
+        miss: 0.999,
+        scatter: 1.0,
+    };
+
     fn tally(collisions: u64, sections: u64) -> FleetTally {
         let mut tally = FleetTally::default();
         tally.referee.section_collisions_count = collisions;
@@ -711,31 +826,46 @@ mod judgement_tests {
     }
 
     #[test]
-    fn few_sections_give_a_verdict_only_when_it_is_beyond_doubt() {
+    fn a_demand_is_met_or_missed_only_by_a_whole_interval() {
         let verdict =
-            |demand, collisions, sections| verdict_of(demand, &tally(collisions, sections));
+            |demand, collisions, sections| verdict_of(demand, &tally(collisions, sections), JUDGE);
         // No collision in 10 000 leaves up to 0.37 per 1000.
         assert_eq!(verdict(Demand::Below(0.2), 0, 10_000), None);
         assert_eq!(verdict(Demand::Below(0.37), 0, 10_000), Some(true));
         assert_eq!(verdict(Demand::Below(0.2), 0, 100_000), Some(true));
         assert_eq!(verdict(Demand::Below(0.2), 50, 10_000), Some(false));
-        assert_eq!(verdict(Demand::Below(0.2), 15, 100_000), Some(false));
+        // However many there are: a rate as the bound may fall on either side.
+        assert_eq!(verdict(Demand::Below(0.2), 15, 100_000), None);
+        assert_eq!(verdict(Demand::Below(0.2), 25, 100_000), None);
+        // Beyond 95 %, and not beyond what a table of many criteria takes.
+        assert_eq!(verdict(Demand::Below(0.2), 32, 100_000), None);
+        assert_eq!(verdict(Demand::Below(0.2), 45, 100_000), Some(false));
         assert_eq!(verdict(Demand::Within(0.2, 4.0), 0, 10_000), None);
         assert_eq!(verdict(Demand::Within(0.2, 4.0), 0, 100_000), Some(false));
         assert_eq!(verdict(Demand::Within(0.2, 4.0), 13, 10_000), Some(true));
         assert_eq!(verdict(Demand::Within(0.2, 4.0), 130, 100_000), Some(true));
+        assert_eq!(verdict(Demand::Within(0.2, 4.0), 22, 100_000), None);
         assert_eq!(verdict(Demand::None, 500, 100_000), None);
     }
 
     #[test]
+    fn collisions_that_come_together_count_as_fewer() {
+        let judge = Judge {
+            scatter: 4.0,
+            ..JUDGE
+        };
+        let verdict = |judge| verdict_of(Demand::Below(0.2), &tally(45, 100_000), judge);
+        assert_eq!((verdict(JUDGE), verdict(judge)), (Some(false), None));
+    }
+
+    #[test]
     fn one_collision_by_any_checker_misses_none_at_all() {
-        let verdict = |tally| verdict_of(Demand::NoneAtAll, &tally);
+        let verdict = |tally| verdict_of(Demand::NoneAtAll, &tally, JUDGE);
         assert_eq!(verdict(tally(0, 10_000)), Some(true));
         assert_eq!(verdict(tally(0, 100)), None);
         assert_eq!(verdict(tally(1, 100)), Some(false));
         let mut overlap = tally(0, 1_000_000);
         overlap.referee.overlaps_count = 1;
-        assert_eq!(verdict_of(Demand::NoneSeen, &overlap), Some(true));
         assert_eq!(verdict(overlap), Some(false));
         let mut early = tally(0, 0);
         early.referee.overlaps_count = 1;

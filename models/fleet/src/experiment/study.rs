@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::case::FleetParameters;
 use crate::experiment::cells::{
-    CellSpec, CollidedRun, FleetTally, SCENARIOS, mechanism_cells, published_cells, scenario_name,
+    CellSpec, CollidedRun, FleetTally, RunFigures, SCENARIOS, mechanism_cells, published_cells,
+    scenario_name,
 };
 use crate::experiment::driver::{Experiment, Setup};
 use crate::experiment::report::{self, CellResult};
@@ -222,7 +223,13 @@ impl Study for FleetStudy {
             if count >= task.sections || is_standing {
                 let robot = &cell.setup.robot;
                 let first = experiment.incidents().first();
+                let tally = experiment.tally();
                 return Some(FleetTally {
+                    runs: vec![RunFigures {
+                        sections: tally.section_count(),
+                        collisions: tally.collision_count(),
+                        missions_per_hour: tally.missions_per_hour().unwrap_or(0.0),
+                    }],
                     stop_error_bound_m: robot.stop_error_bound_m(&scene.world.vehicle),
                     stand_count: u64::from(is_standing),
                     collided: Vec::from_iter(first.map(|incident| CollidedRun {
@@ -230,7 +237,7 @@ impl Study for FleetStudy {
                         seed,
                         first_at: incident.at,
                     })),
-                    ..experiment.tally()
+                    ..tally
                 });
             }
             if !watch(count as f64 / task.sections as f64) {

@@ -27,11 +27,14 @@ impl CaseStudy for Guided {
         ChannelSpec::of::<EgmFeedback>("egm/left/feedback", "robot", "controller"),
         ChannelSpec::recorded::<EgmEvent>("egm/event", "robot"),
     ];
-    const MAY_RESTART: bool = false;
     type Parameters = GuidedParameters;
 
     fn new(_parameters: Self::Parameters, _seed: u64) -> Result<Self, ParameterError> {
         Ok(Self)
+    }
+
+    fn may_restart(_parameters: &GuidedParameters, _role: &str) -> bool {
+        false
     }
 
     fn role(&self, _name: &str) -> Option<Box<dyn Role>> {

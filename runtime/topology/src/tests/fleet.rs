@@ -115,6 +115,30 @@ fn every_fault_of_a_world_names_its_key_and_line() {
     }
 }
 
+#[test]
+fn a_safe_coordinator_may_be_restarted_and_robots_may_not() {
+    let restarted = |process: &str| {
+        let role = format!("processes.{process}.role = ");
+        let anew = format!("processes.{process}.on_exit = \"restart\"\n{role}");
+        let safe = "case.parameters.coordinator.mode=\"safe\"".to_owned();
+        parse(
+            "hall.toml",
+            &HALL.replacen(&role, &anew, 1),
+            &[safe],
+            &known(),
+        )
+    };
+    let topology = restarted("controller").unwrap();
+    let controller = topology.process("controller").unwrap();
+    assert_eq!(controller.restarts.on_exit(), OnExit::Restart { limit: 3 });
+    let errors = restarted("robots").unwrap_err();
+    assert_eq!(
+        errors.errors()[0].key,
+        "processes.robots.on_exit",
+        "{errors}"
+    );
+}
+
 /// A shipped file in a world that takes no planning: what it says of the rest is what counts.
 fn load_small(name: &str) -> Topology {
     load_shipped(name, &["case.parameters.world.scenario=crossing"])

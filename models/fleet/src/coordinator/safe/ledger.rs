@@ -225,10 +225,6 @@ impl Ledger {
         kept.chain(open).map(|entry| &mut entry.sequence)
     }
 
-    pub(crate) fn acknowledged_sequence(&self) -> u32 {
-        self.acknowledged.sequence
-    }
-
     /// Forgets what only a count rests on.
     pub(crate) fn forget_ceiling(&mut self) {
         self.ceiling = self.last_index;
@@ -238,6 +234,11 @@ impl Ledger {
     pub(crate) fn plant_lost_acknowledgement(&mut self) {
         self.acknowledged = self.newest;
         (self.open, self.open_count) = (Default::default(), 0);
+    }
+
+    /// A planted fault: the next state counts as newer than all before.
+    pub(crate) fn plant_stale_state(&mut self) {
+        self.acknowledged = Entry::default();
     }
 }
 
