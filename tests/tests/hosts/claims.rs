@@ -124,7 +124,11 @@ fn a_run_that_wants_the_card_of_another_one_is_refused_and_one_without_it_runs_b
         assert!(keys.iter().all(|key| !refused.stderr.contains(key)));
     }
     let beside = trial("third", 7_970, "software").set("run.duration=\"2 s\"");
-    for summary in [Split::start(&lab, &beside).finish(), first.finish()].concat() {
+    let mut beside = Split::start(&lab, &beside);
+    for host in &mut beside.hosts {
+        ended(host).assert_success();
+    }
+    for summary in [first.finish(), beside.summaries()].concat() {
         for name in CHANNELS {
             assert_eq!(account(&summary, name).fates.lost_count(), 0, "{name}");
         }
