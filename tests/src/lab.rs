@@ -14,7 +14,7 @@ mod self_tests;
 use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Read};
-use std::net::Ipv4Addr;
+use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc;
@@ -251,12 +251,17 @@ impl LabHost {
         }
     }
 
-    /// Gives this host one more address on the first cable.
+    /// Gives this host one more address on the first cable, to be used at once.
     ///
     /// # Panics
     /// When it cannot be done.
-    pub fn add_address(&self, address: Ipv4Addr) {
-        self.change(&["address", "add", &format!("{address}/24")]);
+    pub fn add_address(&self, address: impl Into<IpAddr>) {
+        let address = address.into();
+        if address.is_ipv4() {
+            self.change(&["address", "add", &format!("{address}/24")]);
+        } else {
+            self.change(&["address", "add", &format!("{address}/64"), "nodad"]);
+        }
     }
 
     /// Takes the address of the first cable away from this host, as a lease that ran out does.
@@ -279,8 +284,14 @@ impl LabHost {
     ///
     /// # Panics
     /// When it cannot be done.
-    pub fn pin_neighbour(&self, address: Ipv4Addr, hardware: &str) {
-        self.change(&["neigh", "replace", &address.to_string(), "lladdr", hardware]);
+    pub fn pin_neighbour(&self, address: impl Into<IpAddr>, hardware: &str) {
+        self.change(&[
+            "neigh",
+            "replace",
+            &address.into().to_string(),
+            "lladdr",
+            hardware,
+        ]);
     }
 
     /// Sets the longest packet of the first cable's interface, in bytes, and lets the host forget what it

@@ -1,6 +1,7 @@
-//! Files that another user may have made: a pipe or a device in their place would make their reader wait.
+//! Files whose names others can guess: a pipe or a device in their place would make their reader wait, a link their
+//! writer overwrite what it leads to.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, Read};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
@@ -31,6 +32,20 @@ fn open_with(path: &Path, more: OFlag) -> io::Result<File> {
         return Err(io::Error::other("not a regular file"));
     }
     Ok(file)
+}
+
+/// A new file at `path`, to be written. What has the name goes: a link of another user is not followed.
+///
+/// # Errors
+/// When what is there cannot be removed, or the file not be made.
+pub fn create_anew(path: &Path) -> io::Result<File> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    let mut options = File::options();
+    let options = options.write(true).create_new(true);
+    options.custom_flags(OFlag::O_NOFOLLOW.bits()).open(path)
 }
 
 /// All of the file at `path`.
@@ -66,10 +81,27 @@ mod tests {
         let path = std::env::temp_dir().join(name);
         mkfifo(&path, Mode::S_IRWXU).unwrap();
         let refused = read_to_string(&path).unwrap_err();
-        std::fs::remove_file(&path).unwrap();
+        fs::remove_file(&path).unwrap();
         assert_eq!(refused.to_string(), "not a regular file");
-        std::fs::write(&path, "x").unwrap();
+        fs::write(&path, "x").unwrap();
         assert_eq!(read(&path).unwrap(), b"x");
-        std::fs::remove_file(path).unwrap();
+        fs::remove_file(path).unwrap();
+    }
+
+    #[test]
+    fn a_new_file_takes_the_place_of_a_link_and_leaves_what_it_leads_to() {
+        let folder = format!("hil-plain-file-link-{}", std::process::id());
+        let folder = std::env::temp_dir().join(folder);
+        fs::create_dir(&folder).unwrap();
+        let (thesis, path) = (folder.join("thesis"), folder.join("report.partial"));
+        fs::write(&thesis, "years").unwrap();
+        for _ in 0..2 {
+            std::os::unix::fs::symlink(&thesis, &path).unwrap();
+            io::Write::write_all(&mut create_anew(&path).unwrap(), b"x").unwrap();
+            assert_eq!(read(&thesis).unwrap(), b"years");
+            assert_eq!(read(&path).unwrap(), b"x");
+            fs::remove_file(&path).unwrap();
+        }
+        fs::remove_dir_all(folder).unwrap();
     }
 }

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::{io, process};
 
+use hil_platform::plain_file;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
@@ -205,7 +206,7 @@ impl Recording {
             // Whoever makes it has it: two recorders that begin together must not write one file.
             File::options().write(true).create_new(true).open(&partial)
         } else {
-            File::create(&partial)
+            plain_file::create_anew(&partial)
         };
         let file = file.and_then(QueuedFile::new).map_err(|source| {
             if is_live && source.kind() == io::ErrorKind::AlreadyExists {

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -14,6 +14,7 @@ use crate::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage, start_t
 use crate::run_folder::{RunFolder, utc_text};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::own_folder::OwnFolder;
+use hil_platform::plain_file;
 use hil_topology::{Channel, Process, Program, Topology};
 
 /// A run that is announced for as long as this lives.
@@ -87,9 +88,7 @@ impl Announcement {
         let text = serde_json::to_string_pretty(&self.run).map_err(io::Error::other)?;
         for folder in &self.folders {
             let new = folder.join(format!(".{}.new", LiveRun::FILE_NAME));
-            // One that was left by a kill between the two.
-            let _was_left = fs::remove_file(&new).is_ok();
-            File::create_new(&new)?.write_all(text.as_bytes())?;
+            plain_file::create_anew(&new)?.write_all(text.as_bytes())?;
             fs::rename(&new, path(folder))?;
         }
         Ok(())

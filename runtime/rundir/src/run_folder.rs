@@ -1,9 +1,11 @@
 //! The folder a run leaves behind: where each file lies. What the files say is decided by those
 //! who write them.
 
+use std::fs::{self, DirBuilder};
+use std::io;
+use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
-use std::{fs, io};
 
 /// Paths of one run.
 ///
@@ -35,6 +37,9 @@ impl RunFolder {
         let stamp = utc_stamp(SystemTime::now());
         let suffix = host.map(|host| format!("-{host}")).unwrap_or_default();
         fs::create_dir_all(parent)?;
+        // Whatever the umask: who could write to it could have its files lead elsewhere.
+        let mut folders = DirBuilder::new();
+        folders.mode(0o755);
         for attempt in 0..100 {
             let again = if attempt == 0 {
                 String::new()
@@ -42,13 +47,13 @@ impl RunFolder {
                 format!(".{attempt}")
             };
             let root = parent.join(format!("{name}-{stamp}{suffix}{again}"));
-            match fs::create_dir(&root) {
+            match folders.create(&root) {
                 Ok(()) => {
                     let folder = Self {
                         root: root.canonicalize()?,
                     };
                     for part in ["records", "cards", "launch", "logs"] {
-                        fs::create_dir(folder.root.join(part))?;
+                        folders.create(folder.root.join(part))?;
                     }
                     return Ok(folder);
                 }
@@ -204,6 +209,8 @@ fn utc_parts(at: SystemTime) -> [u64; 6] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nix::sys::stat::{Mode, umask};
+    use std::os::unix::fs::PermissionsExt as _;
     use std::time::Duration;
 
     #[test]
@@ -220,6 +227,20 @@ mod tests {
             );
         }
         assert_eq!(utc_stamp(UNIX_EPOCH), "19700101-000000");
+    }
+
+    #[test]
+    fn nobody_else_may_write_to_a_run_folder_whatever_the_umask() {
+        let parent = std::env::temp_dir().join(format!("hil-folder-{}", std::process::id()));
+        let before = umask(Mode::empty());
+        let folder = RunFolder::create(&parent, "x", None);
+        umask(before);
+        let folder = folder.unwrap();
+        for path in [folder.root(), &folder.records()] {
+            let mode = fs::metadata(path).unwrap().permissions().mode();
+            assert_eq!(mode & 0o777, 0o755, "{}", path.display());
+        }
+        fs::remove_dir_all(parent).unwrap();
     }
 
     #[test]

@@ -4,12 +4,13 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use hil_core::time::Instant;
 use nix::errno::Errno;
-use nix::fcntl::{FallocateFlags, fallocate};
+use nix::fcntl::{FallocateFlags, OFlag, fallocate};
 use serde::{Deserialize, Serialize};
 
 use super::event::{Event, ProcessHistory};
@@ -20,6 +21,7 @@ use super::run_folder::RunFolder;
 use crate::protection::RunSecurity;
 use hil_platform::clock_discipline::HostDiscipline;
 use hil_platform::host_facts::HostFacts;
+use hil_platform::plain_file;
 
 /// What `result.json` says it is.
 pub const RUN_RESULT_FORMAT: &str = "hil-run-result";
@@ -178,7 +180,7 @@ struct Head {
 /// # Errors
 /// When there is no room.
 pub fn hold_room(folder: &RunFolder, bytes: u64) -> io::Result<()> {
-    let file = File::create(new_file(folder))?;
+    let file = plain_file::create_anew(&new_file(folder))?;
     let bytes = i64::try_from(bytes).map_err(io::Error::other)?;
     match fallocate(&file, FallocateFlags::empty(), 0, bytes) {
         Err(Errno::EOPNOTSUPP | Errno::ENOSYS) => Ok(()),
@@ -217,6 +219,7 @@ impl RunResult {
             .write(true)
             .create(true)
             .truncate(false)
+            .custom_flags(OFlag::O_NOFOLLOW.bits())
             .open(&new);
         let written = options.and_then(|mut file| {
             file.write_all(text.as_bytes())?;

@@ -47,8 +47,9 @@ options! {
         record: Cow<'static, str> = Cow::Borrowed("runs"), in FOLDER;
         /// How long a host waits for its peers before the run starts.
         start_timeout: Duration = Duration::from_secs(30), in Duration::from_secs(1)..=Duration::from_hours(1);
-        /// How long a host may be silent during the run before it counts as gone. The default lets a radio
-        /// roam, and notices a host that vanished within half a minute.
+        /// How long a host may be silent, or its connection missing, before it counts as gone; also while
+        /// records are exchanged. The default lets a radio roam, and notices a host that vanished within
+        /// half a minute.
         peer_timeout: Duration = Duration::from_secs(30), in Duration::from_secs(1)..=Duration::from_hours(1);
     }
 }

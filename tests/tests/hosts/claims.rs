@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use hil_report::summary::Outcome;
 use hil_tests::account::account;
 use hil_tests::child::{ChildGuard, Finished};
-use hil_tests::lab::Lab;
+use hil_tests::lab::{INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split, count, direction};
@@ -81,6 +81,59 @@ fn a_second_start_is_refused_and_costs_the_first_run_no_message_and_no_connectio
         }
         assert_eq!(folder_count(record.path()), HOSTS.len());
     }
+}
+
+/// Other ports, another meeting, the same card. A cable of a lab has none that stamps; what a run sets up there is
+/// claimed all the same.
+#[test]
+fn a_run_that_wants_the_card_of_another_one_is_refused_and_one_without_it_runs_beside_it() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("card");
+    let trial = |name: &str, port: u16, stamps: &str| {
+        Trial::shipped("shuttle-split.toml", &record.join(name))
+            .set(&format!("links.hop.port={port}"))
+            .set(&format!("hosts.control-pc.control_port={}", port + 9))
+            .set(&format!("links.hop.timestamps=\"{stamps}\""))
+            .set("channels.\"shuttle/command\".depth=256")
+            .set("channels.\"shuttle/status\".depth=256")
+    };
+    let first = trial("first", 7_930, "hardware").set("run.duration=\"10 s\"");
+    let first = Split::start(&lab, &first);
+    first.wait_for_messages("the begin of the run");
+    let others = trial("second", 7_950, "hardware");
+    for (index, host) in HOSTS.iter().enumerate() {
+        let mut again = others.start_on(lab.host(index));
+        let refused = ended(&mut again);
+        println!("{}", refused.stderr);
+        refused.assert_code(75);
+        let (pid, folder) = (first.hosts[index].pid(), first.files[index].root());
+        for words in [
+            format!("hosts.{host}.address"),
+            format!("card {INTERFACE} is held by hil-runtime (process {pid}), the run in "),
+            format!("{};", folder.display()),
+        ] {
+            assert!(
+                refused.stderr.contains(&words),
+                "{words}: {}",
+                refused.stderr
+            );
+        }
+        let keys = ["links.hop.port", "control_port"];
+        assert!(keys.iter().all(|key| !refused.stderr.contains(key)));
+    }
+    let beside = trial("third", 7_970, "software").set("run.duration=\"2 s\"");
+    let mut beside = Split::start(&lab, &beside);
+    for host in &mut beside.hosts {
+        ended(host).assert_success();
+    }
+    for summary in [first.finish(), beside.summaries()].concat() {
+        for name in CHANNELS {
+            assert_eq!(account(&summary, name).fates.lost_count(), 0, "{name}");
+        }
+    }
+    assert!(!record.join("second").exists());
 }
 
 #[test]

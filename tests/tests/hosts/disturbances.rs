@@ -8,8 +8,10 @@ use std::thread;
 use std::time::Duration;
 
 use hil_account::MessageFate;
-use hil_report::summary::{Outcome, RunSummary};
+use hil_report::summary::{Outcome, RunEventKind, RunSummary};
+use hil_rundir::event::EventKind;
 use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
+use hil_tests::child::ChildGuard;
 use hil_tests::lab::{INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
@@ -218,4 +220,79 @@ fn a_disk_that_does_not_answer_makes_no_host_silent() {
         fs::symlink_metadata(&status).is_ok_and(|data| data.is_file())
     });
     stopped(split);
+}
+
+/// A path that drops what passes without a word: no reset, no report, and the cable stays in.
+const SILENT_FOR: Duration = Duration::from_secs(10);
+/// What the hosts' network is slowed to after the run, so that the exchange of records takes seconds.
+const SLOW: &str = "tbf rate 2mbit burst 64kb limit 1mb";
+
+/// What leaves these hosts meets the queue `what`, the kernel's own where it is empty.
+fn set_queue(lab: &Lab, hosts: &[usize], what: &str) {
+    for host in hosts {
+        let words = if what.is_empty() {
+            format!("qdisc delete dev {INTERFACE} root")
+        } else {
+            format!("qdisc replace dev {INTERFACE} root {what}")
+        };
+        let mut command = lab.host(*host).command("tc");
+        let status = command.args(words.split(' ')).status().unwrap();
+        assert!(status.success(), "tc {words}");
+    }
+}
+
+#[test]
+fn a_path_that_drops_everything_silently_for_less_than_a_host_may_be_away_ends_nothing() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("silent-path");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set("case.parameters.rate_hz=200.0")
+        .set("run.duration=\"10 min\"");
+    let mut split = start(&lab, &trial);
+    // Both ways, and either alone.
+    let both = [0, 1];
+    let silences = [&both[..], &both[..1], &both[1..]];
+    for (number, silent) in silences.into_iter().enumerate() {
+        set_queue(&lab, silent, "blackhole");
+        thread::sleep(SILENT_FOR);
+        set_queue(&lab, silent, "");
+        wait_until(LIMIT, "the supervisors' connection", || {
+            let mut told = split.hosts.iter().map(ChildGuard::stderr_so_far);
+            told.all(|text| text.matches("is back after").count() > number)
+        });
+        split.wait_for_messages("a silent path");
+    }
+    set_queue(&lab, &both, SLOW);
+    split.hosts[0].signal(Signal::SIGTERM).unwrap();
+    wait_until(LIMIT, "records of the other host", || {
+        split.files[0].record_bytes("shuttle.command.taken.") > 0
+    });
+    set_queue(&lab, &both, "blackhole");
+    thread::sleep(SILENT_FOR);
+    set_queue(&lab, &both, SLOW);
+    split.ended();
+    for summary in split.summaries() {
+        assert_eq!(summary.run.outcome, Outcome::Stopped);
+        assert!(summary.record_gaps.is_empty(), "{:?}", summary.record_gaps);
+        let cuts: Vec<String> = summary
+            .events
+            .iter()
+            .filter(|event| {
+                matches!(
+                    event.kind,
+                    RunEventKind::Process(EventKind::Reconnected { .. })
+                )
+            })
+            .map(|event| format!("at {:?} s, {}", event.at_s, event.what()))
+            .collect();
+        println!("{}: {cuts:#?}", summary.run.host);
+        assert!(cuts.len() >= 4, "{cuts:?}");
+        for channel in CHANNELS {
+            let said = describe(channel, account(&summary, channel));
+            println!("{}: {said}", summary.run.host);
+        }
+        assert_every_message_is_accounted_for(&summary);
+    }
 }

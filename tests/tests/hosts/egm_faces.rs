@@ -1,6 +1,8 @@
 //! Our controller drives our robot as two strangers would: each run knows the other only by the
 //! robot maker's datagrams, sensor adapter on one host, robot adapter on the other.
 
+use std::net::{Ipv4Addr, UdpSocket};
+use std::thread;
 use std::time::Duration;
 
 use hil_arm::egm::messages::{EgmEventKind, Side};
@@ -8,13 +10,17 @@ use hil_arm::yumi::Joints;
 use hil_arm::yumi::arm::Arm;
 use hil_report::adapter::AdapterSummary;
 use hil_report::summary::{Outcome, RunSummary};
+use hil_rundir::pipe::{AdapterRefusal, RefusalCount};
 use hil_tests::account::assert_account_closes;
 use hil_tests::arms::{Arms, of_kind};
 use hil_tests::lab::{ADDRESSES, Lab};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::{Trial, load_average};
+use hil_tests::trial::{Trial, load_average, wait_until};
 
 const LIMIT: Duration = Duration::from_mins(2);
+/// An address of the hosts' network that is nobody's, and the datagrams that come from there.
+const STRANGER: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 66);
+const SPOKEN_COUNT: u64 = 1_500;
 const SECOND_NS: i64 = 1_000_000_000;
 /// Lag of the control law at a gain of 20/s, four cycles until a motion is measured, and one of
 /// them until a command is used.
@@ -133,6 +139,12 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     let sensor_files = sensor.folder("", LIMIT);
     let mut robot_run = robot.start_on(lab.host(1));
     let robot_files = robot.folder("", LIMIT);
+    wait_until(LIMIT, "the robot at the sensor", || {
+        sensor_files.record_bytes("egm.right.feedback.published.") > 10_000
+    });
+    let (spoken_count, answer_count) = speak_as_a_stranger(&lab);
+    println!("a stranger: {spoken_count} datagrams, {answer_count} answers");
+    assert_eq!(answer_count, 0);
     for run in [&mut robot_run, &mut sensor_run] {
         run.wait_within(LIMIT).unwrap().assert_success();
     }
@@ -146,13 +158,34 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     for (side, arm) in [(Side::Right, Arm::right()), (Side::Left, Arm::left())] {
         assert_driven(&here, &there, side, &arm);
     }
-    judge([&sensor_files.summary(), &robot_files.summary()]);
+    judge(
+        [&sensor_files.summary(), &robot_files.summary()],
+        spoken_count,
+    );
     sensor_files.assert_nothing_left_on(lab.host(0));
     robot_files.assert_nothing_left_on(lab.host(1));
 }
 
-/// What both reports must say of their adapters.
-fn judge([sensor, robot]: [&RunSummary; 2]) {
+/// Datagrams to the sensor of the right arm from an address that is not the robot's, beside those of the robot, for
+/// some seconds; gives how many, and the answers.
+fn speak_as_a_stranger(lab: &Lab) -> (u64, usize) {
+    lab.host(1).add_address(STRANGER);
+    lab.host(1).on_network(|| {
+        let socket = UdpSocket::bind((STRANGER, 0)).unwrap();
+        socket.set_nonblocking(true).unwrap();
+        let (mut spoken_count, mut answer_count) = (0, 0);
+        for number in 0..SPOKEN_COUNT {
+            let words = number.to_le_bytes().repeat(12);
+            spoken_count += u64::from(socket.send_to(&words, (ADDRESSES[0], 6510)).is_ok());
+            thread::sleep(Duration::from_millis(2));
+            answer_count += usize::from(socket.recv(&mut [0; 2048]).is_ok());
+        }
+        (spoken_count, answer_count)
+    })
+}
+
+/// What both reports must say of their adapters, to one of which a stranger spoke.
+fn judge([sensor, robot]: [&RunSummary; 2], spoken_count: u64) {
     for (summary, kind, way) in [
         (sensor, "EGM sensor adapter", ["feedback", "command"]),
         (robot, "EGM robot adapter", ["command", "feedback"]),
@@ -175,7 +208,13 @@ fn judge([sensor, robot]: [&RunSummary; 2]) {
                     .cycle_ns
                     .is_some_and(|cycle_ns| (3_900_000..4_100_000).contains(&cycle_ns))
             );
-            assert_eq!(adapter.refusals, [], "{arm}");
+            let is_spoken_to = kind == "EGM sensor adapter" && arm == "right";
+            let refused = [RefusalCount {
+                cause: AdapterRefusal::ForeignAddress,
+                count: spoken_count,
+            }];
+            let refused = &refused[..usize::from(is_spoken_to)];
+            assert_eq!(adapter.refusals, refused, "{arm}");
             assert_eq!(count(adapter, "socket: kernel_drop_count"), 0);
         }
     }

@@ -256,7 +256,9 @@ fn a_killed_supervisor_takes_its_processes_along_and_the_other_host_says_who_van
 fn kill_supervisor(lab: &Lab, victim: usize) {
     let other = 1 - victim;
     let record = RunFolder::new("supervisor-killed");
-    let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"10 min\"");
+    let trial = Trial::shipped("split.toml", record.path())
+        .set("run.duration=\"10 min\"")
+        .set("run.peer_timeout=\"5 s\"");
     let mut split = start(lab, &trial);
     assert!(split.files[victim].processes().len() >= 2);
     split.hosts[victim].signal(Signal::SIGKILL).unwrap();

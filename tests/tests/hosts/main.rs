@@ -26,6 +26,7 @@ mod probe_run;
 mod secured_run;
 mod soak;
 mod split_run;
+mod stranger_showers;
 mod stranger_words;
 mod strangers;
 mod tcp_run;

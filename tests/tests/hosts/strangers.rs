@@ -66,7 +66,7 @@ pub(super) fn hardware_address(lab: &Lab, index: usize) -> String {
 
 /// One after the other: a recorded datagram, the same with a bit flipped, cut, with another payload, as a
 /// plain one, of another channel, of another session, of another version, and noise.
-fn made_up(recorded: &[Vec<u8>], random: &mut RandomStream, number: u64) -> Vec<u8> {
+pub(super) fn made_up(recorded: &[Vec<u8>], random: &mut RandomStream, number: u64) -> Vec<u8> {
     let index = usize::try_from(random.next_u64() % recorded.len() as u64).unwrap();
     let mut out = recorded[index].clone();
     let byte = random.next_u64().to_le_bytes();

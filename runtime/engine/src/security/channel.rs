@@ -5,6 +5,7 @@ use core::fmt;
 use std::io::{self, Read, Write};
 use std::net::TcpStream;
 use std::sync::Arc;
+use std::time::Duration;
 
 use snow::StatelessTransportState;
 use zeroize::Zeroizing;
@@ -107,9 +108,9 @@ impl SecureReader {
         }
     }
 
-    /// From now on a read waits for as long as it takes.
-    pub(crate) fn wait_for_ever(&mut self) -> io::Result<()> {
-        self.stream.wait_for_ever()
+    /// As that of [`TimedStream`].
+    pub(crate) fn wait_at_most(&mut self, limit: Duration) -> io::Result<()> {
+        self.stream.wait_at_most(limit)
     }
 
     /// Reads the next record; false at the end of the connection.

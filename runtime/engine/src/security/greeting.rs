@@ -98,10 +98,10 @@ impl TimedStream {
         }
     }
 
-    /// From now on a read waits for as long as it takes.
-    pub(crate) fn wait_for_ever(&mut self) -> io::Result<()> {
+    /// From now on a read fails when no byte comes for `limit`.
+    pub(crate) fn wait_at_most(&mut self, limit: Duration) -> io::Result<()> {
         self.deadline = None;
-        self.stream.set_read_timeout(None)
+        self.stream.set_read_timeout(Some(limit))
     }
 
     /// Has the next four bytes read again.

@@ -3,13 +3,13 @@
 //! is refused before it disturbs the first.
 //!
 //! A claim is a listening socket of the abstract Unix namespace: of one network namespace, as ports and
-//! cards are, and freed by the kernel with its process however that ends. Its name says what is claimed
-//! behind a number drawn at random, so that nobody can take it beforehand. Whoever connects learns from the
-//! kernel whose it is, and reads the run's folder. Shared memory has the lock on its folder instead
-//! (`hil_shm::Domain`), which is of one mount namespace as that is.
+//! cards are, and freed by the kernel with its process however that ends. It has one of a few names that follow from
+//! what is claimed: a run binds one of them and then asks at all the others. So of two that begin in one moment the
+//! one that binds later finds the other. Whoever connects learns from the kernel whose it is, and reads the address,
+//! if it is a port, and the run's folder. Shared memory has the lock on its folder instead (`hil_shm::Domain`), which
+//! is of one mount namespace as that is.
 
 use core::fmt;
-use core::str::FromStr;
 use core::time::Duration;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -27,7 +27,6 @@ use hil_core::message::{FNV_OFFSET, fnv1a};
 use hil_nic::nic_clock::card_of;
 use hil_platform::random::random_bytes;
 use hil_platform::text::visible;
-use hil_protocol::transport::IpProtocol;
 use hil_topology::{Topology, collide, control_key};
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
@@ -39,91 +38,26 @@ use nix::unistd::Uid;
 
 /// What the names of all claims begin with.
 const PREFIX: &str = "hil-claim";
-/// The kernel's list of Unix sockets of this network namespace.
-const SOCKETS: &str = "/proc/net/unix";
+/// Names of one resource: a port can be held at different addresses, and others may hold a card's names.
+const NAMES: u8 = 32;
 /// Two runs that begin in one moment see each other: both take their claims back and try again.
 const ATTEMPTS: u32 = 3;
 /// Bound of the time in between, drawn at random.
 const PAUSE_MS_MAX: u64 = 64;
 /// How long holders together may take to say which folder is theirs.
 const TOLD_WITHIN: Duration = Duration::from_secs(3);
-/// Longest path.
-const FOLDER_BYTES_MAX: usize = 4096;
+/// Longest answer: an address and a path.
+const ANSWER_BYTES_MAX: usize = 4096 + 128;
 /// After an error of accept, such as having no descriptor left.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
-/// What one run at a time has.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Resource<'a> {
-    Port(IpProtocol, SocketAddr),
-    /// The card of an interface.
-    Card(&'a str),
-    /// The place of a host, by a number made of its name, among those that meet at an address.
-    Place(SocketAddr, u64),
-}
-
-impl Resource<'_> {
-    fn collides(self, other: Resource<'_>) -> bool {
-        match (self, other) {
-            (Self::Port(one, address), Resource::Port(two, taken)) => {
-                one == two && collide(address, taken)
-            }
-            _ => self == other,
-        }
-    }
-
-    /// Any user can take a port, and so keep a run from starting: who says that it is his is believed. A card
-    /// only a process with the right to can set up.
-    fn is_believed_of(self, holder: &UnixCredentials) -> bool {
-        match self {
-            Self::Port(..) | Self::Place(..) => true,
-            Self::Card(_) => is_trusted(holder.uid()) || may_set_up_cards(holder.pid()),
-        }
-    }
-}
-
-impl fmt::Display for Resource<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Port(protocol, address) => write!(f, "{} {address}", protocol.word()),
-            Self::Card(interface) => write!(f, "card {interface}"),
-            Self::Place(address, host) => write!(f, "place {address} {host:x}"),
-        }
-    }
-}
-
-/// A name that is none of ours.
-struct Foreign;
-
-impl<'a> TryFrom<&'a str> for Resource<'a> {
-    type Error = Foreign;
-
-    fn try_from(text: &'a str) -> Result<Self, Foreign> {
-        fn parsed<T: FromStr>(text: &str) -> Result<T, Foreign> {
-            text.parse().map_err(|_other| Foreign)
-        }
-        let (kind, rest) = text.split_once(' ').ok_or(Foreign)?;
-        let mut protocols = [IpProtocol::Udp, IpProtocol::Tcp].into_iter();
-        if let Some(protocol) = protocols.find(|one| one.word() == kind) {
-            return Ok(Self::Port(protocol, parsed(rest)?));
-        }
-        match kind {
-            "card" => Ok(Self::Card(rest)),
-            "place" => {
-                let (address, host) = rest.split_once(' ').ok_or(Foreign)?;
-                let host = u64::from_str_radix(host, 16).map_err(|_other| Foreign)?;
-                Ok(Self::Place(parsed(address)?, host))
-            }
-            _ => Err(Foreign),
-        }
-    }
-}
-
-/// What a run of a topology needs for itself.
+/// What a run of a topology needs for itself, which one run at a time has.
 #[derive(Debug, Clone)]
 struct Wanted {
-    /// A [`Resource`] as text.
+    /// What all that may collide with it are called: a port without its address, a card, a place among hosts that meet.
     resource: String,
+    /// Of a port.
+    address: Option<SocketAddr>,
     /// What for.
     of: String,
     /// The key of the topology to change.
@@ -131,18 +65,34 @@ struct Wanted {
 }
 
 impl Wanted {
-    fn resource(&self) -> Option<Resource<'_>> {
-        Resource::try_from(self.resource.as_str()).ok()
+    /// Whether a claim of the same resource is one of this; `address` is that of a port, `None` where it is not told.
+    fn collides(&self, address: Option<SocketAddr>) -> bool {
+        let both = self.address.zip(address);
+        both.is_none_or(|(own, other)| collide(own, other))
+    }
+
+    /// Any user can take a port, and so keep a run from starting: who says that it is his is believed. A card
+    /// only a process with the right to can set up.
+    fn is_believed_of(&self, holder: &Holder) -> bool {
+        let may_have_cards =
+            |one: &UnixCredentials| is_trusted(one.uid()) || may_set_up_cards(one.pid());
+        !self.resource.starts_with(CARD) || holder.credentials.as_ref().is_some_and(may_have_cards)
     }
 }
+
+/// What the name of a card as a resource begins with.
+const CARD: &str = "card ";
 
 /// What a run of `topology` on `hosts`, which are this machine, needs for itself.
 fn wanted(topology: &Topology, hosts: &[String]) -> Vec<Wanted> {
     let ports = topology.ports_on(hosts).into_iter().map(|port| {
-        let resource = Resource::Port(port.protocol, port.address).to_string();
-        let of = format!("{resource} of {}", port.of);
-        let key = port.key;
-        Wanted { resource, of, key }
+        let (protocol, address) = (port.protocol.word(), port.address);
+        Wanted {
+            resource: format!("{protocol} {}", address.port()),
+            address: Some(address),
+            of: format!("{protocol} {address} of {}", port.of),
+            key: port.key,
+        }
     });
     let mut wanted: Vec<Wanted> = ports.collect();
     let here = topology.hosts().iter();
@@ -156,7 +106,8 @@ fn wanted(topology: &Topology, hosts: &[String]) -> Vec<Wanted> {
         if let Some(interface) = card_of(topology, host) {
             let part = host.interface.as_ref().map_or("address", |_| "interface");
             wanted.push(Wanted {
-                resource: Resource::Card(&interface).to_string(),
+                resource: format!("{CARD}{interface}"),
+                address: None,
                 of: format!("the hardware time stamps of card {interface}"),
                 key: format!("hosts.{}.{part}", host.name),
             });
@@ -164,7 +115,8 @@ fn wanted(topology: &Topology, hosts: &[String]) -> Vec<Wanted> {
         if let Some((first, address)) = meeting {
             let name = fnv1a(FNV_OFFSET, host.name.as_bytes());
             wanted.push(Wanted {
-                resource: Resource::Place(address, name).to_string(),
+                resource: format!("place {address} {name:x}"),
+                address: None,
                 of: format!(
                     "the place of {} in the run that meets at {address}",
                     host.name
@@ -182,7 +134,7 @@ pub enum ClaimError {
     /// Another run has it: keys of the topology, each with who has what it asks for.
     #[error("another run on this host has what this one needs")]
     Taken(Vec<(String, String)>),
-    /// The system gives no socket, or does not list them.
+    /// The system gives no socket.
     #[error("cannot find out what other runs on this host need: {0}")]
     Io(#[from] io::Error),
 }
@@ -208,7 +160,7 @@ impl Claims {
     /// # Errors
     /// As [`Self::take`].
     pub fn look(topology: &Topology, hosts: &[String]) -> Result<(), ClaimError> {
-        untaken(&wanted(topology, hosts), "")
+        untaken(&wanted(topology, hosts), &BTreeSet::new())
     }
 
     fn take_all(wanted: &[Wanted]) -> Result<Self, ClaimError> {
@@ -217,14 +169,20 @@ impl Claims {
         }
         let mut attempt = 1;
         loop {
-            let own = format!("{:016x}", u64::from_ne_bytes(random_bytes()?));
             // Two hosts here may have one card.
-            let resources: BTreeSet<&str> = wanted.iter().map(|one| &*one.resource).collect();
-            let bound = resources.into_iter().map(|one| listen(&own, one));
-            let bound: Vec<UnixListener> = bound.collect::<io::Result<_>>()?;
+            let apart: BTreeSet<_> = wanted
+                .iter()
+                .map(|one| (&*one.resource, one.address))
+                .collect();
+            let (mut own, mut bound) = (BTreeSet::new(), Vec::new());
+            for (resource, address) in apart {
+                let (name, listener) = bind(resource)?;
+                own.insert(name);
+                bound.push((listener, address));
+            }
             let folder = Arc::default();
             let answering = Answering::start(bound, Arc::clone(&folder))?;
-            // Only once its own are bound: of two that begin together at least one sees the other.
+            // Only once its own are bound: of two that begin together at least one finds the other.
             match untaken(wanted, &own) {
                 Err(ClaimError::Taken(_)) if attempt < ATTEMPTS => drop(answering),
                 Err(error) => return Err(error),
@@ -253,11 +211,14 @@ impl Claims {
 struct Answering {
     stop: UnixStream,
     thread: Option<JoinHandle<()>>,
-    _listeners: Arc<Vec<UnixListener>>,
+    _listeners: Arc<Vec<Bound>>,
 }
 
+/// A claim, and the address of a port.
+type Bound = (UnixListener, Option<SocketAddr>);
+
 impl Answering {
-    fn start(listeners: Vec<UnixListener>, folder: Arc<Mutex<PathBuf>>) -> io::Result<Self> {
+    fn start(listeners: Vec<Bound>, folder: Arc<Mutex<PathBuf>>) -> io::Result<Self> {
         let (stop, stopped) = UnixStream::pair()?;
         let listeners = Arc::new(listeners);
         let answered = Arc::clone(&listeners);
@@ -281,10 +242,10 @@ impl Drop for Answering {
     }
 }
 
-/// Tells this user and root, until `stopped` ends, which folder the run has.
-fn answer(listeners: &[UnixListener], stopped: &UnixStream, folder: &Mutex<PathBuf>) {
+/// Tells, until `stopped` ends, the address of a port, and this user and root which folder the run has.
+fn answer(listeners: &[Bound], stopped: &UnixStream, folder: &Mutex<PathBuf>) {
     loop {
-        let ends = listeners.iter().map(AsFd::as_fd);
+        let ends = listeners.iter().map(|(listener, _)| listener.as_fd());
         let mut waits: Vec<PollFd<'_>> = [stopped.as_fd()]
             .into_iter()
             .chain(ends)
@@ -298,7 +259,7 @@ fn answer(listeners: &[UnixListener], stopped: &UnixStream, folder: &Mutex<PathB
         if is_ready(&waits[0]) {
             return;
         }
-        for (listener, _) in listeners
+        for ((listener, address), _) in listeners
             .iter()
             .zip(&waits[1..])
             .filter(|(_, one)| is_ready(one))
@@ -306,16 +267,14 @@ fn answer(listeners: &[UnixListener], stopped: &UnixStream, folder: &Mutex<PathB
             match listener.accept() {
                 Ok((mut asking, _)) => {
                     let peer = getsockopt(&asking, sockopt::PeerCredentials);
+                    let address = address.map_or_else(String::new, |one| one.to_string());
+                    let mut answer = format!("{address}\n").into_bytes();
                     if peer.is_ok_and(|peer| is_trusted(peer.uid())) {
-                        let folder = folder
-                            .lock()
-                            .unwrap_or_else(PoisonError::into_inner)
-                            .clone();
-                        // A new connection has room for it; one that is gone needs no answer.
-                        let _is_told = asking
-                            .write_all(folder.as_os_str().as_encoded_bytes())
-                            .is_ok();
+                        let folder = folder.lock().unwrap_or_else(PoisonError::into_inner);
+                        answer.extend(folder.as_os_str().as_encoded_bytes());
                     }
+                    // A new connection has room for it; one that is gone needs no answer.
+                    let _is_told = asking.write_all(&answer).is_ok();
                 }
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
                 Err(_) => thread::sleep(ACCEPT_PAUSE),
@@ -337,56 +296,51 @@ fn may_set_up_cards(pid: i32) -> bool {
     rights.is_some_and(|rights| rights & NET_ADMIN != 0)
 }
 
-fn listen(own: &str, resource: &str) -> io::Result<UnixListener> {
-    let name = format!("{PREFIX}/{own}/{resource}");
-    let address = net::SocketAddr::from_abstract_name(name)?;
-    let listener = UnixListener::bind_addr(&address)?;
-    listener.set_nonblocking(true)?;
-    Ok(listener)
+fn names(resource: &str) -> impl Iterator<Item = String> {
+    (0..NAMES).map(move |number| format!("{PREFIX}/{resource}/{number}"))
 }
 
-/// Refuses when a run other than `own` has something of `wanted`.
-fn untaken(wanted: &[Wanted], own: &str) -> Result<(), ClaimError> {
-    if wanted.is_empty() {
-        return Ok(());
+/// Binds the first name of `resource` that nobody has.
+fn bind(resource: &str) -> io::Result<(String, UnixListener)> {
+    for name in names(resource) {
+        let address = net::SocketAddr::from_abstract_name(&name)?;
+        match UnixListener::bind_addr(&address) {
+            Ok(listener) => {
+                listener.set_nonblocking(true)?;
+                return Ok((name, listener));
+            }
+            Err(error) if error.kind() == io::ErrorKind::AddrInUse => {}
+            Err(error) => return Err(error),
+        }
     }
-    let named = |error: io::Error| io::Error::new(error.kind(), format!("{SOCKETS}: {error}"));
-    let sockets = fs::read(SOCKETS).map_err(named)?;
-    let sockets = String::from_utf8_lossy(&sockets);
+    let text = format!("all {NAMES} sockets @{PREFIX}/{resource}/* are in use (`ss -xlp`)");
+    Err(io::Error::new(io::ErrorKind::AddrInUse, text))
+}
+
+/// Refuses when a run other than that with the claims `own` has something of `wanted`.
+fn untaken(wanted: &[Wanted], own: &BTreeSet<String>) -> Result<(), ClaimError> {
     let deadline = Instant::now() + TOLD_WITHIN;
     // One line a key.
     let mut taken = BTreeMap::new();
-    for (name, _, resource) in claimed(&sockets).filter(|(_, other, _)| *other != own) {
-        let colliding = wanted.iter().filter(|one| {
-            let wanted = one.resource();
-            wanted.is_some_and(|wanted| wanted.collides(resource)) && !taken.contains_key(&one.key)
-        });
-        let colliding: Vec<&Wanted> = colliding.collect();
-        if colliding.is_empty() {
-            continue;
-        }
-        let holder = match Holder::ask(name, deadline) {
-            Ok(holder) => Some(holder),
-            // One that is not there any more claims nothing.
-            Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => continue,
-            Err(_unanswered) => None,
-        };
-        let is_believed = holder
-            .as_ref()
-            .map_or(!matches!(resource, Resource::Card(_)), |holder| {
-                resource.is_believed_of(&holder.credentials)
+    let resources: BTreeSet<&str> = wanted.iter().map(|one| &*one.resource).collect();
+    for resource in resources {
+        for name in names(resource).filter(|name| !own.contains(name)) {
+            // One that is not there claims nothing.
+            let Some(holder) = Holder::ask(&name, deadline)? else {
+                continue;
+            };
+            let colliding = wanted.iter().filter(|one| {
+                one.resource == resource
+                    && one.collides(holder.address)
+                    && one.is_believed_of(&holder)
             });
-        if is_believed {
-            let holder = holder.map_or_else(
-                || "a run that does not answer".to_owned(),
-                |holder| holder.to_string(),
-            );
             for one in colliding {
-                let words = format!(
-                    "{} is held by {holder}; give this run another, or end that one",
-                    one.of
-                );
-                taken.insert(one.key.clone(), words);
+                taken.entry(one.key.clone()).or_insert_with(|| {
+                    format!(
+                        "{} is held by {holder}; give this run another, or end that one",
+                        one.of
+                    )
+                });
             }
         }
     }
@@ -397,44 +351,38 @@ fn untaken(wanted: &[Wanted], own: &str) -> Result<(), ClaimError> {
     }
 }
 
-/// The claims in the kernel's list of sockets: whole name, whose, and what.
-fn claimed(sockets: &str) -> impl Iterator<Item = (&str, &str, Resource<'_>)> {
-    sockets.lines().filter_map(|line| {
-        let (_, name) = line.split_once(" @")?;
-        let (own, resource) = name
-            .strip_prefix(PREFIX)?
-            .strip_prefix('/')?
-            .split_once('/')?;
-        Some((name, own, Resource::try_from(resource).ok()?))
-    })
-}
-
 /// Who has a claim.
+#[derive(Default)]
 struct Holder {
-    credentials: UnixCredentials,
+    /// `None` when it takes no connection.
+    credentials: Option<UnixCredentials>,
+    /// Of a port, where it is told.
+    address: Option<SocketAddr>,
     /// Empty where it is not told.
-    folder: PathBuf,
+    folder: String,
 }
 
 impl Holder {
-    fn ask(name: &str, deadline: Instant) -> io::Result<Self> {
+    /// Of the claim `name`; `None` when nobody has it.
+    fn ask(name: &str, deadline: Instant) -> io::Result<Option<Self>> {
         let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
         let socket = socket(AddressFamily::Unix, SockType::Stream, flags, None)?;
-        connect(
-            socket.as_raw_fd(),
-            &UnixAddr::new_abstract(name.as_bytes())?,
-        )?;
+        let address = UnixAddr::new_abstract(name.as_bytes())?;
+        match connect(socket.as_raw_fd(), &address) {
+            Ok(()) => {}
+            Err(Errno::ECONNREFUSED) => return Ok(None),
+            // Its queue is full.
+            Err(Errno::EAGAIN) => return Ok(Some(Self::default())),
+            Err(errno) => return Err(errno.into()),
+        }
         let credentials = getsockopt(&socket, sockopt::PeerCredentials)?;
-        let is_own_or_root = is_trusted(credentials.uid()) || Uid::effective().is_root();
-        let folder = if is_own_or_root {
-            told(UnixStream::from(socket), deadline).unwrap_or_default()
-        } else {
-            String::new()
-        };
-        Ok(Self {
-            credentials,
-            folder: PathBuf::from(folder),
-        })
+        let told = told(UnixStream::from(socket), deadline).unwrap_or_default();
+        let (address, folder) = told.split_once('\n').unwrap_or_default();
+        Ok(Some(Self {
+            credentials: Some(credentials),
+            address: address.parse().ok(),
+            folder: folder.to_owned(),
+        }))
     }
 }
 
@@ -443,14 +391,17 @@ fn told(mut stream: UnixStream, deadline: Instant) -> io::Result<String> {
     let left = deadline.saturating_duration_since(Instant::now());
     // Nothing at all would be no bound.
     stream.set_read_timeout(Some(left.max(Duration::from_millis(1))))?;
-    let mut folder = vec![0; FOLDER_BYTES_MAX];
-    let length = stream.read(&mut folder)?;
-    Ok(String::from_utf8_lossy(&folder[..length]).into_owned())
+    let mut answer = vec![0; ANSWER_BYTES_MAX];
+    let length = stream.read(&mut answer)?;
+    Ok(String::from_utf8_lossy(&answer[..length]).into_owned())
 }
 
 impl fmt::Display for Holder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (pid, uid) = (self.credentials.pid(), self.credentials.uid());
+        let Some(credentials) = &self.credentials else {
+            return f.write_str("a run that does not answer");
+        };
+        let (pid, uid) = (credentials.pid(), credentials.uid());
         match pid {
             // The kernel gives processes that cannot be seen from here no number.
             0 => f.write_str("a process of another container")?,
@@ -465,11 +416,10 @@ impl fmt::Display for Holder {
                 f.write_str(")")?;
             }
         }
-        if self.folder.as_os_str().is_empty() {
+        if self.folder.is_empty() {
             return Ok(());
         }
-        let folder = one_line(&self.folder.to_string_lossy());
-        write!(f, ", the run in {folder}")
+        write!(f, ", the run in {}", one_line(&self.folder))
     }
 }
 
@@ -485,9 +435,19 @@ mod tests {
     /// A card that no other test has.
     fn card(name: &str) -> Vec<Wanted> {
         vec![Wanted {
-            resource: format!("card {name}{}", std::process::id()),
+            resource: format!("{CARD}{name}{}", std::process::id()),
+            address: None,
             of: "the card".to_owned(),
             key: "hosts.a.interface".to_owned(),
+        }]
+    }
+
+    /// A port that no other test has, at `address`.
+    fn port(address: &str) -> Vec<Wanted> {
+        vec![Wanted {
+            resource: format!("udp port{}", std::process::id()),
+            address: Some(address.parse().unwrap()),
+            ..card("p").remove(0)
         }]
     }
 
@@ -499,24 +459,20 @@ mod tests {
     }
 
     #[test]
-    fn what_is_claimed_is_read_back_and_a_port_collides_with_that_of_all_addresses() {
-        let address = |text: &str| text.parse::<SocketAddr>().unwrap();
-        let port = |text| Resource::Port(IpProtocol::Udp, address(text));
-        let (one, any) = (port("10.0.0.1:7400"), port("0.0.0.0:7400"));
-        let place = Resource::Place(address("[fd00::1]:7399"), 0xfe);
-        for resource in [one, place, Resource::Card("eth0")] {
-            let text = resource.to_string();
-            assert!(
-                Resource::try_from(text.as_str()).is_ok_and(|read| read == resource),
-                "{text}"
-            );
+    fn a_port_collides_with_itself_and_with_that_of_all_addresses_and_not_with_another_address() {
+        let first = Claims::take_all(&port("10.0.0.1:7400")).unwrap();
+        let other = Claims::take_all(&port("10.0.0.2:7400")).unwrap();
+        for again in ["10.0.0.1:7400", "0.0.0.0:7400"] {
+            refusal(Claims::take_all(&port(again)));
         }
-        assert!(one.collides(any) && any.collides(one) && one.collides(one));
-        assert!(!one.collides(port("10.0.0.2:7400")) && !one.collides(port("10.0.0.1:7401")));
-        assert!(!one.collides(Resource::Port(IpProtocol::Tcp, address("10.0.0.1:7400"))));
-        for text in ["", "udp", "udp x", "card", "place 10.0.0.1:1", "disk 1"] {
-            assert!(Resource::try_from(text).is_err(), "{text}");
-        }
+        drop(first);
+        // The first name is free again, and the second claim is found all the same.
+        refusal(Claims::take_all(&port("0.0.0.0:7400")));
+        drop(Claims::take_all(&port("10.0.0.1:7400")).unwrap());
+        drop(other);
+        let any = Claims::take_all(&port("0.0.0.0:7400")).unwrap();
+        refusal(Claims::take_all(&port("10.0.0.1:7400")));
+        drop(any);
     }
 
     #[test]
@@ -535,7 +491,10 @@ mod tests {
         let refused = refusal(Claims::take_all(&wanted));
         let told = format!("{own}, the run in /runs/first; ");
         assert!(refused[0].1.contains(&told), "{refused:?}");
-        assert!(matches!(untaken(&wanted, ""), Err(ClaimError::Taken(_))));
+        assert!(matches!(
+            untaken(&wanted, &BTreeSet::new()),
+            Err(ClaimError::Taken(_))
+        ));
         drop(first);
         drop(Claims::take_all(&wanted).unwrap());
     }
@@ -548,7 +507,7 @@ mod tests {
 
     #[test]
     fn of_two_that_begin_together_not_both_are_granted() {
-        for _ in 0..20 {
+        for _ in 0..100 {
             let mut begun = [0, 1].map(|_| Some(thread::spawn(|| Claims::take_all(&card("b")))));
             let got = begun
                 .each_mut()
@@ -559,15 +518,21 @@ mod tests {
     }
 
     #[test]
-    fn names_of_others_and_of_nobody_claim_nothing() {
-        let listed = "Num RefCount Protocol Flags Type St Inode Path\n\
-                      0: 2 0 10000 1 01  9 @hil-claim/1/card x\n\
-                      0: 2 0 10000 1 01 19 @hil-claim/1/tape x\n\
-                      0: 2 0 10000 1 01 29 /run/hil-claim/1/card x\n\
-                      0: 2 0 10000 1 01 39\n";
-        let found: Vec<&str> = claimed(listed).map(|(name, ..)| name).collect();
-        assert_eq!(found, ["hil-claim/1/card x"]);
-        assert!(Holder::ask("hil-claim/1/card x", Instant::now()).is_err());
+    fn a_holder_that_does_not_answer_holds_and_without_a_name_left_nothing_is_claimed() {
+        let wanted = card("d");
+        let squat = |name: String| {
+            let address = net::SocketAddr::from_abstract_name(name).unwrap();
+            UnixListener::bind_addr(&address).unwrap()
+        };
+        let taken: Vec<UnixListener> = names(&wanted[0].resource).map(squat).collect();
+        let error = Claims::take_all(&wanted).unwrap_err();
+        assert!(error.to_string().contains("all 32 sockets"), "{error}");
+        drop(taken);
+        let only = squat(names(&card("e")[0].resource).next().unwrap());
+        let refused = refusal(Claims::take_all(&card("e")));
+        let own = format!("(process {});", std::process::id());
+        assert!(refused[0].1.contains(&own), "{refused:?}");
+        drop(only);
         assert!(!may_set_up_cards(i32::MAX));
     }
 }

@@ -6,23 +6,22 @@ use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::thread::{self, ScopedJoinHandle};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use super::conversation::Conversation;
 use super::frame::{
     CHUNK_BYTES, Frame, PeerMessage, REPORT_BYTES_MAX, is_plain_record_name, write_chunk,
     write_message,
 };
-use super::peer::{Peer, PeerEvent};
+use super::peer::Peer;
 use hil_rundir::event::HostHistory;
 use hil_rundir::file_fault::{FileFault, GapCause, RecordGap};
 
-/// A peer that says nothing for this long while records are due has failed to deliver them.
-const PATIENCE: Duration = Duration::from_secs(20);
-/// How often the first host says that it is still there while it receives.
-const ALIVE_PERIOD: Duration = Duration::from_secs(1);
+/// A peer that lives and neither gives nor takes anything for this long has failed to deliver, as one behind a disk
+/// that stands still for good: so long Linux bears a task that waits for a disk before it reports it
+/// (`kernel.hung_task_timeout_secs`).
+const PROGRESS_PATIENCE: Duration = Duration::from_mins(2);
 
 /// What came from one peer, or from all of them.
 #[derive(Debug, Default)]
@@ -82,13 +81,13 @@ pub(crate) fn exchange(
         Vec::new()
     });
     for peer in peers.iter_mut() {
-        if let Err(error) = peer.allow_writes_to_take(PATIENCE) {
+        if let Err(error) = peer.conversation().expect_progress(PROGRESS_PATIENCE) {
             all.problems.push(format!("{}: {error}", peer.hello.host));
         }
     }
     if is_first_host {
         let here = &story.hosts[0];
-        let take = |host: &str, inbox: &mut _| take_from(here, host, inbox, records);
+        let take = |host: &str, peer: &Conversation| take_from(here, host, peer, records);
         let mut received = receive_from_all(peers, take, |host| {
             let mut received = Received::default();
             let cause = "the receiving thread panicked".to_owned();
@@ -105,7 +104,7 @@ pub(crate) fn exchange(
         }
         distribute(peers, &own, story, &received, records, &mut all);
         let panicked = |_host: &str| Err("the receiving thread panicked".to_owned());
-        let words = receive_from_all(peers, |_host, inbox| take_word(inbox), panicked);
+        let words = receive_from_all(peers, |_host, peer| take_word(peer), panicked);
         for (peer, word) in peers.iter().zip(words) {
             note_word(&peer.hello.host, word, &mut all);
         }
@@ -118,8 +117,7 @@ pub(crate) fn exchange(
         for peer in peers.iter_mut() {
             give_and_take(peer, &own, story, records, &mut all);
             peer.say(&PeerMessage::Taken(all.gaps.clone()));
-            let (_, inbox) = peer.halves();
-            let word = take_word(inbox);
+            let word = take_word(&peer.conversation());
             if word.is_ok() {
                 // It has what was said just now.
                 all.gaps.clear();
@@ -130,41 +128,22 @@ pub(crate) fn exchange(
     all
 }
 
-/// Receives from all peers at once, and says meanwhile that this host is still there; `panicked` stands for
-/// what a thread did not give.
+/// Receives from all peers at once; `panicked` stands for what a thread did not give.
 fn receive_from_all<T: Send>(
-    peers: &mut [Peer],
-    receive: impl Fn(&str, &mut Receiver<PeerEvent>) -> T + Sync,
+    peers: &[Peer],
+    receive: impl Fn(&str, &Conversation) -> T + Sync,
     panicked: impl Fn(&str) -> T,
 ) -> Vec<T> {
     let receive = &receive;
     thread::scope(|scope| {
-        let mut writers = Vec::new();
-        let mut receiving = Vec::new();
-        for peer in peers {
-            let host = peer.hello.host.clone();
-            let (writer, inbox) = peer.halves();
-            writers.push(writer);
-            let thread = {
-                let host = host.clone();
-                scope.spawn(move || receive(&host, inbox))
-            };
-            receiving.push((host, thread));
-        }
-        let mut said = Instant::now();
-        while !receiving.iter().all(|(_, thread)| thread.is_finished()) {
-            if said.elapsed() >= ALIVE_PERIOD {
-                said = Instant::now();
-                for writer in &mut writers {
-                    // A peer that left is noticed by the thread that receives from it.
-                    let _left = write_message(*writer, &PeerMessage::Alive).is_err();
-                }
-            }
-            thread::sleep(Duration::from_millis(2));
-        }
+        let receiving = peers.iter().map(|peer| {
+            let (host, conversation) = (&peer.hello.host, peer.conversation());
+            (host, scope.spawn(move || receive(host, &conversation)))
+        });
+        let receiving: Vec<_> = receiving.collect();
         let joined = receiving.into_iter();
         joined
-            .map(|(host, thread)| thread.join().unwrap_or_else(|_panic| panicked(&host)))
+            .map(|(host, thread)| thread.join().unwrap_or_else(|_panic| panicked(host)))
             .collect()
     })
 }
@@ -192,7 +171,7 @@ fn distribute(
                 stories.extend(other.stories.iter().cloned());
             }
             let host = peer.hello.host.clone();
-            let (writer, _) = peer.halves();
+            let writer = peer.writer();
             let of = hosts_of(&stories);
             let give = move || give_all(writer, &files, &stories);
             sending.push((host, of, scope.spawn(give)));
@@ -221,24 +200,10 @@ fn give_and_take(
     let host = peer.hello.host.clone();
     let own_history = std::slice::from_ref(own_history);
     let conversation = peer.conversation();
-    let (writer, inbox) = peer.halves();
-    let is_taken = AtomicBool::new(false);
+    let writer = peer.writer();
     let (received, sent) = thread::scope(|scope| {
-        let sending = scope.spawn(|| {
-            give_all(writer, own, own_history)?;
-            // A disk that is slow to take what comes looks like a host that is gone otherwise.
-            let mut said = Instant::now();
-            while !is_taken.load(Ordering::Acquire) {
-                if said.elapsed() >= ALIVE_PERIOD {
-                    said = Instant::now();
-                    write_message(writer, &PeerMessage::Alive)?;
-                }
-                thread::sleep(Duration::from_millis(2));
-            }
-            Ok(())
-        });
-        let received = take_from(&own_history[0].hosts[0], &host, inbox, records);
-        is_taken.store(true, Ordering::Release);
+        let sending = scope.spawn(|| give_all(writer, own, own_history));
+        let received = take_from(&own_history[0].hosts[0], &host, &conversation, records);
         if received.is_broken() {
             // What is being sent would wait for as long again.
             conversation.leave();
@@ -276,9 +241,9 @@ fn note_unsent(host: &str, of: Vec<String>, sent: io::Result<()>, all: &mut Rece
 }
 
 /// The gaps that a peer tells in the end.
-fn take_word(inbox: &mut Receiver<PeerEvent>) -> Result<Vec<RecordGap>, String> {
+fn take_word(peer: &Conversation) -> Result<Vec<RecordGap>, String> {
     loop {
-        if let Frame::Message(PeerMessage::Taken(gaps)) = next_frame(inbox)? {
+        if let Frame::Message(PeerMessage::Taken(gaps)) = peer.next_frame()? {
             return Ok(gaps);
         }
     }
@@ -293,15 +258,6 @@ fn note_word(host: &str, word: Result<Vec<RecordGap>, String>, all: &mut Receive
             let text = format!("{host} did not say whether it has all records: {reason}");
             all.problems.push(text);
         }
-    }
-}
-
-fn next_frame(inbox: &mut Receiver<PeerEvent>) -> Result<Frame, String> {
-    match inbox.recv_timeout(PATIENCE) {
-        Ok(PeerEvent::Frame(frame)) => Ok(frame),
-        Ok(PeerEvent::Closed(reason)) => Err(reason),
-        Err(RecvTimeoutError::Disconnected) => Err("connection closed".to_owned()),
-        Err(RecvTimeoutError::Timeout) => Err(format!("silent for {} s", PATIENCE.as_secs())),
     }
 }
 
@@ -407,11 +363,11 @@ impl Incoming {
 }
 
 /// Takes on `here` what `host` sends.
-fn take_from(here: &str, host: &str, inbox: &mut Receiver<PeerEvent>, records: &Path) -> Received {
+fn take_from(here: &str, host: &str, peer: &Conversation, records: &Path) -> Received {
     let mut received = Received::default();
     let mut incoming = Incoming::default();
     let broken = loop {
-        let taken = next_frame(inbox).and_then(|frame| {
+        let taken = peer.next_frame().and_then(|frame| {
             let taken = take_frame(frame, records, &mut incoming, &mut received);
             taken.map_err(|error| error.to_string())
         });

@@ -43,8 +43,8 @@ pub struct PeerHello {
 pub struct Resumed {
     /// Fingerprint of the other end's shared-memory domain, of which each start has another one.
     pub of: [u8; 16],
-    /// Frames taken from the other end.
-    pub taken_count: u64,
+    /// Frames that came from the other end.
+    pub come_count: u64,
 }
 
 /// What supervisors tell each other.
@@ -66,8 +66,14 @@ pub enum PeerMessage {
     },
     /// Nothing new; sent so that silence means something.
     Alive,
-    /// So many frames were taken. It is none itself.
-    Acknowledged(u64),
+    /// What was taken. It is no frame that counts.
+    Acknowledged {
+        /// Frames of the receiver.
+        taken_count: u64,
+        /// Frames that the sender and any host took of each other, apart from words that one lives: whether it makes
+        /// progress.
+        moved_count: u64,
+    },
     /// The sender ends the connection for good. It is no frame that counts.
     Leaving,
     /// How many ticks passed without the processes of the hosts that the sender knows of. Sent in
@@ -153,6 +159,15 @@ pub fn read_frame(input: &mut impl Read) -> io::Result<Frame> {
 /// # Errors
 /// As [`read_frame`].
 pub fn read_frame_within(input: &mut impl Read, bytes_max: usize) -> io::Result<Frame> {
+    read_sized(input, bytes_max).map(|(frame, _)| frame)
+}
+
+/// As [`read_frame`], with the length of the frame's body in bytes.
+pub(super) fn read_sized_frame(input: &mut impl Read) -> io::Result<(Frame, usize)> {
+    read_sized(input, FRAME_BYTES_MAX)
+}
+
+fn read_sized(input: &mut impl Read, bytes_max: usize) -> io::Result<(Frame, usize)> {
     let mut head = [0; 5];
     input.read_exact(&mut head)?;
     let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
@@ -162,14 +177,15 @@ pub fn read_frame_within(input: &mut impl Read, bytes_max: usize) -> io::Result<
     }
     let mut body = Zeroizing::new(vec![0_u8; length]);
     input.read_exact(&mut body)?;
-    match head[4] {
-        KIND_MESSAGE => Ok(Frame::Message(serde_json::from_slice(&body)?)),
-        KIND_CHUNK => Ok(Frame::Chunk(core::mem::take(&mut *body))),
+    let frame = match head[4] {
+        KIND_MESSAGE => Frame::Message(serde_json::from_slice(&body)?),
+        KIND_CHUNK => Frame::Chunk(core::mem::take(&mut *body)),
         kind => {
             let text = format!("the peer sent a frame of unknown kind {kind}");
-            Err(io::Error::new(io::ErrorKind::InvalidData, text))
+            return Err(io::Error::new(io::ErrorKind::InvalidData, text));
         }
-    }
+    };
+    Ok((frame, length))
 }
 
 /// A record file's name as a peer may give it: nothing that could leave the records folder.

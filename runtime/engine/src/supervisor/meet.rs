@@ -89,6 +89,8 @@ pub(crate) struct Meeting {
     pub(crate) expected: Vec<(String, IpAddr)>,
     /// How long to wait for all of them.
     pub(crate) timeout: Duration,
+    /// How long a host that was met may be away.
+    pub(crate) peer_timeout: Duration,
     /// The key they all hold; `None` when the topology says that hops are plain.
     pub(crate) key: Option<PreSharedKey>,
 }

@@ -1,10 +1,13 @@
 //! Two ends of a meeting on loopback: who meets, and who is told why not.
 
 use super::*;
-use crate::supervisor::frame::{Frame, write_message};
+use crate::supervisor::frame::{CHUNK_BYTES, Frame, write_chunk, write_message};
 use crate::supervisor::peer::PeerEvent;
 use std::net::{Ipv4Addr, Shutdown, TcpListener};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+/// How long a host that was met may be away.
+const PEER_TIMEOUT: Duration = Duration::from_secs(5);
 
 fn hello(host: &str, hash: u64, domain: u8) -> PeerHello {
     PeerHello {
@@ -37,6 +40,7 @@ fn pair_with(
         own: address.ip(),
         expected: vec![(other.host.clone(), address.ip())],
         timeout: Duration::from_secs(2),
+        peer_timeout: PEER_TIMEOUT,
         key,
     };
     let there = meeting(false, left, right_key);
@@ -113,6 +117,7 @@ fn refusals_without_proof_of_the_key_are_counted_and_the_right_host_is_met_after
         own: address.ip(),
         expected: vec![(host.to_owned(), address.ip())],
         timeout: Duration::from_secs(20),
+        peer_timeout: PEER_TIMEOUT,
         key: Some(key.clone()),
     };
     let there = meeting(false, "a", &one);
@@ -150,6 +155,7 @@ fn a_host_of_another_name_is_told_at_once_under_the_key() {
         own: address.ip(),
         expected: vec![(host.to_owned(), address.ip())],
         timeout: Duration::from_secs(seconds),
+        peer_timeout: PEER_TIMEOUT,
         key: Some(key.clone()),
     };
     let there = meeting(false, "a", 20);
@@ -205,6 +211,7 @@ fn nobody_there_is_said_with_the_name_and_the_address() {
         own: Ipv4Addr::LOCALHOST.into(),
         expected: vec![("robot-pc".to_owned(), Ipv4Addr::LOCALHOST.into())],
         timeout: Duration::from_millis(1),
+        peer_timeout: PEER_TIMEOUT,
         key: None,
     };
     let error = meet(&meeting, &hello("a", 1, 1), &mut |_| true)
@@ -227,6 +234,7 @@ fn connections_that_say_nothing_keep_a_host_neither_from_its_deadline_nor_from_i
         own: address.ip(),
         expected: vec![("b".to_owned(), address.ip())],
         timeout: Duration::from_secs(1),
+        peer_timeout: PEER_TIMEOUT,
         key: Some(key("knocked")),
     };
     let is_over = AtomicBool::new(false);
@@ -263,6 +271,7 @@ struct Cable {
     address: SocketAddr,
     ends: Arc<Mutex<Vec<TcpStream>>>,
     is_away: Arc<AtomicBool>,
+    is_stalled: Arc<AtomicBool>,
 }
 
 impl Cable {
@@ -272,12 +281,14 @@ impl Cable {
             address: listener.local_addr().unwrap(),
             ends: Arc::default(),
             is_away: Arc::default(),
+            is_stalled: Arc::default(),
         };
         let (ends, is_away) = (Arc::clone(&cable.ends), Arc::clone(&cable.is_away));
+        let is_stalled = Arc::clone(&cable.is_stalled);
         thread::spawn(move || {
             for near in listener.incoming() {
                 let near = near.unwrap();
-                if is_away.load(Ordering::Acquire) {
+                if is_away.load(Ordering::Acquire) || is_stalled.load(Ordering::Acquire) {
                     continue;
                 }
                 let Ok(far) = TcpStream::connect(to) else {
@@ -286,8 +297,21 @@ impl Cable {
                 for (from, into) in [(&near, &far), (&far, &near)] {
                     let (mut from, mut into) =
                         (from.try_clone().unwrap(), into.try_clone().unwrap());
+                    let is_stalled = Arc::clone(&is_stalled);
                     thread::spawn(move || {
-                        let _cut = io::copy(&mut from, &mut into).is_err();
+                        let mut bytes = vec![0; 1 << 16];
+                        while let Ok(count @ 1..) = io::Read::read(&mut from, &mut bytes) {
+                            // What was under way then is gone with the connection.
+                            if is_stalled.load(Ordering::Acquire) {
+                                wait_until("the end of a stall", || {
+                                    !is_stalled.load(Ordering::Acquire)
+                                });
+                                break;
+                            }
+                            if io::Write::write_all(&mut into, &bytes[..count]).is_err() {
+                                break;
+                            }
+                        }
                         let _gone = into.shutdown(Shutdown::Both).is_err();
                     });
                 }
@@ -302,6 +326,11 @@ impl Cable {
         for end in self.ends.lock().unwrap().drain(..) {
             let _gone = end.shutdown(Shutdown::Both).is_err();
         }
+    }
+
+    /// Whether nothing comes through, without a word.
+    fn stall(&self, is_stalled: bool) {
+        self.is_stalled.store(is_stalled, Ordering::Release);
     }
 
     /// Cuts them, and passes no more on.
@@ -331,8 +360,11 @@ fn talk(peer: &mut Peer, allowed: &AtomicU64, taken: &AtomicU64) {
         name: "n".repeat(500),
         size_bytes,
     };
-    peer.allow_writes_to_take(Duration::from_secs(20)).unwrap();
-    let (writer, inbox) = peer.halves();
+    let conversation = peer.conversation();
+    conversation
+        .expect_progress(Duration::from_secs(20))
+        .unwrap();
+    let writer = peer.writer();
     thread::scope(|scope| {
         scope.spawn(|| {
             for number in 0..SENT_COUNT {
@@ -341,10 +373,8 @@ fn talk(peer: &mut Peer, allowed: &AtomicU64, taken: &AtomicU64) {
             }
         });
         for number in 0..SENT_COUNT {
-            match inbox.recv_timeout(Duration::from_secs(20)).unwrap() {
-                PeerEvent::Frame(Frame::Message(message)) => assert_eq!(message, numbered(number)),
-                other => panic!("{number}: {other:?}"),
-            }
+            let frame = conversation.next_frame().unwrap();
+            assert_eq!(frame, Frame::Message(numbered(number)));
             taken.store(number + 1, Ordering::Release);
         }
     });
@@ -364,6 +394,7 @@ fn met_over_a_cable(name: &str) -> (Cable, [Peer; 2]) {
         own: Ipv4Addr::LOCALHOST.into(),
         expected: vec![(host.to_owned(), Ipv4Addr::LOCALHOST.into())],
         timeout: Duration::from_secs(20),
+        peer_timeout: PEER_TIMEOUT,
         key: Some(key.clone()),
     };
     let there = meeting(cable.address, false, "a");
@@ -416,14 +447,12 @@ fn closed(peer: &mut Peer) -> String {
     }
 }
 
-/// The other end reads nothing, so nothing is acknowledged.
+/// The other end takes nothing, so nothing is acknowledged.
 #[test]
 fn a_frame_that_finds_no_room_in_time_ends_the_conversation_at_both_ends() {
     let (_cable, [mut here, mut there]) = met_over_a_cable("full");
-    here.allow_writes_to_take(Duration::from_millis(200))
-        .unwrap();
     let large = PeerMessage::Refused("n".repeat(100_000));
-    let (writer, _) = here.halves();
+    let writer = here.writer();
     let refused = (0..1_000).find_map(|_| write_message(writer, &large).err());
     assert_eq!(refused.unwrap().kind(), io::ErrorKind::TimedOut);
     for peer in [&mut here, &mut there] {
@@ -442,5 +471,121 @@ fn an_end_that_leaves_is_not_waited_for_and_one_that_does_not_come_back_is() {
     for peer in &mut ends {
         let reason = closed(peer);
         assert!(reason.contains("no new one within 5 s"), "{reason}");
+    }
+}
+
+/// A chunk as the exchange of records sends it.
+fn chunk() -> Vec<u8> {
+    vec![7; CHUNK_BYTES]
+}
+
+/// Longer than a silence that is taken for a cut, and more than what may be kept: an end that takes nothing for so long,
+/// as behind a slow disk, is waited for, without a cut.
+#[test]
+fn an_end_that_takes_nothing_for_a_time_is_waited_for_while_the_other_has_much_to_say() {
+    let (_cable, [mut slow, mut other]) = met_over_a_cable("slow");
+    let (taking, giving) = (slow.conversation(), other.conversation());
+    for one in [&taking, &giving] {
+        one.expect_progress(Duration::from_secs(20)).unwrap();
+    }
+    let chunk_count = 64;
+    thread::scope(|scope| {
+        let writer = other.writer();
+        scope.spawn(move || {
+            for _ in 0..chunk_count {
+                write_chunk(writer, &chunk()).unwrap();
+            }
+        });
+        for number in 0..chunk_count {
+            if number == 8 {
+                thread::sleep(Duration::from_secs(7));
+            }
+            assert_eq!(taking.next_frame(), Ok(Frame::Chunk(chunk())));
+        }
+        slow.say(&PeerMessage::Done);
+        assert_eq!(giving.next_frame(), Ok(Frame::Message(PeerMessage::Done)));
+    });
+    for one in [taking, giving] {
+        assert!(one.take_cuts().is_empty());
+    }
+}
+
+/// One says nothing but that it lives, one takes nothing of what it is told.
+#[test]
+fn a_peer_without_progress_is_given_up_in_time_however_often_it_says_that_it_lives() {
+    let (_cable, [here, mut there]) = met_over_a_cable("alive");
+    let waiting = here.conversation();
+    waiting.expect_progress(Duration::from_secs(2)).unwrap();
+    let is_over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            while !is_over.load(Ordering::Acquire) {
+                there.say(&PeerMessage::Alive);
+                thread::sleep(Duration::from_millis(10));
+            }
+        });
+        let reason = loop {
+            match waiting.next_frame() {
+                Ok(frame) => assert_eq!(frame, Frame::Message(PeerMessage::Alive)),
+                Err(reason) => break reason,
+            }
+        };
+        is_over.store(true, Ordering::Release);
+        assert_eq!(reason, "no progress for 2 s");
+    });
+
+    let (_cable, [mut here, _there]) = met_over_a_cable("still");
+    let sending = here.conversation();
+    sending.expect_progress(Duration::from_secs(2)).unwrap();
+    let writer = here.writer();
+    let refused = (0..1_000).find_map(|_| write_chunk(writer, &chunk()).err());
+    let refused = refused.unwrap();
+    assert_eq!(refused.kind(), io::ErrorKind::TimedOut);
+    assert_eq!(refused.to_string(), "no progress for 2 s");
+}
+
+/// A first host that still takes another one's records gives nothing to this one and takes nothing from it.
+#[test]
+fn a_peer_that_makes_progress_with_another_host_is_waited_for() {
+    let (_cable, [here, mut there]) = met_over_a_cable("third");
+    let waiting = here.conversation();
+    waiting.expect_progress(Duration::from_secs(2)).unwrap();
+    let elsewhere = there.conversation();
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            for _ in 0..100 {
+                elsewhere.moved_count.fetch_add(1, Ordering::Relaxed);
+                thread::sleep(Duration::from_millis(50));
+            }
+            there.say(&PeerMessage::Done);
+        });
+        assert_eq!(waiting.next_frame(), Ok(Frame::Message(PeerMessage::Done)));
+    });
+}
+
+/// A path that drops everything without a word, no resets either, for longer than a silence that is taken for a cut.
+#[test]
+fn a_connection_that_falls_silent_is_made_again() {
+    let (cable, mut ends) = met_over_a_cable("silent");
+    for number in 1..=2 {
+        cable.stall(true);
+        let conversations = ends.each_ref().map(Peer::conversation);
+        ends[0].say(&PeerMessage::Ready);
+        thread::sleep(Duration::from_secs(4));
+        cable.stall(false);
+        for conversation in &conversations {
+            let mut cuts = Vec::new();
+            wait_until("the connection after a silence", || {
+                cuts.extend(conversation.take_cuts());
+                !cuts.is_empty()
+            });
+            println!("{number}: {cuts:?}");
+        }
+        let event = ends[1].receive(Duration::from_secs(20));
+        let ready = Frame::Message(PeerMessage::Ready);
+        assert!(
+            matches!(&event, Some(PeerEvent::Frame(frame)) if *frame == ready),
+            "{event:?}"
+        );
     }
 }

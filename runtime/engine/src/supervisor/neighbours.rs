@@ -1,20 +1,35 @@
 //! At which link addresses this host reaches the others on its own network. Whoever answers there for the
-//! address of another takes what is sent to it, and no seal sees that: so a change is told.
-//! Of IPv4 only: changes of IPv6 neighbours are not seen.
+//! address of another (ARP, RFC 826; neighbour discovery, RFC 4861) takes what is sent to it, and no seal sees that:
+//! so a change is told.
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::io;
 use std::net::IpAddr;
 
 use hil_rundir::event::EventKind;
 use hil_topology::{Host, Topology};
+use netlink_packet_core::{
+    NLM_F_DUMP, NLM_F_REQUEST, NetlinkHeader, NetlinkMessage, NetlinkPayload,
+};
+use netlink_packet_route::RouteNetlinkMessage;
+use netlink_packet_route::neighbour::{NeighbourAddress, NeighbourAttribute, NeighbourMessage};
+use netlink_sys::protocols::NETLINK_ROUTE;
+use netlink_sys::{Socket, SocketAddr};
+use nix::net::if_::if_indextoname;
 
 use super::session::is_here;
 
-/// The kernel's table of IPv4 neighbours.
-const TABLE: &str = "/proc/net/arp";
-/// `ATF_COM`: the entry has a link address.
-const COMPLETE: u32 = 2;
+/// Messages of netlink begin at multiples of this (`NLMSG_ALIGNTO`).
+const ALIGNMENT_BYTES: usize = 4;
+
+/// A neighbour that can be reached now.
+#[derive(Debug)]
+struct Neighbour {
+    address: IpAddr,
+    interface: String,
+    /// Its link address.
+    hardware: String,
+}
 
 /// What is known of them.
 #[derive(Debug)]
@@ -38,34 +53,92 @@ impl Neighbours {
 
     /// What has changed since the last look.
     pub(super) fn changes(&mut self) -> Vec<EventKind> {
-        // A kernel without the table has no such neighbours.
-        self.read(&fs::read_to_string(TABLE).unwrap_or_default())
+        // A host that does not list them sees no change.
+        let there = list().unwrap_or_default();
+        self.compare(there)
     }
 
-    fn read(&mut self, table: &str) -> Vec<EventKind> {
-        let changes = table.lines().filter_map(|line| {
-            let words: Vec<&str> = line.split_whitespace().collect();
-            let [address, _, flags, hardware, _, interface] = words[..] else {
-                return None;
-            };
-            let address: IpAddr = address.parse().ok()?;
+    fn compare(&mut self, there: Vec<Neighbour>) -> Vec<EventKind> {
+        let changes = there.into_iter().filter_map(|one| {
+            let Neighbour {
+                address,
+                interface,
+                hardware: now,
+            } = one;
             let peer = self.hosts.get(&address)?.clone();
-            let flags = u32::from_str_radix(flags.strip_prefix("0x")?, 16).ok()?;
-            if flags & COMPLETE == 0 {
-                return None;
-            }
-            let place = (address, interface.to_owned());
-            let before = self.known.insert(place, hardware.to_owned())?;
-            (before != hardware).then(|| EventKind::NeighbourChanged {
+            let place = (address, interface.clone());
+            let before = self.known.insert(place, now.clone())?;
+            (before != now).then(|| EventKind::NeighbourChanged {
                 peer,
                 address,
-                interface: interface.to_owned(),
+                interface,
                 before,
-                now: hardware.to_owned(),
+                now,
             })
         });
         changes.collect()
     }
+}
+
+/// The kernel's neighbours of both families in this network namespace.
+fn list() -> io::Result<Vec<Neighbour>> {
+    let socket = Socket::new(NETLINK_ROUTE)?;
+    socket.connect(&SocketAddr::new(0, 0))?;
+    // The kernel has the next part of its answer ready before the last one is taken.
+    socket.set_non_blocking(true)?;
+    let mut header = NetlinkHeader::default();
+    header.flags = NLM_F_REQUEST | NLM_F_DUMP;
+    let request = RouteNetlinkMessage::GetNeighbour(NeighbourMessage::default());
+    let mut request = NetlinkMessage::new(header, NetlinkPayload::from(request));
+    request.finalize();
+    let mut bytes = vec![0; request.buffer_len()];
+    request.serialize(&mut bytes);
+    socket.send(&bytes, 0)?;
+    let mut neighbours = Vec::new();
+    loop {
+        let (answer, _) = socket.recv_from_full()?;
+        let mut rest = answer.as_slice();
+        while !rest.is_empty() {
+            let message = NetlinkMessage::<RouteNetlinkMessage>::deserialize(rest);
+            let message = message.map_err(io::Error::other)?;
+            match message.payload {
+                NetlinkPayload::Done(_) => return Ok(neighbours),
+                NetlinkPayload::Error(error) => return Err(error.to_io()),
+                NetlinkPayload::InnerMessage(RouteNetlinkMessage::NewNeighbour(one)) => {
+                    neighbours.extend(reachable(&one));
+                }
+                _ => {}
+            }
+            let length = (message.header.length as usize).next_multiple_of(ALIGNMENT_BYTES);
+            rest = rest.get(length..).unwrap_or_default();
+        }
+    }
+}
+
+/// One that has a link address: the kernel gives none of an entry that is not valid.
+fn reachable(message: &NeighbourMessage) -> Option<Neighbour> {
+    let mut attributes = message.attributes.iter();
+    let hardware = attributes.find_map(|one| match one {
+        NeighbourAttribute::LinkLayerAddress(bytes) => Some(bytes),
+        _ => None,
+    })?;
+    let mut attributes = message.attributes.iter();
+    let address = attributes.find_map(|one| match one {
+        NeighbourAttribute::Destination(NeighbourAddress::Inet(address)) => {
+            Some(IpAddr::from(*address))
+        }
+        NeighbourAttribute::Destination(NeighbourAddress::Inet6(address)) => {
+            Some(IpAddr::from(*address))
+        }
+        _ => None,
+    })?;
+    let hardware: Vec<String> = hardware.iter().map(|byte| format!("{byte:02x}")).collect();
+    let interface = if_indextoname(message.header.ifindex).ok()?;
+    Some(Neighbour {
+        address,
+        interface: interface.into_string().ok()?,
+        hardware: hardware.join(":"),
+    })
 }
 
 #[cfg(test)]
@@ -73,33 +146,41 @@ mod tests {
     use super::*;
 
     #[test]
-    fn another_link_address_is_told_and_an_entry_without_one_is_not() {
-        let address = "10.77.0.2".parse().unwrap();
-        let mut neighbours = Neighbours {
-            hosts: BTreeMap::from([(address, "robot-pc".to_owned())]),
-            known: BTreeMap::new(),
-        };
-        let table = |address: &str, flags: &str, hardware: &str| {
-            format!(
-                "IP address       HW type     Flags       HW address            Mask     Device\n\
-                 {address}        0x1         {flags}         {hardware}     *        eth0\n"
-            )
-        };
-        let (first, second) = ("02:00:00:00:00:01", "02:00:00:00:00:02");
-        let incomplete = table("10.77.0.2", "0x0", "00:00:00:00:00:00");
-        for quiet in [
-            incomplete.clone(),
-            table("10.77.0.2", "0x2", first),
-            incomplete,
-            table("10.77.0.2", "0x6", first),
-            table("10.77.0.3", "0x2", second),
-        ] {
-            assert_eq!(neighbours.read(&quiet), [], "{quiet}");
+    fn another_link_address_is_told_of_either_family() {
+        for text in ["10.77.0.2", "fd77::2"] {
+            let address = text.parse().unwrap();
+            let mut neighbours = Neighbours {
+                hosts: BTreeMap::from([(address, "robot-pc".to_owned())]),
+                known: BTreeMap::new(),
+            };
+            let there = |address: IpAddr, hardware: &str| {
+                vec![Neighbour {
+                    address,
+                    interface: "eth0".to_owned(),
+                    hardware: hardware.to_owned(),
+                }]
+            };
+            let (first, second) = ("02:00:00:00:00:01", "02:00:00:00:00:02");
+            let foreign = "10.77.0.3".parse().unwrap();
+            for quiet in [
+                there(address, first),
+                Vec::new(),
+                there(address, first),
+                there(foreign, second),
+                there(foreign, first),
+            ] {
+                assert_eq!(neighbours.compare(quiet), []);
+            }
+            let changes = neighbours.compare(there(address, second));
+            let [EventKind::NeighbourChanged { before, now, .. }] = &changes[..] else {
+                panic!("{changes:?}");
+            };
+            assert_eq!((before.as_str(), now.as_str()), (first, second));
         }
-        let changes = neighbours.read(&table("10.77.0.2", "0x2", second));
-        let [EventKind::NeighbourChanged { before, now, .. }] = &changes[..] else {
-            panic!("{changes:?}");
-        };
-        assert_eq!((before.as_str(), now.as_str()), (first, second));
+    }
+
+    #[test]
+    fn the_kernel_lists_its_neighbours() {
+        assert!(list().is_ok(), "{:?}", list());
     }
 }

@@ -13,6 +13,7 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use hil_platform::plain_file;
 use nix::fcntl::{FallocateFlags, fallocate};
 
 /// What is kept of each end.
@@ -114,7 +115,7 @@ pub(crate) fn cut_middle(log: &Path) -> io::Result<u64> {
     // Its disk space is what the shorter form needs.
     let _kept = release_middle(log).is_err();
     let cut = log.with_extension("cut");
-    let written = File::create(&cut).and_then(|mut out| {
+    let written = plain_file::create_anew(&cut).and_then(|mut out| {
         out.write_all(&head)?;
         writeln!(
             out,

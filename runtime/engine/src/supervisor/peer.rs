@@ -4,7 +4,6 @@
 use std::io::{self, BufReader, BufWriter, Read, Write};
 use std::net::TcpStream;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
 use zeroize::Zeroizing;
@@ -14,9 +13,6 @@ use super::frame::{Frame, PeerHello, PeerMessage, write_message};
 use super::reconnect::Reconnect;
 use crate::security::greeting::{Secured, TimedStream};
 use crate::security::{SecureReader, SecureWriter};
-
-/// Frames that may wait between the reader thread and the supervisor.
-const INBOX_FRAMES: usize = 256;
 
 /// Something a peer said, or that it left.
 #[derive(Debug)]
@@ -35,11 +31,11 @@ pub(super) enum ControlReader {
 }
 
 impl ControlReader {
-    /// From now on a read waits for as long as it takes.
-    pub(super) fn wait_for_ever(&mut self) -> io::Result<()> {
+    /// From now on a read fails when no byte comes for `limit`.
+    pub(super) fn wait_at_most(&mut self, limit: Duration) -> io::Result<()> {
         match self {
-            Self::Plain(reader) => reader.get_mut().wait_for_ever(),
-            Self::Secured(reader) => reader.wait_for_ever(),
+            Self::Plain(reader) => reader.get_mut().wait_at_most(limit),
+            Self::Secured(reader) => reader.wait_at_most(limit),
         }
     }
 }
@@ -136,7 +132,6 @@ pub(crate) struct Peer {
     /// What it said of itself.
     pub(crate) hello: PeerHello,
     writer: PeerWriter,
-    inbox: Receiver<PeerEvent>,
     heard: Instant,
     /// False once something could not be said to it.
     is_open: bool,
@@ -148,15 +143,13 @@ pub(crate) struct Peer {
 impl Peer {
     /// Listens to the connection, and to what `reconnect` finds after it, in threads of its own.
     pub(super) fn new(ends: ControlHalves, reconnect: Reconnect) -> io::Result<Self> {
-        let (sender, inbox) = sync_channel(INBOX_FRAMES);
         let hello = reconnect.theirs.clone();
         Ok(Self {
             hello,
             writer: PeerWriter {
-                conversation: Conversation::begin(ends, reconnect, sender)?,
+                conversation: Conversation::begin(ends, reconnect)?,
                 frame: Zeroizing::default(),
             },
-            inbox,
             heard: Instant::now(),
             is_open: true,
             is_quiet: false,
@@ -170,26 +163,14 @@ impl Peer {
 
     /// The next thing the peer said, waiting up to `timeout`.
     pub(crate) fn receive(&mut self, timeout: Duration) -> Option<PeerEvent> {
-        match self.inbox.recv_timeout(timeout) {
-            Ok(event) => {
-                self.heard = Instant::now();
-                Some(event)
-            }
-            Err(RecvTimeoutError::Timeout) => None,
-            Err(RecvTimeoutError::Disconnected) => {
-                Some(PeerEvent::Closed("connection closed".to_owned()))
-            }
-        }
+        let event = self.writer.conversation.receive(timeout)?;
+        self.heard = Instant::now();
+        Some(event)
     }
 
     /// How long nothing has been heard.
     pub(crate) fn silence(&self) -> Duration {
         self.heard.elapsed()
-    }
-
-    /// Records are larger than greetings: a write may take up to `limit`.
-    pub(crate) fn allow_writes_to_take(&mut self, limit: Duration) -> io::Result<()> {
-        self.writer.conversation.limit_writes(limit)
     }
 
     /// Times without a connection since the last call that are over.
@@ -203,16 +184,14 @@ impl Peer {
         self.writer.conversation.leave();
     }
 
-    /// The conversation, to end it while the halves are in use.
+    /// The conversation, to receive while what is sent is written to [`Peer::writer`].
     pub(super) fn conversation(&self) -> Arc<Conversation> {
         Arc::clone(&self.writer.conversation)
     }
 
-    /// The sending half by itself, so that a thread can send while another receives.
-    pub(crate) fn halves(
-        &mut self,
-    ) -> (&mut (impl Write + Send + use<>), &mut Receiver<PeerEvent>) {
-        (&mut self.writer, &mut self.inbox)
+    /// What frames are written to, so that a thread can send while another receives.
+    pub(crate) fn writer(&mut self) -> &mut (impl Write + Send + use<>) {
+        &mut self.writer
     }
 }
 

@@ -1,7 +1,9 @@
 //! How a connection between supervisors that was cut comes back: the end that made it makes another one, and
 //! the first host listens for as long as one is missing. Only who proves the key is let in, as when the hosts
-//! met; another start of the peer is not.
+//! met; another start of the peer is not. Both try for as long as the run bears a silent host (`run.peer_timeout`),
+//! from their first attempt on: whatever says that the other end is gone, such as a reset, is no proof of it.
 
+use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant as WallInstant};
@@ -12,10 +14,8 @@ use super::meet::{Meeting, connect, greet};
 use super::peer::ControlHalves;
 use super::strangers::Strangers;
 
-/// How often an end that lacks a connection tries.
-const PERIOD: Duration = Duration::from_millis(10);
-/// How long it does, from its first attempt on: at the first host this is the time for which the door is open.
-pub(super) const PATIENCE: Duration = Duration::from_secs(5);
+/// How often an end that lacks a connection tries at first, and later.
+const PERIODS: [Duration; 2] = [Duration::from_millis(10), Duration::from_millis(100)];
 
 /// Where the first host lets those in again that it has met.
 #[derive(Debug, Default)]
@@ -25,6 +25,8 @@ pub(super) struct Door {
     missing_count: usize,
     /// Whoever came and was not looked at: of each host the last one.
     came: Vec<Newcomer>,
+    /// Frames that this host and any peer took of each other, see [`PeerMessage::Acknowledged`].
+    pub(super) moved_count: Arc<AtomicU64>,
 }
 
 impl Door {
@@ -86,24 +88,25 @@ impl Reconnect {
         self.meeting.is_here
     }
 
-    /// A connection to the same start of the peer, and how many frames that has taken; `taken_count` were taken
-    /// here. Tries while `is_wanted`.
+    /// A connection to the same start of the peer, and how many frames came there; here it were `come_count`.
+    /// Tries while `is_wanted`.
     ///
     /// # Errors
     /// Why there is none.
     pub(super) fn make(
         &self,
-        taken_count: u64,
+        come_count: u64,
         is_wanted: impl Fn() -> bool,
     ) -> Result<(ControlHalves, u64), String> {
         let hello = PeerHello {
             resumed: Some(Resumed {
                 of: self.theirs.domain,
-                taken_count,
+                come_count,
             }),
             ..self.own.clone()
         };
         lock(&self.door).missing_count += 1;
+        let patience = self.meeting.peer_timeout;
         let mut first_tried = None;
         let made = loop {
             let found = if self.is_called() {
@@ -114,12 +117,12 @@ impl Reconnect {
             if let Some(made) = found.transpose() {
                 break made;
             }
-            let first_tried = *first_tried.get_or_insert_with(WallInstant::now);
-            if first_tried.elapsed() >= PATIENCE || !is_wanted() {
-                let limit_s = PATIENCE.as_secs();
+            let tried_for = first_tried.get_or_insert_with(WallInstant::now).elapsed();
+            if tried_for >= patience || !is_wanted() {
+                let limit_s = patience.as_secs();
                 break Err(format!("there was no new one within {limit_s} s"));
             }
-            thread::sleep(PERIOD);
+            thread::sleep((tried_for / 10).clamp(PERIODS[0], PERIODS[1]));
         };
         let mut door = lock(&self.door);
         door.missing_count -= 1;
@@ -151,7 +154,7 @@ impl Reconnect {
             return Ok(Some((ends, 0)));
         };
         let said = say(&mut ends, &PeerMessage::Hello(hello.clone()));
-        Ok(said.is_ok().then_some((ends, resumed.taken_count)))
+        Ok(said.is_ok().then_some((ends, resumed.come_count)))
     }
 
     /// Calls the first host once.
@@ -162,7 +165,7 @@ impl Reconnect {
         let key = self.meeting.key.as_ref();
         match greet(stream, hello, &self.theirs.host, key) {
             Ok((ends, PeerMessage::Hello(said))) if said.domain == self.theirs.domain => {
-                Ok(said.resumed.map(|one| (ends, one.taken_count)))
+                Ok(said.resumed.map(|one| (ends, one.come_count)))
             }
             Ok((_, PeerMessage::Refused(reason))) => Err(reason),
             _ => Ok(None),

@@ -165,6 +165,7 @@ fn meeting(
         own: hosts[0].gateway_address(),
         expected,
         timeout: topology.run().start_timeout,
+        peer_timeout: topology.run().peer_timeout,
         key: key.cloned(),
     }
 }

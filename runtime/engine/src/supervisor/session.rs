@@ -454,6 +454,8 @@ impl Session<'_> {
             let silence_max = self.topology.run().peer_timeout;
             if !peer.is_quiet && peer.silence() > silence_max {
                 let silence_s = silence_max.as_secs();
+                // Nothing is waited for any more; it hears so if it can.
+                peer.hang_up();
                 heard.push(Heard::Lost(format!(
                     "{host} has been silent for {silence_s} s"
                 )));

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process;
 
 use super::MARK;
+use hil_platform::plain_file;
 
 /// How much of a file is looked at for its mark, bytes.
 const HEAD_BYTES: u64 = 4096;
@@ -79,7 +80,7 @@ pub fn write(path: &Path, text: &str) -> Result<(), WriteError> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(format!(".{}.partial", process::id()));
     let partial = path.with_file_name(name);
-    let written = File::create(&partial)
+    let written = plain_file::create_anew(&partial)
         .and_then(|mut file| {
             file.write_all(text.as_bytes())
                 .and_then(|()| file.sync_all())

@@ -125,7 +125,7 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
         has_fast_aes: true,
         resumed: Some(Resumed {
             of: [6; 16],
-            taken_count: 7,
+            come_count: 7,
         }),
     };
     let messages = [
@@ -136,7 +136,10 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
             has_one_clock: true,
         },
         PeerMessage::Alive,
-        PeerMessage::Acknowledged(9),
+        PeerMessage::Acknowledged {
+            taken_count: 9,
+            moved_count: 4,
+        },
         PeerMessage::Leaving,
         PeerMessage::Stop(RunOutcome::Interrupted("Ctrl-C".to_owned())),
         PeerMessage::Taken(vec![RecordGap {
