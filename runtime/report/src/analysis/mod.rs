@@ -26,7 +26,6 @@ use std::path::{Path, PathBuf};
 use std::{fs, io};
 
 use hil_account::MessageFate;
-use hil_account::flow::FlowMetrics;
 use hil_account::radio::RadioMetrics;
 use hil_core::case_study::Score;
 use hil_core::plot::PlotSeries;
@@ -164,7 +163,6 @@ pub fn conclude(
     let found = read_channels(&mut summary, &records, &axis);
     summary.flows = found.flows;
     summary.directions = metrics::directions(result);
-    doubt_losses(&mut summary);
     let mut unwritten_files = capture::write(&mut summary, &records);
     summary.faces = adapters::adapter_summaries(&records);
     summary.hardware_stamps = nics::hardware_stamps(&records);
@@ -273,23 +271,6 @@ fn read_channels(
             .extend(radio.map(|radio| (channel.name.clone(), radio)));
     }
     found
-}
-
-/// Where the receiving host had no room for some datagrams, it is unknown which frames these were.
-fn doubt_losses(summary: &mut RunSummary) {
-    for one in &mut summary.flows {
-        let mut directions = summary.directions.iter();
-        let had_no_room = directions.any(|direction| {
-            direction.channels.contains(&one.channel) && direction.no_room_count() > 0
-        });
-        let mut channels = summary.channels.iter();
-        let emulation = channels
-            .find(|channel| channel.name == one.channel)
-            .and_then(|channel| channel.emulation.as_ref()?.overflow_count);
-        if had_no_room || emulation.unwrap_or(0) > 0 {
-            one.flows.iter_mut().for_each(FlowMetrics::doubt_network);
-        }
-    }
 }
 
 /// What the inlets lost of the frames of `channel`.
