@@ -281,16 +281,36 @@ pub fn set_int_option(
 ///
 /// # Errors
 /// What the kernel answered.
-#[allow(unsafe_code, reason = "no crate wraps IPV6_MTU")]
 pub fn int_option(socket: &impl AsFd, level: c_int, name: c_int) -> io::Result<c_int> {
-    let mut value: c_int = 0;
-    let mut length = INT_LENGTH;
-    let pointer = (&raw mut value).cast();
+    let [value] = int_options(socket, level, name)?;
+    Ok(value)
+}
+
+/// Datagrams that the kernel dropped because the receive buffer was full, modulo 2^32 (`SO_MEMINFO`, since
+/// Linux 4.12): what `SO_RXQ_OVFL` will say with the next one.
+///
+/// # Errors
+/// What the kernel answered.
+pub fn drop_count(socket: &impl AsFd) -> io::Result<u32> {
+    let counts = int_options(socket, libc::SOL_SOCKET, libc::SO_MEMINFO)?;
+    let counts: [c_int; libc::SK_MEMINFO_DROPS as usize + 1] = counts;
+    Ok(counts[libc::SK_MEMINFO_DROPS as usize].cast_unsigned())
+}
+
+#[allow(unsafe_code, reason = "no crate wraps IPV6_MTU and SO_MEMINFO")]
+fn int_options<const N: usize>(
+    socket: &impl AsFd,
+    level: c_int,
+    name: c_int,
+) -> io::Result<[c_int; N]> {
+    let mut values = [0; N];
+    let mut length = libc::socklen_t::try_from(size_of_val(&values)).unwrap_or(0);
+    let pointer = values.as_mut_ptr().cast();
     let descriptor = socket.as_fd().as_raw_fd();
-    // SAFETY: the kernel writes at most `length` bytes at `pointer`, a live int of that size.
+    // SAFETY: the kernel writes at most `length` bytes at `pointer`, live ints of that size.
     let result = unsafe { libc::getsockopt(descriptor, level, name, pointer, &raw mut length) };
     if result == 0 {
-        Ok(value)
+        Ok(values)
     } else {
         Err(io::Error::last_os_error())
     }

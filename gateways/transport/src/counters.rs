@@ -167,8 +167,7 @@ counts! {
         damaged_control_count,
         /// Datagrams without a readable source address, dropped.
         sourceless_count,
-        /// Datagrams the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known
-        /// as of the newest datagram received: drops after it show with the next one.
+        /// Datagrams the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`, `SO_MEMINFO`).
         kernel_drop_count,
         /// Replies the transport took.
         reply_count,

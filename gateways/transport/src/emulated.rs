@@ -120,6 +120,8 @@ pub struct EmulatedReceiver {
     counters: ReceiverCounters,
     /// By channel number.
     lost: Vec<LinkCounts>,
+    /// Datagrams of any channel that found all places taken.
+    overflow_count: u64,
 }
 
 impl EmulatedReceiver {
@@ -154,6 +156,7 @@ impl EmulatedReceiver {
             newest_arrival: Instant::from_ns(i64::MIN),
             counters: ReceiverCounters::default(),
             lost: vec![LinkCounts::default(); usize::from(channel_max) + 1],
+            overflow_count: 0,
         }
     }
 
@@ -188,6 +191,7 @@ impl EmulatedReceiver {
     /// Decides the fate of the datagram in `place`.
     fn admit(&mut self, mut received: Received, place: usize) {
         let arrived = self.newest_arrival;
+        received.no_room_count += self.overflow_count;
         let start = place * self.settings.datagram_bytes_max;
         let length_bytes = received.length_bytes;
         let offer = (self.offer_of)(&self.storage[start..start + length_bytes]);
@@ -226,6 +230,7 @@ impl EmulatedReceiver {
         } else if place < self.settings.capacity_count {
             self.held.push(Some(received));
         } else {
+            self.overflow_count += 1;
             if let Some(counts) = self.counts_of(channel) {
                 counts.overflow_count += 1;
             }
@@ -308,6 +313,10 @@ impl DatagramReceiver for EmulatedReceiver {
         let counts = *self.lost.get(usize::from(channel))?;
         let causes = self.links.loss_causes(channel);
         Some(LinkCounts { causes, ..counts })
+    }
+
+    fn no_room_count(&self) -> u64 {
+        self.inner.no_room_count() + self.overflow_count
     }
 
     /// Own counts of what was handed out; the rest from below.

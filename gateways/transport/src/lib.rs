@@ -73,6 +73,9 @@ pub struct Received {
     pub stamps: KernelStamps,
     /// Set when a link model held the datagram.
     pub emulated: Option<EmulatedDelay>,
+    /// Datagrams that found no room on this host before this one came, since the receiver was opened; 0 where
+    /// nothing tells.
+    pub no_room_count: u64,
 }
 
 impl Received {
@@ -86,6 +89,7 @@ impl Received {
             source,
             stamps: KernelStamps::default(),
             emulated: None,
+            no_room_count: 0,
         }
     }
 }
@@ -128,6 +132,11 @@ pub enum SendRefusal {
 }
 
 impl SendRefusal {
+    /// True where there is no way to the peer, whoever the peer is.
+    pub const fn is_unreachable(self) -> bool {
+        matches!(self, Self::Unreachable { .. })
+    }
+
     /// The refusal that `errno` stands for, for a datagram of `length_bytes`.
     pub fn from_errno(errno: i32, length_bytes: usize) -> Self {
         match errno {
@@ -297,6 +306,11 @@ pub trait DatagramReceiver: Debug + Send {
 
     /// What was counted since the start.
     fn counters(&self) -> ReceiverCounters;
+
+    /// [`Received::no_room_count`] as of now, also of what came after the newest datagram.
+    fn no_room_count(&self) -> u64 {
+        self.counters().kernel_drop_count
+    }
 
     /// Does what is due beside receiving, such as taking connections: call it whenever the
     /// descriptor has something and [`DatagramReceiver::receive`] gave nothing.

@@ -24,7 +24,7 @@ use hil_net::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
 use hil_net::reply_stamps::ReplyStamps;
 use hil_net::tcp_info::unacknowledged_bytes;
 use hil_net::timestamping::{
-    MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, int_option,
+    MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, drop_count, int_option,
     interface_mtu_bytes, restart_send_count, set_int_option,
 };
 use hil_net::{TransmitStamp, TxToken};
@@ -474,6 +474,7 @@ impl DatagramSender for UdpSender {
                         source: message.source.unwrap_or(self.peer),
                         stamps: data.stamps,
                         emulated: None,
+                        no_room_count: 0,
                     }));
                 }
                 Ok(None) => return Ok(None),
@@ -603,6 +604,7 @@ impl DatagramReceiver for UdpReceiver {
                 source,
                 stamps: data.stamps,
                 emulated: None,
+                no_room_count: self.counters.kernel_drop_count,
             };
             let is_damaged = data.is_damaged || message.is_control_truncated;
             self.counters.damaged_control_count += u64::from(is_damaged);
@@ -654,7 +656,12 @@ impl DatagramReceiver for UdpReceiver {
     }
 
     fn counters(&self) -> ReceiverCounters {
-        self.counters
+        let mut counters = self.counters;
+        // Where the kernel does not tell, it is as of the newest datagram.
+        if let Ok(count) = drop_count(&self.socket) {
+            counters.kernel_drop_count += u64::from(count.wrapping_sub(self.kernel_drop_count));
+        }
+        counters
     }
 }
 

@@ -3,6 +3,7 @@
 
 use super::fold::RecordsAtHand;
 use super::history::MessageHistory;
+use super::no_room::NoRoom;
 use super::stage::{MessageFate, Side};
 use super::{AccountContext, Interruption, PathProcess};
 use hil_core::record::{EgressRecord, IngressRecord, stamp};
@@ -114,13 +115,14 @@ impl<'a> Evidence<'a> {
         }
         if let Some(egress) = message.egress {
             return Some(if is_refused(&egress) {
-                MessageFate::RefusedByKernel
+                fate_of_refusal(&egress)
             } else if !self.at_hand.ingress {
                 MessageFate::UnknownPeerRecordsUnavailable
             } else if self.is_near(place.producer_ns, self.producer_end_ns) {
                 MessageFate::InFlight
-            } else if stamp(egress.handed_ns).is_some() {
-                MessageFate::LostOnWire
+            } else if let Some(handed_ns) = stamp(egress.handed_ns) {
+                let no_room = NoRoom::fate(self.context.no_room, handed_ns);
+                no_room.unwrap_or(MessageFate::LostOnWire)
             } else {
                 MessageFate::Unexplained
             });
@@ -143,12 +145,15 @@ impl<'a> Evidence<'a> {
         if ingress.flags & IngressRecord::INCOMPLETE != 0 {
             // Only pieces came: because the sender stopped in the middle of it, because the run ended,
             // or because the others got lost.
-            if message.egress.as_ref().is_some_and(is_refused) {
-                MessageFate::RefusedByKernel
+            if let Some(egress) = message.egress.filter(is_refused) {
+                fate_of_refusal(&egress)
             } else if self.is_near(place.producer_ns, self.producer_end_ns) {
                 MessageFate::InFlight
             } else {
-                MessageFate::Incomplete
+                let no_room = message
+                    .handed_ns()
+                    .and_then(|handed_ns| NoRoom::fate(self.context.no_room, handed_ns));
+                no_room.unwrap_or(MessageFate::Incomplete)
             }
         } else if ingress.flags & IngressRecord::LATE != 0 {
             MessageFate::Late
@@ -268,6 +273,7 @@ impl Judge {
         let may_have_been_inside = match fate {
             MessageFate::LostOnWire
             | MessageFate::Incomplete
+            | MessageFate::LostOnWireOrByHarness
             | MessageFate::Unexplained
             | MessageFate::InFlight
             | MessageFate::UnknownPeerRecordsUnavailable => true,
@@ -305,6 +311,14 @@ impl Judge {
 /// True when the sending gateway noted that it could not send the whole message.
 const fn is_refused(egress: &EgressRecord) -> bool {
     egress.flags & EgressRecord::REFUSED_BY_KERNEL != 0
+}
+
+const fn fate_of_refusal(egress: &EgressRecord) -> MessageFate {
+    if egress.flags & EgressRecord::UNREACHABLE != 0 {
+        MessageFate::NetworkUnreachable
+    } else {
+        MessageFate::RefusedByKernel
+    }
 }
 
 /// What is known about when a message was last seen.

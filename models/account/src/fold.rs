@@ -98,7 +98,7 @@ pub enum FirstNumber {
     /// Zero: the records begin with the run.
     Zero,
     /// The lowest on record of the starts known when the first message settles, since the records begin
-    /// in the middle of a run; zero of later starts.
+    /// in the middle of a run, or the producer before it; zero of later starts.
     OnRecord,
 }
 
@@ -254,7 +254,7 @@ impl ChannelFold {
         let mut fold = Self::new(FoldSettings {
             is_gateway: context.path.is_gateway(),
             depth: context.depth,
-            first_number: FirstNumber::Zero,
+            first_number: context.first_number,
             held_max: None,
         });
         fold.expect(RecordsAtHand::of(records, context));

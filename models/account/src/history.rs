@@ -172,10 +172,13 @@ impl MessageHistory {
             _ if self.arrived().is_some() => Crossing::Arrived,
             MessageFate::Taken | MessageFate::SupersededAtConsumer => Crossing::Arrived,
             MessageFate::LostOnWire | MessageFate::Incomplete => Crossing::LostByNetwork,
+            MessageFate::NetworkUnreachable => Crossing::Unreachable,
+            MessageFate::LostOnWireOrByHarness => Crossing::Doubtful,
             MessageFate::InFlight
             | MessageFate::Unexplained
             | MessageFate::UnknownPeerRecordsUnavailable => Crossing::Unknown,
-            MessageFate::SupersededAtInput
+            MessageFate::LostByHarness
+            | MessageFate::SupersededAtInput
             | MessageFate::RefusedByKernel
             | MessageFate::RefusedAtIngress
             | MessageFate::Late

@@ -28,6 +28,7 @@ mod history;
 mod metrics;
 pub mod network;
 pub mod nic_clock;
+mod no_room;
 mod outage;
 pub mod radio;
 #[cfg(test)]
@@ -50,6 +51,7 @@ pub use metrics::{
     BurstCount, ChannelAccount, Closing, ClosingMetrics, Coverage, EndToEnd, FateCounts, Gap, Gaps,
     InterruptionMetrics, SegmentMetrics, StampCoverage,
 };
+pub use no_room::NoRoom;
 pub use outage::{
     EventTime, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFinder, OutageMetrics,
     Preceding, Standing, preceding,
@@ -264,6 +266,8 @@ pub struct AccountContext<'a> {
     pub path: ChannelPath<'a>,
     /// Interruptions of processes on this channel's way.
     pub interruptions: &'a [Interruption],
+    /// Where the receiving host had no room for datagrams of the channel's flow.
+    pub no_room: &'a [NoRoom],
     /// The run on the producer's host clock, if known.
     pub producer_run: Option<RunSpan>,
     /// The run on the consumer's host clock, if known.
@@ -275,6 +279,8 @@ pub struct AccountContext<'a> {
     /// Messages that a reader of the channel has room for, if known: one that so many came after was
     /// pushed out, and any other that was not taken waits.
     pub depth: Option<usize>,
+    /// Where the numbers of the channel's messages begin.
+    pub first_number: FirstNumber,
     /// True when both network cards take their stamps from one hardware clock.
     pub cards_share_clock: bool,
     /// Round trips of the gateways' clock exchange, nanoseconds.
@@ -287,10 +293,12 @@ impl<'a> AccountContext<'a> {
         Self {
             path,
             interruptions: &[],
+            no_room: &[],
             producer_run: None,
             consumer_run: None,
             flight_time_max: FLIGHT_TIME_MAX,
             depth: None,
+            first_number: FirstNumber::Zero,
             cards_share_clock: false,
             round_trips_ns: &[],
         }

@@ -146,6 +146,10 @@ impl OutageFinder {
                 let taken_ns = message.taken.and_then(|record| stamp(record.taken_ns));
                 self.arrived(published_ns, taken_ns);
             }
+            // What its consumer made of it is unknown, but it got through.
+            MessageFate::UnknownPeerRecordsUnavailable if message.arrived().is_some() => {
+                self.arrived(published_ns, None);
+            }
             fate if fate.is_loss() => {
                 let is_first = !self.is_open;
                 self.lost(message.key.sequence, message.count, published_ns);

@@ -72,6 +72,9 @@ impl RadioRow {
                 self.fates = None;
             }
             MessageFate::LostOnWire
+            | MessageFate::NetworkUnreachable
+            | MessageFate::LostByHarness
+            | MessageFate::LostOnWireOrByHarness
             | MessageFate::SupersededAtInput
             | MessageFate::RefusedByKernel
             | MessageFate::Incomplete

@@ -108,10 +108,17 @@ pub enum MessageFate {
     SupersededAtInput,
     /// The send call failed: the peer was absent or the kernel refused.
     RefusedByKernel,
+    /// Not sent for want of a way to the peer: an interface was down or there was no route.
+    NetworkUnreachable,
     /// Handed to the kernel, never received.
     LostOnWire,
     /// Handed to the kernel in pieces, of which only some were received.
     Incomplete,
+    /// It came to the receiving host, which had no room for it: where its number is missing, the host counts as
+    /// many datagrams without room as are missing.
+    LostByHarness,
+    /// The same, but the host counts more or fewer than are missing there.
+    LostOnWireOrByHarness,
     /// Received and not forwarded, for no recorded reason.
     RefusedAtIngress,
     /// Received after the sequence window had moved on.
@@ -132,12 +139,15 @@ pub enum MessageFate {
 
 impl MessageFate {
     /// Every fate, in the order of a message's way.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 16] = [
         Self::Taken,
         Self::SupersededAtInput,
         Self::RefusedByKernel,
+        Self::NetworkUnreachable,
         Self::LostOnWire,
         Self::Incomplete,
+        Self::LostByHarness,
+        Self::LostOnWireOrByHarness,
         Self::RefusedAtIngress,
         Self::Late,
         Self::Duplicate,
@@ -154,8 +164,11 @@ impl MessageFate {
             Self::Taken => "taken by the consumer",
             Self::SupersededAtInput => "superseded at the gateway's input",
             Self::RefusedByKernel => "refused by the kernel or peer absent",
+            Self::NetworkUnreachable => "network unreachable (interface down or no route)",
             Self::LostOnWire => "lost on the wire",
             Self::Incomplete => "incomplete: pieces lost on the wire",
+            Self::LostByHarness => "lost by the harness (no room on the receiving host)",
+            Self::LostOnWireOrByHarness => "lost on the wire or by the harness",
             Self::RefusedAtIngress => "refused by the receiving gateway",
             Self::Late => "too late for the receiving gateway",
             Self::Duplicate => "received only as a duplicate",
@@ -173,8 +186,11 @@ impl MessageFate {
         matches!(
             self,
             Self::RefusedByKernel
+                | Self::NetworkUnreachable
                 | Self::LostOnWire
                 | Self::Incomplete
+                | Self::LostByHarness
+                | Self::LostOnWireOrByHarness
                 | Self::RefusedAtIngress
                 | Self::Late
                 | Self::Duplicate

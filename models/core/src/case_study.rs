@@ -13,6 +13,7 @@ use crate::plot::PlotSeries;
 use crate::replay::Replay;
 use crate::run_log::RunLog;
 use crate::study::Batch;
+use crate::text_file::TextFile;
 
 pub use crate::score::{
     EVENT_MESSAGES_MAX, EVENTS_MAX, ErrorSeries, Harm, LiveEvents, MessageRef, Metric, Occasions,
@@ -45,14 +46,14 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// `[case.parameters]`; use `#[serde(deny_unknown_fields, default)]`.
     type Parameters: DeserializeOwned + Serialize + Default;
 
-    /// Fills in what the parameters name by file; `read` gives a file's text or says why not.
+    /// Fills in what the parameters name by file; `read` gives a file's text or says where it is none.
     /// Models open no file themselves.
     ///
     /// # Errors
     /// Names the parameter and what `read` said.
     fn read_files(
         _parameters: &mut Self::Parameters,
-        _read: &mut dyn FnMut(&str) -> Result<String, String>,
+        _read: &mut dyn FnMut(&str) -> Result<TextFile, String>,
     ) -> Result<(), ParameterError> {
         Ok(())
     }
@@ -72,7 +73,7 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// A fresh instance of the role called `name`; `None` if the case has no such role.
     fn role(&self, name: &str) -> Option<Box<dyn Role>>;
 
-    /// What the check of these parameters leaves open, in words without full stop; nothing by default.
+    /// What the check of these parameters leaves open or warns of, in words without full stop; nothing by default.
     fn undecided(&self) -> Option<String> {
         None
     }

@@ -39,4 +39,5 @@ pub mod run_log;
 pub mod score;
 pub mod simulation;
 pub mod study;
+pub mod text_file;
 pub mod time;

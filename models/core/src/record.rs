@@ -82,6 +82,9 @@ impl EgressRecord {
     pub const RADIO_ACKNOWLEDGED: u32 = 4;
     /// The radio reported that the peer radio did not acknowledge the last fragment.
     pub const RADIO_UNACKNOWLEDGED: u32 = 8;
+    /// It did not leave because there was no way to the peer: an interface that is down, no route, or the last
+    /// report of the network said so.
+    pub const UNREACHABLE: u32 = 16;
 }
 
 /// A gateway received a message from the network.
@@ -192,6 +195,22 @@ impl RoundTripRecord {
         let whole = self.t4_ns.saturating_sub(self.t1_ns);
         whole.saturating_sub(self.t3_ns.saturating_sub(self.t2_ns))
     }
+}
+
+/// A receiving gateway's host had no room for datagrams of a flow: its socket's buffer was full, or the emulated
+/// link held as many as it may. They came between two messages of the flow that it did receive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct NoRoomRecord {
+    /// When the message before was handed to the kernel, the *sending* host's monotonic clock;
+    /// [`UNAVAILABLE`] where there was none.
+    pub after_ns: i64,
+    /// When the message behind was, on the same clock; [`UNAVAILABLE`] where none came any more.
+    pub before_ns: i64,
+    /// When that was noticed, this host's monotonic clock.
+    pub noticed_ns: i64,
+    /// How many datagrams, of whatever kind and sender.
+    pub datagram_count: u64,
 }
 
 /// A program behind an inlet sent an Ethernet frame, which is the message of the same epoch and sequence.

@@ -1,10 +1,13 @@
 //! Motion files in the BVH text format (Biovision hierarchy): reader and writer on text. It opens
 //! no file, and it does not interpret the motion: see [`super::motion`].
 //!
-//! Numbers and keywords may be spread over lines at will; every error names the line it was found
-//! on. No input makes the reader panic, recurse or reserve more memory than the text's own size.
+//! Numbers and keywords may be spread over lines at will, and a name is the rest of its line; every
+//! error names the line it was found on and where that begins in the file. No input makes the reader
+//! panic, recurse or reserve more memory than the text's own size.
 
 use core::fmt::Write as _;
+
+use hil_core::text_file::{Line, TextFile, not_a_number};
 
 use crate::skeleton::{Channel, Skeleton};
 
@@ -20,14 +23,18 @@ pub struct Bvh {
     pub frame_time_s: f64,
     /// Frames one after another, [`Skeleton::channel_count`] values each.
     pub values: Vec<f64>,
+    /// Frames that the file announces, which may be more or fewer.
+    pub announced_count: usize,
 }
 
 /// Why a text is not a motion file.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("line {line}: {problem}")]
+#[error("line {line}, byte {offset}: {problem}")]
 pub struct BvhError {
     /// Line of the offending word, counted from 1; the last line when the text ended early.
-    pub line: usize,
+    pub line: u64,
+    /// Where that line begins in the file.
+    pub offset: u64,
     /// What was wrong with it.
     pub problem: BvhProblem,
 }
@@ -59,11 +66,12 @@ pub enum BvhProblem {
         /// What it may be.
         allowed: &'static str,
     },
-    /// The frame count does not fit the numbers that follow.
-    #[error("{frame_count} frames of {channel_count} values announced, {value_count} values found")]
-    FrameCount {
-        /// Announced frames.
-        frame_count: usize,
+    /// A word is no number.
+    #[error("{0}")]
+    NotANumber(String),
+    /// There is not one whole frame.
+    #[error("no whole frame: {channel_count} values make one, {value_count} found")]
+    NoFrame {
         /// Values per frame.
         channel_count: usize,
         /// Values in the text.
@@ -83,19 +91,26 @@ impl Bvh {
             .chunks_exact(self.skeleton.channel_count().max(1))
     }
 
-    /// Reads a motion file's text.
+    /// What is unusual about the number of frames, in words without full stop.
+    pub fn remark(&self) -> Option<String> {
+        let (announced, found) = (self.announced_count, self.frame_count());
+        (announced != found).then(|| {
+            format!("{announced} frames are announced, {found} whole ones are there and played")
+        })
+    }
+
+    /// Reads a motion file's text. Of frames, as many are read as are whole.
     ///
     /// # Errors
     /// The first line that is not as the format says.
-    pub fn parse(text: &str) -> Result<Self, BvhError> {
-        let mut words = Words::new(text);
+    pub fn parse(file: &TextFile) -> Result<Self, BvhError> {
+        let mut words = Words::new(file);
         words.keyword("HIERARCHY", "the keyword HIERARCHY")?;
         words.keyword("ROOT", "the keyword ROOT")?;
         let skeleton = parse_hierarchy(&mut words)?;
         words.keyword("MOTION", "the keyword MOTION")?;
         words.keyword("Frames:", "the keyword Frames:")?;
-        let count_line = words.line();
-        let frame_count: usize = words.parsed("a frame count")?;
+        let announced_count: usize = words.parsed("a frame count")?;
         words.keyword("Frame", "the keywords Frame Time:")?;
         words.keyword("Time:", "the keywords Frame Time:")?;
         let frame_time_s = words.number("a frame time in seconds")?;
@@ -111,20 +126,19 @@ impl Bvh {
             values.push(words.present_number("a channel value")?);
         }
         let channel_count = skeleton.channel_count();
-        if frame_count.checked_mul(channel_count) != Some(values.len()) || values.is_empty() {
-            return Err(BvhError {
-                line: count_line,
-                problem: BvhProblem::FrameCount {
-                    frame_count,
-                    channel_count,
-                    value_count: values.len(),
-                },
-            });
+        let value_count = values.len();
+        if channel_count == 0 || value_count < channel_count {
+            return Err(words.error(BvhProblem::NoFrame {
+                channel_count,
+                value_count,
+            }));
         }
+        values.truncate(value_count - value_count % channel_count);
         Ok(Self {
             skeleton,
             frame_time_s,
             values,
+            announced_count,
         })
     }
 
@@ -183,8 +197,7 @@ fn parse_joint(
     skeleton: &mut Skeleton,
     parent: Option<usize>,
 ) -> Result<usize, BvhError> {
-    words.next("a joint name")?;
-    let name = words.present.to_owned();
+    let name = words.name("a joint name")?.to_owned();
     if skeleton.joints().len() >= JOINT_COUNT_MAX {
         return Err(words.error(BvhProblem::OutOfRange {
             what: "joint count",
@@ -219,28 +232,27 @@ fn parse_joint(
 }
 
 /// The words of a text, one after the other.
-#[derive(Debug)]
 struct Words<'a> {
-    lines: core::str::Lines<'a>,
-    line_count: usize,
+    lines: Box<dyn Iterator<Item = Line<'a>> + 'a>,
+    /// The one of the present word.
+    line: Line<'a>,
     /// The rest of the line behind the present word.
     rest: &'a str,
     present: &'a str,
 }
 
 impl<'a> Words<'a> {
-    fn new(text: &'a str) -> Self {
+    fn new(file: &'a TextFile) -> Self {
         Self {
-            lines: text.trim_start_matches('\u{feff}').lines(),
-            line_count: 0,
+            lines: Box::new(file.lines()),
+            line: Line {
+                number: 1,
+                offset: 0,
+                content: "",
+            },
             rest: "",
             present: "",
         }
-    }
-
-    /// The line of the present word, counted from 1.
-    fn line(&self) -> usize {
-        self.line_count.max(1)
     }
 
     /// Goes to the next word; false at the end.
@@ -254,9 +266,24 @@ impl<'a> Words<'a> {
             let Some(next) = self.lines.next() else {
                 return false;
             };
-            self.rest = next;
-            self.line_count += 1;
+            self.rest = next.content;
+            self.line = next;
         }
+    }
+
+    /// The next word and the rest of its line, up to a brace that opens there.
+    fn name(&mut self, expected: &'static str) -> Result<&'a str, BvhError> {
+        self.next(expected)?;
+        let line = self.line.content;
+        let start = line.len() - self.rest.len() - self.present.len();
+        let behind = &line[start..];
+        let end = behind.find('{').unwrap_or(behind.len());
+        self.rest = &behind[end..];
+        self.present = behind[..end].trim_end();
+        if self.present.is_empty() {
+            return Err(self.unexpected(expected));
+        }
+        Ok(self.present)
     }
 
     fn is(&self, keyword: &str) -> bool {
@@ -296,7 +323,7 @@ impl<'a> Words<'a> {
         let parsed = self.present.parse().ok();
         parsed
             .filter(|value: &f64| value.is_finite())
-            .ok_or_else(|| self.unexpected(expected))
+            .ok_or_else(|| self.error(BvhProblem::NotANumber(not_a_number(self.present, expected))))
     }
 
     fn unexpected(&self, expected: &'static str) -> BvhError {
@@ -308,7 +335,8 @@ impl<'a> Words<'a> {
 
     fn error(&self, problem: BvhProblem) -> BvhError {
         BvhError {
-            line: self.line(),
+            line: self.line.number,
+            offset: self.line.offset,
             problem,
         }
     }

@@ -4,41 +4,85 @@ use super::*;
 
 const SMALL: &str = "HIERARCHY\nROOT Hips\n{\n  OFFSET 0 0 0\n  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n  JOINT RightHand\n  {\n    OFFSET -50 40 0\n    CHANNELS 3 Yrotation Xrotation Zrotation\n    End Site\n    {\n      OFFSET -10 0 0\n    }\n  }\n}\nMOTION\nFrames: 2\nFrame Time: 0.008\n0 95 0 0 0 0 1 2 3\n0 95 0 0 0 0 1.5 -2e1 3\n";
 
-fn check_error(text: &str, line: usize, message: &str) {
-    let error = Bvh::parse(text).unwrap_err();
+fn parsed(text: &str) -> Result<Bvh, BvhError> {
+    Bvh::parse(&text.into())
+}
+
+#[track_caller]
+fn check_error(text: &str, line: u64, message: &str) {
+    let error = parsed(text).unwrap_err();
     assert_eq!(error.line, line, "{error}");
     assert!(error.to_string().contains(message), "{error}");
 }
 
 #[test]
 fn a_small_file_is_read_as_written() {
-    let bvh = Bvh::parse(SMALL).unwrap();
+    let bvh = parsed(SMALL).unwrap();
     assert_eq!(bvh.frame_count(), 2);
     assert_eq!(bvh.skeleton.channel_count(), 9);
     assert_eq!(bvh.skeleton.joints()[1].parent, Some(0));
     assert_eq!(bvh.frames().count(), 2);
     assert!((bvh.values[16] + 20.0).abs() < 1e-15);
-    assert_eq!(Bvh::parse(&bvh.to_text()).unwrap(), bvh);
+    assert_eq!(parsed(&bvh.to_text()).unwrap(), bvh);
 }
 
 #[test]
 fn windows_line_ends_and_a_byte_order_mark_change_nothing() {
     let windows = format!("\u{feff}{}", SMALL.replace('\n', "\r\n"));
-    assert_eq!(Bvh::parse(&windows), Bvh::parse(SMALL));
+    let windows = TextFile::decode(windows.as_bytes()).unwrap();
+    assert_eq!(Bvh::parse(&windows), parsed(SMALL));
 }
 
 #[test]
 fn errors_name_line_and_cause() {
     check_error("", 1, "expected the keyword HIERARCHY");
-    check_error(&SMALL.replace("-50", "west"), 8, "found \"west\"");
+    check_error(
+        &SMALL.replace("-50", "west"),
+        8,
+        "\"west\" is not an offset",
+    );
+    check_error(&SMALL.replace("0.008", "0,008"), 18, "decimal comma");
+    check_error(&SMALL.replace("1.5", "1,5"), 20, "decimal comma");
     check_error(&SMALL.replace("Yrotation X", "Yaw X"), 9, "channel name");
     check_error(&SMALL.replace("0.008", "0"), 18, "frame time 0 is outside");
     check_error(&SMALL.replace("-2e1", "NaN"), 20, "a channel value");
-    check_error(&SMALL.replace(": 2", ": 3"), 17, "18 values found");
     check_error(&SMALL.replace("CHANNELS 3", "CHANNELS 7"), 9, "0 to 6");
     check_error(&SMALL[..60], 5, "the end of the text");
-    let huge = SMALL.replace(": 2", ": 18446744073709551615");
-    check_error(&huge, 17, "frames of 9 values");
+    let without = &SMALL[..SMALL.find("0 95").unwrap()];
+    check_error(without, 18, "no whole frame: 9 values make one, 0 found");
+    let offset = parsed(&SMALL.replace("-50", "west")).unwrap_err().offset;
+    assert_eq!(offset, SMALL.find("    OFFSET -50").unwrap() as u64);
+}
+
+#[test]
+fn whole_frames_are_played_whatever_was_announced() {
+    assert_eq!(parsed(SMALL).unwrap().remark(), None);
+    for (text, found) in [
+        (SMALL.replace(": 2", ": 3"), 2),
+        (SMALL.replace(": 2", ": 1"), 2),
+        (SMALL.replace(": 2", ": 18446744073709551615"), 2),
+        (SMALL.replace(" -2e1 3", ""), 1),
+    ] {
+        let bvh = parsed(&text).unwrap();
+        assert_eq!(bvh.frame_count(), found);
+        let remark = bvh.remark().unwrap();
+        assert!(remark.contains(&format!("{found} whole ones")), "{remark}");
+    }
+}
+
+#[test]
+fn a_name_is_the_rest_of_its_line_in_any_encoding() {
+    let spaced = SMALL.replace("JOINT RightHand\n  {", "JOINT Bip01 R Hand {");
+    let bvh = parsed(&spaced).unwrap();
+    assert_eq!(bvh.skeleton.joints()[1].name, "Bip01 R Hand");
+    assert_eq!(bvh.values, parsed(SMALL).unwrap().values);
+    let latin1 = SMALL.replace("Hips", "H?fte").replace('?', "\u{fc}");
+    let bytes: Vec<u8> = latin1
+        .chars()
+        .map(|letter| u8::try_from(u32::from(letter)).unwrap())
+        .collect();
+    let bvh = Bvh::parse(&TextFile::decode(&bytes).unwrap()).unwrap();
+    assert_eq!(bvh.skeleton.joints()[0].name, "H\u{fc}fte");
 }
 
 #[test]

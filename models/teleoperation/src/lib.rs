@@ -85,6 +85,7 @@ use hil_core::random::RandomStream;
 use hil_core::replay::Replay;
 use hil_core::run_log::RunLog;
 use hil_core::study::{Batch, into_batch};
+use hil_core::text_file::TextFile;
 
 pub use crate::parameters::{LeftArm, ResumePolicy, SendPolicy, TeleoperationParameters};
 pub use hil_arm::egm::parameters::EgmStartRequest;
@@ -170,7 +171,7 @@ impl CaseStudy for Teleoperation {
 
     fn read_files(
         parameters: &mut Self::Parameters,
-        read: &mut dyn FnMut(&str) -> Result<String, String>,
+        read: &mut dyn FnMut(&str) -> Result<TextFile, String>,
     ) -> Result<(), ParameterError> {
         parameters.read_files(read)
     }
@@ -185,6 +186,10 @@ impl CaseStudy for Teleoperation {
             motion,
             seed,
         })
+    }
+
+    fn undecided(&self) -> Option<String> {
+        self.parameters.motion_remark()
     }
 
     fn role(&self, name: &str) -> Option<Box<dyn Role>> {

@@ -23,10 +23,12 @@ pub struct HumanPose {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MotionError {
     /// The skeleton lacks a hand.
-    #[error("the skeleton has no joint called {names}")]
+    #[error("no joint is {wanted}; there are {}", .joints.join(", "))]
     MissingJoint {
-        /// The names that were looked for.
-        names: String,
+        /// What was looked for.
+        wanted: String,
+        /// The names that there are.
+        joints: Vec<String>,
     },
     /// The file ends too early for the period.
     #[error("{frame_count} frames every {frame_time_s} s end too early for a loop of {period_s} s")]
@@ -50,21 +52,33 @@ pub struct Actor {
 }
 
 impl Actor {
-    /// The person of `skeleton`, lengths times `unit_m`.
+    /// The person of `skeleton`, lengths times `unit_m`, with the hands as they are named.
     ///
     /// # Errors
     /// When a hand is missing.
-    pub fn new(skeleton: &Skeleton, unit_m: f64) -> Result<Self, MotionError> {
-        let find = |names: &[&str]| {
-            skeleton
-                .find(names)
-                .ok_or_else(|| MotionError::MissingJoint {
-                    names: names.join(", "),
-                })
+    pub fn new(skeleton: &Skeleton, hands: Hands<'_>, unit_m: f64) -> Result<Self, MotionError> {
+        let find = |given: Option<&str>, side: [&str; 2]| {
+            let found = match given {
+                Some(name) => skeleton.find(|joint| joint == name),
+                None => ["hand", "wrist"]
+                    .iter()
+                    .find_map(|part| skeleton.find(|joint| is_part(joint, side, part))),
+            };
+            found.ok_or_else(|| MotionError::MissingJoint {
+                wanted: given.map_or_else(
+                    || format!("a {} hand by its name", side[0]),
+                    |name| format!("called \"{name}\""),
+                ),
+                joints: skeleton
+                    .joints()
+                    .iter()
+                    .map(|one| one.name.clone())
+                    .collect(),
+            })
         };
         Ok(Self {
-            right_hand: find(&RIGHT_HAND_NAMES)?,
-            left_hand: find(&LEFT_HAND_NAMES)?,
+            right_hand: find(hands.right, ["right", "r"])?,
+            left_hand: find(hands.left, ["left", "l"])?,
             skeleton: skeleton.clone(),
             unit_m,
         })
@@ -90,17 +104,64 @@ pub struct Recording {
     period_s: f64,
 }
 
-const RIGHT_HAND_NAMES: [&str; 4] = ["RightHand", "RightWrist", "r_hand", "rHand"];
-const LEFT_HAND_NAMES: [&str; 4] = ["LeftHand", "LeftWrist", "l_hand", "lHand"];
+/// The joints that are hands, where they are named.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Hands<'a> {
+    /// The right one.
+    pub right: Option<&'a str>,
+    /// The left one.
+    pub left: Option<&'a str>,
+}
+
+/// True for a joint whose name ends with the words `part` and one of `side`, in either order and whatever is before:
+/// `RightHand`, `mixamorig:RightHand`, `Bip01 R Hand`, `Hand_R`, `hand.R`.
+fn is_part(joint: &str, side: [&str; 2], part: &str) -> bool {
+    let words = words(joint);
+    match &words[..] {
+        [.., one, other] if side.contains(&one.as_str()) && other == part => true,
+        [.., one, other] if side.contains(&other.as_str()) && one == part => true,
+        [.., last] => *last == format!("{}{part}", side[0]),
+        [] => false,
+    }
+}
+
+/// The words of a name in small letters: separated by what is no letter or digit, or by capitals.
+fn words(name: &str) -> Vec<String> {
+    let mut words: Vec<String> = Vec::new();
+    let letters: Vec<char> = name.chars().collect();
+    for (index, letter) in letters.iter().enumerate() {
+        let before = index.checked_sub(1).map(|before| letters[before]);
+        let is_small = |other: Option<&char>| other.is_some_and(|one| one.is_lowercase());
+        let begins = before.is_none_or(|before| {
+            let ends_small = !before.is_uppercase() || is_small(letters.get(index + 1));
+            !before.is_alphanumeric() || (letter.is_uppercase() && ends_small)
+        });
+        if !letter.is_alphanumeric() {
+            continue;
+        }
+        if begins || words.is_empty() {
+            words.push(String::new());
+        }
+        if let Some(word) = words.last_mut() {
+            word.extend(letter.to_lowercase());
+        }
+    }
+    words
+}
 
 impl Recording {
-    /// The part of `bvh` before `period_s`, lengths times `unit_m`. The loop closes from the last
-    /// frame to the first in what is left of the period, at most two frame times.
+    /// The part of `bvh` before `period_s`, lengths times `unit_m`, with the hands as they are
+    /// named. The loop closes from the last frame to the first in what is left of the period, at most two frame times.
     ///
     /// # Errors
     /// When a hand is missing or the file ends too early.
-    pub fn new(bvh: &Bvh, period_s: f64, unit_m: f64) -> Result<Self, MotionError> {
-        let actor = Actor::new(&bvh.skeleton, unit_m)?;
+    pub fn new(
+        bvh: &Bvh,
+        hands: Hands<'_>,
+        period_s: f64,
+        unit_m: f64,
+    ) -> Result<Self, MotionError> {
+        let actor = Actor::new(&bvh.skeleton, hands, unit_m)?;
         let frame_time_s = bvh.frame_time_s;
         let poses: Vec<_> = bvh
             .frames()
@@ -302,8 +363,9 @@ mod tests {
     #[test]
     fn a_recorded_loop_of_504_frames_and_a_bit_is_repeated_by_time() {
         // 4.033 s are 504.125 frames of 125 Hz: repeated by frames, 890 loops would end 0.89 s off.
-        let bvh = Bvh::parse(&swing_bvh(PERIOD_S, 0.1875, 125.0).unwrap()).unwrap();
-        let motion = Motion::Recorded(Recording::new(&bvh, PERIOD_S, UNIT_M).unwrap());
+        let bvh = Bvh::parse(&swing_bvh(PERIOD_S, 0.1875, 125.0).unwrap().as_str().into()).unwrap();
+        let motion =
+            Motion::Recorded(Recording::new(&bvh, Hands::default(), PERIOD_S, UNIT_M).unwrap());
         let random = RandomStream::new(0, "motion");
         let (mut recorded, mut computed) =
             (Player::new(motion, PERIOD_S, 0.0, random), player(0.0, 0));
@@ -359,14 +421,14 @@ mod tests {
 
     #[test]
     fn a_file_that_ends_too_early_is_refused_with_its_length() {
-        let bvh = Bvh::parse(&swing_bvh(2.0, 0.1, 125.0).unwrap()).unwrap();
-        let error = Recording::new(&bvh, PERIOD_S, UNIT_M).unwrap_err();
+        let bvh = Bvh::parse(&swing_bvh(2.0, 0.1, 125.0).unwrap().as_str().into()).unwrap();
+        let error = Recording::new(&bvh, Hands::default(), PERIOD_S, UNIT_M).unwrap_err();
         assert!(
             error.to_string().starts_with("250 frames every 0.008 s"),
             "{error}"
         );
-        assert!(Recording::new(&bvh, 2.0, UNIT_M).is_ok());
-        assert!(Recording::new(&bvh, 1.0, UNIT_M).is_ok());
+        assert!(Recording::new(&bvh, Hands::default(), 2.0, UNIT_M).is_ok());
+        assert!(Recording::new(&bvh, Hands::default(), 1.0, UNIT_M).is_ok());
     }
 
     #[test]
@@ -374,7 +436,41 @@ mod tests {
         let text = swing_bvh(2.0, 0.1, 125.0)
             .unwrap()
             .replace("LeftHand", "Hook");
-        let error = Recording::new(&Bvh::parse(&text).unwrap(), 2.0, UNIT_M).unwrap_err();
-        assert!(error.to_string().contains("LeftHand, LeftWrist"), "{error}");
+        let bvh = Bvh::parse(&text.as_str().into()).unwrap();
+        let error = Recording::new(&bvh, Hands::default(), 2.0, UNIT_M).unwrap_err();
+        let text = error.to_string();
+        assert!(text.starts_with("no joint is a left hand"), "{text}");
+        assert!(
+            text.contains("RightHand") && text.contains("Hook"),
+            "{text}"
+        );
+        // The names that the message lists can be given.
+        let hands = Hands {
+            right: None,
+            left: Some("Hook"),
+        };
+        assert!(Recording::new(&bvh, hands, 2.0, UNIT_M).is_ok());
+    }
+
+    #[test]
+    fn hands_are_found_by_the_names_that_programs_give_them() {
+        for name in [
+            "RightHand",
+            "righthand",
+            "mixamorig:RightHand",
+            "Bip01 R Hand",
+            "Hand_R",
+            "hand.R",
+            "rHand",
+            "RHand",
+            "Armature_hand.r",
+            "Hand Right",
+        ] {
+            assert!(is_part(name, ["right", "r"], "hand"), "{name}");
+            assert!(!is_part(name, ["left", "l"], "hand"), "{name}");
+        }
+        for name in ["RightHandThumb1", "otherhand", "Hand", "RightForeArm", ""] {
+            assert!(!is_part(name, ["right", "r"], "hand"), "{name}");
+        }
     }
 }

@@ -9,10 +9,11 @@ use serde::{Deserialize, Serialize};
 use crate::bvh::Bvh;
 use crate::experiment::TableParameters;
 use crate::follower::MappingSettings;
-use crate::motion::{Motion, Recording};
+use crate::motion::{Hands, Motion, MotionError, Recording};
 use crate::swing::Swing;
 use hil_arm::egm::parameters::{EgmParameters, EgmStartRequest};
 use hil_core::case_study::ParameterError;
+use hil_core::text_file::TextFile;
 
 /// What the left arm does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -93,6 +94,12 @@ hil_core::parameters! {
         /// text in by [`TeleoperationParameters::read_files`].
         #[serde(skip_serializing_if = "Option::is_none")]
         motion_file: Option<String> = None;
+        /// The joint of the motion file that is the right hand, where its name does not say so.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        motion_right_hand: Option<String> = None;
+        /// The joint that is the left hand.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        motion_left_hand: Option<String> = None;
         /// Length unit of the motion file, m.
         motion_unit_m: f64 = 0.01, in 1e-4..=1.0;
         /// The robot's settings.
@@ -103,7 +110,7 @@ hil_core::parameters! {
         tables: TableParameters = TableParameters::default();
         /// Text of `motion_file`; never in a topology file.
         #[serde(skip)]
-        motion_text: Option<String> = None;
+        motion_text: Option<TextFile> = None;
     } check check_together;
 }
 
@@ -121,7 +128,7 @@ impl TeleoperationParameters {
     /// What `read` said, under the key `motion_file`.
     pub fn read_files(
         &mut self,
-        read: &mut dyn FnMut(&str) -> Result<String, String>,
+        read: &mut dyn FnMut(&str) -> Result<TextFile, String>,
     ) -> Result<(), ParameterError> {
         if let Some(path) = &self.motion_file {
             let text = read(path).map_err(|reason| motion_file_error(path, &reason))?;
@@ -149,13 +156,35 @@ impl TeleoperationParameters {
         let Some(path) = &self.motion_file else {
             return Swing::new(self.amplitude_m).map(Motion::Synthetic);
         };
+        let bvh = self.bvh(path)?;
+        let hands = Hands {
+            right: self.motion_right_hand.as_deref(),
+            left: self.motion_left_hand.as_deref(),
+        };
+        let (period_s, unit_m) = (self.motion_period_s, self.motion_unit_m);
+        Recording::new(&bvh, hands, period_s, unit_m)
+            .map(Motion::Recorded)
+            .map_err(|error| match error {
+                MotionError::MissingJoint { .. } => ParameterError::new(
+                    "motion_file",
+                    format!("{path}: {error}; name it with motion_right_hand or motion_left_hand"),
+                ),
+                MotionError::TooShort { .. } => motion_file_error(path, &error),
+            })
+    }
+
+    /// What is unusual about the motion file, in words without full stop.
+    pub(crate) fn motion_remark(&self) -> Option<String> {
+        let path = self.motion_file.as_deref()?;
+        let remark = self.bvh(path).ok()?.remark()?;
+        Some(format!("motion_file {path}: {remark}"))
+    }
+
+    fn bvh(&self, path: &str) -> Result<Bvh, ParameterError> {
         let Some(text) = &self.motion_text else {
             return Err(motion_file_error(path, &"its text was not handed in"));
         };
-        let bvh = Bvh::parse(text).map_err(|error| motion_file_error(path, &error))?;
-        Recording::new(&bvh, self.motion_period_s, self.motion_unit_m)
-            .map(Motion::Recorded)
-            .map_err(|error| motion_file_error(path, &error))
+        Bvh::parse(text).map_err(|error| motion_file_error(path, &error))
     }
 
     /// Commands per second and arm with [`SendPolicy::Free`].
@@ -241,16 +270,18 @@ mod tests {
         );
 
         parameters
-            .read_files(&mut |_| Ok("HIERARCHY\nROOF".to_owned()))
+            .read_files(&mut |_| Ok("HIERARCHY\nROOF".into()))
             .unwrap();
         let error = parameters.motion().unwrap_err().to_string();
         assert!(
-            error.contains("line 2: expected the keyword ROOT"),
+            error.contains("line 2, byte 10: expected the keyword ROOT"),
             "{error}"
         );
 
         let text = swing_bvh(4.033, 0.1, 125.0).unwrap();
-        parameters.read_files(&mut |_| Ok(text.clone())).unwrap();
+        parameters
+            .read_files(&mut |_| Ok(text.as_str().into()))
+            .unwrap();
         let motion = parameters.motion().unwrap();
         let lateral_m = motion.lateral_peak_to_peak_m(parameters.motion_period_s);
         assert!((lateral_m - 0.2).abs() < 1e-5, "{lateral_m}");

@@ -95,13 +95,9 @@ impl Skeleton {
         self.channel_count
     }
 
-    /// The first joint called one of `names`, whatever the case.
-    pub fn find(&self, names: &[&str]) -> Option<usize> {
-        names.iter().find_map(|name| {
-            self.joints
-                .iter()
-                .position(|joint| joint.name.eq_ignore_ascii_case(name))
-        })
+    /// The first joint that `is_it` says yes to by its name.
+    pub fn find(&self, is_it: impl Fn(&str) -> bool) -> Option<usize> {
+        self.joints.iter().position(|joint| is_it(&joint.name))
     }
 
     /// Pose of joint `index` in the skeleton's world frame, lengths times `unit_m`.

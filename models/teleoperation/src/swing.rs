@@ -83,10 +83,11 @@ pub fn swing_bvh(period_s: f64, amplitude_m: f64, rate_hz: f64) -> Result<String
     let times = (0_u32..)
         .map(|index| f64::from(index) * frame_time_s)
         .take_while(|time_s| *time_s < period_s);
-    let values = times
+    let values: Vec<f64> = times
         .flat_map(|time_s| channel_values(swing.shoulder_yaw_rad(time_s / period_s)))
         .collect();
     let bvh = Bvh {
+        announced_count: values.len() / swing.skeleton.channel_count(),
         skeleton: swing.skeleton,
         frame_time_s,
         values,
@@ -145,7 +146,7 @@ mod tests {
     use nalgebra::{Isometry3, Vector3};
 
     use super::*;
-    use crate::motion::Recording;
+    use crate::motion::{Hands, Recording};
 
     fn apart_m(a: &Isometry3<f64>, b: Vector3<f64>) -> f64 {
         (a.translation.vector - b).norm()
@@ -174,7 +175,7 @@ mod tests {
 
     #[test]
     fn a_loop_of_the_paper_has_505_frames_placed_by_time() {
-        let bvh = Bvh::parse(&swing_bvh(4.033, 0.1875, 125.0).unwrap()).unwrap();
+        let bvh = Bvh::parse(&swing_bvh(4.033, 0.1875, 125.0).unwrap().as_str().into()).unwrap();
         assert_eq!(bvh.frame_count(), 505);
         assert!((bvh.frame_time_s - 0.008).abs() < 1e-12);
     }
@@ -182,7 +183,8 @@ mod tests {
     #[test]
     fn the_motion_file_read_back_moves_as_the_synthetic_human() {
         let text = swing_bvh(4.033, 0.1875, 125.0).unwrap();
-        let recording = Recording::new(&Bvh::parse(&text).unwrap(), 4.033, UNIT_M).unwrap();
+        let recording = Bvh::parse(&text.as_str().into()).unwrap();
+        let recording = Recording::new(&recording, Hands::default(), 4.033, UNIT_M).unwrap();
         let swing = Swing::new(0.1875).unwrap();
         for step in 0..2000 {
             let time_s = 4.033 * f64::from(step) / 2000.0;

@@ -231,7 +231,9 @@ fn a_motion_file_drives_the_robot_as_the_synthetic_human_does() {
     let recorded = case(|parameters| {
         let text = swing::swing_bvh(4.033, parameters.amplitude_m, 125.0).unwrap();
         parameters.motion_file = Some("swing.bvh".to_owned());
-        parameters.read_files(&mut |_| Ok(text.clone())).unwrap();
+        parameters
+            .read_files(&mut |_| Ok(text.as_str().into()))
+            .unwrap();
     });
     let last = |case| {
         let result = run(case, None, 6.0);

@@ -1,7 +1,10 @@
 //! The textual form of a trace: lines `# key: value` for the header, then comma-separated values
-//! with the names of their columns first, as in RFC 4180 but without quoting. Text in, text out: it opens no file.
+//! with the names of their columns first, as in RFC 4180; other separators are read as well. Text in, text out: it
+//! opens no file.
 
 use core::fmt::Write;
+
+use hil_core::text_file::{TextFault, TextFile, cells, not_a_number, separator_of, short};
 
 use super::{
     Trace, TraceArrival, TraceDirection, TraceFate, TraceHeader, TraceRecord, UNAVAILABLE_NS,
@@ -25,25 +28,13 @@ pub const COLUMNS: [&str; 10] = [
 /// Most bytes of a message: 1024 datagrams of the longest kind, what a gateway joins at most.
 pub const SIZE_BYTES_MAX: u32 = 1024 * 65_535;
 
-/// What is wrong with a text, and where. What stands before is whole.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("line {line}, byte {offset}: {what}")]
-pub struct CsvFault {
-    /// Line, from 1.
-    pub line: u64,
-    /// Offset of the line in the file.
-    pub offset: u64,
-    /// What is wrong there.
-    pub what: String,
-}
-
 /// What could be read.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CsvDecoded {
     /// Header and every row before the first fault.
     pub trace: Trace,
     /// The first fault; `None` when the text is whole.
-    pub fault: Option<CsvFault>,
+    pub fault: Option<TextFault>,
 }
 
 /// The text of `trace`.
@@ -109,61 +100,91 @@ pub(crate) fn one_line(text: &str) -> String {
 /// # Errors
 /// Before the first row: no line with column names, or a line that cannot be used. Every later
 /// fault is beside what could be read.
-pub fn decode(text: &str) -> Result<CsvDecoded, CsvFault> {
+pub fn decode(file: &TextFile) -> Result<CsvDecoded, TextFault> {
     let mut header = TraceHeader::new("");
     let mut records: Vec<TraceRecord> = Vec::new();
     let mut columns: Option<Columns> = None;
     let mut promised: Option<u64> = None;
-    let (mut offset, mut line) = (0_u64, 0_u64);
-    let fail = |line, offset, what| CsvFault { line, offset, what };
-    for raw in text.split_inclusive('\n') {
-        let start = offset;
-        offset += raw.len() as u64;
-        line += 1;
-        let content = raw.trim_end_matches(['\n', '\r']);
-        if let Some(remark) = content.strip_prefix('#') {
-            match read_remark(remark, &mut header, &mut promised) {
-                Ok(()) => continue,
-                Err(what) if records.is_empty() => return Err(fail(line, start, what)),
-                Err(what) => {
-                    let fault = Some(fail(line, start, what));
-                    let trace = Trace { header, records };
-                    return Ok(CsvDecoded { trace, fault });
-                }
-            }
-        }
-        if content.trim().is_empty() {
-            continue;
-        }
-        let Some(known) = &columns else {
-            let found = Columns::read(content).map_err(|what| fail(line, start, what))?;
-            columns = Some(found);
-            continue;
+    let mut fault = None;
+    for line in file.lines() {
+        let content = line.content;
+        let read = if let Some(remark) = content.strip_prefix('#') {
+            read_remark(remark, &mut header, &mut promised)
+        } else if content.trim().is_empty() {
+            Ok(())
+        } else if let Some(known) = &columns {
+            let before_ns = records.last().map(|record| record.published_ns);
+            let record = known.record(content, records.len() as u64, before_ns);
+            record.map(|record| records.push(record))
+        } else {
+            Columns::read(content).map(|found| columns = Some(found))
         };
-        let before_ns = records.last().map(|record| record.published_ns);
-        let index = records.len() as u64;
-        match known.record(content, index, before_ns) {
-            Ok(record) => records.push(record),
-            Err(what) => {
-                let fault = Some(fail(line, start, what));
-                let trace = Trace { header, records };
-                return Ok(CsvDecoded { trace, fault });
+        if let Err(what) = read {
+            let is_remark = content.starts_with('#');
+            if records.is_empty() && (columns.is_none() || is_remark) {
+                return Err(line.fault(what));
             }
+            fault = Some(line.fault(what));
+            break;
         }
     }
     if columns.is_none() {
         let what = format!("no line with column names, e.g. {}", COLUMNS.join(","));
-        return Err(fail(line + 1, offset, what));
+        return Err(file.end().fault(what));
     }
-    let count = records.len() as u64;
-    let fault = promised
-        .filter(|promised| *promised != count)
-        .map(|promised| {
+    if fault.is_none() {
+        let count = records.len() as u64;
+        let missing = promised.filter(|promised| *promised != count);
+        fault = missing.map(|promised| {
             let what = format!("{count} records, record_count says {promised}");
-            fail(line + 1, offset, what)
+            file.end().fault(what)
         });
+    }
+    // A text of ours, which states its count, means its instants as they are.
+    let first_ns = match promised {
+        Some(_) => 0,
+        None => first_since_1970(&records).map_err(|what| file.end().fault(what))?,
+    };
+    for record in &mut records {
+        record.published_ns = record.published_ns.saturating_sub(first_ns);
+        record.departure_ns = record.departure_ns.saturating_sub(first_ns);
+    }
     let trace = Trace { header, records };
     Ok(CsvDecoded { trace, fault })
+}
+
+/// Times of today since 1970 in nanoseconds are beyond this, and times since the start of a run or of a computer are
+/// not: three years.
+const SINCE_1970_NS: i64 = 100_000_000_000_000_000;
+
+/// The first instant where instants count from 1970, from which they then count; else 0.
+fn first_since_1970(records: &[TraceRecord]) -> Result<i64, String> {
+    let Some((first, last)) = records.first().zip(records.last()) else {
+        return Ok(0);
+    };
+    let first_ns = first.published_ns;
+    if first_ns >= SINCE_1970_NS {
+        return Ok(first_ns);
+    }
+    // In another unit they are years of today, and messages follow each other faster than any do.
+    let span_ns = last.published_ns.saturating_sub(first_ns);
+    let apart_ns = span_ns / i64::try_from(records.len()).unwrap_or(i64::MAX);
+    let units = [
+        ("s", 1_000_000_000, 10),
+        ("ms", 1_000_000, 1_000),
+        ("us", 1_000, 50_000),
+    ];
+    let is_of = |(_, unit_ns, fastest_ns): &(&str, i64, i64)| {
+        let per_s = 1_000_000_000 / unit_ns;
+        let is_of_today = (1_000_000_000 * per_s..3_000_000_000 * per_s).contains(&first_ns);
+        is_of_today && records.len() > 1 && apart_ns < *fastest_ns
+    };
+    match units.into_iter().find(is_of) {
+        None => Ok(0),
+        Some((unit, unit_ns, _)) => Err(format!(
+            "the first instant, {first_ns}, is an epoch time in {unit}, expected nanoseconds: multiply by {unit_ns}"
+        )),
+    }
 }
 
 /// `# key: value`; remarks that are none of ours say nothing.
@@ -204,9 +225,16 @@ fn word(key: &str, value: &str, words: &[&str]) -> Result<usize, String> {
 }
 
 fn number<T: core::str::FromStr>(key: &str, value: &str) -> Result<T, String> {
-    let parsed = value.parse();
-    parsed
-        .map_err(|_not_a_number| format!("{key} is \"{value}\", expected a whole number in range"))
+    let expected = "a whole number in range";
+    value.parse().map_err(|_not_a_number| {
+        let is_epoch = value.parse().is_ok_and(|s: f64| (1e9..3e9).contains(&s));
+        let epoch = if is_epoch {
+            "; an epoch time in seconds? Multiply by 1000000000"
+        } else {
+            ""
+        };
+        format!("{key}: {}{epoch}", not_a_number(value, expected))
+    })
 }
 
 /// Where each column stands.
@@ -214,11 +242,13 @@ fn number<T: core::str::FromStr>(key: &str, value: &str) -> Result<T, String> {
 struct Columns {
     places: [Option<usize>; COLUMNS.len()],
     count: usize,
+    separator: char,
 }
 
 impl Columns {
     fn read(line: &str) -> Result<Self, String> {
-        let names: Vec<&str> = line.split(',').map(str::trim).collect();
+        let separator = separator_of(line);
+        let names = cells(line, separator)?;
         for (index, name) in names.iter().enumerate() {
             if names[..index].contains(name) {
                 return Err(format!("column {name} stands there twice"));
@@ -228,12 +258,14 @@ impl Columns {
         let columns = Self {
             places,
             count: names.len(),
+            separator,
         };
         let has = |index: usize| columns.places[index].is_some();
         if !(has(0) || has(1)) || !(has(2) || has(3)) {
             return Err(format!(
-                "not the columns of a trace: \"{line}\"; needed are published_ns or departure_ns, \
-                 and fate or delay_ns"
+                "not the columns of a trace: \"{}\"; needed are published_ns or departure_ns, \
+                 and fate or delay_ns",
+                short(line)
             ));
         }
         Ok(columns)
@@ -245,13 +277,20 @@ impl Columns {
         index: u64,
         before_ns: Option<i64>,
     ) -> Result<TraceRecord, String> {
-        let cells: Vec<&str> = line.split(',').map(str::trim).collect();
+        let cells = cells(line, self.separator)?;
         if cells.len() != self.count {
             let (found, expected) = (cells.len(), self.count);
-            return Err(format!("{found} values for {expected} columns"));
+            let is_number = |cell: &str| cell.bytes().all(|byte| byte.is_ascii_digit());
+            let comma = match self.separator {
+                ',' if found > expected && cells.iter().all(|cell| is_number(cell)) => {
+                    "; a decimal comma? Expected are whole numbers"
+                }
+                _ => "",
+            };
+            return Err(format!("{found} values for {expected} columns{comma}"));
         }
         let cell = |column: usize| {
-            let text = cells[self.places[column]?];
+            let text: &str = &cells[self.places[column]?];
             (!text.is_empty()).then_some(text)
         };
         let published: Option<i64> = optional(cell(0), COLUMNS[0])?;
@@ -338,13 +377,13 @@ mod tests {
                       10,10,lost-in-network,,,,40,1,0,0\n\
                       10,10,delivered,-3,9,12,40,2,0,1\n";
         assert_eq!(text, golden);
-        let decoded = decode(&text).unwrap();
+        let decoded = decode(&text.as_str().into()).unwrap();
         assert_eq!((decoded.trace, decoded.fault), (sample(), None));
     }
 
     #[test]
     fn two_columns_of_any_measurement_make_a_trace() {
-        let decoded = decode("delay_ns,host,departure_ns\r\n500,a,0\r\n,b,10\r\n").unwrap();
+        let decoded = decode(&"delay_ns,host,departure_ns\r\n500,a,0\r\n,b,10\r\n".into()).unwrap();
         assert_eq!(decoded.fault, None);
         let records = decoded.trace.records;
         assert_eq!(records[0].delay(), Some(500));
@@ -353,23 +392,68 @@ mod tests {
     }
 
     #[test]
+    fn marks_quotes_separators_and_line_ends_change_nothing() {
+        let plain = decode(&"published_ns,delay_ns\n0,5\n10,\n".into()).unwrap();
+        for bytes in [
+            &b"\xef\xbb\xbfpublished_ns,delay_ns\n0,5\n10,\n"[..],
+            b"published_ns;delay_ns\r\n0;5\r\n10;\r\n",
+            b"\"published_ns\"\t\"delay_ns\"\r0\t5\r10\t\r",
+            b"\"published_ns\",\"delay_ns\",\"a, \xfc\"\n\"0\",\"5\",b\n10,,\n",
+        ] {
+            let decoded = decode(&TextFile::decode(bytes).unwrap()).unwrap();
+            assert_eq!(decoded, plain, "{bytes:?}");
+        }
+    }
+
+    #[test]
+    fn instants_since_1970_count_from_the_first_and_other_units_are_named() {
+        let of = |told: fn(i64) -> i64| {
+            let rows = (0..200).map(|row| format!("{},5\n", told(1_700_000_000_000 + 10 * row)));
+            let text = format!("published_ns,delay_ns\n{}", rows.collect::<String>());
+            decode(&text.as_str().into())
+        };
+        let records = of(|ms| ms * 1_000_000).unwrap().trace.records;
+        assert_eq!(
+            (records[0].published_ns, records[199].departure_ns),
+            (0, 1_990_000_000)
+        );
+        let units: [(fn(i64) -> i64, &str); 3] = [
+            (|ms| ms / 1_000, "in s,"),
+            (|ms| ms, "in ms,"),
+            (|ms| ms * 1_000, "in us,"),
+        ];
+        for (told, name) in units {
+            let refused = of(told).unwrap_err().to_string();
+            assert!(
+                refused.contains("epoch time") && refused.contains(name),
+                "{refused}"
+            );
+        }
+    }
+
+    #[test]
     fn what_is_wrong_says_where_and_keeps_the_rest() {
-        let refused = |text: &str| decode(text).unwrap_err().to_string();
+        let refused = |text: &str| decode(&text.into()).unwrap_err().to_string();
         assert!(refused("").starts_with("line 1, byte 0: no line with column names"));
         assert!(refused("a,b\n1,2\n").contains("not the columns of a trace"));
         let start = "departure_ns,delay_ns\n5,1\n";
         for (row, why) in [
             ("4,1\n", "before the row before it"),
-            ("x,1\n", "expected a whole number"),
+            ("x,1\n", "is not a whole number"),
+            ("6;1\n", "1 values for 2 columns"),
+            ("6,5,1\n", "a decimal comma?"),
+            ("\"6,5\",1\n", "has a decimal comma"),
+            ("1700000000.5,1\n", "an epoch time in seconds?"),
             ("6\n", "1 values for 2 columns"),
         ] {
-            let decoded = decode(&format!("{start}{row}")).unwrap();
+            let decoded = decode(&format!("{start}{row}").as_str().into()).unwrap();
             let fault = decoded.fault.unwrap();
             assert_eq!((fault.line, fault.offset), (3, start.len() as u64));
             assert!(fault.what.contains(why), "{fault}");
             assert_eq!(decoded.trace.records.len(), 1);
         }
-        let sized = decode("published_ns,delay_ns,size_bytes\n0,1,40\n1,1,67107841\n").unwrap();
+        let sized =
+            decode(&"published_ns,delay_ns,size_bytes\n0,1,40\n1,1,67107841\n".into()).unwrap();
         let fault = sized.fault.unwrap();
         assert_eq!((fault.line, sized.trace.records.len()), (3, 1));
         assert_eq!(
@@ -378,7 +462,7 @@ mod tests {
         );
         let text = encode(&sample());
         let cut = &text[..text.len() - "10,10,delivered,-3,9,12,40,2,0,1\n".len()];
-        let fault = decode(cut).unwrap().fault.unwrap();
+        let fault = decode(&cut.into()).unwrap().fault.unwrap();
         assert_eq!(fault.what, "2 records, record_count says 3");
         assert_eq!(fault.offset, cut.len() as u64);
     }
@@ -386,7 +470,7 @@ mod tests {
     #[test]
     fn a_bad_key_after_rows_keeps_the_rows() {
         let text = "published_ns,delay_ns\n0,5\n10,6\n# direction: sideways\n20,7\n";
-        let decoded = decode(text).unwrap();
+        let decoded = decode(&text.into()).unwrap();
         assert_eq!(decoded.trace.records.len(), 2);
         let fault = decoded.fault.unwrap();
         assert!(
@@ -394,6 +478,6 @@ mod tests {
             "{fault}"
         );
         let before = "published_ns,delay_ns\n# direction: sideways\n0,5\n";
-        assert_eq!(decode(before).unwrap_err().line, 2);
+        assert_eq!(decode(&before.into()).unwrap_err().line, 2);
     }
 }

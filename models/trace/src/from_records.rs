@@ -173,15 +173,19 @@ fn trace_fate(message: &MessageHistory) -> TraceFate {
     match message.fate {
         MessageFate::Taken | MessageFate::SupersededAtConsumer => TraceFate::Delivered,
         MessageFate::SupersededAtInput | MessageFate::RefusedByKernel => TraceFate::LostBeforeLink,
-        MessageFate::LostOnWire | MessageFate::Incomplete => TraceFate::LostInNetwork,
-        MessageFate::RefusedAtIngress | MessageFate::Late | MessageFate::Duplicate => {
-            TraceFate::LostAfterLink
+        MessageFate::NetworkUnreachable | MessageFate::LostOnWire | MessageFate::Incomplete => {
+            TraceFate::LostInNetwork
         }
+        MessageFate::LostByHarness
+        | MessageFate::RefusedAtIngress
+        | MessageFate::Late
+        | MessageFate::Duplicate => TraceFate::LostAfterLink,
         MessageFate::LostInInterruption => match message.egress {
             Some(_) => TraceFate::LostInNetwork,
             None => TraceFate::LostBeforeLink,
         },
-        MessageFate::InFlight
+        MessageFate::LostOnWireOrByHarness
+        | MessageFate::InFlight
         | MessageFate::Unexplained
         | MessageFate::UnknownPeerRecordsUnavailable => TraceFate::Unknown,
     }

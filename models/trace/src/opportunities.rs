@@ -5,7 +5,8 @@
 
 use core::fmt::Write;
 
-use super::csv::CsvFault;
+use hil_core::text_file::{TextFault, TextFile, not_a_number};
+
 use super::{Trace, TraceFate, TraceHeader, TraceRecord};
 
 /// Bytes of one opportunity.
@@ -92,17 +93,13 @@ pub fn encode(trace: &Trace) -> Result<String, OpportunityError> {
 ///
 /// # Errors
 /// The first line that is no time or is earlier than the one before, and what could be read.
-pub fn decode(text: &str) -> (Trace, Option<CsvFault>) {
+pub fn decode(file: &TextFile) -> (Trace, Option<TextFault>) {
     let mut records: Vec<TraceRecord> = Vec::new();
     let mut header = TraceHeader::new("");
     "opportunities of 1500 bytes, whole milliseconds".clone_into(&mut header.clock);
-    let (mut offset, mut line) = (0_u64, 0_u64);
     let mut fault = None;
-    for raw in text.split_inclusive('\n') {
-        line += 1;
-        let content = raw.trim();
-        let start = offset;
-        offset += raw.len() as u64;
+    for line in file.lines() {
+        let content = line.content.trim().trim_matches('"');
         if content.is_empty() {
             continue;
         }
@@ -116,15 +113,13 @@ pub fn decode(text: &str) -> (Trace, Option<CsvFault>) {
                 records.push(record.delivered(0, MS_NS.unsigned_abs()));
             }
             Err(what) => {
-                let offset = start;
-                fault = Some(CsvFault { line, offset, what });
+                fault = Some(line.fault(what));
                 break;
             }
         }
     }
     if fault.is_none() && records.is_empty() {
-        let what = "no delivery opportunity".to_owned();
-        fault = Some(CsvFault { line, offset, what });
+        fault = Some(file.end().fault("no delivery opportunity"));
     }
     // The file wraps at its last line.
     header.duration_ns = records.last().map_or(0, |record| record.published_ns);
@@ -133,8 +128,8 @@ pub fn decode(text: &str) -> (Trace, Option<CsvFault>) {
 
 fn opportunity(content: &str, before_ns: i64) -> Result<i64, String> {
     let parsed: Result<i64, _> = content.parse();
-    let ms = parsed
-        .map_err(|_not_a_number| format!("\"{content}\" is no whole number of milliseconds"))?;
+    let ms =
+        parsed.map_err(|_not_a_number| not_a_number(content, "a whole number of milliseconds"))?;
     let at_ns = ms.checked_mul(MS_NS).filter(|ns| *ns >= 0);
     let at_ns = at_ns.ok_or_else(|| format!("{ms} ms is outside 0 to 9223372036854"))?;
     if at_ns < before_ns {
@@ -181,7 +176,7 @@ mod tests {
     #[test]
     fn a_text_makes_a_trace_of_its_rate_that_writes_itself() {
         let text = "0\n0\n4\n10\n";
-        let (trace, fault) = decode(text);
+        let (trace, fault) = decode(&text.into());
         assert_eq!((fault, trace.records.len()), (None, 4));
         assert_eq!(trace.header.duration_ns, 10 * MS_NS);
         assert_eq!(trace.records[2].published_ns, 4 * MS_NS);
@@ -190,12 +185,18 @@ mod tests {
 
     #[test]
     fn what_is_wrong_says_where_and_keeps_the_rest() {
-        for (row, why) in [("3\n", "3 ms comes after 5 ms"), ("x\n", "no whole number")] {
-            let (trace, fault) = decode(&format!("1\n5\n{row}7\n"));
+        for (row, why) in [
+            ("3\n", "3 ms comes after 5 ms"),
+            ("x\n", "is not a whole number"),
+        ] {
+            let (trace, fault) = decode(&format!("1\n5\n{row}7\n").as_str().into());
             let fault = fault.unwrap();
             assert_eq!((trace.records.len(), fault.line, fault.offset), (2, 3, 4));
             assert!(fault.what.contains(why), "{fault}");
         }
-        assert_eq!(decode("\n").1.unwrap().what, "no delivery opportunity");
+        assert_eq!(
+            decode(&"\n".into()).1.unwrap().what,
+            "no delivery opportunity"
+        );
     }
 }

@@ -119,7 +119,7 @@ fn a_round_by_time_is_the_run_or_else_from_the_first_record_on() {
     let odd = with(&[epoch_ms, epoch_ms + 10], Some(15));
     assert_eq!(met(odd, &[0, 10, 20]), [0, 1, 0]);
     // Mahimahi's form wraps at its last line: there the next round's first opportunity is.
-    let (opportunities, fault) = opportunities::decode("3\n5\n10\n");
+    let (opportunities, fault) = opportunities::decode(&"3\n5\n10\n".into());
     assert_eq!(fault, None);
     let mut opportunities = opportunities;
     for (record, index) in opportunities.records.iter_mut().zip(0..) {

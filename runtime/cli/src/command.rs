@@ -310,6 +310,11 @@ fn carry_out(
     check_traces(path, &args.overrides, topology, console)?;
     // Told before what may only be missing now.
     check_file(path, topology)?;
+    if let Ok(Some((_, case))) = registry.make_case(topology)
+        && let Some(words) = case.undecided()
+    {
+        console.warn(&words);
+    }
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
         return Ok(show_check(path, topology, None, registry, console));

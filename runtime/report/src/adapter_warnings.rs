@@ -6,6 +6,7 @@ use hil_arm::egm::wire::Cause;
 use super::adapter::AdapterSummary;
 use hil_platform::words::counted;
 use hil_rundir::pipe::{AdapterRefusal, RefusalCount};
+use hil_topology::AdapterKind;
 
 /// The warnings of one arm, most important first.
 pub(super) fn adapter_warnings(adapter: &AdapterSummary) -> Vec<String> {
@@ -41,6 +42,10 @@ fn advice(cause: AdapterRefusal, adapter: &AdapterSummary) -> Option<String> {
         return None;
     };
     let advice = match cause {
+        // Our controller moves seven joints: a sensor adapter takes no `axes = 6`.
+        Cause::WrongArity if adapter.kind == AdapterKind::Sensor => {
+            "the robot must send six joints and J7 as its first external axis, as a YuMi does"
+        }
         Cause::WrongArity => {
             let process = &adapter.process;
             return Some(format!(
@@ -70,7 +75,6 @@ mod tests {
     use super::*;
     use crate::adapter::Answers;
     use hil_arm::egm::messages::Side;
-    use hil_topology::AdapterKind;
 
     fn adapter(kind: AdapterKind, answers: Answers, refusals: &[(Cause, u64)]) -> AdapterSummary {
         let refusals = refusals.iter().map(|(cause, count)| RefusalCount {
@@ -135,6 +139,12 @@ mod tests {
                  has one",
                 "client, right arm: 1 datagram refused: no session",
             ]
+        );
+        let of_robot = adapter(AdapterKind::Sensor, answers(0, 0), &causes[..1]);
+        let warning = adapter_warnings(&of_robot).pop().unwrap();
+        assert!(
+            warning.contains("first external axis") && !warning.contains("axes to 6"),
+            "{warning}"
         );
     }
 }

@@ -562,7 +562,11 @@ impl Evidence {
         let is_lost = messages.any(|one| {
             matches!(
                 one.fate,
-                Some(MessageFate::LostOnWire | MessageFate::Incomplete)
+                Some(
+                    MessageFate::NetworkUnreachable
+                        | MessageFate::LostOnWire
+                        | MessageFate::Incomplete
+                )
             )
         });
         let has_outage = event.outages.iter().any(|outage| {

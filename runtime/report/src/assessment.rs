@@ -321,18 +321,19 @@ fn uncounted_warning(process: &ProcessSummary) -> String {
 
 fn no_room_warning(summary: &RunSummary, direction: &DirectionSummary) -> Option<String> {
     let count = Some(direction.no_room_count()).filter(|count| *count > 0)?;
-    let accounts = carried(summary, direction).filter_map(|one| one.account.as_ref());
-    let lost: u64 = accounts
-        .map(|account| {
-            let fates = &account.fates;
-            fates.of(MessageFate::LostOnWire) + fates.of(MessageFate::Incomplete)
-        })
-        .sum();
-    let lost = match lost.min(count) {
-        0 => String::new(),
-        most => format!(
-            ", which may be what became of up to {} lost on the wire",
-            counted(most, "message")
+    let of = |fate| -> u64 {
+        let accounts = carried(summary, direction).filter_map(|one| one.account.as_ref());
+        accounts.map(|account| account.fates.of(fate)).sum()
+    };
+    let lost = of(MessageFate::LostByHarness);
+    let doubtful = of(MessageFate::LostOnWireOrByHarness);
+    let lost = match (lost, doubtful) {
+        (0, 0) => String::new(),
+        (lost, 0) => format!(", and lost {} so", counted(lost, "message")),
+        (lost, doubtful) => format!(
+            ", and lost {} so and perhaps {} more",
+            counted(lost, "message"),
+            grouped(doubtful)
         ),
     };
     Some(format!(
@@ -435,6 +436,14 @@ fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
         return Vec::new();
     };
     let mut warnings = Vec::new();
+    let unreachable = account.fates.of(MessageFate::NetworkUnreachable);
+    if unreachable > 0 {
+        warnings.push(format!(
+            "{name}: {} lost because {} had no way to its peer: an interface was down or there was no route",
+            counted(unreachable, "message"),
+            channel.from,
+        ));
+    }
     let unexplained = account.fates.of(MessageFate::Unexplained);
     if unexplained > 0 {
         let count = counted(unexplained, "message");

@@ -117,9 +117,17 @@ impl TimedEvent {
         };
         let channel = &self.channel;
         match &self.kind {
-            NetworkEventKind::Outage { lost_count } => {
+            NetworkEventKind::Outage {
+                lost_count,
+                unreachable_count,
+            } => {
                 let lost = counted(*lost_count, "message");
-                format!("outage{length} on {channel}, {lost} lost")
+                let cause = match unreachable_count {
+                    0 => String::new(),
+                    count if count == lost_count => ": network unreachable".to_owned(),
+                    count => format!(", {} of them: network unreachable", grouped(*count)),
+                };
+                format!("outage{length} on {channel}, {lost} lost{cause}")
             }
             NetworkEventKind::LossBurst {
                 lost_count,
@@ -462,7 +470,10 @@ mod tests {
             channel: "shuttle/command".to_owned(),
             from_s,
             until_s,
-            kind: NetworkEventKind::Outage { lost_count: 80 },
+            kind: NetworkEventKind::Outage {
+                lost_count: 80,
+                unreachable_count: 0,
+            },
         }
     }
 

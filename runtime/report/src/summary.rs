@@ -605,6 +605,9 @@ impl LinkKind {
         match (self, fate) {
             (Self::Emulated, MessageFate::LostOnWire) => "lost by the emulated link",
             (Self::Emulated, MessageFate::Incomplete) => "incomplete: lost by the emulated link",
+            (Self::Emulated, MessageFate::LostOnWireOrByHarness) => {
+                "lost by the emulated link or by the harness"
+            }
             (_, fate) => fate.label(),
         }
     }

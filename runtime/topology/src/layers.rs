@@ -5,6 +5,8 @@ use std::fs;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
+use hil_core::text_file::TextFile;
+
 use super::errors::{Fault, Faults, Place, Source};
 use super::tree::{self, Node, Table, Value};
 
@@ -133,10 +135,11 @@ fn is_assignment(text: &str) -> bool {
 
 /// At most one byte more than allowed, so that a device file cannot fill the memory.
 fn read_bounded(path: &Path) -> std::io::Result<String> {
-    let mut text = String::new();
+    let mut bytes = Vec::new();
     let file = fs::File::open(path)?;
-    file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text)?;
-    Ok(text)
+    file.take(FILE_BYTES_MAX + 1).read_to_end(&mut bytes)?;
+    let file = TextFile::decode(&bytes).map_err(std::io::Error::other)?;
+    Ok(file.text().to_owned())
 }
 
 /// One name per file, whatever the path that leads to it.

@@ -12,6 +12,7 @@ use hil_core::plot::PlotSeries;
 use hil_core::replay::Replay;
 use hil_core::run_log::RunLog;
 use hil_core::study::Batch;
+use hil_core::text_file::TextFile;
 use serde_json::Value;
 
 use crate::{KnownCase, KnownCases, ParameterFault, Topology, check_parameters_with};
@@ -297,8 +298,9 @@ fn check_parameters<C: CaseStudy>(
 }
 
 /// Reads a file that a parameter names, relative to the working directory.
-pub(crate) fn read_text(path: &str) -> Result<String, String> {
-    fs::read_to_string(path).map_err(|error| error.to_string())
+pub(crate) fn read_text(path: &str) -> Result<TextFile, String> {
+    let bytes = fs::read(path).map_err(|error| error.to_string())?;
+    TextFile::decode(&bytes).map_err(|fault| fault.to_string())
 }
 
 #[cfg(test)]

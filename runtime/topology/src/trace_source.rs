@@ -11,6 +11,7 @@ use hil_core::case_study::ParameterError;
 use hil_core::link_model::TraceMatch;
 use hil_core::options;
 use hil_core::options::{Scalar as _, Setting, Shape, Short, Templates, TextRule};
+use hil_core::text_file::{TextFault, TextFile};
 use hil_link::delay::DELAY_MAX;
 use hil_link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};
 use hil_trace::fault::TraceFault;
@@ -188,7 +189,7 @@ pub enum TraceFileError {
         /// The file.
         path: PathBuf,
         /// What is wrong.
-        source: csv::CsvFault,
+        source: TextFault,
     },
     /// It cannot be replayed.
     #[error("trace {path}: {source}")]
@@ -332,8 +333,7 @@ impl TraceLaunch {
 pub fn read_whole(path: &Path) -> Result<Trace, TraceFileError> {
     let (path_owned, bytes) = (path.to_owned(), read(path)?);
     if looks_like_text(&bytes) {
-        let text = String::from_utf8_lossy(&bytes);
-        let decoded = csv::decode(&text);
+        let decoded = TextFile::decode(&bytes).and_then(|text| csv::decode(&text));
         let whole = decoded.and_then(|read| read.fault.map_or(Ok(read.trace), Err));
         return whole.map_err(|source| TraceFileError::Csv {
             path: path_owned,
@@ -365,18 +365,16 @@ pub fn read(path: &Path) -> Result<Vec<u8>, TraceFileError> {
     })
 }
 
-/// True for what may be CSV: text by its first bytes, and no trace.
+/// True for what may be text, of any encoding, by its first bytes, and is no trace.
 pub fn looks_like_text(bytes: &[u8]) -> bool {
     let start = &bytes[..bytes.len().min(512)];
-    // A letter may be cut in two at the end.
-    let is_utf8 =
-        core::str::from_utf8(start).map_or_else(|end| end.error_len().is_none(), |_| true);
+    let is_wide = start.starts_with(b"\xff\xfe") || start.starts_with(b"\xfe\xff");
+    let is_letter =
+        |byte: &u8| byte.is_ascii_graphic() || byte.is_ascii_whitespace() || *byte >= 0x80;
+    let letters = start.iter().filter(|byte| byte.is_ascii()).count();
     !start.starts_with(&wire::MAGIC)
         && !start.is_empty()
-        && is_utf8
-        && start
-            .iter()
-            .all(|byte| byte.is_ascii_graphic() || byte.is_ascii_whitespace() || *byte >= 0x80)
+        && (is_wide || (start.iter().all(is_letter) && 2 * letters >= start.len()))
 }
 
 #[cfg(test)]

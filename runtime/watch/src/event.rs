@@ -119,7 +119,7 @@ impl Record {
             RecordKind::NicClock => all(batch, Self::NicClock, take),
             RecordKind::Radio => all(batch, Self::Radio, take),
             RecordKind::LinkCondition => all(batch, Self::LinkCondition, take),
-            RecordKind::Message | RecordKind::Frame => {}
+            RecordKind::Message | RecordKind::Frame | RecordKind::NoRoom => {}
         }
     }
 }

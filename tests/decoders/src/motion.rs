@@ -1,5 +1,6 @@
 //! Motion files.
 
+use hil_core::text_file::TextFile;
 use hil_teleoperation::bvh::Bvh;
 
 use crate::Verdict;
@@ -7,15 +8,15 @@ use crate::Verdict;
 /// A motion that is read can be written and read again: the same joints and channels, as many
 /// frames, and from then on the same text.
 pub(crate) fn bvh(bytes: &[u8]) -> Verdict {
-    let Ok(text) = str::from_utf8(bytes) else {
+    let Ok(text) = TextFile::decode(bytes) else {
         return Verdict::Refused;
     };
-    match Bvh::parse(text) {
+    match Bvh::parse(&text) {
         Ok(motion) => {
             assert!(motion.frame_count() > 0 && motion.frame_time_s > 0.0);
             assert!(motion.values.iter().all(|value| value.is_finite()));
             let written = motion.to_text();
-            let again = Bvh::parse(&written);
+            let again = Bvh::parse(&written.as_str().into());
             // Nine decimals make nothing of a shorter time.
             if motion.frame_time_s >= 1e-9 {
                 let again = again.unwrap_or_else(|fault| panic!("{fault} in\n{written}"));
@@ -32,10 +33,8 @@ pub(crate) fn bvh(bytes: &[u8]) -> Verdict {
             Verdict::Accepted
         }
         Err(fault) => {
-            assert!(
-                fault.line <= text.lines().count().max(1),
-                "a line beyond the end"
-            );
+            assert!(fault.line <= text.end().number, "a line beyond the end");
+            assert!(fault.offset <= bytes.len() as u64, "a byte beyond the end");
             assert!(!fault.problem.to_string().is_empty());
             Verdict::Refused
         }

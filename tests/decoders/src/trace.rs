@@ -1,5 +1,6 @@
 //! Traces of what a link did: the binary form, the text, and delivery opportunities.
 
+use hil_core::text_file::TextFile;
 use hil_trace::fault::{FaultKind, TraceFault};
 use hil_trace::metrics::TraceMetrics;
 use hil_trace::wire::{Decoded, HEADER_BYTES, RECORD_BYTES, TraceDecoder};
@@ -118,7 +119,7 @@ fn check_trace(trace: &Trace) {
         assert_eq!((again.fault, &again.trace), (None, trace));
     }
     let text = csv::encode(trace);
-    let again = csv::decode(&text).expect("what is written as text can be read");
+    let again = csv::decode(&text.as_str().into()).expect("what is written as text can be read");
     assert_eq!(again.fault, None, "{text}");
     assert_eq!(again.trace.records.len(), trace.records.len());
     assert_eq!(csv::encode(&again.trace), text, "the text changes");
@@ -149,17 +150,17 @@ fn check_trace(trace: &Trace) {
     if packets.fold(0_u64, u64::saturating_add) <= OPPORTUNITIES_MAX
         && let Ok(text) = mahimahi::encode(trace)
     {
-        let (_, fault) = mahimahi::decode(&text);
+        let (_, fault) = mahimahi::decode(&text.as_str().into());
         assert_eq!(fault, None, "{text}");
     }
 }
 
 /// A text that is read can be written and read as the same.
 pub(crate) fn csv(bytes: &[u8]) -> Verdict {
-    let Ok(text) = str::from_utf8(bytes) else {
+    let Ok(text) = TextFile::decode(bytes) else {
         return Verdict::Refused;
     };
-    match csv::decode(text) {
+    match csv::decode(&text) {
         Ok(decoded) => {
             if let Some(fault) = &decoded.fault {
                 assert!(fault.offset <= bytes.len() as u64, "a fault beyond the end");
@@ -178,10 +179,10 @@ pub(crate) fn csv(bytes: &[u8]) -> Verdict {
 
 /// Times that are read are written as the same times.
 pub(crate) fn opportunities(bytes: &[u8]) -> Verdict {
-    let Ok(text) = str::from_utf8(bytes) else {
+    let Ok(text) = TextFile::decode(bytes) else {
         return Verdict::Refused;
     };
-    let (trace, fault) = mahimahi::decode(text);
+    let (trace, fault) = mahimahi::decode(&text);
     assert!(trace.records.is_sorted_by_key(|record| record.published_ns));
     if let Some(fault) = &fault {
         assert!(fault.offset <= bytes.len() as u64 && !fault.what.is_empty());
@@ -195,7 +196,10 @@ pub(crate) fn opportunities(bytes: &[u8]) -> Verdict {
         .records
         .first()
         .map_or(0, |record| record.published_ns);
-    let told = text.lines().map(str::trim).filter(|line| !line.is_empty());
+    let told = text
+        .lines()
+        .map(|line| line.content.trim().trim_matches('"'));
+    let told = told.filter(|line| !line.is_empty());
     let told = told.map(|line| line.parse::<i64>().expect("it was read") - first / 1_000_000);
     let again = written
         .lines()

@@ -419,7 +419,7 @@ fn a_written_motion_is_one_that_can_be_read_and_played() {
     let path = path.to_str().unwrap();
     run(&["motion", "--output", path, "--period", "2", "--rate", "100"]).assert_success();
     let text = fs::read_to_string(path).unwrap();
-    let motion = Bvh::parse(&text).unwrap();
+    let motion = Bvh::parse(&text.as_str().into()).unwrap();
     // One period, and the frame that closes it.
     assert!(
         (200..=201).contains(&motion.frame_count()),

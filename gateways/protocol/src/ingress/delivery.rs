@@ -104,6 +104,21 @@ pub enum Disposition {
     Farewell,
 }
 
+impl Disposition {
+    /// The message of which the datagram was the only or the last piece.
+    pub const fn message(&self) -> Option<&MessageInfo> {
+        match self {
+            Self::Delivered(message)
+            | Self::Superseded(message)
+            | Self::Duplicate(message)
+            | Self::Late(message) => Some(message),
+            Self::FragmentStored | Self::Greeted { .. } | Self::SyncRequested | Self::Farewell => {
+                None
+            }
+        }
+    }
+}
+
 counts! {
     /// Counters of an ingress bridge that are of no one channel.
     pub struct IngressCounts {

@@ -59,13 +59,6 @@ pub struct DeadlineMetrics {
     pub program: Distribution,
 }
 
-impl DeadlineMetrics {
-    /// What the network lost may have been lost by a host.
-    pub fn doubt_network(&mut self) {
-        self.unknown_count += core::mem::take(&mut self.missing_by_network_count);
-    }
-}
-
 /// Pairs requests with answers, for each pair of ends.
 #[derive(Debug)]
 pub struct DeadlineFold {

@@ -229,8 +229,7 @@ pub struct FlowMetrics {
     pub taken_count: u64,
     /// Frames that got lost between the gateways.
     pub lost_by_network_count: u64,
-    /// Frames that got lost between the gateways, on the link or in a socket or model of the receiving host that
-    /// had no room: which of these, no record of the frame says.
+    /// Frames that got lost on the link or for want of room on the receiving host, whose counts do not say which.
     #[serde(default)]
     pub lost_by_either_count: u64,
     /// Frames that got lost on a host: in a queue, a socket or a process of this program.
@@ -248,13 +247,6 @@ pub struct FlowMetrics {
     pub retransmitted_count: Option<u64>,
     /// From leaving the program's interface until the other's was given it.
     pub delay: Distribution,
-}
-
-impl FlowMetrics {
-    /// What got lost between the gateways may have been lost by the receiving host.
-    pub fn doubt_network(&mut self) {
-        self.lost_by_either_count += core::mem::take(&mut self.lost_by_network_count);
-    }
 }
 
 /// Sums frames up by flow. Memory grows by twenty bytes a frame, and by thirty of flows with a deadline.
@@ -286,7 +278,7 @@ struct Keyed {
 #[derive(Debug, Default)]
 struct Flow {
     name: String,
-    counts: [u64; 4],
+    counts: [u64; 5],
     byte_count: u64,
     retransmitted_count: Option<u64>,
     /// When its frames came to the receiving gateway, in the order in which they were sent.
@@ -299,15 +291,20 @@ const TAKEN: usize = 0;
 const BY_NETWORK: usize = 1;
 const BY_HARNESS: usize = 2;
 const NOT_KNOWN: usize = 3;
+const BY_EITHER: usize = 4;
 
 const fn place_of(fate: MessageFate) -> usize {
     match fate {
         MessageFate::Taken => TAKEN,
-        MessageFate::LostOnWire | MessageFate::Incomplete => BY_NETWORK,
+        MessageFate::NetworkUnreachable | MessageFate::LostOnWire | MessageFate::Incomplete => {
+            BY_NETWORK
+        }
+        MessageFate::LostOnWireOrByHarness => BY_EITHER,
         MessageFate::InFlight
         | MessageFate::Unexplained
         | MessageFate::UnknownPeerRecordsUnavailable => NOT_KNOWN,
-        MessageFate::SupersededAtInput
+        MessageFate::LostByHarness
+        | MessageFate::SupersededAtInput
         | MessageFate::RefusedByKernel
         | MessageFate::RefusedAtIngress
         | MessageFate::Late
@@ -428,7 +425,7 @@ impl<'a> FlowFold<'a> {
     /// The flows, those of most frames first, and the frames of those that deadlines are about.
     pub fn finish(self) -> (Vec<FlowMetrics>, FlowPassages) {
         let metrics = |flow: Flow| {
-            let [taken, by_network, by_harness, unknown] = flow.counts;
+            let [taken, by_network, by_harness, unknown, by_either] = flow.counts;
             let reason = if taken == 0 {
                 "no frame was taken"
             } else {
@@ -443,7 +440,7 @@ impl<'a> FlowFold<'a> {
                 byte_count: flow.byte_count,
                 taken_count: taken,
                 lost_by_network_count: by_network,
-                lost_by_either_count: 0,
+                lost_by_either_count: by_either,
                 lost_by_harness_count: by_harness,
                 unknown_count: unknown,
                 reordered_count: reordered.len() as u64,

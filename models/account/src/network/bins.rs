@@ -87,12 +87,12 @@ impl NetworkBins {
             let bin = &mut bins[index];
             match one.crossing {
                 Crossing::Arrived => bin.sent_count += one.count,
-                Crossing::LostByNetwork => {
+                Crossing::LostByNetwork | Crossing::Unreachable => {
                     bin.sent_count += one.count;
                     bin.lost_count += one.count;
                 }
                 Crossing::LostByHost => bin.host_lost_count += one.count,
-                Crossing::Unknown => {}
+                Crossing::Unknown | Crossing::Doubtful => {}
             }
             delays_ns[index].extend(one.delay_ns);
             let bound_ns = one.delay_ns.map(|_| one.delay_bound_ns);

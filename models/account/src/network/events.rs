@@ -34,6 +34,9 @@ pub enum NetworkEventKind {
     Outage {
         /// Messages lost.
         lost_count: u64,
+        /// Of these, because there was no way to the peer: an interface was down or there was no route.
+        #[serde(default)]
+        unreachable_count: u64,
     },
     /// At least two losses with fewer than [`BURST_GAP_MIN`] arrivals in a row between.
     LossBurst {
@@ -123,6 +126,7 @@ fn losses(passages: &Passages) -> Vec<NetworkEvent> {
                 found.push(NetworkEvent {
                     kind: NetworkEventKind::Outage {
                         lost_count: run.lost_count,
+                        unreachable_count: run.unreachable_count,
                     },
                     from: producer(from_ns),
                     until_ns: run.until_ns,

@@ -34,11 +34,13 @@ const HAS_DELAY: i64 = 4;
 const IS_MANY: i64 = 8;
 const CROSSING_SHIFT: u32 = 4;
 
-const CROSSINGS: [Crossing; 4] = [
+const CROSSINGS: [Crossing; 6] = [
     Crossing::Arrived,
     Crossing::LostByNetwork,
     Crossing::LostByHost,
     Crossing::Unknown,
+    Crossing::Doubtful,
+    Crossing::Unreachable,
 ];
 
 const fn crossing_number(crossing: Crossing) -> i64 {
@@ -47,6 +49,8 @@ const fn crossing_number(crossing: Crossing) -> i64 {
         Crossing::LostByNetwork => 1,
         Crossing::LostByHost => 2,
         Crossing::Unknown => 3,
+        Crossing::Doubtful => 4,
+        Crossing::Unreachable => 5,
     }
 }
 

@@ -69,6 +69,8 @@ pub(super) struct LossRun {
     /// Place of the first among the messages handed to the network.
     pub(super) place: u64,
     pub(super) lost_count: u64,
+    /// Of these, without a way to the peer.
+    pub(super) unreachable_count: u64,
     pub(super) from_ns: Option<i64>,
     /// When the next one that arrived was handed over.
     pub(super) until_ns: Option<i64>,
@@ -87,21 +89,25 @@ pub(super) fn loss_runs(passages: &Passages) -> (Vec<LossRun>, u64) {
                     run.until_ns = one.offered_ns;
                 }
             }
-            Crossing::LostByNetwork => {
+            Crossing::LostByNetwork | Crossing::Unreachable => {
                 if !core::mem::replace(&mut is_open, true) {
                     runs.push(LossRun {
                         place,
                         lost_count: 0,
+                        unreachable_count: 0,
                         from_ns: None,
                         until_ns: None,
                     });
                 }
                 if let Some(run) = runs.last_mut() {
                     run.lost_count = run.lost_count.saturating_add(one.count);
+                    if one.crossing == Crossing::Unreachable {
+                        run.unreachable_count = run.unreachable_count.saturating_add(one.count);
+                    }
                     run.from_ns = run.from_ns.or(one.offered_ns);
                 }
             }
-            Crossing::LostByHost | Crossing::Unknown => continue,
+            Crossing::LostByHost | Crossing::Unknown | Crossing::Doubtful => continue,
         }
         place = place.saturating_add(one.count);
     }
@@ -146,6 +152,16 @@ pub(super) fn losses(passages: &Passages, run_ns: Option<(i64, i64)>) -> Metric<
         bursts: bursts(&runs, of_count, lost_count),
         longest: longest(&runs, run_ns),
     })
+}
+
+/// Where the network lost `lost_count` of `of_count` messages, and it or the receiving host `doubtful_count` more.
+pub(super) fn between(lost_count: u64, of_count: u64, doubtful_count: u64) -> Metric<LossMetrics> {
+    let percent_of = |count: u64| 100.0 * count as f64 / (of_count + doubtful_count) as f64;
+    let [low, high] = [lost_count, lost_count + doubtful_count].map(percent_of);
+    Metric::unavailable(&format!(
+        "between {low:.3} % and {high:.3} %: of {doubtful_count} lost it is unknown whether on the wire or for want \
+         of room on the receiving host"
+    ))
 }
 
 fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstMetrics> {

@@ -5,7 +5,8 @@
 //! no robot.
 //!
 //! The network begins where the sending gateway hands a message to the kernel and ends where the
-//! receiving gateway's receive call returned. What a host lost on its own (a message replaced by
+//! receiving gateway's receive call returned; a way to the peer that is not there (an interface that is
+//! down, no route) is the network's. What a host lost on its own (a message replaced by
 //! a newer one before it was sent, refused by the kernel, lost while a process was down) is counted
 //! beside the network's losses and never among them.
 
@@ -44,10 +45,14 @@ pub enum Crossing {
     Arrived,
     /// Handed to the kernel, never received.
     LostByNetwork,
+    /// Lost by the network before it: an interface was down or there was no route.
+    Unreachable,
     /// It never got onto the network, or was lost because a process was down.
     LostByHost,
     /// Still under way at the end, or the other host's records are not at hand.
     Unknown,
+    /// Handed to the kernel, and either lost there or by the receiving host for want of room.
+    Doubtful,
 }
 
 /// One message's way over the network.
@@ -136,8 +141,12 @@ pub struct NetworkMetrics {
     /// Lost before they got onto the network, or because a process was down; not in
     /// `offered_count`.
     pub host_lost_count: u64,
-    /// Still under way at the end of the run, or unknown; not in `offered_count`.
+    /// Still under way at the end of the run, or unknown, also whether the network lost it; not in
+    /// `offered_count`.
     pub unknown_count: u64,
+    /// Of the unknown ones, those that the network lost, or the receiving host for want of room.
+    #[serde(default)]
+    pub doubtful_count: u64,
     /// Copies received again; `None` without the receiver's records.
     pub duplicated_count: Option<u64>,
     /// Messages per second handed to the network, from the first to the last of them.
@@ -168,8 +177,12 @@ impl NetworkMetrics {
     pub fn of(passages: &Passages, context: &NetworkContext<'_>) -> Self {
         let counts = Counts::of(passages);
         let offered_count = counts.arrived.saturating_add(counts.lost);
-        let on_network =
-            |one: &Passage| matches!(one.crossing, Crossing::Arrived | Crossing::LostByNetwork);
+        let on_network = |one: &Passage| {
+            matches!(
+                one.crossing,
+                Crossing::Arrived | Crossing::LostByNetwork | Crossing::Unreachable
+            )
+        };
         let offered = passages.each().filter(on_network);
         let arrived = passages.each().filter(is_arrived);
         let arrived_per_s = rate(arrived.filter_map(|one| Some((one.received_ns?, one.count))));
@@ -182,7 +195,8 @@ impl NetworkMetrics {
             arrived_count: counts.arrived,
             lost_count: counts.lost,
             host_lost_count: counts.host_lost,
-            unknown_count: counts.unknown,
+            unknown_count: counts.unknown + counts.doubtful,
+            doubtful_count: counts.doubtful,
             duplicated_count: context.duplicated_count,
             offered_per_s: rate(offered.filter_map(|one| Some((one.offered_ns?, one.count)))),
             arrived_per_s,
@@ -193,7 +207,10 @@ impl NetworkMetrics {
             delay_bins: delay::delay_bins(passages),
             delay: delay::delays(passages, context.path),
             successive: delay::successive(passages, context.path),
-            loss: loss::losses(passages, context.run_ns),
+            loss: match counts.doubtful {
+                0 => loss::losses(passages, context.run_ns),
+                doubtful_count => loss::between(counts.lost, offered_count, doubtful_count),
+            },
             order: order::order(passages),
             round_trip: round_trip.distribution("no clock exchange took place"),
         }
@@ -207,6 +224,7 @@ struct Counts {
     lost: u64,
     host_lost: u64,
     unknown: u64,
+    doubtful: u64,
 }
 
 impl Counts {
@@ -215,9 +233,10 @@ impl Counts {
         for one in passages.each() {
             let count = match one.crossing {
                 Crossing::Arrived => &mut counts.arrived,
-                Crossing::LostByNetwork => &mut counts.lost,
+                Crossing::LostByNetwork | Crossing::Unreachable => &mut counts.lost,
                 Crossing::LostByHost => &mut counts.host_lost,
                 Crossing::Unknown => &mut counts.unknown,
+                Crossing::Doubtful => &mut counts.doubtful,
             };
             *count = count.saturating_add(one.count);
         }

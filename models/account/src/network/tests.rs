@@ -179,7 +179,7 @@ fn losses_runs_bursts_and_gaps_are_counted_as_rfc_3611_has_them() {
                 lost_count: 5,
                 of_count: 10
             },
-            NetworkEventKind::Outage { lost_count: 20 }
+            outage(20)
         ]
     );
 }
@@ -192,7 +192,7 @@ fn an_outage_that_lasts_to_the_end_is_open() {
     assert!(longest.is_open && longest.length_ns == 50 * PERIOD_NS);
     let events = network_events(&packed(&all));
     assert_eq!(events[0].until_ns, None);
-    assert_eq!(events[0].kind, NetworkEventKind::Outage { lost_count: 50 });
+    assert_eq!(events[0].kind, outage(50));
     assert_eq!(
         loss.measured().unwrap().runs,
         [BurstCount {
@@ -217,7 +217,7 @@ fn a_single_loss_of_a_slow_channel_is_no_event_and_two_in_a_row_are() {
         one == 20 || one == 21
     }))));
     assert_eq!(pair.len(), 1);
-    assert_eq!(pair[0].kind, NetworkEventKind::Outage { lost_count: 2 });
+    assert_eq!(pair[0].kind, outage(2));
     let length_ns = pair[0].until_ns.unwrap() - pair[0].from.ns;
     assert_eq!(length_ns, 1_000_000_000);
 }
@@ -446,4 +446,45 @@ fn nothing_is_concluded_from_nothing() {
     assert!(found.delay.measured().is_none() && found.loss.measured().is_none());
     assert!(found.order.measured().is_none() && found.offered_per_s.is_none());
     assert!(network_events(&packed(&[])).is_empty());
+}
+
+/// None of its messages lacked a way to the peer.
+const fn outage(lost_count: u64) -> NetworkEventKind {
+    NetworkEventKind::Outage {
+        lost_count,
+        unreachable_count: 0,
+    }
+}
+
+#[test]
+fn a_network_that_cannot_be_reached_loses_messages_and_says_why() {
+    let mut all = passages(100, |one| (40..60).contains(&one));
+    for one in &mut all[40..60] {
+        one.crossing = Crossing::Unreachable;
+    }
+    let loss = metrics(&all).loss;
+    let loss = loss.measured().unwrap();
+    assert_eq!(loss.lost_count, 20);
+    assert!(loss.longest.unwrap().length_ns > 0);
+    let events = network_events(&packed(&all));
+    let kind = NetworkEventKind::Outage {
+        lost_count: 20,
+        unreachable_count: 20,
+    };
+    assert_eq!(events[0].kind, kind);
+}
+
+#[test]
+fn what_a_host_may_have_lost_makes_loss_unavailable_with_both_bounds() {
+    let mut all = passages(1_000, |one| one == 3 || one == 7);
+    all[7].crossing = Crossing::Doubtful;
+    let figures = metrics(&all);
+    assert_eq!((figures.doubtful_count, figures.unknown_count), (1, 1));
+    let Metric::Unavailable { reason } = figures.loss else {
+        panic!("{figures:?}");
+    };
+    assert!(
+        reason.starts_with("between 0.100 % and 0.200 %: of 1 lost"),
+        "{reason}"
+    );
 }

@@ -6,14 +6,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::time::Duration;
 
 use hil_core::link_model::ReplayTally;
-use hil_core::record::{EgressRecord, IngressRecord, RoundTripRecord};
+use hil_core::record::{EgressRecord, IngressRecord, NoRoomRecord, RoundTripRecord};
 use hil_core::time::duration_ns;
 use hil_protocol::ingress::reassembly_slots;
 use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings, SettingsError};
 use hil_transport::Stalls;
 
 use super::egress::{Attention, Egress};
-use super::ingress::{Ingress, Output};
+use super::ingress::{Ingress, NoRoom, Output};
 use super::inputs::Inputs;
 use super::kernel_clock::KernelClock;
 use super::line::Line;
@@ -63,6 +63,7 @@ enum Sinks {
     },
     Ingress {
         messages: SharedSink,
+        no_room: RecordSink,
     },
 }
 
@@ -114,6 +115,12 @@ fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks
         },
         Side::Ingress => Sinks::Ingress {
             messages: of_channels(RecordKind::Ingress, size_of::<IngressRecord>())?,
+            no_room: recorder.sink(
+                RecordKind::NoRoom,
+                &launch.flow,
+                size_of::<NoRoomRecord>(),
+                ROUND_TRIPS,
+            )?,
         },
     })
 }
@@ -166,7 +173,7 @@ impl OpenDirection {
                 refusal_backoff: RefusalBackoff::of_replies(),
                 is_established: self.is_established,
             })),
-            (SocketEnd::Receiver(receiver), Sinks::Ingress { messages }) => {
+            (SocketEnd::Receiver(receiver), Sinks::Ingress { messages, no_room }) => {
                 let settings = IngressSettings::new(
                     GatewayContext::identity(launch),
                     around.session,
@@ -187,6 +194,7 @@ impl OpenDirection {
                     bridge: IngressBridge::new(settings)?,
                     outputs: outputs.collect::<Result<_, WorkerError>>()?,
                     records: messages,
+                    no_room: NoRoom::new(no_room),
                     wait: WaitStrategy::new(launch.wait),
                     peer: launch.peer,
                     foreign_count: 0,

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use hil_core::record::{IngressRecord, UNAVAILABLE};
+use hil_core::record::{IngressRecord, NoRoomRecord, UNAVAILABLE};
 use hil_core::time::Instant;
 use hil_protocol::ingress::MessageInfo;
 use hil_protocol::sequence::Order;
@@ -18,7 +18,7 @@ use super::refusal_backoff::RefusalBackoff;
 use super::{WorkerError, poll_descriptors};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy, release};
-use hil_rundir::record::SharedSink;
+use hil_rundir::record::{RecordSink, SharedSink};
 use hil_shm::{ChannelError, RawOutput};
 
 /// Everything the thread works with.
@@ -32,6 +32,7 @@ pub(crate) struct Ingress {
     pub(crate) outputs: Box<[Output]>,
     /// Records of messages, by channel.
     pub(crate) records: SharedSink,
+    pub(super) no_room: NoRoom,
     pub(crate) wait: WaitStrategy,
     pub(crate) peer: SocketAddr,
     /// Datagrams from an address that is not the peer's, dropped unread.
@@ -48,6 +49,39 @@ pub(crate) struct Ingress {
 pub(crate) struct Response {
     sequence: u64,
     handed: Instant,
+}
+
+/// Records between which messages datagrams found no room on this host.
+#[derive(Debug)]
+pub(super) struct NoRoom {
+    sink: RecordSink,
+    recorded_count: u64,
+    /// When the newest message was handed over, on the sender's clock.
+    newest_ns: i64,
+}
+
+impl NoRoom {
+    pub(super) const fn new(sink: RecordSink) -> Self {
+        Self {
+            sink,
+            recorded_count: 0,
+            newest_ns: UNAVAILABLE,
+        }
+    }
+
+    /// `count` found none before the message that was handed over at `handed_ns`, or before the end.
+    fn note(&mut self, count: u64, handed_ns: i64, noticed: Instant) {
+        if count > self.recorded_count {
+            self.sink.push(&NoRoomRecord {
+                after_ns: self.newest_ns,
+                before_ns: handed_ns,
+                noticed_ns: noticed.as_ns(),
+                datagram_count: count - self.recorded_count,
+            });
+            self.recorded_count = count;
+        }
+        self.newest_ns = self.newest_ns.max(handed_ns);
+    }
 }
 
 /// One local channel.
@@ -95,6 +129,8 @@ impl Ingress {
     pub(crate) fn finish(&mut self) {
         self.bridge.finish();
         self.note_incomplete();
+        let count = self.receiver.no_room_count();
+        self.no_room.note(count, UNAVAILABLE, MonotonicClock::now());
     }
 
     /// Records the messages of which some pieces did not come.
@@ -174,6 +210,7 @@ impl Ingress {
             bridge,
             outputs,
             records,
+            no_room,
             buffer,
             ..
         } = self;
@@ -188,6 +225,9 @@ impl Ingress {
         let taken = bridge.on_datagram(at, stamps, bytes, &mut destination);
         let failed = destination.failed;
         if let Ok(disposition) = taken {
+            if let Some(message) = disposition.message() {
+                no_room.note(received.no_room_count, message.handed.as_ns(), at);
+            }
             note_undelivered(records, &arrival, disposition);
         }
         self.note_incomplete();

@@ -39,6 +39,8 @@ pub(crate) struct Line {
     pub(super) message: Option<EgressRecord>,
     pub(super) newest_handed: Instant,
     report_count: u64,
+    /// There is no way to the peer, as the kernel or the network said last.
+    is_unreachable: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -80,6 +82,7 @@ impl Line {
             message: None,
             newest_handed: Instant::ZERO,
             report_count: 0,
+            is_unreachable: false,
         })
     }
 
@@ -114,6 +117,7 @@ impl Line {
             };
             match sent {
                 Ok(token) => {
+                    self.is_unreachable &= key.kind != Kind::Data;
                     let pending = Pending {
                         key,
                         handed,
@@ -125,6 +129,7 @@ impl Line {
                     self.expect_stamp(token, pending);
                 }
                 Err(refusal) => {
+                    self.is_unreachable = refusal.is_unreachable();
                     let is_established = bridge.peer_state() == PeerState::Established;
                     bridge.on_transmit_failed(handed, failure(refusal, is_established));
                     if let Some((channel, record)) = key.channel.zip(record) {
@@ -242,6 +247,8 @@ impl Line {
         self.report_count = counters.network_report_count;
         let newest = counters.newest_report.map(|report| failure(report, true));
         if newest == Some(TransmitFailure::PeerUnreachable) {
+            let newest = counters.newest_report;
+            self.is_unreachable = newest.is_some_and(|report| report.is_unreachable());
             bridge.on_peer_unreachable(now);
         }
     }
@@ -275,7 +282,10 @@ impl Line {
 
     /// Of a message that did not leave, or not as a whole.
     pub(super) fn finish_refused(&mut self, channel: usize, record: EgressRecord) {
-        let flags = EgressRecord::REFUSED_BY_KERNEL;
+        let mut flags = EgressRecord::REFUSED_BY_KERNEL;
+        if self.is_unreachable {
+            flags |= EgressRecord::UNREACHABLE;
+        }
         self.finish(channel, EgressRecord { flags, ..record });
     }
 
@@ -287,7 +297,9 @@ impl Line {
         record: Option<EgressRecord>,
     ) -> Result<(), SendRefusal> {
         self.newest_handed = handed;
-        let token = self.sender.send_parts(piece.head, piece.tail)?;
+        let sent = self.sender.send_parts(piece.head, piece.tail);
+        self.is_unreachable = sent.is_err_and(SendRefusal::is_unreachable);
+        let token = sent?;
         if !piece.is_last {
             // The message's stamp is that of its last piece.
             return Ok(());

@@ -273,12 +273,12 @@ fn check_access(path: &Path, data: &std::fs::Metadata, user: u32) -> Result<(), 
 
 /// Never tells of the content: it may be nearly a key.
 fn parse(text: &str) -> Result<PreSharedKey, String> {
+    // An editor may have put a byte order mark in front and a carriage return behind.
+    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let line = text.strip_suffix('\n').unwrap_or(text);
+    let line = line.strip_suffix('\r').unwrap_or(line);
     if line.is_empty() {
         return Err("is empty".to_owned());
-    }
-    if line.ends_with('\r') {
-        return Err("ends its line as Windows does (CR LF)".to_owned());
     }
     if line.contains('\n') {
         return Err("has more than one line".to_owned());
@@ -383,7 +383,7 @@ mod tests {
         assert!(error.contains("hil-runtime key new"), "{error}");
         let error = PreSharedKey::read(&folder).unwrap_err().to_string();
         assert!(error.contains("not a regular file"), "{error}");
-        PreSharedKey::create(&path).unwrap();
+        let made = PreSharedKey::create(&path).unwrap();
         let good = fs::read_to_string(&path).unwrap();
         let half = &good[..good.len() - 8];
         let zeros = format!("{PREFIX}{}=", "A".repeat(43));
@@ -394,7 +394,6 @@ mod tests {
             half,
             &good.repeat(2),
             &good.replace("v1", "v2"),
-            &good.replace('\n', "\r\n"),
             &zeros,
         ] {
             fs::write(&path, text).unwrap();
@@ -408,6 +407,10 @@ mod tests {
         fs::write(&path, [0xff; 43]).unwrap();
         let error = PreSharedKey::read(&path).unwrap_err().to_string();
         assert!(error.contains("not text; expected one line"), "{error}");
+        let edited = format!("\u{feff}{}", good.replace('\n', "\r\n"));
+        fs::write(&path, edited).unwrap();
+        let read = PreSharedKey::read(&path).unwrap();
+        assert_eq!(read.fingerprint(), made.fingerprint());
         let nowhere = folder.join("of/hop.key");
         let error = PreSharedKey::create(&nowhere).unwrap_err().to_string();
         let cure = format!("mkdir -p {}", folder.join("of").display());

@@ -26,7 +26,7 @@ use std::path::{Path, PathBuf};
 use std::{fs, io};
 
 use hil_account::MessageFate;
-use hil_account::flow::{DeadlineFold, DeadlineMetrics, FlowMetrics, FlowPassages, NamedFlow};
+use hil_account::flow::{DeadlineFold, DeadlineMetrics, FlowPassages, NamedFlow};
 use hil_account::radio::RadioMetrics;
 use hil_core::case_study::Score;
 use hil_core::plot::PlotSeries;
@@ -165,7 +165,6 @@ pub fn conclude(
     summary.flows = found.flows;
     summary.deadlines = found.deadlines;
     summary.directions = metrics::directions(result);
-    doubt_losses(&mut summary);
     let mut unwritten_files = capture::write(&mut summary, &records);
     summary.faces = adapters::adapter_summaries(&records);
     summary.hardware_stamps = nics::hardware_stamps(&records);
@@ -298,28 +297,6 @@ fn deadlines(named: &[NamedFlow], passages: &FlowPassages) -> Vec<DeadlineMetric
             fold.finish()
         })
         .collect()
-}
-
-/// Where the receiving host had no room for some datagrams, it is unknown which frames these were.
-fn doubt_losses(summary: &mut RunSummary) {
-    for one in &mut summary.flows {
-        let mut directions = summary.directions.iter();
-        let had_no_room = directions.any(|direction| {
-            direction.channels.contains(&one.channel) && direction.no_room_count() > 0
-        });
-        let mut channels = summary.channels.iter();
-        let emulation = channels
-            .find(|channel| channel.name == one.channel)
-            .and_then(|channel| channel.emulation.as_ref()?.overflow_count);
-        if had_no_room || emulation.unwrap_or(0) > 0 {
-            one.flows.iter_mut().for_each(FlowMetrics::doubt_network);
-            // Of whichever way they are, an answer or its request may have been among these.
-            summary
-                .deadlines
-                .iter_mut()
-                .for_each(DeadlineMetrics::doubt_network);
-        }
-    }
 }
 
 /// What the inlets lost of the frames of `channel`.

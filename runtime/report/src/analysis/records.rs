@@ -11,11 +11,11 @@ use std::time::Duration;
 use bytemuck::Pod;
 use hil_account::nic_clock::{NicClockRecord, NicTimeline};
 use hil_account::{
-    AccountContext, ChannelPath, ChannelRecords, FLIGHT_QUANTILE, Interruption, ORDER_TOLERANCE_NS,
-    RunSpan, flight_time_max,
+    AccountContext, ChannelPath, ChannelRecords, FLIGHT_QUANTILE, FirstNumber, Interruption,
+    NoRoom, ORDER_TOLERANCE_NS, RunSpan, flight_time_max,
 };
 use hil_core::record::{
-    EgressRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
+    EgressRecord, IngressRecord, NoRoomRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_core::run_log::{Logged, RunLog};
 use hil_link::condition::LinkConditionRecord;
@@ -30,7 +30,7 @@ use hil_rundir::record::stored::{
 use hil_rundir::record::{RecordFile, RecordFileError, RecordKind};
 use hil_rundir::run_result::RunResult;
 use hil_topology::emulation::EmulationLaunch;
-use hil_topology::{Channel, Topology};
+use hil_topology::{Channel, Program, Topology};
 
 /// A finished run: what it was to be, how it went, and every record file that it left.
 #[derive(Debug)]
@@ -49,12 +49,16 @@ pub(crate) struct RunRecords<'a> {
     link_orders: BTreeMap<String, Vec<LinkConditionRecord>>,
     /// Clock exchanges, by flow.
     round_trips: BTreeMap<String, BTreeMap<(u32, u64), RoundTripRecord>>,
+    /// Datagrams without room, by flow.
+    no_room: BTreeMap<String, Vec<NoRoomRecord>>,
     /// Files that could not be opened, with the reason.
     problems: Vec<String>,
     /// What went wrong later.
     faults: ReadFaults,
     /// Processes on the way of each channel that were not there or held up, once asked for.
     interruptions: RefCell<BTreeMap<String, Vec<Interruption>>>,
+    /// The same of the stretches without room, by flow.
+    stretches: RefCell<BTreeMap<String, Vec<NoRoom>>>,
 }
 
 impl<'a> RunRecords<'a> {
@@ -73,9 +77,11 @@ impl<'a> RunRecords<'a> {
             radios: BTreeMap::new(),
             link_orders: BTreeMap::new(),
             round_trips: BTreeMap::new(),
+            no_room: BTreeMap::new(),
             problems: Vec::new(),
             faults: ReadFaults::default(),
             interruptions: RefCell::default(),
+            stretches: RefCell::default(),
         };
         let mut add = |path: &Path| {
             records.add(StoredFile::open(path)?);
@@ -117,6 +123,11 @@ impl<'a> RunRecords<'a> {
                 orders.extend(alone(file).records::<LinkConditionRecord>());
                 return;
             }
+            RecordKind::NoRoom => {
+                let known = self.no_room.entry(name).or_default();
+                known.extend(alone(file).records::<NoRoomRecord>());
+                return;
+            }
             RecordKind::RoundTrip => {
                 let known = self.round_trips.entry(name).or_default();
                 let records = alone(file);
@@ -139,6 +150,7 @@ impl<'a> RunRecords<'a> {
             RecordKind::Frame => &mut channel.frame,
             // They belong to no channel, see above.
             RecordKind::RoundTrip
+            | RecordKind::NoRoom
             | RecordKind::NicClock
             | RecordKind::Radio
             | RecordKind::LinkCondition => return,
@@ -235,6 +247,15 @@ impl<'a> RunRecords<'a> {
         channel: &Channel,
         ask: impl FnOnce(&ChannelRecords<'_>, &AccountContext<'_>) -> T,
     ) -> T {
+        self.consult_with(channel, &self.stretches(channel), ask)
+    }
+
+    fn consult_with<T>(
+        &self,
+        channel: &Channel,
+        no_room: &[NoRoom],
+        ask: impl FnOnce(&ChannelRecords<'_>, &AccountContext<'_>) -> T,
+    ) -> T {
         let (topology, result) = (self.topology, self.result);
         let nothing = ChannelFiles::default();
         let files = self.channels.get(&channel.name).unwrap_or(&nothing);
@@ -274,10 +295,12 @@ impl<'a> RunRecords<'a> {
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {
             interruptions: &interruptions,
+            no_room,
             producer_run: span_of(&channel.from),
             consumer_run: channel.to.as_deref().and_then(span_of),
             flight_time_max: flight_time_max(delay.max(changed).unwrap_or(Duration::ZERO)),
             depth: Some(channel.depth),
+            first_number: first_number(topology, channel),
             cards_share_clock,
             round_trips_ns: &round_trips_ns,
             ..AccountContext::new(path)
@@ -291,6 +314,31 @@ impl<'a> RunRecords<'a> {
         ask(&records, &context)
     }
 
+    /// Where the receiving host had no room for datagrams of the flow that carries `channel`, beside what is missing
+    /// there of all its channels.
+    fn stretches(&self, channel: &Channel) -> Vec<NoRoom> {
+        let crossing = self.topology.crossing(channel);
+        let Some(flow) = crossing.map(|crossing| crossing.flow_name()) else {
+            return Vec::new();
+        };
+        let Some(records) = self.no_room.get(&flow).filter(|all| !all.is_empty()) else {
+            return Vec::new();
+        };
+        if let Some(known) = self.stretches.borrow().get(&flow) {
+            return known.clone();
+        }
+        let mut found = NoRoom::of(records.iter().copied());
+        let crossings = self.topology.crossings();
+        for crossing in crossings.filter(|crossing| crossing.flow_name() == flow) {
+            self.consult_with(crossing.channel, &[], |records, context| {
+                NoRoom::add_missing(&mut found, records, context);
+            });
+        }
+        NoRoom::add_requests(&mut found, self.round_trips(&flow));
+        self.stretches.borrow_mut().insert(flow, found.clone());
+        found
+    }
+
     /// Both kinds read what the channel's processes left.
     fn interruptions(&self, channel: &Channel) -> Vec<Interruption> {
         if let Some(known) = self.interruptions.borrow().get(&channel.name) {
@@ -301,6 +349,14 @@ impl<'a> RunRecords<'a> {
         let mut interruptions = self.interruptions.borrow_mut();
         interruptions.insert(channel.name.clone(), found.clone());
         found
+    }
+}
+
+/// A program of the user's may publish before the run begins; what that was is no message of the run.
+fn first_number(topology: &Topology, channel: &Channel) -> FirstNumber {
+    match topology.process(&channel.from).map(|one| &one.program) {
+        Some(Program::Command { inside: None, .. }) => FirstNumber::OnRecord,
+        _ => FirstNumber::Zero,
     }
 }
 

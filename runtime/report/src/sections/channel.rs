@@ -399,6 +399,11 @@ const ONE_WAY: DelayKind = DelayKind {
     prefix: "network_",
     label: "network, one way",
 };
+/// What a model makes a message wait is no delay of a network.
+const EMULATED: DelayKind = DelayKind {
+    label: "emulated link, one way",
+    ..ONE_WAY
+};
 
 impl DelayKind {
     fn figure(self, name: &str, label: &str, ns: i64, interval: Option<Spread>) -> Metric {
@@ -472,9 +477,14 @@ fn network(sources: &Sources<'_>) -> Vec<Metric> {
         all.extend(round_trips.into_iter().flat_map(round_trip));
         return all;
     };
+    let kind = if sources.link == Some(LinkKind::Emulated) {
+        EMULATED
+    } else {
+        ONE_WAY
+    };
     let mut all = match &network.delay {
-        Measured::Unavailable { reason } => ONE_WAY.unavailable(reason),
-        Measured::Measured(delay) => one_way(delay),
+        Measured::Unavailable { reason } => kind.unavailable(reason),
+        Measured::Measured(delay) => one_way(delay, kind),
     };
     all.extend(successive(&network.successive));
     let of_account = sources.account.map(|account| &account.round_trip);
@@ -525,16 +535,15 @@ fn error_words(bound_ns: u64, is_wider: bool) -> String {
     }
 }
 
-fn one_way(delay: &DelayMetrics) -> Vec<Metric> {
-    let of =
-        |name, label, one: DelayQuantile| ONE_WAY.figure(name, label, one.value_ns, one.interval);
+fn one_way(delay: &DelayMetrics, kind: DelayKind) -> Vec<Metric> {
+    let of = |name, label, one: DelayQuantile| kind.figure(name, label, one.value_ns, one.interval);
     let mut all = vec![
-        ONE_WAY.figure("min", "least", delay.min_ns, None),
+        kind.figure("min", "least", delay.min_ns, None),
         of("p50", "p50", delay.p50),
         of("p95", "p95", delay.p95),
         of("p99", "p99", delay.p99),
         of("p999", "p99.9", delay.p999),
-        ONE_WAY.figure("max", "largest", delay.max_ns, None),
+        kind.figure("max", "largest", delay.max_ns, None),
     ];
     let variation = &delay.variation;
     let error = error_words(variation.bound_ns, variation.is_bound_wider);

@@ -426,19 +426,19 @@ fn an_incomplete_message_is_put_down_to_what_carried_it() {
 }
 
 #[test]
-fn incomplete_messages_may_be_what_found_no_room() {
+fn a_warning_says_how_many_messages_found_no_room() {
     let mut summary = full();
     let account = summary.channels[0].account.as_mut().unwrap();
     account.fates = FateCounts::default();
-    account.fates.add(MessageFate::LostOnWire, 1);
-    account.fates.add(MessageFate::Incomplete, 3);
+    account.fates.add(MessageFate::LostByHarness, 1);
+    account.fates.add(MessageFate::LostOnWireOrByHarness, 3);
     summary.directions[0].counters.push(CountByName {
         group: CounterGroup::Socket,
         name: "kernel_drop_count".to_owned(),
         count: 5,
     });
     let warnings = Assessment::of(&summary).warnings;
-    let words = "up to 4 messages lost on the wire";
+    let words = "and lost 1 message so and perhaps 3 more";
     assert!(
         warnings.iter().any(|one| one.contains(words)),
         "{warnings:?}"

@@ -42,7 +42,7 @@ Examples:
       was lost
   hil-runtime trace convert FILE.trace link.mahimahi
       delivery opportunities of 1500 bytes; what is not kept is said
-  hil-runtime trace convert FILE.trace delays.netem
+  hil-runtime trace convert FILE.trace delays.dist
       a delay distribution for tc ... netem
 
 The form of the input is found by its content, that of the output by the ending

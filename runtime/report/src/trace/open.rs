@@ -4,6 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use hil_core::text_file::TextFile;
 use hil_trace::{Trace, csv, opportunities, wire};
 
 use hil_topology::trace_source::{TraceFileError, looks_like_text, read};
@@ -58,7 +59,11 @@ pub(crate) fn open(path: &Path) -> Result<Opened, TraceFileError> {
     let named = |what: String| format!("{}: {what}", path.display());
     let path_owned = path.to_owned();
     if looks_like_text(&bytes) {
-        let text = String::from_utf8_lossy(&bytes);
+        let failed = |source| TraceFileError::Csv {
+            path: path.to_owned(),
+            source,
+        };
+        let text = TextFile::decode(&bytes).map_err(failed)?;
         if is_opportunities(&text) {
             let (trace, fault) = opportunities::decode(&text);
             return Ok(Opened {
@@ -68,10 +73,7 @@ pub(crate) fn open(path: &Path) -> Result<Opened, TraceFileError> {
                 remark: Some(opportunities::DECODE_LOSS),
             });
         }
-        let decoded = csv::decode(&text).map_err(|source| TraceFileError::Csv {
-            path: path.to_owned(),
-            source,
-        })?;
+        let decoded = csv::decode(&text).map_err(failed)?;
         return Ok(Opened {
             path: path_owned,
             trace: decoded.trace,
@@ -92,9 +94,12 @@ pub(crate) fn open(path: &Path) -> Result<Opened, TraceFileError> {
 }
 
 /// One number per line, and nothing else in the first of them.
-fn is_opportunities(text: &str) -> bool {
-    let first = text.lines().find(|line| !line.trim().is_empty());
-    first.is_some_and(|line| line.trim().bytes().all(|byte| byte.is_ascii_digit()))
+fn is_opportunities(text: &TextFile) -> bool {
+    let mut lines = text
+        .lines()
+        .map(|line| line.content.trim().trim_matches('"'));
+    let first = lines.find(|line| !line.is_empty());
+    first.is_some_and(|line| line.bytes().all(|byte| byte.is_ascii_digit()))
 }
 
 #[cfg(test)]
@@ -103,8 +108,9 @@ mod tests {
 
     #[test]
     fn the_form_is_found_by_content() {
-        assert!(is_opportunities("\n17\n18\n"));
-        assert!(!is_opportunities("published_ns,delay_ns\n0,5\n"));
-        assert!(!is_opportunities("# run: x\n1\n"));
+        let is_form = |text: &str| is_opportunities(&text.into());
+        assert!(is_form("\n17\n18\n") && is_form("\"17\"\n"));
+        assert!(!is_form("published_ns,delay_ns\n0,5\n"));
+        assert!(!is_form("# run: x\n1\n"));
     }
 }

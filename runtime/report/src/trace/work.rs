@@ -306,7 +306,7 @@ fn convert(
     let Some(form) = to.or_else(|| form_of(into)) else {
         let name = into.display();
         console.error(&format!(
-            "{name}: no form by that ending; end it in .trace, .csv, .mahimahi or .netem, or say --to"
+            "{name}: no form by that ending; end it in .trace, .csv, .mahimahi or .dist, or say --to"
         ));
         return CommandEnd::Refused;
     };
@@ -326,7 +326,7 @@ fn convert(
         talk.console.warn(remark);
     }
     let words = format!("making {}", into.display());
-    let converted = talk.during(&words, || converted(&opened.trace, form));
+    let converted = talk.during(&words, || converted(&opened.trace, form, into));
     let (bytes, remark) = match converted {
         Ok(converted) => converted,
         Err(text) => {
@@ -352,7 +352,7 @@ fn convert(
 }
 
 /// The bytes, and what there is to say about them.
-fn converted(trace: &Trace, form: TraceForm) -> Result<(Vec<u8>, String), String> {
+fn converted(trace: &Trace, form: TraceForm, into: &Path) -> Result<(Vec<u8>, String), String> {
     match form {
         TraceForm::Trace => {
             let bytes = wire::encode(trace).map_err(|error| error.to_string())?;
@@ -368,16 +368,33 @@ fn converted(trace: &Trace, form: TraceForm) -> Result<(Vec<u8>, String), String
         TraceForm::Netem => {
             let table = netem::table(trace).ok_or("fewer than two delays, or all are equal")?;
             let remark = format!(
-                "; use it as: netem delay {:.0}us {:.0}us distribution FILE. Not kept: losses, and \
-                 the order of the delays{}; {}",
-                table.mean_ns / 1e3,
-                table.deviation_ns / 1e3,
+                "; {}. Not kept: losses, and the order of the delays{}; {}",
+                netem_use(&table, into),
                 cut_words(&table),
                 bound_words(trace)
             );
             Ok((table.text.into_bytes(), remark))
         }
     }
+}
+
+/// The command that uses the table in `file`: tc looks for NAME.dist in a folder that its environment names
+/// (`get_distribution` in `tc/q_netem.c` of iproute2).
+fn netem_use(table: &NetemTable, file: &Path) -> String {
+    let file = std::path::absolute(file).unwrap_or_else(|_relative| file.to_owned());
+    let folder = file.parent().unwrap_or(&file).display().to_string();
+    let name = file.file_stem().unwrap_or_default().to_string_lossy();
+    let [mean_us, deviation_us] = [table.mean_ns, table.deviation_ns].map(|ns| ns / 1e3);
+    let is_found = file.extension().is_some_and(|ending| ending == "dist");
+    let renamed = if is_found {
+        String::new()
+    } else {
+        format!("name it {name}.dist, as tc looks for that, and ")
+    };
+    format!(
+        "{renamed}use it as: TC_LIB_DIR={folder} tc qdisc replace dev DEVICE root netem delay {mean_us:.0}us \
+         {deviation_us:.0}us distribution {name}"
+    )
 }
 
 /// What of the delays no table of netem's can say.

@@ -20,7 +20,8 @@ use bytemuck::{CheckedBitPattern, Pod};
 use hil_account::nic_clock::NicClockRecord;
 use hil_core::message::Envelope;
 use hil_core::record::{
-    EgressRecord, FrameRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
+    EgressRecord, FrameRecord, IngressRecord, NoRoomRecord, PublishedRecord, RoundTripRecord,
+    TakenRecord,
 };
 use hil_core::run_log::RunLog;
 use hil_link::condition::LinkConditionRecord;
@@ -66,6 +67,8 @@ pub enum RecordKind {
     LinkCondition = 16,
     /// [`FrameRecord`]s of an inlet.
     Frame = 17,
+    /// [`NoRoomRecord`]s of a receiving gateway; the channel is that of its [`RecordKind::RoundTrip`].
+    NoRoom = 18,
 }
 
 impl RecordKind {
@@ -89,6 +92,7 @@ impl RecordKind {
             Self::Radio => "radio",
             Self::LinkCondition => "link-condition",
             Self::Frame => "frame",
+            Self::NoRoom => "no-room",
         }
     }
 
@@ -106,6 +110,7 @@ impl RecordKind {
             Self::Radio => Some(size_of::<RadioRecord>()),
             Self::LinkCondition => Some(size_of::<LinkConditionRecord>()),
             Self::Frame => Some(size_of::<FrameRecord>()),
+            Self::NoRoom => Some(size_of::<NoRoomRecord>()),
             Self::Message => None,
         }
     }

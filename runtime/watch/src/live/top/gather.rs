@@ -370,7 +370,9 @@ fn link_row(
         let fates = &account.fates;
         let unknown = fates.of(MessageFate::UnknownPeerRecordsUnavailable);
         let never_sent = fates.of(MessageFate::SupersededAtInput) + fates.of(MessageFate::InFlight);
-        lost_count += fates.of(MessageFate::LostOnWire) + fates.of(MessageFate::Incomplete);
+        lost_count += fates.of(MessageFate::LostOnWire)
+            + fates.of(MessageFate::Incomplete)
+            + fates.of(MessageFate::NetworkUnreachable);
         known_count += fates.total().saturating_sub(unknown + never_sent);
     }
     let state = match came_count {
