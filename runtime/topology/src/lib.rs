@@ -53,8 +53,8 @@ pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host
 pub use known::{KnownCase, KnownCases, ParameterCheck, ReadParameters, check_parameters_with};
 pub use links::{Emulation, Gateway, Hop, Link, SocketOptions, Timestamps, Via, transport};
 pub use model::{
-    AtExit, Case, Channel, Crossing, Direction, Execution, Host, LinkPorts, MessageLayout, OnExit,
-    Process, Program, Restarts, Run, Scheduling, SchedulingClass, Topology, Wait,
+    AtExit, Case, Channel, Crossing, Execution, Host, LinkPorts, MessageLayout, OnExit, Process,
+    Program, Restarts, Run, Scheduling, SchedulingClass, Topology, Wait,
 };
 pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
 pub use ports::{WantedPort, collide, control_key};

@@ -284,7 +284,7 @@ fn every_key_of_a_channel_and_its_link_reaches_the_checked_topology() {
         panic!("three crossings");
     };
     // `between` starts at the robot, so commands go backward.
-    assert_eq!(command.direction, Direction::Backward);
+    assert_eq!(command.direction, hil_link::spec::Way::Backward);
     assert_eq!(
         command.ports,
         LinkPorts {
