@@ -16,7 +16,8 @@ hil_core::message! {
     struct Command = "example.CartCommand.v1" { speed_mps: f64 }
     struct State = "example.CartState.v1" { position_m: f64, speed_mps: f64 }
 }
-hil_core::parameters! {
+hil_core::options! {
+    /// The case, which is its one parameter.
     struct CartCase { gain_per_s: f64 = 5.0, in 0.0..=100.0; }
 }
 

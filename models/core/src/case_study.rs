@@ -9,6 +9,7 @@ use serde::de::DeserializeOwned;
 use crate::component::Role;
 use crate::endpoint::{RoleChannels, StatedChannel};
 use crate::message::{Message, MessageType, TypeInfo};
+use crate::options::Options;
 use crate::plot::PlotSeries;
 use crate::replay::Replay;
 use crate::run_log::RunLog;
@@ -43,8 +44,8 @@ pub trait CaseStudy: Sized + Debug + 'static {
     const SERIES: &'static [&'static str] = &[];
     /// The figures that [`CaseStudy::calibration`] knows, by name.
     const CALIBRATED_FIGURES: &'static [&'static str] = &[];
-    /// `[case.parameters]`; use `#[serde(deny_unknown_fields, default)]`.
-    type Parameters: DeserializeOwned + Serialize + Default;
+    /// `[case.parameters]`, declared with [`options!`](crate::options!).
+    type Parameters: Options + DeserializeOwned + Serialize + Default;
 
     /// Fills in what the parameters name by file; `read` gives a file's text or says where it is none.
     /// Models open no file themselves.
@@ -231,108 +232,12 @@ impl ParameterError {
         Err(Self::new(key, format!("{value} is outside {allowed_text}")))
     }
 
-    /// As [`ParameterError::check`] for a key below `table`, e.g. `world.`, with the bounds as text.
-    ///
-    /// # Errors
-    /// Names the key, the value and the bounds.
-    pub fn check_range(
-        table: &str,
-        key: &str,
-        value: f64,
-        allowed: core::ops::RangeInclusive<f64>,
-    ) -> Result<(), Self> {
-        let text = format!("{} to {}", allowed.start(), allowed.end());
-        Self::check(&format!("{table}{key}"), value, allowed, &text)
-    }
-}
-
-/// A parameter that may have a range.
-pub trait Bounded {
-    /// Its number; `None` for one that is left out.
-    fn number(&self) -> Option<f64>;
-}
-
-impl Bounded for f64 {
-    fn number(&self) -> Option<f64> {
-        Some(*self)
-    }
-}
-
-impl Bounded for u32 {
-    fn number(&self) -> Option<f64> {
-        Some(f64::from(*self))
-    }
-}
-
-impl<T: Bounded> Bounded for Option<T> {
-    fn number(&self) -> Option<f64> {
-        self.as_ref().and_then(T::number)
-    }
-}
-
-/// Declares parameters, each once: key, meaning, type, default and range. Gives the structure, which
-/// reads from `[case.parameters]` and refuses unknown keys, its defaults and `check`.
-///
-/// `in "table."` says below which table the keys are; `check NAME` names a method that checks the keys
-/// together, each of which is within its range by then.
-///
-/// ```
-/// hil_core::parameters! {
-///     /// What a user sets.
-///     pub struct WheelParameters in "wheels." {
-///         /// Control rate, Hz.
-///         rate_hz: f64 = 100.0, in 1.0..=1000.0;
-///         /// Wheels.
-///         wheel_count: u32 = 4, in 2.0..=18.0;
-///         /// Whether they steer.
-///         is_steering: bool = false;
-///     }
-/// }
-/// let wheels = WheelParameters { wheel_count: 1, ..WheelParameters::default() };
-/// let error = wheels.check().unwrap_err();
-/// assert_eq!(error.to_string(), "wheels.wheel_count 1 is outside 2 to 18");
-/// ```
-#[macro_export]
-macro_rules! parameters {
-    ($(#[$meta:meta])* $vis:vis struct $structure:ident $(in $table:literal)? {
-        $($(#[$field_meta:meta])* $field:ident: $kind:ty = $default:expr
-            $(, in $allowed:expr)?;)+
-    } $(check $together:ident;)?) => {
-        $(#[$meta])*
-        #[derive(Debug, Clone, PartialEq, $crate::serde::Serialize, $crate::serde::Deserialize)]
-        #[serde(crate = "hil_core::serde", deny_unknown_fields, default)]
-        $vis struct $structure {
-            $(
-                $(#[$field_meta])*
-                $(#[doc = concat!("\n\nAllowed: `", stringify!($allowed), "`.")])?
-                $vis $field: $kind,
-            )+
+    /// The same error, seen from the table that has this one as `table`.
+    #[must_use]
+    pub fn below(self, table: &str) -> Self {
+        Self {
+            key: format!("{table}.{}", self.key),
+            ..self
         }
-
-        impl Default for $structure {
-            fn default() -> Self {
-                Self { $($field: $default,)+ }
-            }
-        }
-
-        impl $structure {
-            /// Checks every number against its range.
-            ///
-            /// # Errors
-            /// The first key that is refused, with its value and its range.
-            $vis fn check(&self) -> Result<(), $crate::case_study::ParameterError> {
-                const TABLE: &str = concat!($($table)?);
-                $($(
-                    if let Some(number) = $crate::case_study::Bounded::number(&self.$field) {
-                        let key = stringify!($field);
-                        $crate::case_study::ParameterError::check_range(
-                            TABLE, key, number, $allowed,
-                        )?;
-                    }
-                )?)+
-                $(self.$together()?;)?
-                Ok(())
-            }
-        }
-    };
+    }
 }

@@ -25,6 +25,7 @@ pub mod component;
 pub mod counts;
 pub mod endpoint;
 pub mod interval;
+pub mod label;
 pub mod layout;
 pub mod link_model;
 pub mod message;

@@ -13,6 +13,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
 
+/// The range of a real number that may have any value; NaN is none.
+pub const ANY_NUMBER: RangeInclusive<f64> = f64::MIN..=f64::MAX;
+
 /// What a value of an option may be.
 #[derive(Debug, Clone)]
 pub enum Shape {
@@ -250,9 +253,9 @@ impl<T: Short> Value for Abbreviation<'_, T> {
     }
 }
 
-/// Tables by names that the file chooses.
+/// Tables by names that the file chooses, or in the order of the file.
 pub trait Tables: Debug {
-    /// Makes one of that name.
+    /// Makes one of that name; in an order, the next one.
     fn open(&mut self, name: &str) -> &mut dyn Options;
 }
 
@@ -267,6 +270,8 @@ pub enum Slot<'o> {
     Part(&'o mut dyn Options),
     /// Tables by name; names may have slashes or not.
     Tables(&'o mut dyn Tables, bool),
+    /// Any number of tables, in an order.
+    Rows(&'o mut dyn Tables),
     /// A table that is handed on unread.
     Free,
 }
@@ -315,13 +320,17 @@ impl<'o> Field<'o> {
     /// Checks the value against its range.
     ///
     /// # Errors
-    /// When it is outside. A time that is kept in seconds is named with `_s` behind its key.
+    /// When it is outside. A time that is kept in seconds is named with `_s` behind its key; a key of a table
+    /// below has that table's before it.
     pub fn check(self) -> Result<(), ParameterError> {
         let (value, shape) = match self.slot {
             Slot::Value(value, shape) => (value.get(), shape),
-            Slot::Table(mut table) => return table.options().map_or(Ok(()), Options::check_all),
+            Slot::Table(mut table) => {
+                let checked = table.options().map_or(Ok(()), Options::check_all);
+                return checked.map_err(|error| error.below(self.key));
+            }
             Slot::Part(options) => return options.check_all(),
-            Slot::Tables(..) | Slot::Free => return Ok(()),
+            Slot::Tables(..) | Slot::Rows(_) | Slot::Free => return Ok(()),
         };
         let Some(setting) = value else { return Ok(()) };
         let Some([value, low, high]) = shape.outside(&setting) else {
@@ -545,15 +554,35 @@ macro_rules! lists {
             }
 
             fn from_setting(setting: Setting) -> Result<Self, String> {
-                match setting {
-                    Setting::List(values) => {
-                        values.into_iter().map(Scalar::from_setting).collect()
-                    }
-                    other => mistyped(&other),
-                }
+                listed(setting)
             }
         }
     )*};
+}
+
+impl<T: Scalar + Clone> Scalar for Cow<'static, [T]> {
+    type Range = T::Range;
+    const UNSET: Self = Cow::Borrowed(&[]);
+
+    fn shape(range: Self::Range) -> Shape {
+        Shape::List(Box::new(T::shape(range)))
+    }
+
+    fn to_setting(&self) -> Setting {
+        Setting::List(self.iter().map(Scalar::to_setting).collect())
+    }
+
+    fn from_setting(setting: Setting) -> Result<Self, String> {
+        listed(setting)
+    }
+}
+
+/// The values of a setting that is a list.
+fn listed<T: Scalar, L: FromIterator<T>>(setting: Setting) -> Result<L, String> {
+    match setting {
+        Setting::List(values) => values.into_iter().map(T::from_setting).collect(),
+        other => mistyped(&other),
+    }
 }
 
 lists! {
@@ -582,6 +611,29 @@ impl<T: Options + Kind> Kind for Named<T> {
 
     fn slot(&mut self, has_slashes: bool) -> Slot<'_> {
         Slot::Tables(self, has_slashes)
+    }
+}
+
+/// Tables in the order of the file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Rows<T>(pub Vec<T>);
+
+impl<T: Options + Kind> Tables for Rows<T> {
+    fn open(&mut self, _name: &str) -> &mut dyn Options {
+        let index = self.0.len();
+        self.0.push(T::UNSET);
+        &mut self.0[index]
+    }
+}
+
+impl<T: Options + Kind> Kind for Rows<T> {
+    type Range = ();
+    const UNSET: Self = Self(Vec::new());
+    const IS_OPTIONAL: bool = true;
+
+    fn slot(&mut self, (): ()) -> Slot<'_> {
+        Slot::Rows(self)
     }
 }
 
@@ -654,8 +706,9 @@ pub fn short_table<T: Short>(options: &mut Option<T>) -> Slot<'_> {
 /// A line is `key: type = default, in range, needs(key, condition, "why not");`
 /// below its documentation, and what does not apply is left out. An option without a default is required,
 /// unless its type is an `Option`. One whose condition does not hold is refused in a file and not written.
-/// `with { field: type = value, }` adds what is no option, `as part` makes the options stand in
-/// the table of which this is a field, `as short` is for a table that is [`Short`], and `check` names what is checked of all of them together.
+/// `with { field: type = value, }` adds what is no option, `as part` makes the options stand in the table
+/// of which this is a field, `as short` is for a table that is [`Short`], and `check` names what is checked
+/// of all of them together.
 ///
 /// ```
 /// use std::time::Duration;
@@ -683,23 +736,29 @@ macro_rules! options {
     (@slot $this:ident short) => { $crate::options::table($this) };
     (@optional $value:ident short) => { $crate::options::short_table($value) };
     (@optional $value:ident $($part:ident)?) => { $crate::options::optional_table($value) };
-    ($(#[$meta:meta])* pub struct $name:ident $(as $form:ident)?
+    ($(#[$meta:meta])* $vis:vis struct $name:ident $(as $form:ident)?
         $(with { $($(#[$note:meta])* $extra:ident: $extra_kind:ty = $extra_value:expr,)* })?
     {
         $($(#[doc = $about:literal])* $key:ident: $kind:ty $(= $default:expr)? $(, in $range:expr)?
             $(, hint $hint:literal)? $(, needs($other:ident, $met:expr, $why:expr))?;)*
     } $(check $check:path;)?) => {
-        #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
-        #[serde(deny_unknown_fields)]
+        #[derive(Debug, Clone, PartialEq, $crate::serde::Serialize, $crate::serde::Deserialize)]
+        #[serde(crate = "hil_core::serde", deny_unknown_fields, default)]
         $(#[$meta])*
-        pub struct $name {
-            $($($(#[$note])* pub $extra: $extra_kind,)*)?
-            $($(#[doc = $about])* pub $key: $kind,)*
+        $vis struct $name {
+            $($($(#[$note])* $vis $extra: $extra_kind,)*)?
+            $($(#[doc = $about])* $vis $key: $kind,)*
+        }
+
+        impl Default for $name {
+            fn default() -> Self {
+                Self::TEMPLATE
+            }
         }
 
         impl $name {
             /// Every option at its default; those that are required are unset.
-            pub const TEMPLATE: Self = Self {
+            $vis const TEMPLATE: Self = Self {
                 $($($extra: $extra_value,)*)?
                 $($key: $crate::options!(@or <$kind as $crate::options::Kind>::UNSET $(, $default)?),)*
             };
@@ -707,8 +766,8 @@ macro_rules! options {
             /// Checks every option.
             ///
             /// # Errors
-            /// The first key that is refused.
-            pub fn check(&self) -> Result<(), $crate::case_study::ParameterError> {
+            /// The first key that is refused, with its value and its range.
+            $vis fn check(&self) -> Result<(), $crate::case_study::ParameterError> {
                 $crate::options::Options::check_all(&mut self.clone())
             }
         }
@@ -765,24 +824,11 @@ macro_rules! words {
     ($(#[$meta:meta])* pub enum $name:ident {
         $($(#[$about:meta])* $variant:ident = $word:literal,)*
     }) => {
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-        $(#[$meta])*
-        pub enum $name { $($(#[$about])* #[serde(rename = $word)] $variant,)* }
-
-        impl $name {
-            /// All of them.
-            pub const ALL: &'static [Self] = &[$(Self::$variant),*];
-
-            /// The word in a file.
-            pub const fn word(self) -> &'static str {
-                match self { $(Self::$variant => $word,)* }
-            }
-        }
-
-        impl core::fmt::Display for $name {
-            fn fmt(&self, formatter: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-                formatter.write_str(self.word())
-            }
+        $crate::labelled! {
+            #[derive(Debug, Clone, Copy, PartialEq, Eq, $crate::serde::Serialize, $crate::serde::Deserialize)]
+            #[serde(crate = "hil_core::serde")]
+            $(#[$meta])*
+            pub enum $name, word { $($(#[$about])* #[serde(rename = $word)] $variant = $word,)* }
         }
 
         impl $crate::options::Scalar for $name {
@@ -790,7 +836,7 @@ macro_rules! words {
             const UNSET: Self = Self::ALL[0];
 
             fn shape(range: Self::Range) -> $crate::options::Shape {
-                let allowed = if range.is_empty() { Self::ALL } else { range };
+                let allowed = if range.is_empty() { &Self::ALL } else { range };
                 $crate::options::Shape::Words(allowed.iter().map(|one| one.word()).collect())
             }
 

@@ -129,35 +129,27 @@ impl CaseStudy for Fleet {
     }
 }
 
-hil_core::parameters! {
+hil_core::options! {
     /// `[case.parameters]` of the fleet case. The defaults are the seed paper's figures where it
     /// gives them (section III.B, Table I) and the original implementation's otherwise.
     pub struct FleetParameters {
         /// Independent fleets that share the channels: critical sections come so many times
         /// faster.
-        fleets: u32 = 1, in 1.0..=64.0;
+        fleets: u32 = 1, in 1..=64;
         /// Vehicle, map and number of robots.
-        world: WorldParameters = WorldParameters::default();
+        world: WorldParameters;
         /// How robots drive and take orders.
-        robot: RobotParameters = RobotParameters::default();
+        robot: RobotParameters;
         /// Who goes first, and how it is told.
-        coordinator: CoordinatorParameters = CoordinatorParameters::default();
+        coordinator: CoordinatorParameters;
         /// Where robots are sent.
-        missions: MissionParameters = MissionParameters::default();
+        missions: MissionParameters;
         /// What `hil-runtime tables` computes.
-        tables: TableParameters = TableParameters::default();
-    } check check_tables;
+        tables: TableParameters;
+    }
 }
 
 impl FleetParameters {
-    /// The world is checked when it is built.
-    fn check_tables(&self) -> Result<(), ParameterError> {
-        self.robot.check()?;
-        self.coordinator.check()?;
-        self.missions.check()?;
-        self.tables.check()
-    }
-
     /// Checks that some order lets every robot set out.
     fn check_beginning(&self, scene: &Scene) -> Result<(), ParameterError> {
         let is_safe = self.coordinator.mode == CoordinatorMode::Safe;

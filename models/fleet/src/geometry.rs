@@ -1,17 +1,20 @@
 //! Plane geometry of vehicles: poses, rectangular footprints and their overlap. Map frame, metres
 //! and radians. It knows neither paths nor maps.
 
+use hil_core::options::ANY_NUMBER;
 use serde::{Deserialize, Serialize};
 
-/// Where a vehicle's reference point is and where its front points, in the map frame.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-pub struct Pose {
-    /// Metres.
-    pub x_m: f64,
-    /// Metres.
-    pub y_m: f64,
-    /// Radians from the x axis, counter-clockwise.
-    pub heading_rad: f64,
+hil_core::options! {
+    /// Where a vehicle's reference point is and where its front points, in the map frame.
+    #[derive(Copy)]
+    pub struct Pose {
+        /// Metres.
+        x_m: f64, in ANY_NUMBER;
+        /// Metres.
+        y_m: f64, in ANY_NUMBER;
+        /// Radians from the x axis, counter-clockwise.
+        heading_rad: f64, in ANY_NUMBER;
+    }
 }
 
 impl Pose {
@@ -203,18 +206,19 @@ impl OrientedBox {
     }
 }
 
-/// An upright rectangle in the map frame, metres.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Bounds {
-    /// Left.
-    pub x_min_m: f64,
-    /// Right.
-    pub x_max_m: f64,
-    /// Bottom.
-    pub y_min_m: f64,
-    /// Top.
-    pub y_max_m: f64,
+hil_core::options! {
+    /// An upright rectangle in the map frame, metres.
+    #[derive(Copy)]
+    pub struct Bounds {
+        /// Left.
+        x_min_m: f64, in ANY_NUMBER;
+        /// Right.
+        x_max_m: f64, in ANY_NUMBER;
+        /// Bottom.
+        y_min_m: f64, in ANY_NUMBER;
+        /// Top.
+        y_max_m: f64, in ANY_NUMBER;
+    }
 }
 
 impl Bounds {

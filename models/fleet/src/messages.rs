@@ -3,8 +3,6 @@
 //! our own fixed-size one. Nothing here decides anything.
 
 use hil_core::time::Instant;
-use serde::{Deserialize, Serialize};
-
 hil_core::message! {
     /// What the three messages between controller and robot begin with, 24 bytes.
     #[derive(Eq, Hash, Default)]
@@ -23,15 +21,16 @@ hil_core::message! {
     }
 }
 
-/// What a receiver does with messages that arrive out of order or twice.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum MessageOrder {
-    /// Takes them as they come, as from a raw UDP socket; only the rules of each message decide.
-    #[default]
-    Legacy,
-    /// Passes over each whose `header_id` is not newer than the newest of its kind.
-    Strict,
+hil_core::words! {
+    /// What a receiver does with messages that arrive out of order or twice.
+    #[derive(Default)]
+    pub enum MessageOrder {
+        /// Takes them as they come, as from a raw UDP socket; only the rules of each message decide.
+        #[default]
+        Legacy = "legacy",
+        /// Passes over each whose `header_id` is not newer than the newest of its kind.
+        Strict = "strict",
+    }
 }
 
 hil_core::numbered! {

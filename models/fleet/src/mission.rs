@@ -3,34 +3,33 @@
 
 use core::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
 use crate::geometry::floor_index;
 use crate::scenario::Scene;
 use crate::world::{BayIndex, Route};
 use hil_core::random::RandomStream;
 
-/// How goals are chosen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum MissionMode {
-    /// Any free bay a path leads to, each as likely.
-    #[default]
-    Random,
-    /// To the bay at the other end of the start's shuttle line, and back, for ever.
-    Shuttle,
-    /// Once to the other end of the shuttle line.
-    Once,
+hil_core::words! {
+    /// How goals are chosen.
+    #[derive(Default)]
+    pub enum MissionMode {
+        /// Any free bay a path leads to, each as likely.
+        #[default]
+        Random = "random",
+        /// To the bay at the other end of the start's shuttle line, and back, for ever.
+        Shuttle = "shuttle",
+        /// Once to the other end of the shuttle line.
+        Once = "once",
+    }
 }
 
-hil_core::parameters! {
+hil_core::options! {
     /// `[case.parameters.missions]`.
     #[derive(Copy)]
-    pub struct MissionParameters in "missions." {
+    pub struct MissionParameters {
         /// How goals are chosen.
-        mode: MissionMode = MissionMode::default();
+        mode: MissionMode = MissionMode::Random;
         /// Missions after which a robot stays parked; 0 for no end. `once` gives one at most.
-        missions_per_robot: u32 = 0;
+        missions_per_robot: u32 = 0, in 0..=u32::MAX;
         /// How long a robot stays in a bay before its next mission, seconds.
         parking_s: f64 = 3.0, in 0.0..=3600.0;
     }
@@ -207,6 +206,6 @@ mod tests {
             parking_s: f64::NAN,
             ..MissionParameters::default()
         };
-        assert_eq!(parameters.check().unwrap_err().key, "missions.parking_s");
+        assert_eq!(parameters.check().unwrap_err().key, "parking_s");
     }
 }

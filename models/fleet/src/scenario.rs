@@ -8,7 +8,7 @@
 
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use crate::geometry::{Bounds, Footprint, Pose};
 use crate::map::{self, BAYS_PER_SIDE, Map, raised};
@@ -18,40 +18,42 @@ use crate::planner::{At, Planner, Segment};
 use crate::section::MergePolicy;
 use crate::world::{BayIndex, Route, Vehicle, World};
 use hil_core::case_study::ParameterError;
+use hil_core::options::{ANY_NUMBER, Rows};
 
-/// Where the fleet drives.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Scenario {
-    /// Container yard, 400 m x 220 m, vehicles of 14.8 m x 3 m (Table I).
-    Harbor,
-    /// Hall with racks, 80 m x 44 m, vehicles of 2 m x 0.5 m (Table I).
-    #[default]
-    Warehouse,
-    /// Two straight paths at a right angle.
-    Crossing,
-    /// Two robots swap sides through a corridor for one.
-    HeadOn,
-    /// One robot behind another on the same line.
-    Following,
-    /// Three straight paths that cross in a triangle.
-    ThreeCycle,
-    /// Bounds, obstacles and bays as given.
-    Custom,
+hil_core::words! {
+    /// Where the fleet drives.
+    #[derive(Default)]
+    pub enum Scenario {
+        /// Container yard, 400 m x 220 m, vehicles of 14.8 m x 3 m (Table I).
+        Harbor = "harbor",
+        /// Hall with racks, 80 m x 44 m, vehicles of 2 m x 0.5 m (Table I).
+        #[default]
+        Warehouse = "warehouse",
+        /// Two straight paths at a right angle.
+        Crossing = "crossing",
+        /// Two robots swap sides through a corridor for one.
+        HeadOn = "head-on",
+        /// One robot behind another on the same line.
+        Following = "following",
+        /// Three straight paths that cross in a triangle.
+        ThreeCycle = "three-cycle",
+        /// Bounds, obstacles and bays as given.
+        Custom = "custom",
+    }
 }
 
-hil_core::parameters! {
+hil_core::options! {
     /// `[case.parameters.world]`. What is not given is the scenario's own.
-    pub struct WorldParameters in "world." {
+    pub struct WorldParameters {
         /// Where the fleet drives.
-        scenario: Scenario = Scenario::default();
+        scenario: Scenario = Scenario::Warehouse;
         /// Number of robots. Harbor and warehouse grow by one yard or hall for every 7; the
         /// other scenarios have as many robots as starts, at most this many.
-        robots: u32 = 7, in 1.0..=448.0;
+        robots: u32 = 7, in 1..=448;
         /// Way between neighbouring path poses at most, metres.
         path_spacing_m: f64 = 0.3, in 0.01..=5.0;
         /// Which overlaps count as one critical section.
-        merge: MergePolicy = MergePolicy::default();
+        merge: MergePolicy = MergePolicy::WithinVehicle;
         /// Vehicle length, metres.
         length_m: Option<f64> = None, in 0.05..=100.0;
         /// Vehicle width, metres.
@@ -65,51 +67,52 @@ hil_core::parameters! {
         /// What planned paths keep between vehicle and everything else, metres.
         clearance_m: Option<f64> = None, in 0.0..=100.0;
         /// `custom`: the ground, metres.
-        bounds: Option<Bounds> = None;
+        bounds: Option<Bounds>;
         /// `custom`: what no vehicle may touch.
-        obstacles: Vec<Bounds> = Vec::new();
+        obstacles: Rows<Bounds>;
         /// `custom`: where robots park.
-        bays: Vec<BayParameters> = Vec::new();
+        bays: Rows<BayParameters>;
         /// `custom`: paths given pose by pose. When there are any, none is planned.
-        paths: Vec<PathParameters> = Vec::new();
-    } check check_custom;
+        paths: Rows<PathParameters>;
+    }
+    check WorldParameters::check_custom;
 }
 
-/// Which end of the paths a bay is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum BaySide {
-    /// Forward paths begin here, and robots start here.
-    Left,
-    /// Forward paths end here.
-    Right,
+hil_core::words! {
+    /// Which end of the paths a bay is.
+    pub enum BaySide {
+        /// Forward paths begin here, and robots start here.
+        Left = "left",
+        /// Forward paths end here.
+        Right = "right",
+    }
 }
 
-/// `[[case.parameters.world.bays]]`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct BayParameters {
-    /// Metres.
-    pub x_m: f64,
-    /// Metres.
-    pub y_m: f64,
-    /// Radians; the heading of a vehicle that parks here, whichever way it came.
-    #[serde(default)]
-    pub heading_rad: f64,
-    /// Robots go from left bays to right ones and back.
-    pub side: BaySide,
+hil_core::options! {
+    /// `[[case.parameters.world.bays]]`.
+    #[derive(Copy)]
+    pub struct BayParameters {
+        /// Metres.
+        x_m: f64, in ANY_NUMBER;
+        /// Metres.
+        y_m: f64, in ANY_NUMBER;
+        /// Radians; the heading of a vehicle that parks here, whichever way it came.
+        heading_rad: f64 = 0.0, in ANY_NUMBER;
+        /// Robots go from left bays to right ones and back.
+        side: BaySide;
+    }
 }
 
-/// `[[case.parameters.world.paths]]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PathParameters {
-    /// Index of the left bay in `bays`.
-    pub from: u32,
-    /// Index of the right bay in `bays`.
-    pub to: u32,
-    /// Poses from bay to bay.
-    pub poses: Vec<Pose>,
+hil_core::options! {
+    /// `[[case.parameters.world.paths]]`.
+    pub struct PathParameters {
+        /// Index of the left bay in `bays`.
+        from: u32, in 0..=u32::MAX;
+        /// Index of the right bay in `bays`.
+        to: u32, in 0..=u32::MAX;
+        /// Poses from bay to bay.
+        poses: Rows<Pose>;
+    }
 }
 
 /// A world with its robots in their starting bays.
@@ -140,7 +143,7 @@ impl WorldParameters {
     /// # Errors
     /// Names the key, below `world`, and what is wrong with it.
     pub fn build(&self) -> Result<Scene, ParameterError> {
-        self.check()?;
+        self.check().map_err(|error| error.below("world"))?;
         let vehicle = self.vehicle();
         match self.scenario {
             Scenario::Crossing => self.lines(vehicle, &crossing(&vehicle)),
@@ -206,10 +209,10 @@ impl WorldParameters {
     fn check_custom(&self) -> Result<(), ParameterError> {
         if self.scenario != Scenario::Custom {
             let given = [
-                ("world.bounds", self.bounds.is_some()),
-                ("world.obstacles", !self.obstacles.is_empty()),
-                ("world.bays", !self.bays.is_empty()),
-                ("world.paths", !self.paths.is_empty()),
+                ("bounds", self.bounds.is_some()),
+                ("obstacles", !self.obstacles.0.is_empty()),
+                ("bays", !self.bays.0.is_empty()),
+                ("paths", !self.paths.0.is_empty()),
             ];
             if let Some((key, _)) = given.iter().find(|(_, is_given)| *is_given) {
                 let problem = "is for scenario = \"custom\"; this one has its own";

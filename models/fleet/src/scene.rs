@@ -61,13 +61,13 @@ impl WorldParameters {
             let problem = "is missing, and scenario = \"custom\" needs it";
             return Err(ParameterError::new("world.bounds", problem));
         };
-        let bays = self.bays.iter().map(|bay| MapBay {
+        let bays = self.bays.0.iter().map(|bay| MapBay {
             pose: Pose::new(bay.x_m, bay.y_m, bay.heading_rad),
             side: bay.side,
         });
         Ok(Map {
             bounds,
-            obstacles: self.obstacles.clone(),
+            obstacles: self.obstacles.0.clone(),
             bays: bays.collect(),
             gates: Vec::new(),
             clearance_m: self.clearance_m(),
@@ -78,13 +78,13 @@ impl WorldParameters {
         let map = self.custom_map()?;
         for side in [BaySide::Left, BaySide::Right] {
             if map.bays_of(side).next().is_none() {
-                let problem = format!("has no {side:?} one; robots need one on each side");
-                return Err(ParameterError::new("world.bays", problem.to_lowercase()));
+                let problem = format!("has no {side} one; robots need one on each side");
+                return Err(ParameterError::new("world.bays", problem));
             }
         }
         let (radius_m, spacing_m) = (self.turning_radius_m(), self.path_spacing_m);
         let mut connector = Connector::new(&map, &vehicle, radius_m, spacing_m)?;
-        let connections = if self.paths.is_empty() {
+        let connections = if self.paths.0.is_empty() {
             connector.connect(&|_, _| true)?
         } else {
             self.given_connections(&map, &connector)?
@@ -102,23 +102,19 @@ impl WorldParameters {
         connector: &Connector<'_>,
     ) -> Result<Vec<Connection>, ParameterError> {
         let mut connections = Vec::<Connection>::new();
-        for (index, path) in self.paths.iter().enumerate() {
+        for (index, path) in self.paths.0.iter().enumerate() {
             let key = format!("world.paths[{index}]");
             let error = |problem: String| Err(ParameterError::new(&key, problem));
             let ends = [(path.from, BaySide::Left), (path.to, BaySide::Right)];
             for (bay, side) in ends {
                 if !map.bays_of(side).any(|known| known == bay as usize) {
-                    let side = match side {
-                        BaySide::Left => "left",
-                        BaySide::Right => "right",
-                    };
                     return error(format!("names bay {bay}, which is no {side} bay"));
                 }
             }
             let connection = Connection {
                 from: path.from as usize,
                 to: path.to as usize,
-                poses: path.poses.clone(),
+                poses: path.poses.0.clone(),
             };
             let is_known = |known: &Connection| (known.from, known.to);
             let pair = is_known(&connection);
@@ -126,12 +122,12 @@ impl WorldParameters {
                 return error(format!("joins bays {} and {} again", path.from, path.to));
             }
             // Names a NaN pose before anything compares with it.
-            if let Err(problem) = Path::new(&path.poses, self.path_spacing_m) {
+            if let Err(problem) = Path::new(&path.poses.0, self.path_spacing_m) {
                 return error(problem.to_string());
             }
             let ends = [
-                (path.poses.first(), path.from),
-                (path.poses.last(), path.to),
+                (path.poses.0.first(), path.from),
+                (path.poses.0.last(), path.to),
             ];
             for (pose, bay) in ends {
                 let parked = map.bays[bay as usize].pose;

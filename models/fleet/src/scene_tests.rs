@@ -3,6 +3,7 @@
 use super::*;
 use crate::geometry::Bounds;
 use crate::scenario::{BayParameters, PathParameters, Scenario};
+use hil_core::options::Rows;
 
 fn built_in(scenario: Scenario, robots: u32) -> Scene {
     let parameters = WorldParameters {
@@ -102,18 +103,18 @@ fn yard() -> WorldParameters {
             y_min_m: 0.0,
             y_max_m: 20.0,
         }),
-        obstacles: vec![Bounds {
+        obstacles: Rows(vec![Bounds {
             x_min_m: 18.0,
             x_max_m: 22.0,
             y_min_m: 6.0,
             y_max_m: 14.0,
-        }],
-        bays: vec![
+        }]),
+        bays: Rows(vec![
             bay(2.0, 5.0, BaySide::Left),
             bay(2.0, 15.0, BaySide::Left),
             bay(38.0, 5.0, BaySide::Right),
             bay(38.0, 15.0, BaySide::Right),
-        ],
+        ]),
         ..WorldParameters::default()
     }
 }
@@ -125,10 +126,10 @@ fn a_custom_map_is_planned_and_given_paths_are_taken_as_they_are() {
     assert_eq!(scene.starts, [0, 1]);
     assert_well_formed(&scene);
     let mut given = yard();
-    given.paths = vec![PathParameters {
+    given.paths.0 = vec![PathParameters {
         from: 0,
         to: 2,
-        poses: vec![Pose::new(2.0, 5.0, 0.0), Pose::new(38.0, 5.0, 0.0)],
+        poses: Rows(vec![Pose::new(2.0, 5.0, 0.0), Pose::new(38.0, 5.0, 0.0)]),
     }];
     let scene = given.build().unwrap();
     assert_eq!(scene.world.routes.len(), 2);
@@ -153,32 +154,32 @@ fn bays_and_obstacles_that_make_no_world_are_refused_by_name() {
     };
     let bay = "world.bays[1]";
     check(
-        &|p| p.obstacles[0] = wall,
+        &|p| p.obstacles.0[0] = wall,
         "world.bays[0]",
         "no path to bay 2: no path from",
     );
-    check(&|p| p.bays[1].y_m = 5.5, bay, "overlaps bay 0");
+    check(&|p| p.bays.0[1].y_m = 5.5, bay, "overlaps bay 0");
     check(
-        &|p| (p.bays[1].x_m, p.bays[1].y_m) = (20.0, 10.0),
+        &|p| (p.bays.0[1].x_m, p.bays.0[1].y_m) = (20.0, 10.0),
         bay,
         "obstacle 0",
     );
-    check(&|p| p.bays[1].y_m = 25.0, bay, "edge of the ground");
-    check(&|p| p.bays[1].y_m = f64::NAN, bay, "not finite");
+    check(&|p| p.bays.0[1].y_m = 25.0, bay, "edge of the ground");
+    check(&|p| p.bays.0[1].y_m = f64::NAN, bay, "not finite");
     check(
-        &|p| p.bays[0].side = BaySide::Right,
+        &|p| p.bays.0[0].side = BaySide::Right,
         "world.bays[1]",
         "no path to bay 0",
     );
-    check(&|p| p.bays.truncate(2), "world.bays", "no right one");
+    check(&|p| p.bays.0.truncate(2), "world.bays", "no right one");
     check(&|p| p.bounds = None, "world.bounds", "missing");
     check(
-        &|p| p.obstacles[0].x_max_m = f64::NAN,
+        &|p| p.obstacles.0[0].x_max_m = f64::NAN,
         "world.obstacles[0]",
         "not finite",
     );
     check(
-        &|p| p.obstacles[0].x_max_m = 10.0,
+        &|p| p.obstacles.0[0].x_max_m = 10.0,
         "world.obstacles[0]",
         "no area",
     );
@@ -230,41 +231,41 @@ fn given_paths_that_do_not_fit_the_map_are_refused_by_name() {
     let straight = |from: u32, to: u32, y_m: f64| PathParameters {
         from,
         to,
-        poses: vec![Pose::new(2.0, y_m, 0.0), Pose::new(38.0, y_m, 0.0)],
+        poses: Rows(vec![Pose::new(2.0, y_m, 0.0), Pose::new(38.0, y_m, 0.0)]),
     };
     let by = |pose: Pose| {
         let mut path = straight(0, 2, 5.0);
-        path.poses.insert(1, pose);
+        path.poses.0.insert(1, pose);
         vec![path]
     };
     let path = "world.paths[0]";
     check(
-        &|p| p.paths = by(Pose::new(20.0, 7.0, 0.0)),
+        &|p| p.paths.0 = by(Pose::new(20.0, 7.0, 0.0)),
         path,
         "to obstacle 0",
     );
     check(
-        &|p| p.paths = by(Pose::new(f64::NAN, 5.0, 0.0)),
+        &|p| p.paths.0 = by(Pose::new(f64::NAN, 5.0, 0.0)),
         path,
         "pose 1 of the path is not",
     );
     check(
-        &|p| p.paths = vec![straight(0, 2, 6.0)],
+        &|p| p.paths.0 = vec![straight(0, 2, 6.0)],
         path,
         "does not end in bay 0",
     );
     check(
-        &|p| p.paths = vec![straight(2, 0, 5.0)],
+        &|p| p.paths.0 = vec![straight(2, 0, 5.0)],
         path,
         "no left bay",
     );
     check(
-        &|p| p.paths = vec![straight(0, 9, 5.0)],
+        &|p| p.paths.0 = vec![straight(0, 9, 5.0)],
         path,
         "no right bay",
     );
     check(
-        &|p| p.paths = vec![straight(0, 2, 5.0); 2],
+        &|p| p.paths.0 = vec![straight(0, 2, 5.0); 2],
         "world.paths[1]",
         "again",
     );

@@ -50,15 +50,16 @@ impl Span {
     }
 }
 
-/// Which separate overlaps are taken as one section.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum MergePolicy {
-    /// Those nearer than the vehicle's larger dimension on both paths: the original's rule.
-    #[default]
-    WithinVehicle,
-    /// None.
-    Never,
+hil_core::words! {
+    /// Which separate overlaps are taken as one section.
+    #[derive(Default)]
+    pub enum MergePolicy {
+        /// Those nearer than the vehicle's larger dimension on both paths: the original's rule.
+        #[default]
+        WithinVehicle = "within-vehicle",
+        /// None.
+        Never = "never",
+    }
 }
 
 /// A critical section: on each path a range of poses, and for each pose of one the range of poses

@@ -27,7 +27,6 @@ words! {
 options! {
     /// What a link does to messages. The default does nothing.
     #[derive(Copy)]
-    #[serde(default)]
     pub struct Impairments {
         /// Delay, or its upper end, ms.
         delay_ms: f64 = 0.0, in 0.0..=60_000.0;
@@ -50,12 +49,6 @@ options! {
         stall_mean_s: f64 = 0.0, in 0.0..=60.0;
         /// Mean time from the end of a stall to the next, exponential, s.
         stall_gap_mean_s: f64 = 30.0, in 0.1..=86_400.0;
-    }
-}
-
-impl Default for Impairments {
-    fn default() -> Self {
-        Self::TEMPLATE
     }
 }
 

@@ -28,7 +28,7 @@ hil_core::message! {
     }
 }
 
-hil_core::parameters! {
+hil_core::options! {
     /// The case study, which is its parameters.
     pub struct Shuttle {
         /// Control and reporting rate, Hz.

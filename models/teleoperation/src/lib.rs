@@ -178,7 +178,8 @@ impl CaseStudy for Teleoperation {
 
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {
         parameters.check()?;
-        let settings = parameters.egm.settings()?;
+        let settings = parameters.egm.settings();
+        let settings = settings.map_err(|error| error.below("egm"))?;
         let motion = parameters.motion()?;
         Ok(Self {
             parameters,

@@ -4,8 +4,6 @@
 
 use core::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
 use crate::bvh::Bvh;
 use crate::experiment::TableParameters;
 use crate::follower::MappingSettings;
@@ -15,47 +13,55 @@ use hil_arm::egm::parameters::{EgmParameters, EgmStartRequest};
 use hil_core::case_study::ParameterError;
 use hil_core::text_file::TextFile;
 
-/// What the left arm does.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum LeftArm {
-    /// Holds its start posture.
-    #[default]
-    Hold,
-    /// Mirrors what the right hand does.
-    Mirror,
+hil_core::words! {
+    /// What the left arm does.
+    #[derive(Default)]
+    pub enum LeftArm {
+        /// Holds its start posture.
+        #[default]
+        Hold = "hold",
+        /// Mirrors what the right hand does.
+        Mirror = "mirror",
+    }
 }
 
-/// When the controller sends commands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum SendPolicy {
-    /// One per human frame and arm.
-    #[default]
-    Frame,
-    /// One per feedback of the arm, as the maker recommends.
-    Coupled,
-    /// `send_hz` per second and arm, whatever comes in.
-    Free,
+hil_core::words! {
+    /// When the controller sends commands.
+    #[derive(Default)]
+    pub enum SendPolicy {
+        /// One per human frame and arm.
+        #[default]
+        Frame = "frame",
+        /// One per feedback of the arm, as the maker recommends.
+        Coupled = "coupled",
+        /// `send_hz` per second and arm, whatever comes in.
+        Free = "free",
+    }
 }
 
-/// Where an arm goes when guided motion is back after a session ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ResumePolicy {
-    /// To where it would be had nothing happened, as fast as the robot lets it.
-    #[default]
-    Jump,
-    /// There too, but gliding from where the arm is within `blend_s`.
-    Blend,
-    /// Nowhere: hand and tool are taken anew where they are, and the motion goes on from there.
-    Reclutch,
+hil_core::words! {
+    /// Where an arm goes when guided motion is back after a session ended.
+    #[derive(Default)]
+    pub enum ResumePolicy {
+        /// To where it would be had nothing happened, as fast as the robot lets it.
+        #[default]
+        Jump = "jump",
+        /// There too, but gliding from where the arm is within `blend_s`.
+        Blend = "blend",
+        /// Nowhere: hand and tool are taken anew where they are, and the motion goes on from there.
+        Reclutch = "reclutch",
+    }
 }
 
-hil_core::parameters! {
+hil_core::options! {
     /// `[case.parameters]` of the teleoperation case. The defaults are the seed paper's figures where
     /// it gives them (section III.C) and the maker's defaults otherwise.
-    pub struct TeleoperationParameters {
+    pub struct TeleoperationParameters with {
+        /// The text of `motion_file`, once it was read.
+        #[serde(skip)]
+        motion_text: Option<TextFile> = None,
+    }
+    {
         /// Length of one motion loop, s.
         motion_period_s: f64 = 4.033, in 0.5..=60.0;
         /// How long the human rests before the motion begins, s: nobody swings before guided
@@ -81,8 +87,7 @@ hil_core::parameters! {
         send: SendPolicy = SendPolicy::Frame;
         /// Commands per second and arm with `send = "free"`, Hz; 250 when left out. Refused
         /// with any other `send`.
-        #[serde(skip_serializing_if = "Option::is_none")]
-        send_hz: Option<f64> = None, in 1.0..=1000.0;
+        send_hz: Option<f64>, in 1.0..=1000.0;
         /// Where an arm goes when guided motion is back.
         resume: ResumePolicy = ResumePolicy::Jump;
         /// How long the way of `resume = "blend"` takes, s.
@@ -92,26 +97,21 @@ hil_core::parameters! {
         trigger_after_s: f64 = 3.0, in 0.0..=60.0;
         /// A BVH motion file to play instead of the synthetic swing. Whoever can open files puts its
         /// text in by [`TeleoperationParameters::read_files`].
-        #[serde(skip_serializing_if = "Option::is_none")]
-        motion_file: Option<String> = None;
+        motion_file: Option<String>;
         /// The joint of the motion file that is the right hand, where its name does not say so.
-        #[serde(skip_serializing_if = "Option::is_none")]
-        motion_right_hand: Option<String> = None;
+        motion_right_hand: Option<String>;
         /// The joint that is the left hand.
-        #[serde(skip_serializing_if = "Option::is_none")]
-        motion_left_hand: Option<String> = None;
+        motion_left_hand: Option<String>;
         /// Length unit of the motion file, m.
         motion_unit_m: f64 = 0.01, in 1e-4..=1.0;
         /// The robot's settings.
-        egm: EgmParameters = EgmParameters::default();
+        egm: EgmParameters;
         /// What the controller asks for instead of them.
-        egm_start: EgmStartRequest = EgmStartRequest::default();
+        egm_start: EgmStartRequest;
         /// What `hil-runtime tables` and `calibrate` compute.
-        tables: TableParameters = TableParameters::default();
-        /// Text of `motion_file`; never in a topology file.
-        #[serde(skip)]
-        motion_text: Option<TextFile> = None;
-    } check check_together;
+        tables: TableParameters;
+    }
+    check TeleoperationParameters::check_sending;
 }
 
 /// Commands per second and arm where nothing is said: as many as the robot has cycles.
@@ -137,15 +137,14 @@ impl TeleoperationParameters {
         Ok(())
     }
 
-    fn check_together(&self) -> Result<(), ParameterError> {
+    fn check_sending(&self) -> Result<(), ParameterError> {
         if let Some(send_hz) = self.send_hz
             && self.send != SendPolicy::Free
         {
             let problem = format!("{send_hz} has no effect: it needs send = \"free\"");
             return Err(ParameterError::new("send_hz", problem));
         }
-        self.egm_start.check()?;
-        self.tables.check()
+        Ok(())
     }
 
     /// The motion to play.

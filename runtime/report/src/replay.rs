@@ -6,8 +6,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use hil_core::replay::Replay;
-use serde::Deserialize;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use crate::analysis::AnalysisError;
 use crate::analysis::records::{MessageRecords, missing_count};
@@ -15,6 +14,7 @@ use crate::summary::RunSummary;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_present::terminal::canvas::wrapped;
+use hil_rundir::manifest::Manifest;
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::{CaseEntry, CaseError, Registry};
 
@@ -75,29 +75,6 @@ pub struct Replayed {
     replay: Replay,
 }
 
-/// What of a manifest a replay needs.
-#[derive(Debug, Deserialize)]
-struct Manifest {
-    topology: ManifestTopology,
-}
-
-#[derive(Debug, Deserialize)]
-struct ManifestTopology {
-    case: Option<ManifestCase>,
-    run: ManifestRun,
-}
-
-#[derive(Debug, Deserialize)]
-struct ManifestCase {
-    name: String,
-    parameters: Value,
-}
-
-#[derive(Debug, Deserialize)]
-struct ManifestRun {
-    seed: u64,
-}
-
 /// Replays the run in `folder`; `tell` hears what is done, and the share of it where that is known.
 ///
 /// # Errors
@@ -107,20 +84,16 @@ pub fn replay(
     registry: &Registry,
     tell: &dyn Fn(Option<f64>, &str),
 ) -> Result<Replayed, ReplayError> {
-    let path = folder.manifest();
-    let manifest = fs::read_to_string(&path)
-        .map_err(|error| error.to_string())
-        .and_then(|text| {
-            serde_json::from_str::<Manifest>(&text).map_err(|error| error.to_string())
-        });
-    let topology = manifest
-        .map_err(|problem| ReplayError::Manifest { path, problem })?
-        .topology;
-    let ManifestCase { name, parameters } = topology.case.ok_or(ReplayError::NoCase)?;
+    let manifest = Manifest::read(folder).map_err(|error| ReplayError::Manifest {
+        path: folder.manifest(),
+        problem: error.to_string(),
+    })?;
+    let case = manifest.topology.get("case").ok_or(ReplayError::NoCase)?;
+    let name = case["name"].as_str().unwrap_or_default().to_owned();
     let Some(entry) = registry.find(&name) else {
         return Err(ReplayError::UnknownCase { name });
     };
-    let case = match entry.make(parameters, topology.run.seed) {
+    let case = match entry.make(case["parameters"].clone(), manifest.seed) {
         Ok(case) => case,
         Err(source) => return Err(ReplayError::Case { name, source }),
     };

@@ -1,6 +1,9 @@
 //! What the tables say about each other: hosts and processes. Channels and links follow in
 //! `check_channels`. Nothing is read here; the result is the checked topology.
 
+use hil_core::case_study::ParameterError;
+use hil_core::options::Options;
+
 use super::check_adapter::{check_adapter, check_adapters, is_dispensable};
 use super::check_channels;
 use super::check_frames;
@@ -8,10 +11,11 @@ use super::checks::Checks;
 use super::clock_path;
 use super::errors::Fault;
 use super::flows::{self, Flow};
-use super::known::{KnownCase, KnownCases, ParameterFault};
+use super::known::{KnownCase, KnownCases};
 use super::model::{Case, Host, OnExit, Process, Program, Topology};
+use super::reader;
 use super::tables::{CaseTable, File, ProcessTable};
-use super::tree::{self, Table, Value, join, to_plain_table};
+use super::tree::{self, Table, Value, join};
 
 /// Name of the host of a file without `[hosts]`.
 const IMPLICIT_HOST: &str = "local";
@@ -98,41 +102,30 @@ fn find_case<'k>(
 }
 
 fn check_case(known: &KnownCase, seed: u64, checks: &Checks<'_>) -> Option<Case> {
-    let empty = Table::new();
-    let table = match tree::find(checks.tree, "case.parameters").map(|node| &node.value) {
+    let path = "case.parameters";
+    let (empty, node) = (Table::new(), tree::find(checks.tree, path));
+    let table = match node.map(|node| &node.value) {
         Some(Value::Table(table)) => table,
         _ => &empty,
     };
-    let checked = (known.check_parameters)(&to_plain_table(table), seed);
-    let refuse = |found: Vec<ParameterFault>| {
-        for fault in found {
-            refuse_parameter(fault, checks);
-        }
+    let place = node.map_or(checks.top, |node| node.key_place);
+    let mut read =
+        |options: &mut dyn Options| reader::read(options, path, table, place, checks.faults);
+    let checked = (known.check_parameters)(&mut read, seed);
+    let refuse = |error: ParameterError| {
+        // A key may end in an index, as in `bays[2]`, which needs no quotes.
+        let below = |path: String, step: &str| match step.split_once('[') {
+            Some((key, index)) => format!("{}[{index}", join(&path, key)),
+            None => join(&path, step),
+        };
+        let key = error.key.split('.').fold(path.to_owned(), below);
+        // A parameter left at its default has no line: then the fault is at that of its table.
+        checks.refuse(key, Fault::Parameter(error.problem));
     };
-    let parameters = checked.map_err(refuse).ok()?;
     Some(Case {
         name: known.name.to_owned(),
-        parameters,
+        parameters: checked.map_err(refuse).ok()??,
     })
-}
-
-/// A parameter left at its default has no line: then the fault is at that of its table.
-fn refuse_parameter(fault: ParameterFault, checks: &Checks<'_>) {
-    let Some((last, keys)) = fault.key.split_last() else {
-        return checks.refuse("case.parameters", Fault::Parameter(fault.message));
-    };
-    // A key may end in an index, as in `bays[2]`, which needs no quotes.
-    let below = |path: String, step: &String| match step.split_once('[') {
-        Some((key, index)) => format!("{}[{index}", join(&path, key)),
-        None => join(&path, step),
-    };
-    let table = keys.iter().fold("case.parameters".to_owned(), below);
-    if fault.is_unknown_key {
-        let allowed = fault.valid_keys;
-        checks.refuse_key(&table, last, Fault::UnknownKey { allowed });
-    } else {
-        checks.refuse(below(table, last), Fault::Parameter(fault.message));
-    }
 }
 
 /// The hosts by name.

@@ -27,16 +27,6 @@ impl Checks<'_> {
         self.faults.add(path, Some(place), fault);
     }
 
-    /// Notes a fault of the key itself, of the table at `path`.
-    pub(super) fn refuse_key(&self, path: &str, key: &str, fault: Fault) {
-        let path = join(path, key);
-        let place = match tree::find(self.tree, &path) {
-            Some(node) => node.key_place,
-            None => tree::place_of(self.tree, &path).unwrap_or(self.top),
-        };
-        self.faults.add(path, Some(place), fault);
-    }
-
     /// Notes that keys do not go together.
     pub(super) fn refuse_because(&self, path: impl Into<String>, why: impl Into<String>) {
         self.refuse(path, Fault::Inconsistent(why.into()));

@@ -45,7 +45,7 @@ impl EmulationLaunch {
         Some(Self {
             spec: crossing.spec?.clone(),
             link: crossing.link.name.clone(),
-            way: crossing.direction.way(),
+            way: crossing.direction,
             seed,
             trace: crossing.link.emulation().and_then(|emulation| {
                 let trace = emulation.trace.as_ref()?;

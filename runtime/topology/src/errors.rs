@@ -284,7 +284,11 @@ impl Faults {
     }
 
     pub(super) fn is_empty(&self) -> bool {
-        self.found.borrow().is_empty()
+        self.count() == 0
+    }
+
+    pub(super) fn count(&self) -> usize {
+        self.found.borrow().len()
     }
 
     /// Turns places into lines and columns of `sources`.

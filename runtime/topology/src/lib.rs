@@ -31,7 +31,6 @@ mod layers;
 mod links;
 mod model;
 mod names;
-mod parameter_reader;
 mod ports;
 mod reader;
 pub mod registry;
@@ -52,11 +51,11 @@ pub use check_adapter::{command_channel, feedback_channel};
 pub use clock_path::{ClockEnd, ClockPath, describe_end};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
 pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};
-pub use known::{KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with};
+pub use known::{KnownCase, KnownCases, ParameterCheck, ReadParameters, check_parameters_with};
 pub use links::{Emulation, Gateway, Hop, Link, SocketOptions, Timestamps, Via, transport};
 pub use model::{
-    AtExit, Case, Channel, Crossing, Direction, Execution, Host, LinkPorts, MessageLayout, OnExit,
-    Process, Program, Restarts, Run, Scheduling, SchedulingClass, Topology, Wait,
+    AtExit, Case, Channel, Crossing, Execution, Host, LinkPorts, MessageLayout, OnExit, Process,
+    Program, Restarts, Run, Scheduling, SchedulingClass, Topology, Wait,
 };
 pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
 pub use ports::{WantedPort, collide, control_key};
@@ -188,7 +187,7 @@ fn read_and_check(
     };
     let topology = {
         let mut file = tables::File::TEMPLATE;
-        reader::read(&mut file, &table, top, &layers.faults);
+        reader::read(&mut file, "", &table, top, &layers.faults);
         let checks = checks::Checks {
             tree: &table,
             faults: &layers.faults,

@@ -399,24 +399,15 @@ impl LinkPorts {
     }
 
     /// The ports of one way of a link with first port `base`; `None` beyond 65535.
-    pub fn of(base: u16, direction: Direction, is_one_address: bool) -> Option<Self> {
+    pub fn of(base: u16, direction: Way, is_one_address: bool) -> Option<Self> {
         let offset = match direction {
-            Direction::Forward => 0,
-            Direction::Backward => 1,
+            Way::Forward => 0,
+            Way::Backward => 1,
         };
         let receiver = base.checked_add(offset)?;
         let sender = receiver.checked_add(if is_one_address { 2 } else { 0 })?;
         Some(Self { sender, receiver })
     }
-}
-
-/// The way a channel travels on its link.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Direction {
-    /// From the first host of [`Link::between`] to the second.
-    Forward,
-    /// From the second to the first.
-    Backward,
 }
 
 /// A channel whose producer and consumer are on different hosts.
@@ -435,7 +426,7 @@ pub struct Crossing<'a> {
     /// Host of the consumer.
     pub to_host: &'a Host,
     /// Its way on the link.
-    pub direction: Direction,
+    pub direction: Way,
     /// What the emulation does to it; `None` on a real hop.
     pub spec: Option<&'a LinkSpec>,
 }
@@ -522,16 +513,16 @@ impl Topology {
         let to_host = self.host(&self.process(channel.to.as_deref()?)?.host)?;
         let is_forward = link.between.as_ref()?[0] == from_host.name;
         let direction = if is_forward {
-            Direction::Forward
+            Way::Forward
         } else {
-            Direction::Backward
+            Way::Backward
         };
         let is_one_address = from_host.gateway_address() == to_host.gateway_address();
         let ports = LinkPorts::of(hop.port, direction, is_one_address)?;
         let emulation = link.emulation();
         let spec = emulation.map(|emulation| match direction {
-            Direction::Forward => &emulation.forward,
-            Direction::Backward => &emulation.backward,
+            Way::Forward => &emulation.forward,
+            Way::Backward => &emulation.backward,
         });
         Some(Crossing {
             channel,
@@ -546,20 +537,10 @@ impl Topology {
     }
 }
 
-impl Direction {
-    /// The same way as the link models call it.
-    pub const fn way(self) -> Way {
-        match self {
-            Self::Forward => Way::Forward,
-            Self::Backward => Way::Backward,
-        }
-    }
-}
-
 impl Crossing<'_> {
     /// Name of all that goes this way on the link: the flow.
     pub fn flow_name(&self) -> String {
-        flow_name(&self.link.name, self.direction.way())
+        flow_name(&self.link.name, self.direction)
     }
 
     /// The same for a reader: `hop/forward`.
@@ -574,7 +555,7 @@ impl Topology {
     pub fn flow_number(&self, crossing: &Crossing<'_>) -> u16 {
         let links = self.links.iter();
         let before = links.take_while(|link| link.name != crossing.link.name);
-        let ways = 2 * before.count() + usize::from(crossing.direction == Direction::Backward);
+        let ways = 2 * before.count() + usize::from(crossing.direction == Way::Backward);
         let number = u16::try_from(self.clock_paths().count() + ways).unwrap_or(u16::MAX);
         u16::MAX - number
     }

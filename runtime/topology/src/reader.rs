@@ -2,7 +2,9 @@
 //! its place and the reading goes on, so that one attempt shows every fault; keys that no declaration
 //! has are refused.
 
-use hil_core::options::{Field, Options, Setting, Shape, Slot, Table as TableSlot, Tables};
+use hil_core::options::{
+    ANY_NUMBER, Field, Options, Setting, Shape, Slot, Table as TableSlot, Tables,
+};
 
 use super::errors::{Fault, Faults, Place};
 use super::tables::{NAME, NAME_WITH_SLASHES};
@@ -24,11 +26,20 @@ struct Reader<'t> {
     refused: Vec<&'static str>,
 }
 
-/// Reads the whole file into `options`; `top` is where a missing table would stand.
-pub(super) fn read(options: &mut dyn Options, table: &Table, top: Place, faults: &Faults) {
-    let mut reader = Reader::new(String::new(), top, table, faults);
+/// Reads the table at `path` into `options`; `place` is where what is missing would stand. False when
+/// something is missing or refused.
+pub(super) fn read(
+    options: &mut dyn Options,
+    path: &str,
+    table: &Table,
+    place: Place,
+    faults: &Faults,
+) -> bool {
+    let mut reader = Reader::new(path.to_owned(), place, table, faults);
+    let before = faults.count();
     reader.options(options);
     reader.finish();
+    faults.count() == before
 }
 
 impl<'t> Reader<'t> {
@@ -114,6 +125,7 @@ impl<'t> Reader<'t> {
             Slot::Table(mut slot) => self.table(key, &mut *slot),
             Slot::Part(options) => self.options(options),
             Slot::Tables(tables, has_slashes) => self.tables(key, tables, has_slashes),
+            Slot::Rows(rows) => self.rows(key, rows),
             Slot::Free => {
                 let node = self.node(key);
                 node.is_none_or(|node| self.below(key, node, "a table").is_some())
@@ -306,6 +318,27 @@ impl<'t> Reader<'t> {
         is_usable
     }
 
+    /// Reads an array of tables.
+    fn rows(&mut self, key: &'static str, rows: &mut dyn Tables) -> bool {
+        let Some(node) = self.node(key) else {
+            return true;
+        };
+        let Value::Array(items) = &node.value else {
+            return self
+                .wrong_type(key, node, "an array of tables")
+                .unwrap_or(false);
+        };
+        let mut is_usable = true;
+        for (index, item) in items.iter().enumerate() {
+            let path = format!("{}[{index}]", join(&self.path, key));
+            is_usable &= match &item.value {
+                Value::Table(table) => read(rows.open(""), &path, table, item.place, self.faults),
+                _ => self.wrong_type(key, item, "a table").unwrap_or(false),
+            };
+        }
+        is_usable
+    }
+
     /// Refuses every key that no declaration has.
     fn finish(self) {
         for (key, node) in self.table {
@@ -354,6 +387,7 @@ pub(super) fn range_text(shape: &Shape) -> String {
     }
     match shape {
         Shape::Integer(ends) => range(&ends.start().to_string(), &ends.end().to_string()),
+        Shape::Number(ends) if *ends == ANY_NUMBER => "the real numbers".to_owned(),
         Shape::Number(ends) => range(&ends.start().to_string(), &ends.end().to_string()),
         Shape::Time(ends) => {
             let [min, max] = [ends.start(), ends.end()].map(|end| format_duration(*end));

@@ -15,7 +15,7 @@ use hil_core::study::Batch;
 use hil_core::text_file::TextFile;
 use serde_json::Value;
 
-use crate::{KnownCase, KnownCases, ParameterFault, Topology, check_parameters_with};
+use crate::{KnownCase, KnownCases, ReadParameters, Topology, check_parameters_with};
 
 /// A case whose type is no longer known: what `[case]` resolves to.
 pub trait Case: Debug {
@@ -289,10 +289,10 @@ fn make<C: CaseStudy>(parameters: Value, seed: u64) -> Result<Box<dyn Case>, Cas
 
 /// Checks parameters as the topology reader does, with the files that they name.
 fn check_parameters<C: CaseStudy>(
-    table: &toml::Table,
+    read: ReadParameters<'_>,
     seed: u64,
-) -> Result<toml::Table, Vec<ParameterFault>> {
-    check_parameters_with::<C>(table, seed, &mut |parameters| {
+) -> Result<Option<toml::Table>, ParameterError> {
+    check_parameters_with::<C>(read, seed, &mut |parameters| {
         C::read_files(parameters, &mut read_text)
     })
 }

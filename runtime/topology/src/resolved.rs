@@ -178,7 +178,7 @@ pub(super) fn write(options: &mut dyn Options, table: &mut Table) {
             }
             Slot::Part(part) => write(part, table),
             // The file as a whole is not written from its declaration: what it lacks is filled in.
-            Slot::Tables(..) | Slot::Free => {}
+            Slot::Tables(..) | Slot::Rows(_) | Slot::Free => {}
         }
     }
 }

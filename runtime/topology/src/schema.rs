@@ -84,6 +84,10 @@ impl Keys {
                     });
                     self.add(key, about, tables);
                 }
+                Slot::Rows(rows) => {
+                    let items = object(rows.open(""));
+                    self.add(key, about, json!({ "type": "array", "items": items }));
+                }
                 Slot::Free => self.add(key, about, json!({ "type": "object" })),
             }
         }
@@ -229,6 +233,10 @@ impl Sections {
                 Slot::Tables(tables, _) => {
                     self.add(&format!("{below}.{ANY_NAME}"), tables.open(ANY_NAME), "");
                     row(key, "tables by name", "", &about)
+                }
+                Slot::Rows(rows) => {
+                    self.add(&format!("[{below}]"), rows.open(""), "");
+                    row(key, "tables in an order", "", &about)
                 }
                 Slot::Free => row(key, "a table", "", &about),
             };
@@ -393,7 +401,7 @@ mod tests {
                 end: 0,
             };
             let table = tree::parse(&sources, 0, &faults).unwrap();
-            reader::read(&mut File::TEMPLATE.clone(), &table, place, &faults);
+            reader::read(&mut File::TEMPLATE.clone(), "", &table, place, &faults);
             let words = faults.into_errors(Vec::from(sources)).to_string();
             assert!(!words.contains("is not a known key"), "{words}");
         }
@@ -414,7 +422,9 @@ mod tests {
                     let names = slot.templates().map_or(1, |one| one.names.len());
                     (0..names).for_each(|index| check_defaults(slot.open(index), count));
                 }
-                Slot::Tables(tables, _) => check_defaults(tables.open("any"), count),
+                Slot::Tables(tables, _) | Slot::Rows(tables) => {
+                    check_defaults(tables.open("any"), count);
+                }
                 Slot::Free => {}
             }
         }

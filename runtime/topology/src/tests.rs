@@ -27,7 +27,7 @@ use hil_link::delay::DelayLaw;
 use hil_link::loss::LossLaw;
 use hil_link::spec::LinkSpec;
 use hil_shuttle::Shuttle;
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 
 use super::*;
 
@@ -35,19 +35,19 @@ hil_core::message! {
     struct Frame = "test.Frame.v1" { joints_rad: [f64; 7] }
 }
 
-#[derive(Debug, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-struct TeleoperationParameters {
-    rate_hz: f64,
-    mirrored: bool,
-    servo: ServoParameters,
+hil_core::options! {
+    struct TeleoperationParameters {
+        rate_hz: f64 = 0.0, in 0.0..=1000.0;
+        mirrored: bool = false;
+        servo: ServoParameters;
+    }
 }
 
-#[derive(Debug, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-struct ServoParameters {
-    gain_per_s: f64,
-    cycle_us: u32,
+hil_core::options! {
+    struct ServoParameters {
+        gain_per_s: f64 = 0.0, in 0.0..=20.0;
+        cycle_us: u32 = 0, in 0..=100_000;
+    }
 }
 
 /// A case of three roles and three channels, without models; the shipped one of this name has
@@ -67,10 +67,7 @@ impl CaseStudy for Teleoperation {
     type Parameters = TeleoperationParameters;
 
     fn new(parameters: Self::Parameters, _seed: u64) -> Result<Self, ParameterError> {
-        ParameterError::check("rate_hz", parameters.rate_hz, 0.0..=1000.0, "0 to 1000")?;
-        let gain = parameters.servo.gain_per_s;
-        ParameterError::check("servo.gain_per_s", gain, 0.0..=20.0, "0 to 20")?;
-        Ok(Self)
+        parameters.check().map(|()| Self)
     }
 
     fn role(&self, _name: &str) -> Option<Box<dyn Role>> {
@@ -287,7 +284,7 @@ fn every_key_of_a_channel_and_its_link_reaches_the_checked_topology() {
         panic!("three crossings");
     };
     // `between` starts at the robot, so commands go backward.
-    assert_eq!(command.direction, Direction::Backward);
+    assert_eq!(command.direction, hil_link::spec::Way::Backward);
     assert_eq!(
         command.ports,
         LinkPorts {

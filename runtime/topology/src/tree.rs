@@ -56,17 +56,16 @@ impl Value {
             Self::Array(items) => {
                 toml::Value::Array(items.iter().map(|item| item.value.to_plain()).collect())
             }
-            Self::Table(table) => toml::Value::Table(to_plain_table(table)),
+            Self::Table(table) => {
+                let table = table.iter();
+                toml::Value::Table(
+                    table
+                        .map(|(key, node)| (key.clone(), node.value.to_plain()))
+                        .collect(),
+                )
+            }
         }
     }
-}
-
-/// The same table without places.
-pub(super) fn to_plain_table(table: &Table) -> toml::Table {
-    table
-        .iter()
-        .map(|(key, node)| (key.clone(), node.value.to_plain()))
-        .collect()
 }
 
 /// Parses the source with this index; notes every syntax error.

@@ -10,77 +10,78 @@ use crate::egm::controller::DELAY_CYCLES_MAX;
 use crate::egm::messages::{MotionRefusal, Side};
 use hil_core::case_study::ParameterError;
 
-/// A named set of settings that single keys may then change.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Preset {
-    /// The maker's defaults, with their traps.
-    AbbDefault,
-    /// Everything open: level 0, highest gain, no filter to speak of.
-    Raw,
-    /// As the `YuMi` programs of KTH set it.
-    KthYumi,
-    /// Fitted so that calibrated outages reproduce the seed paper's motion loss; the paper states
-    /// none of these values.
-    #[default]
-    Paper,
+hil_core::words! {
+    /// A named set of settings that single keys may then change.
+    #[derive(Default)]
+    pub enum Preset {
+        /// The maker's defaults, with their traps.
+        AbbDefault = "abb-default",
+        /// Everything open: level 0, highest gain, no filter to speak of.
+        Raw = "raw",
+        /// As the `YuMi` programs of KTH set it.
+        KthYumi = "kth-yumi",
+        /// Fitted so that calibrated outages reproduce the seed paper's motion loss; the paper states
+        /// none of these values.
+        #[default]
+        Paper = "paper",
+    }
 }
 
-/// How the controller takes queued commands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum QueuePolicy {
-    /// One per cycle, oldest first, as the maker documents it.
-    Fifo1,
-    /// The newest; those it overtook are dropped and counted. What would help.
-    Latest,
+hil_core::words! {
+    /// How the controller takes queued commands.
+    pub enum QueuePolicy {
+        /// One per cycle, oldest first, as the maker documents it.
+        Fifo1 = "fifo1",
+        /// The newest; those it overtook are dropped and counted. What would help.
+        Latest = "latest",
+    }
 }
 
-/// What becomes of the motion when a session is stopped by request.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum StopMode {
-    /// Stays where it is.
-    Hold,
-    /// Returns to where the session started.
-    RampDown,
+hil_core::words! {
+    /// What becomes of the motion when a session is stopped by request.
+    pub enum StopMode {
+        /// Stays where it is.
+        Hold = "hold",
+        /// Returns to where the session started.
+        RampDown = "ramp-down",
+    }
 }
 
-/// What starts the first session.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum StartMode {
-    /// A request to the motion server.
-    Request,
-    /// The program by itself, from the robot's start.
-    PowerOn,
+hil_core::words! {
+    /// What starts the first session.
+    pub enum StartMode {
+        /// A request to the motion server.
+        Request = "request",
+        /// The program by itself, from the robot's start.
+        PowerOn = "power-on",
+    }
 }
 
-/// What the program does when a session ended by itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum RestartPolicy {
-    /// Starts the next at once; setting it up takes `activation_s`.
-    AutoRetry,
-    /// Waits `restart_wait_s` first.
-    WaitThenRestart,
-    /// Goes idle until a request starts the next.
-    ExternalTrigger,
-    /// Moves to the home posture first.
-    GoHomeFirst,
+hil_core::words! {
+    /// What the program does when a session ended by itself.
+    pub enum RestartPolicy {
+        /// Starts the next at once; setting it up takes `activation_s`.
+        AutoRetry = "auto_retry",
+        /// Waits `restart_wait_s` first.
+        WaitThenRestart = "wait_then_restart",
+        /// Goes idle until a request starts the next.
+        ExternalTrigger = "external_trigger",
+        /// Moves to the home posture first.
+        GoHomeFirst = "go_home_first",
+    }
 }
 
-/// Whose program starts guided motion by itself with [`StartMode::PowerOn`]. The other arm stands
-/// still until a request moves it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum GuidedArms {
-    /// Both arms'.
-    Both,
-    /// The right arm's.
-    Right,
-    /// The left arm's.
-    Left,
+hil_core::words! {
+    /// Whose program starts guided motion by itself with [`StartMode::PowerOn`]. The other arm stands
+    /// still until a request moves it.
+    pub enum GuidedArms {
+        /// Both arms'.
+        Both = "both",
+        /// The right arm's.
+        Right = "right",
+        /// The left arm's.
+        Left = "left",
+    }
 }
 
 impl GuidedArms {
@@ -98,21 +99,17 @@ impl GuidedArms {
 /// default, range, and what becomes of it in SI units. Gives [`EgmParameters`], [`ControllerSettings`]
 /// and what leads from one to the other.
 macro_rules! settings {
-    ($($(#[doc = $about:literal])+ $(#[serde($($serde:tt)+)])? $key:ident: $kind:ty = $abb:expr
+    ($($(#[doc = $about:literal])+ $key:ident: $kind:ty = $abb:expr
         $(, in $allowed:expr)?, as $field:ident: $si:ty = $convert:expr;)+) => {
-        /// `[case.parameters.egm]`. A key left out takes the preset's value; written out again, every
-        /// key in force is there, see [`EgmParameters::spelled_out`].
-        #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-        #[serde(deny_unknown_fields, default, remote = "Self")]
-        pub struct EgmParameters {
-            /// Where the other keys come from.
-            pub preset: Preset,
-            $(
-                $(#[doc = $about])+
-                $(#[doc = concat!("\n\nAllowed: `", stringify!($allowed), "`.")])?
-                $(#[serde($($serde)+)])?
-                pub $key: Option<$kind>,
-            )+
+        hil_core::options! {
+            /// `[case.parameters.egm]`. A key left out takes the preset's value; written out again, every
+            /// key in force is there, see [`EgmParameters::spelled_out`].
+            #[serde(remote = "Self")]
+            pub struct EgmParameters {
+                /// Where the other keys come from.
+                preset: Preset = Preset::Paper;
+                $($(#[doc = $about])+ $key: Option<$kind> $(, in $allowed)?;)+
+            }
         }
 
         /// The settings in force: a preset and what the keys changed. SI units and radians.
@@ -127,7 +124,7 @@ macro_rules! settings {
         mod allowed {
             use super::{DELAY_CYCLES_MAX, RangeInclusive};
 
-            $($(pub(super) const $key: RangeInclusive<f64> = $allowed;)?)+
+            $($(pub(super) const $key: RangeInclusive<$kind> = $allowed;)?)+
         }
 
         impl EgmParameters {
@@ -146,12 +143,11 @@ macro_rules! settings {
             }
 
             /// The settings of a set of parameters that states every key.
-            fn converted(&self) -> Result<ControllerSettings, ParameterError> {
+            fn converted(&self) -> ControllerSettings {
                 const STATED: &str = "a preset states every key";
-                $($(check("egm.", stringify!($key), self.$key.map(f64::from), &$allowed)?;)?)+
-                Ok(ControllerSettings {
+                ControllerSettings {
                     $($field: $convert(self.$key.expect(STATED)),)+
-                })
+                }
             }
         }
     };
@@ -163,7 +159,7 @@ settings! {
     /// Queue policy.
     queue: QueuePolicy = QueuePolicy::Fifo1, as queue: QueuePolicy = as_is;
     /// Commands the queue holds; further ones are dropped and counted.
-    queue_capacity: u32 = 1000, in 1.0..=100_000.0, as queue_capacity: usize = whole;
+    queue_capacity: u32 = 1000, in 1..=100_000, as queue_capacity: usize = whole;
     /// Default Proportional Position Gain, 1/s.
     position_gain_per_s: f64 = 5.0, in 0.0..=20.0, as position_gain_per_s: f64 = as_is;
     /// Default Low Pass Filter Bandwidth, Hz; 0 switches it off.
@@ -196,13 +192,12 @@ settings! {
     /// What follows a session that ended by itself.
     restart: RestartPolicy = RestartPolicy::AutoRetry, as restart: RestartPolicy = as_is;
     /// Wait of `wait_then_restart`, s; refused with a policy that never waits.
-    #[serde(skip_serializing_if = "Option::is_none")]
     restart_wait_s: f64 = 1.0, in 0.0..=60.0, as restart_wait_s: f64 = as_is;
     /// How long setting a session up takes (fine point, synchronisation, set-up), s.
     activation_s: f64 = 0.5, in 0.0..=60.0, as activation_s: f64 = as_is;
     /// Cycles by which the measured joints lag the planned ones: the maker's control lag of 10 to
     /// 20 ms, filtering level included.
-    control_delay_cycles: u32 = 4, in 0.0..=DELAY_CYCLES_MAX as f64,
+    control_delay_cycles: u32 = 4, in 0..=DELAY_CYCLES_MAX as u32,
         as control_delay_cycles: usize = whole;
 }
 
@@ -225,32 +220,22 @@ macro_rules! start_settings {
             pub const KEEP: Self = Self { $($field: f64::NAN,)+ };
         }
 
-        /// `[case.parameters.egm_start]`: what the controller asks the robot to change when it asks for
-        /// guided motion. A key left out keeps the robot's setting; ranges are those of
-        /// [`EgmParameters`].
-        #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-        #[serde(deny_unknown_fields, default)]
-        pub struct EgmStartRequest {
-            $(
-                #[doc = concat!("See [`EgmParameters::", stringify!($key), "`].")]
-                #[serde(skip_serializing_if = "Option::is_none")]
-                pub $key: Option<f64>,
-            )+
+        hil_core::options! {
+            /// `[case.parameters.egm_start]`: what the controller asks the robot to change when it asks for
+            /// guided motion. A key left out keeps the robot's setting; ranges are those of
+            /// [`EgmParameters`].
+            pub struct EgmStartRequest {
+                $(
+                    /// For this session, in place of the robot's setting of this name.
+                    $key: Option<f64>, in allowed::$key;
+                )+
+            }
         }
 
         impl EgmStartRequest {
             /// As it travels; a key left out is NaN.
             pub fn message(&self) -> EgmStartParameters {
                 EgmStartParameters { $($field: self.$key.map_or(f64::NAN, $unit.to_si),)+ }
-            }
-
-            /// Checks the keys as if the robot had them: its ranges are the same.
-            ///
-            /// # Errors
-            /// The first key outside its range, as `egm_start.<key>`.
-            pub fn check(&self) -> Result<(), ParameterError> {
-                $(check("egm_start.", stringify!($key), self.$key, &allowed::$key)?;)+
-                Ok(())
             }
         }
 
@@ -321,17 +306,6 @@ impl Unit {
     }
 }
 
-fn check(
-    table: &str,
-    key: &str,
-    value: Option<f64>,
-    allowed: &RangeInclusive<f64>,
-) -> Result<(), ParameterError> {
-    value.map_or(Ok(()), |value| {
-        ParameterError::check_range(table, key, value, allowed.clone())
-    })
-}
-
 const fn as_is<T: Copy>(value: T) -> T {
     value
 }
@@ -346,12 +320,8 @@ const fn whole(count: u32) -> usize {
 
 impl ControllerSettings {
     /// The settings of a preset.
-    ///
-    /// # Panics
-    /// Never: the presets are within their ranges.
     pub fn of(preset: Preset) -> Self {
-        let settings = EgmParameters::of(preset).converted();
-        settings.expect("presets are within their ranges")
+        EgmParameters::of(preset).converted()
     }
 }
 
@@ -419,18 +389,16 @@ impl EgmParameters {
     /// The settings in force: the preset's, where no key changes them.
     ///
     /// # Errors
-    /// The first key outside its range, as `egm.<key>`.
-    ///
-    /// # Panics
-    /// Not with the presets of this file, each of which states every key.
+    /// The first key outside its range.
     pub fn settings(&self) -> Result<ControllerSettings, ParameterError> {
-        let settings = self.or(&Self::of(self.preset)).converted()?;
+        self.check()?;
+        let settings = self.or(&Self::of(self.preset)).converted();
         if let Some(wait_s) = self.restart_wait_s
             && settings.restart != RestartPolicy::WaitThenRestart
         {
             let problem =
-                format!("{wait_s} has no effect: it needs egm.restart = \"wait_then_restart\"");
-            return Err(ParameterError::new("egm.restart_wait_s", problem));
+                format!("{wait_s} has no effect: it needs restart = \"wait_then_restart\"");
+            return Err(ParameterError::new("restart_wait_s", problem));
         }
         Ok(settings)
     }

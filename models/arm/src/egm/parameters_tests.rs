@@ -82,7 +82,7 @@ fn each_number_outside_its_range_is_refused_by_its_key() {
                 continue;
             }
             let error = with(&key, value).unwrap_err();
-            assert_eq!(error.key, format!("egm.{}", key.name));
+            assert_eq!(error.key, key.name);
             assert!(error.to_string().contains(" to "), "{error}");
         }
     }
@@ -252,7 +252,7 @@ fn a_wait_is_refused_where_nothing_waits() {
             ..EgmParameters::default()
         };
         let error = parameters.settings().unwrap_err();
-        assert_eq!(error.key, "egm.restart_wait_s");
+        assert_eq!(error.key, "restart_wait_s");
         assert!(error.problem.contains("wait_then_restart"), "{error}");
     }
 }

@@ -2,31 +2,29 @@
 
 use core::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
 use crate::coordinator::policy::PolicyName;
 use crate::coordinator::safe::SafeParameters;
 use crate::messages::MessageOrder;
-use hil_core::case_study::ParameterError;
 
-/// Which rules give robots their way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum CoordinatorMode {
-    /// The original's: orders are believed delivered.
-    #[default]
-    Legacy,
-    /// Acknowledged movement authority.
-    Safe,
+hil_core::words! {
+    /// Which rules give robots their way.
+    #[derive(Default)]
+    pub enum CoordinatorMode {
+        /// The original's: orders are believed delivered.
+        #[default]
+        Legacy = "legacy",
+        /// Acknowledged movement authority.
+        Safe = "safe",
+    }
 }
 
-hil_core::parameters! {
+hil_core::options! {
     /// `[case.parameters.coordinator]`.
-    pub struct CoordinatorParameters in "coordinator." {
+    pub struct CoordinatorParameters {
         /// The rules.
-        mode: CoordinatorMode = CoordinatorMode::default();
+        mode: CoordinatorMode = CoordinatorMode::Legacy;
         /// Who goes first when both could wait.
-        policy: PolicyName = PolicyName::default();
+        policy: PolicyName = PolicyName::ClosestFirst;
         /// Control period, ms.
         control_period_ms: f64 = 1000.0, in 10.0..=60_000.0;
         /// Largest message delay the coordinator reckons with, ms; the channel's may differ.
@@ -34,27 +32,23 @@ hil_core::parameters! {
         /// Tracking period of the robots it reckons with, ms.
         tracking_period_ms: f64 = 30.0, in 1.0..=10_000.0;
         /// Copies sent of every authority.
-        replicas: u32 = 1, in 1.0..=10.0;
+        replicas: u32 = 1, in 1..=10;
         /// How states that overtook each other are taken.
-        message_order: MessageOrder = MessageOrder::default();
+        message_order: MessageOrder = MessageOrder::Legacy;
         /// Path poses kept between a wait point and the section.
-        trailing_points: u32 = 3, in 0.0..=100.0;
+        trailing_points: u32 = 3, in 0..=100;
         /// Missions begun per control period.
-        missions_per_cycle: u32 = 1, in 1.0..=1000.0;
+        missions_per_cycle: u32 = 1, in 1..=1000;
         /// Time without way after which a robot is put at its goal, s.
         stuck_after_s: f64 = 120.0, in 1.0..=100_000.0;
         /// Reverse orders to break up cycles of waiting robots.
         break_deadlocks: bool = true;
         /// What only the safe mode needs.
-        safe: SafeParameters = SafeParameters::default();
-    } check check_safe;
+        safe: SafeParameters;
+    }
 }
 
 impl CoordinatorParameters {
-    fn check_safe(&self) -> Result<(), ParameterError> {
-        self.safe.check()
-    }
-
     /// Tc.
     pub fn control_period(&self) -> Duration {
         milliseconds(self.control_period_ms)
@@ -93,17 +87,8 @@ mod tests {
             let text = parameters.check().unwrap_err().to_string();
             assert!(text.contains(expected), "{text}");
         };
-        check(
-            |p| p.replicas = 11,
-            "coordinator.replicas 11 is outside 1 to 10",
-        );
-        check(
-            |p| p.known_delay_ms = f64::NAN,
-            "coordinator.known_delay_ms NaN",
-        );
-        check(
-            |p| p.control_period_ms = 0.0,
-            "coordinator.control_period_ms 0",
-        );
+        check(|p| p.replicas = 11, "replicas 11 is outside 1 to 10");
+        check(|p| p.known_delay_ms = f64::NAN, "known_delay_ms NaN");
+        check(|p| p.control_period_ms = 0.0, "control_period_ms 0");
     }
 }

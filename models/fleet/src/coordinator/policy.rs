@@ -4,8 +4,6 @@
 use core::cmp::Ordering;
 use core::fmt::Debug;
 
-use serde::{Deserialize, Serialize};
-
 use crate::section::{Section, Side};
 use hil_core::time::Instant;
 
@@ -63,19 +61,20 @@ pub trait OrderingPolicy: Debug {
     fn compare(&self, contest: &Contest<'_>) -> Ordering;
 }
 
-/// The policies that a topology file can name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum PolicyName {
-    /// [`ClosestFirst`].
-    #[default]
-    ClosestFirst,
-    /// [`FirstCome`].
-    FirstCome,
-    /// [`LongestQueue`].
-    LongestQueue,
-    /// [`QuickestThrough`].
-    QuickestThrough,
+hil_core::words! {
+    /// The policies that a topology file can name.
+    #[derive(Default)]
+    pub enum PolicyName {
+        /// [`ClosestFirst`].
+        #[default]
+        ClosestFirst = "closest-first",
+        /// [`FirstCome`].
+        FirstCome = "first-come",
+        /// [`LongestQueue`].
+        LongestQueue = "longest-queue",
+        /// [`QuickestThrough`].
+        QuickestThrough = "quickest-through",
+    }
 }
 
 impl PolicyName {

@@ -518,9 +518,10 @@ impl Setup {
     /// # Errors
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
-        self.robot.check()?;
-        self.coordinator.check()?;
-        self.missions.check()?;
+        let below = |table| move |error: ParameterError| error.below(table);
+        self.robot.check().map_err(below("robot"))?;
+        self.coordinator.check().map_err(below("coordinator"))?;
+        self.missions.check().map_err(below("missions"))?;
         if let Some(wifi) = &self.links.wifi {
             wifi.check()?;
         }

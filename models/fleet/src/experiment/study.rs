@@ -1,7 +1,7 @@
 //! The study `hil-runtime tables` runs for the fleet case: every cell cut into tasks with seeds of
 //! their own. What the tables look like is in `report`.
 
-use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 
 use crate::case::FleetParameters;
 use crate::experiment::cells::{
@@ -17,62 +17,40 @@ use hil_core::study::{Study, StudyReport, Watch};
 use hil_core::time::Instant;
 use hil_link::impaired::DelayLaw;
 
-/// Which tables.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum TablePart {
-    /// Tables II and III of the seed paper.
-    Published,
-    /// What each impairment does to each coordinator.
-    Mechanisms,
-}
-
-/// `[case.parameters.tables]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct TableParameters {
-    /// Critical sections per cell, 1..=1000000000.
-    pub sections: u64,
-    /// Critical sections per task, 100..=1000000: a cell is cut into independent runs of so many.
-    pub sections_per_task: u64,
+hil_core::words! {
     /// Which tables.
-    pub parts: Vec<TablePart>,
-    /// How the static rows' delay is drawn.
-    pub delay_law: DelayLaw,
-    /// Only cells whose name contains one of these; empty for all.
-    pub cells: Vec<String>,
-}
-
-impl Default for TableParameters {
-    fn default() -> Self {
-        Self {
-            sections: 10_000,
-            sections_per_task: 5_000,
-            parts: vec![TablePart::Published, TablePart::Mechanisms],
-            delay_law: DelayLaw::Constant,
-            cells: Vec::new(),
-        }
+    pub enum TablePart {
+        /// Tables II and III of the seed paper.
+        Published = "published",
+        /// What each impairment does to each coordinator.
+        Mechanisms = "mechanisms",
     }
 }
 
+hil_core::options! {
+    /// `[case.parameters.tables]`.
+    pub struct TableParameters {
+        /// Critical sections per cell.
+        sections: u64 = 10_000, in 1..=1_000_000_000;
+        /// Critical sections per task: a cell is cut into independent runs of so many.
+        sections_per_task: u64 = 5_000, in 100..=1_000_000;
+        /// Which tables.
+        parts: Cow<'static, [TablePart]> = Cow::Borrowed(&TablePart::ALL);
+        /// How the static rows' delay is drawn.
+        delay_law: DelayLaw = DelayLaw::Constant;
+        /// Only cells whose name contains one of these; empty for all.
+        cells: Vec<String> = Vec::new();
+    }
+    check TableParameters::check_parts;
+}
+
 impl TableParameters {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// The first key outside its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
+    fn check_parts(&self) -> Result<(), ParameterError> {
         if self.parts.is_empty() {
             let problem = "[] leaves nothing to compute; name published, mechanisms or both";
-            return Err(ParameterError::new("tables.parts", problem));
+            return Err(ParameterError::new("parts", problem));
         }
-        let (all, each) = (self.sections as f64, self.sections_per_task as f64);
-        ParameterError::check("tables.sections", all, 1.0..=1e9, "1 to 1000000000")?;
-        ParameterError::check(
-            "tables.sections_per_task",
-            each,
-            100.0..=1e6,
-            "100 to 1000000",
-        )
+        Ok(())
     }
 }
 
@@ -115,7 +93,7 @@ impl FleetStudy {
             ..Setup::default()
         };
         let mut cells = Vec::new();
-        for part in &tables.parts {
+        for part in tables.parts.iter() {
             cells.extend(match part {
                 TablePart::Published => published_cells(&base, tables.delay_law),
                 TablePart::Mechanisms => mechanism_cells(&base),

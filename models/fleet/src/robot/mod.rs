@@ -14,7 +14,7 @@ mod tracker;
 use core::time::Duration;
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use crate::geometry::{Pose, floor_index};
 use crate::messages::{
@@ -570,20 +570,21 @@ impl RobotCounters {
     }
 }
 
-/// How a robot follows its path.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum TrackerKind {
-    /// Piecewise constant acceleration in closed form; stops at its authority without error.
-    #[default]
-    Exact,
-    /// The original's: a numerical integration whose decisions fall on its ticks.
-    LegacyRk4,
+hil_core::words! {
+    /// How a robot follows its path.
+    #[derive(Default)]
+    pub enum TrackerKind {
+        /// Piecewise constant acceleration in closed form; stops at its authority without error.
+        #[default]
+        Exact = "exact",
+        /// The original's: a numerical integration whose decisions fall on its ticks.
+        LegacyRk4 = "legacy-rk4",
+    }
 }
 
-hil_core::parameters! {
+hil_core::options! {
     /// `[case.parameters.robot]`.
-    pub struct RobotParameters in "robot." {
+    pub struct RobotParameters {
         /// How a robot follows its path.
         tracker: TrackerKind = TrackerKind::Exact;
         /// From tick to tick, and so from state to state, of a robot under way, ms.
@@ -648,9 +649,9 @@ mod parameters_tests {
             change(&mut parameters);
             assert_eq!(parameters.check().unwrap_err().key, key);
         };
-        check("robot.tracking_period_ms", |p| p.tracking_period_ms = 0.0);
-        check("robot.parked_period_ms", |p| p.parked_period_ms = f64::NAN);
-        check("robot.inflation_delay_ms", |p| p.inflation_delay_ms = -1.0);
+        check("tracking_period_ms", |p| p.tracking_period_ms = 0.0);
+        check("parked_period_ms", |p| p.parked_period_ms = f64::NAN);
+        check("inflation_delay_ms", |p| p.inflation_delay_ms = -1.0);
         assert_eq!(RobotParameters::default().check(), Ok(()));
     }
 

@@ -50,7 +50,6 @@ const SHORT_RANGE_OUTAGES: Outages = Outages {
 options! {
     /// A Wi-Fi 6 link between two stations. The defaults are the preset `wifi6-short-range`.
     #[derive(Copy)]
-    #[serde(default)]
     pub struct WifiSpec as short {
         /// Distance of the two radios, m.
         distance_m: f64 = 20.0, in 1.0..=300.0;
@@ -118,12 +117,6 @@ options! {
         outages: Outages = SHORT_RANGE_OUTAGES;
     }
     check WifiSpec::check_fit;
-}
-
-impl Default for WifiSpec {
-    fn default() -> Self {
-        Self::TEMPLATE
-    }
 }
 
 impl WifiSpec {

@@ -1,8 +1,6 @@
 //! The study `hil-runtime tables` runs for the teleoperation case: every condition with every seed.
 //! What the table looks like is in `report`.
 
-use serde::{Deserialize, Serialize};
-
 use crate::experiment::conditions::{Condition, base, conditions};
 use crate::experiment::drive::{Tally, drive};
 use crate::experiment::report::{self, Row};
@@ -124,38 +122,16 @@ impl Study for MotionLossStudy {
     }
 }
 
-/// `[case.parameters.tables]`: the size of what `hil-runtime tables` and `calibrate` compute.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct TableParameters {
-    /// Motion loops per run, 5..=2000; the seed paper played 890.
-    pub loops: u32,
-    /// Runs per condition, each with a seed of its own, 1..=1000.
-    pub seeds: u32,
-    /// Only conditions whose name contains one of these, each of which must be part of one; empty
-    /// for all.
-    pub conditions: Vec<String>,
-}
-
-impl Default for TableParameters {
-    fn default() -> Self {
-        Self {
-            loops: 890,
-            seeds: 12,
-            conditions: Vec::new(),
-        }
-    }
-}
-
-impl TableParameters {
-    /// Checks every number against its range.
-    ///
-    /// # Errors
-    /// The first key outside its range.
-    pub fn check(&self) -> Result<(), ParameterError> {
-        let (loops, seeds) = (f64::from(self.loops), f64::from(self.seeds));
-        ParameterError::check("tables.loops", loops, 5.0..=2000.0, "5 to 2000")?;
-        ParameterError::check("tables.seeds", seeds, 1.0..=1000.0, "1 to 1000")
+hil_core::options! {
+    /// `[case.parameters.tables]`: the size of what `hil-runtime tables` and `calibrate` compute.
+    pub struct TableParameters {
+        /// Motion loops per run; the seed paper played 890.
+        loops: u32 = 890, in 5..=2000;
+        /// Runs per condition, each with a seed of its own.
+        seeds: u32 = 12, in 1..=1000;
+        /// Only conditions whose name contains one of these, each of which must be part of one; empty
+        /// for all.
+        conditions: Vec<String> = Vec::new();
     }
 }
 
@@ -170,9 +146,9 @@ mod parameters_tests {
             change(&mut parameters);
             parameters.check().unwrap_err().key
         };
-        assert_eq!(refused(|p| p.loops = 4), "tables.loops");
-        assert_eq!(refused(|p| p.loops = 2001), "tables.loops");
-        assert_eq!(refused(|p| p.seeds = 0), "tables.seeds");
+        assert_eq!(refused(|p| p.loops = 4), "loops");
+        assert_eq!(refused(|p| p.loops = 2001), "loops");
+        assert_eq!(refused(|p| p.seeds = 0), "seeds");
         assert_eq!(TableParameters::default().check(), Ok(()));
     }
 }

@@ -36,12 +36,6 @@ struct DelayKey {
     metric: usize,
 }
 
-/// A delay of one run, nanoseconds.
-#[derive(Debug, Clone, Copy)]
-struct RunDelay {
-    estimate: Estimate,
-}
-
 const METRICS: [&str; 4] = ["p50", "p99", "p99.9", "max"];
 
 /// So many runs of the base, and so many new ones.
@@ -120,7 +114,7 @@ fn accounts(run: &ComparedRun) -> impl Iterator<Item = (&str, &ChannelAccount)> 
 }
 
 /// Every delay of a run, in nanoseconds.
-fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, RunDelay> {
+fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, Estimate> {
     let mut found = BTreeMap::new();
     for (channel, account) in accounts(run) {
         let mut add = |part, distribution: &Distribution, own| {
@@ -148,24 +142,22 @@ fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, RunDelay> {
 }
 
 /// The delays of [`METRICS`], each with its `own` interval.
-fn run_delays(figures: &LatencySummary, own: [Option<Spread>; 4]) -> [RunDelay; 4] {
+fn run_delays(figures: &LatencySummary, own: [Option<Spread>; 4]) -> [Estimate; 4] {
     let values = [
         figures.p50_ns,
         figures.p99_ns,
         figures.p999_ns,
         figures.max_ns,
     ];
-    core::array::from_fn(|metric| RunDelay {
-        estimate: Estimate {
-            value: values[metric] as f64,
-            interval: own[metric].and_then(Spread::known),
-        },
+    core::array::from_fn(|metric| Estimate {
+        value: values[metric] as f64,
+        interval: own[metric].and_then(Spread::known),
     })
 }
 
 fn delays(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
     let collect = |runs: &[ComparedRun]| {
-        let mut all: BTreeMap<DelayKey, Vec<RunDelay>> = BTreeMap::new();
+        let mut all: BTreeMap<DelayKey, Vec<Estimate>> = BTreeMap::new();
         for (key, one) in runs.iter().flat_map(delays_of) {
             all.entry(key).or_default().push(one);
         }
@@ -183,44 +175,43 @@ fn delays(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
         .collect()
 }
 
-fn delay_figure(key: &DelayKey, base: &[RunDelay], new: &[RunDelay], of: Counts) -> ComparedMetric {
-    let b = of_all(geometric(base), base.len(), of[0]);
-    let n = of_all(geometric(new), new.len(), of[1]);
-    let both = b.zip(n);
-    let (interval, method) = match both {
-        None => (None, ABSENT),
-        Some(_) if is_partial([base.len(), new.len()], of) => (None, PARTIAL),
-        Some((b, n)) => delay_interval(base, new, b, n, METRICS[key.metric]),
+fn delay_figure(key: &DelayKey, base: &[Estimate], new: &[Estimate], of: Counts) -> ComparedMetric {
+    let metric = METRICS[key.metric];
+    let have = [base.len(), new.len()];
+    let sides = [geometric(base), geometric(new)];
+    let figure = figure(ChartKind::Delay, metric, sides, have, of);
+    let both = figure.base.zip(figure.new);
+    let both = both.filter(|_| have.contains(&1));
+    let repeated = welch(&logarithms(base), &logarithms(new), CONFIDENCE);
+    let method = if have == [1, 1] { RANKS } else { MIXED };
+    let none = if metric == "max" {
+        NO_MAXIMUM
+    } else {
+        NO_INTERVAL
     };
-    let is_repeated = base.len() > 1 && new.len() > 1;
+    let own = both.and_then(|(b, n)| ratio(b, n));
+    let (interval, method) = figure.tested(of, repeated.and_then(exponential), own, [method, none]);
     ComparedMetric {
         channel: Some(key.channel.clone()),
         part: Some(key.part),
         unit: "ns".to_owned(),
         ratio_interval: interval,
-        difference_interval: both
-            .filter(|_| !is_repeated)
-            .and_then(|(b, n)| difference(b, n)),
+        difference_interval: both.and_then(|(b, n)| difference(b, n)),
         verdict: verdict(interval, 1.0, [Verdict::Faster, Verdict::Slower]),
         method: method.to_owned(),
-        ..figure(
-            ChartKind::Delay,
-            METRICS[key.metric],
-            b,
-            n,
-            [base.len(), new.len()],
-        )
+        ..figure
     }
 }
 
-/// What two sides come to in every figure, of which `have` runs have it.
+/// What two sides come to in every figure, of which `have` of their runs have it.
 fn figure(
     kind: ChartKind,
     metric: &str,
-    base: Option<Estimate>,
-    new: Option<Estimate>,
+    sides: [Option<Estimate>; 2],
     have: Counts,
+    of: Counts,
 ) -> ComparedMetric {
+    let [base, new] = [0, 1].map(|side| of_all(sides[side], have[side], of[side]));
     let both = base.zip(new);
     ComparedMetric {
         channel: None,
@@ -242,33 +233,30 @@ fn figure(
     }
 }
 
-/// The interval of the ratio, and how it came about or why there is none.
-fn delay_interval(
-    base: &[RunDelay],
-    new: &[RunDelay],
-    b: Estimate,
-    n: Estimate,
-    metric: &str,
-) -> (Option<Interval>, &'static str) {
-    let repeated_count = [base, new].iter().filter(|side| side.len() > 1).count();
-    let (found, method) = match repeated_count {
-        2 => {
-            let spread = welch(&logarithms(base), &logarithms(new), CONFIDENCE);
-            (spread.and_then(exponential), REPETITIONS)
+impl ComparedMetric {
+    /// The interval that it gets and how that came about, or why there is none: the repetitions', else that
+    /// of its `own` intervals, by the first method; the second text is for where there is neither.
+    fn tested(
+        &self,
+        of: Counts,
+        repeated: Option<Interval>,
+        own: Option<Interval>,
+        [method, none]: [&'static str; 2],
+    ) -> (Option<Interval>, &'static str) {
+        let have = [self.base_count, self.new_count];
+        match (repeated, own) {
+            _ if self.difference.is_none() => (None, ABSENT),
+            _ if is_partial(have, of) => (None, PARTIAL),
+            (Some(_), _) => (repeated, REPETITIONS),
+            (None, Some(_)) => (own, method),
+            (None, None) if have.iter().all(|count| *count > 1) => (None, NO_SPREAD),
+            (None, None) => (None, none),
         }
-        1 => (ratio(b, n), MIXED),
-        _ => (ratio(b, n), RANKS),
-    };
-    match (found, repeated_count) {
-        (Some(_), _) => (found, method),
-        (None, 2) => (None, NO_SPREAD),
-        (None, _) if metric == "max" => (None, NO_MAXIMUM),
-        (None, _) => (None, NO_INTERVAL),
     }
 }
 
-fn logarithms(side: &[RunDelay]) -> Vec<f64> {
-    side.iter().map(|one| one.estimate.value.ln()).collect()
+fn logarithms(side: &[Estimate]) -> Vec<f64> {
+    side.iter().map(|one| one.value.ln()).collect()
 }
 
 /// Back from an interval of logarithms; `None` where that cannot be written as a number.
@@ -278,20 +266,25 @@ fn exponential(one: Interval) -> Option<Interval> {
     is_known.then_some(Interval { low, high, ..one })
 }
 
+/// The mean with Student's interval; `None` of nothing.
+fn mean(values: &[f64]) -> Option<Estimate> {
+    (!values.is_empty()).then(|| Estimate {
+        value: values.iter().sum::<f64>() / values.len() as f64,
+        interval: mean_interval(values, CONFIDENCE),
+    })
+}
+
 /// One run's figure as it is; of several the geometric mean, with Student's interval of the logarithms.
-fn geometric(side: &[RunDelay]) -> Option<Estimate> {
-    match side {
-        [] => None,
-        [only] => Some(only.estimate),
-        several => {
-            let logs = logarithms(several);
-            let value = (logs.iter().sum::<f64>() / logs.len() as f64).exp();
-            value.is_finite().then(|| Estimate {
-                value,
-                interval: mean_interval(&logs, CONFIDENCE).and_then(exponential),
-            })
-        }
+fn geometric(side: &[Estimate]) -> Option<Estimate> {
+    if let [only] = side {
+        return Some(*only);
     }
+    let logarithm = mean(&logarithms(side))?;
+    let value = logarithm.value.exp();
+    value.is_finite().then(|| Estimate {
+        value,
+        interval: logarithm.interval.and_then(exponential),
+    })
 }
 
 fn verdict(interval: Option<Interval>, none: f64, [below, above]: [Verdict; 2]) -> Verdict {
@@ -378,8 +371,8 @@ fn mean_share(side: &[RunLoss]) -> Option<Estimate> {
         _ => mean_interval(&values, CONFIDENCE).map(|found| found.map(|end| end.clamp(0.0, 1.0))),
     };
     Some(Estimate {
-        value: values.iter().sum::<f64>() / values.len() as f64,
         interval,
+        ..mean(&values)?
     })
 }
 
@@ -389,27 +382,21 @@ fn values_of(side: &[RunLoss]) -> Vec<f64> {
 
 fn loss_figure(channel: &str, base: &[RunLoss], new: &[RunLoss], of: Counts) -> ComparedMetric {
     let have = [base.len(), new.len()];
-    let be = of_all(mean_share(base), have[0], of[0]);
-    let ne = of_all(mean_share(new), have[1], of[1]);
-    let both = be.zip(ne);
+    let sides = [mean_share(base), mean_share(new)];
+    let figure = figure(ChartKind::Loss, "loss", sides, have, of);
     let repeated = welch(&values_of(base), &values_of(new), CONFIDENCE);
-    let own = both.and_then(|(b, n)| difference(b, n));
     let is_lossless = base.iter().chain(new).all(|one| one.share.count == 0);
-    let (interval, method) = match (both, repeated, own) {
-        (None, ..) => (None, ABSENT),
-        (Some(_), ..) if is_partial(have, of) => (None, PARTIAL),
-        (_, Some(found), _) => (Some(found), REPETITIONS),
-        (_, None, Some(found)) if have == [1, 1] || is_lossless => (Some(found), EFFECTIVE),
-        (_, None, Some(found)) => (Some(found), MIXED),
-        (_, None, None) if have.iter().all(|count| *count > 1) => (None, NO_SPREAD),
-        (_, None, None) => (None, NO_INTERVAL),
-    };
+    let is_own = have == [1, 1] || is_lossless;
+    let method = if is_own { EFFECTIVE } else { MIXED };
+    let both = figure.base.zip(figure.new);
+    let own = both.and_then(|(b, n)| difference(b, n));
+    let (interval, method) = figure.tested(of, repeated, own, [method, NO_INTERVAL]);
     ComparedMetric {
         channel: Some(channel.to_owned()),
         difference_interval: interval,
         verdict: verdict(interval, 0.0, [Verdict::LosesLess, Verdict::LosesMore]),
         method: method.to_owned(),
-        ..figure(ChartKind::Loss, "loss", be, ne, [base.len(), new.len()])
+        ..figure
     }
 }
 
@@ -429,21 +416,13 @@ fn scores(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
 fn score_figure(metric: &ScoreMetric, base: &[ComparedRun], new: &[ComparedRun]) -> ComparedMetric {
     let (bs, ns) = (scores_of(metric, base), scores_of(metric, new));
     let (have, of) = ([bs.len(), ns.len()], [base.len(), new.len()]);
-    let b = of_all(mean_score(&bs), have[0], of[0]);
-    let n = of_all(mean_score(&ns), have[1], of[1]);
-    let both = b.zip(n);
+    let sides = [mean_score(&bs), mean_score(&ns)];
+    let figure = figure(ChartKind::Score, &metric.name, sides, have, of);
     let repeated = welch(&plain(&bs), &plain(&ns), CONFIDENCE);
+    let both = figure.base.zip(figure.new);
     let own = both.and_then(|(b, n)| difference(b, n));
-    let repeated_count = have.iter().filter(|count| **count > 1).count();
-    let (interval, method) = match (both, repeated, own) {
-        (None, ..) => (None, ABSENT),
-        (Some(_), ..) if is_partial(have, of) => (None, PARTIAL),
-        (_, Some(found), _) => (Some(found), REPETITIONS),
-        (_, None, Some(found)) if repeated_count > 0 => (Some(found), MIXED),
-        (_, None, Some(found)) => (Some(found), OWN),
-        (_, None, None) if repeated_count == 2 => (None, NO_SPREAD),
-        (_, None, None) => (None, NO_OWN),
-    };
+    let method = if have == [1, 1] { OWN } else { MIXED };
+    let (interval, method) = figure.tested(of, repeated, own, [method, NO_OWN]);
     ComparedMetric {
         label: metric.label.clone(),
         unit: metric.unit.clone(),
@@ -453,7 +432,7 @@ fn score_figure(metric: &ScoreMetric, base: &[ComparedRun], new: &[ComparedRun])
         difference_interval: interval,
         verdict: verdict(interval, 0.0, [Verdict::Lower, Verdict::Higher]),
         method: method.to_owned(),
-        ..figure(ChartKind::Score, &metric.name, b, n, have)
+        ..figure
     }
 }
 
@@ -477,15 +456,8 @@ fn plain(side: &[Estimate]) -> Vec<f64> {
 /// One run's score as it is; of several the mean with Student's interval.
 fn mean_score(side: &[Estimate]) -> Option<Estimate> {
     match side {
-        [] => None,
         [only] => Some(*only),
-        several => {
-            let values = plain(several);
-            Some(Estimate {
-                value: values.iter().sum::<f64>() / values.len() as f64,
-                interval: mean_interval(&values, CONFIDENCE),
-            })
-        }
+        several => mean(&plain(several)),
     }
 }
 

@@ -74,10 +74,12 @@ impl Run {
         let root = format!("hil-replay-{}-{number}", std::process::id());
         let folder = RunFolder::existing(&std::env::temp_dir().join(root));
         fs::create_dir_all(folder.records()).unwrap();
-        let manifest = json!({ "topology": {
-            "run": { "seed": 7 },
-            "case": { "name": case, "parameters": { "gain_per_s": 2.5 } },
-        }});
+        let manifest = json!({
+            "schema_version": 1,
+            "program": { "name": "hil-runtime", "version": "1" },
+            "seed": 7,
+            "topology": { "case": { "name": case, "parameters": { "gain_per_s": 2.5 } } },
+        });
         fs::write(folder.manifest(), manifest.to_string()).unwrap();
         Self { folder }
     }
@@ -138,7 +140,7 @@ fn a_run_that_comes_out_the_same_is_identical() {
         text.contains("  compared          5 messages, none differs\n"),
         "{text}"
     );
-    let value: Value = serde_json::from_str(&replayed.json()).unwrap();
+    let value: serde_json::Value = serde_json::from_str(&replayed.json()).unwrap();
     assert_eq!(value["is_identical"], true);
     assert_eq!(value["replay"]["compared_count"], 5);
 }
@@ -194,7 +196,10 @@ fn what_cannot_be_replayed_is_said_to_be_so() {
     assert_eq!(error(&Run::of("submarine")), unknown);
     fs::remove_file(run.folder.manifest()).unwrap();
     assert!(error(&run).contains("manifest.json: not a run's folder: "));
-    let manifest = json!({ "topology": { "run": { "seed": 7 } } });
+    let manifest = json!({
+        "schema_version": 1,
+        "program": { "name": "hil-runtime", "version": "1" },
+    });
     fs::write(run.folder.manifest(), manifest.to_string()).unwrap();
     assert_eq!(
         error(&run),

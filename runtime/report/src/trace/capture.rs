@@ -6,6 +6,7 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
+use hil_link::spec::Way;
 use hil_trace::from_records::{TraceChannel, each_traced, link_trace};
 use hil_trace::wire::TraceEncoder;
 use hil_trace::{TraceArrival, TraceDirection, TraceHeader, TraceRecord, UNAVAILABLE_NS};
@@ -16,7 +17,7 @@ use crate::summary::{Fact, RunSummary};
 use hil_rundir::file_fault::FileFault;
 use hil_rundir::run_result::RunResult;
 use hil_topology::trace_source::file_name;
-use hil_topology::{Crossing, Direction, Via};
+use hil_topology::{Crossing, Via};
 
 /// What a trace of clocks without a relation says of them.
 pub(crate) const NOT_ALIGNED: &str = "clocks not aligned";
@@ -190,8 +191,8 @@ fn header(result: &RunResult, crossing: &Crossing<'_>, has_delay: bool) -> Trace
         link: cut(&crossing.link.name, TraceHeader::LINK_BYTES),
         clock: cut(clock, TraceHeader::CLOCK_BYTES),
         direction: match crossing.direction {
-            Direction::Forward => TraceDirection::Forward,
-            Direction::Backward => TraceDirection::Backward,
+            Way::Forward => TraceDirection::Forward,
+            Way::Backward => TraceDirection::Backward,
         },
         arrival: TraceArrival::Received,
         link_change_count: 0,

@@ -9,10 +9,10 @@ use super::*;
 #[derive(Debug)]
 struct Guided;
 
-#[derive(Debug, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-struct GuidedParameters {
-    egm: EgmParameters,
+hil_core::options! {
+    struct GuidedParameters {
+        egm: EgmParameters;
+    }
 }
 
 impl CaseStudy for Guided {

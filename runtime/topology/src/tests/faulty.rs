@@ -279,7 +279,7 @@ const FAULTY: &[Faulty] = &[
         "rate_hz = 125.0",
         "rate_hz = \"fast\" #!",
         "case.parameters.rate_hz",
-        &["invalid type", "f64"],
+        &["a number"],
     ),
     Faulty(
         "rate_hz = 125.0",
@@ -303,7 +303,7 @@ const FAULTY: &[Faulty] = &[
         "rate_hz = 125.0",
         "servo.cycle_us = true #!",
         "case.parameters.servo.cycle_us",
-        &["invalid type"],
+        &["an integer"],
     ),
     // References.
     Faulty(

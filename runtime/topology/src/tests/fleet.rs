@@ -57,9 +57,9 @@ const FAULTY: &[Faulty] = &[
     ),
     Faulty(
         "[[case.parameters.world.bays]]\nx_m = 3.0",
-        "[[case.parameters.world.bays]] #!\nx_m = nan",
-        "case.parameters.world.bays[0]",
-        "is not finite",
+        "[[case.parameters.world.bays]]\nx_m = nan #!",
+        "case.parameters.world.bays[0].x_m",
+        "the real numbers",
     ),
     Faulty(
         "[[case.parameters.world.bays]]\nx_m = 37.0",

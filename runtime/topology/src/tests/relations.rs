@@ -210,10 +210,13 @@ fn the_outages_of_a_link_are_those_of_both_ways() {
     assert!(spec.is_some_and(|spec| !spec.outages.is_active()));
 }
 
-fn check_with_refusal(table: &toml::Table, seed: u64) -> Result<toml::Table, Vec<ParameterFault>> {
+fn check_with_refusal(
+    read: ReadParameters<'_>,
+    seed: u64,
+) -> Result<Option<toml::Table>, ParameterError> {
     let mut refuse =
         |_: &mut Shuttle| ParameterError::check("gain_per_s", 1.0, 2.0..=3.0, "2 to 3");
-    check_parameters_with::<Shuttle>(table, seed, &mut refuse)
+    check_parameters_with::<Shuttle>(read, seed, &mut refuse)
 }
 
 #[test]

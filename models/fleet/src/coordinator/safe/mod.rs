@@ -396,10 +396,10 @@ fn spacing_min_m(world: &World) -> f64 {
         .fold(f64::INFINITY, f64::min)
 }
 
-hil_core::parameters! {
+hil_core::options! {
     /// `[case.parameters.coordinator.safe]`.
     #[derive(Copy)]
-    pub struct SafeParameters in "coordinator.safe." {
+    pub struct SafeParameters {
         /// How far robots may stop from the end of their authority, m; 0 for the exact
         /// tracker, [`RobotParameters::stop_error_bound_m`](crate::robot::RobotParameters::stop_error_bound_m) for the stepped one.
         stop_error_m: f64 = 0.0, in 0.0..=1000.0;

@@ -7,7 +7,7 @@ use crate::compare::conditions::{Condition, Verdicts};
 use hil_core::interval::IntervalMethod;
 
 fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedMetric {
-    let side = |all: &[f64]| -> Vec<RunDelay> {
+    let side = |all: &[f64]| -> Vec<Estimate> {
         let estimate = |ms: &f64| Estimate {
             value: ms * 1e6,
             interval: Some(Interval::new(
@@ -16,10 +16,7 @@ fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedMetric {
                 IntervalMethod::EffectiveRanks,
             )),
         };
-        let delay = |ms: &f64| RunDelay {
-            estimate: estimate(ms),
-        };
-        all.iter().map(delay).collect()
+        all.iter().map(estimate).collect()
     };
     let key = DelayKey {
         channel: "a/b".to_owned(),

@@ -24,7 +24,7 @@ use crate::live::process;
 use crate::live::robot::RobotWatch;
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::status::{self, Phase, ProcessStatus, RunStatus};
-use hil_topology::{Channel, Direction, Link, Topology};
+use hil_topology::{Channel, Link, Topology};
 
 /// The supervisor tells of its processes twice a second; what is older than this is said to be old.
 const STATUS_AGE_MAX: Duration = Duration::from_secs(2);
@@ -410,12 +410,8 @@ fn condition_words(
     if ordered != LinkCondition::Topology {
         return format!("{ordered}, changed by hand");
     }
-    let is_this_way = |direction: Direction| match way {
-        Way::Forward => direction == Direction::Forward,
-        Way::Backward => direction == Direction::Backward,
-    };
     let mut crossings = topology.crossings();
-    let crossing = crossings.find(|one| one.link.name == link.name && is_this_way(one.direction));
+    let crossing = crossings.find(|one| one.link.name == link.name && one.direction == way);
     // Changes are on record where the gateway is that emulates the direction.
     let is_known = crossing.is_none_or(|crossing| {
         let mut here = observer.run().hosts();
