@@ -27,28 +27,18 @@ pub enum Step<'a> {
     Ended,
 }
 
-/// Which format a capture has.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
-    /// pcap, stamps in microseconds.
-    PcapMicroseconds,
-    /// pcap, stamps in nanoseconds.
-    PcapNanoseconds,
-    /// pcap, stamps in microseconds, with interface and direction in each record.
-    PcapModified,
-    /// pcapng.
-    Pcapng,
-}
-
-impl Format {
-    /// The words a report prints.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::PcapMicroseconds => "pcap (microseconds)",
-            Self::PcapNanoseconds => "pcap (nanoseconds)",
-            Self::PcapModified => "pcap (modified)",
-            Self::Pcapng => "pcapng",
-        }
+hil_core::labelled! {
+    /// Which format a capture has.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum Format, label {
+        /// pcap, stamps in microseconds.
+        PcapMicroseconds = "pcap (microseconds)",
+        /// pcap, stamps in nanoseconds.
+        PcapNanoseconds = "pcap (nanoseconds)",
+        /// pcap, stamps in microseconds, with interface and direction in each record.
+        PcapModified = "pcap (modified)",
+        /// pcapng.
+        Pcapng = "pcapng",
     }
 }
 

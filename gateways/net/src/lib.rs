@@ -99,25 +99,16 @@ pub mod link_type {
     pub const LINUX_SLL2: u16 = 276;
 }
 
-/// Which way a packet passed its interface.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
-pub enum Direction {
-    /// The capture does not say.
-    #[default]
-    Unknown,
-    /// It came in.
-    Inbound,
-    /// It went out.
-    Outbound,
-}
-
-impl Direction {
-    /// The word a report prints.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::Inbound => "in",
-            Self::Outbound => "out",
-        }
+hil_core::labelled! {
+    /// Which way a packet passed its interface.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+    pub enum Direction, label {
+        /// The capture does not say.
+        #[default]
+        Unknown = "unknown",
+        /// It came in.
+        Inbound = "in",
+        /// It went out.
+        Outbound = "out",
     }
 }

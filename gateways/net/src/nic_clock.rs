@@ -48,24 +48,16 @@ impl NicPair {
     }
 }
 
-/// How the pairs come about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ReadMethod {
-    /// `PTP_SYS_OFFSET_EXTENDED`: the driver reads the real-time clock right before and after the
-    /// card's register.
-    Driver,
-    /// Calls of `clock_gettime` around one another: for drivers without the above. The window is
-    /// wider, and so is the bound.
-    Calls,
-}
-
-impl ReadMethod {
-    /// In words.
-    pub const fn text(self) -> &'static str {
-        match self {
-            Self::Driver => "read within the driver (PTP_SYS_OFFSET_EXTENDED)",
-            Self::Calls => "read by calls around one another (clock_gettime)",
-        }
+hil_core::labelled! {
+    /// How the pairs come about.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum ReadMethod, text {
+        /// `PTP_SYS_OFFSET_EXTENDED`: the driver reads the real-time clock right before and after the
+        /// card's register.
+        Driver = "read within the driver (PTP_SYS_OFFSET_EXTENDED)",
+        /// Calls of `clock_gettime` around one another: for drivers without the above. The window is
+        /// wider, and so is the bound.
+        Calls = "read by calls around one another (clock_gettime)",
     }
 }
 

@@ -132,40 +132,23 @@ fn split_name(bytes: &[u8]) -> Result<(&str, &[u8]), Refusal> {
     }
 }
 
-/// How a greeting was answered.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::CheckedBitPattern)]
-#[repr(u8)]
-pub enum HelloStatus {
-    /// Messages will be taken.
-    Accepted = 0,
-    /// The channels differ: in number, names, types, sizes or alignments.
-    ChannelsDiffer = 1,
-    /// Both ends of the flow lie in one shared-memory domain: messages would bypass the hop.
-    SharedDomain = 2,
-    /// The flow is not carried there.
-    UnknownFlow = 3,
-    /// The two gateways speak different versions.
-    VersionMismatch = 4,
-    /// The session is not known there, probably because the answering gateway restarted.
-    GreetAgain = 5,
-}
-
-impl HelloStatus {
-    /// The words a report prints.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Accepted => "accepted",
-            Self::ChannelsDiffer => {
-                "the channels of the link differ; use the same topology and the same build on both \
-                 hosts"
-            }
-            Self::SharedDomain => {
-                "both ends are in one shared-memory domain, so messages would bypass the network"
-            }
-            Self::UnknownFlow => "another link ends there",
-            Self::VersionMismatch => "the gateways speak different versions of the protocol",
-            Self::GreetAgain => "the session is not known there",
-        }
+hil_core::labelled! {
+    /// How a greeting was answered.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::CheckedBitPattern)]
+    #[repr(u8)]
+    pub enum HelloStatus, label {
+        /// Messages will be taken.
+        Accepted: 0 = "accepted",
+        /// The channels differ: in number, names, types, sizes or alignments.
+        ChannelsDiffer: 1 = "the channels of the link differ; use the same topology and the same build on both hosts",
+        /// Both ends of the flow lie in one shared-memory domain: messages would bypass the hop.
+        SharedDomain: 2 = "both ends are in one shared-memory domain, so messages would bypass the network",
+        /// The flow is not carried there.
+        UnknownFlow: 3 = "another link ends there",
+        /// The two gateways speak different versions.
+        VersionMismatch: 4 = "the gateways speak different versions of the protocol",
+        /// The session is not known there, probably because the answering gateway restarted.
+        GreetAgain: 5 = "the session is not known there",
     }
 }
 

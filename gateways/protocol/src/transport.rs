@@ -61,21 +61,13 @@ pub struct TransportOption {
     pub max: i64,
 }
 
-/// A protocol whose ports a host gives to one socket at a time.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum IpProtocol {
-    /// Datagrams.
-    Udp,
-    /// Connections.
-    Tcp,
-}
-
-impl IpProtocol {
-    /// The word for it in `/proc/net` and in firewall rules.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Udp => "udp",
-            Self::Tcp => "tcp",
-        }
+hil_core::labelled! {
+    /// A protocol whose ports a host gives to one socket at a time.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+    pub enum IpProtocol, word {
+        /// Datagrams.
+        Udp = "udp",
+        /// Connections.
+        Tcp = "tcp",
     }
 }

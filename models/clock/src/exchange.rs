@@ -15,16 +15,18 @@ pub enum Requester {
     Remote,
 }
 
-/// What took a stamp.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum StampKind {
-    /// The program, beside its system call.
-    Application,
-    /// The kernel, on its real-time clock.
-    KernelSoftware,
-    /// The network card, on a clock of its own.
-    NetworkCard,
+hil_core::labelled! {
+    /// What took a stamp.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum StampKind, label {
+        /// The program, beside its system call.
+        Application = "application",
+        /// The kernel, on its real-time clock.
+        KernelSoftware = "kernel",
+        /// The network card, on a clock of its own.
+        NetworkCard = "network card",
+    }
 }
 
 impl StampKind {
@@ -35,15 +37,6 @@ impl StampKind {
             1 => Some(Self::KernelSoftware),
             2 => Some(Self::NetworkCard),
             _ => None,
-        }
-    }
-
-    /// The words a report prints.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Application => "application",
-            Self::KernelSoftware => "kernel",
-            Self::NetworkCard => "network card",
         }
     }
 }

@@ -5,43 +5,31 @@ use core::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// How an interval was obtained.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum IntervalMethod {
-    /// Of a share: beta distribution (Clopper and Pearson 1934, mid-p) on the effective sample.
-    EffectiveShare,
-    /// Of a quantile: ranks (Woodruff 1952) of the effective sample.
-    EffectiveRanks,
-    /// Of a mean: Student's on the variance of an effective sample.
-    EffectiveMean,
-    /// Of a share of independent trials (Clopper and Pearson 1934).
-    Exact,
-    /// Of a share of independent trials (Wilson 1927).
-    Score,
-    /// Of a mean of repetitions (Student 1908).
-    Student,
-    /// Of a difference or ratio of repetitions (Welch 1947).
-    Welch,
-    /// Of a difference or ratio, from the interval of each side (MOVER, Zou and Donner 2008).
-    Mover,
+hil_core::labelled! {
+    /// How an interval was obtained.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum IntervalMethod, name {
+        /// Of a share: beta distribution (Clopper and Pearson 1934, mid-p) on the effective sample.
+        EffectiveShare = "beta interval on the effective sample",
+        /// Of a quantile: ranks (Woodruff 1952) of the effective sample.
+        EffectiveRanks = "ranks of the effective sample",
+        /// Of a mean: Student's on the variance of an effective sample.
+        EffectiveMean = "Student's interval on the effective sample",
+        /// Of a share of independent trials (Clopper and Pearson 1934).
+        Exact = "Clopper and Pearson's interval",
+        /// Of a share of independent trials (Wilson 1927).
+        Score = "Wilson's interval",
+        /// Of a mean of repetitions (Student 1908).
+        Student = "Student's interval",
+        /// Of a difference or ratio of repetitions (Welch 1947).
+        Welch = "Welch's interval",
+        /// Of a difference or ratio, from the interval of each side (MOVER, Zou and Donner 2008).
+        Mover = "MOVER of both sides' intervals",
+    }
 }
 
 impl IntervalMethod {
-    /// What a report calls it.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::EffectiveShare => "beta interval on the effective sample",
-            Self::EffectiveRanks => "ranks of the effective sample",
-            Self::EffectiveMean => "Student's interval on the effective sample",
-            Self::Exact => "Clopper and Pearson's interval",
-            Self::Score => "Wilson's interval",
-            Self::Student => "Student's interval",
-            Self::Welch => "Welch's interval",
-            Self::Mover => "MOVER of both sides' intervals",
-        }
-    }
-
     /// What its coverage takes for granted.
     pub const fn assumption(self) -> &'static str {
         match self {

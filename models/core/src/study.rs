@@ -111,40 +111,21 @@ pub struct Larger {
     pub parameters: Vec<String>,
 }
 
-/// How a row stands to the published one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Verdict {
-    /// No difference at 5 %, in a sample of half the published one's size or more.
-    Agrees,
-    /// The interval of the difference does not hold zero.
-    Differs,
-    /// No difference at 5 %, in a smaller sample.
-    Inconclusive,
-    /// Parameters of the row were fitted to the published value.
-    Fitted,
-    /// Nothing is published of the row, or of something else.
-    NotComparable,
-}
-
-impl Verdict {
-    const ALL: [Self; 5] = [
-        Self::Agrees,
-        Self::Differs,
-        Self::Inconclusive,
-        Self::Fitted,
-        Self::NotComparable,
-    ];
-
-    /// What a table calls it.
-    pub const fn words(self) -> &'static str {
-        match self {
-            Self::Agrees => "agrees",
-            Self::Differs => "differs",
-            Self::Inconclusive => "inconclusive",
-            Self::Fitted => "fitted",
-            Self::NotComparable => "not comparable",
-        }
+hil_core::labelled! {
+    /// How a row stands to the published one.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+    #[serde(rename_all = "kebab-case")]
+    pub enum Verdict, words {
+        /// No difference at 5 %, in a sample of half the published one's size or more.
+        Agrees = "agrees",
+        /// The interval of the difference does not hold zero.
+        Differs = "differs",
+        /// No difference at 5 %, in a smaller sample.
+        Inconclusive = "inconclusive",
+        /// Parameters of the row were fitted to the published value.
+        Fitted = "fitted",
+        /// Nothing is published of the row, or of something else.
+        NotComparable = "not comparable",
     }
 }
 

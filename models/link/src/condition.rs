@@ -142,40 +142,25 @@ impl LinkChangeRequest {
     }
 }
 
-/// What became of an order.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum OrderOutcome {
-    /// It took effect.
-    InForce,
-    /// It could not be understood, or a number was outside its range.
-    Malformed,
-    /// The gateway has too little room for what would be under way.
-    NoRoom,
-    /// Earlier changes wait for a message to meet them.
-    Busy,
+hil_core::labelled! {
+    /// What became of an order.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum OrderOutcome, words {
+        /// It took effect.
+        InForce: 0 = "",
+        /// It could not be understood, or a number was outside its range.
+        Malformed: 1 = "it is of another version, or a number is outside its range",
+        /// The gateway has too little room for what would be under way.
+        NoRoom: 2 = "the gateway has too little room for what would be under way",
+        /// Earlier changes wait for a message to meet them.
+        Busy: 3 = "earlier changes still wait for a message to meet them",
+    }
 }
 
 impl OrderOutcome {
-    const ALL: [Self; 4] = [Self::InForce, Self::Malformed, Self::NoRoom, Self::Busy];
-
     /// The number in a record.
     pub const fn number(self) -> u32 {
-        match self {
-            Self::InForce => 0,
-            Self::Malformed => 1,
-            Self::NoRoom => 2,
-            Self::Busy => 3,
-        }
-    }
-
-    /// Why it did not take effect, in words; empty where it did.
-    pub const fn words(self) -> &'static str {
-        match self {
-            Self::InForce => "",
-            Self::Malformed => "it is of another version, or a number is outside its range",
-            Self::NoRoom => "the gateway has too little room for what would be under way",
-            Self::Busy => "earlier changes still wait for a message to meet them",
-        }
+        self as u32
     }
 }
 
@@ -216,23 +201,13 @@ impl LinkConditionRecord {
     }
 }
 
-impl Way {
-    /// The word for it in topologies and reports.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Forward => "forward",
-            Self::Backward => "backward",
-        }
-    }
-}
-
 const FLOW_PREFIX: &str = "hil/link/";
 
 /// What one link carries one way: the name under which its gateways' clock exchanges and the orders to
 /// change it are recorded, and of the channel on which those orders travel. Names that begin with `hil/`
 /// are reserved.
 pub fn flow_name(link: &str, way: Way) -> String {
-    format!("{FLOW_PREFIX}{link}/{}", way.word())
+    format!("{FLOW_PREFIX}{link}/{way}")
 }
 
 /// What a reader is shown of such a name: `hop/forward`; another name as it is.

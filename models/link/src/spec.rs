@@ -64,14 +64,16 @@ pub struct LinkSpec {
     pub duplication: Option<Duplication>,
 }
 
-/// Which way on a link.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Way {
-    /// From the first host of the link to the second.
-    Forward,
-    /// From the second to the first.
-    Backward,
+hil_core::labelled! {
+    /// Which way on a link.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+    #[serde(rename_all = "kebab-case")]
+    pub enum Way, word {
+        /// From the first host of the link to the second.
+        Forward = "forward",
+        /// From the second to the first.
+        Backward = "backward",
+    }
 }
 
 /// Which channel of which run a model is for: it names the random streams.

@@ -5,43 +5,25 @@ use serde::{Deserialize, Serialize};
 
 use super::catalogue;
 
-/// How a finding bears on a measurement. Later is worse.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Severity {
-    /// As it should be.
-    Ok,
-    /// Costs something that a careful reader wants to know of.
-    Note,
-    /// Could not be read; the value says why. Never taken for ok.
-    CannotTell,
-    /// Spoils figures in microseconds, or a run as the topology wants it.
-    Warning,
-    /// Prevents a run, or makes its figures wrong.
-    Error,
+hil_core::labelled! {
+    /// How a finding bears on a measurement. Later is worse.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum Severity, word {
+        /// As it should be.
+        Ok = "ok",
+        /// Costs something that a careful reader wants to know of.
+        Note = "note",
+        /// Could not be read; the value says why. Never taken for ok.
+        CannotTell = "cannot_tell",
+        /// Spoils figures in microseconds, or a run as the topology wants it.
+        Warning = "warning",
+        /// Prevents a run, or makes its figures wrong.
+        Error = "error",
+    }
 }
 
 impl Severity {
-    /// All of them, from the best to the worst.
-    pub const ALL: [Self; 5] = [
-        Self::Ok,
-        Self::Note,
-        Self::CannotTell,
-        Self::Warning,
-        Self::Error,
-    ];
-
-    /// The word in the JSON.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Ok => "ok",
-            Self::Note => "note",
-            Self::CannotTell => "cannot_tell",
-            Self::Warning => "warning",
-            Self::Error => "error",
-        }
-    }
-
     /// Ok where `is_ok`.
     pub(super) const fn ok_if(is_ok: bool, otherwise: Self) -> Self {
         if is_ok { Self::Ok } else { otherwise }

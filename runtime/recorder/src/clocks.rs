@@ -13,31 +13,20 @@ use crate::facts::{Words, table};
 use crate::net::{self, MessageLatency};
 use crate::run::Run;
 
-/// Where a host's relation to real time comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Basis {
-    /// Its gateways noted it beside the messages.
-    Gateways,
-    /// Its supervisor read both clocks before the run.
-    Manifest,
-    /// That of another host, which reads the same clock.
-    OtherHost,
-    /// Its clock is another one: its messages have the times at which they arrived here.
-    Arrival,
-    /// Nothing is known: times are those of its monotonic clock.
-    None,
-}
-
-impl Basis {
-    /// What a recording says of it.
-    const fn words(self) -> &'static str {
-        match self {
-            Self::Gateways => "real time, by what the gateways noted beside the messages",
-            Self::Manifest => "real time, by a read of both clocks before the run",
-            Self::OtherHost => "real time, by another host that reads the same clock",
-            Self::Arrival => "real time of arrival on the recording host: its own clock is another",
-            Self::None => "monotonic clock, not real time: no relation was noted",
-        }
+hil_core::labelled! {
+    /// Where a host's relation to real time comes from.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub(crate) enum Basis, words {
+        /// Its gateways noted it beside the messages.
+        Gateways = "real time, by what the gateways noted beside the messages",
+        /// Its supervisor read both clocks before the run.
+        Manifest = "real time, by a read of both clocks before the run",
+        /// That of another host, which reads the same clock.
+        OtherHost = "real time, by another host that reads the same clock",
+        /// Its clock is another one: its messages have the times at which they arrived here.
+        Arrival = "real time of arrival on the recording host: its own clock is another",
+        /// Nothing is known: times are those of its monotonic clock.
+        None = "monotonic clock, not real time: no relation was noted",
     }
 }
 

@@ -154,53 +154,48 @@ pub enum Unresolved {
     WithinChance,
 }
 
-/// Why a run tests nothing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(tag = "reason", rename_all = "snake_case")]
-pub enum Untested {
-    /// It failed.
-    RunFailed,
-    /// No channel crossed a network or a model of one.
-    NoNetwork,
-    /// No foreign program answered.
-    NoForeignProgram,
-    /// The robot has no score that counts what hurts it.
-    NoScore,
-}
-
-/// What was put to the test.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Subject {
-    /// A network.
-    Network,
-    /// An emulated link.
-    EmulatedLink,
-    /// A link model in virtual time.
-    LinkModel,
-    /// The network of a foreign program.
-    ForeignNetwork,
-}
-
-impl fmt::Display for Subject {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(match self {
-            Self::Network => "the network",
-            Self::EmulatedLink => "the emulated link",
-            Self::LinkModel => "the link model",
-            Self::ForeignNetwork => "the foreign program or its network",
-        })
+hil_core::labelled! {
+    /// Why a run tests nothing.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+    #[serde(tag = "reason", rename_all = "snake_case")]
+    pub enum Untested, label {
+        /// It failed.
+        RunFailed = "the run failed",
+        /// No channel crossed a network or a model of one.
+        NoNetwork = "no channel went over a network",
+        /// No foreign program answered.
+        NoForeignProgram = "no foreign program answered",
+        /// The robot has no score that counts what hurts it.
+        NoScore = "no score counts what hurts this robot",
     }
 }
 
-/// What the network may have hurt.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Object {
-    /// The robot of a case.
-    Robot,
-    /// Programs of the user's, of which nothing is known but their messages or frames.
-    Programs,
+hil_core::labelled! {
+    /// What was put to the test.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum Subject, label {
+        /// A network.
+        Network = "the network",
+        /// An emulated link.
+        EmulatedLink = "the emulated link",
+        /// A link model in virtual time.
+        LinkModel = "the link model",
+        /// The network of a foreign program.
+        ForeignNetwork = "the foreign program or its network",
+    }
+}
+
+hil_core::labelled! {
+    /// What the network may have hurt.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum Object, label {
+        /// The robot of a case.
+        Robot = "the robot",
+        /// Programs of the user's, of which nothing is known but their messages or frames.
+        Programs = "the programs",
+    }
 }
 
 impl Object {
@@ -211,15 +206,6 @@ impl Object {
         } else {
             Self::Robot
         }
-    }
-}
-
-impl fmt::Display for Object {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(match self {
-            Self::Robot => "the robot",
-            Self::Programs => "the programs",
-        })
     }
 }
 
@@ -418,7 +404,7 @@ impl Hurt {
     pub(crate) fn words(&self, object: Object) -> String {
         let because = Untested::NoScore;
         if object == Object::Programs && *self == (Self::NotTested { because }) {
-            "NOT TESTED: what hurts these programs is not known; what became of their messages is above"
+            "NOT TESTED: what hurts these programs is not known; the lines above count what was lost"
                 .to_owned()
         } else {
             self.to_string()
@@ -462,17 +448,6 @@ impl fmt::Display for Unresolved {
                 "the robot was hurt, but unaligned clocks leave open whether the network came first",
             ),
         }
-    }
-}
-
-impl fmt::Display for Untested {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(match self {
-            Self::RunFailed => "the run failed",
-            Self::NoNetwork => "no channel went over a network",
-            Self::NoForeignProgram => "no foreign program answered",
-            Self::NoScore => "no score counts what hurts this robot",
-        })
     }
 }
 

@@ -20,31 +20,23 @@ pub struct ClockSection {
     pub pairs: Vec<HostPairClock>,
 }
 
-/// What the one-way figures between two hosts rest on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ClockRung {
-    /// Both read one clock: exact.
-    OneClock,
-    /// Both system clocks follow one reference, each within a bound of its own.
-    Disciplined,
-    /// The four-stamp exchanges of the gateways.
-    Exchanges,
-    /// Nothing: no figure crosses from one host to the other.
-    None,
+hil_core::labelled! {
+    /// What the one-way figures between two hosts rest on.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum ClockRung, label {
+        /// Both read one clock: exact.
+        OneClock = "one clock",
+        /// Both system clocks follow one reference, each within a bound of its own.
+        Disciplined = "system clocks disciplined to one reference",
+        /// The four-stamp exchanges of the gateways.
+        Exchanges = "exchanges beside the data",
+        /// Nothing: no figure crosses from one host to the other.
+        None = "not aligned",
+    }
 }
 
 impl ClockRung {
-    /// The words a report prints.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::OneClock => "one clock",
-            Self::Disciplined => "system clocks disciplined to one reference",
-            Self::Exchanges => "exchanges beside the data",
-            Self::None => "not aligned",
-        }
-    }
-
     /// The same, where some of the exchanges may have come over a clock path.
     pub const fn words(self, has_path_exchanges: bool) -> &'static str {
         match self {

@@ -1,7 +1,6 @@
 //! The network of a run as a summary keeps it: figures of each channel, what happened, both on the
 //! time of the run beside what the robot did. Figures are computed elsewhere.
 
-use core::fmt;
 use hil_account::network::{NetworkEventKind, NetworkMetrics};
 use hil_stats::correlation::PairCorrelation;
 use serde::{Deserialize, Serialize};
@@ -257,38 +256,27 @@ impl Timeline {
     }
 }
 
-/// What is bad about a network, as one number over time.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum NetworkQuantity {
-    /// The share of messages that were lost.
-    Loss,
-    /// The largest delay, seconds.
-    Delay,
-    /// The longest time without an arrival, seconds.
-    Silence,
+hil_core::labelled! {
+    /// What is bad about a network, as one number over time.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum NetworkQuantity, label {
+        /// The share of messages that were lost.
+        Loss = "loss",
+        /// The largest delay, seconds.
+        Delay = "delay",
+        /// The longest time without an arrival, seconds.
+        Silence = "silence",
+    }
 }
 
 impl NetworkQuantity {
-    /// All of them.
-    pub const ALL: [Self; 3] = [Self::Loss, Self::Delay, Self::Silence];
-
     /// `1` for a share, else the SI unit.
     pub const fn unit(self) -> &'static str {
         match self {
             Self::Loss => "1",
             Self::Delay | Self::Silence => "s",
         }
-    }
-}
-
-impl fmt::Display for NetworkQuantity {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(match self {
-            Self::Loss => "loss",
-            Self::Delay => "delay",
-            Self::Silence => "silence",
-        })
     }
 }
 

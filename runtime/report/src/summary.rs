@@ -461,31 +461,21 @@ pub enum RunEventKind {
     },
 }
 
-/// What a radio did.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum RadioChange {
-    /// It associated.
-    Associated,
-    /// It went to another access point.
-    Roamed,
-    /// It lost its association.
-    Disconnected,
-    /// A station left it.
-    StationLeft,
-    /// The quality of its connection changed.
-    QualityChanged,
-}
-
-impl RadioChange {
-    const fn label(self) -> &'static str {
-        match self {
-            Self::Associated => "associated",
-            Self::Roamed => "roamed",
-            Self::Disconnected => "disconnected",
-            Self::StationLeft => "station left",
-            Self::QualityChanged => "connection quality changed",
-        }
+hil_core::labelled! {
+    /// What a radio did.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum RadioChange, label {
+        /// It associated.
+        Associated = "associated",
+        /// It went to another access point.
+        Roamed = "roamed",
+        /// It lost its association.
+        Disconnected = "disconnected",
+        /// A station left it.
+        StationLeft = "station left",
+        /// The quality of its connection changed.
+        QualityChanged = "connection quality changed",
     }
 }
 

@@ -123,23 +123,15 @@ pub struct ChannelLaunch {
     pub emulation: Option<EmulationLaunch>,
 }
 
-/// Which way a gateway thread carries its channels.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Side {
-    /// From shared memory to the network.
-    Egress,
-    /// From the network to shared memory.
-    Ingress,
-}
-
-impl Side {
-    /// The word for it.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Egress => "egress",
-            Self::Ingress => "ingress",
-        }
+hil_core::labelled! {
+    /// Which way a gateway thread carries its channels.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "kebab-case")]
+    pub enum Side, word {
+        /// From shared memory to the network.
+        Egress = "egress",
+        /// From the network to shared memory.
+        Ingress = "ingress",
     }
 }
 

@@ -174,43 +174,29 @@ pub struct InletReport {
     pub lost: Vec<CountByName>,
 }
 
-/// What of a direction or arm counted something.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum CounterGroup {
-    /// The direction or arm itself.
-    Own,
-    /// What it refused, by cause.
-    Refused,
-    /// Its socket.
-    Socket,
-    /// Its transport: what only that one counts.
-    Transport,
-    /// Its seal, where its hop is sealed.
-    Seal,
-    /// The order of messages.
-    Messages,
-    /// The pieces of messages.
-    Pieces,
-    /// Its replies.
-    Replies,
-    /// Commands that were not sent, by cause.
-    NotSent,
-}
-
-impl CounterGroup {
-    const fn prefix(self) -> &'static str {
-        match self {
-            Self::Own => "",
-            Self::Refused => "refused: ",
-            Self::Socket => "socket: ",
-            Self::Transport => "transport: ",
-            Self::Seal => "seal: ",
-            Self::Messages => "messages: ",
-            Self::Pieces => "pieces: ",
-            Self::Replies => "replies: ",
-            Self::NotSent => "commands not sent: ",
-        }
+hil_core::labelled! {
+    /// What of a direction or arm counted something.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum CounterGroup, prefix {
+        /// The direction or arm itself.
+        Own = "",
+        /// What it refused, by cause.
+        Refused = "refused: ",
+        /// Its socket.
+        Socket = "socket: ",
+        /// Its transport: what only that one counts.
+        Transport = "transport: ",
+        /// Its seal, where its hop is sealed.
+        Seal = "seal: ",
+        /// The order of messages.
+        Messages = "messages: ",
+        /// The pieces of messages.
+        Pieces = "pieces: ",
+        /// Its replies.
+        Replies = "replies: ",
+        /// Commands that were not sent, by cause.
+        NotSent = "commands not sent: ",
     }
 }
 

@@ -2,7 +2,6 @@
 //! robot maker's own guided-motion datagrams (EGM). Its keys are declared here;
 //! which of the two adapters it is follows from the case, see `check_adapter`.
 
-use core::fmt;
 use std::net::{IpAddr, SocketAddr};
 
 use hil_arm::egm::messages::Side;
@@ -66,22 +65,15 @@ words! {
     }
 }
 
-/// Which side of the protocol an adapter is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum AdapterKind {
-    /// We are the robot: the foreign program plays the role that commands it.
-    Robot,
-    /// We are the sensor: the foreign program, or a real robot, plays the robot.
-    Sensor,
-}
-
-impl fmt::Display for AdapterKind {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(match self {
-            Self::Robot => "EGM robot adapter",
-            Self::Sensor => "EGM sensor adapter",
-        })
+hil_core::labelled! {
+    /// Which side of the protocol an adapter is.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "kebab-case")]
+    pub enum AdapterKind, label {
+        /// We are the robot: the foreign program plays the role that commands it.
+        Robot = "EGM robot adapter",
+        /// We are the sensor: the foreign program, or a real robot, plays the robot.
+        Sensor = "EGM sensor adapter",
     }
 }
 

@@ -55,22 +55,14 @@ impl fmt::Debug for RunSecret {
     }
 }
 
-/// The cipher that both hosts use.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Suite {
-    /// AES-256-GCM (NIST SP 800-38D): the fastest where every processor has the instructions.
-    Aes256Gcm,
-    /// ChaCha20-Poly1305 (RFC 8439): as safe, and fast without them.
-    ChaCha20Poly1305,
-}
-
-impl Suite {
-    /// As reports print it.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Aes256Gcm => "AES-256-GCM",
-            Self::ChaCha20Poly1305 => "ChaCha20-Poly1305",
-        }
+hil_core::labelled! {
+    /// The cipher that both hosts use.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum Suite, label {
+        /// AES-256-GCM (NIST SP 800-38D): the fastest where every processor has the instructions.
+        Aes256Gcm = "AES-256-GCM",
+        /// ChaCha20-Poly1305 (RFC 8439): as safe, and fast without them.
+        ChaCha20Poly1305 = "ChaCha20-Poly1305",
     }
 }
 

@@ -6,14 +6,16 @@ use serde::{Deserialize, Serialize};
 pub use crate::egm::parameters::EgmStartParameters;
 use crate::yumi::{Joints, Pose};
 
-/// One of the robot's two arms, each a motion task of its own.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Side {
-    /// The robot's right arm.
-    Right,
-    /// The robot's left arm.
-    Left,
+hil_core::labelled! {
+    /// One of the robot's two arms, each a motion task of its own.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum Side, word {
+        /// The robot's right arm.
+        Right = "right",
+        /// The robot's left arm.
+        Left = "left",
+    }
 }
 
 impl Side {
@@ -28,14 +30,6 @@ impl Side {
     /// As [`Side::index`], as messages carry it.
     pub const fn number(self) -> u32 {
         self as u32
-    }
-
-    /// `right` or `left`.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Right => "right",
-            Self::Left => "left",
-        }
     }
 }
 

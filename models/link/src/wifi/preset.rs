@@ -6,28 +6,19 @@ use crate::outages::Outages;
 use crate::wifi::spec::WifiSpec;
 use hil_core::options::{Scalar as _, Setting, Shape, Short, Templates};
 
-/// A link by name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WifiPreset {
-    /// Two routers, 20 m apart, in adjacent laboratory areas.
-    ShortRange,
-    /// Two routers, 35 m apart, the second at the end of the corridor.
-    LongRange,
+hil_core::labelled! {
+    /// A link by name.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum WifiPreset, name {
+        /// Two routers, 20 m apart, in adjacent laboratory areas.
+        ShortRange = "wifi6-short-range",
+        /// Two routers, 35 m apart, the second at the end of the corridor.
+        LongRange = "wifi6-long-range",
+    }
 }
 
 impl WifiPreset {
-    /// All of them.
-    pub const ALL: [Self; 2] = [Self::ShortRange, Self::LongRange];
-
     const NAMES: &'static [&'static str] = &[Self::ALL[0].name(), Self::ALL[1].name()];
-
-    /// Its name in files.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::ShortRange => "wifi6-short-range",
-            Self::LongRange => "wifi6-long-range",
-        }
-    }
 
     /// The preset of that name.
     pub fn named(name: &str) -> Option<Self> {

@@ -1,29 +1,18 @@
 //! Which access category of IEEE 802.11 (enhanced distributed channel access, clause 10.23.2) a
 //! datagram's marks lead to, as Linux decides it. It sets nothing.
 
-use core::fmt;
-
-/// Who may try first when stations contend for the air, and how long they wait.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum AccessCategory {
-    /// `AC_BK`: waits longest.
-    Background,
-    /// `AC_BE`.
-    BestEffort,
-    /// `AC_VI`.
-    Video,
-    /// `AC_VO`: waits least.
-    Voice,
-}
-
-impl fmt::Display for AccessCategory {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Background => "background (AC_BK)",
-            Self::BestEffort => "best effort (AC_BE)",
-            Self::Video => "video (AC_VI)",
-            Self::Voice => "voice (AC_VO)",
-        })
+hil_core::labelled! {
+    /// Who may try first when stations contend for the air, and how long they wait.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+    pub enum AccessCategory, label {
+        /// `AC_BK`: waits longest.
+        Background = "background (AC_BK)",
+        /// `AC_BE`.
+        BestEffort = "best effort (AC_BE)",
+        /// `AC_VI`.
+        Video = "video (AC_VI)",
+        /// `AC_VO`: waits least.
+        Voice = "voice (AC_VO)",
     }
 }
 

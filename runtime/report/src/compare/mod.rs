@@ -81,40 +81,27 @@ impl ComparedRun {
     }
 }
 
-/// How a figure of the new runs stands to that of the base.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub(crate) enum Verdict {
-    /// The interval has both directions in it.
-    NoDifferenceShown,
-    /// Shorter delays, by the whole interval.
-    Faster,
-    /// Longer delays, by the whole interval.
-    Slower,
-    /// Fewer losses, by the whole interval.
-    LosesLess,
-    /// More losses, by the whole interval.
-    LosesMore,
-    /// A smaller score, by the whole interval; which is better, the case knows.
-    Lower,
-    /// A larger score, by the whole interval.
-    Higher,
-    /// No interval can be had.
-    NotTested,
-}
-
-impl Verdict {
-    pub(crate) const fn words(self) -> &'static str {
-        match self {
-            Self::NoDifferenceShown => "no difference shown",
-            Self::Faster => "faster",
-            Self::Slower => "slower",
-            Self::LosesLess => "loses less",
-            Self::LosesMore => "loses more",
-            Self::Lower => "lower",
-            Self::Higher => "higher",
-            Self::NotTested => "not tested",
-        }
+hil_core::labelled! {
+    /// How a figure of the new runs stands to that of the base.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+    #[serde(rename_all = "snake_case")]
+    pub(crate) enum Verdict, words {
+        /// The interval has both directions in it.
+        NoDifferenceShown = "no difference shown",
+        /// Shorter delays, by the whole interval.
+        Faster = "faster",
+        /// Longer delays, by the whole interval.
+        Slower = "slower",
+        /// Fewer losses, by the whole interval.
+        LosesLess = "loses less",
+        /// More losses, by the whole interval.
+        LosesMore = "loses more",
+        /// A smaller score, by the whole interval; which is better, the case knows.
+        Lower = "lower",
+        /// A larger score, by the whole interval.
+        Higher = "higher",
+        /// No interval can be had.
+        NotTested = "not tested",
     }
 }
 

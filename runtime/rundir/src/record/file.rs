@@ -37,59 +37,43 @@ pub const HEADER_BYTES: usize = 128;
 /// file: a file that grows by the page is longer than its records, and so is one whose writer was killed.
 pub(super) const END_AT: usize = 24;
 
-/// What a record file holds; its number stands for it in the header.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
-#[repr(u32)]
-pub enum RecordKind {
-    /// [`PublishedRecord`]s of a producer.
-    Published = 1,
-    /// [`TakenRecord`]s of a consumer.
-    Taken = 2,
-    /// [`EgressRecord`]s of a sending gateway.
-    Egress = 3,
-    /// [`IngressRecord`]s of a receiving gateway.
-    Ingress = 4,
-    /// Messages: an [`Envelope`] and the payload.
-    Message = 6,
-    /// [`RoundTripRecord`]s of a sending gateway.
-    RoundTrip = 7,
-    /// [`AdapterSentRecord`]s of an adapter: datagrams to a foreign program.
-    AdapterSent = 8,
-    /// [`AdapterReceivedRecord`]s of an adapter: datagrams of a foreign program.
-    AdapterReceived = 9,
-    /// [`NicClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
-    NicClock = 10,
-    /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
-    Radio = 15,
-    /// [`LinkConditionRecord`]s of a gateway that emulates a link; the channel is that of the orders,
-    /// `hil/link/<link>/<direction>`.
-    LinkCondition = 16,
-    /// [`FrameRecord`]s of an inlet.
-    Frame = 17,
+hil_core::labelled! {
+    /// What a record file holds; its number stands for it in the header.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
+    #[repr(u32)]
+    pub enum RecordKind, name {
+        /// [`PublishedRecord`]s of a producer.
+        Published: 1 = "published",
+        /// [`TakenRecord`]s of a consumer.
+        Taken: 2 = "taken",
+        /// [`EgressRecord`]s of a sending gateway.
+        Egress: 3 = "egress",
+        /// [`IngressRecord`]s of a receiving gateway.
+        Ingress: 4 = "ingress",
+        /// Messages: an [`Envelope`] and the payload.
+        Message: 6 = "message",
+        /// [`RoundTripRecord`]s of a sending gateway.
+        RoundTrip: 7 = "round-trip",
+        /// [`AdapterSentRecord`]s of an adapter: datagrams to a foreign program.
+        AdapterSent: 8 = "face-sent",
+        /// [`AdapterReceivedRecord`]s of an adapter: datagrams of a foreign program.
+        AdapterReceived: 9 = "face-received",
+        /// [`NicClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
+        NicClock: 10 = "card-clock",
+        /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
+        Radio: 15 = "radio",
+        /// [`LinkConditionRecord`]s of a gateway that emulates a link; the channel is that of the orders,
+        /// `hil/link/<link>/<direction>`.
+        LinkCondition: 16 = "link-condition",
+        /// [`FrameRecord`]s of an inlet.
+        Frame: 17 = "frame",
+    }
 }
 
 impl RecordKind {
     /// How the names of all files begin that hold such records of `channel`.
     pub fn file_name_start(self, channel: &str) -> String {
         format!("{}.{}.", channel.replace('/', "."), self.name())
-    }
-
-    /// In file names.
-    const fn name(self) -> &'static str {
-        match self {
-            Self::Published => "published",
-            Self::Taken => "taken",
-            Self::Egress => "egress",
-            Self::Ingress => "ingress",
-            Self::Message => "message",
-            Self::RoundTrip => "round-trip",
-            Self::AdapterSent => "face-sent",
-            Self::AdapterReceived => "face-received",
-            Self::NicClock => "card-clock",
-            Self::Radio => "radio",
-            Self::LinkCondition => "link-condition",
-            Self::Frame => "frame",
-        }
     }
 
     /// Size of one record; `None` where it depends on the channel.

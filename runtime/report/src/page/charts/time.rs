@@ -35,31 +35,20 @@ impl Mark {
     }
 }
 
-/// What a mark of a figure over time stands for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::page) enum MarkClass {
-    /// A grave event of the score.
-    Incident,
-    /// A dangerous one.
-    Hazard,
-    /// Any other one.
-    Notice,
-    /// A link that was changed by hand.
-    Change,
-    /// A time in which nothing got through.
-    Band,
-}
-
-impl MarkClass {
-    /// The class in the page's style sheet.
-    const fn word(self) -> &'static str {
-        match self {
-            Self::Incident => "incident",
-            Self::Hazard => "hazard",
-            Self::Notice => "notice",
-            Self::Change => "change",
-            Self::Band => "band",
-        }
+hil_core::labelled! {
+    /// What a mark of a figure over time stands for.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub(in crate::page) enum MarkClass, word {
+        /// A grave event of the score.
+        Incident = "incident",
+        /// A dangerous one.
+        Hazard = "hazard",
+        /// Any other one.
+        Notice = "notice",
+        /// A link that was changed by hand.
+        Change = "change",
+        /// A time in which nothing got through.
+        Band = "band",
     }
 }
 

@@ -2,7 +2,6 @@
 //! known is `None`. Nothing here gathers or draws.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::path::PathBuf;
 
 use hil_core::case_study::Severity;
@@ -33,22 +32,24 @@ pub(crate) struct View {
     pub(crate) problems: Vec<String>,
 }
 
-/// How far a run is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub(crate) enum RunState {
-    /// Its processes make themselves ready.
-    Starting,
-    /// It runs.
-    Running,
-    /// Its processes are being ended.
-    Ending,
-    /// It is over.
-    Ended,
-    /// Its supervisor was killed.
-    SupervisorGone,
-    /// Its supervisor does not tell.
-    Unknown,
+hil_core::labelled! {
+    /// How far a run is.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+    #[serde(rename_all = "snake_case")]
+    pub(crate) enum RunState, label {
+        /// Its processes make themselves ready.
+        Starting = "starting",
+        /// It runs.
+        Running = "running",
+        /// Its processes are being ended.
+        Ending = "ending",
+        /// It is over.
+        Ended = "ended",
+        /// Its supervisor was killed.
+        SupervisorGone = "supervisor gone",
+        /// Its supervisor does not tell.
+        Unknown = "unknown",
+    }
 }
 
 impl From<Phase> for RunState {
@@ -58,19 +59,6 @@ impl From<Phase> for RunState {
             Phase::Running => Self::Running,
             Phase::Ending => Self::Ending,
         }
-    }
-}
-
-impl fmt::Display for RunState {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(match self {
-            Self::Starting => "starting",
-            Self::Running => "running",
-            Self::Ending => "ending",
-            Self::Ended => "ended",
-            Self::SupervisorGone => "supervisor gone",
-            Self::Unknown => "unknown",
-        })
     }
 }
 
@@ -173,25 +161,17 @@ pub(crate) struct SegmentRow {
     pub(crate) time: Option<Quantiles>,
 }
 
-/// Whether a link carries anything.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub(crate) enum LinkState {
-    /// Messages came over it within the window.
-    Carries,
-    /// None did.
-    Silent,
-    /// None of its messages come to this host.
-    Unknown,
-}
-
-impl LinkState {
-    pub(crate) const fn label(self) -> &'static str {
-        match self {
-            Self::Carries => "carries",
-            Self::Silent => "silent",
-            Self::Unknown => "unknown",
-        }
+hil_core::labelled! {
+    /// Whether a link carries anything.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+    #[serde(rename_all = "snake_case")]
+    pub(crate) enum LinkState, label {
+        /// Messages came over it within the window.
+        Carries = "carries",
+        /// None did.
+        Silent = "silent",
+        /// None of its messages come to this host.
+        Unknown = "unknown",
     }
 }
 
