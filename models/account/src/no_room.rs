@@ -19,6 +19,9 @@ pub struct NoRoom {
     missing_count: u64,
 }
 
+/// Clock requests in a row that an account asks after: those of a week at ten a second.
+const REQUESTS_MAX: u64 = 6_048_000;
+
 impl NoRoom {
     /// The stretches of a flow, in order, without what is missing in them.
     pub fn of(records: impl Iterator<Item = NoRoomRecord>) -> Vec<Self> {
@@ -66,10 +69,12 @@ impl NoRoom {
                 && last.session == exchange.session
             {
                 let steps = exchange.sequence.saturating_sub(last.sequence);
-                let apart_ns = exchange.t1_ns.saturating_sub(last.t1_ns) as f64;
-                for step in 1..steps {
-                    let since_ns = apart_ns * step as f64 / steps as f64;
-                    if let Some(index) = Self::find(all, last.t1_ns + since_ns as i64) {
+                let apart_ns = exchange.t1_ns.saturating_sub(last.t1_ns);
+                // A number that is further on than a run has requests is no request's.
+                for step in 1..steps.min(REQUESTS_MAX) {
+                    let since_ns = i128::from(apart_ns) * i128::from(step) / i128::from(steps);
+                    let since_ns = i64::try_from(since_ns).unwrap_or(i64::MAX);
+                    if let Some(index) = Self::find(all, last.t1_ns.saturating_add(since_ns)) {
                         all[index].missing_count += 1;
                     }
                 }

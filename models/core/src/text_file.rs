@@ -90,7 +90,7 @@ impl TextFile {
         let bytes = &bytes[mark_bytes..];
         if let Some(zero) = bytes.iter().position(|byte| *byte == 0) {
             let before = &bytes[..zero];
-            let line = 1 + before.iter().filter(|byte| **byte == b'\n').count() as u64;
+            let line = before.split(|byte| *byte == b'\n').count() as u64;
             let what =
                 "a zero byte: no text, or UTF-16 without a byte order mark; save it as UTF-8";
             return refuse(line, (mark_bytes + zero) as u64, what.to_owned());

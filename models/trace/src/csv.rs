@@ -350,6 +350,8 @@ fn optional<T: core::str::FromStr>(text: Option<&str>, name: &str) -> Result<Opt
 mod tests {
     use super::*;
 
+    type OfMilliseconds = fn(i64) -> i64;
+
     fn sample() -> Trace {
         let mut header = TraceHeader::new("egm/right/command");
         header.clock = "one clock".to_owned();
@@ -417,7 +419,7 @@ mod tests {
             (records[0].published_ns, records[199].departure_ns),
             (0, 1_990_000_000)
         );
-        let units: [(fn(i64) -> i64, &str); 3] = [
+        let units: [(OfMilliseconds, &str); 3] = [
             (|ms| ms / 1_000, "in s,"),
             (|ms| ms, "in ms,"),
             (|ms| ms * 1_000, "in us,"),

@@ -95,6 +95,10 @@ impl GuidedArms {
     }
 }
 
+/// [`DELAY_CYCLES_MAX`], as a setting states it.
+const DELAY_CYCLES: u32 = 16;
+const _: () = assert!(DELAY_CYCLES as usize == DELAY_CYCLES_MAX);
+
 /// Declares the settings of the controller, one a line: what it is, key and type in files, the maker's
 /// default, range, and what becomes of it in SI units. Gives [`EgmParameters`], [`ControllerSettings`]
 /// and what leads from one to the other.
@@ -122,7 +126,7 @@ macro_rules! settings {
         #[allow(non_upper_case_globals, reason = "as the keys are spelled")]
         #[allow(dead_code, reason = "a request may change only some of them")]
         mod allowed {
-            use super::{DELAY_CYCLES_MAX, RangeInclusive};
+            use super::{DELAY_CYCLES, RangeInclusive};
 
             $($(pub(super) const $key: RangeInclusive<$kind> = $allowed;)?)+
         }
@@ -197,7 +201,7 @@ settings! {
     activation_s: f64 = 0.5, in 0.0..=60.0, as activation_s: f64 = as_is;
     /// Cycles by which the measured joints lag the planned ones: the maker's control lag of 10 to
     /// 20 ms, filtering level included.
-    control_delay_cycles: u32 = 4, in 0..=DELAY_CYCLES_MAX as u32,
+    control_delay_cycles: u32 = 4, in 0..=DELAY_CYCLES,
         as control_delay_cycles: usize = whole;
 }
 

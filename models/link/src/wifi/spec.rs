@@ -239,6 +239,9 @@ mod tests {
         assert_eq!(refused(|spec| spec.fading_m = 0.2), "fading_m");
         assert_eq!(refused(|spec| spec.contender_count = 0), "busy_ratio");
         assert_eq!(refused(|spec| spec.distance_m = f64::NAN), "distance_m");
-        assert_eq!(refused(|spec| spec.outages.per_hour = -1.0), "per_hour");
+        assert_eq!(
+            refused(|spec| spec.outages.per_hour = -1.0),
+            "outages.per_hour"
+        );
     }
 }

@@ -248,7 +248,7 @@ impl Line {
         let newest = counters.newest_report.map(|report| failure(report, true));
         if newest == Some(TransmitFailure::PeerUnreachable) {
             let newest = counters.newest_report;
-            self.is_unreachable = newest.is_some_and(|report| report.is_unreachable());
+            self.is_unreachable = newest.is_some_and(SendRefusal::is_unreachable);
             bridge.on_peer_unreachable(now);
         }
     }

@@ -68,7 +68,7 @@ impl Neighbours {
             let peer = self.hosts.get(&address)?.clone();
             let place = (address, interface.clone());
             let before = self.known.insert(place, now.clone())?;
-            (before != now).then(|| EventKind::NeighbourChanged {
+            (before != now).then_some(EventKind::NeighbourChanged {
                 peer,
                 address,
                 interface,
