@@ -24,7 +24,7 @@ Examples:
   hil-runtime --topology deploy/topologies/split.toml
       this host's share of the loop; start the same command on the other host
   hil-runtime --topology deploy/topologies/split.toml --on-one-pc
-      both hosts on this PC, each with a network of its own and a virtual cable between them
+      both hosts on this PC, each with a network of its own
   hil-runtime --topology deploy/topologies/split.toml --check
       say what is wrong with the file, start nothing
   hil-runtime join --link 'delay 5ms loss 1%' -- ./ctrl 10.77.0.2 -- ./robot
@@ -145,7 +145,7 @@ pub struct RunArgs {
 
     /// Run all hosts of the file on this PC, each with a network and shared memory of its own, joined by virtual
     /// Ethernet; needs neither root nor a key.
-    #[arg(long, conflicts_with = "host")]
+    #[arg(long, conflicts_with_all = ["host", "domain_root"])]
     pub on_one_pc: bool,
 
     /// The host among those of --on-one-pc that this process is; not for use by hand.

@@ -291,9 +291,9 @@ fn run_topology(
 /// Runs all hosts of `topology` here, each under a supervisor of its own.
 fn on_one_pc(path: &Path, topology: &Topology, console: &mut Console) -> Result<u8, Refusal> {
     host::run_all(topology, console).map_err(|error| match error {
-        HostsError::WithoutAddress | HostsError::OneInterface { .. } => {
-            usage(format!("{}: {error}", path.display()))
-        }
+        HostsError::WithoutAddress
+        | HostsError::OneInterface { .. }
+        | HostsError::SameInterface(_) => usage(format!("{}: {error}", path.display())),
         other => Refusal::new(exit::HOST_UNFIT, other),
     })
 }

@@ -246,15 +246,20 @@ fn a_killed_end_comes_back_and_a_cable_pulled_in_the_run_leaves_a_gap_that_is_to
             assert_eq!(events.count(), 1, "{:?}", summary.events);
         }
     }
-    // Two starts of the asking end, and nothing of messages that there are none of.
+    // Two starts of each end, and nothing of messages that there are none of.
     let names = std::fs::read_dir(files).unwrap().map(|entry| {
         let name = entry.unwrap().file_name();
         name.to_string_lossy().into_owned()
     });
     let mut names: Vec<String> = names.filter(|name| name.starts_with("clock.")).collect();
     names.sort();
-    let file = "clock.control-pc-robot-pc.round-trip.clock-robot-pc-control-pc";
-    assert_eq!(names, [0, 1].map(|start| format!("{file}.{start}.rec")));
+    let path = "clock.control-pc-robot-pc";
+    let of_ends = [
+        "no-room.clock-control-pc-robot-pc",
+        "round-trip.clock-robot-pc-control-pc",
+    ];
+    let files = of_ends.map(|end| [0, 1].map(|start| format!("{path}.{end}.{start}.rec")));
+    assert_eq!(names, files.concat());
 }
 
 #[test]

@@ -1,6 +1,6 @@
-//! Requests and their answers: whether each came back in time, and if not, whose time it took. An answer to a request
-//! is the first frame that the other program sent back after it was given the request, since what programs
-//! say is not read. Times of two hosts are never compared: a request and its answer are timed where the
+//! Requests and their answers: whether each came back in time, and if not, whose time it took. The answer to a request
+//! is the first frame that the other program sent back after it was given the request and before it was given the
+//! next, since what programs say is not read. Times of two hosts are never compared: a request and its answer are timed where the
 //! request began, and the program between them where it ran.
 
 use hil_stats::histogram::Distribution;
@@ -47,7 +47,7 @@ pub struct DeadlineMetrics {
     pub late_by_both_count: u64,
     /// The network lost the request or the answer.
     pub missing_by_network_count: u64,
-    /// The program was given the request and sent nothing any more.
+    /// The program was given the request and sent nothing before it was given the next.
     pub missing_by_program_count: u64,
     /// A host lost the request or the answer.
     pub missing_by_harness_count: u64,
@@ -95,38 +95,51 @@ impl DeadlineFold {
     pub fn add(&mut self, requests: &[FramePassage], answers: &[FramePassage]) {
         // The last moment of which the requesting program's host knows.
         let last_ns = requests.iter().map(|request| request.sent_ns).max();
+        let mut given = Vec::new();
         for request in requests {
             self.metrics.request_count += 1;
-            let is_over = last_ns.is_some_and(|ns| ns - request.sent_ns >= self.metrics.limit_ns);
-            self.add_one(request, answers, is_over);
+            match request.end {
+                FrameEnd::Given(given_ns) => given.push((given_ns, request.sent_ns)),
+                end => self.metrics.add_missing(end),
+            }
+        }
+        given.sort_unstable();
+        for (index, &(given_ns, sent_ns)) in given.iter().enumerate() {
+            let first = answers.partition_point(|answer| answer.sent_ns < given_ns);
+            let next_ns = given.get(index + 1).map(|(next_ns, _)| *next_ns);
+            let is_its = |answer: &&FramePassage| next_ns.is_none_or(|ns| answer.sent_ns < ns);
+            if let Some(answer) = answers.get(first).filter(is_its) {
+                self.add_answered([sent_ns, given_ns], answer);
+                continue;
+            }
+            let waited_ns = last_ns.map_or(0, |ns| ns.saturating_sub(sent_ns));
+            if next_ns.is_some() || waited_ns >= self.metrics.limit_ns {
+                self.metrics.missing_by_program_count += 1;
+            } else {
+                self.metrics.unknown_count += 1;
+            }
         }
     }
 
-    fn add_one(&mut self, request: &FramePassage, answers: &[FramePassage], is_over: bool) {
+    /// Adds requests that no frame answers by its ends, as those to many.
+    pub fn add_unanswerable(&mut self, requests: &[FramePassage]) {
+        self.metrics.request_count += requests.len() as u64;
+        self.metrics.unknown_count += requests.len() as u64;
+    }
+
+    fn add_answered(&mut self, [sent_ns, given_ns]: [i64; 2], answer: &FramePassage) {
         let metrics = &mut self.metrics;
-        let given_ns = match request.end {
-            FrameEnd::Given(given_ns) => given_ns,
-            end => return metrics.add_missing(end),
-        };
-        let first = answers.partition_point(|answer| answer.sent_ns < given_ns);
-        let Some(answer) = answers.get(first) else {
-            if is_over {
-                metrics.missing_by_program_count += 1;
-            } else {
-                metrics.unknown_count += 1;
-            }
-            return;
-        };
         let back_ns = match answer.end {
             FrameEnd::Given(back_ns) => back_ns,
             end => return metrics.add_missing(end),
         };
-        let response_ns = back_ns.saturating_sub(request.sent_ns);
+        let response_ns = back_ns.saturating_sub(sent_ns);
         let program_ns = answer.sent_ns.saturating_sub(given_ns);
         self.responses_ns.push(response_ns);
         self.programs_ns.push(program_ns);
         let is_long = |ns: i64| ns > metrics.limit_ns;
-        let (program, network) = (is_long(program_ns), is_long(response_ns - program_ns));
+        let network_ns = response_ns.saturating_sub(program_ns);
+        let (program, network) = (is_long(program_ns), is_long(network_ns));
         let count = match (is_long(response_ns), network, program) {
             (false, ..) => &mut metrics.in_time_count,
             (true, true, false) => &mut metrics.late_by_network_count,
@@ -147,6 +160,11 @@ impl DeadlineFold {
 }
 
 impl DeadlineMetrics {
+    /// An inlet lost frames, of which answers may have been.
+    pub fn doubt_program(&mut self) {
+        self.unknown_count += core::mem::take(&mut self.missing_by_program_count);
+    }
+
     fn add_missing(&mut self, end: FrameEnd) {
         *match end {
             FrameEnd::LostByNetwork => &mut self.missing_by_network_count,
@@ -232,6 +250,22 @@ mod tests {
         assert_eq!(counts, [10, 1, 1, 1, 2, 2, 1, 1, 1]);
         assert_eq!(found.response.measured().unwrap().max_ns, 11 * MS);
         assert_eq!(found.program.measured().unwrap().max_ns, 5 * MS);
+    }
+
+    #[test]
+    fn an_answer_serves_the_newest_request_that_was_given_before_it() {
+        let requests = [request(0, 1), request(4, 1), request(8, 1)];
+        let found = folded(
+            4 * MS,
+            &requests,
+            &[answer(6, 1), answer(7, 1), answer(10, 1)],
+        );
+        let counts = [found.missing_by_program_count, found.in_time_count];
+        assert_eq!(counts, [1, 2]);
+        assert_eq!(found.response.measured().unwrap().max_ns, 3 * MS);
+        let mut fold = DeadlineFold::new("to many", MS);
+        fold.add_unanswerable(&requests);
+        assert_eq!(fold.finish().unknown_count, 3);
     }
 
     #[test]

@@ -15,7 +15,7 @@ pub struct FlowFilter(Vec<Term>);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Term {
-    Protocol(&'static [u8]),
+    Protocol(u8),
     Arp,
     V4,
     V6,
@@ -50,8 +50,8 @@ pub enum FilterError {
     Empty,
     /// A word that it does not know.
     #[error(
-        "has `{0}`; known are udp, tcp, icmp, arp, ip, ip6, [src|dst] host ADDRESS, [src|dst] port NUMBER, \
-         joined by `and`"
+        "has `{0}` where one of udp, tcp, icmp, icmp6, arp, ip, ip6, [src|dst] host ADDRESS or [src|dst] port NUMBER \
+         is expected"
     )]
     Word(String),
     /// A word without what belongs to it.
@@ -81,10 +81,10 @@ impl FromStr for FlowFilter {
                 other => (End::Either, other),
             };
             terms.push(match (end, kind) {
-                (End::Either, "udp") => Term::Protocol(&[UDP]),
-                (End::Either, "tcp") => Term::Protocol(&[TCP]),
-                (End::Either, "icmp") => Term::Protocol(&[ICMP]),
-                (End::Either, "icmp6") => Term::Protocol(&[ICMP_V6]),
+                (End::Either, "udp") => Term::Protocol(UDP),
+                (End::Either, "tcp") => Term::Protocol(TCP),
+                (End::Either, "icmp") => Term::Protocol(ICMP),
+                (End::Either, "icmp6") => Term::Protocol(ICMP_V6),
                 (End::Either, "arp") => Term::Arp,
                 (End::Either, "ip") => Term::V4,
                 (End::Either, "ip6") => Term::V6,
@@ -108,6 +108,19 @@ fn value<T: FromStr>(kind: &'static str, text: &str) -> Result<T, FilterError> {
 }
 
 impl FlowFilter {
+    /// True where no frame that goes back is of it.
+    pub fn is_one_way(&self) -> bool {
+        let is_end = |term: &Term| matches!(term, Term::Host(end, _) | Term::Port(end, _) if *end != End::Either);
+        self.0.iter().any(is_end)
+    }
+
+    /// True where it takes datagrams alone, so that each frame back is the program's: TCP acknowledges by itself.
+    pub fn is_of_datagrams(&self) -> bool {
+        let is_datagrams =
+            |term: &Term| matches!(term, Term::Protocol(protocol) if *protocol != TCP);
+        self.0.iter().any(is_datagrams)
+    }
+
     /// True of a frame of this flow.
     pub fn takes(&self, key: &FlowKey) -> bool {
         self.0.iter().all(|term| term.is_of(key))
@@ -118,7 +131,7 @@ impl Term {
     fn is_of(self, key: &FlowKey) -> bool {
         match (self, *key) {
             (Self::Arp, FlowKey::Other(kind)) => kind == ARP,
-            (Self::Protocol(list), FlowKey::Ip { protocol, .. }) => list.contains(&protocol),
+            (Self::Protocol(own), FlowKey::Ip { protocol, .. }) => own == protocol,
             (Self::V4, FlowKey::Ip { source, .. }) => source.is_ipv4(),
             (Self::V6, FlowKey::Ip { source, .. }) => source.is_ipv6(),
             (
@@ -170,6 +183,16 @@ mod tests {
         }
         let arp: FlowFilter = "arp".parse().unwrap();
         assert!(arp.takes(&FlowKey::Other(0x0806)));
+        for (text, one_way, datagrams) in [
+            ("udp dst port 1", true, true),
+            ("udp port 1", false, true),
+            ("tcp dst port 1", true, false),
+            ("src host 10.0.0.1", true, false),
+        ] {
+            let filter: FlowFilter = text.parse().unwrap();
+            let found = (filter.is_one_way(), filter.is_of_datagrams());
+            assert_eq!(found, (one_way, datagrams), "{text}");
+        }
         let port: FlowFilter = "udp port 1".parse().unwrap();
         assert!(!port.takes(&FlowKey::Rest));
     }

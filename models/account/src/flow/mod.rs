@@ -72,21 +72,29 @@ impl FlowKey {
         Self::read(head.unwrap_or(&record.head)).unwrap_or(Self::TooShort)
     }
 
-    /// Of the frames that go back; `None` where these have no ends.
+    const fn has_ports(&self) -> bool {
+        matches!(self, Self::Ip { ports: Some(_), .. })
+    }
+
+    /// Of the frames that go back; `None` where these have no ends of their own, as behind frames to many.
     pub fn reversed(self) -> Option<Self> {
+        let is_of_many = |address: IpAddr| match address {
+            IpAddr::V4(address) => address.is_multicast() || address.is_broadcast(),
+            IpAddr::V6(address) => address.is_multicast(),
+        };
         match self {
             Self::Ip {
                 protocol,
                 source,
                 destination,
                 ports,
-            } => Some(Self::Ip {
+            } if !is_of_many(destination) => Some(Self::Ip {
                 protocol,
                 source: destination,
                 destination: source,
                 ports: ports.map(|[from, to]| [to, from]),
             }),
-            Self::Other(_) | Self::TooShort | Self::Rest => None,
+            Self::Ip { .. } | Self::Other(_) | Self::TooShort | Self::Rest => None,
         }
     }
 
@@ -113,23 +121,33 @@ fn packet_of(frame: &[u8]) -> Option<(u16, &[u8])> {
     Some((kind, frame.get(at + 2..)?))
 }
 
-/// What a TCP segment brings: from which number of the stream, how many bytes (RFC 9293, section 3.1). `None` of
-/// anything else, and behind options of IPv6.
-fn tcp_bytes(frame: &[u8]) -> Option<(u32, u32)> {
+/// What a TCP segment brings to its stream (RFC 9293, section 3.1).
+struct Segment {
+    /// Number of its first byte.
+    number: u32,
+    /// How many.
+    byte_count: u32,
+    /// It begins a stream.
+    begins: bool,
+}
+
+/// The segment of a whole IPv4 packet; over IPv6 the head that is kept of a frame is too short for one.
+fn tcp_segment(frame: &[u8]) -> Option<Segment> {
+    const SYN: u8 = 0x02;
+    const FRAGMENT: u16 = 0x3fff;
     let (kind, packet) = packet_of(frame)?;
-    let (header_bytes, packet_bytes) = match (kind, packet.first()? >> 4) {
-        (0x0800, 4) if packet.get(9) == Some(&TCP) => (
-            usize::from(packet[0] & 0x0f) * 4,
-            usize::from(u16_at(packet, 2)?),
-        ),
-        (0x86dd, 6) if packet.get(6) == Some(&TCP) => (40, 40 + usize::from(u16_at(packet, 4)?)),
-        _ => return None,
-    };
+    if kind != 0x0800 || *packet.get(9)? != TCP || u16_at(packet, 6)? & FRAGMENT != 0 {
+        return None;
+    }
+    let header_bytes = usize::from(packet.first()? & 0x0f) * 4;
     let segment = packet.get(header_bytes..)?;
-    let number = u32::from_be_bytes(array_at(segment, 4)?);
     let data_at = header_bytes + usize::from(*segment.get(12)? >> 4) * 4;
-    let length = u32::try_from(packet_bytes.checked_sub(data_at)?).ok()?;
-    Some((number, length))
+    let byte_count = usize::from(u16_at(packet, 2)?).checked_sub(data_at)?;
+    Some(Segment {
+        number: u32::from_be_bytes(array_at(segment, 4)?),
+        byte_count: u32::try_from(byte_count).ok()?,
+        begins: segment.get(13)? & SYN != 0,
+    })
 }
 
 fn u16_at(bytes: &[u8], at: usize) -> Option<u16> {
@@ -241,22 +259,22 @@ pub struct FlowMetrics {
     /// Largest extent of these: the places that a buffer needs to restore the order (section 4.2).
     #[serde(default)]
     pub reordered_extent_max: u64,
-    /// Of TCP: frames with bytes of the stream that one before had brought, so that the program's kernel sent them
-    /// again.
+    /// Of TCP over IPv4: frames with bytes of the stream that one before had brought, so that the program's kernel
+    /// sent them again.
     #[serde(default)]
     pub retransmitted_count: Option<u64>,
     /// From leaving the program's interface until the other's was given it.
     pub delay: Distribution,
 }
 
-/// Sums frames up by flow. Memory grows by twenty bytes a frame, and by thirty of flows with a deadline.
+/// Sums frames up by flow. Memory grows by 32 bytes a frame, and by as many again of flows with a deadline.
 #[derive(Debug, Default)]
 pub struct FlowFold<'a> {
     named: &'a [NamedFlow],
     indices: BTreeMap<FlowKey, u32>,
     keyed: Vec<Keyed>,
-    /// The key of each frame, by the start of its inlet and its number.
-    frames: BTreeMap<u32, Vec<u32>>,
+    /// The numbers of the frames in order, each with the place of its key, by the start of its inlet.
+    frames: BTreeMap<u32, Vec<(u64, u32)>>,
     flows: Vec<Flow>,
 }
 
@@ -326,27 +344,31 @@ impl<'a> FlowFold<'a> {
     /// Takes what is known of a frame itself; before [`FlowFold::add`] of its message.
     pub fn add_frame(&mut self, record: &FrameRecord) {
         let index = self.index_of(FlowKey::of(record));
-        let Ok(sequence) = usize::try_from(record.sequence) else {
-            return;
-        };
         let frames = self.frames.entry(record.epoch).or_default();
-        // Numbers follow one another; a hole is of records that are lost.
-        if frames.len() <= sequence {
-            frames.resize(sequence + 1, UNKNOWN);
+        // An inlet numbers its frames as they come; others are of a damaged file.
+        if frames
+            .last()
+            .is_some_and(|(last, _)| *last >= record.sequence)
+        {
+            return;
         }
-        frames[sequence] = index;
+        frames.push((record.sequence, index));
         let keyed = &mut self.keyed[index as usize];
         let flow = &mut self.flows[keyed.flow];
         flow.byte_count += u64::from(record.length_bytes);
         let head = record.head.get(..usize::from(record.head_bytes));
-        if let Some((number, length)) = head.and_then(tcp_bytes) {
+        let segment = head.filter(|_| keyed.key.has_ports()).and_then(tcp_segment);
+        if let Some(segment) = segment {
             let count = flow.retransmitted_count.get_or_insert(0);
+            if segment.begins {
+                keyed.next_byte = None;
+            }
             // Numbers come round.
-            let is_before = |next: u32| number.wrapping_sub(next).cast_signed() < 0;
-            if length > 0 && keyed.next_byte.is_some_and(is_before) {
+            let is_before = |next: u32| segment.number.wrapping_sub(next).cast_signed() < 0;
+            if segment.byte_count > 0 && keyed.next_byte.is_some_and(is_before) {
                 *count += 1;
-            } else if length > 0 {
-                keyed.next_byte = Some(number.wrapping_add(length));
+            } else if segment.byte_count > 0 {
+                keyed.next_byte = Some(segment.number.wrapping_add(segment.byte_count));
             }
         }
     }
@@ -355,15 +377,24 @@ impl<'a> FlowFold<'a> {
         if let Some(index) = self.indices.get(&key) {
             return *index;
         }
-        let key = if self.indices.len() < FLOWS_MAX {
-            key
-        } else {
+        let named = self.named.iter().find(|one| one.filter.takes(&key));
+        let is_beyond = self.indices.len() >= FLOWS_MAX;
+        if let Some(one) = named.filter(|_| is_beyond)
+            && let Some(index) = self
+                .keyed
+                .iter()
+                .position(|keyed| self.flows[keyed.flow].name == one.name)
+        {
+            return u32::try_from(index).unwrap_or(UNKNOWN);
+        }
+        let key = if is_beyond && named.is_none() {
             FlowKey::Rest
+        } else {
+            key
         };
         let next = u32::try_from(self.keyed.len()).unwrap_or(UNKNOWN);
         let index = *self.indices.entry(key).or_insert(next);
         if index == next {
-            let named = self.named.iter().find(|one| one.filter.takes(&key));
             let name = named.map_or_else(|| key.to_string(), |one| one.name.clone());
             let known = named.and(self.flows.iter().position(|flow| flow.name == name));
             let flow = known.unwrap_or_else(|| {
@@ -394,11 +425,12 @@ impl<'a> FlowFold<'a> {
 
     /// Takes the fate of a frame; one without a record is of no flow.
     pub fn add(&mut self, message: &MessageHistory, path: ChannelPath<'_>) {
-        let frames = self.frames.get(&message.epoch);
-        let index = usize::try_from(message.key.sequence)
-            .ok()
-            .and_then(|sequence| frames?.get(sequence).copied());
-        let Some(index) = index.filter(|index| *index != UNKNOWN) else {
+        let frames = self
+            .frames
+            .get(&message.epoch)
+            .map_or(&[][..], Vec::as_slice);
+        let found = frames.binary_search_by_key(&message.key.sequence, |(sequence, _)| *sequence);
+        let Ok(index) = found.map(|place| frames[place].1) else {
             return;
         };
         let place = place_of(message.fate);
@@ -595,24 +627,29 @@ mod tests {
 
     #[test]
     fn bytes_of_a_stream_that_are_sent_again_are_counted() {
+        const ACK: u8 = 0x10;
+        const SYN: u8 = 0x02;
         let mut fold = FlowFold::default();
         let mut files = Files::default();
         let segments = [
-            (u32::MAX - 9, 20_u16),
-            (10, 30),
+            (u32::MAX - 9, 20_u16, ACK),
+            (10, 30, ACK),
             // An acknowledgement alone, of an old number.
-            (5, 0),
-            (10, 30),
-            (40, 5),
-            (42, 8),
+            (5, 0, ACK),
+            (10, 30, ACK),
+            (40, 5, ACK),
+            (42, 8, ACK),
+            // Another connection between the same ports.
+            (7, 0, SYN),
+            (8, 5, ACK),
         ];
-        for (sequence, (number, length)) in (0..).zip(segments) {
+        for (sequence, (number, length, flags)) in (0..).zip(segments) {
             files.write(at(7, sequence), MessageFate::Taken);
             let segment = [
                 &[0, 1, 0, 2][..],
                 &number.to_be_bytes(),
                 &[0; 4],
-                &[0x50, 0, 0, 0],
+                &[0x50, flags, 0, 0],
             ]
             .concat();
             let mut packet = packet(6, 0, &segment);

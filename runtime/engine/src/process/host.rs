@@ -3,7 +3,7 @@
 
 use std::ffi::OsString;
 use std::fs::{DirBuilder, File};
-use std::io::{self, BufRead as _, BufReader, pipe};
+use std::io::{self, BufReader, pipe};
 use std::net::IpAddr;
 use std::os::fd::AsFd as _;
 use std::os::unix::fs::DirBuilderExt as _;
@@ -27,7 +27,7 @@ use nix::unistd::dup2_stdin;
 
 use super::own_program::{OwnProgramError, bind_to};
 use crate::security::PreSharedKey;
-use crate::supervisor::Child;
+use crate::supervisor::{Child, next_line};
 
 /// The argument that asks for it.
 pub const ALL: &str = "--on-one-pc";
@@ -42,6 +42,8 @@ const INTERFACES: &str = "eth";
 
 /// Lines of other hosts that wait to be said.
 const LINES: usize = 64;
+/// What is said of a longer one.
+const LINE_BYTES_MAX: usize = 4096;
 /// How often it is looked whether a host has ended.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// How long the others may go on once a host has failed.
@@ -70,6 +72,12 @@ pub enum HostsError {
         /// Of hosts.
         count: usize,
     },
+    /// The link under test and the clock path of a host.
+    #[error(
+        "hosts.{0}.interface and clock_interface are one, and on one PC each path has an interface of its own; leave \
+         one out"
+    )]
+    SameInterface(String),
     /// The kernel refuses something here.
     #[error(transparent)]
     Refused(#[from] Refusal),
@@ -149,7 +157,9 @@ pub fn run_all(topology: &Topology, console: &mut Console) -> Result<u8, HostsEr
             helper.stdout(Stdio::null()).stderr(write);
             let (lines, name) = (lines.clone(), host.name.clone());
             thread::spawn(move || {
-                for line in BufReader::new(read).lines().map_while(Result::ok) {
+                let mut words = BufReader::new(read);
+                while let Ok(Some(line)) = next_line(&mut words, LINE_BYTES_MAX) {
+                    let line = String::from_utf8_lossy(&line);
                     if lines.send(format!("{name}: {line}")).is_err() {
                         return;
                     }
@@ -224,11 +234,23 @@ fn wires(hosts: &[Host]) -> Result<Vec<Wire>, HostsError> {
     if hosts.iter().any(|host| host.address.is_none()) {
         return Err(HostsError::WithoutAddress);
     }
+    let has_one = |host: &&Host| host.interface.is_some() && host.interface == host.clock_interface;
+    if let Some(host) = hosts.iter().find(has_one) {
+        return Err(HostsError::SameInterface(host.name.clone()));
+    }
     let mut next = vec![0; hosts.len()];
     let mut end = |index: usize, key: &'static str, address: IpAddr, named: &Option<String>| {
         let host: &Host = &hosts[index];
-        let drawn = format!("{INTERFACES}{}", next[index]);
-        next[index] += 1;
+        let has =
+            |name: &String| [&host.interface, &host.clock_interface].contains(&&Some(name.clone()));
+        let mut drawn = format!("{INTERFACES}{}", next[index]);
+        while has(&drawn) {
+            next[index] += 1;
+            drawn = format!("{INTERFACES}{}", next[index]);
+        }
+        if named.is_none() {
+            next[index] += 1;
+        }
         if named.is_some() && hosts.len() > 2 {
             return Err(HostsError::OneInterface {
                 host: host.name.clone(),
@@ -304,9 +326,13 @@ mod tests {
     #[test]
     fn each_two_hosts_have_a_wire_and_clock_paths_have_one_of_their_own() {
         let hosts = |hosts: &[&str]| {
-            let head = "version = 1\nname = \"wires\"\n[hosts]\n";
-            let process = "\n[processes.one]\nhost = \"a\"\nrun = [\"true\"]\n";
-            let text = format!("{head}{}{process}", hosts.join("\n"));
+            let rest = "[processes]\none = { host = \"a\", run = [\"true\"] }\n\
+                        two = { host = \"b\", run = [\"true\"] }\n\
+                        [channels.c]\nfrom = \"one\"\nto = \"two\"\nlink = \"hop\"\n\
+                        message = { name = \"m\", size_bytes = 8 }\n\
+                        [links.hop]\nvia = \"udp\"\nbetween = [\"a\", \"b\"]\n";
+            let hosts = hosts.join("\n");
+            let text = format!("version = 1\nname = \"wires\"\n[hosts]\n{hosts}\n{rest}");
             let topology = hil_topology::parse("wires", &text, &[], Registry::default().known());
             topology.unwrap().hosts().to_vec()
         };
@@ -319,7 +345,16 @@ mod tests {
         let other = "b = { address = \"192.168.1.2\", clock_address = \"fd00::2\" }";
         let third = "c.address = \"10.0.0.3\"";
         let made = wires(&hosts(&[first, other])).unwrap();
-        assert_eq!(names(&made), [["lan", "eth0"], ["eth1", "eth1"]]);
+        assert_eq!(names(&made), [["lan", "eth0"], ["eth0", "eth1"]]);
+        let taken =
+            "a = { address = \"10.0.0.1\", interface = \"eth0\", clock_address = \"fd00::1\" }";
+        assert_eq!(
+            names(&wires(&hosts(&[taken, other])).unwrap()),
+            [["eth0", "eth0"], ["eth1", "eth1"]]
+        );
+        let same = taken.replace("clock_address", "clock_interface = \"eth0\", clock_address");
+        let error = wires(&hosts(&[&same, other])).unwrap_err();
+        assert!(matches!(error, HostsError::SameInterface(_)), "{error}");
         let error = wires(&hosts(&[first, other, third])).unwrap_err();
         assert!(
             error.to_string().starts_with("hosts.a.interface "),

@@ -26,7 +26,7 @@ use std::path::{Path, PathBuf};
 use std::{fs, io};
 
 use hil_account::MessageFate;
-use hil_account::flow::{DeadlineFold, DeadlineMetrics, FlowPassages, NamedFlow};
+use hil_account::flow::{DeadlineFold, DeadlineMetrics, FlowKey, FlowPassages, NamedFlow};
 use hil_account::radio::RadioMetrics;
 use hil_core::case_study::Score;
 use hil_core::plot::PlotSeries;
@@ -281,6 +281,10 @@ fn read_channels(
             .extend(radio.map(|radio| (channel.name.clone(), radio)));
     }
     found.deadlines = deadlines(&named, &passages);
+    if found.flows.iter().any(|one| one.inlet_lost_count() > 0) {
+        let deadlines = found.deadlines.iter_mut();
+        deadlines.for_each(DeadlineMetrics::doubt_program);
+    }
     found
 }
 
@@ -290,9 +294,17 @@ fn deadlines(named: &[NamedFlow], passages: &FlowPassages) -> Vec<DeadlineMetric
     timed
         .map(|(flow, limit_ns)| {
             let mut fold = DeadlineFold::new(&flow.name, limit_ns);
-            for (key, requests) in passages.iter().filter(|(key, _)| flow.filter.takes(key)) {
-                let back = key.reversed().and_then(|back| passages.get(&back));
-                fold.add(requests, back.map_or(&[], Vec::as_slice));
+            // As a frame has one flow.
+            let is_its = |key: &FlowKey| {
+                let mut named = named.iter();
+                named.find(|one| one.filter.takes(key)) == Some(flow)
+            };
+            for (key, requests) in passages.iter().filter(|(key, _)| is_its(key)) {
+                let Some(back) = key.reversed() else {
+                    fold.add_unanswerable(requests);
+                    continue;
+                };
+                fold.add(requests, passages.get(&back).map_or(&[], Vec::as_slice));
             }
             fold.finish()
         })
