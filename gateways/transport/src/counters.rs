@@ -194,7 +194,7 @@ counts! {
 pub struct LinkCounts {
     /// Datagrams it lost.
     pub lost_count: u64,
-    /// Datagrams dropped because the emulation already held as many as it may.
+    /// Datagrams, and copies that it makes of them, dropped because the emulation already held as many as it may.
     pub overflow_count: u64,
     /// What the lost ones were lost to; `None` for a model that does not tell.
     pub causes: Option<LossCauses>,

@@ -120,7 +120,7 @@ pub struct EmulatedReceiver {
     counters: ReceiverCounters,
     /// By channel number.
     lost: Vec<LinkCounts>,
-    /// Datagrams of any channel that found all places taken.
+    /// Datagrams of any channel that found all places taken; not the copies of those that found one.
     overflow_count: u64,
 }
 
@@ -199,7 +199,8 @@ impl EmulatedReceiver {
         // does not depend on how full we were.
         let fate = offer.and_then(|offer| self.links.offer(arrived, length_bytes, offer));
         let Some((offer, fate)) = offer.zip(fate) else {
-            self.hold(received, place, arrived, None);
+            let is_held = self.hold(received, place, arrived, None);
+            self.overflow_count += u64::from(!is_held);
             return;
         };
         let channel = Some(offer.channel);
@@ -210,7 +211,8 @@ impl EmulatedReceiver {
             return;
         };
         received.emulated = Some(EmulatedDelay { arrived, due });
-        self.hold(received, place, due, channel);
+        let is_held = self.hold(received, place, due, channel);
+        self.overflow_count += u64::from(!is_held);
         if let Some(due) = fate.second_arrival() {
             let copy = self.next_place();
             self.storage.copy_within(
@@ -222,22 +224,29 @@ impl EmulatedReceiver {
         }
     }
 
-    /// Keeps the datagram in `place` until `due`, if that is a place.
-    fn hold(&mut self, received: Received, place: usize, due: Instant, channel: Option<u16>) {
+    /// Keeps the datagram in `place` until `due`, if that is a place; else counts it among the channel's, if it
+    /// is of one, and gives false.
+    fn hold(
+        &mut self,
+        received: Received,
+        place: usize,
+        due: Instant,
+        channel: Option<u16>,
+    ) -> bool {
         if place < self.held.len() {
             self.free.pop();
             self.held[place] = Some(received);
         } else if place < self.settings.capacity_count {
             self.held.push(Some(received));
         } else {
-            self.overflow_count += 1;
             if let Some(counts) = self.counts_of(channel) {
                 counts.overflow_count += 1;
             }
-            return;
+            return false;
         }
         self.order.push(Reverse((due, self.arrival_count, place)));
         self.arrival_count += 1;
+        true
     }
 
     fn counts_of(&mut self, channel: Option<u16>) -> Option<&mut LinkCounts> {

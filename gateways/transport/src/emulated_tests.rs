@@ -173,6 +173,11 @@ fn copies_that_find_no_room_are_counted_and_the_receiver_stays_bounded() {
     }
     // Two places for the first, one for the second: its copy, and both of the others, drop.
     assert_eq!(receiver.counts().overflow_count, 5);
+    assert_eq!(
+        receiver.no_room_count(),
+        2,
+        "a copy is no datagram that was sent"
+    );
     let at = |ms| Instant::from_ns(ms * MS);
     assert_eq!(take(&mut receiver, at(10)).unwrap().0, 0);
     assert_eq!(take(&mut receiver, at(10)).unwrap().0, 1);

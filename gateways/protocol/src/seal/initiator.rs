@@ -11,7 +11,7 @@ use crate::wire::{Kind, TAG_BYTES, u32_at};
 
 /// Clock exchanges without an authentic reply after which keys are asked for again: the receiver may
 /// have started anew, and then knows the old ones no more.
-const UNANSWERED_MAX: u32 = 3;
+pub const UNANSWERED_MAX: u32 = 3;
 /// Starts of the receiver whose keys are never taken up again.
 const RETIRED_LENGTH: usize = 32;
 

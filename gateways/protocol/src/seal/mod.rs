@@ -33,7 +33,7 @@ mod traffic;
 pub mod window;
 
 pub use counts::{SealCounts, SealRefusal, SealRefusalCounts};
-pub use initiator::{Heard, Initiator};
+pub use initiator::{Heard, Initiator, UNANSWERED_MAX};
 pub use keys::{Association, RunSecret, SALT_BYTES, Salt, Suite};
 pub use layout::KEY_EXCHANGE_BYTES;
 pub use responder::{Opened, Responder};

@@ -2,6 +2,7 @@
 //! row, bursts and gaps as in RFC 3611, and the longest time without a message. Losses of a host
 //! neither count nor interrupt anything here.
 
+use core::fmt;
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
@@ -154,14 +155,22 @@ pub(super) fn losses(passages: &Passages, run_ns: Option<(i64, i64)>) -> Metric<
     })
 }
 
-/// Where the network lost `lost_count` of `of_count` messages, and it or the receiving host `doubtful_count` more.
-pub(super) fn between(lost_count: u64, of_count: u64, doubtful_count: u64) -> Metric<LossMetrics> {
-    let percent_of = |count: u64| 100.0 * count as f64 / (of_count + doubtful_count) as f64;
-    let [low, high] = [lost_count, lost_count + doubtful_count].map(percent_of);
-    Metric::unavailable(&format!(
-        "between {low:.3} % and {high:.3} %: of {doubtful_count} lost it is unknown whether on the wire or for want \
-         of room on the receiving host"
-    ))
+/// Between what the loss ratio of the network is, where it or the receiving host lost some messages.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LossBounds {
+    /// If the host lost all of these.
+    pub low: f64,
+    /// If the network did.
+    pub high: f64,
+    /// How many these are.
+    pub doubtful_count: u64,
+}
+
+impl fmt::Display for LossBounds {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [low, high] = [self.low, self.high].map(|ratio| 100.0 * ratio);
+        write!(f, "between {low:.3} % and {high:.3} %")
+    }
 }
 
 fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstMetrics> {

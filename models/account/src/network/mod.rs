@@ -32,7 +32,7 @@ pub use events::{
     interruptions, network_events,
 };
 pub use list::Passages;
-pub use loss::{BURST_GAP_MIN, BurstMetrics, LongestLoss, LossMetrics};
+pub use loss::{BURST_GAP_MIN, BurstMetrics, LongestLoss, LossBounds, LossMetrics};
 pub use order::OrderMetrics;
 
 use crate::{ChannelPath, Side};
@@ -209,11 +209,25 @@ impl NetworkMetrics {
             successive: delay::successive(passages, context.path),
             loss: match counts.doubtful {
                 0 => loss::losses(passages, context.run_ns),
-                doubtful_count => loss::between(counts.lost, offered_count, doubtful_count),
+                _ => Metric::unavailable(
+                    "it is unknown of some messages whether they were lost on the wire or for want of room on the \
+                     receiving host",
+                ),
             },
             order: order::order(passages),
             round_trip: round_trip.distribution("no clock exchange took place"),
         }
+    }
+
+    /// Between what the loss ratio is; `None` where it is one figure, or there is none.
+    pub fn loss_bounds(&self) -> Option<LossBounds> {
+        let doubtful_count = Some(self.doubtful_count).filter(|count| *count > 0)?;
+        let of = self.offered_count.saturating_add(doubtful_count) as f64;
+        Some(LossBounds {
+            low: self.lost_count as f64 / of,
+            high: self.lost_count.saturating_add(doubtful_count) as f64 / of,
+            doubtful_count,
+        })
     }
 }
 

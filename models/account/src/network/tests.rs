@@ -480,11 +480,15 @@ fn what_a_host_may_have_lost_makes_loss_unavailable_with_both_bounds() {
     all[7].crossing = Crossing::Doubtful;
     let figures = metrics(&all);
     assert_eq!((figures.doubtful_count, figures.unknown_count), (1, 1));
-    let Metric::Unavailable { reason } = figures.loss else {
-        panic!("{figures:?}");
+    assert!(figures.loss.measured().is_none());
+    let bounds = figures.loss_bounds().unwrap();
+    let expected = LossBounds {
+        low: 0.001,
+        high: 0.002,
+        doubtful_count: 1,
     };
-    assert!(
-        reason.starts_with("between 0.100 % and 0.200 %: of 1 lost"),
-        "{reason}"
-    );
+    assert_eq!(bounds, expected);
+    assert_eq!(bounds.to_string(), "between 0.100 % and 0.200 %");
+    let known = metrics(&passages(1_000, |one| one == 3));
+    assert_eq!(known.loss_bounds(), None);
 }

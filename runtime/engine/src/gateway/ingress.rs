@@ -33,6 +33,7 @@ pub(crate) struct Ingress {
     /// Records of messages, by channel.
     pub(crate) records: SharedSink,
     pub(super) no_room: NoRoom,
+    pub(super) no_room_records: RecordSink,
     pub(crate) wait: WaitStrategy,
     pub(crate) peer: SocketAddr,
     /// Datagrams from an address that is not the peer's, dropped unread.
@@ -51,36 +52,60 @@ pub(crate) struct Response {
     handed: Instant,
 }
 
-/// Records between which messages datagrams found no room on this host.
+/// A message whose sender's clock went on by this much more or less than this host's since the one that came before
+/// it says nothing of where datagrams are missing: without a seal anybody may have written it.
+const STRAY_NS: u64 = 60_000_000_000;
+
+/// Between which messages datagrams found no room on this host.
 #[derive(Debug)]
 pub(super) struct NoRoom {
-    sink: RecordSink,
     recorded_count: u64,
     /// When the newest message was handed over, on the sender's clock.
     newest_ns: i64,
+    /// When the last one to come was handed over, and when it came.
+    last: Option<(i64, i64)>,
 }
 
 impl NoRoom {
-    pub(super) const fn new(sink: RecordSink) -> Self {
+    pub(super) const fn new() -> Self {
         Self {
-            sink,
             recorded_count: 0,
             newest_ns: UNAVAILABLE,
+            last: None,
         }
     }
 
-    /// `count` found none before the message that was handed over at `handed_ns`, or before the end.
-    fn note(&mut self, count: u64, handed_ns: i64, noticed: Instant) {
-        if count > self.recorded_count {
-            self.sink.push(&NoRoomRecord {
-                after_ns: self.newest_ns,
-                before_ns: handed_ns,
-                noticed_ns: noticed.as_ns(),
-                datagram_count: count - self.recorded_count,
+    /// What to record when `count` found none before the message that was handed over at `handed_ns`, or before the
+    /// end. A message that was overtaken or is a copy does not tell; the next one will.
+    fn note(&mut self, count: u64, handed_ns: i64, noticed: Instant) -> Option<NoRoomRecord> {
+        let noticed_ns = noticed.as_ns();
+        if handed_ns != UNAVAILABLE {
+            let last = self.last.replace((handed_ns, noticed_ns));
+            let is_stray = last.is_some_and(|(before_ns, came_ns)| {
+                let passed_ns = noticed_ns.saturating_sub(came_ns);
+                let apart_ns = handed_ns.saturating_sub(before_ns);
+                apart_ns.saturating_sub(passed_ns).unsigned_abs() > STRAY_NS
             });
-            self.recorded_count = count;
+            let behind_ns = self.newest_ns.saturating_sub(handed_ns);
+            let is_overtaken = behind_ns >= 0 && behind_ns.unsigned_abs() <= STRAY_NS;
+            if is_stray || is_overtaken {
+                return None;
+            }
+            if behind_ns > 0 {
+                // The newest was a stray one.
+                self.newest_ns = UNAVAILABLE;
+            }
         }
+        let record = (count > self.recorded_count).then(|| NoRoomRecord {
+            after_ns: self.newest_ns,
+            before_ns: handed_ns,
+            noticed_ns,
+            datagram_count: count - self.recorded_count,
+        });
+        // A link model may hand over later what came earlier.
+        self.recorded_count = self.recorded_count.max(count);
         self.newest_ns = self.newest_ns.max(handed_ns);
+        record
     }
 }
 
@@ -130,7 +155,10 @@ impl Ingress {
         self.bridge.finish();
         self.note_incomplete();
         let count = self.receiver.no_room_count();
-        self.no_room.note(count, UNAVAILABLE, MonotonicClock::now());
+        let record = self.no_room.note(count, UNAVAILABLE, MonotonicClock::now());
+        if let Some(record) = record {
+            self.no_room_records.push(&record);
+        }
     }
 
     /// Records the messages of which some pieces did not come.
@@ -211,6 +239,7 @@ impl Ingress {
             outputs,
             records,
             no_room,
+            no_room_records,
             buffer,
             ..
         } = self;
@@ -225,8 +254,11 @@ impl Ingress {
         let taken = bridge.on_datagram(at, stamps, bytes, &mut destination);
         let failed = destination.failed;
         if let Ok(disposition) = taken {
-            if let Some(message) = disposition.message() {
-                no_room.note(received.no_room_count, message.handed.as_ns(), at);
+            if let Some(message) = disposition.message()
+                && let Some(record) =
+                    no_room.note(received.no_room_count, message.handed.as_ns(), at)
+            {
+                no_room_records.push(&record);
             }
             note_undelivered(records, &arrival, disposition);
         }
@@ -374,4 +406,57 @@ fn note_undelivered(messages: &mut SharedSink, arrival: &Arrival, disposition: D
     };
     let record = arrival.record(&message, UNAVAILABLE, flags);
     messages.push(message.channel, &record);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    /// What is recorded of messages that come a millisecond apart: `(after, before, count)` in milliseconds of the
+    /// sender's clock, of `(handed, count so far)`.
+    fn recorded(messages: &[(i64, u64)]) -> Vec<(i64, i64, u64)> {
+        let mut no_room = NoRoom::new();
+        let noted = (0_i64..)
+            .zip(messages)
+            .filter_map(|(at, (handed_ns, count))| {
+                no_room.note(*count, *handed_ns, Instant::from_ns(at * MS))
+            });
+        let in_ms = |one: NoRoomRecord| (one.after_ns / MS, one.before_ns / MS, one.datagram_count);
+        noted.map(in_ms).collect()
+    }
+
+    #[test]
+    fn drops_noticed_with_an_overtaken_or_repeated_message_lie_before_the_next_new_one() {
+        let late = [(8 * MS, 0), (10 * MS, 0), (9 * MS, 3), (14 * MS, 3)];
+        assert_eq!(recorded(&late), [(10, 14, 3)]);
+        let copy = [(10 * MS, 0), (10 * MS, 3), (14 * MS, 4), (15 * MS, 4)];
+        assert_eq!(recorded(&copy), [(10, 14, 4)]);
+    }
+
+    #[test]
+    fn an_implausible_time_of_handing_over_stops_no_later_record() {
+        for forged_ns in [i64::MAX, i64::MAX - 1, 0, -5] {
+            let base = 1_000_000 * MS;
+            let [first, second, third, last] = [1, 2, 3, 9].map(|at| base + at * MS);
+            let in_between = [
+                (first, 0),
+                (forged_ns, 0),
+                (second, 0),
+                (third, 0),
+                (last, 5),
+            ];
+            let found = recorded(&in_between);
+            assert_eq!(found, [(1_000_003, 1_000_009, 5)], "{forged_ns}");
+            let at_first = [
+                (forged_ns, 0),
+                (first, 0),
+                (second, 0),
+                (third, 0),
+                (last, 5),
+            ];
+            assert_eq!(recorded(&at_first), found, "{forged_ns}");
+        }
+    }
 }

@@ -19,10 +19,12 @@ use hil_core::record::{
 };
 use hil_core::run_log::{Logged, RunLog};
 use hil_link::condition::LinkConditionRecord;
+use hil_protocol::seal::UNANSWERED_MAX;
 
 use super::clocks::HostClocks;
 use super::{AnalysisError, interruptions, link_changes};
 use crate::summary::RecordedMetrics;
+use hil_rundir::protection::HopProtection;
 use hil_rundir::radio_record::RadioRecord;
 use hil_rundir::record::stored::{
     ReadFaults, StoredFile, StoredRecords, file_bytes, sort_by_start,
@@ -188,7 +190,7 @@ impl<'a> RunRecords<'a> {
     }
 
     /// The clock exchanges of the gateways of `flow`: one way of a link, or a clock path.
-    pub(super) fn round_trips(&self, flow: &str) -> impl Iterator<Item = &RoundTripRecord> {
+    pub(super) fn round_trips(&self, flow: &str) -> impl Iterator<Item = &RoundTripRecord> + Clone {
         let known = self.round_trips.get(flow);
         known.into_iter().flat_map(BTreeMap::values)
     }
@@ -334,7 +336,11 @@ impl<'a> RunRecords<'a> {
                 NoRoom::add_missing(&mut found, records, context);
             });
         }
-        NoRoom::add_requests(&mut found, self.round_trips(&flow));
+        let security = self.result.security.as_ref();
+        let is_sealed =
+            security.is_some_and(|one| matches!(one.hops, HopProtection::Sealed { .. }));
+        let unanswered_max = is_sealed.then_some(UNANSWERED_MAX);
+        NoRoom::add_requests(&mut found, self.round_trips(&flow), unanswered_max);
         self.stretches.borrow_mut().insert(flow, found.clone());
         found
     }

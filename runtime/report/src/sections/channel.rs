@@ -326,7 +326,13 @@ fn loss_ratio(network: Option<&NetworkMetrics>) -> Metric {
                 loss.interval
             ))
         }
-        Measured::Unavailable { reason } => unavailable(reason),
+        Measured::Unavailable { reason } => match network.loss_bounds() {
+            Some(bounds) => unavailable(&format!(
+                "{bounds}: of {} lost it is unknown whether on the wire or for want of room on the receiving host",
+                grouped(bounds.doubtful_count)
+            )),
+            None => unavailable(reason),
+        },
     }
 }
 

@@ -274,6 +274,7 @@ impl Observer {
     pub(crate) fn poll(&mut self) {
         let Self {
             follower,
+            topology,
             tails,
             round_trips,
             arrivals,
@@ -293,6 +294,14 @@ impl Observer {
                     let known = arrivals.entry(channel.to_owned()).or_default();
                     let each = batch.messages();
                     known.extend(each.map(|(envelope, _)| Arrival::from(&envelope)));
+                }
+                RecordKind::NoRoom => {
+                    let crossings = topology.iter().flat_map(Topology::crossings);
+                    for crossing in crossings.filter(|one| one.flow_name() == channel) {
+                        if let Some(tail) = tails.get_mut(&crossing.channel.name) {
+                            tail.add_no_room(batch.records());
+                        }
+                    }
                 }
                 RecordKind::LinkCondition => {
                     conditions.add(channel, batch.records::<LinkConditionRecord>());

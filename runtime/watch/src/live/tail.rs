@@ -5,9 +5,9 @@ use std::collections::VecDeque;
 
 use hil_account::{
     AccountContext, AccountFold, ChannelAccount, ChannelFold, ChannelPath, FirstNumber,
-    FoldSettings, MessageHistory, RecordEvent, RecordsAtHand,
+    FoldSettings, MessageHistory, NoRoom, RecordEvent, RecordsAtHand,
 };
-use hil_core::record::{IngressRecord, stamp};
+use hil_core::record::{IngressRecord, NoRoomRecord, stamp};
 
 use super::observer::Arrival;
 use crate::Batch;
@@ -16,12 +16,16 @@ use hil_rundir::record::RecordKind;
 
 /// Most messages of a channel that are held because their fate is not known.
 const HELD_MAX: usize = 4_096;
+/// Stretches without room that are remembered, the newest ones.
+const NO_ROOM_MAX: usize = 1_024;
 
 /// Messages of one channel.
 #[derive(Debug)]
 pub(crate) struct ChannelTail {
     fold: ChannelFold,
     is_gateway: bool,
+    /// Nobody counts yet what is missing in them, so what became of it stays open.
+    no_room: Vec<NoRoom>,
     /// With the publication of each, or that of the one before where it has none.
     settled: VecDeque<(i64, MessageHistory)>,
     /// What a gateway of this host brought, in the order in which it came.
@@ -51,6 +55,7 @@ impl ChannelTail {
                 held_max: Some(HELD_MAX),
             }),
             is_gateway,
+            no_room: Vec::new(),
             settled: VecDeque::new(),
             arrivals: VecDeque::new(),
             newest: None,
@@ -66,6 +71,15 @@ impl ChannelTail {
                 self.push(&event);
             }
         });
+    }
+
+    /// Adds where the receiving host had no room for datagrams of the channel's flow.
+    pub(crate) fn add_no_room(&mut self, records: impl Iterator<Item = NoRoomRecord>) {
+        for record in records {
+            NoRoom::push(&mut self.no_room, &record);
+        }
+        let extra_count = self.no_room.len().saturating_sub(NO_ROOM_MAX);
+        self.no_room.drain(..extra_count);
     }
 
     fn push(&mut self, event: &RecordEvent) {
@@ -117,11 +131,15 @@ impl ChannelTail {
         });
         self.settled_until_ns = self.settled_until_ns.max(until_ns);
         // No clock but the producer's is asked: no end of the run and no interruption is known.
-        let context = AccountContext::new(if self.is_gateway {
+        let path = if self.is_gateway {
             ChannelPath::Gateway { alignment: None }
         } else {
             ChannelPath::SharedMemory
-        });
+        };
+        let context = AccountContext {
+            no_room: &self.no_room,
+            ..AccountContext::new(path)
+        };
         let settled = &mut self.settled;
         self.fold
             .settle(&context, self.settled_until_ns, &mut |message| {
@@ -288,6 +306,31 @@ mod tests {
             ..bytemuck::Zeroable::zeroed()
         };
         (0..20).map(one).collect()
+    }
+
+    #[test]
+    fn what_is_missing_where_the_receiving_host_had_no_room_is_not_called_lost_on_the_wire() {
+        let mut tail = ChannelTail::new(true, None);
+        tail.expect(RecordKind::Ingress);
+        for record in sent() {
+            tail.push(&RecordEvent::Egress(record));
+        }
+        let record = NoRoomRecord {
+            after_ns: 4 * MS + 10,
+            before_ns: 10 * MS + 10,
+            noticed_ns: 0,
+            datagram_count: 5,
+        };
+        tail.add_no_room([record].into_iter());
+        tail.settle(0, 0);
+        let fates = tail
+            .account(
+                i64::MAX,
+                &AccountContext::new(ChannelPath::Gateway { alignment: None }),
+            )
+            .fates;
+        assert_eq!(fates.of(MessageFate::LostOnWireOrByHarness), 5);
+        assert_eq!(fates.of(MessageFate::LostOnWire), 15);
     }
 
     #[test]

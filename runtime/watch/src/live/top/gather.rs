@@ -358,7 +358,7 @@ fn link_row(
 ) -> LinkRow {
     let crossings = topology.crossings();
     let carried = crossings.filter(|crossing| crossing.link.name == link.name);
-    let (mut came_count, mut lost_count, mut known_count) = (None, 0, 0);
+    let (mut came_count, mut lost_count, mut known_count, mut doubtful_count) = (None, 0, 0, 0);
     for crossing in carried {
         let name = crossing.channel.name.as_str();
         if let Some(count) = observer.brought_count(name) {
@@ -373,6 +373,7 @@ fn link_row(
         lost_count += fates.of(MessageFate::LostOnWire)
             + fates.of(MessageFate::Incomplete)
             + fates.of(MessageFate::NetworkUnreachable);
+        doubtful_count += fates.of(MessageFate::LostOnWireOrByHarness);
         known_count += fates.total().saturating_sub(unknown + never_sent);
     }
     let state = match came_count {
@@ -394,7 +395,8 @@ fn link_row(
                 format!("there: {there}; back: {back}")
             }
         }),
-        loss_ratio: (known_count > 0).then(|| lost_count as f64 / known_count as f64),
+        loss_ratio: (known_count > 0 && doubtful_count == 0)
+            .then(|| lost_count as f64 / known_count as f64),
     }
 }
 
