@@ -257,6 +257,12 @@ impl<T: Short> Value for Abbreviation<'_, T> {
 pub trait Tables: Debug {
     /// Makes one of that name; in an order, the next one.
     fn open(&mut self, name: &str) -> &mut dyn Options;
+
+    /// Checks every table.
+    ///
+    /// # Errors
+    /// The first key that is refused, behind `key` and the table's name or index.
+    fn check_all(&mut self, key: &str) -> Result<(), ParameterError>;
 }
 
 /// The place of an option.
@@ -330,7 +336,8 @@ impl<'o> Field<'o> {
                 return checked.map_err(|error| error.below(self.key));
             }
             Slot::Part(options) => return options.check_all(),
-            Slot::Tables(..) | Slot::Rows(_) | Slot::Free => return Ok(()),
+            Slot::Tables(tables, _) | Slot::Rows(tables) => return tables.check_all(self.key),
+            Slot::Free => return Ok(()),
         };
         let Some(setting) = value else { return Ok(()) };
         let Some([value, low, high]) = shape.outside(&setting) else {
@@ -601,6 +608,13 @@ impl<T: Options + Kind> Tables for Named<T> {
     fn open(&mut self, name: &str) -> &mut dyn Options {
         self.0.entry(name.to_owned()).or_insert(T::UNSET)
     }
+
+    fn check_all(&mut self, key: &str) -> Result<(), ParameterError> {
+        self.0.iter_mut().try_for_each(|(name, table)| {
+            let checked = Options::check_all(table);
+            checked.map_err(|error| error.below(&format!("{key}.{name}")))
+        })
+    }
 }
 
 impl<T: Options + Kind> Kind for Named<T> {
@@ -624,6 +638,16 @@ impl<T: Options + Kind> Tables for Rows<T> {
         let index = self.0.len();
         self.0.push(T::UNSET);
         &mut self.0[index]
+    }
+
+    fn check_all(&mut self, key: &str) -> Result<(), ParameterError> {
+        self.0
+            .iter_mut()
+            .enumerate()
+            .try_for_each(|(index, table)| {
+                let checked = Options::check_all(table);
+                checked.map_err(|error| error.below(&format!("{key}[{index}]")))
+            })
     }
 }
 

@@ -20,7 +20,7 @@ pub struct TextFile {
 pub struct TextFault {
     /// Line, from 1.
     pub line: u64,
-    /// Offset of the line in the file.
+    /// Offset in the file, bytes from 0: of the line, or of the byte where one byte is at fault.
     pub offset: u64,
     /// What is wrong there.
     pub what: String,

@@ -120,6 +120,27 @@ fn yard() -> WorldParameters {
 }
 
 #[test]
+fn a_number_in_a_row_is_checked_and_named_with_its_index() {
+    let key = |change: fn(&mut WorldParameters)| {
+        let mut yard = yard();
+        yard.paths.0 = vec![PathParameters {
+            from: 0,
+            to: 2,
+            poses: Rows(vec![Pose::new(2.0, 5.0, 0.0), Pose::new(38.0, 5.0, 0.0)]),
+        }];
+        change(&mut yard);
+        yard.check().err().map(|error| error.key)
+    };
+    assert_eq!(key(|_| ()), None);
+    let refused = |change| key(change).unwrap();
+    assert_eq!(refused(|yard| yard.bays.0[3].x_m = f64::NAN), "bays[3].x_m");
+    let pose = refused(|yard| yard.paths.0[0].poses.0[1].y_m = f64::INFINITY);
+    assert_eq!(pose, "paths[0].poses[1].y_m");
+    let obstacle = refused(|yard| yard.obstacles.0[0].x_min_m = f64::NAN);
+    assert_eq!(obstacle, "obstacles[0].x_min_m");
+}
+
+#[test]
 fn a_custom_map_is_planned_and_given_paths_are_taken_as_they_are() {
     let scene = yard().build().unwrap();
     assert_eq!(scene.world.routes.len(), 8);

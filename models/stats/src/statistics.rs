@@ -44,12 +44,27 @@ pub fn wilson(successes: u64, trials: u64, confidence: f64) -> Option<Interval> 
 /// # Panics
 /// When `successes > trials` or `confidence` is not inside 0..1.
 pub fn clopper_pearson(successes: u64, trials: u64, confidence: f64) -> Option<Interval> {
+    clopper_pearson_at(successes, trials, 1.0, confidence)
+}
+
+/// The same of trials that come together: both counts are divided by `scatter`, the variance of the successes over
+/// that of independent trials, and stay real numbers (Korn and Graubard 1998). `None` without trials.
+///
+/// # Panics
+/// As [`clopper_pearson`], and when `scatter` is not above zero.
+pub fn clopper_pearson_at(
+    successes: u64,
+    trials: u64,
+    scatter: f64,
+    confidence: f64,
+) -> Option<Interval> {
     check(successes, trials, confidence);
+    assert!(scatter > 0.0, "scatter {scatter} is not above zero");
     if trials == 0 {
         return None;
     }
     let tail = 0.5 * (1.0 - confidence);
-    let (k, misses) = (successes as f64, (trials - successes) as f64);
+    let [k, misses] = [successes, trials - successes].map(|count| count as f64 / scatter);
     let low = if successes == 0 {
         0.0
     } else {
@@ -124,6 +139,19 @@ mod tests {
         }
         assert_eq!(wilson(0, 0, 0.95), None);
         assert_eq!(clopper_pearson(0, 0, 0.95), None);
+    }
+
+    #[test]
+    fn counts_divided_by_the_scatter_stay_real() {
+        // Whole quotients are as such counts; one between two counts lies between their intervals.
+        let halved = clopper_pearson_at(2 * 81, 2 * 263, 2.0, 0.95).unwrap();
+        assert_interval(halved, 0.2527, 0.3676);
+        let of = |successes| clopper_pearson_at(successes, 2100, 2.1, 0.95).unwrap();
+        let whole = |successes| clopper_pearson(successes, 1000, 0.95).unwrap();
+        let one = of(1);
+        assert!(whole(0).low < one.low && one.low < whole(1).low, "{one:?}");
+        assert!(whole(0).high < one.high && one.high < whole(1).high);
+        assert_interval(of(0), 0.0, whole(0).high);
     }
 
     #[test]

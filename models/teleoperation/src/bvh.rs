@@ -25,6 +25,8 @@ pub struct Bvh {
     pub values: Vec<f64>,
     /// Frames that the file announces, which may be more or fewer.
     pub announced_count: usize,
+    /// Values behind the last whole frame, which are not among `values`.
+    pub cut_count: usize,
 }
 
 /// Why a text is not a motion file.
@@ -93,9 +95,16 @@ impl Bvh {
 
     /// What is unusual about the number of frames, in words without full stop.
     pub fn remark(&self) -> Option<String> {
-        let (announced, found) = (self.announced_count, self.frame_count());
-        (announced != found).then(|| {
-            format!("{announced} frames are announced, {found} whole ones are there and played")
+        let (announced, found, cut) = (self.announced_count, self.frame_count(), self.cut_count);
+        let behind = if cut > 0 {
+            format!("; {cut} values behind the last one are no whole frame and not played")
+        } else {
+            String::new()
+        };
+        (announced != found || cut > 0).then(|| {
+            format!(
+                "{announced} frames are announced, {found} whole ones are there and played{behind}"
+            )
         })
     }
 
@@ -133,12 +142,14 @@ impl Bvh {
                 value_count,
             }));
         }
-        values.truncate(value_count - value_count % channel_count);
+        let cut_count = value_count % channel_count;
+        values.truncate(value_count - cut_count);
         Ok(Self {
             skeleton,
             frame_time_s,
             values,
             announced_count,
+            cut_count,
         })
     }
 

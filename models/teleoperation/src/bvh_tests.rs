@@ -71,6 +71,19 @@ fn whole_frames_are_played_whatever_was_announced() {
 }
 
 #[test]
+fn a_cut_last_frame_is_told_of_also_when_the_counts_agree() {
+    for (announced, values) in [(2, "1 2"), (1, "1"), (2, "4")] {
+        let text = SMALL.replace(": 2", &format!(": {announced}"));
+        let bvh = parsed(&format!("{}\n{values}\n", text.trim_end())).unwrap();
+        let count = values.split(' ').count();
+        assert_eq!((bvh.frame_count(), bvh.cut_count), (2, count));
+        let remark = bvh.remark().unwrap();
+        let told = format!("{count} values behind the last one");
+        assert!(remark.contains(&told), "{remark}");
+    }
+}
+
+#[test]
 fn a_name_is_the_rest_of_its_line_in_any_encoding() {
     let spaced = SMALL.replace("JOINT RightHand\n  {", "JOINT Bip01 R Hand {");
     let bvh = parsed(&spaced).unwrap();

@@ -88,6 +88,7 @@ pub fn swing_bvh(period_s: f64, amplitude_m: f64, rate_hz: f64) -> Result<String
         .collect();
     let bvh = Bvh {
         announced_count: values.len() / swing.skeleton.channel_count(),
+        cut_count: 0,
         skeleton: swing.skeleton,
         frame_time_s,
         values,

@@ -166,23 +166,27 @@ fn first_since_1970(records: &[TraceRecord]) -> Result<i64, String> {
     if first_ns >= SINCE_1970_NS {
         return Ok(first_ns);
     }
-    // In another unit they are years of today, and messages follow each other faster than any do.
+    // In another unit they are years of today (2008 to 2039), and distinct instants are nearer than those of messages.
     let span_ns = last.published_ns.saturating_sub(first_ns);
-    let apart_ns = span_ns / i64::try_from(records.len()).unwrap_or(i64::MAX);
+    let steps = records.windows(2);
+    let steps = steps.filter(|two| two[1].published_ns > two[0].published_ns);
+    let step_count = i64::try_from(steps.count()).unwrap_or(i64::MAX);
     let units = [
-        ("s", 1_000_000_000, 10),
-        ("ms", 1_000_000, 1_000),
-        ("us", 1_000, 50_000),
+        ("s", 1_000_000_000, 10, 1),
+        ("ms", 1_000_000, 1_000, 2),
+        ("us", 1_000, 50_000, 2),
     ];
-    let is_of = |(_, unit_ns, fastest_ns): &(&str, i64, i64)| {
+    let is_of = |(_, unit_ns, nearest_ns, steps_min): &(&str, i64, i64, i64)| {
         let per_s = 1_000_000_000 / unit_ns;
-        let is_of_today = (1_000_000_000 * per_s..3_000_000_000 * per_s).contains(&first_ns);
-        is_of_today && records.len() > 1 && apart_ns < *fastest_ns
+        let is_of_today = (1_200_000_000 * per_s..2_200_000_000 * per_s).contains(&first_ns);
+        is_of_today && step_count >= *steps_min && span_ns / step_count < *nearest_ns
     };
     match units.into_iter().find(is_of) {
         None => Ok(0),
-        Some((unit, unit_ns, _)) => Err(format!(
-            "the first instant, {first_ns}, is an epoch time in {unit}, expected nanoseconds: multiply by {unit_ns}"
+        Some((unit, unit_ns, ..)) => Err(format!(
+            "the first instant, {first_ns}, is an epoch time in {unit}, expected nanoseconds: multiply by {unit_ns}; \
+             if they are nanoseconds, say so with a first line \"# record_count: {}\"",
+            records.len()
         )),
     }
 }
@@ -431,6 +435,40 @@ mod tests {
                 "{refused}"
             );
         }
+    }
+
+    #[test]
+    fn instants_of_a_computer_long_up_are_no_epoch_times() {
+        let decoded = |instants: &[i64]| {
+            let rows = instants.iter().map(|ns| format!("{ns},5\n"));
+            let text = format!("published_ns,delay_ns\n{}", rows.collect::<String>());
+            (decode(&text.as_str().into()), text)
+        };
+        let (hour, day) = (3_600_000_000_000, 86_400_000_000_000);
+        let every = |start: i64, ns: i64| Vec::from_iter((0..500).map(|row| start + ns * row));
+        for instants in [
+            // One instant of several messages, a batch, and messages of 1 kHz, all within 1000 to 3000 s.
+            vec![hour / 2; 2],
+            vec![hour / 2, hour / 2, hour / 2 + 400],
+            every(hour / 2, 1_000_000),
+            // 1 Gbit/s of full frames, and 100 Hz.
+            every(12 * day, 12_304),
+            every(30 * day, 12_304),
+            every(20 * day, 10_000_000),
+        ] {
+            let records = decoded(&instants).0.unwrap().trace.records;
+            assert_eq!(records[0].published_ns, instants[0]);
+        }
+        // That capture between the 14th and the 25th day could be of 80 Hz in microseconds: the text has to say it.
+        let instants = every(20 * day, 12_304);
+        let (refused, text) = decoded(&instants);
+        let refused = refused.unwrap_err().to_string();
+        let line = refused.split('"').nth(1).unwrap();
+        let said = decode(&format!("{line}\n{text}").as_str().into()).unwrap();
+        assert_eq!(
+            (said.fault, said.trace.records[0].published_ns),
+            (None, instants[0])
+        );
     }
 
     #[test]

@@ -89,7 +89,11 @@ pub fn replay(
         problem: error.to_string(),
     })?;
     let case = manifest.topology.get("case").ok_or(ReplayError::NoCase)?;
-    let name = case["name"].as_str().unwrap_or_default().to_owned();
+    let name = case["name"].as_str().ok_or_else(|| ReplayError::Manifest {
+        path: folder.manifest(),
+        problem: format!("topology.case.name is {}, expected text", case["name"]),
+    })?;
+    let name = name.to_owned();
     let Some(entry) = registry.find(&name) else {
         return Err(ReplayError::UnknownCase { name });
     };

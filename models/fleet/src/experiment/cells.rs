@@ -465,7 +465,7 @@ pub struct RunFigures {
     /// See [`FleetTally::collision_count`].
     pub collisions: u64,
     /// See [`FleetTally::missions_per_hour`].
-    pub missions_per_hour: f64,
+    pub missions_per_hour: Option<f64>,
 }
 
 /// Where to see a collision again.

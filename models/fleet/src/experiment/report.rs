@@ -4,15 +4,14 @@
 use crate::coordinator::parameters::CoordinatorMode;
 use crate::experiment::cells::{
     CellSpec, CollidedRun, Condition, Demand, FleetTally, Mechanism, Place, PublishedRow,
-    SCENARIOS, collision_interval, mode_name, published_rows, scenario_name,
+    RunFigures, SCENARIOS, collision_interval, mode_name, published_rows, scenario_name,
 };
 use crate::experiment::study::{FleetStudy, worlds_text};
-use crate::geometry::floor_index;
 use crate::scenario::Scenario;
 use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_link::impaired::DelayLaw;
 use hil_stats::comparison::{Share, against_published, welch};
-use hil_stats::statistics::{CONFIDENCE, clopper_pearson};
+use hil_stats::statistics::{CONFIDENCE, clopper_pearson_at};
 
 /// A cell with what came of it; `None` when it was not run.
 #[derive(Debug)]
@@ -127,14 +126,14 @@ impl Judge {
         }
     }
 
-    /// The interval of collisions per 1000 critical sections.
+    /// The interval of collisions per 1000 critical sections; `None` without sections, and where there are more
+    /// collisions than sections.
     fn per_1000(&self, tally: &FleetTally, confidence: f64) -> Option<(f64, f64)> {
-        let divided = |count: u64| floor_index(count as f64 / self.scatter + 0.5) as u64;
         let (collisions, sections) = (tally.collision_count(), tally.section_count());
         if collisions > sections {
             return None;
         }
-        let interval = clopper_pearson(divided(collisions), divided(sections), confidence)?;
+        let interval = clopper_pearson_at(collisions, sections, self.scatter, confidence)?;
         Some((1e3 * interval.low, 1e3 * interval.high))
     }
 
@@ -618,6 +617,10 @@ pub(crate) fn demand_text(demand: Demand) -> String {
 /// Whether a demand is met; `None` when there are too few critical sections to say.
 pub(crate) fn verdict_of(demand: Demand, tally: &FleetTally, judge: Judge) -> Option<bool> {
     let interval = |confidence| judge.per_1000(tally, confidence);
+    // Without an interval there are no sections, or more collisions than sections.
+    if demand != Demand::None && interval(CONFIDENCE).is_none() {
+        return (tally.any_collision_count() > 0).then_some(false);
+    }
     match demand {
         Demand::None => None,
         Demand::Below(bound) => judge.verdict(
@@ -745,15 +748,26 @@ fn safe_criteria(results: &[CellResult<'_>]) -> [Criterion; 3] {
 
 /// Safety costs little where nothing is wrong: by the logarithms of the runs' rates (Welch 1947).
 fn throughput(scenario: Scenario, results: &[CellResult<'_>], judge: Judge) -> Criterion {
+    let tally = |mode| mechanism_tally(results, scenario, Mechanism::Clean, mode);
+    let is_telling = |tally: &FleetTally| tally.section_count() >= RATE_SECTIONS_MIN;
     let rates = |mode| {
-        let tally = mechanism_tally(results, scenario, Mechanism::Clean, mode);
-        let is_telling = |tally: &&FleetTally| tally.section_count() >= RATE_SECTIONS_MIN;
-        let runs = &tally.filter(is_telling)?.runs;
-        let rates: Vec<f64> = runs.iter().map(|run| run.missions_per_hour.ln()).collect();
-        rates.iter().all(|rate| rate.is_finite()).then_some(rates)
+        let runs = &tally(mode).filter(|tally| is_telling(tally))?.runs;
+        let rate = |run: &RunFigures| Some(run.missions_per_hour?.ln());
+        let rates: Option<Vec<f64>> = runs.iter().map(rate).collect();
+        rates.filter(|rates| rates.iter().all(|rate| rate.is_finite()))
     };
+    // A rate of zero has no logarithm: such a run is a miss by itself, unless it was too short to end a mission.
+    let idle_count = tally(CoordinatorMode::Safe).map_or(0, |tally| {
+        let is_idle = |run: &&RunFigures| run.missions_per_hour == Some(0.0);
+        let is_judged = tally.stand_count > 0 || is_telling(tally);
+        tally.runs.iter().filter(is_idle).count() * usize::from(is_judged)
+    });
+    let idle = (idle_count > 0).then(|| {
+        let finding = format!("runs of safe without a mission driven to its end: {idle_count}");
+        (Some(false), finding)
+    });
     let both = rates(CoordinatorMode::Legacy).zip(rates(CoordinatorMode::Safe));
-    let known = both.and_then(|(legacy, safe)| {
+    let compared = both.and_then(|(legacy, safe)| {
         let interval = |confidence| {
             let difference = welch(&legacy, &safe, confidence)?;
             Some(difference.map(f64::exp))
@@ -776,8 +790,10 @@ fn throughput(scenario: Scenario, results: &[CellResult<'_>], judge: Judge) -> C
     let scenario = scenario_name(scenario);
     criterion(
         format!("{scenario}: safe keeps 90 % of legacy's missions per hour when clean"),
-        known,
-        &format!("{NOT_RUN}, in a single run, or with fewer than {RATE_SECTIONS_MIN} CS"),
+        idle.or(compared),
+        &format!(
+            "{NOT_RUN}, in a single run, with fewer than {RATE_SECTIONS_MIN} CS, or legacy ended no mission in a run"
+        ),
     )
 }
 
@@ -806,12 +822,15 @@ fn loss_exceeds_delay(scenario: Scenario, results: &[CellResult<'_>], judge: Jud
     });
     let scenario = scenario_name(scenario);
     let text = format!("{scenario}, legacy: losing 10 % of the commands is worse than 300 ms");
-    criterion(text, known, NOT_RUN)
+    let missing = format!("{NOT_RUN}, or more collisions than CS");
+    criterion(text, known, &missing)
 }
 
 #[cfg(test)]
 mod judgement_tests {
     use super::*;
+    use crate::experiment::Setup;
+    use crate::experiment::cells::mechanism_cells;
 
     const JUDGE: Judge = Judge {
         miss: 0.999,
@@ -856,6 +875,88 @@ mod judgement_tests {
         };
         let verdict = |judge| verdict_of(Demand::Below(0.2), &tally(45, 100_000), judge);
         assert_eq!((verdict(JUDGE), verdict(judge)), (Some(false), None));
+        // One stays more than none.
+        let (low, high) = judge.per_1000(&tally(1, 100_000), CONFIDENCE).unwrap();
+        let none = judge.per_1000(&tally(0, 100_000), CONFIDENCE).unwrap();
+        assert!(none.0 == 0.0 && low > 0.0 && high > none.1);
+    }
+
+    #[test]
+    fn collisions_without_an_interval_miss_every_demand() {
+        for demand in [
+            Demand::Below(0.2),
+            Demand::Within(0.2, 4.0),
+            Demand::NoneAtAll,
+        ] {
+            let verdict =
+                |collisions, sections| verdict_of(demand, &tally(collisions, sections), JUDGE);
+            assert_eq!(verdict(3, 2), Some(false));
+            assert_eq!(verdict(1, 0), Some(false));
+            assert_eq!(verdict(0, 0), None);
+        }
+        assert_eq!(verdict_of(Demand::None, &tally(3, 2), JUDGE), None);
+    }
+
+    /// The criterion on missions per hour of legacy and safe runs, so many sections a run; the safe fleet came to a
+    /// stand so many times.
+    fn throughput_of(
+        legacy: &[Option<f64>],
+        safe: &[Option<f64>],
+        sections: u64,
+        stand_count: u64,
+    ) -> Criterion {
+        let cells = mechanism_cells(&Setup::default());
+        let result = |mode, rates: &[Option<f64>]| {
+            let place = Place::Mechanism {
+                mechanism: Mechanism::Clean,
+                mode,
+            };
+            let is_it =
+                |cell: &&CellSpec| cell.id.scenario == SCENARIOS[0] && cell.id.place == place;
+            let mut sum = tally(0, sections * rates.len() as u64);
+            sum.runs = rates
+                .iter()
+                .map(|rate| RunFigures {
+                    sections,
+                    collisions: 0,
+                    missions_per_hour: *rate,
+                })
+                .collect();
+            (cells.iter().find(is_it).unwrap(), sum)
+        };
+        let (legacy_cell, legacy) = result(CoordinatorMode::Legacy, legacy);
+        let (safe_cell, mut safe) = result(CoordinatorMode::Safe, safe);
+        safe.stand_count = stand_count;
+        let results = [(legacy_cell, legacy), (safe_cell, safe)].map(|(cell, tally)| CellResult {
+            cell,
+            tally: Some(tally),
+        });
+        throughput(SCENARIOS[0], &results, JUDGE)
+    }
+
+    #[test]
+    fn a_safe_fleet_that_ends_no_mission_misses_its_rate() {
+        let (fast, idle) = ([Some(100.0), Some(101.0), Some(99.0)], Some(0.0));
+        let verdict =
+            |safe: &[_], sections, stands| throughput_of(&fast, safe, sections, stands).is_met;
+        assert_eq!(verdict(&fast, 1000, 0), Some(true));
+        assert_eq!(
+            verdict(&[Some(50.0), Some(50.5), Some(49.5)], 1000, 0),
+            Some(false)
+        );
+        let one_idle = [fast[0], idle, fast[2]];
+        assert_eq!(verdict(&one_idle, 1000, 1), Some(false));
+        // Also of one run, and of a fleet that stood before it passed many sections.
+        assert_eq!(verdict(&[idle], 2, 1), Some(false));
+        assert!(
+            throughput_of(&fast, &one_idle, 1000, 1)
+                .finding
+                .ends_with("driven to its end: 1")
+        );
+        // Too short to end one, a rate that is unavailable, and legacy at a stand say nothing.
+        assert_eq!(verdict(&[idle, idle], 2, 0), None);
+        assert_eq!(verdict(&[fast[0], None, fast[2]], 1000, 0), None);
+        assert_eq!(throughput_of(&one_idle, &fast, 1000, 0).is_met, None);
     }
 
     #[test]

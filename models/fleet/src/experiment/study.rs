@@ -206,7 +206,7 @@ impl Study for FleetStudy {
                     runs: vec![RunFigures {
                         sections: tally.section_count(),
                         collisions: tally.collision_count(),
-                        missions_per_hour: tally.missions_per_hour().unwrap_or(0.0),
+                        missions_per_hour: tally.missions_per_hour(),
                     }],
                     stop_error_bound_m: robot.stop_error_bound_m(&scene.world.vehicle),
                     stand_count: u64::from(is_standing),

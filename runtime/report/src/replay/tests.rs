@@ -208,6 +208,26 @@ fn what_cannot_be_replayed_is_said_to_be_so() {
 }
 
 #[test]
+fn a_manifest_without_the_name_of_its_case_is_damaged() {
+    let run = Run::of("doubler");
+    for case in [
+        json!({ "parameters": {} }),
+        json!({ "name": 7 }),
+        json!("doubler"),
+    ] {
+        let manifest = json!({
+            "schema_version": 1,
+            "program": { "name": "hil-runtime", "version": "1" },
+            "topology": { "case": case },
+        });
+        fs::write(run.folder.manifest(), manifest.to_string()).unwrap();
+        let error = run.replay().unwrap_err().to_string();
+        let expected = "manifest.json: not a run's folder: topology.case.name is ";
+        assert!(error.contains(expected), "{error}");
+    }
+}
+
+#[test]
 fn a_long_method_wraps_within_the_page() {
     let replay = Replay {
         method: "twice of each and nothing but that ".repeat(8),

@@ -382,7 +382,7 @@ fn converted(trace: &Trace, form: TraceForm, into: &Path) -> Result<(Vec<u8>, St
 /// (`get_distribution` in `tc/q_netem.c` of iproute2).
 fn netem_use(table: &NetemTable, file: &Path) -> String {
     let file = std::path::absolute(file).unwrap_or_else(|_relative| file.to_owned());
-    let folder = file.parent().unwrap_or(&file).display().to_string();
+    let folder = shell_word(&file.parent().unwrap_or(&file).to_string_lossy());
     let name = file.file_stem().unwrap_or_default().to_string_lossy();
     let [mean_us, deviation_us] = [table.mean_ns, table.deviation_ns].map(|ns| ns / 1e3);
     let is_found = file.extension().is_some_and(|ending| ending == "dist");
@@ -391,10 +391,20 @@ fn netem_use(table: &NetemTable, file: &Path) -> String {
     } else {
         format!("name it {name}.dist, as tc looks for that, and ")
     };
+    let name = shell_word(&name);
     format!(
         "{renamed}use it as: TC_LIB_DIR={folder} tc qdisc replace dev DEVICE root netem delay {mean_us:.0}us \
          {deviation_us:.0}us distribution {name}"
     )
+}
+
+/// One word of a command as a POSIX shell takes it (POSIX.1-2017, 2.2.2).
+fn shell_word(text: &str) -> String {
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-+:@%,".contains(letter);
+    if !text.is_empty() && text.chars().all(is_plain) {
+        return text.to_owned();
+    }
+    format!("'{}'", text.replace('\'', "'\\''"))
 }
 
 /// What of the delays no table of netem's can say.
@@ -452,6 +462,18 @@ mod tests {
         }
         assert_eq!(key("hop"), "hop");
         assert_eq!(key("a.b"), "\"a.b\"");
+    }
+
+    #[test]
+    fn a_shell_takes_a_word_of_a_command_as_it_was() {
+        assert_eq!(shell_word("/srv/runs/a-1.dist"), "/srv/runs/a-1.dist");
+        for text in ["/my runs/a", "it's", "$HOME `x` \"y\"", "", "a;b", "~", "µ"] {
+            let script = format!("printf %s {}", shell_word(text));
+            let printed = std::process::Command::new("sh")
+                .args(["-c", &script])
+                .output();
+            assert_eq!(printed.unwrap().stdout, text.as_bytes(), "{script}");
+        }
     }
 
     #[test]

@@ -10,7 +10,8 @@
 //! - Authority is extended only if the plan stays valid with the larger reservation, or another
 //!   valid plan is found for it. Otherwise the extension is withheld.
 //! - Robots that go forward and authorities that shrink only make reservations smaller, which
-//!   never invalidates a plan.
+//!   never invalidates a plan, with one gap: `Plan::keeps` counts a robot at the end of way beyond its move aside, and
+//!   that way may be taken back.
 //! - A mission is admitted only if a valid plan with it exists; until then its robot counts as
 //!   parked. Its reservation, the bay's pose, is the same before and after.
 //!
