@@ -303,7 +303,7 @@ impl Attacker {
     ///
     /// # Panics
     /// When it has no socket.
-    pub fn shower(&self, packets: &[Vec<u8>], span: Duration, rate: u32) -> Flood {
+    pub fn send_repeatedly(&self, packets: &[Vec<u8>], span: Duration, rate: u32) -> Flood {
         let to = packets.iter().map(|packet| {
             let address: [u8; 4] = [packet[16], packet[17], packet[18], packet[19]];
             SockAddr::from(SocketAddrV4::new(address.into(), 0))

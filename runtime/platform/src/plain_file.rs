@@ -93,12 +93,12 @@ mod tests {
         let folder = format!("hil-plain-file-link-{}", std::process::id());
         let folder = std::env::temp_dir().join(folder);
         fs::create_dir(&folder).unwrap();
-        let (thesis, path) = (folder.join("thesis"), folder.join("report.partial"));
-        fs::write(&thesis, "years").unwrap();
+        let (target, path) = (folder.join("target"), folder.join("report.partial"));
+        fs::write(&target, "kept").unwrap();
         for _ in 0..2 {
-            std::os::unix::fs::symlink(&thesis, &path).unwrap();
+            std::os::unix::fs::symlink(&target, &path).unwrap();
             io::Write::write_all(&mut create_anew(&path).unwrap(), b"x").unwrap();
-            assert_eq!(read(&thesis).unwrap(), b"years");
+            assert_eq!(read(&target).unwrap(), b"kept");
             assert_eq!(read(&path).unwrap(), b"x");
             fs::remove_file(&path).unwrap();
         }

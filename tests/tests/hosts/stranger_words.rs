@@ -66,7 +66,7 @@ const REPORTS_SPAN: Duration = Duration::from_secs(5);
 /// An address of the hosts' network that is in no topology.
 const FOREIGN: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 66);
 
-/// A run on whose sending gateway of commands forged reports rain.
+/// A run with forged reports to its sending gateway of commands.
 fn under_reports(lab: &Lab, trial: &Trial, stranger: &Attacker) -> (Flood, [RunSummary; 2]) {
     let split = Split::start(lab, trial);
     split.wait_for_messages("the begin of the run");

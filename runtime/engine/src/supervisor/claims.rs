@@ -25,6 +25,7 @@ use std::time::Instant;
 
 use hil_core::message::{FNV_OFFSET, fnv1a};
 use hil_nic::nic_clock::card_of;
+use hil_platform::console::Console;
 use hil_platform::random::random_bytes;
 use hil_platform::text::visible;
 use hil_topology::{Topology, collide, control_key};
@@ -144,6 +145,8 @@ pub enum ClaimError {
 pub struct Claims {
     _answering: Option<Answering>,
     folder: Arc<Mutex<PathBuf>>,
+    /// Cards all of whose names are held by processes that are not believed: later runs do not find this one.
+    unnamed: Vec<String>,
 }
 
 impl Claims {
@@ -175,8 +178,12 @@ impl Claims {
                 .map(|one| (&*one.resource, one.address))
                 .collect();
             let (mut own, mut bound) = (BTreeSet::new(), Vec::new());
+            let mut unnamed = Vec::new();
             for (resource, address) in apart {
-                let (name, listener) = bind(resource)?;
+                let Some((name, listener)) = bind(resource)? else {
+                    unnamed.push(resource.to_owned());
+                    continue;
+                };
                 own.insert(name);
                 bound.push((listener, address));
             }
@@ -190,6 +197,7 @@ impl Claims {
                     return Ok(Self {
                         _answering: Some(answering),
                         folder,
+                        unnamed,
                     });
                 }
             }
@@ -199,8 +207,18 @@ impl Claims {
         }
     }
 
-    /// From now on other runs are told that this one's folder is `folder`.
-    pub(super) fn tell(&self, folder: &Path) {
+    /// From now on other runs are told that this one's folder is `folder`. Warns of cards that no run is kept from.
+    pub(super) fn tell(&self, folder: &Path, console: &mut Console) {
+        for resource in &self.unnamed {
+            console.warn(&format!(
+                "{}, by processes that may not set up a card: a second run that needs this card is not refused",
+                in_use(resource)
+            ));
+        }
+        self.set_folder(folder);
+    }
+
+    fn set_folder(&self, folder: &Path) {
         let mut told = self.folder.lock().unwrap_or_else(PoisonError::into_inner);
         folder.clone_into(&mut told);
     }
@@ -287,8 +305,14 @@ fn is_trusted(uid: u32) -> bool {
     uid == 0 || uid == Uid::effective().as_raw()
 }
 
-/// Whether process `pid` has `CAP_NET_ADMIN`.
+/// Whether process `pid` has `CAP_NET_ADMIN` in this process's user namespace: any user has all rights in one of his
+/// own (`user_namespaces(7)`).
 fn may_set_up_cards(pid: i32) -> bool {
+    has_net_admin(pid) && is_of_this_user_namespace(pid)
+}
+
+/// In its own user namespace.
+fn has_net_admin(pid: i32) -> bool {
     const NET_ADMIN: u64 = 1 << 12;
     let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
     let rights = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
@@ -296,25 +320,40 @@ fn may_set_up_cards(pid: i32) -> bool {
     rights.is_some_and(|rights| rights & NET_ADMIN != 0)
 }
 
+/// By the map of its users, which everybody may read; the link `ns/user` of another user's process only root may. To give
+/// another namespace the map of this one takes the right to set any user (`CAP_SETUID`).
+fn is_of_this_user_namespace(pid: i32) -> bool {
+    let map = |pid: &str| fs::read(format!("/proc/{pid}/uid_map")).ok();
+    let own = map("self");
+    own.is_some() && map(&pid.to_string()) == own
+}
+
 fn names(resource: &str) -> impl Iterator<Item = String> {
     (0..NAMES).map(move |number| format!("{PREFIX}/{resource}/{number}"))
 }
 
-/// Binds the first name of `resource` that nobody has.
-fn bind(resource: &str) -> io::Result<(String, UnixListener)> {
+/// Binds the first name of `resource` that nobody has; `None` when a card has none left: any user can hold its names,
+/// and only those who can set up a card keep a run from it ([`Wanted::is_believed_of`]).
+fn bind(resource: &str) -> io::Result<Option<(String, UnixListener)>> {
     for name in names(resource) {
         let address = net::SocketAddr::from_abstract_name(&name)?;
         match UnixListener::bind_addr(&address) {
             Ok(listener) => {
                 listener.set_nonblocking(true)?;
-                return Ok((name, listener));
+                return Ok(Some((name, listener)));
             }
             Err(error) if error.kind() == io::ErrorKind::AddrInUse => {}
             Err(error) => return Err(error),
         }
     }
-    let text = format!("all {NAMES} sockets @{PREFIX}/{resource}/* are in use (`ss -xlp`)");
-    Err(io::Error::new(io::ErrorKind::AddrInUse, text))
+    if resource.starts_with(CARD) {
+        return Ok(None);
+    }
+    Err(io::Error::new(io::ErrorKind::AddrInUse, in_use(resource)))
+}
+
+fn in_use(resource: &str) -> String {
+    format!("all {NAMES} sockets @{PREFIX}/{resource}/* are in use (`ss -xlp`)")
 }
 
 /// Refuses when a run other than that with the claims `own` has something of `wanted`.
@@ -431,6 +470,9 @@ fn one_line(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::io::{BufRead, BufReader};
+    use std::os::unix::process::CommandExt;
+    use std::process::{Child, Command, Stdio};
 
     /// A card that no other test has.
     fn card(name: &str) -> Vec<Wanted> {
@@ -487,7 +529,7 @@ mod tests {
         assert_eq!(key, "hosts.a.interface");
         assert!(words.starts_with("the card is held by "), "{words}");
         assert!(words.contains(&format!("{own}; ")), "{words}");
-        first.tell(Path::new("/runs/first"));
+        first.set_folder(Path::new("/runs/first"));
         let refused = refusal(Claims::take_all(&wanted));
         let told = format!("{own}, the run in /runs/first; ");
         assert!(refused[0].1.contains(&told), "{refused:?}");
@@ -507,6 +549,7 @@ mod tests {
 
     #[test]
     fn of_two_that_begin_together_not_both_are_granted() {
+        let mut granted_count = 0;
         for _ in 0..100 {
             let mut begun = [0, 1].map(|_| Some(thread::spawn(|| Claims::take_all(&card("b")))));
             let got = begun
@@ -514,25 +557,100 @@ mod tests {
                 .map(|one| one.take().unwrap().join().unwrap());
             let granted = got.iter().filter(|one| one.is_ok()).count();
             assert!(granted <= 1, "{granted}");
+            granted_count += granted;
         }
+        println!("{granted_count} of 100 pairs had one granted");
+        assert!(granted_count > 0);
+    }
+
+    /// All names of `wanted`.
+    fn names_of(wanted: &[Wanted]) -> impl Iterator<Item = String> {
+        names(&wanted[0].resource)
+    }
+
+    fn squat(name: String) -> UnixListener {
+        let address = net::SocketAddr::from_abstract_name(name).unwrap();
+        UnixListener::bind_addr(&address).unwrap()
     }
 
     #[test]
-    fn a_holder_that_does_not_answer_holds_and_without_a_name_left_nothing_is_claimed() {
+    fn a_holder_that_does_not_answer_holds_and_a_port_without_a_name_left_is_not_claimed() {
         let wanted = card("d");
-        let squat = |name: String| {
-            let address = net::SocketAddr::from_abstract_name(name).unwrap();
-            UnixListener::bind_addr(&address).unwrap()
-        };
-        let taken: Vec<UnixListener> = names(&wanted[0].resource).map(squat).collect();
-        let error = Claims::take_all(&wanted).unwrap_err();
-        assert!(error.to_string().contains("all 32 sockets"), "{error}");
-        drop(taken);
-        let only = squat(names(&card("e")[0].resource).next().unwrap());
-        let refused = refusal(Claims::take_all(&card("e")));
+        let taken: Vec<UnixListener> = names_of(&wanted).map(squat).collect();
+        let refused = refusal(Claims::take_all(&wanted));
         let own = format!("(process {});", std::process::id());
         assert!(refused[0].1.contains(&own), "{refused:?}");
-        drop(only);
+        drop(taken);
+
+        let port = vec![Wanted {
+            resource: format!("udp full{}", std::process::id()),
+            ..port("10.0.0.1:7400").remove(0)
+        }];
+        let _taken: Vec<UnixListener> = names_of(&port).map(squat).collect();
+        let error = Claims::take_all(&port).unwrap_err();
+        assert!(error.to_string().contains("all 32 sockets"), "{error}");
+    }
+
+    /// A process that ends with its test.
+    struct Other(Child);
+
+    impl Drop for Other {
+        fn drop(&mut self) {
+            let _gone = self.0.kill().is_err();
+            let _gone = self.0.wait().is_err();
+        }
+    }
+
+    /// Runs `command`, as another user where this one is root.
+    fn other(command: &mut Command) -> Other {
+        if Uid::effective().is_root() {
+            command.uid(ANOTHER_USER).gid(ANOTHER_USER);
+        }
+        Other(command.stdout(Stdio::piped()).spawn().unwrap())
+    }
+
+    const ANOTHER_USER: u32 = 65_534;
+
+    #[test]
+    fn another_user_with_all_names_of_a_card_keeps_no_run_from_it() {
+        if !Uid::effective().is_root() {
+            println!("skipped: only root can start a process of another user");
+            return;
+        }
+        let wanted = card("f");
+        let script = "import socket, sys, time\n\
+            held = [socket.socket(socket.AF_UNIX) for _ in sys.argv[1:]]\n\
+            for one, name in zip(held, sys.argv[1:]):\n one.bind(chr(0) + name)\n one.listen()\n\
+            print('held', flush=True)\n\
+            time.sleep(600)\n";
+        let mut squatter = Command::new("python3");
+        squatter.args(["-c", script]).args(names_of(&wanted));
+        let mut squatter = other(&mut squatter);
+        let mut said = [0; 4];
+        let mut output = squatter.0.stdout.take().unwrap();
+        output.read_exact(&mut said).unwrap();
+        let claims = Claims::take_all(&wanted).unwrap();
+        assert_eq!(claims.unnamed, [wanted[0].resource.clone()]);
+    }
+
+    #[test]
+    fn all_rights_in_a_user_namespace_of_its_own_set_up_no_card() {
         assert!(!may_set_up_cards(i32::MAX));
+        let own = i32::try_from(std::process::id()).unwrap();
+        assert_eq!(may_set_up_cards(own), has_net_admin(own));
+        let script = "echo in && exec sleep 600";
+        let mut apart = Command::new("unshare");
+        apart.args(["--user", "--map-root-user", "sh", "-c", script]);
+        let mut apart = other(&mut apart);
+        let mut said = String::new();
+        let output = apart.0.stdout.take().unwrap();
+        BufReader::new(output).read_line(&mut said).unwrap();
+        if said.is_empty() {
+            println!("skipped: this host gives no user namespace");
+            return;
+        }
+        let pid = i32::try_from(apart.0.id()).unwrap();
+        assert!(has_net_admin(pid));
+        assert!(!may_set_up_cards(pid));
     }
 }

@@ -121,7 +121,7 @@ impl Conversation {
             }),
             changed: Condvar::new(),
             writer: Mutex::new(None),
-            moved_count: Arc::clone(&lock(&reconnect.door).moved_count),
+            moved_count: Arc::clone(&lock(&reconnect.readmission).moved_count),
         });
         conversation.go_on(ends, 0)?;
         let kept = Arc::clone(&conversation);

@@ -13,7 +13,7 @@ use super::control_listener::{
 };
 use super::frame::{PeerHello, PeerMessage};
 use super::peer::{ControlHalves, Peer};
-use super::reconnect::{Door, Reconnect, lock};
+use super::reconnect::{Readmission, Reconnect, lock};
 use super::strangers::{Cause, Strangers};
 use crate::security::PreSharedKey;
 use crate::security::greeting::{GreetingError, Why};
@@ -234,7 +234,7 @@ fn host(
     let listen = |source| PeerError::Listen { address, source };
     let admission = meeting.admission(&hello.host);
     let mut control_listener = ControlListener::open(address, admission).map_err(listen)?;
-    let door = Arc::new(Mutex::new(Door::default()));
+    let readmission = Arc::new(Mutex::new(Readmission::default()));
     let mut peers: Vec<Peer> = Vec::new();
     loop {
         let admitted = control_listener.admit_waiting(&mut patience.strangers);
@@ -243,8 +243,8 @@ fn host(
         }
         while let Some(newcomer) = control_listener.look(&mut patience.strangers) {
             if newcomer.hello.resumed.is_some() {
-                lock(&door).take(newcomer, hello);
-            } else if let Some(peer) = welcome(newcomer, hello, &door, patience)? {
+                lock(&readmission).take(newcomer, hello);
+            } else if let Some(peer) = welcome(newcomer, hello, &readmission, patience)? {
                 // One that gave up and came again: nobody waits for its first connection.
                 peers.retain_mut(|known| {
                     let is_other = known.hello.host != peer.hello.host;
@@ -274,7 +274,7 @@ fn host(
 fn welcome(
     newcomer: Newcomer,
     hello: &PeerHello,
-    door: &Arc<Mutex<Door>>,
+    readmission: &Arc<Mutex<Readmission>>,
     patience: &mut Patience<'_>,
 ) -> Result<Option<Peer>, PeerError> {
     let Newcomer {
@@ -292,7 +292,7 @@ fn welcome(
         meeting: patience.meeting.clone(),
         own: hello.clone(),
         theirs,
-        door: Arc::clone(door),
+        readmission: Arc::clone(readmission),
     };
     let mut peer = match Peer::new(ends, reconnect) {
         Ok(peer) => peer,
@@ -343,7 +343,7 @@ fn join(
                     meeting: meeting.clone(),
                     own: hello.clone(),
                     theirs,
-                    door: Arc::default(),
+                    readmission: Arc::default(),
                 };
                 match Peer::new(ends, reconnect) {
                     Ok(peer) => return Ok(vec![peer]),

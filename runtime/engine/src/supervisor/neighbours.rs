@@ -38,6 +38,8 @@ pub(super) struct Neighbours {
     hosts: BTreeMap<IpAddr, String>,
     /// Their last link addresses, by address and interface.
     known: BTreeMap<(IpAddr, String), String>,
+    /// That they cannot be listed is told once.
+    has_failed: bool,
 }
 
 impl Neighbours {
@@ -48,17 +50,28 @@ impl Neighbours {
         Self {
             hosts: hosts.collect(),
             known: BTreeMap::new(),
+            has_failed: false,
         }
     }
 
     /// What has changed since the last look.
     pub(super) fn changes(&mut self) -> Vec<EventKind> {
-        // A host that does not list them sees no change.
-        let there = list().unwrap_or_default();
-        self.compare(there)
+        self.compare(list())
     }
 
-    fn compare(&mut self, there: Vec<Neighbour>) -> Vec<EventKind> {
+    fn compare(&mut self, there: io::Result<Vec<Neighbour>>) -> Vec<EventKind> {
+        let there = match there {
+            Ok(there) => there,
+            Err(_) if self.has_failed => return Vec::new(),
+            Err(error) => {
+                self.has_failed = true;
+                let text = format!(
+                    "the kernel does not list the neighbours of this host ({error}): a change of another \
+                     host's link address may not be told"
+                );
+                return vec![EventKind::Warning { text }];
+            }
+        };
         let changes = there.into_iter().filter_map(|one| {
             let Neighbour {
                 address,
@@ -144,6 +157,10 @@ fn reachable(message: &NeighbourMessage) -> Option<Neighbour> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::process::Command;
+    use std::thread;
+
+    use nix::sched::{CloneFlags, unshare};
 
     #[test]
     fn another_link_address_is_told_of_either_family() {
@@ -152,6 +169,7 @@ mod tests {
             let mut neighbours = Neighbours {
                 hosts: BTreeMap::from([(address, "robot-pc".to_owned())]),
                 known: BTreeMap::new(),
+                has_failed: false,
             };
             let there = |address: IpAddr, hardware: &str| {
                 vec![Neighbour {
@@ -169,9 +187,14 @@ mod tests {
                 there(foreign, second),
                 there(foreign, first),
             ] {
-                assert_eq!(neighbours.compare(quiet), []);
+                assert_eq!(neighbours.compare(Ok(quiet)), []);
             }
-            let changes = neighbours.compare(there(address, second));
+            // Without a list nothing is forgotten.
+            let unlisted = || Err(io::ErrorKind::WouldBlock.into());
+            let told = neighbours.compare(unlisted());
+            assert!(matches!(&told[..], [EventKind::Warning { .. }]), "{told:?}");
+            assert_eq!(neighbours.compare(unlisted()), []);
+            let changes = neighbours.compare(Ok(there(address, second)));
             let [EventKind::NeighbourChanged { before, now, .. }] = &changes[..] else {
                 panic!("{changes:?}");
             };
@@ -180,7 +203,34 @@ mod tests {
     }
 
     #[test]
-    fn the_kernel_lists_its_neighbours() {
-        assert!(list().is_ok(), "{:?}", list());
+    fn the_kernel_lists_its_neighbours_of_both_families() {
+        let listed = thread::spawn(|| {
+            if let Err(errno) = unshare(CloneFlags::CLONE_NEWNET) {
+                println!("skipped: no network namespace ({errno})");
+                return None;
+            }
+            for words in [
+                "link add eth0 type veth peer name eth1",
+                "link set eth0 up",
+                "neigh add 10.77.0.2 lladdr 02:00:00:00:00:01 dev eth0 nud permanent",
+                "neigh add fd77::2 lladdr 02:00:00:00:00:02 dev eth0 nud permanent",
+            ] {
+                let done = Command::new("ip").args(words.split(' ')).status();
+                assert!(done.unwrap().success(), "{words}");
+            }
+            Some(list().unwrap())
+        });
+        let Some(listed) = listed.join().unwrap() else {
+            return;
+        };
+        for (address, hardware) in [
+            ("10.77.0.2", "02:00:00:00:00:01"),
+            ("fd77::2", "02:00:00:00:00:02"),
+        ] {
+            let address: IpAddr = address.parse().unwrap();
+            let found = listed.iter().find(|one| one.address == address);
+            let found = found.unwrap_or_else(|| panic!("{listed:?}"));
+            assert_eq!((&*found.interface, &*found.hardware), ("eth0", hardware));
+        }
     }
 }

@@ -19,17 +19,17 @@ const PERIODS: [Duration; 2] = [Duration::from_millis(10), Duration::from_millis
 
 /// Where the first host lets those in again that it has met.
 #[derive(Debug, Default)]
-pub(super) struct Door {
+pub(super) struct Readmission {
     /// Open while a connection is missing.
     listener: Option<ControlListener>,
     missing_count: usize,
-    /// Whoever came and was not looked at: of each host the last one.
+    /// Connections that wait for the thread that lacks them: of each host the last one.
     came: Vec<Newcomer>,
     /// Frames that this host and any peer took of each other, see [`PeerMessage::Acknowledged`].
     pub(super) moved_count: Arc<AtomicU64>,
 }
 
-impl Door {
+impl Readmission {
     /// Keeps one that came until the thread that misses its connection looks for it. One that goes on with a run that
     /// is over hears so.
     pub(super) fn take(&mut self, mut newcomer: Newcomer, own: &PeerHello) {
@@ -74,7 +74,7 @@ pub(super) struct Reconnect {
     pub(super) own: PeerHello,
     pub(super) theirs: PeerHello,
     /// Of all peers.
-    pub(super) door: Arc<Mutex<Door>>,
+    pub(super) readmission: Arc<Mutex<Readmission>>,
 }
 
 impl Reconnect {
@@ -105,7 +105,7 @@ impl Reconnect {
             }),
             ..self.own.clone()
         };
-        lock(&self.door).missing_count += 1;
+        lock(&self.readmission).missing_count += 1;
         let patience = self.meeting.peer_timeout;
         let mut first_tried = None;
         let made = loop {
@@ -124,28 +124,28 @@ impl Reconnect {
             }
             thread::sleep((tried_for / 10).clamp(PERIODS[0], PERIODS[1]));
         };
-        let mut door = lock(&self.door);
-        door.missing_count -= 1;
-        if door.missing_count == 0 {
-            door.listener = None;
-            door.came.clear();
+        let mut readmission = lock(&self.readmission);
+        readmission.missing_count -= 1;
+        if readmission.missing_count == 0 {
+            readmission.listener = None;
+            readmission.came.clear();
         }
         made
     }
 
     /// Looks once whether the peer has come.
     fn look(&self, hello: &PeerHello) -> Result<Option<(ControlHalves, u64)>, String> {
-        let mut door = lock(&self.door);
-        door.look(&self.meeting, &self.own);
-        let mut came = door.came.iter();
+        let mut readmission = lock(&self.readmission);
+        readmission.look(&self.meeting, &self.own);
+        let mut came = readmission.came.iter();
         let Some(place) = came.position(|one| one.hello.host == self.theirs.host) else {
             return Ok(None);
         };
         let Newcomer {
             mut ends,
             hello: said,
-        } = door.came.swap_remove(place);
-        drop(door);
+        } = readmission.came.swap_remove(place);
+        drop(readmission);
         if said.domain != self.theirs.domain {
             return Err("it was started again".to_owned());
         }
@@ -173,6 +173,6 @@ impl Reconnect {
     }
 }
 
-pub(super) fn lock(door: &Mutex<Door>) -> MutexGuard<'_, Door> {
-    door.lock().unwrap_or_else(PoisonError::into_inner)
+pub(super) fn lock(readmission: &Mutex<Readmission>) -> MutexGuard<'_, Readmission> {
+    readmission.lock().unwrap_or_else(PoisonError::into_inner)
 }

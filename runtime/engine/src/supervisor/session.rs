@@ -112,7 +112,7 @@ pub fn run(
         folder: folder.root().to_owned(),
         source,
     };
-    claims.tell(folder.root());
+    claims.tell(folder.root(), console);
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, base, &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
