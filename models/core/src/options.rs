@@ -345,7 +345,10 @@ impl<'o> Field<'o> {
         };
         let is_in_seconds = matches!((&shape, &setting), (Shape::Time(_), Setting::Number(_)));
         let unit = if is_in_seconds { "_s" } else { "" };
-        let problem = format!("{value} is outside {low} to {high}");
+        let problem = match shape {
+            Shape::Number(range) if range == ANY_NUMBER => format!("{value} is not finite"),
+            _ => format!("{value} is outside {low} to {high}"),
+        };
         Err(ParameterError::new(&format!("{}{unit}", self.key), problem))
     }
 }

@@ -186,7 +186,11 @@ fn bays_and_obstacles_that_make_no_world_are_refused_by_name() {
         "obstacle 0",
     );
     check(&|p| p.bays.0[1].y_m = 25.0, bay, "edge of the ground");
-    check(&|p| p.bays.0[1].y_m = f64::NAN, bay, "not finite");
+    check(
+        &|p| p.bays.0[1].y_m = f64::NAN,
+        "world.bays[1].y_m",
+        "not finite",
+    );
     check(
         &|p| p.bays.0[0].side = BaySide::Right,
         "world.bays[1]",
@@ -196,7 +200,7 @@ fn bays_and_obstacles_that_make_no_world_are_refused_by_name() {
     check(&|p| p.bounds = None, "world.bounds", "missing");
     check(
         &|p| p.obstacles.0[0].x_max_m = f64::NAN,
-        "world.obstacles[0]",
+        "world.obstacles[0].x_max_m",
         "not finite",
     );
     check(
@@ -267,8 +271,8 @@ fn given_paths_that_do_not_fit_the_map_are_refused_by_name() {
     );
     check(
         &|p| p.paths.0 = by(Pose::new(f64::NAN, 5.0, 0.0)),
-        path,
-        "pose 1 of the path is not",
+        "world.paths[0].poses[1].x_m",
+        "not finite",
     );
     check(
         &|p| p.paths.0 = vec![straight(0, 2, 6.0)],

@@ -445,7 +445,7 @@ mod tests {
             (decode(&text.as_str().into()), text)
         };
         let (hour, day) = (3_600_000_000_000, 86_400_000_000_000);
-        let every = |start: i64, ns: i64| Vec::from_iter((0..500).map(|row| start + ns * row));
+        let every = |start: i64, ns: i64| (0..500).map(|row| start + ns * row).collect::<Vec<_>>();
         for instants in [
             // One instant of several messages, a batch, and messages of 1 kHz, all within 1000 to 3000 s.
             vec![hour / 2; 2],
