@@ -3,14 +3,13 @@
 
 use std::ffi::OsString;
 use std::fs::{DirBuilder, File};
-use std::io::{self, BufReader, pipe};
+use std::io::{self, PipeReader, Read as _, pipe};
 use std::net::IpAddr;
 use std::os::fd::AsFd as _;
 use std::os::unix::fs::DirBuilderExt as _;
 use std::os::unix::process::CommandExt as _;
 use std::path::Path;
 use std::process::Stdio;
-use std::sync::mpsc::sync_channel;
 use std::time::{Duration, Instant};
 use std::{env, thread};
 
@@ -22,12 +21,13 @@ use hil_platform::signals::Signals;
 use hil_platform::{own_process, systemd};
 use hil_rundir::pipe::ToProcess;
 use hil_topology::{Host, Topology};
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::sys::signal::Signal;
 use nix::unistd::dup2_stdin;
 
 use super::own_program::{OwnProgramError, bind_to};
 use crate::security::PreSharedKey;
-use crate::supervisor::{Child, next_line};
+use crate::supervisor::Child;
 
 /// The argument that asks for it.
 pub const ALL: &str = "--on-one-pc";
@@ -40,16 +40,12 @@ pub const DOMAIN_ROOT: &str = "/dev/shm/hil";
 /// Interfaces of a host, where the topology names none.
 const INTERFACES: &str = "eth";
 
-/// Lines of other hosts that wait to be said.
-const LINES: usize = 64;
-/// What is said of a longer one.
+/// A longer line is said in pieces.
 const LINE_BYTES_MAX: usize = 4096;
 /// How often it is looked whether a host has ended.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// How long the others may go on once a host has failed.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// The last words of a host come at once when it has ended.
-const LAST_WORDS_WITHIN: Duration = Duration::from_secs(1);
 /// Exit code for a host that was killed.
 const FAILED: u8 = 1;
 
@@ -127,7 +123,7 @@ pub fn run_all(topology: &Topology, console: &mut Console) -> Result<u8, HostsEr
     let wires = wires(hosts)?;
     pcs::begin()?;
     let signals = Signals::install()?;
-    let (lines, said) = sync_channel(LINES);
+    let mut words = Vec::new();
     let mut running = Vec::new();
     let mut entered = Vec::new();
     for (index, host) in hosts.iter().enumerate() {
@@ -155,16 +151,7 @@ pub fn run_all(topology: &Topology, console: &mut Console) -> Result<u8, HostsEr
                 helper.arg("--quiet");
             }
             helper.stdout(Stdio::null()).stderr(write);
-            let (lines, name) = (lines.clone(), host.name.clone());
-            thread::spawn(move || {
-                let mut words = BufReader::new(read);
-                while let Ok(Some(line)) = next_line(&mut words, LINE_BYTES_MAX) {
-                    let line = String::from_utf8_lossy(&line);
-                    if lines.send(format!("{name}: {line}")).is_err() {
-                        return;
-                    }
-                }
-            });
+            words.push(Words::of(host, read).map_err(failed)?);
         }
         running.push(Child::spawn_apart(&mut helper).map_err(failed)?);
         // This process keeps no copy of the helper's ends.
@@ -182,16 +169,47 @@ pub fn run_all(topology: &Topology, console: &mut Console) -> Result<u8, HostsEr
             source,
         })?;
     }
-    drop(lines);
-    let code = wait_for_all(&mut running, &signals, || {
-        for line in said.try_iter() {
-            console.rendered(&line);
-        }
-    });
-    while let Ok(line) = said.recv_timeout(LAST_WORDS_WITHIN) {
-        console.rendered(&line);
-    }
+    let mut say = || words.iter_mut().for_each(|one| one.say(console));
+    let code = wait_for_all(&mut running, &signals, &mut say);
+    say();
     Ok(code)
+}
+
+/// The standard error of a host. It is read without a thread: each thread of a starter that is killed would leave the hosts
+/// to the next one with a signal of its own, and the second signal costs the report.
+struct Words {
+    host: String,
+    pipe: PipeReader,
+    /// What came of a line.
+    line: Vec<u8>,
+}
+
+impl Words {
+    fn of(host: &Host, pipe: PipeReader) -> io::Result<Self> {
+        fcntl(&pipe, FcntlArg::F_SETFL(OFlag::O_NONBLOCK))?;
+        Ok(Self {
+            host: host.name.clone(),
+            pipe,
+            line: Vec::new(),
+        })
+    }
+
+    /// Says the lines that have come.
+    fn say(&mut self, console: &mut Console) {
+        let mut bytes = [0; 4096];
+        while let Ok(length @ 1..) = self.pipe.read(&mut bytes) {
+            for byte in &bytes[..length] {
+                if *byte != b'\n' {
+                    self.line.push(*byte);
+                }
+                if *byte == b'\n' || self.line.len() >= LINE_BYTES_MAX {
+                    let line = String::from_utf8_lossy(&self.line);
+                    console.rendered(&format!("{}: {line}", self.host));
+                    self.line.clear();
+                }
+            }
+        }
+    }
 }
 
 /// Waits until all hosts have ended, and tells them once to end when this process is told to, or when one of

@@ -327,7 +327,7 @@ fn started(command: &mut Command) -> io::Result<(std::process::Child, OwnedFd)> 
 ///
 /// # Errors
 /// When reading fails.
-pub(crate) fn next_line(input: &mut impl BufRead, bytes_max: usize) -> io::Result<Option<Vec<u8>>> {
+fn next_line(input: &mut impl BufRead, bytes_max: usize) -> io::Result<Option<Vec<u8>>> {
     let mut line = Vec::new();
     let mut has_begun = false;
     loop {

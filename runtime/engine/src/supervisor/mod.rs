@@ -26,7 +26,7 @@ mod session;
 mod status_publisher;
 mod strangers;
 
-pub(crate) use child::{Child, next_line};
+pub(crate) use child::Child;
 pub use claims::{ClaimError, Claims};
 pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;
