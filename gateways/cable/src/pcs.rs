@@ -8,8 +8,6 @@ use std::fs::{self, File};
 use std::io;
 use std::net::IpAddr;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::thread;
-use std::time::{Duration, Instant};
 
 use hil_net::handover;
 use nix::errno::Errno;
@@ -19,10 +17,6 @@ use crate::inlet::InletError;
 use crate::inside::{ENTERED, let_ping, make_namespaces, mount_own};
 use crate::netlink::{INDEX, LOOPBACK, Netlink, Network, PairEnd};
 use crate::refusal::{Refusal, Step};
-
-/// A run that begins without is told that nothing leaves its interface.
-const CARRIERS_WITHIN: Duration = Duration::from_secs(2);
-const CARRIERS_PERIOD: Duration = Duration::from_millis(5);
 
 /// A wire between two hosts.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -82,14 +76,12 @@ pub fn enter(socket: BorrowedFd<'_>) -> Result<Option<Vec<u8>>, Refusal> {
     };
     let_ping().map_err(|source| Refusal::new(Step::Addresses, source))?;
     mount_own()?;
-    await_carriers();
     Ok(Some(word))
 }
 
-/// Waits until this host's interfaces are up, which the kernel notes a moment after both ends of a wire are.
-fn await_carriers() {
-    let deadline = Instant::now() + CARRIERS_WITHIN;
-    let is_up = |interface: &fs::DirEntry| {
+/// Whether this host's wires are up, which the kernel notes a moment after both of their ends are.
+pub fn are_wires_up() -> bool {
+    let is_up = |interface: fs::DirEntry| {
         let read = |name| fs::read_to_string(interface.path().join(name)).unwrap_or_default();
         // What a kernel adds on its own stays down.
         let is_of_a_wire = read("ifindex")
@@ -98,16 +90,11 @@ fn await_carriers() {
             .is_ok_and(|index: u32| index >= INDEX);
         !is_of_a_wire || read("operstate").trim() == "up"
     };
-    while Instant::now() < deadline {
-        let interfaces = fs::read_dir("/sys/class/net")
-            .into_iter()
-            .flatten()
-            .flatten();
-        if interfaces.into_iter().all(|one| is_up(&one)) {
-            return;
-        }
-        thread::sleep(CARRIERS_PERIOD);
-    }
+    let mut interfaces = fs::read_dir("/sys/class/net")
+        .into_iter()
+        .flatten()
+        .flatten();
+    interfaces.all(is_up)
 }
 
 impl Pc {

@@ -46,6 +46,9 @@ const LINE_BYTES_MAX: usize = 4096;
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// How long the others may go on once a host has failed.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// A run that begins before is told that nothing leaves its interface.
+const WIRES_UP_WITHIN: Duration = Duration::from_secs(2);
+const WIRES_PERIOD: Duration = Duration::from_millis(5);
 /// Exit code for a host that was killed.
 const FAILED: u8 = 1;
 
@@ -318,6 +321,10 @@ pub fn become_host(starter: u32, arguments: &[String]) -> Result<(), OwnProgramE
     };
     if let Some(key) = PreSharedKey::of(&key) {
         key.write(Path::new(KEY_FILE))?;
+    }
+    let deadline = Instant::now() + WIRES_UP_WITHIN;
+    while !pcs::are_wires_up() && Instant::now() < deadline {
+        thread::sleep(WIRES_PERIOD);
     }
     let nothing = File::open("/dev/null").and_then(|nothing| Ok(dup2_stdin(nothing)?));
     nothing
