@@ -181,7 +181,7 @@ mod tests {
     use super::*;
 
     const MS: i64 = 1_000_000;
-    /// What the clock of the answering host is ahead: it plays no part.
+    /// What the clock of the answering host is ahead, which changes no figure.
     const AHEAD_NS: i64 = 77_777 * MS;
 
     fn request(at_ms: i64, there_ms: i64) -> FramePassage {

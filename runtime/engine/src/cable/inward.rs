@@ -73,9 +73,10 @@ impl JobWork for Inward {
             ..
         } = self;
         let delivered = input.take(|envelope, frame| {
-            let sent = ends.sender.send(frame);
+            // Before it is given: the program's kernel may answer within the call.
             let now = MonotonicClock::now();
             wait.on_arrival(now);
+            let sent = ends.sender.send(frame);
             if sent.is_err() {
                 *refused_count += 1;
                 return;

@@ -1,5 +1,5 @@
-//! The hosts of a topology as namespaces of this PC: one starts a supervisor a host, as if each were a PC of
-//! its own, and waits for their ends.
+//! The hosts of a topology as namespaces of this PC: one process starts a supervisor for each host and waits
+//! until all have ended.
 
 use std::ffi::OsString;
 use std::fs::{DirBuilder, File};
@@ -308,7 +308,7 @@ fn wires(hosts: &[Host]) -> Result<Vec<Wire>, HostsError> {
     Ok(wires)
 }
 
-/// Enters a host's namespaces at the wish of the process at the other end of standard input, and becomes this
+/// Enters a host's namespaces, joined by the process at the other end of standard input, and becomes this
 /// program with `arguments`, which ends when that process does. Returns only when it fails.
 ///
 /// # Errors
