@@ -64,11 +64,12 @@ pub(crate) fn open<'a>(
             let waiter = Waiter::open(&domain, &names)?;
             await_programs(work, &domain, &stop)?;
             Ok(Box::new(Witness {
+                channels: &work.channels,
                 streams,
                 sinks,
                 waiter,
                 begun: move || start.get().unwrap_or(Instant::ZERO),
-                _domain: domain,
+                domain,
             }))
         }),
     };
@@ -89,11 +90,9 @@ fn await_programs(
     loop {
         let mut missing = Vec::new();
         for channel in awaited {
-            let census = Census::of(domain, &channel.name)?;
-            let has_writer = !channel.has_publisher || census.writer_count > 0;
-            // This process is a reader, too.
-            let has_reader = !channel.has_reader || census.reader_count > 1;
-            if !has_writer || !has_reader {
+            let has_writer =
+                !channel.has_publisher || Census::of(domain, &channel.name)?.writer_count > 0;
+            if !has_writer || !has_joined(domain, channel)? {
                 missing.push(channel);
             }
         }
@@ -111,6 +110,12 @@ fn await_programs(
         }
         thread::sleep(LOOK_PERIOD);
     }
+}
+
+/// Whether the program that reads `channel`, if one does, has joined it.
+fn has_joined(domain: &Domain, channel: &WitnessedChannel) -> Result<bool, ChannelError> {
+    // This process is a reader, too.
+    Ok(!channel.has_reader || Census::of(domain, &channel.name)?.reader_count > 1)
 }
 
 /// Where the records go that are alike for all channels.
@@ -147,6 +152,8 @@ struct Noted {
     /// Its place among the channels of the sink.
     published: Option<usize>,
     taken: Option<usize>,
+    /// Whether its reader was there when it was looked for: until then nobody takes anything.
+    has_joined: bool,
     messages: Option<RecordSink>,
     count: Arc<AtomicU64>,
 }
@@ -188,6 +195,7 @@ impl Noted {
         Ok(Self {
             published,
             taken,
+            has_joined: false,
             messages: messages.transpose()?,
             count,
         })
@@ -206,7 +214,7 @@ impl Noted {
         if let Some(messages) = &mut self.messages {
             messages.push_message(envelope, payload);
         }
-        if let Some(place) = self.taken {
+        if let Some(place) = self.taken.filter(|_| self.has_joined) {
             let record = TakenRecord {
                 sequence: envelope.sequence,
                 published_ns: envelope.published_ns,
@@ -222,17 +230,32 @@ impl Noted {
 }
 
 /// Reads the channels.
-struct Witness<F> {
+struct Witness<'a, F> {
+    channels: &'a [WitnessedChannel],
     streams: Vec<(RawInput, Noted)>,
     sinks: Sinks,
     waiter: Waiter,
     /// When the run began.
     begun: F,
     /// Outlives the ports.
-    _domain: Domain,
+    domain: Domain,
 }
 
-impl<F: Fn() -> Instant> JobWork for Witness<F> {
+impl<F> Witness<'_, F> {
+    fn look_for_readers(&mut self) -> Result<(), ChannelError> {
+        for (channel, (_, noted)) in self.channels.iter().zip(&mut self.streams) {
+            noted.has_joined = noted.has_joined || has_joined(&self.domain, channel)?;
+        }
+        Ok(())
+    }
+}
+
+impl<F: Fn() -> Instant> JobWork for Witness<'_, F> {
+    fn begin(&mut self, orders: &Orders) -> Result<bool, WorkerError> {
+        self.look_for_readers()?;
+        Ok(orders.wait_for_start())
+    }
+
     fn step(&mut self) -> Result<bool, WorkerError> {
         let begun_ns = (self.begun)().as_ns();
         let mut has_moved = false;
@@ -248,6 +271,7 @@ impl<F: Fn() -> Instant> JobWork for Witness<F> {
     }
 
     fn rest(&mut self) -> Result<(), WorkerError> {
+        self.look_for_readers()?;
         self.waiter.wait(REST)?;
         Ok(())
     }
