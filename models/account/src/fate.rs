@@ -173,7 +173,27 @@ impl<'a> Evidence<'a> {
         if !self.at_hand.taken {
             return Some(MessageFate::UnknownPeerRecordsUnavailable);
         }
-        self.fate_in_buffer(reading, MessageFate::SupersededAtConsumer, at_ns, end_ns)
+        let fate = self.fate_in_buffer(reading, MessageFate::SupersededAtConsumer, at_ns, end_ns);
+        match fate {
+            Some(MessageFate::SupersededAtConsumer | MessageFate::Unexplained)
+                if self.context.has_witness =>
+            {
+                Some(MessageFate::UnknownPeerRecordsUnavailable)
+            }
+            fate => fate,
+        }
+    }
+
+    /// True for what a witness took while the consumer was away.
+    pub(super) fn is_for_nobody(&self, message: &MessageHistory) -> bool {
+        let taken = message.taken.filter(|_| self.context.has_witness);
+        let mut interruptions = self.context.interruptions.iter();
+        taken.is_some_and(|taken| {
+            let taken_at = Instant::from_ns(taken.taken_ns);
+            interruptions.any(|one| {
+                one.place == PathProcess::Consumer && (one.from..=one.until).contains(&taken_at)
+            })
+        })
     }
 
     /// Of a message that was put before a reader at `at_ns` and not taken.

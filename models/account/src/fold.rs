@@ -441,6 +441,9 @@ impl ChannelFold {
             },
         };
         message.key = key;
+        if evidence.is_for_nobody(&message) {
+            message.taken = None;
+        }
         // A message that was taken needs no reading.
         let readings = match message.taken {
             Some(_) => Readings::default(),

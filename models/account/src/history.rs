@@ -285,6 +285,54 @@ mod tests {
     }
 
     #[test]
+    fn what_a_witness_missed_is_unknown_and_what_it_took_without_the_consumer_is_lost() {
+        use MessageFate as Fate;
+        let mut files = Files::default();
+        let written = [
+            Fate::Taken,
+            Fate::Taken,
+            Fate::Taken,
+            Fate::SupersededAtConsumer,
+            Fate::Taken,
+        ];
+        for (sequence, fate) in (0_u64..).zip(written) {
+            files.write(at(7, sequence), fate);
+        }
+        let interruptions = [Interruption {
+            process: "own".to_owned(),
+            place: PathProcess::Consumer,
+            from: Instant::from_ns(at(7, 1).published_ns),
+            until: Instant::from_ns(at(7, 2).published_ns),
+            cause: "killed by signal 9".to_owned(),
+        }];
+        let mut context = same_clock(1_000_000_000).with_interruptions(&interruptions);
+        for (has_witness, expected) in [
+            (false, written),
+            (
+                true,
+                [
+                    Fate::Taken,
+                    Fate::LostInInterruption,
+                    Fate::Taken,
+                    Fate::UnknownPeerRecordsUnavailable,
+                    Fate::Taken,
+                ],
+            ),
+        ] {
+            context.has_witness = has_witness;
+            let found = histories(&files, &context);
+            let found: Vec<_> = found.values().map(|one| one.fate).collect();
+            assert_eq!(found, expected);
+        }
+        let crossings = passages(&files, &context);
+        assert!(
+            crossings
+                .iter()
+                .all(|one| one.crossing == Crossing::Arrived)
+        );
+    }
+
+    #[test]
     fn losses_of_the_host_are_kept_apart_from_those_of_the_network() {
         use Crossing::{Arrived, LostByHost, LostByNetwork};
         use MessageFate as Fate;

@@ -281,6 +281,9 @@ pub struct AccountContext<'a> {
     pub depth: Option<usize>,
     /// Where the numbers of the channel's messages begin.
     pub first_number: FirstNumber,
+    /// True when a witness reads the channel beside its consumer, who keeps no records, and wrote the records of what
+    /// was taken: what it missed the consumer may have taken, and what it took while the consumer was away was lost.
+    pub has_witness: bool,
     /// True when both network cards take their stamps from one hardware clock.
     pub cards_share_clock: bool,
     /// Round trips of the gateways' clock exchange, nanoseconds.
@@ -299,6 +302,7 @@ impl<'a> AccountContext<'a> {
             flight_time_max: FLIGHT_TIME_MAX,
             depth: None,
             first_number: FirstNumber::Zero,
+            has_witness: false,
             cards_share_clock: false,
             round_trips_ns: &[],
         }

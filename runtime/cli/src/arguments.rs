@@ -404,6 +404,9 @@ pub enum Command {
         /// Its address in a network namespace of its own, whose cable goes to standard input.
         #[arg(long)]
         inside: Option<IpAddr>,
+        /// What to ask of the kernel for it, as JSON.
+        #[arg(long)]
+        realtime: Option<String>,
         /// Program and arguments.
         #[arg(last = true, required = true)]
         program: Vec<String>,

@@ -140,10 +140,17 @@ fn run_command(
             supervisor,
             open_files,
             inside,
+            realtime,
             program,
-        } => own_program::become_program(supervisor, open_files, inside, &program)
-            .map(done)
-            .map_err(failed),
+        } => own_program::become_program(
+            supervisor,
+            open_files,
+            inside,
+            realtime.as_deref(),
+            &program,
+        )
+        .map(done)
+        .map_err(failed),
         Command::BecomeHost { starter, arguments } => {
             host::become_host(starter, &arguments)
                 .map(done)

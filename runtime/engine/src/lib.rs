@@ -8,3 +8,4 @@ pub mod gateway;
 pub mod process;
 pub mod security;
 pub mod supervisor;
+mod witness;

@@ -34,10 +34,10 @@ pub enum SchedulingPolicy {
 
 impl SchedulingPolicy {
     /// Policy with its flags, and priority, as the kernel numbers them.
-    const fn of_kernel(self) -> (libc::c_int, u8) {
+    const fn of_kernel(self, fifo_flags: libc::c_int) -> (libc::c_int, u8) {
         match self {
             Self::Other => (libc::SCHED_OTHER, 0),
-            Self::Fifo { priority } => (libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, priority),
+            Self::Fifo { priority } => (libc::SCHED_FIFO | fifo_flags, priority),
         }
     }
 }
@@ -186,9 +186,20 @@ impl Refusal {
 /// about to leave. Threads and processes started later by this thread do not inherit the
 /// real-time policy (`SCHED_RESET_ON_FORK`), but they do inherit the CPU mask.
 pub fn apply(request: &RealtimeRequest) -> RealtimeGrant {
+    apply_with(request, request.cpu.as_slice(), libc::SCHED_RESET_ON_FORK)
+}
+
+/// As [`apply`], for a program that this process becomes: it may use all of `cpus`, any where that is empty, and its
+/// threads inherit its policy.
+pub fn apply_to_program(request: &RealtimeRequest, cpus: &[usize]) -> RealtimeGrant {
+    apply_with(request, cpus, 0)
+}
+
+fn apply_with(request: &RealtimeRequest, cpus: &[usize], fifo_flags: libc::c_int) -> RealtimeGrant {
     let mut grant = RealtimeGrant::default();
-    if let Some(cpu) = request.cpu {
-        grant.add(RealtimeItem::CpuPinning, format!("cpu {cpu}"), pin_to(cpu));
+    if !cpus.is_empty() {
+        let asked = format!("cpu {}", format_cpu_list(cpus));
+        grant.add(RealtimeItem::CpuPinning, asked, pin_to(cpus));
     }
     if request.lock_memory {
         let result = lock_memory();
@@ -198,7 +209,7 @@ pub fn apply(request: &RealtimeRequest) -> RealtimeGrant {
         let asked = format!("timer slack {} ns", slack.as_nanos());
         grant.add(RealtimeItem::TimerSlack, asked, set_timer_slack(slack));
     }
-    let (policy, priority) = request.policy.of_kernel();
+    let (policy, priority) = request.policy.of_kernel(fifo_flags);
     let result = schedule(policy, priority);
     grant.add(RealtimeItem::Scheduling, request.policy.to_string(), result);
     grant
@@ -211,7 +222,7 @@ pub fn has_realtime_priority() -> bool {
     matches!(policy, libc::SCHED_FIFO | libc::SCHED_RR)
 }
 
-fn pin_to(cpu: usize) -> Result<(), Refusal> {
+fn pin_to(cpus: &[usize]) -> Result<(), Refusal> {
     let online = || {
         let files = HostFiles::of_this_host();
         online_cpus(&files)
@@ -223,17 +234,21 @@ fn pin_to(cpu: usize) -> Result<(), Refusal> {
         let fix = "choose one of them that the process's cpuset also allows";
         Refusal::new(errno, reason, fix)
     };
-    // The affinity mask has this many bits; `core_affinity` would index beyond it.
-    if cpu >= libc::CPU_SETSIZE.unsigned_abs() as usize {
-        return Err(refused(Errno::EINVAL));
+    let mut asked = CpuSet::new();
+    for cpu in cpus {
+        asked.set(*cpu).map_err(refused)?;
     }
-    if !core_affinity::set_for_current(CoreId { id: cpu }) {
-        return Err(refused(Errno::last()));
+    match cpus {
+        &[id] => {
+            if !core_affinity::set_for_current(CoreId { id }) {
+                return Err(refused(Errno::last()));
+            }
+        }
+        // The crate sets one.
+        _ => sched_setaffinity(Pid::from_raw(OWN_THREAD), &asked).map_err(refused)?,
     }
-    let mask = sched_getaffinity(Pid::from_raw(0)).map_err(refused)?;
-    let is_exact =
-        (0..CpuSet::count()).all(|index| mask.is_set(index).unwrap_or(false) == (index == cpu));
-    if is_exact {
+    let granted = sched_getaffinity(Pid::from_raw(OWN_THREAD)).map_err(refused)?;
+    if granted == asked {
         Ok(())
     } else {
         Err(refused(Errno::EAGAIN))

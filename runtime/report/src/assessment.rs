@@ -294,7 +294,10 @@ fn uncounted(summary: &RunSummary) -> impl Iterator<Item = &ProcessSummary> {
     };
     summary.processes.iter().filter(move |process| {
         let has_counters = match process.kind {
-            ProcessKind::Component | ProcessKind::Gateway | ProcessKind::Adapter => true,
+            ProcessKind::Component
+            | ProcessKind::Gateway
+            | ProcessKind::Adapter
+            | ProcessKind::Witness => true,
             // It carries no message.
             ProcessKind::ClockPath => false,
             ProcessKind::OwnProgram => carries_frames(process),

@@ -15,7 +15,7 @@ use crate::run_folder::{RunFolder, utc_text};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::own_folder::OwnFolder;
 use hil_platform::plain_file;
-use hil_topology::{Channel, Process, Program, Topology};
+use hil_topology::{Channel, Topology};
 
 /// A run that is announced for as long as this lives.
 #[derive(Debug)]
@@ -137,12 +137,13 @@ pub fn source(
 ) -> Option<Source> {
     let producer = topology.process(&channel.from)?;
     if is_here(&producer.host) {
-        return Some(match producer.program {
-            Program::Command { .. } => Source::SharedMemory {
+        return Some(if producer.role().is_some() {
+            Source::Records {}
+        } else {
+            Source::SharedMemory {
                 host: producer.host.clone(),
                 is_forwarded: false,
-            },
-            Program::BuiltIn { .. } | Program::Egm { .. } => Source::Records {},
+            }
         });
     }
     let consumer = topology.process(channel.to.as_deref()?)?;
@@ -152,18 +153,13 @@ pub fn source(
     })
 }
 
-/// Whether a process that is not here records the messages of `channel`: own programs record nothing.
+/// Whether the messages of `channel` are recorded on a host that is not here: those of roles are.
 fn comes_again(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool) -> bool {
     let producer = topology.process(&channel.from);
-    producer.is_some_and(|producer| !is_here(&producer.host) && keeps_records(&producer.program))
+    producer.is_some_and(|producer| !is_here(&producer.host) && producer.role().is_some())
 }
 
-const fn keeps_records(program: &Program) -> bool {
-    !matches!(program, Program::Command { .. })
-}
-
-/// What the processes here note of each message of `channel`. Own programs note nothing; what carries the
-/// frames of one does.
+/// What the processes here note of each message of `channel`; of own programs, what reads beside them does.
 fn noted(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool) -> Vec<Stage> {
     let ends = [Some(channel.from.as_str()), channel.to.as_deref()];
     let [producer, consumer] = ends.map(|name| topology.process(name?));
@@ -172,13 +168,11 @@ fn noted(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool)
     };
     let crosses = producer.host != consumer.host;
     let (from_here, to_here) = (is_here(&producer.host), is_here(&consumer.host));
-    let is_recorded =
-        |process: &Process| keeps_records(&process.program) || process.inside().is_some();
     let stages = [
-        (Stage::Published, from_here && is_recorded(producer)),
+        (Stage::Published, from_here),
         (Stage::Sent, from_here && crosses),
         (Stage::Received, to_here && crosses),
-        (Stage::Taken, to_here && is_recorded(consumer)),
+        (Stage::Taken, to_here),
     ];
     let noted = stages.into_iter().filter(|(_, is_noted)| *is_noted);
     noted.map(|(stage, _)| stage).collect()

@@ -196,6 +196,8 @@ pub enum ProcessKind {
     Adapter,
     /// A program of the user's.
     OwnProgram,
+    /// Records what programs of the user's publish and are given.
+    Witness,
 }
 
 impl ProcessKind {
@@ -213,6 +215,7 @@ impl ProcessKind {
             Self::ClockPath => "clock path".to_owned(),
             Self::Adapter => format!("{role} by foreign program"),
             Self::OwnProgram => "own program".to_owned(),
+            Self::Witness => "records of own programs".to_owned(),
         }
     }
 }

@@ -48,6 +48,8 @@ pub enum Work {
     Adapter(AdapterSettings),
     /// Runs a program in a network namespace of its own and carries its Ethernet frames.
     Cable(CableWork),
+    /// Records what programs of the user's publish and are given.
+    Witness(WitnessWork),
 }
 
 /// What a component is told.
@@ -226,6 +228,32 @@ pub struct CableWork {
     pub realtime: [RealtimeRequest; 2],
     /// How to wait for frames.
     pub wait: WaitMode,
+}
+
+/// What a process is told that records for the programs of the user's on its host.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WitnessWork {
+    /// How long the run's start waits for a program that joins some channel late or never.
+    pub patience: Duration,
+    /// The channels that they have.
+    pub channels: Vec<WitnessedChannel>,
+}
+
+/// A channel with a program of the user's at an end.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WitnessedChannel {
+    /// Its name.
+    pub name: String,
+    /// Size of one message.
+    pub message_size_bytes: usize,
+    /// Whether a program of the user's publishes here.
+    pub has_publisher: bool,
+    /// Whether a program of the user's reads here.
+    pub has_reader: bool,
+    /// Whether the messages themselves are recorded, for the case to score.
+    pub has_messages: bool,
 }
 
 /// A launch file or card cannot be used.

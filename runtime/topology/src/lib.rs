@@ -57,7 +57,7 @@ pub use model::{
     AtExit, Case, Channel, Crossing, Execution, Host, LinkPorts, MessageLayout, OnExit, Process,
     Program, Restarts, Run, Scheduling, SchedulingClass, Topology, Wait,
 };
-pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
+pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name, witness_name};
 pub use ports::{WantedPort, collide, control_key};
 pub use role_spec::{RoleChannel, RoleSpec};
 pub use security::{Hops, Security};

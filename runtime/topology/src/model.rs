@@ -157,6 +157,11 @@ impl Process {
         }
     }
 
+    /// True for a program of the user's that joins its channels itself and keeps no records: a witness beside it does.
+    pub const fn is_witnessed(&self) -> bool {
+        matches!(self.program, Program::Command { inside: None, .. })
+    }
+
     /// The role of the case it plays, if any.
     pub fn role(&self) -> Option<&str> {
         match &self.program {

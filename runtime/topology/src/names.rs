@@ -11,6 +11,11 @@ pub fn gateway_name(link: &str, host: &str) -> String {
     format!("gateway-{link}-{host}")
 }
 
+/// What the process on `host` is called that records for the programs of the user's there.
+pub fn witness_name(host: &str) -> String {
+    format!("witness-{host}")
+}
+
 /// Name of the process at the end of `path` on `host`.
 pub fn clock_process_name(path: &ClockPath<'_>, host: &str) -> String {
     let other = if path.from.name == host {

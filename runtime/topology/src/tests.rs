@@ -474,3 +474,30 @@ to = 'b'
     assert_eq!(topology.case(), None);
     assert_eq!(topology.channels()[0].message.alignment_bytes, 8);
 }
+
+#[test]
+fn what_a_program_of_the_users_cannot_have_is_refused() {
+    let text = "version = 1\nname = 'own'\nprocesses.a.run = ['./a']\nprocesses.b.run = ['./b']\n";
+    for (line, key, says) in [
+        (
+            "processes.a.lock_memory = true",
+            "processes.a.lock_memory",
+            "must lock its memory itself",
+        ),
+        (
+            "processes.a.wait = 'spin'",
+            "processes.a.wait",
+            "its own business",
+        ),
+        (
+            "processes.witness-local.run = ['./c']",
+            "processes.witness-local",
+            "records for `a`",
+        ),
+    ] {
+        let errors = parse("own.toml", &format!("{text}{line}\n"), &[], &known()).expect_err(key);
+        let text = errors.to_string();
+        assert_eq!(errors.errors()[0].key, key, "{text}");
+        assert!(text.contains(says), "{text}");
+    }
+}

@@ -41,7 +41,7 @@ fn main() -> Result<(), Box<dyn Error>> {
                 let envelope = Envelope {
                     sequence,
                     published_ns: MonotonicClock::now().as_ns(),
-                    epoch: 1,
+                    epoch: std::process::id(),
                     ..Envelope::default()
                 };
                 output.publish(&envelope, payload)?;

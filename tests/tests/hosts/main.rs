@@ -23,6 +23,7 @@ mod kills;
 mod limits;
 mod many_channels;
 mod one_pc;
+mod own_programs;
 mod probe_run;
 mod secured_run;
 mod soak;

@@ -11,10 +11,12 @@ use std::{env, io};
 
 use hil_cable::{Inside, Refusal};
 use hil_platform::open_files;
+use hil_platform::realtime::{self, RealtimeRequest};
 use hil_topology::{Program, Topology};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
 use nix::unistd::{AccessFlags, access, dup2_stdin};
+use serde::{Deserialize, Serialize};
 
 use crate::security::KeyFileError;
 
@@ -46,6 +48,14 @@ pub enum OwnProgramError {
     /// The key of a host cannot be put where it looks for it.
     #[error(transparent)]
     Key(#[from] KeyFileError),
+    /// The kernel does not give it what its process is to have.
+    #[error("cannot give {program} what its process is to have: {refusal}")]
+    Realtime {
+        /// The program.
+        program: String,
+        /// What was refused, why, and the cure.
+        refusal: String,
+    },
     /// The program cannot be executed.
     #[error("cannot execute {program}: {source}")]
     Execute {
@@ -54,6 +64,16 @@ pub enum OwnProgramError {
         /// What the kernel answered.
         source: io::Error,
     },
+}
+
+/// What the kernel is asked for a program: a refusal ends it, as nobody else would tell.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ProgramRealtime {
+    /// The cores it may use; any where there are none.
+    pub cpus: Vec<usize>,
+    /// Scheduling and timer slack.
+    pub request: RealtimeRequest,
 }
 
 /// Replaces this process by `program`, which the kernel will kill when the supervisor ends. With an address
@@ -67,6 +87,7 @@ pub fn become_program(
     supervisor: u32,
     open_files: Option<u64>,
     inside: Option<IpAddr>,
+    realtime: Option<&str>,
     program: &[String],
 ) -> Result<(), OwnProgramError> {
     let name = program.first().cloned().unwrap_or_default();
@@ -82,11 +103,29 @@ pub fn become_program(
         // A change of identity may have unbound it.
         bind_to(supervisor, &name, Signal::SIGKILL)?;
     }
+    if let Some(text) = realtime {
+        claim(text).map_err(|refusal| OwnProgramError::Realtime {
+            program: name.clone(),
+            refusal,
+        })?;
+    }
     let source = Command::new(&name).args(&program[1..]).exec();
     Err(OwnProgramError::Execute {
         program: name,
         source,
     })
+}
+
+/// Asks the kernel for what `text` says; else what it refused.
+fn claim(text: &str) -> Result<(), String> {
+    let asked: ProgramRealtime = serde_json::from_str(text).map_err(|error| error.to_string())?;
+    let grant = realtime::apply_to_program(&asked.request, &asked.cpus);
+    let refusals: Vec<String> = grant.refusals().map(ToString::to_string).collect();
+    if refusals.is_empty() {
+        Ok(())
+    } else {
+        Err(refusals.join("; "))
+    }
 }
 
 /// Lets the kernel send this process a signal when the one that started it ends.
@@ -202,8 +241,19 @@ mod tests {
     }
 
     #[test]
+    fn what_the_kernel_refuses_a_program_is_told_with_the_cure() {
+        let asked = ProgramRealtime {
+            cpus: vec![1_023],
+            request: RealtimeRequest::default(),
+        };
+        let refusal = claim(&serde_json::to_string(&asked).unwrap()).unwrap_err();
+        assert!(refusal.contains("cpu 1023 refused"), "{refusal}");
+        assert!(refusal.contains("choose one of them"), "{refusal}");
+    }
+
+    #[test]
     fn an_orphan_does_not_start() {
-        let error = become_program(u32::MAX, None, None, &["true".to_owned()]).unwrap_err();
+        let error = become_program(u32::MAX, None, None, None, &["true".to_owned()]).unwrap_err();
         assert!(matches!(error, OwnProgramError::Orphaned(_)));
     }
 }

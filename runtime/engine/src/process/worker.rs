@@ -1,5 +1,5 @@
 //! The shell of every process of a run that this binary plays: component, gateway, clock path,
-//! adapter and cable. It hears the supervisor's orders, starts one thread for each job, tells what they count
+//! adapter, cable and witness. It hears the supervisor's orders, starts one thread for each job, tells what they count
 //! and that they turn, and reports their outcome. What a job does is its own business.
 
 use std::panic::resume_unwind;
@@ -22,7 +22,7 @@ use super::component;
 use super::heartbeat::{Heartbeat, Heartbeats};
 use crate::gateway::process::GatewayWatch;
 use crate::gateway::timestamping::TimestampingSetup;
-use crate::{adapter, cable, gateway};
+use crate::{adapter, cable, gateway, witness};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::open_files;
 use hil_platform::realtime::{self, RealtimeGrant, RealtimeRequest, SpinAdvice};
@@ -289,6 +289,7 @@ fn open_and_run(path: &Path, registry: &Registry) -> Result<(), WorkerError> {
         Work::Gateway(work) => gateway::process::open(&launch, work, &orders, &mut recorder),
         Work::Adapter(work) => adapter::process::open(&launch, work, &mut recorder),
         Work::Cable(work) => cable::open(&launch, work, &orders, &mut recorder),
+        Work::Witness(work) => witness::open(&launch, work, &orders, &mut recorder),
     }?;
     let stop = Arc::clone(orders.stop_flag());
     recorder

@@ -21,7 +21,8 @@ use hil_topology::Channel;
 
 /// Writers at a time: one, and its successor while the dead one is not cleaned up yet.
 const WRITERS_MAX: usize = 2;
-/// Readers at a time: consumer or gateway, its successor, and room for four observers.
+/// Readers at a time: consumer or gateway, its successor, and room for four observers, of which one records for a
+/// program of the user's.
 const READERS_MAX: usize = 6;
 /// Observers look about fifty times a second and leave when they see that the run is over; one that
 /// does not has its memory taken from under it.

@@ -371,6 +371,13 @@ fn process_need<'a>(
             channels: vec![work.input.name.clone(), work.output.name.clone()],
             own_bytes: hil_cable::RING_BYTES as u64,
         },
+        ProcessTask::Witness(work) => ProcessContent {
+            open_files: OWN_FILES + COMPONENT_CHANNEL_FILES * work.channels.len() as u64,
+            threads: OWN_THREADS + 1,
+            locks_memory: false,
+            channels: work.channels.iter().map(|one| one.name.clone()).collect(),
+            own_bytes: 0,
+        },
         // What it opens is its own, under its own limit.
         ProcessTask::Foreign { .. } => ProcessContent {
             open_files: 0,

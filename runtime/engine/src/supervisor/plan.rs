@@ -12,6 +12,7 @@ use hil_core::message::{FNV_OFFSET, fnv1a};
 use hil_link::condition::flow_name;
 
 use super::clock_path;
+use crate::process::own_program::ProgramRealtime;
 use hil_platform::domain_address::domain_base_candidates;
 use hil_platform::open_files;
 use hil_platform::own_folder::OwnFolder;
@@ -21,15 +22,18 @@ use hil_rundir::announcement;
 use hil_rundir::event::ProcessKind;
 use hil_rundir::launch::{
     AdapterSettings, ArmLaunch, CableWork, ChannelLaunch, DirectionLaunch, GatewayWork, Side,
-    SocketLaunch,
+    SocketLaunch, WitnessWork, WitnessedChannel,
 };
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{
     AdapterKind, Channel, Crossing, EgmAdapter, Execution, Host, OnExit, Process, Program,
     RoleChannel, RoleSpec, Scheduling, Topology, Wait, command_channel, feedback_channel,
-    gateway_name,
+    gateway_name, witness_name,
 };
+
+/// How long the start of a run waits for a program of the user's that joins some channel late or never.
+const JOIN_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Everything one supervisor is responsible for.
 #[derive(Debug)]
@@ -51,8 +55,8 @@ pub(crate) struct HostPlan {
     pub(crate) arriving: BTreeSet<String>,
     /// Channels for orders to the directions of emulated links that are emulated here.
     pub(crate) orders: BTreeSet<String>,
-    /// Names of those whose messages no process here records: who wants to see them looks into
-    /// the shared memory of this host.
+    /// Names of those whose messages no process here records, so that who wants to see them looks into the shared
+    /// memory of this host, and of those that a witness reads.
     pub(crate) observed: BTreeSet<String>,
 }
 
@@ -82,11 +86,14 @@ pub(crate) enum ProcessTask {
     Adapter(AdapterSettings),
     /// What carries the frames of a program of the user's, in this binary.
     Cable(CableWork),
+    /// What records for the user's own programs of a host, in this binary.
+    Witness(WitnessWork),
     /// The user's own program.
     Foreign {
         card: RoleSpec,
         command: Vec<String>,
         environment: BTreeMap<String, String>,
+        realtime: ProgramRealtime,
     },
 }
 
@@ -106,9 +113,12 @@ impl ProcessPlan {
         matches!(self.task, ProcessTask::Gateway(_)) || self.is_clock_path()
     }
 
-    /// True for what carries messages instead of making them: a gateway, or an adapter.
+    /// True for what carries messages instead of making them, or only reads them: a gateway, an adapter, a witness.
     pub(crate) fn is_carrier(&self) -> bool {
-        matches!(self.task, ProcessTask::Gateway(_) | ProcessTask::Adapter(_))
+        matches!(
+            self.task,
+            ProcessTask::Gateway(_) | ProcessTask::Adapter(_) | ProcessTask::Witness(_)
+        )
     }
 
     /// What it is.
@@ -118,6 +128,7 @@ impl ProcessPlan {
             ProcessTask::Gateway(_) => ProcessKind::Gateway,
             ProcessTask::ClockPath(_) => ProcessKind::ClockPath,
             ProcessTask::Adapter(_) => ProcessKind::Adapter,
+            ProcessTask::Witness(_) => ProcessKind::Witness,
             ProcessTask::Foreign { .. } | ProcessTask::Cable(_) => ProcessKind::OwnProgram,
         }
     }
@@ -129,7 +140,10 @@ impl ProcessPlan {
                 card.role.clone()
             }
             ProcessTask::Adapter(adapter) => Some(adapter.role.clone()),
-            ProcessTask::Gateway(_) | ProcessTask::ClockPath(_) | ProcessTask::Cable(_) => None,
+            ProcessTask::Gateway(_)
+            | ProcessTask::ClockPath(_)
+            | ProcessTask::Cable(_)
+            | ProcessTask::Witness(_) => None,
         }
     }
 }
@@ -150,9 +164,11 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
             let source = announcement::source(topology, channel, &is_here);
             matches!(source, Some(Source::SharedMemory { host: at, .. }) if at == host.name)
         });
+        let witnessed = witnessed(topology, host).into_iter().map(|one| one.name);
+        let observed = observed.map(|channel| channel.name.clone());
         HostPlan {
             name: host.name.clone(),
-            observed: observed.map(|channel| channel.name.clone()).collect(),
+            observed: observed.chain(witnessed).collect(),
             channels: channels.cloned().collect(),
             arriving: arriving(topology, host),
             orders: order_channels(topology, host),
@@ -165,13 +181,49 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
         .iter()
         .filter(|process| is_here(&process.host))
         .map(|process| component(topology, process));
-    let carriers = clock_paths.chain(gateways);
+    let witnesses = hosts.iter().filter_map(|host| {
+        let channels = witnessed(topology, host);
+        (!channels.is_empty()).then(|| ProcessPlan {
+            name: witness_name(&host.name),
+            host: host.name.clone(),
+            task: ProcessTask::Witness(WitnessWork {
+                patience: JOIN_PATIENCE.min(topology.run().start_timeout / 2),
+                channels,
+            }),
+            on_exit: OnExit::EndRun,
+        })
+    });
+    let carriers = clock_paths.chain(gateways).chain(witnesses);
     let mut processes: Vec<ProcessPlan> = carriers.chain(processes).collect();
     processes.sort_by_key(|process| (!process.is_clock_path(), process.is_component()));
     Plan {
         hosts: host_plans.collect(),
         processes,
     }
+}
+
+/// The channels in the shared memory of `host` with a program of the user's there at an end, who records nothing.
+fn witnessed(topology: &Topology, host: &Host) -> Vec<WitnessedChannel> {
+    let own = |name: &str| {
+        let process = topology.process(name)?;
+        (process.is_witnessed() && process.host == host.name).then_some(process)
+    };
+    let channels = topology.channels().iter();
+    let channels = channels.filter(|channel| !channel.is_recorded_only());
+    let witnessed = channels.map(|channel| {
+        let publisher = own(&channel.from);
+        let reader = channel.to.as_deref().and_then(own);
+        WitnessedChannel {
+            name: channel.name.clone(),
+            message_size_bytes: channel.message.size_bytes,
+            has_publisher: publisher.is_some(),
+            has_reader: reader.is_some(),
+            has_messages: publisher.is_some_and(|one| one.role().is_some()),
+        }
+    });
+    witnessed
+        .filter(|one| one.has_publisher || one.has_reader)
+        .collect()
 }
 
 fn arriving(topology: &Topology, host: &Host) -> BTreeSet<String> {
@@ -223,6 +275,15 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
                 card,
                 command: command.clone(),
                 environment: environment.clone(),
+                realtime: ProgramRealtime {
+                    cpus: process
+                        .execution
+                        .cpu
+                        .iter()
+                        .map(|cpu| usize::from(*cpu))
+                        .collect(),
+                    request: realtime(&process.execution, 0),
+                },
             },
         },
         Program::Egm { role, adapter } => {

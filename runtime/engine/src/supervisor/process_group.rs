@@ -241,10 +241,12 @@ impl ProcessGroup {
             }
             ProcessTask::Adapter(adapter) => Some(Work::Adapter(adapter.clone())),
             ProcessTask::Cable(work) => Some(Work::Cable(work.clone())),
+            ProcessTask::Witness(work) => Some(Work::Witness(work.clone())),
             ProcessTask::Foreign {
                 card,
                 command,
                 environment,
+                realtime,
             } => {
                 let role_spec_path = self.folder.role_spec(&name);
                 write(&role_spec_path, card)?;
@@ -253,6 +255,11 @@ impl ProcessGroup {
                 if let Some(limit) = open_files::inherited_limit() {
                     program.args(["--open-files", &limit.to_string()]);
                 }
+                let realtime = serde_json::to_string(realtime);
+                program.args([
+                    "--realtime",
+                    &realtime.expect("its fields have plain names"),
+                ]);
                 program
                     .arg("--")
                     .args(command)
@@ -655,9 +662,11 @@ mod tests {
     use std::path::Path;
     use std::process::ExitStatus;
 
+    use hil_platform::realtime::RealtimeRequest;
     use hil_topology::RoleSpec;
 
     use super::*;
+    use crate::process::own_program::ProgramRealtime;
 
     /// A group of one program of the user's, whose run folder is not there.
     fn group(on_exit: OnExit) -> ProcessGroup {
@@ -677,6 +686,10 @@ mod tests {
                 card,
                 command: vec!["own".to_owned()],
                 environment: BTreeMap::new(),
+                realtime: ProgramRealtime {
+                    cpus: Vec::new(),
+                    request: RealtimeRequest::default(),
+                },
             },
             on_exit,
         };

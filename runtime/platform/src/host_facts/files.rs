@@ -173,9 +173,11 @@ pub fn format_cpu_list(cpus: &[usize]) -> String {
     while index < cpus.len() {
         let first = cpus[index];
         let mut last = first;
-        while cpus.get(index + 1) == Some(&(last + 1)) {
+        while let Some(&next) = cpus.get(index + 1)
+            && last.checked_add(1) == Some(next)
+        {
             index += 1;
-            last = cpus[index];
+            last = next;
         }
         parts.push(if first == last {
             first.to_string()

@@ -103,7 +103,7 @@ fn a_refusal_despite_the_capability_points_at_the_control_group() {
 
 #[test]
 fn what_lets_a_thread_up_again_is_said_as_systemd_reads_it() {
-    let (policy, priority) = SchedulingPolicy::Other.of_kernel();
+    let (policy, priority) = SchedulingPolicy::Other.of_kernel(0);
     let refusal = explain(Errno::EPERM, policy, priority);
     assert_eq!(
         refusal.fix,

@@ -145,18 +145,21 @@ pub(super) fn at_end(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interru
         };
         found.extend(stall.interruption(result, host, &mut published()));
     }
-    if let Some(consumer) = channel.to.as_deref()
-        && let Some(host) = host_of(consumer)
+    // What a witness records tells nothing of the consumer beside it.
+    let consumer = channel.to.as_deref();
+    let consumer = consumer.and_then(|name| topology.process(name));
+    if let Some(consumer) = consumer.filter(|one| !one.is_witnessed())
         && files.taken.is_some()
     {
+        let host = &consumer.host;
         let forwarded = || {
             let records = all::<IngressRecord>(files.ingress.as_ref());
             records.map(|record| record.forwarded_ns)
         };
         let stall = Stall {
-            process: consumer.to_owned(),
+            process: consumer.name.clone(),
             place: PathProcess::Consumer,
-            last_sign_ns: component_sign(records, consumer),
+            last_sign_ns: component_sign(records, &consumer.name),
         };
         found.extend(if is_crossing {
             stall.interruption(result, host, &mut forwarded())

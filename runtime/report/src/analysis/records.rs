@@ -32,7 +32,7 @@ use hil_rundir::record::stored::{
 use hil_rundir::record::{RecordFile, RecordFileError, RecordKind};
 use hil_rundir::run_result::RunResult;
 use hil_topology::emulation::EmulationLaunch;
-use hil_topology::{Channel, Program, Topology};
+use hil_topology::{Channel, Process, Topology};
 
 /// A finished run: what it was to be, how it went, and every record file that it left.
 #[derive(Debug)]
@@ -266,6 +266,8 @@ impl<'a> RunRecords<'a> {
             let (start, end) = *result.spans.get(&topology.process(process)?.host)?;
             Some(RunSpan { start, end })
         };
+        let is_witnessed =
+            |process: &str| topology.process(process).is_some_and(Process::is_witnessed);
         let crossing = topology.crossing(channel);
         let cards_share_clock = crossing
             .as_ref()
@@ -302,7 +304,13 @@ impl<'a> RunRecords<'a> {
             consumer_run: channel.to.as_deref().and_then(span_of),
             flight_time_max: flight_time_max(delay.max(changed).unwrap_or(Duration::ZERO)),
             depth: Some(channel.depth),
-            first_number: first_number(topology, channel),
+            // What such a program published before the run began is no message of the run.
+            first_number: if is_witnessed(&channel.from) {
+                FirstNumber::OnRecord
+            } else {
+                FirstNumber::Zero
+            },
+            has_witness: channel.to.as_deref().is_some_and(is_witnessed),
             cards_share_clock,
             round_trips_ns: &round_trips_ns,
             ..AccountContext::new(path)
@@ -355,14 +363,6 @@ impl<'a> RunRecords<'a> {
         let mut interruptions = self.interruptions.borrow_mut();
         interruptions.insert(channel.name.clone(), found.clone());
         found
-    }
-}
-
-/// A program of the user's may publish before the run begins; what that was is no message of the run.
-fn first_number(topology: &Topology, channel: &Channel) -> FirstNumber {
-    match topology.process(&channel.from).map(|one| &one.program) {
-        Some(Program::Command { inside: None, .. }) => FirstNumber::OnRecord,
-        _ => FirstNumber::Zero,
     }
 }
 
