@@ -242,6 +242,21 @@ impl Attacker {
         }
     }
 
+    /// The ends of a TCP connection with `port` at one of them.
+    ///
+    /// # Panics
+    /// When none is heard within `limit`.
+    pub fn overhear_connection(&self, port: u16, limit: Duration) -> [SocketAddrV4; 2] {
+        let mut ends = None;
+        self.forget_after(0);
+        self.hear(limit, |frame| {
+            ends = Segment::in_frame(frame, port).map(|one| [one.from, one.to]);
+            ends.is_none()
+        });
+        self.forget_after(SWITCH_AGEING);
+        ends.unwrap_or_else(|| panic!("no connection with port {port} is heard"))
+    }
+
     /// Forges resets in the peer's name, each exactly at the place in the stream that `victim` expects next, of
     /// the TCP connection that it is heard to have with `port` at one end, until a new one is begun or `limit` is
     /// over. It knows that the victim has the link address `hardware`. Gives how many it sent.
@@ -365,7 +380,7 @@ impl Attacker {
         rate: u32,
     ) -> Flood {
         let to = SockAddr::from(SocketAddrV4::new(to, 0));
-        let words = REPORTS.map(|kind| (report(kind, quoted), to.clone()));
+        let words = REPORTS.map(|kind| (report(kind, Quoted::Udp, quoted), to.clone()));
         self.send_all((Domain::IPV4, Protocol::ICMPV4), &words, span, rate)
     }
 
@@ -446,14 +461,23 @@ pub fn datagram_v4(from: SocketAddrV4, to: SocketAddrV4, payload: &[u8]) -> Vec<
     bytes
 }
 
-/// A whole IPv4 packet with an ICMP message of `kind`, from the address quoted last, as a report on a datagram from
-/// `quoted[0]` to `quoted[1]`.
-pub fn report_v4(kind: u8, quoted: [SocketAddrV4; 2]) -> Vec<u8> {
+/// The protocol of what a report of the network quotes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quoted {
+    /// A datagram.
+    Udp,
+    /// A segment, with a sequence number that is a guess.
+    Tcp,
+}
+
+/// A whole IPv4 packet with an ICMP message of `kind`, from the address quoted last, as a report on what was sent by
+/// `protocol` from `quoted[0]` to `quoted[1]`.
+pub fn report_v4(kind: u8, protocol: Quoted, quoted: [SocketAddrV4; 2]) -> Vec<u8> {
     let codes = REPORTS.iter().find(|known| known.0 == kind);
     let kind = codes.copied().unwrap_or((kind, 0, 0));
     [
         header_v4(*quoted[1].ip(), *quoted[0].ip(), 1),
-        report(kind, quoted),
+        report(kind, protocol, quoted),
     ]
     .concat()
 }
@@ -461,6 +485,12 @@ pub fn report_v4(kind: u8, quoted: [SocketAddrV4; 2]) -> Vec<u8> {
 /// A whole IPv4 packet that begins a connection.
 pub fn syn_v4(from: SocketAddrV4, to: SocketAddrV4) -> Vec<u8> {
     let segment = tcp(from, to, 1, TCP_SYN);
+    [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
+}
+
+/// A whole IPv4 packet that ends a connection whose receiver expects `sequence` next, and no other.
+pub fn reset_v4(from: SocketAddrV4, to: SocketAddrV4, sequence: u32) -> Vec<u8> {
+    let segment = tcp(from, to, sequence, TCP_RST);
     [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
 }
 
@@ -490,17 +520,25 @@ const REPORTS: [(u8, u8, u32); 8] = [
     (12, 0, 0),
 ];
 
-/// An ICMP message (RFC 792) on a datagram from `quoted[0]` to `quoted[1]`.
-fn report((kind, code, rest): (u8, u8, u32), quoted: [SocketAddrV4; 2]) -> Vec<u8> {
+/// An ICMP message (RFC 792) on what was sent from `quoted[0]` to `quoted[1]`.
+fn report(
+    (kind, code, rest): (u8, u8, u32),
+    protocol: Quoted,
+    quoted: [SocketAddrV4; 2],
+) -> Vec<u8> {
     let mut bytes = vec![kind, code, 0, 0];
     bytes.extend(rest.to_be_bytes());
-    // The header of an IPv4 packet of UDP that was sent, and the first eight bytes behind it.
-    bytes.extend([0x45, 0, 0, 128, 0, 0, 0x40, 0, 64, 17, 0, 0]);
+    // The header of the IPv4 packet, and the first eight bytes behind it.
+    let (number, last) = match protocol {
+        Quoted::Udp => (17, [0, 108, 0, 0]),
+        Quoted::Tcp => (6, [0, 0, 0, 1]),
+    };
+    bytes.extend([0x45, 0, 0, 128, 0, 0, 0x40, 0, 64, number, 0, 0]);
     bytes.extend(quoted[0].ip().octets());
     bytes.extend(quoted[1].ip().octets());
     bytes.extend(quoted[0].port().to_be_bytes());
     bytes.extend(quoted[1].port().to_be_bytes());
-    bytes.extend([0, 108, 0, 0]);
+    bytes.extend(last);
     let sum = checksum(&bytes);
     bytes[2..4].copy_from_slice(&sum);
     bytes
@@ -572,11 +610,7 @@ impl Segment {
         } else {
             (self.from, self.to, self.next)
         };
-        [
-            header_v4(*from.ip(), *to.ip(), 6),
-            tcp(from, to, next, TCP_RST),
-        ]
-        .concat()
+        reset_v4(from, to, next)
     }
 }
 

@@ -1,23 +1,25 @@
 //! What strangers send while a sealed run goes on, in turns with as long a time without: no kind of it costs the run
 //! messages above the time beside it. And neighbours of IPv6.
+//!
+//! `HIL_ATTACK_ROUNDS=20` sends each kind so often, half a second each time: 20,000 messages under it, and as many beside.
 
 use core::cell::Cell;
 use core::ops::Range;
 use std::collections::BTreeSet;
 use std::fs;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddrV4, SocketAddrV6};
-use std::thread;
 use std::time::Duration;
+use std::{env, thread};
 
 use hil_core::random::RandomStream;
 use hil_core::record::{PublishedRecord, TakenRecord};
 use hil_platform::clock::MonotonicClock;
-use hil_report::summary::{CounterGroup, RunEventKind, RunSummary};
+use hil_report::summary::{CounterGroup, RunEvent, RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
 use hil_rundir::run_folder::RunFolder as Folder;
 use hil_rundir::run_result::RunResult;
 use hil_tests::account::assert_accounts_close;
-use hil_tests::attacker::{Attacker, datagram_v4, report_v4, syn_v4};
+use hil_tests::attacker::{Attacker, Quoted, datagram_v4, report_v4, reset_v4, syn_v4};
 use hil_tests::knocker::CONTROL_PORT;
 use hil_tests::lab::{ADDRESSES, INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
@@ -95,8 +97,20 @@ struct Turns {
     quiet_ns: Vec<Range<i64>>,
 }
 
+/// Rounds of attacks: `HIL_ATTACK_ROUNDS`, else `usual`.
+fn round_count(usual: u32) -> u32 {
+    let asked = env::var("HIL_ATTACK_ROUNDS").ok();
+    asked.map_or(usual, |text| text.parse().expect("a number of rounds"))
+}
+
+/// The duration of a run in which so many rounds of `kind_count` attacks are played; some seconds more, in which the
+/// stranger listens before.
+fn run_duration(round_count: u32, kind_count: u32) -> String {
+    format!("run.duration=\"{} s\"", 6 + round_count * kind_count)
+}
+
 /// Plays each attack once a round and nothing after each.
-fn play(attacks: &[(&'static str, &dyn Fn() -> u64)], round_count: usize) -> Vec<Turns> {
+fn play(attacks: &[(&'static str, &dyn Fn() -> u64)], round_count: u32) -> Vec<Turns> {
     let mut all: Vec<Turns> = attacks
         .iter()
         .map(|(name, _)| Turns {
@@ -202,12 +216,13 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
     let stranger = stranger_in(&lab);
     let hardware = [0, 1].map(|index| hardware_address(&lab, index));
     let record = RunFolder::new("forged");
+    let rounds = round_count(6);
     let mut trial = Trial::shipped("shuttle-split.toml", record.path())
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
         .set("channels.\"shuttle/command\".depth=256")
         .set("channels.\"shuttle/status\".depth=256")
-        .set("run.duration=\"30 s\"");
+        .set(&run_duration(rounds, 4));
     for (index, host) in HOSTS.iter().enumerate() {
         lab.host(index).add_address(CLOCK_ADDRESSES[index]);
         for address in [ADDRESSES[index], CLOCK_ADDRESSES[index]] {
@@ -234,7 +249,7 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
         .flat_map(|kind| {
             [0, 1].map(|from| {
                 let [own, other] = [from, 1 - from].map(|end| at(ADDRESSES[end], PORTS[from]));
-                report_v4(kind, [own, other])
+                report_v4(kind, Quoted::Udp, [own, other])
             })
         })
         .collect();
@@ -264,7 +279,7 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
                 sent_count
             }),
         ],
-        6,
+        rounds,
     );
     let files = [0, 1].map(|index| split.files[index].clone());
     let summaries = split.finish();
@@ -302,6 +317,81 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
     }
 }
 
+/// What a stranger can send to the connections of a sealed TCP hop whose ports it heard: the kernel believes none of it
+/// (RFC 5961, RFC 5927), but for a reset with exactly the number that is expected next.
+#[test]
+fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnect() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    lab.put_bridge_between();
+    let stranger = stranger_in(&lab);
+    let hardware = [0, 1].map(|index| hardware_address(&lab, index));
+    stranger.know(ADDRESSES[1].into(), &hardware[1]);
+    let record = RunFolder::new("forged-tcp");
+    let rounds = round_count(6);
+    let trial = Trial::shipped("shuttle-tcp.toml", record.path())
+        .set(&format!("links.hop.port={PORT}"))
+        .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
+        .set("channels.\"shuttle/command\".depth=256")
+        .set("channels.\"shuttle/status\".depth=256")
+        .set(&run_duration(rounds, 3));
+    let split = Split::start(&lab, &trial);
+    split.wait_for_messages("the begin of the run");
+    let connections = PORTS.map(|port| stranger.overhear_connection(port, LIMIT));
+    let ways = || connections.into_iter().flat_map(|[a, b]| [[a, b], [b, a]]);
+    let reports: Vec<_> = (0..=255)
+        .flat_map(|kind| ways().map(move |ends| report_v4(kind, Quoted::Tcp, ends)))
+        .collect();
+    let mut random = RandomStream::new(8, "forged");
+    let mut blind = |forge: fn(SocketAddrV4, SocketAddrV4, u32) -> Vec<u8>| {
+        let packets = (0..1_000).flat_map(|_| {
+            let [a, b, c, d, ..] = random.next_u64().to_le_bytes();
+            let guess = u32::from_le_bytes([a, b, c, d]);
+            ways().map(move |[from, to]| forge(from, to, guess))
+        });
+        packets.collect::<Vec<_>>()
+    };
+    let resets = blind(reset_v4);
+    let beginnings = blind(|from, to, _| syn_v4(from, to));
+    let send = |packets: &[Vec<u8>]| stranger.send_repeatedly(packets, TURN, SENT_HZ).sent_count;
+    let all = play(
+        &[
+            ("ICMP of every type on a TCP hop", &|| send(&reports)),
+            ("resets with a guessed number", &|| send(&resets)),
+            ("beginnings in a connection that is up", &|| {
+                send(&beginnings)
+            }),
+        ],
+        rounds,
+    );
+    let calm_ns = MonotonicClock::now().as_ns();
+    for (host, hardware) in ADDRESSES.into_iter().zip(&hardware) {
+        let sent_count = stranger.reset(PORT, host, hardware, LIMIT);
+        println!("{sent_count} exact resets at {host}");
+        thread::sleep(TURN);
+    }
+    let files = [0, 1].map(|index| split.files[index].clone());
+    let summaries = split.finish();
+    judge(&files, &all);
+    let after = cost(
+        [&files[0], &files[1]],
+        CHANNELS[0],
+        core::slice::from_ref(&(calm_ns..i64::MAX)),
+    );
+    println!("commands under two exact resets: {after:?}");
+    for (summary, name) in summaries.iter().zip(CHANNELS) {
+        let egress = direction(summary, name, "egress");
+        let reconnects = count(egress, "transport: reconnect_count");
+        println!("{name}: {reconnects} reconnects");
+        assert_eq!(reconnects, if name == CHANNELS[0] { 2 } else { 0 });
+        assert!(cuts(summary).is_empty(), "{:?}", summary.events);
+        assert_accounts_close(summary);
+    }
+    let mut told = summaries[0].events.iter().map(RunEvent::what);
+    assert!(told.any(|what| what.contains("and is back (reconnect 2)")));
+}
+
 /// Datagrams that the end of the clock path `flow` on `host` refused, whatever the cause. It has no channels, and is in no
 /// summary.
 fn refused_by_end_of(files: &RunFiles, flow: &str, host: &str) -> u64 {
@@ -323,11 +413,11 @@ fn cuts(summary: &RunSummary) -> Vec<String> {
             RunEventKind::Process(EventKind::Reconnected { .. })
         )
     });
-    cuts.map(hil_report::summary::RunEvent::what).collect()
+    cuts.map(RunEvent::what).collect()
 }
 
 /// A run whose hosts have addresses of IPv6, on a bridge with a stranger.
-fn run_of_v6<'a>(lab: &'a Lab, record: &RunFolder, seconds: u32) -> (Split<'a>, Attacker) {
+fn run_of_v6<'a>(lab: &'a Lab, record: &RunFolder, duration: &str) -> (Split<'a>, Attacker) {
     lab.put_bridge_between();
     let stranger = stranger_in(lab);
     stranger.add_address(FOREIGN_V6);
@@ -336,7 +426,7 @@ fn run_of_v6<'a>(lab: &'a Lab, record: &RunFolder, seconds: u32) -> (Split<'a>, 
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
         .set("channels.\"shuttle/command\".depth=256")
         .set("channels.\"shuttle/status\".depth=256")
-        .set(&format!("run.duration=\"{seconds} s\""));
+        .set(duration);
     for (index, host) in HOSTS.iter().enumerate() {
         let address = ADDRESSES_V6[index];
         lab.host(index).add_address(address);
@@ -354,7 +444,8 @@ fn icmpv6_of_every_type_costs_a_sealed_run_nothing_above_the_time_beside_it() {
         return;
     };
     let record = RunFolder::new("forged-v6");
-    let (split, stranger) = run_of_v6(&lab, &record, 24);
+    let rounds = round_count(10);
+    let (split, stranger) = run_of_v6(&lab, &record, &run_duration(rounds, 2));
     let reports = |to: usize| {
         let end = |index: usize| SocketAddrV6::new(ADDRESSES_V6[index], PORTS[to], 0, 0);
         let quoted = [end(to), end(1 - to)];
@@ -366,7 +457,7 @@ fn icmpv6_of_every_type_costs_a_sealed_run_nothing_above_the_time_beside_it() {
             ("ICMPv6 of every type at the first host", &|| reports(0)),
             ("ICMPv6 of every type at the second host", &|| reports(1)),
         ],
-        10,
+        rounds,
     );
     let files = [0, 1].map(|index| split.files[index].clone());
     let summaries = split.finish();
@@ -389,7 +480,7 @@ fn a_stranger_that_advertises_a_hosts_address_of_ipv6_is_told_with_both_link_add
         return;
     };
     let record = RunFolder::new("claimed-v6");
-    let (mut split, stranger) = run_of_v6(&lab, &record, 8);
+    let (mut split, stranger) = run_of_v6(&lab, &record, "run.duration=\"8 s\"");
     let claimed_at = "02:00:00:00:00:68";
     stranger.claim_v6(ADDRESSES_V6[0], ADDRESSES_V6[1], claimed_at);
     let words = format!("is at {claimed_at} on {INTERFACE}");
