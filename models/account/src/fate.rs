@@ -184,6 +184,13 @@ impl<'a> Evidence<'a> {
         }
     }
 
+    /// True for what was published before the run began, by a program that did not wait for it.
+    pub(super) fn is_before_run(&self, message: &MessageHistory) -> bool {
+        let run = self.context.producer_run;
+        let published_ns = message.published_ns();
+        run.is_some_and(|run| published_ns.is_some_and(|at_ns| at_ns < run.start.as_ns()))
+    }
+
     /// True for what a witness took while the consumer was away.
     pub(super) fn is_for_nobody(&self, message: &MessageHistory) -> bool {
         let taken = message.taken.filter(|_| self.context.has_witness);

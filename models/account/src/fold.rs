@@ -441,6 +441,10 @@ impl ChannelFold {
             },
         };
         message.key = key;
+        if self.settings.first_number == FirstNumber::OnRecord && evidence.is_before_run(&message) {
+            self.advance(index, next, sequence);
+            return true;
+        }
         if evidence.is_for_nobody(&message) {
             message.taken = None;
         }
@@ -466,6 +470,14 @@ impl ChannelFold {
             epoch.rank = Some(key.epoch_rank);
             self.rank_count += 1;
         }
+        self.advance(index, next, sequence);
+        take(&message);
+        true
+    }
+
+    /// Goes on behind `next`, of a start whose first record that has not settled is that of `sequence`.
+    fn advance(&mut self, index: usize, next: u64, sequence: u64) {
+        let epoch = &mut self.epochs[index];
         if next < sequence {
             epoch.next = Some(sequence);
         } else {
@@ -473,8 +485,6 @@ impl ChannelFold {
             epoch.pending.pop_front();
             self.held_count -= 1;
         }
-        take(&message);
-        true
     }
 
     /// How a reader that has not taken a message stands to it.

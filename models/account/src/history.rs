@@ -285,6 +285,21 @@ mod tests {
     }
 
     #[test]
+    fn what_a_program_published_before_the_run_is_no_message_of_it() {
+        let files = Files::delivered(6);
+        let mut context = same_clock(1_000_000_000);
+        context.producer_run = context.producer_run.map(|run| crate::RunSpan {
+            start: Instant::from_ns(at(7, 4).published_ns),
+            ..run
+        });
+        context.first_number = crate::FirstNumber::OnRecord;
+        let found = histories(&files, &context);
+        let numbers: Vec<_> = found.keys().map(|(_, sequence)| *sequence).collect();
+        assert_eq!(numbers, [4, 5]);
+        assert_eq!(account(&files.records(), &context).published_count, 2);
+    }
+
+    #[test]
     fn what_a_witness_missed_is_unknown_and_what_it_took_without_the_consumer_is_lost() {
         use MessageFate as Fate;
         let mut files = Files::default();
