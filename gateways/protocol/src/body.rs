@@ -3,7 +3,7 @@
 //!
 //! Offsets count from the end of the header; all numbers are little-endian.
 //!
-//! **HELLO** (41 bytes and a name):
+//! **HELLO** (41 bytes, a name, and zeros up to the length of datagram that is under test):
 //!
 //! | offset | bytes | field | meaning |
 //! |-------:|------:|-------|---------|
@@ -103,11 +103,8 @@ impl<'a> Hello<'a> {
         if body.len() < HELLO_FIXED_BYTES {
             return Err(Refusal::MalformedBody);
         }
-        let (flow_name, rest) = split_name(&body[HELLO_FIXED_BYTES..])?;
-        if !rest.is_empty() {
-            return Err(Refusal::MalformedBody);
-        }
-        if body[26..HELLO_FIXED_BYTES] != [0; 14] {
+        let (flow_name, padding) = split_name(&body[HELLO_FIXED_BYTES..])?;
+        if body[26..HELLO_FIXED_BYTES] != [0; 14] || padding.iter().any(|byte| *byte != 0) {
             return Err(Refusal::ReservedNotZero);
         }
         Ok(Self {

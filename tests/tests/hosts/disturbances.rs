@@ -8,7 +8,7 @@ use std::thread;
 use std::time::Duration;
 
 use hil_account::MessageFate;
-use hil_report::summary::{Outcome, RunEventKind, RunSummary};
+use hil_report::summary::{Outcome, RunEvent, RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
 use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
 use hil_tests::child::ChildGuard;
@@ -16,10 +16,12 @@ use hil_tests::lab::{INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split};
-use hil_tests::trial::{Trial, load_average, wait_until};
+use hil_tests::trial::{Trial, hop_key, load_average, wait_until};
 use nix::sys::signal::Signal;
 use nix::sys::stat::Mode;
 use nix::unistd::mkfifo;
+
+use super::many_channels;
 
 const LIMIT: Duration = Duration::from_mins(1);
 const RUN_LIMIT: Duration = Duration::from_mins(2);
@@ -294,5 +296,46 @@ fn a_path_that_drops_everything_silently_for_less_than_a_host_may_be_away_ends_n
             println!("{}: {said}", summary.run.host);
         }
         assert_every_message_is_accounted_for(&summary);
+    }
+}
+
+/// Of the narrow path between two switches, bytes; a datagram of it, with room for the headers of IPv6.
+const NARROW_MTU: u16 = 1280;
+const NARROW_DATAGRAM: usize = 1232;
+
+/// A bridge tells nobody what it does not forward, as a path behind a filter does not.
+#[test]
+fn a_path_that_takes_less_than_its_interfaces_is_found_before_the_first_message() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let ports = lab.put_bridge_between();
+    let mut narrow = lab.host(0).command("ip");
+    narrow.args(["link", "set", ports[1], "mtu", &NARROW_MTU.to_string()]);
+    assert!(narrow.status().unwrap().success());
+    for is_sealed in [false, true] {
+        let record = RunFolder::new("narrow");
+        let path = many_channels::topology(&record, 2, 100, Duration::from_secs(4));
+        let mut trial = Trial::of(&path, record.path());
+        if is_sealed {
+            let key = hop_key(record.path());
+            trial = trial
+                .set("security.hops=\"sealed\"")
+                .set(&format!("security.key=\"{}\"", key.display()));
+        }
+        for name in ["there/0", "back/1"] {
+            trial = trial.set(&format!("channels.\"{name}\".message.size_bytes=4000"));
+        }
+        for summary in Split::start(&lab, &trial).finish() {
+            for name in ["there/0", "back/1"] {
+                let account = account(&summary, name);
+                println!("sealed {is_sealed}: {}", describe(name, account));
+                assert_eq!(account.fates.of(MessageFate::LostOnWire), 0);
+                assert!(account.fates.of(MessageFate::Taken) > 200);
+            }
+            let words = format!("takes no datagrams above {NARROW_DATAGRAM} bytes");
+            let is_told = |event: &RunEvent| event.what().contains(&words);
+            assert!(summary.events.iter().any(is_told), "{:?}", summary.events);
+        }
     }
 }

@@ -14,6 +14,7 @@
 mod counts;
 mod exchange;
 pub(crate) mod pacing;
+mod path;
 mod staging;
 mod transmit;
 
@@ -39,6 +40,7 @@ pub use exchange::RoundTrip;
 
 use exchange::Exchanges;
 use pacing::Pacing;
+use path::PathSearch;
 use staging::Staging;
 
 /// A message up to this size is sent in one go. The pieces of a longer one leave between other messages, as
@@ -61,7 +63,8 @@ pub struct EgressSettings {
     pub domain: [u8; 16],
     /// Names this host's monotonic clock; equal ids on both hosts mean one clock.
     pub clock_id: u64,
-    /// Largest datagram the path carries unfragmented: path MTU minus IP and UDP headers.
+    /// Largest datagram the path may carry unfragmented: path MTU minus IP and UDP headers. What it does carry, the bridge
+    /// finds out by its greetings.
     pub datagram_max_bytes: usize,
     /// Time between clock exchanges.
     pub sync_period: Duration,
@@ -95,6 +98,12 @@ impl EgressSettings {
     fn control_bytes(&self) -> usize {
         let body = self.hello().encoded_bytes().max(SYNC_BODY_BYTES);
         HEADER_BYTES + body.max(HELLO_ACK_BODY_BYTES)
+    }
+
+    /// The longest datagram that the flow has to send.
+    fn datagram_bytes(&self) -> usize {
+        let longest = HEADER_BYTES + self.flow.size_max_bytes() as usize + TAG_BYTES;
+        longest.min(self.datagram_max_bytes)
     }
 
     fn check(&self) -> Result<(), SettingsError> {
@@ -200,6 +209,8 @@ pub enum EgressEvent {
         /// The peer answered before with another session.
         is_peer_restart: bool,
     },
+    /// The peer answers, and the longest datagram that the path takes is not found yet.
+    Answered,
     /// The peer refused the flow.
     Refused(HelloStatus),
     /// The peer does not know this session; greeting starts again.
@@ -234,6 +245,7 @@ pub struct EgressBridge {
     sync_timer: PeriodicTimer,
     sync_sequence: u64,
     exchanges: Exchanges,
+    path: PathSearch,
     staging: Staging,
     long: Option<Long>,
     pacing: Pacing,
@@ -304,6 +316,11 @@ impl EgressBridge {
     /// [`SettingsError`] names the setting, its value and its bound.
     pub fn new(settings: EgressSettings) -> Result<Self, SettingsError> {
         settings.check()?;
+        let path = PathSearch::new(
+            settings.datagram_bytes(),
+            settings.control_bytes() + TAG_BYTES,
+        );
+        let control_bytes = settings.control_bytes().max(path.greeting_bytes_max());
         Ok(Self {
             state: PeerState::Greeting,
             peer: None,
@@ -323,9 +340,10 @@ impl EgressBridge {
             pacing: Pacing::new(),
             staging: Staging::new(
                 (settings.flow.size_max_bytes() as usize).min(STAGED_BYTES_MAX),
-                settings.payload_budget_bytes(),
+                path.least_budget_bytes(),
             ),
-            control: vec![0; settings.control_bytes()].into_boxed_slice(),
+            control: vec![0; control_bytes].into_boxed_slice(),
+            path,
             last_transmit: None,
             farewell: Farewell::Open,
             counts: EgressCounts::default(),
@@ -384,7 +402,7 @@ impl EgressBridge {
         }
         self.count_offered(channel, result);
         result?;
-        let plan = FragmentPlan::new(length_bytes, self.settings.payload_budget_bytes())
+        let plan = FragmentPlan::new(length_bytes, self.path.budget_bytes())
             .expect("settings bound the fragments of the largest message");
         let mut header = self.message_header(channel, envelope);
         header.total_len = u32::try_from(length_bytes).expect("size_max_bytes is a u32");
@@ -628,6 +646,11 @@ impl EgressBridge {
         self.state
     }
 
+    /// The longest datagram that greetings found the path to take, where the flow has longer ones to send.
+    pub fn shortened_datagram_bytes(&self) -> Option<usize> {
+        self.path.shortened()
+    }
+
     /// When the last accepted reply came; against `now` it tells a silent peer.
     pub const fn last_heard(&self) -> Option<Instant> {
         self.last_heard
@@ -745,7 +768,15 @@ impl EgressBridge {
             return Err(Refusal::ImplausibleStamp);
         }
         match ack.status {
-            HelloStatus::Accepted => Ok(self.establish(now, arrival, ack)),
+            HelloStatus::Accepted => {
+                let is_established = self.state == PeerState::Established;
+                if !is_established && !self.path.on_answer(ack.answers_handed_ns) {
+                    self.state = PeerState::Greeting;
+                    self.hello_due = self.hello_due.min(now);
+                    return Ok(EgressEvent::Answered);
+                }
+                Ok(self.establish(now, arrival, ack))
+            }
             HelloStatus::GreetAgain => {
                 if self.state == PeerState::Established {
                     self.counts.greet_again_count += 1;
@@ -767,6 +798,7 @@ impl EgressBridge {
         self.counts.peer_restart_count += u64::from(is_peer_restart);
         if self.state != PeerState::Established {
             self.state = PeerState::Established;
+            self.staging.cut_at(self.path.budget_bytes());
             self.sync_timer.start(now);
         }
         self.round_started_ns = Some(ack.answers_handed_ns);
@@ -800,6 +832,7 @@ impl EgressBridge {
         if self.state == PeerState::Established {
             self.round_started_ns = None;
         }
+        self.path.begin();
         self.state = state;
         self.peer = None;
         self.hello_due = due;

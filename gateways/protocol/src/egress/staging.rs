@@ -32,13 +32,19 @@ struct Staged {
 }
 
 impl Staging {
-    pub(super) fn new(size_max_bytes: usize, budget_bytes: usize) -> Self {
-        let count = size_max_bytes.div_ceil(budget_bytes).max(1);
+    /// With room for pieces of `least_budget_bytes`.
+    pub(super) fn new(size_max_bytes: usize, least_budget_bytes: usize) -> Self {
+        let count = size_max_bytes.div_ceil(least_budget_bytes).max(1);
         Self {
-            budget_bytes,
+            budget_bytes: least_budget_bytes,
             buffer: vec![0; count * HEADER_BYTES + size_max_bytes].into_boxed_slice(),
             staged: None,
         }
+    }
+
+    /// Cuts messages into pieces of at most so many bytes from now on, no fewer than there is room for.
+    pub(super) const fn cut_at(&mut self, budget_bytes: usize) {
+        self.budget_bytes = budget_bytes;
     }
 
     /// `header` needs no length, fragment or hand-over fields yet.

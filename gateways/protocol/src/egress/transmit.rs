@@ -8,7 +8,7 @@ use super::{
 };
 use crate::body::SYNC_BODY_BYTES;
 use crate::egress::staging::Piece;
-use crate::wire::{HEADER_BYTES, Header, Kind};
+use crate::wire::{HEADER_BYTES, Header, Kind, TAG_BYTES};
 
 impl EgressBridge {
     pub(super) fn transmit_data(&mut self, now: Instant) -> Transmit<'_> {
@@ -47,8 +47,11 @@ impl EgressBridge {
         let sequence = self.hello_sequence;
         self.hello_sequence += 1;
         self.counts.hello_sent_count += 1;
+        let padded_bytes = self.path.next_length(now.as_ns()) - HEADER_BYTES - TAG_BYTES;
         let hello = self.settings.hello();
-        let body_bytes = hello.encode(&mut self.control[HEADER_BYTES..]);
+        let own_bytes = hello.encode(&mut self.control[HEADER_BYTES..]);
+        let body_bytes = own_bytes.max(padded_bytes);
+        self.control[HEADER_BYTES + own_bytes..HEADER_BYTES + body_bytes].fill(0);
         let mut header = self.flow_header(Kind::Hello);
         header.sequence = sequence;
         self.transmit_control(now, header, body_bytes)
@@ -99,7 +102,7 @@ impl EgressBridge {
         body_bytes: usize,
     ) -> Transmit<'_> {
         header.handed_ns = now.as_ns();
-        header.total_len = u32::try_from(body_bytes).expect("a body is below 1 KiB");
+        header.total_len = u32::try_from(body_bytes).expect("a body is below 64 KiB");
         header.encode(&mut self.control);
         self.counts.datagram_count += 1;
         self.last_transmit = Some(LastTransmit {

@@ -171,6 +171,7 @@ impl OpenDirection {
                 sent: self.counts.into_boxed_slice(),
                 attention: Attention::default(),
                 refusal_backoff: RefusalBackoff::of_replies(),
+                path_bytes: None,
                 is_established: self.is_established,
             })),
             (SocketEnd::Receiver(receiver), Sinks::Ingress { messages, no_room }) => {
@@ -276,6 +277,11 @@ impl Direction {
         let (peer_state, mut counters, transport, seal) = match &self.way {
             BridgeLoop::Egress(egress) => {
                 let sender = egress.line.sender();
+                let found = egress.path_bytes.map(|bytes| {
+                    let text = format!("{bytes} bytes a datagram, less than its interface takes");
+                    ("path as found by greetings".to_owned(), text)
+                });
+                facts.extend(found);
                 (
                     counters::egress_state(egress),
                     counters::of_egress(egress),

@@ -18,6 +18,7 @@ use super::stamp_tracker::STAMP_PATIENCE_NS;
 use super::{WorkerError, poll_descriptors};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy};
+use hil_rundir::pipe::{FromProcess, say};
 use hil_shm::HeldMessage;
 
 /// Longer than any reply; what is longer is no reply and is cut.
@@ -37,6 +38,8 @@ pub(crate) struct Egress {
     pub(crate) sent: Box<[Arc<AtomicU64>]>,
     pub(crate) attention: Attention,
     pub(super) refusal_backoff: RefusalBackoff,
+    /// The longest datagram that the path takes, as told last; `None` while it takes what is sent.
+    pub(super) path_bytes: Option<usize>,
     /// Set while the peer takes messages.
     pub(crate) is_established: Arc<AtomicBool>,
 }
@@ -250,10 +253,22 @@ impl Egress {
                         long.on_piece_arrived();
                     }
                 }
-                Ok(EgressEvent::Accepted { .. } | EgressEvent::GreetAgain) | Err(_) => {}
+                Ok(EgressEvent::Accepted { .. }) => self.tell_path(),
+                Ok(EgressEvent::Answered | EgressEvent::GreetAgain) | Err(_) => {}
             }
         }
         Ok(())
+    }
+
+    /// Says that the path takes less than the interface.
+    fn tell_path(&mut self) {
+        let found = self.bridge.shortened_datagram_bytes();
+        if let Some(bytes) = found.filter(|_| self.path_bytes != found) {
+            say(&FromProcess::Warning(format!(
+                "the path to the peer takes no datagrams above {bytes} bytes: longer messages go in more pieces"
+            )));
+        }
+        self.path_bytes = found;
     }
 
     fn note_round_trip(&mut self, round_trip: &RoundTrip) {
