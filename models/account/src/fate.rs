@@ -191,15 +191,20 @@ impl<'a> Evidence<'a> {
         run.is_some_and(|run| published_ns.is_some_and(|at_ns| at_ns < run.start.as_ns()))
     }
 
-    /// True for what a witness took while the consumer was away.
+    /// True for what a witness took while the consumer was away, or after its end.
     pub(super) fn is_for_nobody(&self, message: &MessageHistory) -> bool {
         let taken = message.taken.filter(|_| self.context.has_witness);
         let mut interruptions = self.context.interruptions.iter();
         taken.is_some_and(|taken| {
             let taken_at = Instant::from_ns(taken.taken_ns);
-            interruptions.any(|one| {
-                one.place == PathProcess::Consumer && (one.from..=one.until).contains(&taken_at)
-            })
+            let is_over = self
+                .context
+                .consumer_run
+                .is_some_and(|run| taken_at > run.end);
+            is_over
+                || interruptions.any(|one| {
+                    one.place == PathProcess::Consumer && (one.from..one.until).contains(&taken_at)
+                })
         })
     }
 

@@ -98,7 +98,8 @@ pub enum FirstNumber {
     /// Zero: the records begin with the run.
     Zero,
     /// The lowest on record of the starts known when the first message settles, since the records begin
-    /// in the middle of a run, or the producer before it; zero of later starts.
+    /// in the middle of a run, or the producer before it; zero of later starts. What was published before the run
+    /// of the producer's host, where that is known, is no message of it.
     OnRecord,
 }
 

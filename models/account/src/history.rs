@@ -320,7 +320,8 @@ mod tests {
             until: Instant::from_ns(at(7, 2).published_ns),
             cause: "killed by signal 9".to_owned(),
         }];
-        let mut context = same_clock(1_000_000_000).with_interruptions(&interruptions);
+        let mut context =
+            same_clock(at(7, 4).published_ns + TAKEN_NS).with_interruptions(&interruptions);
         for (has_witness, expected) in [
             (false, written),
             (

@@ -2,6 +2,7 @@
 //! run until they have joined their channels, then reads these channels beside them and records what they publish
 //! and what they are given. What a program makes of a message, only the program knows.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
@@ -15,8 +16,9 @@ use hil_platform::words::named;
 use hil_rundir::launch::{WitnessWork, WitnessedChannel, WorkerLaunch};
 use hil_rundir::pipe::{FromProcess, Orders, ProcessReport, say};
 use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder, SharedSink};
-use hil_shm::{Census, ChannelError, Domain, RawInput, Waiter, observer_depth};
+use hil_shm::{Attendance, ChannelError, Domain, RawInput, SequenceTracker, Waiter};
 
+use crate::gateway::poll_descriptors;
 use crate::process::recording::forwarded_ns;
 use crate::process::worker::{Counter, Job, JobWork, Opened, WorkerError, open_domain};
 
@@ -26,8 +28,14 @@ const RING_RECORDS_MAX: usize = 65_536;
 /// Channels that are named where many are not joined.
 const NAMED_COUNT: usize = 3;
 const LOOK_PERIOD: Duration = Duration::from_millis(10);
-/// Longest sleep while nothing passes.
-const REST: Duration = Duration::from_millis(100);
+/// How often every channel is looked at, since a program of the user's need not announce what it publishes.
+const SWEEP_PERIOD: Duration = Duration::from_millis(10);
+/// How often it is looked who reads.
+const READERS_PERIOD: Duration = Duration::from_millis(50);
+/// Messages of one channel that are taken in one look at most.
+const LOOK_COUNT_MAX: usize = 1_024;
+/// A publication that comes so long after the run's begin, with a stamp from before it, has a clock of its own.
+const FOREIGN_CLOCK: Duration = Duration::from_secs(2);
 
 /// Opens the record files.
 ///
@@ -53,23 +61,28 @@ pub(crate) fn open<'a>(
         is_watched: true,
         connect: Box::new(move |_thread| {
             let domain = open_domain(launch)?;
-            let streams = work.channels.iter().zip(noted);
-            let streams = streams.map(|(channel, noted)| {
-                let depth = observer_depth(channel.message_size_bytes);
-                let input = RawInput::open(&domain, &channel.name, depth)?;
-                Ok((input, noted))
+            let streams = work.channels.iter().zip(noted).map(|(channel, noted)| {
+                let attendance = Attendance::of(&domain, &channel.name)?;
+                let input = RawInput::open(&domain, &channel.name, attendance.depth_max())?;
+                Ok(Stream {
+                    channel,
+                    attendance,
+                    input,
+                    noted,
+                })
             });
             let streams = streams.collect::<Result<Vec<_>, ChannelError>>()?;
             let names: Vec<&str> = work.channels.iter().map(|one| one.name.as_str()).collect();
             let waiter = Waiter::open(&domain, &names)?;
-            await_programs(work, &domain, &stop)?;
+            await_programs(work.patience, &streams, &stop);
             Ok(Box::new(Witness {
-                channels: &work.channels,
                 streams,
                 sinks,
                 waiter,
-                begun: move || start.get().unwrap_or(Instant::ZERO),
-                domain,
+                begun: move || start.get().expect("the run has begun"),
+                sweep_due: Instant::ZERO,
+                readers_due: Instant::ZERO,
+                _domain: domain,
             }))
         }),
     };
@@ -79,43 +92,31 @@ pub(crate) fn open<'a>(
     })
 }
 
-/// Waits until the programs have joined their channels, or said to stop, or for its patience.
-fn await_programs(
-    work: &WitnessWork,
-    domain: &Domain,
-    stop: &AtomicBool,
-) -> Result<(), ChannelError> {
-    let deadline = WallInstant::now() + work.patience;
-    let mut awaited: Vec<&WitnessedChannel> = work.channels.iter().collect();
+/// Waits until the programs have joined their channels, or said to stop, or for `patience`.
+fn await_programs(patience: Duration, streams: &[Stream<'_>], stop: &AtomicBool) {
+    let deadline = WallInstant::now() + patience;
+    let mut awaited: Vec<&Stream<'_>> = streams.iter().collect();
     loop {
-        let mut missing = Vec::new();
-        for channel in awaited {
-            let has_writer =
-                !channel.has_publisher || Census::of(domain, &channel.name)?.writer_count > 0;
-            if !has_writer || !has_joined(domain, channel)? {
-                missing.push(channel);
-            }
-        }
-        awaited = missing;
+        awaited.retain(|stream| !stream.absent().is_empty());
         if awaited.is_empty() || stop.load(Ordering::Acquire) {
-            return Ok(());
+            return;
         }
         if WallInstant::now() >= deadline {
-            let names: Vec<&str> = awaited.iter().map(|one| one.name.as_str()).collect();
-            let (names, patience_s) = (named(&names, NAMED_COUNT), work.patience.as_secs_f64());
+            let absent = awaited.iter().flat_map(|stream| stream.absent());
+            let programs: BTreeSet<&str> = absent.collect();
+            let programs: Vec<&str> = programs.into_iter().collect();
+            let channels = awaited.iter().map(|stream| stream.channel.name.as_str());
+            let channels: Vec<&str> = channels.collect();
             say(&FromProcess::Warning(format!(
-                "programs of the user's did not join {names} within {patience_s} s; the run begins without"
+                "within {} s {} did not join {}: the run begins without",
+                patience.as_secs_f64(),
+                named(&programs, NAMED_COUNT),
+                named(&channels, NAMED_COUNT),
             )));
-            return Ok(());
+            return;
         }
         thread::sleep(LOOK_PERIOD);
     }
-}
-
-/// Whether the program that reads `channel`, if one does, has joined it.
-fn has_joined(domain: &Domain, channel: &WitnessedChannel) -> Result<bool, ChannelError> {
-    // This process is a reader, too.
-    Ok(!channel.has_reader || Census::of(domain, &channel.name)?.reader_count > 1)
 }
 
 /// Where the records go that are alike for all channels.
@@ -134,12 +135,12 @@ impl Sinks {
         };
         Ok(Self {
             published: of(
-                |one| one.has_publisher,
+                |one| one.publisher.is_some(),
                 RecordKind::Published,
                 size_of::<PublishedRecord>(),
             )?,
             taken: of(
-                |one| one.has_reader,
+                |one| one.reader.is_some(),
                 RecordKind::Taken,
                 size_of::<TakenRecord>(),
             )?,
@@ -152,10 +153,14 @@ struct Noted {
     /// Its place among the channels of the sink.
     published: Option<usize>,
     taken: Option<usize>,
-    /// Whether its reader was there when it was looked for: until then nobody takes anything.
-    has_joined: bool,
+    /// Whether its reader was there when it was looked for last: else nobody takes anything.
+    has_reader: bool,
     messages: Option<RecordSink>,
     count: Arc<AtomicU64>,
+    /// Follows the numbers of a publisher of this host.
+    tracker: SequenceTracker,
+    /// Publications that came in the run with a stamp from long before it.
+    foreign_clock_count: u64,
 }
 
 impl Noted {
@@ -171,8 +176,8 @@ impl Noted {
             places[index] += usize::from(is_noted);
             is_noted.then_some(place)
         };
-        let published = place(0, channel.has_publisher);
-        let taken = place(1, channel.has_reader);
+        let published = place(0, channel.publisher.is_some());
+        let taken = place(1, channel.reader.is_some());
         let count = Arc::new(AtomicU64::new(0));
         counters.push(Counter {
             channel: channel.name.clone(),
@@ -195,14 +200,23 @@ impl Noted {
         Ok(Self {
             published,
             taken,
-            has_joined: false,
+            has_reader: false,
             messages: messages.transpose()?,
             count,
+            tracker: SequenceTracker::default(),
+            foreign_clock_count: 0,
         })
     }
 
-    fn note(&mut self, sinks: &mut Sinks, envelope: &Envelope, payload: &[u8]) {
+    fn note(&mut self, sinks: &mut Sinks, begun: Instant, envelope: &Envelope, payload: &[u8]) {
+        let now = MonotonicClock::now();
+        // What a program on this host said before is no message of the run.
+        if !envelope.is_forwarded() && envelope.published_ns < begun.as_ns() {
+            self.foreign_clock_count += u64::from(now > begun + FOREIGN_CLOCK);
+            return;
+        }
         if let Some(place) = self.published {
+            self.tracker.accept(envelope);
             let record = PublishedRecord {
                 sequence: envelope.sequence,
                 published_ns: envelope.published_ns,
@@ -211,80 +225,146 @@ impl Noted {
             };
             sinks.published.push(place, &record);
         }
-        if let Some(messages) = &mut self.messages {
-            messages.push_message(envelope, payload);
-        }
-        if let Some(place) = self.taken.filter(|_| self.has_joined) {
+        if let Some(place) = self.taken.filter(|_| self.has_reader) {
             let record = TakenRecord {
                 sequence: envelope.sequence,
                 published_ns: envelope.published_ns,
                 forwarded_ns: forwarded_ns(envelope),
-                taken_ns: MonotonicClock::now().as_ns(),
+                taken_ns: now.as_ns(),
                 epoch: envelope.epoch,
                 reserved: 0,
             };
             sinks.taken.push(place, &record);
         }
+        if let Some(messages) = &mut self.messages {
+            messages.push_message(envelope, payload);
+        }
         self.count.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// What is not in the records, and why.
+    fn complain(&self, channel: &str) {
+        let missed = self.tracker.counters().missed_count;
+        if self.published.is_some() && missed > 0 {
+            say(&FromProcess::Warning(format!(
+                "{channel}: {missed} messages were published and replaced before they could be recorded"
+            )));
+        }
+        if self.foreign_clock_count > 0 {
+            say(&FromProcess::Warning(format!(
+                "{channel}: {} messages are in no record, as their publication stamps are from before the run: \
+                 `published_ns` is of CLOCK_MONOTONIC",
+                self.foreign_clock_count
+            )));
+        }
+    }
+}
+
+/// One channel.
+struct Stream<'a> {
+    channel: &'a WitnessedChannel,
+    attendance: Attendance,
+    input: RawInput,
+    noted: Noted,
+}
+
+impl Stream<'_> {
+    /// Programs that have not joined it.
+    fn absent(&self) -> Vec<&str> {
+        let publisher = self.channel.publisher.as_deref();
+        let publisher = publisher.filter(|_| self.attendance.census().writer_count == 0);
+        let reader = self.channel.reader.as_deref();
+        let reader = reader.filter(|_| !self.attendance.has_consumer());
+        publisher.into_iter().chain(reader).collect()
+    }
+
+    /// Takes what waits.
+    fn read(&mut self, sinks: &mut Sinks, begun: Instant) -> Result<(), ChannelError> {
+        for _ in 0..LOOK_COUNT_MAX {
+            let Self { input, noted, .. } = self;
+            if !input
+                .receive(&mut |envelope, payload| noted.note(sinks, begun, envelope, payload))?
+            {
+                break;
+            }
+        }
+        Ok(())
     }
 }
 
 /// Reads the channels.
 struct Witness<'a, F> {
-    channels: &'a [WitnessedChannel],
-    streams: Vec<(RawInput, Noted)>,
+    streams: Vec<Stream<'a>>,
     sinks: Sinks,
     waiter: Waiter,
     /// When the run began.
     begun: F,
+    sweep_due: Instant,
+    readers_due: Instant,
     /// Outlives the ports.
-    domain: Domain,
+    _domain: Domain,
 }
 
-impl<F> Witness<'_, F> {
-    fn look_for_readers(&mut self) -> Result<(), ChannelError> {
-        for (channel, (_, noted)) in self.channels.iter().zip(&mut self.streams) {
-            noted.has_joined = noted.has_joined || has_joined(&self.domain, channel)?;
+impl<F: Fn() -> Instant> Witness<'_, F> {
+    fn look_for_readers(&mut self) {
+        for stream in &mut self.streams {
+            if stream.channel.reader.is_some() {
+                stream.noted.has_reader = stream.attendance.has_consumer();
+            }
         }
-        Ok(())
+    }
+
+    fn sweep(&mut self) -> Result<(), ChannelError> {
+        let begun = (self.begun)();
+        let mut streams = self.streams.iter_mut();
+        streams.try_for_each(|stream| stream.read(&mut self.sinks, begun))
     }
 }
 
 impl<F: Fn() -> Instant> JobWork for Witness<'_, F> {
     fn begin(&mut self, orders: &Orders) -> Result<bool, WorkerError> {
-        self.look_for_readers()?;
+        self.look_for_readers();
         Ok(orders.wait_for_start())
     }
 
     fn step(&mut self) -> Result<bool, WorkerError> {
-        let begun_ns = (self.begun)().as_ns();
+        let now = MonotonicClock::now();
+        if self.readers_due <= now {
+            self.readers_due = now + READERS_PERIOD;
+            self.look_for_readers();
+        }
+        if self.sweep_due <= now {
+            self.sweep_due = now + SWEEP_PERIOD;
+            self.sweep()?;
+            return Ok(false);
+        }
+        let begun = (self.begun)();
         let mut has_moved = false;
-        for (input, noted) in &mut self.streams {
-            has_moved |= input.receive(&mut |envelope, payload| {
-                // What a program on this host said before is no message of the run.
-                if envelope.is_forwarded() || envelope.published_ns >= begun_ns {
-                    noted.note(&mut self.sinks, envelope, payload);
-                }
-            })?;
+        for index in self.waiter.announced()? {
+            has_moved |= self.waiter.drain(index)?;
+            self.streams[index].read(&mut self.sinks, begun)?;
         }
         Ok(has_moved)
     }
 
     fn rest(&mut self) -> Result<(), WorkerError> {
-        self.look_for_readers()?;
-        self.waiter.wait(REST)?;
+        let descriptor = std::iter::once(self.waiter.descriptor());
+        poll_descriptors(descriptor, self.sweep_due)?;
         Ok(())
     }
 
     fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
         stepped?;
-        while self.step()? {}
+        self.sweep()?;
+        for stream in &self.streams {
+            stream.noted.complain(&stream.channel.name);
+        }
         Ok(())
     }
 
     fn report(&mut self) -> ProcessReport {
         let streams = self.streams.iter();
-        let failures = streams.map(|(input, _)| input.connection_failure_count());
+        let failures = streams.map(|stream| stream.input.connection_failure_count());
         ProcessReport {
             connection_failures: failures.sum(),
             ..ProcessReport::default()

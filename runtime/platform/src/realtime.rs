@@ -149,6 +149,12 @@ impl RealtimeGrant {
             .filter(|entry| entry.outcome != GrantOutcome::Granted)
     }
 
+    fn add_policy(&mut self, policy: SchedulingPolicy, fifo_flags: libc::c_int) {
+        let (number, priority) = policy.of_kernel(fifo_flags);
+        let result = schedule(number, priority);
+        self.add(RealtimeItem::Scheduling, policy.to_string(), result);
+    }
+
     fn add(&mut self, item: RealtimeItem, asked: String, result: Result<(), Refusal>) {
         let outcome = match result {
             Ok(()) => GrantOutcome::Granted,
@@ -186,16 +192,32 @@ impl Refusal {
 /// about to leave. Threads and processes started later by this thread do not inherit the
 /// real-time policy (`SCHED_RESET_ON_FORK`), but they do inherit the CPU mask.
 pub fn apply(request: &RealtimeRequest) -> RealtimeGrant {
-    apply_with(request, request.cpu.as_slice(), libc::SCHED_RESET_ON_FORK)
+    let mut grant = prepare(request, request.cpu.as_slice());
+    grant.add_policy(request.policy, libc::SCHED_RESET_ON_FORK);
+    grant
 }
 
 /// As [`apply`], for a program that this process becomes: it may use all of `cpus`, any where that is empty, and its
-/// threads inherit its policy.
-pub fn apply_to_program(request: &RealtimeRequest, cpus: &[usize]) -> RealtimeGrant {
-    apply_with(request, cpus, 0)
+/// threads and children inherit its policy. The normal policy is not asked for: it has what this process has.
+pub fn apply_to_program(
+    policy: SchedulingPolicy,
+    timer_slack: Option<Duration>,
+    cpus: &[usize],
+) -> RealtimeGrant {
+    let request = RealtimeRequest {
+        policy,
+        timer_slack,
+        ..RealtimeRequest::default()
+    };
+    let mut grant = prepare(&request, cpus);
+    if policy != SchedulingPolicy::Other {
+        grant.add_policy(policy, 0);
+    }
+    grant
 }
 
-fn apply_with(request: &RealtimeRequest, cpus: &[usize], fifo_flags: libc::c_int) -> RealtimeGrant {
+/// All but the policy, which comes last.
+fn prepare(request: &RealtimeRequest, cpus: &[usize]) -> RealtimeGrant {
     let mut grant = RealtimeGrant::default();
     if !cpus.is_empty() {
         let asked = format!("cpu {}", format_cpu_list(cpus));
@@ -209,9 +231,6 @@ fn apply_with(request: &RealtimeRequest, cpus: &[usize], fifo_flags: libc::c_int
         let asked = format!("timer slack {} ns", slack.as_nanos());
         grant.add(RealtimeItem::TimerSlack, asked, set_timer_slack(slack));
     }
-    let (policy, priority) = request.policy.of_kernel(fifo_flags);
-    let result = schedule(policy, priority);
-    grant.add(RealtimeItem::Scheduling, request.policy.to_string(), result);
     grant
 }
 

@@ -248,10 +248,10 @@ pub struct WitnessedChannel {
     pub name: String,
     /// Size of one message.
     pub message_size_bytes: usize,
-    /// Whether a program of the user's publishes here.
-    pub has_publisher: bool,
-    /// Whether a program of the user's reads here.
-    pub has_reader: bool,
+    /// The program of the user's that publishes here.
+    pub publisher: Option<String>,
+    /// The program of the user's that reads here.
+    pub reader: Option<String>,
     /// Whether the messages themselves are recorded, for the case to score.
     pub has_messages: bool,
 }

@@ -1,11 +1,14 @@
 //! Who has a channel open: counts of its writers and readers, for people and for programs that must
 //! not become a second writer.
 
+use iceoryx2::identifiers::UniqueNodeId;
+use iceoryx2::prelude::CallbackProgression;
 use iceoryx2::service::port_factory::PortFactory;
 
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
-use super::raw::{discover, open_for_reading};
+use super::members;
+use super::raw::{ReadService, discover, open_for_reading};
 
 /// Who has a channel open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -22,13 +25,58 @@ impl Census {
     /// # Errors
     /// When the channel does not appear in time.
     pub fn of(domain: &Domain, channel: &str) -> Result<Self, ChannelError> {
+        Attendance::of(domain, channel).map(|channel| channel.census())
+    }
+}
+
+/// A channel whose ends are looked at again and again, at the cost of a look into shared memory.
+#[derive(Debug)]
+pub struct Attendance {
+    service: ReadService,
+    own_node: UniqueNodeId,
+}
+
+impl Attendance {
+    /// Looks at `channel`, whatever it carries.
+    ///
+    /// # Errors
+    /// When it does not appear in time.
+    pub fn of(domain: &Domain, channel: &str) -> Result<Self, ChannelError> {
         let within = domain.open_within();
         let message = retry(within, || discover(domain, channel))?;
-        let service = retry(within, || open_for_reading(domain, channel, &message))?;
-        let now = service.dynamic_config();
         Ok(Self {
+            service: retry(within, || open_for_reading(domain, channel, &message))?,
+            own_node: domain.with_node(|node| *node.id()),
+        })
+    }
+
+    /// Who has it open now.
+    pub fn census(&self) -> Census {
+        let now = self.service.dynamic_config();
+        Census {
             writer_count: now.number_of_publishers(),
             reader_count: now.number_of_subscribers(),
-        })
+        }
+    }
+
+    /// True while a process of the run reads it: neither this one nor an observer. One that died counts until its
+    /// supervisor has freed its place.
+    pub fn has_consumer(&self) -> bool {
+        let mut has_consumer = false;
+        self.service.dynamic_config().list_subscribers(|reader| {
+            has_consumer = reader.node_id != self.own_node
+                && reader.subscriber_name != members::observer_port_name();
+            if has_consumer {
+                CallbackProgression::Stop
+            } else {
+                CallbackProgression::Continue
+            }
+        });
+        has_consumer
+    }
+
+    /// Samples that a reader may have waiting.
+    pub fn depth_max(&self) -> usize {
+        self.service.static_config().subscriber_max_buffer_size()
     }
 }

@@ -37,7 +37,7 @@ mod wake;
 mod tests;
 
 pub use capacity::Room;
-pub use census::Census;
+pub use census::{Attendance, Census};
 pub use domain::{Cleanup, Domain, Removal};
 pub use error::{ChannelError, DomainError};
 pub use holder::{ChannelHolder, ChannelSettings};

@@ -3,7 +3,7 @@
 
 use iceoryx2::config::Config;
 use iceoryx2::node::{Node, NodeState, NodeView};
-use iceoryx2::prelude::{CallbackProgression, LogLevel, NodeName, ipc, set_log_level};
+use iceoryx2::prelude::{CallbackProgression, LogLevel, NodeName, PortName, ipc, set_log_level};
 
 /// What the nodes of observers are called.
 const OBSERVER: &str = "hil-observer";
@@ -20,6 +20,16 @@ pub(super) struct Members {
 /// The name under which an observer joins.
 pub(super) fn observer_name() -> NodeName {
     NodeName::new(OBSERVER).expect("a short plain name is a node's name")
+}
+
+/// The name of the ports with which an observer reads.
+pub(super) fn observer_port_name() -> PortName {
+    PortName::new(OBSERVER).expect("a short plain name is a port's name")
+}
+
+/// Whether `node` is an observer's.
+pub(super) fn is_observer(node: &Node<ipc::Service>) -> bool {
+    node.name().as_str() == OBSERVER
 }
 
 /// Counts the living members of the domain that `config` describes.

@@ -16,7 +16,8 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{
-    FileDescriptorBased, MessagingPattern, PayloadHeader, Service, ServiceName, ZeroCopySend, ipc,
+    FileDescriptorBased, MessagingPattern, PayloadHeader, PortName, Service, ServiceName,
+    ZeroCopySend, ipc,
 };
 use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
@@ -32,6 +33,7 @@ use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
 use super::holder::ChannelSettings;
+use super::members;
 use super::wake;
 
 /// What every channel's user header is called; changes when the envelope's layout does.
@@ -557,9 +559,15 @@ impl ByteReader {
         let settings = settings_of(service.static_config(), channel, message);
         check_room(channel, settings.reader_room())?;
         let failures = ConnectionFailures::default();
+        let name = if domain.with_node(members::is_observer) {
+            members::observer_port_name()
+        } else {
+            PortName::new_empty()
+        };
         let subscriber = retry(within, || {
             service
                 .subscriber_builder()
+                .name(&name)
                 .buffer_size(depth)
                 .set_degradation_handler(failures.handler())
                 .create()

@@ -529,7 +529,10 @@ fn an_own_program_that_fails_ends_the_run_and_is_named() {
     let record = RunFolder::new("own-fails");
     let trial = Trial::shipped("shuttle-local.toml", record.path())
         .set("run.duration=\"10 min\"")
-        .set("processes.robot.run=[\"sh\", \"-c\", \"sleep 1; echo no oil >&2; exit 3\"]");
+        .set(&format!(
+            "processes.robot.run=[\"sh\", \"-c\", \"{} 100 & sleep 3; echo no oil >&2; kill $!; exit 3\"]",
+            env!("CARGO_BIN_EXE_hil-traffic")
+        ));
     let mut child = trial.start_here();
     let finished = child.wait_within(LIMIT).unwrap();
     finished.assert_code(1);

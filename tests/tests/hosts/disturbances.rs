@@ -326,7 +326,11 @@ fn a_path_that_takes_less_than_its_interfaces_is_found_before_the_first_message(
         for name in ["there/0", "back/1"] {
             trial = trial.set(&format!("channels.\"{name}\".message.size_bytes=4000"));
         }
-        for summary in Split::start(&lab, &trial).finish() {
+        let mut split = Split::start(&lab, &trial);
+        for finished in split.ended() {
+            finished.assert_success();
+        }
+        for summary in split.summaries() {
             for name in ["there/0", "back/1"] {
                 let account = account(&summary, name);
                 println!("sealed {is_sealed}: {}", describe(name, account));

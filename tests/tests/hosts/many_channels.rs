@@ -202,9 +202,7 @@ fn assert_is_accounted_for(account: &ChannelAccount, name: &str) {
         .map(|figures| figures.count)
         .sum();
     let given = of(MessageFate::Taken);
-    let elsewhere = of(MessageFate::SupersededAtConsumer)
-        + of(MessageFate::InFlight)
-        + of(MessageFate::LostInInterruption);
+    let elsewhere = of(MessageFate::InFlight) + of(MessageFate::LostInInterruption);
     assert!(
         (given..=given + elsewhere).contains(&forwarded),
         "{forwarded} forwarded in {said}"

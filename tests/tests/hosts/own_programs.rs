@@ -24,7 +24,10 @@ fn an_interface_that_is_down_is_a_loss_of_the_network_and_programs_have_whole_ac
     };
     let record = RunFolder::new("own-programs");
     let path = many_channels::topology(&record, 2, HZ, Duration::from_secs(10));
-    let trial = Trial::of(&path, record.path());
+    // One of them takes its time.
+    let program = env!("CARGO_BIN_EXE_hil-traffic");
+    let slow = format!("processes.b.run=[\"sh\", \"-c\", \"sleep 2; exec {program} {HZ}\"]");
+    let trial = Trial::of(&path, record.path()).set(&slow);
     let mut supervisors = [0, 1].map(|index| trial.start_on(lab.host(index)));
     let files = [0, 1].map(|index| {
         let located = lab.host(index).locate(record.path());
@@ -71,7 +74,12 @@ fn an_interface_that_is_down_is_a_loss_of_the_network_and_programs_have_whole_ac
                 )
         });
         assert!(has_cause, "{:?}", network.events);
-        // The first message of the run is the first of the account: nothing was lost to the programs' start.
+        // The run began when both were there.
         assert_eq!(of(MessageFate::SupersededAtInput), 0, "{said}");
+        for name in ["there/0", "back/1"] {
+            let account = account(&summary, name);
+            let said = describe(name, account);
+            assert!(account.published_count > 9 * u64::from(HZ), "{said}");
+        }
     }
 }

@@ -7,11 +7,12 @@ use std::os::fd::AsFd as _;
 use std::os::unix::process::{CommandExt, parent_id};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 use std::{env, io};
 
 use hil_cable::{Inside, Refusal};
 use hil_platform::open_files;
-use hil_platform::realtime::{self, RealtimeRequest};
+use hil_platform::realtime::{self, SchedulingPolicy};
 use hil_topology::{Program, Topology};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
@@ -72,8 +73,10 @@ pub enum OwnProgramError {
 pub struct ProgramRealtime {
     /// The cores it may use; any where there are none.
     pub cpus: Vec<usize>,
-    /// Scheduling and timer slack.
-    pub request: RealtimeRequest,
+    /// Of all its threads, and of all that it starts.
+    pub policy: SchedulingPolicy,
+    /// How late the kernel may wake it; as inherited, where there is none.
+    pub timer_slack: Option<Duration>,
 }
 
 /// Replaces this process by `program`, which the kernel will kill when the supervisor ends. With an address
@@ -119,7 +122,7 @@ pub fn become_program(
 /// Asks the kernel for what `text` says; else what it refused.
 fn claim(text: &str) -> Result<(), String> {
     let asked: ProgramRealtime = serde_json::from_str(text).map_err(|error| error.to_string())?;
-    let grant = realtime::apply_to_program(&asked.request, &asked.cpus);
+    let grant = realtime::apply_to_program(asked.policy, asked.timer_slack, &asked.cpus);
     let refusals: Vec<String> = grant.refusals().map(ToString::to_string).collect();
     if refusals.is_empty() {
         Ok(())
@@ -244,7 +247,8 @@ mod tests {
     fn what_the_kernel_refuses_a_program_is_told_with_the_cure() {
         let asked = ProgramRealtime {
             cpus: vec![1_023],
-            request: RealtimeRequest::default(),
+            policy: SchedulingPolicy::Other,
+            timer_slack: None,
         };
         let refusal = claim(&serde_json::to_string(&asked).unwrap()).unwrap_err();
         assert!(refusal.contains("cpu 1023 refused"), "{refusal}");

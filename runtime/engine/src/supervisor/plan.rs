@@ -32,9 +32,6 @@ use hil_topology::{
     gateway_name, witness_name,
 };
 
-/// How long the start of a run waits for a program of the user's that joins some channel late or never.
-const JOIN_PATIENCE: Duration = Duration::from_secs(5);
-
 /// Everything one supervisor is responsible for.
 #[derive(Debug)]
 pub(crate) struct Plan {
@@ -187,7 +184,7 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
             name: witness_name(&host.name),
             host: host.name.clone(),
             task: ProcessTask::Witness(WitnessWork {
-                patience: JOIN_PATIENCE.min(topology.run().start_timeout / 2),
+                patience: topology.run().start_timeout / 2,
                 channels,
             }),
             on_exit: OnExit::EndRun,
@@ -216,13 +213,13 @@ fn witnessed(topology: &Topology, host: &Host) -> Vec<WitnessedChannel> {
         WitnessedChannel {
             name: channel.name.clone(),
             message_size_bytes: channel.message.size_bytes,
-            has_publisher: publisher.is_some(),
-            has_reader: reader.is_some(),
+            publisher: publisher.map(|one| one.name.clone()),
+            reader: reader.map(|one| one.name.clone()),
             has_messages: publisher.is_some_and(|one| one.role().is_some()),
         }
     });
     witnessed
-        .filter(|one| one.has_publisher || one.has_reader)
+        .filter(|one| one.publisher.is_some() || one.reader.is_some())
         .collect()
 }
 
@@ -275,15 +272,7 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
                 card,
                 command: command.clone(),
                 environment: environment.clone(),
-                realtime: ProgramRealtime {
-                    cpus: process
-                        .execution
-                        .cpu
-                        .iter()
-                        .map(|cpu| usize::from(*cpu))
-                        .collect(),
-                    request: realtime(&process.execution, 0),
-                },
+                realtime: program_realtime(&process.execution),
             },
         },
         Program::Egm { role, adapter } => {
@@ -472,6 +461,20 @@ fn realtime(execution: &Execution, index: usize) -> RealtimeRequest {
         },
         lock_memory: execution.lock_memory,
         timer_slack: Some(execution.timer_slack),
+    }
+}
+
+fn program_realtime(execution: &Execution) -> ProgramRealtime {
+    let cpus = execution.cpu.iter().map(|cpu| usize::from(*cpu));
+    let RealtimeRequest {
+        policy,
+        timer_slack,
+        ..
+    } = realtime(execution, 0);
+    ProgramRealtime {
+        cpus: cpus.collect(),
+        policy,
+        timer_slack,
     }
 }
 

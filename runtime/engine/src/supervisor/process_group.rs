@@ -451,7 +451,13 @@ impl ProcessGroup {
 
     /// From when on nothing is known of what a process carried that now is lost, or records nothing more.
     fn interruption(&self, index: usize) -> Interruption {
-        let from = self.members[index].seen_alive.as_ns() - duration_ns(QUEUE_SPAN);
+        let member = &self.members[index];
+        // What a witness saw a program given was given to it.
+        let queue = match member.plan.task {
+            ProcessTask::Foreign { .. } => Duration::ZERO,
+            _ => QUEUE_SPAN,
+        };
+        let from = member.seen_alive.as_ns() - duration_ns(queue);
         Interruption {
             from: Instant::from_ns(from),
             until: None,
@@ -662,7 +668,7 @@ mod tests {
     use std::path::Path;
     use std::process::ExitStatus;
 
-    use hil_platform::realtime::RealtimeRequest;
+    use hil_platform::realtime::SchedulingPolicy;
     use hil_topology::RoleSpec;
 
     use super::*;
@@ -688,7 +694,8 @@ mod tests {
                 environment: BTreeMap::new(),
                 realtime: ProgramRealtime {
                     cpus: Vec::new(),
-                    request: RealtimeRequest::default(),
+                    policy: SchedulingPolicy::Other,
+                    timer_slack: None,
                 },
             },
             on_exit,

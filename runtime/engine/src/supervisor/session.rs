@@ -152,7 +152,8 @@ pub fn run(
         elsewhere: PeerStatus::new(topology, &hosts),
     };
     let begun = session.begin(topology.run().start_timeout);
-    let start = MonotonicClock::now();
+    let start = session.process_group.started;
+    let start = start.unwrap_or_else(MonotonicClock::now);
     let started = utc_text(SystemTime::now());
     let outcome = match begun {
         Err(outcome) => outcome,

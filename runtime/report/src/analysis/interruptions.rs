@@ -7,12 +7,12 @@
 use std::time::Duration;
 
 use hil_account::{Interruption, PathProcess, flight_time_max};
-use hil_core::record::{IngressRecord, PublishedRecord, RoundTripRecord, UNAVAILABLE};
+use hil_core::record::{IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord, UNAVAILABLE};
 use hil_core::time::{Instant, duration_ns};
 
 use super::records::{ChannelFiles, RunRecords, all};
 use hil_rundir::run_result::RunResult;
-use hil_topology::{Channel, gateway_name};
+use hil_topology::{Channel, Process, gateway_name};
 
 /// Longest time after a receiving gateway is back in which a loss is still put down to its start. Its
 /// sender learns of that by an answer of its kernel (ICMP), or where none comes by clock exchanges that
@@ -42,6 +42,9 @@ pub(super) fn noted(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interrup
             .get(host)
             .map_or(Instant::from_ns(i64::MAX), |span| span.1)
     };
+    let consumer = channel.to.as_deref();
+    let consumer = consumer.and_then(|name| topology.process(name));
+    let is_witnessed = consumer.is_some_and(Process::is_witnessed);
     let mut found = Vec::new();
     for event in &result.events {
         let Some(gap) = event.interruption else {
@@ -67,6 +70,15 @@ pub(super) fn noted(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interrup
                     files.map_or(back, |files| {
                         reached(files, exchanges, event.at, back, latest)
                     })
+                }
+                // A witness beside it saw when it read again.
+                Some(back) if *place == PathProcess::Consumer && is_witnessed => {
+                    let files = records.channels.get(&channel.name);
+                    let taken = files.into_iter().flat_map(|files| {
+                        all::<TakenRecord>(files.taken.as_ref()).map(|one| one.taken_ns)
+                    });
+                    let again = taken.filter(|at_ns| *at_ns >= back.as_ns()).min();
+                    again.map_or(end_of(&event.host), Instant::from_ns)
                 }
                 Some(back) => back,
                 None => end_of(&event.host),

@@ -388,7 +388,10 @@ pub(super) fn facts(summary: &RunSummary) -> Section {
         realtime.fact("granted", Tone::Plain, one.to_string());
     }
     if realtime.is_empty() {
-        realtime.note(Tone::Faint, "nothing was asked for");
+        realtime.note(
+            Tone::Faint,
+            "nothing was asked for, but by own programs, which end where they are refused",
+        );
     }
     section.children.push(realtime);
     let mut host = Section::new("host", "Host that wrote this", "");

@@ -24,8 +24,8 @@ use hil_rundir::manifest::{ChannelDescription, Manifest};
 use hil_rundir::record::RecordKind;
 use hil_rundir::select::{self, SelectError};
 use hil_shm::{Domain, DomainError};
-use hil_topology::Topology;
 use hil_topology::registry::Registry;
+use hil_topology::{Process, Topology};
 
 /// How often records and shared memory are read: short against what queues hold.
 pub(crate) const POLL_PERIOD: Duration = Duration::from_millis(10);
@@ -142,7 +142,17 @@ impl Observer {
             let is_gateway = hosts_of(one, topology.as_ref()).is_some();
             let known = topology.as_ref().and_then(|known| known.channel(&one.name));
             let depth = known.map(|channel| channel.depth);
-            (one.name.clone(), ChannelTail::new(is_gateway, depth))
+            let tail = ChannelTail::new(is_gateway, depth);
+            let consumer = known.and_then(|channel| channel.to.as_deref());
+            let consumer = topology.as_ref().zip(consumer);
+            let consumer = consumer.and_then(|(topology, name)| topology.process(name));
+            let has_witness = consumer.is_some_and(Process::is_witnessed);
+            let tail = if has_witness {
+                tail.beside_witness()
+            } else {
+                tail
+            };
+            (one.name.clone(), tail)
         });
         Ok(Self {
             tails: tails.collect(),

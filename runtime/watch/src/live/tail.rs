@@ -24,6 +24,8 @@ const NO_ROOM_MAX: usize = 1_024;
 pub(crate) struct ChannelTail {
     fold: ChannelFold,
     is_gateway: bool,
+    /// See [`AccountContext::has_witness`].
+    has_witness: bool,
     /// Nobody counts yet what is missing in them, so what became of it stays open.
     no_room: Vec<NoRoom>,
     /// With the publication of each, or that of the one before where it has none.
@@ -55,12 +57,21 @@ impl ChannelTail {
                 held_max: Some(HELD_MAX),
             }),
             is_gateway,
+            has_witness: false,
             no_room: Vec::new(),
             settled: VecDeque::new(),
             arrivals: VecDeque::new(),
             newest: None,
             settled_until_ns: i64::MIN,
             has_noted_late: false,
+        }
+    }
+
+    /// The same of a channel whose consumer keeps no records.
+    pub(crate) fn beside_witness(self) -> Self {
+        Self {
+            has_witness: true,
+            ..self
         }
     }
 
@@ -138,6 +149,7 @@ impl ChannelTail {
         };
         let context = AccountContext {
             no_room: &self.no_room,
+            has_witness: self.has_witness,
             ..AccountContext::new(path)
         };
         let settled = &mut self.settled;
