@@ -147,6 +147,35 @@ impl MessageHistory {
         Some((taken_ns.saturating_sub(published.as_ns()), bound_ns))
     }
 
+    /// What processes, queues and timers of the two hosts took of its time, nanoseconds: until it was handed to
+    /// the kernel, and from when the kernel or the model of an emulated link let it arrive. Each part is of one
+    /// host's clock, and what no record tells is not in it.
+    pub fn host_time_ns(&self) -> i64 {
+        let between = |from_ns: Option<i64>, until_ns: Option<i64>| {
+            let ends = from_ns.zip(until_ns);
+            ends.map_or(0, |(from, until)| until.saturating_sub(from).max(0))
+        };
+        let arrived = self.arrived();
+        let ingress = |of: fn(&IngressRecord) -> i64| arrived.and_then(|record| stamp(of(&record)));
+        let received_ns = ingress(|record| record.received_ns);
+        let reached_ns = ingress(|record| record.rx_software_ns)
+            .zip(ingress(|record| record.realtime_offset_ns))
+            .map(|(realtime_ns, offset_ns)| realtime_ns.saturating_sub(offset_ns));
+        let modelled_ns = ingress(|record| record.emulated_ns);
+        let due_ns = ingress(|record| record.due_ns);
+        let taken_ns = self.taken.and_then(|record| stamp(record.taken_ns));
+        [
+            (self.published_ns(), self.handed_ns()),
+            (reached_ns, modelled_ns.or(received_ns)),
+            (due_ns, received_ns),
+            (received_ns, taken_ns),
+        ]
+        .into_iter()
+        .fold(0, |sum, (from, until)| {
+            sum.saturating_add(between(from, until))
+        })
+    }
+
     /// Its way over the network.
     pub fn passage(&self, path: ChannelPath<'_>) -> Passage {
         let handed_ns = self.handed_ns();

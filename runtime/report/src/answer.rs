@@ -3,6 +3,7 @@
 
 use core::fmt;
 
+use hil_account::flow::DeadlineMetrics;
 use hil_account::network::NetworkEventKind;
 use hil_account::{MessageFate, Standing};
 use hil_core::case_study::{Occasions, Severity};
@@ -30,8 +31,16 @@ const OUTAGE_LOST_MIN: u64 = 3;
 /// Channels, processes or hosts that are named where many have the same fault.
 const NAMED_COUNT: usize = 3;
 
-/// What an answer counts as harm, beside the counts that it lists.
-pub(crate) const COUNTED_AS_HARM: &str = "these, less those by limits of the robot";
+/// What an answer counts as harm, beside the counts that it lists; `None` where it lists none.
+pub(crate) fn counted_as_harm(summary: &RunSummary) -> Option<&'static str> {
+    if summary.harms.len() > summary.deadlines.len() {
+        Some("these, less those by limits of the robot")
+    } else if summary.harms.is_empty() {
+        None
+    } else {
+        Some("these, which would have come in time but for the network")
+    }
+}
 
 /// A way in which the robot can be hurt, and how often it was; see [`hil_core::case_study::Harm`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -69,6 +78,21 @@ impl From<&hil_core::case_study::Harm> for HarmCount {
                 OccasionCount { what, count }
             }),
             interval: harm.interval,
+        }
+    }
+}
+
+impl From<&DeadlineMetrics> for HarmCount {
+    fn from(deadline: &DeadlineMetrics) -> Self {
+        Self {
+            what: format!("{} late or missing", deadline.name),
+            count: Some(deadline.hurt_count()),
+            own_count: 0,
+            occasions: Some(OccasionCount {
+                what: format!("requests of {}", deadline.name),
+                count: deadline.request_count - deadline.unknown_count,
+            }),
+            interval: deadline.hurt_share,
         }
     }
 }
@@ -476,6 +500,10 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
     }
     if is_score_incomplete(summary) {
         return not_resolvable(Unresolved::ScoreIncomplete);
+    }
+    // Whose time it took is known of each request.
+    if summary.deadlines.iter().any(|one| one.hurt_count() > 0) {
+        return Hurt::Yes;
     }
     let harms = summary.harms.iter();
     if harms.map(HarmCount::beyond_own_count).sum::<u64>() > 0 {

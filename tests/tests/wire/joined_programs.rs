@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use hil_account::flow::FlowMetrics;
 use hil_report::summary::RunSummary;
-use hil_tests::binary::hil_runtime_binary;
+use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{processes_mentioning, wait_until};
@@ -105,15 +105,30 @@ impl Place {
     }
 
     fn said_by_first(&self) -> String {
-        fs::read_to_string(self.run_folder().join("logs/first.log")).unwrap()
+        self.said_by("first")
+    }
+
+    fn said_by(&self, program: &str) -> String {
+        let log = self.run_folder().join(format!("logs/{program}.log"));
+        fs::read_to_string(log).unwrap()
+    }
+
+    /// A program that nobody here wrote, or that knows nothing of us, put beside the binary.
+    fn copy_of(&self, program: &str) -> PathBuf {
+        let copy = self.folder.join(program);
+        let source = workspace_folder()
+            .join("tests/foreign_programs")
+            .join(program);
+        fs::copy(source, &copy).unwrap();
+        copy
     }
 }
 
-/// The flow that `begin` begins the name of, from one program or the other.
-fn flow<'a>(summary: &'a RunSummary, begin: &str) -> &'a FlowMetrics {
+/// The flow that has `part` in its name, from one program or the other.
+fn flow<'a>(summary: &'a RunSummary, part: &str) -> &'a FlowMetrics {
     let mut flows = summary.flows.iter().flat_map(|one| &one.flows);
-    let found = flows.find(|one| one.name.starts_with(begin));
-    found.unwrap_or_else(|| panic!("no flow {begin} in {:#?}", summary.flows))
+    let found = flows.find(|one| one.name.contains(part));
+    found.unwrap_or_else(|| panic!("no flow {part} in {:#?}", summary.flows))
 }
 
 /// Every frame has one fate, and no inlet lost any.
@@ -241,6 +256,127 @@ fn iperf3_and_the_account_lose_the_same_datagrams() {
         "{datagrams:?}"
     );
     assert!(flow(&summary, "tcp 10.77.0.1").taken_count > 0);
+}
+
+#[test]
+fn a_java_controller_and_robot_and_the_account_count_the_same_datagrams() {
+    if lacks("javac", "default-jdk-headless") {
+        return;
+    }
+    let place = Place::new("join-java");
+    let agents = place.copy_of("Agents.java");
+    let agents = agents.to_str().unwrap();
+    let link = ["--link", "delay 2ms loss 2%", "--seed", "3"];
+    let controller = ["--", "java", agents, "controller", "10.77.0.2", "1000", "4"];
+    let robot = ["--", "java", agents, "robot", "10.77.0.1"];
+    let finished = place.run(&[&link[..], &controller, &robot].concat());
+    finished.assert_success();
+    let summary = place.summary();
+    assert_closed(&summary);
+    let (commands, status) = (
+        flow(&summary, "10.77.0.2:6001"),
+        flow(&summary, "10.77.0.1:6002"),
+    );
+    let (controller, robot) = (place.said_by("first"), place.said_by("second"));
+    println!("{controller}{}", robot.lines().last().unwrap());
+    assert_eq!(
+        commands.frame_count,
+        number_before(&controller, " commands sent")
+    );
+    let received = robot.lines().last().unwrap();
+    assert_eq!(
+        commands.taken_count,
+        number_before(received, " commands received")
+    );
+    assert_eq!(status.frame_count, commands.taken_count);
+    assert_eq!(
+        status.taken_count,
+        number_before(&controller, " status received")
+    );
+    for one in [commands, status] {
+        assert!(one.lost_by_network_count > 0, "{one:?}");
+        assert_eq!(
+            one.taken_count + one.lost_by_network_count,
+            one.frame_count,
+            "{one:?}"
+        );
+    }
+    let response_us = controller.split("median response ").nth(1).unwrap();
+    assert!(number_before(response_us, " us") >= 4_000, "{controller}");
+}
+
+/// Where a Python with the package RSIPI is.
+const RSI_VARIABLE: &str = "HIL_RSI_PYTHON";
+
+#[test]
+fn a_kuka_controller_misses_the_answers_that_our_deadline_counts() {
+    let python = std::env::var(RSI_VARIABLE).unwrap_or_default();
+    if python.is_empty() {
+        eprintln!("skipped: {RSI_VARIABLE} names no Python with RSIPI");
+        return;
+    }
+    let place = Place::new("join-rsi");
+    let script = place.copy_of("rsi.py");
+    let script = script.display();
+    // RSIPI waits for an answer from one cycle after a packet until another one is over.
+    let topology = format!(
+        r#"version = 1
+name = "rsi"
+[hosts]
+robot-pc = {{}}
+sensor-pc = {{}}
+[processes]
+robot = {{ host = "robot-pc", run = ["{python}", "{script}", "robot", "10.77.0.2", "10"], inside = "10.77.0.1" }}
+sensor = {{ host = "sensor-pc", run = ["{python}", "{script}", "sensor"], inside = "10.77.0.2" }}
+[channels]
+out = {{ from = "robot", to = "sensor", link = "hop" }}
+back = {{ from = "sensor", to = "robot", link = "hop" }}
+[links.hop]
+via = "emulated"
+between = ["robot-pc", "sensor-pc"]
+delay = "1 ms"
+loss_ratio = 0.02
+[flows.cycle]
+match = "udp dst port 64000"
+deadline = "8 ms"
+"#
+    );
+    let file = place.folder.join("rsi.toml");
+    fs::write(&file, topology).unwrap();
+    // As the user of the tests, who can read that Python.
+    let mut command = Command::new(&place.binary);
+    command.args(["--quiet", "--topology"]).arg(&file);
+    command.current_dir(place.folder.path());
+    let mut run = ChildGuard::spawn(&mut command).unwrap();
+    run.wait_within(LIMIT).unwrap().assert_success();
+    place.assert_nothing_left();
+    let summary = place.summary();
+    assert_closed(&summary);
+    let said = place.said_by("robot");
+    let said = said
+        .lines()
+        .find(|line| line.contains(" packets sent"))
+        .unwrap();
+    let [sent, faulty] = [" packets sent", " faulty"].map(|words| number_before(said, words));
+    let cycle = &summary.deadlines[0];
+    println!("RSIPI: {faulty} of {sent} faulty; {cycle:?}");
+    assert_eq!(cycle.request_count, sent);
+    let late = [
+        cycle.late_by_network_count,
+        cycle.late_by_program_count,
+        cycle.late_by_both_count,
+        cycle.late_by_harness_count,
+    ];
+    let missing = cycle.missing_by_network_count + cycle.missing_by_program_count;
+    assert!(cycle.missing_by_network_count > 0, "{cycle:?}");
+    // What was lost last it does not count any more. Whether it still takes what comes at the end of its time hangs
+    // on when it gets a processor.
+    assert!(
+        faulty + 10 >= cycle.missing_by_network_count,
+        "{said}{cycle:?}"
+    );
+    let most = missing + late.iter().sum::<u64>() + cycle.unknown_count + sent / 20;
+    assert!(faulty <= most, "{said}{cycle:?}");
 }
 
 #[test]

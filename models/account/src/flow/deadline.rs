@@ -1,8 +1,12 @@
-//! Requests and their answers: whether each came back in time, and if not, whose time it took. The answer to a request
-//! is the first frame that the other program sent back after it was given the request and before it was given the
-//! next, since what programs say is not read. Times of two hosts are never compared: a request and its answer are timed where the
+//! Requests and their answers: whether each came back in time, and if not, whose time it took. What programs say is
+//! not read: frames that the other program sends back between two requests answer, in order, as many of those that
+//! it was given before and has not answered, the newest ones where they are fewer. Times of two hosts are never compared: a request and its answer are timed where the
 //! request began, and the program between them where it ran.
 
+use std::collections::VecDeque;
+
+use hil_core::interval::Spread;
+use hil_stats::dependence::Batches;
 use hil_stats::histogram::Distribution;
 use serde::{Deserialize, Serialize};
 
@@ -18,8 +22,13 @@ pub struct FramePassage {
 /// What became of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FrameEnd {
-    /// The other program's interface was given it, by the clock of that host.
-    Given(i64),
+    /// The other program's interface was given it.
+    Given {
+        /// When, on the clock of that host, nanoseconds.
+        at_ns: i64,
+        /// What the hosts took of its time, see [`MessageHistory::host_time_ns`](crate::MessageHistory::host_time_ns).
+        host_ns: i64,
+    },
     /// The network lost it.
     LostByNetwork,
     /// A host lost it.
@@ -39,6 +48,9 @@ pub struct DeadlineMetrics {
     pub request_count: u64,
     /// Answered in time.
     pub in_time_count: u64,
+    /// Answered late, but in time without what processes and timers of the hosts took.
+    #[serde(default)]
+    pub late_by_harness_count: u64,
     /// Answered late, of which the network took longer than allowed and the program did not.
     pub late_by_network_count: u64,
     /// Answered late, of which the program took longer than allowed and the network did not.
@@ -53,6 +65,10 @@ pub struct DeadlineMetrics {
     pub missing_by_harness_count: u64,
     /// Unknown: under way at the end of the run, or without records.
     pub unknown_count: u64,
+    /// 95 % interval of the share of those that the network hurt, see [`DeadlineMetrics::hurt_count`], of those
+    /// of which it is known; or why there is none.
+    #[serde(default)]
+    pub hurt_share: Option<Spread>,
     /// From sending a request until its answer was given.
     pub response: Distribution,
     /// Of that, between the request's arrival and the sending of the answer.
@@ -65,6 +81,8 @@ pub struct DeadlineFold {
     metrics: DeadlineMetrics,
     responses_ns: Vec<i64>,
     programs_ns: Vec<i64>,
+    /// When each request was sent, and whether the network hurt it.
+    hurt: Vec<(i64, bool)>,
 }
 
 impl DeadlineFold {
@@ -76,6 +94,7 @@ impl DeadlineFold {
                 limit_ns,
                 request_count: 0,
                 in_time_count: 0,
+                late_by_harness_count: 0,
                 late_by_network_count: 0,
                 late_by_program_count: 0,
                 late_by_both_count: 0,
@@ -83,11 +102,13 @@ impl DeadlineFold {
                 missing_by_program_count: 0,
                 missing_by_harness_count: 0,
                 unknown_count: 0,
+                hurt_share: None,
                 response: Distribution::of_samples(&[], NO_ANSWER),
                 program: Distribution::of_samples(&[], NO_ANSWER),
             },
             responses_ns: Vec::new(),
             programs_ns: Vec::new(),
+            hurt: Vec::new(),
         }
     }
 
@@ -99,22 +120,36 @@ impl DeadlineFold {
         for request in requests {
             self.metrics.request_count += 1;
             match request.end {
-                FrameEnd::Given(given_ns) => given.push((given_ns, request.sent_ns)),
-                end => self.metrics.add_missing(end),
+                FrameEnd::Given { at_ns, host_ns } => given.push([at_ns, request.sent_ns, host_ns]),
+                end => self.add_missing(request.sent_ns, end),
             }
         }
         given.sort_unstable();
-        for (index, &(given_ns, sent_ns)) in given.iter().enumerate() {
-            let first = answers.partition_point(|answer| answer.sent_ns < given_ns);
-            let next_ns = given.get(index + 1).map(|(next_ns, _)| *next_ns);
-            let is_its = |answer: &&FramePassage| next_ns.is_none_or(|ns| answer.sent_ns < ns);
-            if let Some(answer) = answers.get(first).filter(is_its) {
-                self.add_answered([sent_ns, given_ns], answer);
-                continue;
+        let mut waiting = VecDeque::new();
+        for (index, &request) in given.iter().enumerate() {
+            let [given_ns, ..] = request;
+            // What came later than allowed would be the program's, too.
+            let limit_ns = self.metrics.limit_ns;
+            let is_over = |[ns, ..]: &mut [i64; 3]| given_ns.saturating_sub(*ns) > limit_ns;
+            while let Some([_, sent_ns, _]) = waiting.pop_front_if(is_over) {
+                self.add_unanswered(sent_ns);
             }
+            waiting.push_back(request);
+            let next_ns = given
+                .get(index + 1)
+                .map_or(i64::MAX, |[next_ns, ..]| *next_ns);
+            let [first, end] =
+                [given_ns, next_ns].map(|ns| answers.partition_point(|answer| answer.sent_ns < ns));
+            let answered_count = waiting.len().min(end - first);
+            let answered = waiting.drain(waiting.len() - answered_count..);
+            for (request, answer) in answered.zip(&answers[first..]) {
+                self.add_answered(request, answer);
+            }
+        }
+        for [_, sent_ns, _] in waiting {
             let waited_ns = last_ns.map_or(0, |ns| ns.saturating_sub(sent_ns));
-            if next_ns.is_some() || waited_ns >= self.metrics.limit_ns {
-                self.metrics.missing_by_program_count += 1;
+            if waited_ns >= self.metrics.limit_ns {
+                self.add_unanswered(sent_ns);
             } else {
                 self.metrics.unknown_count += 1;
             }
@@ -127,31 +162,62 @@ impl DeadlineFold {
         self.metrics.unknown_count += requests.len() as u64;
     }
 
-    fn add_answered(&mut self, [sent_ns, given_ns]: [i64; 2], answer: &FramePassage) {
-        let metrics = &mut self.metrics;
-        let back_ns = match answer.end {
-            FrameEnd::Given(back_ns) => back_ns,
-            end => return metrics.add_missing(end),
+    fn add_answered(&mut self, [given_ns, sent_ns, host_ns]: [i64; 3], answer: &FramePassage) {
+        let (back_ns, host_ns) = match answer.end {
+            FrameEnd::Given {
+                at_ns,
+                host_ns: back,
+            } => (at_ns, host_ns.saturating_add(back)),
+            end => return self.add_missing(sent_ns, end),
         };
+        let metrics = &mut self.metrics;
         let response_ns = back_ns.saturating_sub(sent_ns);
         let program_ns = answer.sent_ns.saturating_sub(given_ns);
         self.responses_ns.push(response_ns);
         self.programs_ns.push(program_ns);
         let is_long = |ns: i64| ns > metrics.limit_ns;
-        let network_ns = response_ns.saturating_sub(program_ns);
-        let (program, network) = (is_long(program_ns), is_long(network_ns));
-        let count = match (is_long(response_ns), network, program) {
-            (false, ..) => &mut metrics.in_time_count,
-            (true, true, false) => &mut metrics.late_by_network_count,
-            (true, false, true) => &mut metrics.late_by_program_count,
-            (true, ..) => &mut metrics.late_by_both_count,
+        let without_hosts_ns = response_ns.saturating_sub(host_ns);
+        let network_ns = without_hosts_ns.saturating_sub(program_ns);
+        let (count, is_hurt) = if !is_long(response_ns) {
+            (&mut metrics.in_time_count, false)
+        } else if !is_long(without_hosts_ns) {
+            (&mut metrics.late_by_harness_count, false)
+        } else {
+            match (is_long(network_ns), is_long(program_ns)) {
+                (true, false) => (&mut metrics.late_by_network_count, true),
+                (false, true) => (&mut metrics.late_by_program_count, false),
+                _ => (&mut metrics.late_by_both_count, true),
+            }
         };
         *count += 1;
+        self.hurt.push((sent_ns, is_hurt));
+    }
+
+    /// Adds a request of which it, or its answer, was not given.
+    fn add_missing(&mut self, sent_ns: i64, end: FrameEnd) {
+        let (count, is_hurt) = match end {
+            FrameEnd::LostByNetwork => (&mut self.metrics.missing_by_network_count, true),
+            FrameEnd::LostByHarness => (&mut self.metrics.missing_by_harness_count, false),
+            FrameEnd::Given { .. } | FrameEnd::Unknown => {
+                self.metrics.unknown_count += 1;
+                return;
+            }
+        };
+        *count += 1;
+        self.hurt.push((sent_ns, is_hurt));
+    }
+
+    fn add_unanswered(&mut self, sent_ns: i64) {
+        self.metrics.missing_by_program_count += 1;
+        self.hurt.push((sent_ns, false));
     }
 
     /// What it comes to.
-    pub fn finish(self) -> DeadlineMetrics {
+    pub fn finish(mut self) -> DeadlineMetrics {
+        self.hurt.sort_unstable();
+        let hurt = self.hurt.iter().map(|(_, is_hurt)| f64::from(*is_hurt));
         DeadlineMetrics {
+            hurt_share: (!self.hurt.is_empty()).then(|| Batches::of(hurt).share_interval()),
             response: Distribution::of_samples(&self.responses_ns, NO_ANSWER),
             program: Distribution::of_samples(&self.programs_ns, NO_ANSWER),
             ..self.metrics
@@ -165,12 +231,9 @@ impl DeadlineMetrics {
         self.unknown_count += core::mem::take(&mut self.missing_by_program_count);
     }
 
-    fn add_missing(&mut self, end: FrameEnd) {
-        *match end {
-            FrameEnd::LostByNetwork => &mut self.missing_by_network_count,
-            FrameEnd::LostByHarness => &mut self.missing_by_harness_count,
-            FrameEnd::Given(_) | FrameEnd::Unknown => &mut self.unknown_count,
-        } += 1;
+    /// Those that came late or not at all, and would have come in time but for the network.
+    pub const fn hurt_count(&self) -> u64 {
+        self.late_by_network_count + self.late_by_both_count + self.missing_by_network_count
     }
 }
 
@@ -184,17 +247,21 @@ mod tests {
     /// What the clock of the answering host is ahead, which changes no figure.
     const AHEAD_NS: i64 = 77_777 * MS;
 
-    fn request(at_ms: i64, there_ms: i64) -> FramePassage {
+    const fn given(at_ns: i64) -> FrameEnd {
+        FrameEnd::Given { at_ns, host_ns: 0 }
+    }
+
+    const fn request(at_ms: i64, there_ms: i64) -> FramePassage {
         FramePassage {
             sent_ns: at_ms * MS,
-            end: FrameEnd::Given((at_ms + there_ms) * MS + AHEAD_NS),
+            end: given((at_ms + there_ms) * MS + AHEAD_NS),
         }
     }
 
-    fn answer(at_ms: i64, back_ms: i64) -> FramePassage {
+    const fn answer(at_ms: i64, back_ms: i64) -> FramePassage {
         FramePassage {
             sent_ns: at_ms * MS + AHEAD_NS,
-            end: FrameEnd::Given((at_ms + back_ms) * MS),
+            end: given((at_ms + back_ms) * MS),
         }
     }
 
@@ -253,16 +320,77 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_serves_the_newest_request_that_was_given_before_it() {
+    fn what_only_the_hosts_made_late_is_not_the_networks() {
+        let on_hosts = |frame: FramePassage, host_ms: i64| {
+            let FrameEnd::Given { at_ns, .. } = frame.end else {
+                panic!("{frame:?}");
+            };
+            let host_ns = host_ms * MS;
+            let end = FrameEnd::Given { at_ns, host_ns };
+            FramePassage { end, ..frame }
+        };
+        let requests = [
+            on_hosts(request(0, 4), 3),   // 6 ms, 5 of them on the hosts
+            on_hosts(request(100, 9), 3), // 11 ms, 5 on the hosts, 6 over the network
+            on_hosts(request(200, 4), 3), // 14 ms, 5 on the hosts, 8 in the program
+            on_hosts(request(300, 1), 1), // in time
+        ];
+        let answers = [
+            on_hosts(answer(4, 2), 2),
+            on_hosts(answer(109, 2), 2),
+            on_hosts(answer(212, 2), 2),
+            answer(301, 1),
+        ];
+        let found = folded(4 * MS, &requests, &answers);
+        let counts = [
+            found.in_time_count,
+            found.late_by_harness_count,
+            found.late_by_network_count,
+            found.late_by_program_count,
+            found.late_by_both_count,
+        ];
+        assert_eq!(counts, [1, 1, 1, 1, 0]);
+    }
+
+    #[test]
+    fn fewer_answers_are_of_the_newest_requests_and_as_many_are_of_each() {
         let requests = [request(0, 1), request(4, 1), request(8, 1)];
-        let found = folded(
-            4 * MS,
-            &requests,
-            &[answer(6, 1), answer(7, 1), answer(10, 1)],
+        let counts = |answers: &[FramePassage]| {
+            let found = folded(4 * MS, &requests, answers);
+            let counts = [
+                found.in_time_count,
+                found.late_by_program_count,
+                found.missing_by_program_count,
+                found.unknown_count,
+            ];
+            (counts, found.response.measured().unwrap().max_ns)
+        };
+        let all = [answer(2, 1), answer(6, 1), answer(10, 1)];
+        assert_eq!(counts(&all), ([3, 0, 0, 0], 3 * MS));
+        assert_eq!(counts(&all[1..]), ([2, 0, 1, 0], 3 * MS));
+        // Two at once are answered one by one: the first one late.
+        let [one, other] = [answer(6, 1), answer(7, 1)];
+        assert_eq!(counts(&[one, other, all[2]]), ([2, 1, 0, 0], 7 * MS));
+        // More than there were requests are of the program's own accord.
+        assert_eq!(
+            counts(&[all[0], answer(3, 1), all[1], all[2]]),
+            ([3, 0, 0, 0], 3 * MS)
         );
-        let counts = [found.missing_by_program_count, found.in_time_count];
-        assert_eq!(counts, [1, 2]);
-        assert_eq!(found.response.measured().unwrap().max_ns, 3 * MS);
+        assert_eq!(counts(&all[..2]), ([2, 0, 0, 1], 3 * MS));
+    }
+
+    #[test]
+    fn requests_that_a_network_held_back_and_gave_at_once_are_no_silence_of_the_program() {
+        let requests: Vec<_> = (0..10).map(|one| request(4 * one, 50 - 4 * one)).collect();
+        let answers: Vec<_> = (0..10).map(|_| answer(51, 1)).collect();
+        let found = folded(8 * MS, &requests, &answers);
+        let counts = [found.late_by_network_count, found.missing_by_program_count];
+        assert_eq!(counts, [10, 0]);
+    }
+
+    #[test]
+    fn requests_to_many_are_answered_by_nobody_that_is_known() {
+        let requests = [request(0, 1), request(4, 1), request(8, 1)];
         let mut fold = DeadlineFold::new("to many", MS);
         fold.add_unanswerable(&requests);
         assert_eq!(fold.finish().unknown_count, 3);

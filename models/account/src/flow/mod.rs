@@ -52,6 +52,8 @@ pub enum FlowKey {
     TooShort,
     /// Of a flow beyond [`FLOWS_MAX`].
     Rest,
+    /// Of a frame that left no record of its own, as the last ones of a process that was killed.
+    Unrecorded,
 }
 
 /// A flow that has a name.
@@ -94,7 +96,9 @@ impl FlowKey {
                 destination: source,
                 ports: ports.map(|[from, to]| [to, from]),
             }),
-            Self::Ip { .. } | Self::Other(_) | Self::TooShort | Self::Rest => None,
+            Self::Ip { .. } | Self::Other(_) | Self::TooShort | Self::Rest | Self::Unrecorded => {
+                None
+            }
         }
     }
 
@@ -230,6 +234,7 @@ impl fmt::Display for FlowKey {
             Self::Other(kind) => write!(f, "ethernet type {kind:#06x}"),
             Self::TooShort => f.write_str("too short to tell"),
             Self::Rest => f.write_str("all other flows"),
+            Self::Unrecorded => f.write_str("frames without a record of their own"),
         }
     }
 }
@@ -423,22 +428,26 @@ impl<'a> FlowFold<'a> {
         })
     }
 
-    /// Takes the fate of a frame; one without a record is of no flow.
+    /// Takes the fate of a frame.
     pub fn add(&mut self, message: &MessageHistory, path: ChannelPath<'_>) {
         let frames = self
             .frames
             .get(&message.epoch)
             .map_or(&[][..], Vec::as_slice);
         let found = frames.binary_search_by_key(&message.key.sequence, |(sequence, _)| *sequence);
-        let Ok(index) = found.map(|place| frames[place].1) else {
-            return;
+        let index = match found {
+            Ok(place) => frames[place].1,
+            Err(_) => self.index_of(FlowKey::Unrecorded),
         };
         let place = place_of(message.fate);
         let keyed = &mut self.keyed[index as usize];
         if let (Some(passages), Some(sent_ns)) = (&mut keyed.passages, message.published_ns()) {
             let given_ns = message.taken.and_then(|record| stamp(record.taken_ns));
             let end = match (place, given_ns) {
-                (TAKEN, Some(given_ns)) => FrameEnd::Given(given_ns),
+                (TAKEN, Some(given_ns)) => FrameEnd::Given {
+                    at_ns: given_ns,
+                    host_ns: message.host_time_ns(),
+                },
                 (BY_NETWORK, _) => FrameEnd::LostByNetwork,
                 (BY_HARNESS, _) => FrameEnd::LostByHarness,
                 _ => FrameEnd::Unknown,
@@ -446,7 +455,7 @@ impl<'a> FlowFold<'a> {
             passages.push(FramePassage { sent_ns, end });
         }
         let flow = &mut self.flows[keyed.flow];
-        flow.counts[place] += 1;
+        flow.counts[place] += message.count;
         flow.arrivals_ns
             .extend(message.arrived().map(|record| record.received_ns));
         let delay = message.delay_ns(path);
@@ -563,11 +572,16 @@ mod tests {
             Fate::SupersededAtConsumer,
             Fate::RefusedByKernel,
             Fate::Taken,
+            Fate::Taken,
         ];
         let mut files = Files::default();
         let mut fold = FlowFold::default();
         for (sequence, fate) in (0_u64..).zip(fates) {
             files.write(at(7, sequence), fate);
+            // The last frame left no record of its own.
+            if sequence == 7 {
+                continue;
+            }
             // The first frame is of another flow.
             let kind = if sequence == 0 { [8, 6] } else { [8, 0] };
             let bytes = frame(&kind, &packet(1, 0, &[0; 20]));
@@ -578,10 +592,10 @@ mod tests {
             fold.add(one, context.path);
         });
         let (flows, _) = fold.finish();
-        assert_eq!(flows.len(), 2);
-        let [echoes, arp] = &flows[..] else {
-            panic!("two flows");
+        let [echoes, arp, unrecorded] = &flows[..] else {
+            panic!("three flows: {flows:#?}");
         };
+        assert_eq!((unrecorded.frame_count, unrecorded.byte_count), (1, 0));
         assert_eq!(
             (arp.name.as_str(), arp.frame_count, arp.taken_count),
             ("arp", 1, 1)
@@ -694,7 +708,7 @@ mod tests {
         assert_eq!((flows.len(), command.taken_count), (3, 2));
         let counts: Vec<usize> = passages.values().map(Vec::len).collect();
         assert_eq!(counts, [1, 1, 1]);
-        let given = |one: &FramePassage| matches!(one.end, FrameEnd::Given(_));
+        let given = |one: &FramePassage| matches!(one.end, FrameEnd::Given { .. });
         assert!(passages.values().flatten().all(given));
     }
 

@@ -14,6 +14,7 @@ use hil_rundir::pipe::{CountByName, CounterGroup, InletReport, ProcessReport};
 use hil_rundir::record::RecordSink;
 use hil_shm::{Domain, ShmInput, Waiter};
 
+use super::clear;
 use crate::process::recording::forwarded_ns;
 use crate::process::worker::{JobWork, WorkerError};
 
@@ -102,6 +103,11 @@ impl JobWork for Inward {
             core::hint::spin_loop();
         }
         Ok(())
+    }
+
+    fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
+        stepped?;
+        clear(self)
     }
 
     fn report(&mut self) -> ProcessReport {

@@ -24,11 +24,15 @@ use std::os::fd::AsFd as _;
 use self::inward::Inward;
 use self::outward::Outward;
 use self::program::Program;
-use crate::process::worker::{Counter, Job, Opened, WorkerError, open_domain, warn_of_spinning};
+use crate::process::worker::{
+    Counter, Job, JobWork, Opened, WorkerError, open_domain, warn_of_spinning,
+};
 use crate::supervisor::Child;
 
 /// Records a ring holds: half a second at 128,000 frames a second.
 const RING_RECORDS: usize = 65_536;
+/// Frames that are moved at the end at most: a program that does not end keeps sending.
+const CLEARING_MAX: usize = 65_536;
 
 /// Starts the program, which waits for the run, and opens the record files of its frames.
 ///
@@ -135,4 +139,14 @@ fn start(work: &CableWork) -> Result<(Child, Inlet), WorkerError> {
     // This process keeps no copy of the helper's end: the end of a helper is noticed.
     drop(helper);
     Ok((child, Inlet::take(here)?))
+}
+
+/// Moves what waits as a thread ends, so that only what came later is under way at the end of the run.
+fn clear(work: &mut impl JobWork) -> Result<(), WorkerError> {
+    for _ in 0..CLEARING_MAX {
+        if !work.step()? {
+            break;
+        }
+    }
+    Ok(())
 }

@@ -14,13 +14,11 @@ use hil_rundir::pipe::{CountByName, CounterGroup, InletReport, Orders, ProcessRe
 use hil_rundir::record::RecordSink;
 use hil_shm::{Domain, OutputSettings, ShmOutput};
 
+use super::clear;
 use crate::gateway::kernel_clock::KernelClock;
 use crate::gateway::poll_descriptors;
 use crate::process::recording::output_settings;
 use crate::process::worker::{JobWork, WorkerError};
-
-/// Frames that are taken at the end at most: a program that does not end keeps sending.
-const CLEARING_MAX: usize = 65_536;
 
 /// What is open before the thread begins.
 #[derive(Debug)]
@@ -134,12 +132,7 @@ impl JobWork for Outward {
 
     fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
         stepped?;
-        for _ in 0..CLEARING_MAX {
-            if !self.step()? {
-                break;
-            }
-        }
-        Ok(())
+        clear(self)
     }
 
     fn report(&mut self) -> ProcessReport {

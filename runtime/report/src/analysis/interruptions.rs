@@ -162,6 +162,7 @@ pub(super) fn at_end(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interru
     let consumer = consumer.and_then(|name| topology.process(name));
     if let Some(consumer) = consumer.filter(|one| !one.is_witnessed())
         && files.taken.is_some()
+        && !clears_at_end(records, consumer)
     {
         let host = &consumer.host;
         let forwarded = || {
@@ -180,6 +181,15 @@ pub(super) fn at_end(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interru
         });
     }
     found
+}
+
+/// True of a cable that ended in order: what waited for its program was given to it then, and what came after
+/// the end of the program was under way at the end of the run.
+fn clears_at_end(records: &RunRecords<'_>, process: &str) -> bool {
+    let has_cable = records.topology.process(process);
+    let has_cable = has_cable.is_some_and(|one| one.inside().is_some());
+    let mut ended = records.result.processes.iter();
+    has_cable && ended.any(|one| one.name == process && one.report.is_some())
 }
 
 struct Stall {

@@ -39,6 +39,7 @@ use metrics::{
 use outages::OutageHistory;
 use records::RunRecords;
 
+use crate::answer::HarmCount;
 use crate::event_log;
 use crate::summary::{ChannelFlows, CountByName, Fact, RunSummary, SummaryError};
 use crate::terminal;
@@ -173,6 +174,8 @@ pub fn conclude(
         None => (&[][..], Score::default()),
     };
     summary.put_score(&score);
+    let deadlines = summary.deadlines.iter().map(HarmCount::from);
+    summary.harms.extend(deadlines);
     summary.score_events = events::explained(
         &score,
         &records,

@@ -8,7 +8,7 @@ use super::data::{AnswerView, Run, RunKind, Tile, Verdict};
 use super::drawings;
 use super::read::{Found, Manifest, Material};
 use super::timeline;
-use crate::answer::{Answer, COUNTED_AS_HARM, Hurt};
+use crate::answer::{Answer, Hurt, counted_as_harm};
 use crate::assessment::Assessment;
 use crate::sections::{self, Sources, outcome_words};
 use crate::summary::{RunSummary, host_words};
@@ -181,7 +181,7 @@ fn draw(
 
 fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
     let answer = Answer::of(summary, assessment);
-    let rule = Field::new("counted as harm", COUNTED_AS_HARM);
+    let rule = counted_as_harm(summary).map(|words| Field::new("counted as harm", words));
     let plain = |text: String| text.replace(JOINT, " ");
     let (tone, words) = answer.measurement_words(&assessment.network);
     AnswerView {
@@ -205,7 +205,7 @@ fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
             .harms
             .iter()
             .map(|harm| Field::new(&harm.what, plain(harm.words())))
-            .chain((!summary.harms.is_empty()).then_some(rule))
+            .chain(rule)
             .collect(),
         links: summary
             .run

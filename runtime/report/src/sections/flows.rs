@@ -108,6 +108,7 @@ pub(crate) fn deadlines(summary: &RunSummary) -> Section {
             ("network", one.late_by_network_count),
             ("program", one.late_by_program_count),
             ("both", one.late_by_both_count),
+            ("harness", one.late_by_harness_count),
         ];
         let missing = [
             ("network", one.missing_by_network_count),
@@ -118,8 +119,8 @@ pub(crate) fn deadlines(summary: &RunSummary) -> Section {
             format!("{} within {limit}", one.name).into(),
             Cell::Count(one.request_count),
             Cell::Count(one.in_time_count),
-            by_cause(late).into(),
-            by_cause(missing).into(),
+            by_cause(&late).into(),
+            by_cause(&missing).into(),
             Cell::Count(one.unknown_count),
             Cell::duration(response.map(|one| one.p50_ns)),
             Cell::duration(response.map(|one| one.p99_ns)),
@@ -137,7 +138,7 @@ pub(crate) fn deadlines(summary: &RunSummary) -> Section {
 }
 
 /// `3 network, 1 program`.
-fn by_cause(counts: [(&str, u64); 3]) -> String {
+fn by_cause(counts: &[(&str, u64)]) -> String {
     let counts = counts.iter().filter(|(_, count)| *count > 0);
     let words: Vec<String> = counts
         .map(|(cause, count)| format!("{} {cause}", grouped(*count)))

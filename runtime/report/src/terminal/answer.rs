@@ -1,6 +1,6 @@
 //! The answer of a run as the last lines of a report, where a reader looks first. It draws no conclusions.
 
-use crate::answer::{Answer, COUNTED_AS_HARM, Hurt, metric_words};
+use crate::answer::{Answer, Hurt, counted_as_harm, metric_words};
 use crate::assessment::Assessment;
 use crate::sections::events::first_harm;
 use crate::summary::RunSummary;
@@ -36,9 +36,8 @@ pub(super) fn answer(canvas: &mut Canvas, summary: &RunSummary, assessment: &Ass
     for harm in &summary.harms {
         canvas.field_of(LABEL_WIDTH, &harm.what, Tone::Plain, &harm.words());
     }
-    if !summary.harms.is_empty() {
-        let label = "counted as harm";
-        canvas.field_of(LABEL_WIDTH, label, Tone::Plain, COUNTED_AS_HARM);
+    if let Some(words) = counted_as_harm(summary) {
+        canvas.field_of(LABEL_WIDTH, "counted as harm", Tone::Plain, words);
     }
     for name in &summary.headline {
         let metric = summary.score.iter().find(|one| one.name == *name);

@@ -1,5 +1,6 @@
 //! What a run answers, and the report that a run prints.
 
+use hil_account::flow::{DeadlineFold, DeadlineMetrics};
 use hil_core::case_study::Severity;
 
 use super::sample::{awkward, check_golden, empty, flow, full, link};
@@ -286,6 +287,46 @@ fn own_programs(link: LinkKind) -> RunSummary {
         channel.link = link;
     }
     summary
+}
+
+#[test]
+fn requests_that_the_network_made_late_or_lost_are_harm_and_others_are_not() {
+    let of = |late: [u64; 4], missing: [u64; 3]| {
+        let counts = DeadlineMetrics {
+            request_count: 500,
+            late_by_network_count: late[0],
+            late_by_both_count: late[1],
+            late_by_program_count: late[2],
+            late_by_harness_count: late[3],
+            missing_by_network_count: missing[0],
+            missing_by_program_count: missing[1],
+            missing_by_harness_count: missing[2],
+            ..DeadlineFold::new("command", 4_000_000).finish()
+        };
+        let mut summary = own_programs(LinkKind::Emulated);
+        summary.run.case.clear();
+        count_all(&mut summary);
+        summary.harms = vec![HarmCount::from(&counts)];
+        summary.deadlines = vec![counts];
+        (answer(&summary).hurt, brief(&summary, 100, Style::Plain))
+    };
+    let (hurt, page) = of([3, 2, 90, 7], [20, 8, 0]);
+    assert_eq!(hurt, Hurt::Yes);
+    for words in [
+        "Did the emulated link hurt the programs?  YES",
+        "command late or missing           25 of 500 requests of command: 5.00 %",
+        "these, which would have come in time but for the network",
+        "3 network, 90 program, 2 both",
+    ] {
+        assert!(page.contains(words), "{words}:\n{page}");
+    }
+    let (hurt, page) = of([0, 0, 90, 7], [0, 8, 0]);
+    assert_eq!(hurt, Hurt::No);
+    assert!(
+        page.contains("0 of 500 requests of command: 0.00 %"),
+        "{page}"
+    );
+    assert!(page.contains("NO in 500 requests of command"), "{page}");
 }
 
 #[test]
