@@ -74,10 +74,9 @@ fn comes_first(stream: &Stream, a: Sight<'_>, b: Sight<'_>, window_ns: i64) -> O
 /// True when `stream`, seen at `at`, was to be seen at the other point.
 fn is_expected(stream: &Stream, at: &Point, point: &Point, observer: &Observer) -> bool {
     // Out here, in there; into a host and out of it, or out of another whose capture has missed it.
-    let is_on_its_way = match (at.direction, point.direction) {
-        (Direction::Outbound, direction) => direction == Direction::Inbound,
-        (Direction::Inbound, direction) => direction != Direction::Unknown,
-        (Direction::Unknown, direction) => direction == Direction::Unknown,
+    let is_on_its_way = match at.direction {
+        Direction::Inbound => point.direction != Direction::Unknown,
+        Direction::Outbound | Direction::Unknown => point.direction != Direction::Outbound,
     };
     if at.place() == point.place() || !is_on_its_way {
         return false;
