@@ -575,7 +575,8 @@ fn doubts_text(doubts: &[CountedDoubt]) -> String {
             Doubt::Unread(Unread::NoStamp) => format!("{count} without a time stamp"),
             Doubt::Dropped => format!("{count} dropped by the capture"),
             Doubt::Apart => format!(
-                "{count} seen at both points farther apart than --window: a clock that was set, or                  clocks far apart"
+                "{count} seen at both points farther apart than --window: a clock that was set, or clocks \
+                 far apart"
             ),
             Doubt::Unwatched => format!(
                 "{count} seen at one point while the other was not watched, as far as its file tells"
