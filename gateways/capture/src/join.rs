@@ -230,6 +230,15 @@ pub struct Sight<'a> {
     pub seen: &'a Seen,
 }
 
+impl Sight<'_> {
+    /// Both points' stamps are of one host.
+    pub(super) fn is_of_host_of(&self, other: &Self) -> bool {
+        let (a, b) = (self.point, other.point);
+        let is_one_tap = a.interface_index == b.interface_index;
+        a.file_index == b.file_index && (is_one_tap || !self.watch.is_merged)
+    }
+}
+
 /// Which stamps of a point tell when it saw something.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reading {
@@ -322,7 +331,7 @@ pub fn join(
     if first.seen.is_empty() && second.seen.is_empty() && !(is_met(&a) && is_met(&b)) {
         return None;
     }
-    let is_one_clock = settings.is_one_clock || a.point.file_index == b.point.file_index;
+    let is_one_clock = settings.is_one_clock || a.is_of_host_of(&b);
     let (order, is_swapped) = ends(&first, &second, &matches, is_one_clock, round_trip);
     let matches = if is_swapped {
         core::mem::swap(&mut first, &mut second);

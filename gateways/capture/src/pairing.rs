@@ -44,7 +44,7 @@ pub fn join_all(observer: &Observer, settings: &JoinSettings) -> Vec<(Stream, Jo
                 let (a, b) = if at > index { (*a, *b) } else { (*b, *a) };
                 let round_trip = || comes_first(stream, a, b, settings.window_ns);
                 let is_two_clocks = !settings.is_one_clock
-                    && a.point.file_index != b.point.file_index
+                    && !a.is_of_host_of(&b)
                     && a.point.direction == Direction::Unknown;
                 let round_trip = is_two_clocks.then(round_trip).flatten();
                 let joined = join(stream, a, b, settings, round_trip);

@@ -27,6 +27,8 @@ pub(super) struct PcapngFile {
     order: Option<ByteOrder>,
     /// First of this section's interfaces.
     interface_base: usize,
+    /// This section was written by mergecap.
+    is_merged: bool,
     /// Where the next section begins, if this one says.
     section_end: Option<u64>,
 }
@@ -79,7 +81,7 @@ impl PcapngFile {
         let base = self.interface_base;
         let outcome = match kind {
             SECTION => return self.section(window, body, interfaces.len(), length),
-            INTERFACE => describe(body, interfaces, base).map(|()| None),
+            INTERFACE => describe(body, interfaces, base, self.is_merged).map(|()| None),
             ENHANCED_PACKET | OBSOLETE_PACKET | SIMPLE_PACKET => {
                 packet(kind, body, interfaces, base).map(Some)
             }
@@ -111,6 +113,12 @@ impl PcapngFile {
             return self.lost(window, problem);
         };
         self.interface_base = interface_count;
+        self.is_merged = false;
+        // Of options that are broken, those before the fault; the section can be read all the same.
+        let _passed_over = body.options(16, |code, value| {
+            self.is_merged |= code == 4 && value.starts_with(b"Mergecap");
+            Ok(())
+        });
         // A negative length is one that the writer did not know.
         let is_known = section_bytes.cast_signed() >= 0;
         let end = window.offset.checked_add(length).filter(|_| is_known);
@@ -168,6 +176,7 @@ fn describe(
     body: Numbers<'_>,
     interfaces: &mut Vec<CaptureInterface>,
     base: usize,
+    is_merged: bool,
 ) -> Result<(), Problem> {
     const SHORT: Problem = Problem::Malformed("an interface block shorter than 8 bytes");
     let link_type = body.u16(0).ok_or(SHORT)?;
@@ -179,6 +188,7 @@ fn describe(
         link_type,
         snap_bytes,
         unit_ns: (1000, 1),
+        is_merged,
         ..CaptureInterface::default()
     };
     let outcome = body.options(8, |code, value| {

@@ -119,6 +119,8 @@ pub struct Watch {
     cut: BTreeMap<(usize, SocketAddr, SocketAddr, Unread), u64>,
     /// Frames that it did not keep, as its file says.
     pub dropped_count: u64,
+    /// See [`CaptureInterface::is_merged`].
+    pub is_merged: bool,
     /// The file says when it was watched.
     is_stated: bool,
 }
@@ -265,6 +267,7 @@ impl Watch {
         let levels = || sound.iter().map(|index| self.levels[*index]);
         let stamps = hull(levels().map(|level| (level, 0)));
         let steady = hull(levels().map(|level| (level, level.shift_ns.unwrap_or(0))));
+        self.is_merged = interface.is_some_and(|one| one.is_merged);
         let stated = interface.and_then(|one| stated(one, stamps));
         self.is_stated = stated.is_some();
         let widen = |span: Option<Span>| match (span, stated) {

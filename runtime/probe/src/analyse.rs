@@ -237,7 +237,10 @@ impl Report {
         }
         let joins = reading.joined(settings).into_iter();
         let clocks = |one: &Joined| {
-            PointClocks::of(&one.first_point, &one.second_point, settings.is_one_clock)
+            let (first, second) = (&one.first_point, &one.second_point);
+            let mut interfaces = reading.files[first.file_index].interfaces.iter();
+            let is_merged = interfaces.any(|one| one.is_merged);
+            PointClocks::of(first, second, is_merged, settings.is_one_clock)
         };
         Self {
             schema_version: 2,

@@ -362,17 +362,63 @@ fn what_packet_blocks_tell_of_drops_and_what_cannot_be_read_of_them_makes_loss_u
 }
 
 #[test]
+fn interfaces_of_a_merged_file_share_no_clock() {
+    // The second interface's clock is 3 ms behind, and number 20 is lost before it.
+    let mut blocks = vec![(1, vec![1, 0, 0, 0, 0, 0, 0, 0])];
+    for n in 0..100 {
+        blocks.push((6, enhanced(0, n, &[])));
+        if n != 20 {
+            let mut early = enhanced(1, n, &[]);
+            let low = u32::from_le_bytes([early[8], early[9], early[10], early[11]]);
+            early[8..12].copy_from_slice(&(low - 2000).to_le_bytes());
+            blocks.push((6, early));
+        }
+    }
+    let file = pcapng(&blocks);
+    // The section says by option 4 who wrote it.
+    let merged = {
+        let option = [&[4, 0, 8, 0][..], b"Mergecap", &[0; 4]].concat();
+        let mut merged = file.clone();
+        merged.splice(24..24, option);
+        for at in [4, 40] {
+            merged[at] = 44;
+        }
+        merged
+    };
+    for (file, order, lost) in [
+        (&file, OrderSource::Stamps, 0),
+        (&merged, OrderSource::Missing, 1),
+    ] {
+        let mut observer = Observer::new(&["udp:dport=5004,id=0+4".parse().unwrap()]);
+        take(&mut observer, 0, file);
+        let settings = JoinSettings {
+            window_ns: WINDOW_NS,
+            is_one_clock: false,
+        };
+        let (_, joined) = &join_all(&observer, &settings)[0];
+        let told = (joined.figures.order, joined.figures.loss.count());
+        assert_eq!(told, (order, Some(lost)), "{joined:#?}");
+    }
+}
+
+#[test]
 fn a_datagram_on_two_links_of_one_host_is_no_duplicate() {
     let sent_us = |n: u32| BEGIN_US + 100_000 * i64::from(n) + 1000;
     // A cooked capture of a bridge that names no interface; and a mirrored port, on both sides of a router.
-    let cooked = |n: u32, _| [&[0; 14][..], &datagram(n, 32)[12..]].concat();
+    let cooked = |n: u32| [&[0; 14][..], &datagram(n, 32)[12..]].concat();
     let mirrored = |n: u32, side: u8| {
         let mut frame = datagram(n, 32);
         frame[5] = side;
         frame
     };
-    let copies: [(u8, &dyn Fn(u32, u8) -> Vec<u8>); 2] = [(113, &cooked), (1, &mirrored)];
-    for (link_type, copy) in copies {
+    for link_type in [113, 1] {
+        let copy = |n, side| {
+            if link_type == 113 {
+                cooked(n)
+            } else {
+                mirrored(n, side)
+            }
+        };
         let packets = (0..100)
             .filter(|n| *n != 20)
             .flat_map(|n| [(sent_us(n), copy(n, 1)), (sent_us(n) + 5, copy(n, 2))]);
