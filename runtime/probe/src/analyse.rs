@@ -239,8 +239,14 @@ impl Report {
         let clocks = |one: &Joined| {
             let (first, second) = (&one.first_point, &one.second_point);
             let mut interfaces = reading.files[first.file_index].interfaces.iter();
-            let is_merged = interfaces.any(|one| one.is_merged);
-            PointClocks::of(first, second, is_merged, settings.is_one_clock)
+            let is_apart = first.tap() != second.tap() && interfaces.any(|one| one.is_merged);
+            match PointClocks::of(first, second, settings.is_one_clock) {
+                PointClocks::OneFile if is_apart && settings.is_one_clock => {
+                    PointClocks::DeclaredOne
+                }
+                PointClocks::OneFile if is_apart => PointClocks::Unknown,
+                found => found,
+            }
         };
         Self {
             schema_version: 2,

@@ -20,16 +20,9 @@ pub(super) enum PointClocks {
 }
 
 impl PointClocks {
-    /// `is_merged`: the file of the points was put together from several.
-    pub(super) fn of(
-        first: &Point,
-        second: &Point,
-        is_merged: bool,
-        is_declared_one: bool,
-    ) -> Self {
+    pub(super) fn of(first: &Point, second: &Point, is_declared_one: bool) -> Self {
         let is_same_kind = first.esl_port.is_some() == second.esl_port.is_some();
-        let is_one_host = !is_merged || first.tap() == second.tap();
-        if first.file_index == second.file_index && is_same_kind && is_one_host {
+        if first.file_index == second.file_index && is_same_kind {
             Self::OneFile
         } else if is_declared_one {
             Self::DeclaredOne
@@ -106,7 +99,7 @@ mod tests {
             file_index,
             ..Point::default()
         };
-        let of = |second, is_one| PointClocks::of(&point(0), &point(second), false, is_one);
+        let of = |second, is_one| PointClocks::of(&point(0), &point(second), is_one);
         assert_eq!(of(0, false), PointClocks::OneFile);
         assert_eq!(of(1, false), PointClocks::Unknown);
         assert_eq!(of(1, true), PointClocks::DeclaredOne);
@@ -114,15 +107,8 @@ mod tests {
             esl_port: Some(1),
             ..point(0)
         };
-        let mixed = PointClocks::of(&point(0), &of_device, false, false);
+        let mixed = PointClocks::of(&point(0), &of_device, false);
         assert_eq!(mixed, PointClocks::Unknown);
-        let other = Point {
-            interface_index: 1,
-            ..point(0)
-        };
-        let merged = |other| PointClocks::of(&point(0), other, true, false);
-        assert_eq!(merged(&other), PointClocks::Unknown);
-        assert_eq!(merged(&point(0)), PointClocks::OneFile);
         assert_eq!(of(1, false).bound_ns(), None);
         assert_eq!(of(1, true).bound_ns(), Some(0));
     }
