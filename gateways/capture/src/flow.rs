@@ -230,6 +230,8 @@ pub struct OwnHeader {
 pub enum Unidentified {
     /// The capture cut it off before its identity ended.
     CutShort,
+    /// Only its first fragment is known, and its identity is all of it.
+    Fragmented,
     /// It is not of the protocol.
     Foreign,
 }
@@ -335,6 +337,9 @@ fn whole(
     datagram: &UdpDatagram<'_>,
     count: impl FnOnce(&[u8]) -> Result<Option<u32>, Unidentified>,
 ) -> Result<DatagramIdentity, Unidentified> {
+    if datagram.is_fragmented {
+        return Err(Unidentified::Fragmented);
+    }
     if datagram.is_cut_short() {
         return Err(Unidentified::CutShort);
     }

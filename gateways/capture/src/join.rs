@@ -71,6 +71,10 @@ pub enum Doubt {
     Dropped,
     /// Which point comes first is unknown.
     Order,
+    /// Seen at both points, farther apart than [`JoinSettings::window_ns`].
+    Apart,
+    /// Seen at one point while nothing tells that the other was watched, and none was seen at both.
+    Unwatched,
 }
 
 /// A doubt, and how many frames or datagrams it is of.
@@ -197,10 +201,8 @@ impl Pair {
     }
 
     /// One point saw several datagrams in one.
-    fn is_aggregate(&self) -> bool {
-        let (first, second) = (&self.first, &self.second);
-        let largest = first.packet_bytes.max(second.packet_bytes);
-        first.payload_bytes != second.payload_bytes && largest > PACKET_BYTES_MAX
+    const fn is_aggregate(&self) -> bool {
+        self.first.payload_bytes != self.second.payload_bytes
     }
 }
 
@@ -226,6 +228,15 @@ pub struct Sight<'a> {
     pub watch: &'a Watch,
     /// What it saw.
     pub seen: &'a Seen,
+}
+
+impl Sight<'_> {
+    /// Both points' stamps are of one host.
+    pub(super) fn is_of_host_of(&self, other: &Self) -> bool {
+        let (a, b) = (self.point, other.point);
+        let is_one_tap = a.interface_index == b.interface_index;
+        a.file_index == b.file_index && (is_one_tap || !self.watch.is_merged)
+    }
 }
 
 /// Which stamps of a point tell when it saw something.
@@ -263,9 +274,6 @@ impl<'a> Side<'a> {
     /// In the readings that its stamps allow.
     fn each(stream: &Stream, sight: Sight<'a>) -> Vec<Self> {
         let list = sight.seen.get(stream).cloned().unwrap_or_default();
-        if list.is_empty() && sight.watch.spans.is_empty() {
-            return Vec::new();
-        }
         let anchors = sight.watch.anchors_ns.iter();
         let steady = anchors.map(|anchor_ns| Reading::Steady {
             anchor_ns: *anchor_ns,
@@ -305,8 +313,7 @@ impl<'a> Side<'a> {
     }
 }
 
-/// Joins what two points saw of `stream`; `None` when neither saw anything of it, or one did not and
-/// nothing tells that it was watched. `round_trip` is what datagrams the other way tell of the order: true
+/// Joins what two points saw of `stream`; `None` when neither saw anything of it. `round_trip` is what datagrams the other way tell of the order: true
 /// when `b` comes first.
 ///
 /// A point that was watched and saw nothing has lost everything. Whether the stream should have come
@@ -319,10 +326,12 @@ pub fn join(
     round_trip: Option<bool>,
 ) -> Option<Joined> {
     let (mut first, mut second, matches) = best_reading(stream, a, b, settings.window_ns)?;
-    if first.seen.is_empty() && second.seen.is_empty() {
+    // What is not known again was seen all the same.
+    let is_met = |sight: &Sight<'_>| sight.seen.contains_key(stream);
+    if first.seen.is_empty() && second.seen.is_empty() && !(is_met(&a) && is_met(&b)) {
         return None;
     }
-    let is_one_clock = settings.is_one_clock || a.point.file_index == b.point.file_index;
+    let is_one_clock = settings.is_one_clock || a.is_of_host_of(&b);
     let (order, is_swapped) = ends(&first, &second, &matches, is_one_clock, round_trip);
     let matches = if is_swapped {
         core::mem::swap(&mut first, &mut second);
@@ -362,6 +371,7 @@ fn best_reading<'a>(
             let spread = delays().max().zip(delays().min());
             let fit = Fit {
                 matched_count: matches.pairs.len(),
+                reordered_count: Reverse(matches.reordered_count(second)),
                 spread_ns: Reverse(spread.map_or(0, |(most, least)| most.abs_diff(least))),
             };
             if best.as_ref().is_none_or(|(known, _)| fit > *known) {
@@ -376,6 +386,8 @@ fn best_reading<'a>(
 #[derive(PartialEq, Eq, PartialOrd, Ord)]
 struct Fit {
     matched_count: usize,
+    /// A clock that was set mixes what came before it with what came after it.
+    reordered_count: Reverse<usize>,
     /// Of the delays, from the smallest to the largest.
     spread_ns: Reverse<u64>,
 }
@@ -451,6 +463,8 @@ struct Matches {
     only_first: Vec<usize>,
     only_second: Vec<usize>,
     duplicates: Vec<usize>,
+    /// Of those seen at one point only, what has its like at the other, beyond the window.
+    apart_count: usize,
 }
 
 impl Matches {
@@ -466,6 +480,7 @@ impl Matches {
         }
         let mut matches = Self::default();
         for (from, to) in by_key.values() {
+            let before = (matches.only_first.len(), matches.only_second.len());
             let (mut i, mut j, mut newest_match) = (0, 0, None);
             while j < to.len() {
                 let arrival_ns = second.at_ns[to[j]];
@@ -489,10 +504,29 @@ impl Matches {
                 j += 1;
             }
             matches.only_first.extend(&from[i..]);
+            let alone = matches.only_first.len() - before.0;
+            matches.apart_count += alone.min(matches.only_second.len() - before.1);
         }
         matches.pairs.sort_unstable();
         matches.only_first.sort_unstable();
         matches
+    }
+
+    /// Positions of departure in the order of arrival.
+    fn arrivals(&self, second: &Side<'_>) -> Vec<usize> {
+        let mut arrivals: Vec<usize> = (0..self.pairs.len()).collect();
+        arrivals.sort_by_key(|departure| second.at_ns[self.pairs[*departure].1]);
+        arrivals
+    }
+
+    fn reordered_count(&self, second: &Side<'_>) -> usize {
+        let mut latest = 0;
+        let arrivals = self.arrivals(second).into_iter();
+        let late = arrivals.filter(|departure| {
+            latest = latest.max(*departure);
+            *departure < latest
+        });
+        late.count()
     }
 }
 
@@ -582,7 +616,8 @@ fn median(values: &[i64]) -> i64 {
 fn doubts(
     stream: &Stream,
     order: OrderSource,
-    second: &Side<'_>,
+    [first, second]: [&Side<'_>; 2],
+    matches: &Matches,
     pairs: &[Pair],
     alone: [&[Observation]; 2],
 ) -> Vec<CountedDoubt> {
@@ -597,10 +632,18 @@ fn doubts(
     let whole = pairs.iter().filter(|pair| !pair.is_aggregate());
     let whole = whole.map(|pair| pair.first.packet_bytes).max();
     let whole_bytes_max = whole.unwrap_or(0).max(PACKET_BYTES_MAX);
-    let is_large = |one: &&Observation| one.packet_bytes > whole_bytes_max;
     let alone_count: usize = alone.iter().map(|list| list.len()).sum();
-    let large_count: usize = alone
-        .map(|list| list.iter().filter(is_large).count())
+    // Where each point lacks some of the other, one larger than all of the other may be several of them.
+    let is_either_short = alone.iter().all(|list| !list.is_empty());
+    let large_count: usize = [(alone[0], second), (alone[1], first)]
+        .map(|(list, other)| {
+            let largest = other.seen.iter().map(|one| one.payload_bytes).max();
+            let is_large = |one: &&Observation| {
+                one.packet_bytes > whole_bytes_max
+                    || is_either_short && Some(one.payload_bytes) > largest
+            };
+            list.iter().filter(is_large).count()
+        })
         .iter()
         .sum();
     let aggregates = pairs.iter().filter(|pair| pair.is_aggregate()).count();
@@ -608,8 +651,16 @@ fn doubts(
     if alone_count > 0 && order == OrderSource::Unknown {
         add(Doubt::Order, alone_count);
     }
-    if !alone[0].is_empty() {
-        let watch = second.sight.watch;
+    add(Doubt::Apart, matches.apart_count);
+    let is_judged = !pairs.is_empty() || !alone[0].is_empty();
+    let mut blind: Vec<&Side<'_>> = Vec::new();
+    if !is_judged {
+        blind.push(first);
+    }
+    if !is_judged || !alone[0].is_empty() {
+        blind.push(second);
+    }
+    for watch in blind.iter().map(|side| side.sight.watch) {
         let (source, destination) = (stream.source, stream.destination);
         for (why, count) in watch.unread_of(stream.flow_index, source, destination) {
             add(
@@ -619,6 +670,11 @@ fn doubts(
         }
         let dropped = usize::try_from(watch.dropped_count);
         add(Doubt::Dropped, dropped.unwrap_or(usize::MAX));
+    }
+    if !is_judged && doubts.is_empty() {
+        let count = (matches.only_first.len() + matches.only_second.len()) as u64;
+        let doubt = Doubt::Unwatched;
+        doubts.push(CountedDoubt { doubt, count });
     }
     doubts
 }
@@ -639,10 +695,13 @@ fn loss(lost: &[usize], matches: &Matches, doubts: Vec<CountedDoubt>) -> Loss {
             bursts: bursts(lost),
         });
     }
-    let is_bounded =
-        |one: &CountedDoubt| !matches!(one.doubt, Doubt::Order | Doubt::Unread(Unread::Aggregate));
+    let is_bounded = |one: &CountedDoubt| match one.doubt {
+        Doubt::Unread(why) => why != Unread::Aggregate,
+        Doubt::Dropped => true,
+        Doubt::Order | Doubt::Apart | Doubt::Unwatched => false,
+    };
     let unseen_count: u64 = doubts.iter().map(|one| one.count).sum();
-    let range = doubts.iter().all(is_bounded);
+    let range = count > 0 && doubts.iter().all(is_bounded);
     Loss::Unavailable {
         range: range.then(|| (count.saturating_sub(unseen_count), count)),
         doubts,
@@ -680,14 +739,13 @@ fn metrics(
         observations(first, &lost),
         observations(second, &unexplained),
     ];
-    let doubts = doubts(stream, order, second, pairs, [&alone[0], &alone[1]]);
+    let alone = [&alone[0][..], &alone[1]];
+    let doubts = doubts(stream, order, [first, second], matches, pairs, alone);
     let only_count = matches.only_first.len() + matches.only_second.len();
     let matched_count = pairs.len() as u64;
     let clock_steps = [first.steps(), second.steps()];
     let is_set = clock_steps.iter().any(|steps| !steps.is_empty());
-    // Positions of departure in the order of arrival.
-    let mut arrivals: Vec<usize> = (0..pairs.len()).collect();
-    arrivals.sort_by_key(|departure| second.at_ns[matches.pairs[*departure].1]);
+    let arrivals = matches.arrivals(second);
     let (late, _) = reordered(arrivals.iter().map(|departure| *departure as u64));
     let reordered_count = late.len() as u64;
     // Where a clock was set, no delay is known.

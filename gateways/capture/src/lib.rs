@@ -72,6 +72,8 @@ pub struct CaptureInterface {
     pub watch: [Option<Span>; 2],
     /// The interface of an earlier section that this one describes again: rotated or joined files.
     pub repeats: Option<usize>,
+    /// Its file was put together from several, maybe of several hosts: it shares no clock with the others.
+    pub is_merged: bool,
     /// Packets it says it received.
     pub received_count: Option<u64>,
     /// Packets it says were dropped for want of room, by the system or by the interface.

@@ -1,6 +1,6 @@
 //! From a captured frame to the UDP datagram in it. Link layers: Ethernet, Linux cooked captures, BSD
 //! loopback, PPP, 802.11 with or without radiotap, and bare IP; on top of them VLAN tags, `PPPoE`, MPLS
-//! and LLC/SNAP; IPv4 with options, IPv6 with extension headers. Fragments are told apart, not put
+//! and LLC/SNAP; IPv4 with options, IPv6 with extension headers, IP and Ethernet within IP. Fragments are told apart, not put
 //! together; checksums are not checked, since a capture on the sending host sees them unfinished. A
 //! length of 0 in an IP or UDP header (segmentation offload, jumbograms) means: up to the frame's end.
 
@@ -11,6 +11,18 @@ use super::watch::Unread;
 use hil_net::{Direction, link_type};
 
 const UDP: u8 = 17;
+/// IP within IP (RFC 2003, RFC 4213), generic routing encapsulation (RFC 2784), encrypted (RFC 4303) and
+/// authenticated payload (RFC 4302).
+const IPV4_INSIDE: u8 = 4;
+const IPV6_INSIDE: u8 = 41;
+const GRE: u8 = 47;
+const ESP: u8 = 50;
+const AUTHENTICATION: u8 = 51;
+
+/// Behind an IP header with this protocol a UDP datagram may lie.
+const fn may_hold_udp(protocol: u8) -> bool {
+    matches!(protocol, UDP | IPV4_INSIDE | IPV6_INSIDE | GRE | ESP)
+}
 const UDP_HEADER_BYTES: usize = 8;
 /// Headers that are followed before a frame counts as malformed.
 const NESTING_MAX: usize = 8;
@@ -23,8 +35,12 @@ pub struct FramePlace {
     pub direction: Direction,
     /// Number of the interface: a capture on `any` (SLL2).
     pub interface_number: Option<u32>,
-    /// Innermost VLAN, 0..=4095.
-    pub vlan: Option<u16>,
+    /// Outer and innermost VLAN, 1..=4095; 0 for none (number 0 is a priority without a VLAN).
+    pub vlans: [u16; 2],
+    /// For which station of the link it is: of Ethernet.
+    pub station: [u8; 6],
+    /// A cooked capture that may be of several interfaces and does not say which.
+    pub is_of_any: bool,
     /// Leg of an 802.11 frame: to the access point, from it, or neither (`ToDS`, `FromDS`).
     pub radio_leg: Option<(bool, bool)>,
 }
@@ -85,9 +101,11 @@ const ENCRYPTED: NoDatagram = NoDatagram::Unread(Unread::Encrypted);
 enum Layer {
     /// What an `EtherType` says, or below 0x0600 the length of an LLC frame.
     EtherType(u16),
+    Ethernet,
     Llc,
     Ppp,
     Mpls,
+    Gre,
     Ip,
 }
 
@@ -121,10 +139,15 @@ pub fn udp_datagram(
     for _ in 0..NESTING_MAX {
         layer = match layer {
             Layer::EtherType(kind) => walk.ether_type(kind)?,
+            Layer::Ethernet => walk.ethernet()?,
             Layer::Llc => walk.llc()?,
             Layer::Ppp => walk.ppp()?,
             Layer::Mpls => walk.mpls()?,
-            Layer::Ip => return walk.udp(),
+            Layer::Gre => walk.gre()?,
+            Layer::Ip => match walk.ip()? {
+                Inside::Layer(layer) => layer,
+                Inside::Datagram(datagram) => return Ok(datagram),
+            },
         };
     }
     Err(MALFORMED)
@@ -155,8 +178,12 @@ impl<'a> Walk<'a> {
 
     fn link(&mut self, link: u16) -> Result<Layer, NoDatagram> {
         let (layer, length) = match link {
-            link_type::ETHERNET => (Layer::EtherType(self.word(12)?), 14),
+            link_type::ETHERNET => {
+                self.place.station = self.peek(0)?;
+                (Layer::Ethernet, 0)
+            }
             link_type::LINUX_SLL => {
+                self.place.is_of_any = true;
                 self.place.direction = cooked_direction(self.word(0)?);
                 (Layer::EtherType(self.word(14)?), 16)
             }
@@ -168,8 +195,8 @@ impl<'a> Walk<'a> {
             link_type::NULL | link_type::LOOP => {
                 let family: [u8; 4] = self.peek(0)?;
                 let family = u32::from_le_bytes(family).min(u32::from_be_bytes(family));
-                // IPv4, and IPv6 of Linux, NetBSD, FreeBSD and macOS.
-                if !matches!(family, 2 | 10 | 24 | 28 | 30) {
+                // IPv4, and IPv6 of Linux, Windows, NetBSD, FreeBSD and macOS.
+                if !matches!(family, 2 | 10 | 23 | 24 | 28 | 30) {
                     return Err(NotIp);
                 }
                 (Layer::Ip, 4)
@@ -177,10 +204,10 @@ impl<'a> Walk<'a> {
             link_type::PPP | link_type::PPP_SERIAL => (Layer::Ppp, 0),
             link_type::PPP_ETHER => (Layer::Ppp, 6),
             link_type::RADIOTAP => {
-                self.radiotap()?;
-                return self.radio();
+                let is_padded = self.radiotap()?;
+                return self.radio(is_padded);
             }
-            link_type::IEEE802_11 => return self.radio(),
+            link_type::IEEE802_11 => return self.radio(false),
             link_type::RAW
             | link_type::RAW_12
             | link_type::RAW_14
@@ -197,8 +224,11 @@ impl<'a> Walk<'a> {
             // IPv4, IPv6.
             0x0800 | 0x86dd => Layer::Ip,
             // VLAN tags.
-            0x8100 | 0x88a8 | 0x9100 => {
-                self.place.vlan = Some(self.word(0)? & 0x0fff);
+            0x8100 | 0x88a8 | 0x9100 | 0x9200 | 0x9300 => {
+                let vlan = self.word(0)? & 0x0fff;
+                if vlan != 0 {
+                    self.place.vlans = [self.place.vlans[1], vlan];
+                }
                 let inner = self.word(2)?;
                 self.at += 4;
                 Layer::EtherType(inner)
@@ -214,6 +244,23 @@ impl<'a> Walk<'a> {
             // LLC: by a length, or as Linux cooked captures number it.
             0x0000..=0x05dc => Layer::Llc,
             _ => return Err(NotIp),
+        })
+    }
+
+    fn ethernet(&mut self) -> Result<Layer, NoDatagram> {
+        let kind = self.word(12)?;
+        self.at += 14;
+        Ok(Layer::EtherType(kind))
+    }
+
+    /// Without its optional fields (RFC 2784, RFC 2890).
+    fn gre(&mut self) -> Result<Layer, NoDatagram> {
+        let (flags, kind) = (self.word(0)?, self.word(2)?);
+        let optional = [0x8000, 0x2000, 0x1000].map(|bit| usize::from(flags & bit != 0));
+        self.at += 4 + 4 * optional.iter().sum::<usize>();
+        Ok(match kind {
+            0x6558 => Layer::Ethernet,
+            kind => Layer::EtherType(kind.max(0x0600)),
         })
     }
 
@@ -261,12 +308,18 @@ impl<'a> Walk<'a> {
         self.at += 4;
         match self.byte(0)? >> 4 {
             4 | 6 => Ok(Layer::Ip),
+            // The control word of an Ethernet pseudowire (RFC 4448).
+            0 => {
+                self.at += 4;
+                Ok(Layer::Ethernet)
+            }
             _ => Err(NotIp),
         }
     }
 
-    /// Passes the radiotap header; its flags tell of frames whose check sequence is wrong.
-    fn radiotap(&mut self) -> Result<(), NoDatagram> {
+    /// Passes the radiotap header; its flags tell of frames whose check sequence is wrong, and whether the
+    /// 802.11 header is padded to a multiple of four bytes.
+    fn radiotap(&mut self) -> Result<bool, NoDatagram> {
         let fixed: [u8; 8] = self.peek(0)?;
         let mut flags_at = 8;
         let mut present = u32::from_le_bytes([fixed[4], fixed[5], fixed[6], fixed[7]]);
@@ -278,13 +331,22 @@ impl<'a> Walk<'a> {
         if first & 1 != 0 {
             flags_at = flags_at.next_multiple_of(8) + 8;
         }
-        let is_damaged = first & 2 != 0 && self.byte(flags_at)? & 0x40 != 0;
+        let flags = if first & 2 == 0 {
+            0
+        } else {
+            self.byte(flags_at)?
+        };
         self.at += usize::from(u16::from_le_bytes([fixed[2], fixed[3]]));
-        if is_damaged { Err(MALFORMED) } else { Ok(()) }
+        if flags & 0x40 != 0 {
+            Err(MALFORMED)
+        } else {
+            Ok(flags & 0x20 != 0)
+        }
     }
 
     /// A data frame of 802.11 (IEEE 802.11-2020, section 9.3.2).
-    fn radio(&mut self) -> Result<Layer, NoDatagram> {
+    fn radio(&mut self, is_padded: bool) -> Result<Layer, NoDatagram> {
+        let begin = self.at;
         let [control, flags] = self.peek(0)?;
         let is_data = control & 0x0c == 0x08;
         if !is_data || control & 0x40 != 0 {
@@ -308,10 +370,13 @@ impl<'a> Walk<'a> {
                 return Err(NoDatagram::Unread(Unread::Aggregate));
             }
         }
+        if is_padded {
+            self.at = begin + (self.at - begin).next_multiple_of(4);
+        }
         Ok(Layer::Llc)
     }
 
-    fn udp(&self) -> Result<UdpDatagram<'a>, NoDatagram> {
+    fn ip(&mut self) -> Result<Inside<'a>, NoDatagram> {
         let packet = self.frame.get(self.at..).unwrap_or_default();
         let original_bytes = self.original_bytes.saturating_sub(self.at);
         let is_cut = packet.len() < original_bytes;
@@ -327,6 +392,16 @@ impl<'a> Walk<'a> {
             other => other,
         };
         let network = network.map_err(short)?;
+        let layer = match network.protocol {
+            IPV4_INSIDE | IPV6_INSIDE => Some(Layer::Ip),
+            GRE => Some(Layer::Gre),
+            ESP => return Err(ENCRYPTED),
+            _ => None,
+        };
+        if let Some(layer) = layer {
+            self.at += network.header_bytes;
+            return Ok(Inside::Layer(layer));
+        }
         let header: [u8; 8] = array_at(network.segment, 0).ok_or_else(|| short(CUT_SHORT))?;
         let word = |at: usize| u16::from_be_bytes([header[at], header[at + 1]]);
         let length_bytes = match usize::from(word(4)) {
@@ -338,7 +413,7 @@ impl<'a> Walk<'a> {
             return Err(MALFORMED);
         }
         let end = length_bytes.min(network.segment.len());
-        Ok(UdpDatagram {
+        Ok(Inside::Datagram(UdpDatagram {
             source: SocketAddr::new(network.source, word(0)),
             destination: SocketAddr::new(network.destination, word(2)),
             dscp: network.dscp,
@@ -349,8 +424,14 @@ impl<'a> Walk<'a> {
             payload_bytes: length_bytes - UDP_HEADER_BYTES,
             payload: &network.segment[UDP_HEADER_BYTES..end],
             is_fragmented: network.is_fragmented,
-        })
+        }))
     }
+}
+
+/// What is in an IP packet.
+enum Inside<'a> {
+    Layer(Layer),
+    Datagram(UdpDatagram<'a>),
 }
 
 /// By the packet type of a cooked capture: 4 is sent by this host, all else came in.
@@ -362,15 +443,16 @@ const fn cooked_direction(packet_type: u16) -> Direction {
     }
 }
 
-/// What the IP layer tells of the UDP part behind it.
+/// What the IP layer tells of what is behind it.
 struct Network<'a> {
+    protocol: u8,
     source: IpAddr,
     destination: IpAddr,
     dscp: u8,
     hop_limit: u8,
     /// Bytes before `segment`.
     header_bytes: usize,
-    /// The UDP header and payload, without what pads the frame.
+    /// What is behind its headers, without what pads the frame.
     segment: &'a [u8],
     /// Bytes of `segment` on the wire.
     segment_bytes: usize,
@@ -392,22 +474,29 @@ fn ipv4(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
     if header_bytes < 20 || total_bytes < header_bytes {
         return Err(MALFORMED);
     }
-    if fixed[9] != UDP {
+    let fragment = u16::from_be_bytes([fixed[6], fixed[7]]);
+    let is_later = fragment & 0x1fff != 0;
+    let (mut protocol, mut at) = (fixed[9], header_bytes);
+    if protocol == AUTHENTICATION && !is_later {
+        let [next, words] = array_at(packet, at).ok_or(CUT_SHORT)?;
+        (protocol, at) = (next, at + 4 * (usize::from(words) + 2));
+    }
+    if !may_hold_udp(protocol) {
         return Err(NotUdp);
     }
-    let fragment = u16::from_be_bytes([fixed[6], fixed[7]]);
-    if fragment & 0x1fff != 0 {
+    if is_later {
         return Err(LaterFragment);
     }
     let end = total_bytes.min(packet.len());
     Ok(Network {
+        protocol,
         source: part::<4>(&fixed, 12).into(),
         destination: part::<4>(&fixed, 16).into(),
         dscp: fixed[1] >> 2,
         hop_limit: fixed[8],
-        header_bytes,
-        segment: packet.get(header_bytes..end).ok_or(CUT_SHORT)?,
-        segment_bytes: total_bytes - header_bytes,
+        header_bytes: at,
+        segment: packet.get(at..end).ok_or(CUT_SHORT)?,
+        segment_bytes: total_bytes.checked_sub(at).ok_or(MALFORMED)?,
         is_fragmented: fragment & 0x2000 != 0,
     })
 }
@@ -421,9 +510,10 @@ fn ipv6(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
     let traffic_class = (fixed[0] & 0x0f) << 4 | fixed[1] >> 4;
     let (mut next, mut at, mut is_fragmented) = (fixed[6], 40, false);
     for _ in 0..NESTING_MAX {
-        if next == UDP {
+        if may_hold_udp(next) {
             let end = total_bytes.min(packet.len());
             return Ok(Network {
+                protocol: next,
                 source: part::<16>(&fixed, 8).into(),
                 destination: part::<16>(&fixed, 24).into(),
                 dscp: traffic_class >> 2,
@@ -434,7 +524,7 @@ fn ipv6(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
                 is_fragmented,
             });
         }
-        if !matches!(next, 0 | 43 | 44 | 60) {
+        if !matches!(next, 0 | 43 | 44 | AUTHENTICATION | 60) {
             return Err(NotUdp);
         }
         let header: [u8; 8] = array_at(packet, at).ok_or(CUT_SHORT)?;
@@ -445,6 +535,8 @@ fn ipv6(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
                 return Err(LaterFragment);
             }
             is_fragmented |= field & 1 != 0;
+        } else if next == AUTHENTICATION {
+            at += 4 * usize::from(header[1]);
         } else {
             at += 8 * usize::from(header[1]);
         }

@@ -17,7 +17,7 @@ use super::{CaptureInterface, CapturedPacket, esl};
 use hil_net::{Direction, link_type};
 
 /// A place where datagrams were seen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct Point {
     /// Which file.
     pub file_index: usize,
@@ -27,8 +27,8 @@ pub struct Point {
     pub esl_port: Option<u8>,
     /// Which interface of the host, where one capture is of several.
     pub interface_number: Option<u32>,
-    /// In which VLAN, 1..=4095.
-    pub vlan: Option<u16>,
+    /// In which outer and innermost VLAN, 1..=4095; 0 for none.
+    pub vlans: [u16; 2],
     /// Which leg over an access point (`ToDS`, `FromDS`).
     pub radio_leg: Option<(bool, bool)>,
     /// Which way.
@@ -50,8 +50,7 @@ impl Point {
             self.direction = place.direction;
         }
         self.interface_number = place.interface_number.or(self.interface_number);
-        // Number 0 is a priority without a VLAN.
-        self.vlan = place.vlan.filter(|vlan| *vlan != 0);
+        self.vlans = place.vlans;
         self.radio_leg = place.radio_leg;
     }
 
@@ -109,6 +108,8 @@ pub struct Observation {
     pub packet_bytes: u32,
     /// Time to live, or hop limit.
     pub hop_limit: u8,
+    /// For which station of the link it was.
+    pub station: [u8; 6],
     /// By what it is known.
     pub identity: DatagramIdentity,
 }
@@ -127,7 +128,7 @@ pub struct PacketCounts {
     pub other_flow_count: u64,
     /// With the addresses of a flow, but of another protocol.
     pub foreign_count: u64,
-    /// Of a flow, but captured too short to be known again.
+    /// Of a flow, but captured too short, or in fragments, to be known again.
     pub unidentified_count: u64,
     /// First fragments of a followed datagram: the time is that of the first piece.
     pub fragmented_count: u64,
@@ -143,6 +144,9 @@ pub struct PacketCounts {
     pub stampless_count: u64,
     /// Sent again by a radio for want of an acknowledgement, and seen before.
     pub radio_retry_count: u64,
+    /// Seen just before, for another station or in a cooked capture that does not name interfaces: once
+    /// more on another link, not twice on this one.
+    pub elsewhere_count: u64,
     /// Earlier than the packet before it at the same point: a file out of order.
     pub backward_stamp_count: u64,
     /// With the header of an ET2000.
@@ -153,8 +157,10 @@ pub struct PacketCounts {
     pub esl_port_unclear_count: u64,
 }
 
-/// Datagrams among which one that a radio sent again is looked for.
-const RETRY_COUNT_MAX: usize = 256;
+/// Datagrams among which one that was seen before is looked for.
+const COPY_COUNT_MAX: usize = 256;
+/// Longest time between two sightings of one datagram on the links of one host.
+const ELSEWHERE_MAX_NS: u64 = 100_000_000;
 
 /// Takes packets and keeps what is followed.
 #[derive(Debug, Default)]
@@ -162,6 +168,8 @@ pub struct Observer {
     flows: Vec<FlowFilter>,
     seen: BTreeMap<Point, Seen>,
     watches: BTreeMap<Tap, Watch>,
+    /// Packets that a file holds and that could not be read out of it.
+    broken: BTreeMap<usize, u64>,
     counts: PacketCounts,
 }
 
@@ -180,11 +188,9 @@ impl Observer {
         let mut point = Point {
             file_index,
             interface_index: packet.interface_index,
-            esl_port: None,
             interface_number: packet.interface_number,
-            vlan: None,
-            radio_leg: None,
             direction: packet.direction,
+            ..Point::default()
         };
         let (mut frame, mut stamp_ns) = (packet.data, packet.stamp_ns);
         let mut original_bytes = packet.original_bytes as usize;
@@ -241,10 +247,19 @@ impl Observer {
                         own: identity.own.map(|own| (own.channel, own.kind as u8)),
                     };
                     let list = seen.entry(stream).or_default();
-                    let is_known = |one: &Observation| one.identity.key == identity.key;
-                    let mut newest = list.iter().rev().take(RETRY_COUNT_MAX);
-                    if datagram.is_radio_retry && newest.any(is_known) {
+                    let is_known = |one: &&Observation| one.identity.key == identity.key;
+                    let known = list.iter().rev().take(COPY_COUNT_MAX).find(is_known);
+                    let place = &datagram.place;
+                    let is_elsewhere = |known: &Observation| {
+                        (place.is_of_any || place.station != known.station)
+                            && stamp_ns.abs_diff(known.stamp_ns) <= ELSEWHERE_MAX_NS
+                    };
+                    if datagram.is_radio_retry && known.is_some() {
                         counts.radio_retry_count += 1;
+                        return;
+                    }
+                    if known.is_some_and(is_elsewhere) {
+                        counts.elsewhere_count += 1;
                         return;
                     }
                     counts.followed_count += 1;
@@ -258,6 +273,7 @@ impl Observer {
                         payload_bytes: bytes(datagram.payload_bytes),
                         packet_bytes: bytes(datagram.packet_bytes),
                         hop_limit: datagram.hop_limit,
+                        station: place.station,
                         identity,
                     });
                     return;
@@ -265,8 +281,23 @@ impl Observer {
                 // Following our own means looking at everything: what is not ours belongs to no flow.
                 Err(Unidentified::Foreign) if flow.kind == FlowKind::Hil => {}
                 Err(reason) => {
-                    if reason == Unidentified::CutShort {
-                        watch.miss_of(flow_index, source, destination);
+                    let unread = match reason {
+                        Unidentified::CutShort => Some(Unread::CutShort),
+                        Unidentified::Fragmented => Some(Unread::Fragmented),
+                        Unidentified::Foreign => None,
+                    };
+                    if let Some(unread) = unread {
+                        watch.miss_of(flow_index, source, destination, unread);
+                        // Of ours the channel would be of its name.
+                        if flow.kind != FlowKind::Hil {
+                            let stream = Stream {
+                                flow_index,
+                                source,
+                                destination,
+                                own: None,
+                            };
+                            seen.entry(stream).or_default();
+                        }
                     }
                     why = Some(reason);
                 }
@@ -275,8 +306,15 @@ impl Observer {
         *match why {
             None => &mut counts.other_flow_count,
             Some(Unidentified::Foreign) => &mut counts.foreign_count,
-            Some(Unidentified::CutShort) => &mut counts.unidentified_count,
+            Some(Unidentified::CutShort | Unidentified::Fragmented) => {
+                &mut counts.unidentified_count
+            }
         } += 1;
+    }
+
+    /// A packet or block of a file could not be read; what follows it could.
+    pub fn take_broken(&mut self, file_index: usize) {
+        *self.broken.entry(file_index).or_default() += 1;
     }
 
     /// The flows followed.
@@ -300,7 +338,8 @@ impl Observer {
     }
 
     /// Settles what the taps of a file could have seen, after its last packet. An interface of which the
-    /// file has no packet but tells how long it was watched has points too; one that a later section of the
+    /// file has no packet but tells how long it was watched has points too, and so has a file of which
+    /// nothing could be read; one that a later section of the
     /// file describes again, at another time, is the same.
     pub fn finish(&mut self, file_index: usize, interfaces: &[CaptureInterface]) {
         for (interface_index, interface) in interfaces.iter().enumerate() {
@@ -316,8 +355,20 @@ impl Observer {
                 self.add_silent_points(tap);
             }
         }
+        if !self.seen.keys().any(|one| one.file_index == file_index) {
+            let point = Point {
+                file_index,
+                ..Point::default()
+            };
+            self.seen.insert(point, Seen::new());
+            self.watches.entry(point.tap()).or_default();
+        }
+        let broken = self.broken.get(&file_index).copied();
         for (tap, watch) in &mut self.watches {
             if tap.file_index == file_index {
+                for _ in 0..broken.unwrap_or(0) {
+                    watch.miss(Unread::Malformed);
+                }
                 let interface = interfaces.get(tap.interface_index);
                 let dropped_count = interface.and_then(|one| one.dropped_count);
                 watch.dropped_count = dropped_count.unwrap_or(0);
@@ -356,11 +407,8 @@ impl Observer {
             let point = Point {
                 file_index: tap.file_index,
                 interface_index: tap.interface_index,
-                esl_port: None,
-                interface_number: None,
-                vlan: None,
-                radio_leg: None,
                 direction,
+                ..Point::default()
             };
             self.seen.entry(point).or_default();
         }

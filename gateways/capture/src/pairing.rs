@@ -44,7 +44,7 @@ pub fn join_all(observer: &Observer, settings: &JoinSettings) -> Vec<(Stream, Jo
                 let (a, b) = if at > index { (*a, *b) } else { (*b, *a) };
                 let round_trip = || comes_first(stream, a, b, settings.window_ns);
                 let is_two_clocks = !settings.is_one_clock
-                    && a.point.file_index != b.point.file_index
+                    && !a.is_of_host_of(&b)
                     && a.point.direction == Direction::Unknown;
                 let round_trip = is_two_clocks.then(round_trip).flatten();
                 let joined = join(stream, a, b, settings, round_trip);
@@ -74,10 +74,9 @@ fn comes_first(stream: &Stream, a: Sight<'_>, b: Sight<'_>, window_ns: i64) -> O
 /// True when `stream`, seen at `at`, was to be seen at the other point.
 fn is_expected(stream: &Stream, at: &Point, point: &Point, observer: &Observer) -> bool {
     // Out here, in there; into a host and out of it, or out of another whose capture has missed it.
-    let is_on_its_way = match (at.direction, point.direction) {
-        (Direction::Outbound, direction) => direction == Direction::Inbound,
-        (Direction::Inbound, direction) => direction != Direction::Unknown,
-        (Direction::Unknown, direction) => direction == Direction::Unknown,
+    let is_on_its_way = match at.direction {
+        Direction::Inbound => point.direction != Direction::Unknown,
+        Direction::Outbound | Direction::Unknown => point.direction != Direction::Outbound,
     };
     if at.place() == point.place() || !is_on_its_way {
         return false;

@@ -27,6 +27,8 @@ pub(super) struct PcapngFile {
     order: Option<ByteOrder>,
     /// First of this section's interfaces.
     interface_base: usize,
+    /// This section was written by mergecap.
+    is_merged: bool,
     /// Where the next section begins, if this one says.
     section_end: Option<u64>,
 }
@@ -79,7 +81,7 @@ impl PcapngFile {
         let base = self.interface_base;
         let outcome = match kind {
             SECTION => return self.section(window, body, interfaces.len(), length),
-            INTERFACE => describe(body, interfaces, base).map(|()| None),
+            INTERFACE => describe(body, interfaces, base, self.is_merged).map(|()| None),
             ENHANCED_PACKET | OBSOLETE_PACKET | SIMPLE_PACKET => {
                 packet(kind, body, interfaces, base).map(Some)
             }
@@ -111,6 +113,12 @@ impl PcapngFile {
             return self.lost(window, problem);
         };
         self.interface_base = interface_count;
+        self.is_merged = false;
+        // Of options that are broken, those before the fault; the section can be read all the same.
+        let _passed_over = body.options(16, |code, value| {
+            self.is_merged |= code == 4 && value.starts_with(b"Mergecap");
+            Ok(())
+        });
         // A negative length is one that the writer did not know.
         let is_known = section_bytes.cast_signed() >= 0;
         let end = window.offset.checked_add(length).filter(|_| is_known);
@@ -168,6 +176,7 @@ fn describe(
     body: Numbers<'_>,
     interfaces: &mut Vec<CaptureInterface>,
     base: usize,
+    is_merged: bool,
 ) -> Result<(), Problem> {
     const SHORT: Problem = Problem::Malformed("an interface block shorter than 8 bytes");
     let link_type = body.u16(0).ok_or(SHORT)?;
@@ -179,6 +188,7 @@ fn describe(
         link_type,
         snap_bytes,
         unit_ns: (1000, 1),
+        is_merged,
         ..CaptureInterface::default()
     };
     let outcome = body.options(8, |code, value| {
@@ -245,7 +255,7 @@ fn scaled(units: u64, (numerator, denominator): (u64, u64)) -> Option<i64> {
 fn packet(
     kind: u32,
     body: Numbers<'_>,
-    interfaces: &[CaptureInterface],
+    interfaces: &mut [CaptureInterface],
     base: usize,
 ) -> Result<Found, Problem> {
     const SHORT: Problem = Problem::Malformed("a packet block shorter than its fixed part");
@@ -255,7 +265,7 @@ fn packet(
         _ => 0,
     };
     let count = interfaces.len() - base;
-    let described = interfaces[base..].get(index as usize);
+    let described = interfaces[base..].get_mut(index as usize);
     let interface = described.ok_or(Problem::UnknownInterface { index, count })?;
     let interface_index = base + index as usize;
     // A simple packet block says only how long the packet was; snap length or block cut it.
@@ -281,18 +291,33 @@ fn packet(
     }
     let mut direction = Direction::Unknown;
     let mut stamp_ns = None;
+    // Between this packet and the one before; all ones where the writer did not know.
+    let mut dropped_count = None;
+    if kind == OBSOLETE_PACKET {
+        let told = body.u16(2).filter(|count| *count != u16::MAX);
+        dropped_count = told.map(u64::from);
+    }
     if kind != SIMPLE_PACKET {
         body.options(end.next_multiple_of(4), |code, value| {
-            if let (2, Some(flags)) = (code, body.part(value).u32(0)) {
-                direction = match flags & 3 {
-                    1 => Direction::Inbound,
-                    2 => Direction::Outbound,
-                    _ => Direction::Unknown,
-                };
+            let value = body.part(value);
+            match code {
+                2 => {
+                    direction = match value.u32(0).unwrap_or(0) & 3 {
+                        1 => Direction::Inbound,
+                        2 => Direction::Outbound,
+                        _ => Direction::Unknown,
+                    }
+                }
+                4 => dropped_count = value.u64(0),
+                _ => {}
             }
             Ok(())
         })?;
         stamp_ns = Some(in_ns(body.stamp(4).ok_or(SHORT)?, interface)?);
+    }
+    if let Some(count) = dropped_count {
+        let before = interface.dropped_count.unwrap_or(0);
+        interface.dropped_count = Some(before.saturating_add(count));
     }
     Ok(Found {
         interface_index,
@@ -319,8 +344,9 @@ fn statistics(
     body.options(12, |code, value| {
         let value = body.part(value);
         match (code, value.bytes.len()) {
-            (2, 8) => start = value.stamp(0),
-            (3, 8) => end = value.stamp(0),
+            // 0 is not a time: the writer did not fill it in.
+            (2, 8) => start = value.stamp(0).filter(|units| *units > 0),
+            (3, 8) => end = value.stamp(0).filter(|units| *units > 0),
             (4, 8) => interface.received_count = value.u64(0),
             // isb_ifdrop, the only one that dumpcap writes, and isb_osdrop: no room was left.
             (5, 8) => by_interface = value.u64(0),
@@ -330,9 +356,9 @@ fn statistics(
         Ok(())
     })?;
     let dropped = [by_interface, by_system].into_iter().flatten();
-    if let Some(count) = dropped.reduce(u64::saturating_add) {
-        interface.dropped_count = Some(count);
-    }
+    // Of the same drops that packet blocks may have told.
+    let dropped_count = dropped.reduce(u64::saturating_add);
+    interface.dropped_count = interface.dropped_count.max(dropped_count);
     let at = |units: u64, unit_ns| scaled(units, unit_ns)?.checked_add(interface.offset_ns);
     let watch = |unit_ns| {
         let first_ns = at(start?, unit_ns)?;

@@ -2,8 +2,8 @@
 //! or did not keep. Only what it would have seen and did not see is lost.
 //!
 //! A tap's stamps are taken in the order of the file. Where they jump back, or on by more than a day, a
-//! new *level* begins. A level of one or two stamps is a fault of single stamps: it is no time of
-//! watching. Between longer levels the clock was set, or parts of the file are out of order; two points
+//! new *level* begins. A level of one or two stamps far from the others is a fault of single stamps: it is
+//! no time of watching. Between longer levels the clock was set, or parts of the file are out of order; two points
 //! together tell which (see [`super::join`]).
 
 use std::collections::BTreeMap;
@@ -16,9 +16,13 @@ use super::{CaptureInterface, Span};
 
 /// Farthest that a stamp may lie behind the one before it without being of another level: packets that
 /// several queues of a card brought.
-const DISORDER_MAX_NS: i64 = 100_000_000;
+const DISORDER_MAX_NS: i64 = 1_000_000;
+/// Farthest that a single stamp may lie behind the one before it and still be sound.
+const LATE_MAX_NS: i64 = 100_000_000;
 /// Longest silence of a tap.
 const SILENCE_MAX_NS: i64 = 86_400_000_000_000;
+/// A stamp before it, since 1970, is of a clock that was not set.
+const YEAR_NS: i64 = 365 * SILENCE_MAX_NS;
 /// Stamps that are no level of their own.
 const ISOLATED_MAX: u64 = 2;
 /// Levels whose clock another point's is compared with.
@@ -48,6 +52,8 @@ pub enum Unread {
     },
     /// Captured too short (snap length).
     CutShort,
+    /// The first fragment of a datagram that is known by all of its payload.
+    Fragmented,
     /// Lengths or versions that cannot be.
     Malformed,
     /// Sealed by 802.11, `MACsec` or PPP.
@@ -77,10 +83,19 @@ struct Level {
     /// Last and largest stamp before the newest.
     before_ns: Option<(i64, i64)>,
     count: u64,
+    /// How far its first stamp lies behind the one before.
+    behind_ns: i64,
     /// The level before it.
     previous: Option<usize>,
     /// What takes its stamps to a clock that was not set; `None` for isolated ones.
     shift_ns: Option<i64>,
+}
+
+impl Level {
+    /// It begins so little behind the level before it that packets may have come late: none is isolated.
+    fn is_late(&self) -> bool {
+        (1..=LATE_MAX_NS).contains(&self.behind_ns)
+    }
 }
 
 /// See the module documentation.
@@ -100,10 +115,12 @@ pub struct Watch {
     pub(super) anchors_ns: Vec<i64>,
     /// Frames that may hold any datagram.
     pub unread: BTreeMap<Unread, u64>,
-    /// Datagrams of a flow and two sockets that are captured too short to be known again.
-    cut: BTreeMap<(usize, SocketAddr, SocketAddr), u64>,
+    /// Datagrams of a flow and two sockets of which too little was captured to know them again.
+    cut: BTreeMap<(usize, SocketAddr, SocketAddr, Unread), u64>,
     /// Frames that it did not keep, as its file says.
     pub dropped_count: u64,
+    /// See [`CaptureInterface::is_merged`].
+    pub is_merged: bool,
     /// The file says when it was watched.
     is_stated: bool,
 }
@@ -113,8 +130,8 @@ impl Watch {
         *self.unread.entry(why).or_default() += 1;
     }
 
-    pub(super) fn miss_of(&mut self, flow_index: usize, source: SocketAddr, to: SocketAddr) {
-        *self.cut.entry((flow_index, source, to)).or_default() += 1;
+    pub(super) fn miss_of(&mut self, flow: usize, from: SocketAddr, to: SocketAddr, why: Unread) {
+        *self.cut.entry((flow, from, to, why)).or_default() += 1;
     }
 
     /// Frames that may be of a flow between two sockets, and why they cannot be told.
@@ -125,8 +142,10 @@ impl Watch {
         destination: SocketAddr,
     ) -> BTreeMap<Unread, u64> {
         let mut unread = self.unread.clone();
-        if let Some(count) = self.cut.get(&(flow_index, source, destination)) {
-            *unread.entry(Unread::CutShort).or_default() += count;
+        for ((flow, from, to, why), count) in &self.cut {
+            if (*flow, *from, *to) == (flow_index, source, destination) {
+                *unread.entry(*why).or_default() += count;
+            }
         }
         unread
     }
@@ -146,7 +165,8 @@ impl Watch {
         self.pass_over_one_ahead(at_ns);
         let current = self.levels.get(self.current);
         let next = current.and_then(|level| {
-            let previous = level.previous.filter(|_| level.count <= ISOLATED_MAX);
+            let may_return = level.count <= ISOLATED_MAX && !level.is_late();
+            let previous = level.previous.filter(|_| may_return);
             let returns = previous.filter(|index| {
                 let before = &self.levels[*index];
                 fits(before) && (!fits(level) || is_nearer(before, level))
@@ -162,6 +182,7 @@ impl Watch {
             level.max_ns = level.max_ns.max(at_ns);
             level.count += 1;
         } else {
+            let behind_ns = current.map_or(0, |level| level.last_ns.saturating_sub(at_ns));
             let previous = current.map(|_| self.current);
             self.current = self.levels.len();
             self.levels.push(Level {
@@ -171,6 +192,7 @@ impl Watch {
                 max_ns: at_ns,
                 before_ns: None,
                 count: 1,
+                behind_ns,
                 previous,
                 shift_ns: None,
             });
@@ -186,8 +208,8 @@ impl Watch {
         let Some((last_ns, max_ns)) = level.before_ns else {
             return;
         };
-        let goes_on = last_ns.saturating_sub(DISORDER_MAX_NS) <= at_ns;
-        if goes_on && at_ns < level.last_ns.saturating_sub(DISORDER_MAX_NS) {
+        let goes_on = last_ns.saturating_sub(LATE_MAX_NS) <= at_ns;
+        if goes_on && at_ns < level.last_ns.saturating_sub(LATE_MAX_NS) {
             self.ahead.insert((self.current, level.last_ns), last_ns);
             (level.last_ns, level.max_ns, level.before_ns) = (last_ns, max_ns, None);
         }
@@ -206,9 +228,13 @@ impl Watch {
         } else {
             1
         };
-        let sound: Vec<usize> = (0..self.levels.len())
-            .filter(|index| self.levels[*index].count >= least)
-            .collect();
+        let mut sound: Vec<usize> = Vec::new();
+        for (index, level) in self.levels.iter().enumerate() {
+            let goes_on = level.is_late() && sound.last().copied() == level.previous;
+            if level.count >= least || goes_on {
+                sound.push(index);
+            }
+        }
         // The level of most packets keeps its stamps; the others are put next to it.
         let main = sound
             .iter()
@@ -241,6 +267,7 @@ impl Watch {
         let levels = || sound.iter().map(|index| self.levels[*index]);
         let stamps = hull(levels().map(|level| (level, 0)));
         let steady = hull(levels().map(|level| (level, level.shift_ns.unwrap_or(0))));
+        self.is_merged = interface.is_some_and(|one| one.is_merged);
         let stated = interface.and_then(|one| stated(one, stamps));
         self.is_stated = stated.is_some();
         let widen = |span: Option<Span>| match (span, stated) {
@@ -274,8 +301,8 @@ impl Watch {
         }
         if level.shift_ns.is_none() {
             while let (None, Some(previous)) = (level.shift_ns, level.previous) {
+                one.stamp_ns = level.first_ns.saturating_add(level.behind_ns);
                 level = &self.levels[previous];
-                one.stamp_ns = level.last_ns;
             }
             if level.shift_ns.is_none()
                 && let Some(next) = self.levels.iter().find(|level| level.shift_ns.is_some())
@@ -327,11 +354,13 @@ fn hull(levels: impl Iterator<Item = (Level, i64)>) -> Option<Span> {
     spans.reduce(Span::hull)
 }
 
-/// The stated time of watching, in the unit in which it holds the packets.
+/// The stated time of watching, in the unit in which it holds the packets; without packets, in the one in
+/// which it is not the first year of the clock.
 fn stated(interface: &CaptureInterface, stamps: Option<Span>) -> Option<Span> {
     let mut stated = interface.watch.iter().flatten();
     let Some(stamps) = stamps else {
-        return stated.next().copied();
+        let is_set = |span: &&Span| span.first_ns > YEAR_NS;
+        return stated.clone().find(is_set).or(stated.next()).copied();
     };
     let holds = |span: &&Span| {
         span.first_ns.saturating_sub(STATED_SLACK_NS) <= stamps.first_ns

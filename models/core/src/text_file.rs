@@ -96,27 +96,30 @@ impl TextFile {
             return refuse(line, (mark_bytes + zero) as u64, what.to_owned());
         }
         let utf8 = str::from_utf8(bytes);
+        let mut text = utf8.map_or_else(
+            |_latin1| bytes.iter().map(|byte| char::from(*byte)).collect(),
+            str::to_owned,
+        );
+        // Lines that end with a carriage return alone: as long, and known to readers of the whole text.
+        if !text.contains('\n') {
+            text = text.replace('\r', "\n");
+        }
         Ok(Self {
-            text: utf8.map_or_else(
-                |_latin1| bytes.iter().map(|byte| char::from(*byte)).collect(),
-                str::to_owned,
-            ),
+            text,
             mark_bytes,
             is_latin1: utf8.is_err(),
         })
     }
 
-    /// The text without its mark.
+    /// The text without its mark; each line ends with a line feed.
     pub fn text(&self) -> &str {
         &self.text
     }
 
-    /// The lines, which end with a line feed, with or without a carriage return before it, or with a carriage
-    /// return where the text has no line feed.
+    /// The lines, which end with a line feed, with or without a carriage return before it.
     pub fn lines(&self) -> impl Iterator<Item = Line<'_>> {
-        let end = if self.text.contains('\n') { '\n' } else { '\r' };
         let mut offset = self.mark_bytes as u64;
-        let raw = self.text.split_inclusive(end);
+        let raw = self.text.split_inclusive('\n');
         raw.zip(1..).map(move |(raw, number)| {
             let line = Line {
                 number,
@@ -223,16 +226,20 @@ pub fn short(text: &str) -> &str {
     end.map_or(text, |(end, _)| &text[..end])
 }
 
-/// Why `text` is not the number that was `expected`, with what may be meant by it.
-pub fn not_a_number(text: &str, expected: &str) -> String {
+/// True for a number with a comma where a point is expected.
+pub fn has_decimal_comma(text: &str) -> bool {
     let digits = |part: &str| !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit());
     let halves = text.trim_start_matches(['-', '+']).split_once(',');
-    let has_comma = halves.is_some_and(|(whole, rest)| {
+    halves.is_some_and(|(whole, rest)| {
         let (rest, _exponent) = rest.split_once(['e', 'E']).unwrap_or((rest, ""));
         digits(whole) && digits(rest)
-    });
+    })
+}
+
+/// Why `text` is not the number that was `expected`, with what may be meant by it.
+pub fn not_a_number(text: &str, expected: &str) -> String {
     let found = short(text);
-    if has_comma {
+    if has_decimal_comma(text) {
         let point = found.replacen(',', ".", 1);
         format!("\"{found}\" has a decimal comma, expected {expected}, e.g. {point}")
     } else {
@@ -320,5 +327,6 @@ mod tests {
         );
         assert_eq!(not_a_number("west", "a number"), "\"west\" is not a number");
         assert!(!not_a_number("1,2,3", "a number").contains("decimal comma"));
+        assert_eq!(TextFile::decode(b"a\rb\r").unwrap().text(), "a\nb\n");
     }
 }

@@ -5,7 +5,7 @@ use core::cmp::Ordering;
 
 use serde::{Deserialize, Serialize};
 
-use super::special::student_quantile;
+use super::special::{normal_quantile, student_quantile};
 use super::statistics::{CONFIDENCE, wilson};
 use hil_core::interval::{Interval, IntervalMethod};
 use hil_core::study::Verdict;
@@ -40,6 +40,21 @@ pub fn ratio(base: Estimate, new: Estimate) -> Option<Interval> {
         })
     };
     Some(difference(logarithm(base)?, logarithm(new)?)?.map(f64::exp))
+}
+
+/// The interval of a share of which none of `of` were seen, where its events come together as those of another
+/// sample do: `like`, of `like_of`. What that one is worth shows in the width of its interval, and the upper end is
+/// exact (Clopper and Pearson 1934) for as large a part of `of`. `None` when that one has no interval.
+pub fn none_of(of: u64, like: Estimate, like_of: u64) -> Option<Interval> {
+    let tail = 0.5 - 0.5 * CONFIDENCE;
+    let Interval { low, high, .. } = like.interval?;
+    let variance = like.value * (1.0 - like.value);
+    let effective = variance * (2.0 * normal_quantile(1.0 - tail) / (high - low)).powi(2);
+    let worth = of as f64 * (effective / like_of as f64).min(1.0);
+    (worth > 0.0).then(|| {
+        let high = 1.0 - tail.powf(1.0 / worth);
+        Interval::new(0.0, high, IntervalMethod::EffectiveShare)
+    })
 }
 
 /// So many of so many.
@@ -154,6 +169,26 @@ impl Moments {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn none_of_a_sample_is_as_large_as_its_like_is_worth() {
+        let like = |of| Share { count: of / 10, of }.estimate(CONFIDENCE).unwrap();
+        let independent = none_of(1000, like(1000), 1000).unwrap();
+        assert!(independent.low.abs() < 1e-12);
+        // Clopper and Pearson's upper end of none of 1000 is 0.00368.
+        assert!(
+            (0.003..0.005).contains(&independent.high),
+            "{independent:?}"
+        );
+        // Its like is a thousand of which a hundred are worth something.
+        let clustered = none_of(1000, like(100), 1000).unwrap();
+        assert!((0.03..0.05).contains(&clustered.high), "{clustered:?}");
+        let without = Estimate {
+            value: 0.1,
+            interval: None,
+        };
+        assert_eq!(none_of(1000, without, 1000), None);
+    }
 
     #[test]
     fn no_difference_in_a_small_sample_is_no_agreement() {

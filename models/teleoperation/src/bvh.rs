@@ -311,6 +311,14 @@ impl<'a> Words<'a> {
 
     fn keyword(&mut self, keyword: &str, expected: &'static str) -> Result<(), BvhError> {
         self.next(expected)?;
+        // What stands right behind a colon is the next word.
+        let found = self.present.split_at_checked(keyword.len());
+        let is_it = |word: &str| keyword.ends_with(':') && word.eq_ignore_ascii_case(keyword);
+        if let Some((word, behind)) = found.filter(|(word, _)| is_it(word)) {
+            let line = self.line.content;
+            self.rest = &line[line.len() - self.rest.len() - behind.len()..];
+            self.present = word;
+        }
         if self.is(keyword) {
             Ok(())
         } else {

@@ -31,6 +31,8 @@ fn windows_line_ends_and_a_byte_order_mark_change_nothing() {
     let windows = format!("\u{feff}{}", SMALL.replace('\n', "\r\n"));
     let windows = TextFile::decode(windows.as_bytes()).unwrap();
     assert_eq!(Bvh::parse(&windows), parsed(SMALL));
+    let without_blanks = SMALL.replace("s: 2", "s:2").replace("e: 0", "e:0");
+    assert_eq!(parsed(&without_blanks), parsed(SMALL));
 }
 
 #[test]

@@ -31,7 +31,10 @@ pub enum MotionError {
         joints: Vec<String>,
     },
     /// The file ends too early for the period.
-    #[error("{frame_count} frames every {frame_time_s} s end too early for a loop of {period_s} s")]
+    #[error(
+        "{frame_count} frames every {frame_time_s} s end too early for a loop of {period_s} s, and fill one \
+         of motion_period_s = {}", (*frame_count as f64 * frame_time_s * 1e6).round() / 1e6
+    )]
     TooShort {
         /// Frames in the file.
         frame_count: usize,

@@ -155,7 +155,7 @@ pub fn decode(file: &TextFile) -> Result<CsvDecoded, TextFault> {
 
 /// Times of today since 1970 in nanoseconds are beyond this, and times since the start of a run or of a computer are
 /// not: three years.
-const SINCE_1970_NS: i64 = 100_000_000_000_000_000;
+pub(crate) const SINCE_1970_NS: i64 = 100_000_000_000_000_000;
 
 /// The first instant where instants count from 1970, from which they then count; else 0.
 fn first_since_1970(records: &[TraceRecord]) -> Result<i64, String> {
@@ -172,14 +172,17 @@ fn first_since_1970(records: &[TraceRecord]) -> Result<i64, String> {
     let steps = steps.filter(|two| two[1].published_ns > two[0].published_ns);
     let step_count = i64::try_from(steps.count()).unwrap_or(i64::MAX);
     let units = [
-        ("s", 1_000_000_000, 10, 1),
+        ("s", 1_000_000_000, 10, 0),
         ("ms", 1_000_000, 1_000, 2),
         ("us", 1_000, 50_000, 2),
     ];
     let is_of = |(_, unit_ns, nearest_ns, steps_min): &(&str, i64, i64, i64)| {
         let per_s = 1_000_000_000 / unit_ns;
         let is_of_today = (1_200_000_000 * per_s..2_200_000_000 * per_s).contains(&first_ns);
-        is_of_today && step_count >= *steps_min && span_ns / step_count < *nearest_ns
+        is_of_today
+            && records.len() > 1
+            && step_count >= *steps_min
+            && span_ns / step_count.max(1) < *nearest_ns
     };
     match units.into_iter().find(is_of) {
         None => Ok(0),
@@ -428,6 +431,8 @@ mod tests {
             (|ms| ms, "in ms,"),
             (|ms| ms * 1_000, "in us,"),
         ];
+        let within_one = of(|_| 1_700_000_000).unwrap_err().to_string();
+        assert!(within_one.contains("in s,"), "{within_one}");
         for (told, name) in units {
             let refused = of(told).unwrap_err().to_string();
             assert!(

@@ -7,6 +7,7 @@ use core::fmt::Write;
 
 use hil_core::text_file::{TextFault, TextFile, not_a_number};
 
+use super::csv::SINCE_1970_NS;
 use super::{Trace, TraceFate, TraceHeader, TraceRecord};
 
 /// Bytes of one opportunity.
@@ -121,6 +122,14 @@ pub fn decode(file: &TextFile) -> (Trace, Option<TextFault>) {
     if fault.is_none() && records.is_empty() {
         fault = Some(file.end().fault("no delivery opportunity"));
     }
+    // Times since 1970 count from the first.
+    let first_ns = records.first().map_or(0, |first| first.published_ns);
+    if first_ns >= SINCE_1970_NS {
+        for record in &mut records {
+            record.published_ns -= first_ns;
+            record.departure_ns -= first_ns;
+        }
+    }
     // The file wraps at its last line.
     header.duration_ns = records.last().map_or(0, |record| record.published_ns);
     (Trace { header, records }, fault)
@@ -181,6 +190,13 @@ mod tests {
         assert_eq!(trace.header.duration_ns, 10 * MS_NS);
         assert_eq!(trace.records[2].published_ns, 4 * MS_NS);
         assert_eq!(encode(&trace).unwrap(), text);
+    }
+
+    #[test]
+    fn times_since_1970_count_from_the_first() {
+        let (trace, fault) = decode(&"1700000000000\n1700000000007\n".into());
+        assert_eq!((fault, trace.header.duration_ns), (None, 7 * MS_NS));
+        assert_eq!(encode(&trace).unwrap(), "0\n7\n");
     }
 
     #[test]

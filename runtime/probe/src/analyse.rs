@@ -69,14 +69,14 @@ impl Reading {
         if let Some(port) = point.esl_port {
             let _infallible = write!(text, ":port{port}");
         }
-        for (word, number) in [
-            ("if", point.interface_number),
-            ("vlan", point.vlan.map(u32::from)),
-        ] {
-            if let Some(number) = number {
-                let _infallible = write!(text, ":{word}{number}");
-            }
+        if let Some(number) = point.interface_number {
+            let _infallible = write!(text, ":if{number}");
         }
+        let _infallible = match point.vlans {
+            [0, 0] => Ok(()),
+            [0, vlan] => write!(text, ":vlan{vlan}"),
+            [outer, vlan] => write!(text, ":vlan{outer}.{vlan}"),
+        };
         match point.radio_leg {
             Some((true, false)) => text.push_str(":to-ap"),
             Some((false, true)) => text.push_str(":from-ap"),
@@ -237,7 +237,16 @@ impl Report {
         }
         let joins = reading.joined(settings).into_iter();
         let clocks = |one: &Joined| {
-            PointClocks::of(&one.first_point, &one.second_point, settings.is_one_clock)
+            let (first, second) = (&one.first_point, &one.second_point);
+            let mut interfaces = reading.files[first.file_index].interfaces.iter();
+            let is_apart = first.tap() != second.tap() && interfaces.any(|one| one.is_merged);
+            match PointClocks::of(first, second, settings.is_one_clock) {
+                PointClocks::OneFile if is_apart && settings.is_one_clock => {
+                    PointClocks::DeclaredOne
+                }
+                PointClocks::OneFile if is_apart => PointClocks::Unknown,
+                found => found,
+            }
         };
         Self {
             schema_version: 2,
@@ -326,7 +335,7 @@ impl Report {
             ),
             (
                 counts.unidentified_count,
-                "captured too short to be known again",
+                "captured too short or in fragments, not known again",
             ),
             (
                 counts.fragmented_count,
@@ -335,6 +344,10 @@ impl Report {
             (counts.later_fragment_count, "later fragments, left out"),
             (counts.stampless_count, "without a time stamp, left out"),
             (counts.radio_retry_count, "sent again by a radio, left out"),
+            (
+                counts.elsewhere_count,
+                "seen again on another link of the capturing host, left out",
+            ),
             (
                 counts.backward_stamp_count,
                 "earlier than the one before, put in order",
@@ -562,13 +575,21 @@ fn doubts_text(doubts: &[CountedDoubt]) -> String {
                 format!("{count} of link type {link_type}, which is not read")
             }
             Doubt::Unread(Unread::CutShort) => format!("{count} captured too short"),
+            Doubt::Unread(Unread::Fragmented) => format!("{count} in IP fragments"),
             Doubt::Unread(Unread::Malformed) => format!("{count} malformed"),
             Doubt::Unread(Unread::Encrypted) => format!("{count} encrypted"),
             Doubt::Unread(Unread::Aggregate) => {
-                format!("{count} hold several datagrams (segmentation or receive offload)")
+                format!("{count} hold several datagrams (segmentation or receive offload, A-MSDU)")
             }
             Doubt::Unread(Unread::NoStamp) => format!("{count} without a time stamp"),
             Doubt::Dropped => format!("{count} dropped by the capture"),
+            Doubt::Apart => format!(
+                "{count} seen at both points farther apart than --window: a clock that was set, or clocks \
+                 far apart"
+            ),
+            Doubt::Unwatched => format!(
+                "{count} seen at one point while the other was not watched, as far as its file tells"
+            ),
             Doubt::Order => {
                 format!("{count} at one point only, and which comes first is unknown (--one-clock)")
             }

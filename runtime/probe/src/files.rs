@@ -103,7 +103,13 @@ pub(super) fn read(
                 }
                 Err(error) => return Err(failed(error)),
             },
-            Step::Fault(fault) => file.fault(format!("{}: {fault}", path.display())),
+            Step::Fault(fault) => {
+                file.fault(format!("{}: {fault}", path.display()));
+                // Behind any other the file ends: it tells of no time after that.
+                if fault.is_passed {
+                    observer.take_broken(file_index);
+                }
+            }
             Step::Ended => break,
         }
     }

@@ -91,20 +91,13 @@ impl WireClocks {
 
 #[cfg(test)]
 mod tests {
-    use hil_net::Direction;
-
     use super::*;
 
     #[test]
     fn two_files_have_one_clock_only_by_word() {
         let point = |file_index| Point {
             file_index,
-            interface_index: 0,
-            esl_port: None,
-            interface_number: None,
-            vlan: None,
-            radio_leg: None,
-            direction: Direction::Unknown,
+            ..Point::default()
         };
         let of = |second, is_one| PointClocks::of(&point(0), &point(second), is_one);
         assert_eq!(of(0, false), PointClocks::OneFile);

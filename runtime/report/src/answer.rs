@@ -7,7 +7,7 @@ use hil_account::flow::DeadlineMetrics;
 use hil_account::network::NetworkEventKind;
 use hil_account::{MessageFate, Standing};
 use hil_core::case_study::{Occasions, Severity};
-use hil_core::interval::{Interval, Spread};
+use hil_core::interval::{Interval, Spread, TooSmall};
 use hil_platform::text::grouped;
 use hil_platform::words::{counted, named};
 use hil_stats::statistics::{CONFIDENCE, poisson};
@@ -176,6 +176,13 @@ pub enum Unresolved {
     ClocksDiffer,
     /// Of a comparison: chance alone makes such a difference.
     WithinChance,
+    /// Of a comparison: the difference has no interval.
+    NoInterval {
+        /// Of what.
+        what: String,
+        /// Why not.
+        why: TooSmall,
+    },
 }
 
 hil_core::labelled! {
@@ -468,6 +475,9 @@ impl fmt::Display for Unresolved {
                 formatter.write_str("the robot was hurt, but no network event that explains it came before")
             }
             Self::WithinChance => formatter.write_str("what difference there is, chance alone may make"),
+            Self::NoInterval { what, why } => {
+                write!(formatter, "the difference of {what} has no interval: {why}")
+            }
             Self::ClocksDiffer => formatter.write_str(
                 "the robot was hurt, but unaligned clocks leave open whether the network came first",
             ),

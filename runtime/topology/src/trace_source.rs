@@ -365,15 +365,19 @@ pub fn read(path: &Path) -> Result<Vec<u8>, TraceFileError> {
     })
 }
 
-/// True for what may be text, of any encoding, by its first bytes, and is no trace.
+/// True for what may be text, of any encoding, by its first bytes, and is no trace. What is wrong with it, a
+/// zero byte for instance, its decoder says.
 pub fn looks_like_text(bytes: &[u8]) -> bool {
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     let start = &bytes[..bytes.len().min(512)];
     let is_wide = start.starts_with(b"\xff\xfe") || start.starts_with(b"\xfe\xff");
-    let is_letter =
-        |byte: &u8| byte.is_ascii_graphic() || byte.is_ascii_whitespace() || *byte >= 0x80;
-    let letters = start.iter().filter(|byte| byte.is_ascii()).count();
+    let is_letter = |byte: &u8| {
+        let is_ascii = byte.is_ascii_graphic() || byte.is_ascii_whitespace();
+        is_ascii || matches!(*byte, 0 | 0x80..)
+    };
+    let letters = start.iter().filter(|byte| matches!(**byte, 1..0x80));
+    let letters = letters.count();
     !start.starts_with(&wire::MAGIC)
-        && !start.is_empty()
         && (is_wide || (start.iter().all(is_letter) && 2 * letters >= start.len()))
 }
 
@@ -442,6 +446,8 @@ mod tests {
         assert!(looks_like_text(b"# run: x\npublished_ns,delay_ns\n"));
         assert!(!looks_like_text(b"HILTRACE\x01\0\0\0"));
         assert!(!looks_like_text(&[0xd4, 0xc3, 0xb2, 0xa1]));
-        assert!(!looks_like_text(b""));
+        assert!(!looks_like_text(b"\0\0\0\x01\0\0a"));
+        assert!(looks_like_text(b"") && looks_like_text(b"\xef\xbb\xbf"));
+        assert!(looks_like_text(b"f\0a\0t\0e\0\n\0") && looks_like_text(b"1\n2\n\0\n"));
     }
 }

@@ -79,7 +79,11 @@ pub(super) fn parse(sources: &[Source], source_index: usize, faults: &Faults) ->
             start: span.start,
             end: span.end,
         };
-        faults.add("", Some(place), Fault::Syntax(error.message().to_owned()));
+        let mut message = error.message().to_owned();
+        if is_at_decimal_comma(text, place.start) {
+            message.push_str("; a decimal comma? Write a decimal point");
+        }
+        faults.add("", Some(place), Fault::Syntax(message));
     }
     let reader = SourceReader {
         source_index,
@@ -88,6 +92,14 @@ pub(super) fn parse(sources: &[Source], source_index: usize, faults: &Faults) ->
     errors
         .is_empty()
         .then(|| reader.table(document.get_ref(), ""))
+}
+
+/// A comma stands there between two digits.
+fn is_at_decimal_comma(text: &str, at: usize) -> bool {
+    let around = at
+        .checked_sub(1)
+        .and_then(|before| text.as_bytes().get(before..at + 2));
+    matches!(around, Some([a, b',', b]) if a.is_ascii_digit() && b.is_ascii_digit())
 }
 
 struct SourceReader<'a> {

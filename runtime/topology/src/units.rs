@@ -2,6 +2,8 @@
 
 use core::time::Duration;
 
+use hil_core::text_file::has_decimal_comma;
+
 /// Unit words, largest first, in nanoseconds.
 const UNITS: &[(&str, u128)] = &[
     ("h", 3_600_000_000_000),
@@ -31,6 +33,9 @@ pub(crate) enum DurationError {
     /// No unit.
     #[error("has no unit; allowed: {}", allowed())]
     NoUnit,
+    /// A comma where a point is expected.
+    #[error("has a decimal comma; write {0}")]
+    DecimalComma(String),
     /// A unit that is none.
     #[error("has the unknown unit `{0}`; allowed: {allowed}", allowed = allowed())]
     UnknownUnit(String),
@@ -48,9 +53,13 @@ pub(crate) enum DurationError {
 /// When it is no duration.
 pub(super) fn parse_duration(text: &str) -> Result<Duration, DurationError> {
     let text = text.trim();
-    let end = text
-        .find(|letter: char| !letter.is_ascii_digit() && letter != '.')
-        .unwrap_or(text.len());
+    let is_of_number = |letter: char| letter.is_ascii_digit() || letter == '.';
+    let end = |is_of: &dyn Fn(char) -> bool| text.find(|one| !is_of(one)).unwrap_or(text.len());
+    let with_comma = end(&|letter| is_of_number(letter) || letter == ',');
+    if has_decimal_comma(&text[..with_comma]) {
+        return Err(DurationError::DecimalComma(text.replacen(',', ".", 1)));
+    }
+    let end = end(&is_of_number);
     let (number, unit) = text.split_at(end);
     let unit = unit.trim();
     let (whole, fraction) = number.split_once('.').unwrap_or((number, ""));
@@ -169,6 +178,7 @@ mod tests {
             ("1.2.3 s", DurationError::NoNumber),
             ("-4 ms", DurationError::NoNumber),
             ("4 sec", DurationError::UnknownUnit("sec".to_owned())),
+            ("2,5 ms", DurationError::DecimalComma("2.5 ms".to_owned())),
             ("0.5 ns", DurationError::TooFine),
             ("99999999999999999999 s", DurationError::TooLong),
             ("9999999999999999999 h", DurationError::TooLong),

@@ -179,7 +179,7 @@ pub(crate) fn frame(bytes: &[u8]) -> Verdict {
             datagram.payload.len() + 28 <= inner.len(),
             "no room for the headers"
         );
-        assert!(datagram.dscp < 64 && datagram.place.vlan.is_none_or(|vlan| vlan < 4096));
+        assert!(datagram.dscp < 64 && datagram.place.vlans.iter().all(|vlan| *vlan < 4096));
         assert_eq!(
             datagram.is_cut_short(),
             datagram.payload.len() < datagram.payload_bytes

@@ -61,51 +61,80 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
     // Time, flags and rate present; flags say a check sequence follows.
     let radiotap = [0, 0, 18, 0, 7, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1, 0x10, 2];
     let over_air = [&radiotap[..], &qos, &[9; 4]].concat();
+    let other_tag = [&frame[..12], &[0x93, 0, 0, 7], &frame[12..]].concat();
+    // A label and a control word before the Ethernet frame.
+    let pseudowire = [addresses, &[0x88, 0x47, 0, 1, 1, 64, 0, 0, 0, 0], &frame].concat();
+    let within = |protocol: u8, before: &[u8], inner: &[u8]| {
+        let mut outer = bare[..20].to_vec();
+        outer[3] = u8::try_from(20 + before.len() + inner.len()).unwrap();
+        outer[9] = protocol;
+        [&outer, before, inner].concat()
+    };
+    let in_ip = within(4, &[], bare);
+    let in_gre = within(47, &[0x20, 0, 0x65, 0x58, 0, 0, 0, 9], &frame);
+    let authenticated = within(51, &[&[17, 4, 0, 0][..], &[0; 20]].concat(), &bare[20..]);
+    let sealed = within(50, &[0; 8], &bare[20..]);
+    // The header of 26 bytes is padded to 28, say the flags.
+    let padding_told = [0, 0, 9, 0, 2, 0, 0, 0, 0x20];
+    let padded_air = [&padding_told[..], &qos[..26], &[0; 2], &qos[26..]].concat();
     for (link, bytes, vlan) in [
-        (link_type::ETHERNET, frame.as_slice(), None),
-        (link_type::ETHERNET, &tagged, Some(7)),
-        (link_type::ETHERNET, &twice, Some(7)),
-        (link_type::ETHERNET, &padded, None),
-        (link_type::ETHERNET, &session, None),
-        (link_type::ETHERNET, &labels, None),
-        (link_type::ETHERNET, &snap, None),
-        (link_type::LINUX_SLL, &cooked, None),
-        (link_type::LINUX_SLL2, &cooked_2, None),
-        (link_type::RAW, bare, None),
-        (link_type::RAW_12, bare, None),
-        (link_type::RAW_14, bare, None),
-        (link_type::IPV4, bare, None),
-        (link_type::NULL, &loopback([2, 0, 0, 0]), None),
-        (link_type::NULL, &loopback([0, 0, 0, 2]), None),
-        (link_type::LOOP, &loopback([0, 0, 0, 2]), None),
-        (link_type::PPP, &[&[0xff, 3, 0, 0x21], bare].concat(), None),
-        (link_type::PPP, &[&[0x21][..], bare].concat(), None),
+        (link_type::ETHERNET, frame.as_slice(), [0, 0]),
+        (link_type::ETHERNET, &tagged, [0, 7]),
+        (link_type::ETHERNET, &twice, [1, 7]),
+        (link_type::ETHERNET, &other_tag, [0, 7]),
+        (link_type::ETHERNET, &pseudowire, [0, 0]),
+        (link_type::RAW, &in_ip, [0, 0]),
+        (link_type::RAW, &in_gre, [0, 0]),
+        (link_type::RAW, &authenticated, [0, 0]),
+        (link_type::RADIOTAP, &padded_air, [0, 0]),
+        (link_type::ETHERNET, &padded, [0, 0]),
+        (link_type::ETHERNET, &session, [0, 0]),
+        (link_type::ETHERNET, &labels, [0, 0]),
+        (link_type::ETHERNET, &snap, [0, 0]),
+        (link_type::LINUX_SLL, &cooked, [0, 0]),
+        (link_type::LINUX_SLL2, &cooked_2, [0, 0]),
+        (link_type::RAW, bare, [0, 0]),
+        (link_type::RAW_12, bare, [0, 0]),
+        (link_type::RAW_14, bare, [0, 0]),
+        (link_type::IPV4, bare, [0, 0]),
+        (link_type::NULL, &loopback([2, 0, 0, 0]), [0, 0]),
+        (link_type::NULL, &loopback([0, 0, 0, 2]), [0, 0]),
+        (link_type::LOOP, &loopback([0, 0, 0, 2]), [0, 0]),
+        (
+            link_type::PPP,
+            &[&[0xff, 3, 0, 0x21], bare].concat(),
+            [0, 0],
+        ),
+        (link_type::PPP, &[&[0x21][..], bare].concat(), [0, 0]),
         (
             link_type::PPP_SERIAL,
             &[&[0xff, 3, 0, 0x21], bare].concat(),
-            None,
+            [0, 0],
         ),
-        (link_type::PPP_ETHER, &session[14..], None),
-        (link_type::IEEE802_11, &qos, None),
-        (link_type::IEEE802_11, &relayed, None),
-        (link_type::RADIOTAP, &over_air, None),
+        (link_type::PPP_ETHER, &session[14..], [0, 0]),
+        (link_type::IEEE802_11, &qos, [0, 0]),
+        (link_type::IEEE802_11, &relayed, [0, 0]),
+        (link_type::RADIOTAP, &over_air, [0, 0]),
     ] {
         let datagram = udp_datagram(link, bytes);
         let datagram = datagram.unwrap_or_else(|why| panic!("link type {link}: {why:?}"));
         assert_eq!(datagram.source.to_string(), "10.77.0.1:40000");
         assert_eq!(datagram.destination.to_string(), "10.77.0.2:5004");
         assert_eq!(
-            (datagram.payload, datagram.place.vlan),
+            (datagram.payload, datagram.place.vlans),
             (&b"payload"[..], vlan)
         );
         assert_eq!((datagram.dscp, datagram.is_cut_short()), (46, false));
+        let is_longer = usize::from(bytes == authenticated) * 24;
         assert_eq!(
             (datagram.hop_limit, datagram.packet_bytes),
-            (64, bare.len())
+            (64, bare.len() + is_longer)
         );
     }
     let why = Unread::LinkType { link_type: 147 };
     assert_eq!(udp_datagram(147, &frame), Err(unread(why)));
+    let sealed = udp_datagram(link_type::RAW, &sealed);
+    assert_eq!(sealed, Err(unread(Unread::Encrypted)));
     let mut sealed = qos.clone();
     sealed[1] |= 0x40;
     let sealed = udp_datagram(link_type::IEEE802_11, &sealed);

@@ -1,9 +1,9 @@
 //! Was the robot hurt more in the new runs than in the base? What hurt it on both sides, pooled over the runs of each,
 //! and the answer that follows. Figures of the network are elsewhere.
 
-use hil_core::interval::{Interval, IntervalMethod};
-use hil_stats::comparison::{Share, difference};
-use hil_stats::statistics::{CONFIDENCE, poisson};
+use hil_core::interval::{Interval, Spread, TooSmall};
+use hil_stats::comparison::{Estimate, difference, mean_interval, none_of, welch};
+use hil_stats::statistics::CONFIDENCE;
 use serde::Serialize;
 
 use super::ComparedRun;
@@ -30,8 +30,9 @@ pub(crate) struct ComparedHarm {
 pub(crate) struct HarmDifference {
     /// Of the shares of the occasions, or of the rates per second of harms without occasions.
     pub(crate) value: f64,
-    /// 95 %: Newcombe's of the shares; of the rates, between the ends of both (Poisson).
-    pub(crate) interval: Interval,
+    /// 95 %, or why there is none: of a run and a run by the interval of each on its effective sample (MOVER), of
+    /// repetitions Welch's.
+    pub(crate) interval: Spread,
     /// It is of shares.
     pub(crate) is_share: bool,
 }
@@ -40,8 +41,7 @@ pub(crate) struct HarmDifference {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Change {
-    /// By the whole interval of the difference of the shares (Newcombe's); of harms without occasions, by the
-    /// whole intervals of both rates (Poisson).
+    /// By the whole interval of the difference.
     More,
     /// Likewise.
     Less,
@@ -49,47 +49,96 @@ pub(crate) enum Change {
     NotShown,
 }
 
-/// A harm of the runs of one side.
-struct Side {
-    harm: HarmCount,
-    /// Of all runs together, seconds.
-    length_s: f64,
+/// A harm of a run.
+#[derive(Debug, Clone, Copy)]
+struct RunHarm {
+    /// Its share of the occasions, or its rate per second.
+    value: f64,
+    /// How many occasions; `None` of a rate.
+    of: Option<u64>,
+    interval: Spread,
+}
+
+/// Events of a run that are only counted may all be one: the run is the observation.
+const ONE_RUN: TooSmall = TooSmall {
+    effective: 1,
+    needed: 2,
+};
+
+impl RunHarm {
+    /// `None` where it was not counted, or of no occasions or no time.
+    fn of(what: &str, run: &ComparedRun) -> Option<Self> {
+        let harm = run.summary.harms.iter().find(|one| one.what == what)?;
+        let of = harm.occasions.as_ref().map(|one| one.count);
+        let length = of.map_or(run.summary.run.duration_s, |of| of as f64);
+        let value = harm.count? as f64 / length;
+        value.is_finite().then_some(Self {
+            value: of.map_or(value, |_| value.min(1.0)),
+            of,
+            interval: harm.interval.unwrap_or(Spread::Unknown(ONE_RUN)),
+        })
+    }
+
+    /// With its interval; without events that of how they come together in the `other` run.
+    fn estimate(&self, other: &Self) -> Result<Estimate, TooSmall> {
+        let value = self.value;
+        let with = |interval| Estimate {
+            value,
+            interval: Some(interval),
+        };
+        match (self.interval, other.interval) {
+            (Spread::Known(interval), _) => Ok(with(interval)),
+            (Spread::Unknown(why), Spread::Known(interval)) if value == 0.0 => {
+                let like = Estimate {
+                    value: other.value,
+                    interval: Some(interval),
+                };
+                let counts = self.of.zip(other.of);
+                let found = counts.and_then(|(of, like_of)| none_of(of, like, like_of));
+                found.map(with).ok_or(why)
+            }
+            (Spread::Unknown(why), _) => Err(why),
+        }
+    }
 }
 
 impl HarmDifference {
-    fn of(base: &Side, new: &Side) -> Option<Self> {
-        let (base_s, new_s) = (base.length_s, new.length_s);
-        let (base, new) = (&base.harm, &new.harm);
-        if let Some((base, new)) = share(base).zip(share(new)) {
-            let base = base.estimate(CONFIDENCE)?;
-            let new = new.estimate(CONFIDENCE)?;
-            return Some(Self {
-                value: new.value - base.value,
-                interval: difference(base, new)?,
-                is_share: true,
-            });
-        }
-        let (base, new) = base.count.zip(new.count)?;
-        if base_s <= 0.0 || new_s <= 0.0 {
+    fn of(base: &[RunHarm], new: &[RunHarm]) -> Option<Self> {
+        let values = |side: &[RunHarm]| side.iter().map(|one| one.value).collect::<Vec<f64>>();
+        let mean = |side: &[RunHarm]| values(side).iter().sum::<f64>() / side.len() as f64;
+        let is_share = base.first()?.of.is_some();
+        let mut all = base.iter().chain(new);
+        if new.is_empty() || all.any(|one| one.of.is_some() != is_share) {
             return None;
         }
-        let value = new as f64 / new_s - base as f64 / base_s;
-        let [base, new] = [base, new].map(|count| poisson(count, CONFIDENCE));
+        let several = |side: &[RunHarm]| Estimate {
+            value: mean(side),
+            interval: mean_interval(&values(side), CONFIDENCE),
+        };
+        let found = match (base, new) {
+            ([b], [n]) => b
+                .estimate(n)
+                .and_then(|one| Ok(difference(one, n.estimate(b)?))),
+            ([b], _) => b.estimate(b).map(|one| difference(one, several(new))),
+            (_, [n]) => n.estimate(n).map(|one| difference(several(base), one)),
+            _ => Ok(welch(&values(base), &values(new), CONFIDENCE)),
+        };
         Some(Self {
-            value,
-            interval: Interval::new(
-                new.low / new_s - base.high / base_s,
-                new.high / new_s - base.low / base_s,
-                IntervalMethod::Exact,
-            ),
-            is_share: false,
+            value: mean(new) - mean(base),
+            // Repetitions of which none differs from another are worth one.
+            interval: found.and_then(|one| one.ok_or(ONE_RUN)).into(),
+            is_share,
         })
+    }
+
+    fn known(&self) -> Option<Interval> {
+        self.interval.known()
     }
 }
 
 impl Change {
     fn of(difference: Option<HarmDifference>) -> Self {
-        match difference.map(|one| one.interval) {
+        match difference.and_then(|one| one.known()) {
             Some(interval) if interval.low > 0.0 => Self::More,
             Some(interval) if interval.high < 0.0 => Self::Less,
             _ => Self::NotShown,
@@ -106,20 +155,21 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedHarm>
         }
     }
     let compared = whats.into_iter().map(|what| {
-        let [base, new] = [base, new].map(|runs| Side {
-            harm: pooled(what, runs),
-            length_s: runs.iter().map(|run| run.summary.run.duration_s).sum(),
-        });
-        let difference = HarmDifference::of(&base, &new);
-        let has_few = |side: &Side| {
-            let occasions = side.harm.occasions.as_ref();
+        let of_runs = |runs: &[ComparedRun]| {
+            let each = runs.iter().map(|run| RunHarm::of(what, run));
+            each.collect::<Option<Vec<_>>>().unwrap_or_default()
+        };
+        let difference = HarmDifference::of(&of_runs(base), &of_runs(new));
+        let [base, new] = [base, new].map(|runs| pooled(what, runs));
+        let has_few = |harm: &HarmCount| {
+            let occasions = harm.occasions.as_ref();
             occasions.is_some_and(|one| one.count < OCCASIONS_MIN)
         };
         ComparedHarm {
             change: Change::of(difference),
             difference: difference.filter(|_| !has_few(&base) && !has_few(&new)),
-            base: base.harm,
-            new: new.harm,
+            base,
+            new,
         }
     });
     compared.collect()
@@ -152,14 +202,6 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
         }
     }
     sum
-}
-
-fn share(harm: &HarmCount) -> Option<Share> {
-    let of = harm.occasions.as_ref().map(|one| one.count)?;
-    Some(Share {
-        count: harm.count?.min(of),
-        of,
-    })
 }
 
 /// Whether the robot was hurt more in the new runs.
@@ -204,17 +246,42 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
             })
         }
         _ if is_unhurt || is_less => Hurt::No,
-        _ => not_resolvable(Unresolved::WithinChance),
+        _ => not_resolvable(too_small(harms).unwrap_or(Unresolved::WithinChance)),
     }
+}
+
+/// The first harm of the new runs whose difference has no interval.
+fn too_small(harms: &[ComparedHarm]) -> Option<Unresolved> {
+    let mut hurt = harms.iter().filter(|one| one.new.count != Some(0));
+    hurt.find_map(|one| match one.difference?.interval {
+        Spread::Known(_) => None,
+        Spread::Unknown(why) => Some(Unresolved::NoInterval {
+            what: one.new.what.clone(),
+            why,
+        }),
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use std::path::PathBuf;
 
+    use hil_stats::dependence::Batches;
+
     use super::*;
     use crate::summary::Outcome;
     use crate::tests::sample::full;
+
+    /// So many loops lost, evenly or in one go.
+    fn of_loops(count: u64, sent_count: u64, is_even: bool) -> Spread {
+        let step = sent_count / count.max(1);
+        let runs: Vec<(u64, u64)> = if is_even {
+            (0..count).map(|at| (at * step, 1)).collect()
+        } else {
+            vec![(0, count)]
+        };
+        Batches::of_runs(sent_count, runs).share_interval()
+    }
 
     fn run(count: Option<u64>, sent_count: u64) -> ComparedRun {
         let mut summary = full();
@@ -227,7 +294,7 @@ mod tests {
                 what: "motion loops sent".to_owned(),
                 count: sent_count,
             }),
-            interval: None,
+            interval: count.map(|count| of_loops(count, sent_count, true)),
         }];
         ComparedRun {
             folder: PathBuf::from("run"),
@@ -242,19 +309,28 @@ mod tests {
 
     #[test]
     fn more_harm_than_chance_makes_is_a_yes() {
-        let clean = [run(Some(0), 60)];
-        assert_eq!(compared(&clean, &[run(Some(9), 60)]), Hurt::Yes);
-        assert_eq!(compared(&clean, &[run(Some(0), 60)]), Hurt::No);
-        let worse = [run(Some(20), 60)];
-        assert_eq!(compared(&worse, &[run(Some(3), 60)]), Hurt::No, "less");
-        let because = Unresolved::WithinChance;
-        let chance = compared(&clean, &[run(Some(1), 60)]);
+        let clean = [run(Some(0), 600)];
+        assert_eq!(compared(&clean, &[run(Some(90), 600)]), Hurt::Yes);
+        assert_eq!(compared(&clean, &[run(Some(0), 600)]), Hurt::No);
+        let worse = [run(Some(200), 600)];
+        assert_eq!(compared(&worse, &[run(Some(30), 600)]), Hurt::No, "less");
+        let chance = compared(&clean, &[run(Some(1), 600)]);
+        let because = Unresolved::NoInterval {
+            what: "motion loops lost".to_owned(),
+            why: TooSmall {
+                effective: 0,
+                needed: 5,
+            },
+        };
         assert_eq!(chance, Hurt::NotResolvable { because });
-        let more = of(&clean, &[run(Some(9), 60)])[0].difference.unwrap();
-        let Interval { low, high, .. } = more.interval;
+        let because = Unresolved::WithinChance;
+        let same = compared(&[run(Some(90), 600)], &[run(Some(91), 600)]);
+        assert_eq!(same, Hurt::NotResolvable { because });
+        let more = of(&clean, &[run(Some(90), 600)])[0].difference.unwrap();
+        let Interval { low, high, .. } = more.known().unwrap();
         assert!(more.is_share && (more.value - 0.15).abs() < 1e-12);
         assert!(
-            (0.05..0.08).contains(&low) && (0.25..0.27).contains(&high),
+            (0.08..0.14).contains(&low) && (0.16..0.25).contains(&high),
             "{more:?}"
         );
         assert_eq!(
@@ -262,36 +338,55 @@ mod tests {
             None,
             "no rate of nine"
         );
-        // Repetitions are pooled.
-        let repeated: Vec<_> = (0..8).map(|_| run(Some(1), 60)).collect();
+        // Repetitions are as many observations, also of short runs.
+        let repeated: Vec<_> = (0..8).map(|at| run(Some(1 + at % 2), 60)).collect();
         let clean: Vec<_> = (0..8).map(|_| run(Some(0), 60)).collect();
         assert_eq!(compared(&clean, &repeated), Hurt::Yes);
         assert_eq!(
             of(&clean, &repeated)[0].new.words().split(':').next(),
-            Some("8 of 480 motion loops sent")
+            Some("12 of 480 motion loops sent")
         );
     }
 
     #[test]
+    fn events_that_come_in_one_go_are_no_sample() {
+        let mut outage = run(Some(90), 600);
+        outage.summary.harms[0].interval = Some(of_loops(90, 600, false));
+        let outage = [outage];
+        let clean = [run(Some(0), 600)];
+        let difference = of(&clean, &outage)[0].difference.unwrap();
+        assert!(difference.known().is_none(), "{difference:?}");
+        assert!((difference.value - 0.15).abs() < 1e-12);
+        let hurt = compared(&clean, &outage);
+        assert!(matches!(hurt, Hurt::NotResolvable { .. }), "{hurt:?}");
+    }
+
+    #[test]
     fn one_harm_that_became_less_hides_no_other_that_became_more() {
-        let with_stops = |count, stops| {
-            let mut run = run(Some(count), 60);
-            run.summary.harms.push(HarmCount {
-                what: "stops".to_owned(),
-                count: Some(stops),
-                own_count: 0,
-                occasions: None,
-                interval: None,
+        let with_stops = |count: u64, stops: u64| {
+            let each = (0..4).map(|at| {
+                let mut run = run(Some(count + at % 2), 60);
+                run.summary.harms.push(HarmCount {
+                    what: "stops".to_owned(),
+                    count: Some(stops + at % 2 * u64::from(stops > 0)),
+                    own_count: 0,
+                    occasions: None,
+                    interval: None,
+                });
+                run
             });
-            [run]
+            each.collect::<Vec<_>>()
         };
         let better = compared(&with_stops(20, 0), &with_stops(3, 0));
         assert_eq!(better, Hurt::No);
         let worse = compared(&with_stops(20, 0), &with_stops(3, 500));
         assert_eq!(worse, Hurt::Yes);
         let because = Unresolved::WithinChance;
-        let mixed = compared(&with_stops(20, 1), &with_stops(3, 2));
+        let mixed = compared(&with_stops(20, 2), &with_stops(3, 2));
         assert_eq!(mixed, Hurt::NotResolvable { because });
+        // Of one run and one run nothing tells how stops come.
+        let single = compared(&with_stops(0, 0)[..1], &with_stops(0, 500)[..1]);
+        assert!(matches!(single, Hurt::NotResolvable { .. }), "{single:?}");
     }
 
     #[test]

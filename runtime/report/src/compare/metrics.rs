@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use hil_account::{ChannelAccount, FateCounts, MessageFate};
 use hil_core::interval::{Interval, Spread};
-use hil_stats::comparison::{Estimate, Share, difference, mean_interval, ratio, welch};
+use hil_stats::comparison::{Estimate, Share, difference, mean_interval, none_of, ratio, welch};
 use hil_stats::histogram::{Distribution, LatencySummary};
 use hil_stats::statistics::CONFIDENCE;
 
@@ -21,8 +21,9 @@ const PARTIAL: &str = "not every repetition has it";
 const NO_INTERVAL: &str =
     "no interval: the sample of a run is too small, or of segments; repeat the runs";
 const NO_MAXIMUM: &str = "no interval: one run's maximum has none; repeat the runs";
-const EFFECTIVE: &str = "MOVER of each run's interval on its effective sample; of runs without losses \
-                         Wilson's, for independent ones";
+const EFFECTIVE: &str = "MOVER of each run's interval on its effective sample; of runs without losses by \
+                         what the other side's sample is worth, and Wilson's where no run lost any, for \
+                         independent ones";
 const OWN: &str = "MOVER of the scores' own intervals";
 const NO_OWN: &str = "no interval: the score has none of its own; repeat the runs";
 const ABSENT: &str = "unavailable on one side";
@@ -301,7 +302,7 @@ fn verdict(interval: Option<Interval>, none: f64, [below, above]: [Verdict; 2]) 
 struct RunLoss {
     /// Lost among those whose fate is known and final.
     share: Share,
-    /// On the effective sample. Without a loss nothing is known of how they would come together: then Wilson's.
+    /// On the effective sample. Without a loss nothing is known of how they would come together.
     interval: Option<Interval>,
 }
 
@@ -314,7 +315,9 @@ impl RunLoss {
             count: fates.lost_count(),
             of: fates.total().saturating_sub(open),
         };
-        let independent = share.estimate(CONFIDENCE)?;
+        if share.of == 0 {
+            return None;
+        }
         let networks = run.summary.network.iter().flat_map(|one| &one.channels);
         let of_network = networks
             .filter(|one| one.channel == channel)
@@ -323,11 +326,7 @@ impl RunLoss {
         let same = of_network.filter(|loss| loss.lost_count == share.count);
         Some(Self {
             share,
-            interval: if share.count == 0 {
-                independent.interval
-            } else {
-                same.and_then(|loss| loss.interval.known())
-            },
+            interval: same.and_then(|loss| loss.interval.known()),
         })
     }
 
@@ -359,14 +358,18 @@ fn losses(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
         .collect()
 }
 
-/// One run's share as it is; of several their mean with Student's interval. Runs without any loss are one.
-fn mean_share(side: &[RunLoss]) -> Option<Estimate> {
+/// One run's share as it is; of several their mean with Student's interval. Runs without any loss are one, whose
+/// losses would come together as those of the `other` side.
+fn mean_share(side: &[RunLoss], other: &[RunLoss]) -> Option<Estimate> {
     let values = values_of(side);
-    let (first, count) = (side.first()?, side.iter().map(|one| one.share.count).sum());
-    let of = side.iter().map(|one| one.share.of).sum();
-    let interval = match (side.len(), count) {
-        (1, _) => first.interval,
-        (_, 0) => Share { count, of }.estimate(CONFIDENCE)?.interval,
+    let (pooled, pooled_other) = (pooled(side), pooled(other));
+    let interval = match side {
+        _ if pooled.count == 0 && pooled_other.count == 0 => pooled.estimate(CONFIDENCE)?.interval,
+        _ if pooled.count == 0 => {
+            let like = mean_share(other, &[]);
+            like.and_then(|like| none_of(pooled.of, like, pooled_other.of))
+        }
+        [only] => only.interval,
         // A share has no less than none and no more than all.
         _ => mean_interval(&values, CONFIDENCE).map(|found| found.map(|end| end.clamp(0.0, 1.0))),
     };
@@ -376,13 +379,21 @@ fn mean_share(side: &[RunLoss]) -> Option<Estimate> {
     })
 }
 
+fn pooled(side: &[RunLoss]) -> Share {
+    let sum = |part: fn(&Share) -> u64| side.iter().map(|one| part(&one.share)).sum();
+    Share {
+        count: sum(|one| one.count),
+        of: sum(|one| one.of),
+    }
+}
+
 fn values_of(side: &[RunLoss]) -> Vec<f64> {
     side.iter().map(|one| one.value()).collect()
 }
 
 fn loss_figure(channel: &str, base: &[RunLoss], new: &[RunLoss], of: Counts) -> ComparedMetric {
     let have = [base.len(), new.len()];
-    let sides = [mean_share(base), mean_share(new)];
+    let sides = [mean_share(base, new), mean_share(new, base)];
     let figure = figure(ChartKind::Loss, "loss", sides, have, of);
     let repeated = welch(&values_of(base), &values_of(new), CONFIDENCE);
     let is_lossless = base.iter().chain(new).all(|one| one.share.count == 0);

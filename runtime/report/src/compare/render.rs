@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use hil_core::interval::Interval;
+use hil_core::interval::{Interval, Spread};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_present::template::{TemplateError, markdown as document};
@@ -172,9 +172,14 @@ fn harms(comparison: &Comparison) -> Section {
 }
 
 fn difference_words(of: &HarmDifference) -> String {
-    let Interval { low, high, .. } = of.interval;
-    let [value, low, high] = [of.value, low, high].map(|value| more_words(of, value));
-    format!("{value} [{low}, {high}]")
+    let value = more_words(of, of.value);
+    match of.interval {
+        Spread::Known(Interval { low, high, .. }) => {
+            let [low, high] = [low, high].map(|end| more_words(of, end));
+            format!("{value} [{low}, {high}]")
+        }
+        Spread::Unknown(why) => format!("{value} [{why}]"),
+    }
 }
 
 fn more_words(of: &HarmDifference, value: f64) -> String {
@@ -190,9 +195,10 @@ fn left_open(comparison: &Comparison) -> Vec<String> {
     let mut open = Vec::new();
     if comparison.hurt == Hurt::No {
         for one in &comparison.harms {
-            let difference = one.difference.as_ref();
-            if let Some(of) = difference.filter(|one| one.interval.high > 0.0) {
-                let most = more_words(of, of.interval.high);
+            let of = one.difference.as_ref();
+            let ends = of.and_then(|of| Some((of, of.interval.known()?)));
+            if let Some((of, Interval { high, .. })) = ends.filter(|(_, one)| one.high > 0.0) {
+                let most = more_words(of, high);
                 open.push(format!("{}: up to {most} would not show", one.base.what));
             }
         }

@@ -42,6 +42,7 @@ struct Faulty(
 const FAULTY: &[Faulty] = &[
     // Syntax and the first lines.
     Faulty("name = \"good\"", "name = good #!", "", &["not valid TOML"]),
+    Faulty("version = 1", "version = 1,0 #!", "", &["decimal comma"]),
     Faulty(
         "version = 1",
         "version = 2 #!",
