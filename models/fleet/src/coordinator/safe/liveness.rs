@@ -9,9 +9,8 @@
 //!
 //! - Authority is extended only if the plan stays valid with the larger reservation, or another
 //!   valid plan is found for it. Otherwise the extension is withheld.
-//! - Robots that go forward and authorities that shrink only make reservations smaller, which
-//!   never invalidates a plan, with one gap: `Plan::keeps` counts a robot at the end of way beyond its move aside, and
-//!   that way may be taken back.
+//! - Robots that go forward and authorities that shrink only make reservations smaller, which never invalidates a plan:
+//!   no move ends short of what its robot has reserved (`Plan::extend`), so way that is taken back is still part of it.
 //! - A mission is admitted only if a valid plan with it exists; until then its robot counts as
 //!   parked. Its reservation, the bay's pose, is the same before and after.
 //!
@@ -172,16 +171,22 @@ impl Plan {
         upper: usize,
         may_reorder: bool,
     ) -> bool {
-        self.keeps(traffic, robot, upper)
-            || may_reorder && {
-                self.begin_search(traffic, robot);
-                self.spans[robot].upper = upper;
-                self.search(traffic)
+        if self.keeps(traffic, robot, upper) {
+            let end = upper.saturating_sub(self.margin.above);
+            for step in self.moves.iter_mut().filter(|step| step.robot == robot) {
+                step.to = step.to.max(end);
             }
+            return true;
+        }
+        may_reorder && {
+            self.begin_search(traffic, robot);
+            self.spans[robot].upper = upper;
+            self.search(traffic)
+        }
     }
 
-    /// Whether the plan stays valid when `robot` reserves up to `upper`. Only the moves of robots
-    /// that still need one of the new poses can become impossible, and only by this robot.
+    /// Whether the plan stays valid when `robot` reserves up to `upper` and none of its moves ends short of that. Only the
+    /// moves of robots that still need one of the new poses can become impossible, and only by this robot.
     fn keeps(&mut self, traffic: &Traffic, robot: usize, upper: usize) -> bool {
         let is_new = |contact: &Contact| {
             contact.own.lower <= upper
@@ -201,37 +206,39 @@ impl Plan {
             return true;
         }
         let last = traffic.last(robot);
+        let end = upper.saturating_sub(self.margin.above);
         let mut own = Span {
             lower: traffic.span(robot).lower,
             upper,
         };
         for step in &self.moves {
             if step.robot == robot {
-                let standing = self.margin.standing(step.to, last);
-                own = if standing.upper >= own.upper {
-                    standing
-                } else {
-                    let end = own.upper.saturating_sub(self.margin.above);
-                    let lower = end.saturating_sub(self.margin.below).max(own.lower);
-                    Span { lower, ..own }
+                let standing = self.margin.standing(step.to.max(end), last);
+                own = Span {
+                    lower: standing.lower.max(own.lower),
+                    ..standing
                 };
                 continue;
             }
             if !self.is_member[step.robot] {
                 continue;
             }
-            let end = self.margin.standing(step.to, traffic.last(step.robot));
+            let other = self.margin.standing(step.to, traffic.last(step.robot));
             let from = self.spans[step.robot].upper + 1;
             let is_blocked = contacts.iter().any(|contact| {
                 contact.other == step.robot
                     && is_new(contact)
-                    && conflict_of_other(contact, from, end.upper, own).is_some()
+                    && conflict_of_other(contact, from, other.upper, own).is_some()
             });
             if is_blocked {
                 return false;
             }
             let span = &mut self.spans[step.robot];
-            *span = if end.upper >= span.upper { end } else { *span };
+            *span = if other.upper >= span.upper {
+                other
+            } else {
+                *span
+            };
         }
         true
     }
@@ -364,6 +371,27 @@ impl Plan {
             stopped_by(span)
                 .is_none_or(|there| stopped_by(present).is_some_and(|here| here <= there))
         })
+    }
+}
+
+#[cfg(test)]
+impl Plan {
+    /// Whether each move can be made once those before it are, from the present reservations, each robot then standing
+    /// at the end of its move or of the way it has, and each ends at its goal.
+    pub(crate) fn is_possible(&self, traffic: &Traffic) -> bool {
+        let mut spans = traffic.spans.clone();
+        let can_be_made = self.moves.iter().all(|step| {
+            let (robot, last) = (step.robot, traffic.last(step.robot));
+            let reserved = spans[robot].upper;
+            let end = step.to.max(reserved.saturating_sub(self.margin.above));
+            let standing = self.margin.standing(end, last);
+            let conflict = traffic.first_conflict(robot, reserved + 1, standing.upper, &spans);
+            let lower = standing.lower.max(spans[robot].lower);
+            spans[robot] = Span { lower, ..standing };
+            conflict.is_none()
+        });
+        let at_goal = |step: &Move| spans[step.robot] == Span::at(traffic.last(step.robot));
+        can_be_made && self.moves.iter().all(at_goal)
     }
 }
 

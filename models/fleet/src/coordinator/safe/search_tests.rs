@@ -670,6 +670,9 @@ impl Model for Setting {
             Property::always("reservations are apart", |_: &Self, state: &Snapshot| {
                 !state.core.is_complete() || state.core.traffic.first_overlap().is_none()
             }),
+            Property::always("the plan is possible", |_: &Self, state: &Snapshot| {
+                state.core.plan.is_possible(&state.core.traffic)
+            }),
             Property::sometimes(
                 "all reach their goals",
                 |setting: &Self, state: &Snapshot| {
