@@ -185,11 +185,9 @@ pub(super) fn at_end(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interru
 
 /// True of a cable that ended in order: what waited for its program was given to it then, and what came after
 /// the end of the program was under way at the end of the run.
-fn clears_at_end(records: &RunRecords<'_>, process: &str) -> bool {
-    let has_cable = records.topology.process(process);
-    let has_cable = has_cable.is_some_and(|one| one.inside().is_some());
+fn clears_at_end(records: &RunRecords<'_>, process: &Process) -> bool {
     let mut ended = records.result.processes.iter();
-    has_cable && ended.any(|one| one.name == process && one.report.is_some())
+    process.inside().is_some() && ended.any(|one| one.name == process.name && one.report.is_some())
 }
 
 struct Stall {
