@@ -21,8 +21,6 @@ const BUFFER_BYTES: usize = u16::MAX as usize + TAG_BYTES;
 /// Refused datagrams that one call passes over at most, so that a flood of them cannot keep the
 /// thread from its other work.
 pub const REFUSED_PER_LOOK_MAX: usize = 16;
-/// Bytes of the longest greeting there is: its header, 41 bytes and a name of 255.
-const GREETING_BYTES_MAX: usize = 1024;
 
 /// A sender as a gateway owns it: behind the seal where the hop has one. Whatever the transport,
 /// one call through a pointer leads to the socket.
@@ -66,14 +64,14 @@ impl<S: DatagramSender> SealedSender<S> {
             inner,
             seal,
             buffer: vec![0; BUFFER_BYTES].into_boxed_slice(),
-            greeting: vec![0; GREETING_BYTES_MAX].into_boxed_slice(),
+            greeting: vec![0; BUFFER_BYTES].into_boxed_slice(),
             greeting_bytes: 0,
         }
     }
 
     /// Keeps a greeting until keys are answered for, within a round trip; false for anything else.
     fn keep_greeting(&mut self, datagram: &[u8]) -> bool {
-        if datagram[5] != Kind::Hello as u8 || datagram.len() > GREETING_BYTES_MAX {
+        if datagram[5] != Kind::Hello as u8 {
             return false;
         }
         self.greeting[..datagram.len()].copy_from_slice(datagram);

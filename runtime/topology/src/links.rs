@@ -170,7 +170,7 @@ options! {
         receive_buffer_bytes: usize = 212_992, in 4_096..=67_108_864;
         /// Kernel time stamps asked for. A transport without them has `off`.
         timestamps: Timestamps = Timestamps::Software;
-        /// Largest IP packet the path carries. The smallest is what every IPv4 host accepts (RFC 791).
+        /// Largest IP packet that is sent; over UDP greetings find out what the path takes of it. The smallest is what every IPv4 host accepts (RFC 791).
         path_mtu_bytes: usize = 1_500, in 576..=65_535;
     }
 }

@@ -48,6 +48,8 @@ use staging::Staging;
 pub const STAGED_BYTES_MAX: usize = 65_536;
 /// Time between greetings while the peer has not answered or is down.
 pub const HELLO_PERIOD: Duration = Duration::from_millis(50);
+/// Time between a padded greeting and the bare one behind it, which a near peer's answer makes needless.
+const BARE_AFTER: Duration = Duration::from_millis(5);
 /// Time between greetings after the peer refused the flow: it may be restarted with other
 /// settings, but soon is unlikely.
 pub const HELLO_PERIOD_REFUSED: Duration = Duration::from_secs(1);
@@ -772,7 +774,6 @@ impl EgressBridge {
                 let is_established = self.state == PeerState::Established;
                 if !is_established && !self.path.on_answer(ack.answers_handed_ns) {
                     self.state = PeerState::Greeting;
-                    self.hello_due = self.hello_due.min(now);
                     return Ok(EgressEvent::Answered);
                 }
                 Ok(self.establish(now, arrival, ack))

@@ -4,7 +4,8 @@
 use hil_core::time::Instant;
 
 use super::{
-    EgressBridge, Farewell, HELLO_PERIOD, HELLO_PERIOD_REFUSED, LastTransmit, PeerState, Transmit,
+    BARE_AFTER, EgressBridge, Farewell, HELLO_PERIOD, HELLO_PERIOD_REFUSED, LastTransmit,
+    PeerState, Transmit,
 };
 use crate::body::SYNC_BODY_BYTES;
 use crate::egress::staging::Piece;
@@ -42,12 +43,13 @@ impl EgressBridge {
             PeerState::Refused(_) => HELLO_PERIOD_REFUSED,
             _ => HELLO_PERIOD,
         };
-        self.hello_due = now + period;
         self.round_started_ns.get_or_insert(now.as_ns());
         let sequence = self.hello_sequence;
         self.hello_sequence += 1;
         self.counts.hello_sent_count += 1;
-        let padded_bytes = self.path.next_length(now.as_ns()) - HEADER_BYTES - TAG_BYTES;
+        let (length, has_bare) = self.path.next_length(now.as_ns());
+        self.hello_due = now + if has_bare { BARE_AFTER } else { period };
+        let padded_bytes = length - HEADER_BYTES - TAG_BYTES;
         let hello = self.settings.hello();
         let own_bytes = hello.encode(&mut self.control[HEADER_BYTES..]);
         let body_bytes = own_bytes.max(padded_bytes);

@@ -278,7 +278,7 @@ impl Direction {
             BridgeLoop::Egress(egress) => {
                 let sender = egress.line.sender();
                 let found = egress.path_bytes.map(|bytes| {
-                    let text = format!("{bytes} bytes a datagram, less than its interface takes");
+                    let text = format!("{bytes} bytes a datagram, less than the link asks for");
                     ("path as found by greetings".to_owned(), text)
                 });
                 facts.extend(found);

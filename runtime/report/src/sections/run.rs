@@ -388,10 +388,7 @@ pub(super) fn facts(summary: &RunSummary) -> Section {
         realtime.fact("granted", Tone::Plain, one.to_string());
     }
     if realtime.is_empty() {
-        realtime.note(
-            Tone::Faint,
-            "nothing was asked for, but by own programs, which end where they are refused",
-        );
+        realtime.note(Tone::Faint, "nothing was asked for");
     }
     section.children.push(realtime);
     let mut host = Section::new("host", "Host that wrote this", "");
