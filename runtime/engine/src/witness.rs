@@ -13,7 +13,7 @@ use hil_core::record::{PublishedRecord, TakenRecord};
 use hil_core::time::Instant;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::words::named;
-use hil_rundir::launch::{WitnessWork, WitnessedChannel, WorkerLaunch};
+use hil_rundir::launch::{WITNESS_LOOK_PERIOD, WitnessWork, WitnessedChannel, WorkerLaunch};
 use hil_rundir::pipe::{FromProcess, Orders, ProcessReport, say};
 use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder, SharedSink};
 use hil_shm::{Attendance, ChannelError, Domain, RawInput, SequenceTracker, Waiter};
@@ -30,11 +30,9 @@ const NAMED_COUNT: usize = 3;
 const LOOK_PERIOD: Duration = Duration::from_millis(10);
 /// How often every channel is looked at, since a program of the user's need not announce what it publishes.
 const SWEEP_PERIOD: Duration = Duration::from_millis(10);
-/// How often it is looked who reads.
-const READERS_PERIOD: Duration = Duration::from_millis(50);
 /// Messages of one channel that are taken in one look at most.
 const LOOK_COUNT_MAX: usize = 1_024;
-/// A publication that comes so long after the run's begin, with a stamp from before it, has a clock of its own.
+/// A publication that comes so long after the run's begin with a stamp from before it has a clock of its own.
 const FOREIGN_CLOCK: Duration = Duration::from_secs(2);
 
 /// Opens the record files.
@@ -211,8 +209,11 @@ impl Noted {
     fn note(&mut self, sinks: &mut Sinks, begun: Instant, envelope: &Envelope, payload: &[u8]) {
         let now = MonotonicClock::now();
         // What a program on this host said before is no message of the run.
-        if !envelope.is_forwarded() && envelope.published_ns < begun.as_ns() {
-            self.foreign_clock_count += u64::from(now > begun + FOREIGN_CLOCK);
+        let run_ns = begun.as_ns()..=now.as_ns();
+        if !envelope.is_forwarded() && !run_ns.contains(&envelope.published_ns) {
+            let is_of_another_clock =
+                envelope.published_ns > now.as_ns() || now > begun + FOREIGN_CLOCK;
+            self.foreign_clock_count += u64::from(is_of_another_clock);
             return;
         }
         if let Some(place) = self.published {
@@ -252,7 +253,7 @@ impl Noted {
         }
         if self.foreign_clock_count > 0 {
             say(&FromProcess::Warning(format!(
-                "{channel}: {} messages are in no record, as their publication stamps are from before the run: \
+                "{channel}: {} messages are in no record, as their publication stamps are not of the run: \
                  `published_ns` is of CLOCK_MONOTONIC",
                 self.foreign_clock_count
             )));
@@ -330,7 +331,7 @@ impl<F: Fn() -> Instant> JobWork for Witness<'_, F> {
     fn step(&mut self) -> Result<bool, WorkerError> {
         let now = MonotonicClock::now();
         if self.readers_due <= now {
-            self.readers_due = now + READERS_PERIOD;
+            self.readers_due = now + WITNESS_LOOK_PERIOD;
             self.look_for_readers();
         }
         if self.sweep_due <= now {

@@ -230,6 +230,9 @@ pub struct CableWork {
     pub wait: WaitMode,
 }
 
+/// How often a witness looks who reads a channel.
+pub const WITNESS_LOOK_PERIOD: Duration = Duration::from_millis(20);
+
 /// What a process is told that records for the programs of the user's on its host.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

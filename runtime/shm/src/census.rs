@@ -1,8 +1,10 @@
 //! Who has a channel open: counts of its writers and readers, for people and for programs that must
 //! not become a second writer.
 
+use std::path::Path;
+
 use iceoryx2::identifiers::UniqueNodeId;
-use iceoryx2::prelude::CallbackProgression;
+use iceoryx2::prelude::{CallbackProgression, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
 use super::domain::Domain;
@@ -27,6 +29,14 @@ impl Census {
     pub fn of(domain: &Domain, channel: &str) -> Result<Self, ChannelError> {
         Attendance::of(domain, channel).map(|channel| channel.census())
     }
+}
+
+/// Whether the process of `node` was not waited for yet; who cannot be asked counts as living.
+fn lives(node: &UniqueNodeId) -> bool {
+    let process = node.pid::<ipc::Service>();
+    process.map_or(true, |id| {
+        Path::new(&format!("/proc/{}", id.value())).exists()
+    })
 }
 
 /// A channel whose ends are looked at again and again, at the cost of a look into shared memory.
@@ -59,13 +69,13 @@ impl Attendance {
         }
     }
 
-    /// True while a process of the run reads it: neither this one nor an observer. One that died counts until its
-    /// supervisor has freed its place.
+    /// True while a process of the run that lives reads it: neither this one nor an observer.
     pub fn has_consumer(&self) -> bool {
         let mut has_consumer = false;
         self.service.dynamic_config().list_subscribers(|reader| {
             has_consumer = reader.node_id != self.own_node
-                && reader.subscriber_name != members::observer_port_name();
+                && reader.subscriber_name != members::observer_port_name()
+                && lives(&reader.node_id);
             if has_consumer {
                 CallbackProgression::Stop
             } else {

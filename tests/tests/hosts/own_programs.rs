@@ -10,7 +10,8 @@ use hil_tests::account::{account, describe};
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::split::HOSTS;
-use hil_tests::trial::{RunFiles, Trial};
+use hil_tests::trial::{RunFiles, Trial, processes_mentioning};
+use nix::sys::signal::{Signal, kill};
 
 use super::many_channels;
 
@@ -23,11 +24,13 @@ fn an_interface_that_is_down_is_a_loss_of_the_network_and_programs_have_whole_ac
         return;
     };
     let record = RunFolder::new("own-programs");
-    let path = many_channels::topology(&record, 2, HZ, Duration::from_secs(10));
+    let path = many_channels::topology(&record, 2, HZ, Duration::from_secs(14));
     // One of them takes its time.
     let program = env!("CARGO_BIN_EXE_hil-traffic");
-    let slow = format!("processes.b.run=[\"sh\", \"-c\", \"sleep 2; exec {program} {HZ}\"]");
-    let trial = Trial::of(&path, record.path()).set(&slow);
+    let slow = format!("processes.b.run=[\"sh\", \"-c\", \"sleep 2; exec {program} {HZ}.0\"]");
+    let trial = Trial::of(&path, record.path())
+        .set(&slow)
+        .set("processes.b.on_exit=\"restart\"");
     let mut supervisors = [0, 1].map(|index| trial.start_on(lab.host(index)));
     let files = [0, 1].map(|index| {
         let located = lab.host(index).locate(record.path());
@@ -40,11 +43,15 @@ fn an_interface_that_is_down_is_a_loss_of_the_network_and_programs_have_whole_ac
     });
     // The run goes on.
     supervisors[0]
-        .wait_for_output(" / 10 s", LIMIT)
+        .wait_for_output(" / 14 s", LIMIT)
         .unwrap_or_else(|reason| panic!("{reason}"));
     lab.host(0).set_link("eth0", "down");
     thread::sleep(Duration::from_secs(2));
     lab.host(0).set_link("eth0", "up");
+    // It is back after the two seconds that it takes to join.
+    let consumers = processes_mentioning(&format!("{program}\0{HZ}.0"));
+    assert_eq!(consumers.len(), 1);
+    kill(consumers[0], Signal::SIGKILL).unwrap();
     for supervisor in &mut supervisors {
         supervisor.wait_within(LIMIT).unwrap().assert_success();
     }
@@ -58,6 +65,8 @@ fn an_interface_that_is_down_is_a_loss_of_the_network_and_programs_have_whole_ac
             "{said}"
         );
         assert!(of(MessageFate::Taken) > 4 * u64::from(HZ), "{said}");
+        let in_interruption = of(MessageFate::LostInInterruption);
+        assert!(in_interruption > 3 * u64::from(HZ) / 2, "{said}");
         assert_eq!(of(MessageFate::UnknownPeerRecordsUnavailable), 0, "{said}");
         let network = summary.network.as_ref().unwrap();
         let channel = network.channels.iter().find(|one| one.channel == "there/0");

@@ -11,6 +11,7 @@ use hil_core::record::{IngressRecord, PublishedRecord, RoundTripRecord, TakenRec
 use hil_core::time::{Instant, duration_ns};
 
 use super::records::{ChannelFiles, RunRecords, all};
+use hil_rundir::launch::WITNESS_LOOK_PERIOD;
 use hil_rundir::run_result::RunResult;
 use hil_topology::{Channel, Process, gateway_name};
 
@@ -77,7 +78,8 @@ pub(super) fn noted(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interrup
                     let taken = files.into_iter().flat_map(|files| {
                         all::<TakenRecord>(files.taken.as_ref()).map(|one| one.taken_ns)
                     });
-                    let again = taken.filter(|at_ns| *at_ns >= back.as_ns()).min();
+                    let seen = back + WITNESS_LOOK_PERIOD;
+                    let again = taken.filter(|at_ns| *at_ns >= seen.as_ns()).min();
                     again.map_or(end_of(&event.host), Instant::from_ns)
                 }
                 Some(back) => back,
