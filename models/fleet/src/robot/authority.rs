@@ -367,7 +367,7 @@ impl Holder {
         grant.into_iter().chain([early]).flatten()
     }
 
-    /// The authority it keeps for a mission to come rests on nothing any more.
+    /// The authority it keeps for a mission to come.
     pub(crate) fn early(&mut self) -> Option<&mut Authority> {
         self.early.as_mut()
     }

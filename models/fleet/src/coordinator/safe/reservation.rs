@@ -265,4 +265,28 @@ impl Traffic {
             })
             .map(|(robot, other, ..)| (robot, other))
     }
+
+    /// Whether each robot knows every section that neither it nor the other has passed.
+    pub(crate) fn knows_sections_ahead(&self) -> bool {
+        (0..self.robot_count()).all(|robot| {
+            let Some(way) = self.ways[robot] else {
+                return true;
+            };
+            let others = (0..self.robot_count()).filter(|other| *other != robot);
+            let mut others = others.filter_map(|other| Some((other, self.ways[other]?)));
+            others.all(|(other, others)| {
+                let ahead = self.contacts_between(way.path, others.path, other, [robot, other]);
+                let known = self.contacts[robot].iter();
+                let known = known.filter(|contact| contact.other == other).count();
+                known >= ahead.len()
+            })
+        })
+    }
+
+    /// A planted fault: a section counts as passed at its last pose.
+    pub(crate) fn plant_forgotten_sections(&mut self) {
+        for (contacts, span) in self.contacts.iter_mut().zip(&self.spans) {
+            contacts.retain(|contact| contact.own.upper > span.lower);
+        }
+    }
 }

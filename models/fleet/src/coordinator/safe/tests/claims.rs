@@ -1,11 +1,13 @@
 //! The claims themselves: no overlap, every mission ends, equal seeds give equal runs.
 
-use super::rig::{CONDITIONS, Chaos, Rig, RigSetup, safe_parameters};
+use super::rig::{CONDITIONS, Chaos, Rig, RigSetup, coordinator, safe_parameters};
 use super::world::random_scene;
 use crate::coordinator::parameters::CoordinatorParameters;
 use crate::coordinator::policy::PolicyName;
 use crate::coordinator::safe::SafeParameters;
-use crate::mission::MissionMode;
+use crate::messages::{Authority, ToRobot};
+use crate::mission::{MissionMode, MissionParameters};
+use crate::robot::authority::is_newer;
 use crate::robot::{RobotParameters, TrackerKind};
 use crate::scenario::{Scenario, Scene, WorldParameters};
 use core::time::Duration;
@@ -24,6 +26,7 @@ fn setup(chaos: Chaos) -> RigSetup {
         mode: MissionMode::Random,
         chaos,
         restart_every: None,
+        robot_restart_at: None,
     }
 }
 
@@ -141,6 +144,68 @@ fn a_coordinator_that_restarts_again_and_again_keeps_every_robot_safe_and_the_fl
             assert!(tally.missions_done_count > 50, "{context}");
             assert!(tally.sections_passed_count > 20, "{context}");
         }
+    }
+}
+
+#[test]
+fn a_robot_that_restarts_on_its_way_holds_up_a_coordinator_that_restarts() {
+    for (name, chaos) in CONDITIONS {
+        for seed in 0..4_u64 {
+            let scene = random_scene(5, &mut RandomStream::new(seed, "world"));
+            let setup = RigSetup {
+                restart_every: Some(Duration::from_secs(150)),
+                robot_restart_at: Some(Duration::from_secs(50)),
+                ..setup(chaos)
+            };
+            let mut rig = Rig::new(&scene, &setup, seed);
+            rig.run(seconds(300), |_| false);
+            let tally = rig.referee.tally();
+            let counters = rig.coordinator.counters();
+            let context = format!("{name}, seed {seed}: {counters:?} {tally:?}");
+            assert_eq!(rig.restart_count, 1, "{context}");
+            assert!(counters.safe.answers_unplaced > 0, "{context}");
+            assert_eq!(tally.section_collisions_count, 0, "{context}");
+            assert_eq!(tally.overlaps_count + tally.outside_count, 0, "{context}");
+            let mut sent = Vec::new();
+            rig.coordinator
+                .on_cycle(seconds(300), &mut |message| sent.push(message));
+            let is_question = |message: &ToRobot| {
+                matches!(message, ToRobot::Authority(authority)
+                    if authority.flags & Authority::QUESTION != 0)
+            };
+            assert!(
+                !sent.is_empty() && sent.iter().all(is_question),
+                "{context}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_coordinator_that_starts_later_asks_a_newer_question() {
+    let scene = random_scene(2, &mut RandomStream::new(1, "world"));
+    let questions = |start: Instant| {
+        let mut coordinator =
+            coordinator(&scene, &safe_parameters(), &MissionParameters::default(), 1);
+        let mut questions = Vec::new();
+        coordinator.on_cycle(start, &mut |message| {
+            if let ToRobot::Authority(authority) = message {
+                assert_ne!(authority.flags & Authority::QUESTION, 0);
+                questions.push(authority.sequence);
+            }
+        });
+        questions
+    };
+    // Milliseconds; the last two are before and after the question's range is through.
+    let starts_ms = [0, 2, 1000, i64::from(u32::MAX), i64::from(u32::MAX) + 3];
+    let asked = starts_ms.map(|ms| questions(Instant::from_ns(ms * 1_000_000)));
+    for (start_ms, asked) in starts_ms.iter().zip(&asked) {
+        assert_eq!(asked.len(), 2, "{start_ms} ms");
+        assert_eq!(asked[0], asked[1], "{start_ms} ms");
+    }
+    for (earlier, later) in [(0, 1), (1, 2), (3, 4)] {
+        let (earlier, later) = (asked[earlier][0], asked[later][0]);
+        assert!(is_newer(later, earlier), "{earlier} {later}");
     }
 }
 

@@ -101,6 +101,7 @@ pub(super) struct Rig {
     seed: u64,
     restart_every: Option<Duration>,
     pub(super) restart_count: u64,
+    robot_restart_at: Option<Duration>,
 }
 
 pub(super) struct RigSetup {
@@ -109,8 +110,10 @@ pub(super) struct RigSetup {
     pub(super) missions_per_robot: u32,
     pub(super) mode: MissionMode,
     pub(super) chaos: Chaos,
-    /// The coordinator restarts so often; it takes five seconds.
+    /// The coordinator restarts so often; it is away for less time than messages may be under way.
     pub(super) restart_every: Option<Duration>,
+    /// From when on the first robot restarts once, as soon as it drives far from every bay.
+    pub(super) robot_restart_at: Option<Duration>,
 }
 
 pub(super) fn safe_parameters() -> CoordinatorParameters {
@@ -121,9 +124,9 @@ pub(super) fn safe_parameters() -> CoordinatorParameters {
 }
 
 const CYCLE: Duration = Duration::from_secs(1);
-const RESTART: Duration = Duration::from_secs(5);
+const RESTART: Duration = Duration::from_secs(1);
 
-fn coordinator(
+pub(super) fn coordinator(
     scene: &Scene,
     parameters: &CoordinatorParameters,
     missions: &MissionParameters,
@@ -163,6 +166,7 @@ impl Rig {
             seed,
             restart_every: setup.restart_every,
             restart_count: 0,
+            robot_restart_at: setup.robot_restart_at,
         }
     }
 
@@ -185,6 +189,21 @@ impl Rig {
             }
             self.letters[slot] = Some(letter());
             self.queue.push(Reverse((at, slot as u64)));
+        }
+    }
+
+    /// The first robot restarts where it is, if it is to and drives far from every bay.
+    fn restart_robot(&mut self) {
+        let state = self.robots[0].state(self.now);
+        let bays = &self.scene.world.bays;
+        let is_far = bays.iter().all(|bay| {
+            let (x_m, y_m) = (bay.pose.x_m - state.x_m, bay.pose.y_m - state.y_m);
+            x_m.hypot(y_m) > 4.0
+        });
+        let is_due = |at: &Duration| Instant::ZERO + *at <= self.now && is_far;
+        if self.robot_restart_at.take_if(|at| is_due(at)).is_some() {
+            let referee = &mut self.referee;
+            self.robots[0].start(self.now, &mut |truth| referee.on_truth(&truth));
         }
     }
 
@@ -224,6 +243,7 @@ impl Rig {
                 next_restart = self.restart_every.map(|every| at + every);
                 next_cycle = at + RESTART;
             } else if next_cycle == at {
+                self.restart_robot();
                 let mut out = Vec::new();
                 self.coordinator
                     .on_cycle(at, &mut |message| out.push(message));
