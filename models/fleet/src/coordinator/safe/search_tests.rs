@@ -1018,7 +1018,8 @@ fn no_state_of_a_cycle_with_a_restart_of_everyone_is_a_collision() {
     // Depth first, as it keeps few states beside the hashes of those visited.
     let ends = stateright::HasDiscoveries::AnyFailures;
     let setting = cycle().looked_at(&[9]);
-    count(setting.checker().finish_when(ends).spawn_dfs());
+    let states = count(setting.checker().finish_when(ends).spawn_dfs());
+    assert_eq!(states, 12_082_781);
 }
 
 #[test]
