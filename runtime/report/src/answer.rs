@@ -86,7 +86,7 @@ impl From<&DeadlineMetrics> for HarmCount {
     fn from(deadline: &DeadlineMetrics) -> Self {
         Self {
             what: format!("{} late or missing", deadline.name),
-            count: Some(deadline.hurt_count()),
+            count: Some(deadline.hurt_count),
             own_count: 0,
             occasions: Some(OccasionCount {
                 what: format!("requests of {}", deadline.name),
@@ -512,7 +512,7 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
         return not_resolvable(Unresolved::ScoreIncomplete);
     }
     // Whose time it took is known of each request.
-    if summary.deadlines.iter().any(|one| one.hurt_count() > 0) {
+    if summary.deadlines.iter().any(|one| one.hurt_count > 0) {
         return Hurt::Yes;
     }
     let harms = summary.harms.iter();

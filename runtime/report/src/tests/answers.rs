@@ -301,6 +301,7 @@ fn requests_that_the_network_made_late_or_lost_are_harm_and_others_are_not() {
             missing_by_network_count: missing[0],
             missing_by_program_count: missing[1],
             missing_by_harness_count: missing[2],
+            hurt_count: late[0] + late[1] + missing[0],
             ..DeadlineFold::new("command", 4_000_000).finish()
         };
         let mut summary = own_programs(LinkKind::Emulated);
