@@ -86,6 +86,8 @@ pub struct DeadlineFold {
     programs_ns: Vec<i64>,
     /// When each request was sent, and whether the network hurt it.
     hurt: Vec<(i64, bool)>,
+    /// See [`Self::doubt_program`].
+    is_program_doubted: bool,
 }
 
 impl DeadlineFold {
@@ -113,7 +115,13 @@ impl DeadlineFold {
             responses_ns: Vec::new(),
             programs_ns: Vec::new(),
             hurt: Vec::new(),
+            is_program_doubted: false,
         }
+    }
+
+    /// An inlet lost frames, of which answers may have been: requests without an answer are unknown from now on.
+    pub const fn doubt_program(&mut self) {
+        self.is_program_doubted = true;
     }
 
     /// Adds the `requests` of two ends and the frames that go back between these, in order of their sending.
@@ -213,6 +221,10 @@ impl DeadlineFold {
     }
 
     fn add_unanswered(&mut self, sent_ns: i64) {
+        if self.is_program_doubted {
+            self.metrics.unknown_count += 1;
+            return;
+        }
         self.metrics.missing_by_program_count += 1;
         self.hurt.push((sent_ns, false));
     }
@@ -228,13 +240,6 @@ impl DeadlineFold {
             program: Distribution::of_samples(&self.programs_ns, NO_ANSWER),
             ..self.metrics
         }
-    }
-}
-
-impl DeadlineMetrics {
-    /// An inlet lost frames, of which answers may have been.
-    pub fn doubt_program(&mut self) {
-        self.unknown_count += core::mem::take(&mut self.missing_by_program_count);
     }
 }
 
@@ -391,6 +396,36 @@ mod tests {
         let found = folded(8 * MS, &requests, &answers);
         let counts = [found.late_by_network_count, found.missing_by_program_count];
         assert_eq!(counts, [10, 0]);
+    }
+
+    #[test]
+    fn a_share_is_of_the_requests_of_which_it_is_known() {
+        let every = |step: usize, end: FrameEnd| {
+            let requests = (0..1000).map(|one| request(10 * one, 1));
+            let lost = requests.enumerate().map(|(index, one)| match index % step {
+                0 => lost(one, end),
+                _ => one,
+            });
+            lost.collect::<Vec<_>>()
+        };
+        let requests = every(20, FrameEnd::LostByNetwork);
+        // Every second one has an answer.
+        let answers: Vec<_> = (0..500).map(|one| answer(20 * one + 12, 1)).collect();
+        let [known, doubted] = [false, true].map(|is_doubted| {
+            let mut fold = DeadlineFold::new("command", 4 * MS);
+            if is_doubted {
+                fold.doubt_program();
+            }
+            fold.add(&requests, &answers);
+            let found = fold.finish();
+            let of = found.request_count - found.unknown_count;
+            let share = found.hurt_count as f64 / of as f64;
+            let interval = found.hurt_share.and_then(Spread::known).unwrap();
+            assert!(interval.holds(share), "{share}: {interval:?}");
+            (found.missing_by_program_count, found.hurt_count, of)
+        });
+        assert_eq!(known, (450, 50, 1000));
+        assert_eq!(doubted, (0, 50, 550));
     }
 
     #[test]
