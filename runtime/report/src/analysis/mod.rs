@@ -174,8 +174,13 @@ pub fn conclude(
         None => (&[][..], Score::default()),
     };
     summary.put_score(&score);
-    let deadlines = summary.deadlines.iter().map(HarmCount::from);
-    summary.harms.extend(deadlines);
+    // Programs between which nothing is crossed put no network to the test.
+    let has_crossed = summary.flows.iter().any(|flows| {
+        let mut channels = summary.channels.iter();
+        channels.any(|one| one.name == flows.channel && one.link.is_crossing())
+    });
+    let deadlines = summary.deadlines.iter().filter(|_| has_crossed);
+    summary.harms.extend(deadlines.map(HarmCount::from));
     summary.score_events = events::explained(
         &score,
         &records,
