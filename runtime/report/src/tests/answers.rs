@@ -116,6 +116,20 @@ fn a_sample_that_is_too_small_shows_no_absence_of_harm() {
     count_all(&mut enough);
     let enough = answer(&enough);
     assert_eq!((enough.hurt.clone(), enough.tone()), (Hurt::No, Tone::Good));
+    // The harm with the fewest occasions decides.
+    let mut few = run(lost_loops(Some(0), 0, 600));
+    count_all(&mut few);
+    few.harms.push(lost_loops(Some(0), 0, 2));
+    let hurt = answer(&few).hurt;
+    assert!(
+        matches!(
+            hurt,
+            Hurt::NotResolvable {
+                because: Unresolved::SampleTooSmall { count: 2, .. }
+            }
+        ),
+        "{hurt:?}"
+    );
     // Harm is harm, however small the sample.
     assert_eq!(answer(&run(lost_loops(Some(1), 0, 3))).hurt, Hurt::Yes);
     let because = Unresolved::NotCounted;
