@@ -329,6 +329,14 @@ mod tests {
         let numbers: Vec<_> = found.keys().map(|(_, sequence)| *sequence).collect();
         assert_eq!(numbers, [4, 5]);
         assert_eq!(account(&files.records(), &context).published_count, 2);
+        // A number that no record mentions between two of before the run.
+        let mut files = files;
+        files.published.retain(|one| one.sequence != 2);
+        files.egress.retain(|one| one.sequence != 2);
+        files.ingress.retain(|one| one.sequence != 2);
+        files.taken.retain(|one| one.sequence != 2);
+        assert_eq!(histories(&files, &context).len(), 2);
+        assert_eq!(account(&files.records(), &context).published_count, 2);
     }
 
     #[test]
