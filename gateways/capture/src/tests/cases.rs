@@ -440,6 +440,36 @@ fn a_datagram_on_two_links_of_one_host_is_no_duplicate() {
 }
 
 #[test]
+fn equal_datagrams_of_a_capture_on_any_are_no_copies_but_by_their_packets() {
+    // A robot that holds still, at 1 kHz; of a host that numbers its packets, and of one that does not.
+    let cooked = |packet_number: u16| {
+        let mut frame = [&[0; 14][..], &datagram(7, 32)[12..]].concat();
+        frame[20..22].copy_from_slice(&packet_number.to_be_bytes());
+        frame
+    };
+    for flow in ["udp:dport=5004", "udp:dport=5004,id=3+1"] {
+        for (is_numbered, copy_count, told) in [
+            (true, 1, [100, 0]),
+            (true, 2, [100, 100]),
+            (false, 1, [100, 0]),
+        ] {
+            let packets = (0..100 * copy_count).map(|n| {
+                let n = n / copy_count;
+                let number = if is_numbered { n + 1 } else { 0 };
+                (BEGIN_US + 1000 * i64::from(n), cooked(number))
+            });
+            let mut file = pcap(&packets.collect::<Vec<_>>());
+            file[20] = 113;
+            let mut observer = Observer::new(&[flow.parse().unwrap()]);
+            take(&mut observer, 0, &file);
+            let counts = observer.counts();
+            let found = [counts.followed_count, counts.elsewhere_count];
+            assert_eq!(found, told, "{flow}, {is_numbered}");
+        }
+    }
+}
+
+#[test]
 fn an_aggregate_is_no_datagram() {
     // Ten frames of ten datagrams each, sent by segmentation offload.
     let large = (0..10).map(|n| (BEGIN_US + 10_000 * i64::from(n), datagram(10 * n, 10_000)));
