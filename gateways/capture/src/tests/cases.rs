@@ -501,6 +501,15 @@ fn an_aggregate_is_no_datagram() {
             assert_eq!(why, Doubt::Unread(Unread::Aggregate), "{flow}: {joins:#?}");
         }
     }
+    // A large one that was lost, and small ones that the first point missed and that are not its pieces.
+    let sized = |n: u32| if n == 20 { 300 } else { 32 };
+    let without = |missing: &[u32], late_us: i64| {
+        let numbers = (0..100).filter(|n| !missing.contains(n));
+        let packet = |n: u32| (at_us(n) + late_us, datagram(n, sized(n)));
+        pcap(&numbers.map(packet).collect::<Vec<_>>())
+    };
+    let joins = joins_of(&without(&[60, 61], 0), &without(&[20], 500), true);
+    assert_eq!(joins[0].loss.count(), Some(1), "{joins:#?}");
     // As large at both points: a link with jumbo frames, on which one was lost.
     let jumbo = |lost: u32, late_us: i64| {
         let numbers = (0..50).filter(|n| *n != lost);
