@@ -665,9 +665,11 @@ fn doubts(
     if !is_judged || !alone[0].is_empty() {
         blind.push(second);
     }
-    for watch in blind.iter().map(|side| side.sight.watch) {
+    for side in blind {
+        let watch = side.sight.watch;
         let (source, destination) = (stream.source, stream.destination);
-        for (why, count) in watch.unread_of(stream.flow_index, source, destination) {
+        let is_seen = !side.seen.is_empty();
+        for (why, count) in watch.unread_of(stream.flow_index, source, destination, is_seen) {
             add(
                 Doubt::Unread(why),
                 usize::try_from(count).unwrap_or(usize::MAX),

@@ -88,6 +88,13 @@ pub enum NoDatagram {
     NotUdp,
     /// A later fragment of a datagram, without the ports.
     LaterFragment,
+    /// Encrypted (RFC 4303): it may hold any datagram between its ends, or of a tunnel between them.
+    Sealed {
+        /// Where from.
+        source: IpAddr,
+        /// Where to.
+        destination: IpAddr,
+    },
     /// It may hold any datagram.
     Unread(Unread),
 }
@@ -397,7 +404,12 @@ impl<'a> Walk<'a> {
         let layer = match network.protocol {
             IPV4_INSIDE | IPV6_INSIDE => Some(Layer::Ip),
             GRE => Some(Layer::Gre),
-            ESP => return Err(ENCRYPTED),
+            ESP => {
+                return Err(NoDatagram::Sealed {
+                    source: network.source,
+                    destination: network.destination,
+                });
+            }
             _ => None,
         };
         if let Some(layer) = layer {

@@ -224,6 +224,13 @@ impl Observer {
                     NoDatagram::NotIp => &mut counts.not_ip_count,
                     NoDatagram::NotUdp => &mut counts.not_udp_count,
                     NoDatagram::LaterFragment => &mut counts.later_fragment_count,
+                    NoDatagram::Sealed {
+                        source,
+                        destination,
+                    } => {
+                        watch.miss_sealed(source, destination);
+                        &mut counts.unreadable_count
+                    }
                     NoDatagram::Unread(why) => {
                         watch.miss(why);
                         &mut counts.unreadable_count

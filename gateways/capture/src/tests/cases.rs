@@ -470,6 +470,38 @@ fn equal_datagrams_of_a_capture_on_any_are_no_copies_but_by_their_packets() {
 }
 
 #[test]
+fn encrypted_packets_of_other_hosts_hide_nothing_of_a_flow_that_is_seen() {
+    let sealed = |last: u8| {
+        let mut frame = datagram(0, 32);
+        (frame[23], frame[33]) = (50, last);
+        frame
+    };
+    let second = |last: u8, is_readable: bool| {
+        let numbers = (0..100).filter(|n| *n != 20);
+        let packet = |n: u32| {
+            let at_us = BEGIN_US + 100_000 * i64::from(n) + 1000;
+            let frame = if n % 10 == 9 || !is_readable {
+                sealed(last)
+            } else {
+                datagram(n, 32)
+            };
+            (at_us, frame)
+        };
+        pcap(&numbers.map(packet).collect::<Vec<_>>())
+    };
+    let readable = first_point();
+    let of_others = &joins_of(&readable, &second(9, true), true)[0];
+    assert_eq!(of_others.loss.count(), Some(11), "{of_others:#?}");
+    let of_its_hosts = &joins_of(&readable, &second(2, true), true)[0];
+    let encrypted = Doubt::Unread(Unread::Encrypted);
+    assert_eq!(doubts(of_its_hosts), [(encrypted, 10)]);
+    // A tunnel between other ends, of which nothing but that is seen.
+    for joined in joins_of(&readable, &second(9, false), true) {
+        assert_eq!(joined.loss.count(), None, "{joined:#?}");
+    }
+}
+
+#[test]
 fn an_aggregate_is_no_datagram() {
     // Ten frames of ten datagrams each, sent by segmentation offload.
     let large = (0..10).map(|n| (BEGIN_US + 10_000 * i64::from(n), datagram(10 * n, 10_000)));
