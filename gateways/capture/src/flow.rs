@@ -19,6 +19,8 @@ use hil_protocol::wire::{HEADER_BYTES, Header, Kind};
 
 /// What our own datagrams begin with.
 const MAGIC: [u8; 4] = *b"HILG";
+/// Bits of a number that does not come again while one datagram passes a host's links.
+const UNIQUE_BITS: u8 = 32;
 /// Bytes of a frame before the payload of a UDP datagram at most, with a tag and IP options.
 const BEFORE_PAYLOAD_BYTES: usize = 18 + 60 + 8;
 
@@ -190,6 +192,14 @@ pub struct DatagramIdentity {
     pub number: Option<Numbered>,
     /// Its header, when it is ours.
     pub own: Option<OwnHeader>,
+}
+
+impl DatagramIdentity {
+    /// No other datagram of the stream has it within seconds: it is a number wide enough.
+    pub(super) fn is_unique(&self) -> bool {
+        let bits = self.number.map(|number| number.bits.unwrap_or(u8::MAX));
+        bits >= Some(UNIQUE_BITS)
+    }
 }
 
 /// A sequence number and the series it belongs to.

@@ -509,6 +509,7 @@ impl Matches {
         }
         matches.pairs.sort_unstable();
         matches.only_first.sort_unstable();
+        matches.only_second.sort_unstable();
         matches
     }
 
@@ -633,14 +634,18 @@ fn doubts(
     let whole = whole.map(|pair| pair.first.packet_bytes).max();
     let whole_bytes_max = whole.unwrap_or(0).max(PACKET_BYTES_MAX);
     let alone_count: usize = alone.iter().map(|list| list.len()).sum();
-    // Where each point lacks some of the other, one larger than all of the other may be several of them.
-    let is_either_short = alone.iter().all(|list| !list.is_empty());
-    let large_count: usize = [(alone[0], second), (alone[1], first)]
-        .map(|(list, other)| {
+    // One larger than all of the other point may be several that only that one shows.
+    let large_count: usize = [(alone[0], second, alone[1]), (alone[1], first, alone[0])]
+        .map(|(list, other, pieces)| {
             let largest = other.seen.iter().map(|one| one.payload_bytes).max();
+            let mut known = BTreeMap::new();
             let is_large = |one: &&Observation| {
-                one.packet_bytes > whole_bytes_max
-                    || is_either_short && Some(one.payload_bytes) > largest
+                let whole_bytes = one.payload_bytes;
+                let mut has_pieces = || {
+                    let found = known.entry(whole_bytes);
+                    *found.or_insert_with(|| are_together(pieces, whole_bytes))
+                };
+                one.packet_bytes > whole_bytes_max || Some(whole_bytes) > largest && has_pieces()
             };
             list.iter().filter(is_large).count()
         })
@@ -660,9 +665,11 @@ fn doubts(
     if !is_judged || !alone[0].is_empty() {
         blind.push(second);
     }
-    for watch in blind.iter().map(|side| side.sight.watch) {
+    for side in blind {
+        let watch = side.sight.watch;
         let (source, destination) = (stream.source, stream.destination);
-        for (why, count) in watch.unread_of(stream.flow_index, source, destination) {
+        let is_seen = !side.seen.is_empty();
+        for (why, count) in watch.unread_of(stream.flow_index, source, destination, is_seen) {
             add(
                 Doubt::Unread(why),
                 usize::try_from(count).unwrap_or(usize::MAX),
@@ -677,6 +684,19 @@ fn doubts(
         doubts.push(CountedDoubt { doubt, count });
     }
     doubts
+}
+
+/// Whether neighbours in `list`, each of fewer, are of so many bytes together.
+fn are_together(list: &[Observation], whole_bytes: u32) -> bool {
+    let (mut from, mut bytes) = (0, 0_u64);
+    list.iter().any(|one| {
+        bytes += u64::from(one.payload_bytes);
+        while bytes > u64::from(whole_bytes) {
+            bytes -= u64::from(list[from].payload_bytes);
+            from += 1;
+        }
+        bytes == u64::from(whole_bytes)
+    })
 }
 
 fn loss(lost: &[usize], matches: &Matches, doubts: Vec<CountedDoubt>) -> Loss {

@@ -60,6 +60,8 @@ pub struct UdpDatagram<'a> {
     pub place: FramePlace,
     /// An 802.11 frame sent again for want of an acknowledgement.
     pub is_radio_retry: bool,
+    /// Identification of its IP packet; 0 where it has none: of many senders that forbid fragments, and of IPv6.
+    pub packet_number: u16,
     /// Bytes of its IP packet on the wire; of the first fragment when there are several.
     pub packet_bytes: usize,
     /// Bytes of the payload on the wire.
@@ -86,6 +88,13 @@ pub enum NoDatagram {
     NotUdp,
     /// A later fragment of a datagram, without the ports.
     LaterFragment,
+    /// Encrypted (RFC 4303): it may hold any datagram between its ends, or of a tunnel between them.
+    Sealed {
+        /// Where from.
+        source: IpAddr,
+        /// Where to.
+        destination: IpAddr,
+    },
     /// It may hold any datagram.
     Unread(Unread),
 }
@@ -395,7 +404,12 @@ impl<'a> Walk<'a> {
         let layer = match network.protocol {
             IPV4_INSIDE | IPV6_INSIDE => Some(Layer::Ip),
             GRE => Some(Layer::Gre),
-            ESP => return Err(ENCRYPTED),
+            ESP => {
+                return Err(NoDatagram::Sealed {
+                    source: network.source,
+                    destination: network.destination,
+                });
+            }
             _ => None,
         };
         if let Some(layer) = layer {
@@ -420,6 +434,7 @@ impl<'a> Walk<'a> {
             hop_limit: network.hop_limit,
             place: self.place,
             is_radio_retry: self.is_radio_retry,
+            packet_number: network.packet_number,
             packet_bytes: network.header_bytes + network.segment_bytes,
             payload_bytes: length_bytes - UDP_HEADER_BYTES,
             payload: &network.segment[UDP_HEADER_BYTES..end],
@@ -450,6 +465,8 @@ struct Network<'a> {
     destination: IpAddr,
     dscp: u8,
     hop_limit: u8,
+    /// See [`UdpDatagram::packet_number`].
+    packet_number: u16,
     /// Bytes before `segment`.
     header_bytes: usize,
     /// What is behind its headers, without what pads the frame.
@@ -494,6 +511,7 @@ fn ipv4(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
         destination: part::<4>(&fixed, 16).into(),
         dscp: fixed[1] >> 2,
         hop_limit: fixed[8],
+        packet_number: u16::from_be_bytes([fixed[4], fixed[5]]),
         header_bytes: at,
         segment: packet.get(at..end).ok_or(CUT_SHORT)?,
         segment_bytes: total_bytes.checked_sub(at).ok_or(MALFORMED)?,
@@ -518,6 +536,7 @@ fn ipv6(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
                 destination: part::<16>(&fixed, 24).into(),
                 dscp: traffic_class >> 2,
                 hop_limit: fixed[7],
+                packet_number: 0,
                 header_bytes: at,
                 segment: packet.get(at..end).ok_or(CUT_SHORT)?,
                 segment_bytes: total_bytes.checked_sub(at).ok_or(MALFORMED)?,

@@ -106,6 +106,8 @@ pub struct Observation {
     pub payload_bytes: u32,
     /// Bytes of its IP packet; of the first fragment when there are several.
     pub packet_bytes: u32,
+    /// See [`UdpDatagram::packet_number`](super::link::UdpDatagram::packet_number).
+    pub packet_number: u16,
     /// Time to live, or hop limit.
     pub hop_limit: u8,
     /// For which station of the link it was.
@@ -145,7 +147,8 @@ pub struct PacketCounts {
     /// Sent again by a radio for want of an acknowledgement, and seen before.
     pub radio_retry_count: u64,
     /// Seen just before, for another station or in a cooked capture that does not name interfaces: once
-    /// more on another link, not twice on this one.
+    /// more on another link, not twice on this one. In such a capture only by a number of at least 32 bits, or in an
+    /// IP packet of the same identification.
     pub elsewhere_count: u64,
     /// Earlier than the packet before it at the same point: a file out of order.
     pub backward_stamp_count: u64,
@@ -221,6 +224,13 @@ impl Observer {
                     NoDatagram::NotIp => &mut counts.not_ip_count,
                     NoDatagram::NotUdp => &mut counts.not_udp_count,
                     NoDatagram::LaterFragment => &mut counts.later_fragment_count,
+                    NoDatagram::Sealed {
+                        source,
+                        destination,
+                    } => {
+                        watch.miss_sealed(source, destination);
+                        &mut counts.unreadable_count
+                    }
                     NoDatagram::Unread(why) => {
                         watch.miss(why);
                         &mut counts.unreadable_count
@@ -247,11 +257,17 @@ impl Observer {
                         own: identity.own.map(|own| (own.channel, own.kind as u8)),
                     };
                     let list = seen.entry(stream).or_default();
-                    let is_known = |one: &&Observation| one.identity.key == identity.key;
-                    let known = list.iter().rev().take(COPY_COUNT_MAX).find(is_known);
                     let place = &datagram.place;
+                    // Where nothing names the link, another datagram may say the same.
+                    let is_doubtful = place.is_of_any && !identity.is_unique();
+                    let is_known = |one: &&Observation| {
+                        one.identity.key == identity.key
+                            && (!is_doubtful || one.packet_number == datagram.packet_number)
+                    };
+                    let known = list.iter().rev().take(COPY_COUNT_MAX).find(is_known);
                     let is_elsewhere = |known: &Observation| {
                         (place.is_of_any || place.station != known.station)
+                            && (!is_doubtful || datagram.packet_number != 0)
                             && stamp_ns.abs_diff(known.stamp_ns) <= ELSEWHERE_MAX_NS
                     };
                     if datagram.is_radio_retry && known.is_some() {
@@ -272,6 +288,7 @@ impl Observer {
                         level: watch.level(),
                         payload_bytes: bytes(datagram.payload_bytes),
                         packet_bytes: bytes(datagram.packet_bytes),
+                        packet_number: datagram.packet_number,
                         hop_limit: datagram.hop_limit,
                         station: place.station,
                         identity,

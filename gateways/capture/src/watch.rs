@@ -7,7 +7,7 @@
 //! together tell which (see [`super::join`]).
 
 use std::collections::BTreeMap;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 
 use serde::{Deserialize, Serialize};
 
@@ -56,7 +56,7 @@ pub enum Unread {
     Fragmented,
     /// Lengths or versions that cannot be.
     Malformed,
-    /// Sealed by 802.11, `MACsec` or PPP.
+    /// Sealed by 802.11, `MACsec`, PPP or ESP.
     Encrypted,
     /// Several datagrams in one frame: a super-frame of segmentation or receive offload, or an A-MSDU.
     Aggregate,
@@ -117,6 +117,8 @@ pub struct Watch {
     pub unread: BTreeMap<Unread, u64>,
     /// Datagrams of a flow and two sockets of which too little was captured to know them again.
     cut: BTreeMap<(usize, SocketAddr, SocketAddr, Unread), u64>,
+    /// IP packets between two ends whose payload is encrypted.
+    sealed: BTreeMap<(IpAddr, IpAddr), u64>,
     /// Frames that it did not keep, as its file says.
     pub dropped_count: u64,
     /// See [`CaptureInterface::is_merged`].
@@ -134,14 +136,25 @@ impl Watch {
         *self.cut.entry((flow, from, to, why)).or_default() += 1;
     }
 
-    /// Frames that may be of a flow between two sockets, and why they cannot be told.
+    pub(super) fn miss_sealed(&mut self, source: IpAddr, destination: IpAddr) {
+        *self.sealed.entry((source, destination)).or_default() += 1;
+    }
+
+    /// Frames that may be of a flow between two sockets, and why they cannot be told. Encrypted packets between
+    /// other ends may be a tunnel of it, unless it `is_seen` here.
     pub fn unread_of(
         &self,
         flow_index: usize,
         source: SocketAddr,
         destination: SocketAddr,
+        is_seen: bool,
     ) -> BTreeMap<Unread, u64> {
         let mut unread = self.unread.clone();
+        for (ends, count) in &self.sealed {
+            if !is_seen || *ends == (source.ip(), destination.ip()) {
+                *unread.entry(Unread::Encrypted).or_default() += count;
+            }
+        }
         for ((flow, from, to, why), count) in &self.cut {
             if (*flow, *from, *to) == (flow_index, source, destination) {
                 *unread.entry(*why).or_default() += count;
@@ -337,6 +350,9 @@ impl Watch {
         self.steps.extend(other.steps);
         for (why, count) in other.unread {
             *self.unread.entry(why).or_default() += count;
+        }
+        for (ends, count) in other.sealed {
+            *self.sealed.entry(ends).or_default() += count;
         }
         for (of, count) in other.cut {
             *self.cut.entry(of).or_default() += count;

@@ -442,7 +442,10 @@ impl ChannelFold {
             },
         };
         message.key = key;
-        if self.settings.first_number == FirstNumber::OnRecord && evidence.is_before_run(&message) {
+        // Numbers that no record mentions are not later than the record behind them.
+        let first = epoch.pending.front().map(|(_, pending)| &pending.message);
+        let is_on_record = self.settings.first_number == FirstNumber::OnRecord;
+        if is_on_record && first.is_some_and(|first| evidence.is_before_run(first)) {
             self.advance(index, next, sequence);
             return true;
         }

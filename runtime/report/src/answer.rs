@@ -86,7 +86,7 @@ impl From<&DeadlineMetrics> for HarmCount {
     fn from(deadline: &DeadlineMetrics) -> Self {
         Self {
             what: format!("{} late or missing", deadline.name),
-            count: Some(deadline.hurt_count()),
+            count: Some(deadline.hurt_count),
             own_count: 0,
             occasions: Some(OccasionCount {
                 what: format!("requests of {}", deadline.name),
@@ -499,9 +499,9 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
         }
         _ => {}
     }
-    let Some(first) = summary.harms.first() else {
+    if summary.harms.is_empty() {
         return not_tested(Untested::NoScore);
-    };
+    }
     if is_valid(network) == Some(false) {
         return not_resolvable(Unresolved::InvalidMeasurement);
     }
@@ -512,7 +512,7 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
         return not_resolvable(Unresolved::ScoreIncomplete);
     }
     // Whose time it took is known of each request.
-    if summary.deadlines.iter().any(|one| one.hurt_count() > 0) {
+    if summary.deadlines.iter().any(|one| one.hurt_count > 0) {
         return Hurt::Yes;
     }
     let harms = summary.harms.iter();
@@ -534,16 +534,20 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
     if summary.harms.iter().any(|one| one.count.is_none()) {
         return not_resolvable(Unresolved::NotCounted);
     }
-    match &first.occasions {
-        Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
-            not_resolvable(Unresolved::SampleTooSmall {
-                what: what.clone(),
-                count: *count,
-                needed: OCCASIONS_MIN,
-            })
-        }
-        _ => Hurt::No,
-    }
+    too_few_occasions(summary.harms.iter()).map_or(Hurt::No, not_resolvable)
+}
+
+/// Nothing happened in the fewest occasions of a harm, and they are too few to tell.
+pub(crate) fn too_few_occasions<'a>(
+    harms: impl Iterator<Item = &'a HarmCount>,
+) -> Option<Unresolved> {
+    let occasions = harms.filter_map(|harm| harm.occasions.as_ref());
+    let fewest = occasions.min_by_key(|one| one.count)?;
+    (fewest.count < OCCASIONS_MIN).then(|| Unresolved::SampleTooSmall {
+        what: fewest.what.clone(),
+        count: fewest.count,
+        needed: OCCASIONS_MIN,
+    })
 }
 
 /// What counts as a network's doing before an event of the robot.

@@ -440,6 +440,68 @@ fn a_datagram_on_two_links_of_one_host_is_no_duplicate() {
 }
 
 #[test]
+fn equal_datagrams_of_a_capture_on_any_are_no_copies_but_by_their_packets() {
+    // A robot that holds still, at 1 kHz; of a host that numbers its packets, and of one that does not.
+    let cooked = |packet_number: u16| {
+        let mut frame = [&[0; 14][..], &datagram(7, 32)[12..]].concat();
+        frame[20..22].copy_from_slice(&packet_number.to_be_bytes());
+        frame
+    };
+    for flow in ["udp:dport=5004", "udp:dport=5004,id=3+1"] {
+        for (is_numbered, copy_count, told) in [
+            (true, 1, [100, 0]),
+            (true, 2, [100, 100]),
+            (false, 1, [100, 0]),
+        ] {
+            let packets = (0..100 * copy_count).map(|n| {
+                let n = n / copy_count;
+                let number = if is_numbered { n + 1 } else { 0 };
+                (BEGIN_US + 1000 * i64::from(n), cooked(number))
+            });
+            let mut file = pcap(&packets.collect::<Vec<_>>());
+            file[20] = 113;
+            let mut observer = Observer::new(&[flow.parse().unwrap()]);
+            take(&mut observer, 0, &file);
+            let counts = observer.counts();
+            let found = [counts.followed_count, counts.elsewhere_count];
+            assert_eq!(found, told, "{flow}, {is_numbered}");
+        }
+    }
+}
+
+#[test]
+fn encrypted_packets_of_other_hosts_hide_nothing_of_a_flow_that_is_seen() {
+    let sealed = |last: u8| {
+        let mut frame = datagram(0, 32);
+        (frame[23], frame[33]) = (50, last);
+        frame
+    };
+    let second = |last: u8, is_readable: bool| {
+        let numbers = (0..100).filter(|n| *n != 20);
+        let packet = |n: u32| {
+            let at_us = BEGIN_US + 100_000 * i64::from(n) + 1000;
+            let frame = if n % 10 == 9 || !is_readable {
+                sealed(last)
+            } else {
+                datagram(n, 32)
+            };
+            (at_us, frame)
+        };
+        pcap(&numbers.map(packet).collect::<Vec<_>>())
+    };
+    let readable = first_point();
+    let of_others = &joins_of(&readable, &second(9, true), true)[0];
+    assert_eq!(of_others.loss.count(), Some(11), "{of_others:#?}");
+    let of_its_hosts = &joins_of(&readable, &second(2, true), true)[0];
+    let encrypted = Doubt::Unread(Unread::Encrypted);
+    assert_eq!(doubts(of_its_hosts), [(encrypted, 10)]);
+    // A tunnel between other ends, of which nothing but that is seen.
+    for joined in joins_of(&readable, &second(9, false), true) {
+        assert_eq!(joined.loss.count(), None, "{joined:#?}");
+    }
+}
+
+#[test]
 fn an_aggregate_is_no_datagram() {
     // Ten frames of ten datagrams each, sent by segmentation offload.
     let large = (0..10).map(|n| (BEGIN_US + 10_000 * i64::from(n), datagram(10 * n, 10_000)));
@@ -471,6 +533,15 @@ fn an_aggregate_is_no_datagram() {
             assert_eq!(why, Doubt::Unread(Unread::Aggregate), "{flow}: {joins:#?}");
         }
     }
+    // A large one that was lost, and small ones that the first point missed and that are not its pieces.
+    let sized = |n: u32| if n == 20 { 300 } else { 32 };
+    let without = |missing: &[u32], late_us: i64| {
+        let numbers = (0..100).filter(|n| !missing.contains(n));
+        let packet = |n: u32| (at_us(n) + late_us, datagram(n, sized(n)));
+        pcap(&numbers.map(packet).collect::<Vec<_>>())
+    };
+    let joins = joins_of(&without(&[60, 61], 0), &without(&[20], 500), true);
+    assert_eq!(joins[0].loss.count(), Some(1), "{joins:#?}");
     // As large at both points: a link with jumbo frames, on which one was lost.
     let jumbo = |lost: u32, late_us: i64| {
         let numbers = (0..50).filter(|n| *n != lost);

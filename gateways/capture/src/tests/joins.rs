@@ -22,6 +22,7 @@ fn observation(stamp_ns: i64, number: u64) -> Observation {
         level: 0,
         payload_bytes: 80,
         packet_bytes: 108,
+        packet_number: 1,
         hop_limit: 64,
         station: [0; 6],
         identity: DatagramIdentity {

@@ -65,7 +65,10 @@ pub struct DeadlineMetrics {
     pub missing_by_harness_count: u64,
     /// Unknown: under way at the end of the run, or without records.
     pub unknown_count: u64,
-    /// 95 % interval of the share of those that the network hurt, see [`DeadlineMetrics::hurt_count`], of those
+    /// Those that came late or not at all, and would have come in time but for the network: what programs and hosts
+    /// took of their time is within what is allowed, or the network lost them.
+    pub hurt_count: u64,
+    /// 95 % interval of the share of those that the network hurt, see [`Self::hurt_count`], of those
     /// of which it is known; or why there is none.
     #[serde(default)]
     pub hurt_share: Option<Spread>,
@@ -83,6 +86,8 @@ pub struct DeadlineFold {
     programs_ns: Vec<i64>,
     /// When each request was sent, and whether the network hurt it.
     hurt: Vec<(i64, bool)>,
+    /// See [`Self::doubt_program`].
+    is_program_doubted: bool,
 }
 
 impl DeadlineFold {
@@ -102,6 +107,7 @@ impl DeadlineFold {
                 missing_by_program_count: 0,
                 missing_by_harness_count: 0,
                 unknown_count: 0,
+                hurt_count: 0,
                 hurt_share: None,
                 response: Distribution::of_samples(&[], NO_ANSWER),
                 program: Distribution::of_samples(&[], NO_ANSWER),
@@ -109,7 +115,13 @@ impl DeadlineFold {
             responses_ns: Vec::new(),
             programs_ns: Vec::new(),
             hurt: Vec::new(),
+            is_program_doubted: false,
         }
+    }
+
+    /// An inlet lost frames, of which answers may have been: requests without an answer are unknown from now on.
+    pub const fn doubt_program(&mut self) {
+        self.is_program_doubted = true;
     }
 
     /// Adds the `requests` of two ends and the frames that go back between these, in order of their sending.
@@ -178,15 +190,16 @@ impl DeadlineFold {
         let is_long = |ns: i64| ns > metrics.limit_ns;
         let without_hosts_ns = response_ns.saturating_sub(host_ns);
         let network_ns = without_hosts_ns.saturating_sub(program_ns);
-        let (count, is_hurt) = if !is_long(response_ns) {
-            (&mut metrics.in_time_count, false)
+        let is_hurt = is_long(response_ns) && !is_long(response_ns.saturating_sub(network_ns));
+        let count = if !is_long(response_ns) {
+            &mut metrics.in_time_count
         } else if !is_long(without_hosts_ns) {
-            (&mut metrics.late_by_harness_count, false)
+            &mut metrics.late_by_harness_count
         } else {
             match (is_long(network_ns), is_long(program_ns)) {
-                (true, false) => (&mut metrics.late_by_network_count, true),
-                (false, true) => (&mut metrics.late_by_program_count, false),
-                _ => (&mut metrics.late_by_both_count, true),
+                (true, false) => &mut metrics.late_by_network_count,
+                (false, true) => &mut metrics.late_by_program_count,
+                _ => &mut metrics.late_by_both_count,
             }
         };
         *count += 1;
@@ -208,6 +221,10 @@ impl DeadlineFold {
     }
 
     fn add_unanswered(&mut self, sent_ns: i64) {
+        if self.is_program_doubted {
+            self.metrics.unknown_count += 1;
+            return;
+        }
         self.metrics.missing_by_program_count += 1;
         self.hurt.push((sent_ns, false));
     }
@@ -217,23 +234,12 @@ impl DeadlineFold {
         self.hurt.sort_unstable();
         let hurt = self.hurt.iter().map(|(_, is_hurt)| f64::from(*is_hurt));
         DeadlineMetrics {
+            hurt_count: self.hurt.iter().filter(|(_, is_hurt)| *is_hurt).count() as u64,
             hurt_share: (!self.hurt.is_empty()).then(|| Batches::of(hurt).share_interval()),
             response: Distribution::of_samples(&self.responses_ns, NO_ANSWER),
             program: Distribution::of_samples(&self.programs_ns, NO_ANSWER),
             ..self.metrics
         }
-    }
-}
-
-impl DeadlineMetrics {
-    /// An inlet lost frames, of which answers may have been.
-    pub fn doubt_program(&mut self) {
-        self.unknown_count += core::mem::take(&mut self.missing_by_program_count);
-    }
-
-    /// Those that came late or not at all, and would have come in time but for the network.
-    pub const fn hurt_count(&self) -> u64 {
-        self.late_by_network_count + self.late_by_both_count + self.missing_by_network_count
     }
 }
 
@@ -315,6 +321,8 @@ mod tests {
         ];
         // The last request may still be answered when the run ends.
         assert_eq!(counts, [10, 1, 1, 1, 2, 2, 1, 1, 1]);
+        // Of both that were late by both, the program alone took longer than allowed in one.
+        assert_eq!(found.hurt_count, 4);
         assert_eq!(found.response.measured().unwrap().max_ns, 11 * MS);
         assert_eq!(found.program.measured().unwrap().max_ns, 5 * MS);
     }
@@ -348,8 +356,10 @@ mod tests {
             found.late_by_network_count,
             found.late_by_program_count,
             found.late_by_both_count,
+            found.hurt_count,
         ];
-        assert_eq!(counts, [1, 1, 1, 1, 0]);
+        // With 5 ms on the hosts the second would have been late without a network, too.
+        assert_eq!(counts, [1, 1, 1, 1, 0, 0]);
     }
 
     #[test]
@@ -386,6 +396,36 @@ mod tests {
         let found = folded(8 * MS, &requests, &answers);
         let counts = [found.late_by_network_count, found.missing_by_program_count];
         assert_eq!(counts, [10, 0]);
+    }
+
+    #[test]
+    fn a_share_is_of_the_requests_of_which_it_is_known() {
+        let every = |step: usize, end: FrameEnd| {
+            let requests = (0..1000).map(|one| request(10 * one, 1));
+            let lost = requests.enumerate().map(|(index, one)| match index % step {
+                0 => lost(one, end),
+                _ => one,
+            });
+            lost.collect::<Vec<_>>()
+        };
+        let requests = every(20, FrameEnd::LostByNetwork);
+        // Every second one has an answer.
+        let answers: Vec<_> = (0..500).map(|one| answer(20 * one + 12, 1)).collect();
+        let [known, doubted] = [false, true].map(|is_doubted| {
+            let mut fold = DeadlineFold::new("command", 4 * MS);
+            if is_doubted {
+                fold.doubt_program();
+            }
+            fold.add(&requests, &answers);
+            let found = fold.finish();
+            let of = found.request_count - found.unknown_count;
+            let share = found.hurt_count as f64 / of as f64;
+            let interval = found.hurt_share.and_then(Spread::known).unwrap();
+            assert!(interval.holds(share), "{share}: {interval:?}");
+            (found.missing_by_program_count, found.hurt_count, of)
+        });
+        assert_eq!(known, (450, 50, 1000));
+        assert_eq!(doubted, (0, 50, 550));
     }
 
     #[test]

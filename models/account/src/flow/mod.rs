@@ -446,7 +446,7 @@ impl<'a> FlowFold<'a> {
             let end = match (place, given_ns) {
                 (TAKEN, Some(given_ns)) => FrameEnd::Given {
                     at_ns: given_ns,
-                    host_ns: message.host_time_ns(),
+                    host_ns: message.host_time_ns(path),
                 },
                 (BY_NETWORK, _) => FrameEnd::LostByNetwork,
                 (BY_HARNESS, _) => FrameEnd::LostByHarness,
@@ -504,8 +504,8 @@ impl<'a> FlowFold<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::each_history;
     use crate::synthetic::{Files, TAKEN_NS, at, same_clock};
+    use crate::{AccountContext, each_history};
 
     /// An Ethernet frame of this type with this packet in it.
     fn frame(kind: &[u8], packet: &[u8]) -> Vec<u8> {
@@ -710,6 +710,21 @@ mod tests {
         assert_eq!(counts, [1, 1, 1]);
         let given = |one: &FramePassage| matches!(one.end, FrameEnd::Given { .. });
         assert!(passages.values().flatten().all(given));
+    }
+
+    #[test]
+    fn all_time_of_a_path_that_crosses_nothing_is_the_hosts() {
+        let context = AccountContext {
+            path: ChannelPath::SharedMemory,
+            ..same_clock(1_000_000_000)
+        };
+        let mut count = 0;
+        each_history(&Files::delivered(3).records(), &context, |one| {
+            let (whole_ns, _bound_ns) = one.delay_ns(context.path).unwrap();
+            assert_eq!(one.host_time_ns(context.path), whole_ns);
+            count += 1;
+        });
+        assert_eq!(count, 3);
     }
 
     #[test]

@@ -174,8 +174,13 @@ pub fn conclude(
         None => (&[][..], Score::default()),
     };
     summary.put_score(&score);
-    let deadlines = summary.deadlines.iter().map(HarmCount::from);
-    summary.harms.extend(deadlines);
+    // Programs between which nothing is crossed put no network to the test.
+    let has_crossed = summary.flows.iter().any(|flows| {
+        let mut channels = summary.channels.iter();
+        channels.any(|one| one.name == flows.channel && one.link.is_crossing())
+    });
+    let deadlines = summary.deadlines.iter().filter(|_| has_crossed);
+    summary.harms.extend(deadlines.map(HarmCount::from));
     summary.score_events = events::explained(
         &score,
         &records,
@@ -283,20 +288,24 @@ fn read_channels(
             .acknowledgements
             .extend(radio.map(|radio| (channel.name.clone(), radio)));
     }
-    found.deadlines = deadlines(&named, &passages);
-    if found.flows.iter().any(|one| one.inlet_lost_count() > 0) {
-        let deadlines = found.deadlines.iter_mut();
-        deadlines.for_each(DeadlineMetrics::doubt_program);
-    }
+    let is_doubted = found.flows.iter().any(|one| one.inlet_lost_count() > 0);
+    found.deadlines = deadlines(&named, &passages, is_doubted);
     found
 }
 
-/// How the requests of the flows with a deadline were answered.
-fn deadlines(named: &[NamedFlow], passages: &FlowPassages) -> Vec<DeadlineMetrics> {
+/// How the requests of the flows with a deadline were answered; `is_doubted` where an inlet lost frames.
+fn deadlines(
+    named: &[NamedFlow],
+    passages: &FlowPassages,
+    is_doubted: bool,
+) -> Vec<DeadlineMetrics> {
     let timed = named.iter().filter_map(|one| Some((one, one.deadline_ns?)));
     timed
         .map(|(flow, limit_ns)| {
             let mut fold = DeadlineFold::new(&flow.name, limit_ns);
+            if is_doubted {
+                fold.doubt_program();
+            }
             // As a frame has one flow.
             let is_its = |key: &FlowKey| {
                 let mut named = named.iter();

@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::ComparedRun;
 use crate::answer::{
     HarmCount, Hurt, OCCASIONS_MIN, OccasionCount, Unresolved, Untested, is_valid,
+    too_few_occasions,
 };
 use crate::assessment::{Assessment, NetworkVerdict};
 
@@ -218,10 +219,10 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
     if assessments.any(is_invalid) {
         return not_resolvable(Unresolved::InvalidMeasurement);
     }
-    let Some(first) = harms.first() else {
+    if harms.is_empty() {
         let because = Untested::NoScore;
         return Hurt::NotTested { because };
-    };
+    }
     if harms
         .iter()
         .any(|one| one.base.count.is_none() || one.new.count.is_none())
@@ -237,17 +238,13 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
         && harms
             .iter()
             .all(|one| one.change == Change::Less || one.new.count == Some(0));
-    match &first.new.occasions {
-        Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
-            not_resolvable(Unresolved::SampleTooSmall {
-                what: what.clone(),
-                count: *count,
-                needed: OCCASIONS_MIN,
-            })
-        }
-        _ if is_unhurt || is_less => Hurt::No,
-        _ => not_resolvable(too_small(harms).unwrap_or(Unresolved::WithinChance)),
+    if let Some(because) = too_few_occasions(harms.iter().map(|one| &one.new)) {
+        return not_resolvable(because);
     }
+    if is_unhurt || is_less {
+        return Hurt::No;
+    }
+    not_resolvable(too_small(harms).unwrap_or(Unresolved::WithinChance))
 }
 
 /// The first harm of the new runs whose difference has no interval.
@@ -400,6 +397,22 @@ mod tests {
         } = compared(&clean, &[run(Some(0), 4)])
         else {
             panic!("four loops show no absence of harm");
+        };
+        // Nor do two grasps beside many loops.
+        let mut few = run(Some(0), 600);
+        few.summary.harms.push(HarmCount {
+            what: "grasps missed".to_owned(),
+            occasions: Some(OccasionCount {
+                what: "grasps".to_owned(),
+                count: 2,
+            }),
+            ..few.summary.harms[0].clone()
+        });
+        let Hurt::NotResolvable {
+            because: Unresolved::SampleTooSmall { count: 2, .. },
+        } = compared(&[few.clone()], &[few])
+        else {
+            panic!("two grasps show no absence of harm");
         };
         let mut failed = run(Some(0), 60);
         failed.summary.run.outcome = Outcome::Failed;

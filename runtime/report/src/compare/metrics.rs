@@ -358,24 +358,38 @@ fn losses(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
         .collect()
 }
 
-/// One run's share as it is; of several their mean with Student's interval. Runs without any loss are one, whose
-/// losses would come together as those of the `other` side.
-fn mean_share(side: &[RunLoss], other: &[RunLoss]) -> Option<Estimate> {
+/// One run's share as it is; of several their mean with Student's interval, whose width tells what they are worth.
+fn observed_share(side: &[RunLoss]) -> Option<Estimate> {
     let values = values_of(side);
+    Some(Estimate {
+        interval: match side {
+            [only] => only.interval,
+            _ => mean_interval(&values, CONFIDENCE),
+        },
+        ..mean(&values)?
+    })
+}
+
+/// The same within the bounds of a share. Runs without any loss are one, whose losses would come together as those
+/// of the `other` side.
+fn mean_share(side: &[RunLoss], other: &[RunLoss]) -> Option<Estimate> {
+    let observed = observed_share(side)?;
     let (pooled, pooled_other) = (pooled(side), pooled(other));
-    let interval = match side {
-        _ if pooled.count == 0 && pooled_other.count == 0 => pooled.estimate(CONFIDENCE)?.interval,
-        _ if pooled.count == 0 => {
-            let like = mean_share(other, &[]);
+    let interval = match (pooled.count, pooled_other.count) {
+        (0, 0) => pooled.estimate(CONFIDENCE)?.interval,
+        (0, _) => {
+            let like = observed_share(other);
             like.and_then(|like| none_of(pooled.of, like, pooled_other.of))
         }
-        [only] => only.interval,
         // A share has no less than none and no more than all.
-        _ => mean_interval(&values, CONFIDENCE).map(|found| found.map(|end| end.clamp(0.0, 1.0))),
+        _ => {
+            let own = observed.interval;
+            own.map(|found| found.map(|end| end.clamp(0.0, 1.0)))
+        }
     };
     Some(Estimate {
         interval,
-        ..mean(&values)?
+        ..observed
     })
 }
 

@@ -116,6 +116,20 @@ fn a_sample_that_is_too_small_shows_no_absence_of_harm() {
     count_all(&mut enough);
     let enough = answer(&enough);
     assert_eq!((enough.hurt.clone(), enough.tone()), (Hurt::No, Tone::Good));
+    // The harm with the fewest occasions decides.
+    let mut few = run(lost_loops(Some(0), 0, 600));
+    count_all(&mut few);
+    few.harms.push(lost_loops(Some(0), 0, 2));
+    let hurt = answer(&few).hurt;
+    assert!(
+        matches!(
+            hurt,
+            Hurt::NotResolvable {
+                because: Unresolved::SampleTooSmall { count: 2, .. }
+            }
+        ),
+        "{hurt:?}"
+    );
     // Harm is harm, however small the sample.
     assert_eq!(answer(&run(lost_loops(Some(1), 0, 3))).hurt, Hurt::Yes);
     let because = Unresolved::NotCounted;
@@ -301,6 +315,7 @@ fn requests_that_the_network_made_late_or_lost_are_harm_and_others_are_not() {
             missing_by_network_count: missing[0],
             missing_by_program_count: missing[1],
             missing_by_harness_count: missing[2],
+            hurt_count: late[0] + late[1] + missing[0],
             ..DeadlineFold::new("command", 4_000_000).finish()
         };
         let mut summary = own_programs(LinkKind::Emulated);

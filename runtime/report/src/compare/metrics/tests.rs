@@ -129,3 +129,28 @@ fn one_run_against_repetitions_has_an_interval_of_both_kinds() {
     assert_eq!(loss(&[5, 5], &[10, 10], [2, 2]).method, NO_SPREAD);
     assert_eq!(p99(&[3.0], &[6.0], [1, 1]).method, RANKS);
 }
+
+#[test]
+fn what_repetitions_are_worth_is_not_read_from_an_interval_cut_at_no_loss() {
+    // Runs of 1000 that lost 0 and 10: Student's interval of their mean reaches from -0.06 to 0.07.
+    let runs = [0, 10].map(|count| RunLoss {
+        share: Share { count, of: 1000 },
+        interval: None,
+    });
+    let clean = [0].map(|count| RunLoss {
+        share: Share { count, of: 1000 },
+        interval: None,
+    });
+    let like = observed_share(&runs).unwrap();
+    assert!(like.interval.unwrap().low < 0.0);
+    let shown = mean_share(&runs, &clean).unwrap().interval.unwrap();
+    assert!(shown.low >= 0.0);
+    let none = mean_share(&clean, &runs).unwrap().interval.unwrap();
+    let cut = Estimate {
+        interval: Some(shown),
+        ..like
+    };
+    let narrower = none_of(1000, cut, 2000).unwrap();
+    // Half as wide would be worth four times as much.
+    assert!(none.high > 2.0 * narrower.high, "{none:?} {narrower:?}");
+}
