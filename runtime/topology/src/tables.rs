@@ -11,7 +11,7 @@ use hil_core::options::{Free, Named, TextRule};
 use crate::adapter::EgmAdapter;
 use crate::flows::Flow;
 use crate::links::LinkTable;
-use crate::model::{Execution, Host, MessageLayout, Restarts, Run, Wait};
+use crate::model::{Execution, Host, MessageLayout, Restarts, Run};
 use crate::security::Security;
 
 /// Longest name of a run, host, process, channel or link.
@@ -217,14 +217,6 @@ impl ProcessTable {
             (_, Some(words)) if words.first().is_none_or(String::is_empty) => {
                 refuse("run", "is empty, expected a program and its arguments")
             }
-            (_, Some(_)) if self.inside.is_none() && self.execution.lock_memory => refuse(
-                "lock_memory",
-                "does not go with `run`: a lock ends where a program is executed, so it must lock its memory itself",
-            ),
-            (_, Some(_)) if self.inside.is_none() && self.execution.wait != Wait::Block => refuse(
-                "wait",
-                "does not go with `run`: how a program waits is its own business",
-            ),
             _ => Ok(()),
         }
     }

@@ -13,7 +13,7 @@ use std::{env, io};
 use hil_cable::{Inside, Refusal};
 use hil_platform::open_files;
 use hil_platform::realtime::{self, SchedulingPolicy};
-use hil_topology::{Program, Topology};
+use hil_topology::{Process, Program, Topology, Wait};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
 use nix::unistd::{AccessFlags, access, dup2_stdin};
@@ -169,11 +169,11 @@ fn take_cable(inside: Inside, program: &str) -> Result<(), OwnProgramError> {
     })
 }
 
-/// Programs of the user's that a run would start and cannot.
+/// Programs of the user's that a run would start and cannot, or not as its topology says.
 #[derive(Debug, thiserror::Error)]
 #[error("{}", lines(.0))]
 pub struct ProgramsMissing(
-    /// The key of each process, and why its program cannot be started.
+    /// Keys of processes, and what is wrong with each.
     pub Vec<(String, String)>,
 );
 
@@ -190,22 +190,34 @@ fn lines(missing: &[(String, String)]) -> String {
 pub fn find_all(topology: &Topology, hosts: &[String]) -> Result<(), ProgramsMissing> {
     let here = topology.processes().iter();
     let here = here.filter(|process| hosts.contains(&process.host));
-    let missing: Vec<(String, String)> = here
-        .filter_map(|process| match &process.program {
-            Program::Command { command, .. } => {
-                let (name, program) = (&process.name, &command[0]);
-                let error = find(program).err()?;
-                let key = format!("processes.{name}.run");
-                Some((key, format!("cannot start {program}: {error}")))
-            }
-            Program::BuiltIn { .. } | Program::Egm { .. } => None,
-        })
-        .collect();
+    let missing: Vec<(String, String)> = here.flat_map(faults).collect();
     if missing.is_empty() {
         Ok(())
     } else {
         Err(ProgramsMissing(missing))
     }
+}
+
+/// What is wrong with a process, by its keys.
+fn faults(process: &Process) -> Vec<(String, String)> {
+    let Program::Command { command, .. } = &process.program else {
+        return Vec::new();
+    };
+    let key = |key| format!("processes.{}.{key}", process.name);
+    let program = &command[0];
+    let mut faults = Vec::new();
+    if let Err(error) = find(program) {
+        faults.push((key("run"), format!("cannot start {program}: {error}")));
+    }
+    if process.is_witnessed() && process.execution.lock_memory {
+        let why = "a lock ends where a program is executed: it must lock its memory itself";
+        faults.push((key("lock_memory"), why.to_owned()));
+    }
+    if process.is_witnessed() && process.execution.wait != Wait::Block {
+        let why = "how a program of the user's waits is its own business";
+        faults.push((key("wait"), why.to_owned()));
+    }
+    faults
 }
 
 /// Where `program` is, as the shell would find it.
@@ -253,6 +265,28 @@ mod tests {
         let refusal = claim(&serde_json::to_string(&asked).unwrap()).unwrap_err();
         assert!(refusal.contains("cpu 1023 refused"), "{refusal}");
         assert!(refusal.contains("choose one of them"), "{refusal}");
+    }
+
+    #[test]
+    fn what_a_program_cannot_be_given_is_named_with_its_key() {
+        let process = Process {
+            name: "a".to_owned(),
+            host: "pc".to_owned(),
+            program: Program::Command {
+                command: vec!["sh".to_owned()],
+                role: None,
+                environment: std::collections::BTreeMap::new(),
+                inside: None,
+            },
+            execution: hil_topology::Execution {
+                lock_memory: true,
+                wait: Wait::Spin,
+                ..hil_topology::Execution::default()
+            },
+            restarts: hil_topology::Restarts::default(),
+        };
+        let keys: Vec<String> = faults(&process).into_iter().map(|one| one.0).collect();
+        assert_eq!(keys, ["processes.a.lock_memory", "processes.a.wait"]);
     }
 
     #[test]
