@@ -178,8 +178,13 @@ fn a_receiver_that_stood_still_is_no_network_result() {
         let no_room = direction(&summary, channel, "ingress").no_room_count();
         let fates = &account(&summary, channel).fates;
         let lost = fates.of(MessageFate::LostByHarness);
+        // Where the counts differ, as by a datagram that is no message, nobody can say.
+        let doubtful = fates.of(MessageFate::LostOnWireOrByHarness);
         println!("{said}; {no_room} datagrams without room");
-        assert!(lost > 0 && lost <= no_room, "{lost} of {no_room}: {said}");
+        assert!(
+            (1..=no_room).contains(&(lost + doubtful)),
+            "{lost} and {doubtful} of {no_room}: {said}"
+        );
         assert_eq!(fates.of(MessageFate::LostOnWire), 0, "{said}");
         let assessment = Assessment::of(&summary);
         assert!(
@@ -191,7 +196,7 @@ fn a_receiver_that_stood_still_is_no_network_result() {
         );
         let warnings = assessment.warnings.join("\n");
         assert!(
-            warnings.contains(&format!("lost {lost} messages so")),
+            lost == 0 || warnings.contains(&format!("lost {lost} messages so")),
             "{warnings}"
         );
     }
