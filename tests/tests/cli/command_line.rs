@@ -265,8 +265,8 @@ fn end_at_once([first, second]: [Signal; 2]) {
     let finished = child.wait_within(LIMIT).unwrap();
     finished.assert_code(131);
     assert!(!files.has_report(), "the report would have taken time");
-    wait_until(LIMIT, "the end of the own program", || {
-        own_processes().is_empty()
+    wait_until(LIMIT, "the end of all processes", || {
+        own_processes().is_empty() && files.processes().is_empty()
     });
     // What it left in shared memory, the next run removes.
     let next = RunFolder::new("next");
