@@ -1,6 +1,7 @@
-//! A recorder on each host of a split run stands still until its queues have overflown: what it missed is
-//! counted and in its file, the recording goes on afterwards, and the run loses nothing by it.
+//! A recorder on each host of a split run stands still until shared memory would have overflown: what came meanwhile
+//! is read from the records of the run, also of a program of the user's, and the run loses nothing by it.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -20,8 +21,7 @@ use hil_tests::trial::{RunFiles, Trial, wait_until};
 use nix::sys::signal::Signal;
 
 const LIMIT: Duration = Duration::from_mins(2);
-/// The channel of a program that keeps no records: its messages are read from shared memory on either
-/// host, and what is missed of them comes from nowhere else.
+/// The channel of a program that keeps no records: a witness beside it does.
 const CHANNEL: &str = "shuttle/command";
 /// Messages that a recorder finds room for between two looks, at most.
 const ROOM_COUNT: u64 = 1024;
@@ -71,37 +71,25 @@ fn arrived(files: &RunFiles) -> u64 {
     counts.sum::<usize>() as u64
 }
 
-/// What a file has of the channel, and says that it missed, of so many that were published on its host.
-fn check(file: &Path, summary: &RunSummary, here: u64) {
+/// A file has every message of the channel once, and misses none.
+fn check(file: &Path, summary: &RunSummary) {
     let words = &metadata(file)["hil.recording"];
-    let said = |key: &str| -> u64 {
-        let text = words.get(&format!("{key} {CHANNEL}"));
-        text.map_or(0, |text| text.parse().unwrap())
-    };
-    let (missed, before) = (said("missed"), said("before"));
+    let missed = words.get(&format!("missed {CHANNEL}"));
     let messages = read_back(file).remove(&format!("/{CHANNEL}")).unwrap();
-    let numbers: Vec<u64> = messages.iter().map(|one| u64::from(one.sequence)).collect();
+    let numbers: BTreeSet<u64> = messages.iter().map(|one| u64::from(one.sequence)).collect();
     let published = account(summary, CHANNEL).published_count;
-    let recorded = numbers.len() as u64;
     println!(
-        "{}: {recorded} recorded, {missed} missed, {before} before, {here} published here, \
-         {published} by the producer",
-        summary.run.host
+        "{}: {} recorded, {missed:?} missed, {published} published",
+        summary.run.host,
+        messages.len()
     );
-    assert_eq!(recorded + missed + before, here);
-    // Three times its room came while it stood still, and it kept the last of them.
-    assert!(missed >= ROOM_COUNT, "{missed}");
-    let gaps = numbers.windows(2).filter(|two| two[1] > two[0] + 1);
-    let largest = gaps.max_by_key(|two| two[1] - two[0]).unwrap();
-    let after = published - largest[1];
-    println!("the longest gap is after {}, {after} follow it", largest[0]);
-    // More than what waited for it: it went on.
-    assert!(after > 2 * ROOM_COUNT, "{after}");
-    assert!(*numbers.last().unwrap() + ROOM_COUNT > published);
+    assert_eq!(missed, None);
+    assert_eq!(numbers.len(), messages.len());
+    assert_eq!(numbers.len() as u64, published);
 }
 
 #[test]
-fn a_recorder_that_stood_still_counts_what_it_missed_and_costs_the_run_nothing() {
+fn a_recorder_that_stood_still_reads_the_rest_from_the_records_and_costs_the_run_nothing() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
@@ -134,11 +122,8 @@ fn a_recorder_that_stood_still_counts_what_it_missed_and_costs_the_run_nothing()
     for (index, recorder) in recorders.iter_mut().enumerate() {
         let finished = recorder.wait_within(LIMIT).unwrap();
         println!("{}", finished.stdout);
-        assert_eq!(finished.status.code(), Some(1), "{}", finished.stderr);
-        // A message that a newer one replaced before the gateway took it never came to the other host.
-        let producer = account(&summaries[index], CHANNEL).published_count;
-        let here = [producer, arrived(&files)][index];
-        check(&outputs[index], &summaries[index], here);
+        assert_eq!(finished.status.code(), Some(0), "{}", finished.stderr);
+        check(&outputs[index], &summaries[index]);
     }
     for summary in &summaries {
         for name in CHANNELS {
