@@ -51,7 +51,8 @@ pub(crate) fn encode(datagram: &Datagram<'_>, length: usize) -> Vec<u8> {
         // Its body is as it was made: zeros.
         Body::SyncRequest => body_bytes,
         Body::SyncResponse(response) => response.encode(body),
-        Body::Hello(hello) => hello.encode(body),
+        // Zeros may follow it.
+        Body::Hello(hello) => hello.encode(body).max(body_bytes),
         Body::HelloAck(answer) => answer.encode(body),
         Body::PieceAck(ack) => ack.encode(body),
         Body::Bye => 0,
