@@ -41,7 +41,7 @@ fn an_interface_that_is_down_is_a_loss_of_the_network_and_programs_have_whole_ac
             LIMIT,
         )
     });
-    // The run goes on.
+    // Progress is printed from the begin of the run on.
     supervisors[0]
         .wait_for_output(" / 14 s", LIMIT)
         .unwrap_or_else(|reason| panic!("{reason}"));
