@@ -113,11 +113,12 @@ fn give_back(path: &Path) {
     chown(path, Some(Uid::from_raw(0)), Some(Gid::from_raw(0))).unwrap();
 }
 
-/// What `hil-runtime channel list` says where `folder` is the base of domains.
-fn listed(folder: &RunFolder) -> Finished {
+/// What `hil-runtime channel list RUN` says where `folder` is the base of domains beside `/run/hil`, where runs of other
+/// tests may be.
+fn listed(folder: &RunFolder, run: &str) -> Finished {
     let mut command = Command::new(hil_runtime_binary());
     command
-        .args(["channel", "list"])
+        .args(["channel", "list", run])
         .env("TMPDIR", folder.path());
     let began = Instant::now();
     let finished = ChildGuard::spawn(&mut command).unwrap().wait_within(LIMIT);
@@ -132,7 +133,7 @@ fn looking_for_runs_does_not_wait_for_another_users_pipe() {
     fs::create_dir_all(base.join("x")).unwrap();
     mkfifo(&base.join("x/live.json"), Mode::from_bits_truncate(0o644)).unwrap();
     give_away(&base);
-    listed(&record);
+    listed(&record, "x");
 }
 
 /// Of a run whose shared memory lies at a pipe, and of one that is held and whose files are pipes.
@@ -151,13 +152,13 @@ fn looking_at_a_run_that_another_user_announces_does_not_wait_for_his_pipes() {
     let lock = fs::File::open(&held).unwrap();
     let _held = Flock::lock(lock, FlockArg::LockExclusiveNonblock).unwrap();
     give_away(&base);
-    for (root, said) in [(&pipe, "no run"), (&held, "not a regular file")] {
+    for (root, said) in [(&pipe, "no run \"x-1\""), (&held, "not a regular file")] {
         let announced = serde_json::json!({
             "schema_version": 1, "name": "x-1", "topology": "x", "folder": run, "pid": 1,
             "since": "today", "domains": { "a": format!("h0123abcd_@{}", root.display()) },
         });
         record.write("hil-0/x/live.json", &announced.to_string());
-        let finished = listed(&record);
+        let finished = listed(&record, "x-1");
         assert!(finished.stderr.contains(said), "{said}: {finished:?}");
     }
 }
