@@ -195,7 +195,7 @@ fn forged_reports_cost_the_makers_datagrams_nothing_and_a_taken_address_what_is_
         return;
     };
     let stranger = Attacker::join(&lab, FOREIGN);
-    let rounds = round_count(6);
+    let rounds = round_count(4);
     let folder = RunFolder::new("forged-egm");
     let (here, there) = (folder.join("sensor"), folder.join("robot"));
     let sensor = Trial::shipped("egm-robot.toml", &here)
@@ -246,7 +246,7 @@ fn forged_reports_cost_the_makers_datagrams_nothing_and_a_taken_address_what_is_
     let feedbacks = feedbacks_over(&Arms::of(&sensor_files), &Arms::of(&robot_files));
     let cost = |windows_ns: &[Range<i64>]| Cost::of(feedbacks.iter().copied(), windows_ns);
     let bound = Bound {
-        sent_min: 1_000,
+        sent_min: 500,
         ..Bound::MESSAGES
     };
     all[0].judge("messages of the robot", cost, bound);

@@ -90,7 +90,7 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
     };
     let stranger = Attacker::join(&lab, FOREIGN);
     let record = RunFolder::new("forged");
-    let rounds = round_count(6);
+    let rounds = round_count(4);
     let mut trial = Trial::shipped("shuttle-split.toml", record.path())
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
@@ -192,7 +192,7 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
     };
     let stranger = Attacker::join(&lab, FOREIGN);
     let record = RunFolder::new("forged-tcp");
-    let rounds = round_count(6);
+    let rounds = round_count(4);
     let trial = Trial::shipped("shuttle-tcp.toml", record.path())
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
@@ -341,7 +341,7 @@ fn icmpv6_of_every_type_costs_a_sealed_run_nothing_above_the_time_beside_it() {
         return;
     };
     let record = RunFolder::new("forged-v6");
-    let rounds = round_count(10);
+    let rounds = round_count(4);
     let duration = run_duration(rounds, 2);
     let (split, stranger) = run_of_v6(&lab, "shuttle-split.toml", &record, &duration);
     let reports = |to: usize| {
@@ -378,7 +378,7 @@ fn icmpv6_of_every_type_costs_a_sealed_tcp_hop_and_the_supervisors_nothing() {
         return;
     };
     let record = RunFolder::new("forged-tcp-v6");
-    let rounds = round_count(6);
+    let rounds = round_count(4);
     let duration = run_duration(rounds, 1);
     let (split, stranger) = run_of_v6(&lab, "shuttle-tcp.toml", &record, &duration);
     let ways = connections(&lab, &[PORTS[0], PORTS[1], CONTROL_PORT]);
