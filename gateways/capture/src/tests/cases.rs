@@ -428,7 +428,11 @@ fn a_datagram_on_two_links_of_one_host_is_no_duplicate() {
         let told = (figures.loss.count(), figures.duplicated_count);
         // Without interfaces a duplicate looks the same.
         let duplicated_count = (link_type == 1).then_some(0);
-        assert_eq!(told, (Some(1), duplicated_count), "{link_type}: {figures:#?}");
+        assert_eq!(
+            told,
+            (Some(1), duplicated_count),
+            "{link_type}: {figures:#?}"
+        );
     }
     let packets = (0..100).flat_map(|n| {
         [

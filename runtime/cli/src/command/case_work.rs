@@ -15,7 +15,8 @@ use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::Registry;
 
 use super::{
-    Refusal, check_traces, code_of, columns, exit, failed, load, loaded, signals, tell_undecided, usage,
+    Refusal, check_traces, code_of, columns, exit, failed, load, loaded, signals, tell_undecided,
+    usage,
 };
 
 /// Where a run in virtual time is shown.

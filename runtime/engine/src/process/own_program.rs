@@ -189,12 +189,13 @@ fn lines(missing: &[(String, String)]) -> String {
 /// Names the key of each process whose program is not there, and the program.
 pub fn find_all(topology: &Topology, hosts: &[String]) -> Result<(), ProgramsMissing> {
     let witnessed = topology.processes().iter().filter(|one| one.is_witnessed());
-    let witnesses: Vec<String> = witnessed.map(|one| witness_name(&one.host)).collect();
+    let taken_names: Vec<String> = witnessed.map(|one| witness_name(&one.host)).collect();
     let here = topology.processes().iter();
     let here = here.filter(|process| hosts.contains(&process.host));
     let mut missing: Vec<(String, String)> = here.clone().flat_map(faults).collect();
-    for process in here.filter(|one| witnesses.contains(&one.name)) {
-        let why = "is the name of the process that records for programs of the user's: choose another";
+    for process in here.filter(|one| taken_names.contains(&one.name)) {
+        let why =
+            "is the name of the process that records for programs of the user's: choose another";
         missing.push((format!("processes.{}", process.name), why.to_owned()));
     }
     if missing.is_empty() {
@@ -303,7 +304,11 @@ mod tests {
                     from = 'a'\nto = 'witness-local'\n";
         let known = hil_topology::registry::Registry::default();
         let topology = hil_topology::parse("own.toml", text, &[], known.known()).unwrap();
-        let hosts: Vec<String> = topology.hosts().iter().map(|one| one.name.clone()).collect();
+        let hosts: Vec<String> = topology
+            .hosts()
+            .iter()
+            .map(|one| one.name.clone())
+            .collect();
         let refusal = find_all(&topology, &hosts).unwrap_err();
         let keys: Vec<&str> = refusal.0.iter().map(|one| one.0.as_str()).collect();
         assert_eq!(keys, ["processes.witness-local"]);

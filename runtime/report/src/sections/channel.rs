@@ -3,7 +3,6 @@
 
 use core::fmt::Write;
 
-use hil_rundir::event::ProcessKind;
 use hil_account::network::{
     DelayMetrics, DelayQuantile, LossMetrics, Metric as Measured, NetworkMetrics,
     SuccessiveVariation,
@@ -13,6 +12,7 @@ use hil_account::{
     OutageClass, OutageMetrics, SegmentMetrics,
 };
 use hil_core::interval::Spread;
+use hil_rundir::event::ProcessKind;
 use hil_stats::histogram::Distribution;
 
 use hil_platform::text::grouped;

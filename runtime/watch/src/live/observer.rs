@@ -347,7 +347,10 @@ impl Observer {
         }
         if !unbegun.is_empty() {
             let status = RunStatus::read(&run.folder).ok();
-            if status.as_ref().is_none_or(|one| one.phase != Phase::Starting) {
+            if status
+                .as_ref()
+                .is_none_or(|one| one.phase != Phase::Starting)
+            {
                 let start_ns = status.and_then(|one| one.start_ns);
                 for channel in unbegun.drain(..) {
                     if let (Some(tail), Some(start_ns)) = (tails.get_mut(&channel), start_ns) {
