@@ -23,6 +23,11 @@ use crate::lab::Lab;
 /// An address of the hosts' network that is in no topology.
 pub const FOREIGN: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 66);
 
+/// The same in IPv6.
+pub const FOREIGN_V6: Ipv6Addr = Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 0x66);
+/// Packets a second of the attacks that are not floods.
+pub const SENT_HZ: u32 = 2_000;
+
 /// No set-up command takes a tenth of this on an overloaded machine.
 const SETUP_LIMIT: Duration = Duration::from_secs(20);
 /// Ethernet, IPv4 without options and UDP.
@@ -264,13 +269,13 @@ impl Attacker {
         sender.unwrap_or_else(|| panic!("nobody is heard to send to port {port}"))
     }
 
-    /// Forges resets in the peer's name, each exactly at the place in the stream that `victim` expects next, of
+    /// Forges segments in the peer's name, each exactly at the place in the stream that `victim` expects next, of
     /// the TCP connection that it is heard to have with `port` at one end, until a new one is begun or `limit` is
     /// over. Gives how many it sent.
     ///
     /// # Panics
     /// When it has no socket, or nothing of the connection is heard.
-    pub fn reset(&self, port: u16, victim: Ipv4Addr, limit: Duration) -> u64 {
+    pub fn forge_exactly(&self, what: Exact, port: u16, victim: Ipv4Addr, limit: Duration) -> u64 {
         let raw = self.within(|| {
             // Of the protocol 255 the headers are ours as well.
             match Socket::new(Domain::IPV4, Type::RAW, Some(Protocol::from(255))) {
@@ -289,7 +294,8 @@ impl Attacker {
                 return sent_count == 0;
             }
             if segment.flags & TCP_RST == 0 {
-                sent_count += u64::from(raw.send_to(&segment.reset(victim), &to).is_ok());
+                let forged = segment.forged(what, victim);
+                sent_count += u64::from(raw.send_to(&forged, &to).is_ok());
             }
             true
         });
@@ -320,11 +326,12 @@ impl Attacker {
     }
 
     /// Sends whole IPv4 packets, from whatever address they say, one after the other and again from the first, for
-    /// `span` at `rate` a second. The kernel fills in the length and the checksum of the header.
+    /// `span`: each at least once, at [`SENT_HZ`] or faster. The kernel fills in the length and the checksum of the header.
     ///
     /// # Panics
     /// When it has no socket.
-    pub fn send_repeatedly(&self, packets: &[Vec<u8>], span: Duration, rate: u32) -> Flood {
+    pub fn send_repeatedly(&self, packets: &[Vec<u8>], span: Duration) -> Flood {
+        let rate = rate_of_all(packets.len(), span);
         let to = packets.iter().map(|packet| {
             let address: [u8; 4] = [packet[16], packet[17], packet[18], packet[19]];
             SockAddr::from(SocketAddrV4::new(address.into(), 0))
@@ -335,7 +342,7 @@ impl Attacker {
     }
 
     /// Sends messages of ICMP for IPv6, of every type but neighbour advertisements, as reports on what was sent by `protocol`
-    /// from the first of each pair of ends to the second, to the first, for `span` at `rate` a second.
+    /// from the first of each pair of ends to the second, to the first, for `span`: each at least once.
     ///
     /// # Panics
     /// When it has no socket.
@@ -344,10 +351,18 @@ impl Attacker {
         protocol: Quoted,
         quoted: &[[SocketAddrV6; 2]],
         span: Duration,
-        rate: u32,
     ) -> Flood {
         let kinds = (0..=255_u8).filter(|kind| *kind != NEIGHBOUR_ADVERTISEMENT);
-        let kinds = kinds.flat_map(|kind| [0, 1, 4].map(|code| (kind, code)));
+        let kinds = kinds.flat_map(|kind| {
+            // Destination unreachable, time exceeded, parameter problem (RFC 4443, RFC 7112, RFC 8883).
+            let code_max = match kind {
+                1 => 8,
+                3 => 1,
+                4 => 10,
+                _ => 0,
+            };
+            (0..=code_max).map(move |code| (kind, code))
+        });
         let words = kinds.flat_map(|kind| {
             quoted.iter().map(move |ends| {
                 let to = SocketAddrV6::new(*ends[0].ip(), 0, 0, 0);
@@ -355,6 +370,7 @@ impl Attacker {
             })
         });
         let words: Vec<_> = words.collect();
+        let rate = rate_of_all(words.len(), span);
         self.send_all((Domain::IPV6, Protocol::ICMPV6), &words, span, rate)
     }
 
@@ -428,6 +444,16 @@ impl Attacker {
     }
 }
 
+/// Packets a second at which all `count` have left well before `span` is over.
+fn rate_of_all(count: usize, span: Duration) -> u32 {
+    let all = 1.2 * count as f64 / span.as_secs_f64();
+    let mut rates = (1..).map(|thousands| thousands * 1_000);
+    let rate = rates
+        .find(|rate| f64::from(*rate) >= all)
+        .unwrap_or(SENT_HZ);
+    rate.max(SENT_HZ)
+}
+
 /// A type of ICMP for IPv6, and its flag that what is known is to be replaced (RFC 4861).
 const NEIGHBOUR_ADVERTISEMENT: u8 = 136;
 const OVERRIDE: u8 = 0x20;
@@ -472,6 +498,17 @@ pub fn datagram_v4(from: SocketAddrV4, to: SocketAddrV4, payload: &[u8]) -> Vec<
     bytes
 }
 
+/// A forged segment with the numbers that its receiver expects.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Exact {
+    /// A reset.
+    Reset,
+    /// The end of the stream.
+    End,
+    /// 96 bytes of content.
+    Content,
+}
+
 /// The protocol of what a report of the network quotes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Quoted {
@@ -491,27 +528,39 @@ impl Quoted {
     }
 }
 
-/// A whole IPv4 packet with an ICMP message of `kind`, from the address quoted last, as a report on what was sent by
-/// `protocol` from `quoted[0]` to `quoted[1]`.
-pub fn report_v4(kind: u8, protocol: Quoted, quoted: [SocketAddrV4; 2]) -> Vec<u8> {
-    let codes = REPORTS.iter().find(|known| known.0 == kind);
-    let kind = codes.copied().unwrap_or((kind, 0, 0));
-    [
-        header_v4(*quoted[1].ip(), *quoted[0].ip(), 1),
-        report(kind, protocol, quoted),
-    ]
-    .concat()
+/// Whole IPv4 packets with ICMP messages of every type, each code of those that report an error, as reports on what was sent
+/// by `protocol` from the first of each pair of ends to the second: from the second, to the first.
+pub fn reports_v4(protocol: Quoted, quoted: &[[SocketAddrV4; 2]]) -> Vec<Vec<u8>> {
+    let kinds = (0..=255_u8).flat_map(|kind| {
+        let code_max = match kind {
+            // Destination unreachable (RFC 792, RFC 1812), redirect, time exceeded, parameter problem.
+            3 => 15,
+            5 => 3,
+            11 => 1,
+            12 => 2,
+            _ => 0,
+        };
+        // A packet too long for the next hop of 100 bytes; else unused.
+        (0..=code_max).map(move |code| (kind, code, if (kind, code) == (3, 4) { 100 } else { 0 }))
+    });
+    let packets = kinds.flat_map(|kind| {
+        quoted.iter().map(move |ends| {
+            let header = header_v4(*ends[1].ip(), *ends[0].ip(), 1);
+            [header, report(kind, protocol, *ends)].concat()
+        })
+    });
+    packets.collect()
 }
 
 /// A whole IPv4 packet that begins a connection.
 pub fn syn_v4(from: SocketAddrV4, to: SocketAddrV4) -> Vec<u8> {
-    let segment = tcp(from, to, 1, TCP_SYN, &[]);
+    let segment = tcp(from, to, [1, 0], TCP_SYN, &[]);
     [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
 }
 
 /// A whole IPv4 packet that ends a connection whose receiver expects `sequence` next, and no other.
 pub fn reset_v4(from: SocketAddrV4, to: SocketAddrV4, sequence: u32) -> Vec<u8> {
-    let segment = tcp(from, to, sequence, TCP_RST, &[]);
+    let segment = tcp(from, to, [sequence, 0], TCP_RST, &[]);
     [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
 }
 
@@ -520,20 +569,27 @@ pub fn reset_v4(from: SocketAddrV4, to: SocketAddrV4, sequence: u32) -> Vec<u8> 
 /// # Panics
 /// When the content is longer than a packet.
 pub fn segment_v4(from: SocketAddrV4, to: SocketAddrV4, sequence: u32, content: &[u8]) -> Vec<u8> {
-    let segment = tcp(from, to, sequence, TCP_ACK, content);
+    let segment = tcp(from, to, [sequence, 0], TCP_ACK, content);
     [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
 }
 
-/// A TCP segment with `content`.
+/// A TCP segment with `content` and these numbers: its own, and the one it acknowledges.
 ///
 /// # Panics
 /// When the content is longer than a packet.
-fn tcp(from: SocketAddrV4, to: SocketAddrV4, sequence: u32, flags: u8, content: &[u8]) -> Vec<u8> {
+fn tcp(
+    from: SocketAddrV4,
+    to: SocketAddrV4,
+    [sequence, acknowledged]: [u32; 2],
+    flags: u8,
+    content: &[u8],
+) -> Vec<u8> {
     let mut tcp = Vec::new();
     tcp.extend(from.port().to_be_bytes());
     tcp.extend(to.port().to_be_bytes());
     tcp.extend(sequence.to_be_bytes());
-    tcp.extend([0, 0, 0, 0, 5 << 4, flags, 4, 0, 0, 0, 0, 0]);
+    tcp.extend(acknowledged.to_be_bytes());
+    tcp.extend([5 << 4, flags, 4, 0, 0, 0, 0, 0]);
     tcp.extend(content);
     let ends = [from.ip().octets(), to.ip().octets()].concat();
     let length = u16::try_from(tcp.len()).expect("a short segment");
@@ -591,6 +647,7 @@ fn checksum(bytes: &[u8]) -> [u8; 2] {
     [high, low]
 }
 
+const TCP_FIN: u8 = 1;
 const TCP_SYN: u8 = 2;
 const TCP_RST: u8 = 4;
 const TCP_ACK: u8 = 16;
@@ -637,15 +694,21 @@ impl Segment {
             .then_some(segment)
     }
 
-    /// An IPv4 packet with a reset to `victim`, one of both ends, where it expects the next byte. The kernel fills in
-    /// the length and the checksum of its header.
-    fn reset(&self, victim: Ipv4Addr) -> Vec<u8> {
-        let (from, to, next) = if *self.from.ip() == victim {
-            (self.to, self.from, self.acknowledged)
+    /// An IPv4 packet to `victim`, one of both ends, where it expects the next byte. The kernel fills in the length and the
+    /// checksum of its header.
+    fn forged(&self, what: Exact, victim: Ipv4Addr) -> Vec<u8> {
+        let (from, to, next, acknowledged) = if *self.from.ip() == victim {
+            (self.to, self.from, self.acknowledged, self.next)
         } else {
-            (self.from, self.to, self.next)
+            (self.from, self.to, self.next, self.acknowledged)
         };
-        reset_v4(from, to, next)
+        let (flags, content): (u8, &[u8]) = match what {
+            Exact::Reset => (TCP_RST, &[]),
+            Exact::End => (TCP_ACK | TCP_FIN, &[]),
+            Exact::Content => (TCP_ACK, &[0x48; 96]),
+        };
+        let segment = tcp(from, to, [next, acknowledged], flags, content);
+        [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
     }
 }
 

@@ -14,7 +14,7 @@ mod self_tests;
 use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Read};
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc;
@@ -35,6 +35,11 @@ pub const INTERFACE: &str = "eth0";
 pub const ADDRESSES: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 77, 0, 1), Ipv4Addr::new(10, 77, 0, 2)];
 /// The ports of [`Lab::put_bridge_between`] to both hosts, on host 0.
 pub const BRIDGE_PORTS: [&str; 2] = ["port0", "port1"];
+/// Addresses of IPv6 that tests give to host 0 and host 1.
+pub const ADDRESSES_V6: [Ipv6Addr; 2] = [
+    Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 1),
+    Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 2),
+];
 /// The interface of a second cable, see [`Lab::lay_second_cable`].
 pub const SECOND_INTERFACE: &str = "eth1";
 /// The addresses of host 0 and host 1 on a second cable.
@@ -322,13 +327,13 @@ impl LabHost {
         }
     }
 
-    /// The ends of this host's connections of TCP with `port` at either end: its own and the other.
+    /// The ends of this host's connections of TCP in `state` with `port` at either end: its own and the other.
     ///
     /// # Panics
     /// When they cannot be listed.
-    pub fn connections(&self, port: u16) -> Vec<[SocketAddr; 2]> {
+    pub fn connections(&self, state: &str, port: u16) -> Vec<[SocketAddr; 2]> {
         let mut command = self.command("ss");
-        command.args(["-Htn", "state", "established"]);
+        command.args(["-Htn", "state", state]);
         let filter = format!("( sport = :{port} or dport = :{port} )");
         let finished = child::run(command.arg(filter), SETUP_LIMIT);
         let finished = finished.unwrap_or_else(|reason| panic!("{reason}"));
@@ -337,6 +342,14 @@ impl LabHost {
             Some([words.next()?, words.next()?])
         });
         ends.collect()
+    }
+
+    /// Has this host send to `addresses`, as `10.1.0.0/16`, over the first cable.
+    ///
+    /// # Panics
+    /// When it cannot be done.
+    pub fn add_route(&self, addresses: &str) {
+        self.change(&["route", "add", addresses]);
     }
 
     /// Runs `ip -n <this host> <words> dev <the first cable>`.

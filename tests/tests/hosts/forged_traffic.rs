@@ -4,6 +4,7 @@
 //! `HIL_ATTACK_ROUNDS=20` sends each kind so often, half a second each time: 20,000 messages under it, and as many beside.
 
 use core::cell::Cell;
+use core::slice;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6};
 use std::time::Duration;
 use std::{fs, thread};
@@ -16,15 +17,16 @@ use hil_rundir::run_folder::RunFolder as Folder;
 use hil_rundir::run_result::RunResult;
 use hil_tests::account::assert_accounts_close;
 use hil_tests::attacker::{
-    Attacker, FOREIGN, Quoted, datagram_v4, report_v4, reset_v4, segment_v4, syn_v4,
+    Attacker, Exact, FOREIGN, FOREIGN_V6, Quoted, datagram_v4, reports_v4, reset_v4, segment_v4,
+    syn_v4,
 };
 use hil_tests::knocker::CONTROL_PORT;
-use hil_tests::lab::{ADDRESSES, INTERFACE, Lab};
+use hil_tests::lab::{ADDRESSES, ADDRESSES_V6, INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split, count, direction, refused};
 use hil_tests::trial::{RunFiles, Trial};
-use hil_tests::turns::{TURN, cost, judge, play, round_count, run_duration};
+use hil_tests::turns::{TURN, cost, judge, play, roomy, round_count, run_duration};
 
 use super::strangers::made_up;
 
@@ -37,17 +39,12 @@ const PORTS: [u16; 2] = [PORT, PORT + 1];
 const CLOCK_PORT: u16 = 7_390;
 /// Beside those of the data.
 const CLOCK_ADDRESSES: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 77, 0, 11), Ipv4Addr::new(10, 77, 0, 12)];
-const ADDRESSES_V6: [Ipv6Addr; 2] = [
-    Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 1),
-    Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 2),
+const CLOCK_ADDRESSES_V6: [Ipv6Addr; 2] = [
+    Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 0x11),
+    Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 0x12),
 ];
-/// An address that is in no topology.
-const FOREIGN_V6: Ipv6Addr = Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 0x66);
 /// Messages a second of each of the two channels.
 const MESSAGES_HZ: u32 = 1_000;
-/// What a stranger sends in a second.
-pub(super) const SENT_HZ: u32 = 2_000;
-
 /// Resets that the hosts have answered with, for beginnings of connections where nothing listens.
 fn resets_sent(lab: &Lab) -> u64 {
     let counts = [0, 1].map(|index| {
@@ -70,6 +67,9 @@ fn at(address: Ipv4Addr, port: u16) -> SocketAddrV4 {
     SocketAddrV4::new(address, port)
 }
 
+/// Where these come from: a host has to have a way to answer.
+const EVERYWHERE: &str = "10.77.96.0/20";
+
 /// Beginnings of connections from 2000 addresses, to these ports of both hosts.
 fn beginnings(ports: [u16; 2]) -> Vec<Vec<u8>> {
     let packets = (0..2_000_u16).map(|number| {
@@ -91,13 +91,12 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
     let stranger = Attacker::join(&lab, FOREIGN);
     let record = RunFolder::new("forged");
     let rounds = round_count(4);
-    let mut trial = Trial::shipped("shuttle-split.toml", record.path())
+    let mut trial = roomy(Trial::shipped("shuttle-split.toml", record.path()))
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
-        .set("channels.\"shuttle/command\".depth=256")
-        .set("channels.\"shuttle/status\".depth=256")
         .set(&run_duration(rounds, 4));
     for (index, host) in HOSTS.iter().enumerate() {
+        lab.host(index).add_route(EVERYWHERE);
         lab.host(index).add_address(CLOCK_ADDRESSES[index]);
         let address = CLOCK_ADDRESSES[index];
         stranger.know(address.into(), &lab.host(index).hardware_address());
@@ -117,17 +116,14 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
     };
     let datagrams = forge(PORT, ADDRESSES, PORT);
     let exchanges = forge(CLOCK_PORT, CLOCK_ADDRESSES, CLOCK_PORT);
-    let reports: Vec<_> = (0..=255)
-        .flat_map(|kind| {
-            [0, 1].into_iter().flat_map(move |from| {
-                let data = [from, 1 - from].map(|end| at(ADDRESSES[end], PORTS[from]));
-                let clock = [from, 1 - from].map(|end| at(CLOCK_ADDRESSES[end], CLOCK_PORT));
-                [data, clock].map(|ends| report_v4(kind, Quoted::Udp, ends))
-            })
-        })
-        .collect();
+    let quoted = [0, 1].map(|from| {
+        let data = [from, 1 - from].map(|end| at(ADDRESSES[end], PORTS[from]));
+        let clock = [from, 1 - from].map(|end| at(CLOCK_ADDRESSES[end], CLOCK_PORT));
+        [data, clock]
+    });
+    let reports = reports_v4(Quoted::Udp, &quoted.concat());
     let beginnings = beginnings([CONTROL_PORT, PORT]);
-    let send = |packets: &[Vec<u8>]| stranger.send_repeatedly(packets, TURN, SENT_HZ).sent_count;
+    let send = |packets: &[Vec<u8>]| stranger.send_repeatedly(packets, TURN).sent_count;
     let reset_count = Cell::new(0);
     let all = play(
         &[
@@ -193,15 +189,26 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
     let stranger = Attacker::join(&lab, FOREIGN);
     let record = RunFolder::new("forged-tcp");
     let rounds = round_count(4);
-    let trial = Trial::shipped("shuttle-tcp.toml", record.path())
+    let trial = roomy(Trial::shipped("shuttle-tcp.toml", record.path()))
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
-        .set("channels.\"shuttle/command\".depth=256")
-        .set("channels.\"shuttle/status\".depth=256")
-        .set(&run_duration(rounds, 5));
+        .set(&run_duration(rounds + 2, 5));
+    for index in [0, 1] {
+        lab.host(index).add_route(EVERYWHERE);
+    }
     let split = Split::start(&lab, &trial);
     split.wait_for_messages("the begin of the run");
     let ports = [PORTS[0], PORTS[1], CONTROL_PORT];
+    let exact = [Exact::Reset, Exact::End, Exact::Content].map(|what| {
+        let began_ns = MonotonicClock::now().as_ns();
+        for host in ADDRESSES {
+            let sent_count = stranger.forge_exactly(what, PORT, host, LIMIT);
+            println!("{sent_count} of {what:?} at {host}");
+            thread::sleep(TURN);
+        }
+        split.wait_for_messages("an exact forgery");
+        (what, began_ns..MonotonicClock::now().as_ns())
+    });
     let ways = connections(&lab, &ports).map(|ends| {
         ends.map(|end| match end {
             SocketAddr::V4(end) => end,
@@ -209,10 +216,8 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
         })
     });
     let ways: Vec<_> = ways.collect();
+    let reports = reports_v4(Quoted::Tcp, &ways);
     let ways = || ways.iter().copied();
-    let reports: Vec<_> = (0..=255)
-        .flat_map(|kind| ways().map(move |ends| report_v4(kind, Quoted::Tcp, ends)))
-        .collect();
     let mut random = RandomStream::new(8, "forged");
     let mut blind = |forge: fn(SocketAddrV4, SocketAddrV4, u32) -> Vec<u8>| {
         let packets = (0..700).flat_map(|_| {
@@ -225,11 +230,12 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
     let resets = blind(reset_v4);
     let beginnings = blind(|from, to, _| syn_v4(from, to));
     let from_everywhere = self::beginnings(PORTS);
+    let half_open_count = Cell::new(0);
     let contents = blind(|from, to, guess| {
         let words = guess.to_le_bytes().repeat(24);
         segment_v4(from, to, guess, &words)
     });
-    let send = |packets: &[Vec<u8>]| stranger.send_repeatedly(packets, TURN, SENT_HZ).sent_count;
+    let send = |packets: &[Vec<u8>]| stranger.send_repeatedly(packets, TURN).sent_count;
     let all = play(
         &[
             ("ICMP of every type on connections", &|| send(&reports)),
@@ -239,31 +245,36 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
             }),
             ("content with a guessed number", &|| send(&contents)),
             ("beginnings of connections from 2000 addresses", &|| {
-                send(&from_everywhere)
+                let sent_count = send(&from_everywhere);
+                let half_open = lab.host(1).connections("syn-recv", PORT).len();
+                half_open_count.set(half_open_count.get().max(half_open));
+                sent_count
             }),
         ],
         rounds,
     );
-    let calm_ns = MonotonicClock::now().as_ns();
-    for host in ADDRESSES {
-        let sent_count = stranger.reset(PORT, host, LIMIT);
-        println!("{sent_count} exact resets at {host}");
-        thread::sleep(TURN);
-    }
+    println!("{} half-open connections at most", half_open_count.get());
+    assert!(half_open_count.get() > 0);
     let files = [0, 1].map(|index| split.files[index].clone());
     let summaries = split.finish();
     judge(&files, &all);
-    let after = cost(
-        [&files[0], &files[1]],
-        CHANNELS[0],
-        core::slice::from_ref(&(calm_ns..i64::MAX)),
-    );
-    println!("commands under two exact resets: {after:?}");
+    for (what, window_ns) in &exact {
+        let commands = cost(
+            [&files[0], &files[1]],
+            CHANNELS[0],
+            slice::from_ref(window_ns),
+        );
+        println!("commands under an exact {what:?} at each end: {commands:?}");
+    }
     for (summary, name) in summaries.iter().zip(CHANNELS) {
         let egress = direction(summary, name, "egress");
         let reconnects = count(egress, "transport: reconnect_count");
         println!("{name}: {reconnects} reconnects");
-        assert_eq!(reconnects, if name == CHANNELS[0] { 2 } else { 0 });
+        assert!(if name == CHANNELS[0] {
+            reconnects >= 6
+        } else {
+            reconnects == 0
+        });
         assert!(cuts(summary).is_empty(), "{:?}", summary.events);
         assert_accounts_close(summary);
     }
@@ -276,7 +287,7 @@ fn connections(lab: &Lab, ports: &[u16]) -> impl Iterator<Item = [SocketAddr; 2]
     let all: Vec<_> = ports
         .iter()
         .flat_map(|port| {
-            let found = lab.host(0).connections(*port);
+            let found = lab.host(0).connections("established", *port);
             assert!(!found.is_empty(), "no connection with port {port}");
             found
         })
@@ -318,17 +329,20 @@ fn run_of_v6<'a>(
 ) -> (Split<'a>, Attacker) {
     let stranger = Attacker::join(lab, FOREIGN);
     stranger.add_address(FOREIGN_V6);
-    let mut trial = Trial::shipped(topology, record.path())
+    let mut trial = roomy(Trial::shipped(topology, record.path()))
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
-        .set("channels.\"shuttle/command\".depth=256")
-        .set("channels.\"shuttle/status\".depth=256")
         .set(duration);
     for (index, host) in HOSTS.iter().enumerate() {
-        let address = ADDRESSES_V6[index];
-        lab.host(index).add_address(address);
-        stranger.know(address.into(), &lab.host(index).hardware_address());
-        trial = trial.set(&format!("hosts.{host}.address=\"{address}\""));
+        let host_here = lab.host(index);
+        let (address, clock_address) = (ADDRESSES_V6[index], CLOCK_ADDRESSES_V6[index]);
+        for address in [address, clock_address] {
+            host_here.add_address(address);
+            stranger.know(address.into(), &host_here.hardware_address());
+        }
+        trial = trial
+            .set(&format!("hosts.{host}.address=\"{address}\""))
+            .set(&format!("hosts.{host}.clock_address=\"{clock_address}\""));
     }
     let split = Split::start(lab, &trial);
     split.wait_for_messages("the begin of the run");
@@ -345,10 +359,11 @@ fn icmpv6_of_every_type_costs_a_sealed_run_nothing_above_the_time_beside_it() {
     let duration = run_duration(rounds, 2);
     let (split, stranger) = run_of_v6(&lab, "shuttle-split.toml", &record, &duration);
     let reports = |to: usize| {
-        let quoted = [PORTS[to], CLOCK_PORT].map(|port| {
-            [to, 1 - to].map(|index| SocketAddrV6::new(ADDRESSES_V6[index], port, 0, 0))
+        let ends = [(ADDRESSES_V6, PORTS[to]), (CLOCK_ADDRESSES_V6, CLOCK_PORT)];
+        let quoted = ends.map(|(addresses, port)| {
+            [to, 1 - to].map(|index| SocketAddrV6::new(addresses[index], port, 0, 0))
         });
-        let flood = stranger.forge_reports_v6(Quoted::Udp, &quoted, TURN, SENT_HZ);
+        let flood = stranger.forge_reports_v6(Quoted::Udp, &quoted, TURN);
         flood.sent_count
     };
     let all = play(
@@ -391,7 +406,7 @@ fn icmpv6_of_every_type_costs_a_sealed_tcp_hop_and_the_supervisors_nothing() {
         })
         .collect();
     let reports = || {
-        let flood = stranger.forge_reports_v6(Quoted::Tcp, &ways, TURN, SENT_HZ);
+        let flood = stranger.forge_reports_v6(Quoted::Tcp, &ways, TURN);
         flood.sent_count
     };
     let all = play(&[("ICMPv6 of every type on connections", &reports)], rounds);
