@@ -324,11 +324,30 @@ impl<'a> Walk<'a> {
         if matches!(self.byte(0)? >> 4, 4 | 6) {
             return Ok(Layer::Ip);
         }
-        // An Ethernet pseudowire, with its control word or without (RFC 4448).
-        if self.peek(0)? == [0, 0] {
-            self.at += 4;
+        match self.peek(0)? {
+            // An associated channel (RFC 5586).
+            [0x10, 0] => return Err(NotIp),
+            // An Ethernet pseudowire, with its control word or without (RFC 4448): an address may begin so too.
+            [0, 0] if self.is_ethernet(4) && !self.is_ethernet(0) => self.at += 4,
+            _ => {}
         }
         Ok(Layer::Ethernet)
+    }
+
+    /// True when an Ethernet frame with a type that is read begins `ahead`.
+    fn is_ethernet(&self, ahead: usize) -> bool {
+        let mut frame = Walk {
+            at: self.at + ahead,
+            ..*self
+        };
+        let Ok(Layer::EtherType(kind)) = frame.ethernet() else {
+            return false;
+        };
+        match frame.ether_type(kind) {
+            Ok(Layer::Llc) => frame.llc().is_ok(),
+            Ok(_) | Err(ENCRYPTED) => true,
+            Err(_) => false,
+        }
     }
 
     /// Passes the radiotap header; its flags tell of frames whose check sequence is wrong, and whether the

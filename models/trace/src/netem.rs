@@ -42,9 +42,12 @@ pub fn table(trace: &Trace) -> Option<NetemTable> {
     if deviation_ns <= 0.0 {
         return None;
     }
+    let channel = match one_line(&trace.header.channel) {
+        unknown if unknown.is_empty() => "unknown channel".to_owned(),
+        known => known,
+    };
     let mut text = format!(
-        "# delay distribution of {}: tc ... netem delay {:.0}us {:.0}us distribution FILE\n",
-        one_line(&trace.header.channel),
+        "# delay distribution of {channel}: tc ... netem delay {:.0}us {:.0}us distribution FILE\n",
         mean_ns / 1e3,
         deviation_ns / 1e3
     );
@@ -126,6 +129,17 @@ mod tests {
             let line = table.text.lines().nth(1).unwrap().to_owned();
             (table.bound_ns, line)
         };
+        let of_nobody = Trace {
+            header: TraceHeader::new(""),
+            records: [5, 7]
+                .map(|ns| TraceRecord::published(0, 0, 1).delivered(ns, 0))
+                .to_vec(),
+        };
+        let text = table(&of_nobody).unwrap().text;
+        assert!(
+            text.starts_with("# delay distribution of unknown channel: tc"),
+            "{text}"
+        );
         let (bound_ns, line) = told([40_000, 90_000]);
         assert_eq!(bound_ns, Some(90_000));
         assert_eq!(line, "# both within 90.000us by the clocks");

@@ -317,6 +317,8 @@ fn carry_out(
     check_traces(path, &args.overrides, topology, console)?;
     // Told before what may only be missing now.
     check_file(path, topology)?;
+    own_program::check_names(topology)
+        .map_err(|taken| unusable(path, &args.overrides, taken.0, exit::USAGE, console))?;
     tell_undecided(topology, registry, console);
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use hil_capture::flow::FlowFilter;
 use hil_capture::join::{
-    CountedDoubt, Doubt, JoinMetrics, JoinSettings, Joined, Loss, OrderSource,
+    CountedDoubt, Doubt, JoinMetrics, JoinSettings, Joined, Loss, OrderSource, Pair,
 };
 use hil_capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_capture::pairing::join_all;
@@ -86,6 +86,15 @@ impl Reading {
             let _infallible = write!(text, " ({})", point.direction.label());
         }
         text
+    }
+
+    /// To how many nanoseconds stamps of a point are whole.
+    fn unit_ns(&self, point: &Point) -> i64 {
+        let mut interfaces = self.files[point.file_index].interfaces.iter();
+        let (numerator, denominator) = interfaces
+            .nth(point.interface_index)
+            .map_or((1, 1), |interface| interface.unit_ns);
+        i64::try_from(numerator.div_ceil(denominator)).unwrap_or(i64::MAX)
     }
 
     /// Every stream that a card stamped, with how many of its datagrams have the kernel's stamp.
@@ -240,14 +249,15 @@ impl Report {
             let (first, second) = (&one.first_point, &one.second_point);
             let mut interfaces = reading.files[first.file_index].interfaces.iter();
             let is_apart = first.tap() != second.tap() && interfaces.any(|one| one.is_merged);
-            let declared = PointClocks::of(first, second, settings.is_one_clock);
-            match declared.beside(&one.figures.delay) {
-                PointClocks::OneFile if is_apart && settings.is_one_clock => {
-                    PointClocks::DeclaredOne
-                }
-                PointClocks::OneFile if is_apart => PointClocks::Unknown,
-                found => found,
-            }
+            let declared = PointClocks::of(first, second, is_apart, settings);
+            let unit_ns = reading.unit_ns(first).max(reading.unit_ns(second));
+            // Where a clock was set there are none.
+            let is_delay =
+                |pair: &&Pair| one.figures.delay.measured().is_some() && pair.is_stamped();
+            let pairs = one.pairs.iter().filter(is_delay);
+            let delays_ns =
+                pairs.map(|pair| pair.second.stamp_ns.saturating_sub(pair.first.stamp_ns));
+            declared.beside(delays_ns, unit_ns)
         };
         Self {
             schema_version: 2,
@@ -255,22 +265,26 @@ impl Report {
             packets: *reading.observer.counts(),
             points,
             joins: joins
-                .map(|(stream, joined)| JoinReport {
-                    first: reading.name(&joined.first_point),
-                    second: reading.name(&joined.second_point),
-                    clocks: clocks(&joined),
-                    delay_bound_ns: clocks(&joined).bound_ns(),
-                    stream: stream_report(&stream),
-                    figures: joined.figures,
+                .map(|(stream, joined)| {
+                    let clocks = clocks(&joined);
+                    JoinReport {
+                        first: reading.name(&joined.first_point),
+                        second: reading.name(&joined.second_point),
+                        clocks,
+                        delay_bound_ns: clocks.bound_ns(),
+                        stream: stream_report(&stream),
+                        figures: joined.figures,
+                    }
                 })
                 .collect(),
         }
     }
 
-    /// True when loss is unavailable between two points, or a clock was set.
+    /// True when loss is unavailable between two points, a clock was set, or delays contradict that it is one.
     pub(super) fn has_doubts(&self) -> bool {
         let is_doubtful = |one: &JoinReport| {
             one.figures.loss.count().is_none()
+                || one.clocks == PointClocks::Contradicted
                 || one
                     .figures
                     .clock_steps

@@ -1,13 +1,15 @@
 //! Whether two points of captures read one clock: only then is the time between their stamps a
 //! one-way delay. A probe exchanges no clocks, so it must be told, or say that it does not know.
 
+use hil_capture::join::JoinSettings;
 use hil_capture::observe::Point;
 use serde::Serialize;
 
-use hil_stats::histogram::Distribution;
-
 use hil_report::clock_summary::{ClockRung, HostPairClock};
 use hil_report::summary::RunSummary;
+
+/// Share of delays below zero that contradicts one clock.
+const CONTRADICTING_SHARE: f64 = 0.001;
 
 /// On what the time between the stamps of two points rests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -24,11 +26,17 @@ pub(super) enum PointClocks {
 }
 
 impl PointClocks {
-    pub(super) fn of(first: &Point, second: &Point, is_declared_one: bool) -> Self {
+    /// `is_apart` says that one file holds them and was put together from several.
+    pub(super) fn of(
+        first: &Point,
+        second: &Point,
+        is_apart: bool,
+        settings: &JoinSettings,
+    ) -> Self {
         let is_same_kind = first.esl_port.is_some() == second.esl_port.is_some();
-        if first.file_index == second.file_index && is_same_kind {
+        if first.file_index == second.file_index && is_same_kind && !is_apart {
             Self::OneFile
-        } else if is_declared_one {
+        } else if settings.is_one_clock {
             Self::DeclaredOne
         } else {
             Self::Unknown
@@ -43,9 +51,18 @@ impl PointClocks {
         }
     }
 
-    /// What is left of it beside the delays that follow from it.
-    pub(super) fn beside(self, delay: &Distribution) -> Self {
-        let is_contradicted = delay.measured().is_some_and(|delay| delay.min_ns < 0);
+    /// What is left of it beside the delays that follow from it, where stamps are whole units of up to
+    /// `unit_ns`: a stamp cut off at its unit takes less than one from a delay. Delays below that
+    /// contradict one clock if they are all, or at least two and [`CONTRADICTING_SHARE`] of all: a single
+    /// datagram may have been matched with another one that looks like it.
+    pub(super) fn beside(self, delays_ns: impl Iterator<Item = i64>, unit_ns: i64) -> Self {
+        let (mut count, mut below_count) = (0_usize, 0_usize);
+        for delay_ns in delays_ns {
+            count += 1;
+            below_count += usize::from(delay_ns < -unit_ns);
+        }
+        let is_enough = below_count > 1 && below_count as f64 >= CONTRADICTING_SHARE * count as f64;
+        let is_contradicted = is_enough || (count > 0 && below_count == count);
         match self {
             Self::DeclaredOne if is_contradicted => Self::Contradicted,
             found => found,
@@ -110,13 +127,20 @@ impl WireClocks {
 mod tests {
     use super::*;
 
+    const fn said(is_one_clock: bool) -> JoinSettings {
+        JoinSettings {
+            window_ns: 1,
+            is_one_clock,
+        }
+    }
+
     #[test]
     fn two_files_have_one_clock_only_by_word() {
         let point = |file_index| Point {
             file_index,
             ..Point::default()
         };
-        let of = |second, is_one| PointClocks::of(&point(0), &point(second), is_one);
+        let of = |second, is_one| PointClocks::of(&point(0), &point(second), false, &said(is_one));
         assert_eq!(of(0, false), PointClocks::OneFile);
         assert_eq!(of(1, false), PointClocks::Unknown);
         assert_eq!(of(1, true), PointClocks::DeclaredOne);
@@ -124,14 +148,36 @@ mod tests {
             esl_port: Some(1),
             ..point(0)
         };
-        let mixed = PointClocks::of(&point(0), &of_device, false);
+        let mixed = PointClocks::of(&point(0), &of_device, false, &said(false));
         assert_eq!(mixed, PointClocks::Unknown);
         assert_eq!(of(1, false).bound_ns(), None);
         assert_eq!(of(1, true).bound_ns(), Some(0));
-        let delays = |from_ns| Distribution::of_samples(&[from_ns, 2_000_000], "");
-        assert_eq!(of(1, true).beside(&delays(0)), PointClocks::DeclaredOne);
-        let contradicted = of(1, true).beside(&delays(-1));
-        assert_eq!(contradicted, PointClocks::Contradicted);
-        assert_eq!(contradicted.bound_ns(), None);
+    }
+
+    #[test]
+    fn datagrams_that_arrive_before_they_leave_contradict_one_clock() {
+        let merged =
+            |is_one| PointClocks::of(&Point::default(), &Point::default(), true, &said(is_one));
+        assert_eq!(merged(false), PointClocks::Unknown);
+        assert_eq!(merged(true), PointClocks::DeclaredOne);
+        let beside =
+            |delays_ns: &[i64], unit_ns| merged(true).beside(delays_ns.iter().copied(), unit_ns);
+        let early = [-5_000_000; 10];
+        assert_eq!(beside(&early, 1), PointClocks::Contradicted);
+        assert_eq!(beside(&early[..1], 1), PointClocks::Contradicted);
+        assert_eq!(beside(&early, 1).bound_ns(), None);
+        assert_eq!(beside(&[], 1), PointClocks::DeclaredOne);
+        // 0.4 us, the second stamp in whole microseconds.
+        let cut: Vec<i64> = (0..1000).map(|n| (n + 400) / 1000 * 1000 - n).collect();
+        assert_eq!(cut.iter().min(), Some(&-599));
+        assert_eq!(beside(&cut, 1000), PointClocks::DeclaredOne);
+        assert_eq!(beside(&cut, 1), PointClocks::Contradicted);
+        // Datagrams that were matched with others.
+        let mut delays = vec![400_000; 10_000];
+        delays[7] = -30_000_000;
+        assert_eq!(beside(&delays[..10], 1), PointClocks::DeclaredOne);
+        delays[9] = -30_000_000;
+        assert_eq!(beside(&delays, 1), PointClocks::DeclaredOne);
+        assert_eq!(beside(&delays[..2000], 1), PointClocks::Contradicted);
     }
 }

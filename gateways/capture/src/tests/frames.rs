@@ -65,6 +65,10 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
     // A label and a control word before the Ethernet frame.
     let pseudowire = [addresses, &[0x88, 0x47, 0, 1, 1, 64, 0, 0, 0, 0], &frame].concat();
     let bare_pseudowire = [addresses, &[0x88, 0x47, 0, 1, 1, 64], &frame].concat();
+    // An inner address of a virtual router (RFC 9568), with and without a control word.
+    let router = [&[0, 0, 0x5e, 0, 1, 7][..], &frame[6..]].concat();
+    let router_pseudowire = [addresses, &[0x88, 0x47, 0, 1, 1, 64], &router].concat();
+    let router_behind_word = [addresses, &[0x88, 0x47, 0, 1, 1, 64, 0, 0, 0, 9], &router].concat();
     let ring = [addresses, &[0x89, 0x2f, 0x10, 43, 0, 7], &frame[12..]].concat();
     let redundant = [addresses, &[0xf1, 0xc1, 0, 0, 0, 7], &frame[12..]].concat();
     let within = |protocol: u8, before: &[u8], inner: &[u8]| {
@@ -87,6 +91,8 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
         (link_type::ETHERNET, &other_tag, [0, 7]),
         (link_type::ETHERNET, &pseudowire, [0, 0]),
         (link_type::ETHERNET, &bare_pseudowire, [0, 0]),
+        (link_type::ETHERNET, &router_pseudowire, [0, 0]),
+        (link_type::ETHERNET, &router_behind_word, [0, 0]),
         (link_type::ETHERNET, &ring, [0, 0]),
         (link_type::ETHERNET, &redundant, [0, 0]),
         (link_type::RAW, &in_ip, [0, 0]),
@@ -153,6 +159,11 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
     several[24] |= 0x80;
     let several = udp_datagram(link_type::IEEE802_11, &several);
     assert_eq!(several, Err(unread(Unread::Aggregate)));
+    let channel = [addresses, &[0x88, 0x47, 0, 1, 1, 64, 0x10, 0, 0, 7], &frame].concat();
+    assert_eq!(
+        udp_datagram(link_type::ETHERNET, &channel),
+        Err(NoDatagram::NotIp)
+    );
     let management = [&[0x80, 0][..], &[0; 40]].concat();
     let management = udp_datagram(link_type::IEEE802_11, &management);
     assert_eq!(management, Err(NoDatagram::NotIp));

@@ -172,10 +172,21 @@ fn take_cable(inside: Inside, program: &str) -> Result<(), OwnProgramError> {
 /// Programs of the user's that a run would start and cannot, or not as its topology says.
 #[derive(Debug, thiserror::Error)]
 #[error("{}", lines(.0))]
-pub struct ProgramsMissing(
+pub struct ProgramsUnfit(
     /// Keys of processes, and what is wrong with each.
     pub Vec<(String, String)>,
 );
+
+impl ProgramsUnfit {
+    fn unless_none(found: impl Iterator<Item = (String, String)>) -> Result<(), Self> {
+        let found: Vec<_> = found.collect();
+        if found.is_empty() {
+            Ok(())
+        } else {
+            Err(Self(found))
+        }
+    }
+}
 
 fn lines(missing: &[(String, String)]) -> String {
     let lines = missing.iter().map(|(key, why)| format!("{key}: {why}"));
@@ -183,26 +194,35 @@ fn lines(missing: &[(String, String)]) -> String {
 }
 
 /// Looks for the own programs of `topology` that would run on `hosts`, which are this machine, before a
-/// run begins: by this process's search path and from its working folder.
+/// run begins: by this process's search path and from its working folder. Names are looked at on every host.
 ///
 /// # Errors
-/// Names the key of each process whose program is not there, and the program.
-pub fn find_all(topology: &Topology, hosts: &[String]) -> Result<(), ProgramsMissing> {
-    let witnessed = topology.processes().iter().filter(|one| one.is_witnessed());
-    let taken_names: Vec<String> = witnessed.map(|one| witness_name(&one.host)).collect();
+/// Names the key of each process whose program is not there, and the program; each key that a program
+/// cannot be given; and what [`check_names`] refuses.
+pub fn find_all(topology: &Topology, hosts: &[String]) -> Result<(), ProgramsUnfit> {
     let here = topology.processes().iter();
     let here = here.filter(|process| hosts.contains(&process.host));
-    let mut missing: Vec<(String, String)> = here.clone().flat_map(faults).collect();
-    for process in here.filter(|one| taken_names.contains(&one.name)) {
-        let why =
-            "is the name of the process that records for programs of the user's: choose another";
-        missing.push((format!("processes.{}", process.name), why.to_owned()));
-    }
-    if missing.is_empty() {
-        Ok(())
-    } else {
-        Err(ProgramsMissing(missing))
-    }
+    ProgramsUnfit::unless_none(here.flat_map(faults).chain(taken_names(topology)))
+}
+
+/// Refuses processes of any host that are called as one is that records for programs of the user's. A run
+/// would not start; the folder of an older one is read all the same.
+///
+/// # Errors
+/// Names the key of each.
+pub fn check_names(topology: &Topology) -> Result<(), ProgramsUnfit> {
+    ProgramsUnfit::unless_none(taken_names(topology))
+}
+
+fn taken_names(topology: &Topology) -> impl Iterator<Item = (String, String)> {
+    let processes = || topology.processes().iter();
+    let is_taken = move |process: &&Process| {
+        let mut witnessed = processes().filter(|one| one.is_witnessed());
+        witnessed.any(|one| witness_name(&one.host) == process.name)
+    };
+    let why = "is the name of the process that records for programs of the user's: choose another";
+    let taken = processes().filter(is_taken);
+    taken.map(move |process| (format!("processes.{}", process.name), why.to_owned()))
 }
 
 /// What is wrong with a process, by its keys.
@@ -309,9 +329,11 @@ mod tests {
             .iter()
             .map(|one| one.name.clone())
             .collect();
-        let refusal = find_all(&topology, &hosts).unwrap_err();
-        let keys: Vec<&str> = refusal.0.iter().map(|one| one.0.as_str()).collect();
-        assert_eq!(keys, ["processes.witness-local"]);
+        for refusal in [find_all(&topology, &hosts), check_names(&topology)] {
+            let refusal = refusal.unwrap_err();
+            let keys: Vec<&str> = refusal.0.iter().map(|one| one.0.as_str()).collect();
+            assert_eq!(keys, ["processes.witness-local"]);
+        }
     }
 
     #[test]

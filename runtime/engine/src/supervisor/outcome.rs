@@ -13,7 +13,7 @@ use super::meet::PeerError;
 use super::needs::HostTooSmall;
 use super::process_group::ProcessGroupError;
 use super::process_group::Verdict;
-use crate::process::own_program::ProgramsMissing;
+use crate::process::own_program::ProgramsUnfit;
 use crate::security::KeyFileError;
 use hil_rundir::run_result::Outcome;
 use hil_shm::DomainError;
@@ -59,7 +59,7 @@ pub enum RunError {
     Peer(#[from] PeerError),
     /// A program of the user's is not there.
     #[error(transparent)]
-    Programs(#[from] ProgramsMissing),
+    Programs(#[from] ProgramsUnfit),
     /// A process cannot be started.
     #[error("{0}")]
     Start(String),

@@ -446,6 +446,24 @@ fn a_warning_says_how_many_messages_found_no_room() {
 }
 
 #[test]
+fn what_a_witness_took_is_said_to_be_taken_by_it() {
+    let says_so = |summary: &RunSummary| {
+        let text = render(summary, 120, Style::Plain);
+        let words: Vec<&str> = text.split_whitespace().collect();
+        let words = words.join(" ");
+        words.contains("Taken: when the witness beside the program had the message")
+    };
+    let mut summary = full();
+    summary.processes[1].kind = ProcessKind::OwnProgram;
+    assert!(!says_so(&summary), "nobody records for the robot");
+    let witness = process("witness-operator", ProcessKind::Witness, None);
+    summary.processes.push(witness);
+    assert!(says_so(&summary));
+    summary.processes[1].kind = ProcessKind::Component;
+    assert!(!says_so(&summary), "the robot records itself");
+}
+
+#[test]
 fn a_host_that_overran_is_not_a_network_result() {
     let mut summary = full();
     // 0.1 % of 5 000 due ticks is 5: at the limit it still counts.

@@ -23,7 +23,7 @@ use hil_rundir::live_run::{LiveRun, Source};
 use hil_rundir::manifest::{ChannelDescription, Manifest};
 use hil_rundir::record::RecordKind;
 use hil_rundir::select::{self, SelectError};
-use hil_rundir::status::{Phase, RunStatus};
+use hil_rundir::status::RunStatus;
 use hil_shm::{Domain, DomainError};
 use hil_topology::registry::Registry;
 use hil_topology::{Process, Topology};
@@ -157,7 +157,7 @@ impl Observer {
             };
             (one.name.clone(), tail)
         });
-        let tails: BTreeMap<String, ChannelTail> = tails.collect();
+        let mut tails: BTreeMap<String, ChannelTail> = tails.collect();
         let is_of_program_here = |name: &&String| {
             let known = topology.as_ref()?;
             let producer = known.process(&known.channel(name)?.from)?;
@@ -166,7 +166,12 @@ impl Observer {
         };
         let unbegun = tails.keys();
         let unbegun = unbegun.filter(|name| is_of_program_here(name).is_some());
-        let unbegun = unbegun.cloned().collect();
+        let unbegun: Vec<String> = unbegun.cloned().collect();
+        for name in &unbegun {
+            if let Some(tail) = tails.get_mut(name) {
+                tail.await_begin();
+            }
+        }
         Ok(Self {
             tails,
             unbegun,
@@ -346,14 +351,11 @@ impl Observer {
             }
         }
         if !unbegun.is_empty() {
+            // A status that cannot be read says nothing: the next poll asks again.
             let status = RunStatus::read(&run.folder).ok();
-            if status
-                .as_ref()
-                .is_none_or(|one| one.phase != Phase::Starting)
-            {
-                let start_ns = status.and_then(|one| one.start_ns);
+            if let Some(start_ns) = status.and_then(|one| one.start_ns) {
                 for channel in unbegun.drain(..) {
-                    if let (Some(tail), Some(start_ns)) = (tails.get_mut(&channel), start_ns) {
+                    if let Some(tail) = tails.get_mut(&channel) {
                         tail.begin(Instant::from_ns(start_ns));
                     }
                 }
@@ -361,9 +363,6 @@ impl Observer {
         }
         let now_ns = MonotonicClock::now().as_ns();
         for (channel, tail) in tails {
-            if unbegun.contains(channel) {
-                continue;
-            }
             let settling = settling(conditions.flight_time(channel));
             tail.settle(now_ns, duration_ns(settling));
             if tail.notes_late_record() {

@@ -79,8 +79,13 @@ impl ChannelTail {
         }
     }
 
+    /// Knows from now on that the run has not begun: what settles is no message of it, and is forgotten.
+    pub(crate) const fn await_begin(&mut self) {
+        self.begin(Instant::from_ns(i64::MAX));
+    }
+
     /// Knows from now on when the run began, on the producer's clock: what was published before is no message of it.
-    pub(crate) fn begin(&mut self, start: Instant) {
+    pub(crate) const fn begin(&mut self, start: Instant) {
         let end = Instant::from_ns(i64::MAX);
         self.producer_run = Some(RunSpan { start, end });
     }
@@ -276,6 +281,11 @@ mod tests {
     #[test]
     fn what_was_published_before_the_run_began_is_no_message_of_it() {
         let mut tail = tail();
+        tail.await_begin();
+        // Up to 1.209 s: the newest was read at this very time.
+        tail.settle(5_000 * MS, 40 * MS);
+        assert_eq!(tail.fold.held_count(), 40, "those before 110 are forgotten");
+        assert!(tail.settled.is_empty());
         tail.begin(Instant::from_ns(1_120 * MS));
         tail.settle(5_000 * MS, 0);
         let account = account_of(&tail, i64::MAX);
