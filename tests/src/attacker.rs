@@ -18,6 +18,10 @@ use nix::sys::socket::{
 use socket2::{Domain, Protocol, SockAddr, Socket, Type};
 
 use crate::child;
+use crate::lab::Lab;
+
+/// An address of the hosts' network that is in no topology.
+pub const FOREIGN: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 66);
 
 /// No set-up command takes a tenth of this on an overloaded machine.
 const SETUP_LIMIT: Duration = Duration::from_secs(20);
@@ -56,24 +60,20 @@ impl Flood {
 }
 
 impl Attacker {
-    /// Joins a namespace called `namespace` to the bridge of the namespace `first`. It takes the address
-    /// `as_host` and knows that `target` has the link address `hardware`.
+    /// Puts a bridge between the hosts of `lab` and joins it, with the address `as_host`. It knows the link addresses of both.
     ///
     /// # Panics
     /// When it cannot be built.
-    pub fn join(
-        first: &str,
-        namespace: &str,
-        as_host: Ipv4Addr,
-        target: Ipv4Addr,
-        hardware: &str,
-    ) -> Self {
+    pub fn join(lab: &Lab, as_host: Ipv4Addr) -> Self {
+        lab.put_bridge_between();
+        let first = lab.host(0).namespace();
+        // The name of the lab with another host number, so that the next lab sweeps what a kill leaves.
+        let name = &format!("{}2", first.trim_end_matches('0'));
         // From here on dropping it cleans up.
         let attacker = Self {
-            namespace: namespace.to_owned(),
+            namespace: name.clone(),
             first: first.to_owned(),
         };
-        let name = namespace;
         let built = [
             format!("netns add {name}"),
             format!("-n {first} link add port9 type veth peer name eth0 netns {name}"),
@@ -82,12 +82,16 @@ impl Attacker {
             format!("-n {name} link set eth0 arp off"),
             format!("-n {name} address add {as_host}/24 dev eth0"),
             format!("-n {name} link set eth0 up"),
-            neighbour(name, target.into(), hardware),
         ]
         .into_iter()
         .try_for_each(|words| ip(&words));
         if let Err(reason) = built {
             panic!("no attacker: {reason}");
+        }
+        for host in [0, 1].map(|index| lab.host(index)) {
+            if host.address() != as_host {
+                attacker.know(host.address().into(), &host.hardware_address());
+            }
         }
         attacker
     }
@@ -242,29 +246,31 @@ impl Attacker {
         }
     }
 
-    /// The ends of a TCP connection with `port` at one of them.
+    /// Who sends datagrams to `port`.
     ///
     /// # Panics
     /// When none is heard within `limit`.
-    pub fn overhear_connection(&self, port: u16, limit: Duration) -> [SocketAddrV4; 2] {
-        let mut ends = None;
+    pub fn overhear_sender(&self, port: u16, limit: Duration) -> SocketAddrV4 {
+        let mut sender = None;
         self.forget_after(0);
         self.hear(limit, |frame| {
-            ends = Segment::in_frame(frame, port).map(|one| [one.from, one.to]);
-            ends.is_none()
+            sender = payload_to(frame, port).map(|_| {
+                let ip = Ipv4Addr::new(frame[26], frame[27], frame[28], frame[29]);
+                SocketAddrV4::new(ip, u16::from_be_bytes([frame[34], frame[35]]))
+            });
+            sender.is_none()
         });
         self.forget_after(SWITCH_AGEING);
-        ends.unwrap_or_else(|| panic!("no connection with port {port} is heard"))
+        sender.unwrap_or_else(|| panic!("nobody is heard to send to port {port}"))
     }
 
     /// Forges resets in the peer's name, each exactly at the place in the stream that `victim` expects next, of
     /// the TCP connection that it is heard to have with `port` at one end, until a new one is begun or `limit` is
-    /// over. It knows that the victim has the link address `hardware`. Gives how many it sent.
+    /// over. Gives how many it sent.
     ///
     /// # Panics
     /// When it has no socket, or nothing of the connection is heard.
-    pub fn reset(&self, port: u16, victim: Ipv4Addr, hardware: &str, limit: Duration) -> u64 {
-        self.know(victim.into(), hardware);
+    pub fn reset(&self, port: u16, victim: Ipv4Addr, limit: Duration) -> u64 {
         let raw = self.within(|| {
             // Of the protocol 255 the headers are ours as well.
             match Socket::new(Domain::IPV4, Type::RAW, Some(Protocol::from(255))) {
@@ -328,22 +334,26 @@ impl Attacker {
         self.send_all((Domain::IPV4, Protocol::from(255)), &packets, span, rate)
     }
 
-    /// Sends messages of ICMP for IPv6, of every type but neighbour advertisements to `to`, with reports on datagrams from
-    /// `quoted[0]` to `quoted[1]`, for `span` at `rate` a second.
+    /// Sends messages of ICMP for IPv6, of every type but neighbour advertisements, as reports on what was sent by `protocol`
+    /// from the first of each pair of ends to the second, to the first, for `span` at `rate` a second.
     ///
     /// # Panics
     /// When it has no socket.
     pub fn forge_reports_v6(
         &self,
-        to: Ipv6Addr,
-        quoted: [SocketAddrV6; 2],
+        protocol: Quoted,
+        quoted: &[[SocketAddrV6; 2]],
         span: Duration,
         rate: u32,
     ) -> Flood {
-        let to = SockAddr::from(SocketAddrV6::new(to, 0, 0, 0));
         let kinds = (0..=255_u8).filter(|kind| *kind != NEIGHBOUR_ADVERTISEMENT);
         let kinds = kinds.flat_map(|kind| [0, 1, 4].map(|code| (kind, code)));
-        let words = kinds.map(|kind| (report_v6(kind, quoted), to.clone()));
+        let words = kinds.flat_map(|kind| {
+            quoted.iter().map(move |ends| {
+                let to = SocketAddrV6::new(*ends[0].ip(), 0, 0, 0);
+                (report_v6(kind, protocol, *ends), SockAddr::from(to))
+            })
+        });
         let words: Vec<_> = words.collect();
         self.send_all((Domain::IPV6, Protocol::ICMPV6), &words, span, rate)
     }
@@ -424,17 +434,18 @@ const OVERRIDE: u8 = 0x20;
 /// Without it no host believes a word of neighbour discovery.
 const HOPS_OF_NEIGHBOURS: u32 = 255;
 
-/// A message of ICMP for IPv6 (RFC 4443), as a report on a datagram from `quoted[0]` to `quoted[1]`. The kernel fills in the
-/// checksum.
-fn report_v6((kind, code): (u8, u8), quoted: [SocketAddrV6; 2]) -> Vec<u8> {
+/// A message of ICMP for IPv6 (RFC 4443), as a report on what was sent by `protocol` from `quoted[0]` to `quoted[1]`. The
+/// kernel fills in the checksum.
+fn report_v6((kind, code): (u8, u8), protocol: Quoted, quoted: [SocketAddrV6; 2]) -> Vec<u8> {
+    let (number, last) = protocol.wire();
     // Too long for the next hop of 1280 bytes, which is as short as any may be; else unused.
     let mut bytes = vec![kind, code, 0, 0, 0, 0, 5, 0];
-    bytes.extend([0x60, 0, 0, 0, 0, 108, 17, 64]);
+    bytes.extend([0x60, 0, 0, 0, 0, 108, number, 64]);
     bytes.extend(quoted[0].ip().octets());
     bytes.extend(quoted[1].ip().octets());
     bytes.extend(quoted[0].port().to_be_bytes());
     bytes.extend(quoted[1].port().to_be_bytes());
-    bytes.extend([0, 108, 0, 0]);
+    bytes.extend(last);
     bytes
 }
 
@@ -470,6 +481,16 @@ pub enum Quoted {
     Tcp,
 }
 
+impl Quoted {
+    /// The number of the protocol, and what its header has behind the ports.
+    const fn wire(self) -> (u8, [u8; 4]) {
+        match self {
+            Self::Udp => (17, [0, 108, 0, 0]),
+            Self::Tcp => (6, [0, 0, 0, 1]),
+        }
+    }
+}
+
 /// A whole IPv4 packet with an ICMP message of `kind`, from the address quoted last, as a report on what was sent by
 /// `protocol` from `quoted[0]` to `quoted[1]`.
 pub fn report_v4(kind: u8, protocol: Quoted, quoted: [SocketAddrV4; 2]) -> Vec<u8> {
@@ -484,25 +505,41 @@ pub fn report_v4(kind: u8, protocol: Quoted, quoted: [SocketAddrV4; 2]) -> Vec<u
 
 /// A whole IPv4 packet that begins a connection.
 pub fn syn_v4(from: SocketAddrV4, to: SocketAddrV4) -> Vec<u8> {
-    let segment = tcp(from, to, 1, TCP_SYN);
+    let segment = tcp(from, to, 1, TCP_SYN, &[]);
     [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
 }
 
 /// A whole IPv4 packet that ends a connection whose receiver expects `sequence` next, and no other.
 pub fn reset_v4(from: SocketAddrV4, to: SocketAddrV4, sequence: u32) -> Vec<u8> {
-    let segment = tcp(from, to, sequence, TCP_RST);
+    let segment = tcp(from, to, sequence, TCP_RST, &[]);
     [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
 }
 
-/// A TCP segment without content.
-fn tcp(from: SocketAddrV4, to: SocketAddrV4, sequence: u32, flags: u8) -> Vec<u8> {
+/// A whole IPv4 packet that brings `content` to a connection, as if its receiver expected `sequence` next.
+///
+/// # Panics
+/// When the content is longer than a packet.
+pub fn segment_v4(from: SocketAddrV4, to: SocketAddrV4, sequence: u32, content: &[u8]) -> Vec<u8> {
+    let segment = tcp(from, to, sequence, TCP_ACK, content);
+    [header_v4(*from.ip(), *to.ip(), 6), segment].concat()
+}
+
+/// A TCP segment with `content`.
+///
+/// # Panics
+/// When the content is longer than a packet.
+fn tcp(from: SocketAddrV4, to: SocketAddrV4, sequence: u32, flags: u8, content: &[u8]) -> Vec<u8> {
     let mut tcp = Vec::new();
     tcp.extend(from.port().to_be_bytes());
     tcp.extend(to.port().to_be_bytes());
     tcp.extend(sequence.to_be_bytes());
     tcp.extend([0, 0, 0, 0, 5 << 4, flags, 4, 0, 0, 0, 0, 0]);
+    tcp.extend(content);
     let ends = [from.ip().octets(), to.ip().octets()].concat();
-    let sum = checksum(&[ends.as_slice(), &[0, 6, 0, 20], &tcp].concat());
+    let length = u16::try_from(tcp.len()).expect("a short segment");
+    let [high, low] = length.to_be_bytes();
+    let padding = vec![0; tcp.len() % 2];
+    let sum = checksum(&[ends.as_slice(), &[0, 6, high, low], &tcp, &padding].concat());
     tcp[16..18].copy_from_slice(&sum);
     tcp
 }
@@ -529,10 +566,7 @@ fn report(
     let mut bytes = vec![kind, code, 0, 0];
     bytes.extend(rest.to_be_bytes());
     // The header of the IPv4 packet, and the first eight bytes behind it.
-    let (number, last) = match protocol {
-        Quoted::Udp => (17, [0, 108, 0, 0]),
-        Quoted::Tcp => (6, [0, 0, 0, 1]),
-    };
+    let (number, last) = protocol.wire();
     bytes.extend([0x45, 0, 0, 128, 0, 0, 0x40, 0, 64, number, 0, 0]);
     bytes.extend(quoted[0].ip().octets());
     bytes.extend(quoted[1].ip().octets());
@@ -559,6 +593,7 @@ fn checksum(bytes: &[u8]) -> [u8; 2] {
 
 const TCP_SYN: u8 = 2;
 const TCP_RST: u8 = 4;
+const TCP_ACK: u8 = 16;
 
 /// What a stranger needs of a TCP segment that it heard.
 struct Segment {

@@ -14,7 +14,7 @@ mod self_tests;
 use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Read};
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc;
@@ -33,6 +33,8 @@ use crate::trial::wait_until;
 pub const INTERFACE: &str = "eth0";
 /// The addresses of host 0 and host 1.
 pub const ADDRESSES: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 77, 0, 1), Ipv4Addr::new(10, 77, 0, 2)];
+/// The ports of [`Lab::put_bridge_between`] to both hosts, on host 0.
+pub const BRIDGE_PORTS: [&str; 2] = ["port0", "port1"];
 /// The interface of a second cable, see [`Lab::lay_second_cable`].
 pub const SECOND_INTERFACE: &str = "eth1";
 /// The addresses of host 0 and host 1 on a second cable.
@@ -126,14 +128,14 @@ impl Lab {
     }
 
     /// Cuts the first cable and puts a bridge on host 0 in between, whose queues towards either
-    /// host can be throttled at the interfaces it returns.
+    /// host can be throttled at [`BRIDGE_PORTS`].
     ///
     /// What waits there waits on the wire as far as the hosts' kernels can tell: their own queues lie
     /// before the stamp of a departure, and throttling those would show in no stamp.
     ///
     /// # Panics
     /// When it cannot be built.
-    pub fn put_bridge_between(&self) -> [&'static str; 2] {
+    pub fn put_bridge_between(&self) {
         let [first, second] = [0, 1].map(|index| self.hosts[index].namespace.as_str());
         let in_first = |words: &str| -> Result<(), String> {
             let words: Vec<&str> = ["-n", first].into_iter().chain(words.split(' ')).collect();
@@ -146,7 +148,7 @@ impl Lab {
             in_first(&format!(
                 "link add port1 type veth peer name {INTERFACE} netns {second}"
             ))?;
-            for port in ["port0", "port1"] {
+            for port in BRIDGE_PORTS {
                 in_first(&format!("link set {port} master bridge0 up"))?;
             }
             in_first("link set bridge0 up")?;
@@ -157,7 +159,6 @@ impl Lab {
         if let Err(reason) = built() {
             panic!("no bridge: {reason}");
         }
-        ["port0", "port1"]
     }
 
     /// Has the bridge of [`Lab::put_bridge_between`] send every frame to a third port as well, and
@@ -211,6 +212,20 @@ impl LabHost {
     /// The name of its network namespace, for `ip netns exec` by hand.
     pub fn namespace(&self) -> &str {
         &self.namespace
+    }
+
+    /// The link address of the first cable's interface.
+    ///
+    /// # Panics
+    /// When it cannot be read.
+    pub fn hardware_address(&self) -> String {
+        let file = format!("/sys/class/net/{INTERFACE}/address");
+        let mut command = Command::new("ip");
+        command.args(["netns", "exec", &self.namespace, "cat", &file]);
+        match child::run(&mut command, SETUP_LIMIT) {
+            Ok(finished) => finished.stdout.trim().to_owned(),
+            Err(reason) => panic!("{reason}"),
+        }
     }
 
     /// A command that will run on this host.
@@ -305,6 +320,23 @@ impl LabHost {
         if let Err(reason) = namespace::ip(&forget) {
             panic!("{forget:?}: {reason}");
         }
+    }
+
+    /// The ends of this host's connections of TCP with `port` at either end: its own and the other.
+    ///
+    /// # Panics
+    /// When they cannot be listed.
+    pub fn connections(&self, port: u16) -> Vec<[SocketAddr; 2]> {
+        let mut command = self.command("ss");
+        command.args(["-Htn", "state", "established"]);
+        let filter = format!("( sport = :{port} or dport = :{port} )");
+        let finished = child::run(command.arg(filter), SETUP_LIMIT);
+        let finished = finished.unwrap_or_else(|reason| panic!("{reason}"));
+        let ends = finished.stdout.lines().filter_map(|line| {
+            let mut words = line.split_whitespace().filter_map(|word| word.parse().ok());
+            Some([words.next()?, words.next()?])
+        });
+        ends.collect()
     }
 
     /// Runs `ip -n <this host> <words> dev <the first cable>`.

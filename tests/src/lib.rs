@@ -23,4 +23,5 @@ pub mod soak;
 pub mod source_tree;
 pub mod split;
 pub mod trial;
+pub mod turns;
 pub mod worker;

@@ -151,8 +151,8 @@ pub struct JoinMetrics {
     /// Seen at one only, when the other was not watched or not long enough.
     pub edge_count: u64,
     /// Copies of datagrams seen at the second point before (RFC 5560 section 3), beyond those that had
-    /// passed the first.
-    pub duplicated_count: u64,
+    /// passed the first; `None` where they may have passed on another link.
+    pub duplicated_count: Option<u64>,
     /// Seen at the second only: the first capture has gaps.
     pub unexplained_count: u64,
     /// Where the clock of a point was set, first and second point.
@@ -795,6 +795,9 @@ fn metrics(
         let difference = levels.delays[at].saturating_sub(levels.delays[at - 1]);
         difference.saturating_abs()
     });
+    let mut duplicates = matches.duplicates.iter();
+    let may_be_copies = second.seen.iter().any(|one| one.has_copy)
+        || duplicates.any(|index| second.seen[*index].is_of_any);
     let gaps = second.at_ns.windows(2);
     let gaps = gaps.map(|pair| pair[1].saturating_sub(pair[0]));
     JoinMetrics {
@@ -804,7 +807,7 @@ fn metrics(
         matched_count,
         edge_count: (only_count - lost.len() - unexplained.len()) as u64,
         loss: loss(&lost, matches, doubts),
-        duplicated_count: matches.duplicates.len() as u64,
+        duplicated_count: (!may_be_copies).then_some(matches.duplicates.len() as u64),
         unexplained_count: unexplained.len() as u64,
         delay_shift: levels.shift.filter(|_| !is_set),
         delay: distribution(delays.iter().copied(), unmatched),

@@ -243,6 +243,12 @@ impl<'a> Walk<'a> {
                 Layer::EtherType(inner)
             }
             0x8847 | 0x8848 => Layer::Mpls,
+            // HSR (IEC 62439-3) and redundancy (IEEE 802.1CB) tags.
+            0x892f | 0xf1c1 => {
+                let inner = self.word(4)?;
+                self.at += 6;
+                Layer::EtherType(inner)
+            }
             // A PPPoE session.
             0x8864 => {
                 self.at += 6;
@@ -315,15 +321,14 @@ impl<'a> Walk<'a> {
             self.at += 4;
         }
         self.at += 4;
-        match self.byte(0)? >> 4 {
-            4 | 6 => Ok(Layer::Ip),
-            // The control word of an Ethernet pseudowire (RFC 4448).
-            0 => {
-                self.at += 4;
-                Ok(Layer::Ethernet)
-            }
-            _ => Err(NotIp),
+        if matches!(self.byte(0)? >> 4, 4 | 6) {
+            return Ok(Layer::Ip);
         }
+        // An Ethernet pseudowire, with its control word or without (RFC 4448).
+        if self.peek(0)? == [0, 0] {
+            self.at += 4;
+        }
+        Ok(Layer::Ethernet)
     }
 
     /// Passes the radiotap header; its flags tell of frames whose check sequence is wrong, and whether the

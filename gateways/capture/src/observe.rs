@@ -112,6 +112,11 @@ pub struct Observation {
     pub hop_limit: u8,
     /// For which station of the link it was.
     pub station: [u8; 6],
+    /// In a capture that may be of several links and does not say which: one that is equal passed another link, or
+    /// is a duplicate.
+    pub is_of_any: bool,
+    /// Such a one was seen, and left out.
+    pub has_copy: bool,
     /// By what it is known.
     pub identity: DatagramIdentity,
 }
@@ -260,11 +265,12 @@ impl Observer {
                     let place = &datagram.place;
                     // Where nothing names the link, another datagram may say the same.
                     let is_doubtful = place.is_of_any && !identity.is_unique();
-                    let is_known = |one: &&Observation| {
+                    let is_known = |one: &Observation| {
                         one.identity.key == identity.key
                             && (!is_doubtful || one.packet_number == datagram.packet_number)
                     };
-                    let known = list.iter().rev().take(COPY_COUNT_MAX).find(is_known);
+                    let mut newest = list.iter_mut().rev().take(COPY_COUNT_MAX);
+                    let known = newest.find(|one| is_known(one));
                     let is_elsewhere = |known: &Observation| {
                         (place.is_of_any || place.station != known.station)
                             && (!is_doubtful || datagram.packet_number != 0)
@@ -274,7 +280,8 @@ impl Observer {
                         counts.radio_retry_count += 1;
                         return;
                     }
-                    if known.is_some_and(is_elsewhere) {
+                    if let Some(known) = known.filter(|known| is_elsewhere(known)) {
+                        known.has_copy |= place.is_of_any;
                         counts.elsewhere_count += 1;
                         return;
                     }
@@ -291,6 +298,8 @@ impl Observer {
                         packet_number: datagram.packet_number,
                         hop_limit: datagram.hop_limit,
                         station: place.station,
+                        is_of_any: place.is_of_any,
+                        has_copy: false,
                         identity,
                     });
                     return;

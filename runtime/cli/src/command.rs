@@ -317,11 +317,7 @@ fn carry_out(
     check_traces(path, &args.overrides, topology, console)?;
     // Told before what may only be missing now.
     check_file(path, topology)?;
-    if let Ok(Some((_, case))) = registry.make_case(topology)
-        && let Some(words) = case.undecided()
-    {
-        console.warn(&words);
-    }
+    tell_undecided(topology, registry, console);
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
         return Ok(show_check(path, topology, None, registry, console));
@@ -372,6 +368,15 @@ fn carry_out(
         return Ok(code.max(exit::FAILED));
     }
     Ok(code)
+}
+
+/// Warns of what the case's setup leaves open.
+fn tell_undecided(topology: &Topology, registry: &Registry, console: &mut Console) {
+    if let Ok(Some((_, case))) = registry.make_case(topology)
+        && let Some(words) = case.undecided()
+    {
+        console.warn(&words);
+    }
 }
 
 /// Refuses a file whose traces cannot be replayed.

@@ -11,7 +11,7 @@ use hil_capture::join::{
 use hil_capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_capture::pairing::join_all;
 use hil_capture::point::{PointMetrics, single_point_metrics};
-use hil_capture::watch::Unread;
+use hil_capture::watch::{ClockStep, Unread};
 use hil_core::interval::Spread;
 use serde::Serialize;
 
@@ -240,7 +240,8 @@ impl Report {
             let (first, second) = (&one.first_point, &one.second_point);
             let mut interfaces = reading.files[first.file_index].interfaces.iter();
             let is_apart = first.tap() != second.tap() && interfaces.any(|one| one.is_merged);
-            match PointClocks::of(first, second, settings.is_one_clock) {
+            let declared = PointClocks::of(first, second, settings.is_one_clock);
+            match declared.beside(&one.figures.delay) {
                 PointClocks::OneFile if is_apart && settings.is_one_clock => {
                     PointClocks::DeclaredOne
                 }
@@ -283,6 +284,11 @@ impl Report {
     pub(super) fn complaints(&self) -> Vec<String> {
         let mut complaints = Vec::new();
         for one in &self.joins {
+            if one.clocks == PointClocks::Contradicted {
+                let (first, second) = (&one.first, &one.second);
+                let why = one.clocks.words();
+                complaints.push(format!("clocks of {first} and {second}: {why}"));
+            }
             if let Loss::Unavailable { doubts, .. } = &one.figures.loss {
                 let why = doubts_text(doubts);
                 complaints.push(format!("loss from {} to {}: {why}", one.first, one.second));
@@ -293,8 +299,8 @@ impl Report {
             {
                 complaints.extend(steps.iter().map(|step| {
                     format!(
-                        "{point}: its clock was set by {}: delays are unavailable",
-                        duration(step.by_ns)
+                        "{point}: its clock was set {}: delays are unavailable",
+                        step_words(step)
                     )
                 }));
             }
@@ -509,7 +515,7 @@ fn join_section(joined: &JoinReport) -> Section {
         for one in steps {
             fact(
                 "clock step",
-                format!("{} at the {which} point", duration(one.by_ns)),
+                format!("{} at the {which} point", step_words(one)),
             );
         }
     }
@@ -547,16 +553,21 @@ fn join_section(joined: &JoinReport) -> Section {
         }
     }
     let counts = [
-        ("first", figures.first_count),
-        ("second", figures.second_count),
-        ("both", figures.matched_count),
-        ("at an edge", figures.edge_count),
+        ("first", Some(figures.first_count)),
+        ("second", Some(figures.second_count)),
+        ("both", Some(figures.matched_count)),
+        ("at an edge", Some(figures.edge_count)),
         ("duplicated, RFC 5560", figures.duplicated_count),
-        ("unexplained", figures.unexplained_count),
-        ("reordered", figures.reordered_count),
+        ("unexplained", Some(figures.unexplained_count)),
+        ("reordered", Some(figures.reordered_count)),
     ];
     let mut seen = Table::new("", &counts.map(|(label, _)| label));
-    seen.push(counts.map(|(_, count)| Cell::Count(count)));
+    seen.push(counts.map(|(_, count)| count.map_or_else(|| "unknown".into(), Cell::Count)));
+    if figures.duplicated_count.is_none() {
+        "a cooked capture of several links that names none: a duplicate looks like a copy on \
+         another link"
+            .clone_into(&mut seen.note);
+    }
     section.table(seen);
     section.table(quantile_table(&[
         ("delay", &figures.delay),
@@ -564,6 +575,16 @@ fn join_section(joined: &JoinReport) -> Section {
         ("variation, RFC 5481 IPDV", &figures.successive),
     ]));
     section
+}
+
+/// How far a clock was set; time went on meanwhile.
+fn step_words(step: &ClockStep) -> String {
+    let (by, side) = if step.by_ns < 0 {
+        (step.by_ns.saturating_neg(), "back by at least")
+    } else {
+        (step.by_ns, "forward by at most")
+    };
+    format!("{side} {}", duration(by))
 }
 
 /// Why loss is unavailable.

@@ -4,6 +4,8 @@
 use hil_capture::observe::Point;
 use serde::Serialize;
 
+use hil_stats::histogram::Distribution;
+
 use hil_report::clock_summary::{ClockRung, HostPairClock};
 use hil_report::summary::RunSummary;
 
@@ -15,6 +17,8 @@ pub(super) enum PointClocks {
     OneFile,
     /// The user says that it is one.
     DeclaredOne,
+    /// The user says that it is one, and datagrams arrive before they left.
+    Contradicted,
     /// Two files, of which nothing is said.
     Unknown,
 }
@@ -35,7 +39,16 @@ impl PointClocks {
     pub(super) const fn bound_ns(self) -> Option<u64> {
         match self {
             Self::OneFile | Self::DeclaredOne => Some(0),
-            Self::Unknown => None,
+            Self::Contradicted | Self::Unknown => None,
+        }
+    }
+
+    /// What is left of it beside the delays that follow from it.
+    pub(super) fn beside(self, delay: &Distribution) -> Self {
+        let is_contradicted = delay.measured().is_some_and(|delay| delay.min_ns < 0);
+        match self {
+            Self::DeclaredOne if is_contradicted => Self::Contradicted,
+            found => found,
         }
     }
 
@@ -44,6 +57,10 @@ impl PointClocks {
         match self {
             Self::OneFile => "one: both points stand in one file",
             Self::DeclaredOne => "one, as --one-clock says",
+            Self::Contradicted => {
+                "not one, though --one-clock says so: datagrams arrive before they leave; a delay \
+                 holds the difference of two, of unknown size"
+            }
             Self::Unknown => {
                 "not known to be one: a delay holds the difference of two, of unknown size, and \
                  variation and jitter its drift (--one-clock says that it is one)"
@@ -111,5 +128,10 @@ mod tests {
         assert_eq!(mixed, PointClocks::Unknown);
         assert_eq!(of(1, false).bound_ns(), None);
         assert_eq!(of(1, true).bound_ns(), Some(0));
+        let delays = |from_ns| Distribution::of_samples(&[from_ns, 2_000_000], "");
+        assert_eq!(of(1, true).beside(&delays(0)), PointClocks::DeclaredOne);
+        let contradicted = of(1, true).beside(&delays(-1));
+        assert_eq!(contradicted, PointClocks::Contradicted);
+        assert_eq!(contradicted.bound_ns(), None);
     }
 }

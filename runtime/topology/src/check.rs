@@ -13,7 +13,6 @@ use super::errors::Fault;
 use super::flows::{self, Flow};
 use super::known::{KnownCase, KnownCases};
 use super::model::{Case, Host, OnExit, Process, Program, Topology};
-use super::names::witness_name;
 use super::reader;
 use super::tables::{CaseTable, File, ProcessTable};
 use super::tree::{self, Table, Value, join};
@@ -200,16 +199,6 @@ fn check_processes(
             execution: table.execution,
             restarts: table.restarts,
         });
-    }
-    for process in &processes {
-        let mut others = processes.iter().filter(|one| one.is_witnessed());
-        if let Some(other) = others.find(|one| witness_name(&one.host) == process.name) {
-            let fault = format!(
-                "is the name of the process that records for `{}`: choose another",
-                other.name
-            );
-            checks.refuse(join("processes", &process.name), Fault::Inconsistent(fault));
-        }
     }
     processes
 }

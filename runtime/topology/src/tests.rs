@@ -474,12 +474,3 @@ to = 'b'
     assert_eq!(topology.case(), None);
     assert_eq!(topology.channels()[0].message.alignment_bytes, 8);
 }
-
-#[test]
-fn the_name_of_the_process_that_records_for_programs_of_the_users_is_refused() {
-    let text = "version = 1\nname = 'own'\nprocesses.a.run = ['./a']\nprocesses.b.run = ['./b']\n";
-    let line = "processes.witness-local.run = ['./c']";
-    let errors = parse("own.toml", &format!("{text}{line}\n"), &[], &known()).expect_err(line);
-    assert_eq!(errors.errors()[0].key, "processes.witness-local");
-    assert!(errors.to_string().contains("records for `a`"), "{errors}");
-}

@@ -10,7 +10,7 @@ use hil_report::summary::{RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
-use hil_tests::lab::{Lab, SECOND_ADDRESSES, SECOND_INTERFACE};
+use hil_tests::lab::{BRIDGE_PORTS, Lab, SECOND_ADDRESSES, SECOND_INTERFACE};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::split::{HOSTS, Split};
 use hil_tests::trial::{Trial, shipped_topology, wait_until};
@@ -92,8 +92,8 @@ fn warnings<'a>(summary: &'a RunSummary, words: &str) -> Vec<&'a String> {
     all.filter(|warning| warning.contains(words)).collect()
 }
 
-fn throttle(lab: &Lab, ports: [&str; 2], what: &str) {
-    for port in ports {
+fn throttle(lab: &Lab, what: &str) {
+    for port in BRIDGE_PORTS {
         let mut command: Command = lab.host(0).command("tc");
         let words = format!("qdisc {what} dev {port} root");
         let words = if what == "add" {
@@ -112,14 +112,14 @@ fn a_slow_data_link_leaves_the_bound_as_narrow_as_the_clock_path() {
         return;
     };
     let record = RunFolder::new("clock-path");
-    let ports = lab.put_bridge_between();
+    lab.put_bridge_between();
     lab.lay_second_cable();
     let split = start(&lab, &record, "8 s");
     split.wait_for_messages("the begin of the run");
-    throttle(&lab, ports, "add");
+    throttle(&lab, "add");
     std::thread::sleep(Duration::from_secs(6));
     // The records must not go through it.
-    throttle(&lab, ports, "delete");
+    throttle(&lab, "delete");
     let report = split.files[0].clone();
     for summary in &finish(split) {
         let pair = pair(summary);

@@ -12,7 +12,7 @@ use hil_report::summary::{Outcome, RunEvent, RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
 use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
 use hil_tests::child::ChildGuard;
-use hil_tests::lab::{INTERFACE, Lab};
+use hil_tests::lab::{BRIDGE_PORTS, INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split};
@@ -309,9 +309,15 @@ fn a_path_that_takes_less_than_its_interfaces_is_found_before_the_first_message(
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
-    let ports = lab.put_bridge_between();
+    lab.put_bridge_between();
     let mut narrow = lab.host(0).command("ip");
-    narrow.args(["link", "set", ports[1], "mtu", &NARROW_MTU.to_string()]);
+    narrow.args([
+        "link",
+        "set",
+        BRIDGE_PORTS[1],
+        "mtu",
+        &NARROW_MTU.to_string(),
+    ]);
     assert!(narrow.status().unwrap().success());
     for is_sealed in [false, true] {
         let record = RunFolder::new("narrow");

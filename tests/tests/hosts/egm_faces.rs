@@ -1,26 +1,34 @@
 //! Our controller drives our robot as two strangers would: each run knows the other only by the
 //! robot maker's datagrams, sensor adapter on one host, robot adapter on the other.
 
-use std::net::{Ipv4Addr, UdpSocket};
+use core::ops::Range;
+use std::collections::BTreeSet;
+use std::net::{SocketAddrV4, UdpSocket};
 use std::thread;
 use std::time::Duration;
 
 use hil_arm::egm::messages::{EgmEventKind, Side};
 use hil_arm::yumi::Joints;
 use hil_arm::yumi::arm::Arm;
+use hil_platform::clock::MonotonicClock;
 use hil_report::adapter::AdapterSummary;
 use hil_report::summary::{Outcome, RunSummary};
 use hil_rundir::pipe::{AdapterRefusal, RefusalCount};
 use hil_tests::account::assert_account_closes;
 use hil_tests::arms::{Arms, of_kind};
+use hil_tests::attacker::{Attacker, FOREIGN, Quoted, report_v4};
 use hil_tests::lab::{ADDRESSES, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, load_average, wait_until};
+use hil_tests::turns::{Bound, Cost, TURN, play, round_count, run_duration};
+
+use super::forged_traffic::SENT_HZ;
 
 const LIMIT: Duration = Duration::from_mins(2);
-/// An address of the hosts' network that is nobody's, and the datagrams that come from there.
-const STRANGER: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 66);
+/// Datagrams that come from an address that is nobody's.
 const SPOKEN_COUNT: u64 = 1_500;
+/// How long a stranger takes the sensor's address.
+const CLAIMED_FOR: Duration = Duration::from_secs(1);
 const SECOND_NS: i64 = 1_000_000_000;
 /// Lag of the control law at a gain of 20/s, four cycles until a motion is measured, and one of
 /// them until a command is used.
@@ -166,12 +174,105 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     robot_files.assert_nothing_left_on(lab.host(1));
 }
 
+/// Messages of the robot's run that the sensor's run has, by the robot's clock, with when the robot published them.
+fn feedbacks_over(here: &Arms, there: &Arms) -> Vec<(i64, bool)> {
+    [Side::Right, Side::Left]
+        .into_iter()
+        .flat_map(|side| {
+            let came = here.feedbacks(side).into_iter();
+            let came: BTreeSet<_> = came.map(|(_, one)| one.clock_ms).collect();
+            let sent = there.feedbacks(side).into_iter();
+            sent.map(move |(at_ns, one)| (at_ns, came.contains(&one.clock_ms)))
+                .collect::<Vec<_>>()
+        })
+        .collect()
+}
+
+/// Words about the makers' datagrams, which no seal protects, at both ends. Then the robot's address is taken.
+#[test]
+fn forged_reports_cost_the_makers_datagrams_nothing_and_a_taken_address_what_is_sent_there() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let stranger = Attacker::join(&lab, FOREIGN);
+    let rounds = round_count(4);
+    let folder = RunFolder::new("forged-egm");
+    let (here, there) = (folder.join("sensor"), folder.join("robot"));
+    let sensor = Trial::shipped("egm-robot.toml", &here)
+        .set(&run_duration(rounds + 14, 1))
+        .set("case.parameters.left_arm=\"mirror\"");
+    let address = ADDRESSES[0];
+    let robot = Trial::shipped("egm-client.toml", &there)
+        .set(&run_duration(rounds + 8, 1))
+        .set("case.parameters.egm.preset=\"paper\"")
+        .set("case.parameters.egm.arms=\"both\"")
+        .set(&format!("processes.client.egm.right=\"{address}:6510\""))
+        .set(&format!("processes.client.egm.left=\"{address}:6511\""));
+    let mut sensor_run = sensor.start_on(lab.host(0));
+    let sensor_files = sensor.folder("", LIMIT);
+    let mut robot_run = robot.start_on(lab.host(1));
+    let robot_files = robot.folder("", LIMIT);
+    wait_until(LIMIT, "the robot at the sensor", || {
+        sensor_files.record_bytes("egm.right.feedback.published.") > 10_000
+    });
+    let ways = [6510, 6511].map(|port| {
+        let from = stranger.overhear_sender(port, LIMIT);
+        let to = SocketAddrV4::new(address, port);
+        [[from, to], [to, from]]
+    });
+    let reports: Vec<_> = (0..=255)
+        .flat_map(|kind| {
+            ways.concat()
+                .into_iter()
+                .map(move |ends| report_v4(kind, Quoted::Udp, ends))
+        })
+        .collect();
+    let all = play(
+        &[("ICMP of every type on the makers' datagrams", &|| {
+            stranger.send_repeatedly(&reports, TURN, SENT_HZ).sent_count
+        })],
+        rounds,
+    );
+    let now_ns = || MonotonicClock::now().as_ns();
+    let began_ns = now_ns();
+    stranger.claim(ADDRESSES[0], "02:00:00:00:00:70");
+    thread::sleep(CLAIMED_FOR);
+    lab.host(1)
+        .pin_neighbour(ADDRESSES[0], &lab.host(0).hardware_address());
+    let claimed_ns = began_ns..now_ns();
+    for run in [&mut robot_run, &mut sensor_run] {
+        run.wait_within(LIMIT).unwrap().assert_success();
+    }
+    let feedbacks = feedbacks_over(&Arms::of(&sensor_files), &Arms::of(&robot_files));
+    let cost = |windows_ns: &[Range<i64>]| Cost::of(feedbacks.iter().copied(), windows_ns);
+    let bound = Bound {
+        sent_min: 500,
+        ..Bound::MESSAGES
+    };
+    all[0].judge("messages of the robot", cost, bound);
+    let ends = claimed_ns.end..claimed_ns.end + SECOND_NS;
+    let [taken, after] = [claimed_ns, ends].map(|window_ns| cost(&[window_ns]));
+    println!(
+        "while the sensor's address is taken: {taken:?}; in the second after it is pinned: {after:?}"
+    );
+    assert!(taken.lost * 2 > taken.sent && after.lost * 10 < after.sent);
+    for files in [&sensor_files, &robot_files] {
+        let summary = files.summary();
+        assert_eq!(summary.run.outcome, Outcome::Completed);
+        for face in &summary.faces {
+            println!("{} {}: {:?}", face.kind, face.arm.word(), face.counters);
+        }
+    }
+    sensor_files.assert_nothing_left_on(lab.host(0));
+    robot_files.assert_nothing_left_on(lab.host(1));
+}
+
 /// Datagrams to the sensor of the right arm from an address that is not the robot's, beside those of the robot, for
 /// some seconds; gives how many, and the answers.
 fn speak_as_a_stranger(lab: &Lab) -> (u64, usize) {
-    lab.host(1).add_address(STRANGER);
+    lab.host(1).add_address(FOREIGN);
     lab.host(1).on_network(|| {
-        let socket = UdpSocket::bind((STRANGER, 0)).unwrap();
+        let socket = UdpSocket::bind((FOREIGN, 0)).unwrap();
         socket.set_nonblocking(true).unwrap();
         let (mut spoken_count, mut answer_count) = (0, 0);
         for number in 0..SPOKEN_COUNT {

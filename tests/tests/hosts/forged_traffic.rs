@@ -4,30 +4,29 @@
 //! `HIL_ATTACK_ROUNDS=20` sends each kind so often, half a second each time: 20,000 messages under it, and as many beside.
 
 use core::cell::Cell;
-use core::ops::Range;
-use std::collections::BTreeSet;
-use std::fs;
-use std::net::{Ipv4Addr, Ipv6Addr, SocketAddrV4, SocketAddrV6};
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6};
 use std::time::Duration;
-use std::{env, thread};
+use std::{fs, thread};
 
 use hil_core::random::RandomStream;
-use hil_core::record::{PublishedRecord, TakenRecord};
 use hil_platform::clock::MonotonicClock;
 use hil_report::summary::{CounterGroup, RunEvent, RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
 use hil_rundir::run_folder::RunFolder as Folder;
 use hil_rundir::run_result::RunResult;
 use hil_tests::account::assert_accounts_close;
-use hil_tests::attacker::{Attacker, Quoted, datagram_v4, report_v4, reset_v4, syn_v4};
+use hil_tests::attacker::{
+    Attacker, FOREIGN, Quoted, datagram_v4, report_v4, reset_v4, segment_v4, syn_v4,
+};
 use hil_tests::knocker::CONTROL_PORT;
 use hil_tests::lab::{ADDRESSES, INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::shuttle::{CHANNELS, records};
+use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split, count, direction, refused};
 use hil_tests::trial::{RunFiles, Trial};
+use hil_tests::turns::{TURN, cost, judge, play, round_count, run_duration};
 
-use super::strangers::{hardware_address, made_up};
+use super::strangers::made_up;
 
 const LIMIT: Duration = Duration::from_mins(1);
 /// No other file of tests uses these ports.
@@ -42,134 +41,12 @@ const ADDRESSES_V6: [Ipv6Addr; 2] = [
     Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 1),
     Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 2),
 ];
-/// Addresses that are in no topology.
-const FOREIGN: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 66);
+/// An address that is in no topology.
 const FOREIGN_V6: Ipv6Addr = Ipv6Addr::new(0xfd77, 0, 0, 0, 0, 0, 0, 0x66);
 /// Messages a second of each of the two channels.
 const MESSAGES_HZ: u32 = 1_000;
-/// Of an attack, and of the time without that follows it.
-const TURN: Duration = Duration::from_millis(500);
 /// What a stranger sends in a second.
-const SENT_HZ: u32 = 2_000;
-/// Share of messages that an attack may cost above the time without.
-const COST_MAX: f64 = 0.001;
-/// Where none of n messages is lost, the share that is lost is below 3 / n with 95 % confidence (Hanley and Lippman-Hand,
-/// JAMA 1983): fewer messages cannot show [`COST_MAX`].
-const MESSAGES_MIN: usize = 3_000;
-
-/// Messages that were published in some windows of time, and those of them that never came.
-#[derive(Debug, Default, Clone, Copy)]
-struct Cost {
-    published: usize,
-    lost: usize,
-}
-
-impl Cost {
-    fn ratio(self) -> f64 {
-        self.lost as f64 / self.published as f64
-    }
-}
-
-/// Of `channel`, which leads from the first of `files` to the second.
-fn cost(files: [&RunFiles; 2], channel: &str, windows_ns: &[Range<i64>]) -> Cost {
-    let published: Vec<PublishedRecord> = records(files[0], channel, "published");
-    let taken: Vec<TakenRecord> = records(files[1], channel, "taken");
-    let taken: BTreeSet<_> = taken.iter().map(|one| (one.epoch, one.sequence)).collect();
-    let is_inside = |one: &&PublishedRecord| {
-        let mut windows = windows_ns.iter();
-        windows.any(|window| window.contains(&one.published_ns))
-    };
-    let inside: Vec<_> = published.iter().filter(is_inside).collect();
-    let lost = inside
-        .iter()
-        .filter(|one| !taken.contains(&(one.epoch, one.sequence)));
-    Cost {
-        published: inside.len(),
-        lost: lost.count(),
-    }
-}
-
-/// Turns of one kind of attack, and those without between them.
-struct Turns {
-    name: &'static str,
-    sent_count: u64,
-    attacked_ns: Vec<Range<i64>>,
-    quiet_ns: Vec<Range<i64>>,
-}
-
-/// Rounds of attacks: `HIL_ATTACK_ROUNDS`, else `usual`.
-fn round_count(usual: u32) -> u32 {
-    let asked = env::var("HIL_ATTACK_ROUNDS").ok();
-    asked.map_or(usual, |text| text.parse().expect("a number of rounds"))
-}
-
-/// The duration of a run in which so many rounds of `kind_count` attacks are played; some seconds more, in which the
-/// stranger listens before.
-fn run_duration(round_count: u32, kind_count: u32) -> String {
-    format!("run.duration=\"{} s\"", 6 + round_count * kind_count)
-}
-
-/// Plays each attack once a round and nothing after each.
-fn play(attacks: &[(&'static str, &dyn Fn() -> u64)], round_count: u32) -> Vec<Turns> {
-    let mut all: Vec<Turns> = attacks
-        .iter()
-        .map(|(name, _)| Turns {
-            name,
-            sent_count: 0,
-            attacked_ns: Vec::new(),
-            quiet_ns: Vec::new(),
-        })
-        .collect();
-    let now_ns = || MonotonicClock::now().as_ns();
-    for _ in 0..round_count {
-        for ((_, attack), turns) in attacks.iter().zip(&mut all) {
-            let began_ns = now_ns();
-            turns.sent_count += attack();
-            let ended_ns = now_ns();
-            turns.attacked_ns.push(began_ns..ended_ns);
-            thread::sleep(TURN);
-            turns.quiet_ns.push(ended_ns..now_ns());
-        }
-    }
-    all
-}
-
-/// Prints what each kind of attack cost, and checks each: at least [`MESSAGES_MIN`] messages under it and beside it, and
-/// at most [`COST_MAX`] of them lost above the time beside it.
-fn judge(files: &[RunFiles; 2], all: &[Turns]) {
-    let ways = [
-        ([&files[0], &files[1]], CHANNELS[0]),
-        ([&files[1], &files[0]], CHANNELS[1]),
-    ];
-    let both = |windows_ns: &[Range<i64>]| {
-        let costs = ways.map(|(files, channel)| cost(files, channel, windows_ns));
-        Cost {
-            published: costs[0].published + costs[1].published,
-            lost: costs[0].lost + costs[1].lost,
-        }
-    };
-    for turns in all {
-        let [attacked, beside] = [&turns.attacked_ns, &turns.quiet_ns].map(|one| both(one));
-        println!(
-            "{}: {} sent; {} of {} messages lost, {} of {} beside it",
-            turns.name,
-            turns.sent_count,
-            attacked.lost,
-            attacked.published,
-            beside.lost,
-            beside.published
-        );
-        assert!(turns.sent_count > 0, "{}", turns.name);
-        for one in [attacked, beside] {
-            assert!(one.published >= MESSAGES_MIN, "{}: {one:?}", turns.name);
-        }
-        assert!(
-            attacked.ratio() <= beside.ratio() + COST_MAX,
-            "{}: {attacked:?}, {beside:?} beside it",
-            turns.name
-        );
-    }
-}
+pub(super) const SENT_HZ: u32 = 2_000;
 
 /// Resets that the hosts have answered with, for beginnings of connections where nothing listens.
 fn resets_sent(lab: &Lab) -> u64 {
@@ -193,16 +70,15 @@ fn at(address: Ipv4Addr, port: u16) -> SocketAddrV4 {
     SocketAddrV4::new(address, port)
 }
 
-fn stranger_in(lab: &Lab) -> Attacker {
-    let first = lab.host(0).namespace();
-    let name = format!("{}2", first.strip_suffix('0').unwrap());
-    Attacker::join(
-        first,
-        &name,
-        FOREIGN,
-        ADDRESSES[0],
-        &hardware_address(lab, 0),
-    )
+/// Beginnings of connections from 2000 addresses, to these ports of both hosts.
+fn beginnings(ports: [u16; 2]) -> Vec<Vec<u8>> {
+    let packets = (0..2_000_u16).map(|number| {
+        let [high, low] = number.to_be_bytes();
+        let from = at(Ipv4Addr::new(10, 77, 100 + high, low), 1_024 + number);
+        let to = ADDRESSES[usize::from(number / 2 % 2)];
+        syn_v4(from, at(to, ports[usize::from(number % 2)]))
+    });
+    packets.collect()
 }
 
 /// ICMP of every type, datagrams and clock exchanges from the peers' addresses, beginnings of connections from
@@ -212,11 +88,9 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
-    lab.put_bridge_between();
-    let stranger = stranger_in(&lab);
-    let hardware = [0, 1].map(|index| hardware_address(&lab, index));
+    let stranger = Attacker::join(&lab, FOREIGN);
     let record = RunFolder::new("forged");
-    let rounds = round_count(6);
+    let rounds = round_count(4);
     let mut trial = Trial::shipped("shuttle-split.toml", record.path())
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
@@ -225,10 +99,8 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
         .set(&run_duration(rounds, 4));
     for (index, host) in HOSTS.iter().enumerate() {
         lab.host(index).add_address(CLOCK_ADDRESSES[index]);
-        for address in [ADDRESSES[index], CLOCK_ADDRESSES[index]] {
-            stranger.know(address.into(), &hardware[index]);
-        }
         let address = CLOCK_ADDRESSES[index];
+        stranger.know(address.into(), &lab.host(index).hardware_address());
         trial = trial.set(&format!("hosts.{host}.clock_address=\"{address}\""));
     }
     let split = Split::start(&lab, &trial);
@@ -247,20 +119,14 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
     let exchanges = forge(CLOCK_PORT, CLOCK_ADDRESSES, CLOCK_PORT);
     let reports: Vec<_> = (0..=255)
         .flat_map(|kind| {
-            [0, 1].map(|from| {
-                let [own, other] = [from, 1 - from].map(|end| at(ADDRESSES[end], PORTS[from]));
-                report_v4(kind, Quoted::Udp, [own, other])
+            [0, 1].into_iter().flat_map(move |from| {
+                let data = [from, 1 - from].map(|end| at(ADDRESSES[end], PORTS[from]));
+                let clock = [from, 1 - from].map(|end| at(CLOCK_ADDRESSES[end], CLOCK_PORT));
+                [data, clock].map(|ends| report_v4(kind, Quoted::Udp, ends))
             })
         })
         .collect();
-    let beginnings: Vec<_> = (0..2_000_u16)
-        .map(|number| {
-            let [high, low] = number.to_be_bytes();
-            let from = at(Ipv4Addr::new(10, 77, 100 + high, low), 1_024 + number);
-            let port = if number % 2 == 0 { CONTROL_PORT } else { PORT };
-            syn_v4(from, at(ADDRESSES[usize::from(number / 2 % 2)], port))
-        })
-        .collect();
+    let beginnings = beginnings([CONTROL_PORT, PORT]);
     let send = |packets: &[Vec<u8>]| stranger.send_repeatedly(packets, TURN, SENT_HZ).sent_count;
     let reset_count = Cell::new(0);
     let all = play(
@@ -324,23 +190,26 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
-    lab.put_bridge_between();
-    let stranger = stranger_in(&lab);
-    let hardware = [0, 1].map(|index| hardware_address(&lab, index));
-    stranger.know(ADDRESSES[1].into(), &hardware[1]);
+    let stranger = Attacker::join(&lab, FOREIGN);
     let record = RunFolder::new("forged-tcp");
-    let rounds = round_count(6);
+    let rounds = round_count(4);
     let trial = Trial::shipped("shuttle-tcp.toml", record.path())
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
         .set("channels.\"shuttle/command\".depth=256")
         .set("channels.\"shuttle/status\".depth=256")
-        .set(&run_duration(rounds, 3));
+        .set(&run_duration(rounds, 5));
     let split = Split::start(&lab, &trial);
     split.wait_for_messages("the begin of the run");
     let ports = [PORTS[0], PORTS[1], CONTROL_PORT];
-    let connections = ports.map(|port| stranger.overhear_connection(port, LIMIT));
-    let ways = || connections.into_iter().flat_map(|[a, b]| [[a, b], [b, a]]);
+    let ways = connections(&lab, &ports).map(|ends| {
+        ends.map(|end| match end {
+            SocketAddr::V4(end) => end,
+            SocketAddr::V6(end) => panic!("{end} in a run of IPv4"),
+        })
+    });
+    let ways: Vec<_> = ways.collect();
+    let ways = || ways.iter().copied();
     let reports: Vec<_> = (0..=255)
         .flat_map(|kind| ways().map(move |ends| report_v4(kind, Quoted::Tcp, ends)))
         .collect();
@@ -355,6 +224,11 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
     };
     let resets = blind(reset_v4);
     let beginnings = blind(|from, to, _| syn_v4(from, to));
+    let from_everywhere = self::beginnings(PORTS);
+    let contents = blind(|from, to, guess| {
+        let words = guess.to_le_bytes().repeat(24);
+        segment_v4(from, to, guess, &words)
+    });
     let send = |packets: &[Vec<u8>]| stranger.send_repeatedly(packets, TURN, SENT_HZ).sent_count;
     let all = play(
         &[
@@ -363,12 +237,16 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
             ("beginnings in a connection that is up", &|| {
                 send(&beginnings)
             }),
+            ("content with a guessed number", &|| send(&contents)),
+            ("beginnings of connections from 2000 addresses", &|| {
+                send(&from_everywhere)
+            }),
         ],
         rounds,
     );
     let calm_ns = MonotonicClock::now().as_ns();
-    for (host, hardware) in ADDRESSES.into_iter().zip(&hardware) {
-        let sent_count = stranger.reset(PORT, host, hardware, LIMIT);
+    for host in ADDRESSES {
+        let sent_count = stranger.reset(PORT, host, LIMIT);
         println!("{sent_count} exact resets at {host}");
         thread::sleep(TURN);
     }
@@ -391,6 +269,20 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
     }
     let mut told = summaries[0].events.iter().map(RunEvent::what);
     assert!(told.any(|what| what.contains("and is back (reconnect 2)")));
+}
+
+/// Both ways of each connection that has one of `ports`, as its sending end sees it.
+fn connections(lab: &Lab, ports: &[u16]) -> impl Iterator<Item = [SocketAddr; 2]> {
+    let all: Vec<_> = ports
+        .iter()
+        .flat_map(|port| {
+            let found = lab.host(0).connections(*port);
+            assert!(!found.is_empty(), "no connection with port {port}");
+            found
+        })
+        .collect();
+    all.into_iter()
+        .flat_map(|[own, other]| [[own, other], [other, own]])
 }
 
 /// Datagrams that the end of the clock path `flow` on `host` refused, whatever the cause. It has no channels, and is in no
@@ -418,11 +310,15 @@ fn cuts(summary: &RunSummary) -> Vec<String> {
 }
 
 /// A run whose hosts have addresses of IPv6, on a bridge with a stranger.
-fn run_of_v6<'a>(lab: &'a Lab, record: &RunFolder, duration: &str) -> (Split<'a>, Attacker) {
-    lab.put_bridge_between();
-    let stranger = stranger_in(lab);
+fn run_of_v6<'a>(
+    lab: &'a Lab,
+    topology: &str,
+    record: &RunFolder,
+    duration: &str,
+) -> (Split<'a>, Attacker) {
+    let stranger = Attacker::join(lab, FOREIGN);
     stranger.add_address(FOREIGN_V6);
-    let mut trial = Trial::shipped("shuttle-split.toml", record.path())
+    let mut trial = Trial::shipped(topology, record.path())
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
         .set("channels.\"shuttle/command\".depth=256")
@@ -431,7 +327,7 @@ fn run_of_v6<'a>(lab: &'a Lab, record: &RunFolder, duration: &str) -> (Split<'a>
     for (index, host) in HOSTS.iter().enumerate() {
         let address = ADDRESSES_V6[index];
         lab.host(index).add_address(address);
-        stranger.know(address.into(), &hardware_address(lab, index));
+        stranger.know(address.into(), &lab.host(index).hardware_address());
         trial = trial.set(&format!("hosts.{host}.address=\"{address}\""));
     }
     let split = Split::start(lab, &trial);
@@ -445,12 +341,14 @@ fn icmpv6_of_every_type_costs_a_sealed_run_nothing_above_the_time_beside_it() {
         return;
     };
     let record = RunFolder::new("forged-v6");
-    let rounds = round_count(10);
-    let (split, stranger) = run_of_v6(&lab, &record, &run_duration(rounds, 2));
+    let rounds = round_count(4);
+    let duration = run_duration(rounds, 2);
+    let (split, stranger) = run_of_v6(&lab, "shuttle-split.toml", &record, &duration);
     let reports = |to: usize| {
-        let end = |index: usize| SocketAddrV6::new(ADDRESSES_V6[index], PORTS[to], 0, 0);
-        let quoted = [end(to), end(1 - to)];
-        let flood = stranger.forge_reports_v6(ADDRESSES_V6[to], quoted, TURN, SENT_HZ);
+        let quoted = [PORTS[to], CLOCK_PORT].map(|port| {
+            [to, 1 - to].map(|index| SocketAddrV6::new(ADDRESSES_V6[index], port, 0, 0))
+        });
+        let flood = stranger.forge_reports_v6(Quoted::Udp, &quoted, TURN, SENT_HZ);
         flood.sent_count
     };
     let all = play(
@@ -474,6 +372,40 @@ fn icmpv6_of_every_type_costs_a_sealed_run_nothing_above_the_time_beside_it() {
     }
 }
 
+#[test]
+fn icmpv6_of_every_type_costs_a_sealed_tcp_hop_and_the_supervisors_nothing() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("forged-tcp-v6");
+    let rounds = round_count(4);
+    let duration = run_duration(rounds, 1);
+    let (split, stranger) = run_of_v6(&lab, "shuttle-tcp.toml", &record, &duration);
+    let ways = connections(&lab, &[PORTS[0], PORTS[1], CONTROL_PORT]);
+    let ways: Vec<_> = ways
+        .map(|ends| {
+            ends.map(|end| match end {
+                SocketAddr::V6(end) => end,
+                SocketAddr::V4(end) => panic!("{end} in a run of IPv6"),
+            })
+        })
+        .collect();
+    let reports = || {
+        let flood = stranger.forge_reports_v6(Quoted::Tcp, &ways, TURN, SENT_HZ);
+        flood.sent_count
+    };
+    let all = play(&[("ICMPv6 of every type on connections", &reports)], rounds);
+    let files = [0, 1].map(|index| split.files[index].clone());
+    let summaries = split.finish();
+    judge(&files, &all);
+    for (summary, name) in summaries.iter().zip(CHANNELS) {
+        let egress = direction(summary, name, "egress");
+        assert_eq!(count(egress, "transport: reconnect_count"), 0);
+        assert!(cuts(summary).is_empty(), "{:?}", summary.events);
+        assert_accounts_close(summary);
+    }
+}
+
 /// As with ARP, the messages to the host whose address is taken are lost on the wire, and the change is told.
 #[test]
 fn a_stranger_that_advertises_a_hosts_address_of_ipv6_is_told_with_both_link_addresses() {
@@ -481,7 +413,8 @@ fn a_stranger_that_advertises_a_hosts_address_of_ipv6_is_told_with_both_link_add
         return;
     };
     let record = RunFolder::new("claimed-v6");
-    let (mut split, stranger) = run_of_v6(&lab, &record, "run.duration=\"8 s\"");
+    let (mut split, stranger) =
+        run_of_v6(&lab, "shuttle-split.toml", &record, "run.duration=\"8 s\"");
     let claimed_at = "02:00:00:00:00:68";
     stranger.claim_v6(ADDRESSES_V6[0], ADDRESSES_V6[1], claimed_at);
     let words = format!("is at {claimed_at} on {INTERFACE}");
@@ -489,7 +422,7 @@ fn a_stranger_that_advertises_a_hosts_address_of_ipv6_is_told_with_both_link_add
     seen.unwrap_or_else(|reason| panic!("{reason}"));
     // Pinned, it is found again, and stays.
     lab.host(0)
-        .pin_neighbour(ADDRESSES_V6[1], &hardware_address(&lab, 1));
+        .pin_neighbour(ADDRESSES_V6[1], &lab.host(1).hardware_address());
     stranger.claim_v6(ADDRESSES_V6[0], ADDRESSES_V6[1], "02:00:00:00:00:69");
     let summaries = split.finish();
     let changes: Vec<_> = summaries[0]

@@ -1,22 +1,23 @@
 //! What a stranger can say to the supervisors and gateways of a sealed run in a host's place, and what it costs.
 
+use core::slice;
 use std::io::Write;
-use std::net::{Ipv4Addr, SocketAddrV4, TcpListener, TcpStream};
+use std::net::{SocketAddrV4, TcpListener, TcpStream};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use hil_platform::clock::MonotonicClock;
 use hil_report::summary::{RunEvent, RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
 use hil_tests::account::{account, assert_accounts_close};
-use hil_tests::attacker::{Attacker, Flood};
+use hil_tests::attacker::{Attacker, FOREIGN, Flood};
 use hil_tests::knocker::CONTROL_PORT;
-use hil_tests::lab::{ADDRESSES, INTERFACE, Lab};
+use hil_tests::lab::{ADDRESSES, BRIDGE_PORTS, INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split, count, direction};
 use hil_tests::trial::Trial;
-
-use super::strangers::hardware_address;
+use hil_tests::turns::{cost_of_both, cost_of_exchanges};
 
 const LIMIT: Duration = Duration::from_mins(1);
 /// No other file of tests uses these ports.
@@ -63,8 +64,6 @@ fn made_up_refusals_at_a_hosts_address_end_no_waiting_and_are_told() {
 const REPORTS_HZ: u32 = 2_000;
 /// How long.
 const REPORTS_SPAN: Duration = Duration::from_secs(5);
-/// An address of the hosts' network that is in no topology.
-const FOREIGN: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 66);
 
 /// A run with forged reports to its sending gateway of commands.
 fn under_reports(lab: &Lab, trial: &Trial, stranger: &Attacker) -> (Flood, [RunSummary; 2]) {
@@ -80,11 +79,7 @@ fn forged_reports_of_the_network_cost_a_sealed_run_nothing_and_are_counted() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
-    lab.put_bridge_between();
-    let first = lab.host(0).namespace().to_owned();
-    let name = format!("{}2", first.strip_suffix('0').unwrap());
-    let hardware = hardware_address(&lab, 0);
-    let stranger = Attacker::join(&first, &name, FOREIGN, ADDRESSES[0], &hardware);
+    let stranger = Attacker::join(&lab, FOREIGN);
     for is_sealed in [false, true] {
         let record = RunFolder::new("reports");
         let trial = Trial::shipped("shuttle-split.toml", record.path())
@@ -184,14 +179,10 @@ fn exact_resets_of_the_supervisors_connection_cost_reconnects_that_are_told() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
-    let ports = lab.put_bridge_between();
-    let first = lab.host(0).namespace().to_owned();
-    let name = format!("{}2", first.strip_suffix('0').unwrap());
-    let hardware = [0, 1].map(|index| hardware_address(&lab, index));
-    let stranger = Attacker::join(&first, &name, FOREIGN, ADDRESSES[0], &hardware[0]);
+    let stranger = Attacker::join(&lab, FOREIGN);
     let reset_both = |phase: &str| {
-        for (host, hardware) in ADDRESSES.into_iter().zip(&hardware) {
-            let sent_count = stranger.reset(CONTROL_PORT, host, hardware, LIMIT);
+        for host in ADDRESSES {
+            let sent_count = stranger.reset(CONTROL_PORT, host, LIMIT);
             println!("{phase}: {sent_count} resets at {host}");
             thread::sleep(Duration::from_millis(700));
         }
@@ -204,7 +195,7 @@ fn exact_resets_of_the_supervisors_connection_cost_reconnects_that_are_told() {
     let mut split = Split::start(&lab, &trial);
     split.wait_for_messages("the begin of the run");
     reset_both("run");
-    for port in ports {
+    for port in BRIDGE_PORTS {
         let mut command = lab.host(0).command("tc");
         let words = format!("qdisc add dev {port} root {SLOW}");
         let status = command.args(words.split(' ')).status().unwrap();
@@ -243,11 +234,7 @@ fn a_stranger_that_answers_for_a_hosts_address_is_told_with_both_link_addresses(
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
-    lab.put_bridge_between();
-    let first = lab.host(0).namespace().to_owned();
-    let name = format!("{}2", first.strip_suffix('0').unwrap());
-    let hardware = [0, 1].map(|index| hardware_address(&lab, index));
-    let stranger = Attacker::join(&first, &name, FOREIGN, ADDRESSES[0], &hardware[0]);
+    let stranger = Attacker::join(&lab, FOREIGN);
     let lost_counts =
         [(false, CLAIMED_AT[0]), (true, CLAIMED_AT[1])].map(|(is_pinned, claimed_at)| {
             let record = RunFolder::new("claimed");
@@ -264,7 +251,8 @@ fn a_stranger_that_answers_for_a_hosts_address_is_told_with_both_link_addresses(
                 seen.unwrap_or_else(|reason| panic!("{reason}"));
             }
             // It mends the first run, and is there from the start of the second.
-            lab.host(0).pin_neighbour(ADDRESSES[1], &hardware[1]);
+            lab.host(0)
+                .pin_neighbour(ADDRESSES[1], &lab.host(1).hardware_address());
             let summaries = split.finish();
             let told = |event: &RunEvent| match &event.kind {
                 RunEventKind::Process(EventKind::NeighbourChanged { interface, now, .. }) => {
@@ -285,4 +273,61 @@ fn a_stranger_that_answers_for_a_hosts_address_is_told_with_both_link_addresses(
         });
     let [lost_unpinned, lost_pinned] = lost_counts;
     assert!(lost_pinned * 10 < lost_unpinned, "{lost_counts:?}");
+}
+
+/// How long the address is taken: longer than the supervisors wait for a byte.
+const TAKEN_FOR: Duration = Duration::from_secs(5);
+
+/// The hop and the supervisors' connection over TCP wait, and go on; a hop's queue is bounded.
+#[test]
+fn a_taken_address_costs_a_sealed_tcp_hop_and_the_supervisors_what_is_sent_meanwhile() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let stranger = Attacker::join(&lab, FOREIGN);
+    let record = RunFolder::new("taken");
+    let trial = Trial::shipped("shuttle-tcp.toml", record.path())
+        .set(&format!("links.hop.port={PORT}"))
+        .set("run.duration=\"18 s\"");
+    let split = Split::start(&lab, &trial);
+    split.wait_for_messages("the begin of the run");
+    let now_ns = || MonotonicClock::now().as_ns();
+    let began_ns = now_ns();
+    stranger.claim(ADDRESSES[1], CLAIMED_AT[0]);
+    thread::sleep(TAKEN_FOR);
+    lab.host(0)
+        .pin_neighbour(ADDRESSES[1], &lab.host(1).hardware_address());
+    let ended_ns = now_ns();
+    split.wait_for_messages("the address is back");
+    let back_ns = now_ns();
+    let files = [0, 1].map(|index| split.files[index].clone());
+    let summaries = split.finish();
+    for (name, window_ns) in [
+        ("taken", began_ns..ended_ns),
+        ("pinned, until messages came again", ended_ns..back_ns),
+        ("after that", back_ns..back_ns + 3_000_000_000),
+    ] {
+        let windows_ns = slice::from_ref(&window_ns);
+        let messages = cost_of_both(&files, windows_ns);
+        let exchanges = cost_of_exchanges(&files[0], windows_ns);
+        let span_s = (window_ns.end - window_ns.start) as f64 * 1e-9;
+        println!("{name}, {span_s:.2} s: {messages:?} messages, {exchanges:?} clock exchanges");
+        if name == "after that" {
+            assert!(messages.lost * 10 < messages.sent, "{messages:?}");
+        }
+    }
+    let cut = [(&summaries[0], HOSTS[1]), (&summaries[1], HOSTS[0])];
+    assert!(
+        cut.iter()
+            .any(|(summary, peer)| !cuts(summary, peer).is_empty())
+    );
+    for summary in &summaries {
+        assert!(summary.record_gaps.is_empty());
+        assert_accounts_close(summary);
+    }
+    let mut events = summaries[0].events.iter();
+    assert!(events.any(|event| {
+        let kind = &event.kind;
+        matches!(kind, RunEventKind::Process(EventKind::NeighbourChanged { now, .. }) if now == CLAIMED_AT[0])
+    }));
 }

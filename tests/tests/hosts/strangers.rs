@@ -7,7 +7,6 @@
 
 use std::net::SocketAddrV4;
 use std::path::Path;
-use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use std::{env, fs, thread};
@@ -17,8 +16,7 @@ use hil_core::random::RandomStream;
 use hil_platform::clock::MonotonicClock;
 use hil_report::summary::{DirectionSummary, RunSummary};
 use hil_tests::account::{account, assert_accounts_close};
-use hil_tests::attacker::{Attacker, Flood};
-use hil_tests::child;
+use hil_tests::attacker::{Attacker, FOREIGN, Flood};
 use hil_tests::knocker::{CONTROL_PORT, Knocked, knock};
 use hil_tests::lab::{ADDRESSES, Lab};
 use hil_tests::latency::Latencies;
@@ -53,16 +51,6 @@ const RATIO_AIM: f64 = 2.0;
 const LAST_WORDS_MAX: u64 = 8;
 /// What a gateway's resident memory may differ between two moments without having grown.
 const MEMORY_MORE_MAX: u64 = 8 << 20;
-
-/// The hardware address of host `index`.
-pub(super) fn hardware_address(lab: &Lab, index: usize) -> String {
-    let namespace = lab.host(index).namespace();
-    let mut command = Command::new("ip");
-    let file = "/sys/class/net/eth0/address";
-    command.args(["netns", "exec", namespace, "cat", file]);
-    let finished = child::run(&mut command, LIMIT).unwrap();
-    finished.stdout.trim().to_owned()
-}
 
 /// One after the other: a recorded datagram, the same with a bit flipped, cut, with another payload, as a
 /// plain one, of another channel, of another session, of another version, and noise.
@@ -302,12 +290,7 @@ fn a_stranger_with_a_hosts_address_gets_nothing_in_and_stops_nothing() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
-    lab.put_bridge_between();
-    let first = lab.host(0).namespace().to_owned();
-    // The name of the lab with another host number, so that the next lab sweeps what a kill leaves.
-    let name = format!("{}2", first.strip_suffix('0').unwrap());
-    let hardware = hardware_address(&lab, 1);
-    let stranger = Attacker::join(&first, &name, ADDRESSES[0], ADDRESSES[1], &hardware);
+    let stranger = Attacker::join(&lab, ADDRESSES[0]);
     let span = attack_span();
     let (quiet, record) = (RunFolder::new("quiet"), RunFolder::new("attacked"));
     println!("quiet run:");
@@ -350,8 +333,6 @@ const KNOCKS_HZ: u32 = 1_000;
 /// Files and threads that a supervisor may have for connections that said nothing yet, beside its own.
 const HALF_OPEN_FILES_MAX: u64 = 800;
 const HALF_OPEN_THREADS_MAX: u64 = 300;
-/// An address of the hosts' network that is in no topology.
-const FOREIGN: std::net::Ipv4Addr = std::net::Ipv4Addr::new(10, 77, 0, 66);
 
 /// Most that the supervisor held until `is_over`, and what it held first.
 fn watch_supervisor(process: Pid, is_over: impl Fn() -> bool) -> [Held; 2] {

@@ -50,7 +50,12 @@ impl Asked {
         Self::with_token(address, host, origin, None)
     }
 
-    fn with_token(address: &str, host: &str, origin: Option<&str>, token: Option<&str>) -> Self {
+    pub(super) fn with_token(
+        address: &str,
+        host: &str,
+        origin: Option<&str>,
+        token: Option<&str>,
+    ) -> Self {
         let origin = origin.map_or_else(String::new, |origin| format!("Origin: {origin}\r\n"));
         let query = token.map_or_else(String::new, |token| format!("?token={token}"));
         let request = format!(

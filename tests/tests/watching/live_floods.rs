@@ -67,7 +67,7 @@ fn text(content: &str) -> Vec<u8> {
 const TOPICS: u32 = 6;
 
 /// A subscription to them.
-fn subscribe() -> Vec<u8> {
+pub(super) fn subscribe() -> Vec<u8> {
     let each = |id: u32| format!("{{\"id\":{id},\"channelId\":{id}}}");
     let all: Vec<_> = (1..=TOPICS).map(each).collect();
     text(&format!(

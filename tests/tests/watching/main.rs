@@ -12,6 +12,7 @@ mod browser_fleet;
 mod browser_split;
 mod live_access;
 mod live_floods;
+mod live_strangers;
 mod live_view;
 mod mcap;
 mod record_kills;

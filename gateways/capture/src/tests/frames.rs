@@ -64,6 +64,9 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
     let other_tag = [&frame[..12], &[0x93, 0, 0, 7], &frame[12..]].concat();
     // A label and a control word before the Ethernet frame.
     let pseudowire = [addresses, &[0x88, 0x47, 0, 1, 1, 64, 0, 0, 0, 0], &frame].concat();
+    let bare_pseudowire = [addresses, &[0x88, 0x47, 0, 1, 1, 64], &frame].concat();
+    let ring = [addresses, &[0x89, 0x2f, 0x10, 43, 0, 7], &frame[12..]].concat();
+    let redundant = [addresses, &[0xf1, 0xc1, 0, 0, 0, 7], &frame[12..]].concat();
     let within = |protocol: u8, before: &[u8], inner: &[u8]| {
         let mut outer = bare[..20].to_vec();
         outer[3] = u8::try_from(20 + before.len() + inner.len()).unwrap();
@@ -83,6 +86,9 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
         (link_type::ETHERNET, &twice, [1, 7]),
         (link_type::ETHERNET, &other_tag, [0, 7]),
         (link_type::ETHERNET, &pseudowire, [0, 0]),
+        (link_type::ETHERNET, &bare_pseudowire, [0, 0]),
+        (link_type::ETHERNET, &ring, [0, 0]),
+        (link_type::ETHERNET, &redundant, [0, 0]),
         (link_type::RAW, &in_ip, [0, 0]),
         (link_type::RAW, &in_gre, [0, 0]),
         (link_type::RAW, &authenticated, [0, 0]),

@@ -14,7 +14,10 @@ use hil_report::{replay, simulate};
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::Registry;
 
-use super::{Refusal, check_traces, code_of, columns, exit, failed, load, loaded, signals, usage};
+use super::{
+    Refusal, check_traces, code_of, columns, exit, failed, load, loaded, signals, tell_undecided,
+    usage,
+};
 
 /// Where a run in virtual time is shown.
 #[derive(Clone, Copy)]
@@ -38,6 +41,7 @@ pub(super) fn simulate(
         signals.end_program_unless_over("a run in virtual time is shown whole or not at all");
     let topology = load(file, overrides, registry, console)?;
     check_traces(file, overrides, &topology, console)?;
+    tell_undecided(&topology, registry, console);
     let progress = Progress::begin();
     let outcome = output
         .map_or(Ok(()), simulate::check_output)

@@ -13,7 +13,7 @@ use std::{env, io};
 use hil_cable::{Inside, Refusal};
 use hil_platform::open_files;
 use hil_platform::realtime::{self, SchedulingPolicy};
-use hil_topology::{Process, Program, Topology, Wait};
+use hil_topology::{Process, Program, Topology, Wait, witness_name};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
 use nix::unistd::{AccessFlags, access, dup2_stdin};
@@ -188,9 +188,16 @@ fn lines(missing: &[(String, String)]) -> String {
 /// # Errors
 /// Names the key of each process whose program is not there, and the program.
 pub fn find_all(topology: &Topology, hosts: &[String]) -> Result<(), ProgramsMissing> {
+    let witnessed = topology.processes().iter().filter(|one| one.is_witnessed());
+    let taken_names: Vec<String> = witnessed.map(|one| witness_name(&one.host)).collect();
     let here = topology.processes().iter();
     let here = here.filter(|process| hosts.contains(&process.host));
-    let missing: Vec<(String, String)> = here.flat_map(faults).collect();
+    let mut missing: Vec<(String, String)> = here.clone().flat_map(faults).collect();
+    for process in here.filter(|one| taken_names.contains(&one.name)) {
+        let why =
+            "is the name of the process that records for programs of the user's: choose another";
+        missing.push((format!("processes.{}", process.name), why.to_owned()));
+    }
     if missing.is_empty() {
         Ok(())
     } else {
@@ -287,6 +294,24 @@ mod tests {
         };
         let keys: Vec<String> = faults(&process).into_iter().map(|one| one.0).collect();
         assert_eq!(keys, ["processes.a.lock_memory", "processes.a.wait"]);
+    }
+
+    #[test]
+    fn the_name_of_the_process_that_records_is_no_programs() {
+        let text = "version = 1\nname = 'own'\nprocesses.a.run = ['sh']\n\
+                    processes.witness-local.run = ['sh']\n\
+                    [channels.c]\nmessage = { name = 'x.v1', size_bytes = 8 }\n\
+                    from = 'a'\nto = 'witness-local'\n";
+        let known = hil_topology::registry::Registry::default();
+        let topology = hil_topology::parse("own.toml", text, &[], known.known()).unwrap();
+        let hosts: Vec<String> = topology
+            .hosts()
+            .iter()
+            .map(|one| one.name.clone())
+            .collect();
+        let refusal = find_all(&topology, &hosts).unwrap_err();
+        let keys: Vec<&str> = refusal.0.iter().map(|one| one.0.as_str()).collect();
+        assert_eq!(keys, ["processes.witness-local"]);
     }
 
     #[test]

@@ -12,6 +12,7 @@ use hil_account::{
     OutageClass, OutageMetrics, SegmentMetrics,
 };
 use hil_core::interval::Spread;
+use hil_rundir::event::ProcessKind;
 use hil_stats::histogram::Distribution;
 
 use hil_platform::text::grouped;
@@ -127,7 +128,12 @@ fn channel(one: &ChannelSummary, summary: &RunSummary) -> Section {
             .blocks
             .extend(fate_table(account, sources.link).map(hil_present::Block::Table));
         if account.published_count > 0 {
-            section.table(segment_table(account));
+            let mut table = segment_table(account);
+            if is_taken_by_witness(summary, one) {
+                table.note += " Taken: when the witness beside the program had the message; when the program \
+                               read it is not recorded.";
+            }
+            section.table(table);
         }
         section
             .blocks
@@ -749,6 +755,17 @@ pub fn quantile_table(rows: &[(&str, &Distribution)]) -> Table {
         table.push(cells);
     }
     table
+}
+
+/// True where the consumer is a program of the user's that keeps no records.
+fn is_taken_by_witness(summary: &RunSummary, channel: &ChannelSummary) -> bool {
+    let named = |name| summary.processes.iter().find(|one| one.name == name);
+    let consumer = channel.to.as_deref().and_then(named);
+    let consumer = consumer.filter(|one| one.kind == ProcessKind::OwnProgram);
+    consumer.is_some_and(|consumer| {
+        let mut others = summary.processes.iter();
+        others.any(|one| one.kind == ProcessKind::Witness && one.host == consumer.host)
+    })
 }
 
 /// The segments one after the other with their medians as bars, then the whole, then what a missing stamp

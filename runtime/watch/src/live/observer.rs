@@ -9,7 +9,7 @@ use hil_account::{AccountContext, ChannelAccount, ChannelPath, WRITING_TIME_MAX,
 use hil_clock::{ClockMap, ClockSettings, Exchange, Requester};
 use hil_core::message::Envelope;
 use hil_core::record::RoundTripRecord;
-use hil_core::time::{Alignment, duration_ns};
+use hil_core::time::{Alignment, Instant, duration_ns};
 use hil_link::condition::{LinkCondition, LinkConditionRecord};
 use hil_link::spec::Way;
 
@@ -23,6 +23,7 @@ use hil_rundir::live_run::{LiveRun, Source};
 use hil_rundir::manifest::{ChannelDescription, Manifest};
 use hil_rundir::record::RecordKind;
 use hil_rundir::select::{self, SelectError};
+use hil_rundir::status::{Phase, RunStatus};
 use hil_shm::{Domain, DomainError};
 use hil_topology::registry::Registry;
 use hil_topology::{Process, Topology};
@@ -84,6 +85,8 @@ pub(crate) struct Observer {
     topology: Option<Topology>,
     follower: RecordFollower,
     tails: BTreeMap<String, ChannelTail>,
+    /// Channels that a program of this host may write before the run begins; empty once it began.
+    unbegun: Vec<String>,
     round_trips: BTreeMap<String, Vec<RoundTripRecord>>,
     arrivals: BTreeMap<String, Vec<Arrival>>,
     // Before the domains: readers go first.
@@ -154,8 +157,19 @@ impl Observer {
             };
             (one.name.clone(), tail)
         });
+        let tails: BTreeMap<String, ChannelTail> = tails.collect();
+        let is_of_program_here = |name: &&String| {
+            let known = topology.as_ref()?;
+            let producer = known.process(&known.channel(name)?.from)?;
+            let is_here = run.hosts().any(|host| host == producer.host);
+            (is_here && producer.is_witnessed()).then_some(())
+        };
+        let unbegun = tails.keys();
+        let unbegun = unbegun.filter(|name| is_of_program_here(name).is_some());
+        let unbegun = unbegun.cloned().collect();
         Ok(Self {
-            tails: tails.collect(),
+            tails,
+            unbegun,
             follower,
             conditions,
             run,
@@ -283,9 +297,11 @@ impl Observer {
     /// shared memory overflows.
     pub(crate) fn poll(&mut self) {
         let Self {
+            run,
             follower,
             topology,
             tails,
+            unbegun,
             round_trips,
             arrivals,
             passive,
@@ -329,8 +345,25 @@ impl Observer {
                 tail.expect(header.kind);
             }
         }
+        if !unbegun.is_empty() {
+            let status = RunStatus::read(&run.folder).ok();
+            if status
+                .as_ref()
+                .is_none_or(|one| one.phase != Phase::Starting)
+            {
+                let start_ns = status.and_then(|one| one.start_ns);
+                for channel in unbegun.drain(..) {
+                    if let (Some(tail), Some(start_ns)) = (tails.get_mut(&channel), start_ns) {
+                        tail.begin(Instant::from_ns(start_ns));
+                    }
+                }
+            }
+        }
         let now_ns = MonotonicClock::now().as_ns();
         for (channel, tail) in tails {
+            if unbegun.contains(channel) {
+                continue;
+            }
             let settling = settling(conditions.flight_time(channel));
             tail.settle(now_ns, duration_ns(settling));
             if tail.notes_late_record() {

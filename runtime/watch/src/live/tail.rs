@@ -5,9 +5,10 @@ use std::collections::VecDeque;
 
 use hil_account::{
     AccountContext, AccountFold, ChannelAccount, ChannelFold, ChannelPath, FirstNumber,
-    FoldSettings, MessageHistory, NoRoom, RecordEvent, RecordsAtHand,
+    FoldSettings, MessageHistory, NoRoom, RecordEvent, RecordsAtHand, RunSpan,
 };
 use hil_core::record::{IngressRecord, NoRoomRecord, stamp};
+use hil_core::time::Instant;
 
 use super::observer::Arrival;
 use crate::Batch;
@@ -26,6 +27,8 @@ pub(crate) struct ChannelTail {
     is_gateway: bool,
     /// See [`AccountContext::has_witness`].
     has_witness: bool,
+    /// See [`AccountContext::producer_run`]; `None` where its start is not known on the producer's clock.
+    producer_run: Option<RunSpan>,
     /// Nobody counts yet what is missing in them, so what became of it stays open.
     no_room: Vec<NoRoom>,
     /// With the publication of each, or that of the one before where it has none.
@@ -58,6 +61,7 @@ impl ChannelTail {
             }),
             is_gateway,
             has_witness: false,
+            producer_run: None,
             no_room: Vec::new(),
             settled: VecDeque::new(),
             arrivals: VecDeque::new(),
@@ -73,6 +77,12 @@ impl ChannelTail {
             has_witness: true,
             ..self
         }
+    }
+
+    /// Knows from now on when the run began, on the producer's clock: what was published before is no message of it.
+    pub(crate) fn begin(&mut self, start: Instant) {
+        let end = Instant::from_ns(i64::MAX);
+        self.producer_run = Some(RunSpan { start, end });
     }
 
     /// Adds what came, if it is of a kind that accounts are made of.
@@ -150,6 +160,7 @@ impl ChannelTail {
         let context = AccountContext {
             no_room: &self.no_room,
             has_witness: self.has_witness,
+            producer_run: self.producer_run,
             ..AccountContext::new(path)
         };
         let settled = &mut self.settled;
@@ -260,6 +271,16 @@ mod tests {
         assert_eq!(account.fates.of(MessageFate::SupersededAtConsumer), 2);
         let delay = account.end_to_end.distribution.measured().unwrap();
         assert_eq!((delay.min_ns, delay.max_ns), (129, 149));
+    }
+
+    #[test]
+    fn what_was_published_before_the_run_began_is_no_message_of_it() {
+        let mut tail = tail();
+        tail.begin(Instant::from_ns(1_120 * MS));
+        tail.settle(5_000 * MS, 0);
+        let account = account_of(&tail, i64::MAX);
+        assert_eq!(account.published_count, 30, "120 to 149");
+        assert_eq!(account.fates.of(MessageFate::Taken), 27);
     }
 
     #[test]

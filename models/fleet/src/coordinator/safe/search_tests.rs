@@ -980,6 +980,11 @@ fn no_state_of_a_crossing_with_a_restart_of_the_coordinator_is_a_collision() {
 }
 
 #[test]
+fn no_state_of_a_crossing_with_a_restart_of_a_robot_is_a_collision() {
+    assert_states(crossing().restarts(&[0, 1], 0), 65_547);
+}
+
+#[test]
 fn no_state_of_a_crossing_there_and_back_is_a_collision() {
     assert_states(crossing().there_and_back().restarts(&[0, 0], 0), 31_579);
 }
