@@ -58,9 +58,12 @@ const NEARER_MIN: f64 = 0.9;
 /// length says nothing of others.
 const RANKS_MIN: f64 = 0.2;
 
-/// The same where the series forgets more slowly the farther out it is, as a queue does: with [`OUTER`] of it beyond it is worth
-/// less than [`SLOWER`] of what it is at the median, and the quantile with [`OUTERMOST`] beyond is [`SKEWED`] times as far from
-/// the median as its opposite. Luck in the few outcomes far out does not show there.
+/// The same where the quantile with [`OUTERMOST`] beyond is [`SKEWED`] times as far from the median as its opposite: few busy
+/// periods of a queue carry it, and a run that by luck has none of the longest looks like one of a less loaded queue.
+const RANKS_MIN_SKEWED: f64 = 2.0;
+
+/// The same where such a series also forgets more slowly the farther out it is: with [`OUTER`] of it beyond it is worth less than
+/// [`SLOWER`] of what it is at the median. Luck in the few outcomes far out does not show there.
 const RANKS_MIN_SLOWER: f64 = 6.0;
 const OUTER: f64 = 0.1;
 const OUTERMOST: f64 = 0.01;
@@ -591,14 +594,20 @@ impl<'a> Quantiles<'a> {
         Ok(outcomes.effective_by(at_zero, ratio) * student_loss())
     }
 
-    /// Whether the series forgets more slowly the farther out it is, above the median or below it.
-    fn is_slower_outside(&self, is_above: bool) -> Result<bool, TooSmall> {
+    /// Effective ranks that must lie beyond a quantile above the median or below it.
+    fn ranks_min(&self, is_above: bool) -> Result<f64, TooSmall> {
         let count = self.ascending.len();
         let at = |share| self.ascending.at(place_of(share, count)) as f64;
         let side = |beyond: f64| if is_above { 1.0 - beyond } else { beyond };
         let outermost = side(OUTERMOST);
         let [out, opposite] = [outermost, 1.0 - outermost].map(|end| (at(end) - at(0.5)).abs());
-        Ok(out >= SKEWED * opposite && self.worth(side(OUTER))? < SLOWER * self.worth(0.5)?)
+        Ok(if out < SKEWED * opposite {
+            RANKS_MIN
+        } else if self.worth(side(OUTER))? < SLOWER * self.worth(0.5)? {
+            RANKS_MIN_SLOWER
+        } else {
+            RANKS_MIN_SKEWED
+        })
     }
 
     /// Places of both ends.
@@ -607,15 +616,12 @@ impl<'a> Quantiles<'a> {
         let mut worth = self.worth(share)?;
         if NEARER * rare <= 0.5 {
             let (_, of_ranks) = self.ranks?;
-            let is_slower =
-                rare * of_ranks < RANKS_MIN_SLOWER && self.is_slower_outside(share > 0.5)?;
-            let least = if is_slower {
-                RANKS_MIN_SLOWER
-            } else {
-                RANKS_MIN
-            };
-            if rare * of_ranks < least {
-                return Err(too_few(of_ranks, least / rare));
+            // None needs more than that; what it needs takes two passes.
+            if rare * of_ranks < RANKS_MIN_SLOWER {
+                let least = self.ranks_min(share > 0.5)?;
+                if rare * of_ranks < least {
+                    return Err(too_few(of_ranks, least / rare));
+                }
             }
             let nearer = if share <= 0.5 {
                 NEARER * share
