@@ -37,9 +37,11 @@ const SINGLE_COUNT: usize = 16;
 /// Values that a series must have: a quarter of them are ordinates.
 const COUNT_MIN: u64 = 4 * SINGLE_COUNT as u64;
 
-/// What white noise and long memory are given in advance; fading memory has the rest.
-const WHITE_PRIOR: f64 = 0.3;
-const LONG_PRIOR: f64 = 0.35;
+/// What long memory is given in advance, for a mean or share and for the outcomes beyond a quantile; of the rest white noise has
+/// [`WHITE_PRIOR`], fading memory the other part.
+const LONG_PRIOR: f64 = 0.5;
+const LONG_PRIOR_RANKS: f64 = 0.35;
+const WHITE_PRIOR: f64 = 0.46;
 
 /// Effective observations that the rarer outcome of a share must have.
 const RARE_MIN: f64 = 5.0;
@@ -51,6 +53,28 @@ const BEYOND_MIN: f64 = 1.4;
 /// must lie beyond that one for each rank beyond it. Few clusters far out do not show how long clusters are, those nearer by do.
 const NEARER: f64 = 10.0;
 const NEARER_MIN: f64 = 0.9;
+
+/// Effective ranks that must lie beyond a quantile: a series that is slow against the run may have one cluster there, whose
+/// length says nothing of others.
+const RANKS_MIN: f64 = 0.2;
+
+/// The same where the quantile with [`OUTERMOST`] beyond is [`SKEWED`] times as far from the median as its opposite: few busy
+/// periods of a queue carry it, and a run that by luck has none of the longest looks like one of a less loaded queue.
+const RANKS_MIN_SKEWED: f64 = 2.0;
+
+/// The same where such a series also forgets more slowly the farther out it is: with [`OUTER`] of it beyond it is worth less than
+/// [`SLOWER`] of what it is at the median. Luck in the few outcomes far out does not show there.
+const RANKS_MIN_SLOWER: f64 = 6.0;
+const OUTER: f64 = 0.1;
+const OUTERMOST: f64 = 0.01;
+const SLOWER: f64 = 0.8;
+const SKEWED: f64 = 2.0;
+
+/// Tail index of clusters' sizes above which few clusters do not show the variance of one, how many must be there for an index,
+/// and what part of the sample is then left.
+const HEAVY: f64 = 0.1;
+const CLUSTERS_MIN: usize = 10;
+const HEAVY_LOSS: f64 = 0.5;
 
 /// Probability outside an interval on either side.
 const TAIL: f64 = 0.025;
@@ -129,14 +153,14 @@ impl Batches {
     }
 
     /// What the spectrum says of the mean, or that the series is too short to have one.
-    fn at_zero(&self) -> Result<AtZero, TooSmall> {
+    fn at_zero(&self, long_prior: f64) -> Result<AtZero, TooSmall> {
         if self.count < COUNT_MIN {
             return Err(TooSmall {
                 effective: self.count,
                 needed: COUNT_MIN,
             });
         }
-        Ok(AtZero::of(self))
+        Ok(AtZero::of(self, long_prior))
     }
 
     /// How many independent values would have a mean of the same variance, at most all.
@@ -144,7 +168,7 @@ impl Batches {
     /// # Errors
     /// When the series is too short.
     pub fn effective_count(&self) -> Result<f64, TooSmall> {
-        let own = self.at_zero()?;
+        let own = self.at_zero(LONG_PRIOR)?;
         Ok(self.effective_by(own, own.ratio))
     }
 
@@ -158,6 +182,26 @@ impl Batches {
         } else {
             self.count as f64
         }
+    }
+
+    /// How many ones, or zeros, each row of batches with some has.
+    fn clusters(&self, is_one: bool) -> Vec<f64> {
+        let mut clusters = Vec::new();
+        let mut is_within = false;
+        for sum in &self.sums {
+            let size = if is_one {
+                *sum
+            } else {
+                self.per_batch as f64 - sum
+            };
+            match clusters.last_mut() {
+                Some(cluster) if is_within && size > 0.0 => *cluster += size,
+                _ if size > 0.0 => clusters.push(size),
+                _ => {}
+            }
+            is_within = size > 0.0;
+        }
+        clusters
     }
 
     /// The interval of the mean.
@@ -181,7 +225,8 @@ impl Batches {
     /// The interval of the share of ones, in a series of zeros and ones.
     ///
     /// Its end towards the nearer one of none and all is that of a sample of which it is known that it had
-    /// five of the rarer outcome (Cohen and Sackrowitz 1989): others have no interval.
+    /// five of the rarer outcome (Cohen and Sackrowitz 1989): others have no interval. Where the clusters of that outcome have a
+    /// heavy tail, the longest of a run is shorter than the longest there are, and the other end is that of half the sample.
     pub fn share_interval(&self) -> Spread {
         let share = self.mean();
         if self.count == 0 || !(share > 0.0 && share < 1.0) {
@@ -196,7 +241,9 @@ impl Batches {
         if rare * worth < RARE_MIN {
             return Spread::Unknown(too_few(worth, RARE_MIN / rare));
         }
-        let (near, far) = (selected_end(rare, worth, RARE_MIN), far_end(rare, worth));
+        let heavy = tail_index(&self.clusters(share <= 0.5)).is_some_and(|index| index > HEAVY);
+        let of_far = worth * if heavy { HEAVY_LOSS } else { 1.0 };
+        let (near, far) = (selected_end(rare, worth, RARE_MIN), far_end(rare, of_far));
         let (low, high) = if share <= 0.5 {
             (near, far)
         } else {
@@ -204,6 +251,43 @@ impl Batches {
         };
         Spread::Known(Interval::new(low, high, IntervalMethod::EffectiveShare))
     }
+}
+
+/// The tail index of sizes by a generalized Pareto distribution (Zhang and Stephens 2009): 0 of an exponential tail, 0.5 where
+/// the variance ceases to be finite. `None` of too few.
+fn tail_index(sizes: &[f64]) -> Option<f64> {
+    let count = sizes.len();
+    if count < CLUSTERS_MIN {
+        return None;
+    }
+    let mut excess = sizes.to_vec();
+    excess.sort_by(f64::total_cmp);
+    // Sizes are whole numbers: each stands for those nearer to it than to the next.
+    let least = excess[0] - 0.5;
+    for size in &mut excess {
+        *size -= least;
+    }
+    let (n, quarter, largest) = (count as f64, excess[(count + 2) / 4 - 1], excess[count - 1]);
+    let index = |theta: f64| excess.iter().map(|one| (-theta * one).ln_1p()).sum::<f64>() / n;
+    let thetas = 30 + ceil_count(n.sqrt().floor());
+    let of_theta = (1..=thetas).map(|place| {
+        let spread = 1.0 - (thetas as f64 / (place as f64 - 0.5)).sqrt();
+        let theta = 1.0 / largest + spread / (3.0 * quarter);
+        let index = index(theta);
+        (theta, n * ((-theta / index).ln() - index - 1.0))
+    });
+    let of_theta: Vec<_> = of_theta.collect();
+    let best = of_theta
+        .iter()
+        .map(|one| one.1)
+        .fold(f64::NEG_INFINITY, f64::max);
+    let (mut weights, mut sum) = (0.0, 0.0);
+    for (theta, likelihood) in of_theta {
+        let weight = (likelihood - best).exp();
+        weights += weight;
+        sum += weight * theta;
+    }
+    Some(index(sum / weights))
 }
 
 fn too_few(effective: f64, needed: f64) -> TooSmall {
@@ -316,7 +400,7 @@ fn long_variance(memory: f64, count: f64) -> f64 {
 }
 
 impl AtZero {
-    fn of(batches: &Batches) -> Self {
+    fn of(batches: &Batches, long_prior: f64) -> Self {
         let ordinates = periodogram(batches);
         let count = batches.sums.len() as f64;
         let bands = bands(&ordinates, count);
@@ -324,13 +408,12 @@ impl AtZero {
         let mut flat = Models::default();
         flat.push(&bands, bands.iter().map(|_| 1.0), 1.0 / count);
         let highest = ordinates.len() as f64;
+        let rest = 1.0 - long_prior;
+        let faded = fading_models(&bands, highest, count);
         let kinds = [
-            (WHITE_PRIOR, flat),
-            (
-                1.0 - WHITE_PRIOR - LONG_PRIOR,
-                fading_models(&bands, highest, count),
-            ),
-            (LONG_PRIOR, long_models(&bands, highest, count)),
+            (WHITE_PRIOR * rest, flat),
+            ((1.0 - WHITE_PRIOR) * rest, faded),
+            (long_prior, long_models(&bands, highest, count)),
         ];
         let of_mean = averaged(&kinds);
         Self {
@@ -455,8 +538,8 @@ fn bands(ordinates: &[f64], batch_count: f64) -> Vec<Band> {
 pub struct Quantiles<'a> {
     series: &'a Samples,
     ascending: &'a Samples,
-    /// Of the ranks: the memory of the series itself, which an outcome far out hides.
-    ratio: Result<f64, TooSmall>,
+    /// Ratio and effective count of the ranks: the memory of the series itself, which an outcome far out hides.
+    ranks: Result<(f64, f64), TooSmall>,
 }
 
 impl<'a> Quantiles<'a> {
@@ -469,7 +552,10 @@ impl<'a> Quantiles<'a> {
         Self {
             series,
             ascending,
-            ratio: ranks.at_zero().map(|at_zero| at_zero.ratio),
+            ranks: ranks.at_zero(LONG_PRIOR_RANKS).map(|at_zero| {
+                let ratio = at_zero.ratio;
+                (ratio, ranks.effective_by(at_zero, ratio))
+            }),
         }
     }
 
@@ -491,7 +577,7 @@ impl<'a> Quantiles<'a> {
 
     /// Effective observations, as far as the outcome is to lie beyond this quantile or not.
     fn worth(&self, share: f64) -> Result<f64, TooSmall> {
-        let ratio = self.ratio?;
+        let (ratio, _) = self.ranks?;
         let count = self.ascending.len();
         let value = self.ascending.at(place_of(share, count));
         // Of equal values some lie beyond the quantile: whichever outcome is nearer to it.
@@ -504,8 +590,24 @@ impl<'a> Quantiles<'a> {
             let is_inside = one < value || (one == value && !is_below);
             outcomes.push(f64::from(u8::from(is_inside)), 1);
         }
-        let at_zero = outcomes.at_zero()?;
+        let at_zero = outcomes.at_zero(LONG_PRIOR_RANKS)?;
         Ok(outcomes.effective_by(at_zero, ratio) * student_loss())
+    }
+
+    /// Effective ranks that must lie beyond a quantile above the median or below it.
+    fn ranks_min(&self, is_above: bool) -> Result<f64, TooSmall> {
+        let count = self.ascending.len();
+        let at = |share| self.ascending.at(place_of(share, count)) as f64;
+        let side = |beyond: f64| if is_above { 1.0 - beyond } else { beyond };
+        let outermost = side(OUTERMOST);
+        let [out, opposite] = [outermost, 1.0 - outermost].map(|end| (at(end) - at(0.5)).abs());
+        Ok(if out < SKEWED * opposite {
+            RANKS_MIN
+        } else if self.worth(side(OUTER))? < SLOWER * self.worth(0.5)? {
+            RANKS_MIN_SLOWER
+        } else {
+            RANKS_MIN_SKEWED
+        })
     }
 
     /// Places of both ends.
@@ -513,6 +615,14 @@ impl<'a> Quantiles<'a> {
         let rare = share.min(1.0 - share);
         let mut worth = self.worth(share)?;
         if NEARER * rare <= 0.5 {
+            let (_, of_ranks) = self.ranks?;
+            // None needs more than that; what it needs takes two passes.
+            if rare * of_ranks < RANKS_MIN_SLOWER {
+                let least = self.ranks_min(share > 0.5)?;
+                if rare * of_ranks < least {
+                    return Err(too_few(of_ranks, least / rare));
+                }
+            }
             let nearer = if share <= 0.5 {
                 NEARER * share
             } else {
