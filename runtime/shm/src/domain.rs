@@ -6,7 +6,7 @@ use std::ffi::OsString;
 use std::fs;
 use std::io;
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -148,7 +148,19 @@ impl Domain {
         marked.map_err(DomainError::io("write", root_path.join(MARKER)))?;
         let mut domain = Self::join(DomainAddress::new(root_path, prefix), None)?;
         domain.held = Some(held);
+        domain.keep_others_out()?;
         Ok(domain)
+    }
+
+    /// Takes from other users the right to write the file in which processes that join are counted: iceoryx2 0.10 gives
+    /// it to everybody, and whoever cuts it ends each process that joins after that.
+    fn keep_others_out(&self) -> Result<(), DomainError> {
+        for file in shared_memory_files(self.address.prefix()) {
+            let allowed = fs::Permissions::from_mode(0o600);
+            fs::set_permissions(&file, allowed)
+                .map_err(DomainError::io("keep others out of", &file))?;
+        }
+        Ok(())
     }
 
     /// Deletes what a run that was killed left at `root_path`, if it is that of a domain.

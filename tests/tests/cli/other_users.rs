@@ -91,9 +91,9 @@ fn a_sweep_and_a_run_leave_alone_what_another_users_links_lead_to() {
             swept.status, ran.status
         );
         assert!(left && papers.join("hil-domain").exists());
-        assert_ne!(ran.status.code(), Some(0), "{ran:?}");
+        assert_eq!(ran.status.code(), Some(77), "{ran:?}");
         let why = if is_link {
-            "hil-0: "
+            "hil-0 is no folder but a link or a file, of user 0"
         } else {
             "belongs to user 45678, and this is user 0"
         };
@@ -188,6 +188,14 @@ fn an_empty_file_of_another_user_in_shared_memory_costs_a_run_nothing() {
     let planted = [format!("{prefix}x"), format!("{prefix}_1_2.connection")];
     for name in &planted {
         as_stranger(&format!("umask 0; : > /dev/shm/{name}"));
+    }
+    let files_of_run = fs::read_dir("/dev/shm").unwrap().flatten();
+    for file in files_of_run {
+        let name = file.file_name().into_string().unwrap();
+        if name.starts_with(&prefix) && !planted.contains(&name) {
+            let mode = file.metadata().unwrap().permissions().mode();
+            assert_eq!(mode & 0o077, 0, "{name}: {mode:o}");
+        }
     }
     // It is also in the way of nobody who is started again.
     files.kill_process("controller", 0, LIMIT);

@@ -173,17 +173,18 @@ fn cuts(summary: &RunSummary, peer: &str) -> Vec<f64> {
     cuts.collect()
 }
 
-/// An exact reset at either end of the supervisors' connection, twice in the run and twice in the exchange of records.
+/// A reset, an end and content with the exact number at either end of the supervisors' connection in the run, and two resets in
+/// the exchange of records.
 #[test]
-fn exact_resets_of_the_supervisors_connection_cost_reconnects_that_are_told() {
+fn exact_forgeries_in_the_supervisors_connection_cost_reconnects_that_are_told() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
     let stranger = Attacker::join(&lab, FOREIGN);
-    let reset_both = |phase: &str| {
+    let forge_both = |what: Exact, phase: &str| {
         for host in ADDRESSES {
-            let sent_count = stranger.forge_exactly(Exact::Reset, CONTROL_PORT, host, LIMIT);
-            println!("{phase}: {sent_count} resets at {host}");
+            let sent_count = stranger.forge_exactly(what, CONTROL_PORT, host, LIMIT);
+            println!("{phase}: {sent_count} of {what:?} at {host}");
             thread::sleep(Duration::from_millis(700));
         }
     };
@@ -194,7 +195,9 @@ fn exact_resets_of_the_supervisors_connection_cost_reconnects_that_are_told() {
         .set(&format!("run.duration=\"{RESET_RUN_S} s\""));
     let mut split = Split::start(&lab, &trial);
     split.wait_for_messages("the begin of the run");
-    reset_both("run");
+    for what in [Exact::Reset, Exact::End, Exact::Content] {
+        forge_both(what, "run");
+    }
     for port in BRIDGE_PORTS {
         let mut command = lab.host(0).command("tc");
         let words = format!("qdisc add dev {port} root {SLOW}");
@@ -203,13 +206,13 @@ fn exact_resets_of_the_supervisors_connection_cost_reconnects_that_are_told() {
     }
     let exchanged = split.hosts[0].wait_for_output("exchanging records", LIMIT);
     exchanged.unwrap_or_else(|reason| panic!("{reason}"));
-    reset_both("exchange");
+    forge_both(Exact::Reset, "exchange");
     let summaries = split.finish();
     for (summary, peer) in summaries.iter().zip([HOSTS[1], HOSTS[0]]) {
         let (early, late): (Vec<f64>, Vec<f64>) = cuts(summary, peer)
             .into_iter()
             .partition(|at_s| *at_s < f64::from(RESET_RUN_S));
-        assert!(early.len() >= 2 && late.len() >= 2, "{early:?} {late:?}");
+        assert!(early.len() >= 6 && late.len() >= 2, "{early:?} {late:?}");
         assert!(summary.record_gaps.is_empty(), "{:?}", summary.record_gaps);
         for name in CHANNELS {
             let account = account(summary, name);

@@ -213,7 +213,7 @@ fn forged_traffic_costs_a_viewer_nothing_and_an_exact_reset_that_viewer() {
             "messages of the run",
             |windows_ns| cost_of_both(&files, windows_ns),
             Bound {
-                sent_min: 1_000,
+                sent_min: 500,
                 cost_max: 0.01,
             },
         );

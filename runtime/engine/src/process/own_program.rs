@@ -1,6 +1,7 @@
 //! A user's own program as a process of the run: found before the run begins, and bound to its
 //! supervisor, so that it cannot outlive it.
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::net::IpAddr;
 use std::os::fd::AsFd as _;
@@ -13,7 +14,9 @@ use std::{env, io};
 use hil_cable::{Inside, Refusal};
 use hil_platform::open_files;
 use hil_platform::realtime::{self, SchedulingPolicy};
-use hil_topology::{Process, Program, Topology, Wait, witness_name};
+use hil_topology::{
+    Link, Process, Program, Topology, Wait, clock_process_name, gateway_name, witness_name,
+};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
 use nix::unistd::{AccessFlags, access, dup2_stdin};
@@ -205,8 +208,8 @@ pub fn find_all(topology: &Topology, hosts: &[String]) -> Result<(), ProgramsUnf
     ProgramsUnfit::unless_none(here.flat_map(faults).chain(taken_names(topology)))
 }
 
-/// Refuses processes of any host that are called as one is that records for programs of the user's. A run
-/// would not start; the folder of an older one is read all the same.
+/// Refuses processes of any host that are called as one of the run's own: a gateway, an end of a clock path, or what records
+/// for programs of the user's. A run would not start; the folder of an older one is read all the same.
 ///
 /// # Errors
 /// Names the key of each.
@@ -215,13 +218,20 @@ pub fn check_names(topology: &Topology) -> Result<(), ProgramsUnfit> {
 }
 
 fn taken_names(topology: &Topology) -> impl Iterator<Item = (String, String)> {
-    let processes = || topology.processes().iter();
-    let is_taken = move |process: &&Process| {
-        let mut witnessed = processes().filter(|one| one.is_witnessed());
-        witnessed.any(|one| witness_name(&one.host) == process.name)
-    };
-    let why = "is the name of the process that records for programs of the user's: choose another";
-    let taken = processes().filter(is_taken);
+    let between = |link: &Link| link.between.clone().into_iter().flatten();
+    let gateways = topology
+        .links()
+        .iter()
+        .flat_map(|link| between(link).map(|host| gateway_name(&link.name, &host)));
+    let clocks = topology
+        .clock_paths()
+        .flat_map(|path| [path.from, path.to].map(|host| clock_process_name(&path, &host.name)));
+    let processes = topology.processes().iter();
+    let observed = processes.clone().filter(|one| one.is_witnessed());
+    let witnesses = observed.map(|one| witness_name(&one.host));
+    let own: BTreeSet<String> = gateways.chain(clocks).chain(witnesses).collect();
+    let why = "is the name of a process of the run itself: choose another";
+    let taken = processes.filter(move |process| own.contains(&process.name));
     taken.map(move |process| (format!("processes.{}", process.name), why.to_owned()))
 }
 
@@ -317,22 +327,30 @@ mod tests {
     }
 
     #[test]
-    fn the_name_of_the_process_that_records_is_no_programs() {
-        let text = "version = 1\nname = 'own'\nprocesses.a.run = ['sh']\n\
-                    processes.witness-local.run = ['sh']\n\
-                    [channels.c]\nmessage = { name = 'x.v1', size_bytes = 8 }\n\
-                    from = 'a'\nto = 'witness-local'\n";
+    fn the_name_of_a_process_of_the_run_itself_is_no_programs() {
         let known = hil_topology::registry::Registry::default();
-        let topology = hil_topology::parse("own.toml", text, &[], known.known()).unwrap();
-        let hosts: Vec<String> = topology
-            .hosts()
-            .iter()
-            .map(|one| one.name.clone())
-            .collect();
-        for refusal in [find_all(&topology, &hosts), check_names(&topology)] {
-            let refusal = refusal.unwrap_err();
-            let keys: Vec<&str> = refusal.0.iter().map(|one| one.0.as_str()).collect();
-            assert_eq!(keys, ["processes.witness-local"]);
+        let message = "message = { name = 'x.v1', size_bytes = 8 }";
+        for (name, rest) in [
+            ("witness-local", "processes.a.run = ['sh']\n[channels.c]\n"),
+            (
+                "gateway-hop-p",
+                "hosts = { p = {}, q = {} }\nprocesses.gateway-hop-p.host = 'p'\n\
+                 processes.a = { run = ['sh'], host = 'q' }\n\
+                 links.hop = { via = 'emulated', between = ['p', 'q'], port = 7000 }\n\
+                 [channels.c]\nlink = 'hop'\n",
+            ),
+        ] {
+            let text = format!(
+                "version = 1\nname = 'own'\nprocesses.{name}.run = ['sh']\n{rest}{message}\nfrom = 'a'\nto = '{name}'\n"
+            );
+            let topology = hil_topology::parse("own.toml", &text, &[], known.known()).unwrap();
+            let hosts = topology.hosts().iter().map(|one| one.name.clone());
+            let hosts: Vec<String> = hosts.collect();
+            for refusal in [find_all(&topology, &hosts), check_names(&topology)] {
+                let refusal = refusal.unwrap_err();
+                let keys: Vec<&str> = refusal.0.iter().map(|one| one.0.as_str()).collect();
+                assert_eq!(keys, [format!("processes.{name}")]);
+            }
         }
     }
 

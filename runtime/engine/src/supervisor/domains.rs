@@ -12,7 +12,7 @@ use hil_link::condition::{LinkChangeRequest, ORDER_TYPE_NAME};
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::gateway::link_control::ORDERS_MAX;
 use hil_platform::domain_address::checked_root_path;
-use hil_platform::own_folder::OwnFolder;
+use hil_platform::own_folder::{OwnFolder, OwnFolderError};
 use hil_protocol::ingress::reassembly_slots;
 use hil_rundir::announcement::withdraw_abandoned;
 use hil_rundir::live_run::LiveRun;
@@ -71,6 +71,21 @@ impl DomainsError {
             self,
             Self::Domain {
                 source: DomainError::Address(_),
+                ..
+            }
+        )
+    }
+
+    /// The folder is another user's, or others may change it.
+    pub const fn is_of_others(&self) -> bool {
+        matches!(
+            self,
+            Self::Domain {
+                source: DomainError::Folder(
+                    OwnFolderError::Foreign { .. }
+                        | OwnFolderError::NoFolder { .. }
+                        | OwnFolderError::Shared { .. }
+                ),
                 ..
             }
         )
