@@ -80,8 +80,8 @@ impl Cost {
     }
 }
 
-/// The run of the shuttle with room for what comes while the machine stands still for a second: asked is what an attack
-/// costs, not what the host does.
+/// The run of the shuttle with room for what comes while the machine stalls for a second, so that the cost of an attack is
+/// measured and not that of the host.
 #[must_use]
 pub fn roomy(trial: Trial) -> Trial {
     trial

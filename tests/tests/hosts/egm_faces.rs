@@ -4,6 +4,7 @@
 use core::ops::Range;
 use std::collections::BTreeSet;
 use std::net::{SocketAddrV4, UdpSocket};
+use std::path::Path;
 use std::thread;
 use std::time::Duration;
 
@@ -124,6 +125,17 @@ fn assert_driven(here: &Arms, there: &Arms, side: Side, arm: &Arm) {
     }
 }
 
+/// The robot of a run of its own, whose arms both ask the sensor on the first host.
+fn robot_of_both_arms(record: &Path, duration: &str) -> Trial {
+    let address = ADDRESSES[0];
+    Trial::shipped("egm-client.toml", record)
+        .set(duration)
+        .set("case.parameters.egm.preset=\"paper\"")
+        .set("case.parameters.egm.arms=\"both\"")
+        .set(&format!("processes.client.egm.right=\"{address}:6510\""))
+        .set(&format!("processes.client.egm.left=\"{address}:6511\""))
+}
+
 #[test]
 fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
@@ -134,13 +146,7 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     let sensor = Trial::shipped("egm-robot.toml", &here)
         .set("run.duration=\"22 s\"")
         .set("case.parameters.left_arm=\"mirror\"");
-    let address = ADDRESSES[0];
-    let robot = Trial::shipped("egm-client.toml", &there)
-        .set("run.duration=\"16 s\"")
-        .set("case.parameters.egm.preset=\"paper\"")
-        .set("case.parameters.egm.arms=\"both\"")
-        .set(&format!("processes.client.egm.right=\"{address}:6510\""))
-        .set(&format!("processes.client.egm.left=\"{address}:6511\""));
+    let robot = robot_of_both_arms(&there, "run.duration=\"16 s\"");
     let mut sensor_run = sensor.start_on(lab.host(0));
     let sensor_files = sensor.folder("", LIMIT);
     let mut robot_run = robot.start_on(lab.host(1));
@@ -199,13 +205,7 @@ fn forged_reports_cost_the_makers_datagrams_nothing_and_a_taken_address_what_is_
     let sensor = Trial::shipped("egm-robot.toml", &here)
         .set(&run_duration(rounds + 14, 1))
         .set("case.parameters.left_arm=\"mirror\"");
-    let address = ADDRESSES[0];
-    let robot = Trial::shipped("egm-client.toml", &there)
-        .set(&run_duration(rounds + 8, 1))
-        .set("case.parameters.egm.preset=\"paper\"")
-        .set("case.parameters.egm.arms=\"both\"")
-        .set(&format!("processes.client.egm.right=\"{address}:6510\""))
-        .set(&format!("processes.client.egm.left=\"{address}:6511\""));
+    let robot = robot_of_both_arms(&there, &run_duration(rounds + 8, 1));
     let mut sensor_run = sensor.start_on(lab.host(0));
     let sensor_files = sensor.folder("", LIMIT);
     let mut robot_run = robot.start_on(lab.host(1));
@@ -215,7 +215,7 @@ fn forged_reports_cost_the_makers_datagrams_nothing_and_a_taken_address_what_is_
     });
     let ways = [6510, 6511].map(|port| {
         let from = stranger.overhear_sender(port, LIMIT);
-        let to = SocketAddrV4::new(address, port);
+        let to = SocketAddrV4::new(ADDRESSES[0], port);
         [[from, to], [to, from]]
     });
     let reports = reports_v4(Quoted::Udp, &ways.concat());

@@ -231,7 +231,7 @@ fn an_interface_that_goes_ends_the_capture_with_a_whole_file_and_its_own_exit_co
 fn check_analysis(captures: &[PathBuf; 2]) {
     let (report, code) = json(&[Path::new("analyse"), &captures[0], &captures[1]]);
     let joins = report["joins"].as_array().unwrap();
-    // Stamps that a machine which stood still stored out of order may look like those of a clock that was set.
+    // Stamps that a stalled machine stored out of order may look like those of a clock that was set.
     let is_set = joins.iter().any(|joined| {
         let steps = joined["figures"]["clock_steps"].as_array().unwrap();
         steps

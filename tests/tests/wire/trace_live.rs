@@ -243,11 +243,11 @@ fn live_by_tick_nobody_hears_at_a_tick_that_has_no_record() {
         assert!(compared_count as u64 > 80 * RUN_S, "{compared_count}");
         // A replay that is one tick off for good is off on nearly all.
         assert!(
-            off_count <= compared_count / 4,
+            off_count <= compared_count / 20,
             "{off_count} of {compared_count}"
         );
-        // A late message that is taken for the next one's tick repeats one: a loaded machine makes some.
-        let bound = compared_count as u64 / 4;
+        // A late message that is taken for the next one's tick repeats one.
+        let bound = compared_count as u64 / 20;
         assert!(counts.repeated_count <= bound, "{counts:?}");
     }
 }
