@@ -18,8 +18,6 @@ hil_core::labelled! {
         EffectiveMean = "Student's interval on the effective sample",
         /// Of a share of independent trials (Clopper and Pearson 1934).
         Exact = "Clopper and Pearson's interval",
-        /// Of a share of independent trials (Wilson 1927).
-        Score = "Wilson's interval",
         /// Of a mean of repetitions (Student 1908).
         Student = "Student's interval",
         /// Of a difference or ratio of repetitions (Welch 1947).
@@ -36,7 +34,7 @@ impl IntervalMethod {
             Self::EffectiveShare | Self::EffectiveRanks | Self::EffectiveMean => {
                 "the run is stationary; its memory, fading or long, is weighed by the data"
             }
-            Self::Exact | Self::Score => "trials are independent",
+            Self::Exact => "trials are independent, or their counts divided by their scatter",
             Self::Student | Self::Welch => "repetitions are independent",
             Self::Mover => "both sides are independent, and their own intervals hold",
         }

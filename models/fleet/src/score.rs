@@ -6,7 +6,6 @@ use std::collections::BTreeMap;
 
 use crate::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet, FleetParameters};
 use crate::events::events;
-use crate::experiment::collision_interval;
 use crate::messages::{Authority, State, Truth};
 use crate::referee::{Referee, SCAN_PERIOD, Tally};
 use crate::standing::{Standstill, standstills};
@@ -14,6 +13,7 @@ use hil_core::case_study::{ErrorSeries, Harm, Metric, Score};
 use hil_core::interval::Spread;
 use hil_core::run_log::RunLog;
 use hil_core::time::Instant;
+use hil_stats::dependence::Batches;
 use hil_stats::histogram::{LatencyHistogram, LatencySummary};
 use hil_stats::metric::{Label, label};
 
@@ -39,12 +39,13 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
     referee.replay(&mut truths.into_iter(), start, end);
     let run_s = run_end.seconds_since(start);
     let tally = referee.tally();
+    let collided = collided_share(tally, referee.collided_after());
     let mut score = Score {
-        harms: harms(Some(tally)),
+        harms: harms(Some((tally, collided))),
         headline: &["separation_m_min", "missions_per_hour"],
         ..Score::default()
     };
-    score.metrics.extend(collisions(tally));
+    score.metrics.extend(collisions(tally, collided));
     score.metrics.extend(distances(case, tally));
     score.metrics.extend(commands(tally));
     score.metrics.extend(ages(log));
@@ -65,15 +66,18 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
 }
 
 /// What an authority that comes late or not at all leads to.
-fn harms(tally: Option<&Tally>) -> Vec<Harm> {
-    let count = |of: fn(&Tally) -> u64| tally.map(of);
+fn harms(seen: Option<(&Tally, Option<Spread>)>) -> Vec<Harm> {
+    let count = |of: fn(&Tally) -> u64| seen.map(|(tally, _)| of(tally));
     let collisions = Harm::new(
         "collisions, section checker",
         count(|tally| tally.section_collisions_count),
     );
     vec![
-        match tally {
-            Some(tally) => collisions.of(tally.sections_passed_count, "critical sections passed"),
+        match seen {
+            Some((tally, interval)) => Harm {
+                interval,
+                ..collisions.of(tally.sections_passed_count, "critical sections passed")
+            },
             None => collisions,
         },
         Harm::new("collisions, exact", count(|tally| tally.overlaps_count)),
@@ -92,19 +96,34 @@ const COLLISIONS: Label = label(
 
 const STANDING: Label = label("standing_s", "time a whole fleet stood", "s");
 
-fn collisions(tally: &Tally) -> Vec<Metric> {
+/// The interval of collisions per critical section on the effective sample of the sections in the order in which they were
+/// passed: an outage makes several collide. `None` where collisions are not places in that series: more than there are
+/// sections, or more than the referee keeps.
+fn collided_share(tally: &Tally, collided_after: &[u64]) -> Option<Spread> {
+    let (passed, count) = (tally.sections_passed_count, collided_after.len() as u64);
+    if count != tally.section_collisions_count || count > passed {
+        return None;
+    }
+    // Several may collide before the next is passed, and some at the end.
+    let mut places = Vec::with_capacity(collided_after.len());
+    for (index, after) in (0..).zip(collided_after) {
+        let next = places.last().map_or(0, |(place, _)| place + 1);
+        places.push(((*after).max(next).min(passed - (count - index)), 1));
+    }
+    Some(Batches::of_runs(passed, places).share_interval())
+}
+
+fn collisions(tally: &Tally, interval: Option<Spread>) -> Vec<Metric> {
     let passed = tally.sections_passed_count;
     let collided = tally.section_collisions_count;
     let named = label("collision_ratio", "collisions per critical section", "1");
     let mut ratio = if passed == 0 {
         named.unavailable("no robot has passed a critical section")
     } else {
-        let method = "section checker over sections passed; interval of Clopper and Pearson";
+        let method = "section checker over sections passed";
         named.known(collided as f64 / passed as f64, method)
     };
-    ratio.interval = collision_interval(collided, passed)
-        .filter(|_| ratio.value.is_some())
-        .map(Spread::Known);
+    ratio.interval = interval.filter(|_| ratio.value.is_some());
     vec![
         COLLISIONS.count(
             collided,
@@ -420,6 +439,39 @@ mod tests {
             told.len() == 1 && told[0].contains("reached a robot"),
             "{told:?}"
         );
+    }
+
+    #[test]
+    fn collisions_that_come_together_widen_their_interval() {
+        let tally = |count| Tally {
+            sections_passed_count: 2000,
+            section_collisions_count: count,
+            ..Tally::default()
+        };
+        let interval = |places: &[u64]| {
+            let tally = tally(places.len() as u64);
+            collided_share(&tally, places).unwrap()
+        };
+        let apart: Vec<u64> = (0..40).map(|at| 13 + 47 * at + at % 7).collect();
+        let wide = |spread: Spread| spread.known().map(|one| one.high - one.low);
+        let apart = wide(interval(&apart)).unwrap();
+        // Four at a time, as within an outage; several before one section is passed, and at the end.
+        let together: Vec<u64> = (0..40).map(|at| 200 * (at / 4 + 1)).collect();
+        let together = wide(interval(&together));
+        assert!(
+            together.is_none_or(|wide| wide > 1.5 * apart),
+            "{apart}, {together:?}"
+        );
+        // None, or all in one go, tell nothing of how they come.
+        assert_eq!(interval(&[]).known(), None);
+        assert_eq!(interval(&[700; 40]).known(), None);
+        // More than sections, or more than were kept, are no series.
+        assert_eq!(collided_share(&tally(3), &[1, 2]), None);
+        let few = Tally {
+            sections_passed_count: 1,
+            ..tally(2)
+        };
+        assert_eq!(collided_share(&few, &[0, 0]), None);
     }
 
     #[test]

@@ -6,7 +6,7 @@ use core::cmp::Ordering;
 use serde::{Deserialize, Serialize};
 
 use super::special::{normal_quantile, student_quantile};
-use super::statistics::{CONFIDENCE, wilson};
+use super::statistics::{CONFIDENCE, clopper_pearson_at};
 use hil_core::interval::{Interval, IntervalMethod};
 use hil_core::study::Verdict;
 
@@ -20,7 +20,7 @@ pub struct Estimate {
 }
 
 /// The interval of `new - base` for independent estimates, from the interval of each (MOVER, Zou and
-/// Donner 2008; with Wilson intervals it is method 10 of Newcombe 1998). `None` when either has none.
+/// Donner 2008; with score intervals it is method 10 of Newcombe 1998). `None` when either has none.
 pub fn difference(base: Estimate, new: Estimate) -> Option<Interval> {
     let (b, n) = (base.interval?, new.interval?);
     let d = new.value - base.value;
@@ -67,12 +67,12 @@ pub struct Share {
 }
 
 impl Share {
-    /// The share with its Wilson interval; `None` of none.
+    /// The share with its exact interval, both counts divided by `scatter`; `None` of none. See [`clopper_pearson_at`].
     ///
     /// # Panics
-    /// When more count than there are, or `confidence` is not inside 0..1.
-    pub fn estimate(self, confidence: f64) -> Option<Estimate> {
-        let interval = wilson(self.count, self.of, confidence)?;
+    /// When more count than there are, or `scatter` is not above zero.
+    pub fn estimate(self, scatter: f64) -> Option<Estimate> {
+        let interval = clopper_pearson_at(self.count, self.of, scatter, CONFIDENCE)?;
         Some(Estimate {
             value: self.count as f64 / self.of as f64,
             interval: Some(interval),
@@ -80,9 +80,55 @@ impl Share {
     }
 }
 
-/// How `ours` stands to the `published` share; `None` when either is of none.
-pub fn against_published(published: Share, ours: Share) -> Option<Verdict> {
-    let interval = difference(published.estimate(CONFIDENCE)?, ours.estimate(CONFIDENCE)?)?;
+/// How much more the shares of parts of a sample vary than those of independent trials: Pearson's chi-squared and its degrees
+/// of freedom (Rao and Scott 1992). Each part should be long against the time for which events come together.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Scatter {
+    chi_squared: f64,
+    freedom: f64,
+}
+
+impl Scatter {
+    /// That of `parts`; of one part, or where none or all count, it tells nothing.
+    pub fn of(parts: &[Share]) -> Self {
+        let sum = |of: fn(&Share) -> u64| parts.iter().map(of).sum::<u64>() as f64;
+        let share = sum(|part| part.count) / sum(|part| part.of);
+        if !(share > 0.0 && share < 1.0) {
+            return Self::default();
+        }
+        let parts = parts.iter().filter(|part| part.of > 0);
+        let off = parts.clone().map(|part| {
+            let of = part.of as f64;
+            (part.count as f64 - share * of).powi(2) / (share * (1.0 - share) * of)
+        });
+        Self {
+            chi_squared: off.sum(),
+            freedom: parts.count().saturating_sub(1) as f64,
+        }
+    }
+
+    /// That of this sample and `other`, each about its own share.
+    #[must_use]
+    pub fn and(self, other: Self) -> Self {
+        Self {
+            chi_squared: self.chi_squared + other.chi_squared,
+            freedom: self.freedom + other.freedom,
+        }
+    }
+
+    /// The variance over that of independent trials; `None` where nothing tells it.
+    pub fn ratio(self) -> Option<f64> {
+        (self.freedom > 0.0).then(|| self.chi_squared / self.freedom)
+    }
+}
+
+/// How `ours` stands to the `published` share, which is taken to scatter as ours does, by `scatter`; `None` when either
+/// is of none.
+///
+/// # Panics
+/// As [`Share::estimate`].
+pub fn against_published(published: Share, ours: Share, scatter: f64) -> Option<Verdict> {
+    let interval = difference(published.estimate(scatter)?, ours.estimate(scatter)?)?;
     Some(if interval.low > 0.0 || interval.high < 0.0 {
         Verdict::Differs
     } else if 2 * ours.of >= published.of {
@@ -172,7 +218,7 @@ mod tests {
 
     #[test]
     fn none_of_a_sample_is_as_large_as_its_like_is_worth() {
-        let like = |of| Share { count: of / 10, of }.estimate(CONFIDENCE).unwrap();
+        let like = |of| Share { count: of / 10, of }.estimate(1.0).unwrap();
         let independent = none_of(1000, like(1000), 1000).unwrap();
         assert!(independent.low.abs() < 1e-12);
         // Clopper and Pearson's upper end of none of 1000 is 0.00368.
@@ -197,13 +243,41 @@ mod tests {
                 count: 5,
                 of: 10_018,
             };
-            against_published(published, Share { count, of })
+            against_published(published, Share { count, of }, 1.0)
         };
         assert_eq!(against(40, 100_156), Some(Verdict::Agrees));
         assert_eq!(against(2, 5009), Some(Verdict::Agrees));
         assert_eq!(against(0, 420), Some(Verdict::Inconclusive));
         assert_eq!(against(12, 420), Some(Verdict::Differs));
         assert_eq!(against(0, 0), None);
+        // What comes in clusters of four is worth a quarter.
+        let share = |count, of| Share { count, of };
+        let clustered = |scatter| against_published(share(5, 10_018), share(120, 100_156), scatter);
+        assert_eq!(clustered(1.0), Some(Verdict::Differs));
+        assert_eq!(clustered(4.0), Some(Verdict::Agrees));
+    }
+
+    #[test]
+    fn parts_of_independent_trials_scatter_as_they_should() {
+        let shares = |counts: &[u64]| -> Vec<Share> {
+            counts
+                .iter()
+                .map(|count| Share {
+                    count: *count,
+                    of: 100,
+                })
+                .collect()
+        };
+        // By hand: 10 % of 100 each, off by 3, 3, 0, 0; the variance of each is 9.
+        let mixed = Scatter::of(&shares(&[7, 13, 10, 10]));
+        close(mixed.ratio().unwrap(), 2.0 / 3.0, 1e-12);
+        let together = Scatter::of(&shares(&[0, 20, 0, 20]));
+        close(together.ratio().unwrap(), 400.0 / 9.0 / 3.0, 1e-12);
+        let both = mixed.and(together).ratio().unwrap();
+        close(both, (2.0 + 400.0 / 9.0) / 6.0, 1e-12);
+        for none in [&[][..], &[5], &[0, 0], &[100, 100]] {
+            assert_eq!(Scatter::of(&shares(none)).ratio(), None, "{none:?}");
+        }
     }
 
     fn close(found: f64, expected: f64, tolerance: f64) {
@@ -221,12 +295,24 @@ mod tests {
             ((9, 10), (3, 10), 0.1705, 0.8090),
             ((10, 10), (0, 20), 0.6791, 1.0000),
         ] {
-            let share = |count, of| Share { count, of }.estimate(0.95).unwrap();
-            let found = difference(share(k2, n2), share(k1, n1)).unwrap();
+            let found = difference(score(k2, n2), score(k1, n1)).unwrap();
             close(found.low, low, 6e-5);
             close(found.high, high, 6e-5);
         }
-        assert_eq!(Share { count: 0, of: 0 }.estimate(0.95), None);
+        assert_eq!(Share { count: 0, of: 0 }.estimate(1.0), None);
+    }
+
+    /// A share with its score interval (Wilson 1927).
+    fn score(count: u64, of: u64) -> Estimate {
+        let (n, z) = (of as f64, normal_quantile(0.975));
+        let value = count as f64 / n;
+        let (centre, scale) = (value + z * z / (2.0 * n), 1.0 + z * z / n);
+        let spread = z * (value * (1.0 - value) / n + z * z / (4.0 * n * n)).sqrt();
+        let [low, high] = [centre - spread, centre + spread].map(|end| end / scale);
+        Estimate {
+            value,
+            interval: Some(Interval::new(low, high, IntervalMethod::Exact)),
+        }
     }
 
     #[test]

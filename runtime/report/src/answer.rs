@@ -10,7 +10,7 @@ use hil_core::case_study::{Occasions, Severity};
 use hil_core::interval::{Interval, Spread, TooSmall};
 use hil_platform::text::grouped;
 use hil_platform::words::{counted, named};
-use hil_stats::statistics::{CONFIDENCE, poisson};
+use hil_stats::statistics::CONFIDENCE;
 use serde::{Deserialize, Serialize};
 
 use super::assessment::{
@@ -335,8 +335,8 @@ impl Answer {
     pub fn words(&self) -> String {
         match (&self.hurt, &self.sample.occasions) {
             (Hurt::No, Some(OccasionCount { what, count })) => {
-                // Of how long one lasts nothing is known, so it is counted as one event.
-                let most = poisson(0, CONFIDENCE).high;
+                // Of how long one lasts nothing is known, so it is counted as one event, of Poisson's law (Garwood 1936).
+                let most = -(0.5 - 0.5 * CONFIDENCE).ln();
                 format!(
                     "{} in {} {what}, which leaves open up to {most:.1} independent events in as long a run",
                     self.hurt,

@@ -8,11 +8,11 @@ use crate::messages::MessageOrder;
 use crate::referee::Tally;
 use crate::robot::TrackerKind;
 use crate::scenario::Scenario;
-use hil_core::interval::Interval;
 use hil_core::time::Instant;
 use hil_link::impaired::{DelayLaw, Impairments, LinkCounts};
 use hil_link::wifi::WifiPreset;
-use hil_stats::statistics::clopper_pearson;
+use hil_stats::comparison::{Scatter, Share};
+use hil_stats::statistics::clopper_pearson_at;
 
 /// Scenarios of the paper's tables.
 pub(crate) const SCENARIOS: [Scenario; 2] = [Scenario::Harbor, Scenario::Warehouse];
@@ -455,15 +455,15 @@ pub struct FleetTally {
     pub collided: Vec<CollidedRun>,
     /// Its runs one by one, for what they differ by among themselves.
     pub runs: Vec<RunFigures>,
+    /// Variance of its collisions over that of independent sections; below 1 counts as 1.
+    pub scatter: f64,
 }
 
 /// One run of a cell.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct RunFigures {
-    /// See [`FleetTally::section_count`].
-    pub sections: u64,
-    /// See [`FleetTally::collision_count`].
-    pub collisions: u64,
+    /// Collisions of critical sections, in parts of the run one after the other.
+    pub parts: Vec<Share>,
     /// See [`FleetTally::missions_per_hour`].
     pub missions_per_hour: Option<f64>,
 }
@@ -497,7 +497,7 @@ impl FleetTally {
         self.stand_count += other.stand_count;
         let room = COLLIDED_MAX.saturating_sub(self.collided.len());
         self.collided.extend(other.collided.iter().take(room));
-        self.runs.extend(&other.runs);
+        self.runs.extend_from_slice(&other.runs);
     }
 
     /// Critical sections that a robot passed.
@@ -522,10 +522,27 @@ impl FleetTally {
         (sections > 0).then(|| self.collision_count() as f64 / sections as f64)
     }
 
-    /// The 95 % interval of [`FleetTally::collision_ratio`]; `None` without sections.
-    pub fn collision_interval(&self) -> Option<(f64, f64)> {
-        collision_interval(self.collision_count(), self.section_count())
-            .map(|interval| (interval.low, interval.high))
+    /// How much more its collisions vary from part to part than those of independent sections.
+    pub(crate) fn own_scatter(&self) -> Scatter {
+        let parts: Vec<Share> = self
+            .runs
+            .iter()
+            .flat_map(|run| &run.parts)
+            .copied()
+            .collect();
+        Scatter::of(&parts)
+    }
+
+    /// The interval of collisions per 1000 critical sections; `None` without sections, and where there are more
+    /// collisions than sections.
+    pub fn per_1000_interval(&self, confidence: f64) -> Option<(f64, f64)> {
+        let scatter = self.scatter.max(1.0);
+        per_1000_interval(
+            self.collision_count(),
+            self.section_count(),
+            scatter,
+            confidence,
+        )
     }
 
     /// Missions driven to their end per hour of the fleet; `None` before it ran.
@@ -534,13 +551,19 @@ impl FleetTally {
     }
 }
 
-/// The exact interval (Clopper and Pearson 1934) of collisions per critical section, 95 %.
-pub(crate) fn collision_interval(collisions: u64, sections: u64) -> Option<Interval> {
+/// The exact interval of collisions per 1000 critical sections, both counts divided by `scatter` (Korn and Graubard 1998).
+pub(crate) fn per_1000_interval(
+    collisions: u64,
+    sections: u64,
+    scatter: f64,
+    confidence: f64,
+) -> Option<(f64, f64)> {
     // One section can see two collisions; more collisions than sections are no proportion.
     if collisions > sections {
         return None;
     }
-    clopper_pearson(collisions, sections, 0.95)
+    let interval = clopper_pearson_at(collisions, sections, scatter, confidence)?;
+    Some((1e3 * interval.low, 1e3 * interval.high))
 }
 
 /// One row.

@@ -15,5 +15,4 @@ pub use driver::{
 };
 pub use study::{TableParameters, TablePart};
 
-pub(crate) use cells::collision_interval;
 pub(crate) use study::FleetStudy;

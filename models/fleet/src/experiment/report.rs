@@ -4,14 +4,14 @@
 use crate::coordinator::parameters::CoordinatorMode;
 use crate::experiment::cells::{
     CellSpec, CollidedRun, Condition, Demand, FleetTally, Mechanism, Place, PublishedRow,
-    RunFigures, SCENARIOS, collision_interval, mode_name, published_rows, scenario_name,
+    RunFigures, SCENARIOS, mode_name, per_1000_interval, published_rows, scenario_name,
 };
 use crate::experiment::study::{FleetStudy, worlds_text};
 use crate::scenario::Scenario;
 use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_link::impaired::DelayLaw;
-use hil_stats::comparison::{Share, against_published, welch};
-use hil_stats::statistics::{CONFIDENCE, clopper_pearson_at};
+use hil_stats::comparison::{Scatter, Share, against_published, welch};
+use hil_stats::statistics::CONFIDENCE;
 
 /// A cell with what came of it; `None` when it was not run.
 #[derive(Debug)]
@@ -85,22 +85,23 @@ fn notes(study: &FleetStudy, results: &[CellResult<'_>]) -> Vec<String> {
         ),
         format!("delay of the static rows: {law}"),
         worlds_text(study),
-        "intervals: Clopper and Pearson, 95 %; without a collision the upper end is the exact \
-         bound behind the rule of three"
+        "intervals: Clopper and Pearson, 95 %, of counts divided by how much more collisions vary from part to part \
+         of a run than those of independent sections (Korn and Graubard 1998); without a collision that of the other \
+         cells; the paper's, of which no parts are known, as of independent sections"
             .to_owned(),
         "collisions: by the original's checker / true overlaps / of these outside every section; \
          the probability is of the first"
             .to_owned(),
         format!(
             "error rate: if all {} criteria on rates hold, at most {:.0} of 100 tables of other seeds miss one \
-             (Bonferroni); a criterion that does not hold is met in at most 1 of 40; counts are divided by the \
-             scatter among runs over that of independent sections, {} (Rao and Scott 1992); what the safe mode's \
+             (Bonferroni); a criterion that does not hold is met in at most 1 of 40; collisions vary {} as much as \
+             those of independent sections, all cells together (Rao and Scott 1992); what the safe mode's \
              proof rules out has no error rate: once is a miss",
             test_count(results),
             100.0 * ERROR_RATE,
             scatter(results).map_or_else(
-                || "unavailable with single runs".to_owned(),
-                |ratio| format!("{ratio:.2}")
+                || "an unknown number of times".to_owned(),
+                |ratio| format!("{ratio:.2} times")
             ),
         ),
     ]
@@ -114,27 +115,13 @@ const ERROR_RATE: f64 = 0.05;
 pub(crate) struct Judge {
     /// What a miss must leave no doubt of.
     miss: f64,
-    /// By which counts are divided.
-    scatter: f64,
 }
 
 impl Judge {
     fn of(results: &[CellResult<'_>]) -> Self {
         Self {
             miss: 1.0 - ERROR_RATE / test_count(results).max(1) as f64,
-            scatter: scatter(results).unwrap_or(1.0).max(1.0),
         }
-    }
-
-    /// The interval of collisions per 1000 critical sections; `None` without sections, and where there are more
-    /// collisions than sections.
-    fn per_1000(&self, tally: &FleetTally, confidence: f64) -> Option<(f64, f64)> {
-        let (collisions, sections) = (tally.collision_count(), tally.section_count());
-        if collisions > sections {
-            return None;
-        }
-        let interval = clopper_pearson_at(collisions, sections, self.scatter, confidence)?;
-        Some((1e3 * interval.low, 1e3 * interval.high))
     }
 
     /// True when the interval of `figure` lies as `holds` says, at the usual confidence; false when it lies as
@@ -163,22 +150,20 @@ fn test_count(results: &[CellResult<'_>]) -> usize {
     of_rows.count() + of_mechanisms
 }
 
-/// Variance of the collisions among a cell's runs over that of independent sections, pooled over the cells
-/// (Pearson's chi-squared per degree of freedom): above 1 where collisions come together. `None` where no cell with
-/// collisions has two runs.
+/// How much more collisions vary than those of independent sections, each cell about its own share; `None` where no cell with
+/// collisions has two parts.
 fn scatter(results: &[CellResult<'_>]) -> Option<f64> {
-    let (mut sum, mut freedom) = (0.0, 0.0);
-    for tally in results.iter().filter_map(|one| one.tally.as_ref()) {
-        let Some(ratio) = tally.collision_ratio().filter(|ratio| *ratio > 0.0) else {
-            continue;
-        };
-        for run in tally.runs.iter().filter(|run| run.sections > 0) {
-            let expected = ratio * run.sections as f64;
-            sum += (run.collisions as f64 - expected).powi(2) / expected;
-        }
-        freedom += tally.runs.len().saturating_sub(1) as f64;
+    let tallies = results.iter().filter_map(|one| one.tally.as_ref());
+    let all = tallies.map(FleetTally::own_scatter);
+    all.fold(Scatter::default(), Scatter::and).ratio()
+}
+
+/// Gives each cell the scatter that its intervals are of: its own, and at least that of all cells.
+pub(crate) fn take_scatter(results: &mut [CellResult<'_>]) {
+    let of_all = scatter(results).unwrap_or(1.0);
+    for tally in results.iter_mut().filter_map(|one| one.tally.as_mut()) {
+        tally.scatter = tally.own_scatter().ratio().unwrap_or(of_all).max(of_all);
     }
-    (freedom > 0.0).then(|| sum / freedom)
 }
 
 /// What Tables II and III show of ours.
@@ -208,10 +193,7 @@ const PUBLISHED: [Field<PublishedRow>; 4] = [
         "published_per_1000",
         "Paper: 95 %",
         2,
-        |row: &PublishedRow| {
-            collision_interval(row.collisions, row.sections)
-                .map(|interval| (1e3 * interval.low, 1e3 * interval.high))
-        },
+        |row: &PublishedRow| per_1000_interval(row.collisions, row.sections, 1.0, CONFIDENCE),
     )
     .ranked(2),
 ];
@@ -332,7 +314,8 @@ fn verdict_against<'a>(one: &'a CellResult<'a>) -> Option<(&'a CellResult<'a>, V
             };
             let count = tally.referee.section_collisions_count;
             let published = share(row.collisions, row.sections);
-            against_published(published, share(count, tally.section_count()))?
+            let ours = share(count, tally.section_count());
+            against_published(published, ours, tally.scatter.max(1.0))?
         }
         Place::Published { .. } | Place::Variant(_) => Verdict::NotComparable,
     };
@@ -393,9 +376,7 @@ fn per_1000(tally: &FleetTally) -> Option<f64> {
 }
 
 fn interval_per_1000(tally: &FleetTally) -> Option<(f64, f64)> {
-    tally
-        .collision_interval()
-        .map(|(low, high)| (1e3 * low, 1e3 * high))
+    tally.per_1000_interval(CONFIDENCE)
 }
 
 /// What a cell is held against, and whether it holds.
@@ -616,7 +597,7 @@ pub(crate) fn demand_text(demand: Demand) -> String {
 
 /// Whether a demand is met; `None` when there are too few critical sections to say.
 pub(crate) fn verdict_of(demand: Demand, tally: &FleetTally, judge: Judge) -> Option<bool> {
-    let interval = |confidence| judge.per_1000(tally, confidence);
+    let interval = |confidence| tally.per_1000_interval(confidence);
     // Without an interval there are no sections, or more collisions than sections.
     if demand != Demand::None && interval(CONFIDENCE).is_none() {
         return (tally.any_collision_count() > 0).then_some(false);
@@ -660,7 +641,7 @@ pub(crate) fn criteria(results: &[CellResult<'_>]) -> Vec<Criterion> {
             let CellSpec { id, demand, .. } = one.cell;
             let known = one.tally.as_ref().map(|tally| {
                 let is_met = verdict_of(*demand, tally, judge);
-                (is_met, collisions_text(tally, judge))
+                (is_met, collisions_text(tally))
             });
             criterion(format!("{id}: {}", demand_text(*demand)), known, NOT_RUN)
         })
@@ -673,9 +654,9 @@ pub(crate) fn criteria(results: &[CellResult<'_>]) -> Vec<Criterion> {
     criteria
 }
 
-fn collisions_text(tally: &FleetTally, judge: Judge) -> String {
+fn collisions_text(tally: &FleetTally) -> String {
     let seen = &tally.referee;
-    let interval = judge.per_1000(tally, CONFIDENCE);
+    let interval = tally.per_1000_interval(CONFIDENCE);
     let per_1000 = interval.map_or_else(String::new, |(low, high)| {
         format!(", {low:.2} to {high:.2} per 1000")
     });
@@ -804,8 +785,8 @@ fn loss_exceeds_delay(scenario: Scenario, results: &[CellResult<'_>], judge: Jud
     let known = both.and_then(|(loss, delay)| {
         let interval = |confidence| {
             Some((
-                judge.per_1000(loss, confidence)?,
-                judge.per_1000(delay, confidence)?,
+                loss.per_1000_interval(confidence)?,
+                delay.per_1000_interval(confidence)?,
             ))
         };
         let is_met = judge.verdict(
@@ -832,10 +813,7 @@ mod judgement_tests {
     use crate::experiment::Setup;
     use crate::experiment::cells::mechanism_cells;
 
-    const JUDGE: Judge = Judge {
-        miss: 0.999,
-        scatter: 1.0,
-    };
+    const JUDGE: Judge = Judge { miss: 0.999 };
 
     fn tally(collisions: u64, sections: u64) -> FleetTally {
         let mut tally = FleetTally::default();
@@ -869,15 +847,15 @@ mod judgement_tests {
 
     #[test]
     fn collisions_that_come_together_count_as_fewer() {
-        let judge = Judge {
-            scatter: 4.0,
-            ..JUDGE
+        let tally_of = |collisions, scatter| FleetTally {
+            scatter,
+            ..tally(collisions, 100_000)
         };
-        let verdict = |judge| verdict_of(Demand::Below(0.2), &tally(45, 100_000), judge);
-        assert_eq!((verdict(JUDGE), verdict(judge)), (Some(false), None));
+        let verdict = |scatter| verdict_of(Demand::Below(0.2), &tally_of(45, scatter), JUDGE);
+        assert_eq!((verdict(1.0), verdict(4.0)), (Some(false), None));
         // One stays more than none.
-        let (low, high) = judge.per_1000(&tally(1, 100_000), CONFIDENCE).unwrap();
-        let none = judge.per_1000(&tally(0, 100_000), CONFIDENCE).unwrap();
+        let interval = |collisions| tally_of(collisions, 4.0).per_1000_interval(CONFIDENCE);
+        let ((low, high), none) = (interval(1).unwrap(), interval(0).unwrap());
         assert!(none.0 == 0.0 && low > 0.0 && high > none.1);
     }
 
@@ -917,8 +895,7 @@ mod judgement_tests {
             sum.runs = rates
                 .iter()
                 .map(|rate| RunFigures {
-                    sections,
-                    collisions: 0,
+                    parts: Vec::new(),
                     missions_per_hour: *rate,
                 })
                 .collect();

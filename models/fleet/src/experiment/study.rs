@@ -16,6 +16,7 @@ use hil_core::random::RandomStream;
 use hil_core::study::{Study, StudyReport, Watch};
 use hil_core::time::Instant;
 use hil_link::impaired::DelayLaw;
+use hil_stats::comparison::Share;
 
 hil_core::words! {
     /// Which tables.
@@ -73,6 +74,8 @@ struct Task {
     sections: u64,
 }
 
+/// Critical sections of a part of a run: half an hour of a fleet, long against whatever makes collisions come together.
+const PART_SECTIONS: u64 = 500;
 /// Between two looks at how far a run has come.
 const LOOK_NS: i64 = 60_000_000_000;
 /// A fleet that passes no section for so long has come to a stand.
@@ -190,6 +193,8 @@ impl Study for FleetStudy {
         let mut experiment = Experiment::new(scene, &cell.setup, seed)
             .expect("the setup was checked when the study was made");
         let (mut newest_count, mut newest_at) = (0, Instant::ZERO);
+        let mut parts: Vec<Share> = Vec::new();
+        let mut part_start = Share { count: 0, of: 0 };
         loop {
             let until = Instant::from_ns(experiment.now().as_ns() + LOOK_NS);
             experiment.run_until(until, &mut ());
@@ -198,14 +203,25 @@ impl Study for FleetStudy {
                 (newest_count, newest_at) = (count, until);
             }
             let is_standing = until.ns_since(newest_at) > STAND_NS;
-            if count >= task.sections || is_standing {
+            let has_ended = count >= task.sections || is_standing;
+            if has_ended || count - part_start.of >= PART_SECTIONS {
+                let collided = experiment.referee().tally().section_collisions_count;
+                parts.push(Share {
+                    count: collided - part_start.count,
+                    of: count - part_start.of,
+                });
+                part_start = Share {
+                    count: collided,
+                    of: count,
+                };
+            }
+            if has_ended {
                 let robot = &cell.setup.robot;
                 let first = experiment.incidents().first();
                 let tally = experiment.tally();
                 return Some(FleetTally {
                     runs: vec![RunFigures {
-                        sections: tally.section_count(),
-                        collisions: tally.collision_count(),
+                        parts,
                         missions_per_hour: tally.missions_per_hour(),
                     }],
                     stop_error_bound_m: robot.stop_error_bound_m(&scene.world.vehicle),
@@ -236,9 +252,10 @@ impl Study for FleetStudy {
             Some(sum)
         });
         let cells = self.cells.iter().zip(tallies);
-        let results: Vec<_> = cells
+        let mut results: Vec<_> = cells
             .map(|(cell, tally)| CellResult { cell, tally })
             .collect();
+        report::take_scatter(&mut results);
         report::report(self, &results)
     }
 }

@@ -49,6 +49,7 @@ pub struct Referee {
     overlapping: Vec<[u32; 2]>,
     tally: Tally,
     incidents: Vec<Incident>,
+    collided_after: Vec<u64>,
 }
 
 impl Referee {
@@ -74,6 +75,7 @@ impl Referee {
             overlapping: Vec::with_capacity(4 * count),
             tally: Tally::default(),
             incidents: Vec::with_capacity(INCIDENTS_MAX.min(64)),
+            collided_after: Vec::new(),
             world,
         }
     }
@@ -186,6 +188,11 @@ impl Referee {
         &self.incidents
     }
 
+    /// How many critical sections were passed before each of the first [`INCIDENTS_MAX`] collisions by the section checker.
+    pub(crate) fn collided_after(&self) -> &[u64] {
+        &self.collided_after
+    }
+
     fn check(&self, truth: &Truth) -> Option<(usize, TruthKind)> {
         let is_finite = truth.travelled_m.is_finite()
             && truth.speed_mps.is_finite()
@@ -253,6 +260,10 @@ impl Referee {
                 at_index[0].overlaps(&at_index[1])
             });
             self.tally.section_collisions_count += u64::from(begun_count);
+            let passed = self.tally.sections_passed_count;
+            let room = INCIDENTS_MAX.saturating_sub(self.collided_after.len());
+            let begun = core::iter::repeat_n(passed, begun_count as usize);
+            self.collided_after.extend(begun.take(room));
             if begun_count > 0 {
                 self.add_incident(now, pair, IncidentKind::Section);
             }

@@ -10,7 +10,8 @@ use hil_arm::egm::parameters::ControllerSettings;
 use hil_core::case_study::ParameterError;
 use hil_core::study::{Cell, Column, Criterion, Study, StudyReport, Table, Watch};
 use hil_link::outages::Outages;
-use hil_stats::statistics::{CONFIDENCE, poisson};
+use hil_stats::comparison::mean_interval;
+use hil_stats::statistics::CONFIDENCE;
 
 /// Mean lengths of outages on the curve.
 const MEANS_S: [f64; 4] = [0.3, 0.5, 1.0, 2.0];
@@ -87,10 +88,10 @@ pub(crate) struct Point {
 
 #[derive(Debug, Clone, PartialEq)]
 enum Found {
-    /// Outages per hour with their interval, and what came out at that rate.
+    /// Outages per hour with their interval, if the runs show one, and what came out at that rate.
     Rate {
         per_hour: f64,
-        interval: (f64, f64),
+        interval: Option<(f64, f64)>,
         ratio: f64,
     },
     /// Up to this rate fewer loops are lost.
@@ -126,11 +127,13 @@ impl Calibration {
 }
 
 /// One rate that was tried.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct Try {
     per_hour: f64,
     missing_count: u64,
     sent_count: u64,
+    /// The share lost of each run.
+    run_ratios: Vec<f64>,
 }
 
 impl Try {
@@ -162,6 +165,7 @@ impl Search<'_, '_> {
             per_hour,
             missing_count: 0,
             sent_count: 0,
+            run_ratios: Vec::new(),
         };
         let seeds = self.calibration.seeds as usize;
         for replica in 0..seeds {
@@ -173,8 +177,9 @@ impl Search<'_, '_> {
             let tally = drive(&self.calibration.trajectory, &self.setup, seed, &mut look)?;
             tried.missing_count += tally.missing_count();
             tried.sent_count += tally.sent_count;
+            tried.run_ratios.push(tally.loss_ratio());
         }
-        self.tries.push(tried);
+        self.tries.push(tried.clone());
         Some(tried)
     }
 
@@ -189,22 +194,22 @@ impl Search<'_, '_> {
             let tried = self.try_rate(next)?;
             if tried.ratio() < target {
                 if tried.per_hour >= highest {
-                    return Some(self.none_up_to(tried));
+                    return Some(self.none_up_to(&tried));
                 }
-                low = Some(tried);
+                low = Some(tried.clone());
             } else {
-                high = Some(tried);
+                high = Some(tried.clone());
             }
             if (tried.ratio() - target).abs() < NEAR_RATIO * target {
                 break;
             }
-            next = between(low, high, target, highest);
+            next = between(low.as_ref(), high.as_ref(), target, highest);
         }
         let nearest = |a: &&Try, b: &&Try| {
             let apart = |tried: &Try| (tried.ratio() - target).abs();
             apart(a).total_cmp(&apart(b))
         };
-        let best = *self.tries.iter().min_by(nearest)?;
+        let best = self.tries.iter().min_by(nearest)?;
         // A search that only climbed, and is still far below, has not found its rate.
         if high.is_none() && best.ratio() < 0.5 * target {
             return Some(self.none_up_to(best));
@@ -212,25 +217,25 @@ impl Search<'_, '_> {
         Some(self.rate(best))
     }
 
-    fn none_up_to(&self, tried: Try) -> Point {
+    fn none_up_to(&self, tried: &Try) -> Point {
         self.point(Found::NoneUpTo {
             per_hour: tried.per_hour,
             ratio: tried.ratio(),
         })
     }
 
-    /// The rate at which a power law through all tries meets the aim. Its interval is that of the
-    /// count of lost loops at the nearest try, carried over by the same law.
-    fn rate(&self, best: Try) -> Point {
+    /// The rate at which a power law through all tries meets the aim. Its interval is Student's of the runs' shares at
+    /// the nearest try, carried over by the same law: loops are lost together, runs are independent. `None` of one run, and
+    /// where it reaches to no loss at all, which no rate would make.
+    fn rate(&self, best: &Try) -> Point {
         let (exponent, at_one) = power_law(&self.tries);
         let per_hour = ((self.calibration.ratio.ln() - at_one) / exponent).exp();
-        let count = best.missing_count.max(1);
-        let lost = poisson(count, CONFIDENCE);
+        let lost = mean_interval(&best.run_ratios, CONFIDENCE).filter(|lost| lost.low > 0.0);
         // Fewer lost than the true mean: the true rate for the aim is lower, and the other way.
-        let end = |bound: f64| per_hour * (count as f64 / bound).powf(1.0 / exponent);
+        let end = |bound: f64| per_hour * (best.ratio() / bound).powf(1.0 / exponent);
         self.point(Found::Rate {
             per_hour,
-            interval: (end(lost.high), end(lost.low)),
+            interval: lost.map(|lost| (end(lost.high), end(lost.low))),
             ratio: best.ratio(),
         })
     }
@@ -271,10 +276,10 @@ fn power_law(tries: &[Try]) -> (f64, f64) {
 
 /// The next rate to try: on the line between both sides in logarithms, kept off its ends; without
 /// one side, four times as far.
-fn between(low: Option<Try>, high: Option<Try>, target: f64, highest: f64) -> f64 {
+fn between(low: Option<&Try>, high: Option<&Try>, target: f64, highest: f64) -> f64 {
     match (low, high) {
         (Some(low), Some(high)) => {
-            let log = |tried: Try| tried.ratio().max(1e-5).ln();
+            let log = |tried: &Try| tried.ratio().max(1e-5).ln();
             let span = log(high) - log(low);
             let share = if span > 0.0 {
                 (target.ln() - log(low)) / span
@@ -358,8 +363,8 @@ impl Calibration {
             "one loss rate fixes a curve, not a point: measure how long outages last on the real \
              link, then read off their rate"
                 .to_owned(),
-            "the rate is where a power law through all tries meets the aim; interval: of the \
-             Poisson count of lost loops at the nearest try, carried over by that law; outages \
+            "the rate is where a power law through all tries meets the aim; interval: Student's of the \
+             runs' shares at the nearest try, carried over by that law, whose own error is not in it; outages \
              are exponential in length and in the time between them"
                 .to_owned(),
         ]
@@ -401,7 +406,7 @@ impl Calibration {
                 ratio,
             }) => (
                 Some(*per_hour),
-                Some(*interval),
+                *interval,
                 Some(*ratio),
                 self.remark(*ratio),
             ),

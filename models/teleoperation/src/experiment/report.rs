@@ -136,7 +136,7 @@ impl Row<'_> {
                     count: 0,
                     of: u64::from(PUBLISHED_LOOPS),
                 };
-                against_published(published, Share { count, of })
+                against_published(published, Share { count, of }, 1.0)
             }
             _ => Some(Verdict::NotComparable),
         }

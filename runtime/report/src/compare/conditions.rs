@@ -8,6 +8,7 @@ use core::fmt;
 use hil_core::interval::Interval;
 use serde::Serialize;
 
+use super::metrics::{Counts, is_partial};
 use super::{ChartKind, ComparedMetric, Comparison, Part};
 
 /// Why a condition cannot be judged.
@@ -192,9 +193,7 @@ impl Condition {
         verdicts: &mut Verdicts,
     ) -> Result<(), ConditionError> {
         let figures = &comparison.figures;
-        let is_whole = |one: &&ComparedMetric| {
-            one.kind != ChartKind::Delay || one.part == Some(Part::EndToEnd)
-        };
+        let is_whole = |one: &&ComparedMetric| !matches!(one.part, Some(Part::Segment { .. }));
         let named: Vec<&ComparedMetric> = figures
             .iter()
             .filter(is_whole)
@@ -218,9 +217,10 @@ impl Condition {
                 allowed: words(figures.iter().filter_map(|one| one.channel.as_deref())),
             });
         }
+        let of = [comparison.base.len(), comparison.new.len()];
         let (mut judged, mut unjudged) = (Vec::new(), Vec::new());
         for one in meant {
-            match self.judge_one(one, is_strict) {
+            match self.judge_one(one, of, is_strict) {
                 Ok(one) => judged.push(one),
                 Err(ConditionError::Unjudged(one)) => unjudged.push(one),
                 Err(error) => return Err(error),
@@ -239,6 +239,7 @@ impl Condition {
     fn judge_one(
         &self,
         figure: &ComparedMetric,
+        of: Counts,
         is_strict: bool,
     ) -> Result<Judged, ConditionError> {
         let name = name_of(figure);
@@ -256,6 +257,12 @@ impl Condition {
         let holds = match interval {
             _ if is_strict => self.operator.holds(value, self.value),
             Some(interval) => self.operator.holds_of_all(interval, self.value),
+            // Whatever its interval, the figure is in it.
+            None if !self.operator.holds(value, self.value)
+                && !is_partial([figure.base_count, figure.new_count], of) =>
+            {
+                false
+            }
             None => {
                 let why = format!("{}; --strict judges the figure alone", figure.method);
                 return Err(unjudged(why));
@@ -290,8 +297,8 @@ impl Condition {
         let quotient = (figure.ratio, figure.ratio_interval);
         let more = (figure.difference, figure.difference_interval);
         Ok(match (figure.kind, self.unit.as_str()) {
-            (ChartKind::Delay | ChartKind::Score, "x") => quotient,
-            (ChartKind::Delay, "ns") | (ChartKind::Score, "") => new,
+            (ChartKind::Delay | ChartKind::Count | ChartKind::Score, "x") => quotient,
+            (ChartKind::Delay, "ns") | (ChartKind::Count | ChartKind::Score, "") => new,
             (ChartKind::Delay, "us" | "µs") => scaled(new, 1e-3),
             (ChartKind::Delay, "ms") => scaled(new, 1e-6),
             (ChartKind::Delay, "s") => scaled(new, 1e-9),
@@ -310,7 +317,9 @@ impl Condition {
                         ChartKind::Loss => {
                             "% (of the new runs), pp (new less base, percentage points)"
                         }
-                        ChartKind::Score => "x (new by base), or no unit (of the new runs)",
+                        ChartKind::Count | ChartKind::Score => {
+                            "x (new by base), or no unit (of the new runs)"
+                        }
                     },
                 });
             }

@@ -14,7 +14,7 @@ fn figure(metric: &str, kind: ChartKind, [low, value, high]: [f64; 3]) -> Compar
         channel: (kind != ChartKind::Score).then(|| "a/b".to_owned()),
         part: match kind {
             ChartKind::Delay => Some(Part::EndToEnd),
-            ChartKind::Loss | ChartKind::Score => None,
+            ChartKind::Loss | ChartKind::Count | ChartKind::Score => None,
         },
         metric: metric.to_owned(),
         label: metric.to_owned(),

@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 
+use hil_account::network::NetworkMetrics;
 use hil_account::{ChannelAccount, FateCounts, MessageFate};
 use hil_core::interval::{Interval, Spread};
 use hil_stats::comparison::{Estimate, Share, difference, mean_interval, none_of, ratio, welch};
@@ -22,10 +23,12 @@ const NO_INTERVAL: &str =
     "no interval: the sample of a run is too small, or of segments; repeat the runs";
 const NO_MAXIMUM: &str = "no interval: one run's maximum has none; repeat the runs";
 const EFFECTIVE: &str = "MOVER of each run's interval on its effective sample; of runs without losses by \
-                         what the other side's sample is worth, and Wilson's where no run lost any, for \
-                         independent ones";
+                         what the other side's sample is worth";
+const NO_LOSS: &str =
+    "no interval: no run lost any, so that nothing shows how losses come together";
 const OWN: &str = "MOVER of the scores' own intervals";
 const NO_OWN: &str = "no interval: the score has none of its own; repeat the runs";
+const NO_NETWORK: &str = "no interval: of a single run this figure has none; repeat the runs";
 const ABSENT: &str = "unavailable on one side";
 
 /// What a delay is of.
@@ -40,11 +43,11 @@ struct DelayKey {
 const METRICS: [&str; 4] = ["p50", "p99", "p99.9", "max"];
 
 /// So many runs of the base, and so many new ones.
-type Counts = [usize; 2];
+pub(super) type Counts = [usize; 2];
 
 /// Some runs of a side have a figure and others do not. What those would have shown is unknown, so that
 /// nothing may be told by the ones that are left.
-fn is_partial(have: Counts, of: Counts) -> bool {
+pub(super) fn is_partial(have: Counts, of: Counts) -> bool {
     have.iter().zip(of).any(|(have, of)| (1..of).contains(have))
 }
 
@@ -85,12 +88,13 @@ fn of_all(found: Option<Estimate>, have: usize, of: usize) -> Option<Estimate> {
 pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
     let mut figures = delays(base, new);
     figures.extend(losses(base, new));
+    figures.extend(network(base, new));
     // A channel's losses stand before its delays, in the order of the channels.
     let order = channel_order(base, new);
     let place = |one: &ComparedMetric| {
         let channel = one.channel.as_ref();
         let index = channel.and_then(|name| order.iter().position(|known| known == name));
-        (index, one.kind != ChartKind::Loss)
+        (index, one.kind == ChartKind::Delay)
     };
     figures.sort_by_key(place);
     figures.extend(scores(base, new));
@@ -171,13 +175,17 @@ fn delays(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
     keys.into_iter()
         .map(|key| {
             let [b, n] = [&b, &n].map(|all| all.get(key).map_or(&[][..], Vec::as_slice));
-            delay_figure(key, b, n, [base.len(), new.len()])
+            let figure = delay_figure(METRICS[key.metric], b, n, [base.len(), new.len()]);
+            ComparedMetric {
+                channel: Some(key.channel.clone()),
+                part: Some(key.part),
+                ..figure
+            }
         })
         .collect()
 }
 
-fn delay_figure(key: &DelayKey, base: &[Estimate], new: &[Estimate], of: Counts) -> ComparedMetric {
-    let metric = METRICS[key.metric];
+fn delay_figure(metric: &str, base: &[Estimate], new: &[Estimate], of: Counts) -> ComparedMetric {
     let have = [base.len(), new.len()];
     let sides = [geometric(base), geometric(new)];
     let figure = figure(ChartKind::Delay, metric, sides, have, of);
@@ -185,16 +193,14 @@ fn delay_figure(key: &DelayKey, base: &[Estimate], new: &[Estimate], of: Counts)
     let both = both.filter(|_| have.contains(&1));
     let repeated = welch(&logarithms(base), &logarithms(new), CONFIDENCE);
     let method = if have == [1, 1] { RANKS } else { MIXED };
-    let none = if metric == "max" {
-        NO_MAXIMUM
-    } else {
-        NO_INTERVAL
+    let none = match metric {
+        "max" => NO_MAXIMUM,
+        "pdv_p99" | "ipdv_p99" => NO_NETWORK,
+        _ => NO_INTERVAL,
     };
     let own = both.and_then(|(b, n)| ratio(b, n));
     let (interval, method) = figure.tested(of, repeated.and_then(exponential), own, [method, none]);
     ComparedMetric {
-        channel: Some(key.channel.clone()),
-        part: Some(key.part),
         unit: "ns".to_owned(),
         ratio_interval: interval,
         difference_interval: both.and_then(|(b, n)| difference(b, n)),
@@ -318,10 +324,7 @@ impl RunLoss {
         if share.of == 0 {
             return None;
         }
-        let networks = run.summary.network.iter().flat_map(|one| &one.channels);
-        let of_network = networks
-            .filter(|one| one.channel == channel)
-            .find_map(|one| one.figures.loss.measured());
+        let of_network = network_of(run, channel).and_then(|one| one.loss.measured());
         // Of the same messages: the harness may lose some too.
         let same = of_network.filter(|loss| loss.lost_count == share.count);
         Some(Self {
@@ -376,7 +379,7 @@ fn mean_share(side: &[RunLoss], other: &[RunLoss]) -> Option<Estimate> {
     let observed = observed_share(side)?;
     let (pooled, pooled_other) = (pooled(side), pooled(other));
     let interval = match (pooled.count, pooled_other.count) {
-        (0, 0) => pooled.estimate(CONFIDENCE)?.interval,
+        (0, 0) => None,
         (0, _) => {
             let like = observed_share(other);
             like.and_then(|like| none_of(pooled.of, like, pooled_other.of))
@@ -411,11 +414,14 @@ fn loss_figure(channel: &str, base: &[RunLoss], new: &[RunLoss], of: Counts) -> 
     let figure = figure(ChartKind::Loss, "loss", sides, have, of);
     let repeated = welch(&values_of(base), &values_of(new), CONFIDENCE);
     let is_lossless = base.iter().chain(new).all(|one| one.share.count == 0);
-    let is_own = have == [1, 1] || is_lossless;
-    let method = if is_own { EFFECTIVE } else { MIXED };
+    let method = if have == [1, 1] { EFFECTIVE } else { MIXED };
     let both = figure.base.zip(figure.new);
     let own = both.and_then(|(b, n)| difference(b, n));
     let (interval, method) = figure.tested(of, repeated, own, [method, NO_INTERVAL]);
+    let method = match method {
+        NO_SPREAD | NO_INTERVAL if is_lossless => NO_LOSS,
+        method => method,
+    };
     ComparedMetric {
         channel: Some(channel.to_owned()),
         difference_interval: interval,
@@ -423,6 +429,123 @@ fn loss_figure(channel: &str, base: &[RunLoss], new: &[RunLoss], of: Counts) -> 
         method: method.to_owned(),
         ..figure
     }
+}
+
+/// A figure of the network that a run has once a channel.
+struct NetworkFigure {
+    metric: &'static str,
+    kind: ChartKind,
+    unit: &'static str,
+    of: fn(&NetworkMetrics) -> Option<f64>,
+}
+
+/// Beside loss and delay: order by RFC 4737, copies by RFC 5560, losses in a row by RFC 3357, and both forms of delay variation
+/// by RFC 5481. The account defines them.
+const NETWORK: [NetworkFigure; 5] = [
+    NetworkFigure {
+        metric: "reordered",
+        kind: ChartKind::Loss,
+        unit: "1",
+        of: |figures| figures.order.measured().map(|order| order.ratio),
+    },
+    NetworkFigure {
+        metric: "duplicated",
+        kind: ChartKind::Loss,
+        unit: "1",
+        of: |figures| {
+            let share = figures.duplicated_count? as f64 / figures.arrived_count as f64;
+            share.is_finite().then_some(share)
+        },
+    },
+    NetworkFigure {
+        metric: "loss_run_max",
+        kind: ChartKind::Count,
+        unit: "messages",
+        of: |figures| {
+            let runs = figures.loss.measured()?.runs.iter();
+            Some(runs.map(|one| one.length_messages).max().unwrap_or(0) as f64)
+        },
+    },
+    NetworkFigure {
+        metric: "pdv_p99",
+        kind: ChartKind::Delay,
+        unit: "ns",
+        of: |figures| Some(figures.delay.measured()?.variation.p99_ns as f64),
+    },
+    NetworkFigure {
+        metric: "ipdv_p99",
+        kind: ChartKind::Delay,
+        unit: "ns",
+        of: |figures| Some(figures.successive.measured()?.p99_ns as f64),
+    },
+];
+
+/// The figures of [`NETWORK`] of each channel.
+fn network(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
+    let of = [base.len(), new.len()];
+    let mut figures = Vec::new();
+    for channel in channel_order(base, new) {
+        for NetworkFigure {
+            metric,
+            kind,
+            unit,
+            of: value,
+        } in &NETWORK
+        {
+            let side = |runs: &[ComparedRun]| -> Vec<Estimate> {
+                let channels = |run| network_of(run, &channel);
+                let found = runs.iter().filter_map(|run| value(channels(run)?));
+                found
+                    .map(|value| Estimate {
+                        value,
+                        interval: None,
+                    })
+                    .collect()
+            };
+            let (b, n) = (side(base), side(new));
+            if b.is_empty() && n.is_empty() {
+                continue;
+            }
+            let figure = if *kind == ChartKind::Delay {
+                delay_figure(metric, &b, &n, of)
+            } else {
+                counted_figure(*kind, metric, [&b, &n], of)
+            };
+            figures.push(ComparedMetric {
+                channel: Some(channel.clone()),
+                part: (*kind == ChartKind::Delay).then_some(Part::Network),
+                unit: (*unit).to_owned(),
+                ..figure
+            });
+        }
+    }
+    figures
+}
+
+/// A figure that is compared by its difference, which of single runs has no interval.
+fn counted_figure(
+    kind: ChartKind,
+    metric: &str,
+    [base, new]: [&[Estimate]; 2],
+    of: Counts,
+) -> ComparedMetric {
+    let sides = [mean_score(base), mean_score(new)];
+    let figure = figure(kind, metric, sides, [base.len(), new.len()], of);
+    let repeated = welch(&plain(base), &plain(new), CONFIDENCE);
+    let (interval, method) = figure.tested(of, repeated, None, [MIXED, NO_NETWORK]);
+    ComparedMetric {
+        difference_interval: interval,
+        verdict: verdict(interval, 0.0, [Verdict::Lower, Verdict::Higher]),
+        method: method.to_owned(),
+        ..figure
+    }
+}
+
+/// What the network did to a channel in a run.
+fn network_of<'a>(run: &'a ComparedRun, channel: &str) -> Option<&'a NetworkMetrics> {
+    let mut channels = run.summary.network.iter().flat_map(|one| &one.channels);
+    let found = channels.find(|one| one.channel == channel)?;
+    Some(&found.figures)
 }
 
 fn scores(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {

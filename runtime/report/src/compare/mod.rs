@@ -113,6 +113,8 @@ pub(crate) enum ChartKind {
     Delay,
     /// A share, compared by its difference.
     Loss,
+    /// A count of the network's, compared by its difference.
+    Count,
     /// A score, compared by its difference.
     Score,
 }
@@ -123,6 +125,8 @@ pub(crate) enum ChartKind {
 pub(crate) enum Part {
     /// The whole of it.
     EndToEnd,
+    /// From the kernel of one gateway to the other gateway.
+    Network,
     /// From one stage to another.
     Segment {
         /// Where it begins.
@@ -136,6 +140,7 @@ impl fmt::Display for Part {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::EndToEnd => formatter.write_str("end to end"),
+            Self::Network => formatter.write_str("network"),
             Self::Segment { from, to } => write!(formatter, "{from} → {to}"),
         }
     }
@@ -148,7 +153,7 @@ pub(crate) struct ComparedMetric {
     pub(crate) channel: Option<String>,
     /// Which part of the channel's way a delay is of; `None` for losses and scores.
     pub(crate) part: Option<Part>,
-    /// `p50`, `p99`, `p99.9`, `max`, `loss`, or the score's name.
+    /// `p50`, `p99`, `p99.9`, `max`, `loss`, another figure of the network's, or the score's name.
     pub(crate) metric: String,
     /// The same for a reader.
     pub(crate) label: String,

@@ -256,7 +256,7 @@ fn cells(one: &ComparedMetric) -> [String; 6] {
             one.difference_interval
                 .map(|Interval { low, high, .. }| format!("{} to {}", points(low), points(high))),
         ),
-        ChartKind::Score => (
+        ChartKind::Count | ChartKind::Score => (
             one.difference.map(signed),
             one.difference_interval
                 .map(|Interval { low, high, .. }| format!("{} to {}", signed(low), signed(high))),
@@ -294,8 +294,8 @@ fn value(one: &ComparedMetric, estimate: Option<Estimate>) -> String {
     match (one.kind, one.unit.as_str()) {
         (ChartKind::Delay, _) => duration(value as i64),
         (ChartKind::Loss, _) => percent(value),
-        (ChartKind::Score, "1") => figure(value),
-        (ChartKind::Score, unit) => format!("{} {unit}", figure(value)),
+        (ChartKind::Count | ChartKind::Score, "1") => figure(value),
+        (ChartKind::Count | ChartKind::Score, unit) => format!("{} {unit}", figure(value)),
     }
 }
 
@@ -304,9 +304,8 @@ fn methods(comparison: &Comparison) -> Section {
     let mut found: Vec<(&str, Vec<&str>)> = Vec::new();
     for one in &comparison.figures {
         let whom = match one.kind {
-            ChartKind::Delay if one.part == Some(Part::EndToEnd) => one.metric.as_str(),
-            ChartKind::Delay => "segments",
-            ChartKind::Loss => "loss",
+            ChartKind::Delay if matches!(one.part, Some(Part::Segment { .. })) => "segments",
+            ChartKind::Delay | ChartKind::Loss | ChartKind::Count => one.metric.as_str(),
             ChartKind::Score => "scores",
         };
         match found.iter_mut().find(|known| known.0 == one.method) {
@@ -380,13 +379,29 @@ fn channels(comparison: &Comparison) -> Section {
     if names.is_empty() {
         return section;
     }
-    let columns = ["channel", "lost", "p50, new / base", "p99, new / base"];
+    let is_shown = |metric: &str| {
+        let all = comparison.figures.iter();
+        let mut sides = all
+            .filter(|one| one.metric == metric)
+            .flat_map(|one| [one.base, one.new]);
+        sides.any(|side| side.is_some_and(|side| side.value > 0.0))
+    };
+    // Few networks reorder or copy anything.
+    let seldom: Vec<&str> = ["reordered", "duplicated"]
+        .into_iter()
+        .filter(|one| is_shown(one))
+        .collect();
+    let mut columns = vec!["channel", "lost"];
+    columns.extend(&seldom);
+    columns.extend(["p50, new / base", "p99, new / base"]);
     let mut table = Table::new("", &columns);
     for name in names.iter().take(CHANNELS_SHOWN) {
-        let lost = metric(name, None, "loss").map_or_else(String::new, |one| {
-            let [base, new] = [one.base, one.new].map(|side| value(one, side));
-            with_verdict(format!("{base} → {new}"), one.verdict)
-        });
+        let share = |share: &str| {
+            metric(name, None, share).map_or_else(String::new, |one| {
+                let [base, new] = [one.base, one.new].map(|side| value(one, side));
+                with_verdict(format!("{base} → {new}"), one.verdict)
+            })
+        };
         let ratio = |quantile: &str| {
             let one = metric(name, Some(Part::EndToEnd), quantile);
             let known = one.and_then(|one| Some((one.ratio?, one.verdict)));
@@ -394,8 +409,10 @@ fn channels(comparison: &Comparison) -> Section {
                 with_verdict(format!("{ratio:.2}"), verdict)
             })
         };
-        let cells = [(*name).to_owned(), lost, ratio("p50"), ratio("p99")];
-        table.push(cells.map(Into::into));
+        let mut cells = vec![(*name).to_owned(), share("loss")];
+        cells.extend(seldom.iter().map(|one| share(one)));
+        cells.extend(["p50", "p99"].map(ratio));
+        table.push(cells.into_iter().map(Into::into));
     }
     let hidden = names.len().saturating_sub(CHANNELS_SHOWN) as u64;
     if hidden > 0 {
