@@ -334,6 +334,7 @@ fn carry_out(
         hosts,
         domain_root: args.domain_root.clone(),
         topology_file: path.to_path_buf(),
+        revision: REVISION,
         command_line,
         layouts: layouts(topology, registry),
     };
@@ -482,6 +483,9 @@ fn check_file(path: &Path, topology: &Topology) -> Result<(), Refusal> {
         None => Ok(()),
     }
 }
+
+/// The revision that this program was built from, as `build.rs` found it.
+const REVISION: Option<&str> = option_env!("HIL_GIT_REVISION");
 
 /// The processes of a run whose supervisor was killed notice at once, and end.
 const PORTS_FREED_WITHIN: Duration = Duration::from_secs(1);

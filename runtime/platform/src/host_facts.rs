@@ -128,8 +128,18 @@ impl HostFacts {
             "runtime_version",
             Fact::Available(env!("CARGO_PKG_VERSION").to_owned()),
         );
-        list.add("runtime_git_revision", git_revision());
         list
+    }
+
+    /// With the revision of the running program's sources, which the program knows by its build; `None` outside a git checkout.
+    #[must_use]
+    pub fn built_from(mut self, revision: Option<&str>) -> Self {
+        let revision = match revision {
+            Some(revision) if !revision.is_empty() => Fact::Available(revision.to_owned()),
+            _ => Fact::Unavailable("built outside a git checkout".to_owned()),
+        };
+        self.add("runtime_git_revision", revision);
+        self
     }
 
     /// The fact called `label`.
@@ -199,13 +209,6 @@ pub fn limit(resource: Resource, unit: &str) -> Fact<String> {
             format!("{soft}{unit}")
         }
     })
-}
-
-fn git_revision() -> Fact<String> {
-    match option_env!("HIL_GIT_REVISION") {
-        Some(revision) if !revision.is_empty() => Fact::Available(revision.to_owned()),
-        _ => Fact::Unavailable("built outside a git checkout".to_owned()),
-    }
 }
 
 #[cfg(test)]

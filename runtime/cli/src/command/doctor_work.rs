@@ -28,6 +28,7 @@ pub(super) fn doctor(
         "the doctor describes a host whole or not at all; a card it was trying is put back",
     );
     let mut report = hil_doctor::examine(&request);
+    report.host = report.host.built_from(super::REVISION);
     let is_interrupted = if latency.is_thorough {
         // From here on a signal ends the measurement, not the program.
         drop(watch);

@@ -28,6 +28,8 @@ pub struct RunOptions {
     pub domain_root: Option<PathBuf>,
     /// The topology file, for the manifest.
     pub topology_file: PathBuf,
+    /// The revision of the program's sources, for the manifest; `None` outside a git checkout.
+    pub revision: Option<&'static str>,
     /// The command line, for the manifest.
     pub command_line: Vec<String>,
     /// The fields of the channels whose messages are known, by channel, for the manifest.

@@ -89,7 +89,7 @@ pub fn run(
     // What dead runs left is no reason to refuse this one.
     domains::sweep_below(&domain_base(base));
     needs::check(&plan, base)?;
-    let facts = HostFacts::gather();
+    let facts = HostFacts::gather().built_from(options.revision);
     let discipline = HostDiscipline::gather().ok();
     let folder = match prepare_folder(topology, &hosts, options, &facts) {
         Ok(folder) => folder,
