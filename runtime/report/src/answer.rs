@@ -113,11 +113,13 @@ impl HarmCount {
             text = format!("{text} of {} {}", grouped(occasions.count), occasions.what);
             if occasions.count >= OCCASIONS_MIN && count <= occasions.count {
                 let share = percent(count as f64 / occasions.count as f64);
-                let interval = self.interval.and_then(Spread::known);
-                let interval = interval
-                    .map_or_else(String::new, |Interval { low, high, .. }| {
+                let interval = match self.interval {
+                    None => String::new(),
+                    Some(Spread::Unknown(why)) => format!(" [{why}]"),
+                    Some(Spread::Known(Interval { low, high, .. })) => {
                         format!(" [{}, {}]", percent(low), percent(high))
-                    });
+                    }
+                };
                 text = format!("{text}: {share}{interval}");
             }
         }

@@ -4,6 +4,7 @@ use super::*;
 use crate::answer::{Hurt, Object};
 use crate::compare::Comparison;
 use crate::compare::conditions::{Condition, Verdicts};
+use hil_account::network::{Metric, OrderMetrics};
 use hil_core::interval::IntervalMethod;
 
 fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedMetric {
@@ -155,4 +156,64 @@ fn what_repetitions_are_worth_is_not_read_from_an_interval_cut_at_no_loss() {
     let narrower = none_of(1000, cut, 2000).unwrap();
     // Half as wide would be worth four times as much.
     assert!(none.high > 2.0 * narrower.high, "{none:?} {narrower:?}");
+}
+
+#[test]
+fn what_the_network_did_beside_losing_is_compared_by_the_accounts_definitions() {
+    let run = |reordered_count: u64| {
+        let mut summary = crate::tests::sample::full();
+        let channel = &mut summary.network.as_mut().unwrap().channels[0];
+        let figures = &mut channel.figures;
+        let count = figures.arrived_count;
+        figures.order = Metric::Measured(OrderMetrics {
+            count,
+            reordered_count,
+            ratio: reordered_count as f64 / count as f64,
+            extent_p50: Some(1),
+            extent_max: Some(4),
+            n_max: Some(1),
+        });
+        let name = channel.channel.clone();
+        let run = ComparedRun {
+            folder: "run".into(),
+            topology: serde_json::Value::Null,
+            summary,
+        };
+        (name, run, count)
+    };
+    let (name, base, count) = run(10);
+    let of = |metric: &str, base: &[ComparedRun], new: &[ComparedRun]| {
+        let all = network(base, new);
+        let mut all = all.into_iter();
+        let is_it = |one: &ComparedMetric| {
+            one.metric == metric && one.channel.as_deref() == Some(name.as_str())
+        };
+        all.find(is_it).unwrap()
+    };
+    let new = run(30).1;
+    let one = of("reordered", &[base.clone()], &[new.clone()]);
+    let share = |count_of: u64| count_of as f64 / count as f64;
+    assert_eq!(one.base.unwrap().value.to_bits(), share(10).to_bits());
+    assert_eq!(one.new.unwrap().value.to_bits(), share(30).to_bits());
+    assert_eq!(
+        (one.verdict, one.method.as_str()),
+        (Verdict::NotTested, NO_NETWORK)
+    );
+    // Repetitions have Welch's interval.
+    let several = |counts: [u64; 3]| counts.map(|reordered| run(reordered).1);
+    let many = of("reordered", &several([10, 11, 12]), &several([30, 31, 32]));
+    assert_eq!(
+        (many.verdict, many.method.as_str()),
+        (Verdict::Higher, REPETITIONS)
+    );
+    let run_max = of("loss_run_max", &[base.clone()], &[new.clone()]);
+    assert_eq!(
+        (run_max.kind, run_max.unit.as_str()),
+        (ChartKind::Count, "messages")
+    );
+    let variation = of("ipdv_p99", &[base], &[new]);
+    assert_eq!(
+        (variation.part, variation.ratio),
+        (Some(Part::Network), Some(1.0))
+    );
 }
