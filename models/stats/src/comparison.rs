@@ -120,6 +120,13 @@ impl Scatter {
     pub fn ratio(self) -> Option<f64> {
         (self.freedom > 0.0).then(|| self.chi_squared / self.freedom)
     }
+
+    /// What counts are divided by for [`clopper_pearson_at`]: the ratio, and as much more as Student's interval is wider
+    /// than the normal one because the ratio is an estimate itself.
+    pub fn divisor(self) -> Option<f64> {
+        let wider = |freedom| student_quantile(0.975, freedom) / normal_quantile(0.975);
+        Some(self.ratio()? * wider(self.freedom).powi(2))
+    }
 }
 
 /// How `ours` stands to the `published` share, which is taken to scatter as ours does, by `scatter`; `None` when either

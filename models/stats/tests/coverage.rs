@@ -17,10 +17,11 @@ use core::f64::consts::TAU;
 
 use hil_core::interval::{Interval, IntervalMethod, Spread};
 use hil_core::random::RandomStream;
+use hil_stats::comparison::{Scatter, Share};
 use hil_stats::dependence::{Batches, Quantiles};
 use hil_stats::samples::Samples;
 use hil_stats::special::{ceil_count, invert, normal_distribution, normal_quantile, place_of};
-use hil_stats::statistics::clopper_pearson;
+use hil_stats::statistics::{clopper_pearson, clopper_pearson_at};
 use rustfft::FftPlanner;
 use rustfft::num_complex::Complex;
 
@@ -1073,4 +1074,76 @@ fn a_few_runs_of_usual_kinds_are_accepted_and_cover_and_few_bursts_are_refused()
     );
     assert!(median.others[0].covered < 10, "{}", median.words());
     assert!(far.own.accepted <= 6, "{}", far.words());
+}
+
+/// Critical sections of a part, parts of a cell and cells of a table, as `tables` has them by default.
+const PART: u64 = 500;
+const PARTS: usize = 20;
+const CELLS: usize = 20;
+
+/// Collisions of the parts of a cell, `rate` a section, which come in clusters of a geometric law.
+fn parts_of(rate: f64, cluster_mean: f64, random: &mut RandomStream) -> Vec<Share> {
+    let part = |_| {
+        let (mut at, mut count) = (0.0, 0);
+        loop {
+            at += exponential(cluster_mean / rate, random);
+            if at > PART as f64 {
+                break;
+            }
+            count += 1;
+            while random.uniform() < 1.0 - 1.0 / cluster_mean {
+                count += 1;
+            }
+        }
+        Share {
+            count: count.min(PART),
+            of: PART,
+        }
+    };
+    (0..PARTS).map(part).collect()
+}
+
+/// Clopper and Pearson's interval on counts divided by their scatter, as the tables of fleets have it: of a cell alone, and of
+/// one in a table whose other cells have twice its rate and clusters alike.
+#[test]
+#[ignore = "several seconds"]
+fn shares_of_parts_cover_what_they_claim() {
+    println!(
+        "| Collisions per 1000 | In clusters of | Cell alone % | In a table % | As independent % |"
+    );
+    println!("|---|---|---|---|---|");
+    let mut faults = Vec::new();
+    for rate in [0.0005, 0.002, 0.01] {
+        for cluster_mean in [1.0, 1.1, 1.5, 2.0] {
+            let mut tallies = [(); 3].map(|()| Tally::default());
+            for seed in 0..RUNS {
+                let random = &mut RandomStream::new(6_000_000 + seed_offset() + seed, "parts");
+                let parts = parts_of(rate, cluster_mean, random);
+                let own = Scatter::of(&parts);
+                let others =
+                    (1..CELLS).map(|_| Scatter::of(&parts_of(2.0 * rate, cluster_mean, random)));
+                let of_all = others.fold(own, Scatter::and).divisor().unwrap_or(1.0);
+                let alone = own.divisor().unwrap_or(1.0);
+                let sum = |of: fn(&Share) -> u64| parts.iter().map(of).sum::<u64>();
+                let (count, of) = (sum(|part| part.count), sum(|part| part.of));
+                for (tally, by) in tallies.iter_mut().zip([alone, alone.max(of_all), 1.0]) {
+                    tally.add(clopper_pearson_at(count, of, by.max(1.0), 0.95), rate);
+                }
+            }
+            let covered = |tally: &Tally| 100.0 * tally.covered as f64 / tally.runs as f64;
+            let [alone, table, independent] = &tallies;
+            println!(
+                "| {} | {cluster_mean} | {:.1} | {:.1} (≥ {:.1}) | {:.1} |",
+                1e3 * rate,
+                covered(alone),
+                covered(table),
+                100.0 * table.coverage_low(),
+                covered(independent)
+            );
+            if table.coverage_low() < COVERAGE_MIN {
+                faults.push((rate, cluster_mean));
+            }
+        }
+    }
+    assert_eq!(faults, []);
 }

@@ -99,7 +99,7 @@ fn notes(study: &FleetStudy, results: &[CellResult<'_>]) -> Vec<String> {
              proof rules out has no error rate: once is a miss",
             test_count(results),
             100.0 * ERROR_RATE,
-            scatter(results).map_or_else(
+            scatter(results).ratio().map_or_else(
                 || "an unknown number of times".to_owned(),
                 |ratio| format!("{ratio:.2} times")
             ),
@@ -150,19 +150,18 @@ fn test_count(results: &[CellResult<'_>]) -> usize {
     of_rows.count() + of_mechanisms
 }
 
-/// How much more collisions vary than those of independent sections, each cell about its own share; `None` where no cell with
-/// collisions has two parts.
-fn scatter(results: &[CellResult<'_>]) -> Option<f64> {
+/// How much more collisions vary than those of independent sections, each cell about its own share.
+fn scatter(results: &[CellResult<'_>]) -> Scatter {
     let tallies = results.iter().filter_map(|one| one.tally.as_ref());
     let all = tallies.map(FleetTally::own_scatter);
-    all.fold(Scatter::default(), Scatter::and).ratio()
+    all.fold(Scatter::default(), Scatter::and)
 }
 
 /// Gives each cell the scatter that its intervals are of: its own, and at least that of all cells.
 pub(crate) fn take_scatter(results: &mut [CellResult<'_>]) {
-    let of_all = scatter(results).unwrap_or(1.0);
+    let of_all = scatter(results).divisor().unwrap_or(1.0);
     for tally in results.iter_mut().filter_map(|one| one.tally.as_mut()) {
-        tally.scatter = tally.own_scatter().ratio().unwrap_or(of_all).max(of_all);
+        tally.scatter = tally.own_scatter().divisor().unwrap_or(of_all).max(of_all);
     }
 }
 

@@ -182,6 +182,7 @@ fn what_the_network_did_beside_losing_is_compared_by_the_accounts_definitions() 
         (name, run, count)
     };
     let (name, base, count) = run(10);
+    let base = [base];
     let of = |metric: &str, base: &[ComparedRun], new: &[ComparedRun]| {
         let all = network(base, new);
         let mut all = all.into_iter();
@@ -190,8 +191,8 @@ fn what_the_network_did_beside_losing_is_compared_by_the_accounts_definitions() 
         };
         all.find(is_it).unwrap()
     };
-    let new = run(30).1;
-    let one = of("reordered", &[base.clone()], &[new.clone()]);
+    let new = [run(30).1];
+    let one = of("reordered", &base, &new);
     let share = |count_of: u64| count_of as f64 / count as f64;
     assert_eq!(one.base.unwrap().value.to_bits(), share(10).to_bits());
     assert_eq!(one.new.unwrap().value.to_bits(), share(30).to_bits());
@@ -206,12 +207,12 @@ fn what_the_network_did_beside_losing_is_compared_by_the_accounts_definitions() 
         (many.verdict, many.method.as_str()),
         (Verdict::Higher, REPETITIONS)
     );
-    let run_max = of("loss_run_max", &[base.clone()], &[new.clone()]);
+    let run_max = of("loss_run_max", &base, &new);
     assert_eq!(
         (run_max.kind, run_max.unit.as_str()),
         (ChartKind::Count, "messages")
     );
-    let variation = of("ipdv_p99", &[base], &[new]);
+    let variation = of("ipdv_p99", &base, &new);
     assert_eq!(
         (variation.part, variation.ratio),
         (Some(Part::Network), Some(1.0))
