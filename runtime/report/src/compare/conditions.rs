@@ -257,8 +257,10 @@ impl Condition {
         let holds = match interval {
             _ if is_strict => self.operator.holds(value, self.value),
             Some(interval) => self.operator.holds_of_all(interval, self.value),
-            // Whatever its interval, the figure is in it.
-            None if !self.operator.holds(value, self.value)
+            // Nothing shows the interval of no losses; none itself is in it.
+            None if figure.kind == ChartKind::Loss
+                && figure.new.is_some_and(|new| new.value <= 0.0)
+                && !self.operator.holds(value, self.value)
                 && !is_partial([figure.base_count, figure.new_count], of) =>
             {
                 false
