@@ -60,7 +60,7 @@ const RANKS_MIN: f64 = 0.2;
 
 /// The same where the quantile with [`OUTERMOST`] beyond is [`SKEWED`] times as far from the median as its opposite: few busy
 /// periods of a queue carry it, and a run that by luck has none of the longest looks like one of a less loaded queue.
-const RANKS_MIN_SKEWED: f64 = 2.0;
+const RANKS_MIN_SKEWED: f64 = 4.0;
 
 /// The same where such a series also forgets more slowly the farther out it is: with [`OUTER`] of it beyond it is worth less than
 /// [`SLOWER`] of what it is at the median. Luck in the few outcomes far out does not show there.

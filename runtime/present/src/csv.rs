@@ -21,6 +21,11 @@ fn row(run: &str, subject: &str, metric: &Metric) -> String {
     } else {
         &metric.unit
     };
+    let mut method = metric.method.clone();
+    if metric.low.is_none() && !metric.interval.is_empty() {
+        let joint = if method.is_empty() { "" } else { "; " };
+        method += &format!("{joint}no interval: {}", metric.interval);
+    }
     let fields = [
         run.to_owned(),
         subject.to_owned(),
@@ -29,7 +34,7 @@ fn row(run: &str, subject: &str, metric: &Metric) -> String {
         unit.to_owned(),
         number(metric.low),
         number(metric.high),
-        metric.method.clone(),
+        method,
     ];
     fields.map(|field| quoted(&field)).join(",") + "\r\n"
 }

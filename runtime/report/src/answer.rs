@@ -14,7 +14,7 @@ use hil_stats::statistics::CONFIDENCE;
 use serde::{Deserialize, Serialize};
 
 use super::assessment::{
-    Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX, uncounted_start_count,
+    Assessment, HELD_MAX_NS, NetworkVerdict, SKIPPED_TICK_RATIO_MAX, uncounted_start_count,
 };
 use super::clock_summary::ClockSection;
 use super::score_event::ExplainedEvent;
@@ -724,10 +724,18 @@ fn invalid_words(network: &NetworkVerdict) -> Option<String> {
         NetworkVerdict::ReceiverLate { channels, loss } => {
             let flows = named(channels, NAMED_COUNT);
             format!(
-                "receiving gateways were late: no room in the receive buffer of {flows} for {}, so the network lost \
-                 up to {} less than is shown; {repeat}",
-                loss.words("datagrams"),
-                loss.share()
+                "receiving gateways were late: no room in the receive buffer of {flows} for {}; what was lost so, \
+                 or perhaps so, is no loss of the network; {repeat}",
+                loss.words("datagrams")
+            )
+        }
+        NetworkVerdict::GatewayLate { channels, loss } => {
+            let channels = named(channels, NAMED_COUNT);
+            format!(
+                "gateways were late: {} of {channels} were replaced by newer ones or waited on their host for more \
+                 than {}, which is in the delays; {repeat}",
+                loss.words("messages"),
+                duration_s(HELD_MAX_NS as f64 * 1e-9)
             )
         }
         NetworkVerdict::FramesLost { channels, loss } => {
@@ -769,6 +777,7 @@ pub(crate) const fn is_valid(network: &NetworkVerdict) -> Option<bool> {
         NetworkVerdict::EmulationNotKept { .. }
         | NetworkVerdict::HostOverran { .. }
         | NetworkVerdict::ReceiverLate { .. }
+        | NetworkVerdict::GatewayLate { .. }
         | NetworkVerdict::FramesLost { .. }
         | NetworkVerdict::TicksUnknown
         | NetworkVerdict::RecordsMissing { .. } => Some(false),

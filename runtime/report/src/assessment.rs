@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use hil_account::{ChannelAccount, ClosingMetrics, Coverage, MessageFate};
+use hil_account::{ChannelAccount, ClosingMetrics, Coverage, MessageFate, Stage};
 use serde::{Deserialize, Serialize};
 
 use super::adapter::AdapterSummary;
@@ -18,6 +18,9 @@ use hil_rundir::event::ProcessKind;
 
 /// Share of skipped ticks above which the host, not the network, shaped the run.
 pub const SKIPPED_TICK_RATIO_MAX: f64 = 0.001;
+
+/// Longest time that a gateway may let a message wait on its host, before it takes it from the producer or from the kernel.
+pub const HELD_MAX_NS: i64 = 50_000_000;
 
 /// Channels that are named where many have the same fault.
 const NAMED_COUNT: usize = 3;
@@ -62,6 +65,15 @@ pub enum NetworkVerdict {
         /// The channels concerned.
         channels: Vec<String>,
         /// Datagrams without room, of the messages published.
+        #[serde(flatten)]
+        loss: HostLoss,
+    },
+    /// Gateways were late with too many messages: they replaced them by newer ones, or let them wait for longer than
+    /// [`HELD_MAX_NS`] on their host. The run says nothing about the network.
+    GatewayLate {
+        /// The channels concerned.
+        channels: Vec<String>,
+        /// Messages replaced or let wait, of those published.
         #[serde(flatten)]
         loss: HostLoss,
     },
@@ -219,6 +231,8 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         }
     } else if let Some((channels, loss)) = received_late(summary) {
         NetworkVerdict::ReceiverLate { channels, loss }
+    } else if let Some((channels, loss)) = gateway_late(summary) {
+        NetworkVerdict::GatewayLate { channels, loss }
     } else if let Some((channels, loss)) = frames_lost(summary) {
         NetworkVerdict::FramesLost { channels, loss }
     } else if summary.processes.iter().any(is_silent) {
@@ -265,6 +279,35 @@ fn received_late(summary: &RunSummary) -> Option<(Vec<String>, HostLoss)> {
             of_count: accounts.map(|account| account.published_count).sum(),
         };
         (direction.label(), loss)
+    }))
+}
+
+/// The channels with which gateways were late in more than [`SKIPPED_TICK_RATIO_MAX`] of the messages. Before a stream (TCP), messages
+/// also wait because the network is slow: there only what waited in the receiving host counts.
+fn gateway_late(summary: &RunSummary) -> Option<(Vec<String>, HostLoss)> {
+    HostLoss::beyond_limit(summary.channels.iter().filter_map(|channel| {
+        let LinkKind::Network(transport) = channel.link else {
+            return None;
+        };
+        let account = channel.account.as_ref()?;
+        let held = |from, to| -> u64 {
+            let segments = account.segments.iter();
+            let within = segments.filter(|one| (one.from, one.to) == (from, to));
+            let bins = within.flat_map(|one| &one.bins);
+            let long = bins.filter(|bin| bin.from_ns() >= HELD_MAX_NS);
+            long.map(|bin| bin.count).sum()
+        };
+        let mut lost_count = held(Stage::RxSoftware, Stage::Received);
+        if !transport.capabilities.cuts_to_path {
+            lost_count += held(Stage::Published, Stage::TakenByGateway)
+                + account.fates.of(MessageFate::SupersededAtInput);
+        }
+        let loss = HostLoss {
+            lost_count,
+            of_count: account.published_count,
+        };
+        // A single one may be the first of a run, from before the gateway looked.
+        (lost_count > 1).then_some((channel.name.as_str(), loss))
     }))
 }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use hil_account::network::NetworkMetrics;
 use hil_account::{ChannelAccount, FateCounts, MessageFate};
-use hil_core::interval::{Interval, Spread};
+use hil_core::interval::{Interval, Spread, TooSmall};
 use hil_stats::comparison::{Estimate, Share, difference, mean_interval, none_of, ratio, welch};
 use hil_stats::histogram::{Distribution, LatencySummary};
 use hil_stats::statistics::CONFIDENCE;
@@ -566,11 +566,19 @@ fn score_figure(metric: &ScoreMetric, base: &[ComparedRun], new: &[ComparedRun])
     let (have, of) = ([bs.len(), ns.len()], [base.len(), new.len()]);
     let sides = [mean_score(&bs), mean_score(&ns)];
     let figure = figure(ChartKind::Score, &metric.name, sides, have, of);
+    let too_small = base
+        .iter()
+        .chain(new)
+        .find_map(|run| too_small(metric, run));
     let repeated = welch(&plain(&bs), &plain(&ns), CONFIDENCE);
     let both = figure.base.zip(figure.new);
     let own = both.and_then(|(b, n)| difference(b, n));
     let method = if have == [1, 1] { OWN } else { MIXED };
     let (interval, method) = figure.tested(of, repeated, own, [method, NO_OWN]);
+    let method = match too_small {
+        Some(why) if method == NO_OWN => format!("no interval: {why}"),
+        _ => method.to_owned(),
+    };
     ComparedMetric {
         label: metric.label.clone(),
         unit: metric.unit.clone(),
@@ -579,8 +587,17 @@ fn score_figure(metric: &ScoreMetric, base: &[ComparedRun], new: &[ComparedRun])
             .and_then(|(b, n)| ratio(b, n)),
         difference_interval: interval,
         verdict: verdict(interval, 0.0, [Verdict::Lower, Verdict::Higher]),
-        method: method.to_owned(),
+        method,
         ..figure
+    }
+}
+
+/// Why a run's score of that name has no interval of its own, where its sample is too small for one.
+fn too_small(metric: &ScoreMetric, run: &ComparedRun) -> Option<TooSmall> {
+    let mut all = run.summary.score.iter();
+    match all.find(|one| one.name == metric.name)?.interval? {
+        Spread::Known(_) => None,
+        Spread::Unknown(why) => Some(why),
     }
 }
 

@@ -17,15 +17,7 @@ use super::harms::HarmDifference;
 use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict};
 use crate::answer::{Hurt, Object, UnitScale};
 
-const COLUMNS: [&str; 7] = [
-    "of",
-    "metric",
-    "base",
-    "new",
-    "new / base",
-    "95 %",
-    "verdict",
-];
+const COLUMNS: [&str; 6] = ["metric", "base", "new", "new / base", "95 %", "verdict"];
 /// Channels that are listed unless every metric is asked for.
 const CHANNELS_SHOWN: usize = 12;
 
@@ -230,13 +222,16 @@ fn judged(verdicts: &Verdicts) -> Section {
 /// Every metric.
 fn metrics(comparison: &Comparison) -> Section {
     let mut section = Section::new("metrics", "Metrics", "intervals are 95 %");
-    let mut table = Table::new("", &COLUMNS);
-    for one in &comparison.figures {
-        let of = one.channel.as_deref().unwrap_or("score").to_owned();
-        let cells = cells(one).map(Into::into);
-        table.push(core::iter::once(of.into()).chain(cells));
+    let is_of_one = |one: &ComparedMetric, other: &ComparedMetric| one.channel == other.channel;
+    for figures in comparison.figures.chunk_by(is_of_one) {
+        let title = figures[0].channel.as_deref().unwrap_or("scores");
+        let mut table = Table::new(title, &COLUMNS);
+        table.has_long_names = true;
+        for one in figures {
+            table.push(cells(one).map(Into::into));
+        }
+        section.table(table);
     }
-    section.table(table);
     section
 }
 

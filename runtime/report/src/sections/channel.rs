@@ -281,6 +281,25 @@ fn counts(sources: &Sources<'_>) -> Vec<Metric> {
     let published = live(|one| one.published_count);
     let delivered = live(taken);
     let lost = live(|one| one.fates.lost_count());
+    let replaced = live(|one| {
+        one.fates.of(MessageFate::SupersededAtInput)
+            + one.fates.of(MessageFate::SupersededAtConsumer)
+    });
+    // What became of some only the other host knows: a count of the others would read as one of all.
+    let unknown = live(|one| one.fates.of(MessageFate::UnknownPeerRecordsUnavailable));
+    let unknown = unknown.filter(|count| *count > 0);
+    let reason = unknown.map_or_else(
+        || NO_ACCOUNT.to_owned(),
+        |count| {
+            format!(
+                "of {} the other host's records, which are not at hand, would tell; known: {} delivered, {} lost",
+                counted(count, "message"),
+                grouped(delivered.unwrap_or(0)),
+                grouped(lost.unwrap_or(0))
+            )
+        },
+    );
+    let [delivered, lost] = [delivered, lost].map(|count| count.filter(|_| unknown.is_none()));
     let is_total_known = account.is_none_or(|one| one.published_unrecorded_count.is_some());
     let published_method = if is_total_known {
         "every sequence number up to the highest seen"
@@ -289,9 +308,11 @@ fn counts(sources: &Sources<'_>) -> Vec<Metric> {
     };
     [
         figure("published", "published", published, NO_ACCOUNT).by(published_method),
-        figure("delivered", "delivered", delivered, NO_ACCOUNT).by("taken by the consumer"),
-        figure("lost", "lost, by host or network", lost, NO_ACCOUNT)
+        figure("delivered", "delivered", delivered, &reason).by("taken by the consumer"),
+        figure("lost", "lost, by host or network", lost, &reason)
             .by("vanished; messages that a newer one replaced and those under way are not lost"),
+        figure("replaced", "replaced by newer ones", replaced, NO_ACCOUNT)
+            .by("before the sending gateway or the consumer took them"),
     ]
     .into_iter()
     .chain(account.into_iter().flat_map(restarts))

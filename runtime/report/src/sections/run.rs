@@ -159,6 +159,11 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
             let count = loss.words("datagrams");
             no_result(&format!(": {count} {why} {}", channels.join(", ")))
         }
+        NetworkVerdict::GatewayLate { channels, loss } => {
+            let why = "replaced by newer ones or let wait by a late gateway, of";
+            let count = loss.words("messages");
+            no_result(&format!(": {count} {why} {}", channels.join(", ")))
+        }
         NetworkVerdict::RecordsMissing { hosts } => {
             let hosts = hosts.join(", ");
             let text = format!("no verdict: records of other hosts are missing on {hosts}");

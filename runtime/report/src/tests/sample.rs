@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use hil_account::flow::FlowMetrics;
 use hil_account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, FateCounts, MessageFate,
-    account,
+    SegmentMetrics, Stage, account,
 };
 use hil_arm::egm::messages::Side as ArmSide;
 use hil_core::time::Alignment;
@@ -29,7 +29,7 @@ use hil_link::spec::Way;
 use hil_platform::host_facts::{self, HostFact, HostFacts};
 use hil_rundir::event::{EventKind, ProcessKind};
 use hil_rundir::launch::Side;
-use hil_stats::histogram::Distribution;
+use hil_stats::histogram::{Distribution, DurationBin};
 use hil_topology::AdapterKind;
 
 fn run_facts() -> RunFacts {
@@ -578,6 +578,43 @@ fn what_had_no_room_in_a_receive_buffer_is_not_put_down_to_the_network() {
         assert_eq!(text.contains("because the receiving gateway"), count > 0);
         summary.directions[0].counters.pop();
     }
+}
+
+#[test]
+fn a_gateway_that_was_late_is_not_the_network() {
+    let network = |superseded: u64, held: u64, is_stream: bool| {
+        let mut summary = full();
+        let channel = &mut summary.channels[0];
+        channel.link = link(if is_stream { "tcp" } else { "udp" });
+        let account = channel.account.as_mut().unwrap();
+        account.published_count = 5_000;
+        account.fates = FateCounts::default();
+        account.fates.add(MessageFate::Taken, 5_000 - superseded);
+        account
+            .fates
+            .add(MessageFate::SupersededAtInput, superseded);
+        let is_reception = |one: &&mut SegmentMetrics| one.to == Stage::Received;
+        let reception = account.segments.iter_mut().find(is_reception).unwrap();
+        reception.bins = vec![DurationBin {
+            until_ns: 2_000_000_000,
+            count: held,
+        }];
+        Assessment::of(&summary).network
+    };
+    let late = |lost_count| NetworkVerdict::GatewayLate {
+        channels: vec!["arm/command".to_owned()],
+        loss: HostLoss {
+            lost_count,
+            of_count: 5_000,
+        },
+    };
+    assert_eq!(network(5, 0, false), NetworkVerdict::NetworkResult);
+    assert_eq!(network(6, 0, false), late(6));
+    assert_eq!(network(0, 6, false), late(6));
+    assert_eq!(network(3, 3, false), late(6));
+    // Before a stream, messages wait for the network too.
+    assert_eq!(network(600, 0, true), NetworkVerdict::NetworkResult);
+    assert_eq!(network(600, 6, true), late(6));
 }
 
 #[test]

@@ -49,7 +49,7 @@ impl Files {
             reserved: 0,
         });
         let is_down = (2_000..2_190).contains(&sequence);
-        if sequence % 700 == 13 {
+        if sequence % 1_700 == 13 {
             return;
         }
         let (taken_ns, handed_ns) = (next(14_000.0), next(900.0));
