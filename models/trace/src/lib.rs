@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 pub mod csv;
+mod epoch;
 pub mod fault;
 pub mod fit;
 pub mod from_records;
