@@ -8,7 +8,7 @@
 
 use core::fmt::Write as _;
 
-use hil_core::text_file::{Line, TextFile, not_a_number};
+use hil_core::text_file::{Line, TextFile, not_a_number, whole};
 
 use crate::skeleton::{Channel, Skeleton};
 
@@ -138,7 +138,7 @@ impl Bvh {
         }
         words.present_keyword("MOTION", "the keyword MOTION")?;
         words.keyword("Frames:", "the keyword Frames:")?;
-        let announced_count: usize = words.parsed("a frame count")?;
+        let announced_count: usize = words.whole("a frame count")?;
         words.keyword("Frame", "the keywords Frame Time:")?;
         words.keyword("Time:", "the keywords Frame Time:")?;
         let frame_time_s = words.number("a frame time in seconds")?;
@@ -318,7 +318,7 @@ fn parse_joint(
         *part = words.number("an offset")?;
     }
     words.keyword("CHANNELS", "the keyword CHANNELS")?;
-    let count: usize = words.parsed("a channel count")?;
+    let count: usize = words.whole("a channel count")?;
     if count > 6 {
         return Err(words.error(BvhProblem::OutOfRange {
             what: "channel count",
@@ -440,10 +440,9 @@ impl<'a> Words<'a> {
         }
     }
 
-    fn parsed<T: core::str::FromStr>(&mut self, expected: &'static str) -> Result<T, BvhError> {
+    fn whole<T: core::str::FromStr>(&mut self, expected: &'static str) -> Result<T, BvhError> {
         self.next(expected)?;
-        let parsed = self.present.parse().ok();
-        parsed.ok_or_else(|| self.unexpected(expected))
+        whole(self.present).ok_or_else(|| self.unexpected(expected))
     }
 
     fn number(&mut self, expected: &'static str) -> Result<f64, BvhError> {

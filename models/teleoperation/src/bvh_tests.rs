@@ -130,6 +130,7 @@ fn a_line_of_another_count_among_lines_of_a_frame_each_is_a_fault() {
 fn what_programs_write_otherwise_changes_nothing() {
     for (here, there) in [
         ("Frames:", "Frames :"),
+        ("Frames: 2", "Frames: 2.0"),
         ("Frame Time:", "Frame Time :"),
         ("Frame Time: ", "Frame Time :"),
         ("End Site", "EndSite"),
