@@ -82,12 +82,10 @@ impl TextFile {
                 );
             }
         }
-        let mark_bytes = if bytes.starts_with(UTF8_MARK) {
-            UTF8_MARK.len()
-        } else {
-            0
-        };
-        let bytes = &bytes[mark_bytes..];
+        // Two programs may each have put one.
+        let marks = bytes.chunks(UTF8_MARK.len());
+        let mark_bytes = marks.take_while(|bytes| *bytes == UTF8_MARK).count() * UTF8_MARK.len();
+        let bytes = without_filling(&bytes[mark_bytes..]);
         if let Some(zero) = bytes.iter().position(|byte| *byte == 0) {
             let before = &bytes[..zero];
             let line = before.split(|byte| *byte == b'\n').count() as u64;
@@ -100,9 +98,8 @@ impl TextFile {
             |_latin1| bytes.iter().map(|byte| char::from(*byte)).collect(),
             str::to_owned,
         );
-        // Lines that end with a carriage return alone: as long, and known to readers of the whole text.
-        if !text.contains('\n') {
-            text = text.replace('\r', "\n");
+        if text.contains('\r') {
+            text = with_line_feeds(&text);
         }
         Ok(Self {
             text,
@@ -148,6 +145,48 @@ impl TextFile {
             part.len()
         }
     }
+}
+
+/// Without what fills a file behind its text: control-Z of older systems, and zeros behind a whole line.
+fn without_filling(bytes: &[u8]) -> &[u8] {
+    let is_filling = |byte: &u8| matches!(byte, 0 | 0x1a | b'\r' | b'\n' | b' ');
+    let tail = bytes.iter().rposition(|byte| !is_filling(byte));
+    let tail = tail.map_or(0, |last| last + 1);
+    let filling = bytes[tail..]
+        .iter()
+        .position(|byte| matches!(byte, 0 | 0x1a));
+    let Some(end) = filling.map(|place| tail + place) else {
+        return bytes;
+    };
+    let text = &bytes[..end];
+    if bytes[end] == 0x1a || text.ends_with(b"\n") || text.ends_with(b"\r") {
+        text
+    } else {
+        bytes
+    }
+}
+
+/// With a line feed for each line that ends with a carriage return alone: as long, and known to readers of the
+/// whole text.
+fn with_line_feeds(text: &str) -> String {
+    let mut letters = text.chars().peekable();
+    let mut ended = String::with_capacity(text.len());
+    let mut returns = 0;
+    while let Some(letter) = letters.next() {
+        if letter != '\r' {
+            ended.push(letter);
+            continue;
+        }
+        returns += 1;
+        let next = letters.peek();
+        if next == Some(&'\r') {
+            continue;
+        }
+        let ends = if next == Some(&'\n') { "\r" } else { "\n" };
+        ended.extend(core::iter::repeat_n(ends, returns));
+        returns = 0;
+    }
+    ended
 }
 
 /// What separates the cells of a table whose first line is `line`: the most frequent of comma, semicolon and
@@ -236,6 +275,38 @@ pub fn has_decimal_comma(text: &str) -> bool {
     })
 }
 
+/// A whole number, also where a program wrote it with decimals that are all zero.
+pub fn whole<T: core::str::FromStr>(text: &str) -> Option<T> {
+    let number = match text.split_once('.') {
+        Some((number, decimals)) if decimals.bytes().all(|byte| byte == b'0') => number,
+        _ => text,
+    };
+    number.parse().ok()
+}
+
+/// True for what programs write in the place of a value that is missing.
+pub fn is_missing(text: &str) -> bool {
+    let words = ["", "nan", "na", "n/a", "<na>", "nat", "null", "none"];
+    words.iter().any(|word| text.eq_ignore_ascii_case(word))
+}
+
+/// Why `text` is not the whole number that was `expected`, with what may be meant by it.
+pub fn not_whole(text: &str, expected: &str) -> String {
+    let found = short(text);
+    match text.split_once([',', '.']) {
+        Some((number, _)) if has_decimal_comma(text) => {
+            format!("\"{found}\" has a decimal comma, expected {expected}, e.g. {number}")
+        }
+        _ if text.contains(['e', 'E']) && text.parse::<f64>().is_ok() => {
+            format!("\"{found}\" is not {expected} with all its digits")
+        }
+        Some((number, _)) if text.parse::<f64>().is_ok() => {
+            format!("\"{found}\" is not {expected}, e.g. {number}")
+        }
+        _ => format!("\"{found}\" is not {expected}"),
+    }
+}
+
 /// Why `text` is not the number that was `expected`, with what may be meant by it.
 pub fn not_a_number(text: &str, expected: &str) -> String {
     let found = short(text);
@@ -261,13 +332,22 @@ mod tests {
     #[test]
     fn lines_have_their_place_in_the_file_whatever_its_mark_ends_and_encoding() {
         let place = |number, offset, content: &str| (number, offset, content.to_owned());
-        for (bytes, second) in [
-            (&b"a\nb\n"[..], 2),
-            (&b"a\r\nb\r\n"[..], 3),
-            (&b"a\rb\r"[..], 2),
-            (&b"\xef\xbb\xbfa\nb"[..], 5),
+        for bytes in [
+            &b"a\nb\n"[..],
+            b"a\r\nb\r\n",
+            b"a\rb\r",
+            b"a\rb\n",
+            b"a\nb\r",
+            b"\xef\xbb\xbfa\nb",
+            b"\xef\xbb\xbf\xef\xbb\xbfa\nb",
+            b"a\nb\n\0\0\0",
+            b"a\nb\x1a\0",
+            b"a\nb\r\n\x1a\r\n",
         ] {
-            let first = second - 2 - u64::from(bytes.contains(&b'\n') && bytes.contains(&b'\r'));
+            let [first, second] = [b'a', b'b'].map(|letter| {
+                let found = bytes.iter().position(|byte| *byte == letter);
+                found.unwrap() as u64
+            });
             assert_eq!(places(bytes), [place(1, first, "a"), place(2, second, "b")]);
         }
         assert_eq!(
@@ -319,6 +399,39 @@ mod tests {
     }
 
     #[test]
+    fn whole_numbers_may_have_decimals_of_zero_and_what_is_told_of_others_can_be_written() {
+        let numbers = ["4", "4.0", "-4000000.000", "+4.", "0.0"].map(whole::<i64>);
+        assert_eq!(numbers, [4, 4, -4_000_000, 4, 0].map(Some));
+        for text in ["4.5", "4.0.0", "4,0", ".0", "", "4e3", "4.0 "] {
+            assert_eq!(whole::<i64>(text), None, "{text}");
+        }
+        assert_eq!(whole::<u8>("256.0"), None);
+        let told = not_whole("-4,25", "a whole number");
+        assert_eq!(
+            told,
+            "\"-4,25\" has a decimal comma, expected a whole number, e.g. -4"
+        );
+        assert_eq!(
+            not_whole("4.25", "a whole number"),
+            "\"4.25\" is not a whole number, e.g. 4"
+        );
+        assert_eq!(
+            not_whole("1.7e18", "a whole number"),
+            "\"1.7e18\" is not a whole number with all its digits"
+        );
+        assert_eq!(
+            not_whole("1.2.3", "a whole number"),
+            "\"1.2.3\" is not a whole number"
+        );
+        assert!(
+            ["NaN", "NA", "null", "None", ""]
+                .into_iter()
+                .all(is_missing)
+        );
+        assert!(!is_missing("nano") && !is_missing("-1"));
+    }
+
+    #[test]
     fn a_decimal_comma_is_named() {
         let told = not_a_number("-12,5", "a number");
         assert!(
@@ -328,5 +441,7 @@ mod tests {
         assert_eq!(not_a_number("west", "a number"), "\"west\" is not a number");
         assert!(!not_a_number("1,2,3", "a number").contains("decimal comma"));
         assert_eq!(TextFile::decode(b"a\rb\r").unwrap().text(), "a\nb\n");
+        let mixed = TextFile::decode(b"a\r\r\nb\rc\r\nd\r\re").unwrap();
+        assert_eq!(mixed.text(), "a\r\r\nb\nc\r\nd\n\ne");
     }
 }

@@ -1,13 +1,14 @@
 //! Motion files in the BVH text format (Biovision hierarchy): reader and writer on text. It opens
 //! no file, and it does not interpret the motion: see [`super::motion`].
 //!
-//! Numbers and keywords may be spread over lines at will, and a name is the rest of its line; every
+//! Numbers and keywords may be spread over lines at will, and a name is the rest of its line; where lines hold one
+//! frame each, every one has to. Lines that begin with `#` say nothing. Every
 //! error names the line it was found on and where that begins in the file. No input makes the reader
 //! panic, recurse or reserve more memory than the text's own size.
 
 use core::fmt::Write as _;
 
-use hil_core::text_file::{Line, TextFile, not_a_number};
+use hil_core::text_file::{Line, TextFile, not_a_number, whole};
 
 use crate::skeleton::{Channel, Skeleton};
 
@@ -71,6 +72,20 @@ pub enum BvhProblem {
     /// A word is no number.
     #[error("{0}")]
     NotANumber(String),
+    /// A line of a frame has values too few or too many.
+    #[error(
+        "{value_count} values on a line, where a line is a frame of {channel_count}: this frame and those behind \
+         it would be shifted"
+    )]
+    FrameLine {
+        /// Values per frame.
+        channel_count: usize,
+        /// Values on the line.
+        value_count: usize,
+    },
+    /// Another figure after the first.
+    #[error("a second ROOT: one skeleton is read, and this file has more")]
+    SecondRoot,
     /// There is not one whole frame.
     #[error("no whole frame: {channel_count} values make one, {value_count} found")]
     NoFrame {
@@ -117,9 +132,13 @@ impl Bvh {
         words.keyword("HIERARCHY", "the keyword HIERARCHY")?;
         words.keyword("ROOT", "the keyword ROOT")?;
         let skeleton = parse_hierarchy(&mut words)?;
-        words.keyword("MOTION", "the keyword MOTION")?;
+        words.next("the keyword MOTION")?;
+        if words.is("ROOT") {
+            return Err(words.error(BvhProblem::SecondRoot));
+        }
+        words.present_keyword("MOTION", "the keyword MOTION")?;
         words.keyword("Frames:", "the keyword Frames:")?;
-        let announced_count: usize = words.parsed("a frame count")?;
+        let announced_count: usize = words.whole("a frame count")?;
         words.keyword("Frame", "the keywords Frame Time:")?;
         words.keyword("Time:", "the keywords Frame Time:")?;
         let frame_time_s = words.number("a frame time in seconds")?;
@@ -130,17 +149,29 @@ impl Bvh {
                 allowed: "0.000001 to 10 s",
             }));
         }
+        let channel_count = skeleton.channel_count();
         let mut values = Vec::new();
+        let mut lines = FrameLines::new(channel_count);
         while words.advance() {
             values.push(words.present_number("a channel value")?);
+            lines.count(words.line);
         }
-        let channel_count = skeleton.channel_count();
         let value_count = values.len();
         if channel_count == 0 || value_count < channel_count {
             return Err(words.error(BvhProblem::NoFrame {
                 channel_count,
                 value_count,
             }));
+        }
+        if let Some((line, value_count)) = lines.other(announced_count) {
+            return Err(BvhError {
+                line: line.number,
+                offset: line.offset,
+                problem: BvhProblem::FrameLine {
+                    channel_count,
+                    value_count,
+                },
+            });
         }
         let cut_count = value_count % channel_count;
         values.truncate(value_count - cut_count);
@@ -175,6 +206,63 @@ impl Bvh {
     }
 }
 
+/// Whether the lines of values hold one frame each.
+struct FrameLines<'a> {
+    channel_count: usize,
+    /// The newest line and its values so far.
+    newest: Option<(Line<'a>, usize)>,
+    line_count: usize,
+    /// Lines before the newest of one whole frame.
+    whole_count: usize,
+    /// The first line before the newest of another count.
+    other: Option<(Line<'a>, usize)>,
+}
+
+impl<'a> FrameLines<'a> {
+    const fn new(channel_count: usize) -> Self {
+        Self {
+            channel_count,
+            newest: None,
+            line_count: 0,
+            whole_count: 0,
+            other: None,
+        }
+    }
+
+    /// Counts a value on `line`.
+    fn count(&mut self, line: Line<'a>) {
+        if let Some((newest, count)) = &mut self.newest
+            && newest.number == line.number
+        {
+            *count += 1;
+            return;
+        }
+        self.end_line();
+        self.line_count += 1;
+        self.newest = Some((line, 1));
+    }
+
+    fn end_line(&mut self) {
+        match self.newest {
+            Some((_, count)) if count == self.channel_count => self.whole_count += 1,
+            other => self.other = self.other.or(other),
+        }
+    }
+
+    /// The first line of another count than a frame's, where lines hold one frame each. The last one may be cut.
+    fn other(mut self, announced_count: usize) -> Option<(Line<'a>, usize)> {
+        let is_cut = self
+            .newest
+            .is_some_and(|(_, count)| count < self.channel_count);
+        if !is_cut {
+            self.end_line();
+        }
+        let is_frame_each =
+            self.line_count == announced_count || self.whole_count * 2 >= self.line_count;
+        self.other.filter(|_| is_frame_each)
+    }
+}
+
 /// Reads from the root's name to the brace that closes the root.
 fn parse_hierarchy(words: &mut Words<'_>) -> Result<Skeleton, BvhError> {
     const EXPECTED: &str = "JOINT, End Site or a closing brace";
@@ -187,9 +275,16 @@ fn parse_hierarchy(words: &mut Words<'_>) -> Result<Skeleton, BvhError> {
             open.pop();
         } else if words.is("JOINT") {
             open.push(parse_joint(words, &mut skeleton, Some(parent))?);
-        } else if words.is("End") {
-            words.keyword("Site", "the keyword Site")?;
-            words.keyword("{", "an opening brace")?;
+        } else if words.is("End") || words.is("EndSite") {
+            if words.is("End") {
+                words.keyword("Site", "the keyword Site")?;
+            }
+            // Some programs give it a name.
+            words.next("an opening brace")?;
+            if !words.is("{") {
+                words.present_name("an opening brace")?;
+                words.keyword("{", "an opening brace")?;
+            }
             words.keyword("OFFSET", "the keyword OFFSET")?;
             for _ in 0..3 {
                 words.number("an offset")?;
@@ -223,7 +318,7 @@ fn parse_joint(
         *part = words.number("an offset")?;
     }
     words.keyword("CHANNELS", "the keyword CHANNELS")?;
-    let count: usize = words.parsed("a channel count")?;
+    let count: usize = words.whole("a channel count")?;
     if count > 6 {
         return Err(words.error(BvhProblem::OutOfRange {
             what: "channel count",
@@ -277,7 +372,8 @@ impl<'a> Words<'a> {
             let Some(next) = self.lines.next() else {
                 return false;
             };
-            self.rest = next.content;
+            let is_remark = next.content.trim_start().starts_with('#');
+            self.rest = if is_remark { "" } else { next.content };
             self.line = next;
         }
     }
@@ -285,6 +381,11 @@ impl<'a> Words<'a> {
     /// The next word and the rest of its line, up to a brace that opens there.
     fn name(&mut self, expected: &'static str) -> Result<&'a str, BvhError> {
         self.next(expected)?;
+        self.present_name(expected)
+    }
+
+    /// The present word and the rest of its line, up to a brace that opens there.
+    fn present_name(&mut self, expected: &'static str) -> Result<&'a str, BvhError> {
         let line = self.line.content;
         let start = line.len() - self.rest.len() - self.present.len();
         let behind = &line[start..];
@@ -311,6 +412,19 @@ impl<'a> Words<'a> {
 
     fn keyword(&mut self, keyword: &str, expected: &'static str) -> Result<(), BvhError> {
         self.next(expected)?;
+        self.present_keyword(keyword, expected)
+    }
+
+    fn present_keyword(&mut self, keyword: &str, expected: &'static str) -> Result<(), BvhError> {
+        // A colon may stand apart.
+        let behind = self.rest.trim_start();
+        if let Some(word) = keyword.strip_suffix(':')
+            && self.is(word)
+            && let Some(rest) = behind.strip_prefix(':')
+        {
+            self.rest = rest;
+            return Ok(());
+        }
         // What stands right behind a colon is the next word.
         let found = self.present.split_at_checked(keyword.len());
         let is_it = |word: &str| keyword.ends_with(':') && word.eq_ignore_ascii_case(keyword);
@@ -326,10 +440,9 @@ impl<'a> Words<'a> {
         }
     }
 
-    fn parsed<T: core::str::FromStr>(&mut self, expected: &'static str) -> Result<T, BvhError> {
+    fn whole<T: core::str::FromStr>(&mut self, expected: &'static str) -> Result<T, BvhError> {
         self.next(expected)?;
-        let parsed = self.present.parse().ok();
-        parsed.ok_or_else(|| self.unexpected(expected))
+        whole(self.present).ok_or_else(|| self.unexpected(expected))
     }
 
     fn number(&mut self, expected: &'static str) -> Result<f64, BvhError> {

@@ -86,6 +86,75 @@ fn a_cut_last_frame_is_told_of_also_when_the_counts_agree() {
 }
 
 #[test]
+fn a_line_of_another_count_among_lines_of_a_frame_each_is_a_fault() {
+    let frame = "0 95 0 0 0 0 1 2 3\n";
+    let start = &SMALL[..SMALL.find("0 95").unwrap()];
+    let of = |announced: usize, lines: &[&str]| {
+        let start = start.replace(": 2", &format!(": {announced}"));
+        parsed(&(start + &lines.concat()))
+    };
+    let [short, long] = ["0 95 0 0 0 0 1 2\n", "0 95 0 0 0 0 1 2 3 4\n"];
+    for (announced, lines, line) in [
+        (4, [frame, short, frame, long], 20),
+        (4, [frame, long, frame, frame], 20),
+        (9, [frame, frame, frame, long], 22),
+        // One value less on every line, as by a channel that the skeleton should not have.
+        (4, [short, short, short, short], 19),
+    ] {
+        let error = of(announced, &lines).unwrap_err();
+        assert_eq!(error.line, line, "{error}");
+        assert!(
+            error.to_string().contains("where a line is a frame of 9"),
+            "{error}"
+        );
+    }
+    // A file that is still being written, and values spread over lines at will.
+    assert_eq!(of(4, &[frame, frame, frame, short]).unwrap().cut_count, 8);
+    let spread = of(
+        2,
+        &[
+            "0 95 0\n",
+            "0 0 0\n",
+            "1 2 3 0 95 0 0\n",
+            "0 0\n",
+            "1 2\n",
+            "3\n",
+        ],
+    );
+    assert_eq!(spread.unwrap().frame_count(), 2);
+    let both = of(2, &["0 95 0 0 0 0 1 2 3 0 95 0 0 0 0 1 2 3\n"]).unwrap();
+    assert_eq!((both.frame_count(), both.cut_count), (2, 0));
+}
+
+#[test]
+fn what_programs_write_otherwise_changes_nothing() {
+    for (here, there) in [
+        ("Frames:", "Frames :"),
+        ("Frames: 2", "Frames: 2.0"),
+        ("Frame Time:", "Frame Time :"),
+        ("Frame Time: ", "Frame Time :"),
+        ("End Site", "EndSite"),
+        ("End Site", "End Site RightHandEnd"),
+        ("End Site\n    {", "EndSite Tip {"),
+        ("HIERARCHY", "# made by hand\nHIERARCHY"),
+        ("MOTION", "  # motion\nMOTION"),
+        ("0.008\n", "0.008\n# frames: 2\n"),
+    ] {
+        assert_eq!(
+            parsed(&SMALL.replace(here, there)),
+            parsed(SMALL),
+            "{there}"
+        );
+    }
+    for end in [&b"\x1a"[..], b"\0\0\0"] {
+        let filled = TextFile::decode(&[SMALL.as_bytes(), end].concat()).unwrap();
+        assert_eq!(Bvh::parse(&filled), parsed(SMALL));
+    }
+    let second = SMALL.replace("MOTION", "ROOT Prop\n{\n}\nMOTION");
+    check_error(&second, 16, "a second ROOT: one skeleton is read");
+}
+
+#[test]
 fn a_name_is_the_rest_of_its_line_in_any_encoding() {
     let spaced = SMALL.replace("JOINT RightHand\n  {", "JOINT Bip01 R Hand {");
     let bvh = parsed(&spaced).unwrap();

@@ -19,6 +19,9 @@ pub struct HumanPose {
     pub left_hand: Isometry3<f64>,
 }
 
+/// What a loop may take, seconds.
+pub(crate) const LOOP_S: core::ops::RangeInclusive<f64> = 0.5..=60.0;
+
 /// Why a motion file cannot be played.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MotionError {
@@ -32,8 +35,8 @@ pub enum MotionError {
     },
     /// The file ends too early for the period.
     #[error(
-        "{frame_count} frames every {frame_time_s} s end too early for a loop of {period_s} s, and fill one \
-         of motion_period_s = {}", (*frame_count as f64 * frame_time_s * 1e6).round() / 1e6
+        "{frame_count} frames every {frame_time_s} s end too early for a loop of {period_s} s, and fill {}",
+        filled(*frame_count, *frame_time_s)
     )]
     TooShort {
         /// Frames in the file.
@@ -43,6 +46,17 @@ pub enum MotionError {
         /// The loop's period.
         period_s: f64,
     },
+}
+
+/// The loop that so many frames fill.
+fn filled(frame_count: usize, frame_time_s: f64) -> String {
+    let length_s = (frame_count as f64 * frame_time_s * 1e6).round() / 1e6;
+    if LOOP_S.contains(&length_s) {
+        format!("one of motion_period_s = {length_s}")
+    } else {
+        let (least, most) = (LOOP_S.start(), LOOP_S.end());
+        format!("{length_s} s; a loop is of {least} to {most} s")
+    }
 }
 
 /// Where in a skeleton root and hands are: turns frames into poses, one at a time.
@@ -430,8 +444,24 @@ mod tests {
             error.to_string().starts_with("250 frames every 0.008 s"),
             "{error}"
         );
+        let told = error.to_string();
+        assert!(
+            told.ends_with("and fill one of motion_period_s = 2"),
+            "{told}"
+        );
         assert!(Recording::new(&bvh, Hands::default(), 2.0, UNIT_M).is_ok());
         assert!(Recording::new(&bvh, Hands::default(), 1.0, UNIT_M).is_ok());
+        // Nine frames at 20 Hz are no loop that could be asked for.
+        let few = MotionError::TooShort {
+            frame_count: 9,
+            frame_time_s: 0.05,
+            period_s: PERIOD_S,
+        };
+        let told = few.to_string();
+        assert!(
+            told.ends_with("and fill 0.45 s; a loop is of 0.5 to 60 s"),
+            "{told}"
+        );
     }
 
     #[test]

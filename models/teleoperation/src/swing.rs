@@ -8,7 +8,7 @@
 use core::f64::consts::TAU;
 
 use crate::bvh::Bvh;
-use crate::motion::HumanPose;
+use crate::motion::{HumanPose, LOOP_S};
 use crate::skeleton::{Channel, Skeleton};
 use hil_core::case_study::ParameterError;
 
@@ -76,7 +76,7 @@ impl Swing {
 /// When `period_s` is outside 0.5..=60, `amplitude_m` outside 0.01..=0.4 or `rate_hz` outside
 /// 10..=1000.
 pub fn swing_bvh(period_s: f64, amplitude_m: f64, rate_hz: f64) -> Result<String, ParameterError> {
-    ParameterError::check("motion_period_s", period_s, 0.5..=60.0, "0.5 to 60")?;
+    ParameterError::check("motion_period_s", period_s, LOOP_S, "0.5 to 60")?;
     ParameterError::check("rate_hz", rate_hz, 10.0..=1000.0, "10 to 1000")?;
     let swing = Swing::new(amplitude_m)?;
     let frame_time_s = 1.0 / rate_hz;

@@ -4,8 +4,11 @@
 
 use core::fmt::Write;
 
-use hil_core::text_file::{TextFault, TextFile, cells, not_a_number, separator_of, short};
+use hil_core::text_file::{
+    Line, TextFault, TextFile, cells, is_missing, not_whole, separator_of, short, whole,
+};
 
+use super::epoch::{NANOSECONDS, origin};
 use super::{
     Trace, TraceArrival, TraceDirection, TraceFate, TraceHeader, TraceRecord, UNAVAILABLE_NS,
     UNBOUNDED_NS,
@@ -105,23 +108,46 @@ pub fn decode(file: &TextFile) -> Result<CsvDecoded, TextFault> {
     let mut records: Vec<TraceRecord> = Vec::new();
     let mut columns: Option<Columns> = None;
     let mut promised: Option<u64> = None;
+    let mut separator = None;
+    let mut names_line = 0;
     let mut fault = None;
     for line in file.lines() {
         let content = line.content;
-        let read = if let Some(remark) = content.strip_prefix('#') {
-            read_remark(remark, &mut header, &mut promised)
+        let remark = remark(content);
+        let read = if let Some(remark) = remark {
+            // Some programs write the names as a remark.
+            let named = || Columns::read(remark, separator).ok();
+            let named = records.is_empty().then(named).flatten();
+            if named.is_some() {
+                (columns, names_line) = (named, line.number);
+                Ok(())
+            } else {
+                read_remark(remark, &mut header, &mut promised)
+            }
         } else if content.trim().is_empty() {
             Ok(())
+        } else if columns.is_none()
+            && let Some(said) = said_separator(content)
+        {
+            separator = Some(said);
+            Ok(())
         } else if let Some(known) = &columns {
-            let before_ns = records.last().map(|record| record.published_ns);
-            let record = known.record(content, records.len() as u64, before_ns);
-            record.map(|record| records.push(record))
+            // Where a remark had them already.
+            let names = || Columns::read(content, separator).ok();
+            if let Some(names) = records.is_empty().then(names).flatten() {
+                (columns, names_line) = (Some(names), line.number);
+                Ok(())
+            } else {
+                let before_ns = records.last().map(|record| record.published_ns);
+                let record = known.record(content, records.len() as u64, before_ns);
+                record.map(|record| records.push(record))
+            }
         } else {
-            Columns::read(content).map(|found| columns = Some(found))
+            let names = Columns::read(content, separator);
+            names.map(|names| (columns, names_line) = (Some(names), line.number))
         };
         if let Err(what) = read {
-            let is_remark = content.starts_with('#');
-            if records.is_empty() && (columns.is_none() || is_remark) {
+            if records.is_empty() && (columns.is_none() || remark.is_some()) {
                 return Err(line.fault(what));
             }
             fault = Some(line.fault(what));
@@ -140,10 +166,12 @@ pub fn decode(file: &TextFile) -> Result<CsvDecoded, TextFault> {
             file.end().fault(what)
         });
     }
-    // A text of ours, which states its count, means its instants as they are.
+    // A text of ours, which states its count, means its numbers as they are.
     let first_ns = match promised {
         Some(_) => 0,
-        None => first_since_1970(&records).map_err(|what| file.end().fault(what))?,
+        None => first_since_1970(&records)
+            .and_then(|first_ns| no_marks(&records).map(|()| first_ns))
+            .map_err(|Doubt { index, what }| row(file, names_line, index).fault(what))?,
     };
     for record in &mut records {
         record.published_ns = record.published_ns.saturating_sub(first_ns);
@@ -153,45 +181,100 @@ pub fn decode(file: &TextFile) -> Result<CsvDecoded, TextFault> {
     Ok(CsvDecoded { trace, fault })
 }
 
-/// Times of today since 1970 in nanoseconds are beyond this, and times since the start of a run or of a computer are
-/// not: three years.
-pub(crate) const SINCE_1970_NS: i64 = 100_000_000_000_000_000;
+/// What stands behind the `#` of a remark.
+fn remark(content: &str) -> Option<&str> {
+    content.trim_start().strip_prefix('#')
+}
+
+/// The separator of a line `sep=;`, which some spreadsheets want first.
+fn said_separator(content: &str) -> Option<char> {
+    let said = content.trim_start().trim_matches('"');
+    let said = said.split_at_checked("sep=".len());
+    let (_, said) = said.filter(|(key, _)| key.eq_ignore_ascii_case("sep="))?;
+    let mut letters = said.chars();
+    let separator = letters.next()?;
+    letters.as_str().trim().is_empty().then_some(separator)
+}
+
+/// The line of record `index`, behind the line with the names of columns.
+fn row(file: &TextFile, names_line: u64, index: usize) -> Line<'_> {
+    let is_row = |line: &Line<'_>| {
+        let content = line.content;
+        line.number > names_line && !content.trim().is_empty() && remark(content).is_none()
+    };
+    let mut rows = file.lines().filter(is_row);
+    rows.nth(index).unwrap_or_else(|| file.end())
+}
+
+/// What a text that states no count may mean otherwise than it says.
+#[derive(Debug)]
+struct Doubt {
+    /// Of the record.
+    index: usize,
+    what: String,
+}
 
 /// The first instant where instants count from 1970, from which they then count; else 0.
-fn first_since_1970(records: &[TraceRecord]) -> Result<i64, String> {
-    let Some((first, last)) = records.first().zip(records.last()) else {
-        return Ok(0);
+fn first_since_1970(records: &[TraceRecord]) -> Result<i64, Doubt> {
+    let count = records.len();
+    let instants = records.iter().map(|record| record.published_ns);
+    let first_ns = origin(instants, NANOSECONDS).map_err(|fault| {
+        let otherwise = if fault.is_doubt {
+            as_they_are("nanoseconds since a start", count)
+        } else {
+            String::new()
+        };
+        let (index, what) = (fault.index, fault.what + &otherwise);
+        Doubt { index, what }
+    })?;
+    let is_apart = |record: &TraceRecord| {
+        !NANOSECONDS.is_since_start(record.departure_ns.saturating_sub(record.published_ns))
     };
-    let first_ns = first.published_ns;
-    if first_ns >= SINCE_1970_NS {
-        return Ok(first_ns);
-    }
-    // In another unit they are years of today (2008 to 2039), and distinct instants are nearer than those of messages.
-    let span_ns = last.published_ns.saturating_sub(first_ns);
-    let steps = records.windows(2);
-    let steps = steps.filter(|two| two[1].published_ns > two[0].published_ns);
-    let step_count = i64::try_from(steps.count()).unwrap_or(i64::MAX);
-    let units = [
-        ("s", 1_000_000_000, 10, 0),
-        ("ms", 1_000_000, 1_000, 2),
-        ("us", 1_000, 50_000, 2),
+    records.iter().position(is_apart).map_or(Ok(first_ns), |index| {
+        let TraceRecord { published_ns, departure_ns, .. } = records[index];
+        Err(Doubt {
+            index,
+            what: format!(
+                "published at {published_ns} and departed at {departure_ns} ns do not count from the same moment"
+            ),
+        })
+    })
+}
+
+/// How a text says that its numbers are right.
+fn as_they_are(what: &str, count: usize) -> String {
+    format!("; if they are {what}, say so with a first line \"# record_count: {count}\"")
+}
+
+/// A number in the place of a delay that is none: one below zero again and again beside delays above it, or one of years.
+fn no_marks(records: &[TraceRecord]) -> Result<(), Doubt> {
+    type Delay = fn(&TraceRecord) -> Option<i64>;
+    let columns: [(Delay, &str, &str); 2] = [
+        (TraceRecord::delay, COLUMNS[3], "a message that was lost"),
+        (TraceRecord::second_delay, COLUMNS[5], "no second copy"),
     ];
-    let is_of = |(_, unit_ns, nearest_ns, steps_min): &(&str, i64, i64, i64)| {
-        let per_s = 1_000_000_000 / unit_ns;
-        let is_of_today = (1_200_000_000 * per_s..2_200_000_000 * per_s).contains(&first_ns);
-        is_of_today
-            && records.len() > 1
-            && step_count >= *steps_min
-            && span_ns / step_count.max(1) < *nearest_ns
-    };
-    match units.into_iter().find(is_of) {
-        None => Ok(0),
-        Some((unit, unit_ns, ..)) => Err(format!(
-            "the first instant, {first_ns}, is an epoch time in {unit}, expected nanoseconds: multiply by {unit_ns}; \
-             if they are nanoseconds, say so with a first line \"# record_count: {}\"",
-            records.len()
-        )),
+    for (delay, column, meaning) in columns {
+        let delays = || {
+            (0..)
+                .zip(records)
+                .filter_map(|(index, one)| Some((index, delay(one)?)))
+        };
+        let mut below = delays().filter(|(_, ns)| *ns < 0);
+        let first = below.next().filter(|(_, first_ns)| {
+            let is_code =
+                first_ns.to_string()[1..].bytes().all(|digit| digit == b'9') || *first_ns == -1;
+            let again_count = below.clone().filter(|(_, ns)| ns == first_ns).count();
+            let is_one = again_count == below.count() && (is_code || again_count > 0);
+            is_one && delays().any(|(_, ns)| ns > 0)
+        });
+        let years = delays().find(|(_, ns)| !NANOSECONDS.is_since_start(*ns));
+        if let Some((index, ns)) = years.or(first) {
+            let otherwise = as_they_are("delays", records.len());
+            let what = format!("{column} is {ns}: for {meaning} leave it empty{otherwise}");
+            return Err(Doubt { index, what });
+        }
     }
+    Ok(())
 }
 
 /// `# key: value`; remarks that are none of ours say nothing.
@@ -233,14 +316,14 @@ fn word(key: &str, value: &str, words: &[&str]) -> Result<usize, String> {
 
 fn number<T: core::str::FromStr>(key: &str, value: &str) -> Result<T, String> {
     let expected = "a whole number in range";
-    value.parse().map_err(|_not_a_number| {
+    whole(value).ok_or_else(|| {
         let is_epoch = value.parse().is_ok_and(|s: f64| (1e9..3e9).contains(&s));
         let epoch = if is_epoch {
             "; an epoch time in seconds? Multiply by 1000000000"
         } else {
             ""
         };
-        format!("{key}: {}{epoch}", not_a_number(value, expected))
+        format!("{key}: {}{epoch}", not_whole(value, expected))
     })
 }
 
@@ -253,8 +336,8 @@ struct Columns {
 }
 
 impl Columns {
-    fn read(line: &str) -> Result<Self, String> {
-        let separator = separator_of(line);
+    fn read(line: &str, separator: Option<char>) -> Result<Self, String> {
+        let separator = separator.unwrap_or_else(|| separator_of(line));
         let names = cells(line, separator)?;
         for (index, name) in names.iter().enumerate() {
             if names[..index].contains(name) {
@@ -271,8 +354,9 @@ impl Columns {
         if !(has(0) || has(1)) || !(has(2) || has(3)) {
             return Err(format!(
                 "not the columns of a trace: \"{}\"; needed are published_ns or departure_ns, \
-                 and fate or delay_ns",
-                short(line)
+                 and fate or delay_ns, separated by commas{}",
+                short(line),
+                form_words(line)
             ));
         }
         Ok(columns)
@@ -287,21 +371,26 @@ impl Columns {
         let cells = cells(line, self.separator)?;
         if cells.len() != self.count {
             let (found, expected) = (cells.len(), self.count);
-            let is_number = |cell: &str| cell.bytes().all(|byte| byte.is_ascii_digit());
-            let comma = match self.separator {
+            let is_digits = |cell: &str| cell.bytes().all(|byte| byte.is_ascii_digit());
+            let is_number = |cell: &str| !cell.is_empty() && is_digits(cell);
+            let why = match self.separator {
+                _ if found == expected + 1 && cells[expected].is_empty() => {
+                    "; the line ends with a separator"
+                }
                 ',' if found > expected && cells.iter().all(|cell| is_number(cell)) => {
                     "; a decimal comma? Expected are whole numbers"
                 }
                 _ => "",
             };
-            return Err(format!("{found} values for {expected} columns{comma}"));
+            return Err(format!("{found} values for {expected} columns{why}"));
         }
         let cell = |column: usize| {
             let text: &str = &cells[self.places[column]?];
             (!text.is_empty()).then_some(text)
         };
-        let published: Option<i64> = optional(cell(0), COLUMNS[0])?;
-        let departure: Option<i64> = optional(cell(1), COLUMNS[1])?;
+        let number = |column: usize| cell(column).filter(|text| !is_missing(text));
+        let published: Option<i64> = optional(number(0), COLUMNS[0])?;
+        let departure: Option<i64> = optional(number(1), COLUMNS[1])?;
         let Some(published_ns) = published.or(departure) else {
             return Err("neither published_ns nor departure_ns has a value".to_owned());
         };
@@ -310,7 +399,13 @@ impl Columns {
                 "published at {published_ns} ns, before the row before it at {before_ns} ns"
             ));
         }
-        let delay: Option<i64> = optional(cell(3), COLUMNS[3])?;
+        let delay: Option<i64> = optional(number(3), COLUMNS[3])?;
+        if delay == Some(UNAVAILABLE_NS) {
+            let column = COLUMNS[3];
+            return Err(format!(
+                "{column} is {UNAVAILABLE_NS}: for a message that was lost leave it empty"
+            ));
+        }
         let words = TraceFate::ALL.map(TraceFate::word);
         let fate = match cell(2) {
             Some(text) => TraceFate::ALL[word(COLUMNS[2], text, &words)?],
@@ -323,14 +418,14 @@ impl Columns {
                 "a delay of {delay_ns} ns for a message that is {fate}"
             ));
         }
-        let bound: Option<u64> = optional(cell(4), COLUMNS[4])?;
-        let size_bytes = optional(cell(6), COLUMNS[6])?.unwrap_or(0);
+        let bound: Option<u64> = optional(number(4), COLUMNS[4])?;
+        let size_bytes = optional(number(6), COLUMNS[6])?.unwrap_or(0);
         if size_bytes > SIZE_BYTES_MAX {
             return Err(format!(
                 "size_bytes is {size_bytes}, allowed are 0 to {SIZE_BYTES_MAX}"
             ));
         }
-        let flags = optional(cell(9), COLUMNS[9])?.unwrap_or(0);
+        let flags = optional(number(9), COLUMNS[9])?.unwrap_or(0);
         if flags & !TraceRecord::FLAGS != 0 {
             return Err(format!("flags are {flags}, allowed are 0 to 31"));
         }
@@ -339,13 +434,28 @@ impl Columns {
             departure_ns: departure.unwrap_or(published_ns),
             delay_ns: delay.unwrap_or(UNAVAILABLE_NS),
             bound_ns: bound.filter(|_| delay.is_some()).unwrap_or(UNBOUNDED_NS),
-            second_delay_ns: optional(cell(5), COLUMNS[5])?.unwrap_or(UNAVAILABLE_NS),
+            second_delay_ns: optional(number(5), COLUMNS[5])?.unwrap_or(UNAVAILABLE_NS),
             size_bytes,
-            sequence: optional(cell(7), COLUMNS[7])?.unwrap_or(index),
-            start: optional(cell(8), COLUMNS[8])?.unwrap_or(0),
+            sequence: optional(number(7), COLUMNS[7])?.unwrap_or(index),
+            start: optional(number(8), COLUMNS[8])?.unwrap_or(0),
             fate,
             flags,
         })
+    }
+}
+
+/// What a line of numbers in the place of column names may be.
+fn form_words(line: &str) -> &'static str {
+    let is_number = |word: &str| word.parse::<f64>().is_ok();
+    let words = line.split([' ', '\t', ',', ';']);
+    let words = words.filter(|word| !word.is_empty());
+    let count = words.clone().count();
+    if !words.clone().all(is_number) {
+        ""
+    } else if count > 2 && !line.contains([',', ';']) {
+        ". A delay distribution of netem is written, not read"
+    } else {
+        ". Mahimahi's form has whole milliseconds, one a line, and no remarks; `trace convert` makes a table of it"
     }
 }
 
@@ -439,7 +549,15 @@ mod tests {
                 refused.contains("epoch time") && refused.contains(name),
                 "{refused}"
             );
+            assert!(refused.starts_with("line 2, byte 22: "), "{refused}");
         }
+        let mixed = "published_ns,delay_ns\n# a remark\n0,5\n\n1700000000000000000,5\n";
+        let refused = decode(&mixed.into()).unwrap_err();
+        assert_eq!((refused.line, refused.offset), (5, 38));
+        let said = "sep=|\n# published_ns,delay_ns\npublished_ns|delay_ns\n1700000000|5\n";
+        assert_eq!(decode(&said.into()).unwrap_err().line, 4);
+        let apart = "published_ns,departure_ns,delay_ns\n0,1700000000000000000,5\n";
+        assert_eq!(decode(&apart.into()).unwrap_err().line, 2);
     }
 
     #[test]
@@ -452,28 +570,93 @@ mod tests {
         let (hour, day) = (3_600_000_000_000, 86_400_000_000_000);
         let every = |start: i64, ns: i64| (0..500).map(|row| start + ns * row).collect::<Vec<_>>();
         for instants in [
-            // One instant of several messages, a batch, and messages of 1 kHz, all within 1000 to 3000 s.
-            vec![hour / 2; 2],
-            vec![hour / 2, hour / 2, hour / 2 + 400],
-            every(hour / 2, 1_000_000),
+            vec![hour / 4; 2],
+            every(hour, 1_000_000),
             // 1 Gbit/s of full frames, and 100 Hz.
             every(12 * day, 12_304),
-            every(30 * day, 12_304),
-            every(20 * day, 10_000_000),
+            every(30 * day, 10_000_000),
+            // From half an hour to an hour.
+            every(hour / 2, 5_000_000_000),
         ] {
             let records = decoded(&instants).0.unwrap().trace.records;
             assert_eq!(records[0].published_ns, instants[0]);
         }
-        // That capture between the 14th and the 25th day could be of 80 Hz in microseconds: the text has to say it.
-        let instants = every(20 * day, 12_304);
-        let (refused, text) = decoded(&instants);
-        let refused = refused.unwrap_err().to_string();
-        let line = refused.split('"').nth(1).unwrap();
-        let said = decode(&format!("{line}\n{text}").as_str().into()).unwrap();
-        assert_eq!(
-            (said.fault, said.trace.records[0].published_ns),
-            (None, instants[0])
-        );
+        // Between the 14th and the 25th day and from 20 to 37 minutes they could be of another unit, in which a
+        // measurement may be as slow as it likes: the text has to say it.
+        for instants in [
+            every(20 * day, 12_304),
+            every(hour / 2, 1_000_000),
+            vec![hour / 2],
+        ] {
+            let (refused, text) = decoded(&instants);
+            let refused = refused.unwrap_err().to_string();
+            let line = refused.split('"').nth(1).unwrap();
+            let said = decode(&format!("{line}\n{text}").as_str().into()).unwrap();
+            assert_eq!(
+                (said.fault, said.trace.records[0].published_ns),
+                (None, instants[0])
+            );
+        }
+    }
+
+    #[test]
+    fn a_number_in_the_place_of_a_delay_is_no_delay() {
+        let of = |rows: &str| {
+            let text = format!("published_ns,delay_ns,second_delay_ns\n{rows}");
+            decode(&text.as_str().into()).map(|read| read.trace.counts().delivered_count)
+        };
+        for (rows, line, column) in [
+            ("0,4000,\n1,-1,\n2,5000,\n", 3, "delay_ns is -1:"),
+            ("0,4000,\n1,-999,\n2,5000,\n", 3, "delay_ns is -999:"),
+            ("0,-50,\n1,4000,\n2,-50,\n", 2, "delay_ns is -50:"),
+            ("0,4000,-1\n1,4000,9\n", 2, "second_delay_ns is -1:"),
+            (
+                "0,4000,\n1,9223372036854775807,\n",
+                3,
+                "delay_ns is 9223372036854775807:",
+            ),
+        ] {
+            let refused = of(rows).unwrap_err();
+            let what = &refused.what;
+            assert!(
+                what.starts_with(column) && what.contains("leave it empty"),
+                "{what}"
+            );
+            assert_eq!(refused.line, line, "{rows}");
+        }
+        // What two clocks leave of short delays, and clocks that are apart.
+        for rows in [
+            "0,4000,\n1,-50,\n2,5000,\n",
+            "0,40,\n1,-1,\n2,-3,\n",
+            "0,-1,\n1,-1,\n2,0,\n",
+        ] {
+            assert_eq!(of(rows), Ok(3), "{rows}");
+        }
+        let smallest = decode(&"published_ns,delay_ns\n0,5\n1,-9223372036854775808\n".into());
+        assert_eq!(smallest.unwrap().fault.unwrap().line, 3);
+    }
+
+    #[test]
+    fn what_spreadsheets_and_programs_add_changes_nothing() {
+        let plain = decode(&"published_ns,delay_ns\n0,5\n10,\n".into()).unwrap();
+        for text in [
+            "sep=;\npublished_ns;delay_ns\n0;5\n10;\n",
+            "\"sep=|\"\npublished_ns|delay_ns\n0|5\n10|\n",
+            "# published_ns,delay_ns\n0,5\n10,\n",
+            "  # published_ns,delay_ns\npublished_ns,delay_ns\n0,5\n10,\n",
+            "published_ns,delay_ns\n0.0,5.00\n10.0,NaN\n",
+            "published_ns,delay_ns\n  # made by hand\n0,5\n10,NA\n",
+            "published_ns,departure_ns,delay_ns\nnull,0,5\n10,None,null\n",
+        ] {
+            assert_eq!(decode(&text.into()), Ok(plain.clone()), "{text}");
+        }
+        let refused = |text: &str| decode(&text.into()).unwrap_err().what;
+        assert!(refused("3.5\n6.5\n").contains("Mahimahi's form has whole milliseconds"));
+        assert!(refused("3,5\n6,5\n").contains("Mahimahi's form has whole milliseconds"));
+        assert!(refused("# up link\n3\n6\n").contains("no remarks"));
+        let netem = refused("# mean\n -1000 -963 -926 7\n");
+        assert!(netem.contains("netem is written, not read"), "{netem}");
+        assert!(!refused("a,b\n1,2\n").contains("netem"));
     }
 
     #[test]
@@ -487,6 +670,10 @@ mod tests {
             ("x,1\n", "is not a whole number"),
             ("6;1\n", "1 values for 2 columns"),
             ("6,5,1\n", "a decimal comma?"),
+            (
+                "6,5,\n",
+                "3 values for 2 columns; the line ends with a separator",
+            ),
             ("\"6,5\",1\n", "has a decimal comma"),
             ("1700000000.5,1\n", "an epoch time in seconds?"),
             ("6\n", "1 values for 2 columns"),

@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 pub mod csv;
+mod epoch;
 pub mod fault;
 pub mod fit;
 pub mod from_records;
@@ -293,8 +294,6 @@ pub struct TraceCounts {
     pub unknown_count: u64,
     /// Delivered, with a delay.
     pub delay_count: u64,
-    /// [`TraceRecord::REORDERED`].
-    pub reordered_count: u64,
     /// Messages that arrived twice.
     pub duplicated_count: u64,
 }
@@ -312,7 +311,6 @@ impl TraceCounts {
         } += 1;
         let is_delivered = record.fate == TraceFate::Delivered;
         self.delay_count += u64::from(is_delivered && record.delay().is_some());
-        self.reordered_count += u64::from(record.has(TraceRecord::REORDERED));
         self.duplicated_count += u64::from(record.second_delay().is_some());
     }
 

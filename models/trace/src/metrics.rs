@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS};
+use hil_account::network::{Metric, OrderMetrics};
 use hil_core::interval::Spread;
 use hil_stats::dependence::{Batches, Quantiles};
 use hil_stats::histogram::Distribution;
@@ -83,6 +84,13 @@ pub struct TraceMetrics {
     pub late_delay: Distribution,
     /// With intervals.
     pub quantiles: Vec<QuantileMetric>,
+    /// Each delay less the smallest one (RFC 5481, section 4.2: PDV).
+    pub delay_variation: Distribution,
+    /// Difference of the delays of two messages with successive numbers, both delivered, as magnitudes
+    /// (RFC 5481, section 4.1: IPDV).
+    pub successive_variation: Distribution,
+    /// By the instants of arrival.
+    pub order: Metric<OrderMetrics>,
     /// Largest error of any delay from the clocks, 0 on one clock; `None` without delays, and when
     /// that of one of them is not known.
     pub bound_max_ns: Option<u64>,
@@ -129,6 +137,12 @@ impl TraceMetrics {
                 "no message is known to have come too late",
             ),
             quantiles: quantiles(&delays_ns),
+            delay_variation: Distribution::of_samples(&above_smallest(&delays_ns), reason),
+            successive_variation: Distribution::of_samples(
+                &successive_differences(&trace.records),
+                "no two messages with successive numbers have a delay",
+            ),
+            order: order(&trace.records),
             bound_max_ns: trace.delay_bound_ns(),
             longest_outage: longest_outage(&trace.records),
             period_ns: trace.period_ns(),
@@ -191,6 +205,50 @@ fn memory(series: &[f64]) -> Option<Memory> {
         coefficients: (1..=lag_max).map(at).collect(),
         independent_within: 1.96 / n.sqrt(),
     })
+}
+
+fn above_smallest(delays_ns: &[i64]) -> Vec<i64> {
+    let smallest_ns = delays_ns.iter().copied().min().unwrap_or(0);
+    let delays = delays_ns.iter();
+    delays.map(|ns| ns.saturating_sub(smallest_ns)).collect()
+}
+
+fn successive_differences(records: &[TraceRecord]) -> Vec<i64> {
+    let delay_ns = |record: &TraceRecord| {
+        let is_delivered = record.fate == TraceFate::Delivered;
+        record.delay().filter(|_| is_delivered)
+    };
+    let pairs = records.windows(2).filter_map(|pair| {
+        let is_next = pair[0].start == pair[1].start
+            && pair[0].sequence.checked_add(1) == Some(pair[1].sequence);
+        let delays = delay_ns(&pair[0]).zip(delay_ns(&pair[1]));
+        let (one, other) = delays.filter(|_| is_next)?;
+        Some(other.saturating_sub(one).saturating_abs())
+    });
+    pairs.collect()
+}
+
+/// Of the messages whose arrival is known. Those that arrived at once keep the order of their publication.
+fn order(records: &[TraceRecord]) -> Metric<OrderMetrics> {
+    let delivered = records.iter();
+    let mut delivered = delivered.filter(|record| record.fate == TraceFate::Delivered);
+    if delivered.any(|record| record.delay().is_none()) {
+        return Metric::unavailable(
+            "a message was delivered whose instant of arrival is not known",
+        );
+    }
+    let has_arrived = |record: &TraceRecord| {
+        matches!(record.fate, TraceFate::Delivered | TraceFate::LostAfterLink)
+    };
+    let arrived = records.iter().filter(|record| has_arrived(record));
+    let arrivals =
+        arrived.filter_map(|record| Some(record.departure_ns.saturating_add(record.delay()?)));
+    let mut arrivals: Vec<(i64, u64)> = arrivals.zip(0..).collect();
+    arrivals.sort_unstable();
+    OrderMetrics::of(arrivals.into_iter().map(|(_, number)| number)).map_or_else(
+        || Metric::unavailable("no message has a known instant of arrival"),
+        Metric::Measured,
+    )
 }
 
 fn quantiles(delays_ns: &[i64]) -> Vec<QuantileMetric> {
@@ -307,6 +365,34 @@ mod tests {
         assert!((figures.rate_bytes_per_s.unwrap() - 2_500.0).abs() < 1e-6);
         assert_eq!(figures.bound_max_ns, Some(7));
         assert_eq!(figures.delay.measured().unwrap().count, 6);
+    }
+
+    #[test]
+    fn order_and_both_variations_are_those_of_the_instants_of_arrival_whatever_the_flags_say() {
+        // The fourth of ten arrives at 75 ms, behind the four that were published after it.
+        let mut traced = trace("1111111111");
+        traced.records[3].delay_ns = 45 * MS;
+        let figures = TraceMetrics::of(&traced);
+        let order = *figures.order.measured().unwrap();
+        let extents = (order.extent_p50, order.extent_max, order.n_max);
+        assert_eq!((order.count, order.reordered_count), (10, 1));
+        assert_eq!(extents, (Some(4), Some(4), Some(4)));
+        let above = *figures.delay_variation.measured().unwrap();
+        assert_eq!((above.p50_ns, above.max_ns), (0, 44 * MS));
+        let pairs = *figures.successive_variation.measured().unwrap();
+        assert_eq!((pairs.count, pairs.p50_ns, pairs.max_ns), (9, 0, 44 * MS));
+        // Flags tell of what a gateway saw; here it saw nothing late.
+        traced.records[3].delay_ns = MS;
+        traced.records[5].flags = TraceRecord::REORDERED;
+        traced.records[5].fate = TraceFate::LostAfterLink;
+        let order = TraceMetrics::of(&traced).order;
+        assert_eq!(order.measured().unwrap().reordered_count, 0);
+        // A loss parts successive numbers, and an arrival without an instant leaves the order open.
+        let parted = TraceMetrics::of(&trace("1x1")).successive_variation;
+        assert!(parted.measured().is_none());
+        traced.records[0].delay_ns = UNAVAILABLE_NS;
+        assert!(TraceMetrics::of(&traced).order.measured().is_none());
+        assert!(TraceMetrics::of(&trace("x?")).order.measured().is_none());
     }
 
     #[test]

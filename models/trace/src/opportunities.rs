@@ -5,9 +5,9 @@
 
 use core::fmt::Write;
 
-use hil_core::text_file::{TextFault, TextFile, not_a_number};
+use hil_core::text_file::{TextFault, TextFile, not_whole, whole};
 
-use super::csv::SINCE_1970_NS;
+use super::epoch::{MILLISECONDS, origin};
 use super::{Trace, TraceFate, TraceHeader, TraceRecord};
 
 /// Bytes of one opportunity.
@@ -100,7 +100,7 @@ pub fn decode(file: &TextFile) -> (Trace, Option<TextFault>) {
     "opportunities of 1500 bytes, whole milliseconds".clone_into(&mut header.clock);
     let mut fault = None;
     for line in file.lines() {
-        let content = line.content.trim().trim_matches('"');
+        let content = time(line.content);
         if content.is_empty() {
             continue;
         }
@@ -122,23 +122,31 @@ pub fn decode(file: &TextFile) -> (Trace, Option<TextFault>) {
     if fault.is_none() && records.is_empty() {
         fault = Some(file.end().fault("no delivery opportunity"));
     }
-    // Times since 1970 count from the first.
-    let first_ns = records.first().map_or(0, |first| first.published_ns);
-    if first_ns >= SINCE_1970_NS {
-        for record in &mut records {
-            record.published_ns -= first_ns;
-            record.departure_ns -= first_ns;
-        }
+    let instants = records.iter().map(|record| record.published_ns / MS_NS);
+    let first_ms = origin(instants, MILLISECONDS).unwrap_or_else(|wrong| {
+        let mut times = file.lines().filter(|line| !time(line.content).is_empty());
+        let line = times.nth(wrong.index).unwrap_or_else(|| file.end());
+        fault = Some(line.fault(wrong.what));
+        records.truncate(wrong.index);
+        0
+    });
+    for record in &mut records {
+        record.published_ns -= first_ms * MS_NS;
+        record.departure_ns -= first_ms * MS_NS;
     }
     // The file wraps at its last line.
     header.duration_ns = records.last().map_or(0, |record| record.published_ns);
     (Trace { header, records }, fault)
 }
 
+/// What stands on a line, without quotes.
+fn time(content: &str) -> &str {
+    content.trim().trim_matches('"')
+}
+
 fn opportunity(content: &str, before_ns: i64) -> Result<i64, String> {
-    let parsed: Result<i64, _> = content.parse();
-    let ms =
-        parsed.map_err(|_not_a_number| not_a_number(content, "a whole number of milliseconds"))?;
+    let expected = "a whole number of milliseconds";
+    let ms: i64 = whole(content).ok_or_else(|| not_whole(content, expected))?;
     let at_ns = ms.checked_mul(MS_NS).filter(|ns| *ns >= 0);
     let at_ns = at_ns.ok_or_else(|| format!("{ms} ms is outside 0 to 9223372036854"))?;
     if at_ns < before_ns {
@@ -184,7 +192,9 @@ mod tests {
 
     #[test]
     fn a_text_makes_a_trace_of_its_rate_that_writes_itself() {
+        let decimals = decode(&"0.0\n0\n4.000\n10.\n".into());
         let text = "0\n0\n4\n10\n";
+        assert_eq!(decimals, decode(&text.into()));
         let (trace, fault) = decode(&text.into());
         assert_eq!((fault, trace.records.len()), (None, 4));
         assert_eq!(trace.header.duration_ns, 10 * MS_NS);
@@ -197,6 +207,10 @@ mod tests {
         let (trace, fault) = decode(&"1700000000000\n1700000000007\n".into());
         assert_eq!((fault, trace.header.duration_ns), (None, 7 * MS_NS));
         assert_eq!(encode(&trace).unwrap(), "0\n7\n");
+        let (trace, fault) = decode(&"\n1700000000\n1700000007\n".into());
+        let fault = fault.unwrap();
+        assert_eq!((trace.records.len(), fault.line, fault.offset), (0, 2, 1));
+        assert!(fault.what.contains("epoch time in s"), "{fault}");
     }
 
     #[test]
@@ -204,6 +218,7 @@ mod tests {
         for (row, why) in [
             ("3\n", "3 ms comes after 5 ms"),
             ("x\n", "is not a whole number"),
+            ("5.5\n", "is not a whole number"),
         ] {
             let (trace, fault) = decode(&format!("1\n5\n{row}7\n").as_str().into());
             let fault = fault.unwrap();

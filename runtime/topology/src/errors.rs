@@ -90,6 +90,14 @@ pub enum Fault {
         /// What it must be.
         expected: String,
     },
+    /// A text in the place of a number, with a comma where a point is expected.
+    #[error("\"{value}\" has a decimal comma, write {point}")]
+    DecimalComma {
+        /// What it is.
+        value: String,
+        /// What is meant.
+        point: String,
+    },
     /// A number beyond its bounds.
     #[error("{value} is outside {allowed}")]
     OutOfRange {

@@ -5,6 +5,7 @@
 use hil_core::options::{
     ANY_NUMBER, Field, Options, Setting, Shape, Slot, Table as TableSlot, Tables,
 };
+use hil_core::text_file::has_decimal_comma;
 
 use super::errors::{Fault, Faults, Place};
 use super::tables::{NAME, NAME_WITH_SLASHES};
@@ -196,6 +197,17 @@ impl<'t> Reader<'t> {
                 };
                 let read: Vec<Option<(String, String)>> = table.iter().map(text).collect();
                 return read.into_iter().collect::<Option<_>>().map(Setting::Texts);
+            }
+            (Shape::Number(_) | Shape::Integer(_) | Shape::OneOrMore(_), Value::Text(text))
+                if has_decimal_comma(text) =>
+            {
+                let point = match shape {
+                    Shape::Number(_) => text.replacen(',', ".", 1),
+                    _ => text.chars().take_while(|letter| *letter != ',').collect(),
+                };
+                let value = text.clone();
+                self.add(key, node.place, Fault::DecimalComma { value, point });
+                return None;
             }
             _ => return self.wrong_type(key, node, expected(shape)),
         };

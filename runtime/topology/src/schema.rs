@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use super::reader::range_text;
 use super::resolved::plain;
 use super::tables::{File, NAME, NAME_WITH_SLASHES};
-use super::units::unit_words;
+use super::units::{MICROSECONDS, unit_words};
 
 const DIALECT: &str = "https://json-schema.org/draft/2020-12/schema";
 /// Stands for the name of a host, process, channel or link.
@@ -133,10 +133,11 @@ fn value(shape: &Shape) -> Value {
             json!({ "type": "number", "minimum": range.start(), "maximum": range.end() })
         }
         Shape::Time(_) => {
-            let units = unit_words().collect::<Vec<_>>().join("|");
+            let units = unit_words().chain(MICROSECONDS);
+            let units = units.collect::<Vec<_>>().join("|");
             json!({
                 "type": "string",
-                "pattern": format!("^\\s*[0-9]+(\\.[0-9]+)?\\s*({units}|µs)\\s*$"),
+                "pattern": format!("^\\s*[0-9]+(\\.[0-9]+)?\\s*({units})\\s*$"),
                 "description": format!("A duration with its unit, {}.", range_text(shape)),
             })
         }

@@ -47,6 +47,9 @@ pub(crate) enum DurationError {
     TooLong,
 }
 
+/// `us` with the sign for micro, and with the Greek letter that looks like it.
+pub(super) const MICROSECONDS: [&str; 2] = ["\u{b5}s", "\u{3bc}s"];
+
 /// Reads `20 s`, `4ms`, `1.5 us`.
 ///
 /// # Errors
@@ -71,7 +74,7 @@ pub(super) fn parse_duration(text: &str) -> Result<Duration, DurationError> {
     }
     let unit_ns = UNITS
         .iter()
-        .find(|(word, _)| *word == unit || (*word == "us" && unit == "µs"))
+        .find(|(word, _)| *word == unit || (*word == "us" && MICROSECONDS.contains(&unit)))
         .map(|(_, ns)| *ns)
         .ok_or_else(|| DurationError::UnknownUnit(unit.to_owned()))?;
     to_duration(whole, fraction, unit_ns)
@@ -144,7 +147,8 @@ mod tests {
             ("4ms", 4_000_000),
             ("0.1 ms", 100_000),
             ("1.5 us", 1_500),
-            ("2 µs", 2_000),
+            ("2 \u{b5}s", 2_000),
+            ("2 \u{3bc}s", 2_000),
             ("1 h", 3_600_000_000_000),
             ("2 min", 120_000_000_000),
             ("0 s", 0),

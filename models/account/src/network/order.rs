@@ -29,27 +29,34 @@ pub struct OrderMetrics {
     pub n_max: Option<u64>,
 }
 
-pub(super) fn order(passages: &Passages) -> Metric<OrderMetrics> {
-    let (found, count) = reordered(arrivals(passages).map(|(_, number)| number));
-    if count == 0 {
-        return Metric::unavailable("no message is known to have arrived");
+impl OrderMetrics {
+    /// Of messages by their numbers in the order in which they were sent, as they arrived; `None` without any.
+    pub fn of(numbers: impl Iterator<Item = u64>) -> Option<Self> {
+        let (found, count) = reordered(numbers);
+        let n_max = found.iter().map(|one| one.n).max();
+        let mut extents: Vec<i64> = found
+            .into_iter()
+            .map(|one| i64::try_from(one.extent).unwrap_or(i64::MAX))
+            .collect();
+        extents.sort_unstable();
+        let largest = extents.last().copied();
+        let median = largest.map(|_| at_share(&extents, 0.5));
+        (count > 0).then(|| Self {
+            count,
+            reordered_count: extents.len() as u64,
+            ratio: extents.len() as f64 / count as f64,
+            extent_p50: median.map(i64::unsigned_abs),
+            extent_max: largest.map(i64::unsigned_abs),
+            n_max,
+        })
     }
-    let n_max = found.iter().map(|one| one.n).max();
-    let mut extents: Vec<i64> = found
-        .into_iter()
-        .map(|one| i64::try_from(one.extent).unwrap_or(i64::MAX))
-        .collect();
-    extents.sort_unstable();
-    let largest = extents.last().copied();
-    let median = largest.map(|_| at_share(&extents, 0.5));
-    Metric::Measured(OrderMetrics {
-        count,
-        reordered_count: extents.len() as u64,
-        ratio: extents.len() as f64 / count as f64,
-        extent_p50: median.map(i64::unsigned_abs),
-        extent_max: largest.map(i64::unsigned_abs),
-        n_max,
-    })
+}
+
+pub(super) fn order(passages: &Passages) -> Metric<OrderMetrics> {
+    OrderMetrics::of(arrivals(passages).map(|(_, number)| number)).map_or_else(
+        || Metric::unavailable("no message is known to have arrived"),
+        Metric::Measured,
+    )
 }
 
 /// When each message that arrived did, in the order of arrival, and its number among them in the order

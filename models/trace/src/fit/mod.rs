@@ -184,10 +184,13 @@ impl TraceFit {
                 figures.counts.lost_before_link_count + figures.counts.lost_after_link_count
             ));
         }
-        if figures.counts.reordered_count + figures.counts.duplicated_count > 0 {
+        let order = figures.order.measured();
+        let reordered_count = order.map_or(0, |order| order.reordered_count);
+        if reordered_count + figures.counts.duplicated_count > 0 {
             remarks.push(format!(
-                "{} messages came late and {} twice; no law here has that. The trace keeps it.",
-                figures.counts.reordered_count, figures.counts.duplicated_count
+                "{reordered_count} messages came after later ones and {} twice; no law here draws copies, and \
+                 the order follows from the delays it draws. The trace keeps both.",
+                figures.counts.duplicated_count
             ));
         }
         if losses.len() > loss::ASCENT_MAX {

@@ -5,6 +5,7 @@ use std::io;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::{Path, PathBuf};
 
+use hil_core::text_file::has_decimal_comma;
 use hil_platform::console::Console;
 use hil_platform::random::random_bytes;
 use hil_topology::registry::Registry;
@@ -135,31 +136,47 @@ fn only_link(topology: &Table) -> Result<Table, String> {
 /// `delay 5ms loss 1% rate 10Mbit`, any of them.
 fn link_of_words(text: &str) -> Result<Table, String> {
     let mut link = Table::from_iter([via("emulated")]);
-    let words: Vec<&str> = text.split_whitespace().collect();
-    if words.is_empty() {
+    let plain = text.replace(QUOTES, "").replace(['=', ':'], " ");
+    let words = plain.split_whitespace();
+    let words = words.map(|word| word.trim_end_matches([',', ';']));
+    let mut words = words.filter(|word| !word.is_empty()).peekable();
+    if words.peek().is_none() {
         return Err("--link is empty: say delay, loss or rate, or name a topology file".to_owned());
     }
-    for pair in words.chunks(2) {
-        let [key, value] = pair else {
-            return Err(format!("--link: `{}` has no value", pair[0]));
+    while let Some(word) = words.next() {
+        let Some(key) = key(word) else {
+            return Err(format!(
+                "--link: `{word}` is neither delay, loss nor rate, and `{text}` no file"
+            ));
         };
-        let wrong = |expected: &str| format!("--link: {key} is `{value}`, expected {expected}");
-        let (key, value): (&str, Value) = match *key {
-            "delay" => ("delay", (*value).into()),
+        let Some(number) = words.next_if(|word| self::key(word).is_none()) else {
+            return Err(format!("--link: `{key}` has no value"));
+        };
+        // A blank may stand before the unit.
+        let is_number = number.parse::<f64>().is_ok() || has_decimal_comma(number);
+        let unit = words.next_if(|word| is_number && self::key(word).is_none());
+        let value = [number, unit.unwrap_or_default()].concat();
+        let wrong = |expected: &str| {
+            let is_of_number = |letter: char| letter.is_ascii_digit() || letter == ',';
+            let unit = value.trim_start_matches(is_of_number);
+            if has_decimal_comma(&value[..value.len() - unit.len()]) {
+                let point = value.replacen(',', ".", 1);
+                format!("--link: {key} is `{value}` with a decimal comma, write {point}")
+            } else {
+                format!("--link: {key} is `{value}`, expected {expected}")
+            }
+        };
+        let (key, value): (&str, Value) = match key {
             "loss" => {
-                let ratio = per_cent(value).ok_or_else(|| wrong("0% to 100%"))?;
+                let ratio = per_cent(&value).ok_or_else(|| wrong("0% to 100%"))?;
                 ("loss_ratio", ratio.into())
             }
             "rate" => {
-                let bits = bits_per_second(value).ok_or_else(|| wrong("a rate such as 10Mbit"))?;
+                let bits = bits_per_second(&value).ok_or_else(|| wrong("a rate such as 10Mbit"))?;
                 let rate = Table::from_iter([("bits_per_second".to_owned(), bits.into())]);
                 ("rate", rate.into())
             }
-            other => {
-                return Err(format!(
-                    "--link: `{other}` is neither delay, loss nor rate, and `{text}` no file"
-                ));
-            }
+            delay => (delay, value.into()),
         };
         if link.insert(key.to_owned(), value).is_some() {
             return Err(format!("--link: {key} is said twice"));
@@ -168,20 +185,42 @@ fn link_of_words(text: &str) -> Result<Table, String> {
     Ok(link)
 }
 
+/// What a shell or a page of text puts around words.
+const QUOTES: [char; 8] = [
+    '"', '\'', '\u{2018}', '\u{2019}', '\u{201c}', '\u{201d}', '\u{201e}', '\u{feff}',
+];
+
+/// What a word of `--link` is about, in letters of any size.
+fn key(word: &str) -> Option<&'static str> {
+    let keys = ["delay", "loss", "rate"];
+    keys.into_iter().find(|key| word.eq_ignore_ascii_case(key))
+}
+
 fn per_cent(text: &str) -> Option<f64> {
     let share: f64 = text.strip_suffix('%')?.parse().ok()?;
     (0.0..=100.0).contains(&share).then_some(share / 100.0)
 }
 
+/// `10Mbit`, `1.5mbit`, `1gbit/s`: bits, in letters of any size as `tc` has them.
 fn bits_per_second(text: &str) -> Option<i64> {
-    let number = text.strip_suffix("bit")?;
-    let (number, unit) = match number.strip_suffix(['k', 'M', 'G']) {
-        Some(rest) if number.ends_with('k') => (rest, 1_000),
-        Some(rest) if number.ends_with('M') => (rest, 1_000_000),
-        Some(rest) => (rest, 1_000_000_000),
-        None => (number, 1),
-    };
-    number.parse::<i64>().ok()?.checked_mul(unit)
+    let text = text.to_ascii_lowercase();
+    let number = text
+        .strip_suffix("/s")
+        .unwrap_or(&text)
+        .strip_suffix("bit")?;
+    let units = [
+        ("k", 1_000),
+        ("m", 1_000_000),
+        ("g", 1_000_000_000),
+        ("", 1),
+    ];
+    let mut units = units.into_iter();
+    let (number, unit) = units.find_map(|(end, unit)| Some((number.strip_suffix(end)?, unit)))?;
+    let (whole, decimals) = number.split_once('.').unwrap_or((number, ""));
+    let scale = 10_i64.checked_pow(u32::try_from(decimals.len()).ok()?)?;
+    let digits: i64 = [whole, decimals].concat().parse().ok()?;
+    let bits = digits.checked_mul(unit)?;
+    (bits % scale == 0).then_some(bits / scale)
 }
 
 /// The file that runs both programs with `link` between them.
@@ -287,8 +326,29 @@ mod tests {
             link["rate"]["bits_per_second"].as_integer(),
             Some(10_000_000)
         );
+        for other in [
+            "Delay 5 ms, loss 1 % rate 10 Mbit",
+            "\u{feff}delay 5ms; LOSS 1.0%; rate 10mbit/s",
+            "\"delay 5ms\" loss=1% rate: 0.01Gbit",
+            "\u{201c}delay 5ms loss 1% rate 10000.0kbit\u{201d}",
+        ] {
+            assert_eq!(link_of_words(other), Ok(link.clone()), "{other}");
+        }
+        let bits = |text| bits_per_second(text);
+        assert_eq!(bits("1.5Mbit"), Some(1_500_000));
+        assert_eq!(bits("1gbit"), Some(1_000_000_000));
+        assert_eq!(bits("700bit"), Some(700));
+        assert_eq!(
+            [bits("0.5bit"), bits("1.Xbit"), bits("bit"), bits("1mbps")],
+            [None; 4]
+        );
         for (words, says) in [
             ("", "empty"),
+            ("nosuch.toml", "`nosuch.toml` no file"),
+            ("loss rate 1Mbit", "`loss` has no value"),
+            ("loss 0,1%", "decimal comma, write 0.1%"),
+            ("loss 0,1 %", "decimal comma, write 0.1%"),
+            ("rate 1,5Mbit", "decimal comma, write 1.5Mbit"),
             ("delay", "no value"),
             ("loss 2", "0% to 100%"),
             ("loss 101%", "0% to 100%"),
@@ -322,6 +382,11 @@ mod tests {
         let registry = Registry::default();
         for (words, duration, says) in [
             ("delay 5", None, "--link 'delay 5': delay \"5\" "),
+            (
+                "delay 2,5ms",
+                None,
+                "--link 'delay 2,5ms': delay \"2,5ms\" has a decimal comma; write 2.5ms",
+            ),
             (
                 "rate 1bit",
                 None,

@@ -301,7 +301,7 @@ impl Condition {
         Ok(match (figure.kind, self.unit.as_str()) {
             (ChartKind::Delay | ChartKind::Count | ChartKind::Score, "x") => quotient,
             (ChartKind::Delay, "ns") | (ChartKind::Count | ChartKind::Score, "") => new,
-            (ChartKind::Delay, "us" | "µs") => scaled(new, 1e-3),
+            (ChartKind::Delay, "us" | "\u{b5}s" | "\u{3bc}s") => scaled(new, 1e-3),
             (ChartKind::Delay, "ms") => scaled(new, 1e-6),
             (ChartKind::Delay, "s") => scaled(new, 1e-9),
             (ChartKind::Loss, "%") => scaled(new, 100.0),

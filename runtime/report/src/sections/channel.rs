@@ -200,7 +200,7 @@ fn facts(section: &mut Section, account: &ChannelAccount) {
     clocks::one_way(section, account);
     if !account.loss_bursts.is_empty() {
         let text = runs_words(account.loss_bursts.iter().copied());
-        section.fact("lost in a row", Tone::Plain, text);
+        section.fact("lost in a row", Tone::Plain, text + " (RFC 3357)");
     }
     let gaps = &account.gaps;
     if let Some(longest) = gaps.longest {

@@ -80,7 +80,7 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
         Tone::Faint,
         format!(
             "lost by the network; by either: on the link or for want of room on the receiving host; by the \
-             harness: in a process, queue or socket of ours; {inlets}"
+             harness: in a process, queue or socket of ours; {inlets}; reordered: RFC 4737"
         ),
     );
     section

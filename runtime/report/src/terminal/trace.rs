@@ -2,6 +2,7 @@
 //! computed elsewhere.
 
 use core::fmt::Write as _;
+use hil_account::network::{Metric as NetworkMetric, OrderMetrics};
 use hil_core::interval::Spread;
 
 use hil_stats::histogram::Distribution;
@@ -39,9 +40,12 @@ pub(crate) fn render_trace(
         ),
     );
     field("lost", &loss_words(figures));
-    field("bursts", &runs_words(&figures.loss_bursts, "losses"));
     field(
-        "between bursts",
+        "loss periods",
+        &runs_words(&figures.loss_bursts, "losses (RFC 3357)"),
+    );
+    field(
+        "between them",
         &runs_words(&figures.delivery_runs, "deliveries"),
     );
     field(
@@ -70,14 +74,19 @@ pub(crate) fn render_trace(
         "memory of delay",
         &memory_words(figures.delay_memory.as_ref()),
     );
-    field(
-        "order",
-        &format!(
-            "{} reordered (RFC 4737), {} duplicated (RFC 5560)",
-            grouped(counts.reordered_count),
-            grouped(counts.duplicated_count)
+    for (name, standard, found) in [
+        ("PDV", "above the smallest delay", &figures.delay_variation),
+        (
+            "IPDV",
+            "of successive messages",
+            &figures.successive_variation,
         ),
-    );
+    ] {
+        field(name, &variation_words(standard, found));
+    }
+    field("order", &order_words(&figures.order));
+    let duplicated = grouped(counts.duplicated_count);
+    field("copies", &format!("{duplicated} duplicated (RFC 5560)"));
     section.note(
         Tone::Faint,
         "Intervals are 95 %, on the effective number of messages of known fate; memory is the autocorrelation \
@@ -207,6 +216,35 @@ fn delay_words(figures: &TraceMetrics) -> String {
                 duration(delay.min_ns),
                 duration(delay.max_ns),
                 grouped(delay.count)
+            )
+        }
+    }
+}
+
+fn variation_words(of: &str, found: &Distribution) -> String {
+    match found {
+        Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
+        Distribution::Measured(one) => format!(
+            "p50 {}, p99 {}, at most {}; {of} (RFC 5481)",
+            duration(one.p50_ns),
+            duration(one.p99_ns),
+            duration(one.max_ns)
+        ),
+    }
+}
+
+fn order_words(order: &NetworkMetric<OrderMetrics>) -> String {
+    match order {
+        NetworkMetric::Unavailable { reason } => format!("reordered unknown: {reason}"),
+        NetworkMetric::Measured(order) => {
+            let by = order.extent_max.zip(order.n_max);
+            let by = by.map_or_else(String::new, |(extent, n)| {
+                format!(", extent at most {extent}, {n}-reordered at most")
+            });
+            format!(
+                "{} of {} reordered{by} (RFC 4737)",
+                grouped(order.reordered_count),
+                grouped(order.count)
             )
         }
     }
@@ -424,6 +462,13 @@ mod tests {
         }
         assert!(pages[0].contains("80 of 400, 20.00 %"), "{}", pages[0]);
         assert!(pages[0].contains("each within 40 ns"), "{}", pages[0]);
+        for words in [
+            "0 of 320 reordered (RFC 4737)",
+            "(RFC 3357)",
+            "at most 600 µs",
+        ] {
+            assert!(pages[0].contains(words), "{words}: {}", pages[0]);
+        }
         assert!(pages[1].contains("gilbert-elliott"), "{}", pages[1]);
         assert!(pages[2].contains("2–3"), "{}", pages[2]);
     }

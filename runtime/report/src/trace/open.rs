@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use hil_core::text_file::TextFile;
+use hil_core::text_file::{TextFile, whole};
 use hil_trace::{Trace, csv, opportunities, wire};
 
 use hil_topology::trace_source::{TraceFileError, looks_like_text, read};
@@ -99,7 +99,7 @@ fn is_opportunities(text: &TextFile) -> bool {
         .lines()
         .map(|line| line.content.trim().trim_matches('"'));
     let first = lines.find(|line| !line.is_empty());
-    first.is_some_and(|line| line.bytes().all(|byte| byte.is_ascii_digit()))
+    first.is_some_and(|line| whole::<u64>(line).is_some())
 }
 
 #[cfg(test)]
@@ -109,7 +109,7 @@ mod tests {
     #[test]
     fn the_form_is_found_by_content() {
         let is_form = |text: &str| is_opportunities(&text.into());
-        assert!(is_form("\n17\n18\n") && is_form("\"17\"\n"));
+        assert!(is_form("\n17\n18\n") && is_form("\"17\"\n") && is_form("17.0\n"));
         assert!(!is_form("published_ns,delay_ns\n0,5\n"));
         assert!(!is_form("# run: x\n1\n"));
     }

@@ -114,6 +114,18 @@ const FAULTY: &[Faulty] = &[
     ),
     Faulty(
         "via = \"udp\"",
+        "via = \"emulated\"\nloss_ratio = \"0,1\" #!",
+        "links.hop.loss_ratio",
+        &["\"0,1\" has a decimal comma, write 0.1"],
+    ),
+    Faulty(
+        "via = \"udp\"",
+        "via = \"udp\"\ndscp = \"46,0\" #!",
+        "links.hop.dscp",
+        &["\"46,0\" has a decimal comma, write 46"],
+    ),
+    Faulty(
+        "via = \"udp\"",
         "via = \"emulated\"\n[links.hop.outages]\nper_hour = -1 #!",
         "links.hop.outages.per_hour",
         &["-1 is outside 0 to 100000"],
