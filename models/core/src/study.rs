@@ -148,9 +148,14 @@ pub fn summary(rows: &[(String, Verdict)], criteria: &[Criterion]) -> Vec<String
         }
     }
     if !criteria.is_empty() {
-        let count = |is_met| criteria.iter().filter(|one| one.is_met == is_met).count();
+        let judged = criteria.iter().filter(|one| one.is_judged);
+        let count = |is_met| judged.clone().filter(|one| one.is_met == is_met).count();
+        let not_judged = match criteria.len() - judged.clone().count() {
+            0 => String::new(),
+            count => format!(", not judged {count}"),
+        };
         lines.push(format!(
-            "Of {} criteria: met {}, missed {}, too few to judge {}.",
+            "Of {} criteria: met {}, missed {}, too few to judge {}{not_judged}.",
             criteria.len(),
             count(Some(true)),
             count(Some(false)),
@@ -400,6 +405,8 @@ pub struct Criterion {
     pub text: String,
     /// Whether it is met; `None` when there was too little to judge.
     pub is_met: Option<bool>,
+    /// False where no size of the sample would get it judged; what was found says why.
+    pub is_judged: bool,
     /// What was found, and how to see it again.
     pub finding: String,
 }
@@ -477,6 +484,7 @@ mod tests {
         let criterion = |is_met| Criterion {
             text: "no collision".to_owned(),
             is_met,
+            is_judged: true,
             finding: String::new(),
         };
         let report = |criteria| StudyReport {
@@ -532,6 +540,7 @@ mod tests {
         let criterion = |is_met| Criterion {
             text: String::new(),
             is_met,
+            is_judged: true,
             finding: String::new(),
         };
         let criteria = [criterion(Some(true)), criterion(None)];

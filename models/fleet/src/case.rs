@@ -105,7 +105,7 @@ impl CaseStudy for Fleet {
 
     fn undecided(&self) -> Option<String> {
         let is_safe = self.parameters.coordinator.mode == CoordinatorMode::Safe;
-        let reason = undecided_because(&self.scene, self.parameters.missions.mode, is_safe)?;
+        let reason = undecided_because(&self.scene, &self.parameters.missions, is_safe)?;
         Some(format!(
             "feasibility of the start: not decided, because {reason}"
         ))
@@ -150,18 +150,22 @@ hil_core::options! {
 }
 
 impl FleetParameters {
-    /// Checks that some order lets every robot set out.
+    /// Checks that some order lets every robot set out, and drive all of its missions.
     fn check_beginning(&self, scene: &Scene) -> Result<(), ParameterError> {
         let is_safe = self.coordinator.mode == CoordinatorMode::Safe;
-        match beginning(scene, self.missions.mode, is_safe) {
+        let key = match self.world.scenario {
+            Scenario::Custom if !self.world.paths.0.is_empty() => "world.paths",
+            Scenario::Custom => "world.bays",
+            _ => "world.scenario",
+        };
+        match beginning(scene, &self.missions, is_safe) {
             Beginning::Free | Beginning::Undecided(_) => Ok(()),
-            Beginning::Never(chain) => {
-                let key = match self.world.scenario {
-                    Scenario::Custom => "world.bays",
-                    _ => "world.scenario",
-                };
-                Err(ParameterError::new(key, obstruction_text(&chain)))
-            }
+            Beginning::Wayless(one) => Err(ParameterError::new(key, one.to_string())),
+            Beginning::Never(chain) => Err(ParameterError::new(key, obstruction_text(&chain))),
+            Beginning::Crowded(ends) => Err(ParameterError::new(
+                "missions.missions_per_robot",
+                ends.to_string(),
+            )),
         }
     }
 

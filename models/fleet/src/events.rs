@@ -22,7 +22,7 @@ const HELD_UP_AFTER: Duration = Duration::from_millis(300);
 const READING: Duration = Duration::from_millis(20);
 
 /// Copies of one command that an event names.
-const COPIES_NAMED_MAX: usize = 4;
+pub(crate) const COPIES_NAMED_MAX: usize = 4;
 
 /// A command to a robot: an authority by its number, or with 0 the mission itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -102,9 +102,9 @@ struct Found {
 
 /// One sending of a command.
 #[derive(Debug, Clone, Copy)]
-struct Sent {
-    message: MessageRef,
-    at: Instant,
+pub(crate) struct Sent {
+    pub(crate) message: MessageRef,
+    pub(crate) at: Instant,
 }
 
 /// Everything the controller sent.
@@ -122,7 +122,7 @@ impl Orders {
     fn of(log: &RunLog) -> Self {
         let mut orders = Self {
             has_one_clock: log.has_one_clock(),
-            reading: READING + Duration::from_nanos(log.clock_bound_ns()),
+            reading: reading(log),
             ..Self::default()
         };
         for (sent, authority) in sent::<Authority>(log, FLEET_AUTHORITY) {
@@ -174,7 +174,16 @@ impl Orders {
     }
 }
 
-fn sent<M: Message>(log: &RunLog, channel: &'static str) -> impl Iterator<Item = (Sent, M)> {
+/// How much later than its effect a command of `log` may seem to have left.
+pub(crate) fn reading(log: &RunLog) -> Duration {
+    READING + Duration::from_nanos(log.clock_bound_ns())
+}
+
+/// The messages of a channel, each with when it was published.
+pub(crate) fn sent<M: Message>(
+    log: &RunLog,
+    channel: &'static str,
+) -> impl Iterator<Item = (Sent, M)> {
     log.raw(channel).iter().filter_map(move |logged| {
         let message = bytemuck::try_pod_read_unaligned(&logged.payload).ok()?;
         let sent = Sent {

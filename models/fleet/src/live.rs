@@ -51,11 +51,10 @@ impl FleetEvents {
     fn tell_standstills(&mut self, now: Instant) {
         for (fleet_id, one) in &mut self.fleets {
             let since = one.watch.still_since(now);
-            if now > since + self.stuck_after {
+            if now > since + self.stuck_after && one.watch.is_due() {
                 let under_way_count = one.watch.under_way_count();
-                let is_told = under_way_count > 0 || self.has_more_missions;
-                let event = is_told.then(|| one.tell(*fleet_id, since, under_way_count));
-                self.found.extend(event.flatten());
+                let event = one.tell(*fleet_id, since, under_way_count);
+                self.found.extend(event);
             }
         }
     }
@@ -93,16 +92,14 @@ impl LiveEvents for FleetEvents {
             .fleets
             .entry(truth.fleet_id)
             .or_insert_with(|| Standing {
-                watch: Watch::from(Instant::from_ns(truth.at_ns)),
+                watch: Watch::from(Instant::from_ns(truth.at_ns), self.has_more_missions),
                 told: None,
             });
         standing.watch.see(&truth, self.stuck_after);
         // Those that were over before they could be told: many records come at once.
         for (since, _, under_way_count) in standing.watch.take_gaps() {
-            if under_way_count > 0 || self.has_more_missions {
-                let event = standing.tell(truth.fleet_id, since, under_way_count);
-                self.found.extend(event);
-            }
+            let event = standing.tell(truth.fleet_id, since, under_way_count);
+            self.found.extend(event);
         }
         self.referee.on_truth(truth);
     }

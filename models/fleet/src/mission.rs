@@ -36,9 +36,23 @@ hil_core::options! {
 }
 
 impl MissionParameters {
+    /// How long a robot stays in a bay before its next mission.
+    pub(crate) fn parking(&self) -> Duration {
+        Duration::from_secs_f64(self.parking_s)
+    }
+
     /// True when a robot that is parked is always sent on, sooner or later.
     pub(crate) fn never_end(&self) -> bool {
-        self.missions_per_robot == 0 && self.mode != MissionMode::Once
+        self.limit().is_none()
+    }
+
+    /// Missions after which a robot stays parked.
+    pub(crate) fn limit(&self) -> Option<u32> {
+        match (self.mode, self.missions_per_robot) {
+            (MissionMode::Once, _) => Some(1),
+            (MissionMode::Random | MissionMode::Shuttle, 0) => None,
+            (MissionMode::Random | MissionMode::Shuttle, count) => Some(count),
+        }
     }
 }
 
@@ -56,17 +70,10 @@ pub struct MissionSource {
 impl MissionSource {
     /// A source for the robots of `scene`; all its choices come from `random`.
     pub fn new(parameters: &MissionParameters, scene: &Scene, random: RandomStream) -> Self {
-        let asked = match parameters.missions_per_robot {
-            0 => u32::MAX,
-            count => count,
-        };
-        let limit = match parameters.mode {
-            MissionMode::Once => asked.min(1),
-            MissionMode::Random | MissionMode::Shuttle => asked,
-        };
+        let limit = parameters.limit().unwrap_or(u32::MAX);
         Self {
             mode: parameters.mode,
-            parking: Duration::from_secs_f64(parameters.parking_s),
+            parking: parameters.parking(),
             left_counts: vec![limit; scene.starts.len()],
             scene: scene.clone(),
             random,

@@ -8,7 +8,7 @@ use crate::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet, FleetParamet
 use crate::events::events;
 use crate::messages::{Authority, State, Truth};
 use crate::referee::{Referee, SCAN_PERIOD, Tally};
-use crate::standing::{Standstill, standstills};
+use crate::standing::{Patience, Standstill, standstills};
 use hil_core::case_study::{ErrorSeries, Harm, Metric, Score};
 use hil_core::interval::Spread;
 use hil_core::run_log::RunLog;
@@ -16,6 +16,9 @@ use hil_core::time::Instant;
 use hil_stats::dependence::Batches;
 use hil_stats::histogram::{LatencyHistogram, LatencySummary};
 use hil_stats::metric::{Label, label};
+
+/// Control periods in which a command is heard or sent again: the legacy coordinator repeats one after three.
+const ANSWER_PERIODS: u32 = 5;
 
 /// Scores a run.
 pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
@@ -33,15 +36,19 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
         missions,
         ..
     } = case.parameters();
-    let stuck_after = coordinator.stuck_after();
-    let standing = standstills(log, &truths, run_end, stuck_after, missions.never_end());
+    let patience = Patience {
+        after: coordinator.stuck_after(),
+        parking: missions.parking(),
+        answer: ANSWER_PERIODS * coordinator.control_period() + coordinator.known_delay(),
+    };
+    let standing = standstills(log, &truths, run_end, patience, missions.never_end());
     let mut referee = Referee::new(case.scene(), case.parameters().fleets);
     referee.replay(&mut truths.into_iter(), start, end);
     let run_s = run_end.seconds_since(start);
     let tally = referee.tally();
     let collided = collided_share(tally, referee.collided_after());
     let mut score = Score {
-        harms: harms(Some((tally, collided))),
+        harms: harms(Some((tally, collided, &standing))),
         headline: &["separation_m_min", "missions_per_hour"],
         ..Score::default()
     };
@@ -52,8 +59,8 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
     score.metrics.extend(work(tally, run_s));
     let standing_s: f64 = standing.iter().map(Standstill::duration_s).sum();
     let method = format!(
-        "no robot of a fleet moved for more than {} s; all fleets together",
-        stuck_after.as_secs_f64()
+        "no robot of a fleet moved for more than {} s, or at all; all fleets together",
+        patience.after.as_secs_f64()
     );
     score.metrics.push(STANDING.known(standing_s, method));
     let mut found = events(log, referee.incidents());
@@ -66,15 +73,15 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
 }
 
 /// What an authority that comes late or not at all leads to.
-fn harms(seen: Option<(&Tally, Option<Spread>)>) -> Vec<Harm> {
-    let count = |of: fn(&Tally) -> u64| seen.map(|(tally, _)| of(tally));
+fn harms(seen: Option<(&Tally, Option<Spread>, &[Standstill])>) -> Vec<Harm> {
+    let count = |of: fn(&Tally) -> u64| seen.map(|(tally, _, _)| of(tally));
     let collisions = Harm::new(
         "collisions, section checker",
         count(|tally| tally.section_collisions_count),
     );
     vec![
         match seen {
-            Some((tally, interval)) => Harm {
+            Some((tally, interval, _)) => Harm {
                 interval,
                 ..collisions.of(tally.sections_passed_count, "critical sections passed")
             },
@@ -85,7 +92,21 @@ fn harms(seen: Option<(&Tally, Option<Spread>)>) -> Vec<Harm> {
             "times past a late authority",
             count(|tally| tally.authorities_late_count),
         ),
+        standstill_harm(seen.map(|(_, _, standing)| standing)),
     ]
+}
+
+/// Standstills of fleets; what robots that hear all do to one another is their own.
+fn standstill_harm(standing: Option<&[Standstill]>) -> Harm {
+    let own = standing.unwrap_or_default().iter();
+    let own = own.filter(|one| one.is_their_own());
+    Harm {
+        own_count: own.count() as u64,
+        ..Harm::new(
+            "standstills of whole fleets",
+            standing.map(|all| all.len() as u64),
+        )
+    }
 }
 
 const COLLISIONS: Label = label(
@@ -321,6 +342,7 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
+    use crate::coordinator::parameters::CoordinatorMode;
     use crate::scenario::Scenario;
     use hil_core::case_study::CaseStudy;
     use hil_core::link_model::{Fate, LinkModel};
@@ -439,6 +461,56 @@ mod tests {
             told.len() == 1 && told[0].contains("reached a robot"),
             "{told:?}"
         );
+        let harm = score.harms.last().unwrap();
+        assert_eq!(
+            (harm.what, harm.count, harm.own_count),
+            ("standstills of whole fleets", Some(1), 0)
+        );
+    }
+
+    /// Lets nothing through.
+    #[derive(Debug)]
+    struct Nothing;
+
+    impl LinkModel for Nothing {
+        fn offer(&mut self, _now: Instant, _length_bytes: usize) -> Fate {
+            Fate::Lost
+        }
+    }
+
+    #[test]
+    fn a_short_run_without_a_command_that_arrives_is_a_standstill_and_one_that_just_begins_is_not()
+    {
+        for mode in [CoordinatorMode::Legacy, CoordinatorMode::Safe] {
+            let mut parameters = FleetParameters::default();
+            parameters.coordinator.mode = mode;
+            let case = Fleet::new(parameters, 3).unwrap();
+            let standstills = |is_lost: bool, run: Duration| {
+                let lost: BTreeMap<String, Box<dyn Carrier>> =
+                    [FLEET_AUTHORITY, crate::FLEET_MISSION]
+                        .into_iter()
+                        .filter(|_| is_lost)
+                        .map(|channel| (channel.to_owned(), Box::new(Nothing) as Box<dyn Carrier>))
+                        .collect();
+                let result = Simulation::new(&case, lost).unwrap().run(run).unwrap();
+                let score = case.score(&result.log);
+                let events = score.events.iter().map(|event| event.what.clone());
+                (
+                    score.harms.last().unwrap().count.unwrap(),
+                    events.collect::<Vec<_>>(),
+                )
+            };
+            let (count, events) = standstills(true, Duration::from_secs(60));
+            assert_eq!(count, 1, "{mode:?}");
+            assert!(
+                events[0].contains("stood for 60 s") && events[0].ends_with("reached a robot"),
+                "{events:?}"
+            );
+            for run_s in [1, 3, 5, 8, 13, 30] {
+                let (count, events) = standstills(false, Duration::from_secs(run_s));
+                assert_eq!((count, events), (0, Vec::new()), "{mode:?} {run_s} s");
+            }
+        }
     }
 
     #[test]

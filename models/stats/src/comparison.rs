@@ -57,6 +57,46 @@ pub fn none_of(of: u64, like: Estimate, like_of: u64) -> Option<Interval> {
     })
 }
 
+/// How criteria are judged, each by an interval of the sample: what a small sample says is neither met nor missed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Judge {
+    /// The confidence of what a miss must leave no doubt of.
+    miss: f64,
+}
+
+impl Judge {
+    /// By chance, at most this share of tables miss one of their criteria, if all of them hold.
+    pub const ERROR_RATE: f64 = 0.05;
+
+    /// For a table of so many criteria (Bonferroni).
+    pub const fn of_tests(count: usize) -> Self {
+        let count = if count == 0 { 1 } else { count };
+        Self {
+            miss: 1.0 - Self::ERROR_RATE / count as f64,
+        }
+    }
+
+    /// The confidence of the interval that a miss is judged by.
+    pub const fn miss_confidence(self) -> f64 {
+        self.miss
+    }
+
+    /// True when the interval of the figure lies as `holds` says, at the usual confidence; false when it lies as
+    /// `fails` says, at that of a miss; `None` between, or without an interval.
+    pub fn verdict<T>(
+        self,
+        interval: impl Fn(f64) -> Option<T>,
+        holds: impl Fn(&T) -> bool,
+        fails: impl Fn(&T) -> bool,
+    ) -> Option<bool> {
+        if holds(&interval(CONFIDENCE)?) {
+            Some(true)
+        } else {
+            fails(&interval(self.miss)?).then_some(false)
+        }
+    }
+}
+
 /// So many of so many.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Share {

@@ -10,7 +10,7 @@ use crate::experiment::study::{FleetStudy, worlds_text};
 use crate::scenario::Scenario;
 use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_link::impaired::DelayLaw;
-use hil_stats::comparison::{Scatter, Share, against_published, welch};
+use hil_stats::comparison::{Judge, Scatter, Share, against_published, welch};
 use hil_stats::statistics::CONFIDENCE;
 
 /// A cell with what came of it; `None` when it was not run.
@@ -98,46 +98,13 @@ fn notes(study: &FleetStudy, results: &[CellResult<'_>]) -> Vec<String> {
              those of independent sections, all cells together (Rao and Scott 1992); what the safe mode's \
              proof rules out has no error rate: once is a miss",
             test_count(results),
-            100.0 * ERROR_RATE,
+            100.0 * Judge::ERROR_RATE,
             scatter(results).ratio().map_or_else(
                 || "an unknown number of times".to_owned(),
                 |ratio| format!("{ratio:.2} times")
             ),
         ),
     ]
-}
-
-/// By chance, at most this share of tables miss a criterion on rates, if all of them hold.
-const ERROR_RATE: f64 = 0.05;
-
-/// How the criteria on rates are judged: each by an interval of the sample.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Judge {
-    /// What a miss must leave no doubt of.
-    miss: f64,
-}
-
-impl Judge {
-    fn of(results: &[CellResult<'_>]) -> Self {
-        Self {
-            miss: 1.0 - ERROR_RATE / test_count(results).max(1) as f64,
-        }
-    }
-
-    /// True when the interval of `figure` lies as `holds` says, at the usual confidence; false when it lies as
-    /// `fails` says, at that of a miss; `None` between.
-    fn verdict<T>(
-        &self,
-        interval: impl Fn(f64) -> Option<T>,
-        holds: impl Fn(&T) -> bool,
-        fails: impl Fn(&T) -> bool,
-    ) -> Option<bool> {
-        if holds(&interval(CONFIDENCE)?) {
-            Some(true)
-        } else {
-            fails(&interval(self.miss)?).then_some(false)
-        }
-    }
 }
 
 /// Criteria that are tests of a rate.
@@ -203,7 +170,7 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
         Scenario::Harbor => ("table-2-harbor", "Table II, harbor"),
         _ => ("table-3-warehouse", "Table III, warehouse"),
     };
-    let judge = Judge::of(results);
+    let judge = Judge::of_tests(test_count(results));
     let mut rows = Vec::new();
     let ours = || {
         let of_scenario = |one: &&CellResult<'_>| one.cell.id.scenario == scenario;
@@ -624,6 +591,7 @@ fn criterion(text: String, known: Option<(Option<bool>, String)>, missing: &str)
     Criterion {
         text,
         is_met,
+        is_judged: true,
         finding,
     }
 }
@@ -632,7 +600,7 @@ const NOT_RUN: &str = "not run to its end";
 
 /// Everything the study is held against.
 pub(crate) fn criteria(results: &[CellResult<'_>]) -> Vec<Criterion> {
-    let judge = Judge::of(results);
+    let judge = Judge::of_tests(test_count(results));
     let published = results.iter().filter(|one| !one.is_mechanism());
     let mut criteria: Vec<_> = published
         .filter(|one| one.cell.demand != Demand::None)
@@ -697,6 +665,7 @@ fn safe_criteria(results: &[CellResult<'_>]) -> [Criterion; 3] {
     let judged = |what: &str, is_met: bool, finding: String| Criterion {
         text: format!("{}: {what}", mode_name(CoordinatorMode::Safe)),
         is_met: (!is_met || is_telling).then_some(is_met),
+        is_judged: true,
         finding,
     };
     [
@@ -812,7 +781,8 @@ mod judgement_tests {
     use crate::experiment::Setup;
     use crate::experiment::cells::mechanism_cells;
 
-    const JUDGE: Judge = Judge { miss: 0.999 };
+    /// Of a miss that leaves 0.001 of doubt.
+    const JUDGE: Judge = Judge::of_tests(50);
 
     fn tally(collisions: u64, sections: u64) -> FleetTally {
         let mut tally = FleetTally::default();

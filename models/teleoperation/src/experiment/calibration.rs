@@ -334,6 +334,7 @@ impl Study for Calibration {
             criteria: vec![Criterion {
                 text: "at least one point of the curve exists".to_owned(),
                 is_met: outcomes.iter().all(Option::is_some).then_some(found > 0),
+                is_judged: true,
                 finding: format!("{found} of {} points have a rate", outcomes.len()),
             }],
             ..StudyReport::default()

@@ -5,7 +5,7 @@ use crate::experiment::drive::Tally;
 use crate::experiment::study::MotionLossStudy;
 use crate::score::loops::LossKind;
 use hil_core::study::{self, Criterion, Field, Larger, StudyReport, Table, Verdict};
-use hil_stats::comparison::{Share, against_published, mean_interval};
+use hil_stats::comparison::{Judge, Share, against_published, mean_interval};
 use hil_stats::statistics::CONFIDENCE;
 
 /// A condition with the runs of it that ended.
@@ -21,11 +21,8 @@ pub(crate) struct Row<'a> {
 
 /// The whole report.
 pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
-    let confidence = 1.0 - ERROR_RATE / test_count(rows).max(1) as f64;
-    let criteria: Vec<_> = rows
-        .iter()
-        .flat_map(|row| row.criteria(confidence))
-        .collect();
+    let judge = Judge::of_tests(test_count(rows));
+    let criteria: Vec<_> = rows.iter().flat_map(|row| row.criteria(judge)).collect();
     let verdicts = rows
         .iter()
         .filter_map(|row| Some((row.name(), row.verdict()?)));
@@ -35,7 +32,7 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
         notes: notes(study, rows),
         tables: vec![rates(rows), counts(rows), setups(rows)],
         summary: study::summary(&verdicts, &criteria),
-        larger: larger(study, &verdicts, &criteria),
+        larger: larger(study, rows, &verdicts, &criteria),
         criteria,
     }
 }
@@ -43,6 +40,7 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
 /// What more loops or more runs would decide.
 fn larger(
     study: &MotionLossStudy,
+    rows: &[Row<'_>],
     verdicts: &[(String, Verdict)],
     criteria: &[Criterion],
 ) -> Vec<Larger> {
@@ -51,19 +49,48 @@ fn larger(
     if parameters.loops != PUBLISHED_LOOPS {
         needed.push(format!("tables.loops={PUBLISHED_LOOPS}"));
     }
-    if (parameters.seeds as usize) < RUNS_MIN {
-        needed.push(format!("tables.seeds={RUNS_MIN}"));
+    // Longer runs scatter less, so that what short ones need is not known.
+    let runs = if needed.is_empty() && study.is_fitted {
+        runs_needed(rows)
+    } else {
+        RUNS_MIN
+    };
+    if (parameters.seeds as usize) < runs && runs <= SEEDS_MAX {
+        needed.push(format!("tables.seeds={runs}"));
     }
     let is_open = verdicts
         .iter()
         .any(|(_, one)| *one == Verdict::Inconclusive);
-    let is_short = study.is_fitted && criteria.iter().any(|one| one.is_met.is_none());
+    let is_short = criteria
+        .iter()
+        .any(|one| one.is_judged && one.is_met.is_none());
     let larger = Larger {
         of: "inconclusive and too few",
         parameters: needed,
     };
     let is_of_use = (is_open || is_short) && !larger.parameters.is_empty();
     is_of_use.then_some(larger).into_iter().collect()
+}
+
+/// Runs that decide the most of the means that can be decided, in dozens.
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "the value is checked to lie in 0 to the number of seeds that a table can have"
+)]
+fn runs_needed(rows: &[Row<'_>]) -> usize {
+    let judge = Judge::of_tests(test_count(rows));
+    let needed = rows.iter().filter_map(|row| match row.condition.expected {
+        Expected::Published {
+            mean_low,
+            mean_high,
+            ..
+        } => row.runs_needed([mean_low, mean_high], judge),
+        _ => None,
+    });
+    let possible = needed.filter(|runs| (0.0..=SEEDS_MAX as f64).contains(runs));
+    let most = possible.fold(0.0, f64::max) as usize;
+    most.next_multiple_of(RUNS_MIN).clamp(RUNS_MIN, SEEDS_MAX)
 }
 
 fn notes(study: &MotionLossStudy, rows: &[Row<'_>]) -> Vec<String> {
@@ -86,9 +113,10 @@ fn notes(study: &MotionLossStudy, rows: &[Row<'_>]) -> Vec<String> {
             .to_owned(),
         format!(
             "error rate: rows that agree with the paper miss one of the {} criteria on published rates \
-             in at most {:.0} of 100 tables of other seeds (Bonferroni)",
+             in at most {:.0} of 100 tables of other seeds (Bonferroni); a mean outside its range is met in at most \
+             1 of 40",
             test_count(rows),
-            100.0 * ERROR_RATE
+            100.0 * Judge::ERROR_RATE
         ),
         "right arm only; requests to restart are not lost; the hand is followed as with resume = \
          \"jump\""
@@ -248,8 +276,8 @@ pub(crate) fn deviation(values: &[f64]) -> Option<f64> {
 /// Runs of which a mean says something.
 const RUNS_MIN: usize = 12;
 
-/// How often a table misses any criterion on a published rate that holds.
-const ERROR_RATE: f64 = 0.05;
+/// Runs per condition that a table can have.
+const SEEDS_MAX: usize = 1000;
 
 /// Tests on published rates: two a row.
 fn test_count(rows: &[Row<'_>]) -> usize {
@@ -259,7 +287,7 @@ fn test_count(rows: &[Row<'_>]) -> usize {
 }
 
 impl Row<'_> {
-    fn criteria(&self, confidence: f64) -> Vec<Criterion> {
+    fn criteria(&self, judge: Judge) -> Vec<Criterion> {
         match self.condition.expected {
             Expected::Ethernet => vec![self.nothing_lost(true)],
             Expected::NothingLost { nor_tripped } => vec![self.nothing_lost(nor_tripped)],
@@ -268,8 +296,8 @@ impl Row<'_> {
                 mean_low,
                 mean_high,
             } => vec![
-                self.mean_in_range([mean_low, mean_high], confidence),
-                self.published_among_runs(lost, confidence),
+                self.mean_in_range([mean_low, mean_high], judge),
+                self.published_among_runs(lost, judge),
             ],
             Expected::Open => Vec::new(),
         }
@@ -286,73 +314,216 @@ impl Row<'_> {
             ""
         };
         let is_met = lost + unanswered + extra == 0 && (!nor_tripped || trips == 0);
+        // One lost is enough to miss it; to meet it takes as many loops as were published.
+        let is_telling = self.sent() >= u64::from(PUBLISHED_LOOPS);
         Criterion {
             text: format!("{}: MLR is 0 exactly{trips_text}", self.condition.name),
-            is_met: (!self.runs.is_empty()).then_some(is_met),
+            is_met: (!self.runs.is_empty() && (!is_met || is_telling)).then_some(is_met),
+            is_judged: true,
             finding: format!("{lost} of {} loops lost, {trips} trips", self.sent()),
         }
     }
 
-    /// The mean of the rates, and how far Student's interval of it reaches; `None` where motion or robot are not
-    /// those of the fit, or of too few runs.
-    fn judged_mean(&self, confidence: f64) -> Option<(f64, f64)> {
-        let is_judged = self.is_fitted && self.runs.len() >= RUNS_MIN;
-        let interval = mean_interval(&self.rates(), confidence).filter(|_| is_judged)?;
-        Some((
-            f64::midpoint(interval.low, interval.high),
-            0.5 * (interval.high - interval.low),
-        ))
-    }
-
-    fn mean_in_range(&self, [low, high]: [f64; 2], confidence: f64) -> Criterion {
-        let judged = self.judged_mean(confidence);
-        let mean = self.mean(Tally::loss_ratio);
+    /// A criterion on a published rate, which is judged by at least [`RUNS_MIN`] runs of motion and robot of the fit.
+    fn on_published(
+        &self,
+        text: String,
+        finding: Option<String>,
+        is_met: impl FnOnce() -> Option<bool>,
+    ) -> Criterion {
+        let count = self.runs.len();
         Criterion {
-            text: format!(
-                "{}: mean MLR of at least {RUNS_MIN} runs in {low} to {high}, by Student's interval of {:.2} %",
-                self.condition.name,
-                100.0 * confidence
-            ),
-            is_met: judged.map(|(mean, reach)| mean + reach >= low && mean - reach <= high),
-            finding: mean.map_or_else(
-                || "no run".to_owned(),
-                |mean| {
-                    let reach =
-                        judged.map_or_else(String::new, |(_, reach)| format!(" ± {reach:.5}"));
-                    format!("{mean:.5}{reach} in {} runs", self.runs.len())
-                },
-            ),
+            text: format!("{}: {text}", self.condition.name),
+            is_met: (self.is_fitted && count >= RUNS_MIN).then(is_met).flatten(),
+            is_judged: self.is_fitted,
+            finding: if self.is_fitted {
+                finding.map_or_else(
+                    || format!("{count} runs"),
+                    |one| format!("{one} in {count} runs"),
+                )
+            } else {
+                "not the fit's motion or robot".to_owned()
+            },
         }
     }
 
-    /// The published run is one more of ours: Student's interval of a single further run (Hahn and Meeker 1991).
-    fn published_among_runs(&self, lost: u32, confidence: f64) -> Criterion {
-        let runs = &self.runs;
+    /// How the mean stands to its range, and the interval that this is judged by.
+    fn mean_verdict(&self, [low, high]: [f64; 2], judge: Judge) -> Option<bool> {
+        judge.verdict(
+            |confidence| mean_interval(&self.rates(), confidence),
+            |mean| mean.low >= low && mean.high <= high,
+            |mean| mean.high < low || mean.low > high,
+        )
+    }
+
+    fn mean_in_range(&self, [low, high]: [f64; 2], judge: Judge) -> Criterion {
+        let finding = self.mean(Tally::loss_ratio).map(|mean| {
+            let interval = self.runs_interval();
+            let interval = interval.map_or_else(String::new, |(low, high)| {
+                format!(", {low:.5} to {high:.5} (95 %)")
+            });
+            format!("{mean:.5}{interval}")
+        });
+        let text = format!("mean MLR of at least {RUNS_MIN} runs in {low} to {high}");
+        self.on_published(text, finding, || self.mean_verdict([low, high], judge))
+    }
+
+    /// Runs of which the interval of the mean would lie on one side of the ends of its range, if mean and scatter stay as
+    /// they are: twice as many as just would. `None` where it does, or where no number is known.
+    fn runs_needed(&self, range: [f64; 2], judge: Judge) -> Option<f64> {
+        if self.runs.len() >= RUNS_MIN && self.mean_verdict(range, judge).is_some() {
+            return None;
+        }
+        let mean = self.mean(Tally::loss_ratio)?;
+        let is_inside = (range[0]..=range[1]).contains(&mean);
+        let confidence = if is_inside {
+            CONFIDENCE
+        } else {
+            judge.miss_confidence()
+        };
+        let interval = mean_interval(&self.rates(), confidence)?;
+        let reach = 0.5 * (interval.high - interval.low);
+        let to_end = range.map(|end| (mean - end).abs());
+        Some(2.0 * self.runs.len() as f64 * (reach / to_end[0].min(to_end[1])).powi(2))
+    }
+
+    /// The range of a single further run (Hahn and Meeker 1991).
+    fn single_run(&self, confidence: f64) -> Option<(f64, f64)> {
+        let mean = mean_interval(&self.rates(), confidence)?;
+        let middle = f64::midpoint(mean.low, mean.high);
+        let reach = (middle - mean.low) * (self.runs.len() as f64 + 1.0).sqrt();
+        Some((middle - reach, middle + reach))
+    }
+
+    /// The published run is one more of ours. A range that holds a run without a lost loop would hold any small rate: it
+    /// says nothing.
+    fn published_among_runs(&self, lost: u32, judge: Judge) -> Criterion {
         // A short run's rate has another scatter than the published one's.
         let is_as_long = |run: &&Tally| run.sent_count == u64::from(PUBLISHED_LOOPS);
-        let judged = self.judged_mean(confidence);
-        let judged = judged.filter(|_| runs.iter().all(is_as_long));
+        let is_as_long = self.runs.iter().all(is_as_long);
         let published = f64::from(lost) / f64::from(PUBLISHED_LOOPS);
-        let of_one = judged.map(|(mean, reach)| (mean, reach * (runs.len() as f64 + 1.0).sqrt()));
-        Criterion {
-            text: format!(
-                "{}: the published {lost} of {PUBLISHED_LOOPS} loops lost, {published:.5}, in the range of single runs \
-                 of {:.2} %",
-                self.condition.name,
-                100.0 * confidence
-            ),
-            is_met: of_one.map(|(mean, reach)| (published - mean).abs() <= reach),
-            finding: of_one.map_or_else(
-                || format!("{} runs, or too short ones", runs.len()),
-                |(mean, reach)| format!("{:.5} to {:.5}", (mean - reach).max(0.0), mean + reach),
-            ),
-        }
+        let finding = match self.single_run(CONFIDENCE) {
+            _ if !is_as_long => Some("too short ones".to_owned()),
+            range => range.map(|(low, high)| format!("{:.5} to {high:.5}", low.max(0.0))),
+        };
+        let text = format!(
+            "the published {lost} of {PUBLISHED_LOOPS} loops lost, {published:.5}, in the range of 95 % of single runs, \
+             and none lost outside it"
+        );
+        let is_within = |&(low, high): &(f64, f64)| low <= published && published <= high;
+        self.on_published(text, finding, || {
+            judge
+                .verdict(
+                    |confidence| self.single_run(confidence),
+                    |range| range.0 > 0.0 && is_within(range),
+                    |range| !is_within(range),
+                )
+                .filter(|_| is_as_long)
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::experiment::conditions::{base, conditions};
+    use crate::score::loops::LostByKind;
+    use crate::{Teleoperation, TeleoperationParameters};
+    use hil_core::case_study::CaseStudy as _;
+
+    fn condition(name: &str) -> Condition {
+        let case = Teleoperation::new(TeleoperationParameters::default(), 1).unwrap();
+        let mut all = conditions(&base(&case)).into_iter();
+        all.find(|one| one.name == name).unwrap()
+    }
+
+    /// A run for each number of lost loops.
+    fn runs(lost: &[u64], sent_count: u64) -> Vec<Tally> {
+        let run = |lost: &u64| {
+            let mut lost_counts = LostByKind::default();
+            lost_counts[LossKind::Trip as usize] = *lost;
+            Tally {
+                sent_count,
+                executed_count: sent_count - lost,
+                extra_count: 0,
+                lost_counts,
+                lost: Vec::new(),
+                trip_count: 0,
+                hours: 1.0,
+                hold_ratio: 0.0,
+            }
+        };
+        lost.iter().map(run).collect()
+    }
+
+    fn row<'a>(condition: &'a Condition, runs: &'a [Tally], is_fitted: bool) -> Row<'a> {
+        Row {
+            condition,
+            runs: runs.iter().collect(),
+            is_fitted,
+        }
+    }
+
+    #[test]
+    fn a_published_rate_is_met_only_by_what_would_miss_another() {
+        let condition = condition("short-range");
+        // Two criteria: a miss is by 97.5 %. Student's quantiles of 11 degrees of freedom are 2.20099 and 2.59309.
+        let judge = Judge::of_tests(2);
+        let check = |lost: [u64; 12], loops, mean, single| {
+            let runs = runs(&lost, loops);
+            let criteria = row(&condition, &runs, true).criteria(judge);
+            assert_eq!(
+                [criteria[0].is_met, criteria[1].is_met],
+                [mean, single],
+                "{criteria:?}"
+            );
+        };
+        // 0.0167, 0.0043 to 0.0290: 0.006 to 0.011 is in it, not the other way around.
+        check([0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2], 40, None, None);
+        // 0.0081 to 0.0088; single runs 0.0071 to 0.0098, the published 0.0079.
+        let close = [7, 7, 7, 7, 7, 7, 8, 8, 8, 8, 8, 8];
+        check(close, 890, Some(true), Some(true));
+        // 0.0083 to 0.0117; single runs 0.0040 to 0.0161.
+        let wide = [7, 7, 7, 8, 8, 8, 8, 9, 9, 9, 12, 15];
+        check(wide, 890, None, Some(true));
+        // By 97.5 %, 0.0136 to 0.0145; single runs 0.0125 to 0.0156.
+        let high = [12, 13, 12, 13, 12, 13, 12, 13, 12, 13, 12, 13];
+        check(high, 890, Some(false), Some(false));
+        // 0.0103 to 0.01105; single runs by 97.5 % 0.0091 to 0.0123.
+        let edge = [9, 10, 9, 10, 9, 10, 9, 10, 9, 10, 9, 10];
+        check(edge, 890, None, Some(false));
+        // Single runs from -0.023 to 0.040: none lost is in it.
+        let clumped = [0, 0, 0, 0, 0, 0, 1, 1, 2, 20, 25, 35];
+        check(clumped, 890, None, None);
+        // 0.01002 is 0.00098 from the end of its range, the interval reaches 0.00168: 24 (0.00168 / 0.00098)^2 = 70.3.
+        let runs_of = |lost: &[u64]| runs_needed(&[row(&condition, &runs(lost, 890), true)]);
+        assert_eq!((runs_of(&wide), runs_of(&close)), (72, RUNS_MIN));
+    }
+
+    #[test]
+    fn a_row_of_another_motion_or_robot_is_not_too_small_but_not_judged() {
+        let condition = condition("short-range");
+        let runs = runs(&[7; 12], 890);
+        let row = row(&condition, &runs, false);
+        for criterion in row.criteria(Judge::of_tests(2)) {
+            assert_eq!((criterion.is_met, criterion.is_judged), (None, false));
+            assert_eq!(criterion.finding, "not the fit's motion or robot");
+        }
+    }
+
+    #[test]
+    fn nothing_lost_of_fewer_loops_than_were_published_meets_nothing() {
+        for name in ["perfect", "loss-0.5"] {
+            let condition = condition(name);
+            let is_met = |lost, loops| {
+                let runs = runs(&[lost], loops);
+                row(&condition, &runs, true).criteria(Judge::of_tests(0))[0].is_met
+            };
+            assert_eq!(is_met(0, 180), None);
+            assert_eq!(is_met(1, 180), Some(false));
+            assert_eq!(is_met(0, 890), Some(true));
+        }
+    }
 
     #[test]
     fn a_single_run_has_no_deviation() {

@@ -110,6 +110,7 @@ fn criteria(all: &[Criterion], extent: Extent) -> Section {
     for Criterion {
         text,
         is_met,
+        is_judged,
         finding,
     } in all
     {
@@ -117,7 +118,8 @@ fn criteria(all: &[Criterion], extent: Extent) -> Section {
             Some(true) if extent == Extent::Brief => continue,
             Some(true) => (Tone::Good, "met"),
             Some(false) => (Tone::Bad, "MISSED"),
-            None => (Tone::Caution, "too few"),
+            None if *is_judged => (Tone::Caution, "too few"),
+            None => (Tone::Plain, "not judged"),
         };
         section.fact(label, tone, format!("{text}: {finding}"));
     }
@@ -211,6 +213,7 @@ mod tests {
         let criterion = |is_met, text: &str| Criterion {
             text: text.to_owned(),
             is_met,
+            is_judged: text != "foreign",
             finding: "0 of 7".to_owned(),
         };
         let of = |name: &str, is_detail| Table {
@@ -228,6 +231,7 @@ mod tests {
                 criterion(Some(true), "easy"),
                 criterion(Some(false), "hard"),
                 criterion(None, "rare"),
+                criterion(None, "foreign"),
             ],
             summary: vec!["One differs.".to_owned()],
             larger: vec![Larger {
@@ -272,7 +276,7 @@ mod tests {
                      case.parameters.tables.sections=5009";
         let one_line = page.split_whitespace().collect::<Vec<_>>().join(" ");
         for words in [
-            "Held against 1 of 3 met MISSED hard: 0 of 7 too few rare: 0 of 7",
+            "Held against 1 of 4 met MISSED hard: 0 of 7 too few rare: 0 of 7 not judged foreign: 0 of 7",
             "Summary 3 tasks on 2 threads: 2.0 s of wall time One differs. Next",
             &format!("inconclusive rows {again}"),
             "--full",
