@@ -471,6 +471,33 @@ pub fn interface_mtu_bytes(interface: &str) -> io::Result<u32> {
     u32::try_from(mtu_bytes).map_err(io::Error::other)
 }
 
+/// `ETHTOOL_GLINK` of `linux/ethtool.h`.
+const ETHTOOL_GLINK: u32 = 0x0a;
+
+/// `struct ethtool_value` of `linux/ethtool.h`.
+#[derive(Debug)]
+#[repr(C)]
+struct EthtoolValue {
+    command: u32,
+    value: u32,
+}
+
+/// True while `interface` is up and has a carrier (`ETHTOOL_GLINK`), as the driver knows it now.
+///
+/// # Errors
+/// When there is no such interface or its driver does not say (`EOPNOTSUPP`).
+#[allow(unsafe_code, reason = "no crate wraps ETHTOOL_GLINK")]
+pub fn has_carrier(interface: &str) -> io::Result<bool> {
+    let mut link = EthtoolValue {
+        command: ETHTOOL_GLINK,
+        value: 0,
+    };
+    let data = (&raw mut link).cast();
+    // SAFETY: SIOCETHTOOL with this command reads and writes one `ethtool_value`, which `link` is.
+    unsafe { device_request(interface, libc::SIOCETHTOOL, data) }?;
+    Ok(link.value != 0)
+}
+
 /// One `ioctl` to a network interface; gives what the kernel made of the message.
 ///
 /// # Safety

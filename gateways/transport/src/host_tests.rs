@@ -14,7 +14,7 @@ use super::trap_tests::{count_waiting, loopback_settings, sentinel, take_stamps}
 use super::udp::{UdpReceiver, UdpSender};
 use super::{DatagramReceiver, DatagramSender, ReceiverCounters, SendRefusal};
 use hil_net::clock_pair::{ClockPair, monotonic_now};
-use hil_net::timestamping::TimestampMode;
+use hil_net::timestamping::{TimestampMode, has_carrier};
 
 /// Gives `thread` the policy `SCHED_FIFO`; false when the host refuses or lacks `chrt`.
 fn make_realtime(thread: Pid) -> bool {
@@ -155,6 +155,40 @@ fn a_full_queue_on_the_way_out_is_a_state_and_shifts_no_stamp() {
             (counters.queue_full_count, counters.unmatched_stamp_count),
             (5, 0)
         );
+    });
+}
+
+/// The queue refuses as long as it is there, and what it refuses is the network's as soon as the other end is down.
+#[test]
+fn an_interface_whose_cable_is_out_is_an_unreachable_network() {
+    in_an_own_network(|| {
+        if !run("ip link add near type veth peer name far") {
+            println!("skipped: this host has no veth");
+            return;
+        }
+        let is_ready = run("ip addr add 198.51.100.1/24 dev near")
+            && run("ip link set near up")
+            && run("ip link set far up")
+            && run("ip neigh add 198.51.100.2 lladdr 02:00:00:00:00:02 dev near nud permanent")
+            && run("tc qdisc add dev near root pfifo limit 0");
+        assert!(is_ready, "a veth pair can be configured");
+        let mut settings = loopback_settings();
+        settings.local = "198.51.100.1:0".parse().unwrap();
+        settings.peer = ([198, 51, 100, 2], DISCARD_PORT).into();
+        let mut sender = UdpSender::open(&settings).unwrap();
+        within_bound("carrier", || has_carrier("near").unwrap().then_some(()));
+        let errno = libc::ENOBUFS;
+        let refusal = Err(SendRefusal::QueueFull { errno });
+        assert_eq!(sender.send(&[0; 64]), refusal);
+        assert!(run("ip link set far down"));
+        assert!(!has_carrier("near").unwrap());
+        for _ in 0..20 {
+            // Once the queue is gone the kernel takes what it is given and drops it.
+            if let Err(refusal) = sender.send(&[0; 64]) {
+                assert_eq!(refusal, SendRefusal::Unreachable { errno });
+            }
+        }
+        assert_eq!(sender.counters().queue_full_count, 1);
     });
 }
 

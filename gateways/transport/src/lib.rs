@@ -102,13 +102,13 @@ pub enum SendRefusal {
     #[error("nobody listens at the peer (ECONNREFUSED)")]
     PeerRefused,
     /// No way to the peer: `ENETUNREACH`, `EHOSTUNREACH`, `ENETDOWN`, `EHOSTDOWN`, `ENONET` or
-    /// `EACCES`.
+    /// `EACCES`; or `ENOBUFS` of an interface without a carrier.
     #[error("peer is unreachable (errno {errno})")]
     Unreachable {
         /// Which of them.
         errno: i32,
     },
-    /// A queue on the way out is full: `ENOBUFS` or `EAGAIN`.
+    /// A queue on the way out is full: `ENOBUFS` of an interface with a carrier, or `EAGAIN`.
     #[error("a send queue is full (errno {errno})")]
     QueueFull {
         /// Which of them.
@@ -152,6 +152,17 @@ impl SendRefusal {
             libc::ENOBUFS | libc::EAGAIN => Self::QueueFull { errno },
             libc::EMSGSIZE => Self::TooLong { length_bytes },
             _ => Self::Other { errno },
+        }
+    }
+
+    /// The refusal as it is where the interface that it left by has a carrier or not: Linux takes the queue away from an
+    /// interface whose cable is out, and answers as if the queue were full.
+    pub(crate) fn at_interface(self, has_carrier: impl FnOnce() -> bool) -> Self {
+        match self {
+            Self::QueueFull {
+                errno: errno @ libc::ENOBUFS,
+            } if !has_carrier() => Self::Unreachable { errno },
+            other => other,
         }
     }
 
@@ -335,6 +346,20 @@ pub trait DatagramReceiver: Debug + Send {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_full_queue_of_an_interface_without_a_carrier_is_no_way_to_the_peer() {
+        let full = |errno| SendRefusal::QueueFull { errno };
+        let errno = libc::ENOBUFS;
+        let unreachable = SendRefusal::Unreachable { errno };
+        assert_eq!(full(errno).at_interface(|| false), unreachable);
+        assert_eq!(full(errno).at_interface(|| true), full(errno));
+        // The buffer of the socket says nothing of the interface.
+        let of_socket = full(libc::EAGAIN);
+        assert_eq!(of_socket.at_interface(|| false), of_socket);
+        let refused = SendRefusal::PeerRefused;
+        assert_eq!(refused.at_interface(|| unreachable!()), refused);
+    }
 
     #[test]
     fn each_errno_of_the_network_is_a_state() {

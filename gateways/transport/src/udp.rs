@@ -24,8 +24,8 @@ use hil_net::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
 use hil_net::reply_stamps::ReplyStamps;
 use hil_net::tcp_info::unacknowledged_bytes;
 use hil_net::timestamping::{
-    MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, drop_count, int_option,
-    interface_mtu_bytes, restart_send_count, set_int_option,
+    MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, drop_count, has_carrier,
+    int_option, interface_mtu_bytes, restart_send_count, set_int_option,
 };
 use hil_net::{TransmitStamp, TxToken};
 use hil_protocol::seal::{Initiator, Responder};
@@ -146,7 +146,9 @@ pub struct UdpSender {
     /// Reports of the network cost no datagram and decide nothing: on a sealed hop, where nothing is
     /// believed that the seal did not carry, and towards a foreign program.
     ignores_reports: bool,
-    /// Of the interface that the socket's address is on; read once where reports are ignored.
+    /// The interface of the settings, or the one with the socket's address.
+    interface: Option<String>,
+    /// Of this interface; read once where reports are ignored.
     interface_mtu_bytes: Option<u32>,
 }
 
@@ -220,10 +222,16 @@ impl UdpSender {
             refuse("SO_WIFI_STATUS", 1, asked)?;
             radio = Some(Box::new(RadioLedger::new()));
         }
+        let interface = interface_of(settings, &socket);
+        let mtu_bytes = interface
+            .as_deref()
+            .filter(|_| ignores_reports)
+            .and_then(|name| interface_mtu_bytes(name).ok());
         Ok(Self {
             radio,
             ignores_reports,
-            interface_mtu_bytes: ignores_reports.then(|| interface_mtu(settings)).flatten(),
+            interface,
+            interface_mtu_bytes: mtu_bytes,
             granted: granted_options(&socket, settings)?,
             socket,
             peer: settings.peer,
@@ -379,9 +387,14 @@ impl UdpSender {
                 Ok(token)
             }
             Err(error) => {
-                let refusal = SendRefusal::from_io(&error, length_bytes);
+                let refused = SendRefusal::from_io(&error, length_bytes);
+                let has_carrier = || {
+                    let interface = self.interface.as_deref();
+                    interface.is_none_or(|name| has_carrier(name).unwrap_or(true))
+                };
+                let refusal = refused.at_interface(has_carrier);
                 self.counters.count_refusal(refusal);
-                match refusal {
+                match refused {
                     SendRefusal::QueueFull {
                         errno: libc::ENOBUFS,
                     }
@@ -686,11 +699,13 @@ fn open_socket(settings: &SocketSettings, ignores_reports: bool) -> Result<Socke
     Ok(socket)
 }
 
-/// What the interface of the settings, or the one with their address, takes; `None` when none is known.
-fn interface_mtu(settings: &SocketSettings) -> Option<u32> {
+/// The interface of the settings, or the one with the address of `socket`; `None` when none is known.
+fn interface_of(settings: &SocketSettings, socket: &Socket) -> Option<String> {
     let named = settings.interface.clone();
-    let name = named.or_else(|| interface_with_address(settings.local.ip()).ok().flatten())?;
-    interface_mtu_bytes(&name).ok()
+    named.or_else(|| {
+        let address = local_address(socket).ok()?.ip();
+        interface_with_address(address).ok().flatten()
+    })
 }
 
 /// True for what a report of the network (ICMP of either version) becomes; some of them the call itself may answer
