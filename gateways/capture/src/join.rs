@@ -12,7 +12,8 @@
 //! cannot tell: see [`Doubt`]. An *unexplained* datagram was seen at the second point only, while
 //! the first was watched: the first point's capture has missed it.
 
-use core::cmp::Reverse;
+use core::cmp::{Ordering, Reverse};
+use core::ops::Range;
 use std::collections::BTreeMap;
 
 use hil_core::interval::Spread;
@@ -33,6 +34,8 @@ const PACKET_BYTES_MAX: u32 = 1500;
 /// Smallest change of the delays' level that is told, and the datagrams on either side of it.
 const SHIFT_MIN_NS: i64 = 50_000_000;
 const SHIFT_SIDE_MIN: usize = 3;
+/// One in so many stamps equal to the one before shows a clock that ticks more coarsely than datagrams come.
+const EQUAL_SHARE: usize = 10;
 
 /// How two captures are joined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -69,7 +72,7 @@ pub enum Doubt {
     Unread(Unread),
     /// Frames were dropped by the capture there.
     Dropped,
-    /// Which point comes first is unknown.
+    /// Which point comes first is unknown, or told in two ways.
     Order,
     /// Seen at both points, farther apart than [`JoinSettings::window_ns`].
     Apart,
@@ -157,9 +160,9 @@ pub struct JoinMetrics {
     pub unexplained_count: u64,
     /// Where the clock of a point was set, first and second point.
     pub clock_steps: [Vec<ClockStep>; 2],
-    /// A change of the delays that no stamp of one point shows.
-    pub delay_shift: Option<DelayShift>,
-    /// Second stamp minus first; unavailable when a clock was set meanwhile.
+    /// Changes of the delays that no stamp of one point shows.
+    pub delay_shifts: Vec<DelayShift>,
+    /// Second stamp minus first; unavailable when a clock was set meanwhile, or may have been.
     pub delay: Distribution,
     /// 95 % interval of its median, nanoseconds, or why there is none.
     pub delay_p50_interval: Option<Spread>,
@@ -217,6 +220,8 @@ pub struct Joined {
     pub pairs: Vec<Pair>,
     /// The figures.
     pub figures: JoinMetrics,
+    /// To how many nanoseconds the coarser stamps are whole.
+    pub unit_ns: i64,
 }
 
 /// What one of two points could see, and saw.
@@ -305,6 +310,25 @@ impl<'a> Side<'a> {
         spans.any(|span| from_ns >= at(span.first_ns) && to_ns <= at(span.last_ns))
     }
 
+    /// To how many nanoseconds its stamps are whole: as its file says, or coarser where many of them are equal.
+    fn unit_ns(&self) -> i64 {
+        let neighbours = self.at_ns.windows(2);
+        let on_ns = neighbours.map(|pair| pair[1].saturating_sub(pair[0]));
+        let equal_count = on_ns.clone().filter(|on_ns| *on_ns == 0).count();
+        let stated_ns = self.sight.watch.unit_ns.max(1);
+        if EQUAL_SHARE * equal_count < self.at_ns.len() {
+            return stated_ns;
+        }
+        let common = on_ns.fold(0, |a, b| {
+            let (mut a, mut b) = (a, b);
+            while b != 0 {
+                (a, b) = (b, a % b);
+            }
+            a
+        });
+        stated_ns.max(common)
+    }
+
     fn steps(&self) -> Vec<ClockStep> {
         match self.reading {
             Reading::Stamps => Vec::new(),
@@ -332,8 +356,9 @@ pub fn join(
         return None;
     }
     let is_one_clock = settings.is_one_clock || a.is_of_host_of(&b);
-    let (order, is_swapped) = ends(&first, &second, &matches, is_one_clock, round_trip);
-    let matches = if is_swapped {
+    let ends = ends(&first, &second, &matches, is_one_clock, round_trip);
+    let unit_ns = first.unit_ns().max(second.unit_ns());
+    let matches = if ends.is_swapped {
         core::mem::swap(&mut first, &mut second);
         Matches::of(&first, &second, settings.window_ns)
     } else {
@@ -347,8 +372,9 @@ pub fn join(
     Some(Joined {
         first_point: *first.sight.point,
         second_point: *second.sight.point,
-        figures: metrics(stream, order, &first, &second, &pairs, &matches),
+        figures: metrics(stream, &ends, &first, &second, &pairs, &matches),
         pairs,
+        unit_ns,
     })
 }
 
@@ -371,7 +397,7 @@ fn best_reading<'a>(
             let spread = delays().max().zip(delays().min());
             let fit = Fit {
                 matched_count: matches.pairs.len(),
-                reordered_count: Reverse(matches.reordered_count(second)),
+                reordered_count: Reverse(matches.reordered_count()),
                 spread_ns: Reverse(spread.map_or(0, |(most, least)| most.abs_diff(least))),
             };
             if best.as_ref().is_none_or(|(known, _)| fit > *known) {
@@ -392,50 +418,83 @@ struct Fit {
     spread_ns: Reverse<u64>,
 }
 
-/// How the ends are told apart, and whether the second comes first.
+/// How the ends are told apart.
+struct Ends {
+    order: OrderSource,
+    /// The second comes first.
+    is_swapped: bool,
+    /// Something else tells the contrary.
+    is_disputed: bool,
+}
+
+/// How the ends are told apart: by what no clock changes, by stamps where they can tell, by what the packets say
+/// of their direction.
 fn ends(
     first: &Side<'_>,
     second: &Side<'_>,
     matches: &Matches,
     is_one_clock: bool,
     round_trip: Option<bool>,
-) -> (OrderSource, bool) {
-    let (a, b) = (first.sight.point, second.sight.point);
-    // Through a host with two taps the way is in, then out; but both then read one clock.
-    match (a.direction, b.direction) {
-        _ if a.file_index == b.file_index => {}
-        (Direction::Outbound, Direction::Inbound) => return (OrderSource::PacketDirection, false),
-        (Direction::Inbound, Direction::Outbound) => return (OrderSource::PacketDirection, true),
-        _ => {}
-    }
+) -> Ends {
+    let sure = |order, is_swapped| Ends {
+        order,
+        is_swapped,
+        is_disputed: false,
+    };
+    let hops = |&(i, j): &(usize, usize)| (first.seen[i].hop_limit, second.seen[j].hop_limit);
     let count = |is_so: &dyn Fn(&(usize, usize)) -> bool| {
         matches.pairs.iter().filter(|pair| is_so(pair)).count()
     };
-    let hops = |&(i, j): &(usize, usize)| (first.seen[i].hop_limit, second.seen[j].hop_limit);
     let lowered = count(&|pair| hops(pair).0 > hops(pair).1);
     let raised = count(&|pair| hops(pair).0 < hops(pair).1);
     let all = matches.pairs.len();
     if all > 0 && lowered.max(raised) == all {
-        return (OrderSource::HopLimit, raised == all);
+        return sure(OrderSource::HopLimit, raised == all);
     }
+    let levels = Levels::of(first, second, matches);
     // A clock that was set is not one with another.
     let is_steady = [first, second]
         .iter()
         .all(|side| side.reading == Reading::Stamps);
-    if is_one_clock && is_steady && all > 0 {
-        let is_early = |&(i, j): &(usize, usize)| second.at_ns[j] < first.at_ns[i];
-        return (OrderSource::Stamps, 2 * count(&is_early) > all);
+    let by_stamps = (is_one_clock && is_steady)
+        .then(|| levels.is_backward(first.unit_ns().max(second.unit_ns())))
+        .flatten();
+    let (a, b) = (first.sight.point, second.sight.point);
+    // Through a host with two taps the way is in, then out; but both then read one clock.
+    let by_direction = match (a.direction, b.direction) {
+        _ if a.file_index == b.file_index => None,
+        (Direction::Outbound, Direction::Inbound) => Some(false),
+        (Direction::Inbound, Direction::Outbound) => Some(true),
+        _ => None,
+    };
+    if let Some(is_swapped) = by_direction {
+        // Two files of one host that forwards, or clocks that are not one.
+        return Ends {
+            is_disputed: by_stamps == Some(!is_swapped),
+            ..sure(OrderSource::PacketDirection, is_swapped)
+        };
+    }
+    if let Some(is_swapped) = by_stamps {
+        return sure(OrderSource::Stamps, is_swapped);
     }
     if let Some(is_swapped) = round_trip {
-        return (OrderSource::RoundTrip, is_swapped);
+        return sure(OrderSource::RoundTrip, is_swapped);
     }
-    match (
-        matches.only_first.is_empty(),
-        matches.only_second.is_empty(),
-    ) {
-        (false, true) => (OrderSource::Missing, false),
-        (true, false) => (OrderSource::Missing, true),
-        _ => (OrderSource::Unknown, false),
+    // What lies at an edge is missing because of when the captures began and ended.
+    let [only_first, only_second] = levels.alone([first, second], matches);
+    let by_missing = |is_swapped, lacking: &Side<'_>, other: &Side<'_>| Ends {
+        // Else its capture may have missed what the other has: against the order in which the points were named,
+        // only a file that states that it dropped nothing tells.
+        is_disputed: is_swapped
+            && !lacking.seen.is_empty()
+            && !other.seen.is_empty()
+            && !lacking.sight.watch.is_complete,
+        ..sure(OrderSource::Missing, is_swapped)
+    };
+    match (only_first.is_empty(), only_second.is_empty()) {
+        (false, true) => by_missing(false, second, first),
+        (true, false) => by_missing(true, first, second),
+        _ => sure(OrderSource::Unknown, false),
     }
 }
 
@@ -514,15 +573,16 @@ impl Matches {
     }
 
     /// Positions of departure in the order of arrival.
-    fn arrivals(&self, second: &Side<'_>) -> Vec<usize> {
+    fn arrivals(&self) -> Vec<usize> {
         let mut arrivals: Vec<usize> = (0..self.pairs.len()).collect();
-        arrivals.sort_by_key(|departure| second.at_ns[self.pairs[*departure].1]);
+        // Of equal stamps the file tells which came first.
+        arrivals.sort_by_key(|departure| self.pairs[*departure].1);
         arrivals
     }
 
-    fn reordered_count(&self, second: &Side<'_>) -> usize {
+    fn reordered_count(&self) -> usize {
         let mut latest = 0;
-        let arrivals = self.arrivals(second).into_iter();
+        let arrivals = self.arrivals().into_iter();
         let late = arrivals.filter(|departure| {
             latest = latest.max(*departure);
             *departure < latest
@@ -531,80 +591,155 @@ impl Matches {
     }
 }
 
+/// Datagrams in a row whose delays are on one level.
+struct DelayLevel {
+    /// Departure of the first one; of the first level, since ever.
+    from_ns: i64,
+    /// Which of the pairs.
+    places: Range<usize>,
+    /// Smallest and largest delay.
+    bounds: (i64, i64),
+}
+
 /// Delays of the datagrams at both points, in the order of departure, and the level each is on.
 struct Levels {
     /// In the reading of both points.
     delays: Vec<i64>,
-    shift: Option<DelayShift>,
-    /// Smallest and largest delay before and after the shift; without one, twice of all.
-    bounds: [(i64, i64); 2],
+    /// Which of them are of sound stamps.
+    is_stamped: Vec<bool>,
+    /// At least one, in the order of departure.
+    each: Vec<DelayLevel>,
 }
 
 impl Levels {
     fn of(first: &Side<'_>, second: &Side<'_>, matches: &Matches) -> Self {
         let pairs = matches.pairs.iter();
-        let (departures, delays): (Vec<i64>, Vec<i64>) = pairs
-            .map(|&(i, j)| {
-                (
-                    first.at_ns[i],
-                    second.at_ns[j].saturating_sub(first.at_ns[i]),
-                )
-            })
-            .unzip();
-        let bounds = |delays: &[i64]| {
-            let least = delays.iter().min().copied().unwrap_or(0);
-            (least, delays.iter().max().copied().unwrap_or(0))
+        let delay = |&(i, j): &(usize, usize)| second.at_ns[j].saturating_sub(first.at_ns[i]);
+        let delays: Vec<i64> = pairs.clone().map(delay).collect();
+        let is_stamped = |&(i, j): &(usize, usize)| {
+            first.seen[i].is_stamp_sound && second.seen[j].is_stamp_sound
         };
-        let at = shift_place(&delays);
-        let shift = at.map(|at| DelayShift {
-            from_ns: departures[at],
-            by_ns: median(&delays[at..]).saturating_sub(median(&delays[..at])),
+        let mut starts = vec![0];
+        level_starts(&delays, 0, &mut starts);
+        let ends = starts.iter().skip(1).copied().chain([delays.len()]);
+        let each = starts.iter().zip(ends).map(|(from, to)| {
+            let here = &delays[*from..to];
+            let least = here.iter().min().copied().unwrap_or(0);
+            DelayLevel {
+                from_ns: match from {
+                    0 => i64::MIN,
+                    _ => first.at_ns[matches.pairs[*from].0],
+                },
+                places: *from..to,
+                bounds: (least, here.iter().max().copied().unwrap_or(0)),
+            }
         });
-        let (before, after) = delays.split_at(at.unwrap_or(0));
         Self {
-            shift,
-            bounds: if at.is_some() {
-                [bounds(before), bounds(after)]
-            } else {
-                [bounds(&delays); 2]
-            },
+            each: each.collect(),
+            is_stamped: pairs.map(is_stamped).collect(),
             delays,
         }
     }
 
-    /// The least and the most that one which left at `at_ns` would have taken.
-    fn bounds_at(&self, at_ns: i64) -> (i64, i64) {
-        let is_after = self.shift.is_some_and(|shift| at_ns >= shift.from_ns);
-        self.bounds[usize::from(is_after)]
+    fn shifts(&self) -> Vec<DelayShift> {
+        let median = |level: &DelayLevel| median(&self.delays[level.places.clone()]);
+        let pairs = self.each.windows(2);
+        pairs
+            .map(|pair| DelayShift {
+                from_ns: pair[1].from_ns,
+                by_ns: median(&pair[1]).saturating_sub(median(&pair[0])),
+            })
+            .collect()
     }
 
-    fn shift_arrival_ns(&self) -> i64 {
-        self.shift.map_or(i64::MAX, |shift| {
-            shift.from_ns.saturating_add(self.bounds[1].0)
-        })
+    /// Of those seen at one point only, at the first and at the second, what the other would have shown. A datagram
+    /// would have had its other stamp while the point was watched, however fast or slow it was among
+    /// those seen; the rest lies at an edge.
+    fn alone(&self, [first, second]: [&Side<'_>; 2], matches: &Matches) -> [Vec<usize>; 2] {
+        let last_until = |is_past: &dyn Fn(&DelayLevel) -> bool| {
+            let later = self.each.iter().skip(1).rev();
+            let level = later.clone().find(|level| is_past(level));
+            level.or(self.each.first()).map_or((0, 0), |one| one.bounds)
+        };
+        let is_lost = |index: &usize| {
+            let at = first.at_ns[*index];
+            let (fastest, slowest) = last_until(&|level| at >= level.from_ns);
+            second.covers(at.saturating_add(fastest), at.saturating_add(slowest))
+        };
+        let is_unexplained = |index: &usize| {
+            let at = second.at_ns[*index];
+            let arrival_ns = |level: &DelayLevel| level.from_ns.saturating_add(level.bounds.0);
+            let (fastest, slowest) = last_until(&|level| at >= arrival_ns(level));
+            first.covers(at.saturating_sub(slowest), at.saturating_sub(fastest))
+        };
+        let mut alone = [matches.only_first.clone(), matches.only_second.clone()];
+        alone[0].retain(is_lost);
+        alone[1].retain(is_unexplained);
+        alone
+    }
+
+    /// Whether most stamps tell that the second comes first, where they differ by more than their unit; `None` where
+    /// none does, or where a change of the level turns that round.
+    fn is_backward(&self, unit_ns: i64) -> Option<bool> {
+        let mut found = None;
+        for level in &self.each {
+            let places = level.places.clone();
+            let stamped = places.filter(|place| self.is_stamped[*place]);
+            let delays: Vec<i64> = stamped.map(|place| self.delays[place]).collect();
+            let below = delays.iter().filter(|delay| **delay <= -unit_ns).count();
+            let above = delays.iter().filter(|delay| **delay >= unit_ns).count();
+            let here = match below.cmp(&above) {
+                _ if 2 * below.max(above) < delays.len() => return None,
+                Ordering::Equal => continue,
+                more => more == Ordering::Greater,
+            };
+            if found.is_some_and(|known| known != here) {
+                return None;
+            }
+            found = Some(here);
+        }
+        found
     }
 }
 
-/// From which delay on all lie on another level than all before.
-fn shift_place(delays: &[i64]) -> Option<usize> {
-    let running = |delays: &mut dyn Iterator<Item = &i64>| {
-        let mut bounds: Option<(i64, i64)> = None;
-        let each = delays.map(|delay| {
-            let (least, most) = bounds.unwrap_or((*delay, *delay));
-            *bounds.insert((least.min(*delay), most.max(*delay)))
-        });
-        each.collect::<Vec<(i64, i64)>>()
+/// Adds where the delays begin to lie on another level: groups of values apart by more than each is wide, of which
+/// each holds [`SHIFT_SIDE_MIN`] datagrams in a row whenever it holds one.
+fn level_starts(delays: &[i64], from: usize, starts: &mut Vec<usize>) {
+    let mut ascending = delays.to_vec();
+    ascending.sort_unstable();
+    let gap_ns = |at: &usize| ascending[*at].saturating_sub(ascending[at - 1]);
+    let mut gaps: Vec<usize> = (1..ascending.len()).collect();
+    gaps.retain(|at| gap_ns(at) > SHIFT_MIN_NS);
+    gaps.sort_by_key(|at| Reverse(gap_ns(at)));
+    let groups = (1..=gaps.len()).find_map(|count| {
+        let mut begins = gaps[..count].to_vec();
+        begins.sort_unstable();
+        let ends = begins.iter().copied().chain([ascending.len()]);
+        let widths = [0]
+            .iter()
+            .chain(&begins)
+            .zip(ends)
+            .map(|(begin, end)| ascending[end - 1].saturating_sub(ascending[*begin]));
+        let width = widths.max().unwrap_or(0);
+        (gap_ns(&gaps[count - 1]) > width.saturating_mul(4)).then_some(begins)
+    });
+    let Some(begins) = groups else {
+        return;
     };
-    let before = running(&mut delays.iter());
-    let mut after = running(&mut delays.iter().rev());
-    after.reverse();
-    let last = delays.len().checked_sub(SHIFT_SIDE_MIN)?;
-    (SHIFT_SIDE_MIN..=last).find(|at| {
-        let ((a, b), (c, d)) = (before[at - 1], after[*at]);
-        let apart = c.saturating_sub(b).max(a.saturating_sub(d));
-        let width = b.saturating_sub(a).max(d.saturating_sub(c));
-        apart > width.saturating_mul(4).max(SHIFT_MIN_NS)
-    })
+    let least: Vec<i64> = begins.iter().map(|at| ascending[*at]).collect();
+    let group = |delay: &i64| least.partition_point(|begin| begin <= delay);
+    let runs: Vec<&[i64]> = delays.chunk_by(|a, b| group(a) == group(b)).collect();
+    if runs.iter().any(|run| run.len() < SHIFT_SIDE_MIN) {
+        return;
+    }
+    let mut at = from;
+    for run in runs {
+        if at > from {
+            starts.push(at);
+        }
+        level_starts(run, at, starts);
+        at += run.len();
+    }
 }
 
 fn median(values: &[i64]) -> i64 {
@@ -616,7 +751,7 @@ fn median(values: &[i64]) -> i64 {
 /// Why datagrams that the second point does not show may have passed it.
 fn doubts(
     stream: &Stream,
-    order: OrderSource,
+    ends: &Ends,
     [first, second]: [&Side<'_>; 2],
     matches: &Matches,
     pairs: &[Pair],
@@ -653,7 +788,7 @@ fn doubts(
         .sum();
     let aggregates = pairs.iter().filter(|pair| pair.is_aggregate()).count();
     add(Doubt::Unread(Unread::Aggregate), aggregates + large_count);
-    if alone_count > 0 && order == OrderSource::Unknown {
+    if alone_count > 0 && (ends.order == OrderSource::Unknown || ends.is_disputed) {
         add(Doubt::Order, alone_count);
     }
     add(Doubt::Apart, matches.apart_count);
@@ -730,28 +865,14 @@ fn loss(lost: &[usize], matches: &Matches, doubts: Vec<CountedDoubt>) -> Loss {
 
 fn metrics(
     stream: &Stream,
-    order: OrderSource,
+    ends: &Ends,
     first: &Side<'_>,
     second: &Side<'_>,
     pairs: &[Pair],
     matches: &Matches,
 ) -> JoinMetrics {
-    // A datagram would have had its other stamp while the point was watched, however fast or slow it
-    // was among those seen; the rest of what was seen at one point only lies at an edge.
     let levels = Levels::of(first, second, matches);
-    let mut lost = matches.only_first.clone();
-    lost.retain(|index| {
-        let at = first.at_ns[*index];
-        let (fastest, slowest) = levels.bounds_at(at);
-        second.covers(at.saturating_add(fastest), at.saturating_add(slowest))
-    });
-    let mut unexplained = matches.only_second.clone();
-    unexplained.retain(|index| {
-        let at = second.at_ns[*index];
-        let is_after = at >= levels.shift_arrival_ns();
-        let (fastest, slowest) = levels.bounds[usize::from(is_after)];
-        first.covers(at.saturating_sub(slowest), at.saturating_sub(fastest))
-    });
+    let [lost, unexplained] = levels.alone([first, second], matches);
     let observations = |side: &Side<'_>, list: &[usize]| -> Vec<Observation> {
         list.iter().map(|index| side.seen[*index]).collect()
     };
@@ -760,16 +881,18 @@ fn metrics(
         observations(second, &unexplained),
     ];
     let alone = [&alone[0][..], &alone[1]];
-    let doubts = doubts(stream, order, [first, second], matches, pairs, alone);
+    let doubts = doubts(stream, ends, [first, second], matches, pairs, alone);
     let only_count = matches.only_first.len() + matches.only_second.len();
     let matched_count = pairs.len() as u64;
     let clock_steps = [first.steps(), second.steps()];
     let is_set = clock_steps.iter().any(|steps| !steps.is_empty());
-    let arrivals = matches.arrivals(second);
+    let delay_shifts = if is_set { Vec::new() } else { levels.shifts() };
+    let is_unsure = is_set || !delay_shifts.is_empty();
+    let arrivals = matches.arrivals();
     let (late, _) = reordered(arrivals.iter().map(|departure| *departure as u64));
     let reordered_count = late.len() as u64;
-    // Where a clock was set, no delay is known.
-    let is_delay = |departure: &&usize| !is_set && pairs[**departure].is_stamped();
+    // Where a clock was set, or may have been, no delay is known.
+    let is_delay = |departure: &&usize| !is_unsure && pairs[**departure].is_stamped();
     let in_arrival = arrivals.iter().filter(is_delay);
     let in_arrival: Vec<i64> = in_arrival
         .map(|departure| levels.delays[*departure])
@@ -783,6 +906,8 @@ fn metrics(
     let quantiles = Quantiles::of(&series, &ascending);
     let unmatched = if is_set {
         "a clock was set while it stamped"
+    } else if is_unsure {
+        "the delays changed their level: a clock was set, or the way changed"
     } else {
         "no datagram was stamped at both points"
     };
@@ -801,7 +926,7 @@ fn metrics(
     let gaps = second.at_ns.windows(2);
     let gaps = gaps.map(|pair| pair[1].saturating_sub(pair[0]));
     JoinMetrics {
-        order,
+        order: ends.order,
         first_count: first.seen.len() as u64,
         second_count: second.seen.len() as u64,
         matched_count,
@@ -809,7 +934,7 @@ fn metrics(
         loss: loss(&lost, matches, doubts),
         duplicated_count: (!may_be_copies).then_some(matches.duplicates.len() as u64),
         unexplained_count: unexplained.len() as u64,
-        delay_shift: levels.shift.filter(|_| !is_set),
+        delay_shifts,
         delay: distribution(delays.iter().copied(), unmatched),
         delay_p50_interval: quantiles.interval(0.5),
         delay_p99_interval: quantiles.interval(0.99),

@@ -88,15 +88,6 @@ impl Reading {
         text
     }
 
-    /// To how many nanoseconds stamps of a point are whole.
-    fn unit_ns(&self, point: &Point) -> i64 {
-        let mut interfaces = self.files[point.file_index].interfaces.iter();
-        let (numerator, denominator) = interfaces
-            .nth(point.interface_index)
-            .map_or((1, 1), |interface| interface.unit_ns);
-        i64::try_from(numerator.div_ceil(denominator)).unwrap_or(i64::MAX)
-    }
-
     /// Every stream that a card stamped, with how many of its datagrams have the kernel's stamp.
     fn nic_streams(&self) -> impl Iterator<Item = (&Point, &Stream, &Vec<Observation>, u64)> {
         let seen = self.of_cards.seen().iter();
@@ -250,14 +241,13 @@ impl Report {
             let mut interfaces = reading.files[first.file_index].interfaces.iter();
             let is_apart = first.tap() != second.tap() && interfaces.any(|one| one.is_merged);
             let declared = PointClocks::of(first, second, is_apart, settings);
-            let unit_ns = reading.unit_ns(first).max(reading.unit_ns(second));
             // Where a clock was set there are none.
             let is_delay =
                 |pair: &&Pair| one.figures.delay.measured().is_some() && pair.is_stamped();
             let pairs = one.pairs.iter().filter(is_delay);
             let delays_ns =
                 pairs.map(|pair| pair.second.stamp_ns.saturating_sub(pair.first.stamp_ns));
-            declared.beside(delays_ns, unit_ns)
+            declared.beside(delays_ns, one.unit_ns)
         };
         Self {
             schema_version: 2,
@@ -280,11 +270,13 @@ impl Report {
         }
     }
 
-    /// True when loss is unavailable between two points, a clock was set, or delays contradict that it is one.
+    /// True when loss is unavailable between two points, a clock was set or may have been, or delays contradict that
+    /// it is one.
     pub(super) fn has_doubts(&self) -> bool {
         let is_doubtful = |one: &JoinReport| {
             one.figures.loss.count().is_none()
                 || one.clocks == PointClocks::Contradicted
+                || !one.figures.delay_shifts.is_empty()
                 || one
                     .figures
                     .clock_steps
@@ -304,8 +296,18 @@ impl Report {
                 complaints.push(format!("clocks of {first} and {second}: {why}"));
             }
             if let Loss::Unavailable { doubts, .. } = &one.figures.loss {
-                let why = doubts_text(doubts);
+                let why = doubts_text(doubts, one.clocks);
                 complaints.push(format!("loss from {} to {}: {why}", one.first, one.second));
+            }
+            if !one.figures.delay_shifts.is_empty() {
+                let (first, second) = (&one.first, &one.second);
+                let shifts = one.figures.delay_shifts.iter();
+                let by: Vec<String> = shifts.map(|shift| duration(shift.by_ns)).collect();
+                complaints.push(format!(
+                    "delays from {first} to {second}: unavailable, they changed their level by {}: a clock was \
+                     set, or the way changed",
+                    by.join(", ")
+                ));
             }
             for (point, steps) in [&one.first, &one.second]
                 .into_iter()
@@ -513,7 +515,7 @@ fn join_section(joined: &JoinReport) -> Section {
             format!(
                 "unavailable{}: {}",
                 range.unwrap_or_default(),
-                doubts_text(doubts)
+                doubts_text(doubts, joined.clocks)
             )
         }
     };
@@ -533,7 +535,7 @@ fn join_section(joined: &JoinReport) -> Section {
             );
         }
     }
-    if let Some(shift) = figures.delay_shift {
+    for shift in &figures.delay_shifts {
         let more = duration(shift.by_ns);
         fact(
             "level",
@@ -602,7 +604,7 @@ fn step_words(step: &ClockStep) -> String {
 }
 
 /// Why loss is unavailable.
-fn doubts_text(doubts: &[CountedDoubt]) -> String {
+fn doubts_text(doubts: &[CountedDoubt], clocks: PointClocks) -> String {
     let words = doubts
         .iter()
         .map(|CountedDoubt { doubt, count }| match doubt {
@@ -626,7 +628,11 @@ fn doubts_text(doubts: &[CountedDoubt]) -> String {
                 "{count} seen at one point while the other was not watched, as far as its file tells"
             ),
             Doubt::Order => {
-                format!("{count} at one point only, and which comes first is unknown (--one-clock)")
+                let hint = match clocks {
+                    PointClocks::Unknown => " (--one-clock)",
+                    PointClocks::OneFile | PointClocks::DeclaredOne | PointClocks::Contradicted => "",
+                };
+                format!("{count} at one point only, and which comes first is unknown{hint}")
             }
         });
     words.collect::<Vec<String>>().join(", ")
