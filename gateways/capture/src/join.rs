@@ -14,7 +14,7 @@
 
 use core::cmp::{Ordering, Reverse};
 use core::ops::Range;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use hil_core::interval::Spread;
 use hil_stats::dependence::{Batches, Quantiles};
@@ -36,6 +36,8 @@ const SHIFT_MIN_NS: i64 = 50_000_000;
 const SHIFT_SIDE_MIN: usize = 3;
 /// One in so many stamps equal to the one before shows a clock that ticks more coarsely than datagrams come.
 const EQUAL_SHARE: usize = 10;
+/// One in so many datagrams whose identity came before shows that identities come again.
+const LAPPED_SHARE: usize = 10;
 
 /// How two captures are joined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -76,6 +78,10 @@ pub enum Doubt {
     Order,
     /// Seen at both points, farther apart than [`JoinSettings::window_ns`].
     Apart,
+    /// Their identities come again sooner than the delays tell which belongs to which.
+    Ambiguous,
+    /// The like was seen there under other addresses, which this point never saw.
+    Readdressed,
     /// Seen at one point while nothing tells that the other was watched, and none was seen at both.
     Unwatched,
 }
@@ -216,6 +222,8 @@ pub struct Joined {
     pub first_point: Point,
     /// Where then.
     pub second_point: Point,
+    /// Further points of the same two hosts over which a part of it went: see [`Sight::also`].
+    pub also: [Vec<Point>; 2],
     /// What was seen at both, in the order of departure.
     pub pairs: Vec<Pair>,
     /// The figures.
@@ -233,6 +241,10 @@ pub struct Sight<'a> {
     pub watch: &'a Watch,
     /// What it saw.
     pub seen: &'a Seen,
+    /// Further points of its host: what passed one of them did not pass the others, and counts as seen here.
+    pub also: &'a [Point],
+    /// What the other taps of its host could see.
+    pub beside: &'a [&'a Watch],
 }
 
 impl Sight<'_> {
@@ -329,6 +341,19 @@ impl<'a> Side<'a> {
         stated_ns.max(common)
     }
 
+    /// After what time identities come again, where they do as a rule.
+    fn lap_ns(&self) -> Option<i64> {
+        let mut newest = BTreeMap::new();
+        let times = self.seen.iter().zip(&self.at_ns);
+        let again = times.filter_map(|(one, at_ns)| {
+            let before = newest.insert(one.identity.key, *at_ns)?;
+            Some(at_ns.saturating_sub(before))
+        });
+        let again: Vec<i64> = again.collect();
+        let is_rule = !again.is_empty() && LAPPED_SHARE * again.len() >= self.seen.len();
+        is_rule.then(|| median(&again))
+    }
+
     fn steps(&self) -> Vec<ClockStep> {
         match self.reading {
             Reading::Stamps => Vec::new(),
@@ -360,7 +385,7 @@ pub fn join(
     let unit_ns = first.unit_ns().max(second.unit_ns());
     let matches = if ends.is_swapped {
         core::mem::swap(&mut first, &mut second);
-        Matches::of(&first, &second, settings.window_ns)
+        Matches::within(&first, &second, settings.window_ns)
     } else {
         matches
     };
@@ -372,6 +397,7 @@ pub fn join(
     Some(Joined {
         first_point: *first.sight.point,
         second_point: *second.sight.point,
+        also: [&first, &second].map(|side| side.sight.also.to_vec()),
         figures: metrics(stream, &ends, &first, &second, &pairs, &matches),
         pairs,
         unit_ns,
@@ -389,16 +415,11 @@ fn best_reading<'a>(
     let seconds = Side::each(stream, b);
     for first in Side::each(stream, a) {
         for second in &seconds {
-            let matches = Matches::of(&first, second, window_ns);
-            let delays = || {
-                let pairs = matches.pairs.iter();
-                pairs.map(|&(i, j)| second.at_ns[j].saturating_sub(first.at_ns[i]))
-            };
-            let spread = delays().max().zip(delays().min());
+            let matches = Matches::within(&first, second, window_ns);
             let fit = Fit {
                 matched_count: matches.pairs.len(),
                 reordered_count: Reverse(matches.reordered_count()),
-                spread_ns: Reverse(spread.map_or(0, |(most, least)| most.abs_diff(least))),
+                spread_ns: Reverse(width(&matches.delays(&first, second))),
             };
             if best.as_ref().is_none_or(|(known, _)| fit > *known) {
                 best = Some((fit, (first.clone(), second.clone(), matches)));
@@ -415,7 +436,7 @@ struct Fit {
     /// A clock that was set mixes what came before it with what came after it.
     reordered_count: Reverse<usize>,
     /// Of the delays, from the smallest to the largest.
-    spread_ns: Reverse<u64>,
+    spread_ns: Reverse<i64>,
 }
 
 /// How the ends are told apart.
@@ -498,20 +519,30 @@ fn ends(
     }
 }
 
-/// What the median of the stamps' differences at two points is; `None` without a datagram at both.
-pub(super) fn median_difference_ns(
+/// When each datagram seen at both points was seen at `a`, and how much later at `b`; none where a clock was set.
+pub(super) fn differences(
     stream: &Stream,
     a: Sight<'_>,
     b: Sight<'_>,
     window_ns: i64,
-) -> Option<i64> {
-    let (first, second, matches) = best_reading(stream, a, b, window_ns)?;
-    let pairs = matches.pairs.iter();
-    let mut differences: Vec<i64> = pairs
-        .map(|&(i, j)| second.at_ns[j].saturating_sub(first.at_ns[i]))
-        .collect();
-    differences.sort_unstable();
-    differences.get(differences.len() / 2).copied()
+) -> Vec<(i64, i64)> {
+    let Some((first, second, matches)) = best_reading(stream, a, b, window_ns) else {
+        return Vec::new();
+    };
+    let levels = Levels::of(&first, &second, &matches);
+    let is_set = [&first, &second].map(|side| side.reading != Reading::Stamps);
+    if is_set.contains(&true) || levels.each.len() > 1 {
+        return Vec::new();
+    }
+    let times = matches.pairs.iter().map(|(i, _)| first.at_ns[*i]);
+    let each = times.zip(levels.delays).zip(levels.is_stamped);
+    each.filter_map(|(one, is_stamped)| is_stamped.then_some(one))
+        .collect()
+}
+
+/// How many datagrams were seen at both.
+pub(super) fn common_count(stream: &Stream, a: Sight<'_>, b: Sight<'_>, window_ns: i64) -> usize {
+    best_reading(stream, a, b, window_ns).map_or(0, |(_, _, matches)| matches.pairs.len())
 }
 
 /// Who belongs to whom, by positions.
@@ -524,12 +555,38 @@ struct Matches {
     duplicates: Vec<usize>,
     /// Of those seen at one point only, what has its like at the other, beyond the window.
     apart_count: usize,
+    /// Identities come again sooner than the delays tell which belongs to which.
+    is_ambiguous: bool,
 }
 
 impl Matches {
+    /// As told by [`Self::of`]. Where identities come again and the delays show that some were taken for those of the
+    /// next lap, only those within half a lap around the median belong together.
+    fn within(first: &Side<'_>, second: &Side<'_>, window_ns: i64) -> Self {
+        let matches = Self::of(first, second, 0, window_ns);
+        let laps = first.lap_ns().zip(second.lap_ns());
+        let Some(lap_ns) = laps.map(|(a, b)| a.min(b)) else {
+            return matches;
+        };
+        let delays = matches.delays(first, second);
+        if width(&delays) < lap_ns / 2 || lap_ns / 2 >= window_ns {
+            return matches;
+        }
+        let mut near = Self::of(first, second, median(&delays), lap_ns / 2);
+        near.is_ambiguous = width(&near.delays(first, second)) > lap_ns / 4
+            || 10 * near.pairs.len() < 9 * matches.pairs.len();
+        near
+    }
+
+    fn delays(&self, first: &Side<'_>, second: &Side<'_>) -> Vec<i64> {
+        let pairs = self.pairs.iter();
+        let delays = pairs.map(|&(i, j)| second.at_ns[j].saturating_sub(first.at_ns[i]));
+        delays.collect()
+    }
+
     /// Of equal keys the earliest at one point belongs to the earliest at the other that is within
-    /// the window; what remains at the second beside a match is a repetition.
-    fn of(first: &Side<'_>, second: &Side<'_>, window_ns: i64) -> Self {
+    /// the window around a delay; what remains at the second beside a match is a repetition.
+    fn of(first: &Side<'_>, second: &Side<'_>, delay_ns: i64, window_ns: i64) -> Self {
         let mut by_key: BTreeMap<u64, (Vec<usize>, Vec<usize>)> = BTreeMap::new();
         for (index, one) in first.seen.iter().enumerate() {
             by_key.entry(one.identity.key).or_default().0.push(index);
@@ -544,13 +601,14 @@ impl Matches {
             while j < to.len() {
                 let arrival_ns = second.at_ns[to[j]];
                 let since = |at: i64| arrival_ns.saturating_sub(at);
-                match from.get(i).map(|index| since(first.at_ns[*index])) {
-                    Some(delay_ns) if delay_ns > window_ns => {
+                let late_ns = |index: &usize| since(first.at_ns[*index]).saturating_sub(delay_ns);
+                match from.get(i).map(late_ns) {
+                    Some(late_ns) if late_ns > window_ns => {
                         matches.only_first.push(from[i]);
                         i += 1;
                         continue;
                     }
-                    Some(delay_ns) if delay_ns >= -window_ns => {
+                    Some(late_ns) if late_ns >= -window_ns => {
                         matches.pairs.push((from[i], to[j]));
                         newest_match = Some(arrival_ns);
                         i += 1;
@@ -614,8 +672,7 @@ struct Levels {
 impl Levels {
     fn of(first: &Side<'_>, second: &Side<'_>, matches: &Matches) -> Self {
         let pairs = matches.pairs.iter();
-        let delay = |&(i, j): &(usize, usize)| second.at_ns[j].saturating_sub(first.at_ns[i]);
-        let delays: Vec<i64> = pairs.clone().map(delay).collect();
+        let delays = matches.delays(first, second);
         let is_stamped = |&(i, j): &(usize, usize)| {
             first.seen[i].is_stamp_sound && second.seen[j].is_stamp_sound
         };
@@ -742,6 +799,12 @@ fn level_starts(delays: &[i64], from: usize, starts: &mut Vec<usize>) {
     }
 }
 
+/// From the smallest to the largest.
+fn width(values: &[i64]) -> i64 {
+    let bounds = values.iter().min().zip(values.iter().max());
+    bounds.map_or(0, |(least, most)| most.saturating_sub(*least))
+}
+
 fn median(values: &[i64]) -> i64 {
     let mut sorted = values.to_vec();
     sorted.sort_unstable();
@@ -792,6 +855,15 @@ fn doubts(
         add(Doubt::Order, alone_count);
     }
     add(Doubt::Apart, matches.apart_count);
+    if matches.is_ambiguous {
+        add(Doubt::Ambiguous, pairs.len() + alone_count);
+    }
+    for (side, other, list) in [(first, second, alone[0]), (second, first, alone[1])] {
+        add(
+            Doubt::Readdressed,
+            readdressed_count(stream, list, side, other),
+        );
+    }
     let is_judged = !pairs.is_empty() || !alone[0].is_empty();
     let mut blind: Vec<&Side<'_>> = Vec::new();
     if !is_judged {
@@ -810,6 +882,16 @@ fn doubts(
                 usize::try_from(count).unwrap_or(usize::MAX),
             );
         }
+        // What is broken in a file is counted at each of its taps.
+        let beside = side.sight.beside.iter();
+        let beside =
+            beside.flat_map(|watch| watch.unread_of(stream.flow_index, source, destination, true));
+        for (why, count) in beside.filter(|(why, _)| *why != Unread::Malformed) {
+            add(
+                Doubt::Unread(why),
+                usize::try_from(count).unwrap_or(usize::MAX),
+            );
+        }
         let dropped = usize::try_from(watch.dropped_count);
         add(Doubt::Dropped, dropped.unwrap_or(usize::MAX));
     }
@@ -819,6 +901,33 @@ fn doubts(
         doubts.push(CountedDoubt { doubt, count });
     }
     doubts
+}
+
+/// How many of `list`, seen at one point only, are nearly all of a stream that only the other point saw: an
+/// address was translated on the way.
+fn readdressed_count(
+    stream: &Stream,
+    list: &[Observation],
+    side: &Side<'_>,
+    other: &Side<'_>,
+) -> usize {
+    let keys: BTreeSet<u64> = list.iter().map(|one| one.identity.key).collect();
+    let streams = other.sight.seen.iter().filter(|(one, _)| {
+        (one.flow_index, one.own) == (stream.flow_index, stream.own)
+            && !side.sight.seen.contains_key(one)
+    });
+    let counts = streams.map(|(_, seen)| {
+        let found = seen.iter().map(|one| one.identity.key);
+        let found: Vec<u64> = found.filter(|key| keys.contains(key)).collect();
+        let is_same = 5 * found.len() >= 4 * seen.len();
+        let distinct: BTreeSet<u64> = found.into_iter().collect();
+        if is_same && 2 * distinct.len() >= keys.len() {
+            distinct.len()
+        } else {
+            0
+        }
+    });
+    counts.max().unwrap_or(0)
 }
 
 /// Whether neighbours in `list`, each of fewer, are of so many bytes together.
@@ -853,7 +962,9 @@ fn loss(lost: &[usize], matches: &Matches, doubts: Vec<CountedDoubt>) -> Loss {
     let is_bounded = |one: &CountedDoubt| match one.doubt {
         Doubt::Unread(why) => why != Unread::Aggregate,
         Doubt::Dropped => true,
-        Doubt::Order | Doubt::Apart | Doubt::Unwatched => false,
+        Doubt::Order | Doubt::Apart | Doubt::Ambiguous | Doubt::Readdressed | Doubt::Unwatched => {
+            false
+        }
     };
     let unseen_count: u64 = doubts.iter().map(|one| one.count).sum();
     let range = count > 0 && doubts.iter().all(is_bounded);
@@ -887,7 +998,7 @@ fn metrics(
     let clock_steps = [first.steps(), second.steps()];
     let is_set = clock_steps.iter().any(|steps| !steps.is_empty());
     let delay_shifts = if is_set { Vec::new() } else { levels.shifts() };
-    let is_unsure = is_set || !delay_shifts.is_empty();
+    let is_unsure = is_set || matches.is_ambiguous || !delay_shifts.is_empty();
     let arrivals = matches.arrivals();
     let (late, _) = reordered(arrivals.iter().map(|departure| *departure as u64));
     let reordered_count = late.len() as u64;
@@ -906,6 +1017,8 @@ fn metrics(
     let quantiles = Quantiles::of(&series, &ascending);
     let unmatched = if is_set {
         "a clock was set while it stamped"
+    } else if matches.is_ambiguous {
+        "numbers come again too soon to tell which is which"
     } else if is_unsure {
         "the delays changed their level: a clock was set, or the way changed"
     } else {

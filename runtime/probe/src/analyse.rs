@@ -88,6 +88,14 @@ impl Reading {
         text
     }
 
+    /// A point and further ones of its host over which a part of a stream went, in words.
+    fn names(&self, point: &Point, also: &[Point]) -> String {
+        let all = core::iter::once(point).chain(also);
+        all.map(|one| self.name(one))
+            .collect::<Vec<_>>()
+            .join(" + ")
+    }
+
     /// Every stream that a card stamped, with how many of its datagrams have the kernel's stamp.
     fn nic_streams(&self) -> impl Iterator<Item = (&Point, &Stream, &Vec<Observation>, u64)> {
         let seen = self.of_cards.seen().iter();
@@ -258,8 +266,8 @@ impl Report {
                 .map(|(stream, joined)| {
                     let clocks = clocks(&joined);
                     JoinReport {
-                        first: reading.name(&joined.first_point),
-                        second: reading.name(&joined.second_point),
+                        first: reading.names(&joined.first_point, &joined.also[0]),
+                        second: reading.names(&joined.second_point, &joined.also[1]),
                         clocks,
                         delay_bound_ns: clocks.bound_ns(),
                         stream: stream_report(&stream),
@@ -623,6 +631,12 @@ fn doubts_text(doubts: &[CountedDoubt], clocks: PointClocks) -> String {
             Doubt::Apart => format!(
                 "{count} seen at both points farther apart than --window: a clock that was set, or clocks \
                  far apart"
+            ),
+            Doubt::Ambiguous => format!(
+                "{count} whose numbers come again too soon: half a lap must be longer than the delays vary"
+            ),
+            Doubt::Readdressed => format!(
+                "{count} seen at the other point under other addresses (an address was translated on the way)"
             ),
             Doubt::Unwatched => format!(
                 "{count} seen at one point while the other was not watched, as far as its file tells"

@@ -832,3 +832,151 @@ fn what_lies_at_an_edge_tells_no_order_and_what_a_capture_may_have_missed_is_in_
     let figures = &joins_of(&pcap(&leaky.collect::<Vec<_>>()), &came, false)[0];
     assert_eq!(doubts(figures), [(Doubt::Order, 3)], "{figures:#?}");
 }
+
+#[test]
+fn points_of_one_host_that_each_saw_a_part_of_a_stream_count_as_one() {
+    let frame = |n: i64| routed(n, 64);
+    let came = |n: i64| sent_us(n) + 1000;
+    let tagged = |n: i64| {
+        let frame = frame(n);
+        [&frame[..12], &[0x81, 0, 0, 7], &frame[12..]].concat()
+    };
+    let bond = arrived().map(|n| packet(u32::from(n % 2 == 1), came(n), 0, &frame(n)));
+    let bond = pcapng(&[vec![interface(1, 6)], bond.collect()].concat());
+    let half_tagged = arrived().map(|n| (came(n), if n < 25 { frame(n) } else { tagged(n) }));
+    let half_told = arrived().map(|n| packet(0, came(n), u8::from(n % 2 == 1), &frame(n)));
+    for second in [
+        bond,
+        pcap(&half_tagged.collect::<Vec<_>>()),
+        pcapng(&half_told.collect::<Vec<_>>()),
+    ] {
+        let joins = joins_of(&sent_50(), &second, true);
+        assert_eq!(joins.len(), 1, "{joins:#?}");
+        let figures = &joins[0];
+        let told = (
+            figures.loss.count(),
+            figures.second_count,
+            figures.reordered_count,
+        );
+        assert_eq!(told, (Some(1), 49, 0), "{figures:#?}");
+    }
+    // Through two taps of a host in series, of which the second lost one more.
+    let series = arrived().flat_map(|n| {
+        let out = (n != 30).then(|| packet(1, came(n) + 10, 0, &frame(n)));
+        [Some(packet(0, came(n), 0, &frame(n))), out]
+            .into_iter()
+            .flatten()
+    });
+    let series = pcapng(&[vec![interface(1, 6)], series.collect()].concat());
+    let joins = joins_of(&sent_50(), &series, true);
+    let lost: Vec<_> = joins.iter().map(|one| one.loss.count()).collect();
+    assert_eq!(lost, [Some(1), Some(2), Some(1)], "{joins:#?}");
+    // The other half came over a link that is not read.
+    let unread = arrived().map(|n| packet(u32::from(n % 2 == 1), came(n), 0, &frame(n)));
+    let unread = pcapng(&[vec![interface(189, 6)], unread.collect()].concat());
+    let figures = &joins_of(&sent_50(), &unread, true)[0];
+    let why = Doubt::Unread(Unread::LinkType { link_type: 189 });
+    assert_eq!(doubts(figures), [(why, 25)], "{figures:#?}");
+}
+
+#[test]
+fn a_number_that_comes_again_within_the_window_is_told_apart_by_the_delay() {
+    // A number of eight bits, one a millisecond: a lap is 256 ms. 0.3 ms on the way, by a clock 0.4 s ahead.
+    let at_us = |n: i64| BEGIN_US + 1000 * n;
+    let of = |numbers: &mut dyn Iterator<Item = i64>, late_us: &dyn Fn(i64) -> i64| {
+        pcap(
+            &numbers
+                .map(|n| (at_us(n) + late_us(n), routed(n, 64)))
+                .collect::<Vec<_>>(),
+        )
+    };
+    let lost = [300, 301, 302, 900];
+    let first = of(&mut (0..2000), &|_| 0);
+    for late_us in [300, 400_300] {
+        let mut numbers = (0..2000).filter(|n| !lost.contains(n));
+        let second = of(&mut numbers, &|_| late_us);
+        let figures = &joins_by("udp:dport=5004,id=3+1", &first, &second, true)[0];
+        let told = (
+            figures.loss.count(),
+            figures.edge_count,
+            figures.reordered_count,
+        );
+        assert_eq!(told, (Some(4), 0, 0), "{late_us}: {figures:#?}");
+        assert_eq!(figures.delay.measured().unwrap().max_ns, late_us * 1000);
+    }
+    // The delays vary by more than the lap.
+    let mut numbers = (0..2000).filter(|n| !lost.contains(n));
+    let second = of(&mut numbers, &|n| n % 7 * 60_000);
+    let figures = &joins_by("udp:dport=5004,id=3+1", &first, &second, true)[0];
+    let why = doubts(figures);
+    assert!(
+        why.iter().any(|one| one.0 == Doubt::Ambiguous),
+        "{figures:#?}"
+    );
+    assert_eq!(figures.delay.measured(), None);
+}
+
+#[test]
+fn a_stream_under_a_translated_address_is_not_lost() {
+    let readdressed = |n: i64| {
+        let mut frame = routed(n, 64);
+        frame[26..30].copy_from_slice(&[192, 0, 2, 9]);
+        frame
+    };
+    let second = arrived().map(|n| (sent_us(n) + 1000, readdressed(n)));
+    let second: Vec<_> = second.collect();
+    let joins = joins_of(&sent_50(), &pcap(&second), true);
+    assert_eq!(joins.len(), 2, "{joins:#?}");
+    for figures in &joins {
+        assert!(
+            matches!(doubts(figures)[..], [(Doubt::Readdressed, 47..=48)]),
+            "{figures:#?}"
+        );
+    }
+    // Another sender's, with other numbers in part: what was lost was lost.
+    let other = (0..500).map(|n| (sent_us(n) + 1000, readdressed(n)));
+    let joins = joins_of(&sent_50(), &pcap(&other.collect::<Vec<_>>()), true);
+    // All but the first, which left before that capture began.
+    assert_eq!(joins[0].loss.count(), Some(49), "{joins:#?}");
+}
+
+#[test]
+fn a_round_trip_tells_the_order_only_of_datagrams_near_in_time() {
+    // The second clock runs 50 ppm fast; 2 ms there, 3 ms back. Three are lost there, two back.
+    let back = |n: i64| {
+        let payload = [&u32::try_from(n).unwrap().to_be_bytes()[..], &[7; 28]].concat();
+        let mut frame = udp_frame(5004, 5000, &payload);
+        frame[26..34].copy_from_slice(&[10, 77, 0, 2, 10, 77, 0, 1]);
+        frame
+    };
+    let fast = |at_us: i64| BEGIN_US + 3_000_000 + (at_us - BEGIN_US) * 20_001 / 20_000;
+    let files = |back_us: i64| {
+        let (mut a, mut b) = (Vec::new(), Vec::new());
+        for n in 0..1000 {
+            let (there_us, back_us) = (sent_us(n), sent_us(n) + back_us);
+            a.push((there_us, routed(n, 64)));
+            if ![100, 101, 500].contains(&n) {
+                b.push((fast(there_us + 2000), routed(n, 64)));
+            }
+            b.push((fast(back_us), back(n)));
+            if ![200, 201].contains(&n) {
+                a.push((back_us + 3000, back(n)));
+            }
+        }
+        a.sort();
+        b.sort();
+        (pcap(&a), pcap(&b))
+    };
+    let (a, b) = files(500);
+    let joins = joins_by("udp:port=5004,id=0+4", &a, &b, false);
+    let told: Vec<_> = joins
+        .iter()
+        .map(|one| (one.order, one.loss.count()))
+        .collect();
+    let expected = [3, 2].map(|lost| (OrderSource::RoundTrip, Some(lost)));
+    assert_eq!(told, expected, "{joins:#?}");
+    let (a, b) = files(300_000_000);
+    let joins = joins_by("udp:port=5004,id=0+4", &a, &b, false);
+    assert_eq!(joins[0].loss.count(), Some(3), "{joins:#?}");
+    assert_eq!(doubts(&joins[1]), [(Doubt::Order, 2)], "{joins:#?}");
+}
