@@ -12,8 +12,9 @@
 //! cannot tell: see [`Doubt`]. An *unexplained* datagram was seen at the second point only, while
 //! the first was watched: the first point's capture has missed it.
 
-use core::cmp::Reverse;
-use std::collections::BTreeMap;
+use core::cmp::{Ordering, Reverse};
+use core::ops::Range;
+use std::collections::{BTreeMap, BTreeSet};
 
 use hil_core::interval::Spread;
 use hil_stats::dependence::{Batches, Quantiles};
@@ -33,6 +34,10 @@ const PACKET_BYTES_MAX: u32 = 1500;
 /// Smallest change of the delays' level that is told, and the datagrams on either side of it.
 const SHIFT_MIN_NS: i64 = 50_000_000;
 const SHIFT_SIDE_MIN: usize = 3;
+/// One in so many stamps equal to the one before shows a clock that ticks more coarsely than datagrams come.
+const EQUAL_SHARE: usize = 10;
+/// One in so many datagrams whose identity came before shows that identities come again.
+const LAPPED_SHARE: usize = 10;
 
 /// How two captures are joined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -69,10 +74,14 @@ pub enum Doubt {
     Unread(Unread),
     /// Frames were dropped by the capture there.
     Dropped,
-    /// Which point comes first is unknown.
+    /// Which point comes first is unknown, or told in two ways.
     Order,
     /// Seen at both points, farther apart than [`JoinSettings::window_ns`].
     Apart,
+    /// Their identities come again sooner than the delays tell which belongs to which.
+    Ambiguous,
+    /// The like was seen there under other addresses, which this point never saw.
+    Readdressed,
     /// Seen at one point while nothing tells that the other was watched, and none was seen at both.
     Unwatched,
 }
@@ -157,9 +166,9 @@ pub struct JoinMetrics {
     pub unexplained_count: u64,
     /// Where the clock of a point was set, first and second point.
     pub clock_steps: [Vec<ClockStep>; 2],
-    /// A change of the delays that no stamp of one point shows.
-    pub delay_shift: Option<DelayShift>,
-    /// Second stamp minus first; unavailable when a clock was set meanwhile.
+    /// Changes of the delays that no stamp of one point shows.
+    pub delay_shifts: Vec<DelayShift>,
+    /// Second stamp minus first; unavailable when a clock was set meanwhile, or may have been.
     pub delay: Distribution,
     /// 95 % interval of its median, nanoseconds, or why there is none.
     pub delay_p50_interval: Option<Spread>,
@@ -213,10 +222,14 @@ pub struct Joined {
     pub first_point: Point,
     /// Where then.
     pub second_point: Point,
+    /// Further points of the same two hosts over which a part of it went: see [`Sight::also`].
+    pub also: [Vec<Point>; 2],
     /// What was seen at both, in the order of departure.
     pub pairs: Vec<Pair>,
     /// The figures.
     pub figures: JoinMetrics,
+    /// To how many nanoseconds the coarser stamps are whole.
+    pub unit_ns: i64,
 }
 
 /// What one of two points could see, and saw.
@@ -228,6 +241,10 @@ pub struct Sight<'a> {
     pub watch: &'a Watch,
     /// What it saw.
     pub seen: &'a Seen,
+    /// Further points of its host: what passed one of them did not pass the others, and counts as seen here.
+    pub also: &'a [Point],
+    /// What the other taps of its host could see.
+    pub beside: &'a [&'a Watch],
 }
 
 impl Sight<'_> {
@@ -305,6 +322,38 @@ impl<'a> Side<'a> {
         spans.any(|span| from_ns >= at(span.first_ns) && to_ns <= at(span.last_ns))
     }
 
+    /// To how many nanoseconds its stamps are whole: as its file says, or coarser where many of them are equal.
+    fn unit_ns(&self) -> i64 {
+        let neighbours = self.at_ns.windows(2);
+        let on_ns = neighbours.map(|pair| pair[1].saturating_sub(pair[0]));
+        let equal_count = on_ns.clone().filter(|on_ns| *on_ns == 0).count();
+        let stated_ns = self.sight.watch.unit_ns.max(1);
+        if EQUAL_SHARE * equal_count < self.at_ns.len() {
+            return stated_ns;
+        }
+        let common = on_ns.fold(0, |a, b| {
+            let (mut a, mut b) = (a, b);
+            while b != 0 {
+                (a, b) = (b, a % b);
+            }
+            a
+        });
+        stated_ns.max(common)
+    }
+
+    /// After what time identities come again, where they do as a rule.
+    fn lap_ns(&self) -> Option<i64> {
+        let mut newest = BTreeMap::new();
+        let times = self.seen.iter().zip(&self.at_ns);
+        let again = times.filter_map(|(one, at_ns)| {
+            let before = newest.insert(one.identity.key, *at_ns)?;
+            Some(at_ns.saturating_sub(before))
+        });
+        let again: Vec<i64> = again.collect();
+        let is_rule = !again.is_empty() && LAPPED_SHARE * again.len() >= self.seen.len();
+        is_rule.then(|| median(&again))
+    }
+
     fn steps(&self) -> Vec<ClockStep> {
         match self.reading {
             Reading::Stamps => Vec::new(),
@@ -332,10 +381,11 @@ pub fn join(
         return None;
     }
     let is_one_clock = settings.is_one_clock || a.is_of_host_of(&b);
-    let (order, is_swapped) = ends(&first, &second, &matches, is_one_clock, round_trip);
-    let matches = if is_swapped {
+    let ends = ends(&first, &second, &matches, is_one_clock, round_trip);
+    let unit_ns = first.unit_ns().max(second.unit_ns());
+    let matches = if ends.is_swapped {
         core::mem::swap(&mut first, &mut second);
-        Matches::of(&first, &second, settings.window_ns)
+        Matches::within(&first, &second, settings.window_ns)
     } else {
         matches
     };
@@ -347,8 +397,10 @@ pub fn join(
     Some(Joined {
         first_point: *first.sight.point,
         second_point: *second.sight.point,
-        figures: metrics(stream, order, &first, &second, &pairs, &matches),
+        also: [&first, &second].map(|side| side.sight.also.to_vec()),
+        figures: metrics(stream, &ends, &first, &second, &pairs, &matches),
         pairs,
+        unit_ns,
     })
 }
 
@@ -363,16 +415,11 @@ fn best_reading<'a>(
     let seconds = Side::each(stream, b);
     for first in Side::each(stream, a) {
         for second in &seconds {
-            let matches = Matches::of(&first, second, window_ns);
-            let delays = || {
-                let pairs = matches.pairs.iter();
-                pairs.map(|&(i, j)| second.at_ns[j].saturating_sub(first.at_ns[i]))
-            };
-            let spread = delays().max().zip(delays().min());
+            let matches = Matches::within(&first, second, window_ns);
             let fit = Fit {
                 matched_count: matches.pairs.len(),
-                reordered_count: Reverse(matches.reordered_count(second)),
-                spread_ns: Reverse(spread.map_or(0, |(most, least)| most.abs_diff(least))),
+                reordered_count: Reverse(matches.reordered_count()),
+                spread_ns: Reverse(width(&matches.delays(&first, second))),
             };
             if best.as_ref().is_none_or(|(known, _)| fit > *known) {
                 best = Some((fit, (first.clone(), second.clone(), matches)));
@@ -389,70 +436,113 @@ struct Fit {
     /// A clock that was set mixes what came before it with what came after it.
     reordered_count: Reverse<usize>,
     /// Of the delays, from the smallest to the largest.
-    spread_ns: Reverse<u64>,
+    spread_ns: Reverse<i64>,
 }
 
-/// How the ends are told apart, and whether the second comes first.
+/// How the ends are told apart.
+struct Ends {
+    order: OrderSource,
+    /// The second comes first.
+    is_swapped: bool,
+    /// Something else tells the contrary.
+    is_disputed: bool,
+}
+
+/// How the ends are told apart: by what no clock changes, by stamps where they can tell, by what the packets say
+/// of their direction.
 fn ends(
     first: &Side<'_>,
     second: &Side<'_>,
     matches: &Matches,
     is_one_clock: bool,
     round_trip: Option<bool>,
-) -> (OrderSource, bool) {
-    let (a, b) = (first.sight.point, second.sight.point);
-    // Through a host with two taps the way is in, then out; but both then read one clock.
-    match (a.direction, b.direction) {
-        _ if a.file_index == b.file_index => {}
-        (Direction::Outbound, Direction::Inbound) => return (OrderSource::PacketDirection, false),
-        (Direction::Inbound, Direction::Outbound) => return (OrderSource::PacketDirection, true),
-        _ => {}
-    }
+) -> Ends {
+    let sure = |order, is_swapped| Ends {
+        order,
+        is_swapped,
+        is_disputed: false,
+    };
+    let hops = |&(i, j): &(usize, usize)| (first.seen[i].hop_limit, second.seen[j].hop_limit);
     let count = |is_so: &dyn Fn(&(usize, usize)) -> bool| {
         matches.pairs.iter().filter(|pair| is_so(pair)).count()
     };
-    let hops = |&(i, j): &(usize, usize)| (first.seen[i].hop_limit, second.seen[j].hop_limit);
     let lowered = count(&|pair| hops(pair).0 > hops(pair).1);
     let raised = count(&|pair| hops(pair).0 < hops(pair).1);
     let all = matches.pairs.len();
     if all > 0 && lowered.max(raised) == all {
-        return (OrderSource::HopLimit, raised == all);
+        return sure(OrderSource::HopLimit, raised == all);
     }
+    let levels = Levels::of(first, second, matches);
     // A clock that was set is not one with another.
     let is_steady = [first, second]
         .iter()
         .all(|side| side.reading == Reading::Stamps);
-    if is_one_clock && is_steady && all > 0 {
-        let is_early = |&(i, j): &(usize, usize)| second.at_ns[j] < first.at_ns[i];
-        return (OrderSource::Stamps, 2 * count(&is_early) > all);
+    let by_stamps = (is_one_clock && is_steady)
+        .then(|| levels.is_backward(first.unit_ns().max(second.unit_ns())))
+        .flatten();
+    let (a, b) = (first.sight.point, second.sight.point);
+    // Through a host with two taps the way is in, then out; but both then read one clock.
+    let by_direction = match (a.direction, b.direction) {
+        _ if a.file_index == b.file_index => None,
+        (Direction::Outbound, Direction::Inbound) => Some(false),
+        (Direction::Inbound, Direction::Outbound) => Some(true),
+        _ => None,
+    };
+    if let Some(is_swapped) = by_direction {
+        // Two files of one host that forwards, or clocks that are not one.
+        return Ends {
+            is_disputed: by_stamps == Some(!is_swapped),
+            ..sure(OrderSource::PacketDirection, is_swapped)
+        };
+    }
+    if let Some(is_swapped) = by_stamps {
+        return sure(OrderSource::Stamps, is_swapped);
     }
     if let Some(is_swapped) = round_trip {
-        return (OrderSource::RoundTrip, is_swapped);
+        return sure(OrderSource::RoundTrip, is_swapped);
     }
-    match (
-        matches.only_first.is_empty(),
-        matches.only_second.is_empty(),
-    ) {
-        (false, true) => (OrderSource::Missing, false),
-        (true, false) => (OrderSource::Missing, true),
-        _ => (OrderSource::Unknown, false),
+    // What lies at an edge is missing because of when the captures began and ended.
+    let [only_first, only_second] = levels.alone([first, second], matches);
+    let by_missing = |is_swapped, lacking: &Side<'_>, other: &Side<'_>| Ends {
+        // Else its capture may have missed what the other has: against the order in which the points were named,
+        // only a file that states that it dropped nothing tells.
+        is_disputed: is_swapped
+            && !lacking.seen.is_empty()
+            && !other.seen.is_empty()
+            && !lacking.sight.watch.is_complete,
+        ..sure(OrderSource::Missing, is_swapped)
+    };
+    match (only_first.is_empty(), only_second.is_empty()) {
+        (false, true) => by_missing(false, second, first),
+        (true, false) => by_missing(true, first, second),
+        _ => sure(OrderSource::Unknown, false),
     }
 }
 
-/// What the median of the stamps' differences at two points is; `None` without a datagram at both.
-pub(super) fn median_difference_ns(
+/// When each datagram seen at both points was seen at `a`, and how much later at `b`; none where a clock was set.
+pub(super) fn differences(
     stream: &Stream,
     a: Sight<'_>,
     b: Sight<'_>,
     window_ns: i64,
-) -> Option<i64> {
-    let (first, second, matches) = best_reading(stream, a, b, window_ns)?;
-    let pairs = matches.pairs.iter();
-    let mut differences: Vec<i64> = pairs
-        .map(|&(i, j)| second.at_ns[j].saturating_sub(first.at_ns[i]))
-        .collect();
-    differences.sort_unstable();
-    differences.get(differences.len() / 2).copied()
+) -> Vec<(i64, i64)> {
+    let Some((first, second, matches)) = best_reading(stream, a, b, window_ns) else {
+        return Vec::new();
+    };
+    let levels = Levels::of(&first, &second, &matches);
+    let is_set = [&first, &second].map(|side| side.reading != Reading::Stamps);
+    if is_set.contains(&true) || levels.each.len() > 1 {
+        return Vec::new();
+    }
+    let times = matches.pairs.iter().map(|(i, _)| first.at_ns[*i]);
+    let each = times.zip(levels.delays).zip(levels.is_stamped);
+    each.filter_map(|(one, is_stamped)| is_stamped.then_some(one))
+        .collect()
+}
+
+/// How many datagrams were seen at both.
+pub(super) fn common_count(stream: &Stream, a: Sight<'_>, b: Sight<'_>, window_ns: i64) -> usize {
+    best_reading(stream, a, b, window_ns).map_or(0, |(_, _, matches)| matches.pairs.len())
 }
 
 /// Who belongs to whom, by positions.
@@ -465,12 +555,38 @@ struct Matches {
     duplicates: Vec<usize>,
     /// Of those seen at one point only, what has its like at the other, beyond the window.
     apart_count: usize,
+    /// Identities come again sooner than the delays tell which belongs to which.
+    is_ambiguous: bool,
 }
 
 impl Matches {
+    /// As told by [`Self::of`]. Where identities come again and the delays show that some were taken for those of the
+    /// next lap, only those within half a lap around the median belong together.
+    fn within(first: &Side<'_>, second: &Side<'_>, window_ns: i64) -> Self {
+        let matches = Self::of(first, second, 0, window_ns);
+        let laps = first.lap_ns().zip(second.lap_ns());
+        let Some(lap_ns) = laps.map(|(a, b)| a.min(b)) else {
+            return matches;
+        };
+        let delays = matches.delays(first, second);
+        if width(&delays) < lap_ns / 2 || lap_ns / 2 >= window_ns {
+            return matches;
+        }
+        let mut near = Self::of(first, second, median(&delays), lap_ns / 2);
+        near.is_ambiguous = width(&near.delays(first, second)) > lap_ns / 4
+            || 10 * near.pairs.len() < 9 * matches.pairs.len();
+        near
+    }
+
+    fn delays(&self, first: &Side<'_>, second: &Side<'_>) -> Vec<i64> {
+        let pairs = self.pairs.iter();
+        let delays = pairs.map(|&(i, j)| second.at_ns[j].saturating_sub(first.at_ns[i]));
+        delays.collect()
+    }
+
     /// Of equal keys the earliest at one point belongs to the earliest at the other that is within
-    /// the window; what remains at the second beside a match is a repetition.
-    fn of(first: &Side<'_>, second: &Side<'_>, window_ns: i64) -> Self {
+    /// the window around a delay; what remains at the second beside a match is a repetition.
+    fn of(first: &Side<'_>, second: &Side<'_>, delay_ns: i64, window_ns: i64) -> Self {
         let mut by_key: BTreeMap<u64, (Vec<usize>, Vec<usize>)> = BTreeMap::new();
         for (index, one) in first.seen.iter().enumerate() {
             by_key.entry(one.identity.key).or_default().0.push(index);
@@ -485,13 +601,14 @@ impl Matches {
             while j < to.len() {
                 let arrival_ns = second.at_ns[to[j]];
                 let since = |at: i64| arrival_ns.saturating_sub(at);
-                match from.get(i).map(|index| since(first.at_ns[*index])) {
-                    Some(delay_ns) if delay_ns > window_ns => {
+                let late_ns = |index: &usize| since(first.at_ns[*index]).saturating_sub(delay_ns);
+                match from.get(i).map(late_ns) {
+                    Some(late_ns) if late_ns > window_ns => {
                         matches.only_first.push(from[i]);
                         i += 1;
                         continue;
                     }
-                    Some(delay_ns) if delay_ns >= -window_ns => {
+                    Some(late_ns) if late_ns >= -window_ns => {
                         matches.pairs.push((from[i], to[j]));
                         newest_match = Some(arrival_ns);
                         i += 1;
@@ -514,15 +631,16 @@ impl Matches {
     }
 
     /// Positions of departure in the order of arrival.
-    fn arrivals(&self, second: &Side<'_>) -> Vec<usize> {
+    fn arrivals(&self) -> Vec<usize> {
         let mut arrivals: Vec<usize> = (0..self.pairs.len()).collect();
-        arrivals.sort_by_key(|departure| second.at_ns[self.pairs[*departure].1]);
+        // Of equal stamps the file tells which came first.
+        arrivals.sort_by_key(|departure| self.pairs[*departure].1);
         arrivals
     }
 
-    fn reordered_count(&self, second: &Side<'_>) -> usize {
+    fn reordered_count(&self) -> usize {
         let mut latest = 0;
-        let arrivals = self.arrivals(second).into_iter();
+        let arrivals = self.arrivals().into_iter();
         let late = arrivals.filter(|departure| {
             latest = latest.max(*departure);
             *departure < latest
@@ -531,80 +649,160 @@ impl Matches {
     }
 }
 
+/// Datagrams in a row whose delays are on one level.
+struct DelayLevel {
+    /// Departure of the first one; of the first level, since ever.
+    from_ns: i64,
+    /// Which of the pairs.
+    places: Range<usize>,
+    /// Smallest and largest delay.
+    bounds: (i64, i64),
+}
+
 /// Delays of the datagrams at both points, in the order of departure, and the level each is on.
 struct Levels {
     /// In the reading of both points.
     delays: Vec<i64>,
-    shift: Option<DelayShift>,
-    /// Smallest and largest delay before and after the shift; without one, twice of all.
-    bounds: [(i64, i64); 2],
+    /// Which of them are of sound stamps.
+    is_stamped: Vec<bool>,
+    /// At least one, in the order of departure.
+    each: Vec<DelayLevel>,
 }
 
 impl Levels {
     fn of(first: &Side<'_>, second: &Side<'_>, matches: &Matches) -> Self {
         let pairs = matches.pairs.iter();
-        let (departures, delays): (Vec<i64>, Vec<i64>) = pairs
-            .map(|&(i, j)| {
-                (
-                    first.at_ns[i],
-                    second.at_ns[j].saturating_sub(first.at_ns[i]),
-                )
-            })
-            .unzip();
-        let bounds = |delays: &[i64]| {
-            let least = delays.iter().min().copied().unwrap_or(0);
-            (least, delays.iter().max().copied().unwrap_or(0))
+        let delays = matches.delays(first, second);
+        let is_stamped = |&(i, j): &(usize, usize)| {
+            first.seen[i].is_stamp_sound && second.seen[j].is_stamp_sound
         };
-        let at = shift_place(&delays);
-        let shift = at.map(|at| DelayShift {
-            from_ns: departures[at],
-            by_ns: median(&delays[at..]).saturating_sub(median(&delays[..at])),
+        let mut starts = vec![0];
+        level_starts(&delays, 0, &mut starts);
+        let ends = starts.iter().skip(1).copied().chain([delays.len()]);
+        let each = starts.iter().zip(ends).map(|(from, to)| {
+            let here = &delays[*from..to];
+            let least = here.iter().min().copied().unwrap_or(0);
+            DelayLevel {
+                from_ns: match from {
+                    0 => i64::MIN,
+                    _ => first.at_ns[matches.pairs[*from].0],
+                },
+                places: *from..to,
+                bounds: (least, here.iter().max().copied().unwrap_or(0)),
+            }
         });
-        let (before, after) = delays.split_at(at.unwrap_or(0));
         Self {
-            shift,
-            bounds: if at.is_some() {
-                [bounds(before), bounds(after)]
-            } else {
-                [bounds(&delays); 2]
-            },
+            each: each.collect(),
+            is_stamped: pairs.map(is_stamped).collect(),
             delays,
         }
     }
 
-    /// The least and the most that one which left at `at_ns` would have taken.
-    fn bounds_at(&self, at_ns: i64) -> (i64, i64) {
-        let is_after = self.shift.is_some_and(|shift| at_ns >= shift.from_ns);
-        self.bounds[usize::from(is_after)]
+    fn shifts(&self) -> Vec<DelayShift> {
+        let median = |level: &DelayLevel| median(&self.delays[level.places.clone()]);
+        let pairs = self.each.windows(2);
+        pairs
+            .map(|pair| DelayShift {
+                from_ns: pair[1].from_ns,
+                by_ns: median(&pair[1]).saturating_sub(median(&pair[0])),
+            })
+            .collect()
     }
 
-    fn shift_arrival_ns(&self) -> i64 {
-        self.shift.map_or(i64::MAX, |shift| {
-            shift.from_ns.saturating_add(self.bounds[1].0)
-        })
+    /// Of those seen at one point only, at the first and at the second, what the other would have shown. A datagram
+    /// would have had its other stamp while the point was watched, however fast or slow it was among
+    /// those seen; the rest lies at an edge.
+    fn alone(&self, [first, second]: [&Side<'_>; 2], matches: &Matches) -> [Vec<usize>; 2] {
+        let last_until = |is_past: &dyn Fn(&DelayLevel) -> bool| {
+            let later = self.each.iter().skip(1).rev();
+            let level = later.clone().find(|level| is_past(level));
+            level.or(self.each.first()).map_or((0, 0), |one| one.bounds)
+        };
+        let is_lost = |index: &usize| {
+            let at = first.at_ns[*index];
+            let (fastest, slowest) = last_until(&|level| at >= level.from_ns);
+            second.covers(at.saturating_add(fastest), at.saturating_add(slowest))
+        };
+        let is_unexplained = |index: &usize| {
+            let at = second.at_ns[*index];
+            let arrival_ns = |level: &DelayLevel| level.from_ns.saturating_add(level.bounds.0);
+            let (fastest, slowest) = last_until(&|level| at >= arrival_ns(level));
+            first.covers(at.saturating_sub(slowest), at.saturating_sub(fastest))
+        };
+        let mut alone = [matches.only_first.clone(), matches.only_second.clone()];
+        alone[0].retain(is_lost);
+        alone[1].retain(is_unexplained);
+        alone
+    }
+
+    /// Whether most stamps tell that the second comes first, where they differ by more than their unit; `None` where
+    /// none does, or where a change of the level turns that round.
+    fn is_backward(&self, unit_ns: i64) -> Option<bool> {
+        let mut found = None;
+        for level in &self.each {
+            let places = level.places.clone();
+            let stamped = places.filter(|place| self.is_stamped[*place]);
+            let delays: Vec<i64> = stamped.map(|place| self.delays[place]).collect();
+            let below = delays.iter().filter(|delay| **delay <= -unit_ns).count();
+            let above = delays.iter().filter(|delay| **delay >= unit_ns).count();
+            let here = match below.cmp(&above) {
+                _ if 2 * below.max(above) < delays.len() => return None,
+                Ordering::Equal => continue,
+                more => more == Ordering::Greater,
+            };
+            if found.is_some_and(|known| known != here) {
+                return None;
+            }
+            found = Some(here);
+        }
+        found
     }
 }
 
-/// From which delay on all lie on another level than all before.
-fn shift_place(delays: &[i64]) -> Option<usize> {
-    let running = |delays: &mut dyn Iterator<Item = &i64>| {
-        let mut bounds: Option<(i64, i64)> = None;
-        let each = delays.map(|delay| {
-            let (least, most) = bounds.unwrap_or((*delay, *delay));
-            *bounds.insert((least.min(*delay), most.max(*delay)))
-        });
-        each.collect::<Vec<(i64, i64)>>()
+/// Adds where the delays begin to lie on another level: groups of values apart by more than each is wide, of which
+/// each holds [`SHIFT_SIDE_MIN`] datagrams in a row whenever it holds one.
+fn level_starts(delays: &[i64], from: usize, starts: &mut Vec<usize>) {
+    let mut ascending = delays.to_vec();
+    ascending.sort_unstable();
+    let gap_ns = |at: &usize| ascending[*at].saturating_sub(ascending[at - 1]);
+    let mut gaps: Vec<usize> = (1..ascending.len()).collect();
+    gaps.retain(|at| gap_ns(at) > SHIFT_MIN_NS);
+    gaps.sort_by_key(|at| Reverse(gap_ns(at)));
+    let groups = (1..=gaps.len()).find_map(|count| {
+        let mut begins = gaps[..count].to_vec();
+        begins.sort_unstable();
+        let ends = begins.iter().copied().chain([ascending.len()]);
+        let widths = [0]
+            .iter()
+            .chain(&begins)
+            .zip(ends)
+            .map(|(begin, end)| ascending[end - 1].saturating_sub(ascending[*begin]));
+        let width = widths.max().unwrap_or(0);
+        (gap_ns(&gaps[count - 1]) > width.saturating_mul(4)).then_some(begins)
+    });
+    let Some(begins) = groups else {
+        return;
     };
-    let before = running(&mut delays.iter());
-    let mut after = running(&mut delays.iter().rev());
-    after.reverse();
-    let last = delays.len().checked_sub(SHIFT_SIDE_MIN)?;
-    (SHIFT_SIDE_MIN..=last).find(|at| {
-        let ((a, b), (c, d)) = (before[at - 1], after[*at]);
-        let apart = c.saturating_sub(b).max(a.saturating_sub(d));
-        let width = b.saturating_sub(a).max(d.saturating_sub(c));
-        apart > width.saturating_mul(4).max(SHIFT_MIN_NS)
-    })
+    let least: Vec<i64> = begins.iter().map(|at| ascending[*at]).collect();
+    let group = |delay: &i64| least.partition_point(|begin| begin <= delay);
+    let runs: Vec<&[i64]> = delays.chunk_by(|a, b| group(a) == group(b)).collect();
+    if runs.iter().any(|run| run.len() < SHIFT_SIDE_MIN) {
+        return;
+    }
+    let mut at = from;
+    for run in runs {
+        if at > from {
+            starts.push(at);
+        }
+        level_starts(run, at, starts);
+        at += run.len();
+    }
+}
+
+/// From the smallest to the largest.
+fn width(values: &[i64]) -> i64 {
+    let bounds = values.iter().min().zip(values.iter().max());
+    bounds.map_or(0, |(least, most)| most.saturating_sub(*least))
 }
 
 fn median(values: &[i64]) -> i64 {
@@ -616,7 +814,7 @@ fn median(values: &[i64]) -> i64 {
 /// Why datagrams that the second point does not show may have passed it.
 fn doubts(
     stream: &Stream,
-    order: OrderSource,
+    ends: &Ends,
     [first, second]: [&Side<'_>; 2],
     matches: &Matches,
     pairs: &[Pair],
@@ -653,10 +851,19 @@ fn doubts(
         .sum();
     let aggregates = pairs.iter().filter(|pair| pair.is_aggregate()).count();
     add(Doubt::Unread(Unread::Aggregate), aggregates + large_count);
-    if alone_count > 0 && order == OrderSource::Unknown {
+    if alone_count > 0 && (ends.order == OrderSource::Unknown || ends.is_disputed) {
         add(Doubt::Order, alone_count);
     }
     add(Doubt::Apart, matches.apart_count);
+    if matches.is_ambiguous {
+        add(Doubt::Ambiguous, pairs.len() + alone_count);
+    }
+    for (side, other, list) in [(first, second, alone[0]), (second, first, alone[1])] {
+        add(
+            Doubt::Readdressed,
+            readdressed_count(stream, list, side, other),
+        );
+    }
     let is_judged = !pairs.is_empty() || !alone[0].is_empty();
     let mut blind: Vec<&Side<'_>> = Vec::new();
     if !is_judged {
@@ -675,6 +882,16 @@ fn doubts(
                 usize::try_from(count).unwrap_or(usize::MAX),
             );
         }
+        // What is broken in a file is counted at each of its taps.
+        let beside = side.sight.beside.iter();
+        let beside =
+            beside.flat_map(|watch| watch.unread_of(stream.flow_index, source, destination, true));
+        for (why, count) in beside.filter(|(why, _)| *why != Unread::Malformed) {
+            add(
+                Doubt::Unread(why),
+                usize::try_from(count).unwrap_or(usize::MAX),
+            );
+        }
         let dropped = usize::try_from(watch.dropped_count);
         add(Doubt::Dropped, dropped.unwrap_or(usize::MAX));
     }
@@ -684,6 +901,33 @@ fn doubts(
         doubts.push(CountedDoubt { doubt, count });
     }
     doubts
+}
+
+/// How many of `list`, seen at one point only, are nearly all of a stream that only the other point saw: an
+/// address was translated on the way.
+fn readdressed_count(
+    stream: &Stream,
+    list: &[Observation],
+    side: &Side<'_>,
+    other: &Side<'_>,
+) -> usize {
+    let keys: BTreeSet<u64> = list.iter().map(|one| one.identity.key).collect();
+    let streams = other.sight.seen.iter().filter(|(one, _)| {
+        (one.flow_index, one.own) == (stream.flow_index, stream.own)
+            && !side.sight.seen.contains_key(one)
+    });
+    let counts = streams.map(|(_, seen)| {
+        let found = seen.iter().map(|one| one.identity.key);
+        let found: Vec<u64> = found.filter(|key| keys.contains(key)).collect();
+        let is_same = 5 * found.len() >= 4 * seen.len();
+        let distinct: BTreeSet<u64> = found.into_iter().collect();
+        if is_same && 2 * distinct.len() >= keys.len() {
+            distinct.len()
+        } else {
+            0
+        }
+    });
+    counts.max().unwrap_or(0)
 }
 
 /// Whether neighbours in `list`, each of fewer, are of so many bytes together.
@@ -718,7 +962,9 @@ fn loss(lost: &[usize], matches: &Matches, doubts: Vec<CountedDoubt>) -> Loss {
     let is_bounded = |one: &CountedDoubt| match one.doubt {
         Doubt::Unread(why) => why != Unread::Aggregate,
         Doubt::Dropped => true,
-        Doubt::Order | Doubt::Apart | Doubt::Unwatched => false,
+        Doubt::Order | Doubt::Apart | Doubt::Ambiguous | Doubt::Readdressed | Doubt::Unwatched => {
+            false
+        }
     };
     let unseen_count: u64 = doubts.iter().map(|one| one.count).sum();
     let range = count > 0 && doubts.iter().all(is_bounded);
@@ -730,28 +976,14 @@ fn loss(lost: &[usize], matches: &Matches, doubts: Vec<CountedDoubt>) -> Loss {
 
 fn metrics(
     stream: &Stream,
-    order: OrderSource,
+    ends: &Ends,
     first: &Side<'_>,
     second: &Side<'_>,
     pairs: &[Pair],
     matches: &Matches,
 ) -> JoinMetrics {
-    // A datagram would have had its other stamp while the point was watched, however fast or slow it
-    // was among those seen; the rest of what was seen at one point only lies at an edge.
     let levels = Levels::of(first, second, matches);
-    let mut lost = matches.only_first.clone();
-    lost.retain(|index| {
-        let at = first.at_ns[*index];
-        let (fastest, slowest) = levels.bounds_at(at);
-        second.covers(at.saturating_add(fastest), at.saturating_add(slowest))
-    });
-    let mut unexplained = matches.only_second.clone();
-    unexplained.retain(|index| {
-        let at = second.at_ns[*index];
-        let is_after = at >= levels.shift_arrival_ns();
-        let (fastest, slowest) = levels.bounds[usize::from(is_after)];
-        first.covers(at.saturating_sub(slowest), at.saturating_sub(fastest))
-    });
+    let [lost, unexplained] = levels.alone([first, second], matches);
     let observations = |side: &Side<'_>, list: &[usize]| -> Vec<Observation> {
         list.iter().map(|index| side.seen[*index]).collect()
     };
@@ -760,16 +992,18 @@ fn metrics(
         observations(second, &unexplained),
     ];
     let alone = [&alone[0][..], &alone[1]];
-    let doubts = doubts(stream, order, [first, second], matches, pairs, alone);
+    let doubts = doubts(stream, ends, [first, second], matches, pairs, alone);
     let only_count = matches.only_first.len() + matches.only_second.len();
     let matched_count = pairs.len() as u64;
     let clock_steps = [first.steps(), second.steps()];
     let is_set = clock_steps.iter().any(|steps| !steps.is_empty());
-    let arrivals = matches.arrivals(second);
+    let delay_shifts = if is_set { Vec::new() } else { levels.shifts() };
+    let is_unsure = is_set || matches.is_ambiguous || !delay_shifts.is_empty();
+    let arrivals = matches.arrivals();
     let (late, _) = reordered(arrivals.iter().map(|departure| *departure as u64));
     let reordered_count = late.len() as u64;
-    // Where a clock was set, no delay is known.
-    let is_delay = |departure: &&usize| !is_set && pairs[**departure].is_stamped();
+    // Where a clock was set, or may have been, no delay is known.
+    let is_delay = |departure: &&usize| !is_unsure && pairs[**departure].is_stamped();
     let in_arrival = arrivals.iter().filter(is_delay);
     let in_arrival: Vec<i64> = in_arrival
         .map(|departure| levels.delays[*departure])
@@ -783,6 +1017,10 @@ fn metrics(
     let quantiles = Quantiles::of(&series, &ascending);
     let unmatched = if is_set {
         "a clock was set while it stamped"
+    } else if matches.is_ambiguous {
+        "numbers come again too soon to tell which is which"
+    } else if is_unsure {
+        "the delays changed their level: a clock was set, or the way changed"
     } else {
         "no datagram was stamped at both points"
     };
@@ -801,7 +1039,7 @@ fn metrics(
     let gaps = second.at_ns.windows(2);
     let gaps = gaps.map(|pair| pair[1].saturating_sub(pair[0]));
     JoinMetrics {
-        order,
+        order: ends.order,
         first_count: first.seen.len() as u64,
         second_count: second.seen.len() as u64,
         matched_count,
@@ -809,7 +1047,7 @@ fn metrics(
         loss: loss(&lost, matches, doubts),
         duplicated_count: (!may_be_copies).then_some(matches.duplicates.len() as u64),
         unexplained_count: unexplained.len() as u64,
-        delay_shift: levels.shift.filter(|_| !is_set),
+        delay_shifts,
         delay: distribution(delays.iter().copied(), unmatched),
         delay_p50_interval: quantiles.interval(0.5),
         delay_p99_interval: quantiles.interval(0.99),

@@ -1,7 +1,7 @@
 //! What one point alone tells of a stream: how many, how often, which numbers are missing. It knows
 //! neither delay nor loss; a missing number may be one that was never sent.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use hil_stats::histogram::{Distribution, LatencyHistogram};
 use serde::{Deserialize, Serialize};
@@ -50,7 +50,7 @@ pub struct NumberMetrics {
     /// Datagrams with a number seen before; `None` when messages came in pieces, which bear one
     /// number by design.
     pub repeated_count: Option<u64>,
-    /// Datagrams with a number lower than one seen before (RFC 4737 section 3.3).
+    /// Datagrams with a number lower than one seen before, copies apart (RFC 4737 section 3.3).
     pub reordered_count: u64,
 }
 
@@ -148,7 +148,7 @@ fn number_metrics(observations: &[Observation]) -> Option<NumberMetrics> {
     let at_ns = clock(observations);
     in_time.sort_by_key(|one| at_ns(one));
     // By what the datagrams say, and by how often the counting began anew unsaid.
-    let mut series: BTreeMap<(u64, u64), Vec<u64>> = BTreeMap::new();
+    let mut series: BTreeMap<(u64, u64), BTreeSet<u64>> = BTreeMap::new();
     let mut figures = NumberMetrics::default();
     let mut counts: BTreeMap<u64, Unwrapped> = BTreeMap::new();
     let (mut has_pieces, mut repeated_count) = (false, 0);
@@ -159,20 +159,19 @@ fn number_metrics(observations: &[Observation]) -> Option<NumberMetrics> {
             restart_count: 0,
         });
         let number = count.take(&numbered);
-        figures.reordered_count += u64::from(number < count.top);
-        let list = series.entry((numbered.series, count.restart_count));
-        list.or_default().push(number);
+        let seen = series.entry((numbered.series, count.restart_count));
+        let is_new = seen.or_default().insert(number);
+        repeated_count += u64::from(!is_new);
+        // A copy is a repetition; a piece of a late message is late.
+        let is_late = number < count.top && (is_new || numbered.is_piece);
+        figures.reordered_count += u64::from(is_late);
         has_pieces |= numbered.is_piece;
     }
     figures.series_count = series.len() as u64;
     let mut steps: BTreeMap<u64, u64> = BTreeMap::new();
-    for list in series.values_mut() {
-        list.sort_unstable();
-        let before = list.len();
-        list.dedup();
-        repeated_count += (before - list.len()) as u64;
-        for pair in list.windows(2) {
-            *steps.entry(pair[1] - pair[0]).or_default() += 1;
+    for seen in series.values() {
+        for (number, next) in seen.iter().zip(seen.iter().skip(1)) {
+            *steps.entry(next - number).or_default() += 1;
         }
     }
     figures.repeated_count = (!has_pieces).then_some(repeated_count);

@@ -121,6 +121,10 @@ pub struct Watch {
     sealed: BTreeMap<(IpAddr, IpAddr), u64>,
     /// Frames that it did not keep, as its file says.
     pub dropped_count: u64,
+    /// Its file says that none was dropped.
+    pub is_complete: bool,
+    /// To how many nanoseconds its stamps are whole.
+    pub unit_ns: i64,
     /// See [`CaptureInterface::is_merged`].
     pub is_merged: bool,
     /// The file says when it was watched.
@@ -281,6 +285,10 @@ impl Watch {
         let stamps = hull(levels().map(|level| (level, 0)));
         let steady = hull(levels().map(|level| (level, level.shift_ns.unwrap_or(0))));
         self.is_merged = interface.is_some_and(|one| one.is_merged);
+        self.is_complete = interface.is_some_and(|one| one.dropped_count == Some(0));
+        let (numerator, denominator) = interface.map_or((1, 1), |one| one.unit_ns);
+        let unit_ns = numerator.div_ceil(denominator.max(1));
+        self.unit_ns = i64::try_from(unit_ns).unwrap_or(i64::MAX);
         let stated = interface.and_then(|one| stated(one, stamps));
         self.is_stated = stated.is_some();
         let widen = |span: Option<Span>| match (span, stated) {
@@ -358,6 +366,8 @@ impl Watch {
             *self.cut.entry(of).or_default() += count;
         }
         self.dropped_count += other.dropped_count;
+        self.is_complete &= other.is_complete;
+        self.unit_ns = self.unit_ns.max(other.unit_ns);
     }
 }
 

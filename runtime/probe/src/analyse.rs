@@ -88,13 +88,12 @@ impl Reading {
         text
     }
 
-    /// To how many nanoseconds stamps of a point are whole.
-    fn unit_ns(&self, point: &Point) -> i64 {
-        let mut interfaces = self.files[point.file_index].interfaces.iter();
-        let (numerator, denominator) = interfaces
-            .nth(point.interface_index)
-            .map_or((1, 1), |interface| interface.unit_ns);
-        i64::try_from(numerator.div_ceil(denominator)).unwrap_or(i64::MAX)
+    /// A point and further ones of its host over which a part of a stream went, in words.
+    fn names(&self, point: &Point, also: &[Point]) -> String {
+        let all = core::iter::once(point).chain(also);
+        all.map(|one| self.name(one))
+            .collect::<Vec<_>>()
+            .join(" + ")
     }
 
     /// Every stream that a card stamped, with how many of its datagrams have the kernel's stamp.
@@ -250,14 +249,13 @@ impl Report {
             let mut interfaces = reading.files[first.file_index].interfaces.iter();
             let is_apart = first.tap() != second.tap() && interfaces.any(|one| one.is_merged);
             let declared = PointClocks::of(first, second, is_apart, settings);
-            let unit_ns = reading.unit_ns(first).max(reading.unit_ns(second));
             // Where a clock was set there are none.
             let is_delay =
                 |pair: &&Pair| one.figures.delay.measured().is_some() && pair.is_stamped();
             let pairs = one.pairs.iter().filter(is_delay);
             let delays_ns =
                 pairs.map(|pair| pair.second.stamp_ns.saturating_sub(pair.first.stamp_ns));
-            declared.beside(delays_ns, unit_ns)
+            declared.beside(delays_ns, one.unit_ns)
         };
         Self {
             schema_version: 2,
@@ -268,8 +266,8 @@ impl Report {
                 .map(|(stream, joined)| {
                     let clocks = clocks(&joined);
                     JoinReport {
-                        first: reading.name(&joined.first_point),
-                        second: reading.name(&joined.second_point),
+                        first: reading.names(&joined.first_point, &joined.also[0]),
+                        second: reading.names(&joined.second_point, &joined.also[1]),
                         clocks,
                         delay_bound_ns: clocks.bound_ns(),
                         stream: stream_report(&stream),
@@ -280,11 +278,13 @@ impl Report {
         }
     }
 
-    /// True when loss is unavailable between two points, a clock was set, or delays contradict that it is one.
+    /// True when loss is unavailable between two points, a clock was set or may have been, or delays contradict that
+    /// it is one.
     pub(super) fn has_doubts(&self) -> bool {
         let is_doubtful = |one: &JoinReport| {
             one.figures.loss.count().is_none()
                 || one.clocks == PointClocks::Contradicted
+                || !one.figures.delay_shifts.is_empty()
                 || one
                     .figures
                     .clock_steps
@@ -304,8 +304,18 @@ impl Report {
                 complaints.push(format!("clocks of {first} and {second}: {why}"));
             }
             if let Loss::Unavailable { doubts, .. } = &one.figures.loss {
-                let why = doubts_text(doubts);
+                let why = doubts_text(doubts, one.clocks);
                 complaints.push(format!("loss from {} to {}: {why}", one.first, one.second));
+            }
+            if !one.figures.delay_shifts.is_empty() {
+                let (first, second) = (&one.first, &one.second);
+                let shifts = one.figures.delay_shifts.iter();
+                let by: Vec<String> = shifts.map(|shift| duration(shift.by_ns)).collect();
+                complaints.push(format!(
+                    "delays from {first} to {second}: unavailable, they changed their level by {}: a clock was \
+                     set, or the way changed",
+                    by.join(", ")
+                ));
             }
             for (point, steps) in [&one.first, &one.second]
                 .into_iter()
@@ -513,7 +523,7 @@ fn join_section(joined: &JoinReport) -> Section {
             format!(
                 "unavailable{}: {}",
                 range.unwrap_or_default(),
-                doubts_text(doubts)
+                doubts_text(doubts, joined.clocks)
             )
         }
     };
@@ -533,7 +543,7 @@ fn join_section(joined: &JoinReport) -> Section {
             );
         }
     }
-    if let Some(shift) = figures.delay_shift {
+    for shift in &figures.delay_shifts {
         let more = duration(shift.by_ns);
         fact(
             "level",
@@ -602,7 +612,7 @@ fn step_words(step: &ClockStep) -> String {
 }
 
 /// Why loss is unavailable.
-fn doubts_text(doubts: &[CountedDoubt]) -> String {
+fn doubts_text(doubts: &[CountedDoubt], clocks: PointClocks) -> String {
     let words = doubts
         .iter()
         .map(|CountedDoubt { doubt, count }| match doubt {
@@ -622,11 +632,21 @@ fn doubts_text(doubts: &[CountedDoubt]) -> String {
                 "{count} seen at both points farther apart than --window: a clock that was set, or clocks \
                  far apart"
             ),
+            Doubt::Ambiguous => format!(
+                "{count} whose numbers come again too soon: half a lap must be longer than the delays vary"
+            ),
+            Doubt::Readdressed => format!(
+                "{count} seen at the other point under other addresses (an address was translated on the way)"
+            ),
             Doubt::Unwatched => format!(
                 "{count} seen at one point while the other was not watched, as far as its file tells"
             ),
             Doubt::Order => {
-                format!("{count} at one point only, and which comes first is unknown (--one-clock)")
+                let hint = match clocks {
+                    PointClocks::Unknown => " (--one-clock)",
+                    PointClocks::OneFile | PointClocks::DeclaredOne | PointClocks::Contradicted => "",
+                };
+                format!("{count} at one point only, and which comes first is unknown{hint}")
             }
         });
     words.collect::<Vec<String>>().join(", ")
