@@ -11,7 +11,7 @@ use std::net::SocketAddr;
 use serde::{Deserialize, Serialize};
 
 use super::flow::{DatagramIdentity, FlowFilter, FlowKind, Unidentified};
-use super::link::{FramePlace, NoDatagram, udp_datagram};
+use super::link::{FramePlace, NoDatagram, UdpDatagram, udp_datagram};
 use super::watch::{Tap, Unread, Watch};
 use super::{CaptureInterface, CapturedPacket, esl};
 use hil_net::{Direction, link_type};
@@ -165,6 +165,8 @@ pub struct PacketCounts {
     pub esl_port_unclear_count: u64,
 }
 
+/// Tunnels over UDP within one another.
+const TUNNEL_DEPTH_MAX: usize = 4;
 /// Datagrams among which one that was seen before is looked for.
 const COPY_COUNT_MAX: usize = 256;
 /// Longest time between two sightings of one datagram on the links of one host.
@@ -222,7 +224,24 @@ impl Observer {
             return;
         };
         counts.backward_stamp_count += u64::from(watch.stamp(stamp_ns));
-        let datagram = match udp_datagram(packet.link_type, frame, original_bytes) {
+        let flows = &self.flows;
+        let is_followed = |datagram: &UdpDatagram<'_>| {
+            let mut of_addresses = flows.iter().filter(|flow| flow.has_addresses_of(datagram));
+            // Ours may have any address.
+            of_addresses.any(|flow| {
+                flow.kind != FlowKind::Hil || flow.identify(datagram) != Err(Unidentified::Foreign)
+            })
+        };
+        let mut found = udp_datagram(packet.link_type, frame, original_bytes);
+        // Of a tunnel that is not followed itself, what it holds.
+        for _ in 0..TUNNEL_DEPTH_MAX {
+            let outer = found.ok().filter(|datagram| !is_followed(datagram));
+            let Some(inside) = outer.and_then(|datagram| datagram.inside()) else {
+                break;
+            };
+            found = inside;
+        }
+        let datagram = match found {
             Ok(datagram) => datagram,
             Err(reason) => {
                 *match reason {
@@ -232,8 +251,9 @@ impl Observer {
                     NoDatagram::Sealed {
                         source,
                         destination,
+                        why,
                     } => {
-                        watch.miss_sealed(source, destination);
+                        watch.miss_sealed(source, destination, why);
                         &mut counts.unreadable_count
                     }
                     NoDatagram::Unread(why) => {

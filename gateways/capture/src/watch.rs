@@ -6,6 +6,7 @@
 //! no time of watching. Between longer levels the clock was set, or parts of the file are out of order; two points
 //! together tell which (see [`super::join`]).
 
+use core::fmt;
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 
@@ -41,6 +42,37 @@ pub struct Tap {
     pub is_esl: bool,
 }
 
+/// Which header numbers a protocol.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ProtocolSpace {
+    /// Of Ethernet.
+    EtherType,
+    /// Of IP.
+    Ip,
+    /// Of PPP.
+    Ppp,
+    /// Service access point of LLC.
+    Llc,
+    /// Organisation of SNAP.
+    Snap,
+    /// Address family of a BSD loopback.
+    AddressFamily,
+}
+
+impl fmt::Display for ProtocolSpace {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::EtherType => "EtherType",
+            Self::Ip => "IP protocol",
+            Self::Ppp => "PPP protocol",
+            Self::Llc => "LLC service",
+            Self::Snap => "SNAP organisation",
+            Self::AddressFamily => "address family",
+        })
+    }
+}
+
 /// Why it is unknown which datagrams a frame holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "why")]
@@ -49,6 +81,18 @@ pub enum Unread {
     LinkType {
         /// Its number.
         link_type: u16,
+    },
+    /// A protocol that is not read and may carry IP.
+    Protocol {
+        /// Whose number.
+        space: ProtocolSpace,
+        /// Its number.
+        number: u32,
+    },
+    /// Within UDP, in a tunnel that is not read.
+    Tunnel {
+        /// The port that tells.
+        port: u16,
     },
     /// Captured too short (snap length).
     CutShort,
@@ -117,8 +161,8 @@ pub struct Watch {
     pub unread: BTreeMap<Unread, u64>,
     /// Datagrams of a flow and two sockets of which too little was captured to know them again.
     cut: BTreeMap<(usize, SocketAddr, SocketAddr, Unread), u64>,
-    /// IP packets between two ends whose payload is encrypted.
-    sealed: BTreeMap<(IpAddr, IpAddr), u64>,
+    /// IP packets between two ends whose payload is encrypted, or a tunnel's that is not read.
+    sealed: BTreeMap<(IpAddr, IpAddr, Unread), u64>,
     /// Frames that it did not keep, as its file says.
     pub dropped_count: u64,
     /// See [`CaptureInterface::is_merged`].
@@ -136,8 +180,8 @@ impl Watch {
         *self.cut.entry((flow, from, to, why)).or_default() += 1;
     }
 
-    pub(super) fn miss_sealed(&mut self, source: IpAddr, destination: IpAddr) {
-        *self.sealed.entry((source, destination)).or_default() += 1;
+    pub(super) fn miss_sealed(&mut self, source: IpAddr, destination: IpAddr, why: Unread) {
+        *self.sealed.entry((source, destination, why)).or_default() += 1;
     }
 
     /// Frames that may be of a flow between two sockets, and why they cannot be told. Encrypted packets between
@@ -150,9 +194,9 @@ impl Watch {
         is_seen: bool,
     ) -> BTreeMap<Unread, u64> {
         let mut unread = self.unread.clone();
-        for (ends, count) in &self.sealed {
-            if !is_seen || *ends == (source.ip(), destination.ip()) {
-                *unread.entry(Unread::Encrypted).or_default() += count;
+        for ((from, to, why), count) in &self.sealed {
+            if !is_seen || (*from, *to) == (source.ip(), destination.ip()) {
+                *unread.entry(*why).or_default() += count;
             }
         }
         for ((flow, from, to, why), count) in &self.cut {

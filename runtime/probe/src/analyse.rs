@@ -609,6 +609,12 @@ fn doubts_text(doubts: &[CountedDoubt]) -> String {
             Doubt::Unread(Unread::LinkType { link_type }) => {
                 format!("{count} of link type {link_type}, which is not read")
             }
+            Doubt::Unread(Unread::Protocol { space, number }) => {
+                format!("{count} of {space} {number:#06x}, which is not read")
+            }
+            Doubt::Unread(Unread::Tunnel { port }) => {
+                format!("{count} in a tunnel on UDP port {port}, which is not read")
+            }
             Doubt::Unread(Unread::CutShort) => format!("{count} captured too short"),
             Doubt::Unread(Unread::Fragmented) => format!("{count} in IP fragments"),
             Doubt::Unread(Unread::Malformed) => format!("{count} malformed"),

@@ -149,6 +149,7 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
     let ends = NoDatagram::Sealed {
         source: "10.77.0.1".parse().unwrap(),
         destination: "10.77.0.2".parse().unwrap(),
+        why: Unread::Encrypted,
     };
     assert_eq!(sealed, Err(ends));
     let mut sealed = qos.clone();

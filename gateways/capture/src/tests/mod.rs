@@ -1,6 +1,7 @@
 //! Tests of the capture decoders: files made byte by byte and figures of flows
 //! whose truth is known.
 
+mod carried;
 mod cases;
 mod containers;
 mod frames;
