@@ -23,7 +23,7 @@ const ETHER_IP: u8 = 97;
 const MPLS_INSIDE: u8 = 137;
 const ETHERNET_INSIDE: u8 = 143;
 
-/// Behind an IP header with this protocol no UDP datagram lies: ICMP and ICMPv6, IGMP, TCP, EGP, IGRP, RDP, DCCP,
+/// Behind an IP header with this protocol no UDP datagram lies: ICMP and `ICMPv6`, IGMP, TCP, EGP, IGRP, RDP, DCCP,
 /// XTP, IDPR, RSVP, no next header, EIGRP, OSPF, PIM, VRRP, PGM, IS-IS, SCTP, Fibre Channel, mobility, UDP-Lite,
 /// MANET, HIP, SHIM6 and pfsync.
 const fn holds_no_udp(protocol: u8) -> bool {
@@ -87,7 +87,7 @@ const fn unknown(space: ProtocolSpace, number: u32) -> NoDatagram {
     NoDatagram::Unread(Unread::Protocol { space, number })
 }
 
-/// Encrypted in UDP, by the port of either end: NAT traversal of IPsec (RFC 3948), `WireGuard` and its kin, `OpenVPN`,
+/// Encrypted in UDP, by the port of either end: NAT traversal of `IPsec` (RFC 3948), `WireGuard` and its kin, `OpenVPN`,
 /// `ZeroTier`, Nebula.
 const SEALED_PORTS: [u16; 6] = [4500, 51820, 41641, 1194, 9993, 4242];
 /// A tunnel that is not read: L2TP (RFC 2661), AMT (RFC 7450), Teredo (RFC 4380), LISP (RFC 9300), VXLAN-GPE,
@@ -131,6 +131,8 @@ pub struct UdpDatagram<'a> {
     pub place: FramePlace,
     /// An 802.11 frame sent again for want of an acknowledgement.
     pub is_radio_retry: bool,
+    /// Sequence number of its 802.11 frame; one that is sent again keeps it.
+    pub radio_number: Option<u16>,
     /// Identification of its IP packet; 0 where it has none: of many senders that forbid fragments, and of IPv6.
     pub packet_number: u16,
     /// Bytes of its IP packet on the wire; of the first fragment when there are several.
@@ -139,14 +141,40 @@ pub struct UdpDatagram<'a> {
     pub payload_bytes: usize,
     /// What was captured of it; for the first fragment of several, what is in that fragment.
     pub payload: &'a [u8],
-    /// True for the first fragment of a datagram that IP cut up.
-    pub is_fragmented: bool,
+    /// What is here of it, when IP cut it up.
+    pub fragment: Option<Fragment>,
+}
+
+/// A piece of an IP packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Fragment {
+    /// Where from.
+    pub source: IpAddr,
+    /// Where to.
+    pub destination: IpAddr,
+    /// What the packet holds.
+    pub protocol: u8,
+    /// Number that all pieces bear.
+    pub number: u32,
+    /// Where in the packet it begins.
+    pub from_bytes: usize,
+    /// How much it holds.
+    pub bytes: usize,
+    /// None comes behind it in the packet.
+    pub is_last: bool,
+    /// Where it passed.
+    pub place: FramePlace,
 }
 
 impl UdpDatagram<'_> {
     /// True when not all of the payload was captured.
     pub fn is_cut_short(&self) -> bool {
         self.payload.len() < self.payload_bytes
+    }
+
+    /// True for the first fragment of a datagram that IP cut up.
+    pub const fn is_fragmented(&self) -> bool {
+        self.fragment.is_some()
     }
 
     /// What a tunnel over UDP holds, known by its port; `None` for one that is none.
@@ -170,6 +198,7 @@ impl UdpDatagram<'_> {
             at: 0,
             place: self.place,
             is_radio_retry: self.is_radio_retry,
+            radio_number: self.radio_number,
         };
         let layer = match to {
             // VXLAN (RFC 7348), also by the port that Linux once chose.
@@ -188,7 +217,7 @@ impl UdpDatagram<'_> {
                     .flatten();
             }
         };
-        if self.is_fragmented {
+        if self.is_fragmented() {
             return Some(Err(NoDatagram::Unread(Unread::Fragmented)));
         }
         Some(layer.and_then(|layer| walk.follow(layer)))
@@ -202,8 +231,8 @@ pub enum NoDatagram {
     NotIp,
     /// IP, but not UDP.
     NotUdp,
-    /// A later fragment of a datagram, without the ports.
-    LaterFragment,
+    /// A later fragment of a datagram, without the ports; of IP, which.
+    LaterFragment(Option<Fragment>),
     /// It may hold any datagram between its ends, or of a tunnel between them.
     Sealed {
         /// Where from.
@@ -244,6 +273,7 @@ struct Walk<'a> {
     at: usize,
     place: FramePlace,
     is_radio_retry: bool,
+    radio_number: Option<u16>,
 }
 
 /// Looks for a UDP datagram in a frame of the given [`link_type`] that had `original_bytes` on the wire.
@@ -261,6 +291,7 @@ pub fn udp_datagram(
         at: 0,
         place: FramePlace::default(),
         is_radio_retry: false,
+        radio_number: None,
     };
     let layer = walk.link(link)?;
     walk.follow(layer)
@@ -457,14 +488,14 @@ impl<'a> Walk<'a> {
         match service {
             [0xaa, 0xaa, 3] => {}
             [6, 6, 3] => return self.passes(3, Layer::Ip),
-            // Null, management, SNA, PROWAY, spanning trees, X.25 and its kin, IPX, NetBIOS, IPX as it was, OSI.
+            // Null, management, SNA, PROWAY, spanning trees, X.25 and its kin, IPX, NetBIOS, IPX as it was, OSI; and
+            // exchange of identities and tests.
             [
                 0x00 | 0x02 | 0x04 | 0x05 | 0x08 | 0x0c | 0x0e | 0x42 | 0x4e | 0x7e | 0x8e | 0xe0
                 | 0xf0 | 0xf4 | 0xf8 | 0xfe | 0xff,
                 ..,
-            ] => return Err(NotIp),
-            // Exchange of identities and tests.
-            [_, _, 0xaf | 0xbf | 0xe3 | 0xf3] => return Err(NotIp),
+            ]
+            | [_, _, 0xaf | 0xbf | 0xe3 | 0xf3] => return Err(NotIp),
             [destination, ..] => {
                 return Err(unknown(ProtocolSpace::Llc, destination.into()));
             }
@@ -475,9 +506,7 @@ impl<'a> Walk<'a> {
         match [a, b, c] {
             [0, 0, 0 | 0xf8] => Ok(Layer::EtherType(kind.max(0x0600))),
             // Cisco's own (CDP, VTP, PVST), AppleTalk, and other neighbours' discovery: Extreme, Nortel, LLDP-MED.
-            [0, 0, 0x0c] | [8, 0, 7] | [0, 0xe0, 0x2b] | [0, 0, 0x81] | [0, 0x12, 0xbb] => {
-                Err(NotIp)
-            }
+            [0, 0, 0x0c | 0x81] | [8, 0, 7] | [0, 0xe0, 0x2b] | [0, 0x12, 0xbb] => Err(NotIp),
             // Bridged (RFC 2684): spanning trees.
             [0, 0x80, 0xc2] if kind == 0x000e => Err(NotIp),
             _ => Err(unknown(
@@ -589,8 +618,10 @@ impl<'a> Walk<'a> {
         if flags & 0x40 != 0 {
             return Err(ENCRYPTED);
         }
-        if self.word(22)? & 0x0f00 != 0 {
-            return Err(LaterFragment);
+        let sequence = self.word(22)?.swap_bytes();
+        self.radio_number = Some(sequence >> 4);
+        if sequence & 0x0f != 0 {
+            return Err(LaterFragment(None));
         }
         if flags & 0x04 != 0 {
             return Err(NoDatagram::Unread(Unread::Fragmented));
@@ -622,6 +653,10 @@ impl<'a> Walk<'a> {
         let short = |reason| match reason {
             // All of the frame is there.
             CUT_SHORT if !is_cut => MALFORMED,
+            LaterFragment(Some(fragment)) => LaterFragment(Some(Fragment {
+                place: self.place,
+                ..fragment
+            })),
             other => other,
         };
         let network = network.map_err(short)?;
@@ -642,7 +677,7 @@ impl<'a> Walk<'a> {
             other => return Err(unknown(ProtocolSpace::Ip, other.into())),
         };
         if let Some(layer) = layer {
-            if network.is_fragmented {
+            if network.fragment.is_some() {
                 return Err(NoDatagram::Unread(Unread::Fragmented));
             }
             self.at += network.header_bytes + more_bytes;
@@ -654,7 +689,7 @@ impl<'a> Walk<'a> {
             0 => network.segment_bytes,
             length => length,
         };
-        let fits = length_bytes <= network.segment_bytes || network.is_fragmented;
+        let fits = length_bytes <= network.segment_bytes || network.fragment.is_some();
         if length_bytes < UDP_HEADER_BYTES || !fits {
             return Err(MALFORMED);
         }
@@ -666,11 +701,15 @@ impl<'a> Walk<'a> {
             hop_limit: network.hop_limit,
             place: self.place,
             is_radio_retry: self.is_radio_retry,
+            radio_number: self.radio_number,
             packet_number: network.packet_number,
             packet_bytes: network.header_bytes + network.segment_bytes,
             payload_bytes: length_bytes - UDP_HEADER_BYTES,
             payload: &network.segment[UDP_HEADER_BYTES..end],
-            is_fragmented: network.is_fragmented,
+            fragment: network.fragment.map(|fragment| Fragment {
+                place: self.place,
+                ..fragment
+            }),
         }))
     }
 }
@@ -714,7 +753,8 @@ struct Network<'a> {
     segment: &'a [u8],
     /// Bytes of `segment` on the wire.
     segment_bytes: usize,
-    is_fragmented: bool,
+    /// Without its place.
+    fragment: Option<Fragment>,
 }
 
 /// `N` bytes of a header that is there.
@@ -732,8 +772,20 @@ fn ipv4(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
     if header_bytes < 20 || total_bytes < header_bytes {
         return Err(MALFORMED);
     }
-    let fragment = u16::from_be_bytes([fixed[6], fixed[7]]);
-    let is_later = fragment & 0x1fff != 0;
+    let cut = u16::from_be_bytes([fixed[6], fixed[7]]);
+    let is_later = cut & 0x1fff != 0;
+    let (source, destination) = (part::<4>(&fixed, 12).into(), part::<4>(&fixed, 16).into());
+    let packet_number = u16::from_be_bytes([fixed[4], fixed[5]]);
+    let fragment = (cut & 0x3fff != 0).then(|| Fragment {
+        source,
+        destination,
+        protocol: fixed[9],
+        number: packet_number.into(),
+        from_bytes: usize::from(cut & 0x1fff) * 8,
+        bytes: total_bytes - header_bytes,
+        is_last: cut & 0x2000 == 0,
+        place: FramePlace::default(),
+    });
     let (mut protocol, mut at) = (fixed[9], header_bytes);
     if protocol == AUTHENTICATION && !is_later {
         let [next, words] = array_at(packet, at).ok_or(CUT_SHORT)?;
@@ -743,20 +795,20 @@ fn ipv4(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
         return Err(NotUdp);
     }
     if is_later {
-        return Err(LaterFragment);
+        return Err(LaterFragment(fragment));
     }
     let end = total_bytes.min(packet.len());
     Ok(Network {
         protocol,
-        source: part::<4>(&fixed, 12).into(),
-        destination: part::<4>(&fixed, 16).into(),
+        source,
+        destination,
         dscp: fixed[1] >> 2,
         hop_limit: fixed[8],
-        packet_number: u16::from_be_bytes([fixed[4], fixed[5]]),
+        packet_number,
         header_bytes: at,
         segment: packet.get(at..end).ok_or(CUT_SHORT)?,
         segment_bytes: total_bytes.checked_sub(at).ok_or(MALFORMED)?,
-        is_fragmented: fragment & 0x2000 != 0,
+        fragment,
     })
 }
 
@@ -767,7 +819,8 @@ fn ipv6(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
         length => 40 + usize::from(length),
     };
     let traffic_class = (fixed[0] & 0x0f) << 4 | fixed[1] >> 4;
-    let (mut next, mut at, mut is_fragmented) = (fixed[6], 40, false);
+    let (source, destination) = (part::<16>(&fixed, 8).into(), part::<16>(&fixed, 24).into());
+    let (mut next, mut at, mut fragment) = (fixed[6], 40, None);
     for _ in 0..NESTING_MAX {
         if holds_no_udp(next) {
             return Err(NotUdp);
@@ -776,25 +829,36 @@ fn ipv6(packet: &[u8], original_bytes: usize) -> Result<Network<'_>, NoDatagram>
             let end = total_bytes.min(packet.len());
             return Ok(Network {
                 protocol: next,
-                source: part::<16>(&fixed, 8).into(),
-                destination: part::<16>(&fixed, 24).into(),
+                source,
+                destination,
                 dscp: traffic_class >> 2,
                 hop_limit: fixed[7],
                 packet_number: 0,
                 header_bytes: at,
                 segment: packet.get(at..end).ok_or(CUT_SHORT)?,
                 segment_bytes: total_bytes.checked_sub(at).ok_or(MALFORMED)?,
-                is_fragmented,
+                fragment,
             });
         }
         let header: [u8; 8] = array_at(packet, at).ok_or(CUT_SHORT)?;
         at += 8;
         if next == 44 {
             let field = u16::from_be_bytes([header[2], header[3]]);
+            let piece = Fragment {
+                source,
+                destination,
+                protocol: header[0],
+                number: u32::from_be_bytes([header[4], header[5], header[6], header[7]]),
+                from_bytes: usize::from(field & 0xfff8),
+                bytes: total_bytes.saturating_sub(at),
+                is_last: field & 1 == 0,
+                place: FramePlace::default(),
+            };
             if field & 0xfff8 != 0 {
-                return Err(LaterFragment);
+                return Err(LaterFragment(Some(piece)));
             }
-            is_fragmented |= field & 1 != 0;
+            // One that was not cut may have such a header all the same.
+            fragment = (!piece.is_last).then_some(piece).or(fragment);
         } else if next == AUTHENTICATION {
             at += 4 * usize::from(header[1]);
         } else {

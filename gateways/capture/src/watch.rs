@@ -7,12 +7,13 @@
 //! together tell which (see [`super::join`]).
 
 use core::fmt;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
 
 use serde::{Deserialize, Serialize};
 
-use super::observe::Observation;
+use super::kept::surely_keeps;
+use super::observe::{Observation, Stream};
 use super::{CaptureInterface, Span};
 
 /// Farthest that a stamp may lie behind the one before it without being of another level: packets that
@@ -167,6 +168,8 @@ pub struct Watch {
     pub dropped_count: u64,
     /// See [`CaptureInterface::is_merged`].
     pub is_merged: bool,
+    /// See [`CaptureInterface::filter`].
+    filters: BTreeSet<String>,
     /// The file says when it was watched.
     is_stated: bool,
 }
@@ -205,6 +208,12 @@ impl Watch {
             }
         }
         unread
+    }
+
+    /// Filters with which it may not have kept all of a stream.
+    pub(super) fn filters_against(&self, stream: &Stream) -> impl Iterator<Item = &String> {
+        let filters = self.filters.iter();
+        filters.filter(|filter| !surely_keeps(filter, stream))
     }
 
     /// Takes the stamp of the next packet; true when it lies before the one before.
@@ -272,6 +281,11 @@ impl Watch {
         }
     }
 
+    /// The newest stamp of all.
+    pub(super) fn last_ns(&self) -> Option<i64> {
+        self.levels.iter().map(|level| level.max_ns).max()
+    }
+
     /// The level of the newest stamp.
     pub(super) const fn level(&self) -> usize {
         self.current
@@ -325,6 +339,8 @@ impl Watch {
         let stamps = hull(levels().map(|level| (level, 0)));
         let steady = hull(levels().map(|level| (level, level.shift_ns.unwrap_or(0))));
         self.is_merged = interface.is_some_and(|one| one.is_merged);
+        let filter = interface.and_then(|one| one.filter.clone());
+        self.filters = filter.into_iter().collect();
         let stated = interface.and_then(|one| stated(one, stamps));
         self.is_stated = stated.is_some();
         let widen = |span: Option<Span>| match (span, stated) {
@@ -392,6 +408,7 @@ impl Watch {
             }
         }
         self.steps.extend(other.steps);
+        self.filters.extend(other.filters);
         for (why, count) in other.unread {
             *self.unread.entry(why).or_default() += count;
         }
@@ -401,7 +418,7 @@ impl Watch {
         for (of, count) in other.cut {
             *self.cut.entry(of).or_default() += count;
         }
-        self.dropped_count += other.dropped_count;
+        self.dropped_count = self.dropped_count.saturating_add(other.dropped_count);
     }
 }
 

@@ -359,9 +359,17 @@ impl Report {
             ),
             (
                 counts.fragmented_count,
-                "first fragments: stamped when their first piece passed",
+                "in fragments: stamped when the first passed",
             ),
-            (counts.later_fragment_count, "later fragments, left out"),
+            (counts.later_fragment_count, "later fragments"),
+            (
+                counts.incomplete_count,
+                "of which fragments are missing, not counted as seen",
+            ),
+            (
+                counts.damaged_count,
+                "damaged (check sequence, length or symbols), not counted as seen",
+            ),
             (counts.stampless_count, "without a time stamp, left out"),
             (counts.radio_retry_count, "sent again by a radio, left out"),
             (
@@ -372,7 +380,10 @@ impl Report {
                 counts.backward_stamp_count,
                 "earlier than the one before, put in order",
             ),
-            (counts.esl_damaged_count, "damaged, says the ET2000"),
+            (
+                counts.esl_damaged_count,
+                "damaged, says the ET2000, not counted as seen",
+            ),
             (
                 counts.esl_port_unclear_count,
                 "for which the ET2000 names no or several ports",
@@ -623,6 +634,12 @@ fn doubts_text(doubts: &[CountedDoubt]) -> String {
                 format!("{count} hold several datagrams (segmentation or receive offload, A-MSDU)")
             }
             Doubt::Unread(Unread::NoStamp) => format!("{count} without a time stamp"),
+            Doubt::Filtered { filter } => {
+                format!("{count} may have been left out by the capture's filter `{filter}`")
+            }
+            Doubt::Pieces => {
+                format!("{count} in IP fragments of which the capture kept only the first")
+            }
             Doubt::Dropped => format!("{count} dropped by the capture"),
             Doubt::Apart => format!(
                 "{count} seen at both points farther apart than --window: a clock that was set, or clocks \

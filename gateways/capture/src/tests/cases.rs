@@ -61,7 +61,8 @@ pub(super) fn doubts(figures: &JoinMetrics) -> Vec<(Doubt, u64)> {
     match &figures.loss {
         Loss::Counted(_) => Vec::new(),
         Loss::Unavailable { doubts, .. } => {
-            doubts.iter().map(|one| (one.doubt, one.count)).collect()
+            let doubts = doubts.iter();
+            doubts.map(|one| (one.doubt.clone(), one.count)).collect()
         }
     }
 }
@@ -297,7 +298,7 @@ fn points_that_have_no_time_in_common_tell_no_loss() {
     let file = pcap(&fragments);
     let joins = joins_by("udp:dport=5004", &file, &file, true);
     let why = (Doubt::Unread(Unread::Fragmented), 10);
-    assert_eq!(doubts(&joins[0]), [why, why], "{joins:#?}");
+    assert_eq!(doubts(&joins[0]), [why.clone(), why], "{joins:#?}");
 }
 
 /// A pcapng of one interface and these blocks, by type and body.
@@ -539,9 +540,9 @@ fn an_aggregate_is_no_datagram() {
     let small = pcap(&small.collect::<Vec<_>>());
     for (first, second) in [(&large, &small), (&small, &large)] {
         let joins = joins_of(first, second, true);
-        let (why, count) = doubts(&joins[0])[0];
-        assert_eq!(why, Doubt::Unread(Unread::Aggregate));
-        assert!(count >= 10, "{joins:#?}");
+        let (why, count) = &doubts(&joins[0])[0];
+        assert_eq!(*why, Doubt::Unread(Unread::Aggregate));
+        assert!(*count >= 10, "{joins:#?}");
     }
     // Small ones, together smaller than a frame; known by number or by payload.
     let ten = |n: u32| {
@@ -558,8 +559,8 @@ fn an_aggregate_is_no_datagram() {
     for flow in ["udp:dport=5004,id=0+4", "udp:dport=5004"] {
         for (first, second) in [(&large, &small), (&small, &large)] {
             let joins = joins_by(flow, first, second, true);
-            let (why, _) = doubts(&joins[0])[0];
-            assert_eq!(why, Doubt::Unread(Unread::Aggregate), "{flow}: {joins:#?}");
+            let (why, _) = &doubts(&joins[0])[0];
+            assert_eq!(*why, Doubt::Unread(Unread::Aggregate), "{flow}: {joins:#?}");
         }
     }
     // A large one that was lost, and small ones that the first point missed and that are not its pieces.

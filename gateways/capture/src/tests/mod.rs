@@ -6,6 +6,7 @@ mod cases;
 mod containers;
 mod frames;
 mod joins;
+mod limits;
 mod programs;
 
 use super::reader::{CaptureReader, Step};
