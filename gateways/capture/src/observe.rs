@@ -4,6 +4,7 @@
 //! was seen at two points is compared in [`super::join`]; what a tap could have seen is in
 //! [`super::watch`].
 
+use core::cmp::Reverse;
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
@@ -191,6 +192,8 @@ pub struct Observer {
     broken: BTreeMap<usize, u64>,
     fragments: Fragments,
     counts: PacketCounts,
+    /// Datagrams of no followed flow, by the port they went to.
+    other_ports: BTreeMap<u16, u64>,
 }
 
 impl Observer {
@@ -397,7 +400,11 @@ impl Observer {
             }
         }
         *match why {
-            None => &mut counts.other_flow_count,
+            None => {
+                let port = datagram.destination.port();
+                *self.other_ports.entry(port).or_default() += 1;
+                &mut counts.other_flow_count
+            }
             Some(Unidentified::Foreign) => &mut counts.foreign_count,
             Some(Unidentified::CutShort | Unidentified::Fragmented) => {
                 &mut counts.unidentified_count
@@ -418,6 +425,28 @@ impl Observer {
     /// What was counted so far.
     pub const fn counts(&self) -> &PacketCounts {
         &self.counts
+    }
+
+    /// Ports to which most datagrams went that are of no followed flow, with how many.
+    pub fn busiest_other_ports(&self) -> Vec<(u16, u64)> {
+        let mut ports: Vec<(u16, u64)> = self.other_ports.iter().map(|(a, b)| (*a, *b)).collect();
+        ports.sort_by_key(|(_, count)| Reverse(*count));
+        ports
+    }
+
+    /// Streams of a merged interface most of whose datagrams are there twice: two captures became one point.
+    pub fn folded(&self) -> impl Iterator<Item = (&Point, &Stream)> {
+        let merged = self.seen.iter().filter(|(point, _)| {
+            let watch = self.watches.get(&point.tap());
+            watch.is_some_and(|watch| watch.is_merged)
+        });
+        let streams = merged.flat_map(|(point, seen)| seen.iter().map(move |one| (point, one)));
+        let folded = streams.filter(|(_, (_, list))| {
+            let identity = |one: &Observation| (one.identity.key, one.packet_number);
+            let different: BTreeSet<(u64, u16)> = list.iter().map(identity).collect();
+            3 * (list.len() - different.len()) > list.len()
+        });
+        folded.map(|(point, (stream, _))| (point, stream))
     }
 
     /// What was seen so far at each point.

@@ -3,7 +3,8 @@
 //!
 //! A tap's stamps are taken in the order of the file. Where they jump back, or on by more than a day, a
 //! new *level* begins. A level of one or two stamps far from the others is a fault of single stamps: it is
-//! no time of watching. Between longer levels the clock was set, or parts of the file are out of order; two points
+//! no time of watching. So are one or two ahead of all around them, and one or two at the beginning or end,
+//! as far from the rest as none there lies from the next. Between longer levels the clock was set, or parts of the file are out of order; two points
 //! together tell which (see [`super::join`]).
 
 use core::fmt;
@@ -26,7 +27,13 @@ const SILENCE_MAX_NS: i64 = 86_400_000_000_000;
 /// A stamp before it, since 1970, is of a clock that was not set.
 const YEAR_NS: i64 = 365 * SILENCE_MAX_NS;
 /// Stamps that are no level of their own.
-const ISOLATED_MAX: u64 = 2;
+const ISOLATED_COUNT: usize = 2;
+const ISOLATED_MAX: u64 = ISOLATED_COUNT as u64;
+/// How much longer than any other the time is between the rest and a stamp far from it, and how long at least.
+const FAR_FACTOR: i64 = 100;
+const FAR_MIN_NS: i64 = 1_000_000_000;
+/// Times between stamps that tell what is far.
+const USUAL_COUNT_MIN: u64 = 5;
 /// Levels whose clock another point's is compared with.
 const ANCHOR_COUNT_MAX: usize = 4;
 /// How far the stated times of watching may leave out a packet.
@@ -125,9 +132,10 @@ struct Level {
     last_ns: i64,
     min_ns: i64,
     max_ns: i64,
-    /// Last and largest stamp before the newest.
-    before_ns: Option<(i64, i64)>,
+    /// Last and largest stamp before the newest, and before the one before it.
+    before_ns: [Option<(i64, i64)>; ISOLATED_COUNT],
     count: u64,
+    gaps: Gaps,
     /// How far its first stamp lies behind the one before.
     behind_ns: i64,
     /// The level before it.
@@ -136,7 +144,79 @@ struct Level {
     shift_ns: Option<i64>,
 }
 
+/// Times from one stamp of a level to the next.
+#[derive(Debug, Clone, Copy, Default)]
+struct Gaps {
+    /// The first, and the stamps behind them.
+    head: [Option<(i64, i64)>; ISOLATED_COUNT],
+    /// The newest, the last one first.
+    tail: [Option<i64>; ISOLATED_COUNT],
+    /// Of those between, the longest, and how many.
+    usual_max_ns: i64,
+    usual_count: u64,
+}
+
+impl Gaps {
+    fn take(&mut self, gap_ns: i64, at_ns: i64) {
+        if let Some(free) = self.head.iter_mut().find(|gap| gap.is_none()) {
+            *free = Some((gap_ns, at_ns));
+            return;
+        }
+        let [newest, older] = self.tail;
+        if let Some(usual_ns) = older {
+            self.usual_max_ns = self.usual_max_ns.max(usual_ns);
+            self.usual_count += 1;
+        }
+        self.tail = [Some(gap_ns), newest];
+    }
+
+    fn is_far(&self, gap_ns: i64) -> bool {
+        let usual_ns = self.usual_max_ns.saturating_mul(FAR_FACTOR);
+        self.usual_count >= USUAL_COUNT_MIN && gap_ns > usual_ns.max(FAR_MIN_NS)
+    }
+}
+
 impl Level {
+    fn begun(at_ns: i64, behind_ns: i64, previous: Option<usize>) -> Self {
+        Self {
+            first_ns: at_ns,
+            last_ns: at_ns,
+            min_ns: at_ns,
+            max_ns: at_ns,
+            before_ns: [None; _],
+            count: 1,
+            gaps: Gaps::default(),
+            behind_ns,
+            previous,
+            shift_ns: None,
+        }
+    }
+
+    fn take(&mut self, at_ns: i64) {
+        self.gaps.take(at_ns.saturating_sub(self.last_ns), at_ns);
+        let [newest, _] = self.before_ns;
+        self.before_ns = [Some((self.last_ns, self.max_ns)), newest];
+        self.last_ns = at_ns;
+        self.min_ns = self.min_ns.min(at_ns);
+        self.max_ns = self.max_ns.max(at_ns);
+        self.count += 1;
+    }
+
+    /// Leaves out stamps at either end that lie far from all others.
+    fn trim(&mut self) {
+        let gaps = self.gaps;
+        let head = gaps.head.iter().rev().flatten();
+        let mut head = head.filter(|(gap_ns, _)| gaps.is_far(*gap_ns));
+        if let Some((_, first_ns)) = head.next() {
+            (self.first_ns, self.min_ns) = (*first_ns, *first_ns);
+        }
+        let tail = gaps.tail.into_iter().zip(self.before_ns).rev();
+        let mut tail = tail.filter(|(gap_ns, _)| gap_ns.is_some_and(|gap_ns| gaps.is_far(gap_ns)));
+        if let Some((_, Some((last_ns, max_ns)))) = tail.next() {
+            (self.last_ns, self.max_ns) = (last_ns, max_ns);
+        }
+    }
+
     /// It begins so little behind the level before it that packets may have come late: none is isolated.
     fn is_late(&self) -> bool {
         (1..=LATE_MAX_NS).contains(&self.behind_ns)
@@ -228,7 +308,7 @@ impl Watch {
             .levels
             .get(self.current)
             .is_some_and(|level| at_ns < level.last_ns);
-        self.pass_over_one_ahead(at_ns);
+        self.pass_over_those_ahead(at_ns);
         let current = self.levels.get(self.current);
         let next = current.and_then(|level| {
             let may_return = level.count <= ISOLATED_MAX && !level.is_late();
@@ -241,43 +321,38 @@ impl Watch {
         });
         if let Some(index) = next {
             self.current = index;
-            let level = &mut self.levels[index];
-            level.before_ns = Some((level.last_ns, level.max_ns));
-            level.last_ns = at_ns;
-            level.min_ns = level.min_ns.min(at_ns);
-            level.max_ns = level.max_ns.max(at_ns);
-            level.count += 1;
+            self.levels[index].take(at_ns);
         } else {
             let behind_ns = current.map_or(0, |level| level.last_ns.saturating_sub(at_ns));
             let previous = current.map(|_| self.current);
             self.current = self.levels.len();
-            self.levels.push(Level {
-                first_ns: at_ns,
-                last_ns: at_ns,
-                min_ns: at_ns,
-                max_ns: at_ns,
-                before_ns: None,
-                count: 1,
-                behind_ns,
-                previous,
-                shift_ns: None,
-            });
+            self.levels.push(Level::begun(at_ns, behind_ns, previous));
         }
         is_backward
     }
 
-    /// The newest stamp was a single one ahead, if the next goes on from the one before it.
-    fn pass_over_one_ahead(&mut self, at_ns: i64) {
+    /// The newest stamps were one or two ahead, if the next goes on from the one before them.
+    fn pass_over_those_ahead(&mut self, at_ns: i64) {
         let Some(level) = self.levels.get_mut(self.current) else {
             return;
         };
-        let Some((last_ns, max_ns)) = level.before_ns else {
-            return;
-        };
-        let goes_on = last_ns.saturating_sub(LATE_MAX_NS) <= at_ns;
-        if goes_on && at_ns < level.last_ns.saturating_sub(LATE_MAX_NS) {
-            self.ahead.insert((self.current, level.last_ns), last_ns);
-            (level.last_ns, level.max_ns, level.before_ns) = (last_ns, max_ns, None);
+        let late = |at_ns: i64| at_ns.saturating_sub(LATE_MAX_NS);
+        let mut ahead = Vec::new();
+        for before in level.before_ns {
+            let newest_ns = ahead
+                .last()
+                .map_or(level.last_ns, |(_, before_ns)| *before_ns);
+            let Some((last_ns, max_ns)) = before.filter(|_| at_ns < late(newest_ns)) else {
+                return;
+            };
+            ahead.push((newest_ns, last_ns));
+            if late(last_ns) <= at_ns {
+                let current = self.current;
+                let stamps = ahead.iter().map(|(at_ns, _)| ((current, *at_ns), last_ns));
+                self.ahead.extend(stamps);
+                (level.last_ns, level.max_ns, level.before_ns) = (last_ns, max_ns, [None; _]);
+                return;
+            }
         }
     }
 
@@ -293,6 +368,7 @@ impl Watch {
 
     /// Settles levels and times of watching, after the last packet of the file.
     pub(super) fn settle(&mut self, interface: Option<&CaptureInterface>) {
+        self.levels.iter_mut().for_each(Level::trim);
         let most = self.levels.iter().map(|level| level.count).max();
         let least = if most > Some(ISOLATED_MAX) {
             ISOLATED_MAX + 1

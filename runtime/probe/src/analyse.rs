@@ -130,7 +130,38 @@ impl Reading {
     /// True when a file has a fault or says that packets were dropped.
     pub(super) fn has_gaps(&self) -> bool {
         let is_bad = |file: &CaptureFile| file.fault_count > 0 || file.dropped_count() > Some(0);
-        self.files.iter().any(is_bad)
+        self.files.iter().any(is_bad) || self.observer.folded().next().is_some()
+    }
+
+    /// Says so when nothing was followed, and what there was.
+    pub(super) fn nothing_followed(&self) -> Option<String> {
+        /// Ports named.
+        const PORT_COUNT: usize = 5;
+        if self.observer.counts().followed_count > 0 {
+            return None;
+        }
+        let flows: Vec<String> = self
+            .observer
+            .flows()
+            .iter()
+            .map(ToString::to_string)
+            .collect();
+        let flows = flows.join(" or ");
+        let ports = self
+            .observer
+            .busiest_other_ports()
+            .into_iter()
+            .take(PORT_COUNT);
+        let ports = ports.map(|(port, count)| format!("{port} ({})", grouped(count)));
+        let ports: Vec<String> = ports.collect();
+        Some(if ports.is_empty() {
+            format!("no datagram of {flows} is known, nor is there UDP of other flows")
+        } else {
+            let ports = ports.join(", ");
+            format!(
+                "no datagram of {flows} is known; most UDP went to ports {ports}: try --flow udp:dport=PORT"
+            )
+        })
     }
 
     /// Every fault told and every gap, in words.
@@ -149,6 +180,12 @@ impl Reading {
                 ));
             }
         }
+        complaints.extend(self.observer.folded().map(|(point, _)| {
+            format!(
+                "{}: most datagrams are there twice: mergecap made one interface of several captures; merge                  them with `mergecap -I none`, or give both files",
+                self.name(point)
+            )
+        }));
         complaints
     }
 }

@@ -276,3 +276,49 @@ fn a_count_of_all_ones_is_unknown_and_large_ones_add_up() {
     let figures = joins_of(&first_point(), &sections, true).remove(0);
     assert_eq!(doubts(&figures), [(Doubt::Dropped, u64::MAX)]);
 }
+
+#[test]
+fn stamps_far_from_all_others_are_no_time_of_watching() {
+    // The second point watched from number 10 on, or to number 79; number 50 is lost.
+    let other = |at_us: i64| {
+        let mut frame = datagram(0, 32);
+        frame[12..14].copy_from_slice(&[8, 6]);
+        (at_us, frame)
+    };
+    let numbers = |from: u32, to: u32| {
+        let numbers = (from..to).filter(|n| *n != 50);
+        numbers
+            .map(|n| (at_us(n), datagram(n, 32)))
+            .collect::<Vec<_>>()
+    };
+    let hour_us = 3_600_000_000;
+    for by_us in [30_000_000, hour_us] {
+        for count in [1, 2] {
+            let far = |from_us: i64| (0..count).map(move |n| other(from_us + n * 50_000));
+            let early: Vec<_> = far(at_us(10) - by_us).chain(numbers(10, 100)).collect();
+            let ahead: Vec<_> = numbers(0, 80)
+                .into_iter()
+                .chain(far(at_us(79) + by_us))
+                .collect();
+            // And come back.
+            let mut between = numbers(0, 80);
+            between.splice(30..30, far(at_us(29) + by_us));
+            for (packets, edge_count) in [(early, 10), (ahead, 20), (between, 20)] {
+                let figures = &joins_of(&first_point(), &pcap(&packets), true)[0];
+                let told = (figures.loss.count(), figures.edge_count);
+                assert_eq!(
+                    told,
+                    (Some(1), edge_count),
+                    "{by_us}, {count}: {figures:#?}"
+                );
+                assert!(figures.clock_steps[1].is_empty(), "{figures:#?}");
+            }
+        }
+    }
+    // A silence as others are, at the beginning: nothing came then.
+    let mut packets = vec![other(at_us(0) - 1000)];
+    packets.extend(numbers(10, 40));
+    packets.extend(numbers(60, 100));
+    let figures = &joins_of(&first_point(), &pcap(&packets), true)[0];
+    assert_eq!(figures.loss.count(), Some(30), "{figures:#?}");
+}
