@@ -7,13 +7,15 @@
 
 use core::fmt;
 use core::str::FromStr;
-use std::net::IpAddr;
+use std::collections::BTreeSet;
+use std::net::{IpAddr, SocketAddr};
 
 use hil_arm::egm::wire;
 use hil_core::message::{FNV_OFFSET, fnv1a};
 use thiserror::Error;
 
 use super::link::UdpDatagram;
+use super::observe::Stream;
 use hil_net::filter::PacketFilter;
 use hil_protocol::wire::{HEADER_BYTES, Header, Kind};
 
@@ -76,6 +78,9 @@ pub enum FlowError {
         /// What it should be.
         expected: &'static str,
     },
+    /// A condition given twice.
+    #[error("`{0}` is given twice; a second --flow follows another flow")]
+    Repeated(String),
     /// Nothing but `udp` or `egm`: that would follow everything.
     #[error("`{0}` needs a port or an address: otherwise it would follow every datagram")]
     Everything(String),
@@ -95,9 +100,13 @@ impl FromStr for FlowFilter {
             "udp" => FlowKind::Payload,
             other => return Err(FlowError::Kind(other.to_owned())),
         });
+        let mut keys = BTreeSet::new();
         for condition in conditions.split(',').filter(|part| !part.is_empty()) {
             let unknown = || FlowError::Condition(condition.to_owned());
             let (key, value) = condition.split_once('=').ok_or_else(unknown)?;
+            if !keys.insert(key) {
+                return Err(FlowError::Repeated(key.to_owned()));
+            }
             match (key, &mut filter.kind) {
                 ("port", _) => filter.packets.port = Some(port("port", value)?),
                 ("sport", _) => filter.packets.source_port = Some(port("sport", value)?),
@@ -262,7 +271,16 @@ impl FlowFilter {
 
     /// True when addresses and ports are as asked.
     pub fn has_addresses_of(&self, datagram: &UdpDatagram<'_>) -> bool {
-        let (from, to) = (datagram.source, datagram.destination);
+        self.has_ends(datagram.source, datagram.destination)
+    }
+
+    /// True when a tap with this filter keeps the datagrams of a stream.
+    pub(super) fn keeps(&self, stream: &Stream) -> bool {
+        let is_of_kind = self.kind != FlowKind::Hil || stream.own.is_some();
+        is_of_kind && self.has_ends(stream.source, stream.destination)
+    }
+
+    fn has_ends(&self, from: SocketAddr, to: SocketAddr) -> bool {
         let wanted = &self.packets;
         let is_port = |wanted: Option<u16>, port| wanted.is_none_or(|one| one == port);
         let is_address = |wanted: Option<IpAddr>, address| wanted.is_none_or(|one| one == address);
@@ -347,7 +365,7 @@ fn whole(
     datagram: &UdpDatagram<'_>,
     count: impl FnOnce(&[u8]) -> Result<Option<u32>, Unidentified>,
 ) -> Result<DatagramIdentity, Unidentified> {
-    if datagram.is_fragmented {
+    if datagram.is_fragmented() {
         return Err(Unidentified::Fragmented);
     }
     if datagram.is_cut_short() {

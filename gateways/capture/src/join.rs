@@ -67,13 +67,20 @@ pub enum OrderSource {
 }
 
 /// Why a datagram that a point does not show may have passed it all the same.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "doubt")]
 pub enum Doubt {
     /// Frames there could not be read.
     Unread(Unread),
+    /// Only the first of their IP fragments was kept there.
+    Pieces,
     /// Frames were dropped by the capture there.
     Dropped,
+    /// The capture there had a filter that may not have kept them.
+    Filtered {
+        /// In the words of its file.
+        filter: String,
+    },
     /// Which point comes first is unknown, or told in two ways.
     Order,
     /// Seen at both points, farther apart than [`JoinSettings::window_ns`].
@@ -87,7 +94,7 @@ pub enum Doubt {
 }
 
 /// A doubt, and how many frames or datagrams it is of.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CountedDoubt {
     /// Which.
     #[serde(flatten)]
@@ -854,6 +861,8 @@ fn doubts(
     if alone_count > 0 && (ends.order == OrderSource::Unknown || ends.is_disputed) {
         add(Doubt::Order, alone_count);
     }
+    let in_pieces = pairs.iter().filter(|pair| pair.second.lacks_pieces);
+    add(Doubt::Pieces, in_pieces.count());
     add(Doubt::Apart, matches.apart_count);
     if matches.is_ambiguous {
         add(Doubt::Ambiguous, pairs.len() + alone_count);
@@ -894,6 +903,16 @@ fn doubts(
         }
         let dropped = usize::try_from(watch.dropped_count);
         add(Doubt::Dropped, dropped.unwrap_or(usize::MAX));
+        for filter in watch.filters_against(stream) {
+            let filter = filter.clone();
+            let only_count = matches.only_first.len() + matches.only_second.len();
+            let count = if is_judged {
+                alone[0].len()
+            } else {
+                only_count
+            };
+            add(Doubt::Filtered { filter }, count);
+        }
     }
     if !is_judged && doubts.is_empty() {
         let count = (matches.only_first.len() + matches.only_second.len()) as u64;
@@ -961,10 +980,13 @@ fn loss(lost: &[usize], matches: &Matches, doubts: Vec<CountedDoubt>) -> Loss {
     }
     let is_bounded = |one: &CountedDoubt| match one.doubt {
         Doubt::Unread(why) => why != Unread::Aggregate,
-        Doubt::Dropped => true,
-        Doubt::Order | Doubt::Apart | Doubt::Ambiguous | Doubt::Readdressed | Doubt::Unwatched => {
-            false
-        }
+        Doubt::Dropped | Doubt::Filtered { .. } => true,
+        Doubt::Pieces
+        | Doubt::Order
+        | Doubt::Apart
+        | Doubt::Ambiguous
+        | Doubt::Readdressed
+        | Doubt::Unwatched => false,
     };
     let unseen_count: u64 = doubts.iter().map(|one| one.count).sum();
     let range = count > 0 && doubts.iter().all(is_bounded);

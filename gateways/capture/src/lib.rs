@@ -13,11 +13,13 @@ mod bytes;
 pub mod esl;
 pub mod flow;
 pub mod join;
+mod kept;
 pub mod link;
 pub mod observe;
 pub mod pairing;
 mod pcap;
 mod pcapng;
+mod pieces;
 pub mod point;
 pub mod reader;
 pub mod watch;
@@ -67,6 +69,8 @@ pub struct CaptureInterface {
     pub unit_ns: (u64, u64),
     /// What to add to its stamps, nanoseconds.
     pub offset_ns: i64,
+    /// What a packet had to be to be kept, in words; `None` when the file does not say.
+    pub filter: Option<String>,
     /// When it was watched, as its statistics state it: taken in its own unit, and in microseconds.
     /// Wireshark and dumpcap write microseconds whatever the unit; which was meant, the packets tell.
     pub watch: [Option<Span>; 2],
@@ -105,6 +109,8 @@ pub struct CapturedPacket<'a> {
     pub stamp_ns: Option<i64>,
     /// Length on the wire; more than `data` when the packet was cut short.
     pub original_bytes: u32,
+    /// Its check sequence or shape was wrong when it was captured, as the file says.
+    pub is_damaged: bool,
     /// Its stamp is of the network card; see [`CaptureInterface::has_nic_clock`].
     pub is_nic_stamped: bool,
     /// Which way it went.

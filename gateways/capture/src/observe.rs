@@ -4,14 +4,16 @@
 //! was seen at two points is compared in [`super::join`]; what a tap could have seen is in
 //! [`super::watch`].
 
-use std::collections::BTreeMap;
+use core::cmp::Reverse;
 use std::collections::btree_map::Entry;
-use std::net::SocketAddr;
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::{IpAddr, SocketAddr};
 
 use serde::{Deserialize, Serialize};
 
 use super::flow::{DatagramIdentity, FlowFilter, FlowKind, Unidentified};
-use super::link::{FramePlace, NoDatagram, udp_datagram};
+use super::link::{FramePlace, NoDatagram, UdpDatagram, udp_datagram};
+use super::pieces::{Begun, Fragments};
 use super::watch::{Tap, Unread, Watch};
 use super::{CaptureInterface, CapturedPacket, esl};
 use hil_net::{Direction, link_type};
@@ -112,6 +114,10 @@ pub struct Observation {
     pub hop_limit: u8,
     /// For which station of the link it was.
     pub station: [u8; 6],
+    /// See [`UdpDatagram::radio_number`].
+    pub radio_number: Option<u16>,
+    /// Its later fragments are none of what the capture kept.
+    pub lacks_pieces: bool,
     /// In a capture that may be of several links and does not say which: one that is equal passed another link, or
     /// is a duplicate.
     pub is_of_any: bool,
@@ -137,8 +143,12 @@ pub struct PacketCounts {
     pub foreign_count: u64,
     /// Of a flow, but captured too short, or in fragments, to be known again.
     pub unidentified_count: u64,
-    /// First fragments of a followed datagram: the time is that of the first piece.
+    /// Followed datagrams in fragments: the time is that of the first piece.
     pub fragmented_count: u64,
+    /// Of those, such as lack a piece while others of their stream came whole: they are not counted as seen.
+    pub incomplete_count: u64,
+    /// Damaged on the wire, as the file says: they count as not arrived (RFC 7680 section 2.5).
+    pub damaged_count: u64,
     /// Not IP.
     pub not_ip_count: u64,
     /// Not UDP.
@@ -152,22 +162,24 @@ pub struct PacketCounts {
     /// Sent again by a radio for want of an acknowledgement, and seen before.
     pub radio_retry_count: u64,
     /// Seen just before, for another station or in a cooked capture that does not name interfaces: once
-    /// more on another link, not twice on this one. In such a capture only by a number of at least 32 bits, or in an
-    /// IP packet of the same identification.
+    /// more on another link, not twice on this one. Only by a number of at least 32 bits, or in an IP packet of the
+    /// same identification; where packets bear none, by a hop limit that a router changed.
     pub elsewhere_count: u64,
     /// Earlier than the packet before it at the same point: a file out of order.
     pub backward_stamp_count: u64,
     /// With the header of an ET2000.
     pub esl_count: u64,
-    /// Of those, damaged according to the device (frame check sequence or alignment).
+    /// Of those, damaged according to the device (frame check sequence or alignment); see `damaged_count`.
     pub esl_damaged_count: u64,
     /// Of those, with no port or several named.
     pub esl_port_unclear_count: u64,
 }
 
+/// Tunnels over UDP within one another.
+const TUNNEL_DEPTH_MAX: usize = 4;
 /// Datagrams among which one that was seen before is looked for.
 const COPY_COUNT_MAX: usize = 256;
-/// Longest time between two sightings of one datagram on the links of one host.
+/// Longest time between two sightings of one datagram on the links of one host, and of one radio frame.
 const ELSEWHERE_MAX_NS: u64 = 100_000_000;
 
 /// Takes packets and keeps what is followed.
@@ -178,7 +190,10 @@ pub struct Observer {
     watches: BTreeMap<Tap, Watch>,
     /// Packets that a file holds and that could not be read out of it.
     broken: BTreeMap<usize, u64>,
+    fragments: Fragments,
     counts: PacketCounts,
+    /// Datagrams of no followed flow, by the port they went to.
+    other_ports: BTreeMap<u16, u64>,
 }
 
 impl Observer {
@@ -202,11 +217,13 @@ impl Observer {
         };
         let (mut frame, mut stamp_ns) = (packet.data, packet.stamp_ns);
         let mut original_bytes = packet.original_bytes as usize;
+        let mut is_esl_damaged = false;
         if packet.link_type == link_type::ETHERNET
             && let Some((header, inner)) = esl::split(frame)
         {
             self.counts.esl_count += 1;
-            self.counts.esl_damaged_count += u64::from(header.is_damaged());
+            is_esl_damaged = header.is_damaged();
+            self.counts.esl_damaged_count += u64::from(is_esl_damaged);
             self.counts.esl_port_unclear_count += u64::from(header.port_count() != 1);
             frame = inner;
             original_bytes = original_bytes.saturating_sub(esl::HEADER_BYTES);
@@ -222,18 +239,48 @@ impl Observer {
             return;
         };
         counts.backward_stamp_count += u64::from(watch.stamp(stamp_ns));
-        let datagram = match udp_datagram(packet.link_type, frame, original_bytes) {
+        if packet.is_damaged || is_esl_damaged {
+            counts.damaged_count += u64::from(packet.is_damaged);
+            self.seen.entry(point).or_default();
+            return;
+        }
+        let flows = &self.flows;
+        let is_followed = |datagram: &UdpDatagram<'_>| {
+            let mut of_addresses = flows.iter().filter(|flow| flow.has_addresses_of(datagram));
+            // Ours may have any address.
+            of_addresses.any(|flow| {
+                flow.kind != FlowKind::Hil || flow.identify(datagram) != Err(Unidentified::Foreign)
+            })
+        };
+        let mut found = udp_datagram(packet.link_type, frame, original_bytes);
+        // Of a tunnel that is not followed itself, what it holds.
+        for _ in 0..TUNNEL_DEPTH_MAX {
+            let outer = found.ok().filter(|datagram| !is_followed(datagram));
+            let Some(inside) = outer.and_then(|datagram| datagram.inside()) else {
+                break;
+            };
+            found = inside;
+        }
+        let datagram = match found {
             Ok(datagram) => datagram,
             Err(reason) => {
                 *match reason {
                     NoDatagram::NotIp => &mut counts.not_ip_count,
                     NoDatagram::NotUdp => &mut counts.not_udp_count,
-                    NoDatagram::LaterFragment => &mut counts.later_fragment_count,
+                    NoDatagram::LaterFragment(fragment) => {
+                        if let Some(fragment) = fragment {
+                            let mut point = point;
+                            point.add(&fragment.place);
+                            self.fragments.take(point, &fragment, stamp_ns, None);
+                        }
+                        &mut counts.later_fragment_count
+                    }
                     NoDatagram::Sealed {
                         source,
                         destination,
+                        why,
                     } => {
-                        watch.miss_sealed(source, destination);
+                        watch.miss_sealed(source, destination, why);
                         &mut counts.unreadable_count
                     }
                     NoDatagram::Unread(why) => {
@@ -263,30 +310,51 @@ impl Observer {
                     };
                     let list = seen.entry(stream).or_default();
                     let place = &datagram.place;
-                    // Where nothing names the link, another datagram may say the same.
-                    let is_doubtful = place.is_of_any && !identity.is_unique();
-                    let is_known = |one: &Observation| {
-                        one.identity.key == identity.key
-                            && (!is_doubtful || one.packet_number == datagram.packet_number)
-                    };
-                    let mut newest = list.iter_mut().rev().take(COPY_COUNT_MAX);
-                    let known = newest.find(|one| is_known(one));
-                    let is_elsewhere = |known: &Observation| {
-                        (place.is_of_any || place.station != known.station)
-                            && (!is_doubtful || datagram.packet_number != 0)
-                            && stamp_ns.abs_diff(known.stamp_ns) <= ELSEWHERE_MAX_NS
-                    };
-                    if datagram.is_radio_retry && known.is_some() {
+                    // Another datagram may say the same.
+                    let is_doubtful = !identity.is_unique();
+                    let number = datagram.packet_number;
+                    let is_near =
+                        |one: &Observation| stamp_ns.abs_diff(one.stamp_ns) <= ELSEWHERE_MAX_NS;
+                    let is_equal = |one: &Observation| one.identity.key == identity.key;
+                    if datagram.is_radio_retry
+                        && list.iter().rev().take(COPY_COUNT_MAX).any(|one| {
+                            is_equal(one)
+                                && one.radio_number == datagram.radio_number
+                                && is_near(one)
+                        })
+                    {
                         counts.radio_retry_count += 1;
                         return;
                     }
+                    let is_known = |one: &Observation| {
+                        is_equal(one) && (!is_doubtful || one.packet_number == number)
+                    };
+                    let is_elsewhere = |known: &Observation| {
+                        let is_routed = !place.is_of_any && datagram.hop_limit != known.hop_limit;
+                        (place.is_of_any || place.station != known.station)
+                            && (!is_doubtful || number != 0 || is_routed)
+                            && is_near(known)
+                    };
+                    let mut newest = list.iter_mut().rev().take(COPY_COUNT_MAX);
+                    let known = newest.find(|one| is_known(one));
                     if let Some(known) = known.filter(|known| is_elsewhere(known)) {
                         known.has_copy |= place.is_of_any;
                         counts.elsewhere_count += 1;
                         return;
                     }
                     counts.followed_count += 1;
-                    counts.fragmented_count += u64::from(datagram.is_fragmented);
+                    counts.fragmented_count += u64::from(datagram.is_fragmented());
+                    if let Some(fragment) = &datagram.fragment {
+                        let begun = Begun {
+                            point,
+                            stream,
+                            index: list.len(),
+                            first_ns: stamp_ns,
+                            length_ns: None,
+                        };
+                        let fragments = &mut self.fragments;
+                        fragments.take(point, fragment, stamp_ns, Some(begun));
+                    }
                     let bytes = |count| u32::try_from(count).unwrap_or(u32::MAX);
                     list.push(Observation {
                         stamp_ns,
@@ -299,6 +367,8 @@ impl Observer {
                         hop_limit: datagram.hop_limit,
                         station: place.station,
                         is_of_any: place.is_of_any,
+                        radio_number: datagram.radio_number,
+                        lacks_pieces: false,
                         has_copy: false,
                         identity,
                     });
@@ -330,7 +400,11 @@ impl Observer {
             }
         }
         *match why {
-            None => &mut counts.other_flow_count,
+            None => {
+                let port = datagram.destination.port();
+                *self.other_ports.entry(port).or_default() += 1;
+                &mut counts.other_flow_count
+            }
             Some(Unidentified::Foreign) => &mut counts.foreign_count,
             Some(Unidentified::CutShort | Unidentified::Fragmented) => {
                 &mut counts.unidentified_count
@@ -351,6 +425,28 @@ impl Observer {
     /// What was counted so far.
     pub const fn counts(&self) -> &PacketCounts {
         &self.counts
+    }
+
+    /// Ports to which most datagrams went that are of no followed flow, with how many.
+    pub fn busiest_other_ports(&self) -> Vec<(u16, u64)> {
+        let mut ports: Vec<(u16, u64)> = self.other_ports.iter().map(|(a, b)| (*a, *b)).collect();
+        ports.sort_by_key(|(_, count)| Reverse(*count));
+        ports
+    }
+
+    /// Streams of a merged interface most of whose datagrams are there twice: two captures became one point.
+    pub fn folded(&self) -> impl Iterator<Item = (&Point, &Stream)> {
+        let merged = self.seen.iter().filter(|(point, _)| {
+            let watch = self.watches.get(&point.tap());
+            watch.is_some_and(|watch| watch.is_merged)
+        });
+        let streams = merged.flat_map(|(point, seen)| seen.iter().map(move |one| (point, one)));
+        let folded = streams.filter(|(_, (_, list))| {
+            let identity = |one: &Observation| (one.identity.key, one.packet_number);
+            let different: BTreeSet<(u64, u16)> = list.iter().map(identity).collect();
+            3 * (list.len() - different.len()) > list.len()
+        });
+        folded.map(|(point, (stream, _))| (point, stream))
     }
 
     /// What was seen so far at each point.
@@ -389,6 +485,7 @@ impl Observer {
             self.seen.insert(point, Seen::new());
             self.watches.entry(point.tap()).or_default();
         }
+        self.settle_fragments(file_index);
         let broken = self.broken.get(&file_index).copied();
         for (tap, watch) in &mut self.watches {
             if tap.file_index == file_index {
@@ -414,6 +511,53 @@ impl Observer {
             if let Some(first) = interface.repeats {
                 self.join_sections(file_index, first, interface_index);
             }
+        }
+    }
+
+    /// A datagram that lacks a fragment did not come; unless the capture keeps later ones of no datagram of its
+    /// stream, or ended too soon.
+    fn settle_fragments(&mut self, file_index: usize) {
+        let all = self.fragments.finish(file_index);
+        let mut longest: BTreeMap<(Tap, IpAddr, IpAddr), u64> = BTreeMap::new();
+        let ends = |one: &Begun| {
+            let Stream {
+                source,
+                destination,
+                ..
+            } = one.stream;
+            (one.point.tap(), source.ip(), destination.ip())
+        };
+        for one in &all {
+            if let Some(length_ns) = one.length_ns {
+                let known = longest.entry(ends(one)).or_default();
+                *known = length_ns.max(*known);
+            }
+        }
+        let mut missing: BTreeMap<(Point, Stream), BTreeSet<usize>> = BTreeMap::new();
+        for one in all.iter().filter(|one| one.length_ns.is_none()) {
+            let last_ns = self.watches.get(&one.point.tap()).and_then(Watch::last_ns);
+            let may_come = last_ns.map(|last_ns| last_ns.abs_diff(one.first_ns));
+            let is_judged =
+                longest.get(&ends(one)).copied() < may_come && longest.contains_key(&ends(one));
+            if is_judged {
+                let places = missing.entry((one.point, one.stream)).or_default();
+                places.insert(one.index);
+            } else if let Some(seen) = self.seen.get_mut(&one.point)
+                && let Some(list) = seen.get_mut(&one.stream)
+            {
+                list[one.index].lacks_pieces = true;
+            }
+        }
+        for ((point, stream), places) in missing {
+            self.counts.incomplete_count += places.len() as u64;
+            self.counts.followed_count -= places.len() as u64;
+            let seen = self.seen.entry(point).or_default();
+            let list = seen.entry(stream).or_default();
+            let mut index = 0;
+            list.retain(|_| {
+                index += 1;
+                !places.contains(&(index - 1))
+            });
         }
     }
 

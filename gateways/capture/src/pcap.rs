@@ -97,6 +97,7 @@ impl PcapFile {
             stamp_ns: (fraction_ns < 2_000_000_000).then_some(stamp_ns),
             original_bytes,
             direction,
+            is_damaged: false,
             data: header_bytes..end,
         };
         Next::Packet(found, end as u64)

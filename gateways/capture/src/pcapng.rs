@@ -19,6 +19,9 @@ const BLOCK_BYTES_MIN: u32 = 12;
 const BLOCK_BYTES_MAX: u32 = 16 * 1024 * 1024;
 /// Interfaces a file may describe; a broken one could claim any number.
 const INTERFACE_COUNT_MAX: usize = 4096;
+/// Of a packet's flags: wrong check sequence, too long, too short, unaligned, wrong delimiter, preamble or symbol.
+/// The gap before it, which may be wrong too (bit 27), damages nothing.
+const DAMAGED: u32 = 0xf700_0000;
 const SECTION_BODY_BYTES: u64 = 16;
 
 /// Where in the file the reader is.
@@ -195,6 +198,7 @@ fn describe(
         match (code, value) {
             (2, name) => interface.name = Some(String::from_utf8_lossy(name).into_owned()),
             (3, text) => interface.description = Some(String::from_utf8_lossy(text).into_owned()),
+            (11, value) => interface.filter = filter(value),
             (9, &[resolution]) => interface.unit_ns = unit_ns(resolution)?,
             (14, seconds) => {
                 let seconds = body.part(seconds).u64(0).map(u64::cast_signed);
@@ -227,6 +231,20 @@ fn describe(
     // The interface keeps its number also when an option is broken.
     interfaces.push(interface);
     outcome
+}
+
+/// What `if_filter` says: a text behind a 0, or instructions. Some writers leave out what tells which.
+fn filter(value: &[u8]) -> Option<String> {
+    let text = match value.split_first()? {
+        (0, text) => text,
+        (b' '.., _) => value,
+        _ => return Some("compiled".to_owned()),
+    };
+    Some(
+        String::from_utf8_lossy(text)
+            .trim_end_matches('\0')
+            .to_owned(),
+    )
 }
 
 /// Nanoseconds to a unit, as a fraction: `if_tsresol` holds a negative power of 10, or of 2 with its
@@ -290,6 +308,7 @@ fn packet(
         });
     }
     let mut direction = Direction::Unknown;
+    let mut is_damaged = false;
     let mut stamp_ns = None;
     // Between this packet and the one before; all ones where the writer did not know.
     let mut dropped_count = None;
@@ -302,13 +321,15 @@ fn packet(
             let value = body.part(value);
             match code {
                 2 => {
-                    direction = match value.u32(0).unwrap_or(0) & 3 {
+                    let flags = value.u32(0).unwrap_or(0);
+                    is_damaged = flags & DAMAGED != 0;
+                    direction = match flags & 3 {
                         1 => Direction::Inbound,
                         2 => Direction::Outbound,
                         _ => Direction::Unknown,
                     }
                 }
-                4 => dropped_count = value.u64(0),
+                4 => dropped_count = known(value.u64(0)),
                 _ => {}
             }
             Ok(())
@@ -325,8 +346,14 @@ fn packet(
         stamp_ns,
         original_bytes,
         direction,
+        is_damaged,
         data: 8 + header_bytes..8 + end,
     })
+}
+
+/// A count; all ones where the writer did not know it.
+fn known(count: Option<u64>) -> Option<u64> {
+    count.filter(|count| *count != u64::MAX)
 }
 
 fn statistics(
@@ -347,10 +374,10 @@ fn statistics(
             // 0 is not a time: the writer did not fill it in.
             (2, 8) => start = value.stamp(0).filter(|units| *units > 0),
             (3, 8) => end = value.stamp(0).filter(|units| *units > 0),
-            (4, 8) => interface.received_count = value.u64(0),
+            (4, 8) => interface.received_count = known(value.u64(0)),
             // isb_ifdrop, the only one that dumpcap writes, and isb_osdrop: no room was left.
-            (5, 8) => by_interface = value.u64(0),
-            (7, 8) => by_system = value.u64(0),
+            (5, 8) => by_interface = known(value.u64(0)),
+            (7, 8) => by_system = known(value.u64(0)),
             _ => {}
         }
         Ok(())

@@ -100,6 +100,7 @@ pub(super) struct Found {
     pub(super) stamp_ns: Option<i64>,
     pub(super) original_bytes: u32,
     pub(super) direction: Direction,
+    pub(super) is_damaged: bool,
     pub(super) data: Range<usize>,
 }
 
@@ -195,6 +196,7 @@ impl CaptureReader {
                         link_type: interface.link_type,
                         stamp_ns: found.stamp_ns,
                         original_bytes: found.original_bytes,
+                        is_damaged: found.is_damaged,
                         is_nic_stamped: interface.has_nic_clock(),
                         direction: found.direction,
                         data: &self.window.bytes()[found.data],

@@ -3,15 +3,18 @@
 //!
 //! A tap's stamps are taken in the order of the file. Where they jump back, or on by more than a day, a
 //! new *level* begins. A level of one or two stamps far from the others is a fault of single stamps: it is
-//! no time of watching. Between longer levels the clock was set, or parts of the file are out of order; two points
+//! no time of watching. So are one or two ahead of all around them, and one or two at the beginning or end,
+//! as far from the rest as none there lies from the next. Between longer levels the clock was set, or parts of the file are out of order; two points
 //! together tell which (see [`super::join`]).
 
-use std::collections::BTreeMap;
+use core::fmt;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
 
 use serde::{Deserialize, Serialize};
 
-use super::observe::Observation;
+use super::kept::surely_keeps;
+use super::observe::{Observation, Stream};
 use super::{CaptureInterface, Span};
 
 /// Farthest that a stamp may lie behind the one before it without being of another level: packets that
@@ -24,7 +27,13 @@ const SILENCE_MAX_NS: i64 = 86_400_000_000_000;
 /// A stamp before it, since 1970, is of a clock that was not set.
 const YEAR_NS: i64 = 365 * SILENCE_MAX_NS;
 /// Stamps that are no level of their own.
-const ISOLATED_MAX: u64 = 2;
+const ISOLATED_COUNT: usize = 2;
+const ISOLATED_MAX: u64 = ISOLATED_COUNT as u64;
+/// How much longer than any other the time is between the rest and a stamp far from it, and how long at least.
+const FAR_FACTOR: i64 = 100;
+const FAR_MIN_NS: i64 = 1_000_000_000;
+/// Times between stamps that tell what is far.
+const USUAL_COUNT_MIN: u64 = 5;
 /// Levels whose clock another point's is compared with.
 const ANCHOR_COUNT_MAX: usize = 4;
 /// How far the stated times of watching may leave out a packet.
@@ -41,6 +50,37 @@ pub struct Tap {
     pub is_esl: bool,
 }
 
+/// Which header numbers a protocol.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ProtocolSpace {
+    /// Of Ethernet.
+    EtherType,
+    /// Of IP.
+    Ip,
+    /// Of PPP.
+    Ppp,
+    /// Service access point of LLC.
+    Llc,
+    /// Organisation of SNAP.
+    Snap,
+    /// Address family of a BSD loopback.
+    AddressFamily,
+}
+
+impl fmt::Display for ProtocolSpace {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::EtherType => "EtherType",
+            Self::Ip => "IP protocol",
+            Self::Ppp => "PPP protocol",
+            Self::Llc => "LLC service",
+            Self::Snap => "SNAP organisation",
+            Self::AddressFamily => "address family",
+        })
+    }
+}
+
 /// Why it is unknown which datagrams a frame holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "why")]
@@ -49,6 +89,18 @@ pub enum Unread {
     LinkType {
         /// Its number.
         link_type: u16,
+    },
+    /// A protocol that is not read and may carry IP.
+    Protocol {
+        /// Whose number.
+        space: ProtocolSpace,
+        /// Its number.
+        number: u32,
+    },
+    /// Within UDP, in a tunnel that is not read.
+    Tunnel {
+        /// The port that tells.
+        port: u16,
     },
     /// Captured too short (snap length).
     CutShort,
@@ -80,9 +132,10 @@ struct Level {
     last_ns: i64,
     min_ns: i64,
     max_ns: i64,
-    /// Last and largest stamp before the newest.
-    before_ns: Option<(i64, i64)>,
+    /// Last and largest stamp before the newest, and before the one before it.
+    before_ns: [Option<(i64, i64)>; ISOLATED_COUNT],
     count: u64,
+    gaps: Gaps,
     /// How far its first stamp lies behind the one before.
     behind_ns: i64,
     /// The level before it.
@@ -91,7 +144,79 @@ struct Level {
     shift_ns: Option<i64>,
 }
 
+/// Times from one stamp of a level to the next.
+#[derive(Debug, Clone, Copy, Default)]
+struct Gaps {
+    /// The first, and the stamps behind them.
+    head: [Option<(i64, i64)>; ISOLATED_COUNT],
+    /// The newest, the last one first.
+    tail: [Option<i64>; ISOLATED_COUNT],
+    /// Of those between, the longest, and how many.
+    usual_max_ns: i64,
+    usual_count: u64,
+}
+
+impl Gaps {
+    fn take(&mut self, gap_ns: i64, at_ns: i64) {
+        if let Some(free) = self.head.iter_mut().find(|gap| gap.is_none()) {
+            *free = Some((gap_ns, at_ns));
+            return;
+        }
+        let [newest, older] = self.tail;
+        if let Some(usual_ns) = older {
+            self.usual_max_ns = self.usual_max_ns.max(usual_ns);
+            self.usual_count += 1;
+        }
+        self.tail = [Some(gap_ns), newest];
+    }
+
+    fn is_far(&self, gap_ns: i64) -> bool {
+        let usual_ns = self.usual_max_ns.saturating_mul(FAR_FACTOR);
+        self.usual_count >= USUAL_COUNT_MIN && gap_ns > usual_ns.max(FAR_MIN_NS)
+    }
+}
+
 impl Level {
+    fn begun(at_ns: i64, behind_ns: i64, previous: Option<usize>) -> Self {
+        Self {
+            first_ns: at_ns,
+            last_ns: at_ns,
+            min_ns: at_ns,
+            max_ns: at_ns,
+            before_ns: [None; _],
+            count: 1,
+            gaps: Gaps::default(),
+            behind_ns,
+            previous,
+            shift_ns: None,
+        }
+    }
+
+    fn take(&mut self, at_ns: i64) {
+        self.gaps.take(at_ns.saturating_sub(self.last_ns), at_ns);
+        let [newest, _] = self.before_ns;
+        self.before_ns = [Some((self.last_ns, self.max_ns)), newest];
+        self.last_ns = at_ns;
+        self.min_ns = self.min_ns.min(at_ns);
+        self.max_ns = self.max_ns.max(at_ns);
+        self.count += 1;
+    }
+
+    /// Leaves out stamps at either end that lie far from all others.
+    fn trim(&mut self) {
+        let gaps = self.gaps;
+        let head = gaps.head.iter().rev().flatten();
+        let mut head = head.filter(|(gap_ns, _)| gaps.is_far(*gap_ns));
+        if let Some((_, first_ns)) = head.next() {
+            (self.first_ns, self.min_ns) = (*first_ns, *first_ns);
+        }
+        let tail = gaps.tail.into_iter().zip(self.before_ns).rev();
+        let mut tail = tail.filter(|(gap_ns, _)| gap_ns.is_some_and(|gap_ns| gaps.is_far(gap_ns)));
+        if let Some((_, Some((last_ns, max_ns)))) = tail.next() {
+            (self.last_ns, self.max_ns) = (last_ns, max_ns);
+        }
+    }
+
     /// It begins so little behind the level before it that packets may have come late: none is isolated.
     fn is_late(&self) -> bool {
         (1..=LATE_MAX_NS).contains(&self.behind_ns)
@@ -117,8 +242,8 @@ pub struct Watch {
     pub unread: BTreeMap<Unread, u64>,
     /// Datagrams of a flow and two sockets of which too little was captured to know them again.
     cut: BTreeMap<(usize, SocketAddr, SocketAddr, Unread), u64>,
-    /// IP packets between two ends whose payload is encrypted.
-    sealed: BTreeMap<(IpAddr, IpAddr), u64>,
+    /// IP packets between two ends whose payload is encrypted, or a tunnel's that is not read.
+    sealed: BTreeMap<(IpAddr, IpAddr, Unread), u64>,
     /// Frames that it did not keep, as its file says.
     pub dropped_count: u64,
     /// Its file says that none was dropped.
@@ -127,6 +252,8 @@ pub struct Watch {
     pub unit_ns: i64,
     /// See [`CaptureInterface::is_merged`].
     pub is_merged: bool,
+    /// See [`CaptureInterface::filter`].
+    filters: BTreeSet<String>,
     /// The file says when it was watched.
     is_stated: bool,
 }
@@ -140,8 +267,8 @@ impl Watch {
         *self.cut.entry((flow, from, to, why)).or_default() += 1;
     }
 
-    pub(super) fn miss_sealed(&mut self, source: IpAddr, destination: IpAddr) {
-        *self.sealed.entry((source, destination)).or_default() += 1;
+    pub(super) fn miss_sealed(&mut self, source: IpAddr, destination: IpAddr, why: Unread) {
+        *self.sealed.entry((source, destination, why)).or_default() += 1;
     }
 
     /// Frames that may be of a flow between two sockets, and why they cannot be told. Encrypted packets between
@@ -154,9 +281,9 @@ impl Watch {
         is_seen: bool,
     ) -> BTreeMap<Unread, u64> {
         let mut unread = self.unread.clone();
-        for (ends, count) in &self.sealed {
-            if !is_seen || *ends == (source.ip(), destination.ip()) {
-                *unread.entry(Unread::Encrypted).or_default() += count;
+        for ((from, to, why), count) in &self.sealed {
+            if !is_seen || (*from, *to) == (source.ip(), destination.ip()) {
+                *unread.entry(*why).or_default() += count;
             }
         }
         for ((flow, from, to, why), count) in &self.cut {
@@ -165,6 +292,12 @@ impl Watch {
             }
         }
         unread
+    }
+
+    /// Filters with which it may not have kept all of a stream.
+    pub(super) fn filters_against(&self, stream: &Stream) -> impl Iterator<Item = &String> {
+        let filters = self.filters.iter();
+        filters.filter(|filter| !surely_keeps(filter, stream))
     }
 
     /// Takes the stamp of the next packet; true when it lies before the one before.
@@ -179,7 +312,7 @@ impl Watch {
             .levels
             .get(self.current)
             .is_some_and(|level| at_ns < level.last_ns);
-        self.pass_over_one_ahead(at_ns);
+        self.pass_over_those_ahead(at_ns);
         let current = self.levels.get(self.current);
         let next = current.and_then(|level| {
             let may_return = level.count <= ISOLATED_MAX && !level.is_late();
@@ -192,44 +325,44 @@ impl Watch {
         });
         if let Some(index) = next {
             self.current = index;
-            let level = &mut self.levels[index];
-            level.before_ns = Some((level.last_ns, level.max_ns));
-            level.last_ns = at_ns;
-            level.min_ns = level.min_ns.min(at_ns);
-            level.max_ns = level.max_ns.max(at_ns);
-            level.count += 1;
+            self.levels[index].take(at_ns);
         } else {
             let behind_ns = current.map_or(0, |level| level.last_ns.saturating_sub(at_ns));
             let previous = current.map(|_| self.current);
             self.current = self.levels.len();
-            self.levels.push(Level {
-                first_ns: at_ns,
-                last_ns: at_ns,
-                min_ns: at_ns,
-                max_ns: at_ns,
-                before_ns: None,
-                count: 1,
-                behind_ns,
-                previous,
-                shift_ns: None,
-            });
+            self.levels.push(Level::begun(at_ns, behind_ns, previous));
         }
         is_backward
     }
 
-    /// The newest stamp was a single one ahead, if the next goes on from the one before it.
-    fn pass_over_one_ahead(&mut self, at_ns: i64) {
+    /// The newest stamps were one or two ahead, if the next goes on from the one before them.
+    fn pass_over_those_ahead(&mut self, at_ns: i64) {
         let Some(level) = self.levels.get_mut(self.current) else {
             return;
         };
-        let Some((last_ns, max_ns)) = level.before_ns else {
-            return;
-        };
-        let goes_on = last_ns.saturating_sub(LATE_MAX_NS) <= at_ns;
-        if goes_on && at_ns < level.last_ns.saturating_sub(LATE_MAX_NS) {
-            self.ahead.insert((self.current, level.last_ns), last_ns);
-            (level.last_ns, level.max_ns, level.before_ns) = (last_ns, max_ns, None);
+        let late = |at_ns: i64| at_ns.saturating_sub(LATE_MAX_NS);
+        let mut ahead = Vec::new();
+        for before in level.before_ns {
+            let newest_ns = ahead
+                .last()
+                .map_or(level.last_ns, |(_, before_ns)| *before_ns);
+            let Some((last_ns, max_ns)) = before.filter(|_| at_ns < late(newest_ns)) else {
+                return;
+            };
+            ahead.push((newest_ns, last_ns));
+            if late(last_ns) <= at_ns {
+                let current = self.current;
+                let stamps = ahead.iter().map(|(at_ns, _)| ((current, *at_ns), last_ns));
+                self.ahead.extend(stamps);
+                (level.last_ns, level.max_ns, level.before_ns) = (last_ns, max_ns, [None; _]);
+                return;
+            }
         }
+    }
+
+    /// The newest stamp of all.
+    pub(super) fn last_ns(&self) -> Option<i64> {
+        self.levels.iter().map(|level| level.max_ns).max()
     }
 
     /// The level of the newest stamp.
@@ -239,6 +372,7 @@ impl Watch {
 
     /// Settles levels and times of watching, after the last packet of the file.
     pub(super) fn settle(&mut self, interface: Option<&CaptureInterface>) {
+        self.levels.iter_mut().for_each(Level::trim);
         let most = self.levels.iter().map(|level| level.count).max();
         let least = if most > Some(ISOLATED_MAX) {
             ISOLATED_MAX + 1
@@ -289,6 +423,8 @@ impl Watch {
         let (numerator, denominator) = interface.map_or((1, 1), |one| one.unit_ns);
         let unit_ns = numerator.div_ceil(denominator.max(1));
         self.unit_ns = i64::try_from(unit_ns).unwrap_or(i64::MAX);
+        let filter = interface.and_then(|one| one.filter.clone());
+        self.filters = filter.into_iter().collect();
         let stated = interface.and_then(|one| stated(one, stamps));
         self.is_stated = stated.is_some();
         let widen = |span: Option<Span>| match (span, stated) {
@@ -356,6 +492,7 @@ impl Watch {
             }
         }
         self.steps.extend(other.steps);
+        self.filters.extend(other.filters);
         for (why, count) in other.unread {
             *self.unread.entry(why).or_default() += count;
         }
@@ -365,7 +502,7 @@ impl Watch {
         for (of, count) in other.cut {
             *self.cut.entry(of).or_default() += count;
         }
-        self.dropped_count += other.dropped_count;
+        self.dropped_count = self.dropped_count.saturating_add(other.dropped_count);
         self.is_complete &= other.is_complete;
         self.unit_ns = self.unit_ns.max(other.unit_ns);
     }

@@ -129,7 +129,38 @@ impl Reading {
     /// True when a file has a fault or says that packets were dropped.
     pub(super) fn has_gaps(&self) -> bool {
         let is_bad = |file: &CaptureFile| file.fault_count > 0 || file.dropped_count() > Some(0);
-        self.files.iter().any(is_bad)
+        self.files.iter().any(is_bad) || self.observer.folded().next().is_some()
+    }
+
+    /// Says so when nothing was followed, and what there was.
+    pub(super) fn nothing_followed(&self) -> Option<String> {
+        /// Ports named.
+        const PORT_COUNT: usize = 5;
+        if self.observer.counts().followed_count > 0 {
+            return None;
+        }
+        let flows: Vec<String> = self
+            .observer
+            .flows()
+            .iter()
+            .map(ToString::to_string)
+            .collect();
+        let flows = flows.join(" or ");
+        let ports = self
+            .observer
+            .busiest_other_ports()
+            .into_iter()
+            .take(PORT_COUNT);
+        let ports = ports.map(|(port, count)| format!("{port} ({})", grouped(count)));
+        let ports: Vec<String> = ports.collect();
+        Some(if ports.is_empty() {
+            format!("no datagram of {flows} is known, nor is there UDP of other flows")
+        } else {
+            let ports = ports.join(", ");
+            format!(
+                "no datagram of {flows} is known; most UDP went to ports {ports}: try --flow udp:dport=PORT"
+            )
+        })
     }
 
     /// Every fault told and every gap, in words.
@@ -148,6 +179,12 @@ impl Reading {
                 ));
             }
         }
+        complaints.extend(self.observer.folded().map(|(point, _)| {
+            format!(
+                "{}: most datagrams are there twice: mergecap made one interface of several captures; merge                  them with `mergecap -I none`, or give both files",
+                self.name(point)
+            )
+        }));
         complaints
     }
 }
@@ -369,9 +406,17 @@ impl Report {
             ),
             (
                 counts.fragmented_count,
-                "first fragments: stamped when their first piece passed",
+                "in fragments: stamped when the first passed",
             ),
-            (counts.later_fragment_count, "later fragments, left out"),
+            (counts.later_fragment_count, "later fragments"),
+            (
+                counts.incomplete_count,
+                "of which fragments are missing, not counted as seen",
+            ),
+            (
+                counts.damaged_count,
+                "damaged (check sequence, length or symbols), not counted as seen",
+            ),
             (counts.stampless_count, "without a time stamp, left out"),
             (counts.radio_retry_count, "sent again by a radio, left out"),
             (
@@ -382,7 +427,10 @@ impl Report {
                 counts.backward_stamp_count,
                 "earlier than the one before, put in order",
             ),
-            (counts.esl_damaged_count, "damaged, says the ET2000"),
+            (
+                counts.esl_damaged_count,
+                "damaged, says the ET2000, not counted as seen",
+            ),
             (
                 counts.esl_port_unclear_count,
                 "for which the ET2000 names no or several ports",
@@ -619,6 +667,12 @@ fn doubts_text(doubts: &[CountedDoubt], clocks: PointClocks) -> String {
             Doubt::Unread(Unread::LinkType { link_type }) => {
                 format!("{count} of link type {link_type}, which is not read")
             }
+            Doubt::Unread(Unread::Protocol { space, number }) => {
+                format!("{count} of {space} {number:#06x}, which is not read")
+            }
+            Doubt::Unread(Unread::Tunnel { port }) => {
+                format!("{count} in a tunnel on UDP port {port}, which is not read")
+            }
             Doubt::Unread(Unread::CutShort) => format!("{count} captured too short"),
             Doubt::Unread(Unread::Fragmented) => format!("{count} in IP fragments"),
             Doubt::Unread(Unread::Malformed) => format!("{count} malformed"),
@@ -627,6 +681,12 @@ fn doubts_text(doubts: &[CountedDoubt], clocks: PointClocks) -> String {
                 format!("{count} hold several datagrams (segmentation or receive offload, A-MSDU)")
             }
             Doubt::Unread(Unread::NoStamp) => format!("{count} without a time stamp"),
+            Doubt::Filtered { filter } => {
+                format!("{count} may have been left out by the capture's filter `{filter}`")
+            }
+            Doubt::Pieces => {
+                format!("{count} in IP fragments of which the capture kept only the first")
+            }
             Doubt::Dropped => format!("{count} dropped by the capture"),
             Doubt::Apart => format!(
                 "{count} seen at both points farther apart than --window: a clock that was set, or clocks \

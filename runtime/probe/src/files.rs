@@ -39,7 +39,7 @@ impl CaptureFile {
     /// What the file says was dropped while it was made; `None` when it does not say.
     pub(super) fn dropped_count(&self) -> Option<u64> {
         let said = self.interfaces.iter().filter_map(|one| one.dropped_count);
-        said.reduce(|a, b| a + b)
+        said.reduce(u64::saturating_add)
     }
 }
 

@@ -168,12 +168,16 @@ fn analyse(
     if report.is_empty() && !complaints.is_empty() {
         return exit::USAGE;
     }
+    let nothing = captures.nothing_followed();
+    if let Some(words) = &nothing {
+        console.warn(words);
+    }
     console.result(&if reading.json {
         json(&report)
     } else {
         text(&report.sections())
     });
-    if captures.has_gaps() || report.has_doubts() {
+    if nothing.is_some() || captures.has_gaps() || report.has_doubts() {
         exit::GAPS
     } else {
         exit::DONE

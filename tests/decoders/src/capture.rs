@@ -192,6 +192,7 @@ pub(crate) fn frame(bytes: &[u8]) -> Verdict {
         link_type,
         stamp_ns: (original_bytes & 1 == 0).then_some(i64::from(original_bytes)),
         original_bytes,
+        is_damaged: false,
         is_nic_stamped: false,
         direction: Direction::Unknown,
         data: frame,

@@ -12,7 +12,7 @@ use hil_net::Direction;
 
 const REFERENCE: &[u8] = include_bytes!("cases/ref_a.pcap");
 
-fn take(observer: &mut Observer, file_index: usize, file: &[u8]) {
+pub(super) fn take(observer: &mut Observer, file_index: usize, file: &[u8]) {
     let mut reader = CaptureReader::default();
     reader.feed(file);
     reader.end();
@@ -29,11 +29,16 @@ fn take(observer: &mut Observer, file_index: usize, file: &[u8]) {
     observer.finish(file_index, reader.interfaces());
 }
 
-fn joins_of(first: &[u8], second: &[u8], is_one_clock: bool) -> Vec<JoinMetrics> {
+pub(super) fn joins_of(first: &[u8], second: &[u8], is_one_clock: bool) -> Vec<JoinMetrics> {
     joins_by("udp:dport=5004,id=0+4", first, second, is_one_clock)
 }
 
-fn joins_by(flow: &str, first: &[u8], second: &[u8], is_one_clock: bool) -> Vec<JoinMetrics> {
+pub(super) fn joins_by(
+    flow: &str,
+    first: &[u8],
+    second: &[u8],
+    is_one_clock: bool,
+) -> Vec<JoinMetrics> {
     let mut observer = Observer::new(&[flow.parse().unwrap()]);
     take(&mut observer, 0, first);
     take(&mut observer, 1, second);
@@ -52,11 +57,12 @@ fn beside_reference(second: &[u8]) -> JoinMetrics {
     joins.remove(0)
 }
 
-fn doubts(figures: &JoinMetrics) -> Vec<(Doubt, u64)> {
+pub(super) fn doubts(figures: &JoinMetrics) -> Vec<(Doubt, u64)> {
     match &figures.loss {
         Loss::Counted(_) => Vec::new(),
         Loss::Unavailable { doubts, .. } => {
-            doubts.iter().map(|one| (one.doubt, one.count)).collect()
+            let doubts = doubts.iter();
+            doubts.map(|one| (one.doubt.clone(), one.count)).collect()
         }
     }
 }
@@ -156,7 +162,7 @@ fn a_capture_on_any_is_told_apart_by_interface_and_packet_type() {
 }
 
 /// A pcap of Ethernet frames: microseconds since 1970, and the frame.
-fn pcap(packets: &[(i64, Vec<u8>)]) -> Vec<u8> {
+pub(super) fn pcap(packets: &[(i64, Vec<u8>)]) -> Vec<u8> {
     let mut file = REFERENCE[..24].to_vec();
     for (at_us, frame) in packets {
         let length = u32::try_from(frame.len()).unwrap();
@@ -174,23 +180,23 @@ fn pcap(packets: &[(i64, Vec<u8>)]) -> Vec<u8> {
     file
 }
 
-const BEGIN_US: i64 = 1_700_000_000_000_000;
+pub(super) const BEGIN_US: i64 = 1_700_000_000_000_000;
 
 /// Number `n` of the stream, so many bytes long.
-fn datagram(n: u32, bytes: usize) -> Vec<u8> {
+pub(super) fn datagram(n: u32, bytes: usize) -> Vec<u8> {
     let mut payload = n.to_be_bytes().to_vec();
     payload.resize(bytes, 7);
     udp_frame(5000, 5004, &payload)
 }
 
 /// Datagrams 0..100, a tenth of a second apart, without number 20 and as `at` says.
-fn second_point(at: impl Fn(i64) -> i64) -> Vec<u8> {
+pub(super) fn second_point(at: impl Fn(i64) -> i64) -> Vec<u8> {
     let numbers = (0..100).filter(|n| *n != 20);
     let packet = |n: i64| (at(n), datagram(u32::try_from(n).unwrap(), 32));
     pcap(&numbers.map(packet).collect::<Vec<_>>())
 }
 
-fn first_point() -> Vec<u8> {
+pub(super) fn first_point() -> Vec<u8> {
     let packet = |n: i64| {
         (
             BEGIN_US + 100_000 * n,
@@ -299,11 +305,11 @@ fn points_that_have_no_time_in_common_tell_no_loss() {
     let file = pcap(&fragments);
     let joins = joins_by("udp:dport=5004", &file, &file, true);
     let why = (Doubt::Unread(Unread::Fragmented), 10);
-    assert_eq!(doubts(&joins[0]), [why, why], "{joins:#?}");
+    assert_eq!(doubts(&joins[0]), [why.clone(), why], "{joins:#?}");
 }
 
 /// A pcapng of one interface and these blocks, by type and body.
-fn pcapng(blocks: &[(u32, Vec<u8>)]) -> Vec<u8> {
+pub(super) fn pcapng(blocks: &[(u32, Vec<u8>)]) -> Vec<u8> {
     let block = |kind: u32, body: &[u8]| {
         let length = u32::try_from(12 + body.len()).unwrap().to_le_bytes();
         [&kind.to_le_bytes()[..], &length, body, &length].concat()
@@ -324,7 +330,7 @@ fn pcapng(blocks: &[(u32, Vec<u8>)]) -> Vec<u8> {
 }
 
 /// An enhanced packet block's body, with options.
-fn enhanced(interface: u32, n: u32, options: &[u8]) -> Vec<u8> {
+pub(super) fn enhanced(interface: u32, n: u32, options: &[u8]) -> Vec<u8> {
     let at_us = (BEGIN_US + 100_000 * i64::from(n) + 1000).unsigned_abs();
     let mut frame = datagram(n, 32);
     let length = u32::try_from(frame.len()).unwrap();
@@ -541,9 +547,9 @@ fn an_aggregate_is_no_datagram() {
     let small = pcap(&small.collect::<Vec<_>>());
     for (first, second) in [(&large, &small), (&small, &large)] {
         let joins = joins_of(first, second, true);
-        let (why, count) = doubts(&joins[0])[0];
-        assert_eq!(why, Doubt::Unread(Unread::Aggregate));
-        assert!(count >= 10, "{joins:#?}");
+        let (why, count) = &doubts(&joins[0])[0];
+        assert_eq!(*why, Doubt::Unread(Unread::Aggregate));
+        assert!(*count >= 10, "{joins:#?}");
     }
     // Small ones, together smaller than a frame; known by number or by payload.
     let ten = |n: u32| {
@@ -560,8 +566,8 @@ fn an_aggregate_is_no_datagram() {
     for flow in ["udp:dport=5004,id=0+4", "udp:dport=5004"] {
         for (first, second) in [(&large, &small), (&small, &large)] {
             let joins = joins_by(flow, first, second, true);
-            let (why, _) = doubts(&joins[0])[0];
-            assert_eq!(why, Doubt::Unread(Unread::Aggregate), "{flow}: {joins:#?}");
+            let (why, _) = &doubts(&joins[0])[0];
+            assert_eq!(*why, Doubt::Unread(Unread::Aggregate), "{flow}: {joins:#?}");
         }
     }
     // A large one that was lost, and small ones that the first point missed and that are not its pieces.

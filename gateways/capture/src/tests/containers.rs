@@ -350,6 +350,7 @@ fn what_the_writer_wrote_reads_the_same() {
     let watch = read_back.watch[0].unwrap();
     assert_eq!(watch.last_ns, (stamp_ns + 5).cast_signed());
     assert_eq!(read_back.repeats, None);
+    assert_eq!(read_back.filter.as_deref(), Some("hil"));
     assert_eq!(
         (read_back.received_count, read_back.dropped_count),
         (Some(12), Some(2))

@@ -149,6 +149,7 @@ fn the_same_datagram_is_found_behind_every_link_layer() {
     let ends = NoDatagram::Sealed {
         source: "10.77.0.1".parse().unwrap(),
         destination: "10.77.0.2".parse().unwrap(),
+        why: Unread::Encrypted,
     };
     assert_eq!(sealed, Err(ends));
     let mut sealed = qos.clone();
@@ -224,10 +225,14 @@ fn options_fragments_and_extension_headers_are_followed_or_told() {
 
     let mut first = frame.clone();
     first[20] = 0x20;
-    assert!(udp_datagram(1, &first).unwrap().is_fragmented);
+    assert!(udp_datagram(1, &first).unwrap().is_fragmented());
     let mut later = frame.clone();
     later[21] = 9;
-    assert_eq!(udp_datagram(1, &later), Err(NoDatagram::LaterFragment));
+    let Err(NoDatagram::LaterFragment(Some(piece))) = udp_datagram(1, &later) else {
+        panic!("{:?}", udp_datagram(1, &later))
+    };
+    let told = (piece.number, piece.from_bytes, piece.bytes, piece.is_last);
+    assert_eq!(told, (1, 72, 15, true));
     let mut other = frame.clone();
     other[23] = 6;
     assert_eq!(udp_datagram(1, &other), Err(NoDatagram::NotUdp));
@@ -297,6 +302,13 @@ fn flows_are_written_as_they_are_read_and_nonsense_is_refused_by_name() {
         FlowError::Condition("id=1+1".to_owned())
     );
     assert_eq!(refusal("udp:src=10.0.0.1,dst=::1"), FlowError::Families);
+    for (text, key) in [
+        ("udp:dport=5004,dport=5005", "dport"),
+        ("udp:dport=1,id=0+4,id=2+2", "id"),
+        ("hil:src=::1,src=::1", "src"),
+    ] {
+        assert_eq!(refusal(text), FlowError::Repeated(key.to_owned()));
+    }
     for text in [
         "udp:port=0",
         "udp:port=65536",

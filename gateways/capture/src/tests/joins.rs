@@ -26,7 +26,9 @@ fn observation(stamp_ns: i64, number: u64) -> Observation {
         hop_limit: 64,
         station: [0; 6],
         is_of_any: false,
+        radio_number: None,
         has_copy: false,
+        lacks_pieces: false,
         identity: DatagramIdentity {
             key: number.wrapping_mul(0x9e37_79b9_7f4a_7c15),
             number: Some(Numbered {
@@ -309,6 +311,7 @@ fn observer_of(packets: &[(usize, Direction, i64, u16)], host: u8) -> Observer {
                 link_type: link_type::ETHERNET,
                 stamp_ns: Some(*stamp_ns),
                 original_bytes: u32::try_from(data.len()).unwrap(),
+                is_damaged: false,
                 is_nic_stamped: false,
                 direction: *direction,
                 data: &data,

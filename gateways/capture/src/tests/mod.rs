@@ -1,10 +1,12 @@
 //! Tests of the capture decoders: files made byte by byte and figures of flows
 //! whose truth is known.
 
+mod carried;
 mod cases;
 mod containers;
 mod frames;
 mod joins;
+mod limits;
 mod programs;
 
 use super::reader::{CaptureReader, Step};
