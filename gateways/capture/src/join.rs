@@ -331,11 +331,15 @@ impl<'a> Side<'a> {
 
     /// To how many nanoseconds its stamps are whole: as its file says, or coarser where many of them are equal.
     fn unit_ns(&self) -> i64 {
-        let neighbours = self.at_ns.windows(2);
+        // One that is not sound has a neighbour's.
+        let sound = self.seen.iter().zip(&self.at_ns);
+        let sound = sound.filter_map(|(one, at_ns)| one.is_stamp_sound.then_some(*at_ns));
+        let sound: Vec<i64> = sound.collect();
+        let neighbours = sound.windows(2);
         let on_ns = neighbours.map(|pair| pair[1].saturating_sub(pair[0]));
         let equal_count = on_ns.clone().filter(|on_ns| *on_ns == 0).count();
         let stated_ns = self.sight.watch.unit_ns.max(1);
-        if EQUAL_SHARE * equal_count < self.at_ns.len() {
+        if EQUAL_SHARE * equal_count < sound.len() {
             return stated_ns;
         }
         let common = on_ns.fold(0, |a, b| {
@@ -581,7 +585,8 @@ impl Matches {
         }
         let mut near = Self::of(first, second, median(&delays), lap_ns / 2);
         near.is_ambiguous = width(&near.delays(first, second)) > lap_ns / 4
-            || 10 * near.pairs.len() < 9 * matches.pairs.len();
+            || 10 * near.pairs.len() < 9 * matches.pairs.len()
+            || near.apart_count > 0;
         near
     }
 

@@ -809,8 +809,8 @@ fn each_change_of_the_level_is_told_and_withdraws_delays_and_stamps_tell_no_orde
         )
     });
     let figures = &joins_of(&sent_50(), &pcap(&zero.collect::<Vec<_>>()), true)[0];
-    let told = (figures.first_count, figures.loss.count());
-    assert_eq!(told, (50, Some(1)), "{figures:#?}");
+    let told = (figures.order, figures.first_count, figures.loss.count());
+    assert_eq!(told, (OrderSource::Stamps, 50, Some(1)), "{figures:#?}");
 }
 
 #[test]
