@@ -5,6 +5,7 @@
 //! together; checksums are not checked, since a capture on the sending host sees them unfinished. A
 //! length of 0 in an IP or UDP header (segmentation offload, jumbograms) means: up to the frame's end.
 
+use core::ops::ControlFlow;
 use std::net::{IpAddr, SocketAddr};
 
 use super::bytes::array_at;
@@ -309,8 +310,8 @@ impl<'a> Walk<'a> {
                 Layer::Mpls => self.mpls()?,
                 Layer::Gre => self.gre()?,
                 Layer::Ip => match self.ip()? {
-                    Inside::Layer(layer) => layer,
-                    Inside::Datagram(datagram) => return Ok(datagram),
+                    ControlFlow::Continue(layer) => layer,
+                    ControlFlow::Break(datagram) => return Ok(datagram),
                 },
             };
         }
@@ -640,7 +641,8 @@ impl<'a> Walk<'a> {
         Ok(Layer::Llc)
     }
 
-    fn ip(&mut self) -> Result<Inside<'a>, NoDatagram> {
+    /// The datagram, or what else is in an IP packet.
+    fn ip(&mut self) -> Result<ControlFlow<UdpDatagram<'a>, Layer>, NoDatagram> {
         let packet = self.frame.get(self.at..).unwrap_or_default();
         let original_bytes = self.original_bytes.saturating_sub(self.at);
         let is_cut = packet.len() < original_bytes;
@@ -681,7 +683,7 @@ impl<'a> Walk<'a> {
                 return Err(NoDatagram::Unread(Unread::Fragmented));
             }
             self.at += network.header_bytes + more_bytes;
-            return Ok(Inside::Layer(layer));
+            return Ok(ControlFlow::Continue(layer));
         }
         let header: [u8; 8] = array_at(network.segment, 0).ok_or_else(|| short(CUT_SHORT))?;
         let word = |at: usize| u16::from_be_bytes([header[at], header[at + 1]]);
@@ -694,7 +696,7 @@ impl<'a> Walk<'a> {
             return Err(MALFORMED);
         }
         let end = length_bytes.min(network.segment.len());
-        Ok(Inside::Datagram(UdpDatagram {
+        Ok(ControlFlow::Break(UdpDatagram {
             source: SocketAddr::new(network.source, word(0)),
             destination: SocketAddr::new(network.destination, word(2)),
             dscp: network.dscp,
@@ -712,12 +714,6 @@ impl<'a> Walk<'a> {
             }),
         }))
     }
-}
-
-/// What is in an IP packet.
-enum Inside<'a> {
-    Layer(Layer),
-    Datagram(UdpDatagram<'a>),
 }
 
 /// What a cooked capture numbers as `EtherType`, or by numbers of Linux: LLC, and links without IP (CAN, for instance).

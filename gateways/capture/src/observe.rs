@@ -95,6 +95,10 @@ impl Stream {
 
 /// A datagram seen at a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is a statement of its own, and any of them may hold"
+)]
 pub struct Observation {
     /// When, nanoseconds on the point's clock; of a neighbour in the file when it is not sound.
     pub stamp_ns: i64,

@@ -7,6 +7,9 @@ use super::cases::{BEGIN_US, datagram, doubts, first_point, joins_of, pcap};
 
 const ENDS: [u8; 8] = [192, 0, 2, 1, 192, 0, 2, 2];
 
+/// The frame that carries a datagram, by its number.
+type Frames<'a> = &'a dyn Fn(u32) -> Vec<u8>;
+
 fn at_us(n: u32) -> i64 {
     BEGIN_US + 100_000 * i64::from(n) + 1000
 }
@@ -51,7 +54,7 @@ fn datagrams_in_tunnels_that_are_read_are_the_stream() {
     let bare = |n: u32| datagram(n, 32)[14..].to_vec();
     let whole = |n: u32| datagram(n, 32);
     let network_id = [8, 0, 0, 0, 0, 0, 7, 0];
-    let frames: [(&str, &dyn Fn(u32) -> Vec<u8>); 13] = [
+    let frames: [(&str, Frames<'_>); 13] = [
         ("VXLAN", &|n| udp(9, 4789, &behind(&network_id, &whole(n)))),
         ("VXLAN of Linux", &|n| {
             udp(9, 8472, &behind(&network_id, &whole(n)))
@@ -117,7 +120,7 @@ fn datagrams_in_what_is_not_read_make_loss_unavailable_by_name() {
     let bare = |n: u32| datagram(n, 32)[14..].to_vec();
     let whole = |n: u32| datagram(n, 32);
     let protocol = |space, number| Unread::Protocol { space, number };
-    let frames: [(u8, Unread, &dyn Fn(u32) -> Vec<u8>); 16] = [
+    let frames: [(u8, Unread, Frames<'_>); 16] = [
         (1, Unread::Encrypted, &|n| {
             udp(4500, 4500, &behind(&[0, 0, 0x12, 0x34], &whole(n)))
         }),
@@ -149,7 +152,7 @@ fn datagrams_in_what_is_not_read_make_loss_unavailable_by_name() {
         (1, protocol(Llc, 0x9a), &|n| {
             ethernet(60, &behind(&[0x9a, 0x9a, 3], &bare(n)))
         }),
-        (1, protocol(Snap, 0x0080c2), &|n| {
+        (1, protocol(Snap, 0x80c2), &|n| {
             let inner = behind(&[0xaa, 0xaa, 3, 0, 0x80, 0xc2, 0, 7], &whole(n));
             ethernet(u16::try_from(inner.len()).unwrap(), &inner)
         }),
