@@ -151,10 +151,10 @@ pub struct NetworkMetrics {
     pub duplicated_count: Option<u64>,
     /// Messages per second handed to the network, from the first to the last of them.
     pub offered_per_s: Option<f64>,
-    /// Messages per second received, from the first reception to the last, on the receiver's clock;
-    /// `None` below two, and without the receiving gateway's records.
+    /// Of these, messages per second that were received, over the same time: what was lost at its end lowers this rate
+    /// as well. `None` below two that were handed over.
     pub arrived_per_s: Option<f64>,
-    /// Payload bytes per second received over that time, without any header.
+    /// Payload bytes per second of these, without any header.
     pub arrived_bytes_per_s: Option<f64>,
     /// Handed to the kernel to received by the other gateway.
     pub delay: Metric<DelayMetrics>,
@@ -184,8 +184,9 @@ impl NetworkMetrics {
             )
         };
         let offered = passages.each().filter(on_network);
-        let arrived = passages.each().filter(is_arrived);
-        let arrived_per_s = rate(arrived.filter_map(|one| Some((one.received_ns?, one.count))));
+        let offered_per_s = rate(offered.filter_map(|one| Some((one.offered_ns?, one.count))));
+        let arrived_ratio = counts.arrived as f64 / offered_count as f64;
+        let arrived_per_s = offered_per_s.map(|per_s| per_s * arrived_ratio);
         let mut round_trip = LatencyHistogram::default();
         for round_trip_ns in context.round_trips_ns {
             round_trip.record(*round_trip_ns);
@@ -198,7 +199,7 @@ impl NetworkMetrics {
             unknown_count: counts.unknown + counts.doubtful,
             doubtful_count: counts.doubtful,
             duplicated_count: context.duplicated_count,
-            offered_per_s: rate(offered.filter_map(|one| Some((one.offered_ns?, one.count)))),
+            offered_per_s,
             arrived_per_s,
             arrived_bytes_per_s: context
                 .payload_bytes

@@ -515,7 +515,7 @@ fn network(sources: &Sources<'_>) -> Vec<Metric> {
         ),
         (
             "arrived_rate",
-            "messages received",
+            "of these, received",
             "1/s",
             network.arrived_per_s,
         ),
