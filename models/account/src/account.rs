@@ -80,7 +80,7 @@ impl<'a> AccountFold<'a> {
             "every published message has exactly one fate"
         );
         let (at_hand, context) = (self.at_hand, self.context);
-        let (gaps, gap_of_interruption) = self.gaps.finish(at_hand.taken);
+        let (gaps, gap_of_interruption) = self.gaps.finish(at_hand);
         let costs = self.lost_counts.iter().zip(gap_of_interruption);
         let interruptions = context.interruptions.iter().zip(costs);
         ChannelAccount {

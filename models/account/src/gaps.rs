@@ -1,11 +1,12 @@
-//! Losses in a row, and silences at the consumer with what caused them. It does not judge single
+//! Losses in a row, silences at the consumer with what caused them, and those of the producer. It does not judge single
 //! messages: see [`super::fate`].
 
 use core::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 
+use super::fold::RecordsAtHand;
 use super::history::MessageHistory;
-use super::metrics::{BurstCount, Gap, Gaps};
+use super::metrics::{BurstCount, Gap, Gaps, ProducerSilence};
 use super::stage::Side;
 use super::{AccountContext, Interruption, RunSpan};
 use hil_core::record::stamp;
@@ -64,11 +65,72 @@ struct TakenAt {
     next_published_ns: Option<i64>,
 }
 
+/// A publication that the producer recorded.
+#[derive(Debug, Clone, Copy)]
+struct PublishedAt {
+    published_ns: i64,
+    sequence: u64,
+}
+
+/// Finds the longest time in which the producer published nothing.
+#[derive(Debug, Default)]
+struct ProducerFold {
+    /// The newest message; `None` where its record is missing.
+    last: Option<PublishedAt>,
+    periods: LatencyHistogram,
+    /// The longest period and the publication before it.
+    longest: Option<(i64, PublishedAt)>,
+}
+
+impl ProducerFold {
+    fn count(&mut self, message: &MessageHistory) {
+        let published_ns = message.published.and_then(|one| stamp(one.published_ns));
+        // While records are missing it may have published anything.
+        let now = published_ns.map(|published_ns| PublishedAt {
+            published_ns,
+            sequence: message.key.sequence,
+        });
+        if let (Some(before), Some(now)) = (self.last, now) {
+            let period_ns = now.published_ns.saturating_sub(before.published_ns);
+            self.periods.record(period_ns);
+            if self
+                .longest
+                .is_none_or(|(known_ns, _)| known_ns < period_ns)
+            {
+                self.longest = Some((period_ns, before));
+            }
+        }
+        self.last = now;
+    }
+
+    fn finish(self, run: Option<RunSpan>) -> Option<ProducerSilence> {
+        let period_p90_ns = self.periods.quantile(0.9)?;
+        let longest = self.longest?;
+        let tail = self.last.zip(run).map(|(last, run)| {
+            let tail_ns = run.end.as_ns().saturating_sub(last.published_ns);
+            (tail_ns, last)
+        });
+        let tail = tail.filter(|(tail_ns, _)| *tail_ns > longest.0);
+        let (length_ns, after) = tail.unwrap_or(longest);
+        let start_ns = run.map_or(0, |run| run.start.as_ns());
+        Some(ProducerSilence {
+            start_ns: after.published_ns.saturating_sub(start_ns),
+            length_ns,
+            after_sequence: after.sequence,
+            is_open: tail.is_some(),
+            period_p90_ns,
+            period_count: self.periods.count(),
+        })
+    }
+}
+
 /// Collects the silences between taken messages, and for each interruption the longest it overlaps.
 #[derive(Debug)]
 pub(super) struct GapFold<'a> {
     interruptions: &'a [Interruption],
     run: Option<RunSpan>,
+    producer_run: Option<RunSpan>,
+    producer: ProducerFold,
     /// The newest one and the rank of its start, until the message after it is seen.
     held: Option<(u32, TakenAt)>,
     window: BinaryHeap<Reverse<TakenAt>>,
@@ -84,6 +146,8 @@ impl<'a> GapFold<'a> {
         Self {
             interruptions: context.interruptions,
             run: context.consumer_run,
+            producer_run: context.producer_run,
+            producer: ProducerFold::default(),
             held: None,
             window: BinaryHeap::new(),
             last: None,
@@ -95,6 +159,7 @@ impl<'a> GapFold<'a> {
     }
 
     pub(super) fn count(&mut self, message: &MessageHistory) {
+        self.producer.count(message);
         let epoch_rank = message.key.epoch_rank;
         if let Some((held_rank, mut held)) = self.held.take() {
             held.next_published_ns = message.published_ns().filter(|_| held_rank == epoch_rank);
@@ -148,13 +213,13 @@ impl<'a> GapFold<'a> {
     }
 
     /// The silences, and by interruption the longest it overlaps.
-    pub(super) fn finish(mut self, has_records: bool) -> (Gaps, Vec<Option<Gap>>) {
+    pub(super) fn finish(mut self, at_hand: RecordsAtHand) -> (Gaps, Vec<Option<Gap>>) {
         self.window
             .extend(self.held.take().map(|(_, held)| Reverse(held)));
         while self.close_next() {}
         let run = self.run;
         let tail_ns = |last: TakenAt| Some(run?.end.as_ns().saturating_sub(last.taken_ns));
-        let reason = if has_records {
+        let reason = if at_hand.taken {
             "fewer than two messages were taken"
         } else {
             "the consumer's records are not at hand"
@@ -164,6 +229,7 @@ impl<'a> GapFold<'a> {
             longest: self.longest,
             longest_unattributed: self.longest_unattributed,
             last_taken_to_run_end_ns: self.last.and_then(tail_ns),
+            producer: self.producer.finish(self.producer_run),
         };
         (gaps, self.of_interruption)
     }

@@ -49,7 +49,7 @@ pub use fold::{
 pub use history::{Copies, Key, MessageHistory};
 pub use metrics::{
     BurstCount, ChannelAccount, Closing, ClosingMetrics, Coverage, EndToEnd, FateCounts, Gap, Gaps,
-    InterruptionMetrics, SegmentMetrics, StampCoverage,
+    InterruptionMetrics, ProducerSilence, SegmentMetrics, StampCoverage,
 };
 pub use no_room::NoRoom;
 pub use outage::{

@@ -249,6 +249,40 @@ pub struct Gaps {
     /// From the last taken message to the end of the run, nanoseconds; `None` when either is
     /// unknown.
     pub last_taken_to_run_end_ns: Option<i64>,
+    /// The longest time in which the producer published nothing, which is in none of the above; `None` without the
+    /// producer's records, and below two messages.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub producer: Option<ProducerSilence>,
+}
+
+/// The longest time between two publications of one channel, or from the last one to the end of the run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ProducerSilence {
+    /// Start, nanoseconds after the start of the run, or on the producer's clock when that is unknown.
+    pub start_ns: i64,
+    /// Length, nanoseconds.
+    pub length_ns: i64,
+    /// Sequence number of the last message before.
+    pub after_sequence: u64,
+    /// True when nothing came until the end of the run.
+    pub is_open: bool,
+    /// How far apart publications were at most in nine of ten cases, nanoseconds.
+    pub period_p90_ns: i64,
+    /// How many times between two publications that rests on.
+    pub period_count: u64,
+}
+
+impl ProducerSilence {
+    /// Of fewer periods nothing is said of how regular a producer is.
+    const PERIODS_MIN: u64 = 10;
+    /// A silence of more periods is no jitter.
+    const PERIODS_LONG: i64 = 10;
+
+    /// True when it is out of all proportion to the time that is usual between publications of the channel.
+    pub const fn is_long(&self) -> bool {
+        self.period_count >= Self::PERIODS_MIN
+            && self.length_ns > self.period_p90_ns.saturating_mul(Self::PERIODS_LONG)
+    }
 }
 
 /// A time at the consumer in which a message was due: from when the one after the last would have come with the

@@ -232,6 +232,69 @@ fn a_gap_begins_when_a_message_was_due_and_not_while_its_producer_was_idle() {
     assert!(between.max_ns > 4_900 * MS, "{between:?}");
 }
 
+/// A message every 10 ms but for `pause_ms` after the hundredth, taken at once; the run ends after 6 s.
+fn paused(pause_ms: i64, count: u64) -> Gaps {
+    let mut files = Files::default();
+    for sequence in 0..count {
+        let pause_ms = if sequence < 100 { 0 } else { pause_ms };
+        let written = Written {
+            epoch: 1,
+            sequence,
+            published_ns: (sequence.cast_signed() * 10 + pause_ms) * MS,
+        };
+        files.write(written, MessageFate::Taken);
+    }
+    account(&files.records(), &same_clock(6_000 * MS)).gaps
+}
+
+#[test]
+fn the_silence_of_a_producer_is_told_apart_from_that_of_the_way() {
+    let gaps = paused(2_000, 300);
+    assert_eq!(gaps.longest.unwrap().length_ns, 0, "nothing was due");
+    let silence = gaps.producer.unwrap();
+    assert_near(silence.period_p90_ns, 10 * MS);
+    // Message 99 left at 990 ms, message 100 at 1000 ms and the pause.
+    let expected = ProducerSilence {
+        start_ns: 990 * MS,
+        length_ns: 2_010 * MS,
+        after_sequence: 99,
+        is_open: false,
+        period_p90_ns: silence.period_p90_ns,
+        period_count: 299,
+    };
+    assert_eq!(silence, expected);
+    assert!(silence.is_long());
+}
+
+#[test]
+fn a_producer_that_stops_is_silent_until_the_end_of_the_run() {
+    let silence = paused(0, 100).producer.unwrap();
+    assert_eq!(
+        (silence.start_ns, silence.length_ns),
+        (990 * MS, 5_010 * MS)
+    );
+    assert_eq!((silence.after_sequence, silence.is_open), (99, true));
+    assert!(silence.is_long());
+    let to_the_end = paused(0, 600).producer.unwrap();
+    assert_eq!(to_the_end.length_ns, 10 * MS);
+    assert!(!to_the_end.is_long());
+}
+
+#[test]
+fn of_a_producer_whose_records_are_missing_no_silence_is_told() {
+    let mut files = Files::delivered(100);
+    files.published.drain(50..60);
+    let gaps = account(&files.records(), &same_clock(100 * PERIOD_NS)).gaps;
+    let silence = gaps.producer.unwrap();
+    assert_eq!((silence.length_ns, silence.period_count), (PERIOD_NS, 88));
+    let records = ChannelRecords {
+        published: None,
+        ..files.records()
+    };
+    let gaps = account(&records, &same_clock(100 * PERIOD_NS)).gaps;
+    assert_eq!(gaps.producer, None);
+}
+
 #[test]
 fn duplicates_and_reordering_are_counted_beside_the_fates() {
     let mut files = Files::delivered(100);

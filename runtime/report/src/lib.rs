@@ -15,6 +15,7 @@ pub(crate) mod event_log;
 pub mod link_change;
 pub mod network;
 pub mod nic_metrics;
+mod own_programs;
 pub mod page;
 pub mod radio;
 pub mod replay;

@@ -380,6 +380,7 @@ fn account(counts: &ChannelCounts) -> ChannelAccount {
             longest: None,
             longest_unattributed: None,
             last_taken_to_run_end_ns: None,
+            producer: None,
         },
         interruptions: Vec::new(),
     }

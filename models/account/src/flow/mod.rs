@@ -18,9 +18,9 @@ use hil_stats::histogram::Distribution;
 use hil_stats::reordering::reordered;
 use serde::{Deserialize, Serialize};
 
-use crate::ChannelPath;
 use crate::history::MessageHistory;
 use crate::stage::MessageFate;
+use crate::{AccountContext, PathProcess};
 
 /// Flows of a channel that are told apart; what comes later is one.
 pub const FLOWS_MAX: usize = 10_000;
@@ -429,7 +429,8 @@ impl<'a> FlowFold<'a> {
     }
 
     /// Takes the fate of a frame.
-    pub fn add(&mut self, message: &MessageHistory, path: ChannelPath<'_>) {
+    pub fn add(&mut self, message: &MessageHistory, context: &AccountContext<'_>) {
+        let path = context.path;
         let frames = self
             .frames
             .get(&message.epoch)
@@ -439,7 +440,15 @@ impl<'a> FlowFold<'a> {
             Ok(place) => frames[place].1,
             Err(_) => self.index_of(FlowKey::Unrecorded),
         };
-        let place = place_of(message.fate);
+        // What a program would have made of a frame that came after its end, nobody knows.
+        let interruption = message
+            .interruption_index
+            .and_then(|index| context.interruptions.get(index));
+        let is_after_end = interruption.is_some_and(|one| one.place == PathProcess::Consumer);
+        let place = match message.fate {
+            MessageFate::LostInInterruption if is_after_end => NOT_KNOWN,
+            fate => place_of(fate),
+        };
         let keyed = &mut self.keyed[index as usize];
         if let (Some(passages), Some(sent_ns)) = (&mut keyed.passages, message.published_ns()) {
             let given_ns = message.taken.and_then(|record| stamp(record.taken_ns));
@@ -504,8 +513,9 @@ impl<'a> FlowFold<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::synthetic::{Files, TAKEN_NS, at, same_clock};
-    use crate::{AccountContext, each_history};
+    use crate::synthetic::{Files, PERIOD_NS, TAKEN_NS, at, same_clock};
+    use crate::{ChannelPath, Interruption, each_history};
+    use hil_core::time::Instant;
 
     /// An Ethernet frame of this type with this packet in it.
     fn frame(kind: &[u8], packet: &[u8]) -> Vec<u8> {
@@ -589,7 +599,7 @@ mod tests {
         }
         let context = same_clock(1_000_000_000);
         each_history(&files.records(), &context, |one| {
-            fold.add(one, context.path);
+            fold.add(one, &context);
         });
         let (flows, _) = fold.finish();
         let [echoes, arp, unrecorded] = &flows[..] else {
@@ -612,6 +622,53 @@ mod tests {
     }
 
     #[test]
+    fn what_came_after_the_end_of_the_receiving_program_is_unknown_and_in_a_gateway_down_it_is_the_harness()
+     {
+        for (place, lost, expected) in [
+            (
+                PathProcess::Consumer,
+                MessageFate::SupersededAtConsumer,
+                [6, 0, 0, 4],
+            ),
+            (
+                PathProcess::ReceivingGateway,
+                MessageFate::LostOnWire,
+                [6, 0, 4, 0],
+            ),
+        ] {
+            let mut files = Files::default();
+            let mut fold = FlowFold::default();
+            for sequence in 0..10_u64 {
+                let fate = if sequence < 6 {
+                    MessageFate::Taken
+                } else {
+                    lost
+                };
+                files.write(at(7, sequence), fate);
+                let bytes = frame(&[8, 0], &packet(1, 0, &[0; 20]));
+                fold.add_frame(&FrameRecord::new(sequence, at(7, sequence).epoch, &bytes));
+            }
+            let interruptions = [Interruption {
+                process: "second".to_owned(),
+                place,
+                from: Instant::from_ns(6 * PERIOD_NS - 1),
+                until: Instant::from_ns(10 * PERIOD_NS),
+                cause: "killed by SIGSEGV".to_owned(),
+            }];
+            let context = same_clock(1_000 * PERIOD_NS).with_interruptions(&interruptions);
+            each_history(&files.records(), &context, |one| fold.add(one, &context));
+            let (flows, _) = fold.finish();
+            let counts = [
+                flows[0].taken_count,
+                flows[0].lost_by_network_count,
+                flows[0].lost_by_harness_count,
+                flows[0].unknown_count,
+            ];
+            assert_eq!(counts, expected, "{place:?}");
+        }
+    }
+
+    #[test]
     fn order_is_that_of_the_flow_and_not_of_the_channel() {
         let mut fold = FlowFold::default();
         let mut files = Files::default();
@@ -628,7 +685,7 @@ mod tests {
         }
         let context = same_clock(1_000_000_000);
         each_history(&files.records(), &context, |one| {
-            fold.add(one, context.path);
+            fold.add(one, &context);
         });
         let (flows, _) = fold.finish();
         let counts = |name: &str| {
@@ -673,7 +730,7 @@ mod tests {
         }
         let context = same_clock(1_000_000_000);
         each_history(&files.records(), &context, |one| {
-            fold.add(one, context.path);
+            fold.add(one, &context);
         });
         let (flows, _) = fold.finish();
         assert_eq!((flows.len(), flows[0].retransmitted_count), (1, Some(2)));
@@ -701,7 +758,7 @@ mod tests {
         }
         let context = same_clock(1_000_000_000);
         each_history(&files.records(), &context, |one| {
-            fold.add(one, context.path);
+            fold.add(one, &context);
         });
         let (flows, passages) = fold.finish();
         let command = flows.iter().find(|flow| flow.name == "command").unwrap();

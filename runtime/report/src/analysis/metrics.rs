@@ -204,7 +204,7 @@ impl ChannelReading {
                 account.add(message);
                 outages.add(message);
                 radio.add(message);
-                flows.add(message, context.path);
+                flows.add(message, context);
             });
             let (flows, passages) = flows.finish();
             Self {

@@ -40,10 +40,10 @@ use outages::OutageHistory;
 use records::RunRecords;
 
 use crate::answer::HarmCount;
-use crate::event_log;
 use crate::summary::{ChannelFlows, CountByName, Fact, RunSummary, SummaryError};
 use crate::terminal;
 use crate::trace::capture;
+use crate::{event_log, own_programs};
 use hil_platform::text::grouped;
 use hil_rundir::file_fault::FileFault;
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
@@ -381,6 +381,17 @@ fn add_warnings(summary: &mut RunSummary, records: &RunRecords<'_>) {
             ));
         }
     }
+    summary
+        .warnings
+        .extend(own_programs::witness_warnings(result));
+    let channels = records.topology.channels().iter().zip(&summary.channels);
+    let silent = channels.filter_map(|(channel, of)| {
+        let program = records.topology.process(&channel.from)?;
+        let account = of.account.as_ref().filter(|_| program.is_witnessed())?;
+        own_programs::silence_warning(&channel.name, &channel.from, account)
+    });
+    let silent: Vec<String> = silent.collect();
+    summary.warnings.extend(silent);
     for one in &summary.flows {
         if one.inlet_lost_count() > 0 {
             let lost = one.inlet_lost.iter();

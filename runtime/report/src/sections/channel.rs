@@ -9,7 +9,7 @@ use hil_account::network::{
 };
 use hil_account::{
     BurstCount, ChannelAccount, Closing, ClosingMetrics, Coverage, Gap, LongestOutage, MessageFate,
-    OutageClass, OutageMetrics, SegmentMetrics,
+    OutageClass, OutageMetrics, ProducerSilence, SegmentMetrics,
 };
 use hil_core::interval::Spread;
 use hil_rundir::event::ProcessKind;
@@ -23,6 +23,7 @@ use hil_rundir::pipe::StallMetrics;
 
 use super::{clocks, radio};
 use crate::emulation::EmulationMetrics;
+use crate::own_programs::silence_words;
 use crate::summary::{ChannelSummary, LinkKind, RunSummary};
 use crate::trace_counts::replay_words;
 
@@ -211,6 +212,9 @@ fn facts(section: &mut Section, account: &ChannelAccount) {
     {
         let text = format!("otherwise {}", gap_words(account, other));
         section.fact("", Tone::Plain, text);
+    }
+    if let Some(silence) = gaps.producer.filter(ProducerSilence::is_long) {
+        section.fact("producer silent", Tone::Caution, silence_words(&silence));
     }
     for interruption in &account.interruptions {
         let text = format!(
@@ -536,7 +540,7 @@ fn network(sources: &Sources<'_>) -> Vec<Metric> {
         ),
         (
             "arrived_rate",
-            "messages received",
+            "of these, received",
             "1/s",
             network.arrived_per_s,
         ),
