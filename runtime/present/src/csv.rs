@@ -21,11 +21,13 @@ fn row(run: &str, subject: &str, metric: &Metric) -> String {
     } else {
         &metric.unit
     };
-    let mut method = metric.method.clone();
-    if metric.low.is_none() && !metric.interval.is_empty() {
-        let joint = if method.is_empty() { "" } else { "; " };
-        method += &format!("{joint}no interval: {}", metric.interval);
-    }
+    let why = match metric.interval.as_str() {
+        why if metric.low.is_none() && !why.is_empty() => format!("no interval: {why}"),
+        _ => String::new(),
+    };
+    let method = [metric.method.as_str(), why.as_str()];
+    let method = method.into_iter().filter(|one| !one.is_empty());
+    let method = method.collect::<Vec<_>>().join("; ");
     let fields = [
         run.to_owned(),
         subject.to_owned(),
