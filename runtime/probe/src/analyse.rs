@@ -181,7 +181,8 @@ impl Reading {
         }
         complaints.extend(self.observer.folded().map(|(point, _)| {
             format!(
-                "{}: most datagrams are there twice: mergecap made one interface of several captures; merge                  them with `mergecap -I none`, or give both files",
+                "{}: most datagrams are there twice: mergecap made one interface of several captures; give both files, or merge \
+                 them with `mergecap -I none`",
                 self.name(point)
             )
         }));
