@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
-use hil_account::{AccountContext, ChannelPath, ChannelRecords, each_history};
+use hil_account::{AccountContext, ChannelPath, ChannelRecords, MessageFate, each_history};
 use hil_capture::flow::OwnHeader;
 use hil_capture::join::{JoinSettings, Joined};
 use hil_capture::observe::{Observation, Stream};
@@ -55,6 +55,39 @@ impl BothCounts {
     }
 }
 
+/// Datagrams that one side has for a reason and the other has not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Difference {
+    /// Only the gateways know of them: no capture was there.
+    unseen: u64,
+    /// Only the probe saw them: the receiving host had no room.
+    no_room: u64,
+}
+
+impl Difference {
+    const fn is_none(self) -> bool {
+        self.unseen == 0 && self.no_room == 0
+    }
+
+    /// True where both are equal but for these.
+    fn explains(self, both: BothCounts) -> bool {
+        let with_reason = |gateway: u64| (gateway + self.no_room).checked_sub(self.unseen);
+        both.gateway.and_then(with_reason) == Some(both.probe)
+    }
+
+    fn words(self) -> String {
+        let reasons = [
+            (self.no_room, "had no room on the receiving host"),
+            (self.unseen, "went before the capture began"),
+        ];
+        let reasons = reasons.iter().filter(|(count, _)| *count > 0);
+        let reasons: Vec<String> = reasons
+            .map(|(count, why)| format!("{count} {why}"))
+            .collect();
+        reasons.join(", ")
+    }
+}
+
 /// One channel in one direction.
 #[derive(Debug, Serialize)]
 struct ChannelComparison {
@@ -68,6 +101,13 @@ struct ChannelComparison {
     /// Datagrams with messages, by the gateways' records.
     data_sent: BothCounts,
     data_received: BothCounts,
+    /// Datagrams with messages that passed an interface, and for which the run says that the receiving host had no
+    /// room; in the probe's counts of what was received and not in the gateways'.
+    no_room: u64,
+    /// Datagrams with messages of the run that left, or came, before the capture at that place has any of the channel; in
+    /// the gateways' counts and not in the probe's.
+    unseen_sent: u64,
+    unseen_received: u64,
     /// Kernel stamp to kernel stamp, by the gateways.
     gateway_wire: Distribution,
     /// Tap to tap, by the probe, of the same messages.
@@ -87,9 +127,30 @@ impl ChannelComparison {
         Some((probe - gateway).abs() as f64 * 1e-3)
     }
 
+    /// Each count, and how far the gateways' may be from the probe's with a reason: less what was not captured, and
+    /// with what found no room.
+    fn counts(&self) -> [(&'static str, BothCounts, Difference); 4] {
+        let sent = Difference {
+            unseen: self.unseen_sent,
+            no_room: 0,
+        };
+        let received = Difference {
+            unseen: self.unseen_received,
+            no_room: self.no_room,
+        };
+        [
+            ("sent", self.sent, sent),
+            ("received", self.received, received),
+            ("messages sent", self.data_sent, sent),
+            ("messages received", self.data_received, received),
+        ]
+    }
+
     fn agrees_within(&self, limit_us: f64) -> bool {
-        let counts = [self.sent, self.received, self.data_sent, self.data_received];
-        counts.iter().all(BothCounts::is_equal)
+        let counts = self.counts();
+        counts
+            .iter()
+            .all(|(_, both, difference)| difference.explains(*both))
             && self
                 .medians_apart_us()
                 .is_some_and(|apart| apart <= limit_us)
@@ -98,16 +159,13 @@ impl ChannelComparison {
     fn section(&self, limit_us: f64) -> Section {
         let mut section = Section::new("channel", &self.channel, "");
         let mut counts = Table::new("", &["datagrams", "gateways", "probe", ""]);
-        for (what, both) in [
-            ("sent", self.sent),
-            ("received", self.received),
-            ("messages sent", self.data_sent),
-            ("messages received", self.data_received),
-        ] {
-            let (tone, word) = if both.is_equal() {
-                (Tone::Plain, "equal")
+        for (what, both, difference) in self.counts() {
+            let (tone, word) = if both.is_equal() && difference.is_none() {
+                (Tone::Plain, "equal".to_owned())
+            } else if difference.explains(both) {
+                (Tone::Plain, format!("equal, {}", difference.words()))
             } else {
-                (Tone::Bad, "DIFFERENT")
+                (Tone::Bad, "DIFFERENT".to_owned())
             };
             let gateway = match both.gateway {
                 Some(count) => Cell::Count(count),
@@ -213,13 +271,13 @@ pub(super) fn compare(
     };
     let (compared, left_out): (Vec<_>, Vec<_>) = sides.iter().partition(|(name, _)| is_read(name));
     let channels = compared.into_iter().map(|(name, side)| {
-        let sockets = summary.as_ref().map(|summary| socket_counts(summary, name));
+        let said = summary.as_ref().map(|summary| said(summary, name));
         let probe = Probe {
             captures,
             joined: &joined,
             number: numbers.get(name).copied(),
         };
-        channel(name, side, sockets.unwrap_or_default(), &probe)
+        channel(name, side, said.unwrap_or_default(), &probe)
     });
     Ok(Comparison {
         schema_version: 1,
@@ -308,14 +366,17 @@ fn summary(folder: &RunFolder) -> Result<Option<RunSummary>, CompareError> {
         .map_err(|source| CompareError::Summary { path, source })
 }
 
-/// Datagrams with messages of a channel, where the run's summary has them.
+/// What the run's summary says of a channel, where it has it.
 #[derive(Debug, Clone, Copy, Default)]
-struct SocketCounts {
+struct Said {
+    /// Datagrams of the sockets.
     sent: Option<u64>,
     received: Option<u64>,
+    /// Messages for which the receiving host had no room, or may have had none.
+    no_room_messages: u64,
 }
 
-fn socket_counts(summary: &RunSummary, channel: &str) -> SocketCounts {
+fn said(summary: &RunSummary, channel: &str) -> Said {
     let of = |side: Side| {
         let channel = summary.channels.iter().find(|one| one.name == channel)?;
         let ends = channel.ends.iter().filter(|one| one.direction == side);
@@ -325,9 +386,15 @@ fn socket_counts(summary: &RunSummary, channel: &str) -> SocketCounts {
             .map(|one| one.count);
         named.reduce(|a, b| a + b)
     };
-    SocketCounts {
+    let account = summary.channels.iter().find(|one| one.name == channel);
+    let fates = account.and_then(|one| Some(&one.account.as_ref()?.fates));
+    let no_room = fates.map(|fates| {
+        fates.of(MessageFate::LostByHarness) + fates.of(MessageFate::LostOnWireOrByHarness)
+    });
+    Said {
         sent: of(Side::Egress),
         received: of(Side::Ingress),
+        no_room_messages: no_room.unwrap_or_default(),
     }
 }
 
@@ -386,6 +453,15 @@ impl Probe<'_> {
 
     fn count(&self, direction: Direction, wanted: fn(&OwnHeader) -> bool) -> u64 {
         self.headers(direction).filter(wanted).count() as u64
+    }
+
+    /// Datagrams of each message of the channel that went `direction`.
+    fn data(&self, direction: Direction) -> BTreeMap<Message, u64> {
+        let mut all = BTreeMap::new();
+        for own in self.headers(direction).filter(is_data) {
+            *all.entry((own.epoch, own.sequence)).or_default() += 1;
+        }
+        all
     }
 
     /// Greetings and requests of the channel that were answered where they came in.
@@ -461,12 +537,40 @@ fn gateway_wire(side: &GatewaySide) -> BTreeMap<Message, (i64, i64)> {
     gateway
 }
 
-fn channel(
-    name: &str,
-    side: &GatewaySide,
-    sockets: SocketCounts,
-    probe: &Probe<'_>,
-) -> ChannelComparison {
+/// A message that a gateway has a record of.
+#[derive(Debug, Clone, Copy)]
+struct Handed {
+    message: Message,
+    /// When it was handed to the kernel, on the sender's clock.
+    handed_ns: i64,
+    datagram_count: u64,
+}
+
+/// Datagrams of messages that were handed over before the first one that a capture has: it was not there yet.
+fn unseen(records: &[Handed], captured: &BTreeMap<Message, u64>) -> u64 {
+    let seen = records
+        .iter()
+        .filter(|one| captured.contains_key(&one.message));
+    let Some(first_ns) = seen.map(|one| one.handed_ns).min() else {
+        return 0;
+    };
+    let before = records.iter().filter(|one| one.handed_ns < first_ns);
+    before.map(|one| one.datagram_count).sum()
+}
+
+/// Datagrams of messages that came to the receiving host and to no gateway, where the run says of so many that the
+/// host had no room for them; 0 where more are missing than it says.
+fn no_room(received: &[Handed], captured: &BTreeMap<Message, u64>, said_messages: u64) -> u64 {
+    let received: BTreeSet<Message> = received.iter().map(|one| one.message).collect();
+    let missing = captured.iter().filter(|(one, _)| !received.contains(one));
+    let missing: Vec<u64> = missing.map(|(_, count)| *count).collect();
+    if missing.len() as u64 > said_messages {
+        return 0;
+    }
+    missing.iter().sum()
+}
+
+fn channel(name: &str, side: &GatewaySide, said: Said, probe: &Probe<'_>) -> ChannelComparison {
     let has_left = |one: &&EgressRecord| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0;
     let left = side.egress.iter().filter(has_left);
     let data_sent: u64 = left.map(|one| u64::from(one.fragment_count)).sum();
@@ -475,6 +579,25 @@ fn channel(
         .iter()
         .map(|one| u64::from(one.fragment_count))
         .sum();
+    let sent = side.egress.iter().filter(has_left);
+    let sent = sent.map(|one| Handed {
+        message: (one.epoch, one.sequence),
+        handed_ns: one.handed_ns,
+        datagram_count: u64::from(one.fragment_count),
+    });
+    let received = side.ingress.iter().map(|one| Handed {
+        message: (one.epoch, one.sequence),
+        handed_ns: one.handed_ns,
+        datagram_count: u64::from(one.fragment_count),
+    });
+    let received: Vec<Handed> = received.collect();
+    let no_room = no_room(
+        &received,
+        &probe.data(Direction::Inbound),
+        said.no_room_messages,
+    );
+    let unseen_sent = unseen(&sent.collect::<Vec<_>>(), &probe.data(Direction::Outbound));
+    let unseen_received = unseen(&received, &probe.data(Direction::Inbound));
     let gateway = gateway_wire(side);
     let mut columns: [LatencyHistogram; 5] = Default::default();
     for (key, (departure, arrival)) in probe.wire() {
@@ -494,11 +617,11 @@ fn channel(
     ChannelComparison {
         channel: name.to_owned(),
         sent: BothCounts {
-            gateway: sockets.sent,
+            gateway: said.sent,
             probe: probe.count(Direction::Outbound, is_forward),
         },
         received: BothCounts {
-            gateway: sockets.received,
+            gateway: said.received,
             probe: probe.count(Direction::Inbound, is_data) + probe.answered_count(),
         },
         data_sent: BothCounts {
@@ -509,10 +632,75 @@ fn channel(
             gateway: Some(data_received),
             probe: probe.count(Direction::Inbound, is_data),
         },
+        no_room,
+        unseen_sent,
+        unseen_received,
         gateway_wire: columns[0].distribution(reason),
         probe_wire: columns[1].distribution(reason),
         difference: columns[2].distribution(reason),
         departure_difference: columns[3].distribution(reason),
         arrival_difference: columns[4].distribution(reason),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Messages of one datagram each, one a millisecond.
+    fn handed(sequences: impl Iterator<Item = u64>) -> Vec<Handed> {
+        let of = |sequence: u64| Handed {
+            message: (1, sequence),
+            handed_ns: sequence.cast_signed() * 1_000_000,
+            datagram_count: 1,
+        };
+        sequences.map(of).collect()
+    }
+
+    fn captured(sequences: impl Iterator<Item = u64>) -> BTreeMap<Message, u64> {
+        sequences.map(|sequence| ((1, sequence), 1)).collect()
+    }
+
+    #[test]
+    fn what_went_before_the_capture_is_not_compared_and_a_hole_in_it_is() {
+        let records = handed(0..100);
+        assert_eq!(unseen(&records, &captured(3..100)), 3);
+        assert_eq!(unseen(&records, &captured(0..100)), 0);
+        let with_hole = captured((3..50).chain(52..100));
+        assert_eq!(unseen(&records, &with_hole), 3);
+        assert_eq!(unseen(&records, &captured(200..210)), 0, "of another time");
+    }
+
+    #[test]
+    fn what_found_no_room_explains_as_many_as_the_run_says() {
+        // 1201 were sent, 183 of them found no room, and the capture began with the fourth.
+        let received = handed((0..1_000).chain(1_183..1_201));
+        let wire = captured(3..1_201);
+        let difference = |said| Difference {
+            unseen: unseen(&received, &wire),
+            no_room: no_room(&received, &wire, said),
+        };
+        let both = BothCounts {
+            gateway: Some(1_018),
+            probe: 1_198,
+        };
+        assert_eq!((difference(183).unseen, difference(183).no_room), (3, 183));
+        assert!(difference(183).explains(both));
+        assert_eq!(
+            difference(183).words(),
+            "183 had no room on the receiving host, 3 went before the capture began"
+        );
+        // The run says so of one less than are missing: then something else took one.
+        assert!(!difference(182).explains(both));
+        let unknown = BothCounts {
+            gateway: None,
+            probe: 1_198,
+        };
+        assert!(!difference(183).explains(unknown));
+        let other = BothCounts {
+            gateway: Some(1_017),
+            probe: 1_198,
+        };
+        assert!(!difference(183).explains(other));
     }
 }
