@@ -500,7 +500,7 @@ mod tests {
                     events.collect::<Vec<_>>(),
                 )
             };
-            let (count, events) = standstills(true, Duration::from_secs(60));
+            let (count, events) = standstills(true, Duration::from_mins(1));
             assert_eq!(count, 1, "{mode:?}");
             assert!(
                 events[0].contains("stood for 60 s") && events[0].ends_with("reached a robot"),
