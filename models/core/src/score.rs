@@ -24,12 +24,39 @@ pub struct Score {
     /// What happened to the robot, in order of time; at most [`EVENTS_MAX`]. Fill it by
     /// [`Score::add_event`].
     pub events: Vec<ScoreEvent>,
-    /// Events that found no room.
-    pub events_dropped_count: u64,
+    /// Events that found no room: what counts and times are taken from beside [`Self::events`].
+    pub left_out: Vec<LeftOut>,
     /// The ways in which the robot can be hurt, the gravest first; none for a case that knows of none.
     pub harms: Vec<Harm>,
     /// Names of the figures that a reader wants to see first, beside the harms.
     pub headline: &'static [&'static str],
+}
+
+/// An event that found no room in a score.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct LeftOut {
+    /// How much it mattered.
+    pub severity: Severity,
+    /// When it was, as [`ScoreEvent::at`].
+    pub at: Instant,
+    /// As [`ScoreEvent::clock_of`].
+    pub clock_of: &'static str,
+}
+
+impl From<&ScoreEvent> for LeftOut {
+    fn from(event: &ScoreEvent) -> Self {
+        let ScoreEvent {
+            severity,
+            at,
+            clock_of,
+            ..
+        } = *event;
+        Self {
+            severity,
+            at,
+            clock_of,
+        }
+    }
 }
 
 /// A way in which the robot can be hurt, and how often it was.
@@ -250,17 +277,18 @@ impl Score {
     }
 
     /// Appends an event. Without room it takes the place of the latest of the least grave events,
-    /// if it is graver than they are; whatever is left out is counted.
+    /// if it is graver than they are; of whatever is left out, severity and time are kept.
     pub fn add_event(&mut self, event: ScoreEvent) {
         if self.events.len() >= EVENTS_MAX {
-            self.events_dropped_count += 1;
             let severities = self.events.iter().map(|known| known.severity);
             let least = severities.min().filter(|least| *least < event.severity);
             let is_least = |known: &ScoreEvent| Some(known.severity) == least;
-            match self.events.iter().rposition(is_least) {
-                Some(index) => drop(self.events.remove(index)),
-                None => return,
-            }
+            let Some(index) = self.events.iter().rposition(is_least) else {
+                self.left_out.push(LeftOut::from(&event));
+                return;
+            };
+            let removed = self.events.remove(index);
+            self.left_out.push(LeftOut::from(&removed));
         }
         self.events.push(event);
     }
@@ -311,7 +339,15 @@ mod tests {
         score.add_event(event(Severity::Hazard, 1_000));
         score.add_event(event(Severity::Incident, 1_001));
         assert_eq!(score.events.len(), EVENTS_MAX);
-        assert_eq!(score.events_dropped_count, 3);
+        let left_out = |score: &Score| -> Vec<_> {
+            let all = score.left_out.iter();
+            all.map(|one| (one.severity, one.at.as_ns())).collect()
+        };
+        // The first found no room, and the other two took that of the latest notices.
+        assert_eq!(
+            left_out(&score),
+            [1_000, 999, 998].map(|at_ns| (Severity::Notice, at_ns))
+        );
         assert_eq!(score.events.last().unwrap().severity, Severity::Incident);
         assert_eq!(score.events[998].severity, Severity::Hazard);
         assert_eq!(score.events[997].at, Instant::from_ns(997));
@@ -319,7 +355,12 @@ mod tests {
         for at_ns in 0..1_005 {
             score.add_event(event(Severity::Incident, at_ns));
         }
-        assert_eq!((score.events.len(), score.events_dropped_count), (1_000, 5));
+        assert_eq!(score.events.len(), 1_000);
+        let last = [1_000, 1_001, 1_002, 1_003, 1_004];
+        assert_eq!(
+            left_out(&score),
+            last.map(|at_ns| (Severity::Incident, at_ns))
+        );
         assert_eq!(score.events.last().unwrap().at, Instant::from_ns(999));
     }
 

@@ -124,7 +124,7 @@ mod tests {
         let mut all = ScoreEvents {
             events: vec![event(None, Severity::Notice, "hold began"), dropped],
             dropped_count: 7,
-            clocks_differ: false,
+            ..ScoreEvents::default()
         };
         let lines =
             "# seconds since the start of the run, severity, what happened | outages beside it, then \

@@ -1,6 +1,8 @@
 //! What happened to the robot, as a summary keeps it: each event of the score beside the fates of
 //! the messages it names. Fates are found elsewhere, in the analysis.
 
+use std::collections::BTreeMap;
+
 use hil_account::network::NetworkEventKind;
 use hil_account::{MessageFate, Standing};
 use hil_core::case_study::Severity;
@@ -16,9 +18,44 @@ pub struct ScoreEvents {
     pub events: Vec<ExplainedEvent>,
     /// Events the score had no room for.
     pub dropped_count: u64,
+    /// These by severity.
+    #[serde(default)]
+    pub dropped_by_severity: BTreeMap<Severity, u64>,
+    /// When they were, of those whose time is known; seconds as [`ExplainedEvent::at_s`]. A summary that was read
+    /// has none.
+    #[serde(skip)]
+    pub(crate) dropped_at_s: Vec<(Severity, f64)>,
     /// True when the hosts' clocks differ and are not aligned: times of events on different
     /// hosts do not compare.
     pub clocks_differ: bool,
+}
+
+impl ScoreEvents {
+    /// Counts what the score had no room for, each with its time where that is known.
+    #[must_use]
+    pub(crate) fn without(
+        mut self,
+        dropped: impl Iterator<Item = (Severity, Option<f64>)>,
+    ) -> Self {
+        for (severity, at_s) in dropped {
+            self.dropped_count += 1;
+            *self.dropped_by_severity.entry(severity).or_default() += 1;
+            self.dropped_at_s.extend(at_s.map(|at_s| (severity, at_s)));
+        }
+        self
+    }
+
+    /// Events of this severity, listed or not.
+    pub(crate) fn count_of(&self, severity: Severity) -> u64 {
+        let listed = self.events.iter().filter(|one| one.severity == severity);
+        let dropped = self.dropped_by_severity.get(&severity);
+        listed.count() as u64 + dropped.copied().unwrap_or(0)
+    }
+
+    /// All of them.
+    pub(crate) fn total_count(&self) -> u64 {
+        self.events.len() as u64 + self.dropped_count
+    }
 }
 
 /// One event.

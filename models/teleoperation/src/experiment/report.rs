@@ -327,7 +327,7 @@ impl Row<'_> {
     /// A criterion on a published rate, which is judged by at least [`RUNS_MIN`] runs of motion and robot of the fit.
     fn on_published(
         &self,
-        text: String,
+        text: &str,
         finding: Option<String>,
         is_met: impl FnOnce() -> Option<bool>,
     ) -> Criterion {
@@ -339,7 +339,7 @@ impl Row<'_> {
             finding: if self.is_fitted {
                 finding.map_or_else(
                     || format!("{count} runs"),
-                    |one| format!("{one} in {count} runs"),
+                    |one| format!("{one}, of {count} runs"),
                 )
             } else {
                 "not the fit's motion or robot".to_owned()
@@ -365,7 +365,7 @@ impl Row<'_> {
             format!("{mean:.5}{interval}")
         });
         let text = format!("mean MLR of at least {RUNS_MIN} runs in {low} to {high}");
-        self.on_published(text, finding, || self.mean_verdict([low, high], judge))
+        self.on_published(&text, finding, || self.mean_verdict([low, high], judge))
     }
 
     /// Runs of which the interval of the mean would lie on one side of the ends of its range, if mean and scatter stay as
@@ -403,7 +403,7 @@ impl Row<'_> {
         let is_as_long = self.runs.iter().all(is_as_long);
         let published = f64::from(lost) / f64::from(PUBLISHED_LOOPS);
         let finding = match self.single_run(CONFIDENCE) {
-            _ if !is_as_long => Some("too short ones".to_owned()),
+            _ if !is_as_long => Some(format!("not all of {PUBLISHED_LOOPS} loops")),
             range => range.map(|(low, high)| format!("{:.5} to {high:.5}", low.max(0.0))),
         };
         let text = format!(
@@ -411,7 +411,7 @@ impl Row<'_> {
              and none lost outside it"
         );
         let is_within = |&(low, high): &(f64, f64)| low <= published && published <= high;
-        self.on_published(text, finding, || {
+        self.on_published(&text, finding, || {
             judge
                 .verdict(
                     |confidence| self.single_run(confidence),

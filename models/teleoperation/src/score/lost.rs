@@ -8,7 +8,7 @@ use crate::score::record::Command;
 use crate::score::sessions::{events, is_right};
 use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EndCause};
 use hil_core::run_log::RunLog;
-use hil_core::score::{EVENTS_MAX, MessageRef, Score, ScoreEvent, Severity};
+use hil_core::score::{EVENTS_MAX, LeftOut, MessageRef, Score, ScoreEvent, Severity};
 use hil_core::time::Instant;
 
 /// Adds all events in order of time.
@@ -31,7 +31,7 @@ pub(crate) fn add_events(score: &mut Score, run: &Run, loops: Option<&Loops>, lo
     for event in found {
         notices += usize::from(event.severity == Severity::Notice);
         if event.severity == Severity::Notice && notices > EVENTS_MAX {
-            score.events_dropped_count += 1;
+            score.left_out.push(LeftOut::from(&event));
         } else {
             score.add_event(event);
         }

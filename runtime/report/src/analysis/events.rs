@@ -48,16 +48,29 @@ pub(super) fn explained(
     });
     let ways: BTreeMap<&str, Way<'_>> = ways.collect();
     let events = score.events.iter();
-    ScoreEvents {
+    let all = ScoreEvents {
         events: events
             .map(|event| ExplainedEvent {
                 outages: outages_before(event, records, specs, outages, &ways),
                 ..explain(event, topology, axis, &ways)
             })
             .collect(),
-        dropped_count: score.events_dropped_count,
         clocks_differ: axis.is_split(),
-    }
+        ..ScoreEvents::default()
+    };
+    let host_of = |channel| {
+        Some(
+            topology
+                .process(&topology.channel(channel)?.from)?
+                .host
+                .as_str(),
+        )
+    };
+    let left_out = score.left_out.iter();
+    all.without(left_out.map(|one| {
+        let at_s = host_of(one.clock_of).and_then(|host| axis.place_s(host, one.at));
+        (one.severity, at_s)
+    }))
 }
 
 fn explain(

@@ -35,14 +35,16 @@ impl RobotSeries {
     /// The events of a score that matter: one for each.
     pub(super) fn of_events(all: &ScoreEvents) -> Self {
         let is_grave = |severity| severity > Severity::Notice;
-        let has_grave = all.events.iter().any(|event| is_grave(event.severity));
-        let chosen = all
-            .events
+        let listed = all.events.iter();
+        let listed = listed.filter_map(|event| Some((event.severity, event.at_s?)));
+        let timed: Vec<_> = listed.chain(all.dropped_at_s.iter().copied()).collect();
+        let has_grave = [Severity::Incident, Severity::Hazard]
             .iter()
-            .filter(|event| !has_grave || is_grave(event.severity));
-        let mut samples: Vec<_> = chosen
-            .filter_map(|event| Some((event.at_s?, 1.0)))
-            .collect();
+            .any(|one| all.count_of(*one) > 0);
+        let chosen = timed
+            .into_iter()
+            .filter(|(severity, _)| !has_grave || is_grave(*severity));
+        let mut samples: Vec<_> = chosen.map(|(_, at_s)| (at_s, 1.0)).collect();
         samples.sort_by(|a, b| a.0.total_cmp(&b.0));
         let label = if has_grave {
             "incidents and hazards"
@@ -159,6 +161,24 @@ mod tests {
         assert!(known(vec![sample]) && !known(Vec::new()));
         assert!(!RobotSeries::of(errors(vec![sample]), |_| None).is_known());
         assert!(RobotSeries::of_events(&ScoreEvents::default()).is_known());
+    }
+
+    #[test]
+    fn events_that_are_not_listed_are_in_the_series() {
+        let dropped = [
+            (Severity::Hazard, Some(3.5)),
+            (Severity::Notice, Some(1.5)),
+            (Severity::Incident, Some(3.7)),
+            (Severity::Hazard, None),
+            (Severity::Hazard, Some(0.5)),
+        ];
+        let all = ScoreEvents::default().without(dropped.into_iter());
+        let series = RobotSeries::of_events(&all);
+        assert_eq!(series.label(), "incidents and hazards");
+        let bins = series.binned(1.0, 5, true);
+        assert_eq!(bins.map_bits(), vec![1.0, 0.0, 0.0, 2.0, 0.0].map_bits());
+        assert_eq!(all.dropped_count, 5);
+        assert_eq!(all.count_of(Severity::Hazard), 3);
     }
 
     /// Floats compare exactly here: nothing was computed of them.

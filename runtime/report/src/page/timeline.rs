@@ -12,6 +12,7 @@ use crate::answer::UnitScale;
 use crate::link_change::LinkChange;
 use crate::network::{NetworkQuantity, NetworkReport, TimelineRow, TimelineSubject};
 use crate::score_event::{ExplainedEvent, ScoreEvents};
+use hil_platform::text::grouped;
 use hil_present::Drawing;
 use hil_present::units::duration_s;
 
@@ -61,7 +62,15 @@ pub(super) fn over_run(
     let by_hand = changes.iter().filter_map(changed_at);
     let moments = events.events.iter().filter_map(moment);
     let moments: Vec<Mark> = moments.chain(by_hand).collect();
-    let caption = run_caption(report, step_s, width_s, bands.len() == BANDS_MAX);
+    let mut caption = run_caption(report, step_s, width_s, bands.len() == BANDS_MAX);
+    if events.dropped_count > 0 {
+        let marked = format!(
+            " Marked: {} of {} events; the robot's series has all.",
+            grouped(events.events.len() as u64),
+            grouped(events.total_count())
+        );
+        caption.push_str(&marked);
+    }
     let plot = Plot {
         axis: format!("{key}-run"),
         from_s: span.start,

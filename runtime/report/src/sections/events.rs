@@ -26,7 +26,7 @@ const NETWORK_EVENTS_MAX: usize = 40;
 /// What happened to the robot, the gravest events where there are too many, in order of time.
 pub(super) fn robot(all: &ScoreEvents) -> Section {
     let title = "What happened to the robot, and the network before it";
-    let mut section = Section::new("robot", title, severity_counts(&all.events));
+    let mut section = Section::new("robot", title, severity_counts(all));
     if all.events.is_empty() {
         return section;
     }
@@ -35,21 +35,24 @@ pub(super) fn robot(all: &ScoreEvents) -> Section {
                     host named with it, and times of different hosts do not compare.";
         section.note(Tone::Caution, text);
     }
-    let mut note = Vec::new();
-    let total = all.events.len();
-    if total > EVENTS_MAX {
-        let total = grouped(total as u64);
-        note.push(format!(
-            "the {EVENTS_MAX} gravest of {total}; all are in events.log and summary.json"
-        ));
+    if let Some(words) = dropped_words(all) {
+        section.note(Tone::Caution, words);
     }
-    if all.dropped_count > 0 {
-        let dropped = grouped(all.dropped_count);
-        note.push(format!("{dropped} more found no room in the score"));
+    let mut note = String::new();
+    let kept = all.events.len();
+    if kept > EVENTS_MAX {
+        let total = grouped(all.total_count());
+        let those = if all.dropped_count == 0 {
+            "all".to_owned()
+        } else {
+            grouped(kept as u64)
+        };
+        note = format!(
+            "the {EVENTS_MAX} gravest of {total}; {those} are in events.log and summary.json"
+        );
     }
     let events = gravest(&all.events, EVENTS_MAX).into_iter();
     let events = events.map(|one| event(one, all.clocks_differ)).collect();
-    let note = note.join("; ");
     section
         .blocks
         .push(Block::Events(EventList { events, note }));
@@ -65,24 +68,37 @@ pub(crate) fn gravest(events: &[ExplainedEvent], count: usize) -> Vec<&Explained
     order.into_iter().map(|index| &events[index]).collect()
 }
 
-/// How many there are of each severity.
-pub(crate) fn severity_counts(events: &[ExplainedEvent]) -> String {
-    let count = |severity| {
-        let chosen = events.iter().filter(|one| one.severity == severity);
-        chosen.count() as u64
-    };
+/// How many of the events are in no list, where the score had no room for all.
+fn dropped_words(all: &ScoreEvents) -> Option<String> {
+    (all.dropped_count > 0).then(|| {
+        format!(
+            "{} of {} events found no room in the score and are counted only",
+            grouped(all.dropped_count),
+            grouped(all.total_count())
+        )
+    })
+}
+
+/// How many there are of each severity, listed or not.
+pub(crate) fn severity_counts(all: &ScoreEvents) -> String {
     let counts = [
-        counted(count(Severity::Incident), "incident"),
-        counted(count(Severity::Hazard), "hazard"),
-        counted(count(Severity::Notice), "notice"),
+        counted(all.count_of(Severity::Incident), "incident"),
+        counted(all.count_of(Severity::Hazard), "hazard"),
+        counted(all.count_of(Severity::Notice), "notice"),
     ];
-    counts.join(", ")
+    let mut counts = counts.join(", ");
+    // A summary of an earlier version says only how many were left out.
+    let known: u64 = all.dropped_by_severity.values().sum();
+    let unknown = all.dropped_count.saturating_sub(known);
+    if unknown > 0 {
+        counts = format!("{counts}, {} of unknown severity", grouped(unknown));
+    }
+    counts
 }
 
 /// Incidents and hazards.
-pub(crate) fn grave_count(events: &[ExplainedEvent]) -> u64 {
-    let grave = events.iter().filter(|one| one.severity > Severity::Notice);
-    grave.count() as u64
+pub(crate) fn grave_count(all: &ScoreEvents) -> u64 {
+    all.count_of(Severity::Incident) + all.count_of(Severity::Hazard)
 }
 
 /// How grave an event is.

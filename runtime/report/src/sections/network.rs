@@ -111,8 +111,12 @@ fn preceding_words(report: &NetworkReport, events: &ScoreEvents) -> String {
             grouped(noted)
         );
     }
+    let listed = match events.dropped_count {
+        0 => "",
+        _ => "listed ",
+    };
     format!(
-        "{} of {} events of the score have an event of the network in the {window} before them; of \
+        "{} of {} {listed}events of the score have an event of the network in the {window} before them; of \
          all moments of the run {chance} have one. {} events of note on the network.",
         grouped(preceded as u64),
         grouped(known.len() as u64),

@@ -45,11 +45,12 @@ pub(super) fn explained(
             messages_dropped_count: event.messages_dropped_count,
         }
     });
-    ScoreEvents {
+    let all = ScoreEvents {
         events: events.collect(),
-        dropped_count: score.events_dropped_count,
-        clocks_differ: false,
-    }
+        ..ScoreEvents::default()
+    };
+    let left_out = score.left_out.iter();
+    all.without(left_out.map(|one| (one.severity, Some(one.at.as_ns() as f64 * 1e-9))))
 }
 
 fn outages_before(

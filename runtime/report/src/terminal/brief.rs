@@ -18,7 +18,7 @@ use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested}
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
-use crate::sections::events::{cause, gravest_first, severity_counts, severity_tone};
+use crate::sections::events::{cause, grave_count, gravest_first, severity_counts, severity_tone};
 use crate::sections::{deadlines, flows, outcome_words, strips};
 use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
@@ -92,9 +92,9 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
 
 /// What hurt the robot or might have, the gravest first, each with what the network did before.
 fn causes(summary: &RunSummary, width: usize) -> Section {
-    let all = &summary.score_events.events;
+    let all = &summary.score_events;
     let evidence = Evidence::of(summary);
-    let grave = gravest_first(all);
+    let grave = gravest_first(&all.events);
     let title = "Robot, and the network before it";
     let mut section = Section::new("robot", title, severity_counts(all));
     if summary.run.case.is_empty() {
@@ -122,7 +122,8 @@ fn causes(summary: &RunSummary, width: usize) -> Section {
         }
     };
     let events = grave.iter().take(CAUSES_SHOWN).map(event).collect();
-    let note = match grave.len().saturating_sub(CAUSES_SHOWN) as u64 {
+    let shown = grave.len().min(CAUSES_SHOWN) as u64;
+    let note = match grave_count(all).saturating_sub(shown) {
         0 => String::new(),
         hidden => format!("and {} of less weight or later", counted(hidden, "event")),
     };
