@@ -77,8 +77,8 @@ impl Difference {
 
     fn words(self) -> String {
         let reasons = [
-            (self.no_room, "had no room on the receiving host"),
-            (self.unseen, "went before the capture began"),
+            (self.no_room, "found no room"),
+            (self.unseen, "before the capture"),
         ];
         let reasons = reasons.iter().filter(|(count, _)| *count > 0);
         let reasons: Vec<String> = reasons
@@ -539,7 +539,7 @@ fn gateway_wire(side: &GatewaySide) -> BTreeMap<Message, (i64, i64)> {
 
 /// A message that a gateway has a record of.
 #[derive(Debug, Clone, Copy)]
-struct Sent {
+struct NotedMessage {
     message: Message,
     /// When it was handed to the kernel, on the sender's clock.
     handed_ns: i64,
@@ -547,7 +547,7 @@ struct Sent {
 }
 
 /// Datagrams of messages that were handed over before the first one that a capture has: it was not there yet.
-fn unseen(records: &[Sent], captured: &BTreeMap<Message, u64>) -> u64 {
+fn unseen(records: &[NotedMessage], captured: &BTreeMap<Message, u64>) -> u64 {
     let seen = records
         .iter()
         .filter(|one| captured.contains_key(&one.message));
@@ -560,7 +560,11 @@ fn unseen(records: &[Sent], captured: &BTreeMap<Message, u64>) -> u64 {
 
 /// Datagrams of messages that came to the receiving host and to no gateway, where the run says of so many that the
 /// host had no room for them; 0 where more are missing than it says.
-fn no_room(received: &[Sent], captured: &BTreeMap<Message, u64>, said_messages: u64) -> u64 {
+fn no_room(
+    received: &[NotedMessage],
+    captured: &BTreeMap<Message, u64>,
+    said_messages: u64,
+) -> u64 {
     let received: BTreeSet<Message> = received.iter().map(|one| one.message).collect();
     let missing = captured.iter().filter(|(one, _)| !received.contains(one));
     let missing: Vec<u64> = missing.map(|(_, count)| *count).collect();
@@ -580,17 +584,17 @@ fn channel(name: &str, side: &GatewaySide, said: Said, probe: &Probe<'_>) -> Cha
         .map(|one| u64::from(one.fragment_count))
         .sum();
     let sent = side.egress.iter().filter(has_left);
-    let sent = sent.map(|one| Sent {
+    let sent = sent.map(|one| NotedMessage {
         message: (one.epoch, one.sequence),
         handed_ns: one.handed_ns,
         datagram_count: u64::from(one.fragment_count),
     });
-    let received = side.ingress.iter().map(|one| Sent {
+    let received = side.ingress.iter().map(|one| NotedMessage {
         message: (one.epoch, one.sequence),
         handed_ns: one.handed_ns,
         datagram_count: u64::from(one.fragment_count),
     });
-    let received: Vec<Sent> = received.collect();
+    let received: Vec<NotedMessage> = received.collect();
     let no_room = no_room(
         &received,
         &probe.data(Direction::Inbound),
@@ -648,8 +652,8 @@ mod tests {
     use super::*;
 
     /// Messages of one datagram each, one a millisecond.
-    fn handed(sequences: impl Iterator<Item = u64>) -> Vec<Sent> {
-        let of = |sequence: u64| Sent {
+    fn handed(sequences: impl Iterator<Item = u64>) -> Vec<NotedMessage> {
+        let of = |sequence: u64| NotedMessage {
             message: (1, sequence),
             handed_ns: sequence.cast_signed() * 1_000_000,
             datagram_count: 1,
@@ -688,7 +692,7 @@ mod tests {
         assert!(difference(183).explains(both));
         assert_eq!(
             difference(183).words(),
-            "183 had no room on the receiving host, 3 went before the capture began"
+            "183 found no room, 3 before the capture"
         );
         // The run says so of one less than are missing: then something else took one.
         assert!(!difference(182).explains(both));
