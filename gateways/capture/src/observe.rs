@@ -151,7 +151,7 @@ pub struct PacketCounts {
     pub fragmented_count: u64,
     /// Of those, such as lack a piece while others of their stream came whole: they are not counted as seen.
     pub incomplete_count: u64,
-    /// Damaged on the wire, as the file says: they count as not arrived (RFC 7680 section 2.5).
+    /// Damaged on the wire, as the file or the device that captured says: they count as not arrived (RFC 7680 section 2.5).
     pub damaged_count: u64,
     /// Not IP.
     pub not_ip_count: u64,
@@ -173,7 +173,7 @@ pub struct PacketCounts {
     pub backward_stamp_count: u64,
     /// With the header of an ET2000.
     pub esl_count: u64,
-    /// Of those, damaged according to the device (frame check sequence or alignment); see `damaged_count`.
+    /// Of those, damaged according to the device (frame check sequence or alignment); in `damaged_count` too.
     pub esl_damaged_count: u64,
     /// Of those, with no port or several named.
     pub esl_port_unclear_count: u64,
@@ -244,7 +244,7 @@ impl Observer {
         };
         counts.backward_stamp_count += u64::from(watch.stamp(stamp_ns));
         if packet.is_damaged || is_esl_damaged {
-            counts.damaged_count += u64::from(packet.is_damaged);
+            counts.damaged_count += 1;
             self.seen.entry(point).or_default();
             return;
         }

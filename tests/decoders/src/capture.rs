@@ -209,7 +209,8 @@ pub(crate) fn frame(bytes: &[u8]) -> Verdict {
         + counts.not_udp_count
         + counts.later_fragment_count
         + counts.unreadable_count
-        + counts.stampless_count;
+        + counts.stampless_count
+        + counts.damaged_count;
     assert_eq!((counts.packet_count, parts), (1, 1), "{counts:?}");
     Verdict::of(datagram.is_ok())
 }
