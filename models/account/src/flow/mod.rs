@@ -440,7 +440,7 @@ impl<'a> FlowFold<'a> {
             Ok(place) => frames[place].1,
             Err(_) => self.index_of(FlowKey::Unrecorded),
         };
-        // What a program would have made of a frame that came after its end, nobody knows.
+        // Whether a program would have taken a frame that came after its end is unknown.
         let interruption = message
             .interruption_index
             .and_then(|index| context.interruptions.get(index));
