@@ -66,7 +66,7 @@ impl Application {
             (Pause::Sleep(until), Some(waiter)) => {
                 waiter.wait_until(Some(until)).ok()?;
             }
-            _ => core::hint::spin_loop(),
+            _ => wait.spin(),
         }
         None
     }
@@ -308,7 +308,7 @@ impl Opening {
         let sleeps = self.plan.wait != WaitMode::Spin;
         Ok(Application {
             ports: Ports::open(&self.address, &self.plan, self.host, sleeps)?,
-            wait: WaitStrategy::new(self.plan.wait),
+            wait: WaitStrategy::new(self.plan.wait, None),
             payload: vec![0; self.plan.size_bytes],
             woken_after_ns: Vec::with_capacity(1 << 20),
         })

@@ -432,6 +432,12 @@ pub fn spin_advice(cpu: usize) -> SpinAdvice {
     spin_advice_in(cpu, &HostFiles::of_this_host())
 }
 
+/// Whether `cpu` of this host is kept free of other threads; false where that is unknown.
+pub(crate) fn is_isolated(cpu: usize) -> bool {
+    let isolated = IsolatedCpus::read(&HostFiles::of_this_host()).isolated;
+    isolated.available().is_some_and(|cpus| cpus.contains(&cpu))
+}
+
 pub(crate) fn spin_advice_in(cpu: usize, files: &HostFiles) -> SpinAdvice {
     let isolated = IsolatedCpus::read(files).isolated;
     let is_isolated = isolated.available().is_some_and(|cpus| cpus.contains(&cpu));

@@ -3,13 +3,20 @@
 
 use core::time::Duration;
 
+use std::thread;
+
 use hil_core::arrival::ArrivalPredictor;
 use hil_core::time::{Instant, duration_ns};
 use serde::{Deserialize, Serialize};
 
+use crate::realtime::is_isolated;
+
 /// How long before an expected event hybrid waiting starts to spin. Covers a blocking wake-up's
 /// usual latency with some room; longer would only cost processor time.
 pub const SPIN_LEAD: Duration = Duration::from_micros(90);
+
+/// Messages that may stay away before hybrid waiting sleeps until one comes.
+const MISSES_MAX: i64 = 16;
 
 /// No thread waits longer than this at once, so that orders to stop are seen.
 pub const WAIT_MAX: Duration = Duration::from_millis(50);
@@ -62,14 +69,27 @@ pub fn release(now: Instant, due: Instant) -> Pause {
 pub struct WaitStrategy {
     mode: WaitMode,
     predictor: ArrivalPredictor,
+    /// Others may want the processor of a thread that spins.
+    is_shared: bool,
 }
 
 impl WaitStrategy {
-    /// Waiting in `mode`.
-    pub fn new(mode: WaitMode) -> Self {
+    /// Waiting in `mode` on `cpu`, if it is bound to one.
+    pub fn new(mode: WaitMode, cpu: Option<usize>) -> Self {
         Self {
             mode,
             predictor: ArrivalPredictor::default(),
+            is_shared: mode != WaitMode::Block && !cpu.is_some_and(is_isolated),
+        }
+    }
+
+    /// Spins once: looks again at once, or as soon as nobody else wants the processor, unless that is isolated. Else
+    /// a program on the same one waits for as long as the scheduler lets this thread spin.
+    pub fn spin(&self) {
+        if self.is_shared {
+            thread::yield_now();
+        } else {
+            core::hint::spin_loop();
         }
     }
 
@@ -101,13 +121,16 @@ impl WaitStrategy {
     }
 
     /// The arrival to wait for: the expected one until it is overdue by the lead, then the next
-    /// on the grid, so that a loss costs a bounded time of spinning.
+    /// on the grid, so that a loss costs a bounded time of spinning; none once a whole stretch stayed away.
     fn expected(&self, now: Instant) -> Option<Instant> {
         let expected = self.predictor.next_expected()?;
         if now <= expected + SPIN_LEAD {
             return Some(expected);
         }
-        self.predictor.next_expected_after(now)
+        let longest_ns = duration_ns(self.predictor.period()?).saturating_mul(MISSES_MAX);
+        self.predictor
+            .next_expected_after(now)
+            .filter(|_| now.ns_since(expected) <= longest_ns)
     }
 }
 
@@ -122,7 +145,7 @@ mod tests {
     const MS: i64 = 1_000_000;
 
     fn learnt(mode: WaitMode) -> WaitStrategy {
-        let mut wait = WaitStrategy::new(mode);
+        let mut wait = WaitStrategy::new(mode, None);
         (0..20).for_each(|index| wait.on_arrival(Instant::from_ns(index * MS)));
         wait
     }
@@ -176,8 +199,22 @@ mod tests {
     }
 
     #[test]
+    fn hybrid_sleeps_once_a_whole_stretch_stayed_away_and_learns_anew() {
+        let mut wait = learnt(WaitMode::Hybrid);
+        // The last arrival was at 19 ms.
+        let due = |now_ns| wait.pause(Instant::from_ns(now_ns), None);
+        assert_eq!(due(36 * MS), Pause::Spin);
+        let silent = Instant::from_ns(37 * MS);
+        assert_eq!(due(37 * MS), Pause::Sleep(silent + WAIT_MAX));
+        wait.on_arrival(Instant::from_ns(60 * MS));
+        let now = Instant::from_ns(60 * MS + MS / 2);
+        let spin_from = Instant::from_ns(61 * MS - 90_000);
+        assert_eq!(wait.pause(now, None), Pause::Sleep(spin_from));
+    }
+
+    #[test]
     fn hybrid_without_a_known_period_sleeps_like_block() {
-        let wait = WaitStrategy::new(WaitMode::Hybrid);
+        let wait = WaitStrategy::new(WaitMode::Hybrid, None);
         let now = Instant::from_ns(MS);
         assert_eq!(wait.pause(now, None), Pause::Sleep(now + WAIT_MAX));
     }

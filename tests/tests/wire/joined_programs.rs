@@ -384,6 +384,117 @@ deadline = "8 ms"
     assert!(faulty <= most, "{said}{cycle:?}");
 }
 
+/// Runs the topology `text`, named `name`, as the user of the tests, until `meanwhile` is done and it has ended.
+fn run_topology(place: &Place, name: &str, text: &str, meanwhile: impl FnOnce()) -> RunSummary {
+    let file = place.folder.join(name);
+    fs::write(&file, text).unwrap();
+    let mut command = Command::new(&place.binary);
+    command.args(["--quiet", "--topology"]).arg(&file);
+    command.current_dir(place.folder.path());
+    let mut run = ChildGuard::spawn(&mut command).unwrap();
+    meanwhile();
+    run.wait_within(LIMIT).unwrap().assert_success();
+    place.assert_nothing_left();
+    place.summary()
+}
+
+#[test]
+fn programs_of_one_host_need_no_link_and_no_gateway() {
+    if lacks("ping", "iputils-ping") {
+        return;
+    }
+    let topology = r#"version = 1
+name = "neighbours"
+[processes]
+one = { run = ["ping", "-c", "50", "-i", "0.01", "10.77.0.2"], inside = "10.77.0.1" }
+other = { run = ["sleep", "100"], inside = "10.77.0.2" }
+[channels]
+out = { from = "one", to = "other" }
+back = { from = "other", to = "one" }
+"#;
+    let place = Place::new("join-local");
+    let summary = run_topology(&place, "neighbours.toml", topology, || ());
+    assert_closed(&summary);
+    for name in ["icmp 10.77.0.1 → 10.77.0.2", "icmp 10.77.0.2 → 10.77.0.1"] {
+        let echoes = flow(&summary, name);
+        assert_eq!((echoes.frame_count, echoes.taken_count), (50, 50));
+    }
+}
+
+#[test]
+fn killed_gateways_and_programs_come_back_and_frames_flow_again() {
+    if lacks("python3", "python3") {
+        return;
+    }
+    let place = Place::new("join-killed");
+    let talker = place.folder.join("talker.py");
+    let program = "import socket, time\n\
+                   one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n\
+                   while True:\n    one.sendto(b'x' * 64, ('10.77.0.2', 5000))\n    time.sleep(0.002)\n";
+    fs::write(&talker, program).unwrap();
+    let talker = talker.display();
+    let topology = format!(
+        r#"version = 1
+name = "killed"
+[run]
+duration = "16 s"
+[hosts]
+control-pc = {{}}
+robot-pc = {{}}
+[processes]
+controller = {{ host = "control-pc", run = ["python3", "{talker}"], inside = "10.77.0.1", on_exit = "restart" }}
+robot = {{ host = "robot-pc", run = ["sleep", "100"], inside = "10.77.0.2", on_exit = "restart" }}
+[channels]
+out = {{ from = "controller", to = "robot", link = "hop" }}
+back = {{ from = "robot", to = "controller", link = "hop" }}
+[links.hop]
+via = "emulated"
+between = ["control-pc", "robot-pc"]
+delay = "1 ms"
+"#
+    );
+    let victims = [
+        "gateway-hop-robot-pc",
+        "robot",
+        "gateway-hop-control-pc",
+        "controller",
+    ];
+    let kill_each = || {
+        for victim in victims {
+            let process = |instance: u32| {
+                let of_place = processes_mentioning(place.folder.path().to_str().unwrap());
+                let launched = processes_mentioning(&format!("/{victim}.{instance}.json"));
+                launched.into_iter().find(|pid| of_place.contains(pid))
+            };
+            wait_until(LIMIT, "the process runs", || process(0).is_some());
+            // Frames flow, and what flows again after the kill before is recorded.
+            std::thread::sleep(Duration::from_millis(2_000));
+            nix::sys::signal::kill(process(0).unwrap(), Signal::SIGKILL).unwrap();
+            wait_until(LIMIT, "it was started again", || process(1).is_some());
+        }
+    };
+    let summary = run_topology(&place, "killed.toml", &topology, kill_each);
+    for victim in victims {
+        let found = summary.processes.iter().find(|one| one.name == victim);
+        assert_eq!(found.unwrap().restart_count, 1, "{victim}");
+    }
+    let flows = summary.flows.iter().flat_map(|one| &one.flows);
+    let datagrams: Vec<&FlowMetrics> = flows
+        .filter(|one| one.name.contains("udp 10.77.0.1"))
+        .collect();
+    // One of each start of the controller, whose port is another each time.
+    let [before, after] = datagrams[..] else {
+        panic!("{datagrams:#?}");
+    };
+    // Three kills, with two seconds after each of the gateways' and the robot's in which all were taken.
+    assert!(before.taken_count > 1_500, "{before:?}");
+    assert!(after.taken_count > 500, "{after:?}");
+    for one in [before, after] {
+        assert_eq!(one.lost_by_network_count, 0, "{one:?}");
+    }
+    assert!(before.lost_by_harness_count < 500, "{before:?}");
+}
+
 #[test]
 fn ctrl_c_leaves_a_report_and_nothing_else_and_a_program_that_fails_is_named_with_its_exit_code() {
     let place = Place::new("join-end");

@@ -120,7 +120,7 @@ impl Arm {
         }
         let own = self.wait.pause(now, due);
         match own.sooner(self.input.wait.pause(now, None)) {
-            Pause::Spin => core::hint::spin_loop(),
+            Pause::Spin => self.wait.spin(),
             Pause::Sleep(until) => {
                 let listeners = self.waiter.iter().map(Waiter::descriptor);
                 let socket: Option<BorrowedFd<'_>> = self.line.socket.poll_fd();

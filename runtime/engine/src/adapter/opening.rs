@@ -140,7 +140,7 @@ impl OpenedArm {
                 port: ShmInput::open(domain, &arm.input.name, &outgoing, arm.input.depth)?,
                 sink: self.taken,
                 taken,
-                wait: WaitStrategy::new(adapter.wait),
+                wait: WaitStrategy::new(adapter.wait, arm.realtime.cpu),
             },
             output: RecordedOutput {
                 destination: Destination::Channel {
@@ -157,7 +157,7 @@ impl OpenedArm {
             },
             waiter,
             line: self.line,
-            wait: WaitStrategy::new(adapter.wait),
+            wait: WaitStrategy::new(adapter.wait, arm.realtime.cpu),
             buffer: Box::new([0; DATAGRAM_BYTES_MAX]),
             attention: Attention::default(),
             early_count: 0,

@@ -101,7 +101,7 @@ fn frame_jobs<'a>(
             let cable = Outward::join(&here, &output.name, &work.door, true, ends, start)?;
             Ok(Box::new(LocalOutward {
                 cable,
-                wait: WaitStrategy::new(frames.wait),
+                wait: WaitStrategy::new(frames.wait, for_output.cpu),
                 _domain: here,
             }))
         }),
@@ -120,7 +120,7 @@ fn frame_jobs<'a>(
             Ok(Box::new(LocalInward {
                 cable: Inward::join(&here, &input.name, &work.door, input.depth, ends)?,
                 waiter,
-                wait: WaitStrategy::new(frames.wait),
+                wait: WaitStrategy::new(frames.wait, for_input.cpu),
                 _domain: here,
             }))
         }),
@@ -192,7 +192,7 @@ impl JobWork for LocalOutward {
             .wait
             .pause(MonotonicClock::now(), self.cable.next_look())
         {
-            Pause::Spin => core::hint::spin_loop(),
+            Pause::Spin => self.wait.spin(),
             Pause::Sleep(until) => {
                 poll_descriptors(self.cable.descriptor().into_iter(), until)?;
             }
@@ -239,7 +239,7 @@ impl JobWork for LocalInward {
         if let (Pause::Sleep(until), Some(waiter)) = (pause, &mut self.waiter) {
             waiter.wait_until(Some(until))?;
         } else {
-            core::hint::spin_loop();
+            self.wait.spin();
         }
         Ok(())
     }

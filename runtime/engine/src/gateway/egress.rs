@@ -313,7 +313,7 @@ impl Egress {
         }
         match self.wait.pause(now, due) {
             Pause::Spin => {
-                core::hint::spin_loop();
+                self.wait.spin();
                 self.inputs.note_announced()?;
             }
             Pause::Sleep(until) => {

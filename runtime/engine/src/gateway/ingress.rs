@@ -317,7 +317,7 @@ impl Ingress {
             self.wait.pause(now, dues.into_iter().flatten().min())
         };
         match pause {
-            Pause::Spin => core::hint::spin_loop(),
+            Pause::Spin => self.wait.spin(),
             Pause::Sleep(until) => {
                 let away = self.refusal_backoff.until(now, self.refused_count());
                 let socket = self.receiver.poll_fd().filter(|_| away.is_none());

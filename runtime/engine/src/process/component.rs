@@ -61,7 +61,7 @@ pub(super) fn open<'a>(
             Ok(Box::new(Component {
                 endpoint,
                 waiter,
-                wait: WaitStrategy::new(work.wait),
+                wait: WaitStrategy::new(work.wait, work.realtime.cpu),
                 skipped,
                 report: ProcessReport {
                     preparation_s: Some(prepared_in.as_secs_f64()),
@@ -213,7 +213,7 @@ fn connect(
             port: ShmInput::open(domain, port.name, &port.message, depth)?,
             sink,
             taken,
-            wait: WaitStrategy::new(wait),
+            wait: WaitStrategy::new(wait, None),
         })
     };
     let open_output = |port: &Port| {
@@ -280,7 +280,7 @@ impl JobWork for Component {
             pause = pause.sooner(input.wait.pause(now, None));
         }
         match (pause, &mut self.waiter) {
-            (Pause::Spin, _) => core::hint::spin_loop(),
+            (Pause::Spin, _) => self.wait.spin(),
             (Pause::Sleep(until), Some(waiter)) => {
                 waiter.wait_until(Some(until))?;
             }
