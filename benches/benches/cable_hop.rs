@@ -1,0 +1,659 @@
+//! What a cable costs two programs that speak IP: half the round trip of a UDP echo between two programs that each
+//! have a network of their own on two hosts, carried by the product, plain and sealed, beside the same programs
+//! over the bare pair of interfaces between the hosts (`direct`), and with the least in the cable's place that can
+//! stand there (`relay`, see `hil_benches::cable::relay`). Then what each takes of a flood, what a packet of it costs
+//! in processor time, and a stream of TCP. Not a test: it states the aims and whether they were met, and ends
+//! with code 0.
+//!
+//! `cargo bench -p hil-benches --bench cable_hop -- [--rounds N] [--turn MS] [--wait block|hybrid|spin]
+//! [--pin CPU,CPU|none] [--quick]`, about three minutes. It takes root; without, it says what is missing. All
+//! contestants exist the whole time and take turns in an order drawn by lot for each case of a round, on two
+//! processors: all of a host is on one of them, unless `--pin` says otherwise. The programs block. With `--wait spin`
+//! product and relay do not sleep, and the processes of all contestants but the one whose turn it is are stopped
+//! (`SIGSTOP`): two processors have no room for more. The relay gives the processor to others between two looks,
+//! the product waits as `wait` of a topology says; to `hybrid` the relay has no like, and blocks.
+#![allow(clippy::print_stdout, reason = "a bench prints its result")]
+
+use std::fmt::Write as _;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+use std::{env, thread};
+
+use hil_benches::cable::processes::{family, processor_ns};
+use hil_benches::cable::program::{self, Door, Program};
+use hil_benches::cable::relay;
+use hil_benches::gateway::hosts::SetupError;
+use hil_benches::gateway::network::Network;
+use hil_benches::gateway::parties::{MachineTime, stolen_text};
+use hil_benches::turns::{self, verdict};
+use hil_benches::{HostFacts, Quantiles, TypicalRatio, on_cpu};
+use hil_core::random::RandomStream;
+use hil_platform::wait::WaitMode;
+use hil_tests::binary::hil_runtime_binary;
+use hil_tests::child::ChildGuard;
+use hil_tests::lab::{ADDRESSES, Lab};
+use hil_tests::run_folder::RunFolder;
+use hil_tests::trial::Trial;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::json;
+
+const BENCH: &str = "cable_hop";
+const SEED: u64 = 23;
+/// Addresses of the programs inside.
+const INSIDE: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 99, 0, 1), Ipv4Addr::new(10, 99, 0, 2)];
+const NAMES: [&str; 4] = ["direct", "relay", "plain", "sealed"];
+const DIRECT: usize = 0;
+const RELAY: usize = 1;
+/// Which contestants are set against which.
+const PAIRS: [[usize; 2]; 5] = [
+    [2, RELAY],
+    [3, RELAY],
+    [2, DIRECT],
+    [3, DIRECT],
+    [RELAY, DIRECT],
+];
+const RELAY_PORT: u16 = 7_300;
+/// Ports of the two runs of the product, which are on the hosts at the same time: of their supervisors, and of their links.
+const RUN_PORTS: [[u16; 2]; 2] = [[7_399, 7_400], [7_389, 7_380]];
+const SIZES: [usize; 2] = [64, 1024];
+/// From one trip to the next; zero for at once.
+const PERIODS: [Duration; 2] = [Duration::ZERO, Duration::from_millis(1)];
+const LOAD_ROUNDS_MAX: usize = 8;
+const FLOOD_BYTES: usize = 64;
+const FLOOD: Duration = Duration::from_millis(500);
+const STREAM: Duration = Duration::from_millis(800);
+/// What is under way of a flood has come by then.
+const DRAIN: Duration = Duration::from_millis(300);
+/// Of processes that go on after a stop.
+const SETTLE: Duration = Duration::from_millis(30);
+const LIMIT: Duration = Duration::from_mins(1);
+
+/// What the command line says.
+#[derive(Debug)]
+struct Arguments {
+    round_count: usize,
+    turn: Duration,
+    wait: WaitMode,
+    pins: [Option<usize>; 2],
+}
+
+impl Arguments {
+    fn read(mut words: impl Iterator<Item = String>) -> Result<Self, SetupError> {
+        let mut read = Self {
+            round_count: 30,
+            turn: Duration::from_millis(150),
+            wait: WaitMode::Block,
+            pins: [Some(0), Some(1)],
+        };
+        while let Some(word) = words.next() {
+            if word == "--quick" {
+                read.round_count = 6;
+                continue;
+            }
+            let value = words.next().ok_or(format!("{word} needs a value"))?;
+            match word.as_str() {
+                "--rounds" => read.round_count = value.parse()?,
+                "--turn" => read.turn = Duration::from_millis(value.parse()?),
+                "--wait" => read.wait = serde_json::from_value(json!(value))?,
+                "--pin" if value == "none" => read.pins = [None; 2],
+                "--pin" => {
+                    let (first, second) = value.split_once(',').ok_or("--pin takes two")?;
+                    read.pins = [Some(first.parse()?), Some(second.parse()?)];
+                }
+                _ => return Err(format!("unknown argument {word}").into()),
+            }
+        }
+        Ok(read)
+    }
+
+    fn spins(&self) -> bool {
+        self.wait == WaitMode::Spin
+    }
+
+    /// Largest ratios of the median wished for: to the relay and to no cable at all.
+    fn aim(&self, reference: usize) -> f64 {
+        match reference {
+            RELAY => 1.15,
+            _ if self.spins() => 1.5,
+            _ => 2.2,
+        }
+    }
+}
+
+/// Two programs and what carries their frames. The programs end first, and with them the rest.
+#[derive(Debug)]
+struct Contestant {
+    near: Program,
+    far: Program,
+    hosts: Vec<ChildGuard>,
+}
+
+/// What a contestant is started with.
+struct Start<'a> {
+    arguments: &'a Arguments,
+    lab: &'a Lab,
+    folder: &'a RunFolder,
+    executable: &'a str,
+}
+
+impl Start<'_> {
+    /// Runs this file once more on a host, with these words.
+    fn again(&self, index: usize, words: &[String]) -> Result<ChildGuard, SetupError> {
+        let mut command = self.lab.host(index).command(self.executable);
+        command.args(words);
+        Ok(on_cpu(self.arguments.pins[index], || {
+            ChildGuard::spawn(&mut command)
+        })??)
+    }
+
+    fn contestant(&self, index: usize) -> Result<Contestant, SetupError> {
+        let at = |end: &str| self.folder.join(format!("{}-{end}.socket", NAMES[index]));
+        let doors = [Door::open(&at("near"))?, Door::open(&at("far"))?];
+        let peer = if index == DIRECT { ADDRESSES } else { INSIDE }[1];
+        let words = |door: &Door, kind: &str| {
+            let path = door.path().display().to_string();
+            vec![
+                self.executable.to_owned(),
+                kind.to_owned(),
+                path,
+                peer.to_string(),
+            ]
+        };
+        let programs = [words(&doors[0], "--ping"), words(&doors[1], "--echo")];
+        let mut hosts = match index {
+            DIRECT => vec![
+                self.again(0, &programs[0][1..])?,
+                self.again(1, &programs[1][1..])?,
+            ],
+            RELAY => vec![self.relay(0, &programs[0])?, self.relay(1, &programs[1])?],
+            _ => self.product(NAMES[index], &programs)?,
+        };
+        let [near, far] = doors.each_ref().map(|door| await_program(door, &mut hosts));
+        let mut contestant = Contestant {
+            near: near?,
+            far: far?,
+            hosts,
+        };
+        let deadline = Instant::now() + LIMIT;
+        while contestant
+            .ping(0, Duration::from_millis(20), Duration::ZERO)?
+            .half_ns
+            .is_empty()
+        {
+            if Instant::now() > deadline {
+                return Err(format!("{}: no echo within {LIMIT:?}", NAMES[index]).into());
+            }
+        }
+        Ok(contestant)
+    }
+
+    fn relay(&self, index: usize, program: &[String]) -> Result<ChildGuard, SetupError> {
+        let end = |index: usize| format!("{}:{RELAY_PORT}", ADDRESSES[index]);
+        let wait = if self.arguments.spins() {
+            "spin"
+        } else {
+            "block"
+        };
+        let words = [
+            "--relay",
+            &end(index),
+            &end(1 - index),
+            &INSIDE[index].to_string(),
+            wait,
+        ];
+        self.again(index, &[&words.map(str::to_owned)[..], program].concat())
+    }
+
+    fn product(
+        &self,
+        name: &str,
+        programs: &[Vec<String>; 2],
+    ) -> Result<Vec<ChildGuard>, SetupError> {
+        let is_plain = name == "plain";
+        let [control_port, link_port] = RUN_PORTS[usize::from(is_plain)];
+        let [near, far] = programs.each_ref().map(|program| json!(program));
+        let wait = json!(self.arguments.wait);
+        let rounds = u32::try_from(self.arguments.round_count)?;
+        let cases = 2 * u32::try_from(NAMES.len() * SIZES.len() * PERIODS.len())?;
+        let span_s = ((self.arguments.turn + SETTLE) * cases * rounds + 8 * LIMIT).as_secs();
+        let ([a, b], [inside_a, inside_b]) = (ADDRESSES, INSIDE);
+        let mut text = format!(
+            r#"version = 1
+name = "{name}"
+[run]
+duration = "{span_s} s"
+peer_timeout = "1 h"
+[hosts]
+near-pc = {{ address = "{a}", control_port = {control_port} }}
+far-pc = {{ address = "{b}", control_port = {control_port} }}
+[processes]
+near = {{ host = "near-pc", run = {near}, inside = "{inside_a}", wait = {wait} }}
+far = {{ host = "far-pc", run = {far}, inside = "{inside_b}", wait = {wait} }}
+[channels]
+out = {{ from = "near", to = "far", link = "hop" }}
+back = {{ from = "far", to = "near", link = "hop" }}
+[links.hop]
+via = "udp"
+port = {link_port}
+gateway.wait = {wait}
+[security]
+"#
+        );
+        if is_plain {
+            writeln!(text, "hops = \"plain\"")?;
+        }
+        let topology = self.folder.write(format!("{name}.toml"), &text);
+        let trial = Trial::of(&topology, &self.folder.join(name));
+        let start = |index: usize| {
+            on_cpu(self.arguments.pins[index], || {
+                trial.start_on(self.lab.host(index))
+            })
+        };
+        Ok(vec![start(0)?, start(1)?])
+    }
+}
+
+fn await_program(door: &Door, hosts: &mut [ChildGuard]) -> Result<Program, SetupError> {
+    let deadline = Instant::now() + LIMIT;
+    loop {
+        if let Some(program) = door.answer()? {
+            return Ok(program);
+        }
+        let mut ended = hosts
+            .iter_mut()
+            .filter_map(|host| (!host.is_running()).then_some(host));
+        let name = door.path().display();
+        if let Some(host) = ended.next() {
+            let said = host.wait_within(LIMIT)?.stderr;
+            return Err(format!("{name}: it ended: {}", said.trim()).into());
+        }
+        if Instant::now() > deadline {
+            return Err(format!("{name}: nobody within {LIMIT:?}").into());
+        }
+        thread::sleep(Duration::from_millis(5));
+    }
+}
+
+impl Contestant {
+    fn ping(
+        &mut self,
+        bytes: usize,
+        length: Duration,
+        period: Duration,
+    ) -> Result<program::Trips, SetupError> {
+        Ok(self.near.ping(bytes.max(8), length, period)?)
+    }
+
+    /// All processes, the programs included.
+    fn processes(&self) -> Vec<Pid> {
+        self.hosts
+            .iter()
+            .flat_map(|host| family(host.pid()))
+            .collect()
+    }
+
+    /// Processor time of what carries the frames, nanoseconds.
+    fn carrier_ns(&self) -> u64 {
+        let mut carriers = self.processes();
+        carriers.retain(|process| ![self.near.pid, self.far.pid].contains(process));
+        processor_ns(&carriers)
+    }
+
+    /// Stops all of its processes, or has them go on.
+    fn signal(&self, signal: Signal) {
+        let mut processes = self.processes();
+        if signal == Signal::SIGCONT {
+            // Children before those who look after them.
+            processes.reverse();
+        }
+        for process in processes {
+            // Fails only if it ended in between.
+            let _gone = kill(process, signal).is_err();
+        }
+    }
+
+    fn end(self) -> Result<(), SetupError> {
+        drop((self.near, self.far));
+        for mut host in self.hosts {
+            let finished = host.wait_within(LIMIT)?;
+            if !finished.status.success() {
+                let said = finished.stderr.trim().to_owned();
+                return Err(format!("{}: {said}", finished.status).into());
+            }
+        }
+        Ok(())
+    }
+}
+
+/// All contestants, and whose turn it is.
+struct Contest {
+    arguments: Arguments,
+    contestants: Vec<Contestant>,
+    lots: RandomStream,
+}
+
+impl Contest {
+    /// Has each contestant do `work` in an order drawn by lot, alone where they spin.
+    fn each<T>(
+        &mut self,
+        mut work: impl FnMut(&mut Contestant) -> Result<T, SetupError>,
+    ) -> Result<Vec<T>, SetupError> {
+        let mut order: Vec<usize> = (0..self.contestants.len()).collect();
+        for last in (1..order.len()).rev() {
+            let chosen = self.lots.next_u64() % (last as u64 + 1);
+            order.swap(last, usize::try_from(chosen)?);
+        }
+        let mut found: Vec<Option<T>> = order.iter().map(|_| None).collect();
+        for index in order {
+            let contestant = &mut self.contestants[index];
+            if self.arguments.spins() {
+                contestant.signal(Signal::SIGCONT);
+                thread::sleep(SETTLE);
+            }
+            let worked = work(contestant).map_err(|error| format!("{}: {error}", NAMES[index]));
+            found[index] = Some(worked?);
+            if self.arguments.spins() {
+                contestant.signal(Signal::SIGSTOP);
+            }
+        }
+        Ok(found.into_iter().flatten().collect())
+    }
+
+    /// All cases in every round.
+    fn trips(&mut self) -> Result<(), SetupError> {
+        let turn = self.arguments.turn;
+        let cases = PERIODS
+            .iter()
+            .flat_map(|period| SIZES.map(|bytes| Case::new(bytes, *period)));
+        let mut cases: Vec<Case> = cases.collect();
+        let before = MachineTime::read();
+        for _ in 0..self.arguments.round_count {
+            for case in &mut cases {
+                let (bytes, period) = (case.bytes, case.period);
+                let round = self.each(|contestant| contestant.ping(bytes, turn, period))?;
+                case.add(round);
+            }
+        }
+        println!("{}", stolen_text(before, MachineTime::read()));
+        for case in &mut cases {
+            case.print(&self.arguments);
+        }
+        Ok(())
+    }
+
+    /// A flood and a stream through each, in few rounds.
+    fn loads(&mut self) -> Result<(), SetupError> {
+        let mut figures: [Vec<Vec<f64>>; 4] = Default::default();
+        let before = MachineTime::read();
+        let count = self.arguments.round_count.min(LOAD_ROUNDS_MAX);
+        for _ in 0..count {
+            let floods = self.each(|contestant| {
+                let used = contestant.carrier_ns();
+                let sent = contestant.near.flood(FLOOD_BYTES, FLOOD)?;
+                thread::sleep(DRAIN);
+                let (came, span) = contestant.far.flooded()?;
+                let used_us = contestant.carrier_ns().saturating_sub(used) as f64 * 1e-3;
+                let rate = |count: u64, span: Duration| count as f64 / span.as_secs_f64().max(1e-9);
+                Ok([
+                    rate(sent, FLOOD),
+                    rate(came, span),
+                    used_us / came.max(1) as f64,
+                ])
+            })?;
+            let streams = self.each(|contestant| Ok(contestant.near.stream(STREAM)? * 1e-6))?;
+            for (at, rounds) in figures[..3].iter_mut().enumerate() {
+                rounds.push(floods.iter().map(|flood| flood[at]).collect());
+            }
+            figures[3].push(streams);
+        }
+        let stolen = stolen_text(before, MachineTime::read());
+        println!("\nloads, medians of {count} rounds, {stolen}");
+        let units = [
+            ("64 B sent in a flood, 1/s", &PAIRS[..0]),
+            ("64 B received of a flood, 1/s", &PAIRS[..]),
+            (
+                "processor time of carriers per packet received, us",
+                &PAIRS[..2],
+            ),
+            ("TCP, Mbit/s", &PAIRS[..]),
+        ];
+        for ((what, pairs), rounds) in units.into_iter().zip(&figures) {
+            for (index, name) in NAMES.iter().enumerate() {
+                let mut each: Vec<f64> = rounds.iter().map(|round| round[index]).collect();
+                each.sort_unstable_by(f64::total_cmp);
+                let Some(middle) = each.get(each.len() / 2) else {
+                    continue;
+                };
+                println!("  {name:<7} {what} {middle:10.2}");
+                println!(
+                    "{}",
+                    json!({"bench": BENCH, "load": what, "contestant": name, "median": middle, "rounds": each.len()})
+                );
+            }
+            for [one, reference] in pairs {
+                let ratios = rounds.iter().map(|round| round[*one] / round[*reference]);
+                // A connection that broke has no ratio.
+                let ratios = ratios.filter(|ratio| ratio.is_finite() && *ratio > 0.0);
+                print_ratio(
+                    what,
+                    "median",
+                    [NAMES[*one], NAMES[*reference]],
+                    &ratios.collect::<Vec<f64>>(),
+                    None,
+                );
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Round trips of one size at one pace, by contestant.
+struct Case {
+    bytes: usize,
+    period: Duration,
+    half_ns: [Vec<u64>; NAMES.len()],
+    lost_counts: [u64; NAMES.len()],
+    /// Medians and 99th percentiles of each round; a round without an answer to one of them is left out.
+    rounds: Vec<[[u64; 2]; NAMES.len()]>,
+}
+
+impl Case {
+    fn new(bytes: usize, period: Duration) -> Self {
+        Self {
+            bytes,
+            period,
+            half_ns: Default::default(),
+            lost_counts: Default::default(),
+            rounds: Vec::new(),
+        }
+    }
+
+    fn name(&self) -> String {
+        match self.period {
+            Duration::ZERO => format!("{} B one after the other", self.bytes),
+            period => format!("{} B every {period:?}", self.bytes),
+        }
+    }
+
+    fn add(&mut self, round: Vec<program::Trips>) {
+        let mut found = Vec::new();
+        for (index, mut trips) in round.into_iter().enumerate() {
+            let quantiles = Quantiles::of(&mut trips.half_ns);
+            found.extend(quantiles.map(|found| [found.p50_ns, found.p99_ns]));
+            self.lost_counts[index] += trips.lost_count;
+            self.half_ns[index].append(&mut trips.half_ns);
+        }
+        self.rounds
+            .extend(<[[u64; 2]; NAMES.len()]>::try_from(found));
+    }
+
+    fn print(&mut self, arguments: &Arguments) {
+        let case = self.name();
+        println!("\n{case}: half a round trip");
+        let all = self.half_ns.iter_mut().zip(self.lost_counts);
+        for (name, (half_ns, lost_count)) in NAMES.iter().zip(all) {
+            let Some(found) = Quantiles::of(half_ns) else {
+                println!("  {name:<7} no trip came back, {lost_count} were lost");
+                continue;
+            };
+            let us = |ns: u64| ns as f64 * 1e-3;
+            println!(
+                "  {name:<7} p50 {:8.2} us   p99 {:8.2} us   p99.9 {:9.2} us   {} trips, {lost_count} lost",
+                us(found.p50_ns),
+                us(found.p99_ns),
+                us(found.p99_9_ns),
+                found.count
+            );
+            println!(
+                "{}",
+                json!({"bench": BENCH, "case": case, "contestant": name, "half_trip": found.to_json(), "lost": lost_count})
+            );
+        }
+        for [one, reference] in PAIRS {
+            for (at, figure) in ["p50", "p99"].into_iter().enumerate() {
+                let ratios = self
+                    .rounds
+                    .iter()
+                    .map(|round| round[one][at] as f64 / round[reference][at] as f64);
+                let aim = (one != RELAY && figure == "p50").then(|| arguments.aim(reference));
+                print_ratio(
+                    &case,
+                    figure,
+                    [NAMES[one], NAMES[reference]],
+                    &ratios.collect::<Vec<f64>>(),
+                    aim,
+                );
+            }
+        }
+    }
+}
+
+fn print_ratio(case: &str, figure: &str, names: [&str; 2], ratios: &[f64], aim: Option<f64>) {
+    let [one, reference] = names;
+    let Some(found) = TypicalRatio::of(ratios) else {
+        println!("  {case}: too few rounds for {figure} {one} / {reference}");
+        return;
+    };
+    let TypicalRatio { ratio, low, high } = found;
+    let judged = aim.map_or("", |aim| verdict(&found, aim));
+    let said = aim.map_or_else(String::new, |aim| format!(", aim at most {aim}"));
+    println!("  {judged:<9} {figure} {one} / {reference}: {ratio:.3} [{low:.3}, {high:.3}]{said}");
+    println!(
+        "{}",
+        json!({
+            "bench": BENCH, "case": case, "figure": figure, "of": one, "to": reference, "ratio": ratio,
+            "interval_95": [low, high], "rounds": ratios.len(), "aim_max": aim, "verdict": judged,
+        })
+    );
+}
+
+fn measure(arguments: Arguments) -> Result<(), SetupError> {
+    let Arguments {
+        round_count,
+        turn,
+        wait,
+        pins,
+    } = &arguments;
+    let placed = match pins {
+        [Some(first), Some(second)] => format!("hosts on processors {first} and {second}"),
+        _ => "nothing pinned".to_owned(),
+    };
+    let facts = HostFacts::read(&format!("{placed}; the programs block"));
+    println!(
+        "{}\n{round_count} rounds of a {turn:?} turn of each in each case, order by lot of seed {SEED}; ratios of each \
+         round's quantiles, their mean (of logarithms, without the fifth at either end) with its 95 % bootstrap \
+         interval over the rounds; each interval holds by itself",
+        json!({"bench": BENCH, "host": facts.to_json(), "rounds": round_count, "turn_s": turn.as_secs_f64(),
+            "wait": wait, "seed": SEED})
+    );
+    println!("binary: {}", hil_runtime_binary().display());
+    let network = Network::open();
+    let lab = network.lab().ok_or_else(|| network.note().to_owned())?;
+    let folder = RunFolder::new(BENCH);
+    let executable = env::current_exe()?;
+    let executable = executable
+        .to_str()
+        .ok_or("this file has no name in letters")?;
+    let mut contestants = Vec::new();
+    for index in 0..NAMES.len() {
+        let start = Start {
+            arguments: &arguments,
+            lab,
+            folder: &folder,
+            executable,
+        };
+        contestants.push(start.contestant(index)?);
+        if arguments.spins() {
+            contestants[index].signal(Signal::SIGSTOP);
+        }
+    }
+    let mut contest = Contest {
+        arguments,
+        contestants,
+        lots: RandomStream::new(SEED, "turns"),
+    };
+    contest.trips()?;
+    contest.loads()?;
+    for (contestant, name) in contest.contestants.into_iter().zip(NAMES) {
+        contestant.signal(Signal::SIGCONT);
+        contestant
+            .end()
+            .map_err(|error| format!("{name} at its end: {error}"))?;
+    }
+    Ok(())
+}
+
+/// This file as a program of a contestant, or as what carries its frames.
+fn take_part(words: &[String]) -> Option<Result<(), SetupError>> {
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let owned =
+        |words: &[&str]| -> Vec<String> { words.iter().map(|word| (*word).to_owned()).collect() };
+    Some(match words[..] {
+        ["--echo", control, ..] => program::echo(Path::new(control)).map_err(Into::into),
+        ["--ping", control, peer] => match peer.parse() {
+            Ok(peer) => program::ask(Path::new(control), peer).map_err(Into::into),
+            Err(error) => Err(SetupError::from(error)),
+        },
+        ["--relay", here, there, inside, wait, ref program @ ..] => {
+            relay_of(here, there, inside, wait, &owned(program))
+        }
+        [relay::INSIDE, inside, ref program @ ..] => match inside.parse() {
+            Ok(inside) => Err(relay::become_program(inside, &owned(program))),
+            Err(error) => Err(SetupError::from(error)),
+        },
+        _ => return None,
+    })
+}
+
+fn relay_of(
+    here: &str,
+    there: &str,
+    inside: &str,
+    wait: &str,
+    program: &[String],
+) -> Result<(), SetupError> {
+    let ends: [SocketAddr; 2] = [here.parse()?, there.parse()?];
+    relay::run(ends, inside.parse()?, wait == "spin", program)
+}
+
+#[allow(
+    clippy::print_stderr,
+    reason = "what a part of a contestant says before it fails"
+)]
+fn main() -> ExitCode {
+    let words: Vec<String> = env::args()
+        .skip(1)
+        .filter(|word| word != "--bench")
+        .collect();
+    match take_part(&words) {
+        Some(Ok(())) => ExitCode::SUCCESS,
+        Some(Err(error)) => {
+            eprintln!("{BENCH}: {error}");
+            ExitCode::FAILURE
+        }
+        None => turns::exit(BENCH, Arguments::read(words.into_iter()).and_then(measure)),
+    }
+}
