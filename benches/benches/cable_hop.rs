@@ -14,39 +14,28 @@
 //! the product waits as `wait` of a topology says; to `hybrid` the relay has no like, and blocks.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
-use std::fmt::Write as _;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::SocketAddr;
 use std::path::Path;
 use std::process::ExitCode;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use std::{env, thread};
 
-use hil_benches::cable::processes::{family, processor_ns};
-use hil_benches::cable::program::{self, Door, Program};
-use hil_benches::cable::relay;
+use hil_benches::cable::contestant::{Contestant, DIRECT, NAMES, RELAY, Start};
+use hil_benches::cable::{program, relay};
 use hil_benches::gateway::hosts::SetupError;
 use hil_benches::gateway::network::Network;
 use hil_benches::gateway::parties::{MachineTime, stolen_text};
 use hil_benches::turns::{self, verdict};
-use hil_benches::{HostFacts, Quantiles, TypicalRatio, on_cpu};
+use hil_benches::{HostFacts, Quantiles, TypicalRatio};
 use hil_core::random::RandomStream;
 use hil_platform::wait::WaitMode;
 use hil_tests::binary::hil_runtime_binary;
-use hil_tests::child::ChildGuard;
-use hil_tests::lab::{ADDRESSES, Lab};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::Trial;
-use nix::sys::signal::{Signal, kill};
-use nix::unistd::Pid;
+use nix::sys::signal::Signal;
 use serde_json::json;
 
 const BENCH: &str = "cable_hop";
 const SEED: u64 = 23;
-/// Addresses of the programs inside.
-const INSIDE: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 99, 0, 1), Ipv4Addr::new(10, 99, 0, 2)];
-const NAMES: [&str; 4] = ["direct", "relay", "plain", "sealed"];
-const DIRECT: usize = 0;
-const RELAY: usize = 1;
 /// Which contestants are set against which.
 const PAIRS: [[usize; 2]; 5] = [
     [2, RELAY],
@@ -55,9 +44,6 @@ const PAIRS: [[usize; 2]; 5] = [
     [3, DIRECT],
     [RELAY, DIRECT],
 ];
-const RELAY_PORT: u16 = 7_300;
-/// Ports of the two runs of the product, which are on the hosts at the same time: of their supervisors, and of their links.
-const RUN_PORTS: [[u16; 2]; 2] = [[7_399, 7_400], [7_389, 7_380]];
 const SIZES: [usize; 2] = [64, 1024];
 /// From one trip to the next; zero for at once.
 const PERIODS: [Duration; 2] = [Duration::ZERO, Duration::from_millis(1)];
@@ -69,7 +55,6 @@ const STREAM: Duration = Duration::from_millis(800);
 const DRAIN: Duration = Duration::from_millis(300);
 /// Of processes that go on after a stop.
 const SETTLE: Duration = Duration::from_millis(30);
-const LIMIT: Duration = Duration::from_mins(1);
 
 /// What the command line says.
 #[derive(Debug)]
@@ -113,6 +98,13 @@ impl Arguments {
         self.wait == WaitMode::Spin
     }
 
+    /// More than all turns take.
+    fn span(&self) -> Result<Duration, SetupError> {
+        let turns = NAMES.len() * SIZES.len() * PERIODS.len() * self.round_count;
+        let turns = (self.turn + SETTLE) * 2 * u32::try_from(turns)?;
+        Ok(turns + Duration::from_mins(8))
+    }
+
     /// Largest ratios of the median wished for: to the relay and to no cable at all.
     fn aim(&self, reference: usize) -> f64 {
         match reference {
@@ -120,211 +112,6 @@ impl Arguments {
             _ if self.spins() => 1.5,
             _ => 2.2,
         }
-    }
-}
-
-/// Two programs and what carries their frames. The programs end first, and with them the rest.
-#[derive(Debug)]
-struct Contestant {
-    near: Program,
-    far: Program,
-    hosts: Vec<ChildGuard>,
-}
-
-/// What a contestant is started with.
-struct Start<'a> {
-    arguments: &'a Arguments,
-    lab: &'a Lab,
-    folder: &'a RunFolder,
-    executable: &'a str,
-}
-
-impl Start<'_> {
-    /// Runs this file once more on a host, with these words.
-    fn again(&self, index: usize, words: &[String]) -> Result<ChildGuard, SetupError> {
-        let mut command = self.lab.host(index).command(self.executable);
-        command.args(words);
-        Ok(on_cpu(self.arguments.pins[index], || {
-            ChildGuard::spawn(&mut command)
-        })??)
-    }
-
-    fn contestant(&self, index: usize) -> Result<Contestant, SetupError> {
-        let at = |end: &str| self.folder.join(format!("{}-{end}.socket", NAMES[index]));
-        let doors = [Door::open(&at("near"))?, Door::open(&at("far"))?];
-        let peer = if index == DIRECT { ADDRESSES } else { INSIDE }[1];
-        let words = |door: &Door, kind: &str| {
-            let path = door.path().display().to_string();
-            vec![
-                self.executable.to_owned(),
-                kind.to_owned(),
-                path,
-                peer.to_string(),
-            ]
-        };
-        let programs = [words(&doors[0], "--ping"), words(&doors[1], "--echo")];
-        let mut hosts = match index {
-            DIRECT => vec![
-                self.again(0, &programs[0][1..])?,
-                self.again(1, &programs[1][1..])?,
-            ],
-            RELAY => vec![self.relay(0, &programs[0])?, self.relay(1, &programs[1])?],
-            _ => self.product(NAMES[index], &programs)?,
-        };
-        let [near, far] = doors.each_ref().map(|door| await_program(door, &mut hosts));
-        let mut contestant = Contestant {
-            near: near?,
-            far: far?,
-            hosts,
-        };
-        let deadline = Instant::now() + LIMIT;
-        while contestant
-            .ping(0, Duration::from_millis(20), Duration::ZERO)?
-            .half_ns
-            .is_empty()
-        {
-            if Instant::now() > deadline {
-                return Err(format!("{}: no echo within {LIMIT:?}", NAMES[index]).into());
-            }
-        }
-        Ok(contestant)
-    }
-
-    fn relay(&self, index: usize, program: &[String]) -> Result<ChildGuard, SetupError> {
-        let end = |index: usize| format!("{}:{RELAY_PORT}", ADDRESSES[index]);
-        let wait = if self.arguments.spins() {
-            "spin"
-        } else {
-            "block"
-        };
-        let words = [
-            "--relay",
-            &end(index),
-            &end(1 - index),
-            &INSIDE[index].to_string(),
-            wait,
-        ];
-        self.again(index, &[&words.map(str::to_owned)[..], program].concat())
-    }
-
-    fn product(
-        &self,
-        name: &str,
-        programs: &[Vec<String>; 2],
-    ) -> Result<Vec<ChildGuard>, SetupError> {
-        let is_plain = name == "plain";
-        let [control_port, link_port] = RUN_PORTS[usize::from(is_plain)];
-        let [near, far] = programs.each_ref().map(|program| json!(program));
-        let wait = json!(self.arguments.wait);
-        let rounds = u32::try_from(self.arguments.round_count)?;
-        let cases = 2 * u32::try_from(NAMES.len() * SIZES.len() * PERIODS.len())?;
-        let span_s = ((self.arguments.turn + SETTLE) * cases * rounds + 8 * LIMIT).as_secs();
-        let ([a, b], [inside_a, inside_b]) = (ADDRESSES, INSIDE);
-        let mut text = format!(
-            r#"version = 1
-name = "{name}"
-[run]
-duration = "{span_s} s"
-peer_timeout = "1 h"
-[hosts]
-near-pc = {{ address = "{a}", control_port = {control_port} }}
-far-pc = {{ address = "{b}", control_port = {control_port} }}
-[processes]
-near = {{ host = "near-pc", run = {near}, inside = "{inside_a}", wait = {wait} }}
-far = {{ host = "far-pc", run = {far}, inside = "{inside_b}", wait = {wait} }}
-[channels]
-out = {{ from = "near", to = "far", link = "hop" }}
-back = {{ from = "far", to = "near", link = "hop" }}
-[links.hop]
-via = "udp"
-port = {link_port}
-gateway.wait = {wait}
-[security]
-"#
-        );
-        if is_plain {
-            writeln!(text, "hops = \"plain\"")?;
-        }
-        let topology = self.folder.write(format!("{name}.toml"), &text);
-        let trial = Trial::of(&topology, &self.folder.join(name));
-        let start = |index: usize| {
-            on_cpu(self.arguments.pins[index], || {
-                trial.start_on(self.lab.host(index))
-            })
-        };
-        Ok(vec![start(0)?, start(1)?])
-    }
-}
-
-fn await_program(door: &Door, hosts: &mut [ChildGuard]) -> Result<Program, SetupError> {
-    let deadline = Instant::now() + LIMIT;
-    loop {
-        if let Some(program) = door.answer()? {
-            return Ok(program);
-        }
-        let mut ended = hosts
-            .iter_mut()
-            .filter_map(|host| (!host.is_running()).then_some(host));
-        let name = door.path().display();
-        if let Some(host) = ended.next() {
-            let said = host.wait_within(LIMIT)?.stderr;
-            return Err(format!("{name}: it ended: {}", said.trim()).into());
-        }
-        if Instant::now() > deadline {
-            return Err(format!("{name}: nobody within {LIMIT:?}").into());
-        }
-        thread::sleep(Duration::from_millis(5));
-    }
-}
-
-impl Contestant {
-    fn ping(
-        &mut self,
-        bytes: usize,
-        length: Duration,
-        period: Duration,
-    ) -> Result<program::Trips, SetupError> {
-        Ok(self.near.ping(bytes.max(8), length, period)?)
-    }
-
-    /// All processes, the programs included.
-    fn processes(&self) -> Vec<Pid> {
-        self.hosts
-            .iter()
-            .flat_map(|host| family(host.pid()))
-            .collect()
-    }
-
-    /// Processor time of what carries the frames, nanoseconds.
-    fn carrier_ns(&self) -> u64 {
-        let mut carriers = self.processes();
-        carriers.retain(|process| ![self.near.pid, self.far.pid].contains(process));
-        processor_ns(&carriers)
-    }
-
-    /// Stops all of its processes, or has them go on.
-    fn signal(&self, signal: Signal) {
-        let mut processes = self.processes();
-        if signal == Signal::SIGCONT {
-            // Children before those who look after them.
-            processes.reverse();
-        }
-        for process in processes {
-            // Fails only if it ended in between.
-            let _gone = kill(process, signal).is_err();
-        }
-    }
-
-    fn end(self) -> Result<(), SetupError> {
-        drop((self.near, self.far));
-        for mut host in self.hosts {
-            let finished = host.wait_within(LIMIT)?;
-            if !finished.status.success() {
-                let said = finished.stderr.trim().to_owned();
-                return Err(format!("{}: {said}", finished.status).into());
-            }
-        }
-        Ok(())
     }
 }
 
@@ -373,7 +160,8 @@ impl Contest {
         for _ in 0..self.arguments.round_count {
             for case in &mut cases {
                 let (bytes, period) = (case.bytes, case.period);
-                let round = self.each(|contestant| contestant.ping(bytes, turn, period))?;
+                let round =
+                    self.each(|contestant| Ok(contestant.near.ping(bytes, turn, period)?))?;
                 case.add(round);
             }
         }
@@ -577,14 +365,16 @@ fn measure(arguments: Arguments) -> Result<(), SetupError> {
     let executable = executable
         .to_str()
         .ok_or("this file has no name in letters")?;
+    let start = Start {
+        lab,
+        folder: &folder,
+        executable,
+        pins: arguments.pins,
+        wait: arguments.wait,
+        span: arguments.span()?,
+    };
     let mut contestants = Vec::new();
     for index in 0..NAMES.len() {
-        let start = Start {
-            arguments: &arguments,
-            lab,
-            folder: &folder,
-            executable,
-        };
         contestants.push(start.contestant(index)?);
         if arguments.spins() {
             contestants[index].signal(Signal::SIGSTOP);
@@ -654,6 +444,11 @@ fn main() -> ExitCode {
             eprintln!("{BENCH}: {error}");
             ExitCode::FAILURE
         }
-        None => turns::exit(BENCH, Arguments::read(words.into_iter()).and_then(measure)),
+        None => {
+            // A set-up that panics has said why, and cleaned up.
+            let measured = thread::spawn(|| Arguments::read(words.into_iter()).and_then(measure));
+            let panicked = |_cause| Err("a set-up failed, see above".into());
+            turns::exit(BENCH, measured.join().unwrap_or_else(panicked))
+        }
     }
 }

@@ -5,7 +5,7 @@ use std::fs;
 use nix::unistd::Pid;
 
 /// `root` and what it has started that still runs, parents before children.
-pub fn family(root: Pid) -> Vec<Pid> {
+pub(super) fn family(root: Pid) -> Vec<Pid> {
     let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
     let numbers = entries.filter_map(|entry| entry.file_name().to_str()?.parse::<i32>().ok());
     let parents: Vec<(Pid, Pid)> = numbers
@@ -30,7 +30,7 @@ fn parent(process: i32) -> Option<Pid> {
 }
 
 /// Processor time that the threads of `processes` have used so far, nanoseconds.
-pub fn processor_ns(processes: &[Pid]) -> u64 {
+pub(super) fn processor_ns(processes: &[Pid]) -> u64 {
     let tasks = processes.iter().flat_map(|process| {
         let tasks = fs::read_dir(format!("/proc/{process}/task"));
         tasks.into_iter().flatten().flatten()
