@@ -9,9 +9,10 @@
 //! [--pin CPU,CPU|none] [--quick]`, about three minutes. It takes root; without, it says what is missing. All
 //! contestants exist the whole time and take turns in an order drawn by lot for each case of a round, on two
 //! processors: all of a host is on one of them, unless `--pin` says otherwise. The programs block. With `--wait spin`
-//! product and relay do not sleep, and the processes of all contestants but the one whose turn it is are stopped
-//! (`SIGSTOP`): two processors have no room for more. The relay gives the processor to others between two looks,
-//! the product waits as `wait` of a topology says; to `hybrid` the relay has no like, and blocks.
+//! product and relay do not sleep; the relay gives the processor to others between two looks. To `hybrid` it has no
+//! like, and blocks. With either, the processes of all contestants but the one whose turn it is are stopped
+//! (`SIGSTOP`): two processors have no room for more. Two also are too few for a product that spins: it has four
+//! threads on each host.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
 use std::net::SocketAddr;
@@ -98,6 +99,11 @@ impl Arguments {
         self.wait == WaitMode::Spin
     }
 
+    /// Whether the others are stopped during a turn: a carrier that does not always sleep takes their processors.
+    fn is_alone(&self) -> bool {
+        self.wait != WaitMode::Block
+    }
+
     /// More than all turns take.
     fn span(&self) -> Result<Duration, SetupError> {
         let turns = NAMES.len() * SIZES.len() * PERIODS.len() * self.round_count;
@@ -123,7 +129,7 @@ struct Contest {
 }
 
 impl Contest {
-    /// Has each contestant do `work` in an order drawn by lot, alone where they spin.
+    /// Has each contestant do `work` in an order drawn by lot, alone where they do not always sleep.
     fn each<T>(
         &mut self,
         mut work: impl FnMut(&mut Contestant) -> Result<T, SetupError>,
@@ -136,13 +142,13 @@ impl Contest {
         let mut found: Vec<Option<T>> = order.iter().map(|_| None).collect();
         for index in order {
             let contestant = &mut self.contestants[index];
-            if self.arguments.spins() {
+            if self.arguments.is_alone() {
                 contestant.signal(Signal::SIGCONT);
                 thread::sleep(SETTLE);
             }
             let worked = work(contestant).map_err(|error| format!("{}: {error}", NAMES[index]));
             found[index] = Some(worked?);
-            if self.arguments.spins() {
+            if self.arguments.is_alone() {
                 contestant.signal(Signal::SIGSTOP);
             }
         }
@@ -376,7 +382,7 @@ fn measure(arguments: Arguments) -> Result<(), SetupError> {
     let mut contestants = Vec::new();
     for index in 0..NAMES.len() {
         contestants.push(start.contestant(index)?);
-        if arguments.spins() {
+        if arguments.is_alone() {
             contestants[index].signal(Signal::SIGSTOP);
         }
     }
