@@ -92,7 +92,9 @@ impl Loose {
     /// # Errors
     /// When the channel cannot be opened.
     pub fn connect(self) -> Result<(DirectionLaunch, Direction), SetupError> {
-        let direction = self.opened.connect(&self.launch, &self.surroundings)?;
+        let direction =
+            self.opened
+                .connect(&self.launch, &self.surroundings, &RunStart::default())?;
         Ok((self.launch, direction))
     }
 }
@@ -373,6 +375,7 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
             alignment_bytes: plan.message().alignment_bytes,
             depth: plan.depth,
             emulation: None,
+            door: None,
         }],
     }
 }

@@ -2,26 +2,29 @@
 //! that it sends or receives passes through this process, which needs no right for it.
 //!
 //! ```text
-//!   program's namespace          cable's namespace        process of ours, in the host's namespace
+//!   program's namespace          cable's namespace        threads of ours, in the host's namespace
 //!   ┌─────────────────┐          ┌──────────────┐         ┌────────┐
 //!   │ program ─► eth0 ┼── veth ──┼► end ─► ring ┼─────────┼► Inlet │
 //!   └─────────────────┘          └──────────────┘         └────────┘
 //! ```
 //!
 //! A helper process [`enter`]s both namespaces, [`hand_over`]s the socket of the cable's end and becomes the
-//! program; the process that started it takes the socket as an [`Inlet`]. What becomes of the frames between two
-//! inlets is for others: nothing here knows a channel, a link or a datagram.
+//! program. The process that started it keeps the socket behind a [`Door`], where the threads that carry the frames
+//! fetch it as an [`Inlet`]. What becomes of the frames between two inlets is for others: nothing here knows a channel,
+//! a link or a datagram.
 //!
 //! [`pcs`] are whole hosts made in the same way, with a plain pair of interfaces between each two.
 #![forbid(unsafe_code)]
 
+mod door;
 mod inlet;
 mod inside;
 mod netlink;
 pub mod pcs;
 mod refusal;
 
-pub use inlet::{Inlet, InletCounters, InletError};
+pub use door::{CableError, Door, InterfaceDrops};
+pub use inlet::{GivenEnd, Inlet, Knock};
 pub use inside::{CableEnd, Inside, await_go, enter, hand_over, refuse};
 pub use refusal::{Refusal, Step};
 

@@ -13,7 +13,7 @@ use hil_net::handover;
 use nix::errno::Errno;
 use nix::sched::{CloneFlags, setns};
 
-use crate::inlet::InletError;
+use crate::door::CableError;
 use crate::inside::{ENTERED, let_ping, make_namespaces, mount_own};
 use crate::netlink::{INDEX, LOOPBACK, Netlink, Network, PairEnd};
 use crate::refusal::{Refusal, Step};
@@ -102,13 +102,13 @@ impl Pc {
     ///
     /// # Errors
     /// What it was refused.
-    pub fn take(helper: OwnedFd) -> Result<Self, InletError> {
+    pub fn take(helper: OwnedFd) -> Result<Self, CableError> {
         let (word, descriptors) = handover::take(&helper)?;
         if word.is_empty() {
-            return Err(InletError::Gone);
+            return Err(CableError::Gone);
         }
         let [network] = <[OwnedFd; 1]>::try_from(descriptors)
-            .map_err(|_none| InletError::Refused(String::from_utf8_lossy(&word).into_owned()))?;
+            .map_err(|_none| CableError::Refused(String::from_utf8_lossy(&word).into_owned()))?;
         Ok(Self { helper, network })
     }
 

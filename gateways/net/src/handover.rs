@@ -1,13 +1,18 @@
-//! Descriptors from one process to another, with a few bytes beside them, over a socket pair.
+//! Descriptors from one process to another, with a few bytes beside them, over a socket pair or a
+//! socket at a path.
 //!
 //! `unsafe` is allowed here because a received descriptor is a bare number.
 
+use std::fs;
 use std::io::{self, IoSlice, IoSliceMut};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
+use std::path::Path;
 
+use nix::errno::Errno;
 use nix::sys::socket::{
-    AddressFamily, ControlMessage, ControlMessageOwned, MsgFlags, SockFlag, SockType, recvmsg,
-    sendmsg, socketpair,
+    AddressFamily, Backlog, ControlMessage, ControlMessageOwned, MsgFlags, SockFlag, SockType,
+    UnixAddr, accept4, bind, connect as connect_to, listen as listen_at, recvmsg, sendmsg, socket,
+    socketpair,
 };
 
 /// Descriptors of one message.
@@ -25,6 +30,71 @@ pub fn pair() -> io::Result<(OwnedFd, OwnedFd)> {
         None,
         flags,
     )?)
+}
+
+fn at_path(flags: SockFlag) -> io::Result<OwnedFd> {
+    let flags = flags | SockFlag::SOCK_CLOEXEC;
+    Ok(socket(
+        AddressFamily::Unix,
+        SockType::SeqPacket,
+        flags,
+        None,
+    )?)
+}
+
+/// A socket at `path` that others [`connect`] to, in place of what was there.
+///
+/// # Errors
+/// When there can be none.
+pub fn listen(path: &Path) -> io::Result<OwnedFd> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    let listener = at_path(SockFlag::SOCK_NONBLOCK)?;
+    bind(listener.as_raw_fd(), &UnixAddr::new(path)?)?;
+    listen_at(&listener, Backlog::MAXCONN)?;
+    Ok(listener)
+}
+
+/// The next one that connected to `listener`; `None` while nobody has.
+///
+/// # Errors
+/// When the kernel gives no more descriptors.
+#[allow(unsafe_code, reason = "an accepted descriptor is a bare number")]
+pub fn accept(listener: impl AsFd) -> io::Result<Option<OwnedFd>> {
+    let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
+    match accept4(listener.as_fd().as_raw_fd(), flags) {
+        // SAFETY: the kernel has just made this descriptor, and no other owner has it.
+        Ok(number) => Ok(Some(unsafe { OwnedFd::from_raw_fd(number) })),
+        Err(Errno::EAGAIN | Errno::ECONNABORTED | Errno::EINTR) => Ok(None),
+        Err(errno) => Err(errno.into()),
+    }
+}
+
+/// Connects to whoever listens at `path`; `None` where nobody does.
+///
+/// # Errors
+/// When the kernel gives no socket.
+pub fn connect(path: &Path) -> io::Result<Option<OwnedFd>> {
+    let socket = at_path(SockFlag::SOCK_NONBLOCK)?;
+    match connect_to(socket.as_raw_fd(), &UnixAddr::new(path)?) {
+        Ok(()) => Ok(Some(socket)),
+        Err(Errno::ENOENT | Errno::ECONNREFUSED | Errno::EAGAIN | Errno::EINTR) => Ok(None),
+        Err(errno) => Err(errno.into()),
+    }
+}
+
+/// What waits at a socket that does not block, as [`take`]; `None` while nothing does.
+///
+/// # Errors
+/// When receiving fails.
+pub fn take_waiting(socket: impl AsFd) -> io::Result<Option<(Vec<u8>, Vec<OwnedFd>)>> {
+    match take(socket) {
+        Ok(message) => Ok(Some(message)),
+        Err(error) if error.kind() == io::ErrorKind::WouldBlock => Ok(None),
+        Err(error) => Err(error),
+    }
 }
 
 /// Sends `bytes` and copies of `descriptors`, four at most.

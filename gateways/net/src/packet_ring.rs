@@ -133,7 +133,8 @@ pub struct PacketRing {
     map: Mapping,
     frame_bytes: usize,
     frame_count: usize,
-    next_index: usize,
+    /// Where the next packet is looked for; `None` until the first is found that another reader left.
+    next_index: Option<usize>,
     link_type: u16,
     /// What the kernel counted since the tap was opened.
     counted: RingCounters,
@@ -210,7 +211,7 @@ impl PacketRing {
             map,
             frame_bytes: layout.frame,
             frame_count: layout.frame_count(),
-            next_index: 0,
+            next_index: Some(0),
             link_type,
             counted: RingCounters::default(),
             before: RingCounters::default(),
@@ -218,22 +219,18 @@ impl PacketRing {
         }
     }
 
-    /// The ring of a socket that [`CableSocket::attach`] prepared, perhaps in another process.
+    /// The ring of a socket that [`CableSocket::attach`] prepared, perhaps in another process, and that another
+    /// reader has perhaps read from before. It must have ended.
     ///
     /// # Errors
     /// When the kernel does not map it.
     pub fn of_cable(socket: OwnedFd, settings: &RingSettings) -> io::Result<Self> {
         let layout = Layout::of(settings);
         let map = Mapping::of(&socket, layout.ring)?;
-        Ok(Self::new(socket, map, &layout, link_type::ETHERNET))
-    }
-
-    /// Sends frames out of its interface, in whatever thread.
-    ///
-    /// # Errors
-    /// When the kernel gives no more descriptors.
-    pub fn sender(&self) -> io::Result<FrameSender> {
-        self.socket.try_clone().map(FrameSender)
+        Ok(Self {
+            next_index: None,
+            ..Self::new(socket, map, &layout, link_type::ETHERNET)
+        })
     }
 
     /// Readable while a packet waits.
@@ -257,21 +254,42 @@ impl PacketRing {
     /// When the kernel places a packet outside its frame.
     #[allow(unsafe_code, reason = "the frame is memory shared with the kernel")]
     pub fn next_packet(&mut self, take: impl FnOnce(&RingPacket<'_>)) -> bool {
-        let frame = self.map.at(self.next_index * self.frame_bytes);
-        // SAFETY: a frame is aligned to at least 4 bytes, lies within the mapping, begins with its
-        // status, and kernel and program touch that only atomically.
-        let status_cell = unsafe { AtomicU32::from_ptr(frame.as_ptr().cast()) };
+        let Some(index) = self.next_index.or_else(|| self.first_waiting()) else {
+            return false;
+        };
+        let status_cell = self.status_of(index);
         let status = status_cell.load(Ordering::Acquire);
         if status & libc::TP_STATUS_USER == 0 {
             return false;
         }
+        let frame = self.map.at(index * self.frame_bytes);
         // SAFETY: with the user bit set the whole frame is ours: the kernel leaves it alone until its
         // status is set back, which happens after `take` has returned.
         let bytes = unsafe { core::slice::from_raw_parts(frame.as_ptr(), self.frame_bytes) };
         take(&RingPacket::read(bytes, status));
         status_cell.store(libc::TP_STATUS_KERNEL, Ordering::Release);
-        self.next_index = (self.next_index + 1) % self.frame_count;
+        self.next_index = Some((index + 1) % self.frame_count);
         true
+    }
+
+    #[allow(unsafe_code, reason = "the status is memory shared with the kernel")]
+    fn status_of(&self, index: usize) -> &AtomicU32 {
+        let frame = self.map.at(index * self.frame_bytes);
+        // SAFETY: a frame is aligned to at least 4 bytes, lies within the mapping, which lives as long as the ring,
+        // begins with its status, and kernel and program touch that only atomically.
+        unsafe { AtomicU32::from_ptr(frame.as_ptr().cast()) }
+    }
+
+    /// The oldest packet that waits, wherever the kernel is: those that wait lie one behind the other.
+    fn first_waiting(&self) -> Option<usize> {
+        let waits = |index: usize| {
+            self.status_of(index).load(Ordering::Acquire) & libc::TP_STATUS_USER != 0
+        };
+        let found = (0..self.frame_count).find(|&index| waits(index))?;
+        let backwards =
+            (1..self.frame_count).map(|back| (found + self.frame_count - back) % self.frame_count);
+        let first = backwards.take_while(|&index| waits(index)).last();
+        Some(first.unwrap_or(found))
     }
 
     /// What has happened to the interface since it was last asked: `ENETDOWN` when it was taken down
@@ -289,21 +307,29 @@ impl PacketRing {
 
     /// Discards the packets that it holds, at most one turn of the ring, and begins its account anew:
     /// neither they nor what found no room until now is counted. For taps that are to begin together
-    /// and were opened one after the other.
+    /// and were opened one after the other. Gives how many packets that were.
     ///
     /// # Errors
     /// When the kernel does not say what it counted.
-    pub fn begin(&mut self) -> io::Result<()> {
+    pub fn begin(&mut self) -> io::Result<u64> {
         let discarded = (0..self.frame_count).take_while(|_| self.next_packet(|_| ()));
-        self.discarded_count += discarded.count() as u64;
+        let discarded_count = discarded.count() as u64;
+        self.discarded_count += discarded_count;
+        // Of a full ring the kernel's place is not known: it may be any.
+        if discarded_count == self.frame_count as u64 {
+            self.next_index = None;
+        }
         // Read when the ring has room again. What came since then is in it, and counts: hence the sum,
         // and not what was matched until now.
         let dropped_count = self.count()?.dropped_count;
-        self.before = RingCounters {
-            matched_count: self.discarded_count + dropped_count,
-            dropped_count,
-        };
-        Ok(())
+        let before = core::mem::replace(
+            &mut self.before,
+            RingCounters {
+                matched_count: self.discarded_count + dropped_count,
+                dropped_count,
+            },
+        );
+        Ok(discarded_count + dropped_count - before.dropped_count)
     }
 
     /// What was counted since the account began.
@@ -375,6 +401,11 @@ impl CableSocket {
 pub struct FrameSender(OwnedFd);
 
 impl FrameSender {
+    /// Sends through the socket of a ring that [`CableSocket::attach`] prepared.
+    pub const fn of(socket: OwnedFd) -> Self {
+        Self(socket)
+    }
+
     /// Sends `frame`, or fails at once.
     ///
     /// # Errors

@@ -81,7 +81,7 @@ impl NicTap {
     /// Reads the clock and forgets what was heard until now.
     pub(super) fn begin(&mut self) -> Result<(), LiveError> {
         self.start = self.read_clock();
-        told(self.ring.begin(), &self.name)
+        told(self.ring.begin().map(|_discarded| ()), &self.name)
     }
 
     /// Takes over what was counted until now.

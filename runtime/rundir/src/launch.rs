@@ -123,6 +123,8 @@ pub struct ChannelLaunch {
     pub depth: usize,
     /// A link model that its messages meet behind the receiving socket.
     pub emulation: Option<EmulationLaunch>,
+    /// The door of the program on this host whose Ethernet frames its messages are, see [`CableWork::door`].
+    pub door: Option<String>,
 }
 
 hil_core::labelled! {
@@ -208,7 +210,7 @@ pub struct ArmLaunch {
     pub realtime: RealtimeRequest,
 }
 
-/// What a process is told that carries the frames of a program of the user's.
+/// What a process is told that starts a program of the user's with a cable.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CableWork {
@@ -220,10 +222,20 @@ pub struct CableWork {
     pub environment: BTreeMap<String, String>,
     /// Files that the program may have open, if not as many as this process.
     pub open_files: Option<u64>,
+    /// Where the threads that carry its frames fetch the cable's end: a file in the root path of the domain.
+    pub door: String,
     /// The channel of the frames for the program.
     pub input: RoleChannel,
     /// The channel of the frames of the program.
     pub output: RoleChannel,
+    /// Threads of its own that do; `None` where gateways do.
+    pub frames: Option<FrameWork>,
+}
+
+/// Threads that carry the frames of a program whose channels stay on its host.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FrameWork {
     /// What to ask of the kernel for the thread of the output, and for that of the input.
     pub realtime: [RealtimeRequest; 2],
     /// How to wait for frames.

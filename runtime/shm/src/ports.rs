@@ -103,7 +103,7 @@ impl ShmInput {
     ) -> Result<Option<T>, ChannelError> {
         let Self { reader, tracker } = self;
         loop {
-            let taken = reader.receive(|_, envelope, payload| {
+            let taken = reader.receive(|envelope, payload| {
                 tracker.accept(envelope).then(|| take(envelope, payload))
             })?;
             match taken {

@@ -8,7 +8,6 @@ use core::{fmt, slice};
 use std::os::fd::BorrowedFd;
 
 use hil_core::message::{Envelope, TypeInfo};
-use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::LoanError;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
@@ -16,8 +15,7 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{
-    FileDescriptorBased, MessagingPattern, PayloadHeader, PortName, Service, ServiceName,
-    ZeroCopySend, ipc,
+    FileDescriptorBased, MessagingPattern, PortName, Service, ServiceName, ZeroCopySend, ipc,
 };
 use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
@@ -605,7 +603,7 @@ impl ByteReader {
     )]
     pub(crate) fn receive<T>(
         &mut self,
-        take: impl FnOnce(UniqueNodeId, &Envelope, &[u8]) -> T,
+        take: impl FnOnce(&Envelope, &[u8]) -> T,
     ) -> Result<Option<T>, ChannelError> {
         let sample = self.sample()?;
         Ok(sample.map(|sample| {
@@ -621,7 +619,7 @@ impl ByteReader {
             } else {
                 payload
             };
-            take(sample.header().node_id(), envelope, payload)
+            take(envelope, payload)
         }))
     }
 }
@@ -660,7 +658,6 @@ impl fmt::Debug for HeldMessage {
 pub struct RawInput {
     message: TypeInfo,
     reader: ByteReader,
-    own_node: UniqueNodeId,
 }
 
 impl RawInput {
@@ -673,7 +670,6 @@ impl RawInput {
         let message = retry(domain.open_within(), || discover(domain, channel))?;
         Ok(Self {
             reader: ByteReader::open(domain, channel, &message, depth)?,
-            own_node: domain.with_node(|node| *node.id()),
             message,
         })
     }
@@ -694,20 +690,10 @@ impl RawInput {
     /// # Errors
     /// When the channel is broken.
     pub fn hold(&mut self) -> Result<Option<HeldMessage>, ChannelError> {
-        loop {
-            let Some(sample) = self.reader.sample()? else {
-                return Ok(None);
-            };
-            if sample.header().node_id() != self.own_node {
-                return Ok(Some(HeldMessage(sample)));
-            }
-        }
+        Ok(self.reader.sample()?.map(HeldMessage))
     }
 
     /// Hands the oldest waiting sample to `take`; false when none waits. Never blocks.
-    ///
-    /// Samples published through the same [`Domain`] value are passed over, so that a gateway
-    /// does not send back what it delivered itself.
     ///
     /// # Errors
     /// When the channel is broken.
@@ -715,20 +701,9 @@ impl RawInput {
         &mut self,
         take: &mut dyn FnMut(&Envelope, &[u8]),
     ) -> Result<bool, ChannelError> {
-        let own_node = self.own_node;
-        loop {
-            let taken = self.reader.receive(|node, envelope, payload| {
-                let is_foreign = node != own_node;
-                if is_foreign {
-                    take(envelope, payload);
-                }
-                is_foreign
-            })?;
-            match taken {
-                Some(true) => return Ok(true),
-                Some(false) => {}
-                None => return Ok(false),
-            }
-        }
+        let taken = self
+            .reader
+            .receive(|envelope, payload| take(envelope, payload))?;
+        Ok(taken.is_some())
     }
 }

@@ -239,7 +239,9 @@ fn iperf3_and_the_account_lose_the_same_datagrams() {
     let place = Place::new("join-iperf");
     let client =
         "sleep 1; exec iperf3 --udp --bitrate 4M --length 1000 --time 3 --json --client 10.77.0.2";
-    let link = ["--link", "delay 1ms loss 3%", "--seed", "5"];
+    // Losses of a full queue, not by chance: iperf3 gives up when the one datagram that opens its stream, or
+    // the one that answers it, is lost.
+    let link = ["--link", "delay 1ms rate 2Mbit"];
     let programs = ["--", "sh", "-c", client, "--", "iperf3", "--server"];
     place.run(&[&link[..], &programs].concat()).assert_success();
     let (summary, said) = (place.summary(), place.said_by_first());
@@ -251,10 +253,9 @@ fn iperf3_and_the_account_lose_the_same_datagrams() {
     println!("iperf3: {lost} of {packets} lost");
     // Beside its datagrams it sends one that opens the stream; the last ones it does not count as lost.
     assert!((packets..=packets + 2).contains(&datagrams.frame_count));
-    assert!(
-        datagrams.lost_by_network_count.abs_diff(lost) <= 3,
-        "{lost}: {datagrams:?}"
-    );
+    // What was under way when it ended is lost to it.
+    let not_taken = datagrams.lost_by_network_count + datagrams.unknown_count;
+    assert!(not_taken.abs_diff(lost) <= 3, "{lost}: {datagrams:?}");
     assert!(
         lost > 0 && datagrams.lost_by_harness_count == 0,
         "{datagrams:?}"
@@ -470,14 +471,15 @@ fn what_a_stopped_process_of_ours_loses_is_the_harness_and_not_the_network() {
         let worker = processes_mentioning(text);
         worker.into_iter().find(|pid| of_place.contains(pid))
     };
-    wait_until(LIMIT, "the cable of the second program is there", || {
-        own("/second.0.json").is_some()
+    let launch = "/gateway-link-second.0.json";
+    wait_until(LIMIT, "the gateway of the second program is there", || {
+        own(launch).is_some()
     });
-    let cable = own("/second.0.json").unwrap();
+    let gateway = own(launch).unwrap();
     std::thread::sleep(Duration::from_secs(1));
-    nix::sys::signal::kill(cable, Signal::SIGSTOP).unwrap();
+    nix::sys::signal::kill(gateway, Signal::SIGSTOP).unwrap();
     std::thread::sleep(Duration::from_secs(8));
-    nix::sys::signal::kill(cable, Signal::SIGCONT).unwrap();
+    nix::sys::signal::kill(gateway, Signal::SIGCONT).unwrap();
     std::thread::sleep(Duration::from_secs(1));
     child.signal(Signal::SIGINT).unwrap();
     child.wait_within(LIMIT).unwrap();

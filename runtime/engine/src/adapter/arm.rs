@@ -124,7 +124,7 @@ impl Arm {
             Pause::Sleep(until) => {
                 let listeners = self.waiter.iter().map(Waiter::descriptor);
                 let socket: Option<BorrowedFd<'_>> = self.line.socket.poll_fd();
-                let [first, second] = poll_descriptors(listeners.chain(socket), until)?;
+                let [first, second, ..] = poll_descriptors(listeners.chain(socket), until)?;
                 let (is_announced, has_news) = match self.waiter {
                     Some(_) => (first, second),
                     None => (false, first),

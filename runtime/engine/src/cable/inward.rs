@@ -1,84 +1,108 @@
-//! The thread of what a program receives: each message is a frame that the program's interface is given. One that
-//! the interface does not take counts as not taken.
+//! What a program receives: each message is a frame that the program's interface is given. One that the interface
+//! does not take counts as not taken.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use hil_core::message::ETHERNET_FRAME;
 use hil_core::record::TakenRecord;
+use hil_core::time::Instant;
 use hil_net::packet_ring::FrameSender;
 use hil_platform::clock::MonotonicClock;
-use hil_platform::wait::{Pause, WaitMode, WaitStrategy};
-use hil_rundir::launch::CableWork;
-use hil_rundir::pipe::{CountByName, CounterGroup, InletReport, ProcessReport};
-use hil_rundir::record::RecordSink;
-use hil_shm::{Domain, ShmInput, Waiter};
+use hil_rundir::pipe::{CountByName, CounterGroup, InletReport};
+use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder};
+use hil_shm::{Domain, ShmInput};
 
-use super::clear;
+use super::RING_RECORDS;
+use super::attachment::Attachment;
 use crate::process::recording::forwarded_ns;
-use crate::process::worker::{JobWork, WorkerError};
+use crate::process::worker::WorkerError;
 
 /// What is open before the thread begins.
 #[derive(Debug)]
-pub(super) struct Ends {
-    pub(super) sender: FrameSender,
-    pub(super) taken: RecordSink,
+pub(crate) struct OpenInward {
+    taken: RecordSink,
     /// Frames given to the program.
-    pub(super) count: Arc<AtomicU64>,
+    pub(crate) count: Arc<AtomicU64>,
 }
 
-/// See the module documentation.
-#[derive(Debug)]
-pub(super) struct Inward {
-    channel: String,
-    ends: Ends,
-    input: ShmInput,
-    /// `None` for a thread that spins.
-    waiter: Option<Waiter>,
-    wait: WaitStrategy,
-    refused_count: u64,
-    /// Dropped after the ports.
-    _domain: Arc<Domain>,
-}
-
-impl Inward {
-    pub(super) fn join(
-        work: &CableWork,
-        domain: Arc<Domain>,
-        ends: Ends,
-    ) -> Result<Self, WorkerError> {
-        let channel = work.input.name.as_str();
-        let waiter = (work.wait != WaitMode::Spin)
-            .then(|| Waiter::open(&domain, &[channel]))
-            .transpose()?;
+impl OpenInward {
+    /// The record file of the frames on `channel`.
+    ///
+    /// # Errors
+    /// When it cannot be made.
+    pub(crate) fn new(recorder: &mut Recorder, channel: &str) -> Result<Self, RecordFileError> {
+        let size = size_of::<TakenRecord>();
         Ok(Self {
-            channel: channel.to_owned(),
-            ends,
-            input: ShmInput::open(&domain, channel, &ETHERNET_FRAME, work.input.depth)?,
-            waiter,
-            wait: WaitStrategy::new(work.wait),
-            refused_count: 0,
-            _domain: domain,
+            taken: recorder.sink(RecordKind::Taken, channel, size, RING_RECORDS)?,
+            count: Arc::default(),
         })
     }
 }
 
-impl JobWork for Inward {
-    /// Gives the program one waiting frame.
-    fn step(&mut self) -> Result<bool, WorkerError> {
+/// See the module documentation.
+#[derive(Debug)]
+pub(crate) struct Inward {
+    channel: String,
+    ends: OpenInward,
+    attachment: Attachment,
+    sender: Option<FrameSender>,
+    /// A program was there: what comes without one now came after its end.
+    had_program: bool,
+    input: ShmInput,
+    refused_count: u64,
+    absent_count: u64,
+}
+
+impl Inward {
+    /// Joins `channel`, whose frames are for the program behind `door`.
+    ///
+    /// # Errors
+    /// When the channel does not appear.
+    pub(crate) fn join(
+        domain: &Domain,
+        channel: &str,
+        door: &str,
+        depth: usize,
+        ends: OpenInward,
+    ) -> Result<Self, WorkerError> {
+        Ok(Self {
+            channel: channel.to_owned(),
+            ends,
+            attachment: Attachment::new(domain, door),
+            sender: None,
+            had_program: false,
+            input: ShmInput::open(domain, channel, &ETHERNET_FRAME, depth)?,
+            refused_count: 0,
+            absent_count: 0,
+        })
+    }
+
+    /// Gives the program one waiting frame; false when none waits.
+    ///
+    /// # Errors
+    /// When the channel is broken.
+    pub(crate) fn step(&mut self) -> Result<bool, WorkerError> {
+        if self.sender.is_none() && !self.had_program {
+            self.look()?;
+            return Ok(false);
+        }
         let Self {
             ends,
+            sender,
             input,
-            wait,
             refused_count,
+            absent_count,
             ..
         } = self;
         let delivered = input.take(|envelope, frame| {
             // Before it is given: the program's kernel may answer within the call.
             let now = MonotonicClock::now();
-            wait.on_arrival(now);
-            let sent = ends.sender.send(frame);
-            if sent.is_err() {
+            let Some(sender) = sender else {
+                *absent_count += 1;
+                return;
+            };
+            if sender.send(frame).is_err() {
                 *refused_count += 1;
                 return;
             }
@@ -92,36 +116,51 @@ impl JobWork for Inward {
             });
             ends.count.fetch_add(1, Ordering::Relaxed);
         })?;
+        if delivered.is_none() {
+            self.look()?;
+        }
         Ok(delivered.is_some())
     }
 
-    fn rest(&mut self) -> Result<(), WorkerError> {
-        let pause = self.wait.pause(MonotonicClock::now(), None);
-        if let (Pause::Sleep(until), Some(waiter)) = (pause, &mut self.waiter) {
-            waiter.wait_until(Some(until))?;
-        } else {
-            core::hint::spin_loop();
+    /// Looks after the cable, now and then.
+    fn look(&mut self) -> Result<(), WorkerError> {
+        if !self.attachment.is_due(MonotonicClock::now()) {
+            return Ok(());
+        }
+        if self.sender.is_some() {
+            if self.attachment.has_ended() {
+                self.sender = None;
+            }
+        } else if let Some(given) = self.attachment.ask()? {
+            self.sender = Some(given.into_sender());
+            self.had_program = true;
         }
         Ok(())
     }
 
-    fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
-        stepped?;
-        clear(self)
+    /// When it wants another step though no message came; `None` while the program is there.
+    pub(crate) fn next_look(&self) -> Option<Instant> {
+        let is_absent = self.sender.is_none();
+        is_absent.then(|| self.attachment.next_look())
     }
 
-    fn report(&mut self) -> ProcessReport {
-        let lost = [(
-            "refused by the interface of the program",
-            self.refused_count,
-        )];
-        ProcessReport {
-            inlets: vec![InletReport {
-                channel: self.channel.clone(),
-                lost: CountByName::all(CounterGroup::Own, lost).collect(),
-            }],
-            connection_failures: self.input.counters().connection_failure_count,
-            ..ProcessReport::default()
+    /// What was lost on the way to the program.
+    pub(crate) fn report(&self) -> InletReport {
+        let lost = [
+            (
+                "refused by the interface of the program",
+                self.refused_count,
+            ),
+            ("came after the program had ended", self.absent_count),
+        ];
+        InletReport {
+            channel: self.channel.clone(),
+            lost: CountByName::all(CounterGroup::Own, lost).collect(),
         }
+    }
+
+    /// Attempts to connect to a writer that failed.
+    pub(crate) fn connection_failure_count(&self) -> u64 {
+        self.input.counters().connection_failure_count
     }
 }

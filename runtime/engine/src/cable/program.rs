@@ -1,12 +1,15 @@
-//! The thread that waits for the end of a program, or ends it.
+//! The thread that waits for the end of a program, or ends it, and looks after the door to its cable.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use hil_cable::{Door, InterfaceDrops};
 use hil_platform::signals::Signals;
-use hil_rundir::pipe::{FromProcess, Orders, ProcessReport, ToProcess, say};
+use hil_rundir::pipe::{
+    CountByName, CounterGroup, FromProcess, InletReport, Orders, ProcessReport, ToProcess, say,
+};
 
 use crate::process::worker::{JobWork, WorkerError};
 use crate::supervisor::Child;
@@ -20,7 +23,10 @@ const PATIENCE: Duration = Duration::from_secs(2);
 #[derive(Debug)]
 pub(super) struct Program {
     pub(super) child: Child,
+    pub(super) door: Door,
     pub(super) name: String,
+    /// Of what it sends, and of what it receives.
+    pub(super) channels: [String; 2],
     /// Set by the end of the program.
     pub(super) stop: Arc<AtomicBool>,
     /// The group is told to end by a signal, which is not meant for this process.
@@ -33,6 +39,7 @@ impl JobWork for Program {
     }
 
     fn step(&mut self) -> Result<bool, WorkerError> {
+        self.door.attend().map_err(WorkerError::Socket)?;
         let Some(end) = self.child.poll_end() else {
             return Ok(false);
         };
@@ -64,6 +71,22 @@ impl JobWork for Program {
     }
 
     fn report(&mut self) -> ProcessReport {
-        ProcessReport::default()
+        let InterfaceDrops {
+            inward_count,
+            outward_count,
+        } = self.door.drops();
+        let [output, input] = &self.channels;
+        let dropped = |channel: &String, count| InletReport {
+            channel: channel.clone(),
+            lost: CountByName::all(
+                CounterGroup::Own,
+                [("dropped by the interface of the program", count)],
+            )
+            .collect(),
+        };
+        ProcessReport {
+            inlets: vec![dropped(output, outward_count), dropped(input, inward_count)],
+            ..ProcessReport::default()
+        }
     }
 }

@@ -21,11 +21,12 @@ use super::refusal_backoff::RefusalBackoff;
 use super::socket::{OpenSocket, SocketEnd, timestamp_mode};
 use super::stamp_plan::StampPlan;
 use super::{GatewayContext, WorkerError, counters};
+use crate::cable::{Inward, OpenInward, OpenOutward, Outward, clear};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::WaitStrategy;
-use hil_rundir::launch::{DirectionLaunch, Side};
+use hil_rundir::launch::{ChannelLaunch, DirectionLaunch, Side};
 use hil_rundir::pipe::{
-    ChannelReport, CountByName, CounterGroup, DirectionReport, RunStart, StallMetrics,
+    ChannelReport, CountByName, CounterGroup, DirectionReport, InletReport, RunStart, StallMetrics,
 };
 use hil_rundir::record::{RecordKind, RecordSink, Recorder, SharedSink};
 use hil_shm::RawOutput;
@@ -50,7 +51,16 @@ pub struct OpenDirection {
     pub(super) counts: Vec<Arc<AtomicU64>>,
     /// True while the peer takes this direction's messages.
     pub(super) is_established: Arc<AtomicBool>,
+    /// The programs on this host whose frames its messages are, by the index of their channel.
+    pub(super) cables: Vec<(usize, OpenCable)>,
     plan: StampPlan,
+}
+
+/// What is open for a program whose frames a direction carries.
+#[derive(Debug)]
+pub(super) enum OpenCable {
+    Outward(OpenOutward),
+    Inward(OpenInward),
 }
 
 /// The record rings of a direction.
@@ -78,8 +88,15 @@ pub struct Direction {
 
 #[derive(Debug)]
 enum BridgeLoop {
-    Egress(Box<Egress>),
-    Ingress(Box<Ingress>),
+    Egress {
+        egress: Box<Egress>,
+        /// By the index of their channel.
+        cables: Vec<(usize, Outward)>,
+    },
+    Ingress {
+        ingress: Box<Ingress>,
+        cables: Vec<Inward>,
+    },
 }
 
 /// Opens the socket and the record files of `launch`; call it from a thread of normal priority.
@@ -125,6 +142,23 @@ fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks
     })
 }
 
+fn open_cables(
+    launch: &DirectionLaunch,
+    recorder: &mut Recorder,
+) -> Result<Vec<(usize, OpenCable)>, WorkerError> {
+    let channels = launch.channels.iter().enumerate();
+    let mut open = |one: &ChannelLaunch| -> Result<OpenCable, WorkerError> {
+        Ok(match launch.side {
+            Side::Egress => OpenCable::Outward(OpenOutward::new(recorder, &one.channel)?),
+            Side::Ingress => OpenCable::Inward(OpenInward::new(recorder, &one.channel)?),
+        })
+    };
+    channels
+        .filter(|(_, one)| one.door.is_some())
+        .map(|(index, one)| Ok((index, open(one)?)))
+        .collect()
+}
+
 impl OpenDirection {
     /// The direction of an open socket, with its record files.
     ///
@@ -139,6 +173,7 @@ impl OpenDirection {
         Ok(Self {
             socket,
             sinks: open_sinks(launch, recorder)?,
+            cables: open_cables(launch, recorder)?,
             plan,
             counts: launch.channels.iter().map(|_| Arc::default()).collect(),
             // A receiver has nobody to wait for: it takes what comes.
@@ -154,7 +189,24 @@ impl OpenDirection {
         self,
         launch: &DirectionLaunch,
         around: &GatewayContext,
+        start: &RunStart,
     ) -> Result<Direction, WorkerError> {
+        let (domain, mut outward, mut inward) = (&around.domain, Vec::new(), Vec::new());
+        for (index, open) in self.cables {
+            let one = &launch.channels[index];
+            let Some(door) = &one.door else { continue };
+            match open {
+                // The thread that publishes is the one that takes: nobody is to be woken.
+                OpenCable::Outward(open) => {
+                    let start = start.clone();
+                    let cable = Outward::join(domain, &one.channel, door, false, open, start)?;
+                    outward.push((index, cable));
+                }
+                OpenCable::Inward(open) => {
+                    inward.push(Inward::join(domain, &one.channel, door, one.depth, open)?);
+                }
+            }
+        }
         let way = match (self.socket.ends, self.sinks) {
             (
                 SocketEnd::Sender(sender, datagram_max_bytes),
@@ -162,18 +214,21 @@ impl OpenDirection {
                     messages,
                     round_trips,
                 },
-            ) => BridgeLoop::Egress(Box::new(Egress {
-                inputs: Inputs::open(&around.domain, &launch.channels, launch.wait)?,
-                long: None,
-                bridge: egress_bridge(datagram_max_bytes, launch, around)?,
-                line: Line::new(sender, messages, round_trips, around.session, self.plan)?,
-                wait: WaitStrategy::new(launch.wait),
-                sent: self.counts.into_boxed_slice(),
-                attention: Attention::default(),
-                refusal_backoff: RefusalBackoff::of_replies(),
-                path_bytes: None,
-                is_established: self.is_established,
-            })),
+            ) => BridgeLoop::Egress {
+                cables: outward,
+                egress: Box::new(Egress {
+                    inputs: Inputs::open(&around.domain, &launch.channels, launch.wait)?,
+                    long: None,
+                    bridge: egress_bridge(datagram_max_bytes, launch, around)?,
+                    line: Line::new(sender, messages, round_trips, around.session, self.plan)?,
+                    wait: WaitStrategy::new(launch.wait),
+                    sent: self.counts.into_boxed_slice(),
+                    attention: Attention::default(),
+                    refusal_backoff: RefusalBackoff::of_replies(),
+                    path_bytes: None,
+                    is_established: self.is_established,
+                }),
+            },
             (SocketEnd::Receiver(receiver), Sinks::Ingress { messages, no_room }) => {
                 let settings = IngressSettings::new(
                     GatewayContext::identity(launch),
@@ -183,28 +238,32 @@ impl OpenDirection {
                 );
                 let channels = launch.channels.iter().zip(self.counts);
                 let outputs = channels.map(|(one, received)| {
-                    let (domain, slots) = (&around.domain, reassembly_slots(one.size_bytes));
+                    let (name, slots) = (&one.channel, reassembly_slots(one.size_bytes));
+                    let notifies_readers = one.door.is_none();
                     Ok(Output {
-                        port: RawOutput::open_assembling(domain, &one.channel, true, slots)?,
+                        port: RawOutput::open_assembling(domain, name, notifies_readers, slots)?,
                         received,
                     })
                 });
-                BridgeLoop::Ingress(Box::new(Ingress {
-                    receiver,
-                    is_emulated: launch.channels.iter().any(|one| one.emulation.is_some()),
-                    bridge: IngressBridge::new(settings)?,
-                    outputs: outputs.collect::<Result<_, WorkerError>>()?,
-                    records: messages,
-                    no_room: NoRoom::new(),
-                    no_room_records: no_room,
-                    wait: WaitStrategy::new(launch.wait),
-                    peer: launch.peer,
-                    foreign_count: 0,
-                    refusal_backoff: RefusalBackoff::of_messages(),
-                    clock: KernelClock::read()?,
-                    response: None,
-                    buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
-                }))
+                BridgeLoop::Ingress {
+                    cables: inward,
+                    ingress: Box::new(Ingress {
+                        receiver,
+                        is_emulated: launch.channels.iter().any(|one| one.emulation.is_some()),
+                        bridge: IngressBridge::new(settings)?,
+                        outputs: outputs.collect::<Result<_, WorkerError>>()?,
+                        records: messages,
+                        no_room: NoRoom::new(),
+                        no_room_records: no_room,
+                        wait: WaitStrategy::new(launch.wait),
+                        peer: launch.peer,
+                        foreign_count: 0,
+                        refusal_backoff: RefusalBackoff::of_messages(),
+                        clock: KernelClock::read()?,
+                        response: None,
+                        buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
+                    }),
+                }
             }
             _ => unreachable!("sinks and socket are opened for one side"),
         };
@@ -236,14 +295,30 @@ pub(super) fn egress_bridge(
     })
 }
 
+/// Publishes one frame of each program and sends one message.
+fn step_outward(egress: &mut Egress, cables: &mut [(usize, Outward)]) -> Result<bool, WorkerError> {
+    let mut has_moved = false;
+    for (index, cable) in cables {
+        if cable.step()? {
+            egress.note_published(*index);
+            has_moved = true;
+        }
+    }
+    Ok(egress.step()? || has_moved)
+}
+
 impl Direction {
     /// Ends what is under way once told to stop, or after a step that failed.
     pub(super) fn finish(&mut self, stepped: Result<(), WorkerError>) -> Result<(), WorkerError> {
         match &mut self.way {
-            BridgeLoop::Egress(egress) => egress.finish(stepped),
-            BridgeLoop::Ingress(ingress) => {
+            BridgeLoop::Egress { egress, cables } => {
+                let stepped = stepped.and_then(|()| clear(|| step_outward(egress, cables)));
+                egress.finish(stepped)
+            }
+            BridgeLoop::Ingress { ingress, cables } => {
                 ingress.finish();
-                stepped
+                stepped?;
+                cables.iter_mut().try_for_each(|one| clear(|| one.step()))
             }
         }
     }
@@ -254,8 +329,14 @@ impl Direction {
     /// When a channel or the socket itself breaks, or the peer refuses the flow for good.
     pub fn step(&mut self) -> Result<bool, WorkerError> {
         match &mut self.way {
-            BridgeLoop::Egress(egress) => egress.step(),
-            BridgeLoop::Ingress(ingress) => ingress.step(),
+            BridgeLoop::Egress { egress, cables } => step_outward(egress, cables),
+            BridgeLoop::Ingress { ingress, cables } => {
+                let mut has_moved = ingress.step()?;
+                for one in cables {
+                    has_moved |= one.step()?;
+                }
+                Ok(has_moved)
+            }
         }
     }
 
@@ -265,8 +346,20 @@ impl Direction {
     /// When waiting itself fails.
     pub fn rest(&mut self) -> Result<(), WorkerError> {
         match &mut self.way {
-            BridgeLoop::Egress(egress) => egress.rest(),
-            BridgeLoop::Ingress(ingress) => ingress.rest(),
+            BridgeLoop::Egress { egress, cables } => egress.rest(cables),
+            BridgeLoop::Ingress { ingress, cables } => {
+                ingress.rest(cables.iter().filter_map(Inward::next_look).min())
+            }
+        }
+    }
+
+    /// What the inlets of programs lost.
+    pub(super) fn inlets(&mut self) -> Vec<InletReport> {
+        match &mut self.way {
+            BridgeLoop::Egress { cables, .. } => {
+                cables.iter_mut().map(|one| one.1.report()).collect()
+            }
+            BridgeLoop::Ingress { cables, .. } => cables.iter().map(Inward::report).collect(),
         }
     }
 
@@ -275,7 +368,7 @@ impl Direction {
         let now = MonotonicClock::now();
         let mut facts = self.facts.clone();
         let (peer_state, mut counters, transport, seal) = match &self.way {
-            BridgeLoop::Egress(egress) => {
+            BridgeLoop::Egress { egress, .. } => {
                 let sender = egress.line.sender();
                 let found = egress.path_bytes.map(|bytes| {
                     let text = format!("{bytes} bytes a datagram, less than the link asks for");
@@ -289,7 +382,7 @@ impl Direction {
                     sender.seal_counts(),
                 )
             }
-            BridgeLoop::Ingress(ingress) => {
+            BridgeLoop::Ingress { ingress, .. } => {
                 if launch.socket.common.dscp > 0 {
                     let counters = ingress.receiver.counters();
                     facts.extend(counters::mark_fact(launch.socket.common.dscp, &counters));
@@ -312,8 +405,8 @@ impl Direction {
             ChannelReport {
                 channel: one.channel.clone(),
                 counters: match &self.way {
-                    BridgeLoop::Egress(egress) => counters::of_sent(egress, index),
-                    BridgeLoop::Ingress(ingress) => {
+                    BridgeLoop::Egress { egress, .. } => counters::of_sent(egress, index),
+                    BridgeLoop::Ingress { ingress, .. } => {
                         counters::of_received(ingress, index, one.channel_id)
                     }
                 },

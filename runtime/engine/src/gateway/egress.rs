@@ -16,6 +16,7 @@ use super::long_message::LongMessage;
 use super::refusal_backoff::RefusalBackoff;
 use super::stamp_tracker::STAMP_PATIENCE_NS;
 use super::{WorkerError, poll_descriptors};
+use crate::cable::Outward;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy};
 use hil_rundir::pipe::{FromProcess, say};
@@ -289,13 +290,20 @@ impl Egress {
         });
     }
 
-    /// Waits for a message, a stamp, a reply or an appointment.
-    pub(crate) fn rest(&mut self) -> Result<(), WorkerError> {
+    /// A message was published by this thread on the channel with `index`, of which nobody is told.
+    pub(super) fn note_published(&mut self, index: usize) {
+        self.inputs.note_published(index);
+    }
+
+    /// Waits for a message, a stamp, a reply or an appointment; also for the frames of programs, or until their `cables`
+    /// want to be looked at.
+    pub(crate) fn rest(&mut self, cables: &[(usize, Outward)]) -> Result<(), WorkerError> {
         let now = MonotonicClock::now();
         let dues = [
             self.bridge.next_wakeup(),
             self.line.sender.next_due(),
             self.long.as_ref().map(|long| long.due),
+            cables.iter().filter_map(|(_, one)| one.next_look()).min(),
         ];
         let mut due = dues.into_iter().flatten().min();
         if self.line.awaits_stamps() {
@@ -315,12 +323,15 @@ impl Egress {
                 let listener = self.inputs.descriptor();
                 let is_listening = listener.is_some();
                 let socket = self.line.sender.poll_fd().filter(|_| away.is_none());
-                let [first, second] = poll_descriptors(listener.into_iter().chain(socket), until)?;
+                let has_socket = socket.is_some();
+                let own = listener.into_iter().chain(socket);
+                let inlets = cables.iter().filter_map(|(_, one)| one.descriptor());
+                let [first, second, ..] = poll_descriptors(own.chain(inlets), until)?;
                 // Without a listener the socket comes first.
                 let (is_announced, has_socket_news) = if is_listening {
-                    (first, second)
+                    (first, second && has_socket)
                 } else {
-                    (false, first)
+                    (false, first && has_socket)
                 };
                 self.attention.has_news |= has_socket_news || away.is_some();
                 if is_announced {

@@ -302,16 +302,18 @@ impl Ingress {
         }
     }
 
-    /// Waits for a datagram or an appointment.
-    pub(crate) fn rest(&mut self) -> Result<(), WorkerError> {
+    /// Waits for a datagram or an appointment, or until `next_look`.
+    pub(crate) fn rest(&mut self, next_look: Option<Instant>) -> Result<(), WorkerError> {
         let now = MonotonicClock::now();
+        let wakeups = [self.bridge.next_wakeup(), next_look];
+        let wakeup = wakeups.into_iter().flatten().min();
         let due = self.receiver.next_due();
         let pause = if self.is_emulated {
             // A link model's delay is a promise; the bridge's appointments are not.
-            let pause = self.wait.pause(now, self.bridge.next_wakeup());
+            let pause = self.wait.pause(now, wakeup);
             due.map_or(pause, |due| pause.sooner(release(now, due)))
         } else {
-            let dues = [self.bridge.next_wakeup(), due];
+            let dues = [wakeup, due];
             self.wait.pause(now, dues.into_iter().flatten().min())
         };
         match pause {

@@ -209,6 +209,14 @@ impl Inputs {
         self.note_announced()
     }
 
+    /// Notes that the channel with `index` has a message of which nobody was told.
+    pub(super) fn note_published(&mut self, index: usize) {
+        if self.channels[index].place == Place::Idle {
+            self.channels[index].place = Place::Due;
+            self.due.push_back(index);
+        }
+    }
+
     /// Notes which channels are announced.
     ///
     /// # Errors

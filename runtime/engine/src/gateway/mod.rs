@@ -87,36 +87,35 @@ impl GatewayContext {
     }
 }
 
-/// Descriptors one thread waits for: its listener and its socket.
-const DESCRIPTORS_MAX: usize = 2;
+/// Descriptors that one thread waits for at most: its listener, its socket, and inlets of programs.
+pub(crate) const DESCRIPTORS_MAX: usize = 32;
 
-/// Sleeps until a descriptor has something or `until`; says for each whether it has.
+/// Sleeps until a descriptor has something or `until`; says for each whether it has, in their order. Those beyond
+/// [`DESCRIPTORS_MAX`] are not waited for.
 pub(crate) fn poll_descriptors<'a>(
     descriptors: impl Iterator<Item = BorrowedFd<'a>>,
     until: Instant,
 ) -> Result<[bool; DESCRIPTORS_MAX], WorkerError> {
     let left = until.saturating_duration_since(MonotonicClock::now());
-    let mut news = [false; DESCRIPTORS_MAX];
-    // On the stack: waiting is part of the measured path, which does not allocate.
-    let mut polled: [Option<PollFd<'a>>; DESCRIPTORS_MAX] = [const { None }; DESCRIPTORS_MAX];
-    for (place, descriptor) in polled.iter_mut().zip(descriptors) {
-        *place = Some(PollFd::new(descriptor, PollFlags::POLLIN));
-    }
     let timeout = Some(TimeSpec::from_duration(left));
-    let outcome = match polled {
-        [Some(first), Some(second)] => {
-            let mut polled = [first, second];
-            let outcome = ppoll(&mut polled, timeout, None);
-            news = polled.map(|one| one.any().unwrap_or(true));
-            outcome
+    let mut news = [false; DESCRIPTORS_MAX];
+    let mut descriptors = descriptors.take(DESCRIPTORS_MAX);
+    let outcome = if let Some(first) = descriptors.next() {
+        // On the stack: waiting is part of the measured path, which does not allocate.
+        let mut polled: [PollFd<'_>; DESCRIPTORS_MAX] =
+            core::array::from_fn(|_| PollFd::new(first, PollFlags::POLLIN));
+        let mut count = 1;
+        for (place, descriptor) in polled[1..].iter_mut().zip(descriptors) {
+            *place = PollFd::new(descriptor, PollFlags::POLLIN);
+            count += 1;
         }
-        [Some(only), None] | [None, Some(only)] => {
-            let mut polled = [only];
-            let outcome = ppoll(&mut polled, timeout, None);
-            news[0] = polled[0].any().unwrap_or(true);
-            outcome
+        let outcome = ppoll(&mut polled[..count], timeout, None);
+        for (news, polled) in news.iter_mut().zip(&polled[..count]) {
+            *news = polled.any().unwrap_or(true);
         }
-        [None, None] => ppoll(&mut [], timeout, None),
+        outcome
+    } else {
+        ppoll(&mut [], timeout, None)
     };
     match outcome {
         Ok(_) => Ok(news),

@@ -17,7 +17,7 @@ use hil_protocol::SettingsError;
 use hil_transport::socket::SocketError;
 
 use super::connection::Connection;
-use super::direction::{Direction, OpenDirection, egress_bridge};
+use super::direction::{Direction, OpenCable, OpenDirection, egress_bridge};
 use super::link_control::LinkControl;
 use super::socket::{OpenSocket, SocketEnd};
 use super::timestamping::{self, TimestampingSetup};
@@ -27,7 +27,7 @@ use hil_nic::radio::sampler::Sampler;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::WaitMode;
 use hil_rundir::launch::{DirectionLaunch, GatewayWork, Side, WorkerLaunch};
-use hil_rundir::pipe::{FromProcess, Orders, ProcessReport, say};
+use hil_rundir::pipe::{FromProcess, Orders, ProcessReport, RunStart, say};
 use hil_rundir::record::Recorder;
 use hil_rundir::run_seal::RunSeal;
 
@@ -100,7 +100,12 @@ pub(crate) fn open<'a>(
     let jobs = directions.into_iter().map(|(direction, opened)| {
         let spinner = format!("{}: ", flow_label(&direction.flow));
         warn_of_spinning(&spinner, direction.wait, direction.realtime.cpu);
-        job(direction, opened, Arc::clone(&surroundings))
+        job(
+            direction,
+            opened,
+            Arc::clone(&surroundings),
+            orders.run_start(),
+        )
     });
     Ok(Opened {
         jobs: jobs.collect(),
@@ -131,25 +136,38 @@ fn open_sockets(
 }
 
 /// The job of one direction.
-fn job(launch: &DirectionLaunch, opened: OpenDirection, around: Arc<GatewayContext>) -> Job<'_> {
+fn job(
+    launch: &DirectionLaunch,
+    opened: OpenDirection,
+    around: Arc<GatewayContext>,
+    start: RunStart,
+) -> Job<'_> {
     let (way, what) = match launch.side {
         Side::Egress => ("out", "sent"),
         Side::Ingress => ("in", "received"),
     };
     let counters = launch.channels.iter().zip(&opened.counts);
-    let counters = counters.map(|(one, count)| Counter {
-        channel: one.channel.clone(),
-        what,
-        count: Arc::clone(count),
+    let counters = counters.map(|(one, count)| Counter::new(&one.channel, what, count));
+    let of_programs = opened.cables.iter().map(|(index, cable)| {
+        let name = &launch.channels[*index].channel;
+        match cable {
+            OpenCable::Outward(open) => Counter::new(name, "published", &open.given),
+            OpenCable::Inward(open) => Counter::new(name, "taken", &open.count),
+        }
     });
+    let counters = counters.chain(of_programs);
     Job {
         name: format!("{way} {}", flow_label(&launch.flow)),
         counters: counters.collect(),
         is_watched: true,
         connect: Box::new(move |thread| {
             thread.claim(&launch.realtime);
-            let direction = opened.connect(launch, &around)?;
-            Ok(Box::new(DirectionWork { launch, direction }))
+            let direction = opened.connect(launch, &around, &start)?;
+            Ok(Box::new(DirectionWork {
+                launch,
+                direction,
+                _around: around,
+            }))
         }),
     }
 }
@@ -158,6 +176,8 @@ fn job(launch: &DirectionLaunch, opened: OpenDirection, around: Arc<GatewayConte
 struct DirectionWork<'a> {
     launch: &'a DirectionLaunch,
     direction: Direction,
+    /// Dropped after the ports.
+    _around: Arc<GatewayContext>,
 }
 
 impl JobWork for DirectionWork<'_> {
@@ -181,6 +201,7 @@ impl JobWork for DirectionWork<'_> {
     fn report(&mut self) -> ProcessReport {
         ProcessReport {
             directions: vec![self.direction.report(self.launch)],
+            inlets: self.direction.inlets(),
             ..ProcessReport::default()
         }
     }

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use std::{env, thread};
 
 use hil_cable::pcs::{self, Pc, Wire, WireEnd};
-use hil_cable::{InletError, Refusal};
+use hil_cable::{CableError, Refusal};
 use hil_net::handover;
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
@@ -86,7 +86,7 @@ pub enum HostsError {
         /// The host.
         host: String,
         /// Why.
-        source: InletError,
+        source: CableError,
     },
     /// A process cannot be started, or told to begin.
     #[error("cannot start host {host}: {source}")]

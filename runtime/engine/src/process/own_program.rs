@@ -15,7 +15,8 @@ use hil_cable::{Inside, Refusal};
 use hil_platform::open_files;
 use hil_platform::realtime::{self, SchedulingPolicy};
 use hil_topology::{
-    Link, Process, Program, Topology, Wait, clock_process_name, gateway_name, witness_name,
+    Execution, Link, Process, Program, Topology, Wait, clock_process_name, gateway_name,
+    witness_name,
 };
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
@@ -205,7 +206,8 @@ fn lines(missing: &[(String, String)]) -> String {
 pub fn find_all(topology: &Topology, hosts: &[String]) -> Result<(), ProgramsUnfit> {
     let here = topology.processes().iter();
     let here = here.filter(|process| hosts.contains(&process.host));
-    ProgramsUnfit::unless_none(here.flat_map(faults).chain(taken_names(topology)))
+    let faults = here.flat_map(|process| faults(process, carrier(topology, process)));
+    ProgramsUnfit::unless_none(faults.chain(taken_names(topology)))
 }
 
 /// Refuses processes of any host that are called as one of the run's own: a gateway, an end of a clock path, or what records
@@ -235,8 +237,16 @@ fn taken_names(topology: &Topology) -> impl Iterator<Item = (String, String)> {
     taken.map(move |process| (format!("processes.{}", process.name), why.to_owned()))
 }
 
-/// What is wrong with a process, by its keys.
-fn faults(process: &Process) -> Vec<(String, String)> {
+/// The link whose gateway carries the frames of `process`; `None` where they stay on its host, or it has none.
+fn carrier<'a>(topology: &'a Topology, process: &Process) -> Option<&'a str> {
+    process.inside()?;
+    let mut crossings = topology.crossings();
+    let crossing = crossings.find(|crossing| crossing.channel.from == process.name)?;
+    Some(&crossing.link.name)
+}
+
+/// What is wrong with a process whose frames the gateway of link `carrier` carries, by its keys.
+fn faults(process: &Process, carrier: Option<&str>) -> Vec<(String, String)> {
     let Program::Command { command, .. } = &process.program else {
         return Vec::new();
     };
@@ -253,6 +263,14 @@ fn faults(process: &Process) -> Vec<(String, String)> {
     if process.is_witnessed() && process.execution.wait != Wait::Block {
         let why = "how a program of the user's waits is its own business";
         faults.push((key("wait"), why.to_owned()));
+    }
+    if let Some(link) = carrier
+        && process.execution != Execution::default()
+    {
+        let why = format!(
+            "the gateway carries its frames: say of it, at `links.{link}.gateway`, how it is scheduled and waits"
+        );
+        faults.push((format!("processes.{}", process.name), why));
     }
     faults
 }
@@ -315,15 +333,41 @@ mod tests {
                 environment: std::collections::BTreeMap::new(),
                 inside: None,
             },
-            execution: hil_topology::Execution {
+            execution: Execution {
                 lock_memory: true,
                 wait: Wait::Spin,
-                ..hil_topology::Execution::default()
+                ..Execution::default()
             },
             restarts: hil_topology::Restarts::default(),
         };
-        let keys: Vec<String> = faults(&process).into_iter().map(|one| one.0).collect();
+        let keys: Vec<String> = faults(&process, None)
+            .into_iter()
+            .map(|one| one.0)
+            .collect();
         assert_eq!(keys, ["processes.a.lock_memory", "processes.a.wait"]);
+        // Of a program with a cable, which is no witness's.
+        let Program::Command {
+            command,
+            role,
+            environment,
+            ..
+        } = process.program.clone()
+        else {
+            unreachable!("made as one above");
+        };
+        let process = Process {
+            program: Program::Command {
+                command,
+                role,
+                environment,
+                inside: "10.0.0.1".parse().ok(),
+            },
+            ..process
+        };
+        assert_eq!(faults(&process, None), []);
+        let found = faults(&process, Some("hop"));
+        assert_eq!((found.len(), found[0].0.as_str()), (1, "processes.a"));
+        assert!(found[0].1.contains("`links.hop.gateway`"), "{found:?}");
     }
 
     #[test]

@@ -10,7 +10,7 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 use std::{io, thread};
 
-use hil_cable::InletError;
+use hil_cable::CableError;
 use hil_core::endpoint::PortError;
 use hil_protocol::SettingsError;
 use hil_protocol::body::HelloStatus;
@@ -119,7 +119,7 @@ pub enum WorkerError {
     Refused(HelloStatus),
     /// A program's frames cannot be carried.
     #[error(transparent)]
-    Inlet(#[from] InletError),
+    Inlet(#[from] CableError),
     /// The process that becomes a program could not be started.
     #[error("cannot start {program}: {source}")]
     Program {
@@ -231,6 +231,17 @@ pub(crate) struct Counter {
     pub(crate) channel: String,
     pub(crate) what: &'static str,
     pub(crate) count: Arc<AtomicU64>,
+}
+
+impl Counter {
+    /// Counts in `count` how many messages of `channel` were, e.g., `"taken"`.
+    pub(crate) fn new(channel: &str, what: &'static str, count: &Arc<AtomicU64>) -> Self {
+        Self {
+            channel: channel.to_owned(),
+            what,
+            count: Arc::clone(count),
+        }
+    }
 }
 
 /// A worker whose files and sockets are open.

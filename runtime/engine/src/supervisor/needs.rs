@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use hil_platform::host_facts::HostFiles;
 use hil_platform::host_limits::{Headroom, locked_memory_bound, memory_headroom, thread_headroom};
 use hil_platform::{open_files, words};
-use hil_rundir::launch::{AdapterSettings, GatewayWork};
+use hil_rundir::launch::{AdapterSettings, CableWork, GatewayWork};
 use hil_rundir::record::GROWING_FILE_BYTES;
 use hil_shm::{ChannelSettings, Room, SHARED_MEMORY_DIRECTORY};
 use hil_topology::{Host, RoleSpec, Topology};
@@ -29,6 +29,8 @@ const CHILD_FILES: u64 = 4;
 const DIRECTION_FILES: u64 = 8;
 /// Of a gateway or an adapter for each of its channels: port, records, four observers.
 const CARRIED_CHANNEL_FILES: u64 = 16;
+/// Of whoever gives a program's cable away, and of whoever fetches it: socket, ring, connection, records.
+const DOOR_FILES: u64 = 8;
 /// Of a component for each of its channels: port, records, four observers.
 const COMPONENT_CHANNEL_FILES: u64 = 16;
 
@@ -363,14 +365,7 @@ fn process_need<'a>(
         }
         ProcessTask::Gateway(work) | ProcessTask::ClockPath(work) => gateway_content(work),
         ProcessTask::Adapter(adapter) => adapter_content(adapter),
-        ProcessTask::Cable(work) => ProcessContent {
-            open_files: OWN_FILES + 2 * COMPONENT_CHANNEL_FILES,
-            // Frames out, frames in, the end of the program; and the program.
-            threads: OWN_THREADS + 4,
-            locks_memory: work.realtime.iter().any(|one| one.lock_memory),
-            channels: vec![work.input.name.clone(), work.output.name.clone()],
-            own_bytes: hil_cable::RING_BYTES as u64,
-        },
+        ProcessTask::Cable(work) => cable_content(work),
         ProcessTask::Witness(work) => ProcessContent {
             open_files: OWN_FILES + COMPONENT_CHANNEL_FILES * work.channels.len() as u64,
             threads: OWN_THREADS + 1,
@@ -422,19 +417,44 @@ fn channels_of(card: &RoleSpec) -> Vec<String> {
     channels.map(|channel| channel.name.clone()).collect()
 }
 
+/// The end of the program and the program; and threads for its frames where no gateway carries them.
+fn cable_content(work: &CableWork) -> ProcessContent {
+    let own = ProcessContent {
+        open_files: OWN_FILES + DOOR_FILES,
+        threads: OWN_THREADS + 2,
+        locks_memory: false,
+        channels: Vec::new(),
+        own_bytes: 0,
+    };
+    let Some(frames) = &work.frames else {
+        return own;
+    };
+    ProcessContent {
+        open_files: own.open_files + 2 * COMPONENT_CHANNEL_FILES,
+        threads: own.threads + 2,
+        locks_memory: frames.realtime.iter().any(|one| one.lock_memory),
+        channels: vec![work.input.name.clone(), work.output.name.clone()],
+        own_bytes: hil_cable::RING_BYTES as u64,
+    }
+}
+
 fn gateway_content(work: &GatewayWork) -> ProcessContent {
     let count = work.directions.len() as u64;
+    let programs = work.directions.iter().flat_map(|one| &one.channels);
+    let program_count = programs.filter(|one| one.door.is_some()).count() as u64;
     let mut directions = work.directions.iter();
     let channels = work.directions.iter().flat_map(|one| &one.channels);
     let channels: Vec<String> = channels.map(|one| one.channel.clone()).collect();
     ProcessContent {
         open_files: OWN_FILES
             + DIRECTION_FILES * count
-            + CARRIED_CHANNEL_FILES * channels.len() as u64,
+            + CARRIED_CHANNEL_FILES * channels.len() as u64
+            + DOOR_FILES * program_count,
         // One more samples a radio.
         threads: OWN_THREADS + 1 + count,
         locks_memory: directions.any(|one| one.realtime.lock_memory),
-        own_bytes: GROWING_FILE_BYTES * channels.len() as u64,
+        own_bytes: GROWING_FILE_BYTES * channels.len() as u64
+            + hil_cable::RING_BYTES as u64 * program_count,
         channels,
     }
 }

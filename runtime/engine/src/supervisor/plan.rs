@@ -21,8 +21,8 @@ use hil_platform::wait::WaitMode;
 use hil_rundir::announcement;
 use hil_rundir::event::ProcessKind;
 use hil_rundir::launch::{
-    AdapterSettings, ArmLaunch, CableWork, ChannelLaunch, DirectionLaunch, GatewayWork, Side,
-    SocketLaunch, WitnessWork, WitnessedChannel,
+    AdapterSettings, ArmLaunch, CableWork, ChannelLaunch, DirectionLaunch, FrameWork, GatewayWork,
+    Side, SocketLaunch, WitnessWork, WitnessedChannel,
 };
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
@@ -263,10 +263,16 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
                 command: command.clone(),
                 environment: environment.clone(),
                 open_files: open_files::inherited_limit(),
+                door: door_of(topology, &process.name).unwrap_or_default(),
+                frames: topology
+                    .crossings()
+                    .all(|crossing| crossing.channel.name != output.name)
+                    .then(|| FrameWork {
+                        realtime: [0, 1].map(|index| realtime(&process.execution, index)),
+                        wait: wait_mode(process.execution.wait),
+                    }),
                 input,
                 output,
-                realtime: [0, 1].map(|index| realtime(&process.execution, index)),
-                wait: wait_mode(process.execution.wait),
             }),
             None => ProcessTask::Foreign {
                 card,
@@ -287,6 +293,13 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
         task,
         on_exit: process.restarts.on_exit(),
     }
+}
+
+/// The name of the door of process `name`, if it is a program with a cable. It is short: it is that of a socket.
+fn door_of(topology: &Topology, name: &str) -> Option<String> {
+    let mut processes = topology.processes().iter().enumerate();
+    let (index, _) = processes.find(|(_, one)| one.name == name && one.inside().is_some())?;
+    Some(format!("door-{index}"))
 }
 
 /// The channels of a program with an address inside, of which the topology has one each way.
@@ -428,6 +441,10 @@ fn direction(
             alignment_bytes: channel.message.alignment_bytes,
             depth: channel.depth,
             emulation: EmulationLaunch::of(crossing, seed).filter(|_| side == Side::Ingress),
+            door: match side {
+                Side::Egress => door_of(topology, &channel.from),
+                Side::Ingress => channel.to.as_deref().and_then(|to| door_of(topology, to)),
+            },
         }
     });
     Some(DirectionLaunch {

@@ -1,0 +1,169 @@
+//! Where the threads that carry a program's frames fetch the cable's end. It belongs to the process that started
+//! the program and outlives those threads; what the program's interface drops is counted here.
+
+use std::fs::{self, File};
+use std::io;
+use std::os::fd::{AsFd as _, OwnedFd};
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+
+use hil_net::handover;
+
+use crate::INTERFACE;
+use crate::inside::{BEGAN, ENTERED, GO};
+
+/// Why there is no cable.
+#[derive(Debug, thiserror::Error)]
+pub enum CableError {
+    /// The helper said why.
+    #[error("{0}")]
+    Refused(String),
+    /// It ended without a word.
+    #[error("the process that was to become the program ended before it began")]
+    Gone,
+    /// The kernel refuses it.
+    #[error("cannot use the cable's end: {0}")]
+    Io(#[from] io::Error),
+}
+
+/// Frames that the program's interface dropped: lost on this host and in no network.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct InterfaceDrops {
+    /// Put in for the program.
+    pub inward_count: u64,
+    /// Sent by the program.
+    pub outward_count: u64,
+}
+
+/// See the module documentation.
+#[derive(Debug)]
+pub struct Door {
+    listener: OwnedFd,
+    path: PathBuf,
+    cable: OwnedFd,
+    devices: File,
+    /// To the helper, until it becomes the program.
+    helper: OwnedFd,
+    visitors: Vec<OwnedFd>,
+    /// What the interface had dropped when the program began.
+    before: Option<InterfaceDrops>,
+    /// What it has dropped since, as told last.
+    drops: InterfaceDrops,
+}
+
+impl Door {
+    /// Waits for the cable's end from the helper at the other end of `helper`, and gives it away at `path` from
+    /// then on.
+    ///
+    /// # Errors
+    /// When the helper could not make one, or there can be no socket at `path`.
+    pub fn open(path: &Path, helper: OwnedFd) -> Result<Self, CableError> {
+        let (word, descriptors) = handover::take(&helper)?;
+        if word.is_empty() {
+            return Err(CableError::Gone);
+        }
+        let [cable, devices] = <[OwnedFd; 2]>::try_from(descriptors)
+            .map_err(|_none| CableError::Refused(String::from_utf8_lossy(&word).into_owned()))?;
+        debug_assert_eq!(word, ENTERED);
+        Ok(Self {
+            listener: handover::listen(path)?,
+            path: path.to_owned(),
+            cable,
+            devices: devices.into(),
+            helper,
+            visitors: Vec::new(),
+            before: None,
+            drops: InterfaceDrops::default(),
+        })
+    }
+
+    /// Opens to whoever has knocked, lets the program begin once one of them says so, and reads what its
+    /// interface counts.
+    ///
+    /// # Errors
+    /// When the kernel gives no more descriptors, or the helper is gone.
+    pub fn attend(&mut self) -> io::Result<()> {
+        while let Some(visitor) = handover::accept(&self.listener)? {
+            let word = if self.before.is_some() {
+                BEGAN
+            } else {
+                ENTERED
+            };
+            // One that has left is noticed below.
+            let _left = handover::give(&visitor, word, &[self.cable.as_fd()]).is_err();
+            self.visitors.push(visitor);
+        }
+        let mut is_to_begin = false;
+        self.visitors
+            .retain(|visitor| match handover::take_waiting(visitor) {
+                Ok(None) => true,
+                Ok(Some((word, _))) => {
+                    is_to_begin |= word == GO;
+                    !word.is_empty()
+                }
+                Err(_gone) => false,
+            });
+        // Once the program has ended its interface is gone, and the last reading stands.
+        if let Ok(now) = self.dropped_in_all() {
+            let before = self.before.unwrap_or(now);
+            self.drops = InterfaceDrops {
+                inward_count: now.inward_count - before.inward_count,
+                outward_count: now.outward_count - before.outward_count,
+            };
+            if is_to_begin && self.before.is_none() {
+                self.before = Some(now);
+                handover::give(&self.helper, GO, &[])?;
+            }
+        }
+        Ok(())
+    }
+
+    /// What the program's interface has dropped since the program began.
+    pub const fn drops(&self) -> InterfaceDrops {
+        self.drops
+    }
+
+    fn dropped_in_all(&self) -> io::Result<InterfaceDrops> {
+        let mut text = [0; 4096];
+        let length = self.devices.read_at(&mut text, 0)?;
+        let text = String::from_utf8_lossy(&text[..length]);
+        drops(&text).ok_or_else(|| io::ErrorKind::InvalidData.into())
+    }
+}
+
+impl Drop for Door {
+    fn drop(&mut self) {
+        let _removed_before = fs::remove_file(&self.path).is_err();
+    }
+}
+
+/// What the program's interface dropped, of `/proc/net/dev`.
+fn drops(devices: &str) -> Option<InterfaceDrops> {
+    let mut lines = devices
+        .lines()
+        .filter_map(|line| line.trim().split_once(':'));
+    let (_, counts) = lines.find(|(name, _)| *name == INTERFACE)?;
+    let mut counts = counts.split_whitespace().map(|count| count.parse().ok());
+    Some(InterfaceDrops {
+        inward_count: counts.nth(3)??,
+        outward_count: counts.nth(7)??,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_drops_of_the_interface_are_those_of_its_line() {
+        let text = "Inter-|   Receive  |  Transmit\n face |bytes packets errs drop fifo frame compressed \
+                    multicast|bytes packets errs drop fifo colls carrier compressed\n    lo: 1 2 3 4 5 6 7 8 9 \
+                    10 11 12 13 14 15 16\n  eth0: 11 12 13 14 15 16 17 18 19 20 21 22 23 24 25 26\n";
+        let expected = InterfaceDrops {
+            inward_count: 14,
+            outward_count: 22,
+        };
+        assert_eq!(drops(text), Some(expected));
+        assert_eq!(drops("lo: 1"), None);
+    }
+}
