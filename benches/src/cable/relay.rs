@@ -6,11 +6,12 @@ use std::io;
 use std::net::{IpAddr, SocketAddr, UdpSocket};
 use std::os::fd::AsFd as _;
 use std::os::unix::process::CommandExt as _;
-use std::process::{Command, Stdio, exit};
-use std::thread;
+use std::process::{self, Command, Stdio, exit};
+use std::{env, thread};
 
-use hil_cable::{Inlet, Inside};
+use hil_cable::{Door, GivenEnd, Inlet, Inside, Knock};
 use hil_net::handover;
+use hil_net::packet_ring::FrameSender;
 use hil_platform::own_process;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::prctl::set_pdeathsig;
@@ -42,18 +43,36 @@ pub fn run(
     helper.args([INSIDE, &inside.to_string()]).args(program);
     let mut child = helper.stdin(Stdio::from(there)).spawn()?;
     drop(helper);
-    let mut inlet = Inlet::take(here)?;
+    let path = env::temp_dir().join(format!("hil-relay-{}", process::id()));
+    let mut door = Door::open(&path, here)?;
+    let mut fetched = || -> Result<(Knock, GivenEnd), SetupError> {
+        let knock = Knock::at(&path)?.ok_or("no door")?;
+        door.attend()?;
+        let end = knock.take()?.ok_or("the door is shut")?;
+        Ok((knock, end))
+    };
+    let (_, end) = fetched()?;
+    let sender = end.into_sender();
+    let (knock, end) = fetched()?;
+    let mut inlet = end.into_inlet()?;
     inlet.begin()?;
+    knock.begin_program()?;
+    door.attend()?;
+    drop(door);
     thread::spawn(move || {
         exit(i32::from(
             !child.wait().is_ok_and(|status| status.success()),
         ))
     });
-    carry(&mut inlet, &socket, spins)
+    carry(&mut inlet, &sender, &socket, spins)
 }
 
-fn carry(inlet: &mut Inlet, socket: &UdpSocket, spins: bool) -> Result<(), SetupError> {
-    let sender = inlet.sender()?;
+fn carry(
+    inlet: &mut Inlet,
+    sender: &FrameSender,
+    socket: &UdpSocket,
+    spins: bool,
+) -> Result<(), SetupError> {
     let mut buffer = vec![0; 1 << 16];
     loop {
         let mut has_moved = false;
