@@ -1,6 +1,6 @@
 //! What the machine was like while a bench ran. It describes; it does not tune.
 
-use std::{fs, io};
+use std::{fs, io, thread};
 
 use nix::sched::{CpuSet, sched_setaffinity};
 use nix::unistd::Pid;
@@ -40,7 +40,7 @@ impl HostFacts {
         };
         Self {
             cpu_model: field("model name").unwrap_or_else(|| UNAVAILABLE.to_owned()),
-            cpu_count: std::thread::available_parallelism().map_or(0, Into::into),
+            cpu_count: thread::available_parallelism().map_or(0, Into::into),
             is_virtual_machine: field("flags")
                 .is_some_and(|flags| flags.split(' ').any(|flag| flag == "hypervisor")),
             governor: first_word("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor"),
@@ -74,6 +74,22 @@ pub fn pin_to_cpu(cpu: usize) -> io::Result<()> {
     let mut set = CpuSet::new();
     set.set(cpu)?;
     Ok(sched_setaffinity(Pid::from_raw(0), &set)?)
+}
+
+/// What `work` gives in a thread that stays on one processor, if one is named, as what it starts does.
+///
+/// # Errors
+/// As [`pin_to_cpu`].
+///
+/// # Panics
+/// When `work` does.
+pub fn on_cpu<T: Send>(cpu: Option<usize>, work: impl FnOnce() -> T + Send) -> io::Result<T> {
+    let Some(cpu) = cpu else {
+        return Ok(work());
+    };
+    // A child may run where the thread that started it may.
+    let joined = thread::scope(|scope| scope.spawn(|| pin_to_cpu(cpu).map(|()| work())).join());
+    joined.unwrap_or_else(|cause| std::panic::resume_unwind(cause))
 }
 
 fn first_word(path: &str) -> String {

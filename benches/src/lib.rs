@@ -8,6 +8,7 @@
 #![forbid(unsafe_code)]
 
 pub mod adapter;
+pub mod cable;
 pub mod gateway;
 mod host;
 mod quantiles;
@@ -15,7 +16,7 @@ mod report;
 mod rounds;
 pub mod turns;
 
-pub use host::{HostFacts, pin_to_cpu};
+pub use host::{HostFacts, on_cpu, pin_to_cpu};
 pub use quantiles::{PairedRatio, Quantiles, TypicalRatio};
 pub use report::{json_line, table};
 pub use rounds::{Case, Comparison, FLOOR_JUMP_RATIO_MAX, Row, compare};

@@ -30,7 +30,7 @@ use serde_json::{Value, json};
 
 use crate::gateway::hosts::SetupError;
 use crate::gateway::parties::{MachineTime, stolen_text};
-use crate::{HostFacts, Quantiles, TypicalRatio, pin_to_cpu};
+use crate::{HostFacts, Quantiles, TypicalRatio, on_cpu};
 
 const SEED: u64 = 11;
 /// The first messages meet cold processes.
@@ -224,7 +224,8 @@ impl<const N: usize> Contest<N> {
     }
 }
 
-fn verdict(ratio: &TypicalRatio, aim: f64) -> &'static str {
+/// Whether the whole interval of `ratio` is within `aim`.
+pub fn verdict(ratio: &TypicalRatio, aim: f64) -> &'static str {
     if ratio.high <= aim {
         "PASS"
     } else if ratio.low > aim {
@@ -236,15 +237,8 @@ fn verdict(ratio: &TypicalRatio, aim: f64) -> &'static str {
 
 /// Starts the run of one host, whose processes stay on its processor, if it has one.
 fn start(trial: &Trial, lab: &Lab, index: usize, pins: &[usize]) -> Result<ChildGuard, SetupError> {
-    let Some(cpu) = pins.get(index).copied() else {
-        return Ok(trial.start_on(lab.host(index)));
-    };
-    // A child may run where the thread that started it may.
-    let pinned = thread::scope(|scope| {
-        let begin = || pin_to_cpu(cpu).map(|()| trial.start_on(lab.host(index)));
-        scope.spawn(begin).join()
-    });
-    Ok(pinned.map_err(|_panic| "a host could not be started")??)
+    let cpu = pins.get(index).copied();
+    Ok(on_cpu(cpu, || trial.start_on(lab.host(index)))?)
 }
 
 /// Every kind twice a round: there in an order drawn by lot, and back.
