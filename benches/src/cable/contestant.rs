@@ -158,8 +158,8 @@ peer_timeout = "1 h"
 near-pc = {{ address = "{a}", control_port = {control_port} }}
 far-pc = {{ address = "{b}", control_port = {control_port} }}
 [processes]
-near = {{ host = "near-pc", run = {near}, inside = "{inside_a}", wait = {wait} }}
-far = {{ host = "far-pc", run = {far}, inside = "{inside_b}", wait = {wait} }}
+near = {{ host = "near-pc", run = {near}, inside = "{inside_a}" }}
+far = {{ host = "far-pc", run = {far}, inside = "{inside_b}" }}
 [channels]
 out = {{ from = "near", to = "far", link = "hop" }}
 back = {{ from = "far", to = "near", link = "hop" }}
