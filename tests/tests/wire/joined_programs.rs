@@ -468,7 +468,7 @@ delay = "1 ms"
             };
             wait_until(LIMIT, "the process runs", || process(0).is_some());
             // Frames flow, and what flows again after the kill before is recorded.
-            std::thread::sleep(Duration::from_millis(2_000));
+            std::thread::sleep(Duration::from_secs(2));
             nix::sys::signal::kill(process(0).unwrap(), Signal::SIGKILL).unwrap();
             wait_until(LIMIT, "it was started again", || process(1).is_some());
         }
