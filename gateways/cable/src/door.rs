@@ -41,14 +41,13 @@ pub struct Door {
     listener: OwnedFd,
     path: PathBuf,
     cable: OwnedFd,
+    /// What the interface counts. It keeps the program's namespace, so that it can be read when the program is gone.
     devices: File,
     /// To the helper, until it becomes the program.
     helper: OwnedFd,
     visitors: Vec<OwnedFd>,
     /// What the interface had dropped when the program began.
     before: Option<InterfaceDrops>,
-    /// What it has dropped since, as told last.
-    drops: InterfaceDrops,
 }
 
 impl Door {
@@ -73,15 +72,13 @@ impl Door {
             helper,
             visitors: Vec::new(),
             before: None,
-            drops: InterfaceDrops::default(),
         })
     }
 
-    /// Opens to whoever has knocked, lets the program begin once one of them says so, and reads what its
-    /// interface counts.
+    /// Opens to whoever has knocked, and lets the program begin once one of them says so.
     ///
     /// # Errors
-    /// When the kernel gives no more descriptors, or the helper is gone.
+    /// When the kernel gives no more descriptors or does not tell what the interface counts, or the helper is gone.
     pub fn attend(&mut self) -> io::Result<()> {
         while let Some(visitor) = handover::accept(&self.listener)? {
             let word = if self.before.is_some() {
@@ -103,24 +100,24 @@ impl Door {
                 }
                 Err(_gone) => false,
             });
-        // Once the program has ended its interface is gone, and the last reading stands.
-        if let Ok(now) = self.dropped_in_all() {
-            let before = self.before.unwrap_or(now);
-            self.drops = InterfaceDrops {
-                inward_count: now.inward_count - before.inward_count,
-                outward_count: now.outward_count - before.outward_count,
-            };
-            if is_to_begin && self.before.is_none() {
-                self.before = Some(now);
-                handover::give(&self.helper, GO, &[])?;
-            }
+        if is_to_begin && self.before.is_none() {
+            self.before = Some(self.dropped_in_all()?);
+            handover::give(&self.helper, GO, &[])?;
         }
         Ok(())
     }
 
-    /// What the program's interface has dropped since the program began.
-    pub const fn drops(&self) -> InterfaceDrops {
-        self.drops
+    /// What the program's interface has dropped since the program began, also after the program has ended.
+    ///
+    /// # Errors
+    /// When the kernel does not tell.
+    pub fn drops(&self) -> io::Result<InterfaceDrops> {
+        let now = self.dropped_in_all()?;
+        let before = self.before.unwrap_or(now);
+        Ok(InterfaceDrops {
+            inward_count: now.inward_count - before.inward_count,
+            outward_count: now.outward_count - before.outward_count,
+        })
     }
 
     fn dropped_in_all(&self) -> io::Result<InterfaceDrops> {
@@ -153,6 +150,63 @@ fn drops(devices: &str) -> Option<InterfaceDrops> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Knock;
+
+    fn devices(inward: u64, outward: u64) -> String {
+        format!("  eth0: 11 12 13 {inward} 15 16 17 18 19 20 21 {outward} 23 24 25 26\n")
+    }
+
+    #[test]
+    fn whoever_knocks_has_the_end_and_the_program_begins_once() {
+        let folder = std::env::temp_dir().join(format!("hil-door-{}", std::process::id()));
+        fs::create_dir(&folder).unwrap();
+        let counts = folder.join("dev");
+        fs::write(&counts, devices(1, 2)).unwrap();
+        let (helper, program) = handover::pair().unwrap();
+        let end = File::open("/dev/null").unwrap();
+        let file = File::open(&counts).unwrap();
+        handover::give(&program, ENTERED, &[end.as_fd(), file.as_fd()]).unwrap();
+        let path = folder.join("door-0");
+        // A process that was killed leaves its socket.
+        fs::write(&path, "").unwrap();
+        let mut door = Door::open(&path, helper).unwrap();
+
+        let first = Knock::at(&path).unwrap().unwrap();
+        assert!(first.take().unwrap().is_none() && first.is_open());
+        door.attend().unwrap();
+        assert!(!first.take().unwrap().unwrap().has_program_begun);
+        first.begin_program().unwrap();
+        door.attend().unwrap();
+        assert!(crate::await_go(program.as_fd()).unwrap());
+        // Its reader starts anew: it is told, and the program hears nothing more.
+        drop(first);
+        fs::write(&counts, devices(5, 2)).unwrap();
+        let second = Knock::at(&path).unwrap().unwrap();
+        door.attend().unwrap();
+        assert!(second.take().unwrap().unwrap().has_program_begun);
+        second.begin_program().unwrap();
+        door.attend().unwrap();
+        let drops = door.drops().unwrap();
+        assert_eq!((drops.inward_count, drops.outward_count), (4, 0));
+        assert!(second.is_open());
+        drop(door);
+        assert!(!second.is_open() && Knock::at(&path).unwrap().is_none());
+        assert!(!crate::await_go(program.as_fd()).unwrap());
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_helper_that_was_refused_or_is_gone_makes_no_door() {
+        let path = std::env::temp_dir().join(format!("hil-no-door-{}", std::process::id()));
+        let (here, there) = handover::pair().unwrap();
+        handover::give(&there, b"no namespaces", &[]).unwrap();
+        let refused = Door::open(&path, here).unwrap_err();
+        assert_eq!(refused.to_string(), "no namespaces");
+        let (here, there) = handover::pair().unwrap();
+        drop(there);
+        assert!(matches!(Door::open(&path, here), Err(CableError::Gone)));
+        assert!(!path.exists());
+    }
 
     #[test]
     fn the_drops_of_the_interface_are_those_of_its_line() {

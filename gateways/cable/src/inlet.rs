@@ -72,7 +72,7 @@ impl GivenEnd {
     /// When the kernel does not give the ring.
     pub fn into_inlet(self) -> io::Result<Inlet> {
         Ok(Inlet {
-            ring: PacketRing::of_cable(self.socket, &RING)?,
+            ring: PacketRing::of_cable(self.socket, &RING, self.has_program_begun)?,
             tagged: Vec::with_capacity(RING.snap_bytes as usize),
         })
     }

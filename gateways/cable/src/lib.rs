@@ -1,5 +1,5 @@
 //! A cable: a program runs in a network namespace of its own with one Ethernet interface, and every frame
-//! that it sends or receives passes through this process, which needs no right for it.
+//! that it sends or receives passes through threads of ours, which need no right for it.
 //!
 //! ```text
 //!   program's namespace          cable's namespace        threads of ours, in the host's namespace

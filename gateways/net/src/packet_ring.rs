@@ -20,6 +20,7 @@ use std::io;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd};
 
 use nix::net::if_::if_nametoindex;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
 use nix::sys::socket::{MsgFlags, getsockopt, send, setsockopt, sockopt};
 use thiserror::Error;
@@ -219,16 +220,16 @@ impl PacketRing {
         }
     }
 
-    /// The ring of a socket that [`CableSocket::attach`] prepared, perhaps in another process, and that another
-    /// reader has perhaps read from before. It must have ended.
+    /// The ring of a socket that [`CableSocket::attach`] prepared, perhaps in another process. With `was_read` another
+    /// reader has perhaps read from it before; it must have ended.
     ///
     /// # Errors
     /// When the kernel does not map it.
-    pub fn of_cable(socket: OwnedFd, settings: &RingSettings) -> io::Result<Self> {
+    pub fn of_cable(socket: OwnedFd, settings: &RingSettings, was_read: bool) -> io::Result<Self> {
         let layout = Layout::of(settings);
         let map = Mapping::of(&socket, layout.ring)?;
         Ok(Self {
-            next_index: None,
+            next_index: (!was_read).then_some(0),
             ..Self::new(socket, map, &layout, link_type::ETHERNET)
         })
     }
@@ -282,6 +283,11 @@ impl PacketRing {
 
     /// The oldest packet that waits, wherever the kernel is: those that wait lie one behind the other.
     fn first_waiting(&self) -> Option<usize> {
+        // Asking the kernel costs less than looking everywhere.
+        let mut polled = [PollFd::new(self.socket.as_fd(), PollFlags::POLLIN)];
+        if poll(&mut polled, PollTimeout::ZERO) == Ok(0) {
+            return None;
+        }
         let waits = |index: usize| {
             self.status_of(index).load(Ordering::Acquire) & libc::TP_STATUS_USER != 0
         };

@@ -83,8 +83,9 @@ impl WaitStrategy {
         }
     }
 
-    /// Spins once: looks again at once, or as soon as nobody else wants the processor, unless that is isolated. Else
-    /// a program on the same one waits for as long as the scheduler lets this thread spin.
+    /// Spins once while it waits for a message: looks again at once on an isolated processor or in a thread that
+    /// blocks; else lets others of the same priority have the processor first, which would wait for as long as the scheduler lets
+    /// this thread spin.
     pub fn spin(&self) {
         if self.is_shared {
             thread::yield_now();

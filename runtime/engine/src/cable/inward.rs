@@ -9,7 +9,6 @@ use hil_core::record::TakenRecord;
 use hil_core::time::Instant;
 use hil_net::packet_ring::FrameSender;
 use hil_platform::clock::MonotonicClock;
-use hil_rundir::pipe::{CountByName, CounterGroup, InletReport};
 use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder};
 use hil_shm::{Domain, ShmInput};
 
@@ -43,15 +42,12 @@ impl OpenInward {
 /// See the module documentation.
 #[derive(Debug)]
 pub(crate) struct Inward {
-    channel: String,
     ends: OpenInward,
     attachment: Attachment,
     sender: Option<FrameSender>,
     /// A program was there: what comes without one now came after its end.
     had_program: bool,
     input: ShmInput,
-    refused_count: u64,
-    absent_count: u64,
 }
 
 impl Inward {
@@ -67,14 +63,11 @@ impl Inward {
         ends: OpenInward,
     ) -> Result<Self, WorkerError> {
         Ok(Self {
-            channel: channel.to_owned(),
             ends,
             attachment: Attachment::new(domain, door),
             sender: None,
             had_program: false,
             input: ShmInput::open(domain, channel, &ETHERNET_FRAME, depth)?,
-            refused_count: 0,
-            absent_count: 0,
         })
     }
 
@@ -85,25 +78,21 @@ impl Inward {
     pub(crate) fn step(&mut self) -> Result<bool, WorkerError> {
         if self.sender.is_none() && !self.had_program {
             self.look()?;
-            return Ok(false);
+            // What waits already is to be given at once.
+            return Ok(self.sender.is_some());
         }
         let Self {
             ends,
             sender,
             input,
-            refused_count,
-            absent_count,
             ..
         } = self;
         let delivered = input.take(|envelope, frame| {
             // Before it is given: the program's kernel may answer within the call.
             let now = MonotonicClock::now();
-            let Some(sender) = sender else {
-                *absent_count += 1;
-                return;
-            };
-            if sender.send(frame).is_err() {
-                *refused_count += 1;
+            let sent = sender.as_ref().map(|sender| sender.send(frame));
+            // Not taken: its fate says so.
+            if !matches!(sent, Some(Ok(()))) {
                 return;
             }
             ends.taken.push(&TakenRecord {
@@ -142,21 +131,6 @@ impl Inward {
     pub(crate) fn next_look(&self) -> Option<Instant> {
         let is_absent = self.sender.is_none();
         is_absent.then(|| self.attachment.next_look())
-    }
-
-    /// What was lost on the way to the program.
-    pub(crate) fn report(&self) -> InletReport {
-        let lost = [
-            (
-                "refused by the interface of the program",
-                self.refused_count,
-            ),
-            ("came after the program had ended", self.absent_count),
-        ];
-        InletReport {
-            channel: self.channel.clone(),
-            lost: CountByName::all(CounterGroup::Own, lost).collect(),
-        }
     }
 
     /// Attempts to connect to a writer that failed.

@@ -251,7 +251,6 @@ impl JobWork for LocalInward {
 
     fn report(&mut self) -> ProcessReport {
         ProcessReport {
-            inlets: vec![self.cable.report()],
             connection_failures: self.cable.connection_failure_count(),
             ..ProcessReport::default()
         }

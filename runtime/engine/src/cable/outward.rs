@@ -123,6 +123,8 @@ impl Outward {
         let mut outcome = Ok(());
         let has_moved = inlet.next_frame(|realtime_ns, frame| {
             let left = Instant::from_ns(realtime_ns - clock.offset_ns());
+            // Under load too.
+            clock.refresh(left);
             if frame.len() > ETHERNET_FRAME.size_bytes {
                 lost.too_long += 1;
                 return;
@@ -223,7 +225,7 @@ impl Outward {
         ring_full += open.and_then(Result::ok).unwrap_or(0);
         let lost = [
             ("ring of the inlet full", ring_full),
-            ("sent while the gateway was down", unfetched),
+            ("sent while nobody fetched them", unfetched),
             ("longer than 1522 bytes", too_long),
         ];
         InletReport {

@@ -71,10 +71,14 @@ impl JobWork for Program {
     }
 
     fn report(&mut self) -> ProcessReport {
-        let InterfaceDrops {
+        // What the kernel does not tell is left out.
+        let Ok(InterfaceDrops {
             inward_count,
             outward_count,
-        } = self.door.drops();
+        }) = self.door.drops()
+        else {
+            return ProcessReport::default();
+        };
         let [output, input] = &self.channels;
         let dropped = |channel: &String, count| InletReport {
             channel: channel.clone(),

@@ -295,16 +295,17 @@ pub(super) fn egress_bridge(
     })
 }
 
-/// Publishes one frame of each program and sends one message.
+/// Publishes one frame of each program whose last one was sent, and sends one message. What is not published yet
+/// waits in the ring, which has more room than a channel.
 fn step_outward(egress: &mut Egress, cables: &mut [(usize, Outward)]) -> Result<bool, WorkerError> {
     let mut has_moved = false;
     for (index, cable) in cables {
-        if cable.step()? {
-            egress.note_published(*index);
+        if !egress.inputs.has_own(Some(*index)) && cable.step()? {
+            egress.inputs.note_published(*index);
             has_moved = true;
         }
     }
-    Ok(egress.step()? || has_moved)
+    Ok(egress.step()? || has_moved || egress.inputs.has_own(None))
 }
 
 impl Direction {
@@ -353,13 +354,19 @@ impl Direction {
         }
     }
 
-    /// What the inlets of programs lost.
-    pub(super) fn inlets(&mut self) -> Vec<InletReport> {
+    /// What the inlets of programs lost, and how often a port of theirs failed to connect.
+    pub(super) fn cables(&mut self) -> (Vec<InletReport>, u64) {
         match &mut self.way {
             BridgeLoop::Egress { cables, .. } => {
-                cables.iter_mut().map(|one| one.1.report()).collect()
+                let failures = cables.iter().map(|one| one.1.connection_failure_count());
+                let failure_count = failures.sum();
+                let reports = cables.iter_mut().map(|one| one.1.report());
+                (reports.collect(), failure_count)
             }
-            BridgeLoop::Ingress { cables, .. } => cables.iter().map(Inward::report).collect(),
+            BridgeLoop::Ingress { cables, .. } => {
+                let failures = cables.iter().map(Inward::connection_failure_count);
+                (Vec::new(), failures.sum())
+            }
         }
     }
 

@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
 
 use hil_core::message::Envelope;
 use hil_core::record::RoundTripRecord;
@@ -15,7 +16,7 @@ use super::line::Line;
 use super::long_message::LongMessage;
 use super::refusal_backoff::RefusalBackoff;
 use super::stamp_tracker::STAMP_PATIENCE_NS;
-use super::{WorkerError, poll_descriptors};
+use super::{DESCRIPTORS_MAX, WorkerError, poll_descriptors};
 use crate::cable::Outward;
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::{Pause, WaitStrategy};
@@ -58,6 +59,10 @@ pub(crate) struct Attention {
 const LOOK_PERIOD_BUSY_NS: i64 = 5_000_000;
 /// A spinning thread looks after its socket this often.
 const LOOK_PERIOD_NS: i64 = 500_000;
+/// Descriptors that it waits for beside the inlets of programs: its listener and its socket.
+const OWN_DESCRIPTORS: usize = 2;
+/// How often inlets are looked at where there are too many to wait for.
+const UNWATCHED_LOOK_PERIOD: Duration = Duration::from_millis(1);
 /// And any thread so often while a long message waits for a reply.
 const LOOK_PERIOD_HELD_NS: i64 = 50_000;
 
@@ -290,11 +295,6 @@ impl Egress {
         });
     }
 
-    /// A message was published by this thread on the channel with `index`, of which nobody is told.
-    pub(super) fn note_published(&mut self, index: usize) {
-        self.inputs.note_published(index);
-    }
-
     /// Waits for a message, a stamp, a reply or an appointment; also for the frames of programs, or until their `cables`
     /// want to be looked at.
     pub(crate) fn rest(&mut self, cables: &[(usize, Outward)]) -> Result<(), WorkerError> {
@@ -306,6 +306,11 @@ impl Egress {
             cables.iter().filter_map(|(_, one)| one.next_look()).min(),
         ];
         let mut due = dues.into_iter().flatten().min();
+        if cables.len() > DESCRIPTORS_MAX - OWN_DESCRIPTORS {
+            // Nobody wakes this thread for the others.
+            let look = now + UNWATCHED_LOOK_PERIOD;
+            due = Some(due.map_or(look, |due| due.min(look)));
+        }
         if self.line.awaits_stamps() {
             // A stamp makes the socket readable, but an overdue one must be given up in time.
             let patience = Instant::from_ns(now.as_ns() + STAMP_PATIENCE_NS);

@@ -317,6 +317,10 @@ impl Ingress {
             self.wait.pause(now, dues.into_iter().flatten().min())
         };
         match pause {
+            // Who gives the processor away may get it back too late for what is due.
+            Pause::Spin if due.is_some_and(|due| release(now, due) == Pause::Spin) => {
+                core::hint::spin_loop();
+            }
             Pause::Spin => self.wait.spin(),
             Pause::Sleep(until) => {
                 let away = self.refusal_backoff.until(now, self.refused_count());

@@ -51,6 +51,8 @@ struct Input {
     place: Place,
     /// Its announcements are to be taken back.
     is_announced: bool,
+    /// Messages that the reading thread itself published and has not taken yet.
+    own_count: usize,
 }
 
 /// Where a channel is found.
@@ -78,6 +80,7 @@ impl Inputs {
                 is_long: one.size_bytes > STAGED_BYTES_MAX,
                 place: Place::Due,
                 is_announced: false,
+                own_count: 0,
             })
         };
         let names: Vec<&str> = channels.iter().map(|one| one.channel.as_str()).collect();
@@ -157,6 +160,11 @@ impl Inputs {
         };
         // A message may follow, or come before its announcement is taken back.
         let has_moved = !matches!(look, Look::Empty);
+        input.own_count = if has_moved {
+            input.own_count.saturating_sub(1)
+        } else {
+            0
+        };
         input.place = if has_moved || input.is_announced || is_always_looked_at {
             self.due.push_back(index);
             Place::Due
@@ -209,8 +217,18 @@ impl Inputs {
         self.note_announced()
     }
 
+    /// True while a message of [`Inputs::note_published`] waits: on the channel with `index`, or on any.
+    pub(super) fn has_own(&self, index: Option<usize>) -> bool {
+        let channels = match index {
+            Some(index) => core::slice::from_ref(&self.channels[index]),
+            None => &self.channels,
+        };
+        channels.iter().any(|one| one.own_count > 0)
+    }
+
     /// Notes that the channel with `index` has a message of which nobody was told.
     pub(super) fn note_published(&mut self, index: usize) {
+        self.channels[index].own_count += 1;
         if self.channels[index].place == Place::Idle {
             self.channels[index].place = Place::Due;
             self.due.push_back(index);

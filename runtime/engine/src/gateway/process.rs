@@ -199,9 +199,11 @@ impl JobWork for DirectionWork<'_> {
     }
 
     fn report(&mut self) -> ProcessReport {
+        let (inlets, connection_failures) = self.direction.cables();
         ProcessReport {
             directions: vec![self.direction.report(self.launch)],
-            inlets: self.direction.inlets(),
+            inlets,
+            connection_failures,
             ..ProcessReport::default()
         }
     }

@@ -119,7 +119,7 @@ pub enum WorkerError {
     Refused(HelloStatus),
     /// A program's frames cannot be carried.
     #[error(transparent)]
-    Inlet(#[from] CableError),
+    Cable(#[from] CableError),
     /// The process that becomes a program could not be started.
     #[error("cannot start {program}: {source}")]
     Program {

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use hil_platform::host_facts::HostFiles;
 use hil_platform::host_limits::{Headroom, locked_memory_bound, memory_headroom, thread_headroom};
 use hil_platform::{open_files, words};
-use hil_rundir::launch::{AdapterSettings, CableWork, GatewayWork};
+use hil_rundir::launch::{AdapterSettings, CableWork, GatewayWork, Side};
 use hil_rundir::record::GROWING_FILE_BYTES;
 use hil_shm::{ChannelSettings, Room, SHARED_MEMORY_DIRECTORY};
 use hil_topology::{Host, RoleSpec, Topology};
@@ -442,6 +442,10 @@ fn gateway_content(work: &GatewayWork) -> ProcessContent {
     let count = work.directions.len() as u64;
     let programs = work.directions.iter().flat_map(|one| &one.channels);
     let program_count = programs.filter(|one| one.door.is_some()).count() as u64;
+    let outward = work.directions.iter();
+    let outward = outward.filter(|one| one.side == Side::Egress);
+    let rings = outward.flat_map(|one| &one.channels);
+    let ring_count = rings.filter(|one| one.door.is_some()).count() as u64;
     let mut directions = work.directions.iter();
     let channels = work.directions.iter().flat_map(|one| &one.channels);
     let channels: Vec<String> = channels.map(|one| one.channel.clone()).collect();
@@ -454,7 +458,7 @@ fn gateway_content(work: &GatewayWork) -> ProcessContent {
         threads: OWN_THREADS + 1 + count,
         locks_memory: directions.any(|one| one.realtime.lock_memory),
         own_bytes: GROWING_FILE_BYTES * channels.len() as u64
-            + hil_cable::RING_BYTES as u64 * program_count,
+            + hil_cable::RING_BYTES as u64 * ring_count,
         channels,
     }
 }
