@@ -37,11 +37,12 @@ pub(super) fn living(config: &Config) -> Members {
     let mut members = Members::default();
     let listed = Node::<ipc::Service>::list(config, |state| {
         if let NodeState::Alive(view) = state {
-            let name = view
+            let is_observer = view
                 .details()
                 .as_ref()
                 .map(|details| details.name().as_str() == OBSERVER);
-            let count = if name == Some(true) {
+            // One that is just leaving still lives and has no name any more: it is waited for as observers are.
+            let count = if is_observer.unwrap_or(true) {
                 &mut members.observer_count
             } else {
                 &mut members.process_count
