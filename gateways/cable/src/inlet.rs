@@ -53,7 +53,7 @@ impl Knock {
 
     /// False once the process that started the program is gone.
     pub fn is_open(&self) -> bool {
-        matches!(handover::take_waiting(&self.0), Ok(None))
+        handover::is_open(&self.0)
     }
 }
 

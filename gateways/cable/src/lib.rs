@@ -10,7 +10,7 @@
 //!
 //! A helper process [`enter`]s both namespaces, [`hand_over`]s the socket of the cable's end and becomes the
 //! program. The process that started it keeps the socket behind a [`Door`], where the threads that carry the frames
-//! fetch it as an [`Inlet`]. What becomes of the frames between two inlets is for others: nothing here knows a channel,
+//! fetch it as an [`Inlet`]. How frames get from one inlet to another is outside this crate: nothing here knows a channel,
 //! a link or a datagram.
 //!
 //! [`pcs`] are whole hosts made in the same way, with a plain pair of interfaces between each two.

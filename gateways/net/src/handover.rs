@@ -11,8 +11,8 @@ use std::path::Path;
 use nix::errno::Errno;
 use nix::sys::socket::{
     AddressFamily, Backlog, ControlMessage, ControlMessageOwned, MsgFlags, SockFlag, SockType,
-    UnixAddr, accept4, bind, connect as connect_to, listen as listen_at, recvmsg, sendmsg, socket,
-    socketpair,
+    UnixAddr, accept4, bind, connect as connect_to, listen as listen_at, recv, recvmsg, sendmsg,
+    socket, socketpair,
 };
 
 /// Descriptors of one message.
@@ -97,6 +97,15 @@ pub fn take_waiting(socket: impl AsFd) -> io::Result<Option<(Vec<u8>, Vec<OwnedF
     }
 }
 
+/// Whether the other end is there; reads and allocates nothing.
+pub fn is_open(socket: impl AsFd) -> bool {
+    let flags = MsgFlags::MSG_PEEK | MsgFlags::MSG_DONTWAIT;
+    match recv(socket.as_fd().as_raw_fd(), &mut [0], flags) {
+        Ok(length) => length > 0,
+        Err(errno) => matches!(errno, Errno::EAGAIN | Errno::EINTR),
+    }
+}
+
 /// Sends `bytes` and copies of `descriptors`, four at most.
 ///
 /// # Errors
@@ -162,5 +171,10 @@ mod tests {
         File::from(read).read_to_string(&mut text).unwrap();
         assert_eq!(text, "x");
         assert!(take(&there).unwrap().0.is_empty());
+        assert!(!is_open(&there));
+        let (here, there) = pair().unwrap();
+        assert!(is_open(&there));
+        give(&here, b"word", &[]).unwrap();
+        assert!(is_open(&there) && take(&there).unwrap().0 == b"word");
     }
 }

@@ -346,16 +346,8 @@ match = "udp dst port 64000"
 deadline = "8 ms"
 "#
     );
-    let file = place.folder.join("rsi.toml");
-    fs::write(&file, topology).unwrap();
     // As the user of the tests, who can read that Python.
-    let mut command = Command::new(&place.binary);
-    command.args(["--quiet", "--topology"]).arg(&file);
-    command.current_dir(place.folder.path());
-    let mut run = ChildGuard::spawn(&mut command).unwrap();
-    run.wait_within(LIMIT).unwrap().assert_success();
-    place.assert_nothing_left();
-    let summary = place.summary();
+    let summary = run_topology(&place, "rsi.toml", &topology, || ());
     assert_closed(&summary);
     let said = place.said_by("robot");
     let said = said
