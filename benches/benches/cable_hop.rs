@@ -1,12 +1,13 @@
 //! What a cable costs two programs that speak IP: half the round trip of a UDP echo between two programs that each
 //! have a network of their own on two hosts, carried by the product, plain and sealed, beside the same programs
 //! over the bare pair of interfaces between the hosts (`direct`), and with the least in the cable's place that can
-//! stand there (`relay`, see `hil_benches::cable::relay`). Then what each takes of a flood, what a packet of it costs
+//! stand there (`relay`, see `hil_benches::cable::relay`); with `--rattan PROGRAM` also between two networks of one host that
+//! rattan 0.1.1 joins (`cargo install --locked rattan`, with libnftables-dev and libclang-dev). Then what each takes of a flood, what a packet of it costs
 //! in processor time, and a stream of TCP. Not a test: it states the aims and whether they were met, and ends
 //! with code 0.
 //!
 //! `cargo bench -p hil-benches --bench cable_hop -- [--rounds N] [--turn MS] [--wait block|hybrid|spin]
-//! [--pin CPU,CPU|none] [--quick]`, about three minutes. It takes root; without, it says what is missing. All
+//! [--pin CPU,CPU|none] [--rattan PROGRAM] [--quick]`, about three minutes. It takes root; without, it says what is missing. All
 //! contestants exist the whole time and take turns in an order drawn by lot for each case of a round, on two
 //! processors: all of a host is on one of them, unless `--pin` says otherwise. The programs block. With `--wait spin`
 //! product and relay do not sleep; the relay gives the processor to others between two looks. To `hybrid` it has no
@@ -21,7 +22,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 use std::{env, thread};
 
-use hil_benches::cable::contestant::{Contestant, DIRECT, NAMES, RELAY, Start};
+use hil_benches::cable::contestant::{Contestant, DIRECT, NAMES, RATTAN, RELAY, Start};
 use hil_benches::cable::{program, relay};
 use hil_benches::gateway::hosts::SetupError;
 use hil_benches::gateway::network::Network;
@@ -38,12 +39,14 @@ use serde_json::json;
 const BENCH: &str = "cable_hop";
 const SEED: u64 = 23;
 /// Which contestants are set against which.
-const PAIRS: [[usize; 2]; 5] = [
+const PAIRS: [[usize; 2]; 7] = [
     [2, RELAY],
     [3, RELAY],
     [2, DIRECT],
     [3, DIRECT],
     [RELAY, DIRECT],
+    [3, RATTAN],
+    [RATTAN, DIRECT],
 ];
 const SIZES: [usize; 2] = [64, 1024];
 /// From one trip to the next; zero for at once.
@@ -64,6 +67,8 @@ struct Arguments {
     turn: Duration,
     wait: WaitMode,
     pins: [Option<usize>; 2],
+    /// Where rattan is.
+    rattan: Option<String>,
 }
 
 impl Arguments {
@@ -73,6 +78,7 @@ impl Arguments {
             turn: Duration::from_millis(150),
             wait: WaitMode::Block,
             pins: [Some(0), Some(1)],
+            rattan: None,
         };
         while let Some(word) = words.next() {
             if word == "--quick" {
@@ -84,6 +90,7 @@ impl Arguments {
                 "--rounds" => read.round_count = value.parse()?,
                 "--turn" => read.turn = Duration::from_millis(value.parse()?),
                 "--wait" => read.wait = serde_json::from_value(json!(value))?,
+                "--rattan" => read.rattan = Some(value),
                 "--pin" if value == "none" => read.pins = [None; 2],
                 "--pin" => {
                     let (first, second) = value.split_once(',').ok_or("--pin takes two")?;
@@ -93,6 +100,11 @@ impl Arguments {
             }
         }
         Ok(read)
+    }
+
+    /// How many contestants there are.
+    fn count(&self) -> usize {
+        NAMES.len() - usize::from(self.rattan.is_none())
     }
 
     fn spins(&self) -> bool {
@@ -106,7 +118,7 @@ impl Arguments {
 
     /// More than all turns take.
     fn span(&self) -> Result<Duration, SetupError> {
-        let turns = NAMES.len() * SIZES.len() * PERIODS.len() * self.round_count;
+        let turns = self.count() * SIZES.len() * PERIODS.len() * self.round_count;
         let turns = (self.turn + SETTLE) * 2 * u32::try_from(turns)?;
         Ok(turns + Duration::from_mins(8))
     }
@@ -115,6 +127,7 @@ impl Arguments {
     fn aim(&self, reference: usize) -> f64 {
         match reference {
             RELAY => 1.15,
+            RATTAN => 1.0,
             _ if self.spins() => 1.5,
             _ => 2.2,
         }
@@ -129,17 +142,18 @@ struct Contest {
 }
 
 impl Contest {
-    /// Has each contestant do `work` in an order drawn by lot, alone where they do not always sleep.
+    /// Has each of the first `count` contestants do `work` in an order drawn by lot, alone where they do not always sleep.
     fn each<T>(
         &mut self,
+        count: usize,
         mut work: impl FnMut(&mut Contestant) -> Result<T, SetupError>,
     ) -> Result<Vec<T>, SetupError> {
-        let mut order: Vec<usize> = (0..self.contestants.len()).collect();
+        let mut order: Vec<usize> = (0..count).collect();
         for last in (1..order.len()).rev() {
             let chosen = self.lots.next_u64() % (last as u64 + 1);
             order.swap(last, usize::try_from(chosen)?);
         }
-        let mut found: Vec<Option<T>> = order.iter().map(|_| None).collect();
+        let mut found: Vec<Option<T>> = (0..count).map(|_| None).collect();
         for index in order {
             let contestant = &mut self.contestants[index];
             if self.arguments.is_alone() {
@@ -166,8 +180,9 @@ impl Contest {
         for _ in 0..self.arguments.round_count {
             for case in &mut cases {
                 let (bytes, period) = (case.bytes, case.period);
-                let round =
-                    self.each(|contestant| Ok(contestant.near.ping(bytes, turn, period)?))?;
+                let round = self.each(self.contestants.len(), |contestant| {
+                    Ok(contestant.near.ping(bytes, turn, period)?)
+                })?;
                 case.add(round);
             }
         }
@@ -183,8 +198,14 @@ impl Contest {
         let mut figures: [Vec<Vec<f64>>; 4] = Default::default();
         let before = MachineTime::read();
         let count = self.arguments.round_count.min(LOAD_ROUNDS_MAX);
+        // A flood through a rattan that was stopped and goes on never ends.
+        let loaded = if self.arguments.is_alone() {
+            RATTAN.min(self.contestants.len())
+        } else {
+            self.contestants.len()
+        };
         for _ in 0..count {
-            let floods = self.each(|contestant| {
+            let floods = self.each(loaded, |contestant| {
                 let used = contestant.carrier_ns();
                 let sent = contestant.near.flood(FLOOD_BYTES, FLOOD)?;
                 thread::sleep(DRAIN);
@@ -197,7 +218,9 @@ impl Contest {
                     used_us / came.max(1) as f64,
                 ])
             })?;
-            let streams = self.each(|contestant| Ok(contestant.near.stream(STREAM)? * 1e-6))?;
+            let streams = self.each(loaded, |contestant| {
+                Ok(contestant.near.stream(STREAM)? * 1e-6)
+            })?;
             for (at, rounds) in figures[..3].iter_mut().enumerate() {
                 rounds.push(floods.iter().map(|flood| flood[at]).collect());
             }
@@ -215,7 +238,7 @@ impl Contest {
             ("TCP, Mbit/s", &PAIRS[..]),
         ];
         for ((what, pairs), rounds) in units.into_iter().zip(&figures) {
-            for (index, name) in NAMES.iter().enumerate() {
+            for (index, name) in NAMES.iter().enumerate().take(loaded) {
                 let mut each: Vec<f64> = rounds.iter().map(|round| round[index]).collect();
                 each.sort_unstable_by(f64::total_cmp);
                 let Some(middle) = each.get(each.len() / 2) else {
@@ -227,7 +250,10 @@ impl Contest {
                     json!({"bench": BENCH, "load": what, "contestant": name, "median": middle, "rounds": each.len()})
                 );
             }
-            for [one, reference] in pairs {
+            for [one, reference] in pairs
+                .iter()
+                .filter(|pair| pair.iter().all(|one| *one < loaded))
+            {
                 let ratios = rounds.iter().map(|round| round[*one] / round[*reference]);
                 // A connection that broke has no ratio.
                 let ratios = ratios.filter(|ratio| ratio.is_finite() && *ratio > 0.0);
@@ -251,7 +277,7 @@ struct Case {
     half_ns: [Vec<u64>; NAMES.len()],
     lost_counts: [u64; NAMES.len()],
     /// Medians and 99th percentiles of each round; a round without an answer to one of them is left out.
-    rounds: Vec<[[u64; 2]; NAMES.len()]>,
+    rounds: Vec<Vec<[u64; 2]>>,
 }
 
 impl Case {
@@ -273,21 +299,23 @@ impl Case {
     }
 
     fn add(&mut self, round: Vec<program::Trips>) {
-        let mut found = Vec::new();
+        let (mut found, trip_count) = (Vec::new(), round.len());
         for (index, mut trips) in round.into_iter().enumerate() {
             let quantiles = Quantiles::of(&mut trips.half_ns);
             found.extend(quantiles.map(|found| [found.p50_ns, found.p99_ns]));
             self.lost_counts[index] += trips.lost_count;
             self.half_ns[index].append(&mut trips.half_ns);
         }
-        self.rounds
-            .extend(<[[u64; 2]; NAMES.len()]>::try_from(found));
+        if found.len() == trip_count {
+            self.rounds.push(found);
+        }
     }
 
     fn print(&mut self, arguments: &Arguments) {
         let case = self.name();
         println!("\n{case}: half a round trip");
         let all = self.half_ns.iter_mut().zip(self.lost_counts);
+        let all = all.take(arguments.count());
         for (name, (half_ns, lost_count)) in NAMES.iter().zip(all) {
             let Some(found) = Quantiles::of(half_ns) else {
                 println!("  {name:<7} no trip came back, {lost_count} were lost");
@@ -306,13 +334,17 @@ impl Case {
                 json!({"bench": BENCH, "case": case, "contestant": name, "half_trip": found.to_json(), "lost": lost_count})
             );
         }
-        for [one, reference] in PAIRS {
+        for [one, reference] in PAIRS
+            .into_iter()
+            .filter(|pair| pair.iter().all(|one| *one < arguments.count()))
+        {
             for (at, figure) in ["p50", "p99"].into_iter().enumerate() {
                 let ratios = self
                     .rounds
                     .iter()
                     .map(|round| round[one][at] as f64 / round[reference][at] as f64);
-                let aim = (one != RELAY && figure == "p50").then(|| arguments.aim(reference));
+                let is_product = ![RELAY, RATTAN].contains(&one);
+                let aim = (is_product && figure == "p50").then(|| arguments.aim(reference));
                 print_ratio(
                     &case,
                     figure,
@@ -350,6 +382,7 @@ fn measure(arguments: Arguments) -> Result<(), SetupError> {
         turn,
         wait,
         pins,
+        ..
     } = &arguments;
     let placed = match pins {
         [Some(first), Some(second)] => format!("hosts on processors {first} and {second}"),
@@ -378,9 +411,10 @@ fn measure(arguments: Arguments) -> Result<(), SetupError> {
         pins: arguments.pins,
         wait: arguments.wait,
         span: arguments.span()?,
+        rattan: arguments.rattan.as_deref(),
     };
     let mut contestants = Vec::new();
-    for index in 0..NAMES.len() {
+    for index in 0..arguments.count() {
         contestants.push(start.contestant(index)?);
         if arguments.is_alone() {
             contestants[index].signal(Signal::SIGSTOP);

@@ -1,7 +1,9 @@
-//! What is compared: the same two programs on two hosts, with nothing, a relay or the product between them.
+//! What is compared: the same two programs on two hosts, with nothing, a relay or the product between them; and
+//! in two networks of one host with the emulator rattan between them.
 
 use std::fmt::Write as _;
 use std::net::Ipv4Addr;
+use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -19,15 +21,19 @@ use super::program::{Door, Program};
 use crate::gateway::hosts::SetupError;
 use crate::on_cpu;
 
-/// The contestants; the last two are the product.
-pub const NAMES: [&str; 4] = ["direct", "relay", "plain", "sealed"];
+/// The contestants; the third and the fourth are the product. The last one takes part only where it is installed.
+pub const NAMES: [&str; 5] = ["direct", "relay", "plain", "sealed", "rattan"];
 /// The programs on the hosts themselves.
 pub const DIRECT: usize = 0;
 /// See [`super::relay`].
 pub const RELAY: usize = 1;
+/// One process between two networks of one host, without a cell: nothing is emulated, and nothing goes between hosts.
+pub const RATTAN: usize = 4;
 
 /// Addresses of the programs inside.
 const INSIDE: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 99, 0, 1), Ipv4Addr::new(10, 99, 0, 2)];
+/// Where rattan has the program on its right.
+const RATTAN_RIGHT: Ipv4Addr = Ipv4Addr::new(10, 2, 1, 1);
 const RELAY_PORT: u16 = 7_300;
 /// Of the two runs of the product, which are on the hosts at the same time: of supervisors and links.
 const RUN_PORTS: [[u16; 2]; 2] = [[7_399, 7_400], [7_389, 7_380]];
@@ -58,6 +64,8 @@ pub struct Start<'a> {
     pub wait: WaitMode,
     /// Longer than a contestant is needed.
     pub span: Duration,
+    /// Where rattan is, if it takes part.
+    pub rattan: Option<&'a str>,
 }
 
 impl Start<'_> {
@@ -80,7 +88,11 @@ impl Start<'_> {
     pub fn contestant(&self, index: usize) -> Result<Contestant, SetupError> {
         let at = |end: &str| self.folder.join(format!("{}-{end}.socket", NAMES[index]));
         let doors = [Door::open(&at("near"))?, Door::open(&at("far"))?];
-        let peer = if index == DIRECT { ADDRESSES } else { INSIDE }[1];
+        let peer = match index {
+            DIRECT => ADDRESSES[1],
+            RATTAN => RATTAN_RIGHT,
+            _ => INSIDE[1],
+        };
         let words = |door: &Door, kind: &str| {
             let path = door.path().display().to_string();
             vec![
@@ -97,6 +109,7 @@ impl Start<'_> {
                 self.again(1, &programs[1][1..])?,
             ],
             RELAY => vec![self.relay(0, &programs[0])?, self.relay(1, &programs[1])?],
+            RATTAN => vec![self.rattan(&programs)?],
             _ => self.product(NAMES[index], &programs)?,
         };
         let [near, far] = doors.each_ref().map(|door| await_program(door, &mut hosts));
@@ -135,6 +148,37 @@ impl Start<'_> {
             wait,
         ];
         self.again(index, &[&words.map(str::to_owned)[..], program].concat())
+    }
+
+    /// One thread moves the frames, on the processor that the kernel chooses.
+    fn rattan(&self, programs: &[Vec<String>; 2]) -> Result<ChildGuard, SetupError> {
+        let [left, right] = [0, 1].map(|index| {
+            let pin = self.pins[index].map(|cpu| {
+                ["taskset", "-c"]
+                    .map(str::to_owned)
+                    .into_iter()
+                    .chain([cpu.to_string()])
+            });
+            let words = pin
+                .into_iter()
+                .flatten()
+                .chain(programs[index].iter().cloned());
+            json!(words.collect::<Vec<_>>())
+        });
+        let file = self.folder.write(
+            "rattan.toml",
+            &format!(
+                "[env]\nmode = \"Isolated\"\n[links]\nleft = \"right\"\nright = \"left\"\n\
+                 [resource]\ncpu = [0]\n[commands]\nleft = {left}\nright = {right}\n"
+            ),
+        );
+        let program = self.rattan.ok_or("rattan is not here")?;
+        let mut command = Command::new(program);
+        command
+            .args(["run", "-c"])
+            .arg(file)
+            .env("RUST_LOG", "error");
+        Ok(ChildGuard::spawn(&mut command)?)
     }
 
     fn product(

@@ -114,6 +114,7 @@ const SHIPPED: &[&str] = &[
     "split.toml",
     "emulated.toml",
     "outages.toml",
+    "split-outages.toml",
     "static-cells.toml",
     "bad-link.toml",
     "wifi6.toml",

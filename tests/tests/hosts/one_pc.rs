@@ -6,7 +6,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use hil_tests::account::assert_every_message_is_accounted_for;
-use hil_tests::binary::hil_runtime_binary;
+use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::child::ChildGuard;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial, processes_mentioning, wait_until};
@@ -47,6 +47,31 @@ fn assert_nobody_left(record: &RunFolder) {
     wait_until(LIMIT, "the end of all processes", || {
         processes_mentioning(&record.path().to_string_lossy()).is_empty()
     });
+}
+
+#[test]
+fn the_first_command_of_the_readme_ends_in_the_answer_of_a_comparison() {
+    let record = open_folder("try");
+    let release = record.path().join("release");
+    fs::create_dir(&release).unwrap();
+    std::os::unix::fs::symlink(hil_runtime_binary(), release.join("hil-runtime")).unwrap();
+    let mut command = Command::new(workspace_folder().join("deploy/try.sh"));
+    // What it would build is there.
+    command
+        .env("CARGO", "true")
+        .env("CARGO_TARGET_DIR", record.path());
+    command.arg("4").current_dir(record.path());
+    let finished = ChildGuard::spawn(&mut command).unwrap().wait_within(LIMIT);
+    let finished = finished.unwrap();
+    finished.assert_success();
+    let answer = "Was the robot hurt more in the new runs?";
+    assert!(finished.stdout.contains(answer), "{}", finished.stdout);
+    assert!(
+        finished.stdout.contains("sessions of the right arm lost"),
+        "{}",
+        finished.stdout
+    );
+    assert_nobody_left(&record);
 }
 
 #[test]

@@ -26,7 +26,8 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec
     let (mut same, mut differences) = topology(base, new);
     let mut check = |what: &str, of: &dyn Fn(&RunSummary) -> String| {
         let (b, n) = (values(base, of), values(new, of));
-        if b == n && b.len() == 1 {
+        // Of repetitions on both sides: the same set of seeds.
+        if b == n {
             same.push(format!("{what} {}", joined(&b)));
         } else {
             let (b, n) = (joined(&b), joined(&n));
@@ -81,7 +82,7 @@ fn topology(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<Stri
                 .map(Option::unwrap_or_default)
                 .collect::<BTreeSet<_>>()
         });
-        if b != n || b.len() > 1 {
+        if b != n {
             let (b, n) = (joined(&b), joined(&n));
             differences.push(format!("topology {key}: base {b}, new {n}"));
         }

@@ -198,16 +198,35 @@ fn left_open(comparison: &Comparison) -> Vec<String> {
     if comparison.base.len().min(comparison.new.len()) == 1 {
         open.push("how much runs differ by themselves: one run on a side".to_owned());
     }
-    let differing = comparison.differences.iter();
-    let differing = differing.filter_map(|words| words.split(':').next());
-    let differing: Vec<&str> = differing.collect();
-    if !differing.is_empty() {
+    let differing = differing(&comparison.differences);
+    if differing.len() > 1 {
         let differing = differing.join(", ");
         open.push(format!(
             "which of these made the difference: the runs differ in {differing}"
         ));
     }
     open
+}
+
+/// What may have made a difference: the keys of one table of the topology together, such as those of a link. The name of
+/// a topology makes none, and the kinds of links follow from the links.
+fn differing(differences: &[String]) -> Vec<&str> {
+    const LINK: &str = "topology links.";
+    let mut found: Vec<&str> = Vec::new();
+    for words in differences {
+        let what = words.split(':').next().unwrap_or_default();
+        let table = match what.match_indices('.').nth(1) {
+            Some((end, _)) if what.starts_with("topology ") => &what[..end],
+            _ => what,
+        };
+        if what != "topology name" && !found.contains(&table) {
+            found.push(table);
+        }
+    }
+    if found.iter().any(|one| one.starts_with(LINK)) {
+        found.retain(|one| *one != "links");
+    }
+    found
 }
 
 /// Conditions that were asked for.
@@ -422,5 +441,29 @@ fn with_verdict(text: String, verdict: Verdict) -> String {
     match verdict {
         Verdict::NotTested | Verdict::NoDifferenceShown => text,
         verdict => format!("{text}, {}", verdict.words()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::differing;
+
+    #[test]
+    fn the_keys_of_one_link_are_one_difference_and_a_name_is_none() {
+        let differences = |words: &[&str]| -> Vec<String> {
+            let of = |what: &&str| format!("{what}: base none, new x");
+            words.iter().map(of).collect()
+        };
+        let link = [
+            "topology links.hop.forward.delay",
+            "topology links.hop.via",
+            "topology name",
+            "links",
+        ];
+        assert_eq!(differing(&differences(&link)), ["topology links.hop"]);
+        let other = ["topology links.hop.via", "topology run.seed", "kernel"];
+        let expected = ["topology links.hop", "topology run.seed", "kernel"];
+        assert_eq!(differing(&differences(&other)), expected);
+        assert_eq!(differing(&differences(&["links"])), ["links"]);
     }
 }

@@ -1,0 +1,24 @@
+#!/bin/sh
+# A teleoperated robot for ten seconds over a link with outages and over the clean one, once for each seed, and whether
+# the outages hurt it. The two hosts are namespaces of this PC; it needs no root. The README's first command.
+#
+#   deploy/try.sh [SEED...]
+set -eu
+root=$(cd "$(dirname "$0")/.." && pwd)
+target=${CARGO_TARGET_DIR:-$root/target}
+${CARGO:-cargo} build --release --manifest-path "$root/Cargo.toml" --bin hil-runtime
+program=$target/release/hil-runtime
+runs=runs/try-$(date +%Y%m%d-%H%M%S)
+[ $# -gt 0 ] || set -- 4 5 6
+
+run() {
+    echo "== $1, seed $seed" >&2
+    "$program" --topology "$root/deploy/topologies/$2" --on-one-pc --set "name=$1" --set "run.duration=10 s" \
+        --set "run.seed=$seed" --set "run.record=$runs" > /dev/null
+}
+
+for seed; do
+    run outages split-outages.toml
+    run clean split.toml
+done
+"$program" compare --base "$runs"/clean-*-control-pc --new "$runs"/outages-*-control-pc
