@@ -32,7 +32,7 @@ pub fn channel(id: u16, name: &str, message: &MessageType, depth: usize) -> Chan
         alignment_bytes: message.alignment_bytes,
         depth,
         emulation: None,
-        door: None,
+        cable_socket: None,
     }
 }
 

@@ -17,7 +17,7 @@ use nix::unistd::Pid;
 use serde_json::json;
 
 use super::processes::{family, processor_ns};
-use super::program::{Door, Program};
+use super::program::{ControlListener, Program};
 use crate::gateway::hosts::SetupError;
 use crate::on_cpu;
 
@@ -87,14 +87,17 @@ impl Start<'_> {
     /// When the product cannot be started.
     pub fn contestant(&self, index: usize) -> Result<Contestant, SetupError> {
         let at = |end: &str| self.folder.join(format!("{}-{end}.socket", NAMES[index]));
-        let doors = [Door::open(&at("near"))?, Door::open(&at("far"))?];
+        let controls = [
+            ControlListener::open(&at("near"))?,
+            ControlListener::open(&at("far"))?,
+        ];
         let peer = match index {
             DIRECT => ADDRESSES[1],
             RATTAN => RATTAN_RIGHT,
             _ => INSIDE[1],
         };
-        let words = |door: &Door, kind: &str| {
-            let path = door.path().display().to_string();
+        let words = |control: &ControlListener, kind: &str| {
+            let path = control.path().display().to_string();
             vec![
                 self.executable.to_owned(),
                 kind.to_owned(),
@@ -102,7 +105,7 @@ impl Start<'_> {
                 peer.to_string(),
             ]
         };
-        let programs = [words(&doors[0], "--ping"), words(&doors[1], "--echo")];
+        let programs = [words(&controls[0], "--ping"), words(&controls[1], "--echo")];
         let mut hosts = match index {
             DIRECT => vec![
                 self.again(0, &programs[0][1..])?,
@@ -112,7 +115,9 @@ impl Start<'_> {
             RATTAN => vec![self.rattan(&programs)?],
             _ => self.product(NAMES[index], &programs)?,
         };
-        let [near, far] = doors.each_ref().map(|door| await_program(door, &mut hosts));
+        let [near, far] = controls
+            .each_ref()
+            .map(|control| await_program(control, &mut hosts));
         let mut contestant = Contestant {
             near: near?,
             far: far?,
@@ -225,16 +230,19 @@ gateway.wait = {wait}
     }
 }
 
-fn await_program(door: &Door, hosts: &mut [ChildGuard]) -> Result<Program, SetupError> {
+fn await_program(
+    control: &ControlListener,
+    hosts: &mut [ChildGuard],
+) -> Result<Program, SetupError> {
     let deadline = Instant::now() + LIMIT;
     loop {
-        if let Some(program) = door.answer()? {
+        if let Some(program) = control.answer()? {
             return Ok(program);
         }
         let mut ended = hosts
             .iter_mut()
             .filter_map(|host| (!host.is_running()).then_some(host));
-        let name = door.path().display();
+        let name = control.path().display();
         if let Some(host) = ended.next() {
             let finished = host.wait_within(LIMIT)?;
             let said = finished.stderr.trim();

@@ -40,7 +40,7 @@ pub struct Program {
 
 /// Where a program that is about to start will say that it is there.
 #[derive(Debug)]
-pub struct Door {
+pub struct ControlListener {
     listener: UnixListener,
     path: PathBuf,
 }
@@ -54,7 +54,7 @@ pub struct Trips {
     pub lost_count: u64,
 }
 
-impl Door {
+impl ControlListener {
     /// Opens one at `path`.
     ///
     /// # Errors
@@ -375,15 +375,16 @@ mod tests {
     #[test]
     fn both_programs_do_what_they_are_told_and_end_with_the_bench() {
         let folder = RunFolder::new("programs");
-        let doors = ["near", "far"].map(|name| Door::open(&folder.join(name)).unwrap());
-        let [near, far] = [0, 1].map(|index: usize| doors[index].path().to_owned());
+        let controls =
+            ["near", "far"].map(|name| ControlListener::open(&folder.join(name)).unwrap());
+        let [near, far] = [0, 1].map(|index: usize| controls[index].path().to_owned());
         let running = [
             thread::spawn(move || ask(&near, Ipv4Addr::LOCALHOST.into())),
             thread::spawn(move || echo(&far)),
         ];
-        let [mut near, mut far] = doors.map(|door| {
+        let [mut near, mut far] = controls.map(|control| {
             loop {
-                if let Some(program) = door.answer().unwrap() {
+                if let Some(program) = control.answer().unwrap() {
                     break program;
                 }
                 thread::yield_now();

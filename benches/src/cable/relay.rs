@@ -9,7 +9,7 @@ use std::os::unix::process::CommandExt as _;
 use std::process::{self, Command, Stdio, exit};
 use std::{env, thread};
 
-use hil_cable::{Door, GivenEnd, Inlet, Inside, Knock};
+use hil_cable::{CableClient, CableServer, GivenEnd, Inlet, Inside};
 use hil_net::handover;
 use hil_net::packet_ring::FrameSender;
 use hil_platform::own_process;
@@ -44,21 +44,21 @@ pub fn run(
     let mut child = helper.stdin(Stdio::from(there)).spawn()?;
     drop(helper);
     let path = env::temp_dir().join(format!("hil-relay-{}", process::id()));
-    let mut door = Door::open(&path, here)?;
-    let mut fetched = || -> Result<(Knock, GivenEnd), SetupError> {
-        let knock = Knock::at(&path)?.ok_or("no door")?;
-        door.attend()?;
-        let end = knock.take()?.ok_or("the door is shut")?;
-        Ok((knock, end))
+    let mut server = CableServer::open(&path, here)?;
+    let mut fetched = || -> Result<(CableClient, GivenEnd), SetupError> {
+        let client = CableClient::at(&path)?.ok_or("no server")?;
+        server.attend()?;
+        let end = client.take()?.ok_or("the server gives no end")?;
+        Ok((client, end))
     };
     let (_, end) = fetched()?;
     let sender = end.into_sender();
-    let (knock, end) = fetched()?;
+    let (client, end) = fetched()?;
     let mut inlet = end.into_inlet()?;
     inlet.begin()?;
-    knock.begin_program()?;
-    door.attend()?;
-    drop(door);
+    client.begin_program()?;
+    server.attend()?;
+    drop(server);
     thread::spawn(move || {
         exit(i32::from(
             !child.wait().is_ok_and(|status| status.success()),

@@ -375,7 +375,7 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
             alignment_bytes: plan.message().alignment_bytes,
             depth: plan.depth,
             emulation: None,
-            door: None,
+            cable_socket: None,
         }],
     }
 }

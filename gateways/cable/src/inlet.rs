@@ -1,5 +1,5 @@
 //! The cable's end in the thread that carries its frames: what the program sends comes out, and what is put
-//! in it receives. The thread fetches it from the [`Door`](crate::Door) of the process that started the program,
+//! in it receives. The thread fetches it from the [`CableServer`](crate::CableServer) of the process that started the program,
 //! and again after either has started anew.
 
 use std::io;
@@ -15,12 +15,12 @@ use crate::inside::{BEGAN, GO};
 /// Ethernet's two addresses, behind which a VLAN tag stands.
 const ADDRESSES_BYTES: usize = 12;
 
-/// A connection to the door of a cable.
+/// A connection to the [`CableServer`](crate::CableServer) of a program.
 #[derive(Debug)]
-pub struct Knock(OwnedFd);
+pub struct CableClient(OwnedFd);
 
-impl Knock {
-    /// Knocks at the door at `path`; `None` where there is none.
+impl CableClient {
+    /// Connects to the server at `path`; `None` where there is none.
     ///
     /// # Errors
     /// When the kernel gives no socket.
@@ -28,10 +28,10 @@ impl Knock {
         Ok(handover::connect(path)?.map(Self))
     }
 
-    /// The cable's end, once the door has opened, and only once; `None` before.
+    /// The cable's end, once the server has given it, and only once; `None` before.
     ///
     /// # Errors
-    /// When the door is gone.
+    /// When the server is gone.
     pub fn take(&self) -> io::Result<Option<GivenEnd>> {
         let Some((word, mut descriptors)) = handover::take_waiting(&self.0)? else {
             return Ok(None);
@@ -46,7 +46,7 @@ impl Knock {
     /// Lets the program begin.
     ///
     /// # Errors
-    /// When the door is gone.
+    /// When the server is gone.
     pub fn begin_program(&self) -> io::Result<()> {
         handover::give(&self.0, GO, &[])
     }
@@ -57,7 +57,7 @@ impl Knock {
     }
 }
 
-/// The cable's end as it comes through the door.
+/// The cable's end as the server gives it.
 #[derive(Debug)]
 pub struct GivenEnd {
     socket: OwnedFd,
@@ -128,7 +128,7 @@ impl Inlet {
 
     /// Clears what woke whoever waits for frames when none waits: the interface went down, or is gone.
     pub fn clear_error(&self) {
-        let _told_by_the_door = self.ring.check().is_err();
+        let _told_by_the_server = self.ring.check().is_err();
     }
 
     /// Frames that the program sent and found no room in the ring since [`Inlet::begin`].

@@ -170,9 +170,9 @@ pub(crate) fn mount_own() -> Result<(), Refusal> {
     .map_err(refused)
 }
 
-/// First word of a helper that entered, and of a door whose program waits for its beginning.
+/// First word of a helper that entered, and of a server whose program waits for its beginning.
 pub(crate) const ENTERED: &[u8] = b"entered";
-/// First word of a door whose program has begun.
+/// First word of a server whose program has begun.
 pub(crate) const BEGAN: &[u8] = b"began";
 /// And the answer: the run begins.
 pub(crate) const GO: &[u8] = b"go";

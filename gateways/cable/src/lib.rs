@@ -9,24 +9,24 @@
 //! ```
 //!
 //! A helper process [`enter`]s both namespaces, [`hand_over`]s the socket of the cable's end and becomes the
-//! program. The process that started it keeps the socket behind a [`Door`], where the threads that carry the frames
+//! program. The process that started it keeps the socket in a [`CableServer`], where the threads that carry the frames
 //! fetch it as an [`Inlet`]. How frames get from one inlet to another is outside this crate: nothing here knows a channel,
 //! a link or a datagram.
 //!
 //! [`pcs`] are whole hosts made in the same way, with a plain pair of interfaces between each two.
 #![forbid(unsafe_code)]
 
-mod door;
 mod inlet;
 mod inside;
 mod netlink;
 pub mod pcs;
 mod refusal;
+mod server;
 
-pub use door::{CableError, Door, InterfaceDrops};
-pub use inlet::{GivenEnd, Inlet, Knock};
+pub use inlet::{CableClient, GivenEnd, Inlet};
 pub use inside::{CableEnd, Inside, await_go, enter, hand_over, refuse};
 pub use refusal::{Refusal, Step};
+pub use server::{CableError, CableServer, InterfaceDrops};
 
 use hil_net::packet_ring::{RingSettings, RingStamps};
 

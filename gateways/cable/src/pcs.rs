@@ -13,10 +13,10 @@ use hil_net::handover;
 use nix::errno::Errno;
 use nix::sched::{CloneFlags, setns};
 
-use crate::door::CableError;
 use crate::inside::{ENTERED, let_ping, make_namespaces, mount_own};
 use crate::netlink::{INDEX, LOOPBACK, Netlink, Network, PairEnd};
 use crate::refusal::{Refusal, Step};
+use crate::server::CableError;
 
 /// A wire between two hosts.
 #[derive(Debug, Clone, PartialEq, Eq)]

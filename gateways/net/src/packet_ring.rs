@@ -396,6 +396,14 @@ impl CableSocket {
         set_option(&socket, libc::SOL_PACKET, libc::PACKET_VERSION, &version)?;
         setsockopt(&socket, sockopt::ReceiveTimestampns, &true)?;
         ignore_outgoing(&socket)?;
+        // The queue of an interface whose other end is down takes frames, and throws them away.
+        let bypass: c_int = 1;
+        set_option(
+            &socket,
+            libc::SOL_PACKET,
+            libc::PACKET_QDISC_BYPASS,
+            &bypass,
+        )?;
         Layout::of(settings).ask_of(&socket)?;
         bind(&socket, interface_index, EVERY_PROTOCOL.to_be())?;
         Ok(socket)

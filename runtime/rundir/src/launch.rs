@@ -123,8 +123,8 @@ pub struct ChannelLaunch {
     pub depth: usize,
     /// A link model that its messages meet behind the receiving socket.
     pub emulation: Option<EmulationLaunch>,
-    /// The door of the program on this host whose Ethernet frames its messages are, see [`CableWork::door`].
-    pub door: Option<String>,
+    /// The socket of the cable of the program on this host whose Ethernet frames its messages are, see [`CableWork::cable_socket`].
+    pub cable_socket: Option<String>,
 }
 
 hil_core::labelled! {
@@ -223,7 +223,7 @@ pub struct CableWork {
     /// Files that the program may have open, if not as many as this process.
     pub open_files: Option<u64>,
     /// Where the threads that carry its frames fetch the cable's end: a file in the root path of the domain.
-    pub door: String,
+    pub cable_socket: String,
     /// The channel of the frames for the program.
     pub input: RoleChannel,
     /// The channel of the frames of the program.

@@ -174,6 +174,13 @@ pub struct InletReport {
     pub lost: Vec<CountByName>,
 }
 
+impl InletReport {
+    /// Frames that the interface of the program dropped, as it counts them.
+    pub const DROPPED: &str = "dropped by the interface of the program";
+    /// Frames given to it that the kernel did not take: each has a fate of its own, whether or not the interface counts it.
+    pub const REFUSED: &str = "refused by the interface of the program";
+}
+
 hil_core::labelled! {
     /// What of a direction or arm counted something.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

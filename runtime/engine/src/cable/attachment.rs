@@ -4,28 +4,28 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use hil_cable::{GivenEnd, Knock};
+use hil_cable::{CableClient, GivenEnd};
 use hil_core::time::Instant;
 use hil_shm::Domain;
 
 use crate::process::worker::WorkerError;
 
-/// How often it is looked for a door, and whether one is still there.
+/// How often it is looked for a server, and whether one is still there.
 const LOOK_PERIOD: Duration = Duration::from_millis(5);
 
-/// The door of one program.
+/// The connection to the server of one program's cable.
 #[derive(Debug)]
 pub(super) struct Attachment {
     path: PathBuf,
-    knock: Option<Knock>,
+    client: Option<CableClient>,
     looked: Instant,
 }
 
 impl Attachment {
-    pub(super) fn new(domain: &Domain, door: &str) -> Self {
+    pub(super) fn new(domain: &Domain, socket: &str) -> Self {
         Self {
-            path: door_path(domain, door),
-            knock: None,
+            path: socket_path(domain, socket),
+            client: None,
             looked: Instant::ZERO,
         }
     }
@@ -44,37 +44,37 @@ impl Attachment {
         is_due
     }
 
-    /// The cable's end, when its door is there and open.
+    /// The cable's end, when its server is there and gives it.
     pub(super) fn ask(&mut self) -> Result<Option<GivenEnd>, WorkerError> {
-        if self.knock.is_none() {
-            self.knock = Knock::at(&self.path).map_err(WorkerError::Socket)?;
+        if self.client.is_none() {
+            self.client = CableClient::at(&self.path).map_err(WorkerError::Socket)?;
         }
-        let Some(knock) = &self.knock else {
+        let Some(client) = &self.client else {
             return Ok(None);
         };
-        Ok(knock.take().unwrap_or_else(|_gone| {
-            self.knock = None;
+        Ok(client.take().unwrap_or_else(|_gone| {
+            self.client = None;
             None
         }))
     }
 
     /// Lets the program begin; false when its process is gone.
     pub(super) fn begin_program(&self) -> bool {
-        let begun = self.knock.as_ref().map(Knock::begin_program);
+        let begun = self.client.as_ref().map(CableClient::begin_program);
         matches!(begun, Some(Ok(())))
     }
 
-    /// Whether the process behind the door has ended. It is looked for a new one from then on.
+    /// Whether the process of the server has ended. It is looked for a new one from then on.
     pub(super) fn has_ended(&mut self) -> bool {
-        let is_open = self.knock.as_ref().is_some_and(Knock::is_open);
+        let is_open = self.client.as_ref().is_some_and(CableClient::is_open);
         if !is_open {
-            self.knock = None;
+            self.client = None;
         }
         !is_open
     }
 }
 
-/// Where a door of the run in `domain` is.
-pub(super) fn door_path(domain: &Domain, door: &str) -> PathBuf {
-    domain.address().root_path().join(door)
+/// Where a socket of a cable of the run in `domain` is.
+pub(super) fn socket_path(domain: &Domain, socket: &str) -> PathBuf {
+    domain.address().root_path().join(socket)
 }

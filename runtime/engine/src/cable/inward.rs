@@ -9,6 +9,7 @@ use hil_core::record::TakenRecord;
 use hil_core::time::Instant;
 use hil_net::packet_ring::FrameSender;
 use hil_platform::clock::MonotonicClock;
+use hil_rundir::pipe::{CountByName, CounterGroup, InletReport};
 use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder};
 use hil_shm::{Domain, ShmInput};
 
@@ -48,25 +49,30 @@ pub(crate) struct Inward {
     /// A program was there: what comes without one now came after its end.
     had_program: bool,
     input: ShmInput,
+    channel: String,
+    /// Frames that the interface of the program did not take.
+    refused_count: u64,
 }
 
 impl Inward {
-    /// Joins `channel`, whose frames are for the program behind `door`.
+    /// Joins `channel`, whose frames are for the program whose cable has `socket`.
     ///
     /// # Errors
     /// When the channel does not appear.
     pub(crate) fn join(
         domain: &Domain,
         channel: &str,
-        door: &str,
+        socket: &str,
         depth: usize,
         ends: OpenInward,
     ) -> Result<Self, WorkerError> {
         Ok(Self {
             ends,
-            attachment: Attachment::new(domain, door),
+            attachment: Attachment::new(domain, socket),
             sender: None,
             had_program: false,
+            channel: channel.to_owned(),
+            refused_count: 0,
             input: ShmInput::open(domain, channel, &ETHERNET_FRAME, depth)?,
         })
     }
@@ -85,6 +91,7 @@ impl Inward {
             ends,
             sender,
             input,
+            refused_count,
             ..
         } = self;
         let delivered = input.take(|envelope, frame| {
@@ -93,6 +100,7 @@ impl Inward {
             let sent = sender.as_ref().map(|sender| sender.send(frame));
             // Not taken: its fate says so.
             if !matches!(sent, Some(Ok(()))) {
+                *refused_count += u64::from(sent.is_some());
                 return;
             }
             ends.taken.push(&TakenRecord {
@@ -131,6 +139,18 @@ impl Inward {
     pub(crate) fn next_look(&self) -> Option<Instant> {
         let is_absent = self.sender.is_none();
         is_absent.then(|| self.attachment.next_look())
+    }
+
+    /// What the interface of the program did not take.
+    pub(crate) fn report(&self) -> InletReport {
+        InletReport {
+            channel: self.channel.clone(),
+            lost: CountByName::all(
+                CounterGroup::Own,
+                [(InletReport::REFUSED, self.refused_count)],
+            )
+            .collect(),
+        }
     }
 
     /// Attempts to connect to a writer that failed.

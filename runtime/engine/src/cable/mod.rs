@@ -1,5 +1,5 @@
 //! The process of a program with an address inside: it starts the program in namespaces of its own, waits for its
-//! end and keeps the [`Door`] to its cable. Its Ethernet frames are messages, one each: the gateway of its link
+//! end and keeps the [`CableServer`] of its cable. Its Ethernet frames are messages, one each: the gateway of its link
 //! fetches and delivers them in the threads that carry them on, so that nobody is woken in between; where the
 //! program's channels stay on the host, two threads of this process do. What the frames are, a report finds out.
 
@@ -13,7 +13,7 @@ use std::os::fd::AsFd as _;
 use std::process::Stdio;
 use std::sync::Arc;
 
-use hil_cable::Door;
+use hil_cable::CableServer;
 use hil_core::time::Instant;
 use hil_net::handover;
 use hil_platform::clock::MonotonicClock;
@@ -25,7 +25,7 @@ use hil_rundir::pipe::{Orders, ProcessReport};
 use hil_rundir::record::Recorder;
 use hil_shm::{Domain, Waiter};
 
-use self::attachment::door_path;
+use self::attachment::socket_path;
 pub(crate) use self::inward::{Inward, OpenInward};
 pub(crate) use self::outward::{OpenOutward, Outward};
 use self::program::Program;
@@ -52,10 +52,10 @@ pub(crate) fn open<'a>(
 ) -> Result<Opened<'a>, WorkerError> {
     let signals = Signals::install().map_err(WorkerError::Thread)?;
     let domain = Arc::new(open_domain(launch)?);
-    let (child, door) = start(work, &domain)?;
+    let (child, server) = start(work, &domain)?;
     let program = Program {
         child,
-        door,
+        server,
         name: work.command[0].clone(),
         channels: [&work.output, &work.input].map(|one| one.name.clone()),
         stop: Arc::clone(orders.stop_flag()),
@@ -98,7 +98,7 @@ fn frame_jobs<'a>(
         is_watched: true,
         connect: Box::new(move |thread| {
             thread.claim(for_output);
-            let cable = Outward::join(&here, &output.name, &work.door, true, ends, start)?;
+            let cable = Outward::join(&here, &output.name, &work.cable_socket, true, ends, start)?;
             Ok(Box::new(LocalOutward {
                 cable,
                 wait: WaitStrategy::new(frames.wait, for_output.cpu),
@@ -118,7 +118,7 @@ fn frame_jobs<'a>(
                 .then(|| Waiter::open(&here, &[&input.name]))
                 .transpose()?;
             Ok(Box::new(LocalInward {
-                cable: Inward::join(&here, &input.name, &work.door, input.depth, ends)?,
+                cable: Inward::join(&here, &input.name, &work.cable_socket, input.depth, ends)?,
                 waiter,
                 wait: WaitStrategy::new(frames.wait, for_input.cpu),
                 _domain: here,
@@ -128,8 +128,8 @@ fn frame_jobs<'a>(
     Ok([outward, inward])
 }
 
-/// The helper that becomes the program, and the door to its cable.
-fn start(work: &CableWork, domain: &Domain) -> Result<(Child, Door), WorkerError> {
+/// The helper that becomes the program, and the server of its cable.
+fn start(work: &CableWork, domain: &Domain) -> Result<(Child, CableServer), WorkerError> {
     let (here, there) = handover::pair().map_err(WorkerError::Socket)?;
     let failed = |source| WorkerError::Program {
         program: work.command[0].clone(),
@@ -152,7 +152,10 @@ fn start(work: &CableWork, domain: &Domain) -> Result<(Child, Door), WorkerError
     let child = Child::spawn_beside(&mut helper).map_err(failed)?;
     // This process keeps no copy of the helper's end: the end of a helper is noticed.
     drop(helper);
-    Ok((child, Door::open(&door_path(domain, &work.door), here)?))
+    Ok((
+        child,
+        CableServer::open(&socket_path(domain, &work.cable_socket), here)?,
+    ))
 }
 
 /// Moves what waits as a thread ends, so that only what came later is under way at the end of the run.
@@ -251,6 +254,7 @@ impl JobWork for LocalInward {
 
     fn report(&mut self) -> ProcessReport {
         ProcessReport {
+            inlets: vec![self.cable.report()],
             connection_failures: self.cable.connection_failure_count(),
             ..ProcessReport::default()
         }

@@ -71,7 +71,7 @@ struct Lost {
 }
 
 impl Outward {
-    /// Joins `channel`, whose frames are those of the program behind `door`. With `notifies_readers` off, whoever
+    /// Joins `channel`, whose frames are those of the program whose cable has `socket`. With `notifies_readers` off, whoever
     /// calls it wakes them.
     ///
     /// # Errors
@@ -79,7 +79,7 @@ impl Outward {
     pub(crate) fn join(
         domain: &Domain,
         channel: &str,
-        door: &str,
+        socket: &str,
         notifies_readers: bool,
         ends: OpenOutward,
         start: RunStart,
@@ -93,7 +93,7 @@ impl Outward {
         Ok(Self {
             channel: channel.to_owned(),
             ends,
-            attachment: Attachment::new(domain, door),
+            attachment: Attachment::new(domain, socket),
             inlet: None,
             has_program_begun: false,
             is_flowing: false,

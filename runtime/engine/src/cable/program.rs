@@ -1,11 +1,11 @@
-//! The thread that waits for the end of a program, or ends it, and looks after the door to its cable.
+//! The thread that waits for the end of a program, or ends it, and looks after the server of its cable.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_cable::{Door, InterfaceDrops};
+use hil_cable::{CableServer, InterfaceDrops};
 use hil_platform::signals::Signals;
 use hil_rundir::pipe::{
     CountByName, CounterGroup, FromProcess, InletReport, Orders, ProcessReport, ToProcess, say,
@@ -23,7 +23,7 @@ const PATIENCE: Duration = Duration::from_secs(2);
 #[derive(Debug)]
 pub(super) struct Program {
     pub(super) child: Child,
-    pub(super) door: Door,
+    pub(super) server: CableServer,
     pub(super) name: String,
     /// Of what it sends, and of what it receives.
     pub(super) channels: [String; 2],
@@ -39,7 +39,7 @@ impl JobWork for Program {
     }
 
     fn step(&mut self) -> Result<bool, WorkerError> {
-        self.door.attend().map_err(WorkerError::Socket)?;
+        self.server.attend().map_err(WorkerError::Socket)?;
         let Some(end) = self.child.poll_end() else {
             return Ok(false);
         };
@@ -75,18 +75,14 @@ impl JobWork for Program {
         let Ok(InterfaceDrops {
             inward_count,
             outward_count,
-        }) = self.door.drops()
+        }) = self.server.drops()
         else {
             return ProcessReport::default();
         };
         let [output, input] = &self.channels;
         let dropped = |channel: &String, count| InletReport {
             channel: channel.clone(),
-            lost: CountByName::all(
-                CounterGroup::Own,
-                [("dropped by the interface of the program", count)],
-            )
-            .collect(),
+            lost: CountByName::all(CounterGroup::Own, [(InletReport::DROPPED, count)]).collect(),
         };
         ProcessReport {
             inlets: vec![dropped(output, outward_count), dropped(input, inward_count)],

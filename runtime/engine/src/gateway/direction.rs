@@ -154,7 +154,7 @@ fn open_cables(
         })
     };
     channels
-        .filter(|(_, one)| one.door.is_some())
+        .filter(|(_, one)| one.cable_socket.is_some())
         .map(|(index, one)| Ok((index, open(one)?)))
         .collect()
 }
@@ -194,16 +194,18 @@ impl OpenDirection {
         let (domain, mut outward, mut inward) = (&around.domain, Vec::new(), Vec::new());
         for (index, open) in self.cables {
             let one = &launch.channels[index];
-            let Some(door) = &one.door else { continue };
+            let Some(socket) = &one.cable_socket else {
+                continue;
+            };
             match open {
                 // The thread that publishes is the one that takes: nobody is to be woken.
                 OpenCable::Outward(open) => {
                     let start = start.clone();
-                    let cable = Outward::join(domain, &one.channel, door, false, open, start)?;
+                    let cable = Outward::join(domain, &one.channel, socket, false, open, start)?;
                     outward.push((index, cable));
                 }
                 OpenCable::Inward(open) => {
-                    inward.push(Inward::join(domain, &one.channel, door, one.depth, open)?);
+                    inward.push(Inward::join(domain, &one.channel, socket, one.depth, open)?);
                 }
             }
         }
@@ -239,7 +241,7 @@ impl OpenDirection {
                 let channels = launch.channels.iter().zip(self.counts);
                 let outputs = channels.map(|(one, received)| {
                     let (name, slots) = (&one.channel, reassembly_slots(one.size_bytes));
-                    let notifies_readers = one.door.is_none();
+                    let notifies_readers = one.cable_socket.is_none();
                     Ok(Output {
                         port: RawOutput::open_assembling(domain, name, notifies_readers, slots)?,
                         received,
@@ -354,7 +356,7 @@ impl Direction {
         }
     }
 
-    /// What the inlets of programs lost, and how often a port of theirs failed to connect.
+    /// What the inlets of programs lost and their interfaces did not take, and how often a port of theirs failed to connect.
     pub(super) fn cables(&mut self) -> (Vec<InletReport>, u64) {
         match &mut self.way {
             BridgeLoop::Egress { cables, .. } => {
@@ -365,7 +367,8 @@ impl Direction {
             }
             BridgeLoop::Ingress { cables, .. } => {
                 let failures = cables.iter().map(Inward::connection_failure_count);
-                (Vec::new(), failures.sum())
+                let reports = cables.iter().map(Inward::report);
+                (reports.collect(), failures.sum())
             }
         }
     }

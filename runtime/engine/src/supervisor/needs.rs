@@ -30,7 +30,7 @@ const DIRECTION_FILES: u64 = 8;
 /// Of a gateway or an adapter for each of its channels: port, records, four observers.
 const CARRIED_CHANNEL_FILES: u64 = 16;
 /// Of whoever gives a program's cable away, and of whoever fetches it: socket, ring, connection, records.
-const DOOR_FILES: u64 = 8;
+const CABLE_FILES: u64 = 8;
 /// Of a component for each of its channels: port, records, four observers.
 const COMPONENT_CHANNEL_FILES: u64 = 16;
 
@@ -420,7 +420,7 @@ fn channels_of(card: &RoleSpec) -> Vec<String> {
 /// The end of the program and the program; and threads for its frames where no gateway carries them.
 fn cable_content(work: &CableWork) -> ProcessContent {
     let own = ProcessContent {
-        open_files: OWN_FILES + DOOR_FILES,
+        open_files: OWN_FILES + CABLE_FILES,
         threads: OWN_THREADS + 2,
         locks_memory: false,
         channels: Vec::new(),
@@ -441,11 +441,11 @@ fn cable_content(work: &CableWork) -> ProcessContent {
 fn gateway_content(work: &GatewayWork) -> ProcessContent {
     let count = work.directions.len() as u64;
     let programs = work.directions.iter().flat_map(|one| &one.channels);
-    let program_count = programs.filter(|one| one.door.is_some()).count() as u64;
+    let program_count = programs.filter(|one| one.cable_socket.is_some()).count() as u64;
     let outward = work.directions.iter();
     let outward = outward.filter(|one| one.side == Side::Egress);
     let rings = outward.flat_map(|one| &one.channels);
-    let ring_count = rings.filter(|one| one.door.is_some()).count() as u64;
+    let ring_count = rings.filter(|one| one.cable_socket.is_some()).count() as u64;
     let mut directions = work.directions.iter();
     let channels = work.directions.iter().flat_map(|one| &one.channels);
     let channels: Vec<String> = channels.map(|one| one.channel.clone()).collect();
@@ -453,7 +453,7 @@ fn gateway_content(work: &GatewayWork) -> ProcessContent {
         open_files: OWN_FILES
             + DIRECTION_FILES * count
             + CARRIED_CHANNEL_FILES * channels.len() as u64
-            + DOOR_FILES * program_count,
+            + CABLE_FILES * program_count,
         // One more samples a radio.
         threads: OWN_THREADS + 1 + count,
         locks_memory: directions.any(|one| one.realtime.lock_memory),

@@ -263,7 +263,7 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
                 command: command.clone(),
                 environment: environment.clone(),
                 open_files: open_files::inherited_limit(),
-                door: door_of(topology, &process.name).unwrap_or_default(),
+                cable_socket: cable_socket_of(topology, &process.name).unwrap_or_default(),
                 frames: topology
                     .crossings()
                     .all(|crossing| crossing.channel.name != output.name)
@@ -295,11 +295,11 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
     }
 }
 
-/// The name of the door of process `name`, if it is a program with a cable. It is short: it is that of a socket.
-fn door_of(topology: &Topology, name: &str) -> Option<String> {
+/// The name of the socket of the cable of process `name`, if it has one. It is short, as paths of sockets must be.
+fn cable_socket_of(topology: &Topology, name: &str) -> Option<String> {
     let mut processes = topology.processes().iter().enumerate();
     let (index, _) = processes.find(|(_, one)| one.name == name && one.inside().is_some())?;
-    Some(format!("door-{index}"))
+    Some(format!("cable-{index}"))
 }
 
 /// The channels of a program with an address inside, of which the topology has one each way.
@@ -441,9 +441,12 @@ fn direction(
             alignment_bytes: channel.message.alignment_bytes,
             depth: channel.depth,
             emulation: EmulationLaunch::of(crossing, seed).filter(|_| side == Side::Ingress),
-            door: match side {
-                Side::Egress => door_of(topology, &channel.from),
-                Side::Ingress => channel.to.as_deref().and_then(|to| door_of(topology, to)),
+            cable_socket: match side {
+                Side::Egress => cable_socket_of(topology, &channel.from),
+                Side::Ingress => channel
+                    .to
+                    .as_deref()
+                    .and_then(|to| cable_socket_of(topology, to)),
             },
         }
     });

@@ -47,6 +47,7 @@ use crate::{event_log, own_programs};
 use hil_platform::text::grouped;
 use hil_rundir::file_fault::FileFault;
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
+use hil_rundir::pipe::InletReport;
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::run_result::{RunResult, RunResultError};
 use hil_rundir::series::{self, SeriesError};
@@ -331,8 +332,20 @@ fn inlet_lost(result: &RunResult, channel: &str) -> Vec<CountByName> {
         .filter_map(|one| one.report.as_ref());
     let inlets = reports.flat_map(|report| &report.inlets);
     let inlets = inlets.filter(|inlet| inlet.channel == channel);
-    let lost = inlets.flat_map(|inlet| &inlet.lost);
-    lost.filter(|one| one.count > 0).cloned().collect()
+    let (refused, lost): (Vec<&CountByName>, Vec<_>) = inlets
+        .flat_map(|inlet| &inlet.lost)
+        .partition(|one| one.label() == InletReport::REFUSED);
+    let mut refused_count: u64 = refused.iter().map(|one| one.count).sum();
+    let lost = lost.into_iter().cloned().map(|mut one| {
+        // What was refused has a fate already.
+        if one.label() == InletReport::DROPPED {
+            let known_count = one.count.min(refused_count);
+            refused_count -= known_count;
+            one.count -= known_count;
+        }
+        one
+    });
+    lost.filter(|one| one.count > 0).collect()
 }
 
 /// Writes what the case and the network have to plot; gives the file that could not be written. A run whose

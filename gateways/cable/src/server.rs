@@ -37,7 +37,7 @@ pub struct InterfaceDrops {
 
 /// See the module documentation.
 #[derive(Debug)]
-pub struct Door {
+pub struct CableServer {
     listener: OwnedFd,
     path: PathBuf,
     cable: OwnedFd,
@@ -45,12 +45,12 @@ pub struct Door {
     devices: File,
     /// To the helper, until it becomes the program.
     helper: OwnedFd,
-    visitors: Vec<OwnedFd>,
+    clients: Vec<OwnedFd>,
     /// What the interface had dropped when the program began.
     before: Option<InterfaceDrops>,
 }
 
-impl Door {
+impl CableServer {
     /// Waits for the cable's end from the helper at the other end of `helper`, and gives it away at `path` from
     /// then on.
     ///
@@ -70,29 +70,29 @@ impl Door {
             cable,
             devices: devices.into(),
             helper,
-            visitors: Vec::new(),
+            clients: Vec::new(),
             before: None,
         })
     }
 
-    /// Opens to whoever has knocked, and lets the program begin once one of them says so.
+    /// Gives the end to whoever has connected, and lets the program begin once one of them says so.
     ///
     /// # Errors
     /// When the kernel gives no more descriptors or does not tell what the interface counts, or the helper is gone.
     pub fn attend(&mut self) -> io::Result<()> {
-        while let Some(visitor) = handover::accept(&self.listener)? {
+        while let Some(client) = handover::accept(&self.listener)? {
             let word = if self.before.is_some() {
                 BEGAN
             } else {
                 ENTERED
             };
             // One that has left is noticed below.
-            let _left = handover::give(&visitor, word, &[self.cable.as_fd()]).is_err();
-            self.visitors.push(visitor);
+            let _left = handover::give(&client, word, &[self.cable.as_fd()]).is_err();
+            self.clients.push(client);
         }
         let mut is_to_begin = false;
-        self.visitors
-            .retain(|visitor| match handover::take_waiting(visitor) {
+        self.clients
+            .retain(|client| match handover::take_waiting(client) {
                 Ok(None) => true,
                 Ok(Some((word, _))) => {
                     is_to_begin |= word == GO;
@@ -128,7 +128,7 @@ impl Door {
     }
 }
 
-impl Drop for Door {
+impl Drop for CableServer {
     fn drop(&mut self) {
         let _removed_before = fs::remove_file(&self.path).is_err();
     }
@@ -150,15 +150,15 @@ fn drops(devices: &str) -> Option<InterfaceDrops> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Knock;
+    use crate::CableClient;
 
     fn devices(inward: u64, outward: u64) -> String {
         format!("  eth0: 11 12 13 {inward} 15 16 17 18 19 20 21 {outward} 23 24 25 26\n")
     }
 
     #[test]
-    fn whoever_knocks_has_the_end_and_the_program_begins_once() {
-        let folder = std::env::temp_dir().join(format!("hil-door-{}", std::process::id()));
+    fn whoever_connects_has_the_end_and_the_program_begins_once() {
+        let folder = std::env::temp_dir().join(format!("hil-cable-server-{}", std::process::id()));
         fs::create_dir(&folder).unwrap();
         let counts = folder.join("dev");
         fs::write(&counts, devices(1, 2)).unwrap();
@@ -166,45 +166,48 @@ mod tests {
         let end = File::open("/dev/null").unwrap();
         let file = File::open(&counts).unwrap();
         handover::give(&program, ENTERED, &[end.as_fd(), file.as_fd()]).unwrap();
-        let path = folder.join("door-0");
+        let path = folder.join("cable-0");
         // A process that was killed leaves its socket.
         fs::write(&path, "").unwrap();
-        let mut door = Door::open(&path, helper).unwrap();
+        let mut server = CableServer::open(&path, helper).unwrap();
 
-        let first = Knock::at(&path).unwrap().unwrap();
+        let first = CableClient::at(&path).unwrap().unwrap();
         assert!(first.take().unwrap().is_none() && first.is_open());
-        door.attend().unwrap();
+        server.attend().unwrap();
         assert!(!first.take().unwrap().unwrap().has_program_begun);
         first.begin_program().unwrap();
-        door.attend().unwrap();
+        server.attend().unwrap();
         assert!(crate::await_go(program.as_fd()).unwrap());
         // Its reader starts anew: it is told, and the program hears nothing more.
         drop(first);
         fs::write(&counts, devices(5, 2)).unwrap();
-        let second = Knock::at(&path).unwrap().unwrap();
-        door.attend().unwrap();
+        let second = CableClient::at(&path).unwrap().unwrap();
+        server.attend().unwrap();
         assert!(second.take().unwrap().unwrap().has_program_begun);
         second.begin_program().unwrap();
-        door.attend().unwrap();
-        let drops = door.drops().unwrap();
+        server.attend().unwrap();
+        let drops = server.drops().unwrap();
         assert_eq!((drops.inward_count, drops.outward_count), (4, 0));
         assert!(second.is_open());
-        drop(door);
-        assert!(!second.is_open() && Knock::at(&path).unwrap().is_none());
+        drop(server);
+        assert!(!second.is_open() && CableClient::at(&path).unwrap().is_none());
         assert!(!crate::await_go(program.as_fd()).unwrap());
         fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]
-    fn a_helper_that_was_refused_or_is_gone_makes_no_door() {
-        let path = std::env::temp_dir().join(format!("hil-no-door-{}", std::process::id()));
+    fn a_helper_that_was_refused_or_is_gone_makes_no_server() {
+        let path = std::env::temp_dir().join(format!("hil-no-cable-server-{}", std::process::id()));
         let (here, there) = handover::pair().unwrap();
         handover::give(&there, b"no namespaces", &[]).unwrap();
-        let refused = Door::open(&path, here).unwrap_err();
+        let refused = CableServer::open(&path, here).unwrap_err();
         assert_eq!(refused.to_string(), "no namespaces");
         let (here, there) = handover::pair().unwrap();
         drop(there);
-        assert!(matches!(Door::open(&path, here), Err(CableError::Gone)));
+        assert!(matches!(
+            CableServer::open(&path, here),
+            Err(CableError::Gone)
+        ));
         assert!(!path.exists());
     }
 
