@@ -1,5 +1,6 @@
 //! Two programs that speak IP on two hosts: the topology of the manual, over a real hop.
 
+use std::thread;
 use std::time::Duration;
 
 use hil_account::flow::FlowMetrics;
@@ -93,4 +94,44 @@ fn whole_frames_of_either_ip_pass_over_a_path_with_the_smallest_mtu() {
     let flows = ["icmpv6 fd99::1 → fd99::2", "icmpv6 fd99::2 → fd99::1"];
     let addresses = ["fd99::1", "fd99::2"];
     check_echoes(&lab, "joined-narrow-v6", &topology(addresses, 1452), flows);
+}
+
+#[test]
+fn an_interface_of_a_host_that_is_down_is_a_loss_of_the_network_in_flows_as_well() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("joined-down");
+    let text = topology(["10.99.0.1", "10.99.0.2"], 56).replace("\"50\"", "\"500\"");
+    let trial = Trial::of(&record.write("two-programs.toml", &text), record.path())
+        .plain()
+        .set("run.duration=\"60 s\"");
+    let mut children = [0, 1].map(|index| trial.start_on(lab.host(index)));
+    // Progress is printed from the begin of the run on.
+    children[0]
+        .wait_for_output(" / 60 s", LIMIT)
+        .unwrap_or_else(|reason| panic!("{reason}"));
+    thread::sleep(Duration::from_secs(2));
+    lab.host(0).set_link("eth0", "down");
+    thread::sleep(Duration::from_secs(2));
+    lab.host(0).set_link("eth0", "up");
+    for child in &mut children {
+        child.wait_within(LIMIT).unwrap().assert_success();
+    }
+    for (index, host) in HOSTS.iter().enumerate() {
+        let files = trial.folder(host, LIMIT);
+        files.assert_nothing_left_on(lab.host(index));
+        let summary = files.summary();
+        assert_every_message_is_accounted_for(&summary);
+        let requests = echoes(&summary, "icmp 10.99.0.1 → 10.99.0.2");
+        let replies = echoes(&summary, "icmp 10.99.0.2 → 10.99.0.1");
+        println!("{host}: {requests:?}\n{replies:?}");
+        assert_eq!(requests.frame_count, 500, "{host}");
+        // 50 a second.
+        assert!(requests.lost_by_network_count > 50, "{host}: {requests:?}");
+        assert!(requests.taken_count > 250, "{host}: {requests:?}");
+        for flow in [requests, replies] {
+            assert_eq!(flow.lost_by_harness_count, 0, "{host}: {flow:?}");
+        }
+    }
 }

@@ -16,7 +16,7 @@ use hil_tests::trial::{processes_mentioning, wait_until};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
-const LIMIT: Duration = Duration::from_mins(2);
+pub(super) const LIMIT: Duration = Duration::from_mins(2);
 /// Who runs it where the tests run as root: `nobody`, without a capability.
 const NOBODY: [&str; 5] = [
     "--reuid=65534",
@@ -27,28 +27,34 @@ const NOBODY: [&str; 5] = [
 ];
 
 /// Says why a test is skipped that needs `program`; in CI it fails.
-fn lacks(program: &str, package: &str) -> bool {
+pub(super) fn lacks(program: &str, package: &str) -> bool {
+    let Some(reason) = missing(program, package) else {
+        return false;
+    };
+    let is_ci = std::env::var("CI").is_ok_and(|value| !value.is_empty() && value != "false");
+    assert!(!is_ci, "CI has every program, but {reason}");
+    eprintln!("skipped: {reason}");
+    true
+}
+
+/// That `program` is missing and which package has it; `None` where it is there.
+pub(super) fn missing(program: &str, package: &str) -> Option<String> {
     let path = std::env::var("PATH").unwrap_or_default();
     let is_there = path
         .split(':')
         .any(|one| Path::new(one).join(program).is_file());
-    if !is_there {
-        let reason = format!("`{program}` is not in PATH (Debian: apt-get install {package})");
-        let is_ci = std::env::var("CI").is_ok_and(|value| !value.is_empty() && value != "false");
-        assert!(!is_ci, "CI has every program, but {reason}");
-        eprintln!("skipped: {reason}");
-    }
-    !is_there
+    let reason = format!("`{program}` is not in PATH (Debian: apt-get install {package})");
+    (!is_there).then_some(reason)
 }
 
 /// A folder of a user without rights, with a program of its own.
-struct Place {
-    folder: RunFolder,
-    binary: PathBuf,
+pub(super) struct Place {
+    pub(super) folder: RunFolder,
+    pub(super) binary: PathBuf,
 }
 
 impl Place {
-    fn new(label: &str) -> Self {
+    pub(super) fn new(label: &str) -> Self {
         let folder = RunFolder::new(label);
         let binary = folder.join("hil-runtime");
         fs::copy(hil_runtime_binary(), &binary).unwrap();
@@ -59,14 +65,14 @@ impl Place {
     }
 
     /// `hil-runtime join` with these arguments, run by a user without rights.
-    fn join(&self, arguments: &[&str]) -> ChildGuard {
+    pub(super) fn join(&self, arguments: &[&str]) -> ChildGuard {
         self.start(
             &[self.binary.to_str().unwrap(), "join", "--quiet"],
             arguments,
         )
     }
 
-    fn start(&self, program: &[&str], arguments: &[&str]) -> ChildGuard {
+    pub(super) fn start(&self, program: &[&str], arguments: &[&str]) -> ChildGuard {
         let mut command = if nix::unistd::geteuid().is_root() {
             let mut command = Command::new("setpriv");
             command.args(NOBODY).args(program);
@@ -81,13 +87,13 @@ impl Place {
     }
 
     /// Runs it to its end; nothing of it is left.
-    fn run(&self, arguments: &[&str]) -> Finished {
+    pub(super) fn run(&self, arguments: &[&str]) -> Finished {
         let finished = self.join(arguments).wait_within(LIMIT).unwrap();
         self.assert_nothing_left();
         finished
     }
 
-    fn assert_nothing_left(&self) {
+    pub(super) fn assert_nothing_left(&self) {
         let path = self.binary.to_str().unwrap().to_owned();
         wait_until(LIMIT, "every process of the run has ended", || {
             processes_mentioning(&path).is_empty()
@@ -99,7 +105,7 @@ impl Place {
         runs.next().unwrap().unwrap().path()
     }
 
-    fn summary(&self) -> RunSummary {
+    pub(super) fn summary(&self) -> RunSummary {
         let text = fs::read_to_string(self.run_folder().join("summary.json")).unwrap();
         RunSummary::from_json(&text).unwrap()
     }
@@ -108,13 +114,13 @@ impl Place {
         self.said_by("first")
     }
 
-    fn said_by(&self, program: &str) -> String {
+    pub(super) fn said_by(&self, program: &str) -> String {
         let log = self.run_folder().join(format!("logs/{program}.log"));
         fs::read_to_string(log).unwrap()
     }
 
     /// A program that nobody here wrote, or that knows nothing of us, put beside the binary.
-    fn copy_of(&self, program: &str) -> PathBuf {
+    pub(super) fn copy_of(&self, program: &str) -> PathBuf {
         let copy = self.folder.join(program);
         let source = workspace_folder()
             .join("tests/foreign_programs")
@@ -125,24 +131,33 @@ impl Place {
 }
 
 /// The flow that has `part` in its name, from one program or the other.
-fn flow<'a>(summary: &'a RunSummary, part: &str) -> &'a FlowMetrics {
+pub(super) fn flow<'a>(summary: &'a RunSummary, part: &str) -> &'a FlowMetrics {
     let mut flows = summary.flows.iter().flat_map(|one| &one.flows);
     let found = flows.find(|one| one.name.contains(part));
     found.unwrap_or_else(|| panic!("no flow {part} in {:#?}", summary.flows))
 }
 
 /// Every frame has one fate, and no inlet lost any.
-fn assert_closed(summary: &RunSummary) {
-    assert_eq!(summary.flows.len(), 2);
+pub(super) fn assert_closed(summary: &RunSummary) {
+    assert_fates_add_up(summary);
     for channel in &summary.flows {
         // A frame of the kernel's own that comes as a program ends finds its interface down.
         let mut lost = channel.inlet_lost.iter();
         let lost = lost
-            .find(|one| one.label() != "refused by the interface of the program" || one.count > 2);
+            .find(|one| one.label() != "dropped by the interface of the program" || one.count > 2);
         assert_eq!(lost, None, "{}", channel.channel);
-        let mut all_count = 0;
         for flow in &channel.flows {
             println!("{flow:?}");
+        }
+    }
+}
+
+/// Every frame that became a message has one fate.
+pub(super) fn assert_fates_add_up(summary: &RunSummary) {
+    assert_eq!(summary.flows.len(), 2);
+    for channel in &summary.flows {
+        let mut all_count = 0;
+        for flow in &channel.flows {
             let fates = [
                 flow.taken_count,
                 flow.lost_by_network_count,
@@ -161,7 +176,7 @@ fn assert_closed(summary: &RunSummary) {
 }
 
 /// The number in front of `words`.
-fn number_before(text: &str, words: &str) -> u64 {
+pub(super) fn number_before(text: &str, words: &str) -> u64 {
     let before = text.split(words).next().unwrap();
     let digits = before
         .rsplit(|letter: char| !letter.is_ascii_digit())

@@ -11,8 +11,10 @@
 )]
 
 mod bypass;
+mod cable_stress;
 mod dissector;
 mod egm_clients;
+mod foreign_programs;
 mod joined_programs;
 mod live_links;
 mod long_messages;
