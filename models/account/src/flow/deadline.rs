@@ -59,7 +59,7 @@ pub struct DeadlineMetrics {
     pub late_by_both_count: u64,
     /// The network lost the request or the answer.
     pub missing_by_network_count: u64,
-    /// The program was given the request and sent nothing before it was given the next.
+    /// The program was given the request and answered later ones, or nothing any more.
     pub missing_by_program_count: u64,
     /// A host lost the request or the answer.
     pub missing_by_harness_count: u64,
@@ -140,12 +140,6 @@ impl DeadlineFold {
         let mut waiting = VecDeque::new();
         for (index, &request) in given.iter().enumerate() {
             let [given_ns, ..] = request;
-            // What came later than allowed would be the program's, too.
-            let limit_ns = self.metrics.limit_ns;
-            let is_over = |[ns, ..]: &mut [i64; 3]| given_ns.saturating_sub(*ns) > limit_ns;
-            while let Some([_, sent_ns, _]) = waiting.pop_front_if(is_over) {
-                self.add_unanswered(sent_ns);
-            }
             waiting.push_back(request);
             let next_ns = given
                 .get(index + 1)
@@ -156,6 +150,15 @@ impl DeadlineFold {
             let answered = waiting.drain(waiting.len() - answered_count..);
             for (request, answer) in answered.zip(&answers[first..]) {
                 self.add_answered(request, answer);
+            }
+            if answered_count > 0 {
+                // The program has answered later ones. What it answers of these after more than is allowed would be
+                // its own delay, too.
+                let limit_ns = self.metrics.limit_ns;
+                let is_over = |[ns, ..]: &mut [i64; 3]| given_ns.saturating_sub(*ns) > limit_ns;
+                while let Some([_, sent_ns, _]) = waiting.pop_front_if(is_over) {
+                    self.add_unanswered(sent_ns);
+                }
             }
         }
         for [_, sent_ns, _] in waiting {
@@ -283,6 +286,30 @@ mod tests {
         let mut fold = DeadlineFold::new("command", limit_ns);
         fold.add(requests, answers);
         fold.finish()
+    }
+
+    #[test]
+    fn answers_that_a_program_sends_together_after_a_pause_are_those_of_all_requests_of_the_pause()
+    {
+        let requests: Vec<FramePassage> = (0..8).map(|index| request(10 * index, 1)).collect();
+        // The program stood still from the second request to after the seventh.
+        let mut answers = vec![answer(1, 1)];
+        answers.extend([62; 6].map(|at_ms| answer(at_ms, 1)));
+        answers.push(answer(72, 1));
+        let found = folded(20 * MS, &requests, &answers);
+        assert_eq!(
+            (found.missing_by_program_count, found.unknown_count),
+            (0, 0)
+        );
+        assert_eq!((found.in_time_count, found.late_by_program_count), (4, 4));
+        assert_eq!(found.response.measured().unwrap().max_ns, 53 * MS);
+        // Of the pause only the newest is answered: the older ones never are.
+        let skipped = [answers[0], answer(62, 1), answer(72, 1)];
+        let found = folded(20 * MS, &requests, &skipped);
+        assert_eq!(
+            (found.missing_by_program_count, found.in_time_count),
+            (5, 3)
+        );
     }
 
     #[test]

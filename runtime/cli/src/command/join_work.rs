@@ -28,7 +28,8 @@ pub(super) fn join(
     registry: &Registry,
     console: &mut Console,
 ) -> Result<u8, Refusal> {
-    let mut link = link(args.link.as_deref(), registry, console)?;
+    console.set_quiet(args.quiet);
+    let Between { mut link, flows } = between(args.link.as_deref(), registry, console)?;
     let port = free_ports().map_err(|error| failed(format!("no free UDP port: {error}")))?;
     link.insert("port".to_owned(), i64::from(port).into());
     let seed = if let Some(seed) = args.seed {
@@ -37,7 +38,9 @@ pub(super) fn join(
         let bytes = random_bytes().map_err(|error| failed(format!("no seed: {error}")))?;
         u64::from(u32::from_ne_bytes(bytes))
     };
-    let text = topology(args, seed, link).map_err(usage)?.to_string();
+    let mut text = topology(args, seed, link).map_err(usage)?;
+    text.extend(flows.map(|flows| ("flows".to_owned(), flows)));
+    let text = text.to_string();
     let topology = hil_topology::parse("join", &text, &[], registry.known());
     let topology = topology.map_err(|errors| usage(as_typed(args, &errors)))?;
     let run = RunArgs {
@@ -104,17 +107,34 @@ fn free_ports() -> io::Result<u16> {
     outcome
 }
 
-/// The link of a file or of words; without either one that hurts nothing.
-fn link(said: Option<&str>, registry: &Registry, console: &mut Console) -> Result<Table, Refusal> {
+/// What is between the programs.
+struct Between {
+    link: Table,
+    /// Names of flows and their deadlines, of a file.
+    flows: Option<Value>,
+}
+
+/// The link of a file, with its flows, or of words; without either one that hurts nothing.
+fn between(
+    said: Option<&str>,
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<Between, Refusal> {
+    let only = |link| Between { link, flows: None };
     match said {
         Some(path) if Path::new(path).is_file() => {
             let path = PathBuf::from(path);
             let topology = hil_topology::load_case(&path, &[], registry.known());
             let resolved = loaded(topology, console)?.resolved();
-            only_link(&resolved).map_err(|why| usage(format!("{}: {why}", path.display())))
+            let link =
+                only_link(&resolved).map_err(|why| usage(format!("{}: {why}", path.display())))?;
+            Ok(Between {
+                link,
+                flows: resolved.get("flows").cloned(),
+            })
         }
-        Some(words) => link_of_words(words).map_err(usage),
-        None => Ok(Table::from_iter([via("udp")])),
+        Some(words) => link_of_words(words).map(only).map_err(usage),
+        None => Ok(only(Table::from_iter([via("udp")]))),
     }
 }
 

@@ -88,8 +88,7 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
 
 /// How the requests of flows with a deadline were answered.
 pub(crate) fn deadlines(summary: &RunSummary) -> Section {
-    let aside =
-        "from sending a request until the first frame that was sent back after it came was given";
+    let aside = "from sending a request until its answer was given";
     let mut section = Section::new("deadlines", "Deadlines", aside);
     if summary.deadlines.is_empty() {
         return section;
