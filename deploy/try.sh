@@ -4,21 +4,29 @@
 #
 #   deploy/try.sh [SEED...]
 set -eu
-root=$(cd "$(dirname "$0")/.." && pwd)
+root=$(CDPATH="" cd -- "$(dirname "$0")/.." && pwd)
 target=${CARGO_TARGET_DIR:-$root/target}
 ${CARGO:-cargo} build --release --manifest-path "$root/Cargo.toml" --bin hil-runtime
 program=$target/release/hil-runtime
 runs=runs/try-$(date +%Y%m%d-%H%M%S)
 [ $# -gt 0 ] || set -- 4 5 6
 
-# Once more where the host could not keep up, as a busy one, twice at most.
+# A run that the host could not keep up with, as a busy one, is put aside and repeated, twice at most.
 run() {
     for attempt in 1 2 3; do
         echo "== $1, seed $seed" >&2
+        folder=$runs/$1-$seed
         report=$("$program" --topology "$root/deploy/topologies/$2" --on-one-pc --set "name=$1" \
-            --set "run.duration=10 s" --set "run.seed=$seed" --set "run.record=$runs/$1-$seed")
+            --set "run.duration=10 s" --set "run.seed=$seed" --set "run.record=$folder") || {
+            code=$?
+            printf '%s\n' "$report"
+            exit "$code"
+        }
         case $report in
-        *"NOT VALID"*) [ "$attempt" = 3 ] || rm -r "${runs:?}/$1-$seed" ;;
+        *"NOT VALID"*)
+            printf '%s\n' "$report" | grep -A 2 "NOT VALID" >&2
+            [ "$attempt" = 3 ] || mv "$folder" "$runs/invalid-$1-$seed-$attempt"
+            ;;
         *) break ;;
         esac
     done

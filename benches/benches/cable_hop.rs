@@ -39,12 +39,13 @@ use serde_json::json;
 const BENCH: &str = "cable_hop";
 const SEED: u64 = 23;
 /// Which contestants are set against which.
-const PAIRS: [[usize; 2]; 7] = [
+const PAIRS: [[usize; 2]; 8] = [
     [2, RELAY],
     [3, RELAY],
     [2, DIRECT],
     [3, DIRECT],
     [RELAY, DIRECT],
+    [2, RATTAN],
     [3, RATTAN],
     [RATTAN, DIRECT],
 ];
@@ -198,7 +199,7 @@ impl Contest {
         let mut figures: [Vec<Vec<f64>>; 4] = Default::default();
         let before = MachineTime::read();
         let count = self.arguments.round_count.min(LOAD_ROUNDS_MAX);
-        // A flood through a rattan that was stopped and goes on never ends.
+        // Rattan, stopped and continued, does not end a flood.
         let loaded = if self.arguments.is_alone() {
             RATTAN.min(self.contestants.len())
         } else {

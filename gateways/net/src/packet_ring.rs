@@ -396,7 +396,8 @@ impl CableSocket {
         set_option(&socket, libc::SOL_PACKET, libc::PACKET_VERSION, &version)?;
         setsockopt(&socket, sockopt::ReceiveTimestampns, &true)?;
         ignore_outgoing(&socket)?;
-        // The queue of an interface whose other end is down takes frames, and throws them away.
+        // An interface without carrier, as one whose other end is down, has a queue that takes frames and throws them
+        // away (`noop`). Other packet sockets of this end do not see what is sent; those of the other end do.
         let bypass: c_int = 1;
         set_option(
             &socket,

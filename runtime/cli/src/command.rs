@@ -289,6 +289,9 @@ fn run_topology(
         return show_study(path, &topology, args, registry, console);
     }
     let command_line = host::as_typed(env::args());
+    if args.on_one_pc {
+        host::check(&topology).map_err(|error| not_on_one_pc(path, error))?;
+    }
     if args.on_one_pc && !args.check {
         return on_one_pc(path, &topology, console);
     }
@@ -297,12 +300,16 @@ fn run_topology(
 
 /// Runs all hosts of `topology` here, each under a supervisor of its own.
 fn on_one_pc(path: &Path, topology: &Topology, console: &mut Console) -> Result<u8, Refusal> {
-    host::run_all(topology, console).map_err(|error| match error {
+    host::run_all(topology, console).map_err(|error| not_on_one_pc(path, error))
+}
+
+fn not_on_one_pc(path: &Path, error: HostsError) -> Refusal {
+    match error {
         HostsError::WithoutAddress
         | HostsError::OneInterface { .. }
         | HostsError::SameInterface(_) => usage(format!("{}: {error}", path.display())),
         other => Refusal::new(exit::HOST_UNFIT, other),
-    })
+    }
 }
 
 /// Runs `topology`, or checks whether it could, and prints its report; `command_line` repeats the run.

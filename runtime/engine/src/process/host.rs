@@ -114,6 +114,14 @@ pub fn as_typed(arguments: impl Iterator<Item = String>) -> Vec<String> {
         .collect()
 }
 
+/// Whether the hosts of `topology` can be on one PC, as far as its file tells.
+///
+/// # Errors
+/// When they cannot.
+pub fn check(topology: &Topology) -> Result<(), HostsError> {
+    wires(topology.hosts()).map(drop)
+}
+
 /// Runs all hosts of `topology`, each by the arguments of this process, and gives the exit code of the first one
 /// that did not end with 0. The first host has this process's outputs; of others the warnings and errors are
 /// said, each with the host's name. This process must have one thread.

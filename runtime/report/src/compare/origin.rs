@@ -24,10 +24,21 @@ const HOST_FACTS: [(&str, &str); 4] = [
 /// What both sides share, and what they do not.
 pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<String>) {
     let (mut same, mut differences) = topology(base, new);
+    // Repetitions have a seed each: the same on both sides make no difference.
+    let [b, n] = [base, new].map(|runs| {
+        let mut seeds: Vec<u64> = runs.iter().map(|run| run.summary.run.seed).collect();
+        seeds.sort_unstable();
+        let words = seeds.iter().map(u64::to_string);
+        words.collect::<Vec<_>>().join(" and ")
+    });
+    if b == n {
+        same.push(format!("seed {b}"));
+    } else {
+        differences.push(format!("seed: base {b}, new {n}"));
+    }
     let mut check = |what: &str, of: &dyn Fn(&RunSummary) -> String| {
         let (b, n) = (values(base, of), values(new, of));
-        // Of repetitions on both sides: the same set of seeds.
-        if b == n {
+        if b == n && b.len() == 1 {
             same.push(format!("{what} {}", joined(&b)));
         } else {
             let (b, n) = (joined(&b), joined(&n));
@@ -35,7 +46,6 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec
         }
     };
     check("case", &|one| one.run.case.clone());
-    check("seed", &|one| one.run.seed.to_string());
     check("hosts", &|one| {
         let hosts: BTreeSet<&str> = one.processes.iter().map(|it| it.host.as_str()).collect();
         hosts.into_iter().collect::<Vec<_>>().join(" and ")
@@ -82,7 +92,7 @@ fn topology(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<Stri
                 .map(Option::unwrap_or_default)
                 .collect::<BTreeSet<_>>()
         });
-        if b != n {
+        if b != n || b.len() > 1 {
             let (b, n) = (joined(&b), joined(&n));
             differences.push(format!("topology {key}: base {b}, new {n}"));
         }
@@ -121,10 +131,10 @@ fn add_leaves(leaves: &mut BTreeMap<String, String>, path: &str, value: &Value) 
     }
 }
 
-/// Seed and length stand beside the topology. A port changes nothing of what is measured; joined programs take
-/// one that is free.
+/// Seed and length stand beside the topology. A port and a folder change nothing of what is measured; joined programs take
+/// a port that is free.
 fn is_told_elsewhere(key: &str) -> bool {
-    matches!(key, "run.seed" | "run.duration")
+    matches!(key, "run.seed" | "run.duration" | "run.record")
         || key.starts_with("links.") && key.rsplit('.').next() == Some("port")
 }
 
@@ -258,6 +268,18 @@ mod tests {
         let (same, differences) = of(&[link(1, 7_400, "5 ms")], &[link(2, 7_402, "5 ms")]);
         assert!(same[0].starts_with("topology but for"), "{same:?}");
         assert_eq!(differences.len(), 1, "{differences:?}");
+        // Repetitions of the same seeds, of which one met another link.
+        let [one, two, other] =
+            [(1, "5 ms"), (2, "5 ms"), (2, "9 ms")].map(|(seed, delay)| link(seed, 7_400, delay));
+        let (same, differences) = of(&[one.clone(), two.clone()], &[two.clone(), one.clone()]);
+        assert!(same.iter().any(|one| one == "seed 1 and 2"), "{same:?}");
+        assert_eq!(differences, [""; 0]);
+        let (_, differences) = of(&[one.clone(), two.clone()], &[one.clone(), one.clone()]);
+        assert_eq!(differences, ["seed: base 1 and 2, new 1 and 1"]);
+        let sides = [one, other];
+        let (_, differences) = of(&sides, &sides);
+        let expected = "topology links.hop.delay: base 5 ms or 9 ms, new 5 ms or 9 ms";
+        assert_eq!(differences, [expected]);
         // A key of one side only, and a folder without a manifest.
         let (_, differences) = of(&[run(1, json!({}))], &[run(1, json!({ "name": "x" }))]);
         assert_eq!(differences, ["topology name: base none, new x"]);

@@ -208,22 +208,31 @@ fn left_open(comparison: &Comparison) -> Vec<String> {
     open
 }
 
-/// What may have made a difference: the keys of one table of the topology together, such as those of a link. The name of
-/// a topology makes none, and the kinds of links follow from the links.
+/// What may have made a difference: a link that is of another kind with all of its keys, which follow from the kind, and
+/// each other key for itself. The name of a topology makes none, and the kinds of links follow from the links.
 fn differing(differences: &[String]) -> Vec<&str> {
-    const LINK: &str = "topology links.";
+    const LINKS: &str = "topology links.";
+    let whats: Vec<&str> = differences
+        .iter()
+        .map(|words| words.split(':').next().unwrap_or_default())
+        .collect();
+    let kinds: Vec<&str> = whats
+        .iter()
+        .filter(|what| what.starts_with(LINKS))
+        .filter_map(|what| what.strip_suffix(".via"))
+        .collect();
     let mut found: Vec<&str> = Vec::new();
-    for words in differences {
-        let what = words.split(':').next().unwrap_or_default();
-        let table = match what.match_indices('.').nth(1) {
-            Some((end, _)) if what.starts_with("topology ") => &what[..end],
-            _ => what,
+    for what in whats {
+        let is_of = |link: &&&str| {
+            let rest = what.strip_prefix(**link);
+            rest.is_some_and(|rest| rest.starts_with('.'))
         };
-        if what != "topology name" && !found.contains(&table) {
-            found.push(table);
+        let one = kinds.iter().find(is_of).copied().unwrap_or(what);
+        if one != "topology name" && !found.contains(&one) {
+            found.push(one);
         }
     }
-    if found.iter().any(|one| one.starts_with(LINK)) {
+    if found.iter().any(|one| one.starts_with(LINKS)) {
         found.retain(|one| *one != "links");
     }
     found
@@ -449,21 +458,27 @@ mod tests {
     use super::differing;
 
     #[test]
-    fn the_keys_of_one_link_are_one_difference_and_a_name_is_none() {
+    fn the_keys_of_a_link_of_another_kind_are_one_difference_and_a_name_is_none() {
         let differences = |words: &[&str]| -> Vec<String> {
             let of = |what: &&str| format!("{what}: base none, new x");
             words.iter().map(of).collect()
         };
-        let link = [
+        let other_kind = [
             "topology links.hop.forward.delay",
             "topology links.hop.via",
             "topology name",
             "links",
         ];
-        assert_eq!(differing(&differences(&link)), ["topology links.hop"]);
-        let other = ["topology links.hop.via", "topology run.seed", "kernel"];
-        let expected = ["topology links.hop", "topology run.seed", "kernel"];
-        assert_eq!(differing(&differences(&other)), expected);
+        let found = differences(&other_kind);
+        assert_eq!(differing(&found), ["topology links.hop"]);
+        // Of one kind, each key may have made the difference; so may parameters.
+        let keys = [
+            "topology case.parameters.gain",
+            "topology case.parameters.limit",
+            "topology links.hop.delay",
+            "topology links.hop.loss_ratio",
+        ];
+        assert_eq!(differing(&differences(&keys)), keys);
         assert_eq!(differing(&differences(&["links"])), ["links"]);
     }
 }
