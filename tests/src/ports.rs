@@ -1,6 +1,7 @@
 //! Ports of one's own: tests run side by side in the network of this machine, each in a process of its own.
 
 use std::io::{Read, Seek, SeekFrom, Write};
+use std::net::{Ipv4Addr, SocketAddr};
 
 use crate::machine_lock::machine_lock;
 
@@ -32,6 +33,12 @@ pub fn own_ports() -> u16 {
         panic!("no ports: {error}");
     }
     next
+}
+
+/// Two addresses of loopback, of [`own_ports`].
+pub fn own_addresses() -> [SocketAddr; 2] {
+    let first = own_ports();
+    [first, first + 1].map(|port| (Ipv4Addr::LOCALHOST, port).into())
 }
 
 #[cfg(test)]

@@ -1,7 +1,6 @@
 //! The command line as a person uses it: checks, mistakes, Ctrl-C, and what commands do. Their help is in
 //! `help.rs`.
 
-use std::net::{Ipv4Addr, TcpListener};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 use std::{fs, io};
@@ -14,6 +13,7 @@ use hil_tests::binary::{
     hil_runtime as run, hil_runtime_binary, hil_runtime_in as run_in, workspace_folder,
 };
 use hil_tests::child::{ChildGuard, Finished};
+use hil_tests::ports::own_ports;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial, processes_mentioning, shipped_topology, wait_until};
 use nix::sys::signal::Signal;
@@ -113,9 +113,7 @@ fn a_misspelt_key_is_shown_in_its_file_with_what_was_meant() {
 
 /// A split run whose two hosts are on this machine.
 fn split_here(record: &RunFolder) -> Trial {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-    let port = listener.local_addr().unwrap().port();
-    drop(listener);
+    let port = own_ports();
     Trial::shipped("split.toml", record.path())
         .set("hosts.control-pc.address=\"127.0.0.1\"")
         .set("hosts.robot-pc.address=\"127.0.0.2\"")

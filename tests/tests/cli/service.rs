@@ -2,7 +2,6 @@
 //! test stand for them; the real ones are in `tests/lab/systemd.sh`.
 
 use std::fs::{self, File};
-use std::net::{Ipv4Addr, TcpListener};
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixDatagram;
 use std::path::PathBuf;
@@ -12,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
+use hil_tests::ports::own_ports;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
 use nix::sys::signal::{Signal, kill};
@@ -99,9 +99,7 @@ fn systemd_hears_that_a_run_is_up_how_it_goes_and_that_it_ends() {
 fn a_host_that_waits_for_another_is_up_and_says_so() {
     let folder = RunFolder::new("service-waits");
     let mut manager = Manager::new(&folder);
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-    let port = listener.local_addr().unwrap().port();
-    drop(listener);
+    let port = own_ports();
     let trial = Trial::shipped("shuttle-split.toml", &folder.join("runs"))
         .set("hosts.control-pc.address=\"127.0.0.1\"")
         .set("hosts.robot-pc.address=\"127.0.0.2\"")

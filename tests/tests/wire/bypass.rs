@@ -1,7 +1,7 @@
 //! A channel whose two ends share memory bypasses the network it is to measure. Whoever could be
 //! deceived notices, and supervisors never share a domain.
 
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use hil_account::MessageFate;
@@ -10,6 +10,7 @@ use hil_rundir::launch::{DirectionLaunch, Side};
 use hil_shm::{ChannelHolder, ChannelSettings, Domain};
 use hil_shuttle::ShuttleCommand;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
+use hil_tests::ports::{own_addresses, own_ports};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
 use hil_tests::worker::{self, Worker};
@@ -17,12 +18,6 @@ use hil_tests::worker::{self, Worker};
 const CHANNEL: &str = "shuttle/command";
 const LIMIT: Duration = Duration::from_mins(1);
 const REASON: &str = "one shared-memory domain, so messages would bypass the network";
-
-/// Two free ports of the loopback interface.
-fn free_ports() -> [SocketAddr; 2] {
-    let sockets = [(); 2].map(|()| UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap());
-    sockets.map(|socket| socket.local_addr().unwrap())
-}
 
 fn direction(side: Side, addresses: [SocketAddr; 2]) -> DirectionLaunch {
     let message = MessageType::of::<ShuttleCommand>();
@@ -42,7 +37,7 @@ fn domain(folder: &RunFolder, name: &str) -> (ChannelHolder, Domain) {
 fn a_gateway_process_refuses_a_peer_that_shares_its_memory_and_says_why() {
     let folder = RunFolder::new("bypass");
     let (_holder, domain) = domain(&folder, "one");
-    let addresses = free_ports();
+    let addresses = own_addresses();
     let mut ends = [("sending", Side::Egress), ("receiving", Side::Ingress)].map(|(name, side)| {
         let launch = worker::gateway(folder.path(), name, &domain, direction(side, addresses));
         Worker::start(&launch)
@@ -64,9 +59,7 @@ fn a_gateway_process_refuses_a_peer_that_shares_its_memory_and_says_why() {
 #[test]
 fn two_supervisors_with_one_domain_folder_keep_their_memory_apart() {
     let record = RunFolder::new("one-root");
-    let control = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-    let control_port = control.local_addr().unwrap().port();
-    drop(control);
+    let control_port = own_ports();
     let root = record.join("domains");
     let trial = Trial::shipped("shuttle-split.toml", record.path())
         .set("run.duration=\"2 s\"")

@@ -4,7 +4,6 @@
 //! `tests/egm_clients/requirements.txt`), `HIL_EGM_CLIENT_SECONDS` how long each drives (20;
 //! the acceptance asks for 60).
 
-use std::net::{Ipv4Addr, UdpSocket};
 use std::process::Command;
 use std::time::Duration;
 use std::{env, thread};
@@ -15,6 +14,7 @@ use hil_tests::account::{account, assert_account_closes};
 use hil_tests::arms::{Arms, of_kind};
 use hil_tests::binary::workspace_folder;
 use hil_tests::child::ChildGuard;
+use hil_tests::ports::own_ports;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial, load_average, wait_until};
 use nix::sys::signal::Signal;
@@ -74,9 +74,7 @@ struct Robot {
 impl Robot {
     /// Starts the robot, as ought to be done first; then names the client that may come.
     fn start(python: &str, script: &str, restart: &str) -> Self {
-        let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-        let port = socket.local_addr().unwrap().port();
-        drop(socket);
+        let port = own_ports();
         let folder = RunFolder::new(restart);
         let trial = Trial::shipped("egm-client.toml", folder.path())
             .set(&format!("processes.client.egm.right=\"127.0.0.1:{port}\""))

@@ -1,7 +1,7 @@
 //! Messages of megabytes through two gateway processes, beside short ones on the same link: both arrive as they
 //! were sent, and one of which a piece is lost is recorded with what came of it.
 
-use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
+use std::net::SocketAddr;
 use std::thread;
 use std::time::Duration;
 
@@ -13,6 +13,7 @@ use hil_platform::clock::MonotonicClock;
 use hil_rundir::launch::{ChannelLaunch, DirectionLaunch, Side};
 use hil_rundir::record::RecordFile;
 use hil_shm::{ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, ShmOutput};
+use hil_tests::ports::own_addresses;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::worker::{self, Worker};
 use hil_topology::SocketOptions;
@@ -100,9 +101,7 @@ fn play(label: &str, spec: Option<&LinkSpec>) -> Outcome {
         ..ChannelSettings::of("hil/link/hop/forward", &ORDER)
     };
     holders.push(ChannelHolder::create(&domains[1], &orders).unwrap());
-    let sockets = [(); 2].map(|()| UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap());
-    let addresses = sockets.each_ref().map(|one| one.local_addr().unwrap());
-    drop(sockets);
+    let addresses = own_addresses();
     let mut workers = [(0, Side::Egress), (1, Side::Ingress)].map(|(host, side)| {
         let name = format!("gateway-{host}");
         let direction = direction(side, addresses, spec);

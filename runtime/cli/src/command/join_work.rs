@@ -1,6 +1,7 @@
 //! Two programs that speak IP with a link between them: the topology that says so, made of the command line.
 
 use std::env;
+use std::fs;
 use std::io;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::{Path, PathBuf};
@@ -88,19 +89,31 @@ fn as_typed(args: &JoinArgs, errors: &TopologyErrors) -> String {
     typed.join("\n")
 }
 
-/// The first of as many UDP ports in a row as a link takes on one PC, none of which is in use.
+/// Where Linux says from which port on it gives those to sockets that ask for none, ip(7), and its default.
+const GIVEN_AWAY: (&str, u16) = ("/proc/sys/net/ipv4/ip_local_port_range", 32_768);
+/// Above the defaults of our own topologies.
+const FIRST_PORT: u16 = 10_000;
+
+/// The first of as many UDP ports in a row as a link takes on one PC, none of which is in use, by lot. The gateways bind
+/// them a moment later: another program that asks for any port is not given one of them until then.
 fn free_ports() -> io::Result<u16> {
     const ATTEMPTS: u32 = 100;
-    let bind = |port| UdpSocket::bind((Ipv4Addr::LOCALHOST, port));
+    let (file, by_default) = GIVEN_AWAY;
+    let range = fs::read_to_string(file).unwrap_or_default();
+    let first_given = range.split_whitespace().next().map(str::parse);
+    let first_given = first_given.and_then(Result::ok).unwrap_or(by_default);
+    let count = LinkPorts::count(true);
+    // Where the kernel gives nearly all ports away, any will do.
+    let is_room = first_given > FIRST_PORT.saturating_add(1_000);
+    let end = if is_room { first_given } else { u16::MAX } - count;
     let mut outcome = Err(io::ErrorKind::AddrInUse.into());
     for _ in 0..ATTEMPTS {
-        let first = bind(0)?;
-        let port = first.local_addr()?.port();
-        let others =
-            (1..LinkPorts::count(true)).map(|next| bind(port.checked_add(next).unwrap_or(0)));
+        let lot = u16::from_ne_bytes(random_bytes()?);
+        let first = FIRST_PORT + lot % (end - FIRST_PORT);
+        let link = (first..first + count).map(|port| UdpSocket::bind((Ipv4Addr::LOCALHOST, port)));
         // Held until all are known to be free.
-        match others.collect::<io::Result<Vec<_>>>() {
-            Ok(_free) => return Ok(port),
+        match link.collect::<io::Result<Vec<_>>>() {
+            Ok(_free) => return Ok(first),
             Err(error) => outcome = Err(error),
         }
     }
