@@ -9,10 +9,11 @@
 use core::ops::Range;
 use core::time::Duration;
 
-use hil_core::time::Instant;
+use hil_core::time::{Instant, RemoteInstant};
 
+use super::ingress::{Incomplete, MessageInfo};
 use super::refusal::Refusal;
-use super::sequence::Stream;
+use super::wire::Header;
 use crate::counts;
 
 /// Most datagrams of one message: enough for 16 MiB on a path of 576 bytes, with IPv6.
@@ -82,27 +83,6 @@ impl FragmentPlan {
     }
 }
 
-/// One piece as it came from the network, its length already checked against its plan.
-#[derive(Debug, Clone, Copy)]
-pub struct Fragment<'a> {
-    /// Stream of the message.
-    pub stream: Stream,
-    /// Number of the message.
-    pub sequence: u64,
-    /// Bytes of the whole message.
-    pub total_len: u32,
-    /// Which piece.
-    pub index: u16,
-    /// Of how many.
-    pub count: u16,
-    /// The producer's stamp, the sender's monotonic clock.
-    pub published_ns: i64,
-    /// When this piece was handed to the sender's kernel, the sender's monotonic clock.
-    pub handed_ns: i64,
-    /// Its bytes.
-    pub payload: &'a [u8],
-}
-
 /// Where a piece belongs; [`Reassembler::stored`] takes it once the piece is there.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Place {
@@ -119,27 +99,10 @@ pub struct Place {
 /// A message of which every piece is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Assembled {
+    /// Who it is.
+    pub message: MessageInfo,
     /// Bytes of the whole message.
     pub length_bytes: usize,
-    /// When its first piece was handed to the sender's kernel, the sender's monotonic clock.
-    pub handed_ns: i64,
-}
-
-/// A message that was given up: of some of its pieces nothing was seen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct GivenUp {
-    /// Its stream.
-    pub stream: Stream,
-    /// Its number.
-    pub sequence: u64,
-    /// The producer's stamp, the sender's monotonic clock.
-    pub published_ns: i64,
-    /// When the first piece that came was handed to the sender's kernel, the sender's monotonic clock.
-    pub handed_ns: i64,
-    /// When the last piece came.
-    pub heard_at: Instant,
-    /// How many pieces came.
-    pub received_count: u16,
 }
 
 counts! {
@@ -161,51 +124,51 @@ counts! {
 /// Keeps account of the messages that come together in a fixed number of slots.
 #[derive(Debug)]
 pub struct Reassembler {
+    channel: usize,
     slots: Box<[Slot]>,
     size_max_bytes: usize,
     timeout: Duration,
     /// Taken by the owner after every call.
-    given_up: Vec<GivenUp>,
+    given_up: Vec<Incomplete>,
     counts: ReassemblyCounts,
 }
 
 #[derive(Debug, Clone)]
 struct Slot {
-    message: Option<(Stream, u64)>,
+    message: Option<MessageInfo>,
     total_len: u32,
-    count: u16,
     missing: u16,
-    published_ns: i64,
     received: Box<[u64]>,
-    /// Of piece 0.
-    handed_ns: i64,
     started_at: Instant,
     /// When its last piece came.
     heard_at: Instant,
 }
 
 impl Reassembler {
-    /// For `slot_count` messages of at most `size_max_bytes`; an incomplete one is given up `timeout` after
-    /// its last piece.
+    /// For `slot_count` messages of at most `size_max_bytes` of the channel with index `channel`; an incomplete one is
+    /// given up `timeout` after its last piece.
     ///
     /// # Panics
     /// When `slot_count` is zero.
-    pub fn new(slot_count: usize, size_max_bytes: usize, timeout: Duration) -> Self {
+    pub fn new(
+        channel: usize,
+        slot_count: usize,
+        size_max_bytes: usize,
+        timeout: Duration,
+    ) -> Self {
         assert!(slot_count > 0, "reassembly needs at least one slot");
         let empty = Slot {
             message: None,
             total_len: 0,
-            count: 0,
             missing: 0,
-            published_ns: 0,
             // No message has more pieces than bytes.
             received: vec![0; size_max_bytes.clamp(1, FRAGMENT_COUNT_MAX).div_ceil(64)]
                 .into_boxed_slice(),
-            handed_ns: 0,
             started_at: Instant::ZERO,
             heard_at: Instant::ZERO,
         };
         Self {
+            channel,
             slots: vec![empty; slot_count].into_boxed_slice(),
             size_max_bytes,
             timeout,
@@ -214,31 +177,36 @@ impl Reassembler {
         }
     }
 
-    /// Where one piece belongs.
+    /// Where the piece of `piece_bytes` behind `header` belongs.
     ///
     /// # Errors
     /// [`Refusal::Oversize`], [`Refusal::FragmentInconsistent`], [`Refusal::LengthMismatch`] or
     /// [`Refusal::DuplicateFragment`]; the slots are then as they were.
-    pub fn place(&mut self, now: Instant, fragment: &Fragment<'_>) -> Result<Place, Refusal> {
-        if fragment.total_len as usize > self.size_max_bytes {
+    pub fn place(
+        &mut self,
+        now: Instant,
+        header: &Header,
+        piece_bytes: usize,
+    ) -> Result<Place, Refusal> {
+        if header.total_len as usize > self.size_max_bytes {
             return Err(Refusal::Oversize);
         }
-        let range = FragmentPlan::from_wire(fragment.total_len, fragment.count)
-            .and_then(|plan| plan.range(fragment.index))
+        let range = FragmentPlan::from_wire(header.total_len, header.fragment_count)
+            .and_then(|plan| plan.range(header.fragment_index))
             .ok_or(Refusal::FragmentInconsistent)?;
-        if range.len() != fragment.payload.len() {
+        if range.len() != piece_bytes {
             return Err(Refusal::LengthMismatch);
         }
         self.expire(now);
-        let found = self.find(fragment)?;
-        let slot = found.unwrap_or_else(|| self.open(now, fragment));
+        let found = self.find(header)?;
+        let slot = found.unwrap_or_else(|| self.open(now, header));
         self.slots[slot].heard_at = now;
         Ok(Place {
             slot,
             is_first: found.is_none(),
             offset_bytes: range.start,
-            index: fragment.index,
-            handed_ns: fragment.handed_ns,
+            index: header.fragment_index,
+            handed_ns: header.handed_ns,
         })
     }
 
@@ -254,11 +222,11 @@ impl Reassembler {
         if slot.missing > 0 {
             return None;
         }
-        slot.message = None;
+        let message = slot.message.take()?;
         self.counts.completed_count += 1;
         Some(Assembled {
+            message,
             length_bytes: slot.total_len as usize,
-            handed_ns: slot.handed_ns,
         })
     }
 
@@ -295,7 +263,7 @@ impl Reassembler {
     }
 
     /// A message that was given up since this was asked last. Ask until `None` after every other call.
-    pub fn next_given_up(&mut self) -> Option<GivenUp> {
+    pub fn next_given_up(&mut self) -> Option<Incomplete> {
         self.given_up.pop()
     }
 
@@ -304,23 +272,26 @@ impl Reassembler {
         &self.counts
     }
 
-    fn find(&self, fragment: &Fragment<'_>) -> Result<Option<usize>, Refusal> {
-        let message = Some((fragment.stream, fragment.sequence));
-        let Some(index) = self.slots.iter().position(|slot| slot.message == message) else {
+    fn find(&self, header: &Header) -> Result<Option<usize>, Refusal> {
+        let wanted = (header.session, header.epoch, header.sequence);
+        let is_wanted = |one: MessageInfo| (one.session, one.epoch, one.sequence) == wanted;
+        let mut slots = self.slots.iter();
+        let Some(index) = slots.position(|slot| slot.message.is_some_and(is_wanted)) else {
             return Ok(None);
         };
         let slot = &self.slots[index];
-        if (slot.total_len, slot.count) != (fragment.total_len, fragment.count) {
+        let count = slot.message.map(|one| one.fragment_count);
+        if (slot.total_len, count) != (header.total_len, Some(header.fragment_count)) {
             return Err(Refusal::FragmentInconsistent);
         }
-        if slot.has(fragment.index) {
+        if slot.has(header.fragment_index) {
             return Err(Refusal::DuplicateFragment);
         }
         Ok(Some(index))
     }
 
     /// A slot for a new message: a free one, or that of the oldest incomplete message.
-    fn open(&mut self, now: Instant, fragment: &Fragment<'_>) -> usize {
+    fn open(&mut self, now: Instant, header: &Header) -> usize {
         let order = |slot: &Slot| slot.message.map(|_| slot.started_at);
         let (index, slot) = self
             .slots
@@ -333,13 +304,10 @@ impl Reassembler {
             self.given_up.push(given_up);
             self.counts.evicted_count += 1;
         }
-        slot.message = Some((fragment.stream, fragment.sequence));
-        slot.total_len = fragment.total_len;
-        slot.count = fragment.count;
-        slot.missing = fragment.count;
-        slot.published_ns = fragment.published_ns;
-        slot.received[..usize::from(fragment.count).div_ceil(64)].fill(0);
-        slot.handed_ns = fragment.handed_ns;
+        slot.message = Some(MessageInfo::of(self.channel, header));
+        slot.total_len = header.total_len;
+        slot.missing = header.fragment_count;
+        slot.received[..usize::from(header.fragment_count).div_ceil(64)].fill(0);
         slot.started_at = now;
         index
     }
@@ -347,15 +315,14 @@ impl Reassembler {
 
 impl Slot {
     /// Empties it; what is known of its message, if it held one.
-    fn give_up(&mut self) -> Option<GivenUp> {
-        let (stream, sequence) = self.message.take()?;
-        Some(GivenUp {
-            stream,
-            sequence,
-            published_ns: self.published_ns,
-            handed_ns: self.handed_ns,
+    fn give_up(&mut self) -> Option<Incomplete> {
+        let message = self.message.take()?;
+        Some(Incomplete {
+            message: MessageInfo {
+                fragment_count: message.fragment_count - self.missing,
+                ..message
+            },
             heard_at: self.heard_at,
-            received_count: self.count - self.missing,
         })
     }
 
@@ -367,8 +334,8 @@ impl Slot {
         let index = place.index;
         self.received[usize::from(index) / 64] |= 1 << (index % 64);
         self.missing -= 1;
-        if index == 0 {
-            self.handed_ns = place.handed_ns;
+        if let Some(message) = self.message.as_mut().filter(|_| index == 0) {
+            message.handed = RemoteInstant::from_ns(place.handed_ns);
         }
     }
 }

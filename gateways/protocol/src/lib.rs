@@ -20,11 +20,27 @@
 //! ```
 //! use std::time::Duration;
 //! use hil_protocol::{
-//!     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, FlowIdentity, InMemory,
-//!     IngressBridge, IngressSettings,
+//!     ArrivalStamps, ChannelIdentity, Delivery, Destination, EgressBridge, EgressSettings,
+//!     FlowIdentity, IngressBridge, IngressSettings, Payload, Piece,
 //! };
 //! use hil_core::message::Envelope;
 //! use hil_core::time::Instant;
+//!
+//! /// Takes messages that come in one datagram.
+//! #[derive(Default)]
+//! struct Received(Vec<u8>);
+//!
+//! impl Destination for Received {
+//!     fn store(&mut self, _piece: &Piece<'_>) -> bool {
+//!         false
+//!     }
+//!
+//!     fn deliver(&mut self, _delivery: &Delivery, payload: Payload<'_>) {
+//!         if let Payload::Datagram(bytes) = payload {
+//!             self.0.extend_from_slice(bytes);
+//!         }
+//!     }
+//! }
 //!
 //! let channel = ChannelIdentity::new(0, "arm/command", "example.Command.v1", 8, 8);
 //! let name = "link/hop/forward".to_owned();
@@ -40,9 +56,7 @@
 //! })?;
 //! let now = Instant::from_ns(1_000);
 //! let arrival = ArrivalStamps::application(1_000);
-//! let mut received = Vec::new();
-//! let mut memory = InMemory::default();
-//! let mut destination = memory.with(|_, payload| received.extend_from_slice(payload));
+//! let mut destination = Received::default();
 //!
 //! let hello = egress.poll_transmit(now).expect("a greeting comes first").datagram;
 //! ingress.on_datagram(now, arrival, hello, &mut destination)?;
@@ -53,7 +67,7 @@
 //! egress.on_local(now, 0, &envelope, &[42; 8])?;
 //! let data = egress.poll_transmit(now).expect("the message was staged").datagram;
 //! ingress.on_datagram(now, arrival, data, &mut destination)?;
-//! assert_eq!(received, [42; 8]);
+//! assert_eq!(destination.0, [42; 8]);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 #![forbid(unsafe_code)]
@@ -80,9 +94,11 @@ pub use egress::{
     TransmitFailure, TransmitKey,
 };
 pub use ingress::{
-    Delivery, Destination, Disposition, InMemory, Incomplete, IngressBridge, IngressSettings,
-    MessageInfo, Payload, Piece, Reply,
+    Delivery, Destination, Disposition, Incomplete, IngressBridge, IngressSettings, MessageInfo,
+    Payload, Piece, Reply,
 };
+#[cfg(any(test, feature = "lab"))]
+pub use lab::InMemory;
 pub use refusal::{Refusal, RefusalCounts};
 pub use stamps::{ArrivalStamps, StampSource};
 

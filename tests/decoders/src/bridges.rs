@@ -150,7 +150,7 @@ impl Conversation {
             let Some(transmit) = self.egress.poll_transmit(self.now) else {
                 break;
             };
-            let key = transmit.key();
+            let key = transmit.key;
             let bytes = transmit.datagram.to_vec();
             assert!(decode(&bytes).is_ok(), "a gateway sends what is refused");
             self.egress.on_transmit_stamp(key, 700);

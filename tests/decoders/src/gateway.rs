@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use hil_core::time::Instant;
 use hil_net::control::ControlData;
-use hil_protocol::fragment::{Fragment, FragmentPlan, Reassembler};
-use hil_protocol::ingress::{InMemory, Piece};
-use hil_protocol::sequence::Stream;
-use hil_protocol::wire::{Body, Datagram, HEADER_BYTES, decode};
+use hil_protocol::InMemory;
+use hil_protocol::fragment::{FragmentPlan, Reassembler};
+use hil_protocol::ingress::Piece;
+use hil_protocol::wire::{Body, Datagram, HEADER_BYTES, Header, Kind, decode};
 use hil_transport::tcp::frame::{DATAGRAM_BYTES_MAX, FrameReader, PREFIX_BYTES, prefix};
 
 use crate::Verdict;
@@ -69,7 +69,7 @@ const MESSAGE_BYTES_MAX: usize = 2000;
 pub(crate) fn reassembly(bytes: &[u8]) -> Verdict {
     let mut input = Input::new(bytes);
     let mut reassembler =
-        Reassembler::new(SLOT_COUNT, MESSAGE_BYTES_MAX, Duration::from_micros(100));
+        Reassembler::new(0, SLOT_COUNT, MESSAGE_BYTES_MAX, Duration::from_micros(100));
     let mut memory = InMemory::default();
     let mut now = Instant::from_ns(0);
     let mut storage = Vec::with_capacity(MESSAGE_BYTES_MAX);
@@ -89,17 +89,16 @@ pub(crate) fn reassembly(bytes: &[u8]) -> Verdict {
             // A piece of another length than its place has.
             storage.pop();
         }
-        let fragment = Fragment {
-            stream: Stream { session: 1, epoch },
+        let header = Header {
             sequence,
             total_len,
-            index,
-            count,
+            fragment_index: index,
+            fragment_count: count,
             handed_ns: i64::from(index),
-            published_ns: 0,
-            payload: &storage,
+            epoch,
+            ..Header::new(Kind::Data, 1, 0)
         };
-        if let Ok(place) = reassembler.place(now, &fragment) {
+        if let Ok(place) = reassembler.place(now, &header, storage.len()) {
             let slot = place.slot;
             memory.store(&Piece {
                 channel: 0,
@@ -114,7 +113,11 @@ pub(crate) fn reassembly(bytes: &[u8]) -> Verdict {
                 let expected = (0..total_bytes).map(|at| pattern(epoch, sequence, total_bytes, at));
                 let bytes = memory.message(0, slot).iter();
                 assert!(bytes.copied().eq(expected), "mixed pieces");
-                assert_eq!(whole.handed_ns, 0, "not the stamp of the first piece");
+                assert_eq!(
+                    whole.message.handed.as_ns(),
+                    0,
+                    "not the stamp of the first piece"
+                );
             }
         }
         assert!(reassembler.open_count() <= SLOT_COUNT);

@@ -112,11 +112,11 @@ impl Hop {
     ) {
         let arrival = |at: Instant| ArrivalStamps::application(at.as_ns() + CLOCK_OFFSET_NS);
         while let Some(transmit) = self.egress.poll_transmit(gateway_now) {
-            let is_data = transmit.kind == Kind::Data;
+            let is_data = transmit.key.kind == Kind::Data;
             let wire = transmit.datagram.to_vec();
             let mut counts = self.counts.borrow_mut();
             counts.data_datagrams += u64::from(is_data);
-            counts.greetings += u64::from(transmit.kind == Kind::Hello);
+            counts.greetings += u64::from(transmit.key.kind == Kind::Hello);
             let at = match fate {
                 Fate::Delivered(at) if is_data => at + LEAD,
                 Fate::Lost if is_data => continue,

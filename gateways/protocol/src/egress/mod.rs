@@ -159,14 +159,8 @@ pub enum TransmitFailure {
 pub struct Transmit<'a> {
     /// Its bytes.
     pub datagram: &'a [u8],
-    /// What it is.
-    pub kind: Kind,
-    /// Index of the channel whose message it carries.
-    pub channel: Option<usize>,
-    /// The header's sequence number.
-    pub sequence: u64,
-    /// Epoch and sequence of the message it carries.
-    pub message: Option<(u32, u64)>,
+    /// What its stamp is given back with.
+    pub key: TransmitKey,
     /// No further datagram of the same message follows.
     pub is_last_fragment: bool,
 }
@@ -182,21 +176,6 @@ pub struct TransmitKey {
     pub epoch: Option<u32>,
     /// The header's sequence number.
     pub sequence: u64,
-}
-
-impl Transmit<'_> {
-    /// What its stamp is given back with.
-    pub const fn key(&self) -> TransmitKey {
-        TransmitKey {
-            kind: self.kind,
-            channel: self.channel,
-            epoch: match self.message {
-                Some((epoch, _)) => Some(epoch),
-                None => None,
-            },
-            sequence: self.sequence,
-        }
-    }
 }
 
 /// What a reply said.
@@ -296,8 +275,7 @@ struct EgressChannel {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct LastTransmit {
-    kind: Kind,
-    channel: Option<usize>,
+    key: TransmitKey,
     is_last_fragment: bool,
 }
 
@@ -533,25 +511,18 @@ impl EgressBridge {
     /// The datagram given last could not be sent; what is left of its message is given up.
     pub fn on_transmit_failed(&mut self, now: Instant, failure: TransmitFailure) {
         self.counts.transmit_failed_count += 1;
-        match self.last_transmit.take() {
-            Some(LastTransmit {
-                channel: Some(channel),
-                is_last_fragment,
-                ..
-            }) => {
+        if let Some(last) = self.last_transmit.take() {
+            if let Some(channel) = last.key.channel {
                 let counts = &mut self.channels[channel].counts;
                 counts.message_failed_count += 1;
-                if is_last_fragment {
+                if last.is_last_fragment {
                     counts.sent_count -= 1;
                 } else {
                     self.staging.abandon();
                 }
+            } else if last.key.kind == Kind::SyncRequest {
+                self.counts.sync_sent_count -= 1;
             }
-            Some(LastTransmit {
-                kind: Kind::SyncRequest,
-                ..
-            }) => self.counts.sync_sent_count -= 1,
-            _ => {}
         }
         if failure == TransmitFailure::PeerUnreachable {
             self.on_peer_unreachable(now);

@@ -5,7 +5,7 @@ use hil_core::time::Instant;
 
 use super::{
     BARE_AFTER, EgressBridge, Farewell, HELLO_PERIOD, HELLO_PERIOD_REFUSED, LastTransmit,
-    PeerState, Transmit,
+    PeerState, Transmit, TransmitKey,
 };
 use crate::body::SYNC_BODY_BYTES;
 use crate::egress::staging::Piece;
@@ -23,17 +23,19 @@ impl EgressBridge {
         let counts = &mut self.channels[channel].counts;
         counts.datagram_count += 1;
         counts.sent_count += u64::from(is_last_fragment);
-        self.last_transmit = Some(LastTransmit {
+        let key = TransmitKey {
             kind: Kind::Data,
             channel: Some(channel),
+            epoch: Some(header.epoch),
+            sequence: header.sequence,
+        };
+        self.last_transmit = Some(LastTransmit {
+            key,
             is_last_fragment,
         });
         Transmit {
             datagram,
-            kind: Kind::Data,
-            channel: Some(channel),
-            sequence: header.sequence,
-            message: Some((header.epoch, header.sequence)),
+            key,
             is_last_fragment,
         }
     }
@@ -107,17 +109,19 @@ impl EgressBridge {
         header.total_len = u32::try_from(body_bytes).expect("a body is below 64 KiB");
         header.encode(&mut self.control);
         self.counts.datagram_count += 1;
-        self.last_transmit = Some(LastTransmit {
+        let key = TransmitKey {
             kind: header.kind,
             channel: None,
+            epoch: None,
+            sequence: header.sequence,
+        };
+        self.last_transmit = Some(LastTransmit {
+            key,
             is_last_fragment: true,
         });
         Transmit {
             datagram: &self.control[..HEADER_BYTES + body_bytes],
-            kind: header.kind,
-            channel: None,
-            sequence: header.sequence,
-            message: None,
+            key,
             is_last_fragment: true,
         }
     }

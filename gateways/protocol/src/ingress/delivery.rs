@@ -5,7 +5,6 @@ use hil_core::time::{Instant, RemoteInstant};
 
 use super::destination::{Destination, Payload};
 use crate::counts;
-use crate::fragment::GivenUp;
 use crate::sequence::{Order, Stream};
 use crate::wire::{FollowUpField, Header};
 use hil_core::record::FollowUp;
@@ -30,6 +29,19 @@ pub struct MessageInfo {
 }
 
 impl MessageInfo {
+    /// Of the message that a datagram carries, or a piece of.
+    pub(crate) const fn of(channel: usize, header: &Header) -> Self {
+        Self {
+            channel,
+            session: header.session,
+            epoch: header.epoch,
+            sequence: header.sequence,
+            published: RemoteInstant::from_ns(header.published_ns),
+            handed: RemoteInstant::from_ns(header.handed_ns),
+            fragment_count: header.fragment_count,
+        }
+    }
+
     /// The envelope under which a gateway publishes the message on this host at `forwarded`.
     pub fn envelope(&self, forwarded: Instant) -> Envelope {
         Envelope {
@@ -50,23 +62,6 @@ pub struct Incomplete {
     pub message: MessageInfo,
     /// When the last of them came.
     pub heard_at: Instant,
-}
-
-impl Incomplete {
-    pub(super) const fn of(channel: usize, given_up: &GivenUp) -> Self {
-        Self {
-            message: MessageInfo {
-                channel,
-                session: given_up.stream.session,
-                epoch: given_up.stream.epoch,
-                sequence: given_up.sequence,
-                published: RemoteInstant::from_ns(given_up.published_ns),
-                handed: RemoteInstant::from_ns(given_up.handed_ns),
-                fragment_count: given_up.received_count,
-            },
-            heard_at: given_up.heard_at,
-        }
-    }
 }
 
 /// What a message for the local channel is, beside its bytes.
@@ -217,18 +212,6 @@ pub(super) fn stream_of(header: &Header) -> Stream {
     Stream {
         session: header.session,
         epoch: header.epoch,
-    }
-}
-
-pub(super) fn message_of(channel: usize, header: &Header, handed_ns: i64) -> MessageInfo {
-    MessageInfo {
-        channel,
-        session: header.session,
-        epoch: header.epoch,
-        sequence: header.sequence,
-        published: RemoteInstant::from_ns(header.published_ns),
-        handed: RemoteInstant::from_ns(handed_ns),
-        fragment_count: header.fragment_count,
     }
 }
 

@@ -26,7 +26,7 @@ use super::body::{Hello, HelloStatus};
 use super::channel::{ChannelIdentity, ChannelNumbers, FlowIdentity, SettingsError};
 use super::egress::STAGED_BYTES_MAX;
 use super::egress::pacing::is_acknowledged;
-use super::fragment::{Fragment, Reassembler, ReassemblyCounts};
+use super::fragment::{Reassembler, ReassemblyCounts};
 use super::refusal::{Refusal, RefusalCounts};
 use super::sequence::{Order, SequenceCounts, SequenceWindow};
 use super::stamps::ArrivalStamps;
@@ -35,11 +35,11 @@ use super::wire::{self, Body, Header, Kind, Prefix};
 pub use delivery::{
     Delivery, Disposition, Incomplete, IngressChannelCounts, IngressCounts, MessageInfo,
 };
-pub use destination::{Destination, InMemory, Payload, Piece, Taking};
+pub use destination::{Destination, Payload, Piece};
 pub use replies::ReplyCounts;
 
-use delivery::{delivery_of, message_of, stream_of};
-use replies::{AckRequest, PieceRequest, Replies, SyncRequest};
+use delivery::{delivery_of, stream_of};
+use replies::Replies;
 use session::Sessions;
 
 /// Shortest time between two replies that refuse, or ask for a greeting.
@@ -128,12 +128,12 @@ struct IngressChannel {
 }
 
 impl IngressChannel {
-    fn new(identity: &ChannelIdentity) -> Self {
+    fn new(index: usize, identity: &ChannelIdentity) -> Self {
         let size_bytes = identity.size_max_bytes as usize;
         let slot_count = reassembly_slots(size_bytes);
         Self {
             window: SequenceWindow::new(),
-            reassembler: Reassembler::new(slot_count, size_bytes, REASSEMBLY_TIMEOUT),
+            reassembler: Reassembler::new(index, slot_count, size_bytes, REASSEMBLY_TIMEOUT),
             is_jump_allowed: true,
             counts: IngressChannelCounts::default(),
         }
@@ -145,10 +145,10 @@ impl IngressChannel {
     }
 }
 
-/// Puts what `reassembler` gave up of `channel` where the owner finds it.
-fn collect(incomplete: &mut VecDeque<Incomplete>, reassembler: &mut Reassembler, channel: usize) {
+/// Puts what `reassembler` gave up where the owner finds it.
+fn collect(incomplete: &mut VecDeque<Incomplete>, reassembler: &mut Reassembler) {
     while let Some(given_up) = reassembler.next_given_up() {
-        incomplete.push_back(Incomplete::of(channel, &given_up));
+        incomplete.push_back(given_up);
     }
 }
 
@@ -179,7 +179,8 @@ impl IngressBridge {
                 .flow
                 .channels
                 .iter()
-                .map(IngressChannel::new)
+                .enumerate()
+                .map(|(index, identity)| IngressChannel::new(index, identity))
                 .collect(),
             split: Vec::with_capacity(settings.flow.channels.len()),
             incomplete: VecDeque::with_capacity(incomplete_max),
@@ -366,7 +367,8 @@ impl IngressBridge {
                 length_bytes: bytes.len(),
                 header: &header,
             };
-            self.acknowledge(request, HelloStatus::VersionMismatch);
+            self.replies
+                .acknowledge(request, HelloStatus::VersionMismatch);
         }
     }
 
@@ -381,7 +383,7 @@ impl IngressBridge {
                 Refusal::SharedDomain => HelloStatus::SharedDomain,
                 _ => HelloStatus::ChannelsDiffer,
             };
-            self.acknowledge(request, status);
+            self.replies.acknowledge(request, status);
             return Err(refusal);
         }
         if request.header.handed_ns < 0 {
@@ -398,7 +400,7 @@ impl IngressBridge {
             self.replies.forget_transmit_stamp();
         }
         self.counts.session_restart_count += u64::from(greeting.is_restart);
-        self.acknowledge(request, HelloStatus::Accepted);
+        self.replies.acknowledge(request, HelloStatus::Accepted);
         Ok(Disposition::Greeted {
             is_restart: greeting.is_restart,
         })
@@ -425,30 +427,17 @@ impl IngressBridge {
         self.split.retain(|&channel| {
             let reassembler = &mut channels[channel].reassembler;
             reassembler.expire(now);
-            collect(incomplete, reassembler, channel);
+            collect(incomplete, reassembler);
             reassembler.open_count() > 0
         });
     }
 
     fn clear_channels(&mut self) {
-        for (index, channel) in self.channels.iter_mut().enumerate() {
+        for channel in &mut self.channels {
             channel.clear();
-            collect(&mut self.incomplete, &mut channel.reassembler, index);
+            collect(&mut self.incomplete, &mut channel.reassembler);
         }
         self.split.clear();
-    }
-
-    fn acknowledge(&mut self, request: Request<'_>, status: HelloStatus) {
-        self.replies.acknowledge(&AckRequest {
-            now: request.now,
-            status,
-            session: request.header.session,
-            flow: self.settings.flow.flow,
-            sequence: request.header.sequence,
-            answers_handed_ns: request.header.handed_ns,
-            request_bytes: request.length_bytes,
-            destination: request.arrival.peer,
-        });
     }
 
     /// The index of the channel that the datagram is about; `None` when it is about the flow.
@@ -460,7 +449,7 @@ impl IngressBridge {
         }
         let result = self.sessions.check(request.arrival, header);
         if result == Err(Refusal::UnknownSession) {
-            self.acknowledge(request, HelloStatus::GreetAgain);
+            self.replies.acknowledge(request, HelloStatus::GreetAgain);
         }
         result?;
         let type_hash = match channel {
@@ -499,13 +488,13 @@ impl IngressBridge {
             && gap > SEQUENCE_JUMP_MAX
             && !own.is_jump_allowed
         {
-            self.acknowledge(request, HelloStatus::GreetAgain);
+            self.replies.acknowledge(request, HelloStatus::GreetAgain);
             return Err(Refusal::ImplausibleSequence);
         }
         let deliver_reordered = self.settings.deliver_reordered;
         if header.fragment_count == 1 {
             own.is_jump_allowed = false;
-            let message = message_of(channel, header, header.handed_ns);
+            let message = MessageInfo::of(channel, header);
             let window = &mut own.window;
             let order = window.record(stream, header.sequence, header.handed_ns);
             let delivery = delivery_of(header, message, order);
@@ -517,18 +506,8 @@ impl IngressBridge {
             Order::Late => return Err(Refusal::Stale),
             Order::InOrder { .. } | Order::Reordered => {}
         }
-        let fragment = Fragment {
-            stream,
-            sequence: header.sequence,
-            total_len: header.total_len,
-            index: header.fragment_index,
-            count: header.fragment_count,
-            published_ns: header.published_ns,
-            handed_ns: header.handed_ns,
-            payload,
-        };
-        let place = own.reassembler.place(request.now, &fragment)?;
-        collect(&mut self.incomplete, &mut own.reassembler, channel);
+        let place = own.reassembler.place(request.now, header, payload.len())?;
+        collect(&mut self.incomplete, &mut own.reassembler);
         if place.is_first && !self.split.contains(&channel) {
             self.split.push(channel);
         }
@@ -545,41 +524,25 @@ impl IngressBridge {
         }
         let whole = own.reassembler.stored(place);
         if is_acknowledged(header) {
-            self.replies.acknowledge_piece(&PieceRequest {
-                now: request.now,
-                session: header.session,
-                sequence: header.sequence,
-                answers_handed_ns: header.handed_ns,
-                request_bytes: request.length_bytes,
-                destination: request.arrival.peer,
-            });
+            self.replies.acknowledge_piece(request);
         }
         let Some(assembled) = whole else {
             return Ok(Disposition::FragmentStored);
         };
         own.is_jump_allowed = false;
-        let message = message_of(channel, header, assembled.handed_ns);
         let window = &mut own.window;
         let order = window.record(stream, header.sequence, header.handed_ns);
         let payload = Payload::Stored {
             slot,
             length_bytes: assembled.length_bytes,
         };
-        let delivery = delivery_of(header, message, order);
+        let delivery = delivery_of(header, assembled.message, order);
         Ok(delivery.dispose(payload, deliver_reordered, destination))
     }
 
     fn on_sync_request(&mut self, request: Request<'_>) -> Disposition {
         self.sessions.anchor(request.arrival, request.header);
-        self.replies.answer(&SyncRequest {
-            now: request.now,
-            session: request.header.session,
-            sequence: request.header.sequence,
-            t1_ns: request.header.handed_ns,
-            t2_ns: request.arrival.received_ns,
-            t2_source: request.arrival.received_source,
-            destination: request.arrival.peer,
-        });
+        self.replies.answer(request);
         Disposition::SyncRequested
     }
 

@@ -1,17 +1,15 @@
 //! The replies an ingress bridge owes: at most one of each kind waits, and none is longer than its
 //! request. It decides neither what is accepted nor what is refused.
 
-use core::net::SocketAddr;
-
 use hil_core::time::Instant;
 
-use super::{IngressSettings, REFUSAL_REPLY_PERIOD, Reply};
+use super::{IngressSettings, REFUSAL_REPLY_PERIOD, Reply, Request};
 use crate::body::{
     HELLO_ACK_BODY_BYTES, HelloAck, HelloStatus, PIECE_ACK_BODY_BYTES, PieceAck, SYNC_BODY_BYTES,
     SyncResponse,
 };
 use crate::counts;
-use crate::stamps::StampSource;
+use crate::stamps::ArrivalStamps;
 use crate::wire::{FollowUpField, HEADER_BYTES, Header, Kind};
 
 const BUFFER_BYTES: usize = HEADER_BYTES + HELLO_ACK_BODY_BYTES;
@@ -31,37 +29,26 @@ counts! {
     }
 }
 
+/// What a reply repeats of its request.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct AckRequest {
-    pub(super) now: Instant,
-    pub(super) status: HelloStatus,
-    pub(super) session: u32,
-    pub(super) flow: u16,
-    pub(super) sequence: u64,
-    pub(super) answers_handed_ns: i64,
-    pub(super) request_bytes: usize,
-    pub(super) destination: Option<SocketAddr>,
+struct Owed {
+    now: Instant,
+    arrival: ArrivalStamps,
+    session: u32,
+    sequence: u64,
+    handed_ns: i64,
 }
 
-#[derive(Debug, Clone, Copy)]
-pub(super) struct SyncRequest {
-    pub(super) now: Instant,
-    pub(super) session: u32,
-    pub(super) sequence: u64,
-    pub(super) t1_ns: i64,
-    pub(super) t2_ns: i64,
-    pub(super) t2_source: StampSource,
-    pub(super) destination: Option<SocketAddr>,
-}
-
-#[derive(Debug, Clone, Copy)]
-pub(super) struct PieceRequest {
-    pub(super) now: Instant,
-    pub(super) session: u32,
-    pub(super) sequence: u64,
-    pub(super) answers_handed_ns: i64,
-    pub(super) request_bytes: usize,
-    pub(super) destination: Option<SocketAddr>,
+impl Owed {
+    const fn to(request: Request<'_>) -> Self {
+        Self {
+            now: request.now,
+            arrival: request.arrival,
+            session: request.header.session,
+            sequence: request.header.sequence,
+            handed_ns: request.header.handed_ns,
+        }
+    }
 }
 
 #[derive(Debug)]
@@ -72,9 +59,9 @@ pub(super) struct Replies {
     flow: u16,
     digest: u64,
     buffer: [u8; BUFFER_BYTES],
-    ack: Option<AckRequest>,
-    sync: Option<SyncRequest>,
-    piece: Option<PieceRequest>,
+    ack: Option<(HelloStatus, Owed)>,
+    sync: Option<Owed>,
+    piece: Option<Owed>,
     follow_up: Option<FollowUpField>,
     refused_at: Option<Instant>,
     counts: ReplyCounts,
@@ -98,12 +85,12 @@ impl Replies {
         }
     }
 
-    pub(super) fn acknowledge(&mut self, request: &AckRequest) {
-        if request.request_bytes < HEADER_BYTES + HELLO_ACK_BODY_BYTES {
+    pub(super) fn acknowledge(&mut self, request: Request<'_>, status: HelloStatus) {
+        if request.length_bytes < HEADER_BYTES + HELLO_ACK_BODY_BYTES {
             self.counts.amplifying_count += 1;
             return;
         }
-        if request.status != HelloStatus::Accepted {
+        if status != HelloStatus::Accepted {
             let is_recent = |at: Instant| request.now < at + REFUSAL_REPLY_PERIOD;
             if self.refused_at.is_some_and(is_recent) {
                 self.counts.rate_limited_count += 1;
@@ -111,22 +98,22 @@ impl Replies {
             }
             self.refused_at = Some(request.now);
         }
-        let replaced = self.ack.replace(*request);
+        let replaced = self.ack.replace((status, Owed::to(request)));
         self.counts.replaced_count += u64::from(replaced.is_some());
     }
 
     /// A request of this kind is as long as its response, so there is nothing to withhold.
-    pub(super) fn answer(&mut self, request: &SyncRequest) {
-        let replaced = self.sync.replace(*request);
+    pub(super) fn answer(&mut self, request: Request<'_>) {
+        let replaced = self.sync.replace(Owed::to(request));
         self.counts.replaced_count += u64::from(replaced.is_some());
     }
 
-    pub(super) fn acknowledge_piece(&mut self, request: &PieceRequest) {
-        if request.request_bytes < HEADER_BYTES + PIECE_ACK_BODY_BYTES {
+    pub(super) fn acknowledge_piece(&mut self, request: Request<'_>) {
+        if request.length_bytes < HEADER_BYTES + PIECE_ACK_BODY_BYTES {
             self.counts.amplifying_count += 1;
             return;
         }
-        let replaced = self.piece.replace(*request);
+        let replaced = self.piece.replace(Owed::to(request));
         self.counts.replaced_count += u64::from(replaced.is_some());
     }
 
@@ -142,80 +129,53 @@ impl Replies {
     }
 
     pub(super) fn waiting_since(&self) -> Option<Instant> {
-        let ack = self.ack.as_ref().map(|request| request.now);
-        let sync = self.sync.as_ref().map(|request| request.now);
-        let piece = self.piece.as_ref().map(|request| request.now);
-        ack.into_iter().chain(sync).chain(piece).min()
+        let ack = self.ack.map(|(_, owed)| owed);
+        let all = [ack, self.sync, self.piece].into_iter().flatten();
+        all.map(|owed| owed.now).min()
     }
 
     pub(super) fn next(&mut self, now: Instant) -> Option<Reply<'_>> {
-        if let Some(request) = self.ack.take() {
-            return Some(self.hello_ack(now, &request));
-        }
-        if let Some(request) = self.sync.take() {
-            return Some(self.sync_response(now, &request));
-        }
-        let request = self.piece.take()?;
-        Some(self.piece_ack(now, &request))
-    }
-
-    fn hello_ack(&mut self, now: Instant, request: &AckRequest) -> Reply<'_> {
-        let body = HelloAck {
-            status: request.status,
-            session: self.session,
-            clock_id: self.clock_id,
-            domain: self.domain,
-            answers_handed_ns: request.answers_handed_ns,
+        let body = &mut self.buffer[HEADER_BYTES..];
+        let (kind, owed, body_bytes) = if let Some((status, owed)) = self.ack.take() {
+            let ack = HelloAck {
+                status,
+                session: self.session,
+                clock_id: self.clock_id,
+                domain: self.domain,
+                answers_handed_ns: owed.handed_ns,
+            };
+            (Kind::HelloAck, owed, ack.encode(body))
+        } else if let Some(owed) = self.sync.take() {
+            let response = SyncResponse {
+                t1_ns: owed.handed_ns,
+                t2_ns: owed.arrival.received_ns,
+                t3_ns: now.as_ns(),
+                t2_source: owed.arrival.received_source,
+            };
+            (Kind::SyncResponse, owed, response.encode(body))
+        } else {
+            let owed = self.piece.take()?;
+            let ack = PieceAck {
+                answers_handed_ns: owed.handed_ns,
+            };
+            (Kind::PieceAck, owed, ack.encode(body))
         };
-        let length = body.encode(&mut self.buffer[HEADER_BYTES..]);
-        let mut header = Header::new(Kind::HelloAck, request.session, request.flow);
-        header.sequence = request.sequence;
+        let mut header = Header::new(kind, owed.session, self.flow);
+        header.sequence = owed.sequence;
         header.handed_ns = now.as_ns();
-        self.reply(header, length, request.destination)
-    }
-
-    fn sync_response(&mut self, now: Instant, request: &SyncRequest) -> Reply<'_> {
-        let body = SyncResponse {
-            t1_ns: request.t1_ns,
-            t2_ns: request.t2_ns,
-            t3_ns: now.as_ns(),
-            t2_source: request.t2_source,
-        };
-        let length = body.encode(&mut self.buffer[HEADER_BYTES..]);
-        let mut header = Header::new(Kind::SyncResponse, request.session, self.flow);
-        header.sequence = request.sequence;
-        header.handed_ns = now.as_ns();
-        header.follow_up = self.follow_up.take();
-        self.reply(header, length, request.destination)
-    }
-
-    fn piece_ack(&mut self, now: Instant, request: &PieceRequest) -> Reply<'_> {
-        let body = PieceAck {
-            answers_handed_ns: request.answers_handed_ns,
-        };
-        let length = body.encode(&mut self.buffer[HEADER_BYTES..]);
-        let mut header = Header::new(Kind::PieceAck, request.session, self.flow);
-        header.sequence = request.sequence;
-        header.handed_ns = now.as_ns();
-        self.reply(header, length, request.destination)
-    }
-
-    fn reply(
-        &mut self,
-        mut header: Header,
-        body_bytes: usize,
-        destination: Option<SocketAddr>,
-    ) -> Reply<'_> {
         header.type_hash = self.digest;
         header.total_len = u32::try_from(body_bytes).expect("a body is below 1 KiB");
+        if kind == Kind::SyncResponse {
+            header.follow_up = self.follow_up.take();
+        }
         header.encode(&mut self.buffer);
         self.counts.sent_count += 1;
-        Reply {
+        Some(Reply {
             datagram: &self.buffer[..HEADER_BYTES + body_bytes],
-            kind: header.kind,
-            sequence: header.sequence,
-            destination,
-        }
+            kind,
+            sequence: owed.sequence,
+            destination: owed.arrival.peer,
+        })
     }
 
     pub(super) const fn counts(&self) -> &ReplyCounts {

@@ -8,8 +8,8 @@ use hil_core::time::Instant;
 use super::golden::bytes;
 use crate::channel::FlowIdentity;
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings, PeerState};
-use crate::ingress::{Disposition, InMemory, IngressBridge, IngressSettings};
-use crate::lab::rtt_ns;
+use crate::ingress::{Disposition, IngressBridge, IngressSettings};
+use crate::lab::{InMemory, rtt_ns};
 use crate::refusal::Refusal;
 use crate::stamps::{ArrivalStamps, StampSource};
 use crate::wire::{HEADER_BYTES, Header, Kind};
@@ -74,7 +74,7 @@ fn it_exchanges_clocks_every_period_with_all_four_stamps_of_the_kernel() {
         let now_ns = 1_000_000_000 + step * 1_000_000;
         let now = Instant::from_ns(now_ns + OFFSET_NS);
         while let Some(transmit) = egress.poll_transmit(now) {
-            let key = transmit.key();
+            let key = transmit.key;
             assert_ne!(key.kind, Kind::Data);
             let there_ns = now_ns + DEPARTURE_NS + DELAY_NS;
             let taken = ingress.on_datagram(

@@ -6,9 +6,9 @@ use hil_core::time::Instant;
 use crate::channel::{ChannelIdentity, FlowIdentity};
 use crate::egress::{EgressBridge, EgressEvent, EgressSettings};
 use crate::ingress::{
-    Delivery, Destination, Disposition, InMemory, IngressBridge, IngressSettings, Payload, Piece,
+    Delivery, Destination, Disposition, IngressBridge, IngressSettings, Payload, Piece,
 };
-use crate::lab::{Impairment, Lab, egress_settings, ingress_settings};
+use crate::lab::{Impairment, InMemory, Lab, egress_settings, ingress_settings};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
 use crate::wire::{HEADER_BYTES, Header, Kind};

@@ -5,29 +5,33 @@ use core::time::Duration;
 use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
-use crate::fragment::{FRAGMENT_COUNT_MAX, Fragment, FragmentPlan, Reassembler};
-use crate::ingress::{InMemory, Piece};
+use crate::fragment::{FRAGMENT_COUNT_MAX, FragmentPlan, Reassembler};
+use crate::ingress::Piece;
+use crate::lab::InMemory;
 use crate::refusal::Refusal;
-use crate::sequence::Stream;
-use crate::wire::{HEADER_BYTES, TAG_BYTES};
+use crate::wire::{HEADER_BYTES, Header, Kind, TAG_BYTES};
 
-const STREAM: Stream = Stream {
-    session: 1,
-    epoch: 1,
-};
 const TIMEOUT: Duration = Duration::from_millis(10);
+
+#[derive(Clone, Copy)]
+struct Fragment<'a> {
+    header: Header,
+    payload: &'a [u8],
+}
 
 fn pieces(sequence: u64, message: &[u8], budget: usize) -> Vec<Fragment<'_>> {
     let plan = FragmentPlan::new(message.len(), budget).unwrap();
     (0..plan.count())
         .map(|index| Fragment {
-            stream: STREAM,
-            sequence,
-            total_len: u32::try_from(message.len()).unwrap(),
-            index,
-            count: plan.count(),
-            handed_ns: 100 + i64::from(index),
-            published_ns: 0,
+            header: Header {
+                sequence,
+                total_len: u32::try_from(message.len()).unwrap(),
+                fragment_index: index,
+                fragment_count: plan.count(),
+                handed_ns: 100 + i64::from(index),
+                epoch: 1,
+                ..Header::new(Kind::Data, 1, 0)
+            },
             payload: &message[plan.range(index).unwrap()],
         })
         .collect()
@@ -49,7 +53,7 @@ struct Assembly {
 impl Assembly {
     fn new(slot_count: usize, size_max_bytes: usize) -> Self {
         Self {
-            reassembler: Reassembler::new(slot_count, size_max_bytes, TIMEOUT),
+            reassembler: Reassembler::new(0, slot_count, size_max_bytes, TIMEOUT),
             memory: InMemory::default(),
         }
     }
@@ -60,19 +64,20 @@ impl Assembly {
         now: Instant,
         fragment: &Fragment<'_>,
     ) -> Result<Option<(Vec<u8>, i64)>, Refusal> {
-        let place = self.reassembler.place(now, fragment)?;
+        let (header, payload) = (&fragment.header, fragment.payload);
+        let place = self.reassembler.place(now, header, payload.len())?;
         let slot = place.slot;
         self.memory.store(&Piece {
             channel: 0,
             slot,
             is_first: place.is_first,
             offset_bytes: place.offset_bytes,
-            payload: fragment.payload,
+            payload,
         });
         Ok(self.reassembler.stored(place).map(|whole| {
             let bytes = self.memory.message(0, slot);
             assert_eq!(bytes.len(), whole.length_bytes);
-            (bytes.to_vec(), whole.handed_ns)
+            (bytes.to_vec(), whole.message.handed.as_ns())
         }))
     }
 }
@@ -134,7 +139,7 @@ fn pieces_in_any_order_and_interleaved_come_together() {
         for piece in &all {
             let whole = assembly.insert(Instant::ZERO, piece).unwrap();
             if let Some((bytes, handed_ns)) = whole {
-                let index = usize::try_from(piece.sequence).unwrap();
+                let index = usize::try_from(piece.header.sequence).unwrap();
                 assert_eq!(bytes, messages[index], "seed {seed}");
                 assert_eq!(handed_ns, 100);
                 completed += 1;
@@ -231,7 +236,9 @@ fn a_piece_that_was_not_stored_is_missing_until_it_comes_again() {
     let whole = message(200, 1);
     let mut assembly = Assembly::new(1, 200);
     let halves = pieces(0, &whole, 100);
-    let place = assembly.reassembler.place(Instant::ZERO, &halves[0]);
+    let (header, payload) = (&halves[0].header, halves[0].payload);
+    let reassembler = &mut assembly.reassembler;
+    let place = reassembler.place(Instant::ZERO, header, payload.len());
     assert!(place.unwrap().is_first);
     assert_eq!(assembly.insert(Instant::ZERO, &halves[1]), Ok(None));
     let again = assembly.insert(Instant::ZERO, &halves[0]).unwrap();

@@ -3,6 +3,7 @@
 
 use core::net::SocketAddr;
 use core::time::Duration;
+use std::collections::BTreeMap;
 
 use hil_core::message::Envelope;
 use hil_core::random::RandomStream;
@@ -12,7 +13,9 @@ use crate::channel::{ChannelIdentity, FlowIdentity};
 use crate::egress::{
     EgressBridge, EgressEvent, EgressSettings, LocalRefusal, RoundTrip, TransmitFailure,
 };
-use crate::ingress::{Disposition, InMemory, IngressBridge, IngressSettings, MessageInfo};
+use crate::ingress::{
+    Delivery, Destination, Disposition, IngressBridge, IngressSettings, MessageInfo, Payload, Piece,
+};
 use crate::refusal::Refusal;
 use crate::sequence::Order;
 use crate::stamps::{ArrivalStamps, StampSource};
@@ -54,6 +57,65 @@ pub fn ingress_settings(session: u32, size_max_bytes: u32) -> IngressSettings {
 /// Time under way, both directions together: `(t4 - t1) - (t3 - t2)`.
 pub fn rtt_ns(one: &RoundTrip) -> i64 {
     one.t4_ns - one.t1_ns - (one.t3_ns - one.t2_ns)
+}
+
+/// Messages in pieces come together in memory of this process: for simulations, benches and tests. It allocates.
+#[derive(Debug, Default)]
+pub struct InMemory {
+    /// By channel and slot.
+    messages: BTreeMap<(usize, usize), Vec<u8>>,
+}
+
+impl InMemory {
+    /// A destination that hands whole messages to `take`.
+    pub fn with<F: FnMut(&Delivery, &[u8])>(&mut self, take: F) -> Taking<'_, F> {
+        Taking { memory: self, take }
+    }
+
+    /// Puts a piece into the memory of its slot.
+    pub fn store(&mut self, piece: &Piece<'_>) {
+        let message = self
+            .messages
+            .entry((piece.channel, piece.slot))
+            .or_default();
+        if piece.is_first {
+            message.clear();
+        }
+        let end = piece.offset_bytes + piece.payload.len();
+        if message.len() < end {
+            message.resize(end, 0);
+        }
+        message[piece.offset_bytes..end].copy_from_slice(piece.payload);
+    }
+
+    /// What is stored in a slot; nothing where nothing was.
+    pub fn message(&self, channel: usize, slot: usize) -> &[u8] {
+        self.messages
+            .get(&(channel, slot))
+            .map_or(&[], Vec::as_slice)
+    }
+}
+
+/// An [`InMemory`] with who takes its messages.
+#[derive(Debug)]
+pub struct Taking<'a, F> {
+    memory: &'a mut InMemory,
+    take: F,
+}
+
+impl<F: FnMut(&Delivery, &[u8])> Destination for Taking<'_, F> {
+    fn store(&mut self, piece: &Piece<'_>) -> bool {
+        self.memory.store(piece);
+        true
+    }
+
+    fn deliver(&mut self, delivery: &Delivery, payload: Payload<'_>) {
+        let bytes = match payload {
+            Payload::Datagram(bytes) => bytes,
+            Payload::Stored { slot, .. } => self.memory.message(delivery.message.channel, slot),
+        };
+        (self.take)(delivery, bytes);
+    }
 }
 
 /// Whereto a datagram goes.
@@ -328,7 +390,7 @@ impl<M: Medium> Lab<M> {
     pub fn drain_egress(&mut self) {
         let (now, egress_now) = (self.now(), self.egress_now());
         while let Some(transmit) = self.egress.poll_transmit(egress_now) {
-            let (kind, key) = (transmit.kind, transmit.key());
+            let (kind, key) = (transmit.key.kind, transmit.key);
             assert!(transmit.datagram.len() + 16 <= 1472);
             let is_last = transmit.is_last_fragment;
             if !self.is_listening {

@@ -3,8 +3,8 @@
 use hil_core::time::Instant;
 
 use crate::egress::{EgressBridge, LocalRefusal, PeerState, TransmitKey};
-use crate::ingress::{Disposition, InMemory, IngressBridge};
-use crate::lab::{Impairment, Lab, TX_NS, egress_settings, ingress_settings};
+use crate::ingress::{Disposition, IngressBridge};
+use crate::lab::{Impairment, InMemory, Lab, TX_NS, egress_settings, ingress_settings};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
 use crate::wire::Kind;

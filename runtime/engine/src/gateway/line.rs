@@ -98,7 +98,7 @@ impl Line {
                 break;
             };
             self.newest_handed = handed;
-            let key = transmit.key();
+            let key = transmit.key;
             let is_last = transmit.is_last_fragment;
             if key.kind == Kind::Data
                 && let Some(record) = &mut self.message

@@ -68,7 +68,7 @@ fn converse(
     let mut memory = InMemory::default();
     let mut destination = memory.with(|_, _| {});
     while let Some(transmit) = sender.poll_transmit(now) {
-        let key = transmit.key();
+        let key = transmit.key;
         let datagram = transmit.datagram.to_vec();
         sender.on_transmit_stamp(key, 900);
         let _counted = receiver.on_datagram(now, arrival, &datagram, &mut destination);
