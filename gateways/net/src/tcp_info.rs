@@ -18,14 +18,14 @@ const INFO_LENGTH: libc::socklen_t = 256;
 const UNSEEN: u32 = u32::MAX;
 
 /// One reading of `TCP_INFO`. What the running kernel does not tell is `None`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ConnectionInfo {
     /// Segments sent and not acknowledged.
     pub unacknowledged_segments: Option<u32>,
     /// Segments sent again, since the beginning.
-    pub retransmitted_segments: Option<u32>,
+    pub retransmitted_segments: Option<u64>,
     /// Segments that came before their turn, since the beginning.
-    pub out_of_order_segments: Option<u32>,
+    pub out_of_order_segments: Option<u64>,
     /// Smoothed round trip.
     pub rtt_us: Option<u32>,
     /// Its mean deviation.
@@ -63,6 +63,24 @@ impl ConnectionInfo {
         Ok(Self::parse(&bytes[..length]))
     }
 
+    /// Of this connection and of `later` behind it: what counts since the beginning is of both together.
+    #[must_use]
+    pub fn followed_by(&self, later: &Self) -> Self {
+        let sum = |of: fn(&Self) -> Option<u64>| match (of(self), of(later)) {
+            (Some(one), Some(other)) => Some(one + other),
+            (one, other) => one.or(other),
+        };
+        Self {
+            retransmitted_segments: sum(|one| one.retransmitted_segments),
+            out_of_order_segments: sum(|one| one.out_of_order_segments),
+            busy_us: sum(|one| one.busy_us),
+            window_limited_us: sum(|one| one.window_limited_us),
+            buffer_limited_us: sum(|one| one.buffer_limited_us),
+            received_bytes: sum(|one| one.received_bytes),
+            ..*later
+        }
+    }
+
     /// Offsets as in `linux/tcp.h`; the structure only ever grows at its end.
     fn parse(bytes: &[u8]) -> Self {
         let word = |at: usize| {
@@ -77,13 +95,13 @@ impl ConnectionInfo {
             unacknowledged_segments: word(24),
             rtt_us: word(68),
             rtt_variation_us: word(72),
-            retransmitted_segments: word(100),
+            retransmitted_segments: word(100).map(u64::from),
             received_bytes: long(128),
             rtt_min_us: word(148).filter(|us| *us != UNSEEN),
             busy_us: long(168),
             window_limited_us: long(176),
             buffer_limited_us: long(184),
-            out_of_order_segments: word(224),
+            out_of_order_segments: word(224).map(u64::from),
         }
     }
 }

@@ -34,6 +34,14 @@ pub struct Stalls {
     pub threshold: Duration,
 }
 
+impl Stalls {
+    pub(crate) fn add(&mut self, length: Duration) {
+        self.count += 1;
+        self.total += length;
+        self.longest = self.longest.max(length);
+    }
+}
+
 /// How often connections came and went, for a thread that tells of it while another carries
 /// messages.
 #[derive(Debug, Default)]

@@ -35,59 +35,14 @@ pub(super) struct StreamMetrics {
     pub(super) backlogged: Duration,
     /// Most bytes seen waiting for an acknowledgement, in our buffer or in the kernel's.
     pub(super) waiting_bytes_max: u64,
-    /// A byte that waits longer than this is stalled: twice the smallest round trip and 50 ms,
-    /// the longest that a receiver in good health keeps an acknowledgement back.
-    pub(super) stall_threshold: Duration,
-    /// Stalls: spans in which the oldest unacknowledged byte was stalled.
-    pub(super) stall_count: u64,
-    /// Their length together, each from when its first byte was sent.
-    pub(super) stalled: Duration,
-    /// The longest.
-    pub(super) stall_longest: Duration,
-    /// Time with data under way or waiting for it, as the kernel counts.
-    pub(super) busy: Option<Duration>,
-    /// Of that, while the receiver's window was closed: the peer did not read.
-    pub(super) window_limited: Option<Duration>,
-    /// Of that, while the send buffer was full.
-    pub(super) buffer_limited: Option<Duration>,
-    /// Segments sent again.
-    pub(super) retransmitted_segment_count: Option<u64>,
-    /// Segments that came before their turn.
-    pub(super) out_of_order_segment_count: Option<u64>,
-    /// Smoothed round trip of the newest connection.
-    pub(super) rtt: Option<Duration>,
-    /// Its mean deviation.
-    pub(super) rtt_variation: Option<Duration>,
-    /// The smallest round trip of the newest connection.
-    pub(super) rtt_min: Option<Duration>,
+    /// Spans in which the oldest unacknowledged byte waited longer than twice the smallest round trip and 50 ms, the
+    /// longest that a receiver in good health keeps an acknowledgement back.
+    pub(super) stalls: Stalls,
+    /// What the kernel told, of all connections together.
+    pub(super) kernel: ConnectionInfo,
 }
 
 impl StreamMetrics {
-    /// Adds what the kernel says of a connection.
-    pub(super) fn add(&mut self, info: &ConnectionInfo) {
-        let micros = |us: u32| Duration::from_micros(us.into());
-        add(&mut self.busy, info.busy_us.map(Duration::from_micros));
-        add(
-            &mut self.window_limited,
-            info.window_limited_us.map(Duration::from_micros),
-        );
-        add(
-            &mut self.buffer_limited,
-            info.buffer_limited_us.map(Duration::from_micros),
-        );
-        add(
-            &mut self.retransmitted_segment_count,
-            info.retransmitted_segments.map(u64::from),
-        );
-        add(
-            &mut self.out_of_order_segment_count,
-            info.out_of_order_segments.map(u64::from),
-        );
-        self.rtt = info.rtt_us.map(micros);
-        self.rtt_variation = info.rtt_variation_us.map(micros);
-        self.rtt_min = info.rtt_min_us.map(micros);
-    }
-
     /// Times the peer was connected to again.
     pub(super) fn reconnect_count(&self) -> u64 {
         self.connection_count.saturating_sub(1)
@@ -103,21 +58,19 @@ impl StreamMetrics {
                 ("TCP round trip", round_trip(self)),
                 (
                     "segments",
-                    format!("{} sent again", optional(self.retransmitted_segment_count)),
+                    format!(
+                        "{} sent again",
+                        optional(self.kernel.retransmitted_segments)
+                    ),
                 ),
             ],
-            stalls: Some(Stalls {
-                count: self.stall_count,
-                total: self.stalled,
-                longest: self.stall_longest,
-                threshold: self.stall_threshold,
-            }),
+            stalls: Some(self.stalls),
         }
     }
 
     /// What the receiving end reports.
     pub(super) fn of_receiver(&self) -> EndReport {
-        let early = optional(self.out_of_order_segment_count);
+        let early = optional(self.kernel.out_of_order_segments);
         EndReport {
             counters: self.counters(),
             facts: vec![
@@ -145,33 +98,23 @@ impl StreamMetrics {
             ("backlog_bytes_max", self.backlog_bytes_max),
             ("backlogged_us", micros(self.backlogged)),
             ("waiting_bytes_max", self.waiting_bytes_max),
-            ("stall_count", self.stall_count),
-            ("stalled_us", micros(self.stalled)),
-            ("stall_longest_us", micros(self.stall_longest)),
+            ("stall_count", self.stalls.count),
+            ("stalled_us", micros(self.stalls.total)),
+            ("stall_longest_us", micros(self.stalls.longest)),
         ];
-        let (resent, early) = (
-            self.retransmitted_segment_count,
-            self.out_of_order_segment_count,
-        );
+        let kernel = &self.kernel;
         let told = [
-            ("busy_us", self.busy.map(micros)),
-            ("window_limited_us", self.window_limited.map(micros)),
-            ("buffer_limited_us", self.buffer_limited.map(micros)),
-            ("retransmitted_segment_count", resent),
-            ("out_of_order_segment_count", early),
+            ("busy_us", kernel.busy_us),
+            ("window_limited_us", kernel.window_limited_us),
+            ("buffer_limited_us", kernel.buffer_limited_us),
+            ("retransmitted_segment_count", kernel.retransmitted_segments),
+            ("out_of_order_segment_count", kernel.out_of_order_segments),
         ];
         let told = told
             .into_iter()
             .filter_map(|(key, count)| Some((key, count?)));
         known.into_iter().chain(told).collect()
     }
-}
-
-fn add<T: core::ops::Add<Output = T> + Copy>(sum: &mut Option<T>, more: Option<T>) {
-    *sum = match (*sum, more) {
-        (Some(sum), Some(more)) => Some(sum + more),
-        (sum, more) => sum.or(more),
-    };
 }
 
 fn connections(figures: &StreamMetrics) -> String {
@@ -200,14 +143,22 @@ fn connections(figures: &StreamMetrics) -> String {
 }
 
 fn waiting(figures: &StreamMetrics) -> String {
-    let busy = figures.busy.map_or("unavailable".to_owned(), milliseconds);
+    let micros = Duration::from_micros;
+    let busy = figures.kernel.busy_us.map(micros);
+    let busy = busy.map_or("unavailable".to_owned(), milliseconds);
     let seen = figures.waiting_bytes_max;
     let mut words = vec![format!(
         "at most {seen} bytes seen, {busy} by the kernel's count"
     )];
     for (what, time) in [
-        ("for a closed window", figures.window_limited),
-        ("for a full send buffer", figures.buffer_limited),
+        (
+            "for a closed window",
+            figures.kernel.window_limited_us.map(micros),
+        ),
+        (
+            "for a full send buffer",
+            figures.kernel.buffer_limited_us.map(micros),
+        ),
         ("in the gateway's own buffer", Some(figures.backlogged)),
     ] {
         if let Some(time) = time.filter(|time| !time.is_zero()) {
@@ -218,12 +169,15 @@ fn waiting(figures: &StreamMetrics) -> String {
 }
 
 fn round_trip(figures: &StreamMetrics) -> String {
-    let optional = |time: Option<Duration>| time.map_or("unavailable".to_owned(), milliseconds);
+    let optional = |us: Option<u32>| {
+        let time = us.map(|us| Duration::from_micros(us.into()));
+        time.map_or("unavailable".to_owned(), milliseconds)
+    };
     format!(
         "{} smoothed, deviation {}, smallest {}",
-        optional(figures.rtt),
-        optional(figures.rtt_variation),
-        optional(figures.rtt_min)
+        optional(figures.kernel.rtt_us),
+        optional(figures.kernel.rtt_variation_us),
+        optional(figures.kernel.rtt_min_us)
     )
 }
 
@@ -246,12 +200,15 @@ mod tests {
 
     #[test]
     fn what_the_kernel_does_not_tell_is_unavailable_and_stalls_are_numbers() {
+        let expected = Stalls {
+            count: 1,
+            total: Duration::from_millis(300),
+            longest: Duration::from_millis(300),
+            threshold: Duration::from_millis(44),
+        };
         let figures = StreamMetrics {
             connection_count: 2,
-            stall_count: 1,
-            stalled: Duration::from_millis(300),
-            stall_longest: Duration::from_millis(300),
-            stall_threshold: Duration::from_millis(44),
+            stalls: expected,
             newest_errno: Some(libc::ECONNREFUSED),
             ..StreamMetrics::default()
         };
@@ -266,12 +223,6 @@ mod tests {
             "{}",
             of("connections")
         );
-        let expected = Stalls {
-            count: 1,
-            total: Duration::from_millis(300),
-            longest: Duration::from_millis(300),
-            threshold: Duration::from_millis(44),
-        };
         assert_eq!(report.stalls, Some(expected));
         assert!(of("TCP round trip").starts_with("unavailable smoothed"));
         assert_eq!(of("segments"), "unavailable sent again");

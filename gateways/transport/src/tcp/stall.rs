@@ -6,6 +6,8 @@ use std::collections::VecDeque;
 
 use hil_core::time::Instant;
 
+use crate::Stalls;
+
 /// A receiver may keep an acknowledgement back for 40 ms (`TCP_DELACK_MIN` of Linux) or for one
 /// round trip, whichever is longer, and both it and the data are under way; its timer may be a
 /// tick late, 10 ms at the slowest. What waits longer than that is not waiting for politeness.
@@ -22,23 +24,6 @@ struct Mark {
     since: Instant,
 }
 
-/// What was seen of stalls.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct StallMetrics {
-    pub(super) count: u64,
-    pub(super) total: Duration,
-    pub(super) longest: Duration,
-    pub(super) waiting_bytes_max: u64,
-}
-
-impl StallMetrics {
-    fn add(&mut self, length: Duration) {
-        self.count += 1;
-        self.total += length;
-        self.longest = self.longest.max(length);
-    }
-}
-
 /// The watch.
 #[derive(Debug)]
 pub(super) struct StallWatch {
@@ -47,7 +32,9 @@ pub(super) struct StallWatch {
     accepted: u64,
     rtt_min: Duration,
     stalled_since: Option<Instant>,
-    figures: StallMetrics,
+    stalls: Stalls,
+    /// Most bytes seen waiting.
+    pub(super) waiting_bytes_max: u64,
 }
 
 impl StallWatch {
@@ -57,7 +44,8 @@ impl StallWatch {
             accepted: 0,
             rtt_min: Duration::ZERO,
             stalled_since: None,
-            figures: StallMetrics::default(),
+            stalls: Stalls::default(),
+            waiting_bytes_max: 0,
         }
     }
 
@@ -89,7 +77,7 @@ impl StallWatch {
 
     /// The last `waiting` bytes of the stream are not acknowledged yet.
     pub(super) fn on_look(&mut self, waiting: u64, now: Instant) {
-        self.figures.waiting_bytes_max = self.figures.waiting_bytes_max.max(waiting);
+        self.waiting_bytes_max = self.waiting_bytes_max.max(waiting);
         let acknowledged = self.accepted.saturating_sub(waiting);
         while self
             .marks
@@ -118,7 +106,7 @@ impl StallWatch {
 
     fn end_stall(&mut self, since: Instant, now: Instant) {
         self.stalled_since = None;
-        self.figures.add(now.saturating_duration_since(since));
+        self.stalls.add(now.saturating_duration_since(since));
     }
 
     /// When to look next without any other reason to; `None` while nothing waits.
@@ -133,12 +121,15 @@ impl StallWatch {
     }
 
     /// What was seen until `now`, a stall that still lasts included.
-    pub(super) fn metrics(&self, now: Instant) -> StallMetrics {
-        let mut figures = self.figures;
+    pub(super) fn metrics(&self, now: Instant) -> Stalls {
+        let mut stalls = Stalls {
+            threshold: self.threshold(),
+            ..self.stalls
+        };
         if let Some(since) = self.stalled_since {
-            figures.add(now.saturating_duration_since(since));
+            stalls.add(now.saturating_duration_since(since));
         }
-        figures
+        stalls
     }
 }
 
@@ -175,7 +166,7 @@ mod tests {
             (figures.count, figures.longest),
             (1, Duration::from_millis(90))
         );
-        assert_eq!(figures.waiting_bytes_max, 200);
+        assert_eq!(watch.waiting_bytes_max, 200);
         assert_eq!(watch.next_look(at(90)), None);
     }
 
@@ -196,13 +187,11 @@ mod tests {
         let mut watch = watch();
         watch.on_accepted(100, at(0));
         watch.on_look(0, at(500));
-        assert_eq!(
-            watch.metrics(at(500)),
-            StallMetrics {
-                waiting_bytes_max: 0,
-                ..StallMetrics::default()
-            }
-        );
+        let none = Stalls {
+            threshold: watch.threshold(),
+            ..Stalls::default()
+        };
+        assert_eq!((watch.metrics(at(500)), watch.waiting_bytes_max), (none, 0));
     }
 
     #[test]

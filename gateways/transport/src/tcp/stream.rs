@@ -159,7 +159,7 @@ impl Stream {
             u64::from(self.reader.waiting_bytes() > 0 && ending != Ending::BadFrame);
         figures.abandoned_bytes += left;
         if let Some(info) = self.info.take() {
-            figures.add(&info);
+            figures.kernel = figures.kernel.followed_by(&info);
         }
         self.reader.clear();
         self.backlog.clear();
@@ -327,14 +327,10 @@ impl Stream {
             .as_ref()
             .and_then(|socket| ConnectionInfo::read(socket).ok());
         if let Some(info) = info.or(self.info) {
-            figures.add(&info);
+            figures.kernel = figures.kernel.followed_by(&info);
         }
-        let stalls = self.watch.metrics(now);
-        figures.stall_threshold = self.watch.threshold();
-        figures.stall_count = stalls.count;
-        figures.stalled = stalls.total;
-        figures.stall_longest = stalls.longest;
-        figures.waiting_bytes_max = stalls.waiting_bytes_max;
+        figures.stalls = self.watch.metrics(now);
+        figures.waiting_bytes_max = self.watch.waiting_bytes_max;
         if let Some(since) = self.backlogged {
             figures.backlogged += now.saturating_duration_since(since);
         }
