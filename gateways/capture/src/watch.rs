@@ -7,7 +7,6 @@
 //! as far from the rest as none there lies from the next. Between longer levels the clock was set, or parts of the file are out of order; two points
 //! together tell which (see [`super::join`]).
 
-use core::fmt;
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
 
@@ -50,34 +49,23 @@ pub struct Tap {
     pub is_esl: bool,
 }
 
-/// Which header numbers a protocol.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ProtocolSpace {
-    /// Of Ethernet.
-    EtherType,
-    /// Of IP.
-    Ip,
-    /// Of PPP.
-    Ppp,
-    /// Service access point of LLC.
-    Llc,
-    /// Organisation of SNAP.
-    Snap,
-    /// Address family of a BSD loopback.
-    AddressFamily,
-}
-
-impl fmt::Display for ProtocolSpace {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::EtherType => "EtherType",
-            Self::Ip => "IP protocol",
-            Self::Ppp => "PPP protocol",
-            Self::Llc => "LLC service",
-            Self::Snap => "SNAP organisation",
-            Self::AddressFamily => "address family",
-        })
+hil_core::labelled! {
+    /// Which header numbers a protocol.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum ProtocolSpace, label {
+        /// Of Ethernet.
+        EtherType = "EtherType",
+        /// Of IP.
+        Ip = "IP protocol",
+        /// Of PPP.
+        Ppp = "PPP protocol",
+        /// Service access point of LLC.
+        Llc = "LLC service",
+        /// Organisation of SNAP.
+        Snap = "SNAP organisation",
+        /// Address family of a BSD loopback.
+        AddressFamily = "address family",
     }
 }
 
