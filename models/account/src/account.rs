@@ -7,9 +7,9 @@ use super::fold::{RecordsAtHand, each_history};
 use super::gaps::{Bursts, GapFold};
 use super::history::{Copies, MessageHistory};
 use super::metrics::{ChannelAccount, FateCounts, InterruptionMetrics};
+use super::network::round_trip;
 use super::segments::SegmentFold;
 use super::{AccountContext, ChannelRecords};
-use hil_stats::histogram::{Distribution, LatencyHistogram};
 
 /// Sums messages up to the account of a channel. Memory grows by the few bytes a message that exact
 /// quantiles take.
@@ -96,7 +96,7 @@ impl<'a> AccountFold<'a> {
             end_to_end: self.segments.end_to_end(),
             closing: self.segments.closing(),
             coverage: self.segments.coverage,
-            round_trip: round_trip(context),
+            round_trip: round_trip(context.round_trips_ns),
             loss_bursts: self.bursts.finish(),
             gaps,
             interruptions: interruptions
@@ -120,12 +120,4 @@ pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Ch
     let mut fold = AccountFold::new(RecordsAtHand::of(records, context), context);
     each_history(records, context, |message| fold.add(message));
     fold.finish()
-}
-
-fn round_trip(context: &AccountContext<'_>) -> Distribution {
-    let mut histogram = LatencyHistogram::default();
-    for round_trip_ns in context.round_trips_ns {
-        histogram.record(*round_trip_ns);
-    }
-    histogram.distribution("no clock exchange took place")
 }

@@ -2,11 +2,11 @@
 //! messages: see [`super::fate`].
 
 use core::cmp::Reverse;
-use std::collections::{BTreeMap, BinaryHeap};
+use std::collections::BinaryHeap;
 
 use super::fold::RecordsAtHand;
 use super::history::MessageHistory;
-use super::metrics::{BurstCount, Gap, Gaps, ProducerSilence};
+use super::metrics::{BurstCount, BurstLengths, Gap, Gaps, ProducerSilence};
 use super::stage::Side;
 use super::{AccountContext, Interruption, RunSpan};
 use hil_core::record::stamp;
@@ -17,7 +17,7 @@ use hil_stats::histogram::LatencyHistogram;
 pub(super) struct Bursts {
     length: u64,
     epoch_rank: u32,
-    counts: BTreeMap<u64, u64>,
+    lengths: BurstLengths,
 }
 
 impl Bursts {
@@ -33,21 +33,12 @@ impl Bursts {
     }
 
     fn end(&mut self) {
-        if self.length > 0 {
-            *self.counts.entry(self.length).or_insert(0) += 1;
-            self.length = 0;
-        }
+        self.lengths.add(core::mem::take(&mut self.length));
     }
 
     pub(super) fn finish(mut self) -> Vec<BurstCount> {
         self.end();
-        let counts = self.counts.into_iter();
-        counts
-            .map(|(length_messages, count)| BurstCount {
-                length_messages,
-                count,
-            })
-            .collect()
+        self.lengths.finish()
     }
 }
 

@@ -197,25 +197,11 @@ impl MessageHistory {
         }
     }
 
-    /// What the network did to it.
+    /// What the network did to it. What happened behind the receiving gateway is not the network's.
     pub fn crossing(&self) -> Crossing {
-        match self.fate {
-            // What happened behind the receiving gateway is not the network's.
-            _ if self.arrived().is_some() => Crossing::Arrived,
-            MessageFate::Taken | MessageFate::SupersededAtConsumer => Crossing::Arrived,
-            MessageFate::LostOnWire | MessageFate::Incomplete => Crossing::LostByNetwork,
-            MessageFate::NetworkUnreachable => Crossing::Unreachable,
-            MessageFate::LostOnWireOrByHarness => Crossing::Doubtful,
-            MessageFate::InFlight
-            | MessageFate::Unexplained
-            | MessageFate::UnknownPeerRecordsUnavailable => Crossing::Unknown,
-            MessageFate::LostByHarness
-            | MessageFate::SupersededAtInput
-            | MessageFate::RefusedByKernel
-            | MessageFate::RefusedAtIngress
-            | MessageFate::Late
-            | MessageFate::Duplicate
-            | MessageFate::LostInInterruption => Crossing::LostByHost,
+        match self.arrived() {
+            Some(_) => Crossing::Arrived,
+            None => self.fate.crossing(),
         }
     }
 }

@@ -35,6 +35,8 @@ pub mod radio;
 mod random_fates_tests;
 mod segments;
 mod stage;
+#[cfg(any(test, feature = "lab"))]
+#[path = "tests/synthetic.rs"]
 pub mod synthetic;
 #[cfg(test)]
 mod tests;
@@ -48,8 +50,8 @@ pub use fold::{
 };
 pub use history::{Copies, Key, MessageHistory};
 pub use metrics::{
-    BurstCount, ChannelAccount, Closing, ClosingMetrics, Coverage, EndToEnd, FateCounts, Gap, Gaps,
-    InterruptionMetrics, ProducerSilence, SegmentMetrics, StampCoverage,
+    BurstCount, BurstLengths, ChannelAccount, Closing, ClosingMetrics, Coverage, EndToEnd,
+    FateCounts, Gap, Gaps, InterruptionMetrics, ProducerSilence, SegmentMetrics, StampCoverage,
 };
 pub use no_room::NoRoom;
 pub use outage::{
@@ -306,13 +308,6 @@ impl<'a> AccountContext<'a> {
             cards_share_clock: false,
             round_trips_ns: &[],
         }
-    }
-
-    /// The same with these interruptions.
-    #[must_use]
-    pub const fn with_interruptions(mut self, interruptions: &'a [Interruption]) -> Self {
-        self.interruptions = interruptions;
-        self
     }
 }
 

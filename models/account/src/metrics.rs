@@ -237,6 +237,28 @@ pub struct BurstCount {
     pub count: u64,
 }
 
+/// Counts runs by their lengths.
+#[derive(Debug, Clone, Default)]
+pub struct BurstLengths(BTreeMap<u64, u64>);
+
+impl BurstLengths {
+    /// Adds one of so many messages; none is no run.
+    pub fn add(&mut self, length_messages: u64) {
+        if length_messages > 0 {
+            *self.0.entry(length_messages).or_insert(0) += 1;
+        }
+    }
+
+    /// The counts, the shortest first.
+    pub fn finish(self) -> Vec<BurstCount> {
+        let count = |(length_messages, count)| BurstCount {
+            length_messages,
+            count,
+        };
+        self.0.into_iter().map(count).collect()
+    }
+}
+
 /// The time between successive messages at the consumer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Gaps {

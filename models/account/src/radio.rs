@@ -9,6 +9,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::network::Crossing;
 use crate::stage::MessageFate;
 use crate::{MessageHistory, RecordSource, RecordsAtHand};
 use hil_core::record::{EgressRecord, UNAVAILABLE, stamp};
@@ -62,25 +63,13 @@ impl RadioRow {
     fn add(&mut self, message: &MessageHistory) {
         self.count += 1;
         let Some(fates) = &mut self.fates else { return };
-        match message.fate {
-            _ if message.arrived().is_some() => fates.arrived_count += 1,
-            MessageFate::Taken | MessageFate::SupersededAtConsumer => fates.arrived_count += 1,
-            MessageFate::LostInInterruption => fates.interrupted_count += 1,
-            MessageFate::InFlight => fates.in_flight_count += 1,
+        match (message.crossing(), message.fate) {
+            (Crossing::Arrived, _) => fates.arrived_count += 1,
+            (_, MessageFate::LostInInterruption) => fates.interrupted_count += 1,
+            (_, MessageFate::InFlight) => fates.in_flight_count += 1,
             // Without any receiver's records all of them are unknown, and with them none is.
-            MessageFate::UnknownPeerRecordsUnavailable | MessageFate::Unexplained => {
-                self.fates = None;
-            }
-            MessageFate::LostOnWire
-            | MessageFate::NetworkUnreachable
-            | MessageFate::LostByHarness
-            | MessageFate::LostOnWireOrByHarness
-            | MessageFate::SupersededAtInput
-            | MessageFate::RefusedByKernel
-            | MessageFate::Incomplete
-            | MessageFate::RefusedAtIngress
-            | MessageFate::Late
-            | MessageFate::Duplicate => fates.lost_count += 1,
+            (Crossing::Unknown, _) => self.fates = None,
+            _ => fates.lost_count += 1,
         }
     }
 }

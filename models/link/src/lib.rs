@@ -14,7 +14,4 @@ pub mod outages;
 pub mod rate;
 pub mod reordering;
 pub mod spec;
-pub mod trace;
-mod trace_offers;
-mod trace_ticks;
 pub mod wifi;

@@ -1,5 +1,5 @@
 //! A link trace: what one channel's messages met on a link, one record each. It is what a run
-//! leaves, what the models are fitted to, and what [`hil_link::trace::TraceLink`] replays. It
+//! leaves, what the models are fitted to, and what [`replay::TraceLink`] replays. It
 //! opens no file; layouts are in `docs/traces.md`.
 //!
 //! [`wire`] is the binary form, [`csv`] the textual one, [`opportunities`] that of Mahimahi,
@@ -14,15 +14,14 @@ pub mod from_records;
 pub mod metrics;
 pub mod netem;
 pub mod opportunities;
+pub mod replay;
+mod replay_offers;
 #[cfg(test)]
 mod replay_tests;
+mod replay_ticks;
 pub mod wire;
 
-use core::fmt;
-
 use serde::{Deserialize, Serialize};
-
-use hil_link::trace::{ReplayFate, ReplayRecord, ReplayTrace};
 
 /// An instant or a delay that is not known; never a made-up zero.
 pub const UNAVAILABLE_NS: i64 = i64::MIN;
@@ -30,55 +29,31 @@ pub const UNAVAILABLE_NS: i64 = i64::MIN;
 /// A bound that is not known.
 pub const UNBOUNDED_NS: u64 = u64::MAX;
 
-/// What became of a message.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum TraceFate {
-    /// Nobody can say: it was under way when the run ended, or the other host's records are missing.
-    Unknown,
-    /// The receiving gateway published it.
-    Delivered,
-    /// Handed to the kernel, never received.
-    LostInNetwork,
-    /// It never left the sending host: superseded, refused by the kernel, or its gateway was down.
-    LostBeforeLink,
-    /// The receiving host had it and did not publish it: late, a duplicate, or refused.
-    LostAfterLink,
+hil_core::labelled! {
+    /// What became of a message.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum TraceFate, word {
+        /// Nobody can say: it was under way when the run ended, or the other host's records are missing.
+        Unknown = "unknown",
+        /// The receiving gateway published it.
+        Delivered = "delivered",
+        /// Handed to the kernel, never received.
+        LostInNetwork = "lost-in-network",
+        /// It never left the sending host: superseded, refused by the kernel, or its gateway was down.
+        LostBeforeLink = "lost-before-link",
+        /// The receiving host had it and did not publish it: late, a duplicate, or refused.
+        LostAfterLink = "lost-after-link",
+    }
 }
 
 impl TraceFate {
-    /// Every fate, in the order of their codes.
-    pub const ALL: [Self; 5] = [
-        Self::Unknown,
-        Self::Delivered,
-        Self::LostInNetwork,
-        Self::LostBeforeLink,
-        Self::LostAfterLink,
-    ];
-
-    /// The word in a text form.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::Delivered => "delivered",
-            Self::LostInNetwork => "lost-in-network",
-            Self::LostBeforeLink => "lost-before-link",
-            Self::LostAfterLink => "lost-after-link",
-        }
-    }
-
     /// True when the consumer's host never got it, for whatever reason.
     pub const fn is_loss(self) -> bool {
         matches!(
             self,
             Self::LostInNetwork | Self::LostBeforeLink | Self::LostAfterLink
         )
-    }
-}
-
-impl fmt::Display for TraceFate {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.word())
     }
 }
 
@@ -165,55 +140,31 @@ impl TraceRecord {
     }
 }
 
-/// Which way a channel travels on its link.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum TraceDirection {
-    /// Not known.
-    Unknown,
-    /// From the first host of the link's `between` to the second.
-    Forward,
-    /// From the second to the first.
-    Backward,
-}
-
-impl TraceDirection {
-    /// Every direction, in the order of their codes.
-    pub const ALL: [Self; 3] = [Self::Unknown, Self::Forward, Self::Backward];
-
-    /// The word in a text form.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::Forward => "forward",
-            Self::Backward => "backward",
-        }
+hil_core::labelled! {
+    /// Which way a channel travels on its link.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum TraceDirection, word {
+        /// Not known.
+        Unknown = "unknown",
+        /// From the first host of the link's `between` to the second.
+        Forward = "forward",
+        /// From the second to the first.
+        Backward = "backward",
     }
 }
 
-/// Where a delay ends.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum TraceArrival {
-    /// Not known, as in a trace from elsewhere.
-    Unknown,
-    /// The receiving gateway's receive call had returned.
-    Received,
-    /// The packet was seen at the second point of a capture.
-    Captured,
-}
-
-impl TraceArrival {
-    /// Every kind, in the order of their codes.
-    pub const ALL: [Self; 3] = [Self::Unknown, Self::Received, Self::Captured];
-
-    /// The word in a text form.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::Received => "received",
-            Self::Captured => "captured",
-        }
+hil_core::labelled! {
+    /// Where a delay ends.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum TraceArrival, word {
+        /// Not known, as in a trace from elsewhere.
+        Unknown = "unknown",
+        /// The receiving gateway's receive call had returned.
+        Received = "received",
+        /// The packet was seen at the second point of a capture.
+        Captured = "captured",
     }
 }
 
@@ -321,28 +272,6 @@ impl TraceCounts {
 }
 
 impl Trace {
-    /// What a replay needs of it.
-    pub fn replayed(&self) -> ReplayTrace {
-        let record = |record: &TraceRecord| ReplayRecord {
-            published_ns: record.published_ns,
-            start: record.start,
-            fate: match record.fate {
-                TraceFate::Delivered => ReplayFate::Delivered,
-                TraceFate::Unknown => ReplayFate::Unknown,
-                _ => ReplayFate::Lost,
-            },
-            delay_ns: record.delay(),
-            second_delay_ns: record.second_delay(),
-        };
-        let duration_ns = self.header.duration_ns;
-        ReplayTrace {
-            records: self.records.iter().map(record).collect(),
-            period_ns: self.period_ns(),
-            duration_ns: (duration_ns != UNAVAILABLE_NS).then_some(duration_ns),
-            clock: self.header.clock.clone(),
-        }
-    }
-
     /// What its messages met.
     pub fn counts(&self) -> TraceCounts {
         let mut counts = TraceCounts::default();

@@ -2,12 +2,11 @@
 //! delays, quantiles, the longest outage. Every share and quantile has its interval. It fits no
 //! model: see [`super::fit`].
 
-use std::collections::BTreeMap;
-
 use serde::{Deserialize, Serialize};
 
 use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS};
 use hil_account::network::{Metric, OrderMetrics};
+use hil_account::{BurstCount, BurstLengths};
 use hil_core::interval::Spread;
 use hil_stats::dependence::{Batches, Quantiles};
 use hil_stats::histogram::Distribution;
@@ -17,15 +16,6 @@ use hil_stats::samples::Samples;
 pub const QUANTILES: [f64; 6] = [0.01, 0.1, 0.5, 0.9, 0.99, 0.999];
 /// Longest lag of an autocorrelation, messages.
 pub const LAG_MAX: usize = 100;
-
-/// A run of equal fates.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RunCount {
-    /// Messages in a row.
-    pub length_messages: u64,
-    /// How often.
-    pub count: u64,
-}
 
 /// One quantile of the delay.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -70,9 +60,9 @@ pub struct TraceMetrics {
     /// Its 95 % interval, or why there is none.
     pub loss_ratio_interval: Option<Spread>,
     /// Losses in a row, by length. A message of unknown fate ends a row.
-    pub loss_bursts: Vec<RunCount>,
+    pub loss_bursts: Vec<BurstCount>,
     /// Deliveries in a row, by length.
-    pub delivery_runs: Vec<RunCount>,
+    pub delivery_runs: Vec<BurstCount>,
     /// Of losses; `None` when none or all were lost.
     pub loss_memory: Option<Memory>,
     /// Of successive delivered messages' delays; `None` when they do not vary.
@@ -159,31 +149,18 @@ pub fn known_losses(trace: &Trace) -> Vec<bool> {
     known.map(|record| record.fate.is_loss()).collect()
 }
 
-fn run_counts(trace: &Trace, of_losses: bool) -> Vec<RunCount> {
-    let mut counts: BTreeMap<u64, u64> = BTreeMap::new();
-    let mut length = 0;
-    let mut end = |length: &mut u64| {
-        if *length > 0 {
-            *counts.entry(*length).or_insert(0) += 1;
-            *length = 0;
-        }
-    };
+fn run_counts(trace: &Trace, of_losses: bool) -> Vec<BurstCount> {
+    let (mut lengths, mut length) = (BurstLengths::default(), 0);
     for record in &trace.records {
         let is_known = record.fate != TraceFate::Unknown;
         if is_known && record.fate.is_loss() == of_losses {
             length += 1;
         } else {
-            end(&mut length);
+            lengths.add(core::mem::take(&mut length));
         }
     }
-    end(&mut length);
-    let counts = counts.into_iter();
-    counts
-        .map(|(length_messages, count)| RunCount {
-            length_messages,
-            count,
-        })
-        .collect()
+    lengths.add(length);
+    lengths.finish()
 }
 
 /// Sample autocorrelation (Box and Jenkins, equation 2.1.11) up to [`LAG_MAX`] or a quarter of the
@@ -351,7 +328,7 @@ mod tests {
         assert!((ratio - 7.0 / 13.0).abs() < 1e-12);
         let interval = figures.loss_ratio_interval.unwrap();
         assert_eq!(interval.known(), None, "13 messages are too few");
-        let pairs = |runs: &[RunCount]| -> Vec<(u64, u64)> {
+        let pairs = |runs: &[BurstCount]| -> Vec<(u64, u64)> {
             let runs = runs.iter();
             runs.map(|run| (run.length_messages, run.count)).collect()
         };

@@ -3,9 +3,9 @@
 use core::time::Duration;
 
 use super::*;
+use crate::replay::{ReplayError, TraceEnd, TraceLink, TraceReplay};
 use hil_core::link_model::{Fate, LinkModel, MessageNumber, TraceMatch};
 use hil_core::time::{Instant, RemoteInstant};
-use hil_link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};
 
 const MS: i64 = 1_000_000;
 
@@ -26,7 +26,7 @@ fn link(matching: TraceMatch, end: TraceEnd) -> TraceLink {
         end,
         delay_otherwise: None,
     };
-    TraceLink::new(trace().replayed(), replay).unwrap()
+    TraceLink::new(trace(), replay).unwrap()
 }
 
 fn at(ms: i64) -> Instant {
@@ -89,7 +89,7 @@ fn a_round_by_time_is_the_run_or_else_from_the_first_record_on() {
     };
     // Met is told by the delay, which is the record's index in nanoseconds.
     let met = |trace: Trace, offers: &[i64]| {
-        let mut link = TraceLink::new(trace.replayed(), replay).unwrap();
+        let mut link = TraceLink::new(trace.clone(), replay).unwrap();
         let mut index = |ms: &i64| {
             let arrival = link.offer(at(*ms), 1).arrival().unwrap();
             arrival.as_ns() - ms * MS
@@ -143,7 +143,7 @@ fn by_tick_a_message_meets_the_record_of_its_tick_and_what_nobody_published_is_l
         end: TraceEnd::Perfect,
         delay_otherwise: None,
     };
-    let mut link = TraceLink::new(ticking.replayed(), replay).unwrap();
+    let mut link = TraceLink::new(ticking.clone(), replay).unwrap();
     for tick in 0..100 {
         let now = at(500 + tick * 10);
         let expected = match tick % 10 {
@@ -158,7 +158,7 @@ fn by_tick_a_message_meets_the_record_of_its_tick_and_what_nobody_published_is_l
     assert_eq!((counts.met_count, counts.unpublished_count), (90, 10));
     assert_eq!((counts.repeated_count, counts.beyond_end_count), (2, 1));
     assert_eq!(counts.offered_count, 103);
-    let without_period = TraceLink::new(trace().replayed(), replay).unwrap();
+    let without_period = TraceLink::new(trace(), replay).unwrap();
     assert_eq!(without_period.tally().counts().matching, TraceMatch::Index);
 }
 
@@ -173,7 +173,7 @@ fn by_tick_what_counts_is_when_a_message_was_published_not_when_it_arrived() {
         end: TraceEnd::Perfect,
         delay_otherwise: None,
     };
-    let mut link = TraceLink::new(ticking.replayed(), replay).unwrap();
+    let mut link = TraceLink::new(ticking.clone(), replay).unwrap();
     let mut now = at(0);
     for tick in 0..100 {
         // Held up on the way by up to three periods, so that several come at once; the producer's clock
@@ -217,25 +217,25 @@ fn unknown_delays_need_a_word_and_negative_ones_are_counted() {
     let mut unknown = trace();
     unknown.records[2].delay_ns = UNAVAILABLE_NS;
     unknown.header.clock = "clocks not aligned".to_owned();
-    let error = TraceLink::new(unknown.replayed(), TraceReplay::default()).unwrap_err();
+    let error = TraceLink::new(unknown.clone(), TraceReplay::default()).unwrap_err();
     assert!(error.to_string().contains("record 2"), "{error}");
     let replay = TraceReplay {
         delay_otherwise: Some(Duration::from_millis(4)),
         ..TraceReplay::default()
     };
-    let mut link = TraceLink::new(unknown.replayed(), replay).unwrap();
+    let mut link = TraceLink::new(unknown.clone(), replay).unwrap();
     let fate = link.offer_message(at(0), number(0, 2));
     assert_eq!(fate.arrival(), Some(at(3)));
     let mut early = trace();
     early.records[0].delay_ns = -5;
-    let mut link = TraceLink::new(early.replayed(), TraceReplay::default()).unwrap();
+    let mut link = TraceLink::new(early.clone(), TraceReplay::default()).unwrap();
     assert_eq!(link.offer(at(1), 1), Fate::Delivered(at(1)));
     assert_eq!(link.tally().counts().negative_delay_count, 1);
     let empty = Trace {
         records: Vec::new(),
         ..trace()
     };
-    let refused = TraceLink::new(empty.replayed(), TraceReplay::default());
+    let refused = TraceLink::new(empty.clone(), TraceReplay::default());
     assert_eq!(refused.unwrap_err(), ReplayError::Empty);
 }
 
@@ -251,7 +251,7 @@ fn pieces_and_copies_of_a_message_meet_one_record_and_count_once() {
             matching,
             ..TraceReplay::default()
         };
-        let mut link = TraceLink::new(ticking.replayed(), replay).unwrap();
+        let mut link = TraceLink::new(ticking.clone(), replay).unwrap();
         for (tick, record) in (0..100).zip(&ticking.records) {
             // Three pieces; a copy of one when the next two messages are through already.
             for (ms, sequence) in [(0, tick), (1, tick), (4, tick), (5, tick - 2)] {

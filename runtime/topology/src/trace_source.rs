@@ -1,5 +1,5 @@
 //! Where a link's traces lie, and how they become its model: `[links.<name>.trace]`. It reads the
-//! files; what a message meets then is `hil_link::trace`.
+//! files; what a message meets then is `hil_trace::replay`.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,8 +13,8 @@ use hil_core::options;
 use hil_core::options::{Scalar as _, Setting, Shape, Short, Templates, TextRule};
 use hil_core::text_file::{TextFault, TextFile};
 use hil_link::delay::DELAY_MAX;
-use hil_link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};
 use hil_trace::fault::TraceFault;
+use hil_trace::replay::{ReplayError, TraceEnd, TraceLink, TraceReplay};
 use hil_trace::wire::Decoded;
 use hil_trace::{Trace, csv, wire};
 use serde::{Deserialize, Serialize};
@@ -314,7 +314,7 @@ impl TraceLaunch {
             source,
         };
         let trace = read_whole(&self.file).map_err(failed)?;
-        let link = TraceLink::new(trace.replayed(), self.replay);
+        let link = TraceLink::new(trace, self.replay);
         let link = link.map_err(|source| {
             failed(TraceFileError::Replay {
                 path: self.file.clone(),

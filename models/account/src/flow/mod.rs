@@ -19,6 +19,7 @@ use hil_stats::reordering::reordered;
 use serde::{Deserialize, Serialize};
 
 use crate::history::MessageHistory;
+use crate::network::Crossing;
 use crate::stage::MessageFate;
 use crate::{AccountContext, PathProcess};
 
@@ -317,23 +318,15 @@ const NOT_KNOWN: usize = 3;
 const BY_EITHER: usize = 4;
 
 const fn place_of(fate: MessageFate) -> usize {
-    match fate {
-        MessageFate::Taken => TAKEN,
-        MessageFate::NetworkUnreachable | MessageFate::LostOnWire | MessageFate::Incomplete => {
-            BY_NETWORK
-        }
-        MessageFate::LostOnWireOrByHarness => BY_EITHER,
-        MessageFate::InFlight
-        | MessageFate::Unexplained
-        | MessageFate::UnknownPeerRecordsUnavailable => NOT_KNOWN,
-        MessageFate::LostByHarness
-        | MessageFate::SupersededAtInput
-        | MessageFate::RefusedByKernel
-        | MessageFate::RefusedAtIngress
-        | MessageFate::Late
-        | MessageFate::Duplicate
-        | MessageFate::SupersededAtConsumer
-        | MessageFate::LostInInterruption => BY_HARNESS,
+    if matches!(fate, MessageFate::SupersededAtConsumer) {
+        return BY_HARNESS;
+    }
+    match fate.crossing() {
+        Crossing::Arrived => TAKEN,
+        Crossing::LostByNetwork | Crossing::Unreachable => BY_NETWORK,
+        Crossing::Doubtful => BY_EITHER,
+        Crossing::Unknown => NOT_KNOWN,
+        Crossing::LostByHost => BY_HARNESS,
     }
 }
 

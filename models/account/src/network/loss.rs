@@ -3,12 +3,11 @@
 //! neither count nor interrupt anything here.
 
 use core::fmt;
-use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
 use super::{Crossing, Metric, Passages};
-use crate::BurstCount;
+use crate::{BurstCount, BurstLengths};
 use hil_core::interval::Spread;
 use hil_stats::dependence::Batches;
 
@@ -134,22 +133,16 @@ pub(super) fn losses(passages: &Passages, run_ns: Option<(i64, i64)>) -> Metric<
         return Metric::unavailable("no message is known to have been lost or to have arrived");
     }
     let of_runs = runs.iter().map(|run| (run.place, run.lost_count));
-    let mut lengths: BTreeMap<u64, u64> = BTreeMap::new();
+    let mut lengths = BurstLengths::default();
     for run in &runs {
-        *lengths.entry(run.lost_count).or_insert(0) += 1;
+        lengths.add(run.lost_count);
     }
-    let lengths = lengths.into_iter();
     Metric::Measured(LossMetrics {
         lost_count,
         of_count,
         ratio: lost_count as f64 / of_count as f64,
         interval: Batches::of_runs(of_count, of_runs).share_interval(),
-        runs: lengths
-            .map(|(length_messages, count)| BurstCount {
-                length_messages,
-                count,
-            })
-            .collect(),
+        runs: lengths.finish(),
         bursts: bursts(&runs, of_count, lost_count),
         longest: longest(&runs, run_ns),
     })

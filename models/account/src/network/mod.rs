@@ -187,10 +187,6 @@ impl NetworkMetrics {
         let offered_per_s = rate(offered.filter_map(|one| Some((one.offered_ns?, one.count))));
         let arrived_ratio = counts.arrived as f64 / offered_count as f64;
         let arrived_per_s = offered_per_s.map(|per_s| per_s * arrived_ratio);
-        let mut round_trip = LatencyHistogram::default();
-        for round_trip_ns in context.round_trips_ns {
-            round_trip.record(*round_trip_ns);
-        }
         Self {
             offered_count,
             arrived_count: counts.arrived,
@@ -216,7 +212,7 @@ impl NetworkMetrics {
                 ),
             },
             order: order::order(passages),
-            round_trip: round_trip.distribution("no clock exchange took place"),
+            round_trip: round_trip(context.round_trips_ns),
         }
     }
 
@@ -230,6 +226,15 @@ impl NetworkMetrics {
             doubtful_count,
         })
     }
+}
+
+/// Round trips of the gateways' clock exchange.
+pub(crate) fn round_trip(round_trips_ns: &[i64]) -> Distribution {
+    let mut histogram = LatencyHistogram::default();
+    for round_trip_ns in round_trips_ns {
+        histogram.record(*round_trip_ns);
+    }
+    histogram.distribution("no clock exchange took place")
 }
 
 /// Messages by what became of them.

@@ -4,9 +4,9 @@ use hil_core::link_model::TraceMatch;
 use hil_core::random::RandomStream;
 use hil_link::outages::{Outage, OutageSchedule, Outages};
 use hil_link::spec::{LinkSpec, Way};
-use hil_link::trace::{TraceLink, TraceReplay};
 use hil_protocol::wire::Header;
 use hil_topology::emulation::EmulationLaunch;
+use hil_trace::replay::{TraceLink, TraceReplay};
 use hil_trace::{Trace, TraceFate, TraceHeader, TraceRecord};
 use hil_transport::queue::queue_pair;
 
@@ -107,7 +107,7 @@ fn traced(matching: TraceMatch) -> TraceLink {
         matching,
         ..TraceReplay::default()
     };
-    TraceLink::new(trace.replayed(), replay).unwrap()
+    TraceLink::new(trace, replay).unwrap()
 }
 
 #[test]

@@ -5,9 +5,10 @@ use core::fmt::Write as _;
 use hil_account::network::{Metric as NetworkMetric, OrderMetrics};
 use hil_core::interval::Spread;
 
+use hil_account::BurstCount;
 use hil_stats::histogram::Distribution;
 use hil_trace::fit::{Fit, Ranking, TraceFit};
-use hil_trace::metrics::{Memory, RunCount, TraceMetrics};
+use hil_trace::metrics::{Memory, TraceMetrics};
 use hil_trace::{Trace, TraceHeader};
 
 use hil_platform::text::grouped;
@@ -163,7 +164,7 @@ fn loss_words(figures: &TraceMetrics) -> String {
     text
 }
 
-fn runs_words(runs: &[RunCount], of: &str) -> String {
+fn runs_words(runs: &[BurstCount], of: &str) -> String {
     let count: u64 = runs.iter().map(|run| run.count).sum();
     let messages: u64 = runs.iter().map(|run| run.count * run.length_messages).sum();
     let Some(longest) = runs.last() else {
@@ -400,7 +401,7 @@ fn push_bar(table: &mut Table, name: Cell, value: Cell, end: f64) {
 }
 
 /// Burst lengths in classes of powers of two, with their share.
-fn classes(runs: &[RunCount]) -> Vec<(String, u64, f64)> {
+fn classes(runs: &[BurstCount]) -> Vec<(String, u64, f64)> {
     let total: u64 = runs.iter().map(|run| run.count).sum();
     let mut found: Vec<(String, u64, f64)> = Vec::new();
     let longest = runs.last().map_or(0, |run| run.length_messages);

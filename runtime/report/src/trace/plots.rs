@@ -1,7 +1,8 @@
 //! The series of a trace, ready for any plotting program.
 
+use hil_account::BurstCount;
 use hil_core::plot::{PlotColumn, PlotSeries};
-use hil_trace::metrics::{RunCount, TraceMetrics};
+use hil_trace::metrics::TraceMetrics;
 use hil_trace::{Trace, UNBOUNDED_NS};
 
 const fn column(name: &'static str, label: &'static str, unit: &'static str) -> PlotColumn {
@@ -69,7 +70,7 @@ fn bound_ms(bound_ns: Option<u64>) -> f64 {
     bound_ns.map_or(f64::NAN, |ns| ns as f64 * 1e-6)
 }
 
-fn runs(name: &str, title: &str, runs: &[RunCount]) -> PlotSeries {
+fn runs(name: &str, title: &str, runs: &[BurstCount]) -> PlotSeries {
     let values = runs
         .iter()
         .flat_map(|run| [run.length_messages as f64, run.count as f64])

@@ -1,7 +1,6 @@
 //! Tests of the ticks of a trace, against a producer that a loaded host holds up.
 
 use super::*;
-use crate::trace::ReplayFate;
 use core::time::Duration;
 use hil_core::random::RandomStream;
 use hil_core::time::{Instant, PeriodicTimer};
@@ -27,14 +26,8 @@ struct Published {
     lateness: f64,
 }
 
-fn record(published_ns: i64) -> ReplayRecord {
-    ReplayRecord {
-        published_ns,
-        start: 0,
-        fate: ReplayFate::Unknown,
-        delay_ns: None,
-        second_delay_ns: None,
-    }
+fn record(published_ns: i64) -> TraceRecord {
+    TraceRecord::published(published_ns, 0, 0)
 }
 
 fn whole_ns(ns: f64) -> i64 {
@@ -43,7 +36,7 @@ fn whole_ns(ns: f64) -> i64 {
 
 /// A run of a producer with the timer that producers have. One wake-up in ten is late by up to 0.45
 /// of a period, the others by up to 0.02.
-fn run(host: Host, seed: u64) -> (Vec<ReplayRecord>, Vec<Published>) {
+fn run(host: Host, seed: u64) -> (Vec<TraceRecord>, Vec<Published>) {
     // The timer counts in its own nanoseconds; the trace's clock runs at another rate.
     let nominal_ns = 1_000_000;
     let rate = host.period_ns / nominal_ns as f64;

@@ -3,7 +3,7 @@
 //! trace's, so its grid is followed like that of a trace: by the same rules over the first messages, and
 //! message by message from then on.
 
-use crate::trace_ticks::{EARLY_RATIO, sort_out, whole};
+use crate::replay_ticks::{EARLY_RATIO, sort_out, whole};
 use hil_core::link_model::MessageNumber;
 
 /// Messages that the grid is sought in anew with each of them: the first of a run is the coldest, and

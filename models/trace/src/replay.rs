@@ -1,54 +1,16 @@
 //! A recorded trace as a link: each message meets what a message of the trace met. It draws no
-//! random number and reads no file; a trace comes to it as a [`ReplayTrace`].
+//! random number and reads no file.
 
 use core::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::trace_offers::{OfferGrid, Offered};
-use crate::trace_ticks::Ticks;
+use super::replay_offers::{OfferGrid, Offered};
+use super::replay_ticks::Ticks;
+use super::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS};
 use hil_core::link_model::{Fate, LinkModel, MessageNumber, ReplayEvent, ReplayTally, TraceMatch};
 use hil_core::time::{Instant, RemoteInstant};
 use hil_core::words;
-
-/// A trace as far as a replay needs it.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ReplayTrace {
-    /// What each message met, in the order of publication.
-    pub records: Vec<ReplayRecord>,
-    /// Middle of the times from one publication to the next; `None` below two messages.
-    pub period_ns: Option<i64>,
-    /// Length of the run that it was taken from, where it is known.
-    pub duration_ns: Option<i64>,
-    /// What it says of its clocks.
-    pub clock: String,
-}
-
-/// What one message of a trace met.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ReplayRecord {
-    /// When it was published, nanoseconds since the run's start.
-    pub published_ns: i64,
-    /// Starts of the producer before this message's.
-    pub start: u16,
-    /// What became of it.
-    pub fate: ReplayFate,
-    /// Its delay, where it is known.
-    pub delay_ns: Option<i64>,
-    /// That of its second copy, if there was one and it is known.
-    pub second_delay_ns: Option<i64>,
-}
-
-/// What became of a message of a trace.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ReplayFate {
-    /// It arrived.
-    Delivered,
-    /// It was lost, wherever.
-    Lost,
-    /// Nobody can say.
-    Unknown,
-}
 
 words! {
     /// What a message meets that comes after the end of the trace.
@@ -98,7 +60,7 @@ pub enum ReplayError {
 /// that was delivered in all, each as much later as the record says.
 #[derive(Debug, Clone, Copy)]
 enum Met {
-    Record(ReplayRecord),
+    Record(TraceRecord),
     /// The trace has no record at its tick.
     Unpublished,
     /// It came after the end.
@@ -108,7 +70,7 @@ enum Met {
 /// The link.
 #[derive(Debug)]
 pub struct TraceLink {
-    trace: ReplayTrace,
+    trace: Trace,
     replay: TraceReplay,
     /// What time zero of the run is in the trace, and the length of one round through it, above
     /// zero.
@@ -136,21 +98,20 @@ impl TraceLink {
     ///
     /// # Errors
     /// [`ReplayError`].
-    pub fn new(trace: ReplayTrace, mut replay: TraceReplay) -> Result<Self, ReplayError> {
+    pub fn new(trace: Trace, mut replay: TraceReplay) -> Result<Self, ReplayError> {
         let Some(last) = trace.records.last() else {
             return Err(ReplayError::Empty);
         };
         let mut records = trace.records.iter();
-        let unknown = |record: &ReplayRecord| {
-            record.fate == ReplayFate::Delivered && record.delay_ns.is_none()
-        };
+        let unknown =
+            |record: &TraceRecord| record.fate == TraceFate::Delivered && record.delay().is_none();
         if replay.delay_otherwise.is_none()
             && let Some(index) = records.position(unknown)
         {
-            let clock = trace.clock;
+            let clock = trace.header.clock;
             return Err(ReplayError::DelayUnknown { index, clock });
         }
-        let period_ns = trace.period_ns.unwrap_or(0);
+        let period_ns = trace.period_ns().unwrap_or(0);
         let (origin_ns, end_ns) = round(&trace, last.published_ns, period_ns);
         let ticks = match replay.matching {
             TraceMatch::Index | TraceMatch::Time => None,
@@ -180,7 +141,7 @@ impl TraceLink {
     /// The longest delay it can add.
     pub fn delay_max(&self) -> Duration {
         let delays = self.trace.records.iter();
-        let delays = delays.flat_map(|record| [record.delay_ns, record.second_delay_ns]);
+        let delays = delays.flat_map(|record| [record.delay(), record.second_delay()]);
         let longest_ns = delays.flatten().max().unwrap_or(0).max(0);
         let longest = Duration::from_nanos(longest_ns.unsigned_abs());
         longest.max(self.replay.delay_otherwise.unwrap_or_default())
@@ -200,9 +161,9 @@ impl TraceLink {
         };
         self.offered.keep(number, met);
         if let Met::Record(record) = met
-            && record.fate == ReplayFate::Delivered
+            && record.fate == TraceFate::Delivered
         {
-            let delays = [record.delay_ns, record.second_delay_ns];
+            let delays = [record.delay(), record.second_delay()];
             for _ in delays.into_iter().flatten().filter(|delay| *delay < 0) {
                 self.tally.count(ReplayEvent::NegativeDelay);
             }
@@ -211,22 +172,24 @@ impl TraceLink {
     }
 
     /// Counts what a message meets with a record of its own, or none after the end.
-    fn counted(&self, place: Option<(ReplayRecord, bool)>) -> Met {
+    fn counted(&self, place: Option<(TraceRecord, bool)>) -> Met {
         let Some((record, is_beyond)) = place else {
             self.tally.count(ReplayEvent::BeyondEnd);
             return Met::End;
         };
         self.tally.count(match record.fate {
             _ if is_beyond => ReplayEvent::BeyondEnd,
-            ReplayFate::Delivered => ReplayEvent::Delivered,
-            ReplayFate::Unknown => ReplayEvent::Unknown,
-            ReplayFate::Lost => ReplayEvent::Lost,
+            TraceFate::Delivered => ReplayEvent::Delivered,
+            TraceFate::Unknown => ReplayEvent::Unknown,
+            TraceFate::LostInNetwork | TraceFate::LostBeforeLink | TraceFate::LostAfterLink => {
+                ReplayEvent::Lost
+            }
         });
         Met::Record(record)
     }
 
     /// The record, and whether it stands for one after the end; `None` after the end.
-    fn by_index(&self, number: u64) -> Option<(ReplayRecord, bool)> {
+    fn by_index(&self, number: u64) -> Option<(TraceRecord, bool)> {
         let records = &self.trace.records;
         let count = records.len() as u64;
         let is_beyond = number >= count;
@@ -237,7 +200,7 @@ impl TraceLink {
         Some((records[index], is_beyond))
     }
 
-    fn by_time(&self, now: Instant) -> Option<(ReplayRecord, bool)> {
+    fn by_time(&self, now: Instant) -> Option<(TraceRecord, bool)> {
         let is_beyond = now.as_ns() >= self.span_ns;
         if is_beyond && self.replay.end != TraceEnd::Wrap {
             return None;
@@ -311,14 +274,14 @@ impl TraceLink {
 
     fn fate(&self, met: Met, now: Instant) -> Fate {
         let record = match met {
-            Met::Record(record) if record.fate == ReplayFate::Delivered => record,
+            Met::Record(record) if record.fate == TraceFate::Delivered => record,
             Met::End if self.replay.end != TraceEnd::Lost => return Fate::Delivered(now),
             Met::Record(_) | Met::Unpublished | Met::End => return Fate::Lost,
         };
         let after = |delay_ns: i64| now + Duration::from_nanos(delay_ns.max(0).unsigned_abs());
         let otherwise = now + self.replay.delay_otherwise.unwrap_or_default();
-        let first = record.delay_ns.map_or(otherwise, after);
-        match record.second_delay_ns.map(after) {
+        let first = record.delay().map_or(otherwise, after);
+        match record.second_delay().map(after) {
             None => Fate::Delivered(first),
             Some(second) => Fate::Duplicated {
                 first: first.min(second),
@@ -332,11 +295,10 @@ impl TraceLink {
 /// was, so also a text of opportunities, which wraps at its last line; else with its first record and
 /// a period after its last. Instants of another origin than the run's thus do not count as a time
 /// without end before the first record.
-fn round(trace: &ReplayTrace, last_ns: i64, period_ns: i64) -> (i64, i64) {
+fn round(trace: &Trace, last_ns: i64, period_ns: i64) -> (i64, i64) {
     let first_ns = trace.records.first().map_or(0, |first| first.published_ns);
-    if let Some(duration_ns) = trace.duration_ns
-        && first_ns <= duration_ns
-    {
+    let duration_ns = trace.header.duration_ns;
+    if duration_ns != UNAVAILABLE_NS && first_ns <= duration_ns {
         return (0, duration_ns.max(last_ns));
     }
     (first_ns, last_ns.saturating_add(period_ns))

@@ -1,6 +1,6 @@
 //! Writes the records that messages of known fates would have left, for tests of what reads them.
 
-use super::{AccountContext, ChannelPath, ChannelRecords, MessageFate, RunSpan};
+use super::{AccountContext, ChannelPath, ChannelRecords, Interruption, MessageFate, RunSpan};
 use hil_core::record::{
     EgressRecord, FollowUp, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
 };
@@ -191,6 +191,15 @@ fn arrived(message: Written) -> IngressRecord {
         session: 41,
         flags: 0,
         fragment_count: 1,
+    }
+}
+
+impl<'a> AccountContext<'a> {
+    /// The same with these interruptions.
+    #[must_use]
+    pub const fn with_interruptions(mut self, interruptions: &'a [Interruption]) -> Self {
+        self.interruptions = interruptions;
+        self
     }
 }
 

@@ -1,6 +1,6 @@
 //! Which tick of its producer each record of a trace belongs to, from the instants alone; and which
 //! ticks have no record because the process that should have published was held up. The messages offered to
-//! a replay have theirs from [`super::trace_offers`].
+//! a replay have theirs from [`super::replay_offers`].
 //!
 //! A producer's timer stands on an absolute grid (`time::PeriodicTimer`): its messages leave late, never
 //! early, and a late one moves none after it. So the grid is the lower edge of the instants. It is found
@@ -8,7 +8,7 @@
 //! correcting phase and period a little: an error of the period does not add up, however long the
 //! trace is. What is promised, and what no instant can tell, is said in `docs/traces.md`.
 
-use super::trace::ReplayRecord;
+use super::TraceRecord;
 
 /// Fewest records with a period.
 const RECORDS_MIN: usize = 16;
@@ -305,14 +305,14 @@ fn middle_period(instants: &[f64], ticks: &[u64]) -> Option<f64> {
 impl Ticks {
     /// The ticks of `records`; `None` when their instants have no period, or the producer was
     /// started anew, which begins another grid.
-    pub(super) fn of(records: &[ReplayRecord], middle_ns: i64) -> Option<Self> {
+    pub(super) fn of(records: &[TraceRecord], middle_ns: i64) -> Option<Self> {
         let is_restarted = records.iter().any(|record| record.start > 0);
         if records.len() < RECORDS_MIN || middle_ns <= 0 || is_restarted {
             return None;
         }
         let first_ns = records[0].published_ns;
         let since_first =
-            |record: &ReplayRecord| record.published_ns.saturating_sub(first_ns) as f64;
+            |record: &TraceRecord| record.published_ns.saturating_sub(first_ns) as f64;
         let instants: Vec<f64> = records.iter().map(since_first).collect();
         let span_ns = instants[instants.len() - 1];
         if span_ns <= 0.0 || span_ns / middle_ns as f64 > TICKS_MAX as f64 {
@@ -340,5 +340,5 @@ impl Ticks {
 }
 
 #[cfg(test)]
-#[path = "trace_ticks_tests.rs"]
+#[path = "replay_ticks_tests.rs"]
 mod tests;
