@@ -4,10 +4,11 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS};
+use super::{Trace, TraceCounts, TraceFate, TraceRecord};
 use hil_account::network::{Metric, OrderMetrics};
-use hil_account::{BurstCount, BurstLengths};
+use hil_account::{BurstCount, BurstLengths, OutageFinder, OutageMetrics};
 use hil_core::interval::Spread;
+use hil_core::time::Instant;
 use hil_stats::dependence::{Batches, Quantiles};
 use hil_stats::histogram::Distribution;
 use hil_stats::samples::Samples;
@@ -244,37 +245,23 @@ fn quantiles(delays_ns: &[i64]) -> Vec<QuantileMetric> {
 }
 
 fn longest_outage(records: &[TraceRecord]) -> Option<TraceOutage> {
-    let mut longest: Option<TraceOutage> = None;
-    let mut current: Option<TraceOutage> = None;
-    let mut keep = |found: TraceOutage| {
-        if longest.is_none_or(|known| known.length_ns < found.length_ns) {
-            longest = Some(found);
-        }
-    };
-    let mut last_ns = UNAVAILABLE_NS;
+    let mut outages = OutageFinder::default();
     for record in records {
-        last_ns = record.published_ns;
+        let published_ns = Some(record.published_ns);
         if record.fate.is_loss() {
-            let outage = current.get_or_insert(TraceOutage {
-                from_ns: record.published_ns,
-                length_ns: 0,
-                lost_count: 0,
-                is_open: false,
-            });
-            outage.lost_count += 1;
-        } else if record.fate == TraceFate::Delivered
-            && let Some(mut outage) = current.take()
-        {
-            outage.length_ns = record.published_ns.saturating_sub(outage.from_ns);
-            keep(outage);
+            outages.lost(record.sequence, 1, published_ns);
+        } else if record.fate == TraceFate::Delivered {
+            outages.arrived(published_ns, None);
         }
     }
-    if let Some(mut outage) = current {
-        outage.length_ns = last_ns.saturating_sub(outage.from_ns);
-        outage.is_open = true;
-        keep(outage);
-    }
-    longest
+    let end = Instant::from_ns(records.last()?.published_ns);
+    let longest = OutageMetrics::of(&outages.finish(), Some(end)).longest?;
+    Some(TraceOutage {
+        from_ns: longest.start_ns,
+        length_ns: longest.length_ns,
+        lost_count: longest.lost_count,
+        is_open: longest.is_open,
+    })
 }
 
 fn rates(records: &[TraceRecord]) -> (Option<f64>, Option<f64>) {
@@ -296,7 +283,7 @@ fn rates(records: &[TraceRecord]) -> (Option<f64>, Option<f64>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::TraceHeader;
+    use crate::{TraceHeader, UNAVAILABLE_NS};
     use hil_core::random::RandomStream;
 
     const MS: i64 = 1_000_000;

@@ -168,162 +168,73 @@ fn to_u32(size: usize) -> u32 {
     u32::try_from(size).expect("the sizes of the format are small")
 }
 
-/// Reads a trace that is wholly in memory.
+/// Reads a trace.
 ///
 /// # Errors
 /// When not even the header can be read; every later fault is beside what could be.
 pub fn decode(bytes: &[u8]) -> Result<Decoded, TraceFault> {
-    let mut decoder = TraceDecoder::default();
-    let mut records = Vec::new();
-    let fault = decoder
-        .feed(bytes, &mut |record| records.push(record))
-        .and_then(|()| decoder.finish())
-        .err();
-    match (decoder.header, fault) {
-        (Some(header), fault) => Ok(Decoded {
-            trace: Trace { header, records },
-            fault,
-        }),
-        (None, Some(fault)) => Err(fault),
-        (None, None) => unreachable!("a decoder without a header does not finish"),
-    }
-}
-
-/// Reads a trace piece by piece; holds at most one header or record of it.
-#[derive(Debug, Default)]
-pub struct TraceDecoder {
-    header: Option<TraceHeader>,
-    record_count: u64,
-    /// Bytes of the part that is not whole yet.
-    held: Vec<u8>,
-    /// Of the first of them.
-    offset: u64,
-    read_count: u64,
-    before_ns: Option<i64>,
-    fault: Option<TraceFault>,
-}
-
-impl TraceDecoder {
-    /// The header, as soon as it was read.
-    pub fn header(&self) -> Option<&TraceHeader> {
-        self.header.as_ref()
-    }
-
-    /// Takes the next bytes and hands each record to `take`.
-    ///
-    /// # Errors
-    /// The first fault, also on every later call; the records handed out before are whole.
-    pub fn feed(
-        &mut self,
-        mut bytes: &[u8],
-        take: &mut dyn FnMut(TraceRecord),
-    ) -> Result<(), TraceFault> {
-        if let Some(fault) = &self.fault {
-            return Err(fault.clone());
-        }
-        loop {
-            if self.is_complete() && !bytes.is_empty() {
-                let count = bytes.len() as u64;
-                return self.fail(0, FaultKind::Trailing { count });
-            }
-            let wanted = if self.header.is_some() {
-                RECORD_BYTES
-            } else {
-                HEADER_BYTES
-            };
-            let missing = (wanted - self.held.len()).min(bytes.len());
-            let (next, rest) = bytes.split_at(missing);
-            self.held.extend_from_slice(next);
-            bytes = rest;
-            if self.held.len() < wanted {
-                return Ok(());
-            }
-            self.part(take)?;
-            self.offset += wanted as u64;
-            self.held.clear();
-        }
-    }
-
-    /// Says that there are no more bytes.
-    ///
-    /// # Errors
-    /// The fault found before, or that the trace is not whole.
-    pub fn finish(&mut self) -> Result<(), TraceFault> {
-        if let Some(fault) = &self.fault {
-            return Err(fault.clone());
-        }
-        if self.header.is_none() {
-            let found = self.held.len();
-            if !MAGIC.starts_with(&self.held[..found.min(MAGIC.len())]) {
-                let found = self.held[..found.min(MAGIC.len())].to_vec();
-                return self.fail(0, FaultKind::Foreign { found });
-            }
-            let what = FaultKind::Truncated {
-                found: found as u64,
+    let Some((head, rest)) = bytes.split_at_checked(HEADER_BYTES) else {
+        let begin = &bytes[..bytes.len().min(MAGIC.len())];
+        let what = if MAGIC.starts_with(begin) {
+            FaultKind::Truncated {
+                found: bytes.len() as u64,
                 expected: HEADER_BYTES as u64,
                 unit: "bytes of the header",
-            };
-            return self.fail(0, what);
-        }
-        if !self.is_complete() {
+            }
+        } else {
+            let found = begin.to_vec();
+            FaultKind::Foreign { found }
+        };
+        return Err(TraceFault { offset: 0, what });
+    };
+    let (header, count) =
+        decode_header(head).map_err(|(offset, what)| TraceFault { offset, what })?;
+    let mut records: Vec<TraceRecord> = Vec::new();
+    let fault = decode_records(rest, count, &mut records).err();
+    let fault = fault.map(|(at, what)| TraceFault {
+        offset: (HEADER_BYTES + records.len() * RECORD_BYTES) as u64 + at,
+        what,
+    });
+    let trace = Trace { header, records };
+    Ok(Decoded { trace, fault })
+}
+
+/// Reads `count` records, which are all there is in `bytes`; the place of a fault counts from the record it is in.
+fn decode_records(
+    mut bytes: &[u8],
+    count: u64,
+    records: &mut Vec<TraceRecord>,
+) -> Result<(), (u64, FaultKind)> {
+    for expected in 0..u32::try_from(count).unwrap_or(u32::MAX) {
+        let Some((part, rest)) = bytes.split_at_checked(RECORD_BYTES) else {
             let what = FaultKind::Truncated {
-                found: self.read_count,
-                expected: self.record_count,
+                found: expected.into(),
+                expected: count,
                 unit: "records",
             };
-            return self.fail(0, what);
-        }
-        Ok(())
-    }
-
-    fn is_complete(&self) -> bool {
-        self.header.is_some() && self.read_count == self.record_count
-    }
-
-    fn part(&mut self, take: &mut dyn FnMut(TraceRecord)) -> Result<(), TraceFault> {
-        let held = core::mem::take(&mut self.held);
-        let outcome = if self.header.is_none() {
-            decode_header(&held).map(|(header, count)| {
-                self.header = Some(header);
-                self.record_count = count;
-            })
-        } else {
-            self.record(&held).map(|record| {
-                self.before_ns = Some(record.published_ns);
-                self.read_count += 1;
-                take(record);
-            })
+            return Err((0, what));
         };
-        self.held = held;
-        outcome.or_else(|(at, what)| self.fail(at, what))
-    }
-
-    fn record(&self, bytes: &[u8]) -> Result<TraceRecord, (u64, FaultKind)> {
-        check_sum(bytes, RECORD_SUM_AT, "record")?;
-        let expected = u32::try_from(self.read_count).unwrap_or(u32::MAX);
-        let found = u32_at(bytes, 56);
+        check_sum(part, RECORD_SUM_AT, "record")?;
+        let found = u32_at(part, 56);
         if found != expected {
             return Err((56, FaultKind::Place { found, expected }));
         }
-        let record = decode_record(bytes)?;
+        let record = decode_record(part)?;
         let published_ns = record.published_ns;
-        match self.before_ns {
-            Some(before_ns) if published_ns < before_ns => Err((
-                0,
-                FaultKind::Order {
-                    published_ns,
-                    before_ns,
-                },
-            )),
-            _ => Ok(record),
+        let before = records.last().map(|before| before.published_ns);
+        if let Some(before_ns) = before.filter(|before_ns| published_ns < *before_ns) {
+            let what = FaultKind::Order {
+                published_ns,
+                before_ns,
+            };
+            return Err((0, what));
         }
+        records.push(record);
+        bytes = rest;
     }
-
-    fn fail(&mut self, at: u64, what: FaultKind) -> Result<(), TraceFault> {
-        let offset = self.offset + at;
-        let fault = TraceFault { offset, what };
-        self.fault = Some(fault.clone());
-        Err(fault)
+    match bytes.len() as u64 {
+        0 => Ok(()),
+        count => Err((0, FaultKind::Trailing { count })),
     }
 }
 

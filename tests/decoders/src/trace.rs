@@ -1,9 +1,8 @@
 //! Traces of what a link did: the binary form, the text, and delivery opportunities.
 
 use hil_core::text_file::TextFile;
-use hil_trace::fault::{FaultKind, TraceFault};
 use hil_trace::metrics::TraceMetrics;
-use hil_trace::wire::{Decoded, HEADER_BYTES, RECORD_BYTES, TraceDecoder};
+use hil_trace::wire::{HEADER_BYTES, RECORD_BYTES};
 use hil_trace::{Trace, TraceHeader, csv, netem, opportunities as mahimahi, wire};
 
 use crate::Verdict;
@@ -14,10 +13,9 @@ const FIGURED_RECORDS_MAX: usize = 24;
 /// Opportunities that are written out.
 const OPPORTUNITIES_MAX: u64 = 4096;
 
-/// However a file is fed, the same is read; what is read is written and read as the same.
+/// What is read is written and read as the same.
 ///
-/// The first byte says how the file is fed, and whether its check sums are made right first: no
-/// search finds those.
+/// The first byte says whether the check sums of the file are made right first: no search finds those.
 pub(crate) fn binary(bytes: &[u8]) -> Verdict {
     let mut input = Input::new(bytes);
     let mode = input.byte();
@@ -25,17 +23,9 @@ pub(crate) fn binary(bytes: &[u8]) -> Verdict {
     if mode & 1 == 0 {
         make_sums_right(&mut file, mode & 2 == 0);
     }
-    let whole = wire::decode(&file).map(|decoded| Decoded {
-        fault: decoded.fault.map(uncounted),
-        ..decoded
-    });
-    let portions = decode_in_portions(&file, 1 + usize::from(mode >> 2));
+    let whole = wire::decode(&file);
     match &whole {
         Ok(decoded) => {
-            assert_eq!(
-                portions,
-                (Some(decoded.trace.clone()), decoded.fault.clone())
-            );
             let read_bytes = HEADER_BYTES + decoded.trace.records.len() * RECORD_BYTES;
             assert!(
                 read_bytes <= file.len(),
@@ -44,35 +34,11 @@ pub(crate) fn binary(bytes: &[u8]) -> Verdict {
             check_trace(&decoded.trace);
         }
         Err(fault) => {
-            assert_eq!(portions, (None, Some(fault.clone())));
             assert!(fault.offset <= file.len() as u64, "a fault beyond the end");
             assert!(!fault.to_string().is_empty());
         }
     }
     Verdict::of(whole.is_ok_and(|decoded| decoded.fault.is_none()))
-}
-
-fn decode_in_portions(file: &[u8], portion: usize) -> (Option<Trace>, Option<TraceFault>) {
-    let mut decoder = TraceDecoder::default();
-    let mut records = Vec::new();
-    let fed = file
-        .chunks(portion)
-        .try_for_each(|part| decoder.feed(part, &mut |record| records.push(record)));
-    let fault = fed.and_then(|()| decoder.finish()).err().map(uncounted);
-    let trace = decoder
-        .header()
-        .cloned()
-        .map(|header| Trace { header, records });
-    (trace, fault)
-}
-
-/// How much there is behind the last record is told of the portion at hand, not of the file.
-fn uncounted(fault: TraceFault) -> TraceFault {
-    let what = match fault.what {
-        FaultKind::Trailing { .. } => FaultKind::Trailing { count: 0 },
-        other => other,
-    };
-    TraceFault { what, ..fault }
 }
 
 /// Gives header and records the check sums and, with `places`, the numbers that belong to them.
