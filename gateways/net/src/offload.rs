@@ -4,7 +4,7 @@
 
 use std::io;
 
-use super::timestamping::device_request;
+use super::timestamping::{EthtoolValue, device_request};
 
 /// Switches off what an interface leaves to hardware: sums over what it sends (`ETHTOOL_STXCSUM`) and cutting
 /// TCP into frames (`ETHTOOL_STSO`, `ETHTOOL_SGSO`), so that whoever takes a frame from the other end of a
@@ -14,17 +14,11 @@ use super::timestamping::device_request;
 /// When the driver refuses.
 #[allow(unsafe_code, reason = "no crate wraps these commands")]
 pub fn finish_frames_in_software(interface: &str) -> io::Result<()> {
-    /// `ethtool_value` of `linux/ethtool.h`.
-    #[repr(C)]
-    struct Switch {
-        command: u32,
-        value: u32,
-    }
     const ETHTOOL_STXCSUM: u32 = 0x17;
     const ETHTOOL_STSO: u32 = 0x1f;
     const ETHTOOL_SGSO: u32 = 0x24;
     for command in [ETHTOOL_STXCSUM, ETHTOOL_STSO, ETHTOOL_SGSO] {
-        let mut switch = Switch { command, value: 0 };
+        let mut switch = EthtoolValue { command, value: 0 };
         let data = (&raw mut switch).cast();
         // SAFETY: SIOCETHTOOL with these commands reads one `ethtool_value`, which `switch` is.
         unsafe { device_request(interface, libc::SIOCETHTOOL, data) }?;

@@ -477,9 +477,9 @@ const ETHTOOL_GLINK: u32 = 0x0a;
 /// `struct ethtool_value` of `linux/ethtool.h`.
 #[derive(Debug)]
 #[repr(C)]
-struct EthtoolValue {
-    command: u32,
-    value: u32,
+pub(super) struct EthtoolValue {
+    pub(super) command: u32,
+    pub(super) value: u32,
 }
 
 /// True while `interface` is up and has a carrier (`ETHTOOL_GLINK`), as the driver knows it now.

@@ -34,25 +34,15 @@ const HAS_DELAY: i64 = 4;
 const IS_MANY: i64 = 8;
 const CROSSING_SHIFT: u32 = 4;
 
+/// By their numbers.
 const CROSSINGS: [Crossing; 6] = [
     Crossing::Arrived,
     Crossing::LostByNetwork,
+    Crossing::Unreachable,
     Crossing::LostByHost,
     Crossing::Unknown,
     Crossing::Doubtful,
-    Crossing::Unreachable,
 ];
-
-const fn crossing_number(crossing: Crossing) -> i64 {
-    match crossing {
-        Crossing::Arrived => 0,
-        Crossing::LostByNetwork => 1,
-        Crossing::LostByHost => 2,
-        Crossing::Unknown => 3,
-        Crossing::Doubtful => 4,
-        Crossing::Unreachable => 5,
-    }
-}
 
 impl Follows {
     /// Notes a passage, so that what is expected moves on with it.
@@ -76,7 +66,7 @@ impl Follows {
 impl Passages {
     /// Appends the next one.
     pub fn push(&mut self, one: &Passage) {
-        let mut head = crossing_number(one.crossing) << CROSSING_SHIFT;
+        let mut head = (one.crossing as i64) << CROSSING_SHIFT;
         let flags = [
             (one.offered_ns.is_some(), IS_OFFERED),
             (one.received_ns.is_some(), IS_RECEIVED),
@@ -212,7 +202,7 @@ mod tests {
         assert!(packed.each().eq(passages.iter().copied()));
         assert_eq!(Passages::default().each().count(), 0);
         for (number, crossing) in (0..).zip(CROSSINGS) {
-            assert_eq!(crossing_number(crossing), number);
+            assert_eq!(crossing as i64, number);
         }
     }
 

@@ -36,7 +36,6 @@ use channel::{Fading, Shadowing, median_snr_db};
 use contention::Contention;
 use phy::{Phy, nanoseconds};
 use power_save::Doze;
-use rate::Rates;
 
 /// What became of the messages offered. Every message has one of the four fates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -64,9 +63,9 @@ pub struct WifiCounts {
 /// The link.
 #[derive(Debug, Clone)]
 pub struct WifiLink {
+    spec: WifiSpec,
     phy: Phy,
     contention: Contention,
-    rates: Rates,
     median_snr_db: f64,
     shadowing: Shadowing,
     fading: Fading,
@@ -74,8 +73,6 @@ pub struct WifiLink {
     local: (i64, f64, usize),
     doze: Option<Doze>,
     outages: OutageLink,
-    is_buffered: bool,
-    attempt_limit: usize,
     lifetime_ns: i64,
     forwarding: Duration,
     random: RandomStream,
@@ -116,17 +113,15 @@ impl WifiLink {
             (PowerSave::Forward, Way::Forward) | (PowerSave::Backward, Way::Backward)
         );
         Ok(Self {
+            spec: *spec,
             phy: Phy::new(spec),
             contention: Contention::new(spec),
-            rates: Rates::new(spec),
             median_snr_db: median_snr_db(spec),
             shadowing: Shadowing::new(spec, shadowing_key),
             fading: Fading::new(spec, fading_key),
             local: (i64::MIN, 0.0, 0),
             doze: is_dozing.then(|| Doze::new(spec, beacon_phase)),
             outages: OutageLink::new(spec.outages, shared, Instant::ZERO)?,
-            is_buffered: spec.outages.buffered,
-            attempt_limit: spec.attempt_limit as usize,
             lifetime_ns: nanoseconds(spec.lifetime_ms * 1e6),
             forwarding: Duration::from_secs_f64(spec.forwarding_us * 1e-6),
             random,
@@ -157,7 +152,7 @@ impl WifiLink {
         let (step, shadowing_db) = self.shadowing.at(at);
         if self.local.0 != step {
             let snr_db = self.median_snr_db + shadowing_db;
-            self.local = (step, snr_db, self.rates.settled(snr_db));
+            self.local = (step, snr_db, self.spec.settled(snr_db));
         }
         (self.local.1, self.local.2)
     }
@@ -166,16 +161,17 @@ impl WifiLink {
     /// up; sets when the next may follow. No attempt begins after the lifetime.
     fn send(&mut self, offered: Instant, mut at: Instant, air_bytes: u64) -> Received {
         let access = self.contention.access;
+        let attempt_limit = self.spec.attempt_limit as usize;
         let mut window = access.window_min;
         let mut result = Err(Gone::Exhausted);
-        for attempt in 0..self.attempt_limit {
+        for attempt in 0..attempt_limit {
             if at.ns_since(offered) > self.lifetime_ns {
                 // It grew too old in its back-off, which the next frame takes over.
                 self.ready = at;
                 return Err(Gone::Expired);
             }
             let (snr_db, settled) = self.local(at);
-            let mcs = self.rates.stepped_down(settled, attempt);
+            let mcs = self.spec.stepped_down(settled, attempt);
             let ppdu_ns = self.phy.ppdu_ns(mcs, air_bytes);
             let snr_db = snr_db + self.fading.at(at);
             self.counts.attempt_count += 1;
@@ -186,7 +182,7 @@ impl WifiLink {
                 air_ns = ppdu_ns.max(self.contention.busy_ns(&mut self.random));
                 false
             } else {
-                let error_ratio = self.rates.error_ratio(mcs, snr_db, air_bytes);
+                let error_ratio = self.spec.error_ratio(mcs, snr_db, air_bytes);
                 let is_error = self.random.chance(error_ratio);
                 self.counts.error_count += u64::from(is_error);
                 !is_error
@@ -198,7 +194,7 @@ impl WifiLink {
                 break;
             }
             window = access.widened(window);
-            if attempt + 1 < self.attempt_limit {
+            if attempt + 1 < attempt_limit {
                 at = after(at, self.contention.backoff_ns(&mut self.random, window));
             }
         }
@@ -252,7 +248,7 @@ impl LinkModel for WifiLink {
         };
         // Heads of the line come in order of time, as the outages are asked.
         if let Some(outage) = self.outages.outage_at(begin) {
-            if !self.is_buffered {
+            if !self.spec.outages.buffered {
                 self.counts.outage_count += 1;
                 return Fate::Lost;
             }

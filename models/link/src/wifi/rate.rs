@@ -16,36 +16,21 @@ const THRESHOLDS_DB: [f64; MCS_COUNT] = [
 /// Bytes of the frames that the thresholds are for.
 const REFERENCE_BYTES: f64 = 4096.0;
 
-/// Rates of one link.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Rates {
-    slope_per_db: f64,
-    margin_db: f64,
-    mcs_max: usize,
-    attempts_per_rate: usize,
-}
-
-impl Rates {
-    pub(crate) fn new(spec: &WifiSpec) -> Self {
-        Self {
-            slope_per_db: spec.error_slope_per_db,
-            margin_db: spec.rate_margin_db,
-            mcs_max: spec.mcs_max as usize,
-            attempts_per_rate: spec.attempts_per_rate as usize,
-        }
-    }
-
+impl WifiSpec {
     /// The scheme that a sender settles on at an average signal-to-noise ratio: the highest whose
     /// threshold lies a margin below. It stands for the steady state of a controller that samples
     /// rates, as Minstrel does in Linux, and not for its learning.
     pub(crate) fn settled(&self, snr_db: f64) -> usize {
-        let is_reached = |mcs: &usize| THRESHOLDS_DB[*mcs] + self.margin_db <= snr_db;
-        (0..=self.mcs_max).rev().find(is_reached).unwrap_or(0)
+        let is_reached = |mcs: &usize| THRESHOLDS_DB[*mcs] + self.rate_margin_db <= snr_db;
+        (0..=self.mcs_max as usize)
+            .rev()
+            .find(is_reached)
+            .unwrap_or(0)
     }
 
     /// The scheme of the `attempt`-th attempt, counted from 0: one lower after so many failures.
     pub(crate) fn stepped_down(&self, settled: usize, attempt: usize) -> usize {
-        settled.saturating_sub(attempt / self.attempts_per_rate)
+        settled.saturating_sub(attempt / self.attempts_per_rate as usize)
     }
 
     /// Probability that a PPDU of `air_bytes` at the scheme `mcs` is not received: a logistic curve
@@ -53,7 +38,7 @@ impl Rates {
     /// Both are approximations; link simulations give curves of similar steepness.
     pub(crate) fn error_ratio(&self, mcs: usize, snr_db: f64, air_bytes: u64) -> f64 {
         // 0.1 at the threshold: odds of 1 to 9.
-        let odds = (self.slope_per_db * (THRESHOLDS_DB[mcs] - snr_db)).exp() / 9.0;
+        let odds = (self.error_slope_per_db * (THRESHOLDS_DB[mcs] - snr_db)).exp() / 9.0;
         // (1 - error of the reference) is 1 / (1 + odds).
         let length_ratio = air_bytes as f64 / REFERENCE_BYTES;
         -(-length_ratio * odds.ln_1p()).exp_m1()
@@ -64,14 +49,14 @@ impl Rates {
 mod tests {
     use super::*;
 
-    fn rates() -> Rates {
-        Rates::new(&WifiSpec {
+    fn rates() -> WifiSpec {
+        WifiSpec {
             error_slope_per_db: 3.0,
             rate_margin_db: 2.0,
             mcs_max: 11,
             attempts_per_rate: 2,
             ..WifiSpec::default()
-        })
+        }
     }
 
     #[test]

@@ -5,7 +5,6 @@ use core::time::Duration;
 
 use crate::outages::Outages;
 use crate::wifi::phy::PPDU_MAX_NS;
-use crate::wifi::rate::Rates;
 use crate::wifi::{channel, contention};
 use hil_core::case_study::ParameterError;
 use hil_core::{options, words};
@@ -141,7 +140,7 @@ impl WifiSpec {
             self.wall_count,
             self.channel_width_mhz,
             self.stream_count,
-            Rates::new(self).settled(snr_db),
+            self.settled(snr_db),
             self.mcs_max,
             self.attempt_limit,
             self.lifetime_ms,

@@ -64,7 +64,7 @@ fn at_snr(spec: WifiSpec, snr_db: f64) -> WifiSpec {
 fn a_clean_medium_delays_by_the_airtime_alone() {
     let spec = bare();
     let phy = Phy::new(&spec);
-    let mcs = Rates::new(&spec).settled(median_snr_db(&spec));
+    let mcs = spec.settled(median_snr_db(&spec));
     let airtime_ns = phy.ppdu_ns(mcs, Phy::air_bytes(100));
     let mut link = link(&spec, 1);
     let all = delays(&mut link, COUNT, 4_000_000);
@@ -83,12 +83,11 @@ fn what_is_left_after_the_retries_is_the_product_of_their_error_ratios() {
             error_slope_per_db: 1.0,
             ..at_snr(bare(), snr_db)
         };
-        let rates = Rates::new(&spec);
-        let settled = rates.settled(snr_db);
+        let settled = spec.settled(snr_db);
         let air_bytes = Phy::air_bytes(100);
         let error = |attempt| {
-            let mcs = rates.stepped_down(settled, attempt);
-            rates.error_ratio(mcs, snr_db, air_bytes)
+            let mcs = spec.stepped_down(settled, attempt);
+            spec.error_ratio(mcs, snr_db, air_bytes)
         };
         let expected: f64 = (0..attempt_limit as usize).map(error).product();
         let mut link = link(&spec, 2);
@@ -112,10 +111,9 @@ fn each_step_down_the_rates_has_its_own_error_ratio() {
         error_slope_per_db: 0.5,
         ..at_snr(bare(), 16.5)
     };
-    let rates = Rates::new(&spec);
     let air_bytes = Phy::air_bytes(100);
-    let error = |mcs| rates.error_ratio(mcs, 16.5, air_bytes);
-    assert_eq!(rates.settled(16.5), 4);
+    let error = |mcs| spec.error_ratio(mcs, 16.5, air_bytes);
+    assert_eq!(spec.settled(16.5), 4);
     let mut link = link(&spec, 3);
     delays(&mut link, COUNT, 4_000_000);
     let counts = link.counts();
@@ -259,16 +257,15 @@ fn rayleigh_fading_loses_what_its_density_says() {
         rate_margin_db: 0.0,
         ..at_snr(bare(), 10.0)
     };
-    let rates = Rates::new(&spec);
     let air_bytes = Phy::air_bytes(100);
-    let settled = rates.settled(10.0);
+    let settled = spec.settled(10.0);
     // The error ratio over the exponential density of the gain, by the midpoint rule.
     let step = 1e-4;
     let expected: f64 = (0..400_000)
         .map(|index| {
             let gain = (f64::from(index) + 0.5) * step;
             let snr_db = 10.0 + 10.0 * gain.log10();
-            step * (-gain).exp() * rates.error_ratio(settled, snr_db, air_bytes)
+            step * (-gain).exp() * spec.error_ratio(settled, snr_db, air_bytes)
         })
         .sum();
     let mut link = link(&spec, 7);
