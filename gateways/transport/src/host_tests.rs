@@ -74,7 +74,7 @@ fn a_sentinel_keeps_the_stamps_when_a_realtime_thread_starves_the_kernel() {
 }
 
 #[test]
-fn a_probe_in_a_realtime_thread_ends_and_says_where_it_ran() {
+fn a_probe_in_a_realtime_thread_ends() {
     let mut settings = ProbeSettings::loopback(TimestampMode::Software);
     settings.bound = Duration::from_millis(300);
     let Some(result) = in_a_realtime_thread(|| arm_and_probe(&settings)) else {
@@ -83,7 +83,6 @@ fn a_probe_in_a_realtime_thread_ends_and_says_where_it_ran() {
     };
     let (report, _sentinel) = result.unwrap();
     println!("{report:?}");
-    assert_eq!(report.is_caller_realtime, Some(true));
     assert_ne!(report.rx_software, Availability::NotOffered);
     if report.rx_software == Availability::Seen {
         assert!(report.attempts >= settings.proof_count);

@@ -5,7 +5,7 @@
 use core::time::Duration;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::os::fd::BorrowedFd;
-use std::{fs, io, thread};
+use std::{io, thread};
 
 use hil_core::time::Instant;
 use nix::poll::{PollFd, PollFlags, ppoll};
@@ -90,15 +90,10 @@ pub struct ProbeReport {
     pub capabilities: Option<TimestampCapabilities>,
     /// Datagrams sent to find the receive stamps.
     pub attempts: u32,
-    /// Datagrams sent to find the transmit stamps.
-    pub transmit_attempts: u32,
     /// Why transmit probes did not leave, if some did not.
     pub newest_refusal: Option<SendRefusal>,
     /// Time the probe took.
     pub waited_ns: i64,
-    /// The calling thread has a real-time policy, so it may have kept the kernel's worker from
-    /// running; `None` when the policy could not be read.
-    pub is_caller_realtime: Option<bool>,
 }
 
 /// Keeps the kernel's receive stamps switched on. Hold it as long as any receiver needs them.
@@ -167,10 +162,8 @@ pub fn arm_and_probe(settings: &ProbeSettings) -> Result<(ProbeReport, Sentinel)
         tx_hardware: judge(seen.hardware, claims_tx_hardware),
         capabilities,
         attempts,
-        transmit_attempts: seen.attempts,
         newest_refusal: seen.newest_refusal,
         waited_ns: monotonic_now()?.ns_since(start),
-        is_caller_realtime: is_this_thread_realtime(),
     };
     let sentinel = Sentinel {
         _receiver: receiver,
@@ -250,7 +243,6 @@ struct TransmitFinding {
     software: bool,
     scheduled: bool,
     hardware: bool,
-    attempts: u32,
     newest_refusal: Option<SendRefusal>,
 }
 
@@ -269,7 +261,6 @@ fn probe_transmit(
     let end = monotonic_now()? + settings.bound;
     let mut in_row = [0_u32; 3];
     loop {
-        finding.attempts += 1;
         let seen = match sender.send(PROBE_DATAGRAM) {
             Ok(token) => collect_stamps(sender, token, mode)?,
             Err(refusal) => {
@@ -351,16 +342,6 @@ fn wait(descriptor: Option<BorrowedFd<'_>>, flags: PollFlags, bound: Duration) -
     }
 }
 
-/// Whether the policy of this thread is `SCHED_FIFO` (1), `SCHED_RR` (2) or `SCHED_DEADLINE`
-/// (6): field 41 of `/proc/thread-self/stat` (proc(5)).
-fn is_this_thread_realtime() -> Option<bool> {
-    let line = fs::read_to_string("/proc/thread-self/stat").ok()?;
-    // The name, field 2, may contain spaces and brackets; field 3 follows its last bracket.
-    let (_, fields) = line.rsplit_once(") ")?;
-    let policy = fields.split_ascii_whitespace().nth(41 - 3)?;
-    Some(matches!(policy, "1" | "2" | "6"))
-}
-
 #[cfg(test)]
 mod tests {
     use hil_core::time::duration_ns;
@@ -401,7 +382,7 @@ mod tests {
     fn a_run_without_stamps_probes_nothing() {
         let settings = ProbeSettings::loopback(TimestampMode::Off);
         let (report, _sentinel) = arm_and_probe(&settings).unwrap();
-        assert_eq!((report.attempts, report.transmit_attempts), (0, 0));
+        assert_eq!(report.attempts, 0);
         assert_eq!(report.rx_software, Availability::NotOffered);
     }
 
@@ -420,10 +401,5 @@ mod tests {
         settings.interface = Some("lo".into());
         let error = arm_and_probe(&settings).unwrap_err();
         assert!(matches!(error, ProbeError::NoTarget { .. }), "{error}");
-    }
-
-    #[test]
-    fn the_policy_of_a_thread_can_be_read() {
-        assert!(is_this_thread_realtime().is_some());
     }
 }

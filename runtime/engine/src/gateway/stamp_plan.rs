@@ -212,10 +212,8 @@ mod tests {
             tx_hardware: Availability::NotOffered,
             capabilities: None,
             attempts: 5,
-            transmit_attempts: 5,
             newest_refusal: None,
             waited_ns: 0,
-            is_caller_realtime: Some(false),
         }
     }
 
