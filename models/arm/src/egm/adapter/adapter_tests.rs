@@ -78,7 +78,7 @@ fn each_clients_datagram_is_taken_or_refused_for_what_it_is() {
     let outcome = |axes: Axes, datagram: &[u8]| match opened(axes).decode(datagram) {
         Ok(command) if command.flags == 0 => "position",
         Ok(_) => "position and speed",
-        Err(refusal) => refusal.label(),
+        Err(refusal) => refusal.cause().label(),
     };
     for (name, datagram) in all() {
         let both = [Axes::Six, Axes::Seven].map(|axes| outcome(axes, &datagram));
@@ -288,7 +288,11 @@ fn limits_bind_exactly_and_survive_the_conversion_to_degrees() {
             let mut beyond = limits;
             beyond[place] *= 1.0 + 1e-6;
             assert_eq!(
-                sensor.command(&command(beyond)).unwrap_err().label(),
+                sensor
+                    .command(&command(beyond))
+                    .unwrap_err()
+                    .cause()
+                    .label(),
                 "outside joint limits"
             );
         }

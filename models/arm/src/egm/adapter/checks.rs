@@ -3,7 +3,7 @@
 use crate::egm::adapter::Axes;
 use crate::egm::wire::messages::{EgmHeader, EgmJoints};
 use crate::egm::wire::{
-    EXTERNAL_PLACE, MessageType, ROBOT_JOINT_COUNT, Refusal, WireError, WireJoints, message_type,
+    EXTERNAL_PLACE, MessageType, ROBOT_JOINT_COUNT, Refusal, WireJoints, message_type,
 };
 use crate::yumi::arm::{POSITION_MAX_RAD, POSITION_MIN_RAD};
 use crate::yumi::{CHAIN_TO_MAKER, Joints};
@@ -21,10 +21,10 @@ pub const FEEDBACK_SLACK_RAD: f64 = 5.0_f64.to_radians();
 pub const SPEED_REFERENCE_MAX_RAD_PER_S: f64 = 1000.0_f64.to_radians();
 
 /// Why `datagram`, which should have been an `expected`, could not be decoded.
-pub(super) fn undecodable(error: WireError, datagram: &[u8], expected: MessageType) -> Refusal {
+pub(super) fn undecodable(error: Refusal, datagram: &[u8], expected: MessageType) -> Refusal {
     match message_type(datagram) {
         Some(found) if found != expected => wrong_type(found as i32, expected),
-        _ => error.into(),
+        _ => error,
     }
 }
 

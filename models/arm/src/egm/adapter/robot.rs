@@ -10,8 +10,8 @@ use crate::egm::adapter::checks::{self, Sender};
 use crate::egm::adapter::{Axes, REORDERING_MAX_MS, RobotWare};
 use crate::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
 use crate::egm::wire::messages::{
-    EgmCartesian, EgmClock, EgmEuler, EgmFeedBack, EgmHeader, EgmJoints, EgmPlanned, EgmPose,
-    EgmQuaternion, EgmSensor, EgmSpeedRef, EgmTimestamp, MessageType,
+    EgmCartesian, EgmClock, EgmEuler, EgmHeader, EgmJoints, EgmPlanned, EgmPose, EgmQuaternion,
+    EgmSensor, EgmSpeedRef, EgmTimestamp, MessageType,
 };
 use crate::egm::wire::robot::{
     EgmMciState, EgmMotorState, EgmRapidCtrlExecState, EgmRobot, MciState, MotorState, RapidState,
@@ -314,39 +314,36 @@ fn time_stamp(at: Duration) -> EgmTimestamp {
 
 /// Clears a message but keeps its lists of joints, which are then empty instead of absent.
 fn recycle(message: &mut EgmSensor) {
-    let planned = message.planned.take().unwrap_or_default();
+    let planned = emptied(message.planned.take());
     let speed = message.speed_ref.take().unwrap_or_default();
     message.clear();
-    message.planned = Some(EgmPlanned {
-        joints: Some(emptied(planned.joints)),
-        external_joints: Some(emptied(planned.external_joints)),
-        ..EgmPlanned::default()
-    });
+    message.planned = Some(planned);
     message.speed_ref = Some(EgmSpeedRef {
-        joints: Some(emptied(speed.joints)),
-        external_joints: Some(emptied(speed.external_joints)),
+        joints: Some(emptied_list(speed.joints)),
+        external_joints: Some(emptied_list(speed.external_joints)),
         ..EgmSpeedRef::default()
     });
 }
 
 /// The same for a robot's message.
 pub(super) fn recycle_robot(message: &mut EgmRobot) {
-    let feed_back = message.feed_back.take().unwrap_or_default();
-    let planned = message.planned.take().unwrap_or_default();
+    let feed_back = emptied(message.feed_back.take());
+    let planned = emptied(message.planned.take());
     message.clear();
-    message.feed_back = Some(EgmFeedBack {
-        joints: Some(emptied(feed_back.joints)),
-        external_joints: Some(emptied(feed_back.external_joints)),
-        ..EgmFeedBack::default()
-    });
-    message.planned = Some(EgmPlanned {
-        joints: Some(emptied(planned.joints)),
-        external_joints: Some(emptied(planned.external_joints)),
-        ..EgmPlanned::default()
-    });
+    message.feed_back = Some(feed_back);
+    message.planned = Some(planned);
 }
 
-fn emptied(list: Option<EgmJoints>) -> EgmJoints {
+fn emptied(part: Option<EgmPlanned>) -> EgmPlanned {
+    let part = part.unwrap_or_default();
+    EgmPlanned {
+        joints: Some(emptied_list(part.joints)),
+        external_joints: Some(emptied_list(part.external_joints)),
+        ..EgmPlanned::default()
+    }
+}
+
+fn emptied_list(list: Option<EgmJoints>) -> EgmJoints {
     let mut list = list.unwrap_or_default();
     list.joints.clear();
     list

@@ -333,6 +333,9 @@ fn a_command_that_shall_reach_no_robot_stays_here() {
     bad.speed_rad_per_s[6] = 18.0;
     assert_eq!(adapter.command(&bad), Ok(()), "a speed that is not meant");
     bad.flags = EgmCommand::HAS_SPEED;
-    assert_eq!(adapter.command(&bad).unwrap_err().label(), "too fast");
+    assert_eq!(
+        adapter.command(&bad).unwrap_err().cause().label(),
+        "too fast"
+    );
     assert_eq!(adapter.commands().accepted(), 1);
 }

@@ -1,6 +1,8 @@
 //! What happens to a command before the control law sees it: checks, the wait for its grid point,
 //! the controller's queue. It knows no session; the controller tells it whether one runs.
 
+use std::collections::VecDeque;
+
 use bytemuck::Zeroable;
 
 use crate::egm::messages::{CommandRefusal, EgmCommand};
@@ -136,23 +138,21 @@ pub(super) struct Inbox {
     policy: QueuePolicy,
     /// Handed over, but no grid point came to them yet: what they meet is decided there, so that
     /// it does not matter how early the driver hands them over.
-    pending: Ring<Arrival>,
-    queue: Ring<Arrival>,
+    pending: VecDeque<Arrival>,
+    queue: VecDeque<Arrival>,
+    /// Commands that the queue holds; as many may be pending, or [`PENDING_CAPACITY_MIN`].
+    queue_capacity: usize,
     counters: CommandCounters,
     has_pending_overflow: bool,
 }
 
 impl Inbox {
     pub(super) fn new(policy: QueuePolicy, queue_capacity: usize) -> Self {
-        let blank = Arrival {
-            at: Instant::ZERO,
-            command: EgmCommand::zeroed(),
-            is_faultless: false,
-        };
         Self {
             policy,
-            pending: Ring::new(queue_capacity.max(PENDING_CAPACITY_MIN), blank),
-            queue: Ring::new(queue_capacity, blank),
+            pending: touched(queue_capacity.max(PENDING_CAPACITY_MIN)),
+            queue: touched(queue_capacity),
+            queue_capacity,
             counters: CommandCounters::default(),
             has_pending_overflow: false,
         }
@@ -170,7 +170,9 @@ impl Inbox {
             command: *command,
             is_faultless: is_faultless(command),
         };
-        if !self.pending.push(&arrival) {
+        if self.pending.len() < self.queue_capacity.max(PENDING_CAPACITY_MIN) {
+            self.pending.push_back(arrival);
+        } else {
             self.counters.dropped += 1;
             self.has_pending_overflow = true;
         }
@@ -192,13 +194,16 @@ impl Inbox {
                 *self.refused_count(fault.refusal) += 1;
                 Fate::Refused(fault)
             }
-            None if self.queue.push(arrival) => Fate::Queued,
+            None if self.queue.len() < self.queue_capacity => {
+                self.queue.push_back(*arrival);
+                Fate::Queued
+            }
             None => {
                 self.counters.dropped += 1;
                 Fate::Dropped
             }
         };
-        self.pending.discard_front();
+        discard_front(&mut self.pending);
         Some((arrived, fate))
     }
 
@@ -223,7 +228,7 @@ impl Inbox {
         };
         take(next);
         match self.policy {
-            QueuePolicy::Fifo1 => self.queue.discard_front(),
+            QueuePolicy::Fifo1 => discard_front(&mut self.queue),
             QueuePolicy::Latest => {
                 self.queue.clear();
                 self.counters.superseded += waiting as u64 - 1;
@@ -251,7 +256,7 @@ impl Inbox {
 
     /// True while the queue is at most half full.
     pub(super) fn has_room_again(&self) -> bool {
-        2 * self.queue.len() <= self.queue.capacity()
+        2 * self.queue.len() <= self.queue_capacity
     }
 
     pub(super) fn counters(&self) -> &CommandCounters {
@@ -259,102 +264,23 @@ impl Inbox {
     }
 }
 
-/// The buffer.
-#[derive(Debug, Clone)]
-pub(super) struct Ring<T> {
-    slots: Box<[T]>,
-    first: usize,
-    len: usize,
+/// An empty queue with room for `capacity` arrivals, all of it touched now.
+fn touched(capacity: usize) -> VecDeque<Arrival> {
+    let blank = Arrival {
+        at: Instant::ZERO,
+        command: EgmCommand::zeroed(),
+        is_faultless: false,
+    };
+    let mut queue = VecDeque::from(vec![blank; capacity]);
+    queue.clear();
+    queue
 }
 
-impl<T: Copy> Ring<T> {
-    /// Room for `capacity` values, all touched now by writing `blank`.
-    pub(super) fn new(capacity: usize, blank: T) -> Self {
-        Self {
-            slots: vec![blank; capacity.max(1)].into_boxed_slice(),
-            first: 0,
-            len: 0,
-        }
-    }
-
-    pub(super) fn len(&self) -> usize {
-        self.len
-    }
-
-    pub(super) fn capacity(&self) -> usize {
-        self.slots.len()
-    }
-
-    fn slot(&self, index: usize) -> usize {
-        let slot = self.first + index;
-        if slot < self.slots.len() {
-            slot
-        } else {
-            slot - self.slots.len()
-        }
-    }
-
-    /// Appends `value`; false when it does not fit.
-    #[must_use]
-    pub(super) fn push(&mut self, value: &T) -> bool {
-        if self.len == self.slots.len() {
-            return false;
-        }
-        self.slots[self.slot(self.len)] = *value;
-        self.len += 1;
-        true
-    }
-
-    pub(super) fn front(&self) -> Option<&T> {
-        (self.len > 0).then(|| &self.slots[self.first])
-    }
-
-    pub(super) fn back(&self) -> Option<&T> {
-        (self.len > 0).then(|| &self.slots[self.slot(self.len - 1)])
-    }
-
-    /// Forgets the oldest.
-    pub(super) fn discard_front(&mut self) {
-        if self.len > 0 {
-            self.first = self.slot(1);
-            self.len -= 1;
-        }
+/// Forgets the oldest.
+fn discard_front(queue: &mut VecDeque<Arrival>) {
+    queue.pop_front();
+    if queue.is_empty() {
         // Starting over at the front keeps a short queue within a few cache lines.
-        if self.len == 0 {
-            self.first = 0;
-        }
-    }
-
-    pub(super) fn clear(&mut self) {
-        (self.first, self.len) = (0, 0);
-    }
-}
-
-#[cfg(test)]
-mod ring_tests {
-    use super::*;
-
-    #[test]
-    fn values_come_out_in_order_and_never_exceed_the_capacity() {
-        let mut ring = Ring::new(3, 0);
-        let (mut next_in, mut next_out) = (0, 0);
-        for step in 0..100 {
-            for _ in 0..step % 5 {
-                let fits = ring.len() < 3;
-                assert_eq!(ring.push(&next_in), fits);
-                next_in += i32::from(fits);
-            }
-            assert_eq!(ring.back().copied(), (ring.len() > 0).then(|| next_in - 1));
-            for _ in 0..step % 3 {
-                assert_eq!(
-                    ring.front().copied(),
-                    (next_out < next_in).then_some(next_out)
-                );
-                next_out += i32::from(ring.front().is_some());
-                ring.discard_front();
-            }
-        }
-        ring.clear();
-        assert_eq!((ring.front(), ring.len(), ring.capacity()), (None, 0, 3));
+        queue.clear();
     }
 }

@@ -184,13 +184,10 @@ fn what_is_not_kept_is_only_what_is_documented() {
 #[test]
 fn what_is_no_message_is_refused() {
     let cut = &one(0, "sensor_joints")[..30];
-    assert!(matches!(decode_sensor(cut), Err(WireError::NotProtobuf(_))));
+    assert!(matches!(decode_sensor(cut), Err(Refusal::NotProtobuf)));
     let long = vec![0; DATAGRAM_BYTES_MAX + 1];
     let length_bytes = long.len();
-    assert_eq!(
-        decode_robot(&long),
-        Err(WireError::TooLong { length_bytes })
-    );
+    assert_eq!(decode_robot(&long), Err(Refusal::TooLong { length_bytes }));
     assert_eq!(
         message_type(&one(0, "path_correction")),
         Some(MessageType::PathCorrection)

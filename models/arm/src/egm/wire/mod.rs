@@ -45,7 +45,7 @@
 //! let mut reply = Vec::new();
 //! wire::encode(&answer, &mut reply);
 //! assert_eq!(reply.len(), 64);
-//! # Ok::<(), wire::WireError>(())
+//! # Ok::<(), wire::Refusal>(())
 //! ```
 
 pub mod messages;
@@ -63,25 +63,11 @@ use crate::yumi::{CHAIN_TO_MAKER, JOINT_COUNT, Joints};
 /// robots stay far below it.
 pub const DATAGRAM_BYTES_MAX: usize = 1472;
 
-/// A datagram that is no message.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum WireError {
-    /// Longer than [`DATAGRAM_BYTES_MAX`].
-    #[error("datagram of {length_bytes} bytes is longer than {DATAGRAM_BYTES_MAX}")]
-    TooLong {
-        /// Its length.
-        length_bytes: usize,
-    },
-    /// Not the bytes of that message.
-    #[error("datagram is not the protobuf message expected")]
-    NotProtobuf(#[source] prost::DecodeError),
-}
-
 /// Decodes a sensor's position guidance.
 ///
 /// # Errors
 /// When the bytes are no such message. What the message says is not judged.
-pub fn decode_sensor(datagram: &[u8]) -> Result<EgmSensor, WireError> {
+pub fn decode_sensor(datagram: &[u8]) -> Result<EgmSensor, Refusal> {
     decode(datagram)
 }
 
@@ -89,7 +75,7 @@ pub fn decode_sensor(datagram: &[u8]) -> Result<EgmSensor, WireError> {
 ///
 /// # Errors
 /// When the bytes are no such message. What the message says is not judged.
-pub fn decode_robot(datagram: &[u8]) -> Result<EgmRobot, WireError> {
+pub fn decode_robot(datagram: &[u8]) -> Result<EgmRobot, Refusal> {
     decode(datagram)
 }
 
@@ -97,24 +83,27 @@ pub fn decode_robot(datagram: &[u8]) -> Result<EgmRobot, WireError> {
 ///
 /// # Errors
 /// When the bytes are no such message. What the message says is not judged.
-pub fn decode_path_correction(datagram: &[u8]) -> Result<EgmSensorPathCorr, WireError> {
+pub fn decode_path_correction(datagram: &[u8]) -> Result<EgmSensorPathCorr, Refusal> {
     decode(datagram)
 }
 
-fn decode<M: Message + Default>(datagram: &[u8]) -> Result<M, WireError> {
+fn decode<M: Message + Default>(datagram: &[u8]) -> Result<M, Refusal> {
     let mut message = M::default();
     merge(datagram, &mut message)?;
     Ok(message)
 }
 
 /// Adds what the datagram says to `message`: with a cleared one, the same as decoding into it.
-pub(crate) fn merge<M: Message>(datagram: &[u8], message: &mut M) -> Result<(), WireError> {
+pub(crate) fn merge<M: Message>(datagram: &[u8], message: &mut M) -> Result<(), Refusal> {
     if datagram.len() > DATAGRAM_BYTES_MAX {
-        return Err(WireError::TooLong {
+        return Err(Refusal::TooLong {
             length_bytes: datagram.len(),
         });
     }
-    message.merge(datagram).map_err(WireError::NotProtobuf)
+    // Which byte it failed at helps nobody: the whole datagram is refused and counted.
+    message
+        .merge(datagram)
+        .map_err(|_at_byte| Refusal::NotProtobuf)
 }
 
 /// Only the header: to tell a message of another type from bytes that are no message.

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::egm::wire::{DATAGRAM_BYTES_MAX, ROBOT_JOINT_COUNT, WireError};
+use crate::egm::wire::{DATAGRAM_BYTES_MAX, ROBOT_JOINT_COUNT};
 
 /// One datagram or command that is not taken.
 ///
@@ -93,15 +93,6 @@ pub enum Refusal {
     },
 }
 
-impl From<WireError> for Refusal {
-    fn from(error: WireError) -> Self {
-        match error {
-            WireError::TooLong { length_bytes } => Self::TooLong { length_bytes },
-            WireError::NotProtobuf(_) => Self::NotProtobuf,
-        }
-    }
-}
-
 /// Makes [`Cause`] of the names of all refusals and a few words for each.
 macro_rules! causes {
     ($($cause:ident: $label:literal),+ $(,)?) => {
@@ -154,13 +145,6 @@ causes! {
     Repeated: "duplicated",
 }
 
-impl Refusal {
-    /// A few words for a report.
-    pub const fn label(&self) -> &'static str {
-        self.cause().label()
-    }
-}
-
 /// What became of the datagrams or commands of one direction. Without allocation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct DatagramCounts {
@@ -191,14 +175,9 @@ impl DatagramCounts {
         self.refused_counts[cause as usize]
     }
 
-    /// Those refused for any cause.
-    pub fn refused_total(&self) -> u64 {
-        self.refused_counts.iter().sum()
-    }
-
     /// All that came.
     pub fn total(&self) -> u64 {
-        self.accepted_count + self.refused_total()
+        self.accepted_count + self.refused_counts.iter().sum::<u64>()
     }
 
     /// Cause and count of each cause that occurred.
@@ -223,10 +202,7 @@ mod tests {
             };
             assert_eq!(counts.note(outcome), outcome);
         }
-        assert_eq!(
-            (counts.accepted(), counts.refused_total(), counts.total()),
-            (4, 6, 10)
-        );
+        assert_eq!((counts.accepted(), counts.total()), (4, 10));
         let causes: Vec<_> = counts.causes().collect();
         assert_eq!(causes, [(Cause::MissingHeader, 3), (Cause::NotFinite, 3)]);
     }
@@ -243,6 +219,6 @@ mod tests {
             said.starts_with("12 joints and 1 external axes do not make 7 joints"),
             "{said}"
         );
-        assert_eq!(refusal.label(), "wrong number of joints");
+        assert_eq!(refusal.cause().label(), "wrong number of joints");
     }
 }
