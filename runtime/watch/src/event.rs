@@ -1,18 +1,13 @@
 //! What an observer hears of a run, one thing at a time.
 
 use bytemuck::Pod;
-use hil_account::RecordEvent;
-use hil_account::nic_clock::NicClockRecord;
+use hil_account::{MessageName, RecordEvent};
 use hil_core::message::Envelope;
-use hil_core::record::{
-    EgressRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
-};
+use hil_core::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord};
 use hil_link::condition::LinkConditionRecord;
 
 use super::feed::WatchedChannel;
 use super::follow::Batch;
-use hil_rundir::adapter_record::{AdapterReceivedRecord, AdapterSentRecord};
-use hil_rundir::radio_record::RadioRecord;
 use hil_rundir::record::RecordKind;
 
 /// Something that happened in a run. Messages and records of one process and kind come in order;
@@ -34,8 +29,6 @@ pub enum Event<'a> {
     Record {
         /// The channel, as record files name it.
         channel: &'a str,
-        /// The process.
-        writer: &'a str,
         /// True when the process runs on this host; else it came at the end, from another one.
         is_of_this_host: bool,
         /// What.
@@ -65,7 +58,7 @@ pub enum Origin {
     OtherHost,
 }
 
-/// A record of any kind but a message or a frame.
+/// A record of the way of a message, or of an order to a link.
 #[derive(Debug, Clone, Copy)]
 pub enum Record {
     /// A producer published.
@@ -76,34 +69,28 @@ pub enum Record {
     Egress(EgressRecord),
     /// A gateway received.
     Ingress(IngressRecord),
-    /// A clock exchange.
-    RoundTrip(RoundTripRecord),
-    /// An adapter sent.
-    AdapterSent(AdapterSentRecord),
-    /// An adapter received.
-    AdapterReceived(AdapterReceivedRecord),
-    /// A network card's clock was read.
-    NicClock(NicClockRecord),
-    /// A radio was asked, or said something.
-    Radio(RadioRecord),
     /// An emulated link was given an order; the channel is `hil/link/<link>/<direction>`.
     LinkCondition(LinkConditionRecord),
 }
 
 impl Record {
-    /// The record as the account of its channel takes it; `None` of a kind that says nothing of the
-    /// way of a message.
+    /// The message that it is of; `None` of an order to a link.
+    pub fn message(&self) -> Option<MessageName> {
+        self.of_message().map(|event| event.message())
+    }
+
+    /// The record as the account of its channel takes it; `None` of an order to a link.
     pub(crate) const fn of_message(&self) -> Option<RecordEvent> {
         match *self {
             Self::Published(record) => Some(RecordEvent::Published(record)),
             Self::Taken(record) => Some(RecordEvent::Taken(record)),
             Self::Egress(record) => Some(RecordEvent::Egress(record)),
             Self::Ingress(record) => Some(RecordEvent::Ingress(record)),
-            _ => None,
+            Self::LinkCondition(_) => None,
         }
     }
 
-    /// The records of a batch, in order; none of a batch of messages.
+    /// The records of a batch, in order; none of a batch of another kind.
     pub(super) fn each(batch: &Batch<'_>, take: &mut dyn FnMut(Self)) {
         fn all<R: Pod>(batch: &Batch<'_>, of: fn(R) -> Record, take: &mut dyn FnMut(Record)) {
             batch.records().map(of).for_each(take);
@@ -113,13 +100,8 @@ impl Record {
             RecordKind::Taken => all(batch, Self::Taken, take),
             RecordKind::Egress => all(batch, Self::Egress, take),
             RecordKind::Ingress => all(batch, Self::Ingress, take),
-            RecordKind::RoundTrip => all(batch, Self::RoundTrip, take),
-            RecordKind::AdapterSent => all(batch, Self::AdapterSent, take),
-            RecordKind::AdapterReceived => all(batch, Self::AdapterReceived, take),
-            RecordKind::NicClock => all(batch, Self::NicClock, take),
-            RecordKind::Radio => all(batch, Self::Radio, take),
             RecordKind::LinkCondition => all(batch, Self::LinkCondition, take),
-            RecordKind::Message | RecordKind::Frame | RecordKind::NoRoom => {}
+            _ => {}
         }
     }
 }

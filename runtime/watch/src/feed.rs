@@ -8,7 +8,7 @@ use std::time::{Duration, Instant as WallInstant};
 use hil_core::message::Envelope;
 
 use super::event::{Event, Origin, Record};
-use super::follow::{Batch, RecordFollower};
+use super::follow::RecordFollower;
 use super::passive::{PassiveCounters, PassiveReader};
 use super::shared::Shared;
 use super::since::Since;
@@ -377,19 +377,36 @@ impl Feed {
                 }
                 take(Event::Record {
                     channel: name,
-                    writer: batch.writer,
                     is_of_this_host,
                     record,
                 });
             });
             match channels.get(name) {
                 Some(channel) => {
-                    let mut admits = |one: &Envelope| {
-                        since.as_mut().is_none_or(|since| {
-                            since.admits(name, one.epoch, one.sequence, is_of_this_host)
-                        })
+                    let origin = match channel.source {
+                        Some(Source::Records {}) => Origin::Records,
+                        Some(Source::SharedMemory { .. }) | None => Origin::OtherHost,
                     };
-                    give_messages(batch, channel, shared, &mut admits, take);
+                    for (envelope, payload) in batch.messages() {
+                        let Envelope {
+                            epoch, sequence, ..
+                        } = envelope;
+                        let is_admitted = since.as_mut().is_none_or(|since| {
+                            since.admits(name, epoch, sequence, is_of_this_host)
+                        });
+                        let mut is_new = || {
+                            let shared = shared.as_deref_mut();
+                            shared.is_none_or(|shared| shared.seen.insert(epoch, sequence))
+                        };
+                        if is_admitted && is_new() {
+                            take(Event::Message {
+                                channel,
+                                origin,
+                                envelope: &envelope,
+                                payload,
+                            });
+                        }
+                    }
                 }
                 None if batch.messages().next().is_some() => {
                     problems.push(format!("{name}: no channel of the manifest; left out"));
@@ -425,33 +442,6 @@ impl Feed {
                 Poll::Over
             }
             Stage::Running | Stage::Orphaned(_) | Stage::Over => Poll::Idle,
-        }
-    }
-}
-
-fn give_messages(
-    batch: &Batch<'_>,
-    channel: &WatchedChannel,
-    mut shared: Option<&mut Shared>,
-    admits: &mut dyn FnMut(&Envelope) -> bool,
-    take: &mut dyn FnMut(Event<'_>),
-) {
-    let origin = match channel.source {
-        Some(Source::Records {}) => Origin::Records,
-        Some(Source::SharedMemory { .. }) | None => Origin::OtherHost,
-    };
-    for (envelope, payload) in batch.messages() {
-        let mut is_new = || {
-            let shared = shared.as_deref_mut();
-            shared.is_none_or(|shared| shared.seen.insert(envelope.epoch, envelope.sequence))
-        };
-        if admits(&envelope) && is_new() {
-            take(Event::Message {
-                channel,
-                origin,
-                envelope: &envelope,
-                payload,
-            });
         }
     }
 }

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use hil_core::message::Envelope;
 
-use hil_shm::{ChannelError, Domain, InputCounters, RawInput, SequenceTracker, observer_depth};
+use hil_shm::{ChannelError, Domain, RawInput, SequenceTracker, observer_depth};
 
 /// What came, and what did not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -17,10 +17,6 @@ pub struct PassiveCounters {
     pub earlier_count: u64,
     /// Numbers that never came. Behind a gateway the network's losses are among them.
     pub gap_count: u64,
-    /// Messages that came after one with a higher number; only a gateway can cause that.
-    pub reordered_count: u64,
-    /// New starts of the writer.
-    pub restart_count: u64,
 }
 
 /// Reads one channel.
@@ -78,20 +74,11 @@ impl PassiveReader {
 
     /// What came so far.
     pub fn counters(&self) -> PassiveCounters {
-        let InputCounters {
-            received_count,
-            missed_count,
-            reordered_count,
-            outdated_count,
-            restart_count,
-            ..
-        } = self.tracker.counters();
+        let counters = self.tracker.counters();
         PassiveCounters {
-            received_count: received_count + outdated_count,
+            received_count: counters.received_count + counters.outdated_count,
             earlier_count: self.earlier_count.unwrap_or(0),
-            gap_count: missed_count,
-            reordered_count,
-            restart_count,
+            gap_count: counters.missed_count,
         }
     }
 }

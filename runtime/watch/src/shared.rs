@@ -74,8 +74,6 @@ impl Shared {
             received_count: self.past.received_count + now.received_count,
             earlier_count: self.past.earlier_count + now.earlier_count,
             gap_count: self.past.gap_count + now.gap_count,
-            reordered_count: self.past.reordered_count + now.reordered_count,
-            restart_count: self.past.restart_count + now.restart_count,
         }
     }
 

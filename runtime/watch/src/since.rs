@@ -40,8 +40,9 @@ impl Since {
         record: &Record,
         is_of_this_host: bool,
     ) -> bool {
-        let message = record.of_message().map(|event| event.message());
-        message.is_none_or(|one| self.admits(channel, one.epoch, one.sequence, is_of_this_host))
+        record
+            .message()
+            .is_none_or(|one| self.admits(channel, one.epoch, one.sequence, is_of_this_host))
     }
 
     fn note(&mut self, channel: &str, epoch: u32, sequence: u64) {

@@ -170,34 +170,12 @@ pub struct Confirmed {
 pub struct RunLinks {
     records: PathBuf,
     directions: Vec<LinkDirection>,
-    /// Every link of the topology and what carries it.
-    carried: BTreeMap<String, Carrier>,
+    /// Every link of the topology and the topology's word for what carries it.
+    carried: BTreeMap<String, String>,
 }
 
-/// What carries a link.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Carrier {
-    /// A model of a network.
-    Emulated,
-    /// Something real, by the topology's word for it.
-    Real(String),
-}
-
-impl Carrier {
-    fn from_word(word: &str) -> Self {
-        match word {
-            "emulated" => Self::Emulated,
-            real => Self::Real(real.to_owned()),
-        }
-    }
-
-    fn word(&self) -> &str {
-        match self {
-            Self::Emulated => "emulated",
-            Self::Real(word) => word,
-        }
-    }
-}
+/// The word for a model of a network; any other is for something real.
+const EMULATED: &str = "emulated";
 
 impl RunLinks {
     /// Reads which links the run in `folder` has. The run need not go on any more.
@@ -230,16 +208,8 @@ impl RunLinks {
         &self.directions
     }
 
-    /// Every link of the run and what carries it.
-    pub fn carried(&self) -> &BTreeMap<String, Carrier> {
-        &self.carried
-    }
-
     /// Every order that was given to `direction`, oldest first.
-    ///
-    /// # Errors
-    /// When the gateway's records cannot be read.
-    pub fn orders(&self, direction: &LinkDirection) -> Result<Vec<LinkConditionRecord>, LinkError> {
+    fn orders(&self, direction: &LinkDirection) -> Result<Vec<LinkConditionRecord>, LinkError> {
         Ok(orders_on_record(&self.records, &direction.order_channel())?)
     }
 
@@ -272,13 +242,13 @@ impl RunLinks {
                 asked: name.to_owned(),
                 known: self.known(),
             }),
-            Some(Carrier::Real(via)) => Err(LinkError::NotEmulated {
-                link,
-                via: via.clone(),
-            }),
-            Some(Carrier::Emulated) => Err(LinkError::Elsewhere {
+            Some(via) if via == EMULATED => Err(LinkError::Elsewhere {
                 link,
                 way: way.unwrap_or(Way::Forward),
+            }),
+            Some(via) => Err(LinkError::NotEmulated {
+                link,
+                via: via.clone(),
             }),
         }
     }
@@ -301,7 +271,7 @@ impl RunLinks {
             return "none".to_owned();
         }
         let words = self.carried.iter();
-        let words = words.map(|(link, carrier)| format!("{link} ({})", carrier.word()));
+        let words = words.map(|(link, via)| format!("{link} ({via})"));
         words.collect::<Vec<_>>().join(", ")
     }
 
@@ -436,11 +406,11 @@ fn add_directions(directions: &mut Vec<LinkDirection>, launch: &WorkerLaunch, wo
 }
 
 /// What carries each link, by the manifest's topology.
-fn carried(topology: &Value) -> BTreeMap<String, Carrier> {
+fn carried(topology: &Value) -> BTreeMap<String, String> {
     let links = topology.get("links").and_then(Value::as_object);
     let words = links.into_iter().flatten().filter_map(|(name, link)| {
         let via = link.get("via")?.as_str()?;
-        Some((name.clone(), Carrier::from_word(via)))
+        Some((name.clone(), via.to_owned()))
     });
     words.collect()
 }

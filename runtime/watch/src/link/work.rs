@@ -7,7 +7,7 @@ use hil_link::condition::LinkCondition;
 use serde_json::{Value, json};
 
 use super::cli::{LinkCommand, RunChoice, SetArgs};
-use super::{Carrier, Confirmed, LinkDirection, LinkError, RunLinks};
+use super::{Confirmed, EMULATED, LinkDirection, LinkError, RunLinks};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::console::{CommandEnd, Console};
 use hil_rundir::select;
@@ -86,7 +86,7 @@ fn show(choice: &RunChoice) -> Outcome<String> {
     let links = open(choice)?;
     let mut rows = Vec::new();
     let mut text = Vec::new();
-    for direction in links.directions() {
+    for direction in &links.directions {
         let (condition, since) = links.condition(direction).map_err(|error| end_of(&error))?;
         let ago_s = since.map(|since| MonotonicClock::now().seconds_since(since));
         rows.push(json!({
@@ -100,16 +100,12 @@ fn show(choice: &RunChoice) -> Outcome<String> {
         }));
         text.push(shown(direction, condition, ago_s));
     }
-    for (link, carrier) in links.carried() {
-        match carrier {
-            Carrier::Real(via) => {
-                rows.push(json!({ "direction": link, "via": via }));
-                text.push(format!("{link}: carried by {via}, nothing to set"));
-            }
-            Carrier::Emulated if links.directions().iter().all(|one| one.link != *link) => {
-                text.push(format!("{link}: emulated on another host"));
-            }
-            Carrier::Emulated => {}
+    for (link, via) in &links.carried {
+        if via != EMULATED {
+            rows.push(json!({ "direction": link, "via": via }));
+            text.push(format!("{link}: carried by {via}, nothing to set"));
+        } else if links.directions.iter().all(|one| one.link != *link) {
+            text.push(format!("{link}: emulated on another host"));
         }
     }
     if choice.json {

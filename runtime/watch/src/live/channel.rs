@@ -4,9 +4,8 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::cli::{ChannelArgs, ChannelCommand};
+use super::cli::{ChannelArgs, ChannelCommand, WindowArgs};
 use super::observer::{ObserveError, Observer};
-use super::pace::Pace;
 use super::top::via;
 use super::{delay, echo, hz};
 use hil_platform::console::{CommandEnd, Console};
@@ -83,18 +82,64 @@ pub(super) enum Scope {
     Total,
 }
 
-/// How many of an observer's problems the user was told.
-#[derive(Debug, Default)]
-pub(super) struct ReportedProblems(usize);
+/// What is said of the messages of one scope.
+pub(super) struct Said {
+    pub(super) text: String,
+    pub(super) message_count: u64,
+}
 
-impl ReportedProblems {
-    /// Tells those that are new.
-    pub(super) fn tell(&mut self, observer: &Observer, console: &mut Console) {
-        let problems = observer.problems();
-        for problem in problems.iter().skip(self.0) {
+/// Says what `answer` gives of each window, until one is enough, the run is over or a signal comes, and of
+/// all messages then. What lies further back than `kept` is forgotten; `nothing` says what did not happen
+/// where the only window has no message.
+pub(super) fn by_windows(
+    mut observer: Observer,
+    args: &WindowArgs,
+    kept: Duration,
+    nothing: &'static str,
+    signals: &Signals,
+    console: &mut Console,
+    answer: &mut dyn FnMut(&mut Observer, Scope) -> Result<Said, ChannelError>,
+) -> Result<CommandEnd, ChannelError> {
+    let mut told_count = 0;
+    let mut tell = |observer: &Observer, console: &mut Console| {
+        for problem in observer.problems().iter().skip(told_count) {
             console.warn(problem);
         }
-        self.0 = problems.len();
+        told_count = observer.problems().len();
+    };
+    tell(&observer, console);
+    loop {
+        let is_whole = observer.poll_for(args.window, signals);
+        tell(&observer, console);
+        let is_last = !is_whole || observer.is_over();
+        if is_whole {
+            let said = answer(&mut observer, Scope::Window)?;
+            let is_heard = console.result(&said.text);
+            if is_heard && args.once && said.message_count == 0 {
+                return Err(ChannelError::Nothing {
+                    channel: args.which.channel.clone(),
+                    why: nothing,
+                    window_s: args.window.as_secs_f64(),
+                });
+            }
+            if !is_heard || args.once {
+                return Ok(CommandEnd::Done);
+            }
+        }
+        if is_last {
+            console.result(&answer(&mut observer, Scope::Total)?.text);
+            return Ok(end_of(is_whole));
+        }
+        observer.trim(kept);
+    }
+}
+
+/// How a command ends whose last window is whole, or was cut short by a signal.
+const fn end_of(is_whole: bool) -> CommandEnd {
+    if is_whole {
+        CommandEnd::Done
+    } else {
+        CommandEnd::Interrupted
     }
 }
 
@@ -161,16 +206,9 @@ fn list(
         .iter()
         .map(|one| ends(&mut observer, one))
         .collect();
-    for one in &channels {
-        observer.count_unrecorded(&one.name);
-    }
+    observer.count_all_unrecorded();
     let is_whole = observer.poll_for(window, signals);
     let rows = channels.iter().zip(ends).map(|(one, ends)| {
-        let arrivals = observer.arrivals(&one.name).unwrap_or_default();
-        let mut pace = Pace::default();
-        for arrival in &arrivals {
-            pace.take(arrival);
-        }
         let topology = observer.topology();
         Row {
             name: one.name.clone(),
@@ -180,7 +218,7 @@ fn list(
             from_host: one.from_host.clone(),
             to_host: one.to_host.clone(),
             via: via(topology, topology.and_then(|all| all.channel(&one.name))),
-            rate_hz: pace.turn().rate_hz,
+            rate_hz: observer.rate_hz(&one.name),
             ends,
         }
     });
@@ -196,11 +234,7 @@ fn list(
     for problem in observer.problems() {
         console.warn(problem);
     }
-    if is_whole {
-        CommandEnd::Done
-    } else {
-        CommandEnd::Interrupted
-    }
+    end_of(is_whole)
 }
 
 fn ends(observer: &mut Observer, channel: &ChannelDescription) -> Vec<HostEnds> {

@@ -4,15 +4,13 @@
 use std::time::Duration;
 
 use hil_account::{ChannelAccount, Closing, MessageFate, SegmentMetrics};
-use hil_clock::ClockMap;
 use hil_core::time::duration_ns;
 use hil_stats::histogram::Distribution;
-use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::channel::{ChannelError, ReportedProblems, Scope};
+use super::channel::{ChannelError, Said, Scope, by_windows};
 use super::cli::WindowArgs;
-use super::observer::Observer;
+use super::observer::{ClockFigures, Observer};
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_platform::text::grouped;
@@ -21,6 +19,7 @@ use hil_present::terminal::canvas::Style;
 use hil_present::terminal::render;
 use hil_present::units::{duration, unsigned_duration};
 use hil_present::{Section, Tone};
+use hil_report::clock_summary::ClockRung;
 use hil_report::quantile_table;
 
 /// The totals reach back no further: they are of messages that are kept in memory.
@@ -36,93 +35,25 @@ pub(super) fn run(
     console: &mut Console,
 ) -> Result<CommandEnd, ChannelError> {
     let name = observer.channel(&args.which.channel)?.name.clone();
-    let mut reported = ReportedProblems::default();
-    reported.tell(&observer, console);
-    observer.settle(signals);
-    loop {
-        let is_whole = observer.poll_for(args.window, signals);
-        reported.tell(&observer, console);
-        let is_last = !is_whole || observer.is_over();
-        if is_whole {
-            let account = observer.account(&name, args.window);
-            let clock = clock(&observer, &name);
-            let (of, account) = (Scope::Window, account.as_ref());
-            let text = answer(&name, of, args.window, account, &clock, args.json)?;
-            if !console.result(&text) {
-                return Ok(CommandEnd::Done);
-            }
-            if args.once {
-                let is_empty = account.is_none_or(|account| account.published_count == 0);
-                return if is_empty {
-                    Err(ChannelError::Nothing {
-                        channel: name,
-                        why: "no message was recorded here",
-                        window_s: args.window.as_secs_f64(),
-                    })
-                } else {
-                    Ok(CommandEnd::Done)
-                };
-            }
-        }
-        if is_last {
-            let account = observer.account(&name, TOTAL_MAX);
-            let clock = clock(&observer, &name);
-            let (of, account) = (Scope::Total, account.as_ref());
-            console.result(&answer(&name, of, TOTAL_MAX, account, &clock, args.json)?);
-            return Ok(if is_whole {
-                CommandEnd::Done
-            } else {
-                CommandEnd::Interrupted
-            });
-        }
-        observer.trim(TOTAL_MAX);
-    }
-}
-
-/// What relates the clocks of a channel's two hosts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-enum ClockRelation {
-    #[serde(rename = "one clock")]
-    OneClock,
-    #[serde(rename = "exchanges")]
-    Exchanges,
-    #[serde(rename = "not aligned")]
-    NotAligned,
-}
-
-/// How the clocks of a channel's two hosts stand to each other.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-struct Clock {
-    relation: ClockRelation,
-    /// Exchanges of the last half minute.
-    exchange_count: Option<u64>,
-    /// Estimated offset of the consumer's host against the producer's, nanoseconds.
-    offset_ns: Option<i64>,
-}
-
-fn clock(observer: &Observer, channel: &str) -> Clock {
-    let one = Clock {
-        relation: ClockRelation::OneClock,
-        exchange_count: None,
-        offset_ns: Some(0),
+    let settling = observer.longest_settling();
+    observer.poll_for(settling, signals);
+    let answer = &mut |observer: &mut Observer, of| {
+        let window = match of {
+            Scope::Window => args.window,
+            Scope::Total => TOTAL_MAX,
+        };
+        let account = observer.account(&name, window);
+        let hosts = observer.hosts_of(&name);
+        let clock = hosts.map_or(ClockFigures::ONE_CLOCK, |(from, to)| {
+            observer.clock(&from, &to)
+        });
+        Ok(Said {
+            text: answer(&name, of, window, account.as_ref(), &clock, args.json)?,
+            message_count: account.map_or(0, |account| account.published_count),
+        })
     };
-    let Some((from, to)) = observer.hosts_of(channel) else {
-        return one;
-    };
-    if observer.has_one_clock() {
-        return one;
-    }
-    let map = observer.clock_map(&from, &to);
-    let figures = map.as_ref().map(ClockMap::metrics);
-    Clock {
-        relation: if figures.is_some() {
-            ClockRelation::Exchanges
-        } else {
-            ClockRelation::NotAligned
-        },
-        exchange_count: figures.map(|figures| figures.exchange_count),
-        offset_ns: figures.and_then(|figures| Some(figures.offset?.estimate_ns)),
-    }
+    let nothing = "no message was recorded here";
+    by_windows(observer, args, TOTAL_MAX, nothing, signals, console, answer)
 }
 
 fn answer(
@@ -130,7 +61,7 @@ fn answer(
     of: Scope,
     window: Duration,
     account: Option<&ChannelAccount>,
-    clock: &Clock,
+    clock: &ClockFigures,
     is_json: bool,
 ) -> Result<String, ChannelError> {
     if is_json {
@@ -153,7 +84,7 @@ fn answer(
     Ok(text(&format!("{channel}, {of}"), account, clock))
 }
 
-fn metrics(account: &ChannelAccount, clock: &Clock) -> Value {
+fn metrics(account: &ChannelAccount, clock: &ClockFigures) -> Value {
     let each = account.segments.iter();
     let segments: Vec<Value> = each
         .map(|segment| {
@@ -183,7 +114,14 @@ fn metrics(account: &ChannelAccount, clock: &Clock) -> Value {
         "fates": fates,
         "end_to_end": quantiles(&account.end_to_end.distribution),
         "bound_ns": account.end_to_end.alignment_bound_ns,
-        "clock": clock,
+        "clock": {
+            "relation": match clock.rung {
+                ClockRung::Exchanges => "exchanges",
+                rung => rung.label(),
+            },
+            "exchange_count": clock.exchange_count,
+            "offset_ns": clock.offset_ns,
+        },
         "segments": segments,
         "closing": closing,
     })
@@ -203,7 +141,7 @@ fn quantiles(distribution: &Distribution) -> Value {
     }
 }
 
-fn text(head: &str, account: &ChannelAccount, clock: &Clock) -> String {
+fn text(head: &str, account: &ChannelAccount, clock: &ClockFigures) -> String {
     let mut section = Section::new("delay", head, counted(account.published_count, "message"));
     let fates = account.fates.iter().filter_map(|(fate, count)| {
         let words = match fate {
@@ -222,8 +160,8 @@ fn text(head: &str, account: &ChannelAccount, clock: &Clock) -> String {
     section.fact(
         "clock",
         Tone::Plain,
-        match (clock.relation, end_to_end.alignment_bound_ns) {
-            (ClockRelation::OneClock, _) => "both ends read one clock".to_owned(),
+        match (clock.rung, end_to_end.alignment_bound_ns) {
+            (ClockRung::OneClock, _) => "both ends read one clock".to_owned(),
             (_, Some(bound_ns)) => {
                 let bound = unsigned_duration(bound_ns);
                 let count = clock.exchange_count.unwrap_or(0);
@@ -263,12 +201,6 @@ mod tests {
     use hil_account::{AccountContext, ChannelPath, ChannelRecords, account};
     use hil_core::record::{PublishedRecord, TakenRecord, UNAVAILABLE};
 
-    const ONE_CLOCK: Clock = Clock {
-        relation: ClockRelation::OneClock,
-        exchange_count: None,
-        offset_ns: Some(0),
-    };
-
     fn sample() -> ChannelAccount {
         let published: Vec<PublishedRecord> = (0..10)
             .map(|sequence| PublishedRecord {
@@ -305,7 +237,7 @@ mod tests {
             Scope::Window,
             Duration::from_secs(1),
             Some(&sample()),
-            &ONE_CLOCK,
+            &ClockFigures::ONE_CLOCK,
             false,
         );
         let text = text.unwrap().replace('\u{a0}', " ");
@@ -327,10 +259,11 @@ mod tests {
         let nothing = ChannelRecords::default();
         let path = ChannelPath::Gateway { alignment: None };
         let account = account(&nothing, &AccountContext::new(path));
-        let clock = Clock {
-            relation: ClockRelation::NotAligned,
+        let clock = ClockFigures {
+            rung: ClockRung::None,
             exchange_count: None,
             offset_ns: None,
+            bound_ns: None,
         };
         let of_account = |account: Option<&ChannelAccount>, is_json| {
             let second = Duration::from_secs(1);

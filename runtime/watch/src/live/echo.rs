@@ -46,12 +46,17 @@ struct Answer<'a> {
     epoch: u32,
     /// On the monotonic clock of the producer's host.
     published_ns: i64,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    fields: Option<Value>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    value: Option<Value>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    bytes: Option<String>,
+    #[serde(flatten)]
+    content: Content,
+}
+
+/// What is shown of a message.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Content {
+    Fields(Value),
+    Value(Value),
+    Bytes(String),
 }
 
 pub(super) fn run(
@@ -203,16 +208,13 @@ fn text(
     envelope: &Envelope,
     payload: &[u8],
 ) -> Result<String, ChannelError> {
-    let (mut fields, mut value, mut digits) = (None, None, None);
-    match form {
-        Form::Whole(decoder) => fields = decoder.decode(payload),
-        Form::Part(decoder, part) => value = decoder.decode_part(part, payload),
-        Form::Bytes => digits = Some(hex(payload)),
-    }
-    if fields.is_none() && value.is_none() && digits.is_none() {
-        // Of another size than its layout: shown as it is.
-        digits = Some(hex(payload));
-    }
+    let content = match form {
+        Form::Whole(decoder) => decoder.decode(payload).map(Content::Fields),
+        Form::Part(decoder, part) => decoder.decode_part(part, payload).map(Content::Value),
+        Form::Bytes => None,
+    };
+    // Of another size than its layout it is shown as it is.
+    let content = content.unwrap_or_else(|| Content::Bytes(hex(payload)));
     if is_json {
         let answer = Answer {
             channel: &channel.name,
@@ -220,20 +222,16 @@ fn text(
             sequence: envelope.sequence,
             epoch: envelope.epoch,
             published_ns: envelope.published_ns,
-            fields,
-            value,
-            bytes: digits,
+            content,
         };
         return Ok(format!("{}\n", serde_json::to_string(&answer)?));
     }
-    if let Some(value) = value {
-        return Ok(format!("{value}\n"));
-    }
-    let published_s = Duration::from_nanos(envelope.published_ns.unsigned_abs()).as_secs_f64();
-    let body = match fields {
-        Some(fields) => fields.lines(),
-        None => format!("{}\n", digits.unwrap_or_default()),
+    let body = match content {
+        Content::Value(value) => return Ok(format!("{value}\n")),
+        Content::Fields(fields) => fields.lines(),
+        Content::Bytes(digits) => format!("{digits}\n"),
     };
+    let published_s = Duration::from_nanos(envelope.published_ns.unsigned_abs()).as_secs_f64();
     Ok(format!(
         "--- {} number {} of start {}, published at {published_s:.6} s\n{body}",
         channel.name, envelope.sequence, envelope.epoch

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::channel::{ChannelError, ReportedProblems, Scope};
+use super::channel::{ChannelError, Said, Scope, by_windows};
 use super::cli::WindowArgs;
 use super::observer::Observer;
 use super::pace::{Pace, PaceMetrics};
@@ -38,59 +38,35 @@ pub(super) fn run(
         _ => "publication",
     };
     observer.count_unrecorded(&name);
-    let mut reported = ReportedProblems::default();
-    reported.tell(&observer, console);
     let mut pace = Pace::default();
-    let answer = |console: &mut Console, of, figures: &PaceMetrics| {
-        let answer = Answer {
-            channel: &name,
-            seen_at,
-            of,
-            window_s: args.window.as_secs_f64(),
-            figures,
+    let answer = &mut |observer: &mut Observer, of| {
+        for arrival in observer.take_arrivals(&name) {
+            pace.take(&arrival);
+        }
+        let figures = match of {
+            Scope::Window => pace.turn(),
+            Scope::Total => pace.total(),
         };
         let text = if args.json {
+            let answer = Answer {
+                channel: &name,
+                seen_at,
+                of,
+                window_s: args.window.as_secs_f64(),
+                figures: &figures,
+            };
             format!("{}\n", serde_json::to_string(&answer)?)
         } else {
             let of = if of == Scope::Total { "in all  " } else { "" };
-            format!("{of}{}\n", words(&name, figures))
+            format!("{of}{}\n", words(&name, &figures))
         };
-        Ok::<bool, ChannelError>(console.result(&text))
+        Ok(Said {
+            text,
+            message_count: figures.message_count,
+        })
     };
-    loop {
-        let is_whole = observer.poll_for(args.window, signals);
-        reported.tell(&observer, console);
-        let arrivals = observer.take_arrivals(&name);
-        for arrival in &arrivals {
-            pace.take(arrival);
-        }
-        observer.trim(args.window);
-        if is_whole {
-            let figures = pace.turn();
-            if !answer(console, Scope::Window, &figures)? {
-                return Ok(CommandEnd::Done);
-            }
-            if args.once {
-                return if figures.message_count == 0 {
-                    Err(ChannelError::Nothing {
-                        channel: name.clone(),
-                        why: "no message came",
-                        window_s: args.window.as_secs_f64(),
-                    })
-                } else {
-                    Ok(CommandEnd::Done)
-                };
-            }
-        }
-        if !is_whole || observer.is_over() {
-            answer(console, Scope::Total, &pace.total())?;
-            return Ok(if is_whole {
-                CommandEnd::Done
-            } else {
-                CommandEnd::Interrupted
-            });
-        }
-    }
+    let (kept, nothing) = (args.window, "no message came");
+    by_windows(observer, args, kept, nothing, signals, console, answer)
 }
 
 /// The figures on one line.

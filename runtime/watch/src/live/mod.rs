@@ -10,6 +10,5 @@ mod hz;
 mod observer;
 mod pace;
 mod process;
-mod robot;
 mod tail;
 pub mod top;

@@ -14,6 +14,7 @@ use hil_link::condition::{LinkCondition, LinkConditionRecord};
 use hil_link::spec::Way;
 
 use super::conditions::LinkConditions;
+use super::pace::Pace;
 use super::tail::ChannelTail;
 use crate::{PassiveReader, RecordFollower};
 use hil_platform::clock::MonotonicClock;
@@ -117,6 +118,30 @@ impl From<&Envelope> for Arrival {
     }
 }
 
+/// How the clocks of two hosts stand to each other, by the exchanges of the last half minute.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct ClockFigures {
+    /// What they rest on. What daemons say of system clocks is asked at the end of a run only, so that rung
+    /// is none of these.
+    pub(crate) rung: ClockRung,
+    /// Exchanges; `None` where none is needed or there was none.
+    pub(crate) exchange_count: Option<u64>,
+    /// What to add to the first one's monotonic clock to have the second one's, nanoseconds.
+    pub(crate) offset_ns: Option<i64>,
+    /// Largest error of that, nanoseconds.
+    pub(crate) bound_ns: Option<u64>,
+}
+
+impl ClockFigures {
+    /// Of hosts that read one clock.
+    pub(crate) const ONE_CLOCK: Self = Self {
+        rung: ClockRung::OneClock,
+        exchange_count: None,
+        offset_ns: Some(0),
+        bound_ns: Some(0),
+    };
+}
+
 impl Observer {
     /// Begins to observe the run that `wanted` means, from now on.
     ///
@@ -140,38 +165,26 @@ impl Observer {
             .map(LinkConditions::of)
             .unwrap_or_default();
         problems.extend(conditions.read(&records));
+        let mut unbegun = Vec::new();
         let channels = manifest.channels.iter();
         let tails = channels.map(|one| {
             let is_gateway = hosts_of(one, topology.as_ref()).is_some();
             let known = topology.as_ref().and_then(|known| known.channel(&one.name));
-            let depth = known.map(|channel| channel.depth);
-            let tail = ChannelTail::new(is_gateway, depth);
-            let consumer = known.and_then(|channel| channel.to.as_deref());
-            let consumer = topology.as_ref().zip(consumer);
-            let consumer = consumer.and_then(|(topology, name)| topology.process(name));
-            let has_witness = consumer.is_some_and(Process::is_witnessed);
-            let tail = if has_witness {
-                tail.beside_witness()
-            } else {
-                tail
+            let witnessed = |name: Option<&str>| -> Option<&Process> {
+                let process = topology.as_ref()?.process(name?)?;
+                Some(process).filter(|process| process.is_witnessed())
             };
+            let mut tail = ChannelTail::new(is_gateway, known.map(|channel| channel.depth));
+            let consumer = known.and_then(|channel| channel.to.as_deref());
+            tail.has_witness = witnessed(consumer).is_some();
+            let producer = witnessed(known.map(|channel| channel.from.as_str()));
+            if producer.is_some_and(|producer| run.hosts().any(|host| host == producer.host)) {
+                tail.await_begin();
+                unbegun.push(one.name.clone());
+            }
             (one.name.clone(), tail)
         });
-        let mut tails: BTreeMap<String, ChannelTail> = tails.collect();
-        let is_of_program_here = |name: &&String| {
-            let known = topology.as_ref()?;
-            let producer = known.process(&known.channel(name)?.from)?;
-            let is_here = run.hosts().any(|host| host == producer.host);
-            (is_here && producer.is_witnessed()).then_some(())
-        };
-        let unbegun = tails.keys();
-        let unbegun = unbegun.filter(|name| is_of_program_here(name).is_some());
-        let unbegun: Vec<String> = unbegun.cloned().collect();
-        for name in &unbegun {
-            if let Some(tail) = tails.get_mut(name) {
-                tail.await_begin();
-            }
-        }
+        let tails = tails.collect();
         Ok(Self {
             tails,
             unbegun,
@@ -218,12 +231,14 @@ impl Observer {
     /// # Errors
     /// When there is none, with those there are.
     pub(crate) fn channel(&self, name: &str) -> Result<&ChannelDescription, ObserveError> {
-        let mut channels = self.manifest.channels.iter();
-        let found = channels.find(|one| one.name == name);
-        let description = found.ok_or_else(|| ObserveError::NoChannel {
-            run: self.run.name.clone(),
-            channel: name.to_owned(),
-            known: self.channel_names().join(", "),
+        let description = self.described(name).ok_or_else(|| {
+            let channels = self.manifest.channels.iter();
+            let known: Vec<&str> = channels.map(|one| one.name.as_str()).collect();
+            ObserveError::NoChannel {
+                run: self.run.name.clone(),
+                channel: name.to_owned(),
+                known: known.join(", "),
+            }
         })?;
         if self.source(name).is_none() {
             let hosts = [&description.from_host, &description.to_host];
@@ -237,9 +252,9 @@ impl Observer {
         Ok(description)
     }
 
-    fn channel_names(&self) -> Vec<&str> {
-        let channels = self.manifest.channels.iter();
-        channels.map(|one| one.name.as_str()).collect()
+    fn described(&self, channel: &str) -> Option<&ChannelDescription> {
+        let mut channels = self.manifest.channels.iter();
+        channels.find(|one| one.name == channel)
     }
 
     /// Where the messages of `channel` can be had; `None` when it has no end here.
@@ -277,6 +292,13 @@ impl Observer {
             &channel.name,
             channel.size_bytes,
         )?)
+    }
+
+    /// As [`Self::count_unrecorded`], of every channel.
+    pub(crate) fn count_all_unrecorded(&mut self) {
+        for channel in self.manifest.channels.clone() {
+            self.count_unrecorded(&channel.name);
+        }
     }
 
     /// Also counts the messages of `channel` in shared memory, if nobody here records them: of a
@@ -428,7 +450,7 @@ impl Observer {
 
     /// The messages of `channel` as this host first sees them, in the order in which they came.
     /// `None` when nothing tells of it.
-    pub(crate) fn arrivals(&self, channel: &str) -> Option<Vec<Arrival>> {
+    fn arrivals(&self, channel: &str) -> Option<Vec<Arrival>> {
         if let Some(Source::SharedMemory {
             is_forwarded: true, ..
         }) = self.source(channel)
@@ -439,10 +461,19 @@ impl Observer {
         self.arrivals.get(channel).cloned()
     }
 
+    /// Messages per second of `channel` as this host first sees them; `None` of fewer than two.
+    pub(crate) fn rate_hz(&self, channel: &str) -> Option<f64> {
+        let mut pace = Pace::default();
+        for arrival in self.arrivals(channel)? {
+            pace.take(&arrival);
+        }
+        pace.turn().rate_hz
+    }
+
     /// How many messages of `channel` a gateway of this host brought. `None` when none is here that
     /// could have.
     pub(crate) fn brought_count(&self, channel: &str) -> Option<usize> {
-        let to_host = self.ends(channel).1?;
+        let to_host = self.described(channel)?.to_host.as_ref()?;
         let is_here = self.run.hosts().any(|here| here == to_host);
         let tail = self.tails.get(channel);
         let tail = tail.filter(|tail| is_here && !tail.is_empty())?;
@@ -496,9 +527,7 @@ impl Observer {
 
     /// Both hosts of a channel that crosses a link; without a topology, of one between two hosts.
     pub(crate) fn hosts_of(&self, channel: &str) -> Option<(String, String)> {
-        let mut channels = self.manifest.channels.iter();
-        let found = channels.find(|one| one.name == channel)?;
-        hosts_of(found, self.topology.as_ref())
+        hosts_of(self.described(channel)?, self.topology.as_ref())
     }
 
     /// What the direction `way` of `link` was ordered to do, as far as this host knows.
@@ -506,45 +535,36 @@ impl Observer {
         self.conditions.now(link, way)
     }
 
-    /// Polls for [`Self::longest_settling`]; false when a signal came before.
-    pub(crate) fn settle(&mut self, signals: &Signals) -> bool {
-        self.poll_for(self.longest_settling(), signals)
-    }
-
     /// How long the first messages of the first window need to be written down by all who meet them.
     pub(crate) fn longest_settling(&self) -> Duration {
         settling(self.conditions.longest_flight_time())
     }
 
-    fn ends(&self, channel: &str) -> (Option<&String>, Option<&String>) {
-        let mut channels = self.manifest.channels.iter();
-        let found = channels.find(|one| one.name == channel);
-        found.map_or((None, None), |one| {
-            (one.from_host.as_ref(), one.to_host.as_ref())
-        })
-    }
-
     /// How the clock of `from` relates to that of `to` by the exchanges of the last half minute;
     /// `None` without any.
-    pub(crate) fn clock_map(&self, from: &str, to: &str) -> Option<ClockMap> {
+    fn clock_map(&self, from: &str, to: &str) -> Option<ClockMap> {
         let exchanges = self.exchanges(from, to);
         let map = ClockMap::new(&exchanges, ClockSettings::default());
         map.metrics().offset.is_some().then_some(map)
     }
 
-    /// What figures between the two hosts rest on during the run, in the words of a report. What
-    /// daemons say of system clocks is asked at its end only, so that rung is none of these.
-    pub(crate) fn clock_rung(&self, from: &str, to: &str) -> &'static str {
+    /// The same in figures.
+    pub(crate) fn clock(&self, from: &str, to: &str) -> ClockFigures {
         if self.has_one_clock() {
-            return ClockRung::OneClock.label();
+            return ClockFigures::ONE_CLOCK;
         }
-        if self.clock_map(from, to).is_none() {
-            return ClockRung::None.label();
+        let map = self.clock_map(from, to);
+        let metrics = map.as_ref().map(ClockMap::metrics);
+        ClockFigures {
+            rung: metrics.map_or(ClockRung::None, |_| ClockRung::Exchanges),
+            exchange_count: metrics.map(|one| one.exchange_count),
+            offset_ns: metrics.and_then(|one| Some(one.offset?.estimate_ns)),
+            bound_ns: metrics.and_then(|one| Some(one.bound?.median_ns)),
         }
-        ClockRung::Exchanges.words(self.has_clock_path_exchanges(from, to))
     }
 
-    fn has_clock_path_exchanges(&self, from: &str, to: &str) -> bool {
+    /// True when some of the exchanges between the two hosts came over a clock path.
+    pub(crate) fn has_clock_path_exchanges(&self, from: &str, to: &str) -> bool {
         let paths = self.topology().into_iter().flat_map(Topology::clock_paths);
         let mut of_pair = paths.filter(|path| {
             let ends = (path.from.name.as_str(), path.to.name.as_str());
@@ -584,17 +604,15 @@ impl Observer {
     /// The host that asks and the host that answers in the exchanges recorded as `name`: of one way of a
     /// link, whose sending gateway asks, or of a clock path.
     fn exchanging_hosts(&self, name: &str) -> Option<(String, String)> {
-        if let Some(topology) = &self.topology {
-            let clock_path = topology.clock_paths().find(|path| path.name() == name);
-            if let Some(path) = clock_path {
-                return Some((path.from.name.clone(), path.to.name.clone()));
-            }
-            let mut crossings = topology.crossings();
-            let crossing = crossings.find(|one| one.flow_name() == name)?;
-            let (from, to) = (crossing.from_host, crossing.to_host);
-            return Some((from.name.clone(), to.name.clone()));
+        let topology = self.topology.as_ref()?;
+        let clock_path = topology.clock_paths().find(|path| path.name() == name);
+        if let Some(path) = clock_path {
+            return Some((path.from.name.clone(), path.to.name.clone()));
         }
-        None
+        let mut crossings = topology.crossings();
+        let crossing = crossings.find(|one| one.flow_name() == name)?;
+        let (from, to) = (crossing.from_host, crossing.to_host);
+        Some((from.name.clone(), to.name.clone()))
     }
 }
 

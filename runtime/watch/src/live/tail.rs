@@ -26,7 +26,7 @@ pub(crate) struct ChannelTail {
     fold: ChannelFold,
     is_gateway: bool,
     /// See [`AccountContext::has_witness`].
-    has_witness: bool,
+    pub(crate) has_witness: bool,
     /// See [`AccountContext::producer_run`]; `None` where its start is not known on the producer's clock.
     producer_run: Option<RunSpan>,
     /// Nobody counts yet what is missing in them, so what became of it stays open.
@@ -68,14 +68,6 @@ impl ChannelTail {
             newest: None,
             settled_until_ns: i64::MIN,
             has_noted_late: false,
-        }
-    }
-
-    /// The same of a channel whose consumer keeps no records.
-    pub(crate) fn beside_witness(self) -> Self {
-        Self {
-            has_witness: true,
-            ..self
         }
     }
 

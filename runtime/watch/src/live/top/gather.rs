@@ -6,22 +6,19 @@ use std::io;
 use std::time::Duration;
 
 use hil_account::{ChannelAccount, MessageFate};
-use hil_clock::ClockMap;
-use hil_core::score::ScoreEvent;
 use hil_core::time::Instant;
 use hil_link::condition::LinkCondition;
 use hil_link::spec::{LinkSpec, Way};
 use hil_stats::histogram::Distribution;
 
 use super::draw::HISTORY_COLUMNS;
+use super::robot::RobotWatch;
 use super::view::{
-    ChannelRow, ClockRow, LinkRow, LinkState, PeerStatusRow, ProcessRow, Quantiles, RobotEventRow,
-    RobotView, RunState, RunView, SegmentRow, View,
+    ChannelRow, ClockRow, LinkRow, LinkState, PeerStatusRow, ProcessRow, Quantiles, RobotView,
+    RunState, RunView, SegmentRow, View,
 };
 use crate::live::observer::Observer;
-use crate::live::pace::Pace;
 use crate::live::process;
-use crate::live::robot::RobotWatch;
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::status::{self, Phase, ProcessStatus, RunStatus};
 use hil_topology::{Channel, Link, Topology};
@@ -147,18 +144,8 @@ impl Gatherer {
     }
 
     fn robot(&self, status: Option<&RunStatus>) -> Option<RobotView> {
-        let look = self.robot.as_ref()?.look()?;
         let start_ns = status.and_then(|status| status.start_ns);
-        let row = |event: ScoreEvent| RobotEventRow {
-            at_s: start_ns.map(|start_ns| event.at.seconds_since(Instant::from_ns(start_ns))),
-            severity: event.severity,
-            what: event.what,
-        };
-        Some(RobotView {
-            recent: look.recent.into_iter().map(row).collect(),
-            event_count: look.count,
-            is_behind: look.is_behind,
-        })
+        self.robot.as_ref()?.look(start_ns.map(Instant::from_ns))
     }
 
     fn channels(
@@ -272,13 +259,6 @@ fn process_row(
 }
 
 fn channel_row(observer: &Observer, name: &str, account: Option<&ChannelAccount>) -> ChannelRow {
-    let rate_hz = observer.arrivals(name).and_then(|arrivals| {
-        let mut pace = Pace::default();
-        for arrival in &arrivals {
-            pace.take(arrival);
-        }
-        pace.turn().rate_hz
-    });
     let topology = observer.topology();
     let channel = topology.and_then(|topology| topology.channel(name));
     let end_to_end = account.map(|account| &account.end_to_end);
@@ -293,7 +273,7 @@ fn channel_row(observer: &Observer, name: &str, account: Option<&ChannelAccount>
     ChannelRow {
         name: name.to_owned(),
         via: via(topology, channel),
-        rate_hz,
+        rate_hz: observer.rate_hz(name),
         lost_count: account.and_then(lost_count),
         delay: end_to_end.and_then(|one| quantiles(&one.distribution)),
         why_no_delay: match end_to_end.map(|one| &one.distribution) {
@@ -446,24 +426,13 @@ fn clocks(observer: &Observer) -> Vec<ClockRow> {
 }
 
 fn clock_row(observer: &Observer, from: String, to: String) -> ClockRow {
-    let rung = observer.clock_rung(&from, &to).to_owned();
-    if observer.has_one_clock() {
-        return ClockRow {
-            from,
-            to,
-            rung,
-            exchange_count: None,
-            offset_ns: Some(0),
-            bound_ns: Some(0),
-        };
-    }
-    let map = observer.clock_map(&from, &to);
-    let figures = map.as_ref().map(ClockMap::metrics);
+    let figures = observer.clock(&from, &to);
+    let has_path_exchanges = observer.has_clock_path_exchanges(&from, &to);
     ClockRow {
-        rung,
-        exchange_count: figures.map(|figures| figures.exchange_count),
-        offset_ns: figures.and_then(|one| Some(one.offset?.estimate_ns)),
-        bound_ns: figures.and_then(|one| Some(one.bound?.median_ns)),
+        rung: figures.rung.words(has_path_exchanges).to_owned(),
+        exchange_count: figures.exchange_count,
+        offset_ns: figures.offset_ns,
+        bound_ns: figures.bound_ns,
         from,
         to,
     }

@@ -2,6 +2,7 @@
 
 mod draw;
 mod gather;
+mod robot;
 mod screen;
 mod view;
 
@@ -9,12 +10,12 @@ use std::io::{self, IsTerminal};
 
 use super::cli::TopArgs;
 use super::observer::{ObserveError, Observer};
-use super::robot::RobotWatch;
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::signals::Signals;
 use hil_topology::registry::Registry;
 
 pub(crate) use gather::via;
+use robot::RobotWatch;
 
 /// Why there is no view.
 #[derive(Debug, thiserror::Error)]
@@ -42,15 +43,7 @@ pub fn run(
     console: &mut Console,
 ) -> Result<CommandEnd, TopError> {
     let mut observer = Observer::open(args.run.as_deref(), registry)?;
-    let names: Vec<String> = observer
-        .manifest()
-        .channels
-        .iter()
-        .map(|one| one.name.clone())
-        .collect();
-    for name in names {
-        observer.count_unrecorded(&name);
-    }
+    observer.count_all_unrecorded();
     let case = observer
         .topology()
         .and_then(|topology| registry.make_case(topology).ok()?);

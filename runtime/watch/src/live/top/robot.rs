@@ -8,6 +8,7 @@ use std::time::Duration;
 use hil_core::score::{LiveEvents, ScoreEvent};
 use hil_core::time::Instant;
 
+use super::view::{RobotEventRow, RobotView};
 use crate::RecordFollower;
 
 /// Events that are kept to be shown.
@@ -19,7 +20,7 @@ const STEP_SPAN: Duration = Duration::from_secs(10);
 
 /// The events of one run's robot, from its beginning on.
 #[derive(Debug)]
-pub(crate) struct RobotWatch {
+pub(super) struct RobotWatch {
     follower: RecordFollower,
     events: Box<dyn LiveEvents>,
     /// Publication of the newest message read.
@@ -34,20 +35,9 @@ pub(crate) struct RobotWatch {
     problems: Vec<String>,
 }
 
-/// The gravest events of a robot, of equal ones the newest.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct RobotLook {
-    /// Some of them, the newest first.
-    pub(crate) recent: Vec<ScoreEvent>,
-    /// All since the run began.
-    pub(crate) count: u64,
-    /// More of the past is still to be read: newer events are missing.
-    pub(crate) is_behind: bool,
-}
-
 impl RobotWatch {
     /// Those that `events` finds in the record files of `folder`.
-    pub(crate) fn new(folder: &Path, events: Box<dyn LiveEvents>) -> Self {
+    pub(super) fn new(folder: &Path, events: Box<dyn LiveEvents>) -> Self {
         Self {
             follower: RecordFollower::new(folder).with_messages_of(events.channels()),
             events,
@@ -62,7 +52,7 @@ impl RobotWatch {
     }
 
     /// Takes a step towards `now`.
-    pub(crate) fn step(&mut self, now: Instant) {
+    pub(super) fn step(&mut self, now: Instant) {
         // What was read is judged before more is.
         if self.judged_until >= self.newest.map(|newest| newest.min(now)) {
             self.read();
@@ -102,17 +92,23 @@ impl RobotWatch {
     }
 
     /// Record files that cannot be read, and why.
-    pub(crate) fn problems(&self) -> &[String] {
+    pub(super) fn problems(&self) -> &[String] {
         &self.problems
     }
 
-    /// What was found; `None` while none of the messages is recorded on this host.
-    pub(crate) fn look(&self) -> Option<RobotLook> {
+    /// What was found in a run that began at `start`; `None` while none of the messages is recorded on this
+    /// host.
+    pub(super) fn look(&self, start: Option<Instant>) -> Option<RobotView> {
         let mut recent = self.recent.clone();
         recent.sort_by_key(|event| Reverse(event.at));
-        self.newest.map(|_| RobotLook {
-            recent,
-            count: self.count,
+        let row = |event: ScoreEvent| RobotEventRow {
+            at_s: start.map(|start| event.at.seconds_since(start)),
+            severity: event.severity,
+            what: event.what,
+        };
+        self.newest.map(|_| RobotView {
+            recent: recent.into_iter().map(row).collect(),
+            event_count: self.count,
             is_behind: self.is_behind,
         })
     }
@@ -186,19 +182,19 @@ mod tests {
         std::fs::create_dir_all(&folder).unwrap();
         let mut watch = RobotWatch::new(&folder, Box::<Each>::default());
         watch.step(Instant::ZERO);
-        assert_eq!(watch.look(), None);
+        assert_eq!(watch.look(None), None);
         write_messages(&folder, "a/other", 30);
         write_messages(&folder, "a/b", 20);
         watch.follower.look_again();
         watch.step(Instant::from_ns(11));
-        let look = watch.look().unwrap();
-        assert_eq!((look.count, look.recent.len()), (11, SHOWN_MAX));
+        let look = watch.look(None).unwrap();
+        assert_eq!((look.event_count, look.recent.len()), (11, SHOWN_MAX));
         assert_eq!(look.recent[0].what, "a/b 11");
         // The one of more weight stays.
         assert_eq!(look.recent[SHOWN_MAX - 1].what, "a/b 2");
         assert!(!look.is_behind);
         watch.step(Instant::from_ns(100));
-        assert_eq!(watch.look().unwrap().count, 19);
+        assert_eq!(watch.look(None).unwrap().event_count, 19);
         assert!(watch.problems().is_empty());
         std::fs::remove_dir_all(&folder).unwrap();
     }
@@ -214,7 +210,7 @@ mod tests {
         let now = Instant::ZERO + 3 * STEP_SPAN;
         let mut steps = [0; 4].map(|_| {
             watch.step(now);
-            watch.look().unwrap().is_behind
+            watch.look(None).unwrap().is_behind
         });
         assert_eq!(steps, [true, true, false, false]);
         assert_eq!(watch.problems().len(), 1);
@@ -225,7 +221,7 @@ mod tests {
         append(&folder, &header, "robot", &later);
         steps = [0; 4].map(|_| {
             watch.step(now);
-            watch.look().unwrap().is_behind
+            watch.look(None).unwrap().is_behind
         });
         assert!(steps[0]);
         assert!(!steps[3]);
