@@ -134,14 +134,18 @@ impl Controller {
         &self,
         parameters: &EgmStartParameters,
     ) -> Result<ControllerSettings, MotionRefusal> {
-        match self.state() {
-            SessionState::Idle if self.request.is_none() => {}
-            SessionState::Activating | SessionState::Running => {
-                return Err(MotionRefusal::GuidedMotionRuns);
-            }
-            _ => return Err(MotionRefusal::Busy),
-        }
+        self.must_be_idle()?;
         self.settings.with(parameters)
+    }
+
+    fn must_be_idle(&self) -> Result<(), MotionRefusal> {
+        match self.state() {
+            SessionState::Idle if self.request.is_none() => Ok(()),
+            SessionState::Activating | SessionState::Running => {
+                Err(MotionRefusal::GuidedMotionRuns)
+            }
+            _ => Err(MotionRefusal::Busy),
+        }
     }
 
     /// Stops guided motion by the stop mode, from the next cycle on, and what a restart policy
@@ -171,12 +175,9 @@ impl Controller {
     /// # Errors
     /// What that would refuse it with.
     pub fn can_move(&self, path: &[Joints]) -> Result<(), MotionRefusal> {
-        match self.state() {
-            SessionState::Idle if self.request.is_none() && self.plan.is_at_rest() => {}
-            SessionState::Activating | SessionState::Running => {
-                return Err(MotionRefusal::GuidedMotionRuns);
-            }
-            _ => return Err(MotionRefusal::Busy),
+        self.must_be_idle()?;
+        if !self.plan.is_at_rest() {
+            return Err(MotionRefusal::Busy);
         }
         if !path.iter().flatten().all(|q| q.is_finite()) {
             return Err(MotionRefusal::BadNumber);
