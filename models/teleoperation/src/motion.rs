@@ -62,10 +62,10 @@ fn filled(frame_count: usize, frame_time_s: f64) -> String {
 /// Where in a skeleton root and hands are: turns frames into poses, one at a time.
 #[derive(Debug, Clone)]
 pub struct Actor {
-    skeleton: Skeleton,
-    right_hand: usize,
-    left_hand: usize,
-    unit_m: f64,
+    pub(crate) skeleton: Skeleton,
+    pub(crate) right_hand: usize,
+    pub(crate) left_hand: usize,
+    pub(crate) unit_m: f64,
 }
 
 impl Actor {

@@ -197,23 +197,21 @@ impl MotionServer {
             must_be_free(kind, controllers[side.index()].state())
                 .map_err(|why| Refusal { why, side })?;
         }
-        let paths = match kind {
-            MotionKind::EgmStart | MotionKind::EgmStop | MotionKind::GetState => Vec::new(),
-            MotionKind::MoveJoints => {
-                self.joint_paths(request, &request.joints_rad, controllers)?
-            }
-            MotionKind::Home => {
-                self.joint_paths(request, &Side::BOTH.map(home_rad), controllers)?
-            }
-            MotionKind::MoveLinear => self.linear_paths(request, controllers)?,
+        let moves = |paths: Vec<Vec<Joints>>| -> Vec<Order> {
+            let moves = paths.into_iter().map(|path| Order::Move(kind, path));
+            moves.collect()
         };
-        let orders: Vec<Order> = match kind {
+        let orders = match kind {
+            MotionKind::GetState => Vec::new(),
             MotionKind::EgmStart => sides.iter().map(|_| Order::Start(request.egm)).collect(),
             MotionKind::EgmStop => sides.iter().map(|_| Order::Stop).collect(),
-            _ => paths
-                .into_iter()
-                .map(|path| Order::Move(kind, path))
-                .collect(),
+            MotionKind::MoveJoints => {
+                moves(self.joint_paths(request, &request.joints_rad, controllers)?)
+            }
+            MotionKind::Home => {
+                moves(self.joint_paths(request, &Side::BOTH.map(home_rad), controllers)?)
+            }
+            MotionKind::MoveLinear => moves(self.linear_paths(request, controllers)?),
         };
         let orders: Vec<_> = sides.into_iter().zip(orders).collect();
         // An arm may still refuse, e.g. because it is not yet at rest. So that one does not move

@@ -8,7 +8,7 @@
 use core::f64::consts::TAU;
 
 use crate::bvh::Bvh;
-use crate::motion::{HumanPose, LOOP_S};
+use crate::motion::{Actor, HumanPose, LOOP_S};
 use crate::skeleton::{Channel, Skeleton};
 use hil_core::case_study::ParameterError;
 
@@ -28,10 +28,8 @@ const LEFT_SHOULDER_ROLL: usize = 20;
 /// The side-to-side swing.
 #[derive(Debug, Clone)]
 pub struct Swing {
-    skeleton: Skeleton,
-    right_hand_index: usize,
+    actor: Actor,
     amplitude_m: f64,
-    resting: HumanPose,
 }
 
 impl Swing {
@@ -41,27 +39,16 @@ impl Swing {
     /// When `amplitude_m` is outside 0.01..=0.4: the arm is 0.54 m long.
     pub fn new(amplitude_m: f64) -> Result<Self, ParameterError> {
         ParameterError::check("amplitude_m", amplitude_m, 0.01..=0.4, "0.01 to 0.4")?;
-        let (skeleton, right_hand_index, left_hand_index) = person();
-        let values = channel_values(0.0);
         Ok(Self {
-            resting: HumanPose {
-                root: skeleton.pose(0, &values, UNIT_M),
-                right_hand: skeleton.pose(right_hand_index, &values, UNIT_M),
-                left_hand: skeleton.pose(left_hand_index, &values, UNIT_M),
-            },
-            skeleton,
-            right_hand_index,
+            actor: person(),
             amplitude_m,
         })
     }
 
     /// Root and hands at `phase` of a loop, 0..1.
     pub fn at(&self, phase: f64) -> HumanPose {
-        let values = channel_values(self.shoulder_yaw_rad(phase));
-        HumanPose {
-            right_hand: self.skeleton.pose(self.right_hand_index, &values, UNIT_M),
-            ..self.resting
-        }
+        self.actor
+            .pose(&channel_values(self.shoulder_yaw_rad(phase)))
     }
 
     /// Shoulder angle that puts the hand where the sine wants it.
@@ -87,17 +74,17 @@ pub fn swing_bvh(period_s: f64, amplitude_m: f64, rate_hz: f64) -> Result<String
         .flat_map(|time_s| channel_values(swing.shoulder_yaw_rad(time_s / period_s)))
         .collect();
     let bvh = Bvh {
-        announced_count: values.len() / swing.skeleton.channel_count(),
+        announced_count: values.len() / swing.actor.skeleton.channel_count(),
         cut_count: 0,
-        skeleton: swing.skeleton,
+        skeleton: swing.actor.skeleton,
         frame_time_s,
         values,
     };
     Ok(bvh.to_text())
 }
 
-/// Skeleton, right hand and left hand of a person 1.75 m tall with arms stretched sideways.
-fn person() -> (Skeleton, usize, usize) {
+/// A person 1.75 m tall with arms stretched sideways.
+fn person() -> Actor {
     use Channel::{Position, Rotation};
     let turns = [Rotation(1), Rotation(0), Rotation(2)];
     let root = [
@@ -128,7 +115,12 @@ fn person() -> (Skeleton, usize, usize) {
     );
     let left_hand = person.push("LeftHand", Some(elbow), [FOREARM_CM, 0.0, 0.0], &turns);
     debug_assert_eq!(person.channel_count(), CHANNEL_COUNT);
-    (person, right_hand, left_hand)
+    Actor {
+        skeleton: person,
+        right_hand,
+        left_hand,
+        unit_m: UNIT_M,
+    }
 }
 
 /// One frame: hips at standing height, right arm forward and turned by `yaw_rad` to the left,

@@ -5,7 +5,7 @@
 use core::time::Duration;
 
 use crate::experiment::trajectory::{Trajectory, requested};
-use crate::score::loops::{Evidence, Loops, LostByKind, Pause, PauseAfter, Span};
+use crate::score::loops::{Evidence, Loops, LostByKind, PauseAfter};
 use hil_arm::egm::controller::Controller;
 use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EgmStartParameters, EndCause, SessionState};
 use hil_arm::egm::parameters::ControllerSettings;
@@ -184,7 +184,10 @@ impl<'a> Run<'a> {
             send_period: Duration::from_nanos(send_period_ns.unwrap_or(0).unsigned_abs()),
             idle_since: None,
             happened: Happened {
-                pause_began: Some((0, PauseAfter::Start)),
+                evidence: Evidence {
+                    pause_began: Some((0, PauseAfter::Start)),
+                    ..Evidence::default()
+                },
                 ..Happened::default()
             },
             moved: Vec::new(),
@@ -319,9 +322,6 @@ const RADIO_STREAM: &str = "radio";
 struct Happened {
     evidence: Evidence,
     trip_count: u64,
-    hold_began_ns: Option<i64>,
-    throttle_began_ns: Option<i64>,
-    pause_began: Option<(i64, PauseAfter)>,
     running_began_ns: Option<i64>,
     running_ns: i64,
 }
@@ -333,20 +333,21 @@ impl Happened {
         const ENDED: u32 = EgmEventKind::Ended as u32;
         const HOLD_BEGAN: u32 = EgmEventKind::HoldBegan as u32;
         const HOLD_ENDED: u32 = EgmEventKind::HoldEnded as u32;
+        let evidence = &mut self.evidence;
         match event.kind {
             RUNNING => {
-                self.end_pause(event.at_ns);
+                evidence.end_pause(event.at_ns);
                 self.running_began_ns = Some(event.at_ns);
             }
             ENDED => {
-                self.end_hold(event.at_ns);
+                evidence.end_hold(event.at_ns);
+                let cause = EndCause::from_number(event.cause);
+                evidence.pause_began = Some((event.at_ns, PauseAfter::Session(cause)));
                 self.trip_count += 1;
                 self.end_running(event.at_ns);
-                let cause = EndCause::from_number(event.cause);
-                self.pause_began = Some((event.at_ns, PauseAfter::Session(cause)));
             }
-            HOLD_BEGAN => self.hold_began_ns = Some(event.at_ns),
-            HOLD_ENDED => self.end_hold(event.at_ns),
+            HOLD_BEGAN => evidence.hold_began_ns = Some(event.at_ns),
+            HOLD_ENDED => evidence.end_hold(event.at_ns),
             _ => {}
         }
     }
@@ -354,22 +355,9 @@ impl Happened {
     #[inline]
     fn note_throttle(&mut self, at_ns: i64, is_throttled: bool) {
         if is_throttled {
-            self.throttle_began_ns.get_or_insert(at_ns);
+            self.evidence.throttle_began_ns.get_or_insert(at_ns);
         } else {
-            let throttled = &mut self.evidence.throttled;
-            throttled.extend(Span::ended(&mut self.throttle_began_ns, at_ns));
-        }
-    }
-
-    fn end_hold(&mut self, end_ns: i64) {
-        let holds = &mut self.evidence.holds;
-        holds.extend(Span::ended(&mut self.hold_began_ns, end_ns));
-    }
-
-    fn end_pause(&mut self, end_ns: i64) {
-        if let Some((begin_ns, after)) = self.pause_began.take() {
-            let span = Span { begin_ns, end_ns };
-            self.evidence.pauses.push(Pause { span, after });
+            self.evidence.end_throttle(at_ns);
         }
     }
 
@@ -380,9 +368,9 @@ impl Happened {
     }
 
     fn finish(&mut self, end_ns: i64) {
-        self.note_throttle(end_ns, false);
-        self.end_hold(end_ns);
-        self.end_pause(end_ns);
+        self.evidence.end_throttle(end_ns);
+        self.evidence.end_hold(end_ns);
+        self.evidence.end_pause(end_ns);
         self.end_running(end_ns);
     }
 

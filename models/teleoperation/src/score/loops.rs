@@ -318,6 +318,12 @@ pub(crate) struct Evidence {
     pub(crate) throttled: Vec<Span>,
     /// Times without feedback.
     pub(crate) unseen: Vec<Span>,
+    /// Since when there is no session, and what came before.
+    pub(crate) pause_began: Option<(i64, PauseAfter)>,
+    /// Since when the arm holds.
+    pub(crate) hold_began_ns: Option<i64>,
+    /// Since when `MaxSpeedDeviation` binds.
+    pub(crate) throttle_began_ns: Option<i64>,
 }
 
 /// Something explains a lost loop when it fills at least this share of the loop's time.
@@ -330,12 +336,7 @@ impl Evidence {
     /// Why the loop whose peak was due at `due_ns` was lost: what happened within half a period
     /// of it. A pause explains it before missing feedback does, then a hold, clipping, throttling.
     pub(crate) fn cause_of(&self, due_ns: i64, period_ns: f64) -> LossCause {
-        #[allow(clippy::cast_possible_truncation, reason = "at most a minute")]
-        let half_ns = (0.5 * period_ns) as i64;
-        let window = Span {
-            begin_ns: due_ns - half_ns,
-            end_ns: due_ns + half_ns,
-        };
+        let window = Span::around(due_ns, period_ns);
         let pauses = within(&self.pauses, window, |pause| pause.span);
         let paused_ns: i64 = pauses
             .iter()
@@ -369,6 +370,26 @@ impl Evidence {
 }
 
 impl Evidence {
+    /// The time without a session is over, if one is under way.
+    pub(crate) fn end_pause(&mut self, end_ns: i64) {
+        if let Some((begin_ns, after)) = self.pause_began.take() {
+            let span = Span { begin_ns, end_ns };
+            self.pauses.push(Pause { span, after });
+        }
+    }
+
+    /// The hold is over, if one is under way.
+    pub(crate) fn end_hold(&mut self, end_ns: i64) {
+        self.holds
+            .extend(Span::ended(&mut self.hold_began_ns, end_ns));
+    }
+
+    /// `MaxSpeedDeviation` binds no more, if it did.
+    pub(crate) fn end_throttle(&mut self, end_ns: i64) {
+        self.throttled
+            .extend(Span::ended(&mut self.throttle_began_ns, end_ns));
+    }
+
     /// How many of the lost loops of `loops` were lost for each reason.
     pub(crate) fn lost_by_kind(&self, loops: &Loops, period_ns: f64) -> LostByKind {
         let mut counts = LostByKind::default();
@@ -380,6 +401,16 @@ impl Evidence {
 }
 
 impl Span {
+    /// Half a period before and after the peak at `at_ns`.
+    #[allow(clippy::cast_possible_truncation, reason = "at most a minute")]
+    pub(crate) fn around(at_ns: i64, period_ns: f64) -> Self {
+        let half_ns = (0.5 * period_ns) as i64;
+        Self {
+            begin_ns: at_ns - half_ns,
+            end_ns: at_ns + half_ns,
+        }
+    }
+
     fn overlap_ns(self, other: Self) -> i64 {
         let begin_ns = self.begin_ns.max(other.begin_ns);
         (self.end_ns.min(other.end_ns) - begin_ns).max(0)

@@ -4,11 +4,10 @@
 use crate::EGM_RIGHT_FEEDBACK;
 use crate::score::Run;
 use crate::score::loops::{Loops, LossCause, Span, within};
-use crate::score::record::Command;
 use crate::score::sessions::{events, is_right};
 use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EndCause};
 use hil_core::run_log::RunLog;
-use hil_core::score::{EVENTS_MAX, LeftOut, MessageRef, Score, ScoreEvent, Severity};
+use hil_core::score::{EVENTS_MAX, LeftOut, Score, ScoreEvent, Severity};
 use hil_core::time::Instant;
 
 /// Adds all events in order of time.
@@ -42,18 +41,18 @@ fn event(severity: Severity, at_ns: i64, what: String) -> ScoreEvent {
     ScoreEvent::new(severity, Instant::from_ns(at_ns), EGM_RIGHT_FEEDBACK, what)
 }
 
-fn naming(event: ScoreEvent, commands: &[Command]) -> ScoreEvent {
-    let messages = commands.iter().map(|command| command.message);
-    messages.fold(event, |event: ScoreEvent, message: MessageRef| {
-        event.naming(message)
-    })
-}
-
 impl Run {
+    /// The event with the commands that were under way in `span`, which the robot had none in.
+    fn naming(&self, event: ScoreEvent, span: Span) -> ScoreEvent {
+        let commands = self.record.commands_between(span.begin_ns, span.end_ns);
+        let messages = commands.iter().map(|command| command.message);
+        messages.fold(event, ScoreEvent::naming)
+    }
+
     fn lost_loop(&self, loops: &Loops, index: usize, due_ns: i64) -> ScoreEvent {
         let (evidence, period_ns) = (&self.sessions.evidence, self.counter.period_ns);
         let cause = evidence.cause_of(due_ns, period_ns);
-        let window = self.window(due_ns);
+        let window = Span::around(due_ns, period_ns);
         let mut what = format!(
             "motion loop {} of {} lost: {}",
             index + 1,
@@ -77,10 +76,7 @@ impl Run {
             }
         };
         match silence {
-            Some(span) => naming(
-                named,
-                self.record.commands_between(span.begin_ns, span.end_ns),
-            ),
+            Some(span) => self.naming(named, span),
             None => named,
         }
     }
@@ -101,15 +97,6 @@ impl Run {
                 ..pause
             },
             None => pause,
-        }
-    }
-
-    #[allow(clippy::cast_possible_truncation, reason = "at most a minute")]
-    fn window(&self, due_ns: i64) -> Span {
-        let half_ns = (0.5 * self.counter.period_ns) as i64;
-        Span {
-            begin_ns: due_ns - half_ns,
-            end_ns: due_ns + half_ns,
         }
     }
 
@@ -134,11 +121,7 @@ impl Run {
             .map(|hold| {
                 let held_s = (hold.end_ns - hold.begin_ns) as f64 * 1e-9;
                 let what = format!("right arm held for {held_s:.3} s for want of commands");
-                let named = event(Severity::Hazard, hold.begin_ns, what);
-                naming(
-                    named,
-                    self.record.commands_between(hold.begin_ns, hold.end_ns),
-                )
+                self.naming(event(Severity::Hazard, hold.begin_ns, what), *hold)
             })
             .collect()
     }
@@ -154,12 +137,7 @@ impl Run {
             begin_ns: told.at_ns,
             end_ns: told.at_ns,
         };
-        let silence = self.silence_before(pause);
-        naming(
-            named,
-            self.record
-                .commands_between(silence.begin_ns, silence.end_ns),
-        )
+        self.naming(named, self.silence_before(pause))
     }
 }
 

@@ -111,17 +111,16 @@ impl Sent {
             is_parked(command.flags) || gap_ns as f64 > silence_ns
         });
         let is_behind_the_network = log.raw(HUMAN_FRAME).is_empty();
+        let commanded = |what| Self {
+            samples: record.sent_y(),
+            what,
+        };
         if followed.is_none() || (!has_left_out && !is_behind_the_network) {
-            return Self {
-                samples: record.sent_y(),
-                what: "as commanded",
-            };
+            return commanded("as commanded");
         }
         if is_behind_the_network {
-            return Self {
-                samples: record.sent_y(),
-                what: "as the commands arrived: what was lost on their way is not counted",
-            };
+            let what = "as the commands arrived: what was lost on their way is not counted";
+            return commanded(what);
         }
         let scale = case.parameters.mapping_scale_ratio;
         let begin_ns = followed.map_or(0, |command| command.at_ns);
@@ -136,10 +135,7 @@ impl Sent {
             .filter(|(at, y_m)| *at >= begin_ns && y_m.is_finite())
             .collect();
         if samples.is_empty() {
-            return Self {
-                samples: record.sent_y(),
-                what: "as commanded, without the loops in which the sender was silent",
-            };
+            return commanded("as commanded, without the loops in which the sender was silent");
         }
         Self {
             samples,

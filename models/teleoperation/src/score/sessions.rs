@@ -174,10 +174,6 @@ struct Reading {
     running: Option<u32>,
     /// The session that ran last, and when it ended.
     ended: Option<(u32, i64)>,
-    /// The first feedback without a session, when no session ran before it.
-    unbegun: Option<(i64, PauseAfter)>,
-    hold_began_ns: Option<i64>,
-    throttle_began_ns: Option<i64>,
     resumed_ns: Option<i64>,
     /// When the newest feedback came.
     heard_ns: Option<i64>,
@@ -197,8 +193,8 @@ impl Reading {
         let session = feedback.is_running().then_some(feedback.session);
         if session != self.running {
             if let Some(before) = self.running {
-                self.end_hold(at_ns);
-                self.end_throttle(at_ns);
+                self.sessions.evidence.end_hold(at_ns);
+                self.sessions.evidence.end_throttle(at_ns);
                 // Behind a silence it is not known when the session ended: at its beginning, at
                 // the earliest.
                 self.ended = Some((before, if is_unseen { heard_ns } else { at_ns }));
@@ -208,24 +204,27 @@ impl Reading {
             }
             self.running = session;
         }
+        let evidence = &mut self.sessions.evidence;
         if session.is_none() {
-            if self.sessions.count == 0 && self.unbegun.is_none() {
-                self.unbegun = Some((at_ns, before(feedback)));
+            // From the first feedback without a session on, when no session ran before it.
+            if self.sessions.count == 0 {
+                let unbegun = || (at_ns, before(feedback));
+                evidence.pause_began.get_or_insert_with(unbegun);
             }
             return;
         }
         self.sessions.running_count += 1;
         if feedback.has(EgmFeedback::SPEED_DEVIATION_LIMITED) {
             self.sessions.throttled_count += 1;
-            self.throttle_began_ns.get_or_insert(at_ns);
+            evidence.throttle_began_ns.get_or_insert(at_ns);
         } else {
-            self.end_throttle(at_ns);
+            evidence.end_throttle(at_ns);
         }
         if feedback.has(EgmFeedback::HOLDING) {
             self.sessions.holding_count += 1;
-            self.hold_began_ns.get_or_insert(at_ns);
-        } else if self.hold_began_ns.is_some() {
-            self.end_hold(at_ns);
+            evidence.hold_began_ns.get_or_insert(at_ns);
+        } else if evidence.hold_began_ns.is_some() {
+            evidence.end_hold(at_ns);
             self.resumed_ns = Some(at_ns);
         }
         if self
@@ -240,32 +239,11 @@ impl Reading {
 
     fn begin(&mut self, at_ns: i64) {
         self.sessions.count += 1;
-        self.end_unbegun(at_ns);
+        self.sessions.evidence.end_pause(at_ns);
         if let Some((session, ended_ns)) = self.ended.take() {
             self.pause(session, ended_ns, Some(at_ns), at_ns);
             self.resumed_ns = Some(at_ns);
         }
-    }
-
-    fn end_unbegun(&mut self, end_ns: i64) {
-        if let Some((begin_ns, after)) = self.unbegun.take() {
-            let span = Span { begin_ns, end_ns };
-            self.sessions.evidence.pauses.push(Pause { span, after });
-        }
-    }
-
-    fn end_throttle(&mut self, end_ns: i64) {
-        let evidence = &mut self.sessions.evidence;
-        evidence
-            .throttled
-            .extend(Span::ended(&mut self.throttle_began_ns, end_ns));
-    }
-
-    fn end_hold(&mut self, end_ns: i64) {
-        let evidence = &mut self.sessions.evidence;
-        evidence
-            .holds
-            .extend(Span::ended(&mut self.hold_began_ns, end_ns));
     }
 
     fn pause(&mut self, session: u32, begin_ns: i64, until_ns: Option<i64>, end_ns: i64) {
@@ -285,9 +263,10 @@ impl Reading {
 
     fn finish(mut self, last: Option<&Feedback>) -> Sessions {
         if let Some(last) = last {
-            self.end_unbegun(last.at_ns);
-            self.end_hold(last.at_ns);
-            self.end_throttle(last.at_ns);
+            let evidence = &mut self.sessions.evidence;
+            evidence.end_pause(last.at_ns);
+            evidence.end_hold(last.at_ns);
+            evidence.end_throttle(last.at_ns);
             if let Some((session, ended_ns)) = self.ended.take() {
                 self.pause(session, ended_ns, None, last.at_ns);
             }
