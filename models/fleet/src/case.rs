@@ -160,7 +160,7 @@ impl FleetParameters {
         };
         match beginning(scene, &self.missions, is_safe) {
             Beginning::Free | Beginning::Undecided(_) => Ok(()),
-            Beginning::Wayless(one) => Err(ParameterError::new(key, one.to_string())),
+            Beginning::Wayless(what) => Err(ParameterError::new(key, what)),
             Beginning::Never(chain) => Err(ParameterError::new(key, obstruction_text(&chain))),
             Beginning::Crowded(ends) => Err(ParameterError::new(
                 "missions.missions_per_robot",

@@ -3,7 +3,7 @@
 
 use core::fmt;
 
-use crate::mission::{MissionMode, MissionParameters};
+use crate::mission::{MissionMode, MissionParameters, ways};
 use crate::scenario::Scene;
 use crate::world::{BayIndex, Route, World};
 
@@ -14,8 +14,8 @@ pub(crate) enum Beginning {
     Free,
     /// Each robot can set out once others have; one of those that cannot before.
     Undecided(Obstruction),
-    /// A robot that no way leads from where it starts to where it may go.
-    Wayless(Wayless),
+    /// A robot that no way leads from where it starts to where it may go: which, and what it lacks, in words.
+    Wayless(String),
     /// More robots stop after their last missions than find a bay each to stop in.
     Crowded(Ends),
     /// Robots each of which waits for the next, and the last for the first, whatever the others do.
@@ -32,25 +32,6 @@ pub(crate) struct Obstruction {
     by: usize,
 }
 
-/// A robot that can never set out, whoever else does.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Wayless {
-    robot: usize,
-    bay: BayIndex,
-    want: Want,
-}
-
-/// What a robot lacks that can never set out.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Want {
-    /// Any path.
-    Path,
-    /// A bay that is the other end of its shuttle line.
-    Partner,
-    /// A path to that bay.
-    PathTo(BayIndex),
-}
-
 /// Where robots stay after their last missions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Ends {
@@ -58,17 +39,6 @@ pub(crate) struct Ends {
     robots: usize,
     /// Robots that find a bay each, at most.
     parked: usize,
-}
-
-/// The ways that a robot in `bay` may be sent.
-fn ways(scene: &Scene, mode: MissionMode, bay: BayIndex) -> impl Iterator<Item = &Route> {
-    let is_meant = move |route: &&Route| match mode {
-        MissionMode::Random => true,
-        MissionMode::Shuttle | MissionMode::Once => {
-            scene.partners.get(bay).copied().flatten() == Some(route.to)
-        }
-    };
-    scene.world.routes_from(bay).iter().filter(is_meant)
 }
 
 /// What is known of the beginning of `scene`'s robots. In the safe mode a vehicle in the way of another is in its
@@ -88,11 +58,17 @@ pub(crate) fn beginning(scene: &Scene, missions: &MissionParameters, is_safe: bo
     if let Some(robot) = blocked.iter().position(Vec::is_empty) {
         let bay = starts[robot];
         let partner = scene.partners.get(bay).copied().flatten();
-        let want = match missions.mode {
-            MissionMode::Random => Want::Path,
-            MissionMode::Shuttle | MissionMode::Once => partner.map_or(Want::Partner, Want::PathTo),
+        let lack = match (missions.mode, partner) {
+            (MissionMode::Random, _) => "no path leads from there".to_owned(),
+            (MissionMode::Shuttle | MissionMode::Once, None) => {
+                "no bay is the other end of its shuttle line".to_owned()
+            }
+            (MissionMode::Shuttle | MissionMode::Once, Some(to)) => {
+                format!("no path leads to bay {to}, the other end of its shuttle line")
+            }
         };
-        return Beginning::Wayless(Wayless { robot, bay, want });
+        let what = format!("robot {robot} in bay {bay} can never set out: {lack}");
+        return Beginning::Wayless(what);
     }
     let mut is_waiting = vec![true; starts.len()];
     loop {
@@ -327,21 +303,6 @@ impl fmt::Display for Obstruction {
     }
 }
 
-impl fmt::Display for Wayless {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { robot, bay, want } = self;
-        write!(f, "robot {robot} in bay {bay} can never set out: ")?;
-        match want {
-            Want::Path => write!(f, "no path leads from there"),
-            Want::Partner => write!(f, "no bay is the other end of its shuttle line"),
-            Want::PathTo(to) => write!(
-                f,
-                "no path leads to bay {to}, the other end of its shuttle line"
-            ),
-        }
-    }
-}
-
 impl fmt::Display for Ends {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self {
@@ -525,7 +486,7 @@ mod tests {
     fn a_robot_without_a_way_to_go_is_named_in_both_modes() {
         for is_safe in [true, false] {
             let said = |scene: &Scene, mode| match beginning(scene, &missions(mode, 0), is_safe) {
-                Beginning::Wayless(one) => one.to_string(),
+                Beginning::Wayless(what) => what,
                 other => format!("{other:?}"),
             };
             // Only robot 0 has a path.

@@ -27,6 +27,11 @@ impl Pose {
         }
     }
 
+    /// True without NaN or infinity.
+    pub fn is_finite(&self) -> bool {
+        self.x_m.is_finite() && self.y_m.is_finite() && self.heading_rad.is_finite()
+    }
+
     /// Distance between the reference points.
     pub fn distance_m(&self, other: &Self) -> f64 {
         (self.x_m - other.x_m).hypot(self.y_m - other.y_m)
@@ -125,39 +130,33 @@ impl OrientedBox {
     /// True when the two share a point of positive depth; touching is no overlap. Separating
     /// axes (Gottschalk, Lin and Manocha 1996), in the plane.
     pub fn overlaps(&self, other: &Self) -> bool {
-        let offset = [
-            other.centre[0] - self.centre[0],
-            other.centre[1] - self.centre[1],
-        ];
-        let cosine = (self.axis[0] * other.axis[0] + self.axis[1] * other.axis[1]).abs();
-        let sine = (self.axis[0] * other.axis[1] - self.axis[1] * other.axis[0]).abs();
-        let is_apart = |from: &Self, to: &Self| {
-            let along = (offset[0] * from.axis[0] + offset[1] * from.axis[1]).abs();
-            let across = (offset[1] * from.axis[0] - offset[0] * from.axis[1]).abs();
-            along >= from.half_m[0] + to.half_m[0] * cosine + to.half_m[1] * sine
-                || across >= from.half_m[1] + to.half_m[0] * sine + to.half_m[1] * cosine
-        };
-        !is_apart(self, other) && !is_apart(other, self)
+        let gap_m = self.gaps_m(other);
+        gap_m(self, other) < 0.0 && gap_m(other, self) < 0.0
     }
 
     /// The largest gap between the two along any of their sides: at least 0 when they are apart,
     /// and then no more than their distance; below 0 when they overlap, and then by as much as
     /// one must move to leave the other.
     pub fn gap_m(&self, other: &Self) -> f64 {
+        let gap_m = self.gaps_m(other);
+        gap_m(self, other).max(gap_m(other, self))
+    }
+
+    /// The larger gap between the two along the sides of the one given first.
+    fn gaps_m(&self, other: &Self) -> impl Fn(&Self, &Self) -> f64 {
         let offset = [
             other.centre[0] - self.centre[0],
             other.centre[1] - self.centre[1],
         ];
         let cosine = (self.axis[0] * other.axis[0] + self.axis[1] * other.axis[1]).abs();
         let sine = (self.axis[0] * other.axis[1] - self.axis[1] * other.axis[0]).abs();
-        let gap = |from: &Self, to: &Self| {
+        move |from, to| {
             let along = (offset[0] * from.axis[0] + offset[1] * from.axis[1]).abs();
             let across = (offset[1] * from.axis[0] - offset[0] * from.axis[1]).abs();
             let along_m = along - (from.half_m[0] + to.half_m[0] * cosine + to.half_m[1] * sine);
             let across_m = across - (from.half_m[1] + to.half_m[0] * sine + to.half_m[1] * cosine);
             along_m.max(across_m)
-        };
-        gap(self, other).max(gap(other, self))
+        }
     }
 
     /// The corners, counter-clockwise from the front left.

@@ -59,8 +59,7 @@ impl Map {
                 key: format!("world.bays[{index}]"),
                 problem: format!("at {} {problem}", At(&bay.pose)),
             };
-            let numbers = [bay.pose.x_m, bay.pose.y_m, bay.pose.heading_rad];
-            if !numbers.iter().all(|number| number.is_finite()) {
+            if !bay.pose.is_finite() {
                 return Err(error("is not finite".to_owned()));
             }
             if let Some(blocker) = space.blocker(&bay.pose) {

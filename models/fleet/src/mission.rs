@@ -56,6 +56,21 @@ impl MissionParameters {
     }
 }
 
+/// The ways that a robot in `bay` may be sent.
+pub(crate) fn ways(
+    scene: &Scene,
+    mode: MissionMode,
+    bay: BayIndex,
+) -> impl Iterator<Item = &Route> {
+    let is_meant = move |route: &&Route| match mode {
+        MissionMode::Random => true,
+        MissionMode::Shuttle | MissionMode::Once => {
+            scene.partners.get(bay).copied().flatten() == Some(route.to)
+        }
+    };
+    scene.world.routes_from(bay).iter().filter(is_meant)
+}
+
 /// Gives out missions.
 #[derive(Debug, Clone)]
 pub struct MissionSource {
@@ -100,26 +115,16 @@ impl MissionSource {
         if self.left_counts[robot] == 0 {
             return None;
         }
-        let routes = self.scene.world.routes_from(at);
-        let route = match self.mode {
-            MissionMode::Random => {
-                let free_count = routes.iter().filter(|route| is_free(route.to)).count();
-                if free_count == 0 {
-                    return None;
-                }
-                let pick = floor_index(self.random.uniform() * free_count as f64);
-                let mut free = routes.iter().filter(|route| is_free(route.to));
-                free.nth(pick.min(free_count - 1))
-            }
-            MissionMode::Shuttle | MissionMode::Once => {
-                let partner = self.scene.partners.get(at).copied().flatten()?;
-                let mut there = routes.iter().filter(|route| route.to == partner);
-                there.next().filter(|route| is_free(route.to))
-            }
-        }?;
+        let free = || ways(&self.scene, self.mode, at).filter(|route| is_free(route.to));
+        let last = free().count().checked_sub(1)?;
+        let pick = match self.mode {
+            MissionMode::Random => floor_index(self.random.uniform() * (last + 1) as f64),
+            MissionMode::Shuttle | MissionMode::Once => 0,
+        };
+        let route = *free().nth(pick.min(last))?;
         // Without a limit the count never runs out within a run's mission numbers.
         self.left_counts[robot] -= 1;
-        Some(*route)
+        Some(route)
     }
 }
 

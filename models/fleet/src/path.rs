@@ -80,7 +80,7 @@ impl Path {
             return Err(PathError::Spacing { spacing_m });
         }
         for (index, pose) in poses.iter().enumerate() {
-            if !(pose.x_m.is_finite() && pose.y_m.is_finite() && pose.heading_rad.is_finite()) {
+            if !pose.is_finite() {
                 return Err(PathError::NotFinite {
                     index,
                     x_m: pose.x_m,

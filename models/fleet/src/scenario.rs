@@ -8,8 +8,6 @@
 
 use std::sync::Arc;
 
-use serde::Serialize;
-
 use crate::geometry::{Bounds, Footprint, Pose};
 use crate::map::{self, BAYS_PER_SIDE, Map, raised};
 use crate::path::{Path, PathLibrary};
@@ -129,7 +127,7 @@ pub struct Scene {
 }
 
 /// What planning a world's paths took.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct PlanningSummary {
     /// Paths the planner was asked for; paths which repeat another one elsewhere are not.
     pub planned_count: u64,

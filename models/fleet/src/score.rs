@@ -43,7 +43,7 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
     };
     let standing = standstills(log, &truths, run_end, patience, missions.never_end());
     let mut referee = Referee::new(case.scene(), case.parameters().fleets);
-    referee.replay(&mut truths.into_iter(), start, end);
+    referee.replay(&mut truths.into_iter(), start, end, &mut |_, _| {});
     let run_s = run_end.seconds_since(start);
     let tally = referee.tally();
     let collided = collided_share(tally, referee.collided_after());
@@ -230,7 +230,7 @@ pub(crate) fn errors(case: &Fleet, log: &RunLog) -> Vec<ErrorSeries> {
     };
     let mut samples = Vec::new();
     let mut referee = Referee::new(case.scene(), case.parameters().fleets);
-    referee.replay_seeing(&mut truths.into_iter(), start, end, &mut |now, referee| {
+    referee.replay(&mut truths.into_iter(), start, end, &mut |now, referee| {
         samples.push((now, referee.standing_count() as f64));
     });
     vec![ErrorSeries {

@@ -48,6 +48,11 @@ impl Span {
             upper: index,
         }
     }
+
+    /// From one pose to another.
+    pub const fn between(lower: usize, upper: usize) -> Self {
+        Self { lower, upper }
+    }
 }
 
 hil_core::words! {
@@ -97,13 +102,13 @@ impl Section {
         (first <= last).then_some((first as usize, last as usize))
     }
 
-    /// First pose at or after `from` on `side` that overlaps any of the poses of `leader`
+    /// First pose of `poses` on `side` that overlaps any of the poses of `leader`
     /// on the other path: where a follower must not go yet.
-    pub fn first_conflict(&self, side: Side, from: usize, leader: Span) -> Option<usize> {
+    pub fn first_conflict(&self, side: Side, poses: Span, leader: Span) -> Option<usize> {
         if leader.lower > self.end(side.other()) || leader.upper < self.start(side.other()) {
             return None;
         }
-        (from.max(self.start(side))..=self.end(side)).find(|&index| {
+        (poses.lower.max(self.start(side))..=poses.upper.min(self.end(side))).find(|&index| {
             self.partners(side, index)
                 .is_some_and(|(first, last)| first <= leader.upper && leader.lower <= last)
         })
@@ -620,10 +625,10 @@ mod tests {
             lower: 100,
             upper: 200,
         };
-        let first = sections[0].first_conflict(Side::Second, 0, beyond);
+        let first = sections[0].first_conflict(Side::Second, Span::between(0, usize::MAX), beyond);
         assert_eq!(first, Some(81));
         assert_eq!(
-            sections[0].first_conflict(Side::Second, 0, Span::at(100)),
+            sections[0].first_conflict(Side::Second, Span::between(0, usize::MAX), Span::at(100)),
             Some(81)
         );
     }

@@ -1,8 +1,6 @@
 //! What a coordinator counts. It counts only what the coordinator itself can know: collisions
 //! are the referee's business.
 
-use serde::Serialize;
-
 /// Figures of one coordinator since its start.
 #[derive(Debug, Clone, Default)]
 pub struct CoordinatorCounters {
@@ -14,7 +12,7 @@ pub struct CoordinatorCounters {
 
 hil_core::counts! {
     /// The plain counts of a coordinator.
-    #[derive(Eq, Serialize)]
+    #[derive(Eq)]
     pub struct CoordinatorCounts {
         /// States taken over into a robot's view.
         states_accepted: u64;
@@ -55,7 +53,7 @@ hil_core::counts! {
 
 hil_core::counts! {
     /// Counts of the safe rules.
-    #[derive(Eq, Serialize)]
+    #[derive(Eq)]
     pub struct SafeCounts {
         /// Extensions not given because no order was found in which all could still finish.
         grants_withheld: u64;

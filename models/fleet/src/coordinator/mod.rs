@@ -23,6 +23,7 @@ use crate::coordinator::safe::reservation::Traffic;
 use crate::messages::{Mission, State, ToRobot};
 use crate::mission::MissionSource;
 use crate::scenario::Scene;
+use crate::world::Vehicle;
 use hil_core::time::Instant;
 
 /// What rules decide on, and with, in one control cycle.
@@ -65,6 +66,20 @@ pub(crate) trait Rules: Debug {
     fn resets_stuck_robots(&self) -> bool {
         true
     }
+}
+
+/// Way a vehicle at `speed_mps` makes at most in `time_s` and then needs to stop, metres, if it speeds up by
+/// `pessimism_ratio` better and brakes by as much worse than it should.
+pub(crate) fn reach_m(vehicle: &Vehicle, pessimism_ratio: f64, speed_mps: f64, time_s: f64) -> f64 {
+    let speed_mps = speed_mps.max(0.0);
+    let speeding_up_mps2 = (1.0 + pessimism_ratio) * vehicle.acceleration_mps2;
+    let braking_mps2 = (1.0 - pessimism_ratio) * vehicle.acceleration_mps2;
+    let to_full_s = ((vehicle.speed_max_mps - speed_mps) / speeding_up_mps2).max(0.0);
+    let speeding_up_s = to_full_s.min(time_s);
+    let fast_mps = speed_mps + speeding_up_mps2 * speeding_up_s;
+    0.5 * (speed_mps + fast_mps) * speeding_up_s
+        + fast_mps * (time_s - speeding_up_s)
+        + fast_mps * fast_mps / (2.0 * braking_mps2)
 }
 
 /// One fleet's coordinator.

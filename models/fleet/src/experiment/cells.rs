@@ -17,15 +17,6 @@ use hil_stats::statistics::clopper_pearson_at;
 /// Scenarios of the paper's tables.
 pub(crate) const SCENARIOS: [Scenario; 2] = [Scenario::Harbor, Scenario::Warehouse];
 
-/// What a scenario is called in tables.
-pub(crate) const fn scenario_name(scenario: Scenario) -> &'static str {
-    match scenario {
-        Scenario::Harbor => "harbor",
-        Scenario::Warehouse => "warehouse",
-        _ => "other",
-    }
-}
-
 /// The published rows of a scenario.
 pub(crate) const fn published_rows(scenario: Scenario) -> &'static [PublishedRow] {
     match scenario {
@@ -94,7 +85,7 @@ impl core::fmt::Display for CellId {
 impl CellId {
     /// What the seeds of its runs are drawn from: equal as long as equal tables are wanted.
     pub(crate) fn seed_name(&self) -> String {
-        let scenario = scenario_name(self.scenario);
+        let scenario = self.scenario;
         match &self.place {
             Place::Published { row, copies } => match row.condition {
                 Condition::Static {
@@ -103,19 +94,9 @@ impl CellId {
                 } => format!("{scenario}, loss {loss_ratio}, {delay_ms} ms, {copies} copies"),
                 Condition::HardwareInTheLoop(network) => format!("{scenario}, {network}"),
             },
-            Place::Variant(variant) => format!("{scenario}, {}", variant.label()),
-            Place::Mechanism { mechanism, mode } => {
-                format!("{scenario}, {}, {}", mechanism.label(), mode_name(*mode))
-            }
+            Place::Variant(variant) => format!("{scenario}, {variant}"),
+            Place::Mechanism { mechanism, mode } => format!("{scenario}, {mechanism}, {mode}"),
         }
-    }
-}
-
-/// What a mode is called in tables.
-pub(crate) const fn mode_name(mode: CoordinatorMode) -> &'static str {
-    match mode {
-        CoordinatorMode::Legacy => "legacy",
-        CoordinatorMode::Safe => "safe",
     }
 }
 
@@ -222,39 +203,24 @@ fn demand_of(scenario: Scenario, loss_ratio: f64, delay_ms: f64, copies: u32) ->
     }
 }
 
-/// Harbor, 100 ms, no loss, with one thing changed; the last changes all that the network could
-/// be blamed for, and keeps the nominal steps.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Variant {
-    /// Steps as long as they should be.
-    NominalSteps,
-    /// A tracker without error.
-    ExactTracker,
-    /// Robots wait 6 poses before a section.
-    WideMargin,
-    /// Steps as long as they should be, status over the network, the delay unknown.
-    DelayedStatus,
+hil_core::labelled! {
+    /// Harbor, 100 ms, no loss, with one thing changed; the last changes all that the network could
+    /// be blamed for, and keeps the nominal steps. In the order of the table, with what that calls it; the
+    /// seeds of its cells are drawn from it too.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub(crate) enum Variant, label {
+        /// Steps as long as they should be.
+        NominalSteps = "100 ms, steps of nominal length",
+        /// A tracker without error.
+        ExactTracker = "100 ms, exact tracker",
+        /// Robots wait 6 poses before a section.
+        WideMargin = "100 ms, margin of 6 poses",
+        /// Steps as long as they should be, status over the network, the delay unknown.
+        DelayedStatus = "100 ms, nominal steps, delayed status, delay unknown",
+    }
 }
 
 impl Variant {
-    /// All of them, in the order of the table.
-    const ALL: [Self; 4] = [
-        Self::NominalSteps,
-        Self::ExactTracker,
-        Self::WideMargin,
-        Self::DelayedStatus,
-    ];
-
-    /// What a table calls it; the seeds of its cells are drawn from it too.
-    pub(crate) const fn label(self) -> &'static str {
-        match self {
-            Self::NominalSteps => "100 ms, steps of nominal length",
-            Self::ExactTracker => "100 ms, exact tracker",
-            Self::WideMargin => "100 ms, margin of 6 poses",
-            Self::DelayedStatus => "100 ms, nominal steps, delayed status, delay unknown",
-        }
-    }
-
     fn cell(self, base: &Setup, law: DelayLaw) -> CellSpec {
         let mut setup = original(base, 100.0, law, 0.0, 1);
         match self {
@@ -281,74 +247,41 @@ impl Variant {
     }
 }
 
-/// What the network, or the controller's host, does in a row of the table of mechanisms.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Mechanism {
-    /// Nothing.
-    Clean,
-    /// Every message takes 300 ms.
-    Delay300Ms,
-    /// Every message takes 1 s.
-    Delay1S,
-    /// Messages take 0 to 1 s.
-    DelayTo1S,
-    /// A tenth of the commands is lost.
-    CommandLoss10,
-    /// A tenth of the status is lost.
-    StatusLoss10,
-    /// A tenth of both is lost.
-    Loss10,
-    /// Three tenths of both are lost.
-    Loss30,
-    /// The network stalls for 1 s in 30 s.
-    Stall1S,
-    /// The network stalls for 3 s in 30 s.
-    Stall3S,
-    /// The controller's host overruns.
-    Overrun,
-    /// A tenth of the messages comes twice.
-    Repeated,
-    /// A tenth of the messages is held back.
-    HeldBack,
+hil_core::labelled! {
+    /// What the network, or the controller's host, does in a row of the table of mechanisms. In the order of the
+    /// table, with what that calls it; the seeds of its cells are drawn from it too.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub(crate) enum Mechanism, label {
+        /// Nothing.
+        Clean = "clean",
+        /// Every message takes 300 ms.
+        Delay300Ms = "delay 300 ms",
+        /// Every message takes 1 s.
+        Delay1S = "delay 1 s",
+        /// Messages take 0 to 1 s.
+        DelayTo1S = "delay 0 to 1 s",
+        /// A tenth of the commands is lost.
+        CommandLoss10 = "loss 10 %, commands",
+        /// A tenth of the status is lost.
+        StatusLoss10 = "loss 10 %, status",
+        /// A tenth of both is lost.
+        Loss10 = "loss 10 %, both",
+        /// Three tenths of both are lost.
+        Loss30 = "loss 30 %, both",
+        /// The network stalls for 1 s in 30 s.
+        Stall1S = "stalls, mean 1 s in 30 s",
+        /// The network stalls for 3 s in 30 s.
+        Stall3S = "stalls, mean 3 s in 30 s",
+        /// The controller's host overruns.
+        Overrun = "overrun to 4 s",
+        /// A tenth of the messages comes twice.
+        Repeated = "10 % repeated to 3 s late",
+        /// A tenth of the messages is held back.
+        HeldBack = "10 % held back to 3 s",
+    }
 }
 
 impl Mechanism {
-    /// All of them, in the order of the table.
-    pub(crate) const ALL: [Self; 13] = [
-        Self::Clean,
-        Self::Delay300Ms,
-        Self::Delay1S,
-        Self::DelayTo1S,
-        Self::CommandLoss10,
-        Self::StatusLoss10,
-        Self::Loss10,
-        Self::Loss30,
-        Self::Stall1S,
-        Self::Stall3S,
-        Self::Overrun,
-        Self::Repeated,
-        Self::HeldBack,
-    ];
-
-    /// What a table calls it; the seeds of its cells are drawn from it too.
-    pub(crate) const fn label(self) -> &'static str {
-        match self {
-            Self::Clean => "clean",
-            Self::Delay300Ms => "delay 300 ms",
-            Self::Delay1S => "delay 1 s",
-            Self::DelayTo1S => "delay 0 to 1 s",
-            Self::CommandLoss10 => "loss 10 %, commands",
-            Self::StatusLoss10 => "loss 10 %, status",
-            Self::Loss10 => "loss 10 %, both",
-            Self::Loss30 => "loss 30 %, both",
-            Self::Stall1S => "stalls, mean 1 s in 30 s",
-            Self::Stall3S => "stalls, mean 3 s in 30 s",
-            Self::Overrun => "overrun to 4 s",
-            Self::Repeated => "10 % repeated to 3 s late",
-            Self::HeldBack => "10 % held back to 3 s",
-        }
-    }
-
     fn apply(self, setup: &mut Setup) {
         match self {
             Self::Clean => {}
@@ -591,25 +524,16 @@ pub(crate) enum Condition {
     HardwareInTheLoop(PublishedNetwork),
 }
 
-/// A network of the paper's own measurements.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum PublishedNetwork {
-    /// A wire.
-    Ethernet,
-    /// A radio at 20 m.
-    ShortRange,
-    /// A radio at 35 m.
-    LongRange,
-}
-
-impl core::fmt::Display for PublishedNetwork {
-    /// What the paper calls it.
-    fn fmt(&self, formatter: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        formatter.write_str(match self {
-            Self::Ethernet => "Ethernet",
-            Self::ShortRange => "short-range Wi-Fi 6",
-            Self::LongRange => "long-range Wi-Fi 6",
-        })
+hil_core::labelled! {
+    /// A network of the paper's own measurements, and what the paper calls it.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub(crate) enum PublishedNetwork, label {
+        /// A wire.
+        Ethernet = "Ethernet",
+        /// A radio at 20 m.
+        ShortRange = "short-range Wi-Fi 6",
+        /// A radio at 35 m.
+        LongRange = "long-range Wi-Fi 6",
     }
 }
 

@@ -3,8 +3,6 @@
 
 use core::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
 use crate::controller::coordinator_of;
 use crate::coordinator::Coordinator;
 use crate::coordinator::parameters::CoordinatorParameters;
@@ -471,8 +469,7 @@ impl Agenda {
 }
 
 /// How the coordinator learns what the robots do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum StatusPath {
     /// It reads their true state at each decision, whatever the network does; missions reach the
     /// robots at once. The original since 2020.
@@ -483,7 +480,7 @@ pub enum StatusPath {
 }
 
 /// What lies between coordinator and robots.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Links {
     /// Whether states go over the network at all.
     pub status_path: StatusPath,

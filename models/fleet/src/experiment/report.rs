@@ -4,7 +4,7 @@
 use crate::coordinator::parameters::CoordinatorMode;
 use crate::experiment::cells::{
     CellSpec, CollidedRun, Condition, Demand, FleetTally, Mechanism, Place, PublishedRow,
-    RunFigures, SCENARIOS, mode_name, per_1000_interval, published_rows, scenario_name,
+    RunFigures, SCENARIOS, per_1000_interval, published_rows,
 };
 use crate::experiment::study::{FleetStudy, worlds_text};
 use crate::scenario::Scenario;
@@ -485,7 +485,6 @@ fn mechanism_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
     let mut columns = vec![Column::new("mechanism", "What the network does")];
     columns.extend(Field::columns(&LEGACY));
     columns.extend(Field::columns(&SAFE));
-    let scenario = scenario_name(scenario);
     Table {
         name: format!("mechanisms-{scenario}"),
         title: format!(
@@ -663,7 +662,7 @@ fn safe_criteria(results: &[CellResult<'_>]) -> [Criterion; 3] {
     let safe = &sum.safe;
     let impossible = safe.states_impossible + safe.authorities_exceeded + safe.margins_exceeded;
     let judged = |what: &str, is_met: bool, finding: String| Criterion {
-        text: format!("{}: {what}", mode_name(CoordinatorMode::Safe)),
+        text: format!("{}: {what}", CoordinatorMode::Safe),
         is_met: (!is_met || is_telling).then_some(is_met),
         is_judged: true,
         finding,
@@ -736,7 +735,6 @@ fn throughput(scenario: Scenario, results: &[CellResult<'_>], judge: Judge) -> C
         );
         Some((is_met, finding))
     });
-    let scenario = scenario_name(scenario);
     criterion(
         format!("{scenario}: safe keeps 90 % of legacy's missions per hour when clean"),
         idle.or(compared),
@@ -769,7 +767,6 @@ fn loss_exceeds_delay(scenario: Scenario, results: &[CellResult<'_>], judge: Jud
         );
         Some((is_met, finding))
     });
-    let scenario = scenario_name(scenario);
     let text = format!("{scenario}, legacy: losing 10 % of the commands is worse than 300 ms");
     let missing = format!("{NOT_RUN}, or more collisions than CS");
     criterion(text, known, &missing)

@@ -6,7 +6,6 @@ use std::borrow::Cow;
 use crate::case::FleetParameters;
 use crate::experiment::cells::{
     CellSpec, CollidedRun, FleetTally, RunFigures, SCENARIOS, mechanism_cells, published_cells,
-    scenario_name,
 };
 use crate::experiment::driver::{Experiment, Setup};
 use crate::experiment::report::{self, CellResult};
@@ -265,8 +264,7 @@ pub(crate) fn worlds_text(study: &FleetStudy) -> String {
     let text = |(scenario, scene): &(Scenario, Scene)| {
         let (world, planning) = (&scene.world, &scene.planning);
         format!(
-            "{}: {} robots, {} bays, {} paths ({} planned, {} states expanded)",
-            scenario_name(*scenario),
+            "{scenario}: {} robots, {} bays, {} paths ({} planned, {} states expanded)",
             scene.starts.len(),
             world.bays.len(),
             world.paths.len() / 2,

@@ -173,10 +173,7 @@ impl Planner {
     /// When there is none; see [`PlanError`].
     pub fn plan(&mut self, start: &Pose, goal: &Pose) -> Result<Plan, PlanError> {
         let (start, goal) = (*start, *goal);
-        let is_finite = |pose: &Pose| {
-            pose.x_m.is_finite() && pose.y_m.is_finite() && pose.heading_rad.is_finite()
-        };
-        if !(is_finite(&start) && is_finite(&goal)) {
+        if !(start.is_finite() && goal.is_finite()) {
             return Err(PlanError::NotFinite { start, goal });
         }
         if let Some(blocker) = self.space.blocker(&start) {

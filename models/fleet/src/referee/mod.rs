@@ -141,18 +141,8 @@ impl Referee {
     }
 
     /// Feeds records, sorted by time, and scans every [`SCAN_PERIOD`] from `start` to `end`: for
-    /// the recorded truth of a live run.
+    /// the recorded truth of a live run. `see` looks on after every scan.
     pub fn replay(
-        &mut self,
-        records: &mut dyn Iterator<Item = Truth>,
-        start: Instant,
-        end: Instant,
-    ) {
-        self.replay_seeing(records, start, end, &mut |_, _| {});
-    }
-
-    /// As [`Self::replay`]; `see` looks on after every scan.
-    pub(crate) fn replay_seeing(
         &mut self,
         records: &mut dyn Iterator<Item = Truth>,
         start: Instant,
@@ -450,7 +440,6 @@ impl Track {
 
 hil_core::counts! {
     /// Counts of one run, all fleets together.
-    #[derive(Serialize)]
     pub struct Tally {
         /// Critical sections of two missions under way at once, both still ahead.
         sections_created_count: u64;
@@ -537,7 +526,7 @@ pub enum IncidentKind {
 }
 
 /// Something that must not happen, with what led to it.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Incident {
     /// The scan that saw it.
     pub at: Instant,
@@ -558,7 +547,7 @@ pub struct Incident {
 }
 
 /// What became of the authority a robot got last before an incident.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Cause {
     /// A [`TruthKind`] as a number; 0 when it had none.
     pub kind: u32,

@@ -128,7 +128,12 @@ fn a_replay_of_sorted_records_gives_the_same_tally() {
     }
     records.sort_by_key(|truth| truth.at_ns);
     let mut referee = Referee::new(&scene, 1);
-    referee.replay(&mut records.into_iter(), Instant::ZERO, at(40.0));
+    referee.replay(
+        &mut records.into_iter(),
+        Instant::ZERO,
+        at(40.0),
+        &mut |_, _| {},
+    );
     let tally = referee.tally();
     assert_eq!((tally.overlaps_count, tally.missions_done_count), (1, 2));
     assert_eq!(tally.scans_count, 1334);

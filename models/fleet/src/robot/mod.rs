@@ -14,8 +14,6 @@ mod tracker;
 use core::time::Duration;
 use std::sync::Arc;
 
-use serde::Serialize;
-
 use crate::geometry::{Pose, floor_index};
 use crate::messages::{
     Authority, Header, MessageOrder, Mission, Phase, State, Truth, TruthKind, first_id,
@@ -507,7 +505,7 @@ fn in_order(newest: &mut Option<u32>, header: &Header) -> bool {
 }
 
 /// Counted since the robot was made.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct RobotCounters {
     /// Missions begun.
     pub missions_started_count: u64,

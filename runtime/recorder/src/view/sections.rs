@@ -228,19 +228,16 @@ pub(crate) fn of_pair(
         let inside = that(&|robot, side| robot.index >= section.start(side));
         let may_pass = that(&|robot, side| robot.granted >= section.start(side));
         // One may follow the other through it, as long as no two poses that they may take meet.
-        let other_way = Span {
-            lower: other.index,
-            upper: other.granted,
-        };
-        let meeting = section.first_conflict(Side::First, one.index, other_way);
-        let is_contested = meeting.is_some_and(|pose| pose <= one.granted);
+        let own_way = Span::between(one.index, one.granted);
+        let other_way = Span::between(other.index, other.granted);
+        let meeting = section.first_conflict(Side::First, own_way, other_way);
         list.push(SectionPicture {
             id: format!("{fleet}:{}-{}:{index}", one.robot, other.robot),
             fleet,
             robots: [one.robot, other.robot],
             may_pass,
             inside,
-            is_contested,
+            is_contested: meeting.is_some(),
             polygon: areas.of(world, one.path, other.path, index).to_vec(),
         });
     }

@@ -15,7 +15,7 @@ use crate::coordinator::parameters::CoordinatorParameters;
 use crate::coordinator::policy::{Contest, OrderingPolicy};
 use crate::coordinator::roster::{RobotView, Roster};
 use crate::coordinator::sections::ActiveSection;
-use crate::coordinator::{Cycle, Rules};
+use crate::coordinator::{Cycle, Rules, reach_m};
 use crate::messages::{Authority, Header, TO_GOAL, ToRobot};
 use crate::scenario::Scene;
 use crate::section::{Side, Span};
@@ -331,10 +331,8 @@ impl CircleFinder {
 /// The forward model of one kind of vehicle.
 #[derive(Debug, Clone)]
 pub(crate) struct ForwardModel {
+    vehicle: Vehicle,
     lookahead_s: f64,
-    speed_max_mps: f64,
-    speeding_up_mps2: f64,
-    braking_mps2: f64,
 }
 
 /// Vehicles may speed up this much better, and brake as much worse, than they should.
@@ -343,23 +341,15 @@ const PESSIMISM_RATIO: f64 = 0.1;
 impl ForwardModel {
     pub(crate) fn new(vehicle: &Vehicle, parameters: &CoordinatorParameters) -> Self {
         Self {
+            vehicle: *vehicle,
             lookahead_s: lookahead(parameters).as_secs_f64(),
-            speed_max_mps: vehicle.speed_max_mps,
-            speeding_up_mps2: (1.0 + PESSIMISM_RATIO) * vehicle.acceleration_mps2,
-            braking_mps2: (1.0 - PESSIMISM_RATIO) * vehicle.acceleration_mps2,
         }
     }
 
     /// Way a vehicle at `speed_mps` still makes when it first speeds up for the lookahead and
     /// then brakes, metres.
     pub(crate) fn stopping_way_m(&self, speed_mps: f64) -> f64 {
-        let speed_mps = speed_mps.max(0.0);
-        let to_full_s = ((self.speed_max_mps - speed_mps) / self.speeding_up_mps2).max(0.0);
-        let speeding_up_s = to_full_s.min(self.lookahead_s);
-        let fast_mps = speed_mps + self.speeding_up_mps2 * speeding_up_s;
-        0.5 * (speed_mps + fast_mps) * speeding_up_s
-            + fast_mps * (self.lookahead_s - speeding_up_s)
-            + fast_mps * fast_mps / (2.0 * self.braking_mps2)
+        reach_m(&self.vehicle, PESSIMISM_RATIO, speed_mps, self.lookahead_s)
     }
 
     /// The pose at which the robot of `view` could stop at the earliest.
@@ -540,7 +530,7 @@ fn among_unstoppable(
     if is_in_the_way {
         let conflict = active
             .section()
-            .first_conflict(leader, leading.index, Span::at(stands_at));
+            .first_conflict(leader, sweep, Span::at(stands_at));
         decision.leader_wait = conflict.map(|index| index.saturating_sub(trailing_points));
     }
     decision
@@ -565,7 +555,7 @@ pub(crate) fn wait_index(
         };
         active
             .section()
-            .first_conflict(waiting, start, sweep)
+            .first_conflict(waiting, Span::between(start, active.end(waiting)), sweep)
             .unwrap_or(start)
     };
     conflict.saturating_sub(trailing_points)

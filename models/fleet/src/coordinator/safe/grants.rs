@@ -5,11 +5,11 @@
 use core::cmp::Ordering;
 use core::time::Duration;
 
-use crate::coordinator::Cycle;
 use crate::coordinator::policy::Contest;
 use crate::coordinator::roster::Roster;
 use crate::coordinator::safe::reservation::Contact;
-use crate::coordinator::safe::{SafeRules, lookahead_s, reach_m};
+use crate::coordinator::safe::{SafeRules, lookahead_s};
+use crate::coordinator::{Cycle, reach_m};
 use crate::section::{Side, Span};
 use hil_core::time::Instant;
 
@@ -92,10 +92,11 @@ impl SafeRules {
             self.reserve_ms,
         );
         // The robot may be almost a pose beyond the one it passed last.
-        let way_m = path.way_to_m(ledger.lower() + 1)
-            + reach_m(&self.world.vehicle, view.speed_mps, time_s);
+        let vehicle = &self.world.vehicle;
+        let speed_mps = view.speed_mps.min(vehicle.speed_max_mps);
+        let way_m = path.way_to_m(ledger.lower() + 1) + reach_m(vehicle, 0.0, speed_mps, time_s);
         // One that came to stand short of the end of its authority still needs more to go on.
-        let needed = ledger.lower() + self.core.margin.below + 2;
+        let needed = ledger.lower() + self.core.margin.poses + 2;
         let want = (path.index_at(way_m) + 1).max(needed).min(last);
         (want > ledger.bound()).then_some(Candidate {
             robot,
@@ -181,13 +182,13 @@ impl SafeRules {
             .filter_map(|contact| {
                 let entry = contact.section().first_conflict(
                     Side::Second,
-                    span.lower,
+                    Span::between(span.lower, usize::MAX),
                     Span {
                         lower: from,
                         upper: contact.own.upper,
                     },
                 )?;
-                let end = entry.checked_sub(self.core.margin.above + 1)?;
+                let end = entry.checked_sub(self.core.margin.poses + 1)?;
                 let is_useful = end >= earliest && entry <= span.upper;
                 let prefers = || self.compare(cycle, robot, contact) == Ordering::Less;
                 (is_useful && prefers()).then_some(end)

@@ -287,7 +287,7 @@ impl Interlocking {
         let mut end = want;
         if let Some((index, other)) = conflict {
             extension.stopped_by = Some(other);
-            end = (index - 1).saturating_sub(margin.above);
+            end = (index - 1).saturating_sub(margin.poses);
         }
         let free_end = end;
         for _ in 0..ENDS_MAX {
@@ -301,7 +301,7 @@ impl Interlocking {
             }
             extension.withheld_count += 1;
             let start = section_start(self.traffic.contacts(robot), upper);
-            end = start.saturating_sub(margin.above + 1);
+            end = start.saturating_sub(margin.poses + 1);
         }
         // What the plan itself foresees next is always possible.
         let planned = self.plan.next_end(robot).map_or(0, |end| end.min(free_end));

@@ -36,16 +36,14 @@ use crate::section::{Side, Span};
 /// How far from the end of its authority a robot may come to stand, in poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct StopMargin {
-    /// Short of it.
-    pub(crate) below: usize,
-    /// Beyond it.
-    pub(crate) above: usize,
+    /// As many short of it as beyond it.
+    pub(crate) poses: usize,
 }
 
 impl StopMargin {
     /// What a robot with authority up to `index` may cover at most.
     pub(crate) fn upper(&self, index: usize, last: usize) -> usize {
-        index.saturating_add(self.above).min(last)
+        index.saturating_add(self.poses).min(last)
     }
 
     /// What a robot covers that came to stand at the end of its authority.
@@ -54,7 +52,7 @@ impl StopMargin {
             return Span::at(last);
         }
         Span {
-            lower: index.saturating_sub(self.below),
+            lower: index.saturating_sub(self.poses),
             upper: self.upper(index, last),
         }
     }
@@ -106,7 +104,7 @@ impl Plan {
         let margin = self.margin;
         self.moves.retain(|step| {
             step.to >= traffic.last(step.robot)
-                || traffic.span(step.robot).lower + margin.below < step.to
+                || traffic.span(step.robot).lower + margin.poses < step.to
         });
     }
 
@@ -172,7 +170,7 @@ impl Plan {
         may_reorder: bool,
     ) -> bool {
         if self.keeps(traffic, robot, upper) {
-            let end = upper.saturating_sub(self.margin.above);
+            let end = upper.saturating_sub(self.margin.poses);
             for step in self.moves.iter_mut().filter(|step| step.robot == robot) {
                 step.to = step.to.max(end);
             }
@@ -206,7 +204,7 @@ impl Plan {
             return true;
         }
         let last = traffic.last(robot);
-        let end = upper.saturating_sub(self.margin.above);
+        let end = upper.saturating_sub(self.margin.poses);
         let mut own = Span {
             lower: traffic.span(robot).lower,
             upper,
@@ -224,11 +222,11 @@ impl Plan {
                 continue;
             }
             let other = self.margin.standing(step.to, traffic.last(step.robot));
-            let from = self.spans[step.robot].upper + 1;
+            let poses = Span::between(self.spans[step.robot].upper + 1, other.upper);
             let is_blocked = contacts.iter().any(|contact| {
                 contact.other == step.robot
                     && is_new(contact)
-                    && conflict_of_other(contact, from, other.upper, own).is_some()
+                    && (contact.section().first_conflict(Side::Second, poses, own)).is_some()
             });
             if is_blocked {
                 return false;
@@ -331,8 +329,8 @@ impl Plan {
             return false;
         };
         let margin = self.margin;
-        let present = upper.saturating_sub(margin.above);
-        let mut end = (conflict - 1).saturating_sub(margin.above);
+        let present = upper.saturating_sub(margin.poses);
+        let mut end = (conflict - 1).saturating_sub(margin.poses);
         while end > present {
             let standing = margin.standing(end, last);
             let span = Span {
@@ -346,7 +344,7 @@ impl Plan {
             }
             // Next, before the section that begins last before this end.
             end =
-                section_start(traffic.contacts(robot), span.upper).saturating_sub(margin.above + 1);
+                section_start(traffic.contacts(robot), span.upper).saturating_sub(margin.poses + 1);
         }
         false
     }
@@ -361,11 +359,13 @@ impl Plan {
             if !self.is_pending[other] {
                 return true;
             }
-            let (from, to) = (self.spans[other].upper + 1, traffic.last(other));
+            let poses = Span::between(self.spans[other].upper + 1, traffic.last(other));
             let stopped_by = |taken: Span| {
                 let conflicts = group.iter();
                 conflicts
-                    .filter_map(|contact| conflict_of_other(contact, from, to, taken))
+                    .filter_map(|contact| {
+                        contact.section().first_conflict(Side::Second, poses, taken)
+                    })
                     .min()
             };
             stopped_by(span)
@@ -383,7 +383,7 @@ impl Plan {
         let can_be_made = self.moves.iter().all(|step| {
             let (robot, last) = (step.robot, traffic.last(step.robot));
             let reserved = spans[robot].upper;
-            let end = step.to.max(reserved.saturating_sub(self.margin.above));
+            let end = step.to.max(reserved.saturating_sub(self.margin.poses));
             let standing = self.margin.standing(end, last);
             let conflict = traffic.first_conflict(robot, reserved + 1, standing.upper, &spans);
             let lower = standing.lower.max(spans[robot].lower);
@@ -416,15 +416,4 @@ const SIDESTEPS_PER_ROBOT: usize = 4;
 pub(crate) fn section_start(contacts: &[Contact], upper: usize) -> usize {
     let starts = contacts.iter().map(|contact| contact.own.lower);
     starts.filter(|start| *start <= upper).max().unwrap_or(0)
-}
-
-/// First pose of `from..=to` of the *other* robot that overlaps what this one has in `taken`.
-fn conflict_of_other(contact: &Contact, from: usize, to: usize, taken: Span) -> Option<usize> {
-    if contact.others.upper < from || contact.others.lower > to {
-        return None;
-    }
-    contact
-        .section()
-        .first_conflict(Side::Second, from, taken)
-        .filter(|index| *index <= to)
 }

@@ -40,7 +40,7 @@ use crate::coordinator::{Cycle, Rules};
 use crate::geometry::floor_index;
 use crate::messages::{Mission, State, ToRobot, first_id};
 use crate::mission::MissionSource;
-use crate::world::{BayIndex, Vehicle, World};
+use crate::world::{BayIndex, World};
 use hil_core::time::Instant;
 
 /// The rules of the safe mode.
@@ -250,7 +250,7 @@ impl Rules for SafeRules {
             view.is_counted_stuck = false;
         }
         let (lower, bound) = (member.ledger.lower(), member.ledger.bound());
-        if lower >= bound + self.core.margin.above && lower < self.core.traffic.last(robot) {
+        if lower >= bound + self.core.margin.poses && lower < self.core.traffic.last(robot) {
             self.counts.margins_exceeded += 1;
         }
     }
@@ -372,17 +372,6 @@ fn follow(estimate_s: f64, sample_s: f64) -> f64 {
     sample_s.max(estimate_s + DECAY * (sample_s - estimate_s))
 }
 
-/// Way a robot at `speed_mps` makes at most in `time_s`, and then needs to stop.
-pub(crate) fn reach_m(vehicle: &Vehicle, speed_mps: f64, time_s: f64) -> f64 {
-    let (speed_max_mps, acceleration_mps2) = (vehicle.speed_max_mps, vehicle.acceleration_mps2);
-    let speed_mps = speed_mps.clamp(0.0, speed_max_mps);
-    let accelerating_s = ((speed_max_mps - speed_mps) / acceleration_mps2).min(time_s);
-    let end_mps = speed_mps + acceleration_mps2 * accelerating_s;
-    0.5 * (speed_mps + end_mps) * accelerating_s
-        + end_mps * (time_s - accelerating_s)
-        + end_mps * end_mps / (2.0 * acceleration_mps2)
-}
-
 /// Seconds until an authority sent a control cycle from now is sure to be at the robot, counted
 /// from when the state known now was sampled.
 pub(crate) fn lookahead_s(cycle_s: f64, round_trip_s: f64, reserve_ms: f64) -> f64 {
@@ -423,17 +412,16 @@ impl SafeParameters {
     pub(crate) fn stop_margin(&self, world: &World) -> StopMargin {
         let spacing_m = spacing_min_m(world);
         let poses = floor_index((self.stop_error_m / spacing_m).ceil()) + 1;
-        StopMargin {
-            below: poses,
-            above: poses,
-        }
+        StopMargin { poses }
     }
 }
 
 #[cfg(test)]
 mod horizon_tests {
     use super::*;
+    use crate::coordinator::reach_m;
     use crate::geometry::Footprint;
+    use crate::world::Vehicle;
 
     const CART: Vehicle = Vehicle {
         footprint: Footprint {
@@ -447,7 +435,7 @@ mod horizon_tests {
     #[test]
     fn reach_follows_its_closed_form() {
         let check = |speed, time, expected: f64| {
-            let reach = reach_m(&CART, speed, time);
+            let reach = reach_m(&CART, 0.0, speed, time);
             assert!((reach - expected).abs() < 1e-12, "{reach} {expected}");
         };
         check(2.0, 0.0, 2.0);

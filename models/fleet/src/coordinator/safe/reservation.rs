@@ -28,19 +28,6 @@ impl Contact {
     pub(crate) fn section(&self) -> &Section {
         &self.sections[self.position]
     }
-
-    /// First pose of `from..=to` that overlaps a pose the other robot has in `taken`.
-    pub(crate) fn first_conflict(&self, from: usize, to: usize, taken: Span) -> Option<usize> {
-        if taken.lower > self.others.upper || taken.upper < self.others.lower {
-            return None;
-        }
-        let section = self.section();
-        (from.max(self.own.lower)..=to.min(self.own.upper)).find(|&index| {
-            section
-                .partners(Side::First, index)
-                .is_some_and(|(first, last)| first <= taken.upper && taken.lower <= last)
-        })
-    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -162,7 +149,8 @@ impl Traffic {
             if contact.own.lower > to || contact.own.upper < from {
                 continue;
             }
-            if let Some(index) = contact.first_conflict(from, to, spans[contact.other]) {
+            let (poses, taken) = (Span::between(from, to), spans[contact.other]);
+            if let Some(index) = contact.section().first_conflict(Side::First, poses, taken) {
                 found = Some((index, contact.other));
                 if index == from {
                     break;

@@ -32,7 +32,7 @@ use crate::scenario::{Scenario, WorldParameters};
 use crate::section::{MergePolicy, Side, Span};
 use crate::world::{Bay, BayIndex, Route, Vehicle, World};
 
-const MARGIN: StopMargin = StopMargin { below: 1, above: 1 };
+const MARGIN: StopMargin = StopMargin { poses: 1 };
 
 /// What is searched.
 #[derive(Debug, Clone)]

@@ -9,7 +9,7 @@ use crate::scenario::{Scenario, Scene, WorldParameters};
 use crate::world::{BayIndex, World};
 use hil_core::random::RandomStream;
 
-const MARGIN: StopMargin = StopMargin { below: 1, above: 1 };
+const MARGIN: StopMargin = StopMargin { poses: 1 };
 const QUESTION: u32 = 1;
 
 /// A robot that hears and tells everything, stops in no time, and stands at the end of its authority at last.
