@@ -1,6 +1,6 @@
 // The robot's arms in space: measured solid, commanded as an outline; own projection, far parts first.
 
-import { FONT, age, isEmpty, make, polyline, quantity, surface, write } from "./format.js";
+import { FONT, age, chipOf, isEmpty, legendEntry, make, quantity, stroked, surface, write } from "./format.js";
 
 const START = { turn: -0.62, tilt: 0.36, zoom: 1 };
 const CENTRE = [0.2, 0, 0.26];
@@ -15,8 +15,7 @@ export class ArmScene {
   }
 
   legend() {
-    const entry = (kind, words) => make("li", {}, make("i", { class: kind }), words);
-    return [entry("solid", "measured"), entry("ghost", "commanded"), make("li", {}, "drag to turn, Ctrl and wheel or + and − to zoom")];
+    return [legendEntry("solid", "measured"), legendEntry("ghost", "commanded"), make("li", {}, "drag to turn, Ctrl and wheel or + and − to zoom")];
   }
 
   drag(dx, dy) {
@@ -69,13 +68,9 @@ export class ArmScene {
   }
 
   floor(context) {
-    context.strokeStyle = this.colours.rule;
-    context.lineWidth = 1;
     const line = (from, to) => {
       const [a, b] = [this.project(from), this.project(to)];
-      if (!a || !b) return;
-      polyline(context, [[a.x, a.y], [b.x, b.y]]);
-      context.stroke();
+      if (a && b) stroked(context, [[a.x, a.y], [b.x, b.y]], this.colours.rule, 1);
     };
     const { x, y, step } = FLOOR_M;
     for (let at = x[0]; at <= x[1] + 1e-9; at += step) line([at, y[0], 0], [at, y[1], 0]);
@@ -126,12 +121,7 @@ export class ArmScene {
   }
 
   tool(context, arm, trail) {
-    const draw = (points, style, line) => {
-      context.strokeStyle = style;
-      context.lineWidth = line;
-      polyline(context, points.map(({ x, y }) => [x, y]));
-      context.stroke();
-    };
+    const draw = (points, style, width) => stroked(context, points.map(({ x, y }) => [x, y]), style, width);
     const seen = (points) => points.map((point) => this.project(point)).filter(Boolean);
     if (trail?.length > 1) {
       context.globalAlpha = 0.7;
@@ -155,17 +145,15 @@ export class ArmScene {
       const end = this.project(CENTRE.map((value, index) => value + (index === axis ? 0.1 : 0)));
       const unit = 24 / (0.1 * origin.scale);
       const [dx, dy] = [(end.x - origin.x) * unit, (end.y - origin.y) * unit];
-      context.strokeStyle = context.fillStyle = colour;
-      context.lineWidth = 2;
-      polyline(context, [corner, [corner[0] + dx, corner[1] + dy]]);
-      context.stroke();
+      context.fillStyle = colour;
+      stroked(context, [corner, [corner[0] + dx, corner[1] + dy]], colour, 2);
       context.fillText(name, corner[0] + dx * 1.45, corner[1] + dy * 1.45);
     });
   }
 
   list(arms) {
     for (const arm of arms.arms) {
-      if (!this.chips.has(arm.side)) this.chips.set(arm.side, this.chip(arm.side));
+      if (!this.chips.has(arm.side)) this.chips.set(arm.side, chipOf(this.list_, arm.side, { "data-arm": arm.side }, "whole"));
       const { mark, text, item } = this.chips.get(arm.side);
       mark.style.background = this.colourOf(arm);
       const session = arm.session === null ? arm.state ?? "no session" : `${arm.state ?? "unknown"}, session ${arm.session}`;
@@ -175,14 +163,6 @@ export class ArmScene {
       const tool = this.tools.find((one) => one.side === arm.side);
       if (tool) Object.assign(text.dataset, { x: tool.x_px.toFixed(1), y: tool.y_px.toFixed(1) });
     }
-  }
-
-  chip(side) {
-    const mark = make("b", {}, side);
-    const text = make("output", { "data-arm": side });
-    const item = make("li", { class: "whole" }, mark, text);
-    this.list_.append(item);
-    return { item, mark, text };
   }
 
   describe(x, y) {
@@ -202,10 +182,7 @@ export class ArmScene {
 
 function stroke(context, { a, b }, style, width, alpha, shift = 0) {
   context.globalAlpha = alpha;
-  context.strokeStyle = style;
-  context.lineWidth = width;
-  polyline(context, [a, b].map(({ x, y }) => [x + shift, y + shift]));
-  context.stroke();
+  stroked(context, [a, b].map(({ x, y }) => [x + shift, y + shift]), style, width);
   context.globalAlpha = 1;
 }
 

@@ -1,6 +1,6 @@
 // The fleet from above: ground, ways, critical sections, vehicles to scale and where they met.
 
-import { FONT, age, isEmpty, keepOnly, make, polyline, quantity, surface, write } from "./format.js";
+import { FONT, age, chipOf, isEmpty, keepOnly, legendEntry, polyline, quantity, stroked, surface, write } from "./format.js";
 
 const PADDING_PX = 14;
 const NUMBER_FITS_PX = 15;
@@ -13,9 +13,8 @@ export class FleetScene {
   }
 
   legend() {
-    const entry = (kind, words, text = "") => make("li", {}, make("i", { class: kind }, text), words);
-    return [entry("thick", "way granted"), entry("dashed", "planned way"), entry("area", "section, colour: who may pass"),
-      entry("both", "granted to both at once"), entry("stale", "stale"), entry("cross", "collision", "×")];
+    return [legendEntry("thick", "way granted"), legendEntry("dashed", "planned way"), legendEntry("area", "section, colour: who may pass"),
+      legendEntry("both", "granted to both at once"), legendEntry("stale", "stale"), legendEntry("cross", "collision", "×")];
   }
 
   drag(dx, dy) {
@@ -268,10 +267,8 @@ export class FleetScene {
     const decade = 10 ** Math.floor(Math.log10(wanted_m));
     const length_m = [5, 2, 1].map((step) => step * decade).find((step) => step <= wanted_m);
     const [left, right, bottom] = [width / 2 - (length_m * this.scale) / 2, width / 2 + (length_m * this.scale) / 2, height - 3];
-    context.strokeStyle = context.fillStyle = this.colours.faint;
-    context.lineWidth = 1.5;
-    polyline(context, [[left, bottom - 4], [left, bottom], [right, bottom], [right, bottom - 4]]);
-    context.stroke();
+    context.fillStyle = this.colours.faint;
+    stroked(context, [[left, bottom - 4], [left, bottom], [right, bottom], [right, bottom - 4]], this.colours.faint, 1.5);
     context.font = `12px ${FONT}`;
     context.textAlign = "left";
     context.textBaseline = "alphabetic";
@@ -284,7 +281,7 @@ export class FleetScene {
     for (const robot of robots) {
       const key = `${robot.fleet}/${robot.id}`;
       present.add(key);
-      if (!this.chips.has(key)) this.chips.set(key, this.chip(key, robot));
+      if (!this.chips.has(key)) this.chips.set(key, chipOf(this.robots, String(robot.id), { "data-robot": key }));
       const { item, mark, text } = this.chips.get(key);
       const drawn = this.drawn.find((one) => one.robot === robot);
       item.classList.toggle("stale", robot.is_stale);
@@ -296,14 +293,6 @@ export class FleetScene {
       Object.assign(text.dataset, { x: drawn.x_px.toFixed(1), y: drawn.y_px.toFixed(1), xM: robot.x_m, yM: robot.y_m });
     }
     keepOnly(this.chips, present);
-  }
-
-  chip(key, robot) {
-    const mark = make("b", {}, String(robot.id));
-    const text = make("output", { "data-robot": key });
-    const item = make("li", {}, mark, text);
-    this.robots.append(item);
-    return { item, mark, text };
   }
 
   // What is under the pointer, in words.

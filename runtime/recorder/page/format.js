@@ -63,6 +63,20 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+// An entry of a scene's legend.
+export function legendEntry(kind, words, text = "") {
+  return make("li", {}, make("i", { class: kind }, text), words);
+}
+
+// Something of a scene in words, at the end of their list.
+export function chipOf(list, name, told, kind) {
+  const mark = make("b", {}, name);
+  const text = make("output", told);
+  const item = make("li", { class: kind }, mark, text);
+  list.append(item);
+  return { item, mark, text };
+}
+
 // Puts a child at its place among its parent's others, and touches nothing when it is there.
 export function keepAt(parent, index, child) {
   if (parent.children[index] !== child) parent.insertBefore(child, parent.children[index] ?? null);
@@ -109,6 +123,14 @@ export function polyline(context, points, isClosed = false) {
   context.beginPath();
   points.forEach(([x, y], index) => context[index ? "lineTo" : "moveTo"](x, y));
   if (isClosed) context.closePath();
+}
+
+// A line through points [x, y].
+export function stroked(context, points, style, width) {
+  context.strokeStyle = style;
+  context.lineWidth = width;
+  polyline(context, points);
+  context.stroke();
 }
 
 // A canvas without an area, as before the first layout: there is nothing to draw on, and a sheet of

@@ -1,6 +1,6 @@
 // Strip charts of delays: one strip per segment of a channel, or per channel, over the last stretch of time.
 
-import { FONT, UNAVAILABLE, keepAt, keepOnly, make, microseconds, polyline, surface, write } from "./format.js";
+import { FONT, UNAVAILABLE, keepAt, keepOnly, make, microseconds, polyline, stroked, surface, write } from "./format.js";
 
 const WHOLE = "published to taken";
 const LEFT_PX = 58;
@@ -140,20 +140,15 @@ export class Strips {
     context.font = `11px ${FONT}`;
     context.textAlign = "right";
     context.textBaseline = "middle";
-    context.lineWidth = 1;
     for (const { value, y } of scale.ticks) {
-      context.strokeStyle = colours.rule;
-      polyline(context, [[LEFT_PX, y], [width, y]]);
-      context.stroke();
+      stroked(context, [[LEFT_PX, y], [width, y]], colours.rule, 1);
       context.fillStyle = colours.faint;
       context.fillText(value === 0 ? "0" : microseconds(value).replace(/\.0+ /, " "), LEFT_PX - 6, Math.min(Math.max(y, 7), height - 7));
     }
     const step = this.drawn_s / 6;
-    context.strokeStyle = colours.rule;
     for (let number = 1; number < 6; number += 1) {
       const at = x(from + number * step);
-      polyline(context, [[at, 0], [at, height]]);
-      context.stroke();
+      stroked(context, [[at, 0], [at, height]], colours.rule, 1);
     }
   }
 

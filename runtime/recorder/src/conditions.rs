@@ -3,16 +3,14 @@
 
 use std::collections::BTreeMap;
 
-use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome};
+use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome, flow_name};
+use hil_link::spec::Way;
 use serde_json::Value;
 
 use crate::schema::own_message;
 use crate::sink::{Sink, Topic};
 use crate::topics::Names;
 use crate::writer::Stamp;
-
-/// Before the link and the direction in the name under which orders are recorded.
-const RECORDED_AS: &str = "hil/link/";
 
 own_message! {
     /// An order to one direction of a link and what became of it.
@@ -42,7 +40,7 @@ own_message! {
 }
 
 impl OrderedCondition {
-    fn of(link: &str, direction: &str, record: &LinkConditionRecord) -> Self {
+    fn of(link: &str, direction: Way, record: &LinkConditionRecord) -> Self {
         let (condition, delay_ns, loss_ratio) = match record.condition() {
             Some(LinkCondition::Topology) => ("topology", None, None),
             Some(LinkCondition::Fixed { loss_ratio, .. }) => {
@@ -57,7 +55,7 @@ impl OrderedCondition {
             number: record.number,
             request: record.request,
             link: link.to_owned(),
-            direction: direction.to_owned(),
+            direction: direction.word().to_owned(),
             condition: condition.to_owned(),
             delay_ns,
             loss_ratio,
@@ -79,7 +77,7 @@ pub(crate) struct Conditions {
 #[derive(Debug)]
 struct Direction {
     link: String,
-    way: String,
+    way: Way,
     /// Of the gateway that emulates it.
     host: String,
     topic: Topic,
@@ -92,17 +90,17 @@ impl Conditions {
         let links = topology["links"].as_object().into_iter().flatten();
         for (link, described) in links.filter(|(_, one)| one["via"] == "emulated") {
             // A gateway emulates the direction that ends at its host.
-            for (way, end) in [("forward", 1), ("backward", 0)] {
+            for (way, end) in [(Way::Forward, 1), (Way::Backward, 0)] {
                 let host = described["between"][end].as_str().unwrap_or_default();
                 let name = names.claim(format!("/net/{link}/{way}/condition"));
-                let metadata = [("link", link.as_str()), ("direction", way)];
+                let metadata = [("link", link.as_str()), ("direction", way.word())];
                 let direction = Direction {
                     link: link.clone(),
-                    way: way.to_owned(),
+                    way,
                     host: host.to_owned(),
                     topic: Topic::new(name, OrderedCondition::schema(), &metadata),
                 };
-                directions.insert(format!("{RECORDED_AS}{link}/{way}"), direction);
+                directions.insert(flow_name(link, way), direction);
             }
         }
         Self { directions }
@@ -138,7 +136,7 @@ impl Conditions {
         let Some(direction) = self.directions.get_mut(channel) else {
             return Ok(());
         };
-        let ordered = OrderedCondition::of(&direction.link, &direction.way, record);
+        let ordered = OrderedCondition::of(&direction.link, direction.way, record);
         let at = Stamp::new(at_ns, record.number);
         direction.topic.put(sink, at, &ordered)
     }
@@ -154,7 +152,7 @@ mod tests {
     fn an_order_says_what_it_asked_for_and_why_it_was_refused() {
         let mut record = LinkConditionRecord::zeroed();
         (record.kind, record.delay_ns, record.loss_ratio) = (1, 40_000_000, 0.2);
-        let ordered = OrderedCondition::of("hop", "forward", &record);
+        let ordered = OrderedCondition::of("hop", Way::Forward, &record);
         assert_eq!(
             (ordered.condition.as_str(), ordered.is_in_force),
             ("fixed", true)
@@ -164,14 +162,14 @@ mod tests {
             (Some(40_000_000), Some(0.2))
         );
         (record.kind, record.outcome) = (2, 2);
-        let ordered = OrderedCondition::of("hop", "forward", &record);
+        let ordered = OrderedCondition::of("hop", Way::Forward, &record);
         assert_eq!(
             (ordered.condition.as_str(), ordered.loss_ratio),
             ("cut", Some(1.0))
         );
         assert!(!ordered.is_in_force && ordered.refusal.contains("too little room"));
         (record.kind, record.outcome) = (9, 9);
-        let ordered = OrderedCondition::of("hop", "forward", &record);
+        let ordered = OrderedCondition::of("hop", Way::Forward, &record);
         assert_eq!(ordered.condition, "unknown");
         assert!(!ordered.is_in_force && !ordered.refusal.is_empty());
     }

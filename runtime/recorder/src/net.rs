@@ -135,35 +135,23 @@ impl Noted {
     /// the way of the first, and of pieces of a message that never arrived.
     pub(crate) fn of(record: &Record) -> Option<Self> {
         const NO_ARRIVAL: u32 = IngressRecord::DUPLICATE | IngressRecord::INCOMPLETE;
-        let (stage, epoch, sequence, published_ns, at_ns) = match record {
-            Record::Published(one) => {
-                let at_ns = one.published_ns;
-                (Stage::Published, one.epoch, one.sequence, at_ns, at_ns)
-            }
-            Record::Egress(one) => {
-                let (published_ns, at_ns) = (one.published_ns, one.taken_ns);
-                (Stage::Sent, one.epoch, one.sequence, published_ns, at_ns)
-            }
+        let (stage, at_ns) = match record {
+            Record::Published(one) => (Stage::Published, one.published_ns),
+            Record::Egress(one) => (Stage::Sent, one.taken_ns),
             Record::Ingress(one) if one.flags & NO_ARRIVAL == 0 => {
-                let (published_ns, at_ns) = (one.published_ns, one.received_ns);
-                (
-                    Stage::Received,
-                    one.epoch,
-                    one.sequence,
-                    published_ns,
-                    at_ns,
-                )
+                (Stage::Received, one.received_ns)
             }
-            Record::Taken(one) => {
-                let (published_ns, at_ns) = (one.published_ns, one.taken_ns);
-                (Stage::Taken, one.epoch, one.sequence, published_ns, at_ns)
-            }
+            Record::Taken(one) => (Stage::Taken, one.taken_ns),
             _ => return None,
         };
+        let name = record.message()?;
         Some(Self {
             stage,
-            message: MessageId { epoch, sequence },
-            published_ns,
+            message: MessageId {
+                epoch: name.epoch,
+                sequence: name.sequence,
+            },
+            published_ns: name.published_ns,
             at_ns,
         })
     }
@@ -221,7 +209,7 @@ impl MessageLatency {
                 self.forwarded_ns = stamp(one.forwarded_ns);
                 self.receiver_realtime_offset_ns = stamp(one.realtime_offset_ns);
             }
-            _ => {}
+            Record::LinkCondition(_) => {}
         }
     }
 

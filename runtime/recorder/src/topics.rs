@@ -71,15 +71,8 @@ pub(crate) struct View {
     pub(crate) prefix: &'static str,
     /// Its schema.
     pub(crate) schema: fn() -> Schema,
-    draw: fn(Published<'_>) -> Option<Vec<u8>>,
-}
-
-/// A message of a channel.
-#[derive(Debug, Clone, Copy)]
-struct Published<'a> {
-    channel: &'a str,
-    at: Timestamp,
-    payload: &'a [u8],
+    /// A message of this channel, published then, as bytes.
+    draw: fn(&str, Timestamp, &[u8]) -> Option<Vec<u8>>,
 }
 
 impl View {
@@ -87,31 +80,31 @@ impl View {
     const COMMANDED_JOINTS: Self = Self {
         prefix: "/joints",
         schema: well_known::<JointStates>,
-        draw: |published| {
-            let command: EgmCommand = read(published.payload)?;
+        draw: |channel, at, payload| {
+            let command: EgmCommand = read(payload)?;
             let speeds = command.flags & EgmCommand::HAS_SPEED != 0;
             let speeds = speeds.then_some(&command.speed_rad_per_s);
-            Some(joints(published, &command.position_rad, speeds).encode_to_vec())
+            Some(joints(channel, at, &command.position_rad, speeds).encode_to_vec())
         },
     };
     /// Joint positions that an arm reports.
     const MEASURED_JOINTS: Self = Self {
         prefix: "/joints",
         schema: well_known::<JointStates>,
-        draw: |published| {
-            let feedback: EgmFeedback = read(published.payload)?;
-            Some(joints(published, &feedback.measured_rad, None).encode_to_vec())
+        draw: |channel, at, payload| {
+            let feedback: EgmFeedback = read(payload)?;
+            Some(joints(channel, at, &feedback.measured_rad, None).encode_to_vec())
         },
     };
     /// Where an arm reports its tool.
     const TOOL: Self = Self {
         prefix: "/tool",
         schema: well_known::<PoseInFrame>,
-        draw: |published| {
-            let feedback: EgmFeedback = read(published.payload)?;
+        draw: |_channel, at, payload| {
+            let feedback: EgmFeedback = read(payload)?;
             let [w, i, j, k] = feedback.tool.quaternion_wxyz;
             let tool = PoseInFrame {
-                timestamp: Some(published.at),
+                timestamp: Some(at),
                 frame_id: "body".to_owned(),
                 pose: Some(pose(feedback.tool.position_m, [i, j, k, w])),
             };
@@ -122,9 +115,9 @@ impl View {
     const VEHICLES: Self = Self {
         prefix: "/scene",
         schema: well_known::<SceneUpdate>,
-        draw: |published| {
-            let state = read(published.payload)?;
-            Some(vehicle(&state, published.at).encode_to_vec())
+        draw: |_channel, at, payload| {
+            let state = read(payload)?;
+            Some(vehicle(&state, at).encode_to_vec())
         },
     };
 
@@ -143,11 +136,7 @@ impl View {
     /// What `payload`, a message of `channel` published at `at_ns`, looks like; nothing when it has
     /// another size.
     pub(crate) fn show(self, channel: &str, at_ns: u64, payload: &[u8]) -> Option<Vec<u8>> {
-        (self.draw)(Published {
-            channel,
-            at: timestamp(at_ns)?,
-            payload,
-        })
+        (self.draw)(channel, timestamp(at_ns)?, payload)
     }
 }
 
@@ -177,11 +166,12 @@ pub(crate) fn side_of(channel: &str) -> Option<Side> {
 }
 
 fn joints(
-    published: Published<'_>,
+    channel: &str,
+    at: Timestamp,
     positions_rad: &[f64; 7],
     speeds_rad_per_s: Option<&[f64; 7]>,
 ) -> JointStates {
-    let side = side_of(published.channel).map_or("", Side::word);
+    let side = side_of(channel).map_or("", Side::word);
     let joints = positions_rad.iter().enumerate();
     let joints = joints.map(|(index, position_rad)| JointState {
         name: joint_name(side, index),
@@ -190,7 +180,7 @@ fn joints(
         ..JointState::default()
     });
     JointStates {
-        timestamp: Some(published.at),
+        timestamp: Some(at),
         joints: joints.collect(),
     }
 }

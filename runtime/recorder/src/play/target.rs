@@ -46,7 +46,7 @@ impl Target {
     pub(crate) fn find(into: Option<&str>) -> Result<Self, Failure> {
         let card = env::var_os("HIL_CARD").map(PathBuf::from);
         let (run, is_ours) = match (into, card) {
-            (None, Some(card)) => (run_of_nic(&card)?, true),
+            (None, Some(card)) => (run_of_card(&card)?, true),
             (into, _) => (select(into).map_err(Failure::usage)?, false),
         };
         let manifest = run.manifest().map_err(|source| {
@@ -172,7 +172,7 @@ impl Outlet {
 }
 
 /// The run in whose folder the card lies: it started this program.
-fn run_of_nic(card: &Path) -> Result<LiveRun, Failure> {
+fn run_of_card(card: &Path) -> Result<LiveRun, Failure> {
     let failed = |why: &str| {
         let card = card.display();
         Failure::usage(format!(

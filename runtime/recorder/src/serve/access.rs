@@ -11,6 +11,8 @@ use std::fmt::{self, Write as _};
 use std::net::{Ipv4Addr, Ipv6Addr};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use hyper::StatusCode;
+
 use super::head::{Head, only};
 use super::passage::Excess;
 use super::token::Token;
@@ -58,15 +60,15 @@ pub(crate) enum Refusal {
 }
 
 impl Refusal {
-    /// The number and word of HTTP.
-    pub(crate) const fn status(&self) -> (u16, &'static str) {
+    /// As HTTP has it.
+    pub(crate) const fn status(&self) -> StatusCode {
         match self {
-            Self::Malformed | Self::NoHost => (400, "Bad Request"),
-            Self::TooSlow | Self::Crowded(_) => (408, "Request Timeout"),
-            Self::TooLong => (431, "Request Header Fields Too Large"),
-            Self::ForeignHost(_) | Self::ForeignOrigin(_) | Self::NoToken => (403, "Forbidden"),
-            Self::Excess(_) => (429, "Too Many Requests"),
-            Self::Full(_) | Self::NoServer(_) => (503, "Service Unavailable"),
+            Self::Malformed | Self::NoHost => StatusCode::BAD_REQUEST,
+            Self::TooSlow | Self::Crowded(_) => StatusCode::REQUEST_TIMEOUT,
+            Self::TooLong => StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE,
+            Self::ForeignHost(_) | Self::ForeignOrigin(_) | Self::NoToken => StatusCode::FORBIDDEN,
+            Self::Excess(_) => StatusCode::TOO_MANY_REQUESTS,
+            Self::Full(_) | Self::NoServer(_) => StatusCode::SERVICE_UNAVAILABLE,
         }
     }
 
@@ -237,8 +239,7 @@ impl Access {
         &self,
         hosts: impl Iterator<Item = &'a [u8]>,
     ) -> Result<(), Refusal> {
-        let host = only(hosts).map_err(|_ambiguous| Refusal::Malformed);
-        let judged = host.and_then(|host| self.judge_host(host.as_deref()).map(drop));
+        let judged = only(hosts).and_then(|host| self.judge_host(host.as_deref()).map(drop));
         judged.inspect_err(|refusal| self.count(refusal))
     }
 

@@ -20,7 +20,7 @@ use tokio::time::{sleep, timeout};
 
 use super::access::{Access, Refusal};
 use super::gate::Gate;
-use super::head::{Head, Parsed, head_bytes, parse};
+use super::head::{Head, head_bytes, parse};
 use super::passage::{AllViewers, End, GONE_AFTER, pass};
 use super::token;
 
@@ -288,10 +288,9 @@ async fn read_head(
         }
         // A head can only end where a line does.
         if bytes[read..].contains(&b'\n') {
-            match parse(bytes) {
-                Parsed::Whole(head) => return Ok(Some(Ok(head))),
-                Parsed::Broken => return Ok(Some(Err(Refusal::Malformed))),
-                Parsed::Partial => {}
+            let parsed = parse(bytes);
+            if parsed.is_some() {
+                return Ok(parsed);
             }
         }
         if bytes.len() >= HEAD_BYTES_MAX {
@@ -318,10 +317,10 @@ async fn connect(server: &Gate) -> Result<TcpStream, Refusal> {
 
 /// Says no, and why.
 async fn refuse(viewer: &mut TcpStream, refusal: &Refusal) -> io::Result<()> {
-    let (code, word) = refusal.status();
+    let status = refusal.status();
     let words = refusal.words();
     let answer = format!(
-        "HTTP/1.1 {code} {word}\r\nContent-Type: text/plain; charset=utf-8\r\n\
+        "HTTP/1.1 {status}\r\nContent-Type: text/plain; charset=utf-8\r\n\
          X-Content-Type-Options: nosniff\r\nContent-Length: {}\r\nConnection: close\r\n\r\n{words}\n",
         words.len() + 1
     );

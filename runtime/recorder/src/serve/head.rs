@@ -3,6 +3,8 @@
 
 use httparse::{Request, Response, Status};
 
+use super::access::Refusal;
+
 /// Header fields of a request at most; a browser sends about fifteen.
 const FIELDS_MAX: usize = 96;
 
@@ -18,40 +20,31 @@ pub(super) struct Head {
     pub(super) token: Option<String>,
 }
 
-/// How far the head of a request has come.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Parsed {
-    /// Not all of it is there.
-    Partial,
-    /// It is whole.
-    Whole(Head),
-    /// It will never be one.
-    Broken,
-}
-
-/// Reads the beginning of `bytes`.
-pub(super) fn parse(bytes: &[u8]) -> Parsed {
+/// The head that `bytes` begin with; `None` while it is not whole.
+///
+/// # Errors
+/// When it will never be one.
+pub(super) fn parse(bytes: &[u8]) -> Option<Result<Head, Refusal>> {
     let mut fields = [httparse::EMPTY_HEADER; FIELDS_MAX];
     let mut request = Request::new(&mut fields);
     match request.parse(bytes) {
-        Ok(Status::Partial) => Parsed::Partial,
-        Ok(Status::Complete(_)) => {
-            let values = |name: &'static str| {
-                let fields = request.headers.iter();
-                let named = fields.filter(move |field| field.name.eq_ignore_ascii_case(name));
-                named.map(|field| field.value)
-            };
-            match (only(values("host")), only(values("origin"))) {
-                (Ok(host), Ok(origin)) => Parsed::Whole(Head {
-                    host,
-                    origin,
-                    token: request.path.and_then(token).map(str::to_owned),
-                }),
-                _ => Parsed::Broken,
-            }
-        }
-        Err(_) => Parsed::Broken,
+        Ok(Status::Partial) => return None,
+        Ok(Status::Complete(_)) => {}
+        Err(_) => return Some(Err(Refusal::Malformed)),
     }
+    let value = |name: &str| {
+        let fields = request.headers.iter();
+        let named = fields.filter(|field| field.name.eq_ignore_ascii_case(name));
+        only(named.map(|field| field.value))
+    };
+    let head = || {
+        Ok(Head {
+            host: value("host")?,
+            origin: value("origin")?,
+            token: request.path.and_then(token).map(str::to_owned),
+        })
+    };
+    Some(head())
 }
 
 /// Bytes of the head that `bytes` begin with, of a request or of an answer; `None` while it is not whole.
@@ -73,22 +66,22 @@ fn token(path: &str) -> Option<&str> {
         .find_map(|part| part.strip_prefix("token="))
 }
 
-/// More than one value, or one that is no text: readers of it could disagree.
-#[derive(Debug, PartialEq, Eq)]
-pub(super) struct Ambiguous;
-
 /// The only one of these values, if there is any.
+///
+/// # Errors
+/// When there are several, or it is no text: readers of it could disagree.
 pub(super) fn only<'a>(
     mut values: impl Iterator<Item = &'a [u8]>,
-) -> Result<Option<String>, Ambiguous> {
-    match (values.next(), values.next()) {
-        (None, _) => Ok(None),
-        (Some(value), None) => {
-            let text = str::from_utf8(value).ok().filter(|text| text.is_ascii());
-            text.map(|text| Some(text.to_owned())).ok_or(Ambiguous)
-        }
-        (Some(_), Some(_)) => Err(Ambiguous),
+) -> Result<Option<String>, Refusal> {
+    let first = values.next();
+    if values.next().is_some() {
+        return Err(Refusal::Malformed);
     }
+    first.map_or(Ok(None), |value| {
+        let text = str::from_utf8(value).ok().filter(|text| text.is_ascii());
+        let text = text.ok_or(Refusal::Malformed)?;
+        Ok(Some(text.to_owned()))
+    })
 }
 
 #[cfg(test)]
@@ -100,6 +93,8 @@ mod tests {
         format!("{begin}{fields}\r\n\r\n").into_bytes()
     }
 
+    const BROKEN: Option<Result<Head, Refusal>> = Some(Err(Refusal::Malformed));
+
     #[test]
     fn host_and_origin_are_read_whatever_their_case() {
         let parsed = parse(&request("hOsT: localhost:8765\r\nORIGIN: http://x"));
@@ -108,10 +103,10 @@ mod tests {
             origin: Some("http://x".to_owned()),
             token: None,
         };
-        assert_eq!(parsed, Parsed::Whole(head));
+        assert_eq!(parsed, Some(Ok(head)));
         let parsed = parse(&request("X-Host: a"));
         let head = Head::default();
-        assert_eq!(parsed, Parsed::Whole(head));
+        assert_eq!(parsed, Some(Ok(head)));
     }
 
     #[test]
@@ -127,7 +122,7 @@ mod tests {
             assert_eq!(token(path), expected, "{path}");
         }
         let parsed = parse(b"GET /?token=7 HTTP/1.1\r\n\r\n");
-        assert!(matches!(parsed, Parsed::Whole(head) if head.token.as_deref() == Some("7")));
+        assert!(matches!(parsed, Some(Ok(head)) if head.token.as_deref() == Some("7")));
     }
 
     #[test]
@@ -141,20 +136,20 @@ mod tests {
             "Host: localhost\r\nOrigin: http://\u{9b}31m",
             "Host: localhost\u{0}",
         ] {
-            assert_eq!(parse(&request(fields)), Parsed::Broken, "{fields:?}");
+            assert_eq!(parse(&request(fields)), BROKEN, "{fields:?}");
         }
-        assert_eq!(parse(b"\x16\x03\x01\x02\x00"), Parsed::Broken);
+        assert_eq!(parse(b"\x16\x03\x01\x02\x00"), BROKEN);
         let many = (0..=FIELDS_MAX).map(|index| format!("X-{index}: 1\r\n"));
-        assert_eq!(parse(&request(&many.collect::<String>())), Parsed::Broken);
+        assert_eq!(parse(&request(&many.collect::<String>())), BROKEN);
     }
 
     #[test]
     fn a_head_is_whole_at_its_last_byte_and_not_before() {
         let whole = request("Host: localhost:8765\r\nOrigin: https://evil.example");
         for end in 0..whole.len() {
-            assert_eq!(parse(&whole[..end]), Parsed::Partial, "{end} bytes");
+            assert_eq!(parse(&whole[..end]), None, "{end} bytes");
         }
-        assert!(matches!(parse(&whole), Parsed::Whole(_)));
+        assert!(matches!(parse(&whole), Some(Ok(_))));
         let more = [&whole[..], b"\x81\x85\x00\x01\x02\x03"].concat();
         assert_eq!(parse(&more), parse(&whole));
     }

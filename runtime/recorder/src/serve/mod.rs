@@ -369,13 +369,11 @@ pub(crate) fn judge_head(
     machine: &str,
     page_port: u16,
 ) -> Option<Result<String, Refusal>> {
-    let head = match head::parse(bytes) {
-        head::Parsed::Partial => return None,
-        head::Parsed::Broken => return Some(Err(Refusal::Malformed)),
-        head::Parsed::Whole(head) => head,
-    };
-    let judged = Access::new(&[], &[], Some(machine)).judge(&head, page_port);
-    Some(judged.and_then(|()| head.host.ok_or(Refusal::NoHost)))
+    let head = head::parse(bytes)?;
+    Some(head.and_then(|head| {
+        Access::new(&[], &[], Some(machine)).judge(&head, page_port)?;
+        head.host.ok_or(Refusal::NoHost)
+    }))
 }
 
 #[cfg(test)]

@@ -93,7 +93,7 @@ async fn serve_one(stream: TcpStream, config: Bytes, access: Arc<Access>) -> hyp
         let hosts = request.headers().get_all(header::HOST).iter();
         let answer = match access.judge_page(hosts.map(HeaderValue::as_bytes)) {
             Ok(()) => answer(request.method(), request.uri().path(), &config),
-            Err(refusal) => refused(&refusal),
+            Err(refusal) => plain(refusal.status(), format!("{}\n", refusal.words())),
         };
         async move { Ok::<_, Infallible>(answer) }
     });
@@ -122,12 +122,6 @@ fn answer(method: &Method, path: &str, config: &Bytes) -> Response<Full<Bytes>> 
 
 fn plain(status: StatusCode, words: impl Into<Bytes>) -> Response<Full<Bytes>> {
     with_headers(status, "text/plain; charset=utf-8", words.into())
-}
-
-fn refused(refusal: &Refusal) -> Response<Full<Bytes>> {
-    let (code, _) = refusal.status();
-    let status = StatusCode::from_u16(code).unwrap_or(StatusCode::FORBIDDEN);
-    plain(status, format!("{}\n", refusal.words()))
 }
 
 fn with_headers(status: StatusCode, kind: &'static str, content: Bytes) -> Response<Full<Bytes>> {
