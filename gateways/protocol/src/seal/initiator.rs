@@ -48,7 +48,6 @@ pub struct Initiator {
     retired: [Option<Salt>; RETIRED_LENGTH],
     retired_next: usize,
     unanswered_count: u32,
-    rotation_count: u64,
     counts: SealCounts,
 }
 
@@ -66,7 +65,6 @@ impl Initiator {
             retired: [None; RETIRED_LENGTH],
             retired_next: 0,
             unanswered_count: 0,
-            rotation_count: 0,
             counts: SealCounts::default(),
         }
     }
@@ -124,8 +122,8 @@ impl Initiator {
         let length = head.len() + tail.len() + TAG_BYTES;
         out[..head.len()].copy_from_slice(head);
         out[head.len()..][..tail.len()].copy_from_slice(tail);
-        traffic.forward.seal(&mut out[..length]);
-        self.counts.sealed_count += 1;
+        let counts = &mut self.counts;
+        traffic.forward.seal(&mut out[..length], counts);
         Some(length)
     }
 
@@ -136,10 +134,7 @@ impl Initiator {
     pub fn open(&mut self, datagram: &mut [u8]) -> Result<Heard, SealRefusal> {
         let result = self.accept(datagram);
         match result {
-            Ok(Heard::Reply(_)) => {
-                self.counts.opened_count += 1;
-                self.unanswered_count = 0;
-            }
+            Ok(Heard::Reply(_)) => self.unanswered_count = 0,
             Ok(_) => {}
             Err(cause) => self.counts.refused.count(cause),
         }
@@ -158,7 +153,8 @@ impl Initiator {
             .as_mut()
             .filter(|_| fields.session == self.session);
         let traffic = traffic.ok_or(SealRefusal::ForeignSession)?;
-        traffic.backward.open(fields, datagram).map(Heard::Reply)
+        let opened = traffic.backward.open(fields, datagram, &mut self.counts);
+        opened.map(Heard::Reply)
     }
 
     fn take_keys(&mut self, datagram: &[u8]) -> Result<Heard, SealRefusal> {
@@ -182,7 +178,8 @@ impl Initiator {
         {
             self.answered = answer.request;
             let now_ns = answer.handed_ns;
-            traffic.backward.catch_up(answer.generation, now_ns);
+            let counts = &mut self.counts;
+            traffic.backward.catch_up(answer.generation, now_ns, counts);
             return Ok(Heard::Nothing);
         }
         // Keys that were in use once must never be again: their numbers would begin anew.
@@ -196,7 +193,6 @@ impl Initiator {
 
     fn adopt(&mut self, answering: Salt) {
         if let Some(old) = self.traffic.take() {
-            self.rotation_count += old.forward.rotation_count + old.backward.rotation_count;
             self.retired[self.retired_next] = Some(old.answering);
             self.retired_next = (self.retired_next + 1) % RETIRED_LENGTH;
         }
@@ -212,14 +208,7 @@ impl Initiator {
     }
 
     /// What was counted so far.
-    pub fn counts(&self) -> SealCounts {
-        let now = self.traffic.as_ref();
-        let turned = now.map_or(0, |one| {
-            one.forward.rotation_count + one.backward.rotation_count
-        });
-        SealCounts {
-            rotation_count: self.rotation_count + turned,
-            ..self.counts
-        }
+    pub const fn counts(&self) -> SealCounts {
+        self.counts
     }
 }

@@ -46,7 +46,6 @@ pub struct Responder {
     places: Box<[Option<Place>]>,
     /// Counts uses, to tell which place was used last.
     clock: u64,
-    rotation_count: u64,
     counts: SealCounts,
 }
 
@@ -60,7 +59,6 @@ impl Responder {
             rotation,
             places: (0..PLACES).map(|_| None).collect(),
             clock: 0,
-            rotation_count: 0,
             counts: SealCounts::default(),
         }
     }
@@ -72,7 +70,7 @@ impl Responder {
     pub fn open(&mut self, datagram: &mut [u8]) -> Result<Opened, SealRefusal> {
         let result = self.accept(datagram);
         match &result {
-            Ok(Opened::Datagram(_)) => self.counts.opened_count += 1,
+            Ok(Opened::Datagram(_)) => {}
             Ok(Opened::Answer(_)) => self.counts.key_exchange_count += 1,
             Err(cause) => self.counts.refused.count(*cause),
         }
@@ -87,7 +85,7 @@ impl Responder {
             _ => return Err(SealRefusal::WrongWay),
         }
         let place = find(&mut self.places, fields.session).ok_or(SealRefusal::ForeignSession)?;
-        let length = place.forward.open(fields, datagram)?;
+        let length = place.forward.open(fields, datagram, &mut self.counts)?;
         self.clock += 1;
         place.used = self.clock;
         place.is_proven = true;
@@ -106,8 +104,8 @@ impl Responder {
             Some(place) => {
                 place.request = request.request;
                 if request.about == about(&place.answering) {
-                    let forward = &mut place.forward;
-                    forward.catch_up(request.generation, request.handed_ns);
+                    let (forward, counts) = (&mut place.forward, &mut self.counts);
+                    forward.catch_up(request.generation, request.handed_ns, counts);
                 }
             }
             None => self.agree(&request),
@@ -151,9 +149,7 @@ impl Responder {
             used: self.clock,
         };
         let index = self.place_for(request.session);
-        if let Some(old) = self.places[index].replace(place) {
-            self.rotation_count += old.forward.rotation_count + old.backward.rotation_count;
-        }
+        self.places[index] = Some(place);
         self.counts.agreement_count += 1;
     }
 
@@ -177,8 +173,8 @@ impl Responder {
         let place = find(&mut self.places, u32_at(reply, 8))?;
         let length = reply.len() + TAG_BYTES;
         out[..reply.len()].copy_from_slice(reply);
-        place.backward.seal(&mut out[..length]);
-        self.counts.sealed_count += 1;
+        let counts = &mut self.counts;
+        place.backward.seal(&mut out[..length], counts);
         Some(length)
     }
 
@@ -188,15 +184,8 @@ impl Responder {
     }
 
     /// What was counted so far.
-    pub fn counts(&self) -> SealCounts {
-        let places = self.places.iter().flatten();
-        let turned: u64 = places
-            .map(|one| one.forward.rotation_count + one.backward.rotation_count)
-            .sum();
-        SealCounts {
-            rotation_count: self.rotation_count + turned,
-            ..self.counts
-        }
+    pub const fn counts(&self) -> SealCounts {
+        self.counts
     }
 }
 

@@ -1,7 +1,7 @@
 //! One way of an agreed association: sealing under a key that rotates, and opening under the keys that
 //! may be in use. It draws no random number and reads no clock: time is what the datagrams say.
 
-use super::counts::SealRefusal;
+use super::counts::{SealCounts, SealRefusal};
 use super::keys::{Generation, SealKey};
 use super::layout::{SealFields, clear_marks, handed_ns_of};
 use super::window::ReplayWindow;
@@ -46,7 +46,6 @@ pub(super) struct SealingWay {
     /// When its first datagram was handed over.
     since_ns: Option<i64>,
     rotation: Rotation,
-    pub(super) rotation_count: u64,
 }
 
 impl SealingWay {
@@ -58,7 +57,6 @@ impl SealingWay {
             number: 0,
             since_ns: None,
             rotation,
-            rotation_count: 0,
         }
     }
 
@@ -68,18 +66,20 @@ impl SealingWay {
     }
 
     /// Seals the plain datagram at the start of `datagram`, whose last 16 bytes take the tag.
-    pub(super) fn seal(&mut self, datagram: &mut [u8]) {
+    pub(super) fn seal(&mut self, datagram: &mut [u8], counts: &mut SealCounts) {
         let handed_ns = handed_ns_of(datagram);
         let since_ns = *self.since_ns.get_or_insert(handed_ns);
         if self.number >= self.rotation.datagram_count
             || handed_ns.saturating_sub(since_ns) >= self.rotation.period_ns
         {
             self.rotate(handed_ns);
+            counts.rotation_count += 1;
         }
         let fields = SealFields::of_plain(datagram, low_byte(self.index), self.number);
         self.number += 1;
         fields.write(datagram);
         self.key.seal(fields.nonce(), datagram);
+        counts.sealed_count += 1;
     }
 
     fn rotate(&mut self, handed_ns: i64) {
@@ -88,7 +88,6 @@ impl SealingWay {
         self.index = self.index.wrapping_add(1);
         self.number = 0;
         self.since_ns = Some(handed_ns);
-        self.rotation_count += 1;
     }
 }
 
@@ -127,7 +126,6 @@ pub(super) struct OpeningWay {
     /// When the first datagram of the current generation was handed over.
     since_ns: i64,
     grace_ns: i64,
-    pub(super) rotation_count: u64,
 }
 
 impl OpeningWay {
@@ -141,7 +139,6 @@ impl OpeningWay {
             next_generation,
             since_ns: i64::MIN,
             grace_ns: rotation.grace_ns,
-            rotation_count: 0,
         }
     }
 
@@ -150,13 +147,14 @@ impl OpeningWay {
         &mut self,
         fields: SealFields,
         datagram: &mut [u8],
+        counts: &mut SealCounts,
     ) -> Result<usize, SealRefusal> {
         let ahead = fields.generation.wrapping_sub(low_byte(self.index));
         match (ahead, &mut self.previous) {
             (0, _) => self.current.open(fields, datagram)?,
             (1, _) => {
                 self.next.open(fields, datagram)?;
-                self.turn(handed_ns_of(datagram));
+                self.turn(handed_ns_of(datagram), counts);
             }
             (u8::MAX, Some(previous)) => previous.open(fields, datagram)?,
             _ => return Err(SealRefusal::StaleEpoch),
@@ -170,29 +168,30 @@ impl OpeningWay {
             datagram.len() >= HEADER_BYTES + TAG_BYTES,
             "checked with the marks"
         );
+        counts.opened_count += 1;
         Ok(datagram.len() - TAG_BYTES)
     }
 
     /// The next generation becomes the current one.
-    fn turn(&mut self, handed_ns: i64) {
+    fn turn(&mut self, handed_ns: i64, counts: &mut SealCounts) {
         self.next_generation = self.next_generation.next();
         let after = OpeningKey::new(&self.next_generation);
         let new = core::mem::replace(&mut self.next, after);
         self.previous = Some(core::mem::replace(&mut self.current, new));
         self.index = self.index.wrapping_add(1);
         self.since_ns = handed_ns;
-        self.rotation_count += 1;
+        counts.rotation_count += 1;
     }
 
     /// Goes to generation `index`, of which an authentic key exchange tells: the datagrams that would
     /// have told of the ones between were lost.
-    pub(super) fn catch_up(&mut self, index: u32, handed_ns: i64) {
+    pub(super) fn catch_up(&mut self, index: u32, handed_ns: i64, counts: &mut SealCounts) {
         let ahead = index.wrapping_sub(self.index);
         if !(2..=CATCH_UP_MAX).contains(&ahead) {
             return;
         }
         for _ in 0..ahead {
-            self.turn(handed_ns);
+            self.turn(handed_ns, counts);
         }
         self.previous = None;
     }
