@@ -890,17 +890,13 @@ fn doubts(
         let watch = side.sight.watch;
         let (source, destination) = (stream.source, stream.destination);
         let is_seen = !side.seen.is_empty();
-        for (why, count) in watch.unread_of(stream.flow_index, source, destination, is_seen) {
-            add(
-                Doubt::Unread(why),
-                usize::try_from(count).unwrap_or(usize::MAX),
-            );
-        }
+        let unread = watch.unread_of(stream.flow_index, source, destination, is_seen);
         // What is broken in a file is counted at each of its taps.
         let beside = side.sight.beside.iter();
         let beside =
             beside.flat_map(|watch| watch.unread_of(stream.flow_index, source, destination, true));
-        for (why, count) in beside.filter(|(why, _)| *why != Unread::Malformed) {
+        let beside = beside.filter(|(why, _)| *why != Unread::Malformed);
+        for (why, count) in unread.into_iter().chain(beside) {
             add(
                 Doubt::Unread(why),
                 usize::try_from(count).unwrap_or(usize::MAX),
@@ -1030,14 +1026,11 @@ fn metrics(
     let (late, _) = reordered(arrivals.iter().map(|departure| *departure as u64));
     let reordered_count = late.len() as u64;
     // Where a clock was set, or may have been, no delay is known.
-    let is_delay = |departure: &&usize| !is_unsure && pairs[**departure].is_stamped();
-    let in_arrival = arrivals.iter().filter(is_delay);
-    let in_arrival: Vec<i64> = in_arrival
-        .map(|departure| levels.delays[*departure])
-        .collect();
-    let in_departure: Vec<usize> = (0..pairs.len()).collect();
-    let delays = in_departure.iter().filter(is_delay);
-    let delays: Vec<i64> = delays.map(|departure| levels.delays[*departure]).collect();
+    let is_delay = |departure: &usize| !is_unsure && pairs[*departure].is_stamped();
+    let delay_of = |departure: usize| levels.delays[departure];
+    let in_arrival = arrivals.iter().copied().filter(is_delay);
+    let in_arrival: Vec<i64> = in_arrival.map(delay_of).collect();
+    let delays: Vec<i64> = (0..pairs.len()).filter(is_delay).map(delay_of).collect();
     let jitter = jitter_ns(&in_arrival);
     let series: Samples = delays.iter().copied().collect();
     let ascending = series.ascending();
@@ -1054,7 +1047,7 @@ fn metrics(
     let fastest = delays.iter().min().copied().unwrap_or(0);
     let variation = delays.iter().map(|delay| delay.saturating_sub(fastest));
     let neighbours = (1..pairs.len()).filter(|at| {
-        matches.pairs[at - 1].0 + 1 == matches.pairs[*at].0 && is_delay(&&(at - 1)) && is_delay(&at)
+        matches.pairs[at - 1].0 + 1 == matches.pairs[*at].0 && is_delay(&(at - 1)) && is_delay(at)
     });
     let successive = neighbours.map(|at| {
         let difference = levels.delays[at].saturating_sub(levels.delays[at - 1]);

@@ -22,11 +22,24 @@ const DRIFT_MAX_PPM: i64 = 200;
 const COMMON_SHARE: usize = 10;
 
 /// Points of one host over which a stream went in parts.
-struct Parts {
+struct Parts<'a> {
     point: Point,
     also: Vec<Point>,
     watch: Watch,
     seen: Seen,
+    beside: Vec<&'a Watch>,
+}
+
+impl Parts<'_> {
+    fn sight(&self) -> Sight<'_> {
+        Sight {
+            point: &self.point,
+            watch: &self.watch,
+            seen: &self.seen,
+            also: &self.also,
+            beside: &self.beside,
+        }
+    }
 }
 
 /// Every stream at every two points it passed or should have passed.
@@ -35,7 +48,7 @@ pub fn join_all(observer: &Observer, settings: &JoinSettings) -> Vec<(Stream, Jo
     let all: Vec<&Point> = observer.seen().keys().collect();
     let beside: Vec<Vec<&Watch>> = all
         .iter()
-        .map(|point| other_taps(observer, &[point.tap()]))
+        .map(|point| other_taps(observer, &BTreeSet::from([point.tap()])))
         .collect();
     let points: Vec<Sight<'_>> = observer
         .seen()
@@ -54,30 +67,14 @@ pub fn join_all(observer: &Observer, settings: &JoinSettings) -> Vec<(Stream, Jo
     let mut found = Vec::new();
     for stream in streams {
         let groups = groups(stream, &points, settings.window_ns);
-        let parts: Vec<Option<Parts>> = groups
+        let parts: Vec<Option<Parts<'_>>> = groups
             .iter()
-            .map(|group| (group.len() > 1).then(|| together(stream, &points, group)))
-            .collect();
-        let others: Vec<Vec<&Watch>> = groups
-            .iter()
-            .map(|group| {
-                let taps: Vec<Tap> = group.iter().map(|at| points[*at].point.tap()).collect();
-                other_taps(observer, &taps)
-            })
+            .map(|group| (group.len() > 1).then(|| together(stream, &points, group, observer)))
             .collect();
         let sights: Vec<Sight<'_>> = groups
             .iter()
-            .zip(parts.iter().zip(&others))
-            .map(|(group, (parts, beside))| match parts {
-                Some(parts) => Sight {
-                    point: &parts.point,
-                    watch: &parts.watch,
-                    seen: &parts.seen,
-                    also: &parts.also,
-                    beside,
-                },
-                None => points[group[0]],
-            })
+            .zip(&parts)
+            .map(|(group, parts)| parts.as_ref().map_or(points[group[0]], Parts::sight))
             .collect();
         let mut join_two = |a: Sight<'_>, b: Sight<'_>| {
             let round_trip = || comes_first(stream, a, b, settings.window_ns);
@@ -112,7 +109,7 @@ pub fn join_all(observer: &Observer, settings: &JoinSettings) -> Vec<(Stream, Jo
 }
 
 /// What the other taps of the host of these could see.
-fn other_taps<'a>(observer: &'a Observer, taps: &[Tap]) -> Vec<&'a Watch> {
+fn other_taps<'a>(observer: &'a Observer, taps: &BTreeSet<Tap>) -> Vec<&'a Watch> {
     let watches = observer.watches().iter();
     let of_host = watches.filter(|(tap, watch)| {
         let is_of_file = taps.iter().any(|one| one.file_index == tap.file_index);
@@ -151,7 +148,12 @@ fn groups(stream: &Stream, points: &[Sight<'_>], window_ns: i64) -> Vec<Vec<usiz
 }
 
 /// What the points of a group saw of a stream, as one.
-fn together(stream: &Stream, points: &[Sight<'_>], group: &[usize]) -> Parts {
+fn together<'a>(
+    stream: &Stream,
+    points: &[Sight<'_>],
+    group: &[usize],
+    observer: &'a Observer,
+) -> Parts<'a> {
     let members = || group.iter().map(|at| points[*at]);
     // One that tells its direction tells that of all.
     let mut known = members().map(|sight| *sight.point);
@@ -172,6 +174,7 @@ fn together(stream: &Stream, points: &[Sight<'_>], group: &[usize]) -> Parts {
             .filter(|one| *one != point)
             .collect(),
         watch,
+        beside: other_taps(observer, &taps),
         seen: Seen::from([(*stream, seen.flatten().copied().collect())]),
     }
 }
