@@ -293,12 +293,10 @@ fn read_remark(
         "link" => value.clone_into(&mut header.link),
         "clock" => value.clone_into(&mut header.clock),
         "direction" => {
-            let words = TraceDirection::ALL.map(TraceDirection::word);
-            header.direction = TraceDirection::ALL[word(key, value, &words)?];
+            header.direction = named(key, value, TraceDirection::ALL, TraceDirection::word)?;
         }
         "arrival" => {
-            let words = TraceArrival::ALL.map(TraceArrival::word);
-            header.arrival = TraceArrival::ALL[word(key, value, &words)?];
+            header.arrival = named(key, value, TraceArrival::ALL, TraceArrival::word)?;
         }
         "link_change_count" => header.link_change_count = number(key, value)?,
         "origin_ns" => header.origin_ns = number(key, value)?,
@@ -309,9 +307,18 @@ fn read_remark(
     Ok(())
 }
 
-fn word(key: &str, value: &str, words: &[&str]) -> Result<usize, String> {
-    let found = words.iter().position(|word| *word == value);
-    found.ok_or_else(|| format!("{key} is \"{value}\", allowed are {}", words.join(", ")))
+/// The one of `all` whose word is `value`.
+fn named<T: Copy, const N: usize>(
+    key: &str,
+    value: &str,
+    all: [T; N],
+    word: fn(T) -> &'static str,
+) -> Result<T, String> {
+    let found = all.into_iter().find(|one| word(*one) == value);
+    found.ok_or_else(|| {
+        let allowed = all.map(word).join(", ");
+        format!("{key} is \"{value}\", allowed are {allowed}")
+    })
 }
 
 fn number<T: core::str::FromStr>(key: &str, value: &str) -> Result<T, String> {
@@ -406,9 +413,8 @@ impl Columns {
                 "{column} is {UNAVAILABLE_NS}: for a message that was lost leave it empty"
             ));
         }
-        let words = TraceFate::ALL.map(TraceFate::word);
         let fate = match cell(2) {
-            Some(text) => TraceFate::ALL[word(COLUMNS[2], text, &words)?],
+            Some(text) => named(COLUMNS[2], text, TraceFate::ALL, TraceFate::word)?,
             None if delay.is_some() => TraceFate::Delivered,
             None => TraceFate::LostInNetwork,
         };

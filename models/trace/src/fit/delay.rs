@@ -81,7 +81,7 @@ pub(super) fn rank(delays_s: &[f64], tested: &[f64], seed: u64) -> Ranking {
     }
     let rest = if is_equal { "fixed" } else { "histogram" };
     let best = taken.or_else(|| fits.iter().position(|fit| fit.law == rest));
-    let mut why = match (taken, best) {
+    let why = match (taken, best) {
         (Some(_), _) => format!(
             "smallest AIC among those whose distance has a probability of {REFUSED_BELOW} or more"
         ),
@@ -92,11 +92,7 @@ pub(super) fn rank(delays_s: &[f64], tested: &[f64], seed: u64) -> Ranking {
         ),
         (None, None) => "no law of a link has such delays".to_owned(),
     };
-    for reason in left_out {
-        why.push_str("; left out: ");
-        why.push_str(&reason);
-    }
-    Ranking { fits, best, why }
+    Ranking::of(fits, best, why, &left_out)
 }
 
 /// The distance of `ascending` from the law fitted to it, and its probability when samples of that

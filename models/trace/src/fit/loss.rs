@@ -52,7 +52,7 @@ pub(super) fn rank(trace: &Trace, losses: &[bool]) -> Ranking {
     }
     Ranking::sort(&mut fits);
     let accepted = fits.iter().position(Fit::is_accepted);
-    let mut why = match accepted {
+    let why = match accepted {
         Some(_) => format!(
             "smallest AIC among those whose burst lengths have a probability of {REFUSED_BELOW} \
              or more, or are too few to test"
@@ -62,15 +62,7 @@ pub(super) fn rank(trace: &Trace, losses: &[bool]) -> Ranking {
              replay the trace itself where they matter"
         ),
     };
-    for reason in left_out {
-        why.push_str("; left out: ");
-        why.push_str(&reason);
-    }
-    Ranking {
-        best: Some(accepted.unwrap_or(0)),
-        fits,
-        why,
-    }
+    Ranking::of(fits, Some(accepted.unwrap_or(0)), why, &left_out)
 }
 
 fn bernoulli(losses: &[bool], lost_count: usize) -> Fit {

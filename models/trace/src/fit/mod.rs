@@ -85,6 +85,15 @@ pub struct Ranking {
 }
 
 impl Ranking {
+    /// The rule, and which laws were left out, with the reason of each.
+    fn of(fits: Vec<Fit>, best: Option<usize>, mut why: String, left_out: &[String]) -> Self {
+        for reason in left_out {
+            why.push_str("; left out: ");
+            why.push_str(reason);
+        }
+        Self { fits, best, why }
+    }
+
     fn none(why: &str) -> Self {
         Self {
             fits: Vec::new(),
