@@ -103,6 +103,21 @@ pub fn shortened(text: &str, width: usize) -> String {
     short
 }
 
+/// A word of a command as a POSIX shell reads it back (POSIX.1-2017, 2.2.2).
+pub fn shell_word(text: &str) -> String {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/._-=:@%,+".contains(&byte);
+    if !text.is_empty() && text.bytes().all(is_plain) {
+        return text.to_owned();
+    }
+    format!("'{}'", text.replace('\'', r"'\''"))
+}
+
+/// A command line that a shell reads back as it was.
+pub fn shell_words(words: &[impl AsRef<str>]) -> String {
+    let quoted = words.iter().map(|word| shell_word(word.as_ref()));
+    quoted.collect::<Vec<_>>().join(" ")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -144,5 +159,17 @@ mod tests {
         assert_eq!(grouped(0), "0");
         assert_eq!(grouped(999), "999");
         assert_eq!(grouped(1_234_567), "1,234,567");
+    }
+
+    #[test]
+    fn a_shell_takes_a_word_of_a_command_as_it_was() {
+        assert_eq!(shell_word("/srv/runs/a-1.dist"), "/srv/runs/a-1.dist");
+        for text in ["/my runs/a", "it's", "$HOME `x` \"y\"", "", "a;b", "~", "µ"] {
+            let script = format!("printf %s {}", shell_word(text));
+            let printed = std::process::Command::new("sh")
+                .args(["-c", &script])
+                .output();
+            assert_eq!(printed.unwrap().stdout, text.as_bytes(), "{script}");
+        }
     }
 }

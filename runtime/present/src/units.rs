@@ -64,19 +64,24 @@ pub fn percent(ratio: f64) -> String {
     format!("{value:.2}{JOINT}%")
 }
 
-/// A figure of a score: enough digits for its size, never more than it holds.
+/// Below it a figure says no more than that it is.
+const FIGURE_MIN: f64 = 1e-12;
+
+/// A figure of a score, without an exponent: enough digits for its size, never more than it holds.
 pub fn figure(value: f64) -> String {
     let magnitude = value.abs();
-    if value.fract().abs() < f64::EPSILON && magnitude < 1e9 {
+    if magnitude > 0.0 && magnitude < FIGURE_MIN {
+        format!("<{FIGURE_MIN:.12}")
+    } else if value.fract().abs() < f64::EPSILON && magnitude < 1e9 {
         format!("{value:.0}")
-    } else if (1e-3..1e6).contains(&magnitude) {
-        let digits = 3.0 - magnitude.log10().floor().clamp(-3.0, 3.0);
+    } else if magnitude < 1e6 {
+        let digits = 3.0 - magnitude.log10().floor().clamp(-12.0, 3.0);
         format!("{value:.*}", digit_count(digits))
-    } else if (1e6..1e15).contains(&magnitude) {
+    } else if magnitude < 1e15 {
         let sign = if value < 0.0 { "-" } else { "" };
         format!("{sign}{}", grouped(whole(magnitude)))
     } else {
-        format!("{value:.3e}")
+        format!("{value:.0}")
     }
 }
 
@@ -92,7 +97,7 @@ const fn whole(value: f64) -> u64 {
 #[allow(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
-    reason = "the caller clamps to 0..=6"
+    reason = "the caller clamps to 0..=15"
 )]
 const fn digit_count(digits: f64) -> usize {
     digits as usize
@@ -173,7 +178,9 @@ mod tests {
         assert_eq!(figure(890.0), "890");
         assert_eq!(figure(195.324_5), "195.3");
         assert_eq!(figure(0.001_234_56), "0.001235");
-        assert_eq!(figure(1.234_56e-6), "1.235e-6");
+        assert_eq!(figure(1.234_56e-6), "0.000001235");
+        assert_eq!(figure(-1e-15), "<0.000000000001");
+        assert_eq!(figure(f64::MIN_POSITIVE), "<0.000000000001");
         assert_eq!(figure(-0.5), "-0.5000");
         assert_eq!(figure(7_315_012.4), "7,315,012");
     }

@@ -115,6 +115,8 @@ impl HarmCount {
                 let share = percent(count as f64 / occasions.count as f64);
                 let interval = match self.interval {
                     None => String::new(),
+                    // How those come together that did not happen is unknown whatever the sample.
+                    Some(Spread::Unknown(_)) if count == 0 => String::new(),
                     Some(Spread::Unknown(why)) => format!(" [{why}]"),
                     Some(Spread::Known(Interval { low, high, .. })) => {
                         format!(" [{}, {}]", percent(low), percent(high))
@@ -424,7 +426,7 @@ impl Answer {
         let text = format!("{length_s:.1} s, {messages} published on {channels}");
         match occasions {
             Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
-                format!("{text}, {count} {what}: too small for a rate, which takes {OCCASIONS_MIN}")
+                format!("{text}, {what}: {count}, too few for a rate, which takes {OCCASIONS_MIN}")
             }
             Some(OccasionCount { what, count }) => format!("{text}, {} {what}", grouped(*count)),
             None => text,
@@ -437,7 +439,8 @@ impl Hurt {
     pub(crate) fn words(&self, object: Object) -> String {
         let because = Untested::NoScore;
         if object == Object::Programs && *self == (Self::NotTested { because }) {
-            "NOT TESTED: what hurts these programs is not known; the lines above count what was lost"
+            "NOT TESTED: what hurts these programs is not known (a deadline in [flows.NAME] tells); the channels \
+             count what was lost"
                 .to_owned()
         } else {
             self.to_string()
@@ -467,7 +470,7 @@ impl fmt::Display for Unresolved {
                 needed,
             } => write!(
                 formatter,
-                "no harm was seen, but the sample is too small: {count} {what}, {needed} needed"
+                "no harm was seen, but the sample is too small ({what}: {count}, needed: {needed})"
             ),
             Self::ScoreIncomplete => {
                 formatter.write_str("records of what the robot did are missing")

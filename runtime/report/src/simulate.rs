@@ -20,7 +20,6 @@ use hil_core::simulation::{Carrier, ChannelCounts, Simulation, SimulationResult}
 use hil_core::time::{Instant, duration_ns};
 use hil_stats::histogram::Distribution;
 
-use crate::analysis::metrics::shell_words;
 use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
 use crate::analysis::outages::OutageHistory;
 
@@ -32,6 +31,7 @@ use crate::summary::{
     RecordedMetrics, RunFacts, RunSummary, emulated_links,
 };
 use crate::terminal;
+use hil_platform::text::shell_words;
 use hil_present::units::percent;
 use hil_rundir::launch::Side;
 use hil_rundir::pipe::CounterGroup;

@@ -175,10 +175,13 @@ pub struct InletReport {
 }
 
 impl InletReport {
-    /// Frames that the interface of the program dropped, as it counts them.
-    pub const DROPPED: &str = "dropped by the interface of the program";
-    /// Frames given to it that the kernel did not take: each has a fate of its own, whether or not the interface counts it.
-    pub const REFUSED: &str = "refused by the interface of the program";
+    /// Frames that the interface of the program that sent them dropped, as it counts them.
+    pub const DROPPED_SENT: &str = "dropped by the interface of the sender";
+    /// Frames that the interface of the program that they were given to dropped, as it counts them.
+    pub const DROPPED_GIVEN: &str = "dropped by the interface of the receiver";
+    /// Of those given to it, the ones that the kernel did not take: each has a fate of its own, whether or not the
+    /// interface counts it.
+    pub const REFUSED: &str = "refused by the interface of the receiver";
 }
 
 hil_core::labelled! {

@@ -80,12 +80,15 @@ impl JobWork for Program {
             return ProcessReport::default();
         };
         let [output, input] = &self.channels;
-        let dropped = |channel: &String, count| InletReport {
+        let dropped = |channel: &String, counted| InletReport {
             channel: channel.clone(),
-            lost: CountByName::all(CounterGroup::Own, [(InletReport::DROPPED, count)]).collect(),
+            lost: CountByName::all(CounterGroup::Own, [counted]).collect(),
         };
         ProcessReport {
-            inlets: vec![dropped(output, outward_count), dropped(input, inward_count)],
+            inlets: vec![
+                dropped(output, (InletReport::DROPPED_SENT, outward_count)),
+                dropped(input, (InletReport::DROPPED_GIVEN, inward_count)),
+            ],
             ..ProcessReport::default()
         }
     }

@@ -17,6 +17,7 @@ use crate::summary::{
     ProcessSummary, RealtimeFacts, RunEvent, RunEventKind, RunFacts, emulated_links,
 };
 use hil_platform::realtime::GrantOutcome;
+use hil_platform::text::shell_words;
 use hil_rundir::event::{Event, ProcessHistory};
 use hil_rundir::run_result::{self, RunResult};
 use hil_topology::{Channel, Topology};
@@ -120,19 +121,6 @@ pub(super) fn realtime_facts(processes: &[ProcessHistory]) -> RealtimeFacts {
         side.push(Fact::new(what, who));
     }
     facts
-}
-
-/// A command line that a shell reads back as it was.
-pub(crate) fn shell_words(words: &[String]) -> String {
-    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/._-=:@,+".contains(&byte);
-    let quoted = words.iter().map(|word| {
-        if !word.is_empty() && word.bytes().all(is_plain) {
-            word.clone()
-        } else {
-            format!("'{}'", word.replace('\'', r"'\''"))
-        }
-    });
-    quoted.collect::<Vec<_>>().join(" ")
 }
 
 pub(super) fn process_summary(process: &ProcessHistory) -> ProcessSummary {

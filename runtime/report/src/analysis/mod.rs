@@ -275,9 +275,12 @@ fn read_channels(
             passages.entry(key).or_default().extend(frames);
         }
         if channel.carries_frames() {
+            let processes = records.result.processes.iter();
+            let reports = processes.filter_map(|one| one.report.as_ref());
+            let inlets = reports.flat_map(|report| &report.inlets);
             found.flows.push(ChannelFlows {
                 channel: channel.name.clone(),
-                inlet_lost: inlet_lost(records.result, &channel.name),
+                inlet_lost: inlet_lost(inlets, &channel.name),
                 flows: reading.flows,
             });
         }
@@ -324,28 +327,23 @@ fn deadlines(
         .collect()
 }
 
-/// What the inlets lost of the frames of `channel`.
-fn inlet_lost(result: &RunResult, channel: &str) -> Vec<CountByName> {
-    let reports = result
-        .processes
-        .iter()
-        .filter_map(|one| one.report.as_ref());
-    let inlets = reports.flat_map(|report| &report.inlets);
+/// What the inlets lost of the frames of `channel`, beside those that have a fate.
+fn inlet_lost<'a>(
+    inlets: impl Iterator<Item = &'a InletReport>,
+    channel: &str,
+) -> Vec<CountByName> {
     let inlets = inlets.filter(|inlet| inlet.channel == channel);
-    let (refused, lost): (Vec<&CountByName>, Vec<_>) = inlets
-        .flat_map(|inlet| &inlet.lost)
+    let (refused, mut lost): (Vec<CountByName>, Vec<_>) = inlets
+        .flat_map(|inlet| inlet.lost.iter().cloned())
         .partition(|one| one.label() == InletReport::REFUSED);
-    let mut refused_count: u64 = refused.iter().map(|one| one.count).sum();
-    let lost = lost.into_iter().cloned().map(|mut one| {
-        // What was refused has a fate already.
-        if one.label() == InletReport::DROPPED {
-            let known_count = one.count.min(refused_count);
-            refused_count -= known_count;
-            one.count -= known_count;
-        }
-        one
-    });
-    lost.filter(|one| one.count > 0).collect()
+    let refused_count: u64 = refused.iter().map(|one| one.count).sum();
+    // One interface takes the frames of a channel.
+    let mut dropped = lost.iter_mut();
+    if let Some(one) = dropped.find(|one| one.label() == InletReport::DROPPED_GIVEN) {
+        one.count = one.count.saturating_sub(refused_count);
+    }
+    lost.retain(|one| one.count > 0);
+    lost
 }
 
 /// Writes what the case and the network have to plot; gives the file that could not be written. A run whose
@@ -420,4 +418,35 @@ fn add_warnings(summary: &mut RunSummary, records: &RunRecords<'_>) {
     let pairs = &records.clocks.section.pairs;
     let paths = pairs.iter().filter_map(clock_path::warning);
     summary.warnings.extend(paths);
+}
+
+#[cfg(test)]
+mod tests {
+    use hil_rundir::pipe::CounterGroup;
+
+    use super::*;
+
+    #[test]
+    fn what_the_receiver_refused_is_no_further_loss_and_what_the_sender_dropped_is() {
+        let inlet = |channel: &str, name, count| InletReport {
+            channel: channel.to_owned(),
+            lost: CountByName::all(CounterGroup::Own, [(name, count)]).collect(),
+        };
+        let lost = |given_count, refused_count| {
+            let all = [
+                inlet("a", InletReport::DROPPED_SENT, 5),
+                inlet("a", InletReport::DROPPED_GIVEN, given_count),
+                inlet("a", InletReport::REFUSED, refused_count),
+                inlet("b", InletReport::REFUSED, 100),
+            ];
+            let found = inlet_lost(all.iter(), "a");
+            let found = found.iter().map(|one| (one.label(), one.count));
+            found.collect::<Vec<_>>()
+        };
+        let sent = (InletReport::DROPPED_SENT.to_owned(), 5);
+        let given = |count| (InletReport::DROPPED_GIVEN.to_owned(), count);
+        assert_eq!(lost(7, 3), [sent.clone(), given(4)]);
+        // The interface does not count what it refused.
+        assert_eq!(lost(2, 3), [sent]);
+    }
 }

@@ -1,6 +1,6 @@
 //! The frames of programs that speak IP, by flow: counted, lost by whom, delayed. Nothing is computed here.
 
-use hil_account::flow::FlowMetrics;
+use hil_account::flow::{DeadlineMetrics, FlowMetrics};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_present::units::duration_s;
@@ -86,8 +86,8 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
     section
 }
 
-/// How the requests of flows with a deadline were answered.
-pub(crate) fn deadlines(summary: &RunSummary) -> Section {
+/// How the requests of flows with a deadline were answered; of so many, those with most harm first if there are more.
+pub(crate) fn deadlines(summary: &RunSummary, shown_count: usize) -> Section {
     let aside = "from sending a request until its answer was given";
     let mut section = Section::new("deadlines", "Deadlines", aside);
     if summary.deadlines.is_empty() {
@@ -100,7 +100,13 @@ pub(crate) fn deadlines(summary: &RunSummary) -> Section {
         .ranked("p50", 1)
         .ranked("unknown", 2)
         .with_long_names();
-    for one in &summary.deadlines {
+    let mut deadlines: Vec<&DeadlineMetrics> = summary.deadlines.iter().collect();
+    if deadlines.len() > shown_count {
+        deadlines.sort_by_key(|one| core::cmp::Reverse(one.hurt_count));
+        let hidden = counted((deadlines.len() - shown_count) as u64, "further deadline");
+        table.note = format!("{hidden} with --full");
+    }
+    for one in deadlines.into_iter().take(shown_count) {
         let response = one.response.measured();
         let limit = duration_s(one.limit_ns as f64 * 1e-9);
         let late = [

@@ -52,7 +52,7 @@ pub(crate) fn of_run(summary: &RunSummary, assessment: &Assessment) -> Vec<Secti
         sections.push(events::network(report));
     }
     sections.push(flows(summary, FLOWS_SHOWN));
-    sections.push(deadlines(summary));
+    sections.push(deadlines(summary, usize::MAX));
     sections.push(channel::channels(summary));
     sections.push(run::links(&summary.directions));
     sections.push(adapter::adapters(&summary.faces));

@@ -1,13 +1,13 @@
 //! A study's report as sections, and as JSON. It computes nothing.
 
 use hil_core::study::{Cell, Criterion, Larger, StudyReport, Table};
+use hil_platform::text::shell_words;
 use hil_present::terminal::canvas::{Canvas, Style};
 use hil_present::terminal::section;
 use hil_present::{self as present, Column, Row, Section, Tone};
 use serde_json::json;
 
 use super::{Cost, Invocation};
-use crate::analysis::metrics::shell_words;
 
 /// Which part of a report a page has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 
 use hil_account::network::NetworkMetrics;
 use hil_account::{ChannelAccount, MessageFate};
-use hil_platform::text::{grouped, shortened};
+use hil_platform::text::{columns, grouped, shell_word, shortened, visible};
 use hil_platform::words::counted;
 
-use hil_present::terminal::canvas::{Canvas, INDENT, Style, wrapped};
+use hil_present::terminal::canvas::{Canvas, INDENT, Style, left, wrapped};
 use hil_present::terminal::section;
 use hil_present::units::seconds;
 use hil_present::{Block, Cell, Event, EventList, Row, Section, Table, Tone, UNAVAILABLE};
@@ -23,15 +23,60 @@ use crate::sections::{deadlines, flows, outcome_words, strips};
 use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
 
-/// Events of the robot and channels on the page.
-const CAUSES_SHOWN: usize = 3;
-const CHANNELS_SHOWN: usize = 6;
-const FLOWS_SHOWN: usize = 6;
-/// Lines of a page, and of these what warnings take beside their text.
+/// How much of each kind a page shows.
+#[derive(Debug, Clone, Copy)]
+struct Extent {
+    /// Events of the robot.
+    causes: usize,
+    /// Channels, and links above them.
+    channels: usize,
+    flows: usize,
+    deadlines: usize,
+    /// Rows of the robot in the time strip.
+    robot_rows: usize,
+    /// Ways in which the robot can be hurt.
+    harms: usize,
+}
+
+/// The first whose page has no more than [`LINES_MAX`] rows is taken.
+const EXTENTS: [Extent; 4] = [
+    Extent {
+        causes: 3,
+        channels: 6,
+        flows: 6,
+        deadlines: 6,
+        robot_rows: 2,
+        harms: 6,
+    },
+    Extent {
+        causes: 3,
+        channels: 4,
+        flows: 4,
+        deadlines: 4,
+        robot_rows: 1,
+        harms: 6,
+    },
+    Extent {
+        causes: 2,
+        channels: 3,
+        flows: 3,
+        deadlines: 3,
+        robot_rows: 1,
+        harms: 4,
+    },
+    Extent {
+        causes: 1,
+        channels: 2,
+        flows: 2,
+        deadlines: 2,
+        robot_rows: 1,
+        harms: 3,
+    },
+];
+
+/// Rows of a page on a terminal, and of these what warnings take beside their text.
 const LINES_MAX: usize = 50;
 const WARNINGS_FRAME: usize = 3;
-/// Rows of the robot in the time strip.
-const ROBOT_ROWS: usize = 2;
 /// Columns of a text beside a time.
 const EVENT_MARGIN: usize = 16;
 /// Columns of a channel's name.
@@ -41,33 +86,49 @@ const NEXT_WIDTH: usize = 24;
 /// Channels are alike whose figures differ by less than this share.
 const ALIKE_RATIO: f64 = 0.25;
 
-/// The report of a run as text of at most `width_columns` columns (clamped to 80..=120) and 50 lines.
+/// The report of a run as text of at most `width_columns` columns (clamped to 80..=120) and 50 rows. Only a command to
+/// copy stands on one line however long it is.
 pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String {
     let assessment = Assessment::of(summary);
-    let mut canvas = Canvas::new(width_columns, style);
-    title(&mut canvas, summary);
-    let width = canvas.width();
-    for one in [
-        causes(summary, width),
-        // A line for each link is one less for channels.
-        channels(
-            summary,
-            CHANNELS_SHOWN - summary.run.links.len().min(LINKS_SHOWN + 1),
-        ),
-        flows(summary, FLOWS_SHOWN),
-        deadlines(summary),
-        over_time(summary),
-    ] {
-        section(&mut canvas, &one);
-    }
-    let mut end = Canvas::new(width_columns, style);
-    next(&mut end, summary, &Answer::of(summary, &assessment));
-    answer::answer(&mut end, summary, &assessment);
-    let [begin, end] = [canvas, end].map(Canvas::finish);
-    let room = LINES_MAX.saturating_sub(begin.lines().count() + end.lines().count());
-    let mut between = Canvas::new(width_columns, style);
-    warnings(&mut between, &assessment, room);
-    begin + &between.finish() + &end
+    let answer = Answer::of(summary, &assessment);
+    let canvas = || Canvas::new(width_columns, style);
+    let commands = next_commands(summary, &answer);
+    let has_warnings = !assessment.warnings.is_empty();
+    let mut extents = EXTENTS.into_iter();
+    let page = |extent: Extent, is_last: bool| {
+        let [mut begin, mut between, mut end] = [canvas(), canvas(), canvas()];
+        title(&mut begin, summary);
+        for one in [
+            causes(summary, begin.width(), extent.causes),
+            // A line for each link is one less for channels.
+            channels(
+                summary,
+                extent
+                    .channels
+                    .saturating_sub(summary.run.links.len().min(LINKS_SHOWN + 1))
+                    .max(1),
+            ),
+            flows(summary, extent.flows),
+            deadlines(summary, extent.deadlines),
+            over_time(summary, extent.robot_rows),
+        ] {
+            section(&mut begin, &one);
+        }
+        let folded_rows = next(&mut end, &commands);
+        answer::answer(&mut end, summary, &assessment, extent.harms);
+        let [begin, end] = [begin, end].map(Canvas::finish);
+        let rows = begin.lines().count() + end.lines().count() + folded_rows;
+        if rows + usize::from(has_warnings) > LINES_MAX && !is_last {
+            return None;
+        }
+        warnings(&mut between, &assessment, LINES_MAX.saturating_sub(rows));
+        Some(begin + &between.finish() + &end)
+    };
+    let [.., least] = EXTENTS;
+    extents
+        .find_map(|extent| page(extent, false))
+        .or_else(|| page(least, true))
+        .unwrap_or_default()
 }
 
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
@@ -91,7 +152,7 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
 }
 
 /// What hurt the robot or might have, the gravest first, each with what the network did before.
-fn causes(summary: &RunSummary, width: usize) -> Section {
+fn causes(summary: &RunSummary, width: usize, shown_count: usize) -> Section {
     let all = &summary.score_events;
     let evidence = Evidence::of(summary);
     let grave = gravest_first(&all.events);
@@ -121,8 +182,8 @@ fn causes(summary: &RunSummary, width: usize) -> Section {
             beside: vec![shortened(&cause, room)],
         }
     };
-    let events = grave.iter().take(CAUSES_SHOWN).map(event).collect();
-    let shown = grave.len().min(CAUSES_SHOWN) as u64;
+    let events = grave.iter().take(shown_count).map(event).collect();
+    let shown = grave.len().min(shown_count) as u64;
     let note = match grave_count(all).saturating_sub(shown) {
         0 => String::new(),
         hidden => format!("and {} of less weight or later", counted(hidden, "event")),
@@ -295,7 +356,8 @@ fn channels(summary: &RunSummary, shown_count: usize) -> Section {
                     grouped(line.published_count)
                 )
                 .into(),
-                Cell::share((line.published_count > 0).then(|| line.loss_ratio())),
+                // No rate of a few.
+                Cell::share((line.published_count >= OCCASIONS_MIN).then(|| line.loss_ratio())),
                 Cell::duration(line.gap_ns),
             ],
             tone: if line.lost_count > 0 {
@@ -317,7 +379,7 @@ fn channels(summary: &RunSummary, shown_count: usize) -> Section {
 }
 
 /// The network above, the robot below, on one axis.
-fn over_time(summary: &RunSummary) -> Section {
+fn over_time(summary: &RunSummary, robot_row_count: usize) -> Section {
     let aside = "largest value a column, own scale a row, · unknown";
     let Some(report) = &summary.network else {
         return Section::new("over-time", "", aside);
@@ -329,7 +391,7 @@ fn over_time(summary: &RunSummary) -> Section {
     }
     let robot = report.timeline.rows.iter();
     let robot = robot.filter(|row| matches!(row.subject, TimelineSubject::Robot { .. }));
-    rows.extend(robot.take(ROBOT_ROWS).cloned());
+    rows.extend(robot.take(robot_row_count).cloned());
     let step_s = report.timeline.step_s;
     let strips = strips(&Timeline { step_s, rows }, &summary.link_changes);
     section.blocks.extend(strips.map(Block::Strips));
@@ -399,64 +461,90 @@ fn warnings(canvas: &mut Canvas, assessment: &Assessment, room: usize) {
     }
 }
 
+/// A command to copy.
+#[derive(Debug)]
+struct NextCommand {
+    /// What it is for.
+    what: &'static str,
+    /// As a shell takes it.
+    command: String,
+}
+
 /// Three commands with this run's paths, the one that makes a better answer first.
-fn next(canvas: &mut Canvas, summary: &RunSummary, answer: &Answer) {
+fn next_commands(summary: &RunSummary, answer: &Answer) -> Vec<NextCommand> {
     let run = &summary.run;
     let mut commands = Vec::new();
+    let mut push = |what, command| commands.push(NextCommand { what, command });
     match &answer.hurt {
         Hurt::NotResolvable {
             because: Unresolved::SampleTooSmall { count, .. },
         } => {
             let factor = OCCASIONS_MIN.div_ceil((*count).max(1)) as f64 * 1.2;
             let length_s = (run.duration_s * factor).ceil();
-            commands.push((
+            push(
                 "a sample large enough",
                 format!(
                     "{} --set 'run.duration=\"{length_s} s\"'",
                     without_duration(&run.repeat_command)
                 ),
-            ));
+            );
         }
         Hurt::NotResolvable {
             because: Unresolved::InvalidMeasurement,
-        } => commands.push(("what hinders this host", "hil-runtime doctor".to_owned())),
+        } => push("what hinders this host", "hil-runtime doctor".to_owned()),
         Hurt::NotResolvable {
             because: Unresolved::ClocksDiffer,
-        } => commands.push(("what aligns the clocks", "hil-runtime doctor".to_owned())),
+        } => push("what aligns the clocks", "hil-runtime doctor".to_owned()),
         Hurt::NotTested {
             because: Untested::NoNetwork,
-        } => commands.push((
+        } => push(
             "over a link that hurts",
             "hil-runtime --topology deploy/topologies/outages.toml".to_owned(),
-        )),
+        ),
         _ => {}
     }
     if run.folder == NO_FOLDER {
         let command = format!("{} -o FOLDER", run.repeat_command);
-        commands.push(("to keep this run", command));
+        push("to keep this run", command);
     } else {
-        let folder = &run.folder;
-        commands.push((
+        let folder = shell_word(&run.folder);
+        push(
             "as a page",
             format!("hil-runtime report {folder} -o report.html"),
-        ));
-        commands.push((
+        );
+        push(
             "every figure",
             format!("hil-runtime report {folder} --full"),
-        ));
-        commands.push((
+        );
+        push(
             "against a clean run",
             format!("hil-runtime compare CLEAN-RUN {folder}"),
-        ));
+        );
     }
+    commands.truncate(3);
+    commands
+}
+
+/// Draws the commands; how many rows of a terminal they take beside their lines.
+fn next(canvas: &mut Canvas, commands: &[NextCommand]) -> usize {
     if commands.is_empty() {
-        return;
+        return 0;
     }
     canvas.heading("Next", "");
-    for (what, command) in commands.into_iter().take(3) {
-        let room = 3 * (canvas.width() - NEXT_WIDTH) - 30;
-        canvas.field_of(NEXT_WIDTH, what, Tone::Plain, &shortened(&command, room));
+    let mut folded_rows = 0;
+    for NextCommand { what, command } in commands {
+        let lead = format!("{:INDENT$}{}", "", left(what, NEXT_WIDTH));
+        let command = visible(command);
+        if columns(&lead) + columns(&command) <= canvas.width() {
+            let lead = canvas.paint(Tone::Faint, &lead);
+            canvas.line(&format!("{lead}{command}"));
+        } else {
+            canvas.painted_line(Tone::Faint, lead.trim_end());
+            canvas.line(&command);
+            folded_rows += (columns(&command).max(1) - 1) / canvas.width();
+        }
     }
+    folded_rows
 }
 
 /// A command without the length that it was given.

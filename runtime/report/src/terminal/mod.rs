@@ -51,7 +51,7 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     for one in sections::of_run(summary, &assessment) {
         section(&mut canvas, &one);
     }
-    answer::answer(&mut canvas, summary, &assessment);
+    answer::answer(&mut canvas, summary, &assessment, usize::MAX);
     canvas.finish()
 }
 

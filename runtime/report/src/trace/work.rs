@@ -19,6 +19,7 @@ use super::plots;
 use crate::terminal::{self, Style};
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::Progress;
+use hil_platform::text::shell_word;
 use hil_rundir::series;
 use hil_topology::trace_source::TraceFileError;
 
@@ -398,15 +399,6 @@ fn netem_use(table: &NetemTable, file: &Path) -> String {
     )
 }
 
-/// One word of a command as a POSIX shell takes it (POSIX.1-2017, 2.2.2).
-fn shell_word(text: &str) -> String {
-    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-+:@%,".contains(letter);
-    if !text.is_empty() && text.chars().all(is_plain) {
-        return text.to_owned();
-    }
-    format!("'{}'", text.replace('\'', "'\\''"))
-}
-
 /// What of the delays no table of netem's can say.
 fn cut_words(table: &NetemTable) -> String {
     if table.cut_count == 0 {
@@ -462,18 +454,6 @@ mod tests {
         }
         assert_eq!(key("hop"), "hop");
         assert_eq!(key("a.b"), "\"a.b\"");
-    }
-
-    #[test]
-    fn a_shell_takes_a_word_of_a_command_as_it_was() {
-        assert_eq!(shell_word("/srv/runs/a-1.dist"), "/srv/runs/a-1.dist");
-        for text in ["/my runs/a", "it's", "$HOME `x` \"y\"", "", "a;b", "~", "µ"] {
-            let script = format!("printf %s {}", shell_word(text));
-            let printed = std::process::Command::new("sh")
-                .args(["-c", &script])
-                .output();
-            assert_eq!(printed.unwrap().stdout, text.as_bytes(), "{script}");
-        }
     }
 
     #[test]
