@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 use std::{io, process, ptr, thread};
 
-use nix::sys::signal::SigSet;
+use nix::sys::signal::{SigSet, Signal};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::flag;
 
@@ -126,13 +126,17 @@ impl Signals {
         EndWatch { is_over }
     }
 
+    /// The signal that came.
+    pub fn received_signal(&self) -> Option<Signal> {
+        let number = i32::try_from(self.which.load(Ordering::Acquire)).ok()?;
+        Signal::try_from(number).ok()
+    }
+
     /// The signal that came, in words.
     pub fn received(&self) -> Option<&'static str> {
-        match i32::try_from(self.which.load(Ordering::Acquire)) {
-            Ok(SIGINT) => Some("Ctrl-C (SIGINT)"),
-            Ok(SIGTERM) => Some("SIGTERM"),
-            Ok(SIGHUP) => Some("SIGHUP"),
-            _ => None,
-        }
+        self.received_signal().map(|signal| match signal {
+            Signal::SIGINT => "Ctrl-C (SIGINT)",
+            other => other.as_str(),
+        })
     }
 }

@@ -106,7 +106,11 @@ fn a_user_without_rights_runs_both_hosts_over_a_hop_with_kernel_stamps() {
 
 #[test]
 fn a_stop_of_the_one_command_ends_both_hosts_with_their_reports() {
-    for signal in [Signal::SIGTERM, Signal::SIGKILL] {
+    for (signal, words) in [
+        (Signal::SIGINT, Some("Ctrl-C")),
+        (Signal::SIGTERM, Some("SIGTERM")),
+        (Signal::SIGKILL, None),
+    ] {
         let record = open_folder("one-pc-stop");
         let (trial, mut child) = start(&record, &["run.duration='10 min'"]);
         let folders = folders(&trial);
@@ -115,12 +119,14 @@ fn a_stop_of_the_one_command_ends_both_hosts_with_their_reports() {
         });
         child.signal(signal).unwrap();
         let finished = child.wait_within(LIMIT).unwrap();
-        if signal == Signal::SIGTERM {
+        if words.is_some() {
             finished.assert_code(130);
         }
         assert_nobody_left(&record);
         for files in folders {
             assert!(files.has_report(), "{signal}: {}", files.root().display());
+            let report = files.read("report.txt");
+            assert!(report.contains(words.unwrap_or_default()), "{report}");
         }
     }
 }

@@ -505,7 +505,7 @@ delay = "1 ms"
 }
 
 #[test]
-fn ctrl_c_leaves_a_report_and_nothing_else_and_a_program_that_fails_is_named_with_its_exit_code() {
+fn ctrl_c_leaves_a_report_and_nothing_else_and_a_program_that_fails_is_named_with_its_last_words() {
     let place = Place::new("join-end");
     let mut child = place.join(&[
         "--",
@@ -548,13 +548,13 @@ fn ctrl_c_leaves_a_report_and_nothing_else_and_a_program_that_fails_is_named_wit
     assert_eq!(finished.stderr.lines().count(), 1, "{}", finished.stderr);
 
     let place = Place::new("join-failed");
-    let finished = place.run(&["--", "sh", "-c", "exit 7", "--", "sleep", "100"]);
+    let script = "echo no such device >&2; exit 7";
+    let finished = place.run(&["--", "sh", "-c", script, "--", "sleep", "100"]);
     assert_eq!(finished.status.code(), Some(1));
-    assert!(
-        finished.stderr.contains("sh ended with exit code 7"),
-        "{}",
-        finished.stderr
-    );
+    let said = "sh ended with exit code 7, after it said \"no such device\"";
+    for words in [said, "/logs/first.log"] {
+        assert!(finished.stderr.contains(words), "{}", finished.stderr);
+    }
 }
 
 #[test]

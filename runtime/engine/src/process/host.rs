@@ -19,7 +19,6 @@ use hil_net::handover;
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
 use hil_platform::{own_process, systemd};
-use hil_rundir::pipe::ToProcess;
 use hil_topology::{Host, Topology};
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::sys::signal::Signal;
@@ -44,8 +43,12 @@ const INTERFACES: &str = "eth";
 const LINE_BYTES_MAX: usize = 4096;
 /// How often it is looked whether a host has ended.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
-/// How long the others may go on once a host has failed.
+/// How long the others may go on once a host has failed, which it tells them.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// Once one could not begin, which it tells nobody.
+const UNBEGUN_PATIENCE: Duration = Duration::from_secs(2);
+/// Exit code of a supervisor that could not begin.
+const UNBEGUN: u8 = 2;
 /// A run that begins before is told that nothing leaves its interface.
 const WIRES_UP_WITHIN: Duration = Duration::from_secs(2);
 const WIRES_PERIOD: Duration = Duration::from_millis(5);
@@ -240,18 +243,25 @@ fn wait_for_all(hosts: &mut [Child], signals: &Signals, mut meanwhile: impl FnMu
                 .code()
                 .and_then(|code| code.try_into().ok())
                 .unwrap_or(FAILED);
-            stop_at = stop_at.or(Some(now + PATIENCE));
+            let patience = if code == UNBEGUN {
+                UNBEGUN_PATIENCE
+            } else {
+                PATIENCE
+            };
+            stop_at = stop_at.or(Some(now + patience));
         }
         if ends.iter().all(Option::is_some) {
             return code;
         }
-        if signals.received().is_some() {
+        let received = signals.received_signal();
+        if received.is_some() {
             stop_at = Some(now);
         }
         if !is_told && stop_at.is_some_and(|at| now >= at) {
             is_told = true;
+            // Each host's report says by which signal the run ended.
             for host in &mut *hosts {
-                host.order(&ToProcess::Stop);
+                host.signal(received.unwrap_or(Signal::SIGTERM));
             }
         }
         thread::sleep(LOOK_PERIOD);

@@ -265,7 +265,7 @@ impl Child {
     }
 
     /// Signals its group, as long as the group's number is its own for certain.
-    fn signal(&self, signal: Signal) {
+    pub(crate) fn signal(&self, signal: Signal) {
         if self.end.is_none() && self.look().is_ok() {
             self.signal_group(signal);
         }
@@ -350,9 +350,9 @@ fn next_line(input: &mut impl BufRead, bytes_max: usize) -> io::Result<Option<Ve
     }
 }
 
-/// The last line that a process said on its standard error, if it said any: as much of it as fits a
-/// line of a report.
-pub(crate) fn last_line(log: &Path) -> Option<String> {
+/// The last line that a process said on its standard error and that does not have `known` in it, if there is one: as
+/// much of it as fits a line of a report.
+pub(crate) fn last_line(log: &Path, known: Option<&str>) -> Option<String> {
     const TAIL_BYTES: u64 = 4096;
     const LINE_CHARS: usize = 200;
     let mut file = File::open(log).ok()?;
@@ -363,7 +363,8 @@ pub(crate) fn last_line(log: &Path) -> Option<String> {
     file.take(TAIL_BYTES).read_to_end(&mut bytes).ok()?;
     let text = String::from_utf8_lossy(&bytes);
     let lines = text.lines().map(str::trim);
-    let last = lines.rev().find(|line| !line.is_empty())?;
+    let is_news = |line: &&str| !line.is_empty() && known.is_none_or(|known| !line.contains(known));
+    let last = lines.rev().find(is_news)?;
     let plain = last.chars().filter(|one| !one.is_control());
     Some(plain.take(LINE_CHARS).collect())
 }
@@ -409,7 +410,7 @@ mod tests {
     #[test]
     fn the_last_line_that_was_said_is_found_whatever_it_is() {
         let log = env::temp_dir().join(format!("hil-last-{}.log", std::process::id()));
-        assert_eq!(last_line(&log), None);
+        assert_eq!(last_line(&log, None), None);
         for (said, expected) in [
             ("", None),
             ("\n \n", None),
@@ -420,10 +421,16 @@ mod tests {
             ("\u{1b}[31mred\n", Some("[31mred")),
         ] {
             fs::write(&log, said).unwrap();
-            assert_eq!(last_line(&log).as_deref(), expected, "{said:?}");
+            assert_eq!(last_line(&log, None).as_deref(), expected, "{said:?}");
         }
+        fs::write(&log, "no such device\nerror: ./robot ended\n").unwrap();
+        let last = last_line(&log, Some("./robot ended"));
+        assert_eq!(last.as_deref(), Some("no such device"));
         fs::write(&log, [vec![0xff; 10_000], b"end".to_vec()].concat()).unwrap();
-        assert_eq!(last_line(&log).map(|line| line.chars().count()), Some(200));
+        assert_eq!(
+            last_line(&log, None).map(|line| line.chars().count()),
+            Some(200)
+        );
         fs::remove_file(log).unwrap();
     }
 

@@ -391,13 +391,21 @@ impl ProcessGroup {
         let complaint = member.complaint.as_ref();
         let failure_kind = complaint.map_or(FailureKind::Fault, |failure| failure.kind);
         if let Some(failure) = complaint {
-            what = format!("{what}: {}", failure.text);
+            // What a program of the user's said came before what its starter says of its end.
+            let last = match member.plan.task {
+                ProcessTask::Cable(_) => last_line(&log, Some(&failure.text)),
+                _ => None,
+            };
+            what = match last {
+                None => format!("{what}: {}", failure.text),
+                Some(last) => format!("{what}: {}, after it said \"{last}\"", failure.text),
+            };
         } else if end.signal() == Some(libc::SIGBUS)
             && let Ok(free) = Room::free()
         {
             what = format!("{what}; {SHARED_MEMORY_DIRECTORY} has {free} free");
         } else if end.code().is_some_and(|code| code != 0)
-            && let Some(last) = last_line(&log)
+            && let Some(last) = last_line(&log, None)
         {
             what = format!("{what}, after it said \"{last}\"");
         }
@@ -442,6 +450,15 @@ impl ProcessGroup {
         if is_orderly {
             Verdict::Finished(text)
         } else {
+            let has_own_output = matches!(
+                self.members[index].plan.task,
+                ProcessTask::Cable(_) | ProcessTask::Foreign { .. }
+            );
+            let text = if has_own_output {
+                format!("{text}; its output is in {}", log.display())
+            } else {
+                text
+            };
             Verdict::Failed(Failure {
                 kind: failure_kind,
                 text,

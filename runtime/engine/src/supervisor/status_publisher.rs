@@ -77,8 +77,11 @@ impl StatusPublisher {
             .iter()
             .flat_map(|member| &member.progress);
         let channels = progress_line::of_channels(topology, progress);
-        let time = progress_line::of_time(elapsed, planned);
-        console.progress(&format!("{time}  {channels}"));
+        // Before the first counts there is nothing to tell.
+        if !channels.is_empty() {
+            let time = progress_line::of_time(elapsed, planned);
+            console.progress(&format!("{time}  {channels}"));
+        }
     }
 
     /// A tick of the watchdog says that the loop of the supervisor turns, which calls this, and those

@@ -414,6 +414,14 @@ fn add_warnings(summary: &mut RunSummary, records: &RunRecords<'_>) {
             ));
         }
     }
+    for NamedFlow { name, .. } in records.topology.named_flows() {
+        let mut flows = summary.flows.iter().flat_map(|one| &one.flows);
+        if !flows.any(|flow| flow.name == name) {
+            summary.warnings.push(format!(
+                "flows.{name}: no frame matches, or those that do belong to a flow that stands before it"
+            ));
+        }
+    }
     summary.warnings.extend(records.clocks.warnings());
     let pairs = &records.clocks.section.pairs;
     let paths = pairs.iter().filter_map(clock_path::warning);
