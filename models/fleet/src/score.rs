@@ -89,7 +89,7 @@ fn harms(seen: Option<(&Tally, Option<Spread>, &[Standstill])>) -> Vec<Harm> {
         },
         Harm::new("collisions, exact", count(|tally| tally.overlaps_count)),
         Harm::new(
-            "times past a late authority",
+            "overruns of a late authority",
             count(|tally| tally.authorities_late_count),
         ),
         standstill_harm(seen.map(|(_, _, standing)| standing)),

@@ -31,17 +31,6 @@ const OUTAGE_LOST_MIN: u64 = 3;
 /// Channels, processes or hosts that are named where many have the same fault.
 const NAMED_COUNT: usize = 3;
 
-/// What an answer counts as harm, beside the counts that it lists; `None` where it lists none.
-pub(crate) fn counted_as_harm(summary: &RunSummary) -> Option<&'static str> {
-    if summary.harms.len() > summary.deadlines.len() {
-        Some("these, less those by limits of the robot")
-    } else if summary.harms.is_empty() {
-        None
-    } else {
-        Some("these, which would have come in time but for the network")
-    }
-}
-
 /// A way in which the robot can be hurt, and how often it was; see [`hil_core::case_study::Harm`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct HarmCount {
@@ -341,8 +330,9 @@ impl Answer {
             (Hurt::No, Some(OccasionCount { what, count })) => {
                 // Of how long one lasts nothing is known, so it is counted as one event, of Poisson's law (Garwood 1936).
                 let most = -(0.5 - 0.5 * CONFIDENCE).ln();
+                let percent = 100.0 * CONFIDENCE;
                 format!(
-                    "{} in {} {what}, which leaves open up to {most:.1} independent events in as long a run",
+                    "{}: no harm in {} {what} ({percent:.0} %: at most {most:.1} in a run this long, Poisson)",
                     self.hurt,
                     grouped(*count)
                 )
@@ -382,7 +372,8 @@ impl Answer {
                 )
             }
             Clocks::Unaligned => {
-                "; clocks are not aligned: one-way delays are unavailable".to_owned()
+                "; one-way delays and what came first are unavailable: the hosts' clocks are not aligned"
+                    .to_owned()
             }
         };
         let uncounted_count = self.measurement.uncounted_start_count;
@@ -439,8 +430,7 @@ impl Hurt {
     pub(crate) fn words(&self, object: Object) -> String {
         let because = Untested::NoScore;
         if object == Object::Programs && *self == (Self::NotTested { because }) {
-            "NOT TESTED: what hurts these programs is not known (a deadline in [flows.NAME] tells); the channels \
-             count what was lost"
+            "NOT TESTED: nothing says what hurts these programs; to test it, set a deadline in [flows.NAME]"
                 .to_owned()
         } else {
             self.to_string()
@@ -477,14 +467,14 @@ impl fmt::Display for Unresolved {
             }
             Self::NotCounted => formatter.write_str("what hurts the robot could not be counted"),
             Self::NoNetworkEventBefore => {
-                formatter.write_str("the robot was hurt, but no network event that explains it came before")
+                formatter.write_str("no network event that explains the harm came before it")
             }
             Self::WithinChance => formatter.write_str("what difference there is, chance alone may make"),
             Self::NoInterval { what, why } => {
-                write!(formatter, "the difference of {what} has no interval: {why}")
+                write!(formatter, "of the difference of {what} there is {why}")
             }
             Self::ClocksDiffer => formatter.write_str(
-                "the robot was hurt, but unaligned clocks leave open whether the network came first",
+                "the hosts' clocks are not aligned, which leaves open whether a network event came before the harm",
             ),
         }
     }
@@ -619,20 +609,20 @@ fn is_score_incomplete(summary: &RunSummary) -> bool {
     })
 }
 
-/// The figure in the unit that people think in, with its interval.
+/// The figure in the unit that people think in, with its interval if it has one.
 pub(crate) fn metric_words(metric: &ScoreMetric) -> String {
     let scale = UnitScale::of(&metric.unit);
     let value = metric
         .value
         .map_or_else(|| "unavailable".to_owned(), |value| scale.words(value));
     let interval = match metric.interval {
-        None => String::new(),
         Some(Spread::Known(one)) => format!(
             " [{}, {}]",
             figure(scale.scaled(one.low)),
             figure(scale.scaled(one.high))
         ),
-        Some(Spread::Unknown(why)) => format!(" [{why}]"),
+        // The full report says why there is none.
+        None | Some(Spread::Unknown(_)) => String::new(),
     };
     format!("{value}{interval}")
 }
@@ -719,10 +709,18 @@ fn invalid_words(network: &NetworkVerdict) -> Option<String> {
             let skipped: u64 = processes.iter().map(|one| one.skipped_tick_count).sum();
             let due: u64 = processes.iter().map(|one| one.due_tick_count).sum();
             let names: Vec<&str> = processes.iter().map(|one| one.process.as_str()).collect();
+            let noun = if names.len() == 1 {
+                "process"
+            } else {
+                "processes"
+            };
             let names = named(&names, NAMED_COUNT);
             let share = percent(skipped as f64 / due.max(1) as f64);
             let ticks = format!("{} of {} ticks", grouped(skipped), grouped(due));
-            format!("the host overran: {names} skipped {ticks} ({share}); {repeat}")
+            let most = percent(SKIPPED_TICK_RATIO_MAX);
+            format!(
+                "the host overran: {noun} {names} skipped {ticks} ({share}, at most {most} may be); {repeat}"
+            )
         }
         NetworkVerdict::ReceiverLate { channels, loss } => {
             let flows = named(channels, NAMED_COUNT);

@@ -57,7 +57,7 @@ counts! {
         refused_pending_count,
         /// Refused: the session had ended.
         refused_closed_count,
-        /// Datagrams about it given to the owner, its farewell among them.
+        /// Datagrams about it that the owner sent, its farewell among them.
         datagram_count,
     }
 }

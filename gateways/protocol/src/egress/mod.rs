@@ -514,6 +514,7 @@ impl EgressBridge {
         if let Some(last) = self.last_transmit.take() {
             if let Some(channel) = last.key.channel {
                 let counts = &mut self.channels[channel].counts;
+                counts.datagram_count -= 1;
                 counts.message_failed_count += 1;
                 if last.is_last_fragment {
                     counts.sent_count -= 1;
@@ -522,6 +523,12 @@ impl EgressBridge {
                 }
             } else if last.key.kind == Kind::SyncRequest {
                 self.counts.sync_sent_count -= 1;
+            } else if last.key.kind == Kind::Bye
+                && let Farewell::Due { from } = self.farewell
+                && let Some(channel) = from.checked_sub(1)
+            {
+                // The peer may be gone before it is told so.
+                self.channels[channel].counts.datagram_count -= 1;
             }
         }
         if failure == TransmitFailure::PeerUnreachable {

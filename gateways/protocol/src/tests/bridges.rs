@@ -15,6 +15,7 @@ use crate::lab::{
 use crate::refusal::Refusal;
 use crate::sequence::Order;
 use crate::stamps::{ArrivalStamps, StampSource};
+use crate::wire::Kind;
 
 const DELAY: Impairment = Impairment {
     delay_ns: 300_000,
@@ -205,7 +206,24 @@ fn a_transmission_that_fails_is_counted_and_its_message_given_up() {
     assert_eq!(lab.egress.peer_state(), PeerState::Established);
     let counts = lab.egress.channel_counts(0);
     assert_eq!((counts.sent_count, counts.message_failed_count), (0, 1));
+    assert_eq!(counts.datagram_count, 0);
     assert_eq!(lab.egress.counts().transmit_failed_count, 1);
+}
+
+#[test]
+fn a_farewell_that_could_not_be_sent_is_no_datagram_of_its_channel() {
+    let mut lab = Lab::new(1, 64, DELAY);
+    lab.run_ms(2);
+    lab.publish().unwrap();
+    lab.run_ms(1);
+    let sent_count = lab.egress.channel_counts(0).datagram_count;
+    lab.egress.bye();
+    let now = lab.egress_now();
+    let farewell = lab.egress.poll_transmit(now).unwrap();
+    assert_eq!(farewell.key.kind, Kind::Bye);
+    lab.egress
+        .on_transmit_failed(now, TransmitFailure::PeerUnreachable);
+    assert_eq!(lab.egress.channel_counts(0).datagram_count, sent_count);
 }
 
 #[test]

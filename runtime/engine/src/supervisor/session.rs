@@ -116,7 +116,11 @@ pub fn run(
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, base, &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
-    let gathered = gather(topology, key.as_ref(), &hosts, &domains, signals, console)?;
+    let gathered = gather(topology, key.as_ref(), &hosts, &domains, signals, console);
+    let gathered = gathered.inspect_err(|_| {
+        // It holds nothing of a run yet; the error that is told is the first one.
+        let _left = fs::remove_dir_all(folder.root()).is_err();
+    })?;
     let peers = gathered.peers;
     let here = clock_id()?;
     let process_group =

@@ -134,7 +134,7 @@ fn words(outage: &EventOutage, interrupted: Option<&str>, later_ns: Option<i64>)
         text.push_str(&[", while ", process, " was down"].concat());
     }
     match outage.standing {
-        Standing::UnderWay => text.push_str(", under way"),
+        Standing::UnderWay => text.push_str(", under way then"),
         Standing::OverFor(ns) => {
             let over = duration_s(ns as f64 * 1e-9);
             text.push_str(&[", over for ", &over].concat());
@@ -208,7 +208,7 @@ mod tests {
                 43_204,
                 Some(
                     "outage of 1.84 s on egm/right/command, 41.200 s to 43.040 s, 230 messages \
-                     lost, under way",
+                     lost, under way then",
                 ),
             ),
             (
@@ -233,7 +233,7 @@ mod tests {
                 60_900,
                 Some(
                     "outage of 1.00 s on egm/right/command, from 59.000 s on, 125 messages lost, \
-                     under way",
+                     under way then",
                 ),
             ),
             (42_000, None),

@@ -124,10 +124,18 @@ impl HarmDifference {
             (_, [n]) => n.estimate(n).map(|one| difference(several(base), one)),
             _ => Ok(welch(&values(base), &values(new), CONFIDENCE)),
         };
+        // No share is above one, whatever repetitions scatter.
+        let within = |one: Interval| {
+            if is_share {
+                one.map(|end| end.clamp(-1.0, 1.0))
+            } else {
+                one
+            }
+        };
         Some(Self {
             value: mean(new) - mean(base),
             // Repetitions of which none differs from another are worth one.
-            interval: found.and_then(|one| one.ok_or(ONE_RUN)).into(),
+            interval: found.and_then(|one| one.map(within).ok_or(ONE_RUN)).into(),
             is_share,
         })
     }
@@ -238,7 +246,10 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
         && harms
             .iter()
             .all(|one| one.change == Change::Less || one.new.count == Some(0));
-    if let Some(because) = too_few_occasions(harms.iter().map(|one| &one.new)) {
+    if let Some(mut because) = too_few_occasions(harms.iter().map(|one| &one.new)) {
+        if let Unresolved::SampleTooSmall { what, .. } = &mut because {
+            what.push_str(" in the new runs");
+        }
         return not_resolvable(because);
     }
     if is_unhurt || is_less {
@@ -335,6 +346,10 @@ mod tests {
             None,
             "no rate of nine"
         );
+        let scattered = [run(Some(60), 60), run(Some(40), 60), run(Some(60), 60)];
+        let none = [run(Some(0), 60), run(Some(0), 60), run(Some(1), 60)];
+        let wide = of(&none, &scattered)[0].difference.unwrap();
+        assert!(wide.known().unwrap().high <= 1.0, "{wide:?}");
         // Repetitions are as many observations, also of short runs.
         let repeated: Vec<_> = (0..8).map(|at| run(Some(1 + at % 2), 60)).collect();
         let clean: Vec<_> = (0..8).map(|_| run(Some(0), 60)).collect();

@@ -25,6 +25,7 @@ use crate::summary::{RunSummary, SummaryError};
 use harms::ComparedHarm;
 use hil_rundir::manifest::Manifest;
 use hil_rundir::run_folder::RunFolder;
+use origin::Difference;
 use serde_json::Value;
 
 /// Why runs cannot be compared.
@@ -203,7 +204,7 @@ pub(crate) struct Comparison {
     /// What both sides have in common that matters.
     pub(crate) same: Vec<String>,
     /// In what the runs differ beside the figures; empty when in nothing that is known.
-    pub(crate) differences: Vec<String>,
+    pub(crate) differences: Vec<Difference>,
     /// Why figures must be read with care.
     pub(crate) cautions: Vec<String>,
     /// What was to be hurt: programs where no run has a robot.
@@ -231,7 +232,10 @@ impl Comparison {
         cautions.extend(metrics::cautions(&figures, [base.len(), new.len()]));
         let harms = harms::of(base, new);
         let hurt = harms::hurt(&harms, base, new);
-        let mut first_harms = new.iter().filter_map(|run| first_harm(&run.summary));
+        let mut first_harms = new.iter().filter_map(|run| {
+            let words = first_harm(&run.summary)?;
+            Some(format!("in {}: {words}", run.folder.display()))
+        });
         let headline = new.first().map(|run| run.summary.headline.clone());
         Self {
             base: folders(base),

@@ -1,6 +1,9 @@
 //! Whether runs may be compared: what they have in common and where they differ beside their figures.
 
+use core::fmt;
 use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Serialize;
 
 use super::{ComparedRun, Measurements};
 use crate::answer::Answer;
@@ -10,8 +13,73 @@ use hil_platform::host_facts::Fact;
 use hil_platform::words::counted;
 use serde_json::Value;
 
-/// Keys of topologies that are named; all are in `manifest.json`.
-const KEYS_SHOWN: usize = 12;
+/// In what runs differ beside their figures.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct Difference {
+    #[serde(flatten)]
+    pub(crate) what: Differing,
+    /// Of the base; several values are told one after the other.
+    pub(crate) base: String,
+    /// Of the new runs.
+    pub(crate) new: String,
+    /// Those that follow from it: a link of another kind has other keys.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub(crate) following: Vec<Difference>,
+}
+
+/// What differs.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(tag = "of", content = "what", rename_all = "snake_case")]
+pub(crate) enum Differing {
+    /// A key of the topologies, with dots.
+    Key(String),
+    /// The topologies, of which not every folder has the keys.
+    Topology,
+    /// The seeds of the runs.
+    Seed,
+    /// The kinds of links that their channels crossed, which follow from the topologies.
+    Links,
+    /// Another fact of a run or a host.
+    Fact(&'static str),
+}
+
+impl fmt::Display for Differing {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Key(key) => write!(formatter, "topology {key}"),
+            Self::Topology => {
+                formatter.write_str("topology, of which not every folder has the keys")
+            }
+            Self::Seed => formatter.write_str("seed"),
+            Self::Links => formatter.write_str("links"),
+            Self::Fact(what) => formatter.write_str(what),
+        }
+    }
+}
+
+impl fmt::Display for Difference {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            what, base, new, ..
+        } = self;
+        write!(formatter, "{what}: base {base}, new {new}")?;
+        match self.following.len() as u64 {
+            0 => Ok(()),
+            count => write!(formatter, ", and {} with it", counted(count, "key")),
+        }
+    }
+}
+
+impl Difference {
+    fn new(what: Differing, base: String, new: String) -> Self {
+        Self {
+            what,
+            base,
+            new,
+            following: Vec::new(),
+        }
+    }
+}
 
 /// Facts of a host that change what it can measure, and their words.
 const HOST_FACTS: [(&str, &str); 4] = [
@@ -22,7 +90,7 @@ const HOST_FACTS: [(&str, &str); 4] = [
 ];
 
 /// What both sides share, and what they do not.
-pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<String>) {
+pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<Difference>) {
     let (mut same, mut differences) = topology(base, new);
     // Repetitions have a seed each: the same on both sides make no difference.
     let [b, n] = [base, new].map(|runs| {
@@ -34,28 +102,29 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec
     if b == n {
         same.push(format!("seed {b}"));
     } else {
-        differences.push(format!("seed: base {b}, new {n}"));
+        differences.push(Difference::new(Differing::Seed, b, n));
     }
-    let mut check = |what: &str, of: &dyn Fn(&RunSummary) -> String| {
+    let mut check = |what: Differing, of: &dyn Fn(&RunSummary) -> String| {
         let (b, n) = (values(base, of), values(new, of));
         if b == n && b.len() == 1 {
             same.push(format!("{what} {}", joined(&b)));
         } else {
-            let (b, n) = (joined(&b), joined(&n));
-            differences.push(format!("{what}: base {b}, new {n}"));
+            differences.push(Difference::new(what, joined(&b), joined(&n)));
         }
     };
-    check("case", &|one| one.run.case.clone());
-    check("hosts", &|one| {
+    check(Differing::Fact("case"), &|one| one.run.case.clone());
+    check(Differing::Fact("hosts"), &|one| {
         let hosts: BTreeSet<&str> = one.processes.iter().map(|it| it.host.as_str()).collect();
         hosts.into_iter().collect::<Vec<_>>().join(" and ")
     });
-    check("length", &|one| format!("{:.0} s", one.run.duration_s));
-    check("links", &links);
+    check(Differing::Fact("length"), &|one| {
+        format!("{:.0} s", one.run.duration_s)
+    });
+    check(Differing::Links, &links);
     for (label, words) in HOST_FACTS {
         let mut runs = base.iter().chain(new);
         if runs.any(|run| run.summary.host_facts.find(label).is_some()) {
-            check(words, &|one| {
+            check(Differing::Fact(words), &|one| {
                 let found = one.host_facts.find(label);
                 found.map_or_else(|| "unavailable".to_owned(), Fact::to_text)
             });
@@ -65,15 +134,14 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec
 }
 
 /// The same for the topologies.
-fn topology(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<String>) {
+fn topology(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<Difference>) {
     let [b, n] = [base, new].map(|runs| values(runs, &|one| one.run.topology_hash.clone()));
     if b == n && b.len() == 1 {
         return (vec![format!("topology {}", joined(&b))], Vec::new());
     }
     if base.iter().chain(new).any(|run| run.topology.is_null()) {
-        let (b, n) = (joined(&b), joined(&n));
-        let text = format!("topology, of which not every folder has the keys: base {b}, new {n}");
-        return (Vec::new(), vec![text]);
+        let one = Difference::new(Differing::Topology, joined(&b), joined(&n));
+        return (Vec::new(), vec![one]);
     }
     let [base, new] = [base, new].map(|runs| {
         let all = runs.iter().map(|run| {
@@ -93,21 +161,47 @@ fn topology(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<Stri
                 .collect::<BTreeSet<_>>()
         });
         if b != n || b.len() > 1 {
-            let (b, n) = (joined(&b), joined(&n));
-            differences.push(format!("topology {key}: base {b}, new {n}"));
+            let what = Differing::Key(key.clone());
+            differences.push(Difference::new(what, joined(&b), joined(&n)));
         }
     }
     if differences.is_empty() {
         let same = "topology but for seed, length and ports".to_owned();
         return (vec![same], differences);
     }
-    let hidden = differences.len().saturating_sub(KEYS_SHOWN);
-    differences.truncate(KEYS_SHOWN);
-    if hidden > 0 {
-        let hidden = counted(hidden as u64, "more key");
-        differences.push(format!("{hidden} of the topology: see manifest.json"));
+    (Vec::new(), folded(differences))
+}
+
+/// With all keys of a link whose kind differs below its kind.
+fn folded(differences: Vec<Difference>) -> Vec<Difference> {
+    let link_of = |one: &Difference| match &one.what {
+        Differing::Key(key) => {
+            let name = key.strip_prefix("links.")?.split('.').next()?;
+            let is_kind = key.rsplit('.').next() == Some("via");
+            Some((name.to_owned(), is_kind))
+        }
+        _ => None,
+    };
+    let kinds = differences.iter().filter_map(link_of);
+    let kinds: BTreeSet<String> = kinds
+        .filter_map(|(name, is_kind)| is_kind.then_some(name))
+        .collect();
+    let mut found: Vec<Difference> = Vec::new();
+    let mut following: BTreeMap<String, Vec<Difference>> = BTreeMap::new();
+    for one in differences {
+        match link_of(&one) {
+            Some((name, false)) if kinds.contains(&name) => {
+                following.entry(name).or_default().push(one);
+            }
+            _ => found.push(one),
+        }
     }
-    (Vec::new(), differences)
+    for one in &mut found {
+        if let Some((name, true)) = link_of(one) {
+            one.following = following.remove(&name).unwrap_or_default();
+        }
+    }
+    found
 }
 
 /// Every value in `value` by its path; a list is one.
@@ -248,6 +342,10 @@ mod tests {
         }
     }
 
+    fn words(differences: &[Difference]) -> Vec<String> {
+        differences.iter().map(Difference::to_string).collect()
+    }
+
     fn link(seed: u64, port: u16, delay: &str) -> ComparedRun {
         let link = json!({ "port": port, "delay": delay, "between": ["a", "b"] });
         run(
@@ -264,7 +362,7 @@ mod tests {
             "topology links.hop.delay: base 5 ms, new 9 ms",
             "seed: base 1, new 2",
         ];
-        assert_eq!(differences, expected);
+        assert_eq!(words(&differences), expected);
         let (same, differences) = of(&[link(1, 7_400, "5 ms")], &[link(2, 7_402, "5 ms")]);
         assert!(same[0].starts_with("topology but for"), "{same:?}");
         assert_eq!(differences.len(), 1, "{differences:?}");
@@ -273,31 +371,41 @@ mod tests {
             [(1, "5 ms"), (2, "5 ms"), (2, "9 ms")].map(|(seed, delay)| link(seed, 7_400, delay));
         let (same, differences) = of(&[one.clone(), two.clone()], &[two.clone(), one.clone()]);
         assert!(same.iter().any(|one| one == "seed 1 and 2"), "{same:?}");
-        assert_eq!(differences, [""; 0]);
+        assert_eq!(differences, []);
         let (_, differences) = of(&[one.clone(), two.clone()], &[one.clone(), one.clone()]);
-        assert_eq!(differences, ["seed: base 1 and 2, new 1 and 1"]);
+        assert_eq!(words(&differences), ["seed: base 1 and 2, new 1 and 1"]);
         let sides = [one, other];
         let (_, differences) = of(&sides, &sides);
         let expected = "topology links.hop.delay: base 5 ms or 9 ms, new 5 ms or 9 ms";
-        assert_eq!(differences, [expected]);
+        assert_eq!(words(&differences), [expected]);
         // A key of one side only, and a folder without a manifest.
         let (_, differences) = of(&[run(1, json!({}))], &[run(1, json!({ "name": "x" }))]);
-        assert_eq!(differences, ["topology name: base none, new x"]);
+        assert_eq!(words(&differences), ["topology name: base none, new x"]);
         let (_, differences) = of(&[run(1, Value::Null)], &[run(1, json!({ "name": "x" }))]);
-        assert!(
-            differences[0].contains("not every folder"),
-            "{differences:?}"
-        );
-        let many = |word: &str| {
-            let keys = (0..20).map(|index| (format!("k{index}"), json!(word)));
-            run(1, Value::Object(keys.collect()))
+        assert_eq!(differences[0].what, Differing::Topology);
+    }
+
+    #[test]
+    fn the_keys_of_a_link_of_another_kind_follow_from_its_kind() {
+        let with = |hop: Value| {
+            let other = json!({ "via": "tcp", "rate": hop["rate"] });
+            run(1, json!({ "links": { "hop": hop, "other": other } }))
         };
-        let (_, differences) = of(&[many("a")], &[many("b")]);
-        assert_eq!(differences.len(), KEYS_SHOWN + 1);
-        assert!(
-            differences[KEYS_SHOWN].starts_with("8 more keys"),
-            "{differences:?}"
-        );
+        let real = with(json!({ "via": "udp", "dscp": 46 }));
+        let emulated =
+            with(json!({ "via": "emulated", "forward": { "delay": "5 ms" }, "rate": "1 kbit/s" }));
+        let (_, differences) = of(&[real], &[emulated]);
+        let expected = [
+            "topology links.hop.via: base udp, new emulated, and 3 keys with it",
+            "topology links.other.rate: base null, new 1 kbit/s",
+        ];
+        assert_eq!(words(&differences), expected);
+        let following = [
+            "topology links.hop.dscp: base 46, new none",
+            "topology links.hop.forward.delay: base none, new 5 ms",
+            "topology links.hop.rate: base none, new 1 kbit/s",
+        ];
+        assert_eq!(words(&differences[0].following), following);
     }
 
     #[test]

@@ -14,12 +14,21 @@ use hil_stats::comparison::Estimate;
 
 use super::conditions::Verdicts;
 use super::harms::HarmDifference;
+use super::origin::{Difference, Differing};
 use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict};
 use crate::answer::{Hurt, Object, UnitScale};
 
 const COLUMNS: [&str; 6] = ["metric", "base", "new", "new / base", "95 %", "verdict"];
-/// Channels that are listed unless every metric is asked for.
+/// Differences and channels that are listed unless every metric is asked for.
+const DIFFERENCES_SHOWN: usize = 8;
 const CHANNELS_SHOWN: usize = 12;
+
+/// How much is shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Extent {
+    Brief,
+    Full,
+}
 
 /// What differs, the robot, one line a channel, and last the answer.
 pub(super) fn brief(comparison: &Comparison, verdicts: &Verdicts, width: usize) -> String {
@@ -29,7 +38,7 @@ pub(super) fn brief(comparison: &Comparison, verdicts: &Verdicts, width: usize) 
         "--full prints every metric with its method; intervals are 95 %.",
     );
     let sections = [
-        runs(comparison),
+        runs(comparison, Extent::Brief),
         robot(comparison),
         channels(comparison),
         end,
@@ -40,7 +49,7 @@ pub(super) fn brief(comparison: &Comparison, verdicts: &Verdicts, width: usize) 
 /// Every metric, and last the answer.
 pub(super) fn full(comparison: &Comparison, verdicts: &Verdicts, width: usize) -> String {
     let sections = [
-        runs(comparison),
+        runs(comparison, Extent::Full),
         metrics(comparison),
         methods(comparison),
         judged(verdicts),
@@ -88,7 +97,7 @@ pub(super) fn markdown(
     answer.blocks.extend(harms(comparison).blocks);
     let sections = [
         answer,
-        runs(comparison),
+        runs(comparison, Extent::Full),
         metrics(comparison),
         methods(comparison),
         judged(verdicts),
@@ -109,7 +118,7 @@ fn folders(runs: &[PathBuf]) -> String {
 }
 
 /// The runs, and whether they may be compared.
-fn runs(comparison: &Comparison) -> Section {
+fn runs(comparison: &Comparison, extent: Extent) -> Section {
     let mut section = Section::new("runs", "Runs", "");
     section.fact("base", Tone::Plain, folders(&comparison.base));
     section.fact("new", Tone::Plain, folders(&comparison.new));
@@ -121,7 +130,20 @@ fn runs(comparison: &Comparison) -> Section {
         );
     } else {
         section.note(Tone::Caution, "The runs differ in more than their metrics:");
-        list(&mut section, Tone::Caution, &comparison.differences);
+        let all = comparison.differences.iter();
+        let mut items = Vec::new();
+        for one in all {
+            items.push(one.to_string());
+            if extent == Extent::Full {
+                items.extend(one.following.iter().map(Difference::to_string));
+            }
+        }
+        if extent == Extent::Brief && items.len() > DIFFERENCES_SHOWN {
+            let hidden = counted((items.len() - DIFFERENCES_SHOWN) as u64, "more difference");
+            items.truncate(DIFFERENCES_SHOWN);
+            items.push(format!("{hidden} with --full"));
+        }
+        list(&mut section, Tone::Caution, &items);
     }
     if !comparison.cautions.is_empty() {
         section.note(Tone::Caution, "Read with care:");
@@ -137,13 +159,13 @@ fn harms(comparison: &Comparison) -> Section {
         section.note(Tone::Strong, &one.base.what);
         section.fact("base", Tone::Plain, one.base.words());
         section.fact("new", Tone::Plain, one.new.words());
-        if let Some(difference) = &one.difference {
+        let is_none = one.base.count == Some(0) && one.new.count == Some(0);
+        if let Some(difference) = one.difference.as_ref().filter(|_| !is_none) {
             section.fact("new less base", Tone::Plain, difference_words(difference));
         }
     }
-    section.note(Tone::Strong, "cause, validity and what is left open");
     if let Some(words) = &comparison.first_harm {
-        section.fact("first harm, new", Tone::Plain, words);
+        section.fact("first harm", Tone::Plain, words);
     }
     for one in &comparison.measurements {
         let words = match one.runs.as_slice() {
@@ -200,7 +222,8 @@ fn left_open(comparison: &Comparison) -> Vec<String> {
     }
     let differing = differing(&comparison.differences);
     if differing.len() > 1 {
-        let differing = differing.join(", ");
+        let differing = differing.into_iter().map(ToString::to_string);
+        let differing = differing.collect::<Vec<_>>().join(", ");
         open.push(format!(
             "which of these made the difference: the runs differ in {differing}"
         ));
@@ -208,34 +231,18 @@ fn left_open(comparison: &Comparison) -> Vec<String> {
     open
 }
 
-/// What may have made a difference: a link that is of another kind with all of its keys, which follow from the kind, and
-/// each other key for itself. The name of a topology makes none, and the kinds of links follow from the links.
-fn differing(differences: &[String]) -> Vec<&str> {
-    const LINKS: &str = "topology links.";
-    let whats: Vec<&str> = differences
-        .iter()
-        .map(|words| words.split(':').next().unwrap_or_default())
-        .collect();
-    let kinds: Vec<&str> = whats
-        .iter()
-        .filter(|what| what.starts_with(LINKS))
-        .filter_map(|what| what.strip_suffix(".via"))
-        .collect();
-    let mut found: Vec<&str> = Vec::new();
-    for what in whats {
-        let is_of = |link: &&&str| {
-            let rest = what.strip_prefix(**link);
-            rest.is_some_and(|rest| rest.starts_with('.'))
-        };
-        let one = kinds.iter().find(is_of).copied().unwrap_or(what);
-        if one != "topology name" && !found.contains(&one) {
-            found.push(one);
-        }
-    }
-    if found.iter().any(|one| one.starts_with(LINKS)) {
-        found.retain(|one| *one != "links");
-    }
-    found
+/// What may have made a difference: no name of a topology, and not the kinds of links where their keys are told.
+fn differing(differences: &[Difference]) -> Vec<&Differing> {
+    let whats = || differences.iter().map(|one| &one.what);
+    let is_of_link =
+        |what: &Differing| matches!(what, Differing::Key(key) if key.starts_with("links."));
+    let has_links = whats().any(is_of_link);
+    let found = whats().filter(|what| match what {
+        Differing::Key(key) => key != "name",
+        Differing::Links => !has_links,
+        _ => true,
+    });
+    found.collect()
 }
 
 /// Conditions that were asked for.
@@ -455,30 +462,23 @@ fn with_verdict(text: String, verdict: Verdict) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::differing;
+    use super::*;
 
     #[test]
-    fn the_keys_of_a_link_of_another_kind_are_one_difference_and_a_name_is_none() {
-        let differences = |words: &[&str]| -> Vec<String> {
-            let of = |what: &&str| format!("{what}: base none, new x");
-            words.iter().map(of).collect()
+    fn a_name_makes_no_difference_and_links_make_one_where_no_key_of_theirs_does() {
+        let of = |whats: &[Differing]| -> Vec<Difference> {
+            let of = |what: &Differing| Difference {
+                what: what.clone(),
+                base: "none".to_owned(),
+                new: "x".to_owned(),
+                following: Vec::new(),
+            };
+            whats.iter().map(of).collect()
         };
-        let other_kind = [
-            "topology links.hop.forward.delay",
-            "topology links.hop.via",
-            "topology name",
-            "links",
-        ];
-        let found = differences(&other_kind);
-        assert_eq!(differing(&found), ["topology links.hop"]);
-        // Of one kind, each key may have made the difference; so may parameters.
-        let keys = [
-            "topology case.parameters.gain",
-            "topology case.parameters.limit",
-            "topology links.hop.delay",
-            "topology links.hop.loss_ratio",
-        ];
-        assert_eq!(differing(&differences(&keys)), keys);
-        assert_eq!(differing(&differences(&["links"])), ["links"]);
+        let key = |key: &str| Differing::Key(key.to_owned());
+        let [kind, gain] = [key("links.hop.via"), key("case.parameters.gain")];
+        let found = of(&[kind.clone(), gain.clone(), key("name"), Differing::Links]);
+        assert_eq!(differing(&found), [&kind, &gain]);
+        assert_eq!(differing(&of(&[Differing::Links])), [&Differing::Links]);
     }
 }

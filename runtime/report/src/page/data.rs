@@ -75,14 +75,10 @@ pub(crate) struct Tile {
 pub(crate) struct AnswerView {
     pub(crate) question: String,
     pub(crate) answer: Verdict,
-    pub(crate) measurement: Verdict,
-    pub(crate) sample: String,
-    /// The first thing that hurt the robot and what the network did before, where it did.
-    pub(crate) cause: Option<String>,
-    /// What hurt the robot.
+    /// What hurt the robot, and what might have.
     pub(crate) harms: Vec<Field>,
-    /// The emulated links and what they do.
-    pub(crate) links: Vec<Field>,
+    /// Whether the measurement is valid, what the network did, how large the sample is, and the emulated links.
+    pub(crate) badges: Vec<Field>,
 }
 
 /// A judgement.

@@ -8,8 +8,9 @@ use super::data::{AnswerView, Run, RunKind, Tile, Verdict};
 use super::drawings;
 use super::read::{Found, Manifest, Material};
 use super::timeline;
-use crate::answer::{Answer, Hurt, counted_as_harm};
+use crate::answer::Answer;
 use crate::assessment::Assessment;
+use crate::sections::AnswerFacts;
 use crate::sections::{self, Sources, outcome_words};
 use crate::summary::{RunSummary, host_words};
 
@@ -181,9 +182,12 @@ fn draw(
 
 fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
     let answer = Answer::of(summary, assessment);
-    let rule = counted_as_harm(summary).map(|words| Field::new("counted as harm", words));
     let plain = |text: String| text.replace(JOINT, " ");
-    let (tone, words) = answer.measurement_words(&assessment.network);
+    let field = |one: Field| Field {
+        value: plain(one.value),
+        ..one
+    };
+    let facts = AnswerFacts::of(summary, assessment, &answer, usize::MAX);
     AnswerView {
         question: answer.question(),
         answer: Verdict {
@@ -191,27 +195,15 @@ fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
             word: plain(answer.words()),
             text: plain(answer.sentence()),
         },
-        measurement: Verdict {
-            tone,
-            word: "measurement".to_owned(),
-            text: plain(words),
-        },
-        sample: plain(answer.sample_words()),
-        cause: (answer.hurt == Hurt::Yes)
-            .then(|| sections::events::first_harm(summary))
-            .flatten()
-            .map(plain),
-        harms: summary
-            .harms
-            .iter()
-            .map(|harm| Field::new(&harm.what, plain(harm.words())))
-            .chain(rule)
-            .collect(),
-        links: summary
-            .run
-            .links
-            .iter()
-            .map(|link| Field::new(&link.label, &link.value))
+        harms: facts.harms.into_iter().map(field).collect(),
+        badges: [facts.measurement]
+            .into_iter()
+            .chain(facts.rest)
+            .map(field)
+            .chain(summary.run.links.iter().map(|link| {
+                let value = format!("{}: {}", link.label, link.value);
+                Field::new("emulated link", value)
+            }))
             .collect(),
     }
 }

@@ -297,7 +297,7 @@ fn page_and_markdown_name_the_emulated_links_at_their_head() {
     let one = [material(summary)];
     for (format, words, after) in [
         (Format::Html, "hop: fixed delay of 5 ms", "<section"),
-        (Format::Md, "emulated link hop: fixed delay of 5 ms", "## "),
+        (Format::Md, "emulated link: hop: fixed delay of 5 ms", "## "),
     ] {
         let page = render(&one, None, format, None).unwrap();
         assert!(

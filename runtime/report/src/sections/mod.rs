@@ -2,6 +2,7 @@
 //! judged here.
 
 mod adapter;
+mod answer;
 pub(crate) mod channel;
 mod clocks;
 pub(crate) mod events;
@@ -13,6 +14,7 @@ mod radio;
 mod run;
 mod timeline;
 
+pub(crate) use answer::AnswerFacts;
 pub(crate) use channel::Sources;
 pub use channel::quantile_table;
 pub(crate) use flows::{deadlines, flows};

@@ -13,6 +13,7 @@ use hil_present::terminal::section;
 use hil_present::units::seconds;
 use hil_present::{Block, Cell, Event, EventList, Row, Section, Table, Tone, UNAVAILABLE};
 
+use super::answer::AnswerExtent;
 use super::{LINKS_SHOWN, answer, case_lead, links};
 use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested};
 use crate::assessment::Assessment;
@@ -34,8 +35,7 @@ struct Extent {
     deadlines: usize,
     /// Rows of the robot in the time strip.
     robot_rows: usize,
-    /// Ways in which the robot can be hurt.
-    harms: usize,
+    answer: AnswerExtent,
 }
 
 /// The first whose page has no more than [`LINES_MAX`] rows is taken.
@@ -46,7 +46,7 @@ const EXTENTS: [Extent; 4] = [
         flows: 6,
         deadlines: 6,
         robot_rows: 2,
-        harms: 6,
+        answer: AnswerExtent { harms: 6, lines: 5 },
     },
     Extent {
         causes: 3,
@@ -54,7 +54,7 @@ const EXTENTS: [Extent; 4] = [
         flows: 4,
         deadlines: 4,
         robot_rows: 1,
-        harms: 6,
+        answer: AnswerExtent { harms: 6, lines: 4 },
     },
     Extent {
         causes: 2,
@@ -62,7 +62,7 @@ const EXTENTS: [Extent; 4] = [
         flows: 3,
         deadlines: 3,
         robot_rows: 1,
-        harms: 4,
+        answer: AnswerExtent { harms: 4, lines: 3 },
     },
     Extent {
         causes: 1,
@@ -70,7 +70,7 @@ const EXTENTS: [Extent; 4] = [
         flows: 2,
         deadlines: 2,
         robot_rows: 1,
-        harms: 3,
+        answer: AnswerExtent { harms: 2, lines: 2 },
     },
 ];
 
@@ -115,7 +115,7 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
             section(&mut begin, &one);
         }
         let folded_rows = next(&mut end, &commands);
-        answer::answer(&mut end, summary, &assessment, extent.harms);
+        answer::answer(&mut end, summary, &assessment, extent.answer);
         let [begin, end] = [begin, end].map(Canvas::finish);
         let rows = begin.lines().count() + end.lines().count() + folded_rows;
         if rows + usize::from(has_warnings) > LINES_MAX && !is_last {

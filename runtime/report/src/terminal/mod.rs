@@ -7,6 +7,7 @@ mod trace;
 
 use std::path::PathBuf;
 
+use answer::AnswerExtent;
 pub use brief::brief;
 use hil_platform::text::shortened;
 use hil_platform::words::counted;
@@ -51,7 +52,7 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     for one in sections::of_run(summary, &assessment) {
         section(&mut canvas, &one);
     }
-    answer::answer(&mut canvas, summary, &assessment, usize::MAX);
+    answer::answer(&mut canvas, summary, &assessment, AnswerExtent::WHOLE);
     canvas.finish()
 }
 

@@ -1,0 +1,139 @@
+//! What stands below the answer of a run, in every form. It draws no conclusions.
+
+use hil_account::MessageFate;
+use hil_core::interval::Spread;
+use hil_platform::text::grouped;
+use hil_platform::words::counted;
+use hil_present::units::{duration, percent};
+use hil_present::{Field, Tone};
+
+use super::events::{first_harm, gravest_first};
+use crate::answer::{Answer, HarmCount, Hurt, OCCASIONS_MIN, metric_words};
+use crate::assessment::Assessment;
+use crate::summary::RunSummary;
+use hil_core::case_study::Severity;
+
+/// What an answer rests on, in the order of reading.
+#[derive(Debug)]
+pub(crate) struct AnswerFacts {
+    /// Whether the measurement is valid.
+    pub(crate) measurement: Field,
+    /// What hurt the robot, and what might have.
+    pub(crate) harms: Vec<Field>,
+    /// What the network did, what the case counts beside harm, and how large the sample is.
+    pub(crate) rest: Vec<Field>,
+}
+
+impl AnswerFacts {
+    /// Of a run; of its harms `harms_shown`, those that happened first if there are more.
+    pub(crate) fn of(
+        summary: &RunSummary,
+        assessment: &Assessment,
+        answer: &Answer,
+        harms_shown: usize,
+    ) -> Self {
+        let (tone, validity) = answer.measurement_words(&assessment.network);
+        let mut harms = Vec::new();
+        if answer.hurt == Hurt::Yes {
+            let first = first_harm(summary).map(|words| Field::new("first harm", words));
+            harms.extend(first);
+        }
+        let mut counts: Vec<&HarmCount> = summary.harms.iter().collect();
+        if counts.len() > harms_shown {
+            counts.sort_by_key(|harm| harm.count == Some(0));
+        }
+        let shown = counts.iter().take(harms_shown);
+        harms.extend(shown.map(|harm| Field::new(&harm.what, harm.words())));
+        let hidden = counts.len().saturating_sub(harms_shown) as u64;
+        if hidden > 0 {
+            let words = format!("{} with --full", counted(hidden, "further count"));
+            harms.push(Field::toned("", Tone::Faint, words));
+        }
+        if !summary.deadlines.is_empty() {
+            let words = "answers that would have come in time but for the network";
+            harms.push(Field::new("counted as harm", words));
+        }
+        harms.extend(hazards(summary).map(|words| Field::new("short of harm", words)));
+        let mut rest = Vec::new();
+        rest.extend(messages(summary).map(|words| Field::new("messages", words)));
+        let scores = summary.score.iter();
+        let headline = summary.headline.iter().filter_map(|name| {
+            let mut scores = scores.clone();
+            scores.find(|one| one.name == *name && one.value.is_some())
+        });
+        let headline: Vec<_> = headline.collect();
+        let figures = headline.iter();
+        rest.extend(figures.map(|one| Field::new(&one.label, metric_words(one))));
+        let harms_of = summary.harms.iter().map(|one| one.interval);
+        let mut intervals = harms_of.chain(headline.iter().map(|one| one.interval));
+        let has_interval = intervals.any(|one| matches!(one, Some(Spread::Known(_))));
+        let note = if has_interval {
+            "; brackets are 95 % intervals"
+        } else {
+            ""
+        };
+        let words = format!("{}{note}", answer.sample_words());
+        rest.push(Field::new("sample", words));
+        Self {
+            measurement: Field::toned("measurement", tone, validity),
+            harms,
+            rest,
+        }
+    }
+}
+
+/// Hazards, of a robot that was not hurt: how many, and the first.
+fn hazards(summary: &RunSummary) -> Option<String> {
+    let all = &summary.score_events;
+    let mut harms = summary.harms.iter();
+    if summary.harms.is_empty() || harms.any(|one| one.count != Some(0)) {
+        return None;
+    }
+    let count = all.count_of(Severity::Hazard);
+    let mut grave = gravest_first(&all.events).into_iter();
+    let first = grave.find(|one| one.severity == Severity::Hazard)?;
+    Some(format!(
+        "{}, the first: {}",
+        counted(count, "hazard"),
+        first.what
+    ))
+}
+
+/// What became of the messages that crossed a network or a model of one.
+fn messages(summary: &RunSummary) -> Option<String> {
+    let crossing = summary.channels.iter().filter(|one| one.link.is_crossing());
+    let accounts: Vec<_> = crossing
+        .filter_map(|one| Some((one.name.as_str(), one.account.as_ref()?)))
+        .collect();
+    if accounts.is_empty() {
+        return None;
+    }
+    let lost = accounts.iter().map(|(name, account)| {
+        let fates = MessageFate::ALL.into_iter().filter(|fate| fate.is_loss());
+        let lost: u64 = fates.map(|fate| account.fates.of(fate)).sum();
+        (*name, lost, account.published_count)
+    });
+    let lost: Vec<_> = lost.collect();
+    let all: u64 = lost.iter().map(|(_, lost, _)| lost).sum();
+    let ratio = |lost: u64, of: u64| lost as f64 / of.max(1) as f64;
+    let most = lost
+        .iter()
+        .filter(|(_, _, of)| *of >= OCCASIONS_MIN)
+        .max_by(|a, b| ratio(a.1, a.2).total_cmp(&ratio(b.1, b.2)));
+    let mut text = match most {
+        _ if lost.iter().all(|(_, _, of)| *of == 0) => "none published".to_owned(),
+        _ if all == 0 => "none lost".to_owned(),
+        Some((name, lost, of)) if *lost > 0 => {
+            format!("up to {} lost, on {name}", percent(ratio(*lost, *of)))
+        }
+        _ => format!("{} lost", grouped(all)),
+    };
+    let gaps = accounts.iter().filter_map(|(name, account)| {
+        let gap = account.gaps.longest?;
+        Some((gap.length_ns, *name))
+    });
+    if let Some((length_ns, name)) = gaps.max().filter(|(length_ns, _)| *length_ns > 0) {
+        text = format!("{text}; longest gap {}, on {name}", duration(length_ns));
+    }
+    Some(text)
+}
