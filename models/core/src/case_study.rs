@@ -11,9 +11,10 @@ use crate::endpoint::{RoleChannels, StatedChannel};
 use crate::message::{Message, MessageType, TypeInfo};
 use crate::options::Options;
 use crate::plot::PlotSeries;
+use crate::recorded_run::RecordedRun;
 use crate::replay::Replay;
 use crate::run_log::RunLog;
-use crate::study::Batch;
+use crate::study::{Batch, StudyRefusal};
 use crate::text_file::TextFile;
 
 pub use crate::score::{
@@ -127,12 +128,15 @@ pub trait CaseStudy: Sized + Debug + 'static {
         Ok(None)
     }
 
-    /// The tables this case can compute in virtual time, of the size its parameters ask for;
-    /// `None` for a case without any.
+    /// The tables this case can compute in virtual time, of the size its parameters ask for, with rows for the
+    /// `recorded` runs; `None` for a case without any.
     ///
     /// # Errors
-    /// Names the parameter that keeps the tables from being computed.
-    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+    /// Names the parameter that keeps the tables from being computed, or the run that can be no row of them.
+    fn study(
+        &self,
+        _recorded: Vec<RecordedRun<Self::Parameters>>,
+    ) -> Result<Option<Box<dyn Batch>>, StudyRefusal> {
         Ok(None)
     }
 }

@@ -35,6 +35,7 @@ pub mod plot;
 pub mod prelude;
 pub mod random;
 pub mod record;
+pub mod recorded_run;
 pub mod replay;
 pub mod run_log;
 pub mod score;

@@ -376,6 +376,105 @@ pub trait Options: Debug {
     }
 }
 
+/// A key that has another value in one table of options than in another.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Difference {
+    /// The key; dots lead into tables.
+    pub key: String,
+    /// Its value, in words.
+    pub found: String,
+    /// The other table's.
+    pub wanted: String,
+}
+
+/// The keys in which `found` differs from `wanted`, a table of the same type, in the order of their declaration.
+///
+/// ```
+/// hil_core::options! {
+///     /// Of a robot.
+///     pub struct Robot {
+///         /// Ticks per second.
+///         rate_hz: f64 = 125.0, in 1.0..=1000.0;
+///         /// A table below.
+///         arm: Arm;
+///     }
+/// }
+/// hil_core::options! {
+///     /// Of its arm.
+///     pub struct Arm {
+///         /// Its joints.
+///         joints: Vec<String> = Vec::new();
+///         /// Degrees of freedom.
+///         freedom: Option<u32> = None, in 1..=9;
+///     }
+/// }
+/// let mut wanted = Robot::default();
+/// let mut found = wanted.clone();
+/// found.arm.joints = vec!["a".to_owned(), "b".to_owned()];
+/// found.arm.freedom = Some(7);
+/// let different = hil_core::options::differences(&mut found, &mut wanted);
+/// let words: Vec<_> = different.iter().map(|one| [&one.key, &one.found, &one.wanted]).collect();
+/// assert_eq!(words, [["arm.joints", "[a, b]", "[]"], ["arm.freedom", "7", "none"]]);
+/// ```
+pub fn differences(found: &mut dyn Options, wanted: &mut dyn Options) -> Vec<Difference> {
+    let mut all = Vec::new();
+    add_differences(&mut all, "", found, wanted);
+    all
+}
+
+fn add_differences(
+    all: &mut Vec<Difference>,
+    prefix: &str,
+    found: &mut dyn Options,
+    wanted: &mut dyn Options,
+) {
+    for (one, other) in found.fields().into_iter().zip(wanted.fields()) {
+        let key = format!("{prefix}{}", one.key);
+        let values = match (one.slot, other.slot) {
+            (Slot::Value(one, _), Slot::Value(other, _)) => [one.get(), other.get()].map(words_of),
+            (Slot::Part(one), Slot::Part(other)) => {
+                add_differences(all, prefix, one, other);
+                continue;
+            }
+            (Slot::Table(mut one), Slot::Table(mut other)) => {
+                match (one.options(), other.options()) {
+                    (Some(one), Some(other)) => {
+                        add_differences(all, &format!("{key}."), one, other);
+                        continue;
+                    }
+                    (one, other) => [one.is_some(), other.is_some()]
+                        .map(|is_there| if is_there { "a table" } else { "none" }.to_owned()),
+                }
+            }
+            (Slot::Tables(one, _), Slot::Tables(other, _))
+            | (Slot::Rows(one), Slot::Rows(other)) => {
+                [one, other].map(|tables| format!("{tables:?}"))
+            }
+            _ => continue,
+        };
+        let [found, wanted] = values;
+        if found != wanted {
+            all.push(Difference { key, found, wanted });
+        }
+    }
+}
+
+fn words_of(value: Option<Setting>) -> String {
+    match value {
+        None => "none".to_owned(),
+        Some(Setting::Boolean(value)) => value.to_string(),
+        Some(Setting::Integer(value)) => value.to_string(),
+        Some(Setting::Number(value)) => value.to_string(),
+        Some(Setting::Time(value)) => format!("{value:?}"),
+        Some(Setting::Text(value)) => value,
+        Some(Setting::List(values)) => {
+            let values = values.into_iter().map(|value| words_of(Some(value)));
+            format!("[{}]", values.collect::<Vec<_>>().join(", "))
+        }
+        Some(Setting::Texts(values)) => format!("{values:?}"),
+    }
+}
+
 /// A type of options.
 pub trait Kind: Debug + Sized {
     /// The range that a declaration states for it.

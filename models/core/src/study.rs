@@ -7,6 +7,8 @@ use core::fmt::Debug;
 
 use serde::Serialize;
 
+use crate::case_study::ParameterError;
+
 /// Looks in on a running task: it hands over the share done, 0..=1, and is told whether to go on.
 pub type Watch<'a> = &'a mut dyn FnMut(f64) -> bool;
 
@@ -83,6 +85,22 @@ impl<S: Study> Batch for ErasedStudy<S> {
             .collect();
         self.0.report(&known)
     }
+}
+
+/// Why a case makes no study of its parameters and the recorded runs.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum StudyRefusal {
+    /// A parameter keeps the tables from being computed.
+    #[error(transparent)]
+    Parameter(#[from] ParameterError),
+    /// A recorded run can be no row.
+    #[error("{folder}: {problem}")]
+    Run {
+        /// Its folder.
+        folder: String,
+        /// What is wrong with it.
+        problem: String,
+    },
 }
 
 /// What a study comes to.

@@ -14,9 +14,10 @@ use crate::score;
 use crate::world::Vehicle;
 use hil_core::case_study::{CaseStudy, ChannelSpec, ParameterError};
 use hil_core::component::Role;
+use hil_core::recorded_run::RecordedRun;
 use hil_core::run_log::RunLog;
 use hil_core::score::{ErrorSeries, LiveEvents, Score};
-use hil_core::study::{Batch, into_batch};
+use hil_core::study::{Batch, StudyRefusal, into_batch};
 
 /// Channel from controller to robots: how far each may go.
 pub const FLEET_AUTHORITY: &str = "fleet/authority";
@@ -123,8 +124,11 @@ impl CaseStudy for Fleet {
         score::errors(self, log)
     }
 
-    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
-        let study = FleetStudy::new(&self.parameters, self.seed)?;
+    fn study(
+        &self,
+        recorded: Vec<RecordedRun<FleetParameters>>,
+    ) -> Result<Option<Box<dyn Batch>>, StudyRefusal> {
+        let study = FleetStudy::new(&self.parameters, self.seed, recorded)?;
         Ok(Some(into_batch(study)))
     }
 }

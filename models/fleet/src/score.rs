@@ -109,11 +109,21 @@ fn standstill_harm(standing: Option<&[Standstill]>) -> Harm {
     }
 }
 
-const COLLISIONS: Label = label(
+pub(crate) const COLLISIONS: Label = label(
     "section_collisions_count",
     "collisions, section checker",
     "1",
 );
+
+pub(crate) const OVERLAPS: Label = label("overlaps_count", "collisions, exact", "1");
+
+pub(crate) const OUTSIDE: Label = label("outside_count", "collisions outside any section", "1");
+
+pub(crate) const CRITICAL_SECTIONS: Label =
+    label("critical_sections_count", "critical sections passed", "1");
+
+pub(crate) const COLLISION_RATIO: Label =
+    label("collision_ratio", "collisions per critical section", "1");
 
 const STANDING: Label = label("standing_s", "time a whole fleet stood", "s");
 
@@ -137,12 +147,11 @@ fn collided_share(tally: &Tally, collided_after: &[u64]) -> Option<Spread> {
 fn collisions(tally: &Tally, interval: Option<Spread>) -> Vec<Metric> {
     let passed = tally.sections_passed_count;
     let collided = tally.section_collisions_count;
-    let named = label("collision_ratio", "collisions per critical section", "1");
     let mut ratio = if passed == 0 {
-        named.unavailable("no robot has passed a critical section")
+        COLLISION_RATIO.unavailable("no robot has passed a critical section")
     } else {
         let method = "section checker over sections passed";
-        named.known(collided as f64 / passed as f64, method)
+        COLLISION_RATIO.known(collided as f64 / passed as f64, method)
     };
     ratio.interval = interval.filter(|_| ratio.value.is_some());
     vec![
@@ -151,15 +160,15 @@ fn collisions(tally: &Tally, interval: Option<Spread>) -> Vec<Metric> {
             "both robots in a section and overlapping at the last path poses they passed, looked \
              at every 30 ms",
         ),
-        label("overlaps_count", "collisions, exact", "1").count(
+        OVERLAPS.count(
             tally.overlaps_count,
             "footprints overlapping where the robots truly were, looked at every 30 ms",
         ),
-        label("outside_count", "collisions outside any section", "1").count(
+        OUTSIDE.count(
             tally.outside_count,
             "exact collisions that began where no critical section is",
         ),
-        label("critical_sections_count", "critical sections passed", "1").count(
+        CRITICAL_SECTIONS.count(
             passed,
             "of two missions under way at once, driven through to the end",
         ),

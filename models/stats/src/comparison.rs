@@ -19,6 +19,16 @@ pub struct Estimate {
     pub interval: Option<Interval>,
 }
 
+impl Estimate {
+    /// Of a share: how many independent trials have as wide an interval. `None` without one.
+    pub fn effective_count(self) -> Option<f64> {
+        let Interval { low, high, .. } = self.interval?;
+        let variance = self.value * (1.0 - self.value);
+        let tail = 0.5 - 0.5 * CONFIDENCE;
+        Some(variance * (2.0 * normal_quantile(1.0 - tail) / (high - low)).powi(2))
+    }
+}
+
 /// The interval of `new - base` for independent estimates, from the interval of each (MOVER, Zou and
 /// Donner 2008; with score intervals it is method 10 of Newcombe 1998). `None` when either has none.
 pub fn difference(base: Estimate, new: Estimate) -> Option<Interval> {
@@ -47,9 +57,7 @@ pub fn ratio(base: Estimate, new: Estimate) -> Option<Interval> {
 /// exact (Clopper and Pearson 1934) for as large a part of `of`. `None` when that one has no interval.
 pub fn none_of(of: u64, like: Estimate, like_of: u64) -> Option<Interval> {
     let tail = 0.5 - 0.5 * CONFIDENCE;
-    let Interval { low, high, .. } = like.interval?;
-    let variance = like.value * (1.0 - like.value);
-    let effective = variance * (2.0 * normal_quantile(1.0 - tail) / (high - low)).powi(2);
+    let effective = like.effective_count()?;
     let worth = of as f64 * (effective / like_of as f64).min(1.0);
     (worth > 0.0).then(|| {
         let high = 1.0 - tail.powf(1.0 / worth);
@@ -175,10 +183,23 @@ impl Scatter {
 /// # Panics
 /// As [`Share::estimate`].
 pub fn against_published(published: Share, ours: Share, scatter: f64) -> Option<Verdict> {
-    let interval = difference(published.estimate(scatter)?, ours.estimate(scatter)?)?;
+    estimate_against_published(published, ours.estimate(scatter)?, ours.of, scatter)
+}
+
+/// The same of `ours` with an interval of its own, a share of `of`.
+///
+/// # Panics
+/// As [`Share::estimate`].
+pub fn estimate_against_published(
+    published: Share,
+    ours: Estimate,
+    of: u64,
+    scatter: f64,
+) -> Option<Verdict> {
+    let interval = difference(published.estimate(scatter)?, ours)?;
     Some(if interval.low > 0.0 || interval.high < 0.0 {
         Verdict::Differs
-    } else if 2 * ours.of >= published.of {
+    } else if 2 * of >= published.of {
         Verdict::Agrees
     } else {
         Verdict::Inconclusive

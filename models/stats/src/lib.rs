@@ -10,6 +10,7 @@ pub mod goodness;
 pub mod histogram;
 pub mod in_order;
 pub mod metric;
+pub mod recorded;
 pub mod reordering;
 pub mod samples;
 pub mod series;

@@ -82,9 +82,10 @@ use hil_core::case_study::{
 use hil_core::component::Role;
 use hil_core::plot::PlotSeries;
 use hil_core::random::RandomStream;
+use hil_core::recorded_run::RecordedRun;
 use hil_core::replay::Replay;
 use hil_core::run_log::RunLog;
-use hil_core::study::{Batch, into_batch};
+use hil_core::study::{Batch, StudyRefusal, into_batch};
 use hil_core::text_file::TextFile;
 
 pub use crate::parameters::{LeftArm, ResumePolicy, SendPolicy, TeleoperationParameters};
@@ -236,7 +237,10 @@ impl CaseStudy for Teleoperation {
         Ok(Some(into_batch(Calibration::new(self, value)?)))
     }
 
-    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
-        Ok(Some(into_batch(MotionLossStudy::new(self)?)))
+    fn study(
+        &self,
+        recorded: Vec<RecordedRun<TeleoperationParameters>>,
+    ) -> Result<Option<Box<dyn Batch>>, StudyRefusal> {
+        Ok(Some(into_batch(MotionLossStudy::new(self, recorded)?)))
     }
 }

@@ -12,7 +12,7 @@ use hil_probe::arguments::ProbeArgs;
 use hil_report::compare::cli as compare_cli;
 use hil_report::compare::cli::CompareArgs;
 use hil_report::page::Format;
-use hil_report::study::BatchArgs;
+use hil_report::study::{BatchArgs, RunArgument};
 use hil_report::trace::cli::TraceCommand;
 use hil_watch::link::cli::LinkCommand;
 use hil_watch::live::cli::{ChannelArgs, TopArgs};
@@ -51,6 +51,18 @@ Exit codes:
   69 a peer host was not reachable        doctor --strict: it is not fit
   70 internal error                   130 interrupted; report complete
                                       131 interrupted twice: no report";
+
+const TABLES_EXAMPLES: &str = "\
+Examples:
+  hil-runtime tables --topology deploy/topologies/tables.toml --sections 100000
+      the published tables of case study 1 beside our own
+  hil-runtime tables --topology deploy/topologies/tables.toml \\
+      --run ethernet=runs/eth-1 --run 'short=runs/wifi-*' --run runs/lte-1
+      the same with recorded runs as rows: two beside the paper's rows for
+      Ethernet and short-range Wi-Fi 6, one that stands for itself
+
+Equal seeds give equal tables, whatever the number of threads. Ctrl-C prints
+what is complete. Exit code 1 when a criterion is missed.";
 
 const JOIN_EXAMPLES: &str = "\
 Examples:
@@ -292,9 +304,7 @@ pub enum Command {
     #[command(after_help = JOIN_EXAMPLES)]
     Join(JoinArgs),
     /// Compute a case's tables in virtual time, on all processors.
-    #[command(
-        after_help = "Example:\n  hil-runtime tables --topology deploy/topologies/tables.toml --sections 100000\n\nEqual seeds give equal tables, whatever the number of threads. Ctrl-C prints\nwhat is complete. Exit code 1 when a criterion is missed."
-    )]
+    #[command(after_help = TABLES_EXAMPLES)]
     Tables {
         /// The topology file (TOML); `[case]` and `[run]` are enough.
         #[arg(long, short, value_name = "FILE")]
@@ -305,6 +315,10 @@ pub enum Command {
         /// Critical sections per cell; short for --set case.parameters.tables.sections=N.
         #[arg(long, value_name = "N")]
         sections: Option<u64>,
+        /// Add the finished run in this folder as a row; `*` in the last part stands for several. LABEL says for which
+        /// network of the paper it stands: ethernet, short or long. Runs of one label are pooled.
+        #[arg(long = "run", value_name = "[LABEL=]FOLDER", num_args = 1..)]
+        runs: Vec<RunArgument>,
         /// How to compute and where to put the tables.
         #[command(flatten)]
         batch: BatchArgs,

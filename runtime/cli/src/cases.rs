@@ -52,7 +52,7 @@ fn offers(entry: &CaseEntry) -> Vec<(&'static str, String)> {
     let case = entry.make(entry.defaults(), 0).ok();
     let has_tables = case
         .as_ref()
-        .is_some_and(|case| matches!(case.study(), Ok(Some(_))));
+        .is_some_and(|case| matches!(case.study(Vec::new()), Ok(Some(_))));
     let has_replay = case
         .as_ref()
         .is_some_and(|case| case.replay(&RunLog::default()).is_some());

@@ -184,11 +184,12 @@ fn run_command(
             topology,
             mut overrides,
             sections,
+            runs,
             batch,
         } => {
             overrides
                 .extend(sections.map(|count| format!("case.parameters.tables.sections={count}")));
-            case_work::tables(&topology, &overrides, &batch, registry, console)
+            case_work::tables(&topology, &overrides, &runs, &batch, registry, console)
         }
         Command::Calibrate(args) => case_work::calibrate(args, registry, console),
         Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),

@@ -598,7 +598,7 @@ impl Evidence {
 }
 
 /// Records of what the robot did are missing, so that what is not in them may have happened.
-fn is_score_incomplete(summary: &RunSummary) -> bool {
+pub(crate) fn is_score_incomplete(summary: &RunSummary) -> bool {
     summary.channels.iter().any(|channel| {
         let recorded = channel.link == LinkKind::RecordOnly;
         recorded

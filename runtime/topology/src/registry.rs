@@ -9,9 +9,10 @@ use hil_core::case_study::{
 };
 use hil_core::component::Role;
 use hil_core::plot::PlotSeries;
+use hil_core::recorded_run::RecordedRun;
 use hil_core::replay::Replay;
 use hil_core::run_log::RunLog;
-use hil_core::study::Batch;
+use hil_core::study::{Batch, StudyRefusal};
 use hil_core::text_file::TextFile;
 use serde_json::Value;
 
@@ -50,11 +51,14 @@ pub trait Case: Debug {
         value: f64,
     ) -> Result<Option<Box<dyn Batch>>, ParameterError>;
 
-    /// See [`CaseStudy::study`].
+    /// See [`CaseStudy::study`]. The runs have their parameters as their manifests state them.
     ///
     /// # Errors
-    /// Names the parameter that keeps the tables from being computed.
-    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError>;
+    /// Names the parameter that keeps the tables from being computed, or the run that can be no row of them.
+    fn study(
+        &self,
+        recorded: Vec<RecordedRun<Value>>,
+    ) -> Result<Option<Box<dyn Batch>>, StudyRefusal>;
 }
 
 #[derive(Debug)]
@@ -97,8 +101,13 @@ impl<C: CaseStudy> Case for Erased<C> {
         self.0.calibration(figure, value)
     }
 
-    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
-        self.0.study()
+    fn study(
+        &self,
+        recorded: Vec<RecordedRun<Value>>,
+    ) -> Result<Option<Box<dyn Batch>>, StudyRefusal> {
+        let recorded = recorded.into_iter();
+        let recorded = recorded.map(|run| run.with_parameters(serde_json::from_value));
+        self.0.study(recorded.collect::<Result<_, _>>()?)
     }
 }
 

@@ -163,6 +163,14 @@ fn what_cannot_be_computed_is_named() {
     let unknown_row = ["--set", "case.parameters.tables.cells=['no such row']"];
     refused(SHIPPED, &unknown_row, "no such row");
     refused(SHIPPED, &["--sections", "0"], "tables.sections");
+    let absent = ["--run", "ethernet=runs/no-such-run"];
+    refused(SHIPPED, &absent, "runs/no-such-run/summary.json");
+    let unlabelled = ["--run", "wifi=runs/a"];
+    refused(
+        SHIPPED,
+        &unlabelled,
+        "label `wifi` is none of ethernet, short, long",
+    );
     let shuttle = "deploy/topologies/shuttle-local.toml";
     refused(shuttle, &[], "case shuttle has no tables");
 }

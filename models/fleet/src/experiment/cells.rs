@@ -8,6 +8,7 @@ use crate::messages::MessageOrder;
 use crate::referee::Tally;
 use crate::robot::TrackerKind;
 use crate::scenario::Scenario;
+use hil_core::recorded_run::PublishedNetwork;
 use hil_core::time::Instant;
 use hil_link::impaired::{DelayLaw, Impairments, LinkCounts};
 use hil_link::wifi::WifiPreset;
@@ -159,8 +160,16 @@ fn original(base: &Setup, delay_ms: f64, law: DelayLaw, loss_ratio: f64, copies:
     setup
 }
 
-/// A row over a radio beside the model of that radio: the original's rules, status over the network,
-/// steps of nominal length, and a coordinator that knows of no delay. `None` for a wire.
+/// What a row with hardware in the loop is about: the original's rules, status over the network, steps of nominal
+/// length, and a coordinator that knows of no delay.
+pub(crate) fn hil_setup(base: &Setup) -> Setup {
+    let mut setup = original(base, 0.0, DelayLaw::Constant, 0.0, 1);
+    setup.robot.step_inflation = false;
+    setup.links.status_path = StatusPath::Network;
+    setup
+}
+
+/// A row over a radio beside the model of that radio. `None` for a wire.
 fn wifi_cell(
     base: &Setup,
     scenario: Scenario,
@@ -172,9 +181,7 @@ fn wifi_cell(
         PublishedNetwork::LongRange => WifiPreset::LongRange,
         PublishedNetwork::Ethernet => return None,
     };
-    let mut setup = original(base, 0.0, DelayLaw::Constant, 0.0, 1);
-    setup.robot.step_inflation = false;
-    setup.links.status_path = StatusPath::Network;
+    let mut setup = hil_setup(base);
     setup.links.wifi = Some(preset.spec());
     Some(CellSpec {
         id: CellId {
@@ -510,6 +517,16 @@ pub(crate) struct PublishedRow {
     pub(crate) collisions: u64,
 }
 
+impl PublishedRow {
+    /// Collisions of critical sections.
+    pub(crate) const fn share(&self) -> Share {
+        Share {
+            count: self.collisions,
+            of: self.sections,
+        }
+    }
+}
+
 /// Under what a row was obtained.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Condition {
@@ -522,19 +539,6 @@ pub(crate) enum Condition {
     },
     /// Hardware in the loop, over this network.
     HardwareInTheLoop(PublishedNetwork),
-}
-
-hil_core::labelled! {
-    /// A network of the paper's own measurements, and what the paper calls it.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-    pub(crate) enum PublishedNetwork, label {
-        /// A wire.
-        Ethernet = "Ethernet",
-        /// A radio at 20 m.
-        ShortRange = "short-range Wi-Fi 6",
-        /// A radio at 35 m.
-        LongRange = "long-range Wi-Fi 6",
-    }
 }
 
 const fn fixed(loss_ratio: f64, delay_ms: f64, sections: u64, collisions: u64) -> PublishedRow {

@@ -4,6 +4,7 @@
 
 mod cells;
 mod driver;
+mod recorded;
 mod report;
 mod study;
 #[cfg(test)]

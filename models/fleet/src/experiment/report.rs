@@ -6,11 +6,14 @@ use crate::experiment::cells::{
     CellSpec, CollidedRun, Condition, Demand, FleetTally, Mechanism, Place, PublishedRow,
     RunFigures, SCENARIOS, per_1000_interval, published_rows,
 };
+use crate::experiment::recorded::FleetRow;
 use crate::experiment::study::{FleetStudy, worlds_text};
+use crate::referee::Tally;
 use crate::scenario::Scenario;
 use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_link::impaired::DelayLaw;
 use hil_stats::comparison::{Judge, Scatter, Share, against_published, welch};
+use hil_stats::recorded::{PooledShare, ROWS_NOTE};
 use hil_stats::statistics::CONFIDENCE;
 
 /// A cell with what came of it; `None` when it was not run.
@@ -30,6 +33,46 @@ impl CellResult<'_> {
     }
 }
 
+/// A row of recorded runs with what happened in them.
+#[derive(Debug)]
+struct RecordedResult<'a> {
+    of: &'a FleetRow,
+    collided: PooledShare,
+    verdict: Verdict,
+}
+
+impl<'a> RecordedResult<'a> {
+    /// Without a collision, collisions are taken to scatter by `of_none`.
+    fn new(of: &'a FleetRow, of_none: f64) -> Self {
+        let collided = of.pooled(of_none);
+        let published = of.published().map(PublishedRow::share);
+        Self {
+            of,
+            collided,
+            verdict: of.row.verdict(&collided, published),
+        }
+    }
+
+    fn cells(&self) -> Vec<Cell> {
+        let (row, happened) = (&self.of.row, &self.collided);
+        let ends = happened.interval.map(|one| (1e3 * one.low, 1e3 * one.high));
+        let mut cells = vec![
+            Cell::text(row.method()),
+            Cell::number(row.loss_ratio(), 4),
+            Cell::number(row.delay_ms(0.5), 2),
+            Cell::number(row.delay_ms(0.99), 2),
+            Cell::Absent,
+            Cell::Count(self.of.tally.sections_passed_count),
+            Cell::text(collisions_of(&self.of.tally)),
+            Cell::number(happened.ratio().map(|ratio| 1e3 * ratio), 2),
+            Cell::interval(ends, 2),
+        ];
+        cells.extend(Field::cells(&PUBLISHED, self.of.published()));
+        cells.extend([Cell::Verdict(self.verdict), Cell::Absent]);
+        cells
+    }
+}
+
 /// What came of the cell of a mechanism.
 fn mechanism_tally<'a>(
     results: &'a [CellResult<'_>],
@@ -46,8 +89,16 @@ fn mechanism_tally<'a>(
 /// The whole report.
 pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyReport {
     let mut tables = Vec::new();
-    if !results.iter().all(CellResult::is_mechanism) {
-        tables.extend(SCENARIOS.map(|scenario| published_table(scenario, results)));
+    let of_none = scatter(results).divisor().unwrap_or(1.0);
+    let recorded = study.recorded.iter();
+    let recorded: Vec<_> = recorded
+        .map(|of| RecordedResult::new(of, of_none))
+        .collect();
+    let has_published = !results.iter().all(CellResult::is_mechanism);
+    if has_published || !recorded.is_empty() {
+        tables.extend(SCENARIOS.map(|scenario| published_table(scenario, results, &recorded)));
+    }
+    if has_published {
         tables.push(motion_table(results));
     }
     if results.iter().any(CellResult::is_mechanism) {
@@ -57,8 +108,12 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
     let verdicts: Vec<_> = results.iter().filter_map(verdict_against).collect();
     let criteria = criteria(results);
     let named = verdicts.iter();
+    let named = named.map(|(one, of)| (one.cell.id.to_string(), *of));
     let named: Vec<_> = named
-        .map(|(one, of)| (one.cell.id.to_string(), *of))
+        .chain(recorded.iter().map(|one| {
+            let name = format!("{}, {}", one.of.scenario, one.of.row.method());
+            (name, one.verdict)
+        }))
         .collect();
     StudyReport {
         title: "Case study 1: collisions per critical section (CS), in virtual time".to_owned(),
@@ -165,7 +220,11 @@ const PUBLISHED: [Field<PublishedRow>; 4] = [
 ];
 
 /// Table II or III.
-fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
+fn published_table(
+    scenario: Scenario,
+    results: &[CellResult<'_>],
+    recorded: &[RecordedResult<'_>],
+) -> Table {
     let (name, title) = match scenario {
         Scenario::Harbor => ("table-2-harbor", "Table II, harbor"),
         _ => ("table-3-warehouse", "Table III, warehouse"),
@@ -176,18 +235,31 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
         let of_scenario = |one: &&CellResult<'_>| one.cell.id.scenario == scenario;
         results.iter().filter(of_scenario)
     };
+    let recorded = recorded.iter().filter(|one| one.of.scenario == scenario);
+    let recorded: Vec<_> = recorded.collect();
+    // Recorded rows have a second quantile of the delay.
+    let is_wide = !recorded.is_empty();
+    let widened = |mut row: Vec<Cell>| {
+        if is_wide {
+            row.insert(P99_PLACE, Cell::Absent);
+        }
+        row
+    };
     for published in published_rows(scenario) {
         let before = rows.len();
         for one in ours() {
             if let Place::Published { row, .. } = one.place()
                 && row == published
             {
-                rows.push(published_row(published, Some(one), judge));
+                rows.push(widened(published_row(published, Some(one), judge)));
             }
         }
         if rows.len() == before {
-            rows.push(published_row(published, None, judge));
+            rows.push(widened(published_row(published, None, judge)));
         }
+        let beside = recorded.iter();
+        let beside = beside.filter(|one| one.of.published() == Some(published));
+        rows.extend(beside.map(|one| one.cells()));
     }
     for one in ours() {
         if let Place::Variant(variant) = one.place() {
@@ -201,9 +273,11 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
             row.extend(Field::cells(&PUBLISHED, None));
             let verdict = verdict_against(one).map(|(_, verdict)| verdict);
             row.extend([Cell::verdict(verdict), judged(one, judge)]);
-            rows.push(row);
+            rows.push(widened(row));
         }
     }
+    let alone = recorded.iter().filter(|one| one.of.published().is_none());
+    rows.extend(alone.map(|one| one.cells()));
     let mut columns = vec![
         Column::new("method", "Method"),
         Column::new("loss_ratio", "PLR"),
@@ -214,7 +288,10 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
     columns.extend(Field::columns(&PUBLISHED));
     columns.push(Column::new("against_paper", "Verdict"));
     columns.push(Column::new("verdict", "Accepted if").ranked(9));
-    Table {
+    if is_wide {
+        columns.insert(P99_PLACE, Column::new("delay_ms_p99", "p99 ms").ranked(1));
+    }
+    let mut table = Table {
         name: name.to_owned(),
         title: title.to_owned(),
         columns,
@@ -229,8 +306,19 @@ fn published_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
              sections at the poses cannot hold; the safe coordinator's guarded sections do"
                 .to_owned(),
         ],
+    };
+    if is_wide {
+        table.notes.push(ROWS_NOTE.to_owned());
+        let notes = recorded.iter();
+        table
+            .notes
+            .extend(notes.map(|one| one.of.row.note(&one.collided)));
     }
+    table
 }
+
+/// Behind the column of delays.
+const P99_PLACE: usize = 3;
 
 /// A published row beside ours, if there is one.
 fn published_row(
@@ -274,14 +362,12 @@ fn verdict_against<'a>(one: &'a CellResult<'a>) -> Option<(&'a CellResult<'a>, V
     let verdict = match one.place() {
         Place::Mechanism { .. } => return None,
         Place::Published { row, .. } if matches!(row.condition, Condition::Static { .. }) => {
-            let share = |count: u64, of: u64| Share {
-                count: count.min(of),
+            let of = tally.section_count();
+            let ours = Share {
+                count: tally.collision_count().min(of),
                 of,
             };
-            let count = tally.referee.section_collisions_count;
-            let published = share(row.collisions, row.sections);
-            let ours = share(count, tally.section_count());
-            against_published(published, ours, tally.scatter.max(1.0))?
+            against_published(row.share(), ours, tally.scatter.max(1.0))?
         }
         Place::Published { .. } | Place::Variant(_) => Verdict::NotComparable,
     };
@@ -330,7 +416,10 @@ fn larger(
 }
 
 fn collisions(tally: &FleetTally) -> String {
-    let seen = &tally.referee;
+    collisions_of(&tally.referee)
+}
+
+fn collisions_of(seen: &Tally) -> String {
     format!(
         "{} / {} / {}",
         seen.section_collisions_count, seen.overlaps_count, seen.outside_count

@@ -8,11 +8,13 @@ use crate::experiment::cells::{
     CellSpec, CollidedRun, FleetTally, RunFigures, SCENARIOS, mechanism_cells, published_cells,
 };
 use crate::experiment::driver::{Experiment, Setup};
+use crate::experiment::recorded::FleetRow;
 use crate::experiment::report::{self, CellResult};
 use crate::scenario::{Scenario, Scene, WorldParameters};
 use hil_core::case_study::ParameterError;
 use hil_core::random::RandomStream;
-use hil_core::study::{Study, StudyReport, Watch};
+use hil_core::recorded_run::RecordedRun;
+use hil_core::study::{Study, StudyRefusal, StudyReport, Watch};
 use hil_core::time::Instant;
 use hil_link::impaired::DelayLaw;
 use hil_stats::comparison::Share;
@@ -63,6 +65,8 @@ pub(crate) struct FleetStudy {
     scenes: Vec<(Scenario, Scene)>,
     /// The cells in order.
     pub(crate) cells: Vec<CellSpec>,
+    /// Rows beside them.
+    pub(crate) recorded: Vec<FleetRow>,
 }
 
 /// One task: a run of one cell.
@@ -82,11 +86,15 @@ const STAND_NS: i64 = 7_200_000_000_000;
 
 impl FleetStudy {
     /// The study with these parameters: those of `tables` say what to compute; those of the other
-    /// tables hold wherever a cell does not say otherwise.
+    /// tables hold wherever a cell does not say otherwise. `recorded` runs become rows.
     ///
     /// # Errors
-    /// Names the parameter that keeps a world from being built, or a filter no cell meets.
-    pub(crate) fn new(parameters: &FleetParameters, seed: u64) -> Result<Self, ParameterError> {
+    /// Names the parameter that keeps a world from being built, a filter no cell meets, or a run that can be no row.
+    pub(crate) fn new(
+        parameters: &FleetParameters,
+        seed: u64,
+        recorded: Vec<RecordedRun<FleetParameters>>,
+    ) -> Result<Self, StudyRefusal> {
         let tables = parameters.tables.clone();
         let base = Setup {
             robot: parameters.robot.clone(),
@@ -107,7 +115,7 @@ impl FleetStudy {
         }
         if cells.is_empty() {
             let problem = format!("{:?} is part of no cell's name", tables.cells);
-            return Err(ParameterError::new("tables.cells", problem));
+            return Err(ParameterError::new("tables.cells", problem).into());
         }
         for cell in &cells {
             cell.setup.check()?;
@@ -127,6 +135,7 @@ impl FleetStudy {
             seed,
             scenes,
             cells,
+            recorded: FleetRow::of_runs(recorded, parameters, &base)?,
         })
     }
 

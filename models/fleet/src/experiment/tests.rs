@@ -337,7 +337,7 @@ fn cells_of_the_tables_keep_their_figures_to_the_bit() {
         parameters.tables.sections = 100;
         parameters.tables.sections_per_task = 100;
         parameters.tables.cells = vec![expected.cell.to_owned()];
-        let study = FleetStudy::new(&parameters, 7).unwrap();
+        let study = FleetStudy::new(&parameters, 7, Vec::new()).unwrap();
         assert_eq!(study.task_count(), 1, "{}", expected.cell);
         let tally = study.run(0, &mut |_| true).unwrap();
         let link =

@@ -53,16 +53,22 @@ pub(crate) const LONG_RANGE: Outages = Outages {
     buffered: false,
 };
 
+/// Loops lost over the short range: 0.008 of those played.
+pub(crate) const SHORT_RANGE_LOST: u32 = 7;
+
+/// Over the long range: 0.03.
+pub(crate) const LONG_RANGE_LOST: u32 = 27;
+
 /// 0.008 of the loops, and where our mean must lie.
 const SHORT_RANGE_PUBLISHED: Expected = Expected::Published {
-    lost: 7,
+    lost: SHORT_RANGE_LOST,
     mean_low: 0.006,
     mean_high: 0.011,
 };
 
 /// 0.03 of the loops.
 const LONG_RANGE_PUBLISHED: Expected = Expected::Published {
-    lost: 27,
+    lost: LONG_RANGE_LOST,
     mean_low: 0.022,
     mean_high: 0.035,
 };

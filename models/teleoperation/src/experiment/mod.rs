@@ -5,6 +5,7 @@
 mod calibration;
 mod conditions;
 mod drive;
+mod recorded;
 mod report;
 mod study;
 #[cfg(test)]

@@ -2,10 +2,12 @@
 
 use crate::experiment::conditions::{Condition, Expected, PUBLISHED_LOOPS};
 use crate::experiment::drive::Tally;
+use crate::experiment::recorded::{MotionLossRow, published_rate};
 use crate::experiment::study::MotionLossStudy;
 use crate::score::loops::LossKind;
-use hil_core::study::{self, Criterion, Field, Larger, StudyReport, Table, Verdict};
+use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_stats::comparison::{Judge, Share, against_published, mean_interval};
+use hil_stats::recorded::ROWS_NOTE;
 use hil_stats::statistics::CONFIDENCE;
 
 /// A condition with the runs of it that ended.
@@ -27,11 +29,14 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
         .iter()
         .filter_map(|row| Some((row.name(), row.verdict()?)));
     let verdicts: Vec<_> = verdicts.collect();
+    let recorded = study.recorded.iter();
+    let recorded = recorded.map(|one| (one.row.method(), one.verdict));
+    let named: Vec<_> = verdicts.iter().cloned().chain(recorded).collect();
     StudyReport {
         title: "Case study 2: motion loss rate (MLR) by condition, in virtual time".to_owned(),
         notes: notes(study, rows),
-        tables: vec![rates(rows), counts(rows), setups(rows)],
-        summary: study::summary(&verdicts, &criteria),
+        tables: vec![rates(rows, &study.recorded), counts(rows), setups(rows)],
+        summary: study::summary(&named, &criteria),
         larger: larger(study, rows, &verdicts, &criteria),
         criteria,
     }
@@ -184,7 +189,63 @@ impl Row<'_> {
     }
 }
 
-fn rates(rows: &[Row<'_>]) -> Table {
+/// Columns of the rates that only a table with recorded rows has.
+const MEASURED: [Column; 6] = [
+    Column::new("loops_sent", "Sent").ranked(4),
+    Column::new("loops_lost", "Lost").ranked(3),
+    Column::new("loss_ratio", "PLR"),
+    Column::new("delay_ms", "Delay ms"),
+    Column::new("delay_ms_p99", "p99 ms").ranked(1),
+    Column::new("published_mlr", "Paper"),
+];
+
+/// The rates of the conditions, with the recorded rows beside those that are held against the same published rate.
+fn rates(rows: &[Row<'_>], recorded: &[MotionLossRow]) -> Table {
+    let mut table = rates_of_conditions(rows);
+    if recorded.is_empty() {
+        return table;
+    }
+    let end = table.columns.len() - 1;
+    table.columns.splice(end..end, MEASURED);
+    let recorded_at = |place: Option<usize>| {
+        let is_there = move |one: &&MotionLossRow| {
+            let beside = |row: &Row<'_>| one.is_beside(row.condition);
+            rows.iter().rposition(beside) == place
+        };
+        recorded.iter().filter(is_there).map(recorded_cells)
+    };
+    let mut wide = Vec::new();
+    for (index, (row, mut cells)) in rows.iter().zip(table.rows).enumerate() {
+        let mut measured = vec![Cell::Absent; MEASURED.len() - 1];
+        measured.push(published_rate(row.condition));
+        cells.splice(end..end, measured);
+        wide.push(cells);
+        wide.extend(recorded_at(Some(index)));
+    }
+    wide.extend(recorded_at(None));
+    table.rows = wide;
+    table.notes.push(ROWS_NOTE.to_owned());
+    let notes = recorded.iter().map(|one| one.row.note(&one.lost));
+    table.notes.extend(notes);
+    table
+}
+
+fn recorded_cells(one: &MotionLossRow) -> Vec<Cell> {
+    let interval = one.lost.interval.map(|ends| (ends.low, ends.high));
+    let mut cells = vec![
+        Cell::text(one.row.method()),
+        Cell::number(one.lost.ratio(), 5),
+        Cell::Absent,
+        Cell::interval(interval, 5),
+        Cell::Absent,
+        Cell::Absent,
+    ];
+    cells.extend(one.measured());
+    cells.push(Cell::Verdict(one.verdict));
+    cells
+}
+
+fn rates_of_conditions(rows: &[Row<'_>]) -> Table {
     let fields: [Field<Row<'_>>; 7] = [
         Field::text("condition", "Condition", Row::name),
         Field::number("mlr_mean", "MLR", 5, |row| row.mean(Tally::loss_ratio)),

@@ -3,13 +3,15 @@
 
 use crate::experiment::conditions::{Condition, base, conditions};
 use crate::experiment::drive::{Tally, drive};
+use crate::experiment::recorded::MotionLossRow;
 use crate::experiment::report::{self, Row};
 use crate::experiment::trajectory::Trajectory;
 use crate::{Teleoperation, TeleoperationParameters};
 use hil_arm::egm::parameters::{ControllerSettings, Preset};
 use hil_core::case_study::ParameterError;
 use hil_core::random::RandomStream;
-use hil_core::study::{Study, StudyReport, Watch};
+use hil_core::recorded_run::RecordedRun;
+use hil_core::study::{Study, StudyRefusal, StudyReport, Watch};
 
 /// The study.
 #[derive(Debug)]
@@ -20,22 +22,29 @@ pub(crate) struct MotionLossStudy {
     pub(crate) conditions: Vec<Condition>,
     /// True when motion and robot are those with which outages were fitted to the paper.
     pub(crate) is_fitted: bool,
+    /// Rows beside those of the conditions.
+    pub(crate) recorded: Vec<MotionLossRow>,
 }
 
 impl MotionLossStudy {
     /// The table of `case`: its motion, its robot, its policies wherever a row does not say
-    /// otherwise.
+    /// otherwise. `recorded` runs become rows.
     ///
     /// # Errors
-    /// An entry of the filter that no condition meets, or a motion without loops.
-    pub(crate) fn new(case: &Teleoperation) -> Result<Self, ParameterError> {
+    /// An entry of the filter that no condition meets, a motion without loops, or a run that can be no row.
+    pub(crate) fn new(
+        case: &Teleoperation,
+        recorded: Vec<RecordedRun<TeleoperationParameters>>,
+    ) -> Result<Self, StudyRefusal> {
         let parameters = case.parameters.tables.clone();
         let mut conditions = conditions(&base(case));
         keep_wanted(&mut conditions, &parameters.conditions)?;
+        let is_fitted = is_fitted(case);
         Ok(Self {
             trajectory: Trajectory::new(case, parameters.loops)?,
             seed: case.seed,
-            is_fitted: is_fitted(case),
+            is_fitted,
+            recorded: MotionLossRow::of_runs(recorded, &case.parameters, is_fitted)?,
             conditions,
             parameters,
         })

@@ -14,7 +14,7 @@ use crate::{EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, Teleoperation, TeleoperationP
 use hil_core::case_study::CaseStudy;
 use hil_core::random::RandomStream;
 use hil_core::simulation::{Carrier, Simulation};
-use hil_core::study::{Cell, Study, Verdict, into_batch};
+use hil_core::study::{Cell, Study, StudyRefusal, Verdict, into_batch};
 use hil_core::time::Instant;
 use hil_link::outages::{OutageLink, Outages};
 use hil_link::wifi::WifiPreset;
@@ -86,7 +86,7 @@ fn the_bare_loop_loses_the_loops_that_the_whole_case_loses() {
 }
 
 fn study(change: impl FnOnce(&mut TeleoperationParameters)) -> MotionLossStudy {
-    MotionLossStudy::new(&case(change)).unwrap()
+    MotionLossStudy::new(&case(change), Vec::new()).unwrap()
 }
 
 #[test]
@@ -187,10 +187,13 @@ fn a_study_names_its_conditions_and_refuses_a_filter_without_any() {
     assert_eq!(named.label(0), "short-range");
     assert_eq!(named.label(23), "long-range");
     assert_eq!(named.label(47), "wifi6-long-range");
-    let error = MotionLossStudy::new(&case(|parameters| {
+    let unknown = case(|parameters| {
         parameters.tables.conditions = vec!["loss".to_owned(), "short range".to_owned()];
-    }))
-    .unwrap_err();
+    });
+    let error = MotionLossStudy::new(&unknown, Vec::new()).unwrap_err();
+    let StudyRefusal::Parameter(error) = error else {
+        panic!("{error}");
+    };
     assert_eq!(error.key, "tables.conditions");
     for said in [
         "\"short range\"",

@@ -26,7 +26,7 @@ use hil_core::case_study::{ErrorSeries, Harm, Score};
 use hil_core::plot::PlotSeries;
 use hil_core::run_log::RunLog;
 use hil_core::score::Metric;
-use hil_stats::metric::label;
+use hil_stats::metric::{Label, label};
 use hil_stats::series::{Estimate, Sample, lag_s, peak_to_peak};
 
 /// Everything a plot of the run shows.
@@ -71,6 +71,13 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     lost::add_events(&mut score, &run, loops.as_ref(), log);
     score
 }
+
+pub(crate) const LOOPS_SENT: Label = label("motion_loops_sent_count", "motion loops sent", "1");
+
+pub(crate) const LOOPS_EXECUTED: Label =
+    label("motion_loops_executed_count", "motion loops executed", "1");
+
+pub(crate) const MOTION_LOSS: Label = label("motion_loss_ratio", "motion loss rate", "1");
 
 /// A sender silent for longer than this share of a loop may have left one out.
 const SILENCE_PERIODS: f64 = 0.25;
@@ -168,23 +175,15 @@ impl Run {
         let counter = self.counter.text();
         let sent = loops.map(|loops| loops.sent_count() as f64);
         let executed = loops.map(|loops| loops.executed_count as f64);
-        let ratio = label("motion_loss_ratio", "motion loss rate", "1").measured(
+        let ratio = MOTION_LOSS.measured(
             loops.map(Loops::loss_ratio),
             format!("(sent - executed) / sent, {counter}"),
             missing,
         );
         let interval = loops.map(Loops::loss_interval);
         let mut metrics = vec![
-            label("motion_loops_sent_count", "motion loops sent", "1").measured(
-                sent,
-                format!("{}, {counter}", self.sent.what),
-                missing,
-            ),
-            label("motion_loops_executed_count", "motion loops executed", "1").measured(
-                executed,
-                format!("as measured, {counter}"),
-                missing,
-            ),
+            LOOPS_SENT.measured(sent, format!("{}, {counter}", self.sent.what), missing),
+            LOOPS_EXECUTED.measured(executed, format!("as measured, {counter}"), missing),
             Metric { interval, ..ratio },
         ];
         metrics.extend(self.causes(loops, missing));

@@ -8,7 +8,7 @@ use hil_core::study::Batch;
 use hil_platform::console::{CommandEnd, Console};
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
-use hil_report::study::{self, BatchArgs, Invocation, StudyError, Wanted};
+use hil_report::study::{self, BatchArgs, Invocation, RunArgument, StudyError, Wanted};
 use hil_report::terminal;
 use hil_report::{replay, simulate};
 use hil_rundir::run_folder::RunFolder;
@@ -62,6 +62,7 @@ pub(super) fn simulate(
 pub(super) fn tables(
     path: &Path,
     overrides: &[String],
+    runs: &[RunArgument],
     batch: &BatchArgs,
     registry: &Registry,
     console: &mut Console,
@@ -71,9 +72,11 @@ pub(super) fn tables(
     let signals = signals()?;
     let topology = hil_topology::load_case(path, overrides, registry.known());
     let topology = loaded(topology, console)?;
-    let study = study::batch_of(&topology, registry, Wanted::Tables);
+    let study = study::batch_of(&topology, registry, Wanted::Tables { runs });
     let path = path.display().to_string();
-    let words = ["hil-runtime", "tables", "--topology", &path];
+    let runs: Vec<String> = runs.iter().map(RunArgument::to_string).collect();
+    let mut words = vec!["hil-runtime", "tables", "--topology", &path];
+    words.extend(runs.iter().flat_map(|run| ["--run", run]));
     let invocation = invocation(&words, overrides);
     compute(study, batch, &invocation, &signals, console)
 }

@@ -3,6 +3,7 @@
 //! tasks alone, whatever the number of threads.
 
 mod pool;
+mod recorded;
 mod sections;
 
 use std::num::NonZeroUsize;
@@ -19,6 +20,8 @@ use hil_present::csv;
 use hil_present::terminal::canvas::Style;
 use hil_topology::Topology;
 use hil_topology::registry::Registry;
+
+pub use self::recorded::RunArgument;
 
 use self::pool::Pool;
 use self::sections::Extent;
@@ -85,11 +88,17 @@ pub enum StudyError {
         /// What it can be calibrated for, in words.
         known: String,
     },
-    /// The case refused its parameters, or the figure's value.
+    /// The case refused its parameters, a recorded run, or the figure's value.
     #[error("{message}")]
     Case {
         /// What it said.
         message: String,
+    },
+    /// A recorded run can be no row.
+    #[error("--run: {problem}")]
+    Run {
+        /// Which one, and why not.
+        problem: String,
     },
     /// A file could not be written.
     #[error("{}: {source}", path.display())]
@@ -105,7 +114,10 @@ pub enum StudyError {
 #[derive(Debug, Clone, Copy)]
 pub enum Wanted<'a> {
     /// Its tables.
-    Tables,
+    Tables {
+        /// Recorded runs that become rows of them.
+        runs: &'a [RunArgument],
+    },
     /// The link parameters under which a figure comes out as a value.
     Calibration {
         /// The figure's name.
@@ -118,7 +130,7 @@ pub enum Wanted<'a> {
 /// The study of the topology's case.
 ///
 /// # Errors
-/// When the case has no study or refuses its parameters.
+/// When the case has no study, or refuses its parameters or a recorded run.
 pub fn batch_of(
     topology: &Topology,
     registry: &Registry,
@@ -131,10 +143,13 @@ pub fn batch_of(
     let (entry, case) = made.ok_or(StudyError::NoCase)?;
     let name = || entry.name.to_owned();
     match wanted {
-        Wanted::Tables => case
-            .study()
-            .map_err(|error| refused(error.to_string()))?
-            .ok_or_else(|| StudyError::NoTables { case: name() }),
+        Wanted::Tables { runs } => {
+            let recorded = recorded::read(runs, entry.name);
+            let recorded = recorded.map_err(|problem| StudyError::Run { problem })?;
+            case.study(recorded)
+                .map_err(|error| refused(error.to_string()))?
+                .ok_or_else(|| StudyError::NoTables { case: name() })
+        }
         Wanted::Calibration { figure, value } => case
             .calibration(figure, value)
             .map_err(|error| refused(error.to_string()))?

@@ -142,6 +142,6 @@ fn what_cannot_be_calibrated_is_said_with_what_can() {
     assert_eq!(error("shuttle", "mlr", 0.5), expected);
     let registry = registry();
     let topology = hil_topology::case_by_name("tuned", &[], registry.known()).unwrap();
-    let error = batch_of(&topology, &registry, Wanted::Tables).unwrap_err();
+    let error = batch_of(&topology, &registry, Wanted::Tables { runs: &[] }).unwrap_err();
     assert_eq!(error.to_string(), "case tuned has no tables");
 }

@@ -1,0 +1,247 @@
+//! A finished run in real time, with hardware in the loop, as a case's tables take it: typed, read by
+//! whoever can open its folder. It judges no figure.
+
+use core::fmt;
+use std::collections::BTreeMap;
+
+use crate::interval::Spread;
+use crate::options::Difference;
+use crate::study::StudyRefusal;
+
+hil_core::labelled! {
+    /// A network over which the seed paper measured with hardware in the loop (section III.A), and what it calls it.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum PublishedNetwork, label {
+        /// A wire.
+        Ethernet = "Ethernet",
+        /// A radio at 20 m.
+        ShortRange = "short-range Wi-Fi 6",
+        /// A radio at 35 m.
+        LongRange = "long-range Wi-Fi 6",
+    }
+}
+
+impl PublishedNetwork {
+    /// Its word on a command line.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Ethernet => "ethernet",
+            Self::ShortRange => "short",
+            Self::LongRange => "long",
+        }
+    }
+}
+
+hil_core::labelled! {
+    /// What kind of link carried a run's messages between its hosts.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+    pub enum LinkOrigin, label {
+        /// A network.
+        Real = "real link",
+        /// The model of one, on some channel at least.
+        Emulated = "emulated link",
+        /// The trace of one, on some channel at least.
+        Traced = "link replayed from a trace",
+    }
+}
+
+/// What carried a run's messages between its hosts.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RecordedLink {
+    /// Of what kind it was.
+    pub origin: LinkOrigin,
+    /// Its transport, or what its model does, in words.
+    pub about: String,
+}
+
+/// So many one-way delays above one and up to another.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DelayBin {
+    /// Lower edge, not included.
+    pub above_ns: i64,
+    /// Upper edge, included.
+    pub until_ns: i64,
+    /// Messages.
+    pub count: u64,
+}
+
+/// What the network did to a run's messages, on all channels that crossed it together.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RecordedCrossing {
+    /// Messages handed to it whose outcome is known.
+    pub offered_count: u64,
+    /// Of these, lost by it; else why that is unavailable.
+    pub lost_count: Result<u64, String>,
+    /// Their delays, from one host's kernel to the other's gateway, in any order; else why there are none.
+    pub delays: Result<Vec<DelayBin>, String>,
+}
+
+/// A figure of a run's score.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RecordedMetric {
+    /// The figure; `None` when the run did not allow it.
+    pub value: Option<f64>,
+    /// Its 95 % interval, or why there is none, where it is a statistic.
+    pub interval: Option<Spread>,
+}
+
+/// Why a recorded run may not be held against the published one.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Doubt {
+    /// It ended before its length.
+    Stopped {
+        /// Why, in words.
+        reason: String,
+    },
+    /// Its measurement is not valid, or nothing tells that it is.
+    NotValid {
+        /// What is said of the measurement, in words.
+        measurement: String,
+    },
+    /// Processes passed over ticks.
+    SkippedTicks {
+        /// So many.
+        skipped_count: u64,
+        /// Of so many that were due.
+        due_count: u64,
+    },
+    /// A link was changed while the run went on.
+    LinkChanged,
+    /// Records of what the robot did are missing.
+    ScoreIncomplete,
+    /// Parameters are not those of the table.
+    OtherParameters(Vec<Difference>),
+    /// Another run of the row has the same seed of an emulated link, which draws the same for both.
+    SharedSeed(u64),
+}
+
+/// Parameters that are named where many differ.
+const NAMED_COUNT: usize = 4;
+
+impl fmt::Display for Doubt {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Stopped { reason } => write!(formatter, "it did not run its length: {reason}"),
+            Self::NotValid { measurement } => write!(formatter, "measurement {measurement}"),
+            Self::SkippedTicks {
+                skipped_count,
+                due_count,
+            } => write!(
+                formatter,
+                "{skipped_count} of {due_count} ticks were skipped"
+            ),
+            Self::LinkChanged => formatter.write_str("a link was changed while it went on"),
+            Self::ScoreIncomplete => {
+                formatter.write_str("records of what the robot did are missing")
+            }
+            Self::OtherParameters(all) => {
+                let named = all.iter().take(NAMED_COUNT).map(|one| {
+                    let Difference { key, found, wanted } = one;
+                    format!("{key} is {found}, the table has {wanted}")
+                });
+                let named = named.collect::<Vec<_>>().join("; ");
+                match all.len().saturating_sub(NAMED_COUNT) {
+                    0 => formatter.write_str(&named),
+                    more => write!(formatter, "{named}; and {more} more"),
+                }
+            }
+            Self::SharedSeed(seed) => write!(
+                formatter,
+                "another run of the row has its seed {seed} of an emulated link, which draws the same for both"
+            ),
+        }
+    }
+}
+
+/// A run that ended, with what a row of a case's tables shows of it. `P` is its `[case.parameters]`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecordedRun<P> {
+    /// Its folder, as it was named.
+    pub folder: String,
+    /// Name of its topology.
+    pub name: String,
+    /// The published network that it stands for; `None` where it stands for itself.
+    pub network: Option<PublishedNetwork>,
+    /// What carried its messages.
+    pub link: RecordedLink,
+    /// Seed of its random streams.
+    pub seed: u64,
+    /// Its `[case.parameters]`.
+    pub parameters: P,
+    /// What the network did to its messages.
+    pub crossing: RecordedCrossing,
+    /// The figures of its score by name.
+    pub score: BTreeMap<String, RecordedMetric>,
+    /// Why it may be held against nothing; empty for most.
+    pub doubts: Vec<Doubt>,
+}
+
+impl<P> RecordedRun<P> {
+    /// The count called `name` of its score.
+    ///
+    /// # Errors
+    /// When the score has none.
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "the value is checked to be a count that a real number holds exactly"
+    )]
+    pub fn count(&self, name: &str) -> Result<u64, StudyRefusal> {
+        let value = self.score.get(name).and_then(|metric| metric.value);
+        let count = value.filter(|value| (0.0..=9.0e15).contains(value));
+        let count = count.map(|value| value.round() as u64);
+        count.ok_or_else(|| self.refused(format!("its score has no {name}")))
+    }
+
+    /// The interval of the figure called `name` of its score, or why there is none; `None` where nothing is known of
+    /// it.
+    pub fn interval(&self, name: &str) -> Option<Spread> {
+        self.score.get(name).and_then(|metric| metric.interval)
+    }
+
+    /// Why it cannot be a row.
+    pub fn refused(&self, problem: impl Into<String>) -> StudyRefusal {
+        StudyRefusal::Run {
+            folder: self.folder.clone(),
+            problem: problem.into(),
+        }
+    }
+
+    /// The same run with what `read` makes of its parameters.
+    ///
+    /// # Errors
+    /// That of `read`, with the folder.
+    pub fn with_parameters<Q, E: fmt::Display>(
+        self,
+        read: impl FnOnce(P) -> Result<Q, E>,
+    ) -> Result<RecordedRun<Q>, StudyRefusal> {
+        let Self {
+            folder,
+            name,
+            network,
+            link,
+            seed,
+            parameters,
+            crossing,
+            score,
+            doubts,
+        } = self;
+        match read(parameters) {
+            Ok(parameters) => Ok(RecordedRun {
+                folder,
+                name,
+                network,
+                link,
+                seed,
+                parameters,
+                crossing,
+                score,
+                doubts,
+            }),
+            Err(error) => {
+                let problem = format!("its case.parameters cannot be read: {error}");
+                Err(StudyRefusal::Run { folder, problem })
+            }
+        }
+    }
+}

@@ -1,0 +1,387 @@
+//! Recorded runs of a fleet as rows of Tables II and III: which run is a row of which table, and what it counted.
+
+use crate::case::FleetParameters;
+use crate::experiment::cells::{Condition, PublishedRow, SCENARIOS, hil_setup, published_rows};
+use crate::experiment::driver::Setup;
+use crate::referee::Tally;
+use crate::scenario::{Scenario, WorldParameters};
+use crate::score::{COLLISION_RATIO, COLLISIONS, CRITICAL_SECTIONS, OUTSIDE, OVERLAPS};
+use hil_core::options::{Difference, differences};
+use hil_core::recorded_run::{Doubt, RecordedRun};
+use hil_core::study::StudyRefusal;
+use hil_stats::comparison::Share;
+use hil_stats::recorded::{PooledShare, RecordedRow, RunShare};
+
+/// A row of recorded runs.
+#[derive(Debug)]
+pub(crate) struct FleetRow {
+    /// Whose table it is a row of.
+    pub(crate) scenario: Scenario,
+    /// Its runs.
+    pub(crate) row: RecordedRow<FleetParameters>,
+    /// What the referee of all its runs counted: sections and collisions.
+    pub(crate) tally: Tally,
+    collided: Vec<RunShare>,
+}
+
+impl FleetRow {
+    /// The rows of `recorded`, beside a table of `parameters` whose cells start from `base`.
+    ///
+    /// # Errors
+    /// Names the run that has no table, or counted no critical sections.
+    pub(crate) fn of_runs(
+        mut recorded: Vec<RecordedRun<FleetParameters>>,
+        parameters: &FleetParameters,
+        base: &Setup,
+    ) -> Result<Vec<Self>, StudyRefusal> {
+        for run in &mut recorded {
+            let scenario = run.parameters.world.scenario;
+            if !SCENARIOS.contains(&scenario) {
+                let [harbor, warehouse] = SCENARIOS;
+                let problem = format!(
+                    "its world.scenario {scenario} has no table; {harbor} and {warehouse} have one"
+                );
+                return Err(run.refused(problem));
+            }
+            let different = different(&run.parameters, expected(&run.parameters, parameters, base));
+            if !different.is_empty() {
+                run.doubts.push(Doubt::OtherParameters(different));
+            }
+        }
+        let are_alike = |one: &FleetParameters, other: &FleetParameters| {
+            let wanted = FleetParameters {
+                fleets: one.fleets,
+                tables: one.tables.clone(),
+                ..other.clone()
+            };
+            different(one, wanted).is_empty()
+        };
+        let rows = RecordedRow::of_runs(recorded, are_alike).into_iter();
+        rows.map(Self::of).collect()
+    }
+
+    fn of(row: RecordedRow<FleetParameters>) -> Result<Self, StudyRefusal> {
+        let (mut tally, mut collided) = (Tally::default(), Vec::new());
+        for run in row.runs() {
+            let share = Share {
+                count: run.count(COLLISIONS.name)?,
+                of: run.count(CRITICAL_SECTIONS.name)?,
+            };
+            if share.of == 0 {
+                return Err(run.refused("no robot passed a critical section"));
+            }
+            tally.section_collisions_count += share.count;
+            tally.sections_passed_count += share.of;
+            tally.overlaps_count += run.count(OVERLAPS.name)?;
+            tally.outside_count += run.count(OUTSIDE.name)?;
+            collided.push(RunShare {
+                share,
+                interval: run.interval(COLLISION_RATIO.name),
+            });
+        }
+        Ok(Self {
+            scenario: row.first().parameters.world.scenario,
+            row,
+            tally,
+            collided,
+        })
+    }
+
+    /// Collisions per critical section; without a collision as if they scattered by `of_none`.
+    pub(crate) fn pooled(&self, of_none: f64) -> PooledShare {
+        PooledShare::of(&self.collided, of_none)
+    }
+
+    /// The paper's row for the same network.
+    pub(crate) fn published(&self) -> Option<&'static PublishedRow> {
+        let network = self.row.first().network?;
+        let mut rows = published_rows(self.scenario).iter();
+        rows.find(|row| row.condition == Condition::HardwareInTheLoop(network))
+    }
+}
+
+/// What the parameters of a run must be for a row beside the paper's: world and missions of the table, robot and coordinator as
+/// in its rows over a radio. The table is that of the run's scenario; how many fleets share the channels is free.
+fn expected(run: &FleetParameters, table: &FleetParameters, base: &Setup) -> FleetParameters {
+    let setup = hil_setup(base);
+    FleetParameters {
+        world: WorldParameters {
+            scenario: run.world.scenario,
+            ..table.world.clone()
+        },
+        robot: setup.robot,
+        coordinator: setup.coordinator,
+        missions: setup.missions,
+        fleets: run.fleets,
+        tables: run.tables.clone(),
+    }
+}
+
+fn different(found: &FleetParameters, mut wanted: FleetParameters) -> Vec<Difference> {
+    differences(&mut found.clone(), &mut wanted)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::coordinator::parameters::CoordinatorMode;
+    use crate::experiment::FleetStudy;
+    use crate::robot::TrackerKind;
+    use hil_core::interval::{Interval, IntervalMethod, Spread};
+    use hil_core::recorded_run::{
+        DelayBin, LinkOrigin, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
+    };
+    use hil_core::study::{Cell, Study, StudyReport, Verdict};
+
+    /// A run of so many collisions, true overlaps, overlaps outside every section, and critical sections.
+    fn run(
+        folder: &str,
+        network: Option<PublishedNetwork>,
+        scenario: Scenario,
+        counts: [u32; 4],
+    ) -> RecordedRun<FleetParameters> {
+        let mut parameters = FleetParameters::default();
+        parameters.world.scenario = scenario;
+        parameters.robot.tracker = TrackerKind::LegacyRk4;
+        parameters.fleets = 4;
+        let names = [COLLISIONS, OVERLAPS, OUTSIDE, CRITICAL_SECTIONS];
+        let score = names.iter().zip(counts).map(|(label, count)| {
+            let metric = RecordedMetric {
+                value: Some(f64::from(count)),
+                interval: None,
+            };
+            (label.name.to_owned(), metric)
+        });
+        RecordedRun {
+            folder: folder.to_owned(),
+            name: "fleet-split".to_owned(),
+            network,
+            link: RecordedLink {
+                origin: LinkOrigin::Real,
+                about: "UDP".to_owned(),
+            },
+            seed: 1,
+            parameters,
+            crossing: RecordedCrossing {
+                offered_count: 8_000,
+                lost_count: Ok(20),
+                delays: Ok(vec![DelayBin {
+                    above_ns: 1_000_000,
+                    until_ns: 2_000_000,
+                    count: 7_980,
+                }]),
+            },
+            score: score.collect(),
+            doubts: Vec::new(),
+        }
+    }
+
+    fn with_interval(
+        mut run: RecordedRun<FleetParameters>,
+        ends: [f64; 2],
+    ) -> RecordedRun<FleetParameters> {
+        let interval = Interval::new(ends[0], ends[1], IntervalMethod::EffectiveShare);
+        let metric = RecordedMetric {
+            value: None,
+            interval: Some(Spread::Known(interval)),
+        };
+        run.score.insert(COLLISION_RATIO.name.to_owned(), metric);
+        run
+    }
+
+    /// The report beside cells of which none was run.
+    fn report(recorded: Vec<RecordedRun<FleetParameters>>) -> Result<StudyReport, StudyRefusal> {
+        let mut parameters = FleetParameters::default();
+        parameters.tables.cells = vec!["warehouse, loss 0, 0 ms".to_owned()];
+        let study = FleetStudy::new(&parameters, 1, recorded)?;
+        Ok(study.report(&vec![None; study.task_count()]))
+    }
+
+    fn number(value: f64, decimals: usize) -> Cell {
+        Cell::number(Some(value), decimals)
+    }
+
+    #[test]
+    fn without_runs_the_tables_are_those_of_virtual_time() {
+        let report = report(Vec::new()).unwrap();
+        let names: Vec<_> = report.tables.iter().map(|one| one.name.as_str()).collect();
+        assert_eq!(names, ["table-2-harbor", "table-3-warehouse", "motion"]);
+        let [harbor, ..] = report.tables.as_slice() else {
+            panic!("{report:?}");
+        };
+        let columns: Vec<_> = harbor.columns.iter().map(|column| column.label).collect();
+        let expected = [
+            "Method",
+            "PLR",
+            "Delay ms",
+            "Copies",
+            "CS",
+            "Collisions",
+            "Per 1000",
+            "95 %",
+            "Paper: CS",
+            "Paper: coll.",
+            "Paper",
+            "Paper: 95 %",
+            "Verdict",
+            "Accepted if",
+        ];
+        assert_eq!(columns, expected);
+        assert_eq!((harbor.rows.len(), harbor.notes.len()), (11, 2));
+    }
+
+    #[test]
+    fn a_labelled_run_is_a_row_below_the_papers_and_is_held_against_it() {
+        // 24 of 12 000 are 2 per 1000. The interval is that of 8496 trials, so that the published 0 of 10 819 reach
+        // 0.48 per 1000: the difference is at least 2 - hypot(2 - 1.2, 0.48) = 1.07.
+        let ethernet = Some(PublishedNetwork::Ethernet);
+        let one = run("runs/eth-1", ethernet, Scenario::Harbor, [24, 7, 1, 12_000]);
+        let one = with_interval(one, [0.001_2, 0.003_1]);
+        let report = report(vec![one]).unwrap();
+        let [harbor, warehouse, ..] = report.tables.as_slice() else {
+            panic!("{report:?}");
+        };
+        assert_eq!((harbor.rows.len(), warehouse.rows.len()), (12, 11));
+        for row in &harbor.rows {
+            assert_eq!(row.len(), harbor.columns.len());
+        }
+        assert_eq!(harbor.columns[P99].name, "delay_ms_p99");
+        assert_eq!(harbor.rows[8][0], Cell::text("HiL, Ethernet"));
+        assert_eq!(harbor.rows[8][P99], Cell::Absent);
+        let found = &harbor.rows[9];
+        let expected = [
+            Cell::text("HiL, Ethernet, real link"),
+            number(0.002_5, 4),
+            number(1.5, 2),
+            number(1.99, 2),
+            Cell::Absent,
+            Cell::Count(12_000),
+            Cell::text("24 / 7 / 1"),
+            number(2.0, 2),
+        ];
+        for (found, expected) in found.iter().zip(&expected) {
+            match (found, expected) {
+                (
+                    Cell::Number { value, decimals },
+                    Cell::Number {
+                        value: wanted,
+                        decimals: as_wanted,
+                    },
+                ) => {
+                    assert!((value - wanted).abs() < 1e-9 && decimals == as_wanted);
+                }
+                _ => assert_eq!(found, expected),
+            }
+        }
+        assert_eq!(found[8], Cell::interval(Some((1.2, 3.1)), 2));
+        assert_eq!(found[9..11], [Cell::Count(10_819), Cell::Count(0)]);
+        assert_eq!(found[13], Cell::Verdict(Verdict::Differs));
+        let note = harbor.notes.last().unwrap();
+        assert_eq!(
+            note,
+            "HiL, Ethernet, real link: runs/eth-1; UDP; interval on the run's effective sample"
+        );
+        let summary = "These differ: harbor, HiL, Ethernet, real link.";
+        assert!(
+            report.summary.iter().any(|line| line == summary),
+            "{:?}",
+            report.summary
+        );
+    }
+
+    const P99: usize = 3;
+
+    #[test]
+    fn runs_of_one_label_and_scenario_are_one_row_with_the_interval_of_their_scatter() {
+        // 24 of 10 000, off by 0.4 each way: 0.0278 over one degree of freedom, times (12.7062 / 1.95996)^2 = 1.17.
+        let short = Some(PublishedNetwork::ShortRange);
+        let runs = [[10, 1, 0, 4_000], [14, 2, 1, 6_000]];
+        let mut runs: Vec<_> = runs
+            .into_iter()
+            .map(|counts| run("runs/wifi", short, Scenario::Warehouse, counts))
+            .collect();
+        runs[1].parameters.fleets = 2;
+        runs.push(run(
+            "runs/harbor",
+            short,
+            Scenario::Harbor,
+            [0, 0, 0, 15_489],
+        ));
+        let report = report(runs).unwrap();
+        let row = |table: usize, index: usize| report.tables[table].rows[index].clone();
+        let pooled = row(1, 10);
+        assert_eq!(pooled[0], Cell::text("HiL, short-range Wi-Fi 6, real link"));
+        assert_eq!(pooled[5], Cell::Count(10_000));
+        assert_eq!(pooled[6], Cell::text("24 / 3 / 1"));
+        // Of 20.5 of 8547: 12.6 and 31.5.
+        let Cell::Interval { low, high, .. } = pooled[8] else {
+            panic!("{pooled:?}");
+        };
+        assert!(
+            (low - 1.47).abs() < 0.03 && (high - 3.69).abs() < 0.05,
+            "{low} {high}"
+        );
+        assert_eq!(pooled[13], Cell::Verdict(Verdict::Agrees));
+        let note = report.tables[1].notes.last().unwrap();
+        assert!(
+            note.contains("divided by 1.17, the scatter among the runs"),
+            "{note}"
+        );
+        // None of as many as were published with 14 is a difference.
+        let harbor = row(0, 10);
+        assert_eq!(harbor[6], Cell::text("0 / 0 / 0"));
+        assert_eq!(harbor[13], Cell::Verdict(Verdict::Differs));
+    }
+
+    #[test]
+    fn a_run_without_a_label_stands_last_and_for_itself() {
+        let alone = run("runs/lte", None, Scenario::Warehouse, [0, 0, 0, 900]);
+        let report = report(vec![alone]).unwrap();
+        let table = &report.tables[1];
+        let row = table.rows.last().unwrap();
+        assert_eq!(row[0], Cell::text("HiL, fleet-split, real link"));
+        assert_eq!(row[9..13], [const { Cell::Absent }; 4]);
+        assert_eq!(row[13], Cell::Verdict(Verdict::NotComparable));
+        assert!(table.notes.last().unwrap().contains("no label"));
+    }
+
+    #[test]
+    fn a_run_of_other_rules_or_of_another_world_is_not_compared_and_says_why() {
+        let ethernet = Some(PublishedNetwork::Ethernet);
+        let mut safe = run("runs/safe", ethernet, Scenario::Harbor, [0, 0, 0, 12_000]);
+        safe.parameters.coordinator.mode = CoordinatorMode::Safe;
+        safe.parameters.world.robots = 14;
+        let plain = run("runs/plain", ethernet, Scenario::Harbor, [0, 0, 0, 12_000]);
+        let report = report(vec![safe, plain]).unwrap();
+        let harbor = &report.tables[0];
+        let verdict = |row: usize| harbor.rows[row][13].clone();
+        // They are no repetitions of each other, so that each is a row.
+        assert_eq!(verdict(9), Cell::Verdict(Verdict::NotComparable));
+        assert_eq!(verdict(10), Cell::Verdict(Verdict::Agrees));
+        let expected = "runs/safe; UDP; none seen: interval of counts divided by 1.00, as in virtual time; \
+                        not comparable: world.robots is 14, the table has 7; coordinator.mode is safe, the \
+                        table has legacy";
+        let is_there = |note: &String| note.contains(expected);
+        assert!(harbor.notes.iter().any(is_there), "{:?}", harbor.notes);
+    }
+
+    #[test]
+    fn a_run_that_is_in_no_table_is_refused_by_folder_and_cause() {
+        let ethernet = Some(PublishedNetwork::Ethernet);
+        let error = |run| report(vec![run]).unwrap_err().to_string();
+        assert_eq!(
+            error(run("runs/a", ethernet, Scenario::Crossing, [0, 0, 0, 10])),
+            "runs/a: its world.scenario crossing has no table; harbor and warehouse have one"
+        );
+        assert_eq!(
+            error(run("runs/a", ethernet, Scenario::Harbor, [0; 4])),
+            "runs/a: no robot passed a critical section"
+        );
+        let mut bare = run("runs/a", ethernet, Scenario::Harbor, [0, 0, 0, 10]);
+        bare.score.remove(CRITICAL_SECTIONS.name);
+        assert_eq!(
+            error(bare),
+            "runs/a: its score has no critical_sections_count"
+        );
+    }
+}

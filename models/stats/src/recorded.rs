@@ -1,0 +1,456 @@
+//! Recorded runs pooled to rows of a case's tables: shares with their intervals, loss and delay of the
+//! network, and how a row stands to the published one. It knows no case.
+
+use core::fmt;
+
+use hil_core::interval::{Interval, Spread, TooSmall};
+use hil_core::recorded_run::{DelayBin, Doubt, LinkOrigin, RecordedRun};
+use hil_core::study::Verdict;
+
+use crate::comparison::{Estimate, Scatter, Share, estimate_against_published};
+
+/// What happened in one run: so many of so many.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RunShare {
+    /// Both counts.
+    pub share: Share,
+    /// The interval of the share on the run's effective sample, or why there is none; `None` where nothing is known
+    /// of it.
+    pub interval: Option<Spread>,
+}
+
+/// What the interval of a pooled share rests on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Basis {
+    /// The effective sample of the only run.
+    OwnSample,
+    /// Counts divided by so much, from how the runs scatter.
+    AmongRuns(f64),
+    /// Of none at all, counts divided by so much, as in the other cells of the table.
+    LikeTheTable(f64),
+    /// There is no interval.
+    None(Option<TooSmall>),
+}
+
+impl fmt::Display for Basis {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::OwnSample => formatter.write_str("interval on the run's effective sample"),
+            Self::AmongRuns(scatter) => write!(
+                formatter,
+                "interval of counts divided by {scatter:.2}, the scatter among the runs"
+            ),
+            Self::LikeTheTable(scatter) => write!(
+                formatter,
+                "none seen: interval of counts divided by {scatter:.2}, as in virtual time"
+            ),
+            Self::None(Some(why)) => write!(formatter, "no interval: {why}"),
+            Self::None(None) => formatter.write_str("no interval: the run gives none"),
+        }
+    }
+}
+
+/// What happened in all runs of a row together.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PooledShare {
+    /// Both counts; as many as there are, where more happened.
+    pub share: Share,
+    /// 95 % interval of the share.
+    pub interval: Option<Interval>,
+    /// What that rests on.
+    pub basis: Basis,
+    /// Variance over that of independent trials, at least 1.
+    scatter: f64,
+}
+
+impl PooledShare {
+    /// Pools `runs`. Of a single run it keeps the run's own interval; where nothing happened the counts are divided by
+    /// `of_none`, at least 1.
+    pub fn of(runs: &[RunShare], of_none: f64) -> Self {
+        let shares: Vec<Share> = runs.iter().map(|run| run.share).collect();
+        let of = shares.iter().map(|one| one.of).sum();
+        let count: u64 = shares.iter().map(|one| one.count).sum();
+        let share = Share {
+            count: count.min(of),
+            of,
+        };
+        let exact = |scatter| share.estimate(scatter).and_then(|one| one.interval);
+        let without = |why| (None, Basis::None(why), 1.0);
+        let (interval, basis, scatter) = match runs {
+            _ if count == 0 => {
+                let scatter = of_none.max(1.0);
+                (exact(scatter), Basis::LikeTheTable(scatter), scatter)
+            }
+            [only] => match only.interval {
+                Some(Spread::Known(interval)) => {
+                    let scatter = Self::scatter_of(share, interval);
+                    (Some(interval), Basis::OwnSample, scatter)
+                }
+                Some(Spread::Unknown(why)) => without(Some(why)),
+                None => without(None),
+            },
+            _ if shares.iter().any(|one| one.count > one.of) => without(None),
+            _ => match Scatter::of(&shares).divisor() {
+                Some(divisor) => {
+                    let scatter = divisor.max(1.0);
+                    (exact(scatter), Basis::AmongRuns(scatter), scatter)
+                }
+                None => without(None),
+            },
+        };
+        Self {
+            share,
+            interval,
+            basis,
+            scatter,
+        }
+    }
+
+    /// What `share` scatters by, if its interval is as wide as `interval`.
+    fn scatter_of(share: Share, interval: Interval) -> f64 {
+        let estimate = Estimate {
+            value: share.count as f64 / share.of as f64,
+            interval: Some(interval),
+        };
+        let effective = estimate.effective_count().filter(|count| *count > 0.0);
+        effective.map_or(1.0, |count| (share.of as f64 / count).max(1.0))
+    }
+
+    /// The share; `None` of none.
+    pub fn ratio(&self) -> Option<f64> {
+        (self.share.of > 0).then(|| self.share.count as f64 / self.share.of as f64)
+    }
+
+    /// How it stands to the `published` share, which is taken to scatter as this one does.
+    fn against(&self, published: Share) -> Verdict {
+        let Some((value, interval)) = self.ratio().zip(self.interval) else {
+            return Verdict::Inconclusive;
+        };
+        let ours = Estimate {
+            value,
+            interval: Some(interval),
+        };
+        estimate_against_published(published, ours, self.share.of, self.scatter)
+            .unwrap_or(Verdict::NotComparable)
+    }
+}
+
+/// Runs that make one row: those of one published network, one link and like parameters, or a run alone.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecordedRow<P> {
+    runs: Vec<RecordedRun<P>>,
+}
+
+impl<P> RecordedRow<P> {
+    /// The rows of `runs`, in the order of their first runs.
+    pub fn of_runs(runs: Vec<RecordedRun<P>>, are_alike: impl Fn(&P, &P) -> bool) -> Vec<Self> {
+        let mut rows: Vec<Self> = Vec::new();
+        for mut run in runs {
+            let is_its = |row: &&mut Self| {
+                let first = row.first();
+                run.network.is_some()
+                    && first.network == run.network
+                    && first.link == run.link
+                    && are_alike(&first.parameters, &run.parameters)
+            };
+            let Some(row) = rows.iter_mut().find(is_its) else {
+                rows.push(Self { runs: vec![run] });
+                continue;
+            };
+            let mut known = row.runs.iter();
+            let is_drawn = run.link.origin != LinkOrigin::Real;
+            if is_drawn && known.any(|other| other.seed == run.seed) {
+                run.doubts.push(Doubt::SharedSeed(run.seed));
+            }
+            row.runs.push(run);
+        }
+        rows
+    }
+
+    /// Its runs.
+    pub fn runs(&self) -> &[RecordedRun<P>] {
+        &self.runs
+    }
+
+    /// The first of them, with which the others have network, link and parameters in common.
+    ///
+    /// # Panics
+    /// Never: a row has a run.
+    pub fn first(&self) -> &RecordedRun<P> {
+        self.runs.first().expect("a row is made of a run")
+    }
+
+    /// How it was obtained, as the paper's first column has it.
+    pub fn method(&self) -> String {
+        let first = self.first();
+        let network = first.network.map_or(first.name.as_str(), |one| one.label());
+        format!("HiL, {network}, {}", first.link.origin)
+    }
+
+    /// Share of the messages that the network lost; `None` where that is unavailable of a run.
+    pub fn loss_ratio(&self) -> Option<f64> {
+        let (mut lost, mut offered) = (0_u64, 0_u64);
+        for run in &self.runs {
+            lost += run.crossing.lost_count.as_ref().ok()?;
+            offered += run.crossing.offered_count;
+        }
+        (offered > 0).then(|| lost as f64 / offered as f64)
+    }
+
+    /// The one-way delay that a `quantile` (0..=1) of all messages did not exceed, milliseconds, within the width of a
+    /// bin; `None` where delays are unavailable of a run.
+    pub fn delay_ms(&self, quantile: f64) -> Option<f64> {
+        let mut bins: Vec<DelayBin> = Vec::new();
+        for run in &self.runs {
+            bins.extend(run.crossing.delays.as_ref().ok()?);
+        }
+        bins.sort_by_key(|bin| bin.until_ns);
+        let rank = quantile * bins.iter().map(|bin| bin.count).sum::<u64>() as f64;
+        let mut below = 0.0;
+        for bin in bins.iter().filter(|bin| bin.count > 0) {
+            let count = bin.count as f64;
+            if below + count >= rank {
+                let width_ns = bin.until_ns.saturating_sub(bin.above_ns) as f64;
+                let delay_ns = bin.above_ns as f64 + width_ns * (rank - below) / count;
+                return Some(1e-6 * delay_ns);
+            }
+            below += count;
+        }
+        None
+    }
+
+    /// How what happened stands to the `published` share.
+    pub fn verdict(&self, happened: &PooledShare, published: Option<Share>) -> Verdict {
+        let is_doubted = self.runs.iter().any(|run| !run.doubts.is_empty());
+        match published.filter(|_| self.first().network.is_some() && !is_doubted) {
+            Some(published) => happened.against(published),
+            None => Verdict::NotComparable,
+        }
+    }
+
+    /// What a reader must know of the row: its runs, its link, what its interval rests on, and why it is not compared
+    /// or lacks a figure.
+    pub fn note(&self, happened: &PooledShare) -> String {
+        let first = self.first();
+        let folders = self.runs.iter().map(|run| run.folder.as_str());
+        let mut parts = vec![
+            folders.collect::<Vec<_>>().join(", "),
+            first.link.about.clone(),
+            happened.basis.to_string(),
+        ];
+        if first.network.is_none() {
+            parts.push("not comparable: no label says for which network it stands".to_owned());
+        }
+        for run in &self.runs {
+            // Of a single run the folder stands before.
+            let of = match self.runs.as_slice() {
+                [_] => String::new(),
+                _ => format!("{}: ", run.folder),
+            };
+            let doubts = run.doubts.iter();
+            parts.extend(doubts.map(|doubt| format!("not comparable: {of}{doubt}")));
+            let crossing = &run.crossing;
+            if let Err(why) = &crossing.lost_count {
+                parts.push(format!("{of}loss is unavailable: {why}"));
+            }
+            if let Err(why) = &crossing.delays {
+                parts.push(format!("{of}delays are unavailable: {why}"));
+            }
+        }
+        parts.retain(|part| !part.is_empty());
+        format!("{}: {}", self.method(), parts.join("; "))
+    }
+}
+
+/// What a table with recorded rows says of them all.
+pub const ROWS_NOTE: &str = "HiL with a kind of link: recorded runs in real time; PLR and delay (p50, p99) are the \
+                             network's, of all messages on the channels that crossed it, delays by a histogram of \
+                             20 bins a decade";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeMap;
+
+    use hil_core::interval::IntervalMethod;
+    use hil_core::recorded_run::{PublishedNetwork, RecordedCrossing, RecordedLink};
+
+    const fn share(count: u64, of: u64) -> Share {
+        Share { count, of }
+    }
+
+    fn run(folder: &str, network: Option<PublishedNetwork>, seed: u64) -> RecordedRun<u8> {
+        RecordedRun {
+            folder: folder.to_owned(),
+            name: "two-pcs".to_owned(),
+            network,
+            link: RecordedLink {
+                origin: LinkOrigin::Emulated,
+                about: "hop: 5 ms".to_owned(),
+            },
+            seed,
+            parameters: 7,
+            crossing: RecordedCrossing {
+                offered_count: 1000,
+                lost_count: Ok(10),
+                delays: Ok(vec![
+                    DelayBin {
+                        above_ns: 1_000_000,
+                        until_ns: 2_000_000,
+                        count: 50,
+                    },
+                    DelayBin {
+                        above_ns: 2_000_000,
+                        until_ns: 4_000_000,
+                        count: 50,
+                    },
+                ]),
+            },
+            score: BTreeMap::new(),
+            doubts: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn a_single_run_keeps_its_interval_and_several_have_that_of_their_scatter() {
+        let interval = Interval::new(0.01, 0.04, IntervalMethod::EffectiveShare);
+        let alone = RunShare {
+            share: share(20, 1000),
+            interval: Some(Spread::Known(interval)),
+        };
+        let one = PooledShare::of(&[alone], 1.0);
+        assert_eq!(
+            (one.interval, one.basis),
+            (Some(interval), Basis::OwnSample)
+        );
+        // 0.02 * 0.98 * (2 * 1.95996 / 0.03)^2 = 334.7 trials: 1000 scatter by 2.99.
+        assert!((one.scatter - 2.988).abs() < 0.01, "{}", one.scatter);
+        // 10 of 1000 thrice, each off by 3, 3, 0: 18 / 9.9 over 2 degrees of freedom is below 1, and Student's quantile
+        // of 2 is 4.30265: 0.909 * (4.30265 / 1.95996)^2 = 4.381.
+        let runs = [7, 13, 10].map(|count| RunShare {
+            share: share(count, 1000),
+            interval: None,
+        });
+        let three = PooledShare::of(&runs, 1.0);
+        assert_eq!(three.share, share(30, 3000));
+        assert!((three.scatter - 4.381).abs() < 0.002, "{}", three.scatter);
+        assert_eq!(three.basis, Basis::AmongRuns(three.scatter));
+        let found = three.interval.unwrap();
+        assert!(found.low > 0.0 && found.holds(0.01), "{found:?}");
+    }
+
+    #[test]
+    fn without_an_interval_a_row_says_why_and_decides_nothing() {
+        let why = TooSmall {
+            effective: 3,
+            needed: 5,
+        };
+        let few = |interval| {
+            let share = share(3, 1000);
+            PooledShare::of(&[RunShare { share, interval }], 1.0)
+        };
+        let found = few(Some(Spread::Unknown(why)));
+        assert_eq!(
+            (found.interval, found.basis),
+            (None, Basis::None(Some(why)))
+        );
+        assert_eq!(found.against(share(0, 1000)), Verdict::Inconclusive);
+        assert_eq!(few(None).basis, Basis::None(None));
+        assert_eq!(PooledShare::of(&[], 1.0).interval, None);
+    }
+
+    #[test]
+    fn of_none_at_all_counts_are_divided_as_in_the_table() {
+        let none = RunShare {
+            share: share(0, 10_000),
+            interval: None,
+        };
+        let high = |of_none| PooledShare::of(&[none], of_none).interval.unwrap().high;
+        // 1 - 0.025^(1 / 10 000), and of a quarter of them.
+        assert!((high(0.5) - 3.688e-4).abs() < 1e-7);
+        assert!((high(4.0) - 1.4745e-3).abs() < 1e-6);
+        let pooled = PooledShare::of(&[none], 1.0);
+        assert_eq!(pooled.against(share(0, 10_000)), Verdict::Agrees);
+        assert_eq!(pooled.against(share(23, 10_000)), Verdict::Differs);
+        assert_eq!(pooled.against(share(0, 30_000)), Verdict::Inconclusive);
+    }
+
+    #[test]
+    fn runs_of_one_network_link_and_parameters_are_one_row() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let mut runs = vec![
+            run("a", short, 1),
+            run("b", None, 1),
+            run("c", short, 2),
+            run("d", None, 1),
+            run("e", short, 1),
+            run("f", short, 3),
+            run("g", short, 4),
+        ];
+        runs[5].link.origin = LinkOrigin::Real;
+        runs[6].parameters = 8;
+        let rows = RecordedRow::of_runs(runs, |one, other| one == other);
+        let folders = |row: &RecordedRow<u8>| -> Vec<String> {
+            row.runs.iter().map(|run| run.folder.clone()).collect()
+        };
+        let folders: Vec<_> = rows.iter().map(|row| folders(row).join(" ")).collect();
+        assert_eq!(folders, ["a c e", "b", "d", "f", "g"]);
+        assert_eq!(rows[0].method(), "HiL, short-range Wi-Fi 6, emulated link");
+        assert_eq!(rows[1].method(), "HiL, two-pcs, emulated link");
+        // An emulated link draws the same for equal seeds.
+        assert_eq!(rows[0].runs[2].doubts, [Doubt::SharedSeed(1)]);
+        assert_eq!(rows[0].runs[1].doubts, []);
+    }
+
+    #[test]
+    fn loss_and_delay_are_of_all_messages_of_all_runs() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let mut other = run("b", short, 2);
+        other.crossing.lost_count = Ok(50);
+        other.crossing.delays = Ok(vec![DelayBin {
+            above_ns: 9_000_000,
+            until_ns: 10_000_000,
+            count: 100,
+        }]);
+        let row = |runs| RecordedRow::of_runs(runs, |_, _| true).remove(0);
+        let one = row(vec![run("a", short, 1)]);
+        assert_eq!(one.loss_ratio(), Some(0.01));
+        // The 50th of 100 is the last of the first bin, the 99th the 49th of 50 from 2 to 4 ms.
+        let close = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
+        assert!(close(one.delay_ms(0.5), 2.0) && close(one.delay_ms(0.99), 3.96));
+        let both = row(vec![run("a", short, 1), other.clone()]);
+        assert_eq!(both.loss_ratio(), Some(0.03));
+        assert!(close(both.delay_ms(0.5), 4.0) && close(both.delay_ms(0.99), 9.98));
+        other.crossing.delays = Err("clocks are not aligned".to_owned());
+        let both = row(vec![run("a", short, 1), other]);
+        assert_eq!(both.delay_ms(0.5), None);
+        let happened = PooledShare::of(&[], 1.0);
+        let note = both.note(&happened);
+        assert!(note.contains("b: delays are unavailable: clocks"), "{note}");
+    }
+
+    #[test]
+    fn a_row_without_a_label_or_with_a_doubt_is_not_compared_and_says_why() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let none = RunShare {
+            share: share(0, 10_000),
+            interval: None,
+        };
+        let happened = PooledShare::of(&[none], 1.0);
+        let of = |run| RecordedRow::of_runs(vec![run], |_, _| true).remove(0);
+        let verdict = |row: &RecordedRow<u8>| row.verdict(&happened, Some(share(0, 10_000)));
+        assert_eq!(verdict(&of(run("a", short, 1))), Verdict::Agrees);
+        let unlabelled = of(run("a", None, 1));
+        assert_eq!(verdict(&unlabelled), Verdict::NotComparable);
+        assert!(unlabelled.note(&happened).contains("no label"));
+        let mut late = run("runs/a", short, 1);
+        late.doubts.push(Doubt::SkippedTicks {
+            skipped_count: 3,
+            due_count: 500,
+        });
+        let late = of(late);
+        assert_eq!(verdict(&late), Verdict::NotComparable);
+        let expected = "not comparable: 3 of 500 ticks were skipped";
+        assert!(late.note(&happened).contains(expected));
+    }
+}
