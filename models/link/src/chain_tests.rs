@@ -399,7 +399,7 @@ fn a_description_says_what_it_does() {
         "1000000 bit/s with a queue of 2000 bytes",
         "0.01 held back by 30 ms",
         "0.02 twice, 5 ms apart",
-        "600 outages per hour",
+        "on average, 600 per hour",
     ] {
         assert!(words.contains(part), "{words}");
     }

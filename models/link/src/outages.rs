@@ -128,14 +128,13 @@ impl Outages {
             buffered,
         } = self;
         let what = if *buffered {
-            "which hold everything until they end"
+            "which hold"
         } else {
-            "which lose everything"
+            "which lose"
         };
         let mean_ms = mean_s * 1e3;
         format!(
-            "{per_hour} outages per hour of {mean_ms} ms on average, {what}, on all channels of the \
-             link both ways, counted from the start of the run"
+            "outages of {mean_ms} ms on average, {per_hour} per hour, {what} all messages of the link in both directions"
         )
     }
 

@@ -328,17 +328,20 @@ impl Answer {
     pub fn words(&self) -> String {
         match (&self.hurt, &self.sample.occasions) {
             (Hurt::No, Some(OccasionCount { what, count })) => {
-                // Of how long one lasts nothing is known, so it is counted as one event, of Poisson's law (Garwood 1936).
-                let most = -(0.5 - 0.5 * CONFIDENCE).ln();
-                let percent = 100.0 * CONFIDENCE;
-                format!(
-                    "{}: no harm in {} {what} ({percent:.0} %: at most {most:.1} in a run this long, Poisson)",
-                    self.hurt,
-                    grouped(*count)
-                )
+                format!("{}: no harm in {} {what}", self.hurt, grouped(*count))
             }
             _ => self.hurt.words(self.object),
         }
+    }
+
+    /// What a NO leaves open, in words; `None` of another answer.
+    pub(crate) fn left_open(&self) -> Option<String> {
+        // Of how long a harm lasts nothing is known, so it is counted as one event, of Poisson's law (Garwood 1936).
+        let most = -(0.5 - 0.5 * CONFIDENCE).ln();
+        let percent = 100.0 * CONFIDENCE;
+        (self.hurt == Hurt::No).then(|| {
+            format!("up to {most:.1} harms in a run this long cannot be excluded ({percent:.0} %, Poisson)")
+        })
     }
 
     /// The same as a sentence of its own.
@@ -372,7 +375,7 @@ impl Answer {
                 )
             }
             Clocks::Unaligned => {
-                "; one-way delays and what came first are unavailable: the hosts' clocks are not aligned"
+                "; one-way delays and the order of events are unavailable: the hosts' clocks are not aligned"
                     .to_owned()
             }
         };
@@ -397,10 +400,14 @@ impl Answer {
                     counted(uncounted_count, "process start")
                 ),
             ),
-            None => (
-                Tone::Plain,
-                format!("valid: hosts and links were kept up with{clocks}"),
-            ),
+            None => {
+                let valid = match self.measurement.clocks {
+                    Clocks::Unaligned => "valid in part",
+                    _ => "valid",
+                };
+                let words = format!("{valid}: hosts and links were kept up with{clocks}");
+                (Tone::Plain, words)
+            }
         }
     }
 
@@ -430,7 +437,7 @@ impl Hurt {
     pub(crate) fn words(&self, object: Object) -> String {
         let because = Untested::NoScore;
         if object == Object::Programs && *self == (Self::NotTested { because }) {
-            "NOT TESTED: nothing says what hurts these programs; to test it, set a deadline in [flows.NAME]"
+            "NOT TESTED: no criterion of harm is set; a deadline in [flows.NAME] of the topology is one"
                 .to_owned()
         } else {
             self.to_string()
@@ -709,17 +716,12 @@ fn invalid_words(network: &NetworkVerdict) -> Option<String> {
             let skipped: u64 = processes.iter().map(|one| one.skipped_tick_count).sum();
             let due: u64 = processes.iter().map(|one| one.due_tick_count).sum();
             let names: Vec<&str> = processes.iter().map(|one| one.process.as_str()).collect();
-            let noun = if names.len() == 1 {
-                "process"
-            } else {
-                "processes"
-            };
             let names = named(&names, NAMED_COUNT);
             let share = percent(skipped as f64 / due.max(1) as f64);
             let ticks = format!("{} of {} ticks", grouped(skipped), grouped(due));
             let most = percent(SKIPPED_TICK_RATIO_MAX);
             format!(
-                "the host overran: {noun} {names} skipped {ticks} ({share}, at most {most} may be); {repeat}"
+                "the host overran: {ticks} were skipped ({share}, the limit is {most}) by {names}; {repeat}"
             )
         }
         NetworkVerdict::ReceiverLate { channels, loss } => {

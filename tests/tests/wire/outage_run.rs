@@ -122,7 +122,10 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
         let facts = carriers
             .filter(|one| one.channels.iter().any(|channel| channel == name))
             .flat_map(|one| &one.facts);
-        let told = facts.filter(|fact| fact.value.contains("2400 outages per hour of 300 ms"));
+        let told = facts.filter(|fact| {
+            fact.value
+                .contains("outages of 300 ms on average, 2400 per hour")
+        });
         assert_eq!(told.count(), 1);
     }
 }

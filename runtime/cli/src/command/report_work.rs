@@ -4,6 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::arguments::ReportArgs;
+use clap::ValueEnum as _;
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_report::analysis;
@@ -101,9 +102,13 @@ fn format(args: &ReportArgs) -> Result<Format, Refusal> {
     }
     args.format.or(figure).or(by_name).or(own).ok_or_else(|| {
         let path = args.output.as_deref().unwrap_or_else(|| Path::new(""));
+        let known = Format::value_variants().iter();
+        let known = known.filter_map(Format::to_possible_value);
+        let known: Vec<String> = known.map(|one| one.get_name().to_owned()).collect();
         usage(format!(
-            "{}: its ending says no format; give --format html, md, tex, csv, json or svg",
-            path.display()
+            "{}: its ending says no format; give --format, one of {}",
+            path.display(),
+            known.join(", ")
         ))
     })
 }

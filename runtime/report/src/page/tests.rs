@@ -1,5 +1,6 @@
 //! Pages of runs that went right, and of runs that went wrong in every way they can.
 
+use clap::ValueEnum as _;
 use std::collections::BTreeMap;
 
 use super::read::{Found, Manifest, Material};
@@ -194,8 +195,9 @@ fn runs_that_went_wrong_get_pages_that_say_so() {
         assert_well_formed(&page);
         assert!(page.contains(expected), "{expected}");
         assert!(page.contains("unavailable"), "{expected}");
-        for format in [Format::Md, Format::Tex, Format::Csv, Format::Json] {
-            let text = render(std::slice::from_ref(&material), None, format, None).unwrap();
+        let texts = Format::value_variants().iter();
+        for format in texts.filter(|one| !matches!(one, Format::Html | Format::Svg)) {
+            let text = render(std::slice::from_ref(&material), None, *format, None).unwrap();
             assert!(!text.contains("NaN"), "{format:?}");
         }
     }

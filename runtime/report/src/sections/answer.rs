@@ -7,7 +7,7 @@ use hil_platform::words::counted;
 use hil_present::units::{duration, percent};
 use hil_present::{Field, Tone};
 
-use super::events::{first_harm, gravest_first};
+use super::events::first_harm;
 use crate::answer::{Answer, HarmCount, Hurt, OCCASIONS_MIN, metric_words};
 use crate::assessment::Assessment;
 use crate::summary::RunSummary;
@@ -53,7 +53,11 @@ impl AnswerFacts {
             let words = "answers that would have come in time but for the network";
             harms.push(Field::new("counted as harm", words));
         }
-        harms.extend(hazards(summary).map(|words| Field::new("short of harm", words)));
+        if answer.hurt == Hurt::No {
+            harms.extend(near_misses(summary).map(|words| Field::new("near misses", words)));
+            let open = answer.left_open();
+            harms.extend(open.map(|words| Field::new("left open", words)));
+        }
         let mut rest = Vec::new();
         rest.extend(messages(summary).map(|words| Field::new("messages", words)));
         let scores = summary.score.iter();
@@ -82,20 +86,20 @@ impl AnswerFacts {
     }
 }
 
-/// Hazards, of a robot that was not hurt: how many, and the first.
-fn hazards(summary: &RunSummary) -> Option<String> {
-    let all = &summary.score_events;
-    let mut harms = summary.harms.iter();
-    if summary.harms.is_empty() || harms.any(|one| one.count != Some(0)) {
+/// Hazards of a robot that was not hurt: how many, and the first; `None` without a robot.
+fn near_misses(summary: &RunSummary) -> Option<String> {
+    if summary.run.case.is_empty() {
         return None;
     }
-    let count = all.count_of(Severity::Hazard);
-    let mut grave = gravest_first(&all.events).into_iter();
-    let first = grave.find(|one| one.severity == Severity::Hazard)?;
-    Some(format!(
-        "{}, the first: {}",
-        counted(count, "hazard"),
-        first.what
+    let all = &summary.score_events;
+    let mut hazards = all.events.iter();
+    let first = hazards.find(|one| one.severity == Severity::Hazard);
+    Some(first.map_or_else(
+        || "none".to_owned(),
+        |first| {
+            let count = counted(all.count_of(Severity::Hazard), "hazard");
+            format!("{count}; first: {}", first.what)
+        },
     ))
 }
 
