@@ -147,6 +147,15 @@ hil_core::labelled! {
     }
 }
 
+/// What is studied, and in what time its rows ran.
+pub fn title(of: &str, has_recorded_runs: bool) -> String {
+    if has_recorded_runs {
+        format!("{of}, in virtual time and of recorded runs")
+    } else {
+        format!("{of}, in virtual time")
+    }
+}
+
 /// What the rows, each with its name, and the criteria come to: at most three lines.
 pub fn summary(rows: &[(String, Verdict)], criteria: &[Criterion]) -> Vec<String> {
     let of = |wanted: Verdict| rows.iter().filter(move |(_, verdict)| *verdict == wanted);

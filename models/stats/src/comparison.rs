@@ -183,7 +183,7 @@ impl Scatter {
 /// # Panics
 /// As [`Share::estimate`].
 pub fn against_published(published: Share, ours: Share, scatter: f64) -> Option<Verdict> {
-    estimate_against_published(published, ours.estimate(scatter)?, ours.of, scatter)
+    estimate_against_published(published, ours.estimate(scatter)?, ours.of as f64, scatter)
 }
 
 /// The same of `ours` with an interval of its own, a share of `of`.
@@ -193,13 +193,13 @@ pub fn against_published(published: Share, ours: Share, scatter: f64) -> Option<
 pub fn estimate_against_published(
     published: Share,
     ours: Estimate,
-    of: u64,
+    of: f64,
     scatter: f64,
 ) -> Option<Verdict> {
     let interval = difference(published.estimate(scatter)?, ours)?;
     Some(if interval.low > 0.0 || interval.high < 0.0 {
         Verdict::Differs
-    } else if 2 * of >= published.of {
+    } else if 2.0 * of >= published.of as f64 {
         Verdict::Agrees
     } else {
         Verdict::Inconclusive

@@ -2,6 +2,7 @@
 //! network, and how a row stands to the published one. It knows no case.
 
 use core::fmt;
+use std::collections::BTreeMap;
 
 use hil_core::interval::{Interval, Spread, TooSmall};
 use hil_core::recorded_run::{DelayBin, Doubt, LinkOrigin, RecordedRun};
@@ -42,10 +43,10 @@ impl fmt::Display for Basis {
             ),
             Self::LikeTheTable(scatter) => write!(
                 formatter,
-                "none seen: interval of counts divided by {scatter:.2}, as in virtual time"
+                "none seen: interval of counts divided by {scatter:.2}, the scatter of the table's cells"
             ),
-            Self::None(Some(why)) => write!(formatter, "no interval: {why}"),
-            Self::None(None) => formatter.write_str("no interval: the run gives none"),
+            Self::None(Some(why)) => why.fmt(formatter),
+            Self::None(None) => formatter.write_str("no interval: the runs give none"),
         }
     }
 }
@@ -65,8 +66,8 @@ pub struct PooledShare {
 
 impl PooledShare {
     /// Pools `runs`. Of a single run it keeps the run's own interval; where nothing happened the counts are divided by
-    /// `of_none`, at least 1.
-    pub fn of(runs: &[RunShare], of_none: f64) -> Self {
+    /// `of_none`, at least 1, or have no interval where that is not known.
+    pub fn of(runs: &[RunShare], of_none: Option<f64>) -> Self {
         let shares: Vec<Share> = runs.iter().map(|run| run.share).collect();
         let of = shares.iter().map(|one| one.of).sum();
         let count: u64 = shares.iter().map(|one| one.count).sum();
@@ -77,10 +78,13 @@ impl PooledShare {
         let exact = |scatter| share.estimate(scatter).and_then(|one| one.interval);
         let without = |why| (None, Basis::None(why), 1.0);
         let (interval, basis, scatter) = match runs {
-            _ if count == 0 => {
-                let scatter = of_none.max(1.0);
-                (exact(scatter), Basis::LikeTheTable(scatter), scatter)
-            }
+            _ if count == 0 => match of_none {
+                Some(of_none) => {
+                    let scatter = of_none.max(1.0);
+                    (exact(scatter), Basis::LikeTheTable(scatter), scatter)
+                }
+                None => without(None),
+            },
             [only] => match only.interval {
                 Some(Spread::Known(interval)) => {
                     let scatter = Self::scatter_of(share, interval);
@@ -130,7 +134,9 @@ impl PooledShare {
             value,
             interval: Some(interval),
         };
-        estimate_against_published(published, ours, self.share.of, self.scatter)
+        // So many independent trials it is worth.
+        let effective = self.share.of as f64 / self.scatter;
+        estimate_against_published(published, ours, effective, self.scatter)
             .unwrap_or(Verdict::NotComparable)
     }
 }
@@ -200,18 +206,20 @@ impl<P> RecordedRow<P> {
     /// The one-way delay that a `quantile` (0..=1) of all messages did not exceed, milliseconds, within the width of a
     /// bin; `None` where delays are unavailable of a run.
     pub fn delay_ms(&self, quantile: f64) -> Option<f64> {
-        let mut bins: Vec<DelayBin> = Vec::new();
+        // Channels and runs have the same bins.
+        let mut counts: BTreeMap<(i64, i64), u64> = BTreeMap::new();
         for run in &self.runs {
-            bins.extend(run.crossing.delays.as_ref().ok()?);
+            for bin in run.crossing.delays.as_ref().ok()? {
+                *counts.entry((bin.until_ns, bin.above_ns)).or_default() += bin.count;
+            }
         }
-        bins.sort_by_key(|bin| bin.until_ns);
-        let rank = quantile * bins.iter().map(|bin| bin.count).sum::<u64>() as f64;
+        let rank = quantile * counts.values().sum::<u64>() as f64;
         let mut below = 0.0;
-        for bin in bins.iter().filter(|bin| bin.count > 0) {
-            let count = bin.count as f64;
+        for ((until_ns, above_ns), count) in counts.into_iter().filter(|(_, count)| *count > 0) {
+            let count = count as f64;
             if below + count >= rank {
-                let width_ns = bin.until_ns.saturating_sub(bin.above_ns) as f64;
-                let delay_ns = bin.above_ns as f64 + width_ns * (rank - below) / count;
+                let width_ns = until_ns.saturating_sub(above_ns) as f64;
+                let delay_ns = above_ns as f64 + width_ns * (rank - below) / count;
                 return Some(1e-6 * delay_ns);
             }
             below += count;
@@ -270,7 +278,6 @@ pub const ROWS_NOTE: &str = "HiL with a kind of link: recorded runs in real time
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::collections::BTreeMap;
 
     use hil_core::interval::IntervalMethod;
     use hil_core::recorded_run::{PublishedNetwork, RecordedCrossing, RecordedLink};
@@ -318,7 +325,7 @@ mod tests {
             share: share(20, 1000),
             interval: Some(Spread::Known(interval)),
         };
-        let one = PooledShare::of(&[alone], 1.0);
+        let one = PooledShare::of(&[alone], Some(1.0));
         assert_eq!(
             (one.interval, one.basis),
             (Some(interval), Basis::OwnSample)
@@ -331,7 +338,7 @@ mod tests {
             share: share(count, 1000),
             interval: None,
         });
-        let three = PooledShare::of(&runs, 1.0);
+        let three = PooledShare::of(&runs, Some(1.0));
         assert_eq!(three.share, share(30, 3000));
         assert!((three.scatter - 4.381).abs() < 0.002, "{}", three.scatter);
         assert_eq!(three.basis, Basis::AmongRuns(three.scatter));
@@ -347,7 +354,7 @@ mod tests {
         };
         let few = |interval| {
             let share = share(3, 1000);
-            PooledShare::of(&[RunShare { share, interval }], 1.0)
+            PooledShare::of(&[RunShare { share, interval }], Some(1.0))
         };
         let found = few(Some(Spread::Unknown(why)));
         assert_eq!(
@@ -356,7 +363,7 @@ mod tests {
         );
         assert_eq!(found.against(share(0, 1000)), Verdict::Inconclusive);
         assert_eq!(few(None).basis, Basis::None(None));
-        assert_eq!(PooledShare::of(&[], 1.0).interval, None);
+        assert_eq!(PooledShare::of(&[], Some(1.0)).interval, None);
     }
 
     #[test]
@@ -365,11 +372,16 @@ mod tests {
             share: share(0, 10_000),
             interval: None,
         };
-        let high = |of_none| PooledShare::of(&[none], of_none).interval.unwrap().high;
+        let high = |of_none| {
+            PooledShare::of(&[none], Some(of_none))
+                .interval
+                .unwrap()
+                .high
+        };
         // 1 - 0.025^(1 / 10 000), and of a quarter of them.
         assert!((high(0.5) - 3.688e-4).abs() < 1e-7);
         assert!((high(4.0) - 1.4745e-3).abs() < 1e-6);
-        let pooled = PooledShare::of(&[none], 1.0);
+        let pooled = PooledShare::of(&[none], Some(1.0));
         assert_eq!(pooled.against(share(0, 10_000)), Verdict::Agrees);
         assert_eq!(pooled.against(share(23, 10_000)), Verdict::Differs);
         assert_eq!(pooled.against(share(0, 30_000)), Verdict::Inconclusive);
@@ -424,7 +436,7 @@ mod tests {
         other.crossing.delays = Err("clocks are not aligned".to_owned());
         let both = row(vec![run("a", short, 1), other]);
         assert_eq!(both.delay_ms(0.5), None);
-        let happened = PooledShare::of(&[], 1.0);
+        let happened = PooledShare::of(&[], Some(1.0));
         let note = both.note(&happened);
         assert!(note.contains("b: delays are unavailable: clocks"), "{note}");
     }
@@ -436,7 +448,7 @@ mod tests {
             share: share(0, 10_000),
             interval: None,
         };
-        let happened = PooledShare::of(&[none], 1.0);
+        let happened = PooledShare::of(&[none], Some(1.0));
         let of = |run| RecordedRow::of_runs(vec![run], |_, _| true).remove(0);
         let verdict = |row: &RecordedRow<u8>| row.verdict(&happened, Some(share(0, 10_000)));
         assert_eq!(verdict(&of(run("a", short, 1))), Verdict::Agrees);

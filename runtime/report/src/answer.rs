@@ -289,6 +289,8 @@ pub struct Answer {
     pub measurement: Measurement,
     /// How large is the sample?
     pub sample: Sample,
+    /// Limits of the robot itself did harm.
+    pub has_own_harm: bool,
 }
 
 impl Answer {
@@ -305,6 +307,7 @@ impl Answer {
             hurt: hurt(summary, &assessment.network),
             subject: subject(summary, &assessment.network),
             object: Object::of(summary),
+            has_own_harm: summary.harms.iter().any(|one| one.own_count > 0),
             measurement: Measurement {
                 is_valid: is_valid(&assessment.network),
                 clocks: clocks(summary),
@@ -324,23 +327,37 @@ impl Answer {
         format!("Did {} hurt {}?", self.subject, self.object)
     }
 
-    /// The answer to it.
-    pub fn words(&self) -> String {
+    /// Why no more can be said, or in how many occasions nothing happened.
+    pub(crate) fn reason(&self) -> Option<String> {
         match (&self.hurt, &self.sample.occasions) {
             (Hurt::No, Some(OccasionCount { what, count })) => {
-                format!("{}: no harm in {} {what}", self.hurt, grouped(*count))
+                let of = if self.has_own_harm {
+                    "no harm but by limits of the robot"
+                } else {
+                    "no harm"
+                };
+                Some(format!("{of} in {} {what}", grouped(*count)))
             }
-            _ => self.hurt.words(self.object),
+            _ => self.hurt.reason(self.object),
         }
+    }
+
+    /// The answer to it.
+    pub fn words(&self) -> String {
+        joined(self.hurt.word(), self.reason())
     }
 
     /// What a NO leaves open, in words; `None` of another answer.
     pub(crate) fn left_open(&self) -> Option<String> {
-        // Of how long a harm lasts nothing is known, so it is counted as one event, of Poisson's law (Garwood 1936).
-        let most = -(0.5 - 0.5 * CONFIDENCE).ln();
+        // Of how many harms come together nothing is known, so an event of them is counted as one, of Poisson's law; the
+        // interval has one end (Garwood 1936).
+        let most = -(1.0 - CONFIDENCE).ln();
         let percent = 100.0 * CONFIDENCE;
         (self.hurt == Hurt::No).then(|| {
-            format!("up to {most:.1} harms in a run this long cannot be excluded ({percent:.0} %, Poisson)")
+            format!(
+                "up to {most:.1} independent events of harm in a run this long cannot be excluded ({percent:.0} %, \
+                 Poisson)"
+            )
         })
     }
 
@@ -432,27 +449,43 @@ impl Answer {
     }
 }
 
-impl Hurt {
-    /// The answer for an object of this kind.
-    pub(crate) fn words(&self, object: Object) -> String {
-        let because = Untested::NoScore;
-        if object == Object::Programs && *self == (Self::NotTested { because }) {
-            "NOT TESTED: no criterion of harm is set; a deadline in [flows.NAME] of the topology is one"
-                .to_owned()
-        } else {
-            self.to_string()
-        }
+/// A word, and why it is that.
+fn joined(word: &str, reason: Option<String>) -> String {
+    match reason {
+        Some(reason) => format!("{word}: {reason}"),
+        None => word.to_owned(),
     }
 }
 
-impl fmt::Display for Hurt {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Hurt {
+    /// The answer in a word or two.
+    pub(crate) const fn word(&self) -> &'static str {
         match self {
-            Self::Yes => formatter.write_str("YES"),
-            Self::No => formatter.write_str("NO"),
-            Self::NotResolvable { because } => write!(formatter, "NOT RESOLVABLE: {because}"),
-            Self::NotTested { because } => write!(formatter, "NOT TESTED: {because}"),
+            Self::Yes => "YES",
+            Self::No => "NO",
+            Self::NotResolvable { .. } => "NOT RESOLVABLE",
+            Self::NotTested { .. } => "NOT TESTED",
         }
+    }
+
+    /// Why no more can be said of an object of this kind.
+    fn reason(&self, object: Object) -> Option<String> {
+        match self {
+            Self::Yes | Self::No => None,
+            Self::NotResolvable { because } => Some(because.to_string()),
+            Self::NotTested {
+                because: Untested::NoScore,
+            } if object == Object::Programs => Some(
+                "no criterion of harm is set; a deadline in [flows.NAME] of the topology is one"
+                    .to_owned(),
+            ),
+            Self::NotTested { because } => Some(because.label().to_owned()),
+        }
+    }
+
+    /// The answer for an object of this kind.
+    pub(crate) fn words(&self, object: Object) -> String {
+        joined(self.word(), self.reason(object))
     }
 }
 

@@ -181,7 +181,7 @@ impl InletReport {
     pub const DROPPED_GIVEN: &str = "dropped by the interface of the receiver";
     /// Of those given to it, the ones that the kernel did not take: each has a fate of its own, whether or not the
     /// interface counts it.
-    pub const REFUSED: &str = "refused by the interface of the receiver";
+    pub const REFUSED: &str = "refused by the interface of the program";
 }
 
 hil_core::labelled! {

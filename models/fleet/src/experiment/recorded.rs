@@ -25,13 +25,12 @@ pub(crate) struct FleetRow {
 }
 
 impl FleetRow {
-    /// The rows of `recorded`, beside a table of `parameters` whose cells start from `base`.
+    /// The rows of `recorded`, beside a table whose cells start from `base`.
     ///
     /// # Errors
     /// Names the run that has no table, or counted no critical sections.
     pub(crate) fn of_runs(
         mut recorded: Vec<RecordedRun<FleetParameters>>,
-        parameters: &FleetParameters,
         base: &Setup,
     ) -> Result<Vec<Self>, StudyRefusal> {
         for run in &mut recorded {
@@ -43,7 +42,7 @@ impl FleetRow {
                 );
                 return Err(run.refused(problem));
             }
-            let different = different(&run.parameters, expected(&run.parameters, parameters, base));
+            let different = different(&run.parameters, expected(&run.parameters, base));
             if !different.is_empty() {
                 run.doubts.push(Doubt::OtherParameters(different));
             }
@@ -89,7 +88,7 @@ impl FleetRow {
 
     /// Collisions per critical section; without a collision as if they scattered by `of_none`.
     pub(crate) fn pooled(&self, of_none: f64) -> PooledShare {
-        PooledShare::of(&self.collided, of_none)
+        PooledShare::of(&self.collided, Some(of_none))
     }
 
     /// The paper's row for the same network.
@@ -100,18 +99,19 @@ impl FleetRow {
     }
 }
 
-/// What the parameters of a run must be for a row beside the paper's: world and missions of the table, robot and coordinator as
-/// in its rows over a radio. The table is that of the run's scenario; how many fleets share the channels is free.
-fn expected(run: &FleetParameters, table: &FleetParameters, base: &Setup) -> FleetParameters {
+/// What the parameters of a run must be for a row beside the paper's: the published world and missions, robot and coordinator as
+/// in the table's rows over a radio. The table is that of the run's scenario; how many fleets share the channels is free.
+fn expected(run: &FleetParameters, base: &Setup) -> FleetParameters {
     let setup = hil_setup(base);
+    let published = FleetParameters::default();
     FleetParameters {
         world: WorldParameters {
             scenario: run.world.scenario,
-            ..table.world.clone()
+            ..published.world
         },
         robot: setup.robot,
         coordinator: setup.coordinator,
-        missions: setup.missions,
+        missions: published.missions,
         fleets: run.fleets,
         tables: run.tables.clone(),
     }

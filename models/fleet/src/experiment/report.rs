@@ -116,7 +116,10 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
         }))
         .collect();
     StudyReport {
-        title: "Case study 1: collisions per critical section (CS), in virtual time".to_owned(),
+        title: study::title(
+            "Case study 1: collisions per critical section (CS)",
+            !study.recorded.is_empty(),
+        ),
         notes: notes(study, results),
         tables,
         summary: study::summary(&named, &criteria),

@@ -135,7 +135,7 @@ impl FleetStudy {
             seed,
             scenes,
             cells,
-            recorded: FleetRow::of_runs(recorded, parameters, &base)?,
+            recorded: FleetRow::of_runs(recorded, &base)?,
         })
     }
 

@@ -61,8 +61,8 @@ impl MotionLossRow {
                 interval: run.interval(MOTION_LOSS.name),
             });
         }
-        // As the row of the perfect channel, of which no lost loops are known either.
-        let lost = PooledShare::of(&lost, 1.0);
+        // How lost loops would come together, runs without any do not tell.
+        let lost = PooledShare::of(&lost, None);
         let published = row.first().network.map(published).filter(|_| is_fitted);
         Ok(Self {
             verdict: row.verdict(&lost, published),

@@ -33,7 +33,10 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
     let recorded = recorded.map(|one| (one.row.method(), one.verdict));
     let named: Vec<_> = verdicts.iter().cloned().chain(recorded).collect();
     StudyReport {
-        title: "Case study 2: motion loss rate (MLR) by condition, in virtual time".to_owned(),
+        title: study::title(
+            "Case study 2: motion loss rate (MLR) by condition",
+            !study.recorded.is_empty(),
+        ),
         notes: notes(study, rows),
         tables: vec![rates(rows, &study.recorded), counts(rows), setups(rows)],
         summary: study::summary(&named, &criteria),

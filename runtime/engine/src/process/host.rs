@@ -45,9 +45,9 @@ const LINE_BYTES_MAX: usize = 4096;
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// How long the others may go on once a host has failed, which it tells them.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Once one could not begin, which it tells nobody.
+/// Once one refused its arguments or its topology, as for a program that is missing, which it tells nobody.
 const UNBEGUN_PATIENCE: Duration = Duration::from_secs(2);
-/// Exit code of a supervisor that could not begin.
+/// Exit code of a supervisor that did so; others may also come from a run that had begun.
 const UNBEGUN: u8 = 2;
 /// A run that begins before is told that nothing leaves its interface.
 const WIRES_UP_WITHIN: Duration = Duration::from_secs(2);

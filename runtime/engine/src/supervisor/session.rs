@@ -114,13 +114,15 @@ pub fn run(
     };
     claims.tell(folder.root(), console);
     let run = folder.root().to_string_lossy();
-    let domains = Domains::create(&plan.hosts, base, &run)?;
-    console.say(&format!("run folder {}", folder.root().display()));
-    let gathered = gather(topology, key.as_ref(), &hosts, &domains, signals, console);
-    let gathered = gathered.inspect_err(|_| {
+    let discard = |_error: &RunError| {
         // It holds nothing of a run yet; the error that is told is the first one.
         let _left = fs::remove_dir_all(folder.root()).is_err();
-    })?;
+    };
+    let domains = Domains::create(&plan.hosts, base, &run).map_err(RunError::from);
+    let domains = domains.inspect_err(discard)?;
+    console.say(&format!("run folder {}", folder.root().display()));
+    let gathered = gather(topology, key.as_ref(), &hosts, &domains, signals, console);
+    let gathered = gathered.inspect_err(discard)?;
     let peers = gathered.peers;
     let here = clock_id()?;
     let process_group =
@@ -132,7 +134,7 @@ pub fn run(
         process_group.names(),
         clocks_known(topology, &hosts, &peers, here),
     );
-    let announcement = announcement.map_err(unwritable)?;
+    let announcement = announcement.map_err(unwritable).inspect_err(discard)?;
     // Before the gateways: they find out by sending what the cards deliver.
     let cards = NicWatch::start(topology, &hosts, &folder.records());
     let status_publisher = StatusPublisher::new(folder.root());

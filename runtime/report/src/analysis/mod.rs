@@ -40,7 +40,7 @@ use outages::OutageHistory;
 use records::RunRecords;
 
 use crate::answer::HarmCount;
-use crate::summary::{ChannelFlows, CountByName, Fact, RunSummary, SummaryError};
+use crate::summary::{ChannelFlows, CountByName, Fact, Outcome, RunSummary, SummaryError};
 use crate::terminal;
 use crate::trace::capture;
 use crate::{event_log, own_programs};
@@ -416,7 +416,8 @@ fn add_warnings(summary: &mut RunSummary, records: &RunRecords<'_>) {
     }
     for NamedFlow { name, .. } in records.topology.named_flows() {
         let mut flows = summary.flows.iter().flat_map(|one| &one.flows);
-        if !flows.any(|flow| flow.name == name) {
+        let has_run = summary.run.outcome != Outcome::Failed;
+        if has_run && !flows.any(|flow| flow.name == name) {
             summary.warnings.push(format!(
                 "flows.{name}: no frame matches, or those that do belong to a flow that stands before it"
             ));

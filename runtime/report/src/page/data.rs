@@ -75,6 +75,8 @@ pub(crate) struct Tile {
 pub(crate) struct AnswerView {
     pub(crate) question: String,
     pub(crate) answer: Verdict,
+    /// Why no more can be said, or in how many occasions nothing happened.
+    pub(crate) reason: Option<String>,
     /// What hurt the robot, and what might have.
     pub(crate) harms: Vec<Field>,
     /// Whether the measurement is valid, what the network did, how large the sample is, and the emulated links.

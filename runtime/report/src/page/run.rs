@@ -192,9 +192,10 @@ fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
         question: answer.question(),
         answer: Verdict {
             tone: answer.tone(),
-            word: plain(answer.words()),
+            word: answer.hurt.word().to_owned(),
             text: plain(answer.sentence()),
         },
+        reason: answer.reason().map(plain),
         harms: facts.harms.into_iter().map(field).collect(),
         badges: [facts.measurement]
             .into_iter()

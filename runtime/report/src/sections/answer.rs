@@ -65,7 +65,7 @@ impl AnswerFacts {
             let mut scores = scores.clone();
             scores.find(|one| one.name == *name && one.value.is_some())
         });
-        let headline: Vec<_> = headline.collect();
+        let headline: Vec<_> = headline.take(harms_shown).collect();
         let figures = headline.iter();
         rest.extend(figures.map(|one| Field::new(&one.label, metric_words(one))));
         let harms_of = summary.harms.iter().map(|one| one.interval);

@@ -198,7 +198,7 @@ pub(crate) fn first_harm(summary: &RunSummary) -> Option<String> {
     let evidence = Evidence::of(summary);
     let gravest = gravest_first(&summary.score_events.events).into_iter();
     let event = gravest.into_iter().find(|event| evidence.explains(event))?;
-    Some(format!("{}; cause: {}", event.what, cause(event)))
+    Some(format!("{}; network: {}", event.what, cause(event)))
 }
 
 /// What happened on the network, the longest events.

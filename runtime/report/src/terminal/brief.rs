@@ -94,8 +94,7 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
     let canvas = || Canvas::new(width_columns, style);
     let commands = next_commands(summary, &answer);
     let has_warnings = !assessment.warnings.is_empty();
-    let mut extents = EXTENTS.into_iter();
-    let page = |extent: Extent, is_last: bool| {
+    let page = |extent: Extent, commands: &[NextCommand], is_last: bool| {
         let [mut begin, mut between, mut end] = [canvas(), canvas(), canvas()];
         title(&mut begin, summary);
         for one in [
@@ -114,7 +113,7 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
         ] {
             section(&mut begin, &one);
         }
-        let folded_rows = next(&mut end, &commands);
+        let folded_rows = next(&mut end, commands);
         answer::answer(&mut end, summary, &assessment, extent.answer);
         let [begin, end] = [begin, end].map(Canvas::finish);
         let rows = begin.lines().count() + end.lines().count() + folded_rows;
@@ -125,9 +124,12 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
         Some(begin + &between.finish() + &end)
     };
     let [.., least] = EXTENTS;
+    let mut extents = EXTENTS.into_iter();
+    let mut counts = (0..commands.len()).rev();
     extents
-        .find_map(|extent| page(extent, false))
-        .or_else(|| page(least, true))
+        .find_map(|extent| page(extent, &commands, false))
+        .or_else(|| counts.find_map(|count| page(least, &commands[..count], false)))
+        .or_else(|| page(least, &[], true))
         .unwrap_or_default()
 }
 

@@ -456,10 +456,16 @@ fn the_printed_report_is_a_page_and_ends_in_the_answer() {
         })
         .collect();
     many.warnings = (0..50).map(|index| format!("warning {index}")).collect();
-    for summary in [many, full(), awkward(), empty()] {
+    let mut deep = run(lost_loops(Some(2), 0, 40));
+    deep.run.folder = format!("/{}run", "a-long-folder-name/".repeat(80));
+    for summary in [many, deep, full(), awkward(), empty()] {
         for width in [80, 100, 120] {
             let page = brief(&summary, width, Style::Plain);
-            let count = page.lines().count();
+            // A terminal breaks what is longer.
+            let rows = page
+                .lines()
+                .map(|line| line.chars().count().max(1).div_ceil(width));
+            let count: usize = rows.sum();
             assert!(count <= 50, "{count} lines:\n{page}");
             // A command to copy is not broken.
             let is_command = |line: &&str| line.contains("hil-runtime ");
