@@ -5,7 +5,7 @@ use core::fmt;
 use std::collections::BTreeMap;
 
 use hil_core::interval::{Interval, Spread, TooSmall};
-use hil_core::recorded_run::{DelayBin, Doubt, LinkOrigin, RecordedRun};
+use hil_core::recorded_run::{Doubt, LinkOrigin, RecordedRun};
 use hil_core::study::Verdict;
 
 use crate::comparison::{Estimate, Scatter, Share, estimate_against_published};
@@ -127,6 +127,14 @@ impl PooledShare {
 
     /// How it stands to the `published` share, which is taken to scatter as this one does.
     fn against(&self, published: Share) -> Verdict {
+        // Nothing happened in either: no interval is needed to see that they do not differ.
+        if self.share.count == 0 && published.count == 0 {
+            return if 2 * self.share.of >= published.of {
+                Verdict::Agrees
+            } else {
+                Verdict::Inconclusive
+            };
+        }
         let Some((value, interval)) = self.ratio().zip(self.interval) else {
             return Verdict::Inconclusive;
         };
@@ -280,7 +288,7 @@ mod tests {
     use super::*;
 
     use hil_core::interval::IntervalMethod;
-    use hil_core::recorded_run::{PublishedNetwork, RecordedCrossing, RecordedLink};
+    use hil_core::recorded_run::{DelayBin, PublishedNetwork, RecordedCrossing, RecordedLink};
 
     const fn share(count: u64, of: u64) -> Share {
         Share { count, of }

@@ -358,9 +358,9 @@ mod tests {
         // They are no repetitions of each other, so that each is a row.
         assert_eq!(verdict(9), Cell::Verdict(Verdict::NotComparable));
         assert_eq!(verdict(10), Cell::Verdict(Verdict::Agrees));
-        let expected = "runs/safe; UDP; none seen: interval of counts divided by 1.00, as in virtual time; \
-                        not comparable: world.robots is 14, the table has 7; coordinator.mode is safe, the \
-                        table has legacy";
+        let expected = "runs/safe; UDP; none seen: interval of counts divided by 1.00, the scatter of the table's \
+                        cells; not comparable: world.robots is 14, the table has 7; coordinator.mode is safe, \
+                        the table has legacy";
         let is_there = |note: &String| note.contains(expected);
         assert!(harbor.notes.iter().any(is_there), "{:?}", harbor.notes);
     }
