@@ -289,7 +289,8 @@ pub struct Answer {
     pub measurement: Measurement,
     /// How large is the sample?
     pub sample: Sample,
-    /// Limits of the robot itself did harm.
+    /// Limits of the robot itself did harm, as its harms tell.
+    #[serde(skip)]
     pub has_own_harm: bool,
 }
 

@@ -94,7 +94,10 @@ fn a_worse_link_is_found_and_scripts_get_their_exit_code() {
         assert!(found(&json, channel, "max")["ratio_interval"].is_null());
     }
     let differences = json["differences"].to_string();
-    assert!(differences.contains("topology"), "{differences}");
+    assert!(
+        differences.contains("links.hop.forward.delay"),
+        "{differences}"
+    );
     check_conditions(near, again, far);
     check_repetitions([near, again], [far, farther]);
     let (code, text, _) = compare(&["--format", "md"], &[near, again]);
