@@ -159,11 +159,9 @@ fn every_message_of_mosquitto_arrives_and_what_its_kernel_sent_again_is_seen_at_
             "mosquitto, {loss:?}: {MESSAGE_COUNT} received in order, {kernel_count} sent again by the clients' kernel; \
              account: {again_count} and by the broker {again_of_broker_count}, {lost_count} lost"
         );
-        // Segments without data are none of ours: the first and the last of a connection.
-        assert!(
-            (again_count..=again_count + 5).contains(&kernel_count),
-            "{of_clients:#?}"
-        );
+        // Segments without data are none of ours: the first and the last of a connection. One that the kernel sent again as
+        // part of a longer one is ours alone.
+        assert!(kernel_count.abs_diff(again_count) <= 5, "{of_clients:#?}");
         assert_eq!(of_clients.len(), 2);
         if loss != Loss::Nothing {
             assert!(again_count > 0 && again_of_broker_count > 0);
@@ -221,7 +219,8 @@ fn ddsperf_finds_itself_by_multicast_and_loses_what_the_account_says_at_full_len
             assert!(received + 600 >= samples.frame_count, "{said}");
         } else {
             assert!(received <= samples.taken_count, "{said}");
-            assert!(lost <= lost_count && lost_count <= lost + 60, "{said}");
+            // A frame may carry two samples; what went before it found the other, or in the last second, it misses.
+            assert!(lost <= lost_count + 5 && lost_count <= lost + 60, "{said}");
         }
     }
 }
