@@ -124,7 +124,7 @@ pub fn run(
     let gathered = gather(topology, key.as_ref(), &hosts, &domains, signals, console);
     let gathered = gathered.inspect_err(discard)?;
     let peers = gathered.peers;
-    let here = clock_id()?;
+    let here = clock_id().map_err(RunError::from).inspect_err(discard)?;
     let process_group =
         ProcessGroup::new(plan.processes, domains.addresses(), &folder, gathered.seal);
     let announcement = Announcement::make(

@@ -103,7 +103,7 @@ fn near_misses(summary: &RunSummary) -> Option<String> {
     ))
 }
 
-/// What became of the messages that crossed a network or a model of one.
+/// Largest loss and longest gap of the messages that crossed a network or a model of one.
 fn messages(summary: &RunSummary) -> Option<String> {
     let crossing = summary.channels.iter().filter(|one| one.link.is_crossing());
     let accounts: Vec<_> = crossing

@@ -490,7 +490,10 @@ mod tests {
         let [Doubt::NotValid { measurement }] = overran.as_slice() else {
             panic!("{overran:?}");
         };
-        assert!(measurement.contains("by controller"), "{measurement}");
+        assert!(
+            measurement.contains("500 of") && measurement.contains("by controller;"),
+            "{measurement}"
+        );
         let restarted = found(|one| one.processes[2].restart_count = 1);
         assert!(matches!(restarted.as_slice(), [Doubt::NotValid { .. }]));
         let stopped = found(|one| one.run.outcome = Outcome::Stopped);
