@@ -215,33 +215,20 @@ impl<P> RecordedRun<P> {
         self,
         read: impl FnOnce(P) -> Result<Q, E>,
     ) -> Result<RecordedRun<Q>, StudyRefusal> {
-        let Self {
-            folder,
-            name,
-            network,
-            link,
-            seed,
+        let parameters = read(self.parameters).map_err(|error| StudyRefusal::Run {
+            folder: self.folder.clone(),
+            problem: format!("its case.parameters cannot be read: {error}"),
+        })?;
+        Ok(RecordedRun {
+            folder: self.folder,
+            name: self.name,
+            network: self.network,
+            link: self.link,
+            seed: self.seed,
             parameters,
-            crossing,
-            score,
-            doubts,
-        } = self;
-        match read(parameters) {
-            Ok(parameters) => Ok(RecordedRun {
-                folder,
-                name,
-                network,
-                link,
-                seed,
-                parameters,
-                crossing,
-                score,
-                doubts,
-            }),
-            Err(error) => {
-                let problem = format!("its case.parameters cannot be read: {error}");
-                Err(StudyRefusal::Run { folder, problem })
-            }
-        }
+            crossing: self.crossing,
+            score: self.score,
+            doubts: self.doubts,
+        })
     }
 }
