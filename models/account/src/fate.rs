@@ -114,7 +114,7 @@ impl<'a> Evidence<'a> {
             };
         }
         if let Some(egress) = message.egress {
-            return Some(if is_refused(&egress) {
+            return Some(if egress.is_refused() {
                 fate_of_refusal(&egress)
             } else if !self.at_hand.ingress {
                 MessageFate::UnknownPeerRecordsUnavailable
@@ -145,7 +145,7 @@ impl<'a> Evidence<'a> {
         if ingress.flags & IngressRecord::INCOMPLETE != 0 {
             // Only pieces came: because the sender stopped in the middle of it, because the run ended,
             // or because the others got lost.
-            if let Some(egress) = message.egress.filter(is_refused) {
+            if let Some(egress) = message.egress.filter(EgressRecord::is_refused) {
                 fate_of_refusal(&egress)
             } else if self.is_near(place.producer_ns, self.producer_end_ns) {
                 MessageFate::InFlight
@@ -338,11 +338,6 @@ impl Judge {
             (None, None) => Position::Unknown,
         }
     }
-}
-
-/// True when the sending gateway noted that it could not send the whole message.
-const fn is_refused(egress: &EgressRecord) -> bool {
-    egress.flags & EgressRecord::REFUSED_BY_KERNEL != 0
 }
 
 const fn fate_of_refusal(egress: &EgressRecord) -> MessageFate {

@@ -1,6 +1,6 @@
 //! The one account of a channel: records go in one by one, and every message comes out once, with what
-//! became of it. It is fed by record files as they grow, by the files of a finished run, or by a
-//! simulation, in any pieces; the fates depend on the records alone, not on the pieces.
+//! became of it. It is fed by record files as they grow or by the files of a finished run, in any pieces; the fates depend
+//! on the records alone, not on the pieces.
 //!
 //! All records of a message carry its publication stamp, so the caller says up to which publication
 //! every record is in. A message whose fate still hangs on what comes later is held back, and with it
@@ -150,7 +150,7 @@ struct Epoch {
     /// The number after that of the last settled message; `None` while the first one is unknown.
     next: Option<u64>,
     /// The messages that have not settled, by their numbers.
-    pending: VecDeque<(u64, Pending)>,
+    pending: VecDeque<(u64, MessageHistory)>,
     /// What the sending gateway had before it.
     input: Buffer,
     /// What the consumer had before it.
@@ -182,53 +182,38 @@ impl Buffer {
     }
 }
 
-/// A message that has not settled.
-#[derive(Debug)]
-struct Pending {
-    message: MessageHistory,
-    /// What other starts of the sending gateway noted of it: they may send it again.
-    resent: Vec<EgressRecord>,
-}
-
-impl Pending {
+impl MessageHistory {
     fn add(&mut self, event: &RecordEvent) {
-        let message = &mut self.message;
         match event {
             RecordEvent::Published(record) => {
-                message.published.get_or_insert(*record);
+                self.published.get_or_insert(*record);
             }
-            RecordEvent::Egress(record) => match &message.egress {
-                None => message.egress = Some(*record),
-                Some(first) if first.session != record.session => self.resent.push(*record),
-                Some(_) => {}
-            },
+            RecordEvent::Egress(record) => {
+                self.egress.get_or_insert(*record);
+            }
             RecordEvent::Ingress(record) => {
-                message.copies.note(record);
-                // The copy that was forwarded is the message, the others are its duplicates.
-                let is_better = message.ingress.is_none_or(|best| {
-                    best.forwarded_ns == UNAVAILABLE && record.forwarded_ns != UNAVAILABLE
-                });
-                if is_better {
-                    message.ingress = Some(*record);
+                self.copies.note(record);
+                let is_incomplete =
+                    |record: &IngressRecord| record.flags & IngressRecord::INCOMPLETE != 0;
+                match &mut self.ingress {
+                    None => self.ingress = Some(*record),
+                    // The copy that was forwarded is the message, the others are its duplicates.
+                    Some(best) if best.forwarded_ns == UNAVAILABLE => {
+                        if record.forwarded_ns != UNAVAILABLE {
+                            *best = *record;
+                        } else if is_incomplete(best) && is_incomplete(record) {
+                            // Pieces that came once the others had been given up.
+                            best.fragment_count =
+                                best.fragment_count.saturating_add(record.fragment_count);
+                        }
+                    }
+                    Some(_) => {}
                 }
             }
             RecordEvent::Taken(record) => {
-                message.taken.get_or_insert(*record);
+                self.taken.get_or_insert(*record);
             }
         }
-    }
-
-    /// The message, with the sending that arrived, else the first.
-    fn message(&self) -> MessageHistory {
-        let mut message = self.message;
-        if let Some((ingress, egress)) = message.ingress.zip(message.egress)
-            && egress.session != ingress.session
-        {
-            let mut others = self.resent.iter();
-            let arrived = others.find(|record| record.session == ingress.session);
-            message.egress = Some(*arrived.unwrap_or(&egress));
-        }
-        message
     }
 }
 
@@ -435,7 +420,7 @@ impl ChannelFold {
             sequence: next.min(sequence),
         };
         let mut message = match epoch.pending.front() {
-            Some((_, pending)) if next >= sequence => pending.message(),
+            Some((_, pending)) if next >= sequence => *pending,
             _ => MessageHistory {
                 count: sequence.saturating_sub(next),
                 ..MessageHistory::unrecorded(epoch.number)
@@ -443,7 +428,7 @@ impl ChannelFold {
         };
         message.key = key;
         // Numbers that no record mentions are not later than the record behind them.
-        let first = epoch.pending.front().map(|(_, pending)| &pending.message);
+        let first = epoch.pending.front().map(|(_, pending)| pending);
         let is_on_record = self.settings.first_number == FirstNumber::OnRecord;
         if is_on_record && first.is_some_and(|first| evidence.is_before_run(first)) {
             self.advance(index, next, sequence);
@@ -537,7 +522,7 @@ impl ChannelFold {
 
 impl Epoch {
     /// What is known of a message that has not settled.
-    fn pending(&mut self, sequence: u64) -> &mut Pending {
+    fn pending(&mut self, sequence: u64) -> &mut MessageHistory {
         // Records mostly come in order.
         let place = match self.pending.back() {
             Some((last, _)) if *last < sequence => self.pending.len(),
@@ -548,10 +533,7 @@ impl Epoch {
             .get(place)
             .is_none_or(|(one, _)| *one != sequence)
         {
-            let pending = Pending {
-                message: MessageHistory::unrecorded(self.number),
-                resent: Vec::new(),
-            };
+            let pending = MessageHistory::unrecorded(self.number);
             self.pending.insert(place, (sequence, pending));
         }
         &mut self.pending[place].1
@@ -562,8 +544,8 @@ impl Epoch {
         let Some(until_ns) = until_ns else {
             return self.pending.len();
         };
-        let is_due = |(_, one): &(u64, Pending)| {
-            let published_ns = one.message.published_ns();
+        let is_due = |(_, one): &(u64, MessageHistory)| {
+            let published_ns = one.published_ns();
             published_ns.is_none_or(|at_ns| at_ns <= until_ns)
         };
         self.pending.partition_point(is_due)
@@ -579,7 +561,7 @@ impl Epoch {
         let mut stamps = self
             .pending
             .iter()
-            .filter_map(|(_, one)| one.message.published_ns());
+            .filter_map(|(_, one)| one.published_ns());
         stamps
             .next()
             .filter(|at_ns| *at_ns <= until_ns)

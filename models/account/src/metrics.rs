@@ -13,8 +13,8 @@ use hil_stats::histogram::{Distribution, DurationBin};
 /// The latency account of one channel.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ChannelAccount {
-    /// Messages the producer published: every sequence number up to the highest seen, of each
-    /// of its starts.
+    /// Messages the producer published: every sequence number up to the highest seen of each of its starts, from the first
+    /// that counts ([`crate::FirstNumber`]).
     pub published_count: u64,
     /// Those without a record of the producer's; `None` when its records are not at hand.
     pub published_unrecorded_count: Option<u64>,

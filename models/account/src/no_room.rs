@@ -4,7 +4,7 @@
 
 use super::stage::MessageFate;
 use super::{AccountContext, ChannelRecords, MessageHistory, each_history};
-use hil_core::record::{EgressRecord, NoRoomRecord, RoundTripRecord, stamp};
+use hil_core::record::{NoRoomRecord, RoundTripRecord, stamp};
 
 /// A stretch between two messages of a flow that came, in which the host dropped some.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -169,8 +169,7 @@ impl Gap {
 
 /// Pieces of a message that left and did not come.
 fn missing_pieces(message: &MessageHistory) -> u64 {
-    let has_left = |one: &EgressRecord| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0;
-    let sent = message.egress.filter(has_left);
+    let sent = message.egress.filter(|one| !one.is_refused());
     let sent = sent.map_or(0, |record| record.fragment_count);
     let came = message.ingress.map_or(0, |record| record.fragment_count);
     u64::from(sent.saturating_sub(came))
@@ -181,6 +180,7 @@ mod tests {
     use super::*;
     use crate::synthetic::{Files, HANDED_NS, PERIOD_NS, at, same_clock};
     use crate::{ChannelAccount, account};
+    use hil_core::record::IngressRecord;
 
     /// Messages 10 to 14 of 100 are missing; the host dropped `dropped_count` between 9 and 15, and number 50 is
     /// missing without any drop.
@@ -250,6 +250,24 @@ mod tests {
     fn ends(all: &[NoRoom]) -> Vec<(i64, i64, u64)> {
         let of = |one: &NoRoom| (one.after_ns, one.before_ns, one.dropped_count);
         all.iter().map(of).collect()
+    }
+
+    #[test]
+    fn pieces_that_come_once_the_others_were_given_up_are_not_missing() {
+        let mut files = Files::default();
+        files.write(at(0, 0), MessageFate::Incomplete);
+        files.egress[0].fragment_count = 10;
+        files.ingress[0].fragment_count = 5;
+        let late = IngressRecord {
+            fragment_count: 4,
+            ..files.ingress[0]
+        };
+        files.ingress.push(late);
+        let mut missing = Vec::new();
+        each_history(&files.records(), &same_clock(1_000_000_000), |one| {
+            missing.push(missing_pieces(one));
+        });
+        assert_eq!(missing, [1]);
     }
 
     #[test]

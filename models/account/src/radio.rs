@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::network::Crossing;
 use crate::stage::MessageFate;
 use crate::{MessageHistory, RecordSource, RecordsAtHand};
-use hil_core::record::{EgressRecord, UNAVAILABLE, stamp};
+use hil_core::record::{EgressRecord, UNAVAILABLE};
 
 /// What became of the messages a gateway sent, by the radio's report of their last datagram. Every
 /// message handed to the kernel is in exactly one row, and there in exactly one class.
@@ -112,7 +112,7 @@ pub struct TransmitStampMetrics {
 /// Where the transmit stamps of `egress` were taken.
 pub fn transmit_stamps(egress: &dyn RecordSource<EgressRecord>) -> TransmitStampMetrics {
     let mut figures = TransmitStampMetrics::default();
-    for record in egress.each().filter(is_handed) {
+    for record in egress.each().filter(EgressRecord::was_handed) {
         figures.handed_count += 1;
         let is_before_queue = record.flags & EgressRecord::STAMPED_BEFORE_QUEUE != 0;
         let counter = match (record.tx_software_ns == UNAVAILABLE, is_before_queue) {
@@ -145,7 +145,7 @@ impl RadioFold {
 
     /// Adds a message; one that was not handed to the kernel does not count.
     pub fn add(&mut self, message: &MessageHistory) {
-        let Some(egress) = message.egress.filter(is_handed) else {
+        let Some(egress) = message.egress.filter(EgressRecord::was_handed) else {
             return;
         };
         let [acknowledged, unacknowledged, unreported] = &mut self.rows;
@@ -190,11 +190,6 @@ fn metrics(rows: [RadioRow; 3]) -> RadioMetrics {
         known_loss_ratio: share(unacknowledged.fates.map(|one| one.lost_count), lost_count),
         lost_ratio: share(lost_count, judged_count),
     }
-}
-
-/// True for a message that was handed to the kernel and not refused.
-fn is_handed(record: &EgressRecord) -> bool {
-    stamp(record.handed_ns).is_some() && record.flags & EgressRecord::REFUSED_BY_KERNEL == 0
 }
 
 #[cfg(test)]

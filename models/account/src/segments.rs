@@ -160,12 +160,13 @@ impl<'a> SegmentFold<'a> {
             return;
         }
         let timeline = Timeline::of(message, self.is_gateway);
-        let (mut sum_ns, mut is_ordered) = (0_i64, true);
+        let (mut sum_ns, mut is_ordered, mut is_whole) = (0_i64, true, true);
         for mark in timeline.marks.iter().flatten() {
             self.mark_counts[mark.stage.index()] += 1;
         }
         for (from, to) in timeline.pairs() {
             let Some((length_ns, bound_ns)) = self.difference(from, to) else {
+                is_whole = false;
                 continue;
             };
             let cell = from.stage.index() * Stage::COUNT + to.stage.index();
@@ -178,6 +179,11 @@ impl<'a> SegmentFold<'a> {
             is_ordered &= length_ns >= -ORDER_TOLERANCE_NS.saturating_add_unsigned(bound_ns);
         }
         self.count_hardware(message);
+        // Of a part of the way there is no sum to hold against the whole: a clock was stepped meanwhile.
+        if !is_whole && self.path.is_aligned() && message.taken.is_some() {
+            self.closing.unaligned_count += 1;
+            return;
+        }
         self.close(message, &timeline, sum_ns, is_ordered);
     }
 
@@ -267,9 +273,7 @@ impl<'a> SegmentFold<'a> {
     fn cover(&mut self, message: &MessageHistory) {
         let has = |ns: i64| stamp(ns).is_some();
         let coverage = &mut self.coverage;
-        let handed = message.egress.filter(|record| {
-            has(record.handed_ns) && record.flags & EgressRecord::REFUSED_BY_KERNEL == 0
-        });
+        let handed = message.egress.filter(EgressRecord::was_handed);
         if let Some(egress) = handed {
             for (coverage, ns) in [
                 (&mut coverage.tx_software, egress.tx_software_ns),
@@ -278,7 +282,7 @@ impl<'a> SegmentFold<'a> {
                 coverage.get_or_insert_default().count(has(ns));
             }
         } else if !self.at_hand.egress
-            && message.ingress.is_some()
+            && message.arrived().is_some()
             && let Some(coverage) = &mut coverage.tx_software
         {
             coverage.count(message.handed_to_tx_ns.is_some_and(has));

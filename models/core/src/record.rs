@@ -1,5 +1,5 @@
 //! The fixed-size records that processes write beside the measured path, one per message and
-//! stage; [`super`] joins them. All times in nanoseconds; [`UNAVAILABLE`] where there was none.
+//! stage; `hil_account::fold` joins them. All times in nanoseconds; [`UNAVAILABLE`] where there was none.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -85,6 +85,16 @@ impl EgressRecord {
     /// It did not leave because there was no way to the peer: an interface that is down, no route, or the last
     /// report of the network said so.
     pub const UNREACHABLE: u32 = 16;
+
+    /// Whether the kernel refused it, or there was nobody to send it to.
+    pub const fn is_refused(&self) -> bool {
+        self.flags & Self::REFUSED_BY_KERNEL != 0
+    }
+
+    /// Whether it was handed to the kernel, which did not refuse it.
+    pub const fn was_handed(&self) -> bool {
+        self.handed_ns != UNAVAILABLE && !self.is_refused()
+    }
 }
 
 /// A gateway received a message from the network.

@@ -575,15 +575,14 @@ fn no_room(
 }
 
 fn channel(name: &str, side: &GatewaySide, said: Said, probe: &Probe<'_>) -> ChannelComparison {
-    let has_left = |one: &&EgressRecord| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0;
-    let left = side.egress.iter().filter(has_left);
+    let left = side.egress.iter().filter(|one| !one.is_refused());
     let data_sent: u64 = left.map(|one| u64::from(one.fragment_count)).sum();
     let data_received: u64 = side
         .ingress
         .iter()
         .map(|one| u64::from(one.fragment_count))
         .sum();
-    let sent = side.egress.iter().filter(has_left);
+    let sent = side.egress.iter().filter(|one| !one.is_refused());
     let sent = sent.map(|one| NotedMessage {
         message: (one.epoch, one.sequence),
         handed_ns: one.handed_ns,

@@ -189,7 +189,7 @@ struct Departure(Option<Bounded>);
 impl StampFold {
     /// Counts what left; gives its stamp.
     fn departure(&mut self, record: &EgressRecord, places: &Places<'_>) -> Option<Departure> {
-        if record.flags & EgressRecord::REFUSED_BY_KERNEL != 0 {
+        if record.is_refused() {
             return None;
         }
         self.sent_count += 1;

@@ -80,8 +80,6 @@ pub struct Delivery {
 pub enum Disposition {
     /// Its message was delivered.
     Delivered(MessageInfo),
-    /// Its message is new but older than one delivered, and newest-wins is set: not delivered.
-    Superseded(MessageInfo),
     /// A copy of a message that was received: not delivered.
     Duplicate(MessageInfo),
     /// Its message is too old to judge: not delivered.
@@ -103,10 +101,9 @@ impl Disposition {
     /// The message of which the datagram was the only or the last piece.
     pub const fn message(&self) -> Option<&MessageInfo> {
         match self {
-            Self::Delivered(message)
-            | Self::Superseded(message)
-            | Self::Duplicate(message)
-            | Self::Late(message) => Some(message),
+            Self::Delivered(message) | Self::Duplicate(message) | Self::Late(message) => {
+                Some(message)
+            }
             Self::FragmentStored | Self::Greeted { .. } | Self::SyncRequested | Self::Farewell => {
                 None
             }
@@ -137,8 +134,6 @@ counts! {
     pub struct IngressChannelCounts {
         /// Messages delivered.
         delivered_count,
-        /// Messages that gave way to a newer one.
-        superseded_count,
         /// Copies.
         duplicate_count,
         /// Messages too old to judge.
@@ -159,7 +154,6 @@ impl IngressCounts {
     pub(super) fn count(&mut self, disposition: &Disposition) {
         let counter = match disposition {
             Disposition::Delivered(_)
-            | Disposition::Superseded(_)
             | Disposition::Duplicate(_)
             | Disposition::Late(_)
             | Disposition::FragmentStored => &mut self.message_datagram_count,
@@ -175,7 +169,6 @@ impl IngressChannelCounts {
     pub(super) fn count(&mut self, disposition: &Disposition) {
         let counter = match disposition {
             Disposition::Delivered(_) => &mut self.delivered_count,
-            Disposition::Superseded(_) => &mut self.superseded_count,
             Disposition::Duplicate(_) => &mut self.duplicate_count,
             Disposition::Late(_) => &mut self.late_count,
             Disposition::FragmentStored => &mut self.fragment_count,
@@ -188,18 +181,16 @@ impl IngressChannelCounts {
 }
 
 impl Delivery {
-    /// Hands the message over unless its order forbids it.
+    /// Hands the message over unless it was received before or is too old to judge.
     pub(super) fn dispose(
         &self,
         payload: Payload<'_>,
-        deliver_reordered: bool,
         destination: &mut dyn Destination,
     ) -> Disposition {
         let message = self.message;
         match self.order {
             Order::Duplicate => Disposition::Duplicate(message),
             Order::Late => Disposition::Late(message),
-            Order::Reordered if !deliver_reordered => Disposition::Superseded(message),
             Order::InOrder { .. } | Order::Reordered => {
                 destination.deliver(self, payload);
                 Disposition::Delivered(message)

@@ -68,20 +68,16 @@ pub struct IngressSettings {
     pub domain: [u8; 16],
     /// Names this host's monotonic clock; equal ids on both hosts mean one clock.
     pub clock_id: u64,
-    /// True to deliver a message that is new but older than one already delivered; false for
-    /// newest-wins.
-    pub deliver_reordered: bool,
 }
 
 impl IngressSettings {
-    /// Reordered messages are delivered.
+    /// Of one flow.
     pub fn new(flow: FlowIdentity, session: u32, domain: [u8; 16], clock_id: u64) -> Self {
         Self {
             flow,
             session,
             domain,
             clock_id,
-            deliver_reordered: true,
         }
     }
 }
@@ -491,7 +487,6 @@ impl IngressBridge {
             self.replies.acknowledge(request, HelloStatus::GreetAgain);
             return Err(Refusal::ImplausibleSequence);
         }
-        let deliver_reordered = self.settings.deliver_reordered;
         if header.fragment_count == 1 {
             own.is_jump_allowed = false;
             let message = MessageInfo::of(channel, header);
@@ -499,7 +494,7 @@ impl IngressBridge {
             let order = window.record(stream, header.sequence, header.handed_ns);
             let delivery = delivery_of(header, message, order);
             let payload = Payload::Datagram(payload);
-            return Ok(delivery.dispose(payload, deliver_reordered, destination));
+            return Ok(delivery.dispose(payload, destination));
         }
         match order {
             Order::Duplicate => return Err(Refusal::DuplicateFragment),
@@ -537,7 +532,7 @@ impl IngressBridge {
             length_bytes: assembled.length_bytes,
         };
         let delivery = delivery_of(header, assembled.message, order);
-        Ok(delivery.dispose(payload, deliver_reordered, destination))
+        Ok(delivery.dispose(payload, destination))
     }
 
     fn on_sync_request(&mut self, request: Request<'_>) -> Disposition {

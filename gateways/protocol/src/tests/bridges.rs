@@ -169,26 +169,6 @@ fn on_a_bad_network_every_message_sent_is_received_or_lost_and_none_delivered_tw
 }
 
 #[test]
-fn newest_wins_never_delivers_a_message_older_than_one_delivered() {
-    let mut lab = Lab::new(5, 64, DELAY);
-    lab.ingress = IngressBridge::new(IngressSettings {
-        deliver_reordered: false,
-        ..ingress_settings(200, 64)
-    })
-    .unwrap();
-    lab.medium.there.impairment.jitter_ns = 5_000_000;
-    lab.publish_for_ms(1000);
-    assert!(
-        lab.delivered
-            .is_sorted_by_key(|delivered| delivered.message.sequence)
-    );
-    let counts = lab.ingress.channel_counts(0);
-    assert!(counts.superseded_count > 0);
-    let received = lab.ingress.sequence_counts(0).received_count;
-    assert_eq!(counts.delivered_count + counts.superseded_count, received);
-}
-
-#[test]
 fn a_transmission_that_fails_is_counted_and_its_message_given_up() {
     let mut lab = Lab::new(1, 5000, DELAY);
     lab.run_ms(2);

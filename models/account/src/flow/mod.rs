@@ -260,11 +260,12 @@ pub struct FlowMetrics {
     pub lost_by_harness_count: u64,
     /// Frames whose fate is unknown, those under way at the end included.
     pub unknown_count: u64,
-    /// Frames that came after a later one of the flow (RFC 4737, section 3.3).
-    pub reordered_count: u64,
+    /// Frames that came after a later one of the flow (RFC 4737, section 3.3); `None` where it is not known when frames
+    /// came.
+    pub reordered_count: Option<u64>,
     /// Largest extent of these: the places that a buffer needs to restore the order (section 4.2).
     #[serde(default)]
-    pub reordered_extent_max: u64,
+    pub reordered_extent_max: Option<u64>,
     /// Of TCP over IPv4: frames with bytes of the stream that one before had brought, so that the program's kernel
     /// sent them again.
     #[serde(default)]
@@ -278,13 +279,16 @@ pub struct FlowMetrics {
 pub struct FlowFold<'a> {
     named: &'a [NamedFlow],
     indices: BTreeMap<FlowKey, u32>,
+    /// The frames of a named flow whose keys are beyond the bound, by the place of its name.
+    beyond: BTreeMap<usize, u32>,
     keyed: Vec<Keyed>,
     /// The numbers of the frames in order, each with the place of its key, by the start of its inlet.
     frames: BTreeMap<u32, Vec<(u64, u32)>>,
     flows: Vec<Flow>,
 }
 
-/// The frames of flows with a deadline and of those that go back.
+/// The frames of flows with a deadline and of those that go back; without any, [`FlowKey::Unrecorded`] where frames are that
+/// may be of any of these.
 pub type FlowPassages = BTreeMap<FlowKey, Vec<FramePassage>>;
 
 /// Frames of one key.
@@ -375,26 +379,29 @@ impl<'a> FlowFold<'a> {
         if let Some(index) = self.indices.get(&key) {
             return *index;
         }
-        let named = self.named.iter().find(|one| one.filter.takes(&key));
+        let named = self.named.iter().position(|one| one.filter.takes(&key));
         let is_beyond = self.indices.len() >= FLOWS_MAX;
-        if let Some(one) = named.filter(|_| is_beyond)
-            && let Some(index) = self
-                .keyed
-                .iter()
-                .position(|keyed| self.flows[keyed.flow].name == one.name)
-        {
-            return u32::try_from(index).unwrap_or(UNKNOWN);
-        }
-        let key = if is_beyond && named.is_none() {
-            FlowKey::Rest
-        } else {
-            key
-        };
+        let is_timed = self.is_timed(key);
+        // An answer is told by its ends, however many there are; otherwise those beyond the bound are not told apart.
         let next = u32::try_from(self.keyed.len()).unwrap_or(UNKNOWN);
-        let index = *self.indices.entry(key).or_insert(next);
+        let (kept, index) = match named.filter(|_| !is_timed) {
+            _ if !is_beyond || is_timed => (key, self.indices.entry(key).or_insert(next)),
+            Some(named) => (FlowKey::Rest, self.beyond.entry(named).or_insert(next)),
+            None => (
+                FlowKey::Rest,
+                self.indices.entry(FlowKey::Rest).or_insert(next),
+            ),
+        };
+        let index = *index;
         if index == next {
-            let name = named.map_or_else(|| key.to_string(), |one| one.name.clone());
-            let known = named.and(self.flows.iter().position(|flow| flow.name == name));
+            let name = match named {
+                Some(named) => self.named[named].name.clone(),
+                None if is_beyond => FlowKey::Rest.to_string(),
+                None => key.to_string(),
+            };
+            let is_shared = named.is_some() || is_beyond;
+            let mut flows = self.flows.iter();
+            let known = flows.position(|flow| is_shared && flow.name == name);
             let flow = known.unwrap_or_else(|| {
                 self.flows.push(Flow {
                     name,
@@ -403,9 +410,9 @@ impl<'a> FlowFold<'a> {
                 self.flows.len() - 1
             });
             self.keyed.push(Keyed {
-                key,
+                key: kept,
                 flow,
-                passages: self.is_timed(key).then(Vec::new),
+                passages: (is_timed || key == FlowKey::Unrecorded).then(Vec::new),
                 next_byte: None,
             });
         }
@@ -443,7 +450,9 @@ impl<'a> FlowFold<'a> {
             fate => place_of(fate),
         };
         let keyed = &mut self.keyed[index as usize];
-        if let (Some(passages), Some(sent_ns)) = (&mut keyed.passages, message.published_ns()) {
+        if keyed.key != FlowKey::Unrecorded
+            && let (Some(passages), Some(sent_ns)) = (&mut keyed.passages, message.published_ns())
+        {
             let given_ns = message.taken.and_then(|record| stamp(record.taken_ns));
             let end = match (place, given_ns) {
                 (TAKEN, Some(given_ns)) => FrameEnd::Given {
@@ -457,7 +466,7 @@ impl<'a> FlowFold<'a> {
             passages.push(FramePassage { sent_ns, end });
         }
         let flow = &mut self.flows[keyed.flow];
-        flow.counts[place] += message.count;
+        flow.counts[place] = flow.counts[place].saturating_add(message.count);
         flow.arrivals_ns
             .extend(message.arrived().map(|record| record.received_ns));
         let delay = message.delay_ns(path);
@@ -476,18 +485,20 @@ impl<'a> FlowFold<'a> {
             };
             let mut arrivals: Vec<(i64, u64)> = flow.arrivals_ns.into_iter().zip(0..).collect();
             arrivals.sort_unstable();
+            let has_arrivals = !arrivals.is_empty();
             let (reordered, _) = reordered(arrivals.into_iter().map(|(_, number)| number));
+            let extent_max = reordered.iter().map(|one| one.extent).max().unwrap_or(0);
             FlowMetrics {
                 name: flow.name,
-                frame_count: flow.counts.iter().sum(),
+                frame_count: flow.counts.iter().copied().fold(0, u64::saturating_add),
                 byte_count: flow.byte_count,
                 taken_count: taken,
                 lost_by_network_count: by_network,
                 lost_by_either_count: by_either,
                 lost_by_harness_count: by_harness,
                 unknown_count: unknown,
-                reordered_count: reordered.len() as u64,
-                reordered_extent_max: reordered.iter().map(|one| one.extent).max().unwrap_or(0),
+                reordered_count: has_arrivals.then_some(reordered.len() as u64),
+                reordered_extent_max: has_arrivals.then_some(extent_max),
                 retransmitted_count: flow.retransmitted_count,
                 delay: Distribution::of_samples(&flow.delays_ns, reason),
             }
@@ -685,8 +696,8 @@ mod tests {
             let flow = flows.iter().find(|flow| flow.name == name).unwrap();
             (flow.reordered_count, flow.reordered_extent_max)
         };
-        assert_eq!(counts("arp"), (0, 0));
-        assert_eq!(counts("icmp 10.77.0.1 → 10.77.0.2"), (2, 2));
+        assert_eq!(counts("arp"), (Some(0), Some(0)));
+        assert_eq!(counts("icmp 10.77.0.1 → 10.77.0.2"), (Some(2), Some(2)));
     }
 
     #[test]
@@ -775,6 +786,68 @@ mod tests {
             count += 1;
         });
         assert_eq!(count, 3);
+    }
+
+    /// A UDP frame between two ports.
+    fn datagram(from: u16, to: u16) -> Vec<u8> {
+        let ports = [&from.to_be_bytes()[..], &to.to_be_bytes(), &[0; 4]].concat();
+        frame(&[8, 0], &packet(17, 0, &ports))
+    }
+
+    /// The same for a TCP segment of 100 bytes from `number` on.
+    fn segment(from: u16, to: u16, number: u32) -> Vec<u8> {
+        let mut header = [&from.to_be_bytes()[..], &to.to_be_bytes()].concat();
+        header.extend(number.to_be_bytes());
+        header.extend([0, 0, 0, 0, 0x50, 0x10, 0, 0, 0, 0, 0, 0]);
+        let mut packet = packet(6, 0, &header);
+        packet[2..4].copy_from_slice(&140_u16.to_be_bytes());
+        frame(&[8, 0], &packet)
+    }
+
+    #[test]
+    fn beyond_the_bound_answers_are_still_told_apart_and_streams_are_not_mixed() {
+        let filter = |text: &str| text.parse().unwrap();
+        let named = [
+            NamedFlow {
+                name: "requests".to_owned(),
+                filter: filter("udp dst port 6510"),
+                deadline_ns: Some(1_000_000),
+            },
+            NamedFlow {
+                name: "pages".to_owned(),
+                filter: filter("tcp dst port 80"),
+                deadline_ns: None,
+            },
+        ];
+        let mut fold = FlowFold::new(&named);
+        let others = (20_000..).take(FLOWS_MAX).map(|port| datagram(port, 9));
+        let timed = [datagram(7, 6510), datagram(6510, 7), datagram(8, 6510)];
+        // Two streams take turns.
+        let streams = (0..10).flat_map(|index| {
+            [
+                segment(11, 80, 1_000 + 100 * index),
+                segment(12, 80, 900_000 - 200 * index),
+            ]
+        });
+        for (sequence, bytes) in (0..).zip(others.chain(timed).chain(streams)) {
+            fold.add_frame(&FrameRecord::new(sequence, 1, &bytes));
+        }
+        let pages = fold.flows.iter().find(|flow| flow.name == "pages").unwrap();
+        assert_eq!(pages.retransmitted_count, None);
+        let rest = FlowKey::Rest.to_string();
+        let beyond = fold.flows[FLOWS_MAX..].iter().map(|flow| &flow.name);
+        assert_eq!(beyond.collect::<Vec<_>>(), ["requests", &rest, "pages"]);
+        // Requests of two ends, and the answers to the first.
+        let (_, passages) = fold.finish();
+        let keys: Vec<_> = passages.keys().map(ToString::to_string).collect();
+        assert_eq!(
+            keys,
+            [
+                "udp 10.77.0.1:7 → 10.77.0.2:6510",
+                "udp 10.77.0.1:8 → 10.77.0.2:6510",
+                "udp 10.77.0.1:6510 → 10.77.0.2:7",
+            ]
+        );
     }
 
     #[test]

@@ -60,13 +60,14 @@ pub struct NetworkBins {
     pub width_ns: i64,
     /// From the start of the run on, without a hole.
     pub bins: Vec<NetworkBin>,
-    /// Messages that are in no bin because the time they were handed over has no place.
+    /// Messages that are in no bin because the time they were handed over has no place. Those that were handed over before
+    /// or after the run, or never, are in none either.
     pub unplaced_count: u64,
 }
 
 impl NetworkBins {
     /// Of a run of `duration_ns`. Messages are put where they were handed to the network, silences
-    /// where the receiver had them. `width_ns` is above zero.
+    /// where the receiver had them.
     pub fn of(passages: &Passages, duration_ns: i64, width_ns: i64, place: &Place<'_>) -> Self {
         let width_ns = width_ns.max(1);
         let count = usize::try_from(duration_ns.max(1).saturating_add(width_ns - 1) / width_ns)

@@ -12,7 +12,6 @@ use hil_stats::dependence::Quantiles;
 use hil_stats::histogram::{DurationBin, LatencyHistogram};
 use hil_stats::in_order::in_order;
 use hil_stats::samples::Samples;
-use hil_stats::special::place_of;
 
 /// A quantile of the delay with its 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -204,11 +203,6 @@ fn variation_bound_ns(
     drift_ns.map_or(twice_ns, |drift_ns| {
         twice_ns.min(drift_ns.saturating_add(moved_ns))
     })
-}
-
-/// The smallest of `ascending` that at least `share` of them do not exceed.
-pub(super) fn at_share(ascending: &[i64], share: f64) -> i64 {
-    ascending[place_of(share, ascending.len())]
 }
 
 pub(super) fn successive(

@@ -3,10 +3,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::delay::at_share;
 use super::{Metric, Passages, is_arrived};
 use hil_stats::in_order::in_order;
 use hil_stats::reordering::reordered;
+use hil_stats::special::place_of;
 
 /// Reordering of the messages that arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -34,19 +34,16 @@ impl OrderMetrics {
     pub fn of(numbers: impl Iterator<Item = u64>) -> Option<Self> {
         let (found, count) = reordered(numbers);
         let n_max = found.iter().map(|one| one.n).max();
-        let mut extents: Vec<i64> = found
-            .into_iter()
-            .map(|one| i64::try_from(one.extent).unwrap_or(i64::MAX))
-            .collect();
+        let mut extents: Vec<u64> = found.into_iter().map(|one| one.extent).collect();
         extents.sort_unstable();
         let largest = extents.last().copied();
-        let median = largest.map(|_| at_share(&extents, 0.5));
+        let median = largest.map(|_| extents[place_of(0.5, extents.len())]);
         (count > 0).then(|| Self {
             count,
             reordered_count: extents.len() as u64,
             ratio: extents.len() as f64 / count as f64,
-            extent_p50: median.map(i64::unsigned_abs),
-            extent_max: largest.map(i64::unsigned_abs),
+            extent_p50: median,
+            extent_max: largest,
             n_max,
         })
     }

@@ -127,25 +127,44 @@ struct Arrival {
 
 impl Arrival {
     fn record(&self, message: &MessageInfo, forwarded_ns: i64, flags: u32) -> IngressRecord {
-        let emulated = self.received.emulated;
+        let Received {
+            stamps, emulated, ..
+        } = self.received;
         IngressRecord {
-            sequence: message.sequence,
-            published_ns: message.published.as_ns(),
-            handed_ns: message.handed.as_ns(),
-            rx_hardware_ns: self.received.stamps.hardware_ns.unwrap_or(UNAVAILABLE),
-            rx_software_ns: self.received.stamps.software_ns.unwrap_or(UNAVAILABLE),
-            received_ns: self.at.as_ns(),
+            rx_hardware_ns: stamps.hardware_ns.unwrap_or(UNAVAILABLE),
+            rx_software_ns: stamps.software_ns.unwrap_or(UNAVAILABLE),
             forwarded_ns,
-            realtime_offset_ns: self.offset_ns,
             emulated_ns: emulated.map_or(UNAVAILABLE, |delay| delay.arrived.as_ns()),
             due_ns: emulated.map_or(UNAVAILABLE, |delay| delay.due.as_ns()),
-            follow_up_sequence: 0,
-            follow_up_ns: UNAVAILABLE,
-            epoch: message.epoch,
-            session: message.session,
-            flags,
-            fragment_count: u32::from(message.fragment_count),
+            ..unstamped_record(message, self.at, self.offset_ns, flags)
         }
+    }
+}
+
+/// The record of a message that was received `at` that time, of which no more is known.
+fn unstamped_record(
+    message: &MessageInfo,
+    at: Instant,
+    offset_ns: i64,
+    flags: u32,
+) -> IngressRecord {
+    IngressRecord {
+        sequence: message.sequence,
+        published_ns: message.published.as_ns(),
+        handed_ns: message.handed.as_ns(),
+        rx_hardware_ns: UNAVAILABLE,
+        rx_software_ns: UNAVAILABLE,
+        received_ns: at.as_ns(),
+        forwarded_ns: UNAVAILABLE,
+        realtime_offset_ns: offset_ns,
+        emulated_ns: UNAVAILABLE,
+        due_ns: UNAVAILABLE,
+        follow_up_sequence: 0,
+        follow_up_ns: UNAVAILABLE,
+        epoch: message.epoch,
+        session: message.session,
+        flags,
+        fragment_count: u32::from(message.fragment_count),
     }
 }
 
@@ -164,24 +183,8 @@ impl Ingress {
     /// Records the messages of which some pieces did not come.
     fn note_incomplete(&mut self) {
         while let Some(Incomplete { message, heard_at }) = self.bridge.next_incomplete() {
-            let record = IngressRecord {
-                sequence: message.sequence,
-                published_ns: message.published.as_ns(),
-                handed_ns: message.handed.as_ns(),
-                rx_hardware_ns: UNAVAILABLE,
-                rx_software_ns: UNAVAILABLE,
-                received_ns: heard_at.as_ns(),
-                forwarded_ns: UNAVAILABLE,
-                realtime_offset_ns: self.clock.offset_ns(),
-                emulated_ns: UNAVAILABLE,
-                due_ns: UNAVAILABLE,
-                follow_up_sequence: 0,
-                follow_up_ns: UNAVAILABLE,
-                epoch: message.epoch,
-                session: message.session,
-                flags: IngressRecord::INCOMPLETE,
-                fragment_count: u32::from(message.fragment_count),
-            };
+            let (offset_ns, flags) = (self.clock.offset_ns(), IngressRecord::INCOMPLETE);
+            let record = unstamped_record(&message, heard_at, offset_ns, flags);
             self.records.push(message.channel, &record);
         }
     }
@@ -403,7 +406,6 @@ fn note_undelivered(messages: &mut SharedSink, arrival: &Arrival, disposition: D
     let (message, flags) = match disposition {
         Disposition::Duplicate(message) => (message, IngressRecord::DUPLICATE),
         Disposition::Late(message) => (message, IngressRecord::LATE),
-        Disposition::Superseded(message) => (message, IngressRecord::REORDERED),
         Disposition::Delivered(_)
         | Disposition::FragmentStored
         | Disposition::Greeted { .. }

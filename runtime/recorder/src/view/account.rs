@@ -3,7 +3,6 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use hil_core::record::EgressRecord;
 use hil_rundir::live_run::Stage;
 use hil_stats::histogram::LatencySummary;
 use hil_watch::Record;
@@ -348,7 +347,7 @@ impl Joined {
         self.stamps.note(record);
         match record {
             Record::Egress(one) => {
-                self.is_refused = one.flags & EgressRecord::REFUSED_BY_KERNEL != 0;
+                self.is_refused = one.is_refused();
             }
             Record::Ingress(_) => self.has_ingress = true,
             _ => {}

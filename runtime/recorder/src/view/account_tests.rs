@@ -1,7 +1,7 @@
 //! Tests of [`super`]: messages of a link that loses some.
 
 use super::*;
-use hil_core::record::{IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
+use hil_core::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
 
 const MS: i64 = 1_000_000;
 

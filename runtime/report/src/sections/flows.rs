@@ -46,7 +46,7 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
             Cell::Count(flow.lost_by_either_count),
             Cell::Count(flow.lost_by_harness_count),
             Cell::Count(flow.unknown_count),
-            Cell::Count(flow.reordered_count),
+            Cell::count(flow.reordered_count),
             Cell::count(flow.retransmitted_count),
             Cell::duration(delay.map(|one| one.p50_ns)),
             Cell::duration(delay.map(|one| one.p99_ns)),

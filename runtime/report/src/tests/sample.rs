@@ -286,8 +286,8 @@ pub(crate) fn flow(name: &str, frame_count: u64, lost: [u64; 2]) -> FlowMetrics 
         lost_by_either_count: 0,
         lost_by_harness_count: lost[1],
         unknown_count: 0,
-        reordered_count: 0,
-        reordered_extent_max: 0,
+        reordered_count: Some(0),
+        reordered_extent_max: Some(0),
         retransmitted_count: None,
         delay: Distribution::of_samples(&[5_000_000], ""),
     }
