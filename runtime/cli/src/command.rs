@@ -555,7 +555,9 @@ fn check_here(
         ClaimError::Io(ref source) => {
             let code = match FailureKind::of(source) {
                 FailureKind::HostTooSmall => exit::HOST_UNFIT,
-                FailureKind::NotThereYet | FailureKind::Fault => exit::INTERNAL,
+                FailureKind::NotThereYet | FailureKind::Fault | FailureKind::ProgramEnded => {
+                    exit::INTERNAL
+                }
             };
             Refusal::new(code, error)
         }
@@ -651,7 +653,6 @@ fn exit_code_of_error(error: &RunError) -> u8 {
             PeerError::Mismatch { .. } | PeerError::Listen { .. } | PeerError::Own { .. },
         ) => exit::USAGE,
         RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
-        RunError::Start(_) => exit::FAILED,
         RunError::Domains(_) | RunError::Identity(_) | RunError::Random(_) => exit::INTERNAL,
     }
 }
@@ -673,7 +674,7 @@ fn exit_code(outcome: &Outcome) -> u8 {
         Outcome::Completed | Outcome::EndedEarly(_) => exit::RAN,
         Outcome::Interrupted(_) => interrupted(),
         Outcome::Failed(failure) => match failure.kind {
-            FailureKind::Fault => exit::FAILED,
+            FailureKind::Fault | FailureKind::ProgramEnded => exit::FAILED,
             FailureKind::NotThereYet => exit::TRY_AGAIN,
             FailureKind::HostTooSmall => exit::HOST_UNFIT,
         },

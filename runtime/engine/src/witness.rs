@@ -19,7 +19,7 @@ use hil_rundir::record::{RecordFileError, RecordKind, RecordSink, Recorder, Shar
 use hil_shm::{Attendance, ChannelError, Domain, RawInput, SequenceTracker, Waiter};
 
 use crate::gateway::poll_descriptors;
-use crate::process::recording::forwarded_ns;
+use crate::process::recording::{published_record, taken_record};
 use crate::process::worker::{Counter, Job, JobWork, Opened, WorkerError, open_domain};
 
 /// Records of one kind that wait for the disk at most: so many for each channel, and of all together.
@@ -177,15 +177,12 @@ impl Noted {
         let published = place(0, channel.publisher.is_some());
         let taken = place(1, channel.reader.is_some());
         let count = Arc::new(AtomicU64::new(0));
-        counters.push(Counter {
-            channel: channel.name.clone(),
-            what: if published.is_some() {
-                "published"
-            } else {
-                "given"
-            },
-            count: Arc::clone(&count),
-        });
+        let what = if published.is_some() {
+            "published"
+        } else {
+            "given"
+        };
+        counters.push(Counter::new(&channel.name, what, &count));
         let message_size = size_of::<Envelope>() + channel.message_size_bytes;
         let messages = channel.has_messages.then(|| {
             recorder.sink(
@@ -218,24 +215,10 @@ impl Noted {
         }
         if let Some(place) = self.published {
             self.tracker.accept(envelope);
-            let record = PublishedRecord {
-                sequence: envelope.sequence,
-                published_ns: envelope.published_ns,
-                epoch: envelope.epoch,
-                reserved: 0,
-            };
-            sinks.published.push(place, &record);
+            sinks.published.push(place, &published_record(envelope));
         }
         if let Some(place) = self.taken.filter(|_| self.has_reader) {
-            let record = TakenRecord {
-                sequence: envelope.sequence,
-                published_ns: envelope.published_ns,
-                forwarded_ns: forwarded_ns(envelope),
-                taken_ns: now.as_ns(),
-                epoch: envelope.epoch,
-                reserved: 0,
-            };
-            sinks.taken.push(place, &record);
+            sinks.taken.push(place, &taken_record(envelope, now));
         }
         if let Some(messages) = &mut self.messages {
             messages.push_message(envelope, payload);

@@ -149,10 +149,10 @@ pub fn locked_memory_bound(files: &HostFiles) -> Option<Headroom> {
     if files.holds_capability(CAP_IPC_LOCK) != Fact::Available(false) {
         return None;
     }
-    let (_, hard) = getrlimit(Resource::RLIMIT_MEMLOCK).ok()?;
-    (hard != RLIM_INFINITY).then_some(Headroom {
+    let (soft, _) = getrlimit(Resource::RLIMIT_MEMLOCK).ok()?;
+    (soft != RLIM_INFINITY).then_some(Headroom {
         bound: Bound::LockedMemory,
-        left: hard,
+        left: soft,
     })
 }
 

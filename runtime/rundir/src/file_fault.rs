@@ -46,8 +46,8 @@ impl fmt::Display for FileFault {
     }
 }
 
-/// Records of other hosts that a host lacks after the exchange: all of them, because an account with a part
-/// of the records would call the rest lost.
+/// Records that a host lacks after the exchange. Of other hosts it lacks all, because an account with a part of the records
+/// would call the rest lost; of its own, those that its disk did not take.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RecordGap {
     /// The host that lacks them.

@@ -88,6 +88,8 @@ pub enum FailureKind {
     NotThereYet,
     /// This host gives too little: descriptors, threads or memory.
     HostTooSmall,
+    /// A program of the user's that it runs ended with a fault, which need not come again.
+    ProgramEnded,
 }
 
 impl FailureKind {

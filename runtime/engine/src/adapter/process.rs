@@ -81,16 +81,11 @@ fn job<'a>(
     domain: Arc<Domain>,
 ) -> Job<'a> {
     let [taken, given] = &opened.counts;
-    let counter = |channel: &str, what, count| Counter {
-        channel: channel.to_owned(),
-        what,
-        count: Arc::clone(count),
-    };
     Job {
         name: format!("egm {}", arm.arm.word()),
         counters: vec![
-            counter(&arm.input.name, "taken", taken),
-            counter(&arm.output.name, "published", given),
+            Counter::new(&arm.input.name, "taken", taken),
+            Counter::new(&arm.output.name, "published", given),
         ],
         is_watched: true,
         connect: Box::new(move |thread| {

@@ -2,10 +2,9 @@
 //! server or an arm the topology gives no address: recorded as taken, counted and dropped, so that
 //! their channels' accounts close. It is not measured and has a thread of normal priority.
 
-use hil_core::message::Envelope;
 use hil_core::record::TakenRecord;
 
-use crate::process::recording::forwarded_ns;
+use crate::process::recording::taken_record;
 use crate::process::worker::{JobWork, WorkerError};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::wait::WAIT_MAX;
@@ -71,7 +70,9 @@ impl JobWork for JoinedSpare {
 
     fn step(&mut self) -> Result<bool, WorkerError> {
         for (input, sink) in &mut self.channels {
-            while input.receive(&mut |envelope, _| sink.push(&taken(envelope)))? {}
+            while input.receive(&mut |envelope, _| {
+                sink.push(&taken_record(envelope, MonotonicClock::now()));
+            })? {}
         }
         Ok(false)
     }
@@ -88,16 +89,5 @@ impl JobWork for JoinedSpare {
     /// What it took is in its records.
     fn report(&mut self) -> ProcessReport {
         ProcessReport::default()
-    }
-}
-
-fn taken(envelope: &Envelope) -> TakenRecord {
-    TakenRecord {
-        sequence: envelope.sequence,
-        published_ns: envelope.published_ns,
-        forwarded_ns: forwarded_ns(envelope),
-        taken_ns: MonotonicClock::now().as_ns(),
-        epoch: envelope.epoch,
-        reserved: 0,
     }
 }

@@ -15,7 +15,7 @@ use hil_shm::{Domain, ShmInput};
 
 use super::RING_RECORDS;
 use super::attachment::Attachment;
-use crate::process::recording::forwarded_ns;
+use crate::process::recording::taken_record;
 use crate::process::worker::WorkerError;
 
 /// What is open before the thread begins.
@@ -103,14 +103,7 @@ impl Inward {
                 *refused_count += u64::from(sent.is_some());
                 return;
             }
-            ends.taken.push(&TakenRecord {
-                sequence: envelope.sequence,
-                published_ns: envelope.published_ns,
-                forwarded_ns: forwarded_ns(envelope),
-                taken_ns: now.as_ns(),
-                epoch: envelope.epoch,
-                reserved: 0,
-            });
+            ends.taken.push(&taken_record(envelope, now));
             ends.count.fetch_add(1, Ordering::Relaxed);
         })?;
         if delivered.is_none() {

@@ -16,7 +16,7 @@ use hil_shm::{Domain, OutputSettings, ShmOutput};
 use super::RING_RECORDS;
 use super::attachment::Attachment;
 use crate::gateway::kernel_clock::KernelClock;
-use crate::process::recording::output_settings;
+use crate::process::recording::{output_settings, published_record};
 use crate::process::worker::WorkerError;
 
 /// What is open before the thread begins.
@@ -123,19 +123,14 @@ impl Outward {
         let mut outcome = Ok(());
         let has_moved = inlet.next_frame(|realtime_ns, frame| {
             let left = Instant::from_ns(realtime_ns - clock.offset_ns());
-            // Under load too.
-            clock.refresh(left);
+            // Under load too. Not by when the frame left: after a step of the system clock that is another time.
+            clock.refresh(MonotonicClock::now());
             if frame.len() > ETHERNET_FRAME.size_bytes {
                 lost.too_long += 1;
                 return;
             }
             outcome = output.publish(left, frame).map(|envelope| {
-                ends.published.push(&PublishedRecord {
-                    sequence: envelope.sequence,
-                    published_ns: envelope.published_ns,
-                    epoch: envelope.epoch,
-                    reserved: 0,
-                });
+                ends.published.push(&published_record(&envelope));
                 let record = FrameRecord::new(envelope.sequence, envelope.epoch, frame);
                 ends.frames.push(&record);
                 ends.given.fetch_add(1, Ordering::Relaxed);

@@ -155,11 +155,7 @@ impl Opening {
         let mut counters = Vec::new();
         let mut counter = |channel: &RoleChannel, what| {
             let count = Arc::default();
-            counters.push(Counter {
-                channel: channel.name.clone(),
-                what,
-                count: Arc::clone(&count),
-            });
+            counters.push(Counter::new(&channel.name, what, &count));
             count
         };
         let mut parts = Parts::default();

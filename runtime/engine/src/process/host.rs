@@ -43,17 +43,15 @@ const INTERFACES: &str = "eth";
 const LINE_BYTES_MAX: usize = 4096;
 /// How often it is looked whether a host has ended.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
-/// How long the others may go on once a host has failed, which it tells them.
-const PATIENCE: Duration = Duration::from_secs(10);
-/// Once one refused its arguments or its topology, as for a program that is missing, which it tells nobody.
-const UNBEGUN_PATIENCE: Duration = Duration::from_secs(2);
-/// Exit code of a supervisor that did so; others may also come from a run that had begun.
-const UNBEGUN: u8 = 2;
+/// How long the others may go on once a host has failed. Of a run that had begun they know by then and end by themselves.
+const PATIENCE: Duration = Duration::from_secs(2);
 /// A run that begins before is told that nothing leaves its interface.
 const WIRES_UP_WITHIN: Duration = Duration::from_secs(2);
 const WIRES_PERIOD: Duration = Duration::from_millis(5);
 /// Exit code for a host that was killed.
 const FAILED: u8 = 1;
+/// For one that the signal which this process was told to end with killed, as it did not listen to signals yet.
+const INTERRUPTED: u8 = 130;
 
 /// Why hosts cannot be on one PC.
 #[derive(Debug, thiserror::Error)]
@@ -230,7 +228,7 @@ impl Words {
 /// them failed; `meanwhile` is called at each look. Gives the exit code of the first one that ended with another
 /// than 0.
 fn wait_for_all(hosts: &mut [Child], signals: &Signals, mut meanwhile: impl FnMut()) -> u8 {
-    let (mut code, mut stop_at, mut is_told) = (0, None, false);
+    let (mut code, mut stop_at, mut is_told, mut is_interrupted) = (0, None, false, false);
     loop {
         meanwhile();
         let ends: Vec<_> = hosts.iter_mut().map(Child::poll_end).collect();
@@ -239,22 +237,17 @@ fn wait_for_all(hosts: &mut [Child], signals: &Signals, mut meanwhile: impl FnMu
         if code == 0
             && let Some(end) = failures.next()
         {
-            code = end
-                .code()
-                .and_then(|code| code.try_into().ok())
-                .unwrap_or(FAILED);
-            let patience = if code == UNBEGUN {
-                UNBEGUN_PATIENCE
-            } else {
-                PATIENCE
-            };
-            stop_at = stop_at.or(Some(now + patience));
+            let said = end.code().and_then(|code| code.try_into().ok());
+            let killed = if is_interrupted { INTERRUPTED } else { FAILED };
+            code = said.unwrap_or(killed);
+            stop_at = stop_at.or(Some(now + PATIENCE));
         }
         if ends.iter().all(Option::is_some) {
             return code;
         }
         let received = signals.received_signal();
         if received.is_some() {
+            is_interrupted = true;
             stop_at = Some(now);
         }
         if !is_told && stop_at.is_some_and(|at| now >= at) {

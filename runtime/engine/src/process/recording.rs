@@ -40,14 +40,7 @@ impl InputPort for RecordedInput {
         port.receive(now, &mut |envelope, payload| {
             let taken_at = MonotonicClock::now();
             wait.on_arrival(taken_at);
-            sink.push(&TakenRecord {
-                sequence: envelope.sequence,
-                published_ns: envelope.published_ns,
-                forwarded_ns: forwarded_ns(envelope),
-                taken_ns: taken_at.as_ns(),
-                epoch: envelope.epoch,
-                reserved: 0,
-            });
+            sink.push(&taken_record(envelope, taken_at));
             taken.fetch_add(1, Ordering::Relaxed);
             take(envelope, payload);
         })
@@ -58,12 +51,29 @@ impl InputPort for RecordedInput {
     }
 }
 
-/// When a gateway of this host published the message of `envelope`, if one did.
-pub(crate) fn forwarded_ns(envelope: &Envelope) -> i64 {
-    if envelope.is_forwarded() {
-        envelope.forwarded_ns
-    } else {
-        UNAVAILABLE
+/// What a producer notes of a message.
+pub(crate) fn published_record(envelope: &Envelope) -> PublishedRecord {
+    PublishedRecord {
+        sequence: envelope.sequence,
+        published_ns: envelope.published_ns,
+        epoch: envelope.epoch,
+        reserved: 0,
+    }
+}
+
+/// What a consumer that took a message `at` that time notes of it.
+pub(crate) fn taken_record(envelope: &Envelope, at: Instant) -> TakenRecord {
+    TakenRecord {
+        sequence: envelope.sequence,
+        published_ns: envelope.published_ns,
+        forwarded_ns: if envelope.is_forwarded() {
+            envelope.forwarded_ns
+        } else {
+            UNAVAILABLE
+        },
+        taken_ns: at.as_ns(),
+        epoch: envelope.epoch,
+        reserved: 0,
     }
 }
 
@@ -116,12 +126,7 @@ impl OutputPort for RecordedOutput {
         let envelope = match &mut self.destination {
             Destination::Channel { port, sink } => {
                 let envelope = port.publish(now, payload)?;
-                sink.push(&PublishedRecord {
-                    sequence: envelope.sequence,
-                    published_ns: envelope.published_ns,
-                    epoch: envelope.epoch,
-                    reserved: 0,
-                });
+                sink.push(&published_record(&envelope));
                 envelope
             }
             Destination::Record(sequencer) => {

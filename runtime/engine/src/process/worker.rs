@@ -153,6 +153,7 @@ impl WorkerError {
             | Self::Thread(source)
             | Self::Session(source) => FailureKind::of(source),
             Self::Channel(ChannelError::NoRoom { .. }) => FailureKind::HostTooSmall,
+            Self::ProgramEnded { .. } => FailureKind::ProgramEnded,
             _ => FailureKind::Fault,
         }
     }

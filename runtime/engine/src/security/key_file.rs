@@ -2,7 +2,7 @@
 //! is never printed; people compare fingerprints.
 
 use core::fmt;
-use std::fs::OpenOptions;
+use std::fs::{self, OpenOptions};
 use std::io::{self, Read, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
@@ -224,9 +224,14 @@ impl PreSharedKey {
         let mut file = options.open(path).map_err(failed)?;
         let encoded = Zeroizing::new(STANDARD.encode(*self.0));
         let line = Zeroizing::new(format!("{PREFIX}{}\n", &*encoded));
-        file.write_all(line.as_bytes())
-            .and_then(|()| file.sync_all())
-            .map_err(failed)
+        let written = file
+            .write_all(line.as_bytes())
+            .and_then(|()| file.sync_all());
+        if written.is_err() {
+            // A part of a key would be in the way of the next.
+            let _removed = fs::remove_file(path).is_ok();
+        }
+        written.map_err(failed)
     }
 
     /// A short name of the key that tells nothing of it: equal on hosts that have the same one.
@@ -252,7 +257,7 @@ impl fmt::Debug for PreSharedKey {
     }
 }
 
-fn check_access(path: &Path, data: &std::fs::Metadata, user: u32) -> Result<(), KeyFileError> {
+fn check_access(path: &Path, data: &fs::Metadata, user: u32) -> Result<(), KeyFileError> {
     let path = || path.to_owned();
     if !data.is_file() {
         return Err(KeyFileError::NotAFile { path: path() });

@@ -120,6 +120,17 @@ impl Child {
             .stdout
             .take()
             .expect("standard output was piped just above");
+        let stdin = process.stdin.take();
+        // If no thread is to be had, it is ended when this is dropped.
+        let mut child = Self {
+            process,
+            pidfd,
+            words: None,
+            stdin,
+            end: None,
+            is_foreign: false,
+            shares_group: false,
+        };
         let words = thread::Builder::new()
             .name(format!("words {index}"))
             .spawn(move || {
@@ -139,16 +150,8 @@ impl Child {
                     }
                 }
             })?;
-        let stdin = process.stdin.take();
-        Ok(Self {
-            process,
-            pidfd,
-            words: Some(words),
-            stdin,
-            end: None,
-            is_foreign: false,
-            shares_group: false,
-        })
+        child.words = Some(words);
+        Ok(child)
     }
 
     /// Starts a user's own command; both its outputs go to `log`.
@@ -234,7 +237,7 @@ impl Child {
         // It may be the run's secret.
         let line = Zeroizing::new(line);
         if let Some(stdin) = &mut self.stdin {
-            // A process that is gone is noticed by poll_exit.
+            // A process that is gone is noticed by poll_end.
             let _gone = stdin
                 .write_all(line.as_bytes())
                 .and_then(|()| stdin.flush())

@@ -10,7 +10,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use super::frame::{Frame, PeerHello, PeerMessage, read_frame_within, write_message};
+use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
 use super::peer::{ControlHalves, ControlReader};
 use super::strangers::{Cause, Strangers};
 use crate::security::PreSharedKey;
@@ -267,7 +267,7 @@ fn greet(
 /// A plain end that shows that it is one of ours hears why it gets no further.
 fn refuse_plain(stream: TimedStream, start: [u8; 4]) -> io::Result<Result<Newcomer, Cause>> {
     let mut ends = plain_ends(stream, start)?;
-    let hello = read_frame_within(&mut ends.reader, HELLO_BYTES_MAX)?;
+    let (hello, _length) = read_frame(&mut ends.reader, HELLO_BYTES_MAX)?;
     if matches!(hello, Frame::Message(PeerMessage::Hello(_))) {
         say(&mut ends, &PeerMessage::Refused(KEY_NEEDED.to_owned()))?;
         return Ok(Err(Cause::WithoutKey));
@@ -306,7 +306,7 @@ fn say_who(
 
 /// The first word of the other end.
 pub(super) fn read_hello(ends: &mut ControlHalves) -> io::Result<PeerMessage> {
-    match read_frame_within(&mut ends.reader, HELLO_BYTES_MAX)? {
+    match read_frame(&mut ends.reader, HELLO_BYTES_MAX)?.0 {
         Frame::Message(message) => Ok(message),
         Frame::Chunk(_) => Err(io::Error::new(
             io::ErrorKind::InvalidData,

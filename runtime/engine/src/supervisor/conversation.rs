@@ -18,7 +18,7 @@ use hil_platform::clock::MonotonicClock;
 use zeroize::Zeroizing;
 
 use super::control_listener::GREETING_TIMEOUT;
-use super::frame::{Frame, PeerMessage, read_sized_frame, write_message};
+use super::frame::{FRAME_BYTES_MAX, Frame, PeerMessage, read_frame, write_message};
 use super::peer::{ControlHalves, ControlReader, ControlWriter, PeerEvent};
 use super::reconnect::{Reconnect, lock};
 
@@ -387,7 +387,7 @@ impl Conversation {
     /// Takes what comes over one connection.
     fn forward(&self, mut input: ControlReader) {
         let cause = loop {
-            match read_sized_frame(&mut input) {
+            match read_frame(&mut input, FRAME_BYTES_MAX) {
                 Ok((
                     Frame::Message(PeerMessage::Acknowledged {
                         taken_count,

@@ -202,7 +202,14 @@ fn give_and_take(
     let conversation = peer.conversation();
     let writer = peer.writer();
     let (received, sent) = thread::scope(|scope| {
-        let sending = scope.spawn(|| give_all(writer, own, own_history));
+        let sending = scope.spawn(|| {
+            let sent = give_all(writer, own, own_history);
+            if sent.is_err() {
+                // The other host waits for the rest before it gives what is waited for here.
+                conversation.leave();
+            }
+            sent
+        });
         let received = take_from(&own_history[0].hosts[0], &host, &conversation, records);
         if received.is_broken() {
             // What is being sent would wait for as long again.
@@ -470,7 +477,7 @@ fn take_frame(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::supervisor::frame::read_frame;
+    use crate::supervisor::frame::{FRAME_BYTES_MAX, read_frame};
     use hil_core::time::Instant as At;
     use hil_rundir::event::{Event, EventKind};
 
@@ -499,7 +506,7 @@ mod tests {
         let mut incoming = Incoming::default();
         let nowhere = Path::new("/nonexistent");
         while !take_frame(
-            read_frame(&mut input)?,
+            read_frame(&mut input, FRAME_BYTES_MAX)?.0,
             nowhere,
             &mut incoming,
             &mut received,

@@ -146,28 +146,12 @@ fn write_frame(out: &mut impl Write, kind: u8, body: &[u8]) -> io::Result<()> {
     out.flush()
 }
 
-/// Reads one frame; waits for it.
+/// Reads one frame of at most `bytes_max`, which bounds what a stranger may announce, and gives it with the length of its
+/// body in bytes; waits for it.
 ///
 /// # Errors
 /// When the connection ends or says something that is not a frame.
-pub fn read_frame(input: &mut impl Read) -> io::Result<Frame> {
-    read_frame_within(input, FRAME_BYTES_MAX)
-}
-
-/// As [`read_frame`], of at most `bytes_max`: what a stranger may announce.
-///
-/// # Errors
-/// As [`read_frame`].
-pub fn read_frame_within(input: &mut impl Read, bytes_max: usize) -> io::Result<Frame> {
-    read_sized(input, bytes_max).map(|(frame, _)| frame)
-}
-
-/// As [`read_frame`], with the length of the frame's body in bytes.
-pub(super) fn read_sized_frame(input: &mut impl Read) -> io::Result<(Frame, usize)> {
-    read_sized(input, FRAME_BYTES_MAX)
-}
-
-fn read_sized(input: &mut impl Read, bytes_max: usize) -> io::Result<(Frame, usize)> {
+pub fn read_frame(input: &mut impl Read, bytes_max: usize) -> io::Result<(Frame, usize)> {
     let mut head = [0; 5];
     input.read_exact(&mut head)?;
     let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
@@ -208,12 +192,15 @@ mod tests {
         write_chunk(&mut wire, &[1, 2, 3]).unwrap();
         let mut input = wire.as_slice();
         assert_eq!(
-            read_frame(&mut input).unwrap(),
+            read_frame(&mut input, FRAME_BYTES_MAX).unwrap().0,
             Frame::Message(PeerMessage::Ready)
         );
-        assert_eq!(read_frame(&mut input).unwrap(), Frame::Chunk(vec![1, 2, 3]));
         assert_eq!(
-            read_frame(&mut input).unwrap_err().kind(),
+            read_frame(&mut input, FRAME_BYTES_MAX).unwrap().0,
+            Frame::Chunk(vec![1, 2, 3])
+        );
+        assert_eq!(
+            read_frame(&mut input, FRAME_BYTES_MAX).unwrap_err().kind(),
             io::ErrorKind::UnexpectedEof
         );
     }

@@ -11,8 +11,6 @@ use super::domains::DomainsError;
 use super::frame::PeerMessage;
 use super::meet::PeerError;
 use super::needs::HostTooSmall;
-use super::process_group::ProcessGroupError;
-use super::process_group::Verdict;
 use crate::process::own_program::ProgramsUnfit;
 use crate::security::KeyFileError;
 use hil_rundir::run_result::Outcome;
@@ -62,9 +60,6 @@ pub enum RunError {
     /// A program of the user's is not there.
     #[error(transparent)]
     Programs(#[from] ProgramsUnfit),
-    /// A process cannot be started.
-    #[error("{0}")]
-    Start(String),
     /// The topology does not say whether strangers may read and forge its messages.
     #[error("{0}")]
     SecurityUnsaid(String),
@@ -80,24 +75,6 @@ pub enum RunError {
     /// An emulated link asks for more than a gateway can hold.
     #[error("the emulated link cannot be kept: {0}")]
     Emulation(EmulationError),
-}
-
-impl Verdict {
-    /// How the run ends by it; `None` when it goes on.
-    pub(super) fn outcome(self) -> Option<Outcome> {
-        match self {
-            Self::Running => None,
-            Self::Finished(text) => Some(Outcome::EndedEarly(text)),
-            Self::Failed(failure) => Some(Outcome::Failed(failure)),
-            Self::Unwritable { host, fault } => Some(Outcome::Unwritable { host, fault }),
-        }
-    }
-}
-
-impl From<ProcessGroupError> for RunError {
-    fn from(error: ProcessGroupError) -> Self {
-        Self::Start(error.to_string())
-    }
 }
 
 /// What came from a peer during the run.

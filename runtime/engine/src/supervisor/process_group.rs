@@ -22,6 +22,7 @@ use hil_rundir::pipe::{
     ChannelProgress, Failure, FailureKind, FromProcess, ProcessReport, ToProcess,
 };
 use hil_rundir::run_folder::RunFolder;
+use hil_rundir::run_result::Outcome;
 use hil_rundir::run_seal::RunSeal;
 use hil_shm::{Room, SHARED_MEMORY_DIRECTORY};
 use hil_topology::OnExit;
@@ -65,24 +66,6 @@ impl ProcessGroupError {
             Self::Launch(_) => FailureKind::Fault,
         }
     }
-}
-
-/// What ended the run, if a process did.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Verdict {
-    /// Everything goes on.
-    Running,
-    /// A process ended by itself without a fault.
-    Finished(String),
-    /// A process failed.
-    Failed(Failure),
-    /// A host cannot write a file that the run needs or records.
-    Unwritable {
-        /// The host.
-        host: String,
-        /// The file.
-        fault: FileFault,
-    },
 }
 
 /// One process with its history.
@@ -185,20 +168,20 @@ impl ProcessGroup {
     /// Starts every process; they wait for [`ProcessGroup::begin`].
     ///
     /// # Errors
-    /// The failure that the start of the run is, as a verdict.
-    pub(crate) fn start(&mut self) -> Result<(), Verdict> {
+    /// How the run ends by it.
+    pub(crate) fn start(&mut self) -> Result<(), Outcome> {
         let started = self.start_all();
         started.map_err(|(index, error)| self.not_started(index, &error))
     }
 
     /// What it means that a process could not be started.
-    fn not_started(&self, index: usize, error: &ProcessGroupError) -> Verdict {
+    fn not_started(&self, index: usize, error: &ProcessGroupError) -> Outcome {
         match error {
-            ProcessGroupError::Launch(LaunchError::Io { path, source }) => Verdict::Unwritable {
+            ProcessGroupError::Launch(LaunchError::Io { path, source }) => Outcome::Unwritable {
                 host: self.members[index].plan.host.clone(),
                 fault: FileFault::new(path, source),
             },
-            other => Verdict::Failed(Failure {
+            other => Outcome::Failed(Failure {
                 kind: other.kind(),
                 text: other.to_string(),
             }),
@@ -301,6 +284,7 @@ impl ProcessGroup {
         }
         let now = MonotonicClock::now();
         member.child = Some(child);
+        member.complaint = None;
         member.seen_alive = now;
         if member.is_ready && self.started.is_some() {
             self.close_interruptions(index, now);
@@ -335,15 +319,15 @@ impl ProcessGroup {
         }
     }
 
-    /// Hears what the processes said, sees who died, and applies the policies.
-    pub(crate) fn watch(&mut self) -> Verdict {
+    /// Hears what the processes said, sees who died, and applies the policies. Gives how the run ends, if one ended it.
+    pub(crate) fn watch(&mut self) -> Option<Outcome> {
         self.listen();
         // Its end, and that of others on the same disk, follows from it.
-        if let Some(verdict) = self.unwritable() {
-            return verdict;
+        if let Some(outcome) = self.unwritable() {
+            return Some(outcome);
         }
         let now = MonotonicClock::now();
-        let mut verdict = Verdict::Running;
+        let mut outcome = None;
         for index in 0..self.members.len() {
             let member = &mut self.members[index];
             let Some(child) = &mut member.child else {
@@ -353,24 +337,30 @@ impl ProcessGroup {
                 member.seen_alive = now;
                 continue;
             };
-            // Its last words decide what its end means; they come within moments.
-            if !child.has_said_all() {
+            // Its last words decide what its end means. They come within moments, unless something that it started
+            // has its output, too.
+            if !child.has_said_all()
+                && now.saturating_duration_since(member.seen_alive) < LAST_WORDS_PATIENCE
+            {
                 continue;
             }
             member.child = None;
             member.end = Some(end.to_string());
             self.listen();
-            if let Some(verdict) = self.unwritable() {
-                return verdict;
+            if let Some(outcome) = self.unwritable() {
+                return Some(outcome);
             }
             let judged = self.judge(index, end, now);
             // A failure is not overridden by an orderly end seen in the same turn.
-            let has_failed = matches!(verdict, Verdict::Failed(_) | Verdict::Unwritable { .. });
-            if !has_failed && judged != Verdict::Running {
-                verdict = judged;
+            let has_failed = matches!(
+                outcome,
+                Some(Outcome::Failed(_) | Outcome::Unwritable { .. })
+            );
+            if !has_failed && judged.is_some() {
+                outcome = judged;
             }
         }
-        verdict
+        outcome
     }
 
     /// Whether a process here cannot record any more.
@@ -378,47 +368,53 @@ impl ProcessGroup {
         self.unwritten.is_some()
     }
 
-    fn unwritable(&self) -> Option<Verdict> {
+    fn unwritable(&self) -> Option<Outcome> {
         let (host, fault) = self.unwritten.clone()?;
-        Some(Verdict::Unwritable { host, fault })
+        Some(Outcome::Unwritable { host, fault })
+    }
+
+    /// What came of a process that ended so, with what it said of it.
+    fn end_words(&self, index: usize, end: ProcessEnd) -> String {
+        let member = &self.members[index];
+        let log = self.folder.log(&member.plan.name);
+        if let Some(Failure { kind, text }) = &member.complaint {
+            // What a program of the user's said came before what its starter says of its end.
+            let last = (*kind == FailureKind::ProgramEnded).then(|| last_line(&log, Some(text)));
+            return match last.flatten() {
+                None => format!("{end}: {text}"),
+                Some(last) => format!("{end}: {text}, after it said \"{last}\""),
+            };
+        }
+        if end.signal() == Some(libc::SIGBUS)
+            && let Ok(free) = Room::free()
+        {
+            return format!("{end}; {SHARED_MEMORY_DIRECTORY} has {free} free");
+        }
+        if end.code().is_some_and(|code| code != 0)
+            && let Some(last) = last_line(&log, None)
+        {
+            return format!("{end}, after it said \"{last}\"");
+        }
+        end.to_string()
     }
 
     /// What the end of a process means: it is started again, or the run ends.
-    fn judge(&mut self, index: usize, end: ProcessEnd, now: Instant) -> Verdict {
+    fn judge(&mut self, index: usize, end: ProcessEnd, now: Instant) -> Option<Outcome> {
+        let what = self.end_words(index, end);
         let member = &mut self.members[index];
-        let mut what = end.to_string();
-        let log = self.folder.log(&member.plan.name);
-        let complaint = member.complaint.as_ref();
-        let failure_kind = complaint.map_or(FailureKind::Fault, |failure| failure.kind);
-        if let Some(failure) = complaint {
-            // What a program of the user's said came before what its starter says of its end.
-            let last = match member.plan.task {
-                ProcessTask::Cable(_) => last_line(&log, Some(&failure.text)),
-                _ => None,
-            };
-            what = match last {
-                None => format!("{what}: {}", failure.text),
-                Some(last) => format!("{what}: {}, after it said \"{last}\"", failure.text),
-            };
-        } else if end.signal() == Some(libc::SIGBUS)
-            && let Ok(free) = Room::free()
-        {
-            what = format!("{what}; {SHARED_MEMORY_DIRECTORY} has {free} free");
-        } else if end.code().is_some_and(|code| code != 0)
-            && let Some(last) = last_line(&log, None)
-        {
-            what = format!("{what}, after it said \"{last}\"");
-        }
+        let kind = member.complaint.as_ref().map(|failure| failure.kind);
+        // What a process cannot do it cannot do when it is started again; a program may.
+        let may_restart = kind.is_none_or(|kind| kind == FailureKind::ProgramEnded);
         member.end = Some(what.clone());
         let limit = match member.plan.on_exit {
             OnExit::EndRun => 0,
             OnExit::Restart { limit } => limit,
         };
         let name = member.plan.name.clone();
-        let is_orderly = end.code() == Some(0) && member.complaint.is_none();
+        let is_orderly = end.code() == Some(0) && kind.is_none();
         let interruption = self.interruption(index);
         let member = &mut self.members[index];
-        if self.started.is_some() && member.restart_count < limit && member.complaint.is_none() {
+        if self.started.is_some() && member.restart_count < limit && may_restart {
             member.restart_count += 1;
             let kind = EventKind::Restarted {
                 end: what,
@@ -427,43 +423,46 @@ impl ProcessGroup {
             };
             self.note(now, index, kind, Some(interruption));
             return match self.spawn(index) {
-                Ok(()) => Verdict::Running,
+                Ok(()) => None,
                 Err(error) if self.members[index].plan.is_clock_path() => {
-                    self.go_on_without(now, index, error.to_string())
+                    self.go_on_without(now, index, error.to_string());
+                    None
                 }
                 Err(error) => {
                     let kind = EventKind::StartFailed {
                         error: error.to_string(),
                     };
                     self.note(now, index, kind, None);
-                    self.not_started(index, &error)
+                    Some(self.not_started(index, &error))
                 }
             };
         }
         if self.members[index].plan.is_clock_path() {
-            return self.go_on_without(now, index, what);
+            self.go_on_without(now, index, what);
+            return None;
         }
         // What it had in its queues, or came for it until the end, is lost with it.
         let interruption = Some(interruption).filter(|_| !is_orderly);
         let text = format!("process {name} {what}");
         self.note(now, index, EventKind::EndedRun { end: what }, interruption);
-        if is_orderly {
-            Verdict::Finished(text)
+        Some(if is_orderly {
+            Outcome::EndedEarly(text)
         } else {
             let has_own_output = matches!(
                 self.members[index].plan.task,
                 ProcessTask::Cable(_) | ProcessTask::Foreign { .. }
             );
             let text = if has_own_output {
+                let log = self.folder.log(&self.members[index].plan.name);
                 format!("{text}; its output is in {}", log.display())
             } else {
                 text
             };
-            Verdict::Failed(Failure {
-                kind: failure_kind,
+            Outcome::Failed(Failure {
+                kind: kind.unwrap_or(FailureKind::Fault),
                 text,
             })
-        }
+        })
     }
 
     /// From when on nothing is known of what a process carried that now is lost, or records nothing more.
@@ -482,10 +481,9 @@ impl ProcessGroup {
     }
 
     /// A clock path that is gone for good: nothing waits for it, and no message depends on it.
-    fn go_on_without(&mut self, now: Instant, index: usize, end: String) -> Verdict {
+    fn go_on_without(&mut self, now: Instant, index: usize, end: String) {
         self.members[index].is_ready = true;
         self.note(now, index, EventKind::GivenUp { end }, None);
-        Verdict::Running
     }
 
     fn listen(&mut self) {
@@ -619,10 +617,11 @@ impl ProcessGroup {
                 self.listen();
                 std::thread::sleep(Duration::from_millis(1));
             }
+            self.listen();
             let end = match child.poll_end() {
                 // What a program of the user's does when it is told to stop.
                 Some(end) if end.signal() == Some(libc::SIGTERM) => "stopped".to_owned(),
-                Some(end) => end.to_string(),
+                Some(end) => self.end_words(index, end),
                 None => "ended".to_owned(),
             };
             if !ended_by_itself {
@@ -724,9 +723,9 @@ mod tests {
 
     #[test]
     fn a_start_that_needs_a_file_that_cannot_be_written_is_told_with_it() {
-        let check = |verdict: Verdict| {
-            let Verdict::Unwritable { host, fault } = verdict else {
-                panic!("{verdict:?}");
+        let check = |outcome: Outcome| {
+            let Outcome::Unwritable { host, fault } = outcome else {
+                panic!("{outcome:?}");
             };
             assert_eq!(host, "pc");
             assert!(fault.path.starts_with("/proc/no-run"), "{fault}");
@@ -735,7 +734,7 @@ mod tests {
         let mut group = group(OnExit::Restart { limit: 1 });
         group.started = Some(MonotonicClock::now());
         let ended = ProcessEnd::Exited(ExitStatus::from_raw(0));
-        check(group.judge(0, ended, MonotonicClock::now()));
+        check(group.judge(0, ended, MonotonicClock::now()).unwrap());
     }
 
     #[test]
@@ -745,17 +744,64 @@ mod tests {
         for kind in [FailureKind::NotThereYet, FailureKind::HostTooSmall] {
             let text = "cannot go on".to_owned();
             group.members[0].complaint = Some(Failure { kind, text });
-            let verdict = group.judge(0, failed, MonotonicClock::now());
-            let Verdict::Failed(failure) = verdict else {
-                panic!("{verdict:?}");
+            let outcome = group.judge(0, failed, MonotonicClock::now());
+            let Some(Outcome::Failed(failure)) = outcome else {
+                panic!("{outcome:?}");
             };
             assert_eq!(failure.kind, kind);
             let said = ": cannot go on; its output is in /proc/no-run/logs/own.log";
             assert!(failure.text.ends_with(said), "{}", failure.text);
         }
         group.members[0].complaint = None;
-        let verdict = group.judge(0, failed, MonotonicClock::now());
-        assert!(matches!(verdict, Verdict::Failed(failure) if failure.kind == FailureKind::Fault));
+        let outcome = group.judge(0, failed, MonotonicClock::now());
+        assert!(
+            matches!(outcome, Some(Outcome::Failed(failure)) if failure.kind == FailureKind::Fault)
+        );
+    }
+
+    #[test]
+    fn a_program_that_ended_may_be_started_again_and_a_process_that_cannot_go_on_may_not() {
+        let failed = ProcessEnd::Exited(ExitStatus::from_raw(1 << 8));
+        for (kind, expected) in [(FailureKind::ProgramEnded, 1), (FailureKind::Fault, 0)] {
+            let mut group = group(OnExit::Restart { limit: 1 });
+            group.started = Some(MonotonicClock::now());
+            let text = "first ended with exit code 3".to_owned();
+            group.members[0].complaint = Some(Failure { kind, text });
+            // It cannot: its folder cannot be written.
+            let outcome = group.judge(0, failed, MonotonicClock::now());
+            assert!(outcome.is_some());
+            assert_eq!(group.members[0].restart_count, expected);
+        }
+    }
+
+    #[test]
+    fn a_process_that_ended_is_judged_though_another_keeps_its_output() {
+        let folder = std::env::temp_dir().join(format!("hil-output-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let id_file = folder.join("id");
+        // The other one is in a session of its own, so that it is not ended with the group.
+        let script = "setsid sh -c 'echo $$ > \"$0\"; exec sleep 600' \"$0\" & \
+                      until [ -s \"$0\" ]; do sleep 0.01; done; exit 3";
+        let mut command = std::process::Command::new("sh");
+        command.args(["-c", script]).arg(&id_file);
+        let mut group = group(OnExit::EndRun);
+        let (log, words) = (folder.join("log"), group.sender.clone());
+        let child = Child::spawn_speaking(command, &log, 0, 0, words).unwrap();
+        group.members[0].child = Some(child);
+        let outcome = loop {
+            if let Some(outcome) = group.watch() {
+                break outcome;
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        };
+        let id = std::fs::read_to_string(&id_file).unwrap();
+        let id = nix::unistd::Pid::from_raw(id.trim().parse().unwrap());
+        nix::sys::signal::kill(id, nix::sys::signal::Signal::SIGKILL).expect("it still runs");
+        let Outcome::Failed(failure) = outcome else {
+            panic!("{outcome:?}");
+        };
+        assert!(failure.text.contains("exit code 3"), "{}", failure.text);
+        std::fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]

@@ -298,11 +298,7 @@ impl Session<'_> {
     /// # Errors
     /// Why the run ended before it began.
     fn begin(&mut self, timeout: Duration) -> Result<(), Outcome> {
-        if let Err(verdict) = self.process_group.start()
-            && let Some(outcome) = verdict.outcome()
-        {
-            return Err(outcome);
-        }
+        self.process_group.start()?;
         let deadline = WallInstant::now() + timeout;
         let mut ready_peers = 0;
         let mut has_told = false;
@@ -322,7 +318,7 @@ impl Session<'_> {
                 has_told = true;
             }
             let mut may_begin = self.peers.is_empty();
-            for event in self.hear() {
+            for event in self.hear_in_time() {
                 match event {
                     Heard::Said(PeerMessage::Ready) => ready_peers += 1,
                     Heard::Said(PeerMessage::Start { has_one_clock }) => {
@@ -368,7 +364,7 @@ impl Session<'_> {
             if let Some(outcome) = self.look_after() {
                 return outcome;
             }
-            if let Some(outcome) = self.hear().into_iter().find_map(Heard::outcome) {
+            if let Some(outcome) = self.hear_in_time().into_iter().find_map(Heard::outcome) {
                 return outcome;
             }
             let elapsed = MonotonicClock::now().saturating_duration_since(start);
@@ -406,12 +402,12 @@ impl Session<'_> {
             return Some(Outcome::Interrupted(signal.to_owned()));
         }
         let known = self.process_group.events().len();
-        let verdict = self.process_group.watch();
+        let outcome = self.process_group.watch();
         for event in &self.process_group.events()[known..] {
             self.console
                 .warn(&format!("{}: {}", event.process, event.kind));
         }
-        verdict.outcome()
+        outcome
     }
 
     /// Tells each peer that this host lives, and what is known of ticks.
@@ -458,17 +454,25 @@ impl Session<'_> {
                     }
                 }
             }
-            let silence_max = self.topology.run().peer_timeout;
-            if !peer.is_quiet && peer.silence() > silence_max {
-                let silence_s = silence_max.as_secs();
-                // Nothing is waited for any more; it hears so if it can.
-                peer.hang_up();
-                heard.push(Heard::Lost(format!(
-                    "{host} has been silent for {silence_s} s"
-                )));
-            }
         }
         self.note_cuts();
+        heard
+    }
+
+    /// The same, with a host that has been silent for too long as one that is lost. Not once the run ends: a host says
+    /// nothing while it waits for its processes.
+    fn hear_in_time(&mut self) -> Vec<Heard> {
+        let mut heard = self.hear();
+        let silence_max = self.topology.run().peer_timeout;
+        for peer in &mut self.peers {
+            if !peer.is_quiet && peer.silence() > silence_max {
+                let (host, silence_s) = (&peer.hello.host, silence_max.as_secs());
+                let text = format!("{host} has been silent for {silence_s} s");
+                heard.push(Heard::Lost(text));
+                // Nothing is waited for any more; it hears so if it can.
+                peer.hang_up();
+            }
+        }
         heard
     }
 

@@ -35,7 +35,6 @@ pub struct KernelOptions {
 
 impl KernelOptions {
     /// From `/boot/config-<release>`, else `/proc/config.gz`.
-    /// What the kernel says.
     pub fn read(files: &HostFiles) -> Fact<Self> {
         let release = kernel_release(files);
         let path = format!("/boot/config-{}", release.to_text());

@@ -207,6 +207,7 @@ pub fn conclude(
     let network_series = network_series.unwrap_or_default();
     unwritten_files.extend(write_series(&mut summary, case, network_series, records));
     summary.record_gaps.clone_from(&result.gaps);
+    summary.record_gaps.extend(storage::own_gaps(result));
     let storage = storage::warnings(result, &unwritten_files);
     summary.warnings.splice(0..0, storage);
     let unwritten = write_texts(&summary, result).err();
@@ -292,7 +293,9 @@ fn read_channels(
             .acknowledgements
             .extend(radio.map(|radio| (channel.name.clone(), radio)));
     }
-    let is_doubted = found.flows.iter().any(|one| one.inlet_lost_count() > 0);
+    // A frame that is not known may have been an answer.
+    let is_doubted = passages.contains_key(&FlowKey::Unrecorded)
+        || found.flows.iter().any(|one| one.inlet_lost_count() > 0);
     found.deadlines = deadlines(&named, &passages, is_doubted);
     found
 }

@@ -47,6 +47,17 @@ pub(super) fn warnings(result: &RunResult, unwritten: &[FileFault]) -> Vec<Strin
     found
 }
 
+/// What hosts lack of their own records. All hosts know it, so that all say the same of the run.
+pub(super) fn own_gaps(result: &RunResult) -> impl Iterator<Item = RecordGap> {
+    unrecorded(result)
+        .into_iter()
+        .map(|(host, faults)| RecordGap {
+            host: host.to_owned(),
+            of: vec![host.to_owned()],
+            cause: GapCause::Unwritable(faults[0].clone()),
+        })
+}
+
 /// The record files that processes could not write any more, by host.
 fn unrecorded(result: &RunResult) -> BTreeMap<&str, Vec<&FileFault>> {
     let mut by_host: BTreeMap<&str, Vec<&FileFault>> = BTreeMap::new();
