@@ -118,9 +118,11 @@ pub fn assert_clean(page: &mut Page<'_>, name: &str) {
     assert!(bytes <= WEIGHT_MAX, "{name}: {bytes} bytes");
 }
 
-/// Waits until the page has been drawn a few times since whatever was done to it.
+/// Waits until the page has been drawn a few times since whatever was done to it, its panels too, which it draws five
+/// times a second.
 pub fn settle(page: &mut Page<'_>) {
-    let frames = "new Promise(done => { let left = 30; const next = () => --left ? \
+    page.value("new Promise(done => setTimeout(() => done(true), 250))");
+    let frames = "new Promise(done => { let left = 3; const next = () => --left ? \
                   requestAnimationFrame(next) : done(true); next(); })";
     page.value(frames);
 }

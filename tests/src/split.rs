@@ -13,7 +13,8 @@ use crate::child::{ChildGuard, Finished};
 use crate::lab::Lab;
 use crate::latency::Latencies;
 use crate::shuttle::{CHANNELS, records};
-use crate::trial::{RunFiles, Trial, wait_until};
+use crate::trial::{RunFiles, Trial, load_average, wait_until};
+use nix::sys::signal::Signal;
 
 /// Names of the hosts in the topology.
 pub const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
@@ -21,6 +22,8 @@ pub const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 pub const ARM_CHANNELS: [&str; 2] = ["egm/right/command", "egm/right/feedback"];
 const LIMIT: Duration = Duration::from_mins(3);
 const RUN_LIMIT: Duration = Duration::from_mins(6);
+/// Of the host that is told to end by a signal, and of the one that hears it from there, as `--help` lists them.
+const STOPPED_CODES: [i32; 2] = [130, 1];
 /// Records of 32 bytes: half a second of commands.
 const FLOWING_BYTES: u64 = 60 * 32;
 
@@ -117,6 +120,53 @@ impl<'a> Split<'a> {
         self.files.each_ref().map(RunFiles::summary)
     }
 
+    /// Ends the run once a test has what it needs and messages flow, so that those of a moment ago have come, and
+    /// checks that it ended so, and that every message has a fate.
+    ///
+    /// # Panics
+    /// When one of these does not hold.
+    pub fn stop(mut self) -> [RunSummary; 2] {
+        self.wait_for_messages("all that the test did");
+        self.interrupt();
+        let summaries = self.stopped();
+        for summary in &summaries {
+            assert_every_message_is_accounted_for(summary);
+        }
+        summaries
+    }
+
+    /// Tells the first host to end the run, as a service manager does.
+    ///
+    /// # Panics
+    /// When either host has ended before.
+    pub fn interrupt(&mut self) {
+        for host in &mut self.hosts {
+            assert!(host.is_running(), "{}", host.stderr_so_far());
+        }
+        let told = self.hosts[0].signal(Signal::SIGTERM);
+        assert_eq!(told, Ok(()), "SIGTERM to {}", HOSTS[0]);
+    }
+
+    /// Waits for the end of a run that was interrupted, and checks that both hosts say so, that it left nothing
+    /// behind and that no records are missing.
+    ///
+    /// # Panics
+    /// When one of these does not hold.
+    pub fn stopped(mut self) -> [RunSummary; 2] {
+        for (finished, code) in self.ended().iter().zip(STOPPED_CODES) {
+            finished.assert_code(code);
+        }
+        let summaries = self.summaries();
+        for summary in &summaries {
+            assert_eq!(summary.run.outcome, Outcome::Stopped, "{:?}", summary.run);
+            let reason = &summary.run.exit_reason;
+            assert!(reason.contains("interrupted by SIGTERM"), "{reason}");
+            assert!(summary.record_gaps.is_empty(), "{:?}", summary.record_gaps);
+            self.print(summary);
+        }
+        summaries
+    }
+
     /// Waits for the end, and checks that it was the planned one, left nothing behind, and that every
     /// message has a fate.
     ///
@@ -141,12 +191,16 @@ impl<'a> Split<'a> {
         let summaries = self.summaries();
         for summary in &summaries {
             assert_eq!(summary.run.outcome, Outcome::Completed, "{:?}", summary.run);
-            for name in self.channels {
-                let said = describe(name, account(summary, name));
-                println!("{}: {said}", summary.run.host);
-            }
+            self.print(summary);
         }
         summaries
+    }
+
+    fn print(&self, summary: &RunSummary) {
+        for name in self.channels {
+            let said = describe(name, account(summary, name));
+            println!("{}: {said}; load {}", summary.run.host, load_average());
+        }
     }
 }
 

@@ -193,12 +193,6 @@ pub fn round_count(usual: u32) -> u32 {
     asked.map_or(usual, |text| text.parse().expect("a number of rounds"))
 }
 
-/// The duration of a run in which so many rounds of `kind_count` attacks are played; some seconds more, in which the
-/// stranger listens before.
-pub fn run_duration(round_count: u32, kind_count: u32) -> String {
-    format!("run.duration=\"{} s\"", 6 + round_count * kind_count)
-}
-
 /// Plays each attack once a round and nothing after each.
 pub fn play(attacks: &[(&'static str, &dyn Fn() -> u64)], round_count: u32) -> Vec<Turns> {
     let mut all: Vec<Turns> = attacks

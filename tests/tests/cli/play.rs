@@ -41,9 +41,10 @@ fn recorded(run: &RunFiles, channel: &str) -> Vec<Vec<u8>> {
     all.collect()
 }
 
-/// A run in which a person swings an arm once, and its recording as one file.
-fn recording(record: &RunFolder) -> (RunFiles, PathBuf) {
-    let trial = Trial::shipped("local.toml", &record.join("first")).set("run.duration=\"4 s\"");
+/// A run of `seconds`, in four of which a person swings an arm once, and its recording as one file.
+fn recording(record: &RunFolder, seconds: u32) -> (RunFiles, PathBuf) {
+    let trial = Trial::shipped("local.toml", &record.join("first"))
+        .set(&format!("run.duration=\"{seconds} s\""));
     trial
         .start_here()
         .wait_within(LIMIT)
@@ -88,7 +89,7 @@ fn strokes(run: &RunFiles) -> Vec<f64> {
 #[test]
 fn a_recorded_person_moves_the_arms_of_another_run() {
     let record = RunFolder::new("play");
-    let (first, file) = recording(&record);
+    let (first, file) = recording(&record, 4);
     let motion: Vec<String> = recorded(&first, MOTION)
         .iter()
         .map(|bytes| hex(bytes))
@@ -149,7 +150,7 @@ fn a_recorded_person_moves_the_arms_of_another_run() {
 #[test]
 fn a_channel_with_a_living_writer_is_refused_and_so_is_what_does_not_fit() {
     let record = RunFolder::new("play-refused");
-    let (_first, file) = recording(&record);
+    let (_first, file) = recording(&record, 1);
     let trial = Trial::shipped("local.toml", &record.join("second")).set("run.duration=\"10 min\"");
     let mut child = trial.start_here();
     let second = trial.folder("", LIMIT);
@@ -197,7 +198,7 @@ fn a_channel_with_a_living_writer_is_refused_and_so_is_what_does_not_fit() {
 #[test]
 fn a_recording_that_is_over_does_not_end_the_run() {
     let record = RunFolder::new("play-once");
-    let (_first, file) = recording(&record);
+    let (_first, file) = recording(&record, 1);
     let trial = with_player(&record, &file, ", \"--speed\", \"100\"").set("run.duration=\"3 s\"");
     trial
         .start_here()

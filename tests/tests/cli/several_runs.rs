@@ -59,7 +59,7 @@ fn runs_side_by_side_do_not_see_each_other() {
 #[test]
 fn of_two_topologies_with_one_port_the_second_is_refused_with_the_key_to_change() {
     let record = RunFolder::new("one-port");
-    let text = emulated_shuttle("first", "").replace("12 s", "8 s");
+    let text = emulated_shuttle("first", "").replace("12 s", "6 s");
     let files = [text.clone(), text.replace("first", "second")];
     let [first, second] = files.map(|text| {
         let name = if text.contains("first") {
@@ -90,7 +90,9 @@ fn of_two_topologies_with_one_port_the_second_is_refused_with_the_key_to_change(
     assert_eq!(summary.run.outcome, Outcome::Completed);
     assert_every_message_is_accounted_for(&summary);
     assert!(!record.join("second").exists());
-    let own = second.set("links.hop.port=24999");
+    let own = second
+        .set("links.hop.port=24999")
+        .set("run.duration=\"1 s\"");
     own.start_here()
         .wait_within(LIMIT)
         .unwrap()

@@ -53,7 +53,7 @@ fn a_second_start_is_refused_and_costs_the_first_run_no_message_and_no_connectio
     for topology in ["shuttle-tcp.toml", "shuttle-split.toml"] {
         let record = RunFolder::new("again");
         let trial = Trial::shipped(topology, record.path())
-            .set("run.duration=\"14 s\"")
+            .set("run.duration=\"10 min\"")
             .set("channels.\"shuttle/command\".depth=256")
             .set("channels.\"shuttle/status\".depth=256");
         // It waits for the other host and has bound no port.
@@ -70,7 +70,7 @@ fn a_second_start_is_refused_and_costs_the_first_run_no_message_and_no_connectio
                 start_again(&mut again, &split.hosts[index], folder, "links.hop.port");
             }
         }
-        let summaries = split.finish();
+        let summaries = split.stop();
         for (summary, name) in summaries
             .iter()
             .flat_map(|one| CHANNELS.map(|name| (one, name)))
@@ -99,7 +99,7 @@ fn a_run_that_wants_the_card_of_another_one_is_refused_and_one_without_it_runs_b
             .set("channels.\"shuttle/command\".depth=256")
             .set("channels.\"shuttle/status\".depth=256")
     };
-    let first = trial("first", 7_930, "hardware").set("run.duration=\"10 s\"");
+    let first = trial("first", 7_930, "hardware").set("run.duration=\"10 min\"");
     let first = Split::start(&lab, &first);
     first.wait_for_messages("the begin of the run");
     let others = trial("second", 7_950, "hardware");
@@ -128,7 +128,7 @@ fn a_run_that_wants_the_card_of_another_one_is_refused_and_one_without_it_runs_b
     for host in &mut beside.hosts {
         ended(host).assert_success();
     }
-    for summary in [first.finish(), beside.summaries()].concat() {
+    for summary in [first.stop(), beside.summaries()].concat() {
         for name in CHANNELS {
             assert_eq!(account(&summary, name).fates.lost_count(), 0, "{name}");
         }

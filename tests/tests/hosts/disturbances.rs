@@ -16,8 +16,7 @@ use hil_tests::lab::{BRIDGE_PORTS, INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split};
-use hil_tests::trial::{Trial, hop_key, load_average, wait_until};
-use nix::sys::signal::Signal;
+use hil_tests::trial::{Trial, hop_key, wait_until};
 use nix::sys::stat::Mode;
 use nix::unistd::mkfifo;
 
@@ -38,22 +37,6 @@ fn start<'a>(lab: &'a Lab, trial: &Trial) -> Split<'a> {
     let split = Split::start(lab, trial);
     split.wait_for_messages("the begin of the run");
     split
-}
-
-/// Stops the run from its first host; every message of it has a fate, and nothing is left.
-fn stopped(mut split: Split<'_>) -> [RunSummary; 2] {
-    split.hosts[0].signal(Signal::SIGTERM).unwrap();
-    split.ended();
-    let summaries = split.summaries();
-    for summary in &summaries {
-        assert_eq!(summary.run.outcome, Outcome::Stopped);
-        assert_every_message_is_accounted_for(summary);
-        for channel in CHANNELS {
-            let said = describe(channel, account(summary, channel));
-            println!("{}: {said}; load {}", summary.run.host, load_average());
-        }
-    }
-    summaries
 }
 
 /// What neither the consumer took nor a newer message replaced.
@@ -114,7 +97,7 @@ fn cable_address_and_packet_size_change_under_a_run_and_it_goes_on() {
     double.assert_code(TRY_AGAIN);
     split.wait_for_messages("a second control-pc");
 
-    for summary in stopped(split) {
+    for summary in split.stop() {
         for channel in CHANNELS {
             assert!(missing(&summary, channel) > 0, "{channel} felt nothing");
         }
@@ -152,7 +135,7 @@ fn a_gateway_that_comes_back_while_the_path_is_away_waits_for_it() {
         }
         split.wait_for_messages("a gateway came back without a path");
     }
-    for summary in stopped(split) {
+    for summary in split.stop() {
         let mut events = summary.events.iter();
         assert!(events.any(|event| event.what().contains("waiting for the link")));
     }
@@ -204,13 +187,13 @@ fn a_disk_that_does_not_answer_makes_no_host_silent() {
     let record = RunFolder::new("slow-disk");
     let trial = Trial::shipped("shuttle-split.toml", record.path())
         .set("run.duration=\"10 min\"")
-        .set("run.peer_timeout=\"4 s\"");
+        .set("run.peer_timeout=\"2 s\"");
     let split = start(&lab, &trial);
     let pipe = split.files[0].root().join("status.json.new");
     wait_until(LIMIT, "a moment without the file", || {
         mkfifo(&pipe, Mode::S_IRWXU).is_ok()
     });
-    thread::sleep(Duration::from_secs(7));
+    thread::sleep(Duration::from_millis(3_500));
     split.wait_for_messages("more than the silence that is borne");
     // The disk answers again.
     let mut held_back = String::new();
@@ -221,11 +204,13 @@ fn a_disk_that_does_not_answer_makes_no_host_silent() {
     wait_until(LIMIT, "the file itself", || {
         fs::symlink_metadata(&status).is_ok_and(|data| data.is_file())
     });
-    stopped(split);
+    split.stop();
 }
 
-/// A path that drops what passes without a word: no reset, no report, and the cable stays in.
-const SILENT_FOR: Duration = Duration::from_secs(10);
+/// A path that drops what passes without a word: no reset, no report, and the cable stays in. A third of the silence that
+/// is borne, and longer than the supervisors wait for a byte.
+const SILENT_FOR: Duration = Duration::from_secs(5);
+const SILENCE_BORNE: &str = "run.peer_timeout=\"15 s\"";
 /// What the hosts' network is slowed to after the run, so that the exchange of records takes seconds.
 const SLOW: &str = "tbf rate 2mbit burst 64kb limit 1mb";
 
@@ -251,7 +236,8 @@ fn a_path_that_drops_everything_silently_for_less_than_a_host_may_be_away_ends_n
     let record = RunFolder::new("silent-path");
     let trial = Trial::shipped("shuttle-split.toml", record.path())
         .set("case.parameters.rate_hz=200.0")
-        .set("run.duration=\"10 min\"");
+        .set("run.duration=\"10 min\"")
+        .set(SILENCE_BORNE);
     let mut split = start(&lab, &trial);
     // Both ways, and either alone.
     let both = [0, 1];
@@ -267,17 +253,14 @@ fn a_path_that_drops_everything_silently_for_less_than_a_host_may_be_away_ends_n
         split.wait_for_messages("a silent path");
     }
     set_queue(&lab, &both, SLOW);
-    split.hosts[0].signal(Signal::SIGTERM).unwrap();
+    split.interrupt();
     wait_until(LIMIT, "records of the other host", || {
         split.files[0].record_bytes("shuttle.command.taken.") > 0
     });
     set_queue(&lab, &both, "blackhole");
     thread::sleep(SILENT_FOR);
     set_queue(&lab, &both, SLOW);
-    split.ended();
-    for summary in split.summaries() {
-        assert_eq!(summary.run.outcome, Outcome::Stopped);
-        assert!(summary.record_gaps.is_empty(), "{:?}", summary.record_gaps);
+    for summary in split.stopped() {
         let cuts: Vec<String> = summary
             .events
             .iter()
@@ -291,10 +274,6 @@ fn a_path_that_drops_everything_silently_for_less_than_a_host_may_be_away_ends_n
             .collect();
         println!("{}: {cuts:#?}", summary.run.host);
         assert!(cuts.len() >= 4, "{cuts:?}");
-        for channel in CHANNELS {
-            let said = describe(channel, account(&summary, channel));
-            println!("{}: {said}", summary.run.host);
-        }
         assert_every_message_is_accounted_for(&summary);
     }
 }

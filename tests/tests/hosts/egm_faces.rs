@@ -18,16 +18,20 @@ use hil_rundir::pipe::{AdapterRefusal, RefusalCount};
 use hil_tests::account::assert_account_closes;
 use hil_tests::arms::{Arms, of_kind};
 use hil_tests::attacker::{Attacker, FOREIGN, Quoted, reports_v4};
+use hil_tests::child::ChildGuard;
 use hil_tests::lab::{ADDRESSES, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, load_average, wait_until};
-use hil_tests::turns::{Bound, Cost, TURN, play, round_count, run_duration};
+use hil_tests::turns::{Bound, Cost, TURN, play, round_count};
+use nix::sys::signal::Signal;
 
 const LIMIT: Duration = Duration::from_mins(2);
 /// Datagrams that come from an address that is nobody's.
 const SPOKEN_COUNT: u64 = 1_500;
 /// How long a stranger takes the sensor's address.
 const CLAIMED_FOR: Duration = Duration::from_secs(1);
+/// How long the runs go on when it has it again.
+const AFTERWARDS: Duration = Duration::from_millis(1200);
 const SECOND_NS: i64 = 1_000_000_000;
 /// Lag of the control law at a gain of 20/s, four cycles until a motion is measured, and one of
 /// them until a command is used.
@@ -136,6 +140,13 @@ fn robot_of_both_arms(record: &Path, duration: &str) -> Trial {
         .set(&format!("processes.client.egm.left=\"{address}:6511\""))
 }
 
+/// Ends a run that goes on until then.
+fn interrupt(run: &mut ChildGuard) {
+    assert!(run.is_running(), "{}", run.stderr_so_far());
+    run.signal(Signal::SIGINT).unwrap();
+    run.wait_within(LIMIT).unwrap().assert_code(130);
+}
+
 #[test]
 fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
@@ -144,7 +155,7 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     let folder = RunFolder::new("faces");
     let (here, there) = (folder.join("sensor"), folder.join("robot"));
     let sensor = Trial::shipped("egm-robot.toml", &here)
-        .set("run.duration=\"22 s\"")
+        .set("run.duration=\"10 min\"")
         .set("case.parameters.left_arm=\"mirror\"");
     let robot = robot_of_both_arms(&there, "run.duration=\"16 s\"");
     let mut sensor_run = sensor.start_on(lab.host(0));
@@ -157,9 +168,8 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     let (spoken_count, answer_count) = speak_as_a_stranger(&lab);
     println!("a stranger: {spoken_count} datagrams, {answer_count} answers");
     assert_eq!(answer_count, 0);
-    for run in [&mut robot_run, &mut sensor_run] {
-        run.wait_within(LIMIT).unwrap().assert_success();
-    }
+    robot_run.wait_within(LIMIT).unwrap().assert_success();
+    interrupt(&mut sensor_run);
     println!(
         "{}\n{}",
         sensor_files.read("report-full.txt"),
@@ -203,9 +213,9 @@ fn forged_reports_cost_the_makers_datagrams_nothing_and_a_taken_address_what_is_
     let folder = RunFolder::new("forged-egm");
     let (here, there) = (folder.join("sensor"), folder.join("robot"));
     let sensor = Trial::shipped("egm-robot.toml", &here)
-        .set(&run_duration(rounds + 14, 1))
+        .set("run.duration=\"10 min\"")
         .set("case.parameters.left_arm=\"mirror\"");
-    let robot = robot_of_both_arms(&there, &run_duration(rounds + 8, 1));
+    let robot = robot_of_both_arms(&there, "run.duration=\"10 min\"");
     let mut sensor_run = sensor.start_on(lab.host(0));
     let sensor_files = sensor.folder("", LIMIT);
     let mut robot_run = robot.start_on(lab.host(1));
@@ -232,8 +242,10 @@ fn forged_reports_cost_the_makers_datagrams_nothing_and_a_taken_address_what_is_
     lab.host(1)
         .pin_neighbour(ADDRESSES[0], &lab.host(0).hardware_address());
     let claimed_ns = began_ns..now_ns();
+    // More than the second after it.
+    thread::sleep(AFTERWARDS);
     for run in [&mut robot_run, &mut sensor_run] {
-        run.wait_within(LIMIT).unwrap().assert_success();
+        interrupt(run);
     }
     let feedbacks = feedbacks_over(&Arms::of(&sensor_files), &Arms::of(&robot_files));
     let cost = |windows_ns: &[Range<i64>]| Cost::of(feedbacks.iter().copied(), windows_ns);
@@ -250,7 +262,7 @@ fn forged_reports_cost_the_makers_datagrams_nothing_and_a_taken_address_what_is_
     assert!(taken.lost * 2 > taken.sent && after.lost < after.sent);
     for files in [&sensor_files, &robot_files] {
         let summary = files.summary();
-        assert_eq!(summary.run.outcome, Outcome::Completed);
+        assert_eq!(summary.run.outcome, Outcome::Stopped);
         for face in &summary.faces {
             let ignored = count(face, "socket: ignored_report_count");
             println!(
@@ -285,11 +297,21 @@ fn speak_as_a_stranger(lab: &Lab) -> (u64, usize) {
 
 /// What both reports must say of their adapters, to one of which a stranger spoke.
 fn judge([sensor, robot]: [&RunSummary; 2], spoken_count: u64) {
-    for (summary, kind, way) in [
-        (sensor, "EGM sensor adapter", ["feedback", "command"]),
-        (robot, "EGM robot adapter", ["command", "feedback"]),
+    for (summary, kind, way, outcome) in [
+        (
+            sensor,
+            "EGM sensor adapter",
+            ["feedback", "command"],
+            Outcome::Stopped,
+        ),
+        (
+            robot,
+            "EGM robot adapter",
+            ["command", "feedback"],
+            Outcome::Completed,
+        ),
     ] {
-        assert_eq!(summary.run.outcome, Outcome::Completed);
+        assert_eq!(summary.run.outcome, outcome);
         for arm in ["right", "left"] {
             for what in ["command", "feedback"] {
                 assert_account_closes(summary, &format!("egm/{arm}/{what}"));

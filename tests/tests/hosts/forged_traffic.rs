@@ -26,7 +26,7 @@ use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split, count, direction, refused};
 use hil_tests::trial::{RunFiles, Trial};
-use hil_tests::turns::{TURN, cost, judge, play, roomy, round_count, run_duration};
+use hil_tests::turns::{TURN, cost, judge, play, roomy, round_count};
 
 use super::strangers::made_up;
 
@@ -45,6 +45,8 @@ const CLOCK_ADDRESSES_V6: [Ipv6Addr; 2] = [
 ];
 /// Messages a second of each of the two channels.
 const MESSAGES_HZ: u32 = 1_000;
+/// Longer than any test: it stops the run itself.
+const UNTIL_STOPPED: &str = "run.duration=\"10 min\"";
 /// Resets that the hosts have answered with, for beginnings of connections where nothing listens.
 fn resets_sent(lab: &Lab) -> u64 {
     let counts = [0, 1].map(|index| {
@@ -94,7 +96,7 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
     let mut trial = roomy(Trial::shipped("shuttle-split.toml", record.path()))
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
-        .set(&run_duration(rounds, 4));
+        .set(UNTIL_STOPPED);
     for (index, host) in HOSTS.iter().enumerate() {
         lab.host(index).add_route(EVERYWHERE);
         lab.host(index).add_address(CLOCK_ADDRESSES[index]);
@@ -144,7 +146,7 @@ fn forged_traffic_of_each_kind_costs_a_sealed_run_nothing_above_the_time_beside_
         rounds,
     );
     let files = [0, 1].map(|index| split.files[index].clone());
-    let summaries = split.finish();
+    let summaries = split.stop();
     judge(&files, &all);
     let [datagrams, exchanges, _, beginnings] = &all[..] else {
         panic!("four kinds");
@@ -192,7 +194,7 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
     let trial = roomy(Trial::shipped("shuttle-tcp.toml", record.path()))
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
-        .set(&run_duration(rounds + 2, 5));
+        .set(UNTIL_STOPPED);
     for index in [0, 1] {
         lab.host(index).add_route(EVERYWHERE);
     }
@@ -256,7 +258,7 @@ fn forged_traffic_costs_a_sealed_tcp_hop_nothing_and_an_exact_reset_one_reconnec
     println!("{} half-open connections at most", half_open_count.get());
     assert!(half_open_count.get() > 0);
     let files = [0, 1].map(|index| split.files[index].clone());
-    let summaries = split.finish();
+    let summaries = split.stop();
     judge(&files, &all);
     for (what, window_ns) in &exact {
         let commands = cost(
@@ -356,8 +358,7 @@ fn icmpv6_of_every_type_costs_a_sealed_run_nothing_above_the_time_beside_it() {
     };
     let record = RunFolder::new("forged-v6");
     let rounds = round_count(4);
-    let duration = run_duration(rounds, 2);
-    let (split, stranger) = run_of_v6(&lab, "shuttle-split.toml", &record, &duration);
+    let (split, stranger) = run_of_v6(&lab, "shuttle-split.toml", &record, UNTIL_STOPPED);
     let reports = |to: usize| {
         let ends = [(ADDRESSES_V6, PORTS[to]), (CLOCK_ADDRESSES_V6, CLOCK_PORT)];
         let quoted = ends.map(|(addresses, port)| {
@@ -374,7 +375,7 @@ fn icmpv6_of_every_type_costs_a_sealed_run_nothing_above_the_time_beside_it() {
         rounds,
     );
     let files = [0, 1].map(|index| split.files[index].clone());
-    let summaries = split.finish();
+    let summaries = split.stop();
     judge(&files, &all);
     for (summary, name) in summaries.iter().zip(CHANNELS) {
         let ignored = count(
@@ -394,8 +395,7 @@ fn icmpv6_of_every_type_costs_a_sealed_tcp_hop_and_the_supervisors_nothing() {
     };
     let record = RunFolder::new("forged-tcp-v6");
     let rounds = round_count(4);
-    let duration = run_duration(rounds, 1);
-    let (split, stranger) = run_of_v6(&lab, "shuttle-tcp.toml", &record, &duration);
+    let (split, stranger) = run_of_v6(&lab, "shuttle-tcp.toml", &record, UNTIL_STOPPED);
     let ways = connections(&lab, &[PORTS[0], PORTS[1], CONTROL_PORT]);
     let ways: Vec<_> = ways
         .map(|ends| {
@@ -411,7 +411,7 @@ fn icmpv6_of_every_type_costs_a_sealed_tcp_hop_and_the_supervisors_nothing() {
     };
     let all = play(&[("ICMPv6 of every type on connections", &reports)], rounds);
     let files = [0, 1].map(|index| split.files[index].clone());
-    let summaries = split.finish();
+    let summaries = split.stop();
     judge(&files, &all);
     for (summary, name) in summaries.iter().zip(CHANNELS) {
         let egress = direction(summary, name, "egress");

@@ -86,7 +86,7 @@ fn hosts_with_other_keys_or_without_one_wait_to_the_end_and_both_say_who_came() 
         return;
     };
     let (record, other) = (RunFolder::new("key-a"), RunFolder::new("key-b"));
-    let patience = "run.start_timeout=\"4 s\"";
+    let patience = "run.start_timeout=\"2 s\"";
     let keyed = trial(&record).set(patience);
     let other_key = format!("security.key=\"{}\"", hop_key(other.path()).display());
     let elsewhere = keyed.clone().set(&other_key);

@@ -9,14 +9,15 @@ use std::time::{Duration, Instant};
 use hil_platform::clock::MonotonicClock;
 use hil_report::summary::{RunEvent, RunEventKind, RunSummary};
 use hil_rundir::event::EventKind;
-use hil_tests::account::{account, assert_accounts_close};
+use hil_tests::account::{account, assert_accounts_close, assert_every_message_is_accounted_for};
 use hil_tests::attacker::{Attacker, Exact, FOREIGN, Flood};
+use hil_tests::child::ChildGuard;
 use hil_tests::knocker::CONTROL_PORT;
 use hil_tests::lab::{ADDRESSES, BRIDGE_PORTS, INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::{HOSTS, Split, count, direction};
-use hil_tests::trial::Trial;
+use hil_tests::trial::{Trial, wait_until};
 use hil_tests::turns::{cost_of_both, cost_of_exchanges, roomy};
 
 const LIMIT: Duration = Duration::from_mins(1);
@@ -62,16 +63,23 @@ fn made_up_refusals_at_a_hosts_address_end_no_waiting_and_are_told() {
 
 /// Forged reports of the network in a second.
 const REPORTS_HZ: u32 = 2_000;
-/// How long.
+/// How long, in a sealed run.
 const REPORTS_SPAN: Duration = Duration::from_secs(5);
+/// In a plain one, of which nothing is asked but that it goes on.
+const PLAIN_REPORTS_SPAN: Duration = Duration::from_secs(2);
 
-/// A run with forged reports to its sending gateway of commands.
-fn under_reports(lab: &Lab, trial: &Trial, stranger: &Attacker) -> (Flood, [RunSummary; 2]) {
+/// A run with forged reports to its sending gateway of commands, for so long.
+fn under_reports(
+    lab: &Lab,
+    trial: &Trial,
+    stranger: &Attacker,
+    span: Duration,
+) -> (Flood, [RunSummary; 2]) {
     let split = Split::start(lab, trial);
     split.wait_for_messages("the begin of the run");
     let quoted = ADDRESSES.map(|address| SocketAddrV4::new(address, PORT));
-    let flood = stranger.forge_reports(ADDRESSES[0], quoted, REPORTS_SPAN, REPORTS_HZ);
-    (flood, split.end())
+    let flood = stranger.forge_reports(ADDRESSES[0], quoted, span, REPORTS_HZ);
+    (flood, split.stop())
 }
 
 #[test]
@@ -85,9 +93,13 @@ fn forged_reports_of_the_network_cost_a_sealed_run_nothing_and_are_counted() {
         let trial = Trial::shipped("shuttle-split.toml", record.path())
             .set(&format!("links.hop.port={PORT}"))
             .set("case.parameters.rate_hz=1000.0")
-            .set("run.duration=\"9 s\"");
-        let trial = if is_sealed { trial } else { trial.plain() };
-        let (flood, summaries) = under_reports(&lab, &trial, &stranger);
+            .set("run.duration=\"10 min\"");
+        let (trial, span) = if is_sealed {
+            (trial, REPORTS_SPAN)
+        } else {
+            (trial.plain(), PLAIN_REPORTS_SPAN)
+        };
+        let (flood, summaries) = under_reports(&lab, &trial, &stranger, span);
         let commands = account(&summaries[1], CHANNELS[0]);
         let sender = direction(&summaries[0], CHANNELS[0], "egress");
         let ignored = count(sender, "socket: ignored_report_count");
@@ -122,7 +134,7 @@ fn empty_connections_from_the_peers_address_cost_a_sealed_tcp_hop_nothing() {
     let record = RunFolder::new("empty");
     let trial = Trial::shipped("shuttle-tcp.toml", record.path())
         .set(&format!("links.hop.port={PORT}"))
-        .set("run.duration=\"8 s\"");
+        .set("run.duration=\"10 min\"");
     let split = Split::start(&lab, &trial);
     split.wait_for_messages("the begin of the run");
     let made = lab.host(0).on_network(|| {
@@ -134,7 +146,7 @@ fn empty_connections_from_the_peers_address_cost_a_sealed_tcp_hop_nothing() {
         }
         open.len()
     });
-    let summaries = split.finish();
+    let summaries = split.stop();
     let commands = account(&summaries[1], CHANNELS[0]);
     let ingress = direction(&summaries[1], CHANNELS[0], "ingress");
     let unproven = count(ingress, "transport: unproven_connection_count");
@@ -151,10 +163,10 @@ fn empty_connections_from_the_peers_address_cost_a_sealed_tcp_hop_nothing() {
     }
 }
 
-/// Length of the run whose supervisors' connection is reset, seconds.
-const RESET_RUN_S: u32 = 20;
+/// Least length of the run whose supervisors' connection is reset: so much there is to exchange.
+const RESET_RUN: Duration = Duration::from_secs(12);
 /// What the hosts' network is slowed to in the run, which needs less, so that the exchange of records takes seconds.
-const SLOW: &str = "tbf rate 8mbit burst 64kb limit 1mb";
+const SLOW: &str = "tbf rate 5mbit burst 64kb limit 1mb";
 
 /// When the connection to `peer` was cut by `summary`, seconds.
 fn cuts(summary: &RunSummary, peer: &str) -> Vec<f64> {
@@ -192,28 +204,42 @@ fn exact_forgeries_in_the_supervisors_connection_cost_reconnects_that_are_told()
     let trial = Trial::shipped("shuttle-split.toml", record.path())
         .set(&format!("links.hop.port={PORT}"))
         .set("case.parameters.rate_hz=1000.0")
-        .set(&format!("run.duration=\"{RESET_RUN_S} s\""));
+        .set("run.duration=\"10 min\"");
     let mut split = Split::start(&lab, &trial);
     split.wait_for_messages("the begin of the run");
+    let began = Instant::now();
     for what in [Exact::Reset, Exact::End, Exact::Content] {
         forge_both(what, "run");
     }
+    let told_cuts = |split: &Split<'_>| {
+        let hosts = split.hosts.each_ref();
+        hosts.map(|host| host.stderr_so_far().matches("is back after").count())
+    };
+    wait_until(LIMIT, "the connection after six cuts", || {
+        told_cuts(&split).iter().all(|count| *count >= 6)
+    });
+    thread::sleep(RESET_RUN.saturating_sub(began.elapsed()));
     for port in BRIDGE_PORTS {
         let mut command = lab.host(0).command("tc");
         let words = format!("qdisc add dev {port} root {SLOW}");
         let status = command.args(words.split(' ')).status().unwrap();
         assert!(status.success(), "tc {words}");
     }
-    let exchanged = split.hosts[0].wait_for_output("exchanging records", LIMIT);
-    exchanged.unwrap_or_else(|reason| panic!("{reason}"));
+    let early_counts = told_cuts(&split);
+    split.interrupt();
+    wait_until(LIMIT, "records of the other host", || {
+        split.files[0].record_bytes("shuttle.command.taken.") > 0
+    });
     forge_both(Exact::Reset, "exchange");
-    let summaries = split.finish();
-    for (summary, peer) in summaries.iter().zip([HOSTS[1], HOSTS[0]]) {
-        let (early, late): (Vec<f64>, Vec<f64>) = cuts(summary, peer)
-            .into_iter()
-            .partition(|at_s| *at_s < f64::from(RESET_RUN_S));
-        assert!(early.len() >= 6 && late.len() >= 2, "{early:?} {late:?}");
-        assert!(summary.record_gaps.is_empty(), "{:?}", summary.record_gaps);
+    let summaries = split.stopped();
+    for (index, summary) in summaries.iter().enumerate() {
+        assert_every_message_is_accounted_for(summary);
+        let all = cuts(summary, HOSTS[1 - index]);
+        let early_count = early_counts[index];
+        assert!(
+            early_count >= 6 && all.len() >= early_count + 2,
+            "{early_count} of {all:?}"
+        );
         for name in CHANNELS {
             let account = account(summary, name);
             println!(
@@ -230,6 +256,8 @@ fn exact_forgeries_in_the_supervisors_connection_cost_reconnects_that_are_told()
 /// Link addresses of a stranger that takes a host's address, and how long it does at least.
 const CLAIMED_AT: [&str; 2] = ["02:00:00:00:00:66", "02:00:00:00:00:67"];
 const CLAIMED_FOR: Duration = Duration::from_secs(1);
+/// How long each run goes on when the host has its address again.
+const PINNED_FOR: Duration = Duration::from_secs(2);
 
 /// It gets what is sent to that host. No seal sees that; the messages are lost on the wire, and the change is told.
 #[test]
@@ -243,7 +271,7 @@ fn a_stranger_that_answers_for_a_hosts_address_is_told_with_both_link_addresses(
             let record = RunFolder::new("claimed");
             let trial = Trial::shipped("shuttle-split.toml", record.path())
                 .set(&format!("links.hop.port={PORT}"))
-                .set("run.duration=\"8 s\"");
+                .set("run.duration=\"10 min\"");
             let mut split = Split::start(&lab, &trial);
             split.wait_for_messages("the begin of the run");
             stranger.claim(ADDRESSES[1], claimed_at);
@@ -256,7 +284,9 @@ fn a_stranger_that_answers_for_a_hosts_address_is_told_with_both_link_addresses(
             // It mends the first run, and is there from the start of the second.
             lab.host(0)
                 .pin_neighbour(ADDRESSES[1], &lab.host(1).hardware_address());
-            let summaries = split.finish();
+            // A supervisor looks ten times a second.
+            thread::sleep(PINNED_FOR);
+            let summaries = split.stop();
             let told = |event: &RunEvent| match &event.kind {
                 RunEventKind::Process(EventKind::NeighbourChanged { interface, now, .. }) => {
                     // The bridge of the lab is on that host as well, and takes over the address of any announcement.
@@ -280,6 +310,8 @@ fn a_stranger_that_answers_for_a_hosts_address_is_told_with_both_link_addresses(
 
 /// How long the address is taken: longer than the supervisors wait for a byte.
 const TAKEN_FOR: Duration = Duration::from_secs(5);
+/// How long the run is looked at when messages come again.
+const AFTERWARDS: Duration = Duration::from_secs(3);
 
 /// The hop and the supervisors' connection over TCP wait, and go on; a hop's queue is bounded.
 #[test]
@@ -291,7 +323,7 @@ fn a_taken_address_costs_a_sealed_tcp_hop_and_the_supervisors_what_is_sent_meanw
     let record = RunFolder::new("taken");
     let trial = Trial::shipped("shuttle-tcp.toml", record.path())
         .set(&format!("links.hop.port={PORT}"))
-        .set("run.duration=\"24 s\"");
+        .set("run.duration=\"10 min\"");
     let trial = roomy(trial);
     let split = Split::start(&lab, &trial);
     split.wait_for_messages("the begin of the run");
@@ -304,12 +336,18 @@ fn a_taken_address_costs_a_sealed_tcp_hop_and_the_supervisors_what_is_sent_meanw
     let ended_ns = now_ns();
     split.wait_for_messages("the address is back");
     let back_ns = now_ns();
+    thread::sleep(AFTERWARDS + Duration::from_millis(200));
+    wait_until(LIMIT, "the supervisors' connection", || {
+        let mut told = split.hosts.iter().map(ChildGuard::stderr_so_far);
+        told.any(|text| text.contains("is back after"))
+    });
     let files = [0, 1].map(|index| split.files[index].clone());
-    let summaries = split.finish();
+    let summaries = split.stop();
+    let afterwards_ns = i64::try_from(AFTERWARDS.as_nanos()).unwrap();
     for (name, window_ns) in [
         ("taken", began_ns..ended_ns),
         ("pinned, until messages came again", ended_ns..back_ns),
-        ("after that", back_ns..back_ns + 3_000_000_000),
+        ("after that", back_ns..back_ns + afterwards_ns),
     ] {
         let windows_ns = slice::from_ref(&window_ns);
         let messages = cost_of_both(&files, windows_ns);

@@ -136,7 +136,7 @@ struct Phase {
 
 /// A run of `span` on which the stranger only listens, or else attacks.
 fn play(record: &Path, lab: &Lab, stranger: &Attacker, span: Duration, attacks: bool) -> Phase {
-    let duration = format!("run.duration=\"{} s\"", span.as_secs() + 6);
+    let duration = format!("run.duration=\"{} s\"", span.as_secs() + 600);
     let trial = Trial::shipped("shuttle-split.toml", record)
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
@@ -175,7 +175,7 @@ fn play(record: &Path, lab: &Lab, stranger: &Attacker, span: Duration, attacks: 
     let window_ns = from_ns..MonotonicClock::now().as_ns();
     let worked_ns = ingress_ns(gateway) - worked_ns;
     let files = [0, 1].map(|index| split.files[index].clone());
-    let summaries = split.finish();
+    let summaries = split.stop();
     Phase {
         summaries,
         flood,

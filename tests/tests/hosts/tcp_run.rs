@@ -32,7 +32,7 @@ fn a_run_over_tcp_accounts_for_every_message_and_loses_none() {
     let record = RunFolder::new("tcp");
     // Deep enough for all that comes at once after a standstill.
     let trial = Trial::shipped("shuttle-tcp.toml", record.path())
-        .set("run.duration=\"8 s\"")
+        .set("run.duration=\"5 s\"")
         .set("channels.\"shuttle/command\".depth=256")
         .set("channels.\"shuttle/status\".depth=256");
     let split = Split::start(&lab, &trial);

@@ -63,7 +63,7 @@ fn every_transport_carries_a_sealed_run_with_a_kill() {
         let record = RunFolder::new(&format!("transport-{}", transport.name));
         let trial = Trial::shipped("shuttle-split.toml", record.path())
             .set(&format!("links.hop.via=\"{}\"", transport.name))
-            .set("run.duration=\"12 s\"");
+            .set("run.duration=\"8 s\"");
         assert_doctor_is_content(&lab, &trial);
         let split = Split::start(&lab, &trial);
         split.wait_for_messages("the begin of the run");

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::browser::{Browser, Page, screenshot_folder};
-use hil_tests::child::run;
+use hil_tests::child::{ChildGuard, run};
 use hil_tests::lab::LabHost;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shown::{DESKTOP, Shown, assert_clean, serve, settle, with_the_cable_pulled};
@@ -335,9 +335,8 @@ fn a_browser_gets_our_page_to_the_socket_and_no_other() {
     );
 }
 
-fn made_report(trial: &Trial, output: &Path) {
-    let finished = trial.start_here().wait_within(LIMIT).unwrap();
-    finished.assert_success();
+fn made_report(trial: &Trial, started: &mut ChildGuard, output: &Path) {
+    started.wait_within(LIMIT).unwrap().assert_success();
     let root = trial.folder("", LIMIT).root().to_owned();
     let mut command = Command::new(hil_runtime_binary());
     command.arg("report").arg(root).arg("-o").arg(output);
@@ -419,18 +418,20 @@ fn reports_of_fleet_and_arms_open_without_a_complaint() {
         return;
     };
     let fleet = RunFolder::new("browser-report-fleet");
-    let trial = Trial::shipped("fleet-emulated.toml", fleet.path())
-        .set("case.parameters.fleets=1")
-        .set("run.duration=\"6 s\"")
-        .on_own_ports(&["commands", "states"]);
-    let page = fleet.join("report.html");
-    made_report(&trial, &page);
-    look_at_report(&mut browser, &page, "report-fleet");
     let arms = RunFolder::new("browser-report-arms");
-    let trial = Trial::shipped("emulated.toml", arms.path())
-        .set("run.duration=\"6 s\"")
-        .on_own_ports(&["hop"]);
-    let page = arms.join("report.html");
-    made_report(&trial, &page);
-    look_at_report(&mut browser, &page, "report-arms");
+    let trials = [
+        Trial::shipped("fleet-emulated.toml", fleet.path())
+            .set("case.parameters.fleets=1")
+            .on_own_ports(&["commands", "states"]),
+        Trial::shipped("emulated.toml", arms.path()).on_own_ports(&["hop"]),
+    ];
+    let trials = trials.map(|trial| trial.set("run.duration=\"6 s\""));
+    let mut runs = trials.each_ref().map(Trial::start_here);
+    let pages = [&fleet, &arms].map(|folder| folder.join("report.html"));
+    for (index, page) in pages.iter().enumerate() {
+        made_report(&trials[index], &mut runs[index], page);
+    }
+    for (page, name) in pages.iter().zip(["report-fleet", "report-arms"]) {
+        look_at_report(&mut browser, page, name);
+    }
 }

@@ -11,8 +11,7 @@ use std::time::Duration;
 
 use hil_core::random::RandomStream;
 use hil_platform::clock::MonotonicClock;
-use hil_report::summary::Outcome;
-use hil_tests::account::{account, assert_every_message_is_accounted_for};
+use hil_tests::account::account;
 use hil_tests::attacker::{
     Attacker, Exact, FOREIGN, FOREIGN_V6, Quoted, reports_v4, reset_v4, segment_v4, syn_v4,
 };
@@ -22,7 +21,7 @@ use hil_tests::live_server::LiveServer;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::split::{HOSTS, Split};
 use hil_tests::trial::Trial;
-use hil_tests::turns::{Bound, TURN, Turns, cost_of_both, play, roomy, round_count, run_duration};
+use hil_tests::turns::{Bound, TURN, Turns, cost_of_both, play, roomy, round_count};
 
 use super::live_access::{Asked, LIMIT};
 use super::live_floods::subscribe;
@@ -105,7 +104,7 @@ fn forged_traffic_costs_a_viewer_nothing_and_an_exact_reset_that_viewer() {
     let trial = Trial::shipped("shuttle-split.toml", record.path())
         .set(&format!("links.hop.port={PORT}"))
         .set("case.parameters.rate_hz=1000.0")
-        .set(&run_duration(rounds + 3, 5));
+        .set("run.duration=\"10 min\"");
     let trial = roomy(trial);
     let split = Split::start(&lab, &trial);
     split.wait_for_messages("the begin of the run");
@@ -206,7 +205,7 @@ fn forged_traffic_costs_a_viewer_nothing_and_an_exact_reset_that_viewer() {
         (next - pinned_ns) as f64 * 1e-9
     );
     let files = [0, 1].map(|index| split.files[index].clone());
-    let summaries = split.finish();
+    let summaries = split.stop();
     server.end();
     for turns in &all {
         turns.judge(
@@ -223,8 +222,6 @@ fn forged_traffic_costs_a_viewer_nothing_and_an_exact_reset_that_viewer() {
     assert!(under_resets.lost * 100 <= under_resets.sent);
     for (summary, host) in summaries.iter().zip(HOSTS) {
         assert_eq!(summary.run.host, host);
-        assert_eq!(summary.run.outcome, Outcome::Completed);
-        assert_every_message_is_accounted_for(summary);
         let lost = account(summary, "shuttle/command").fates.lost_count();
         println!("{host}: {lost} commands lost in all, the second of the taken address with them");
     }

@@ -24,6 +24,9 @@ const LOST_NS_MAX: i64 = 1_000_000_000;
 /// For how much longer the stamps of messages are held back to come in order.
 const HELD_NS: i64 = 300_000_000;
 
+/// How long the run goes on after the last kill.
+const AFTERWARDS: Duration = Duration::from_millis(1500);
+
 /// A recorder that was killed.
 struct Killed {
     file: PathBuf,
@@ -164,23 +167,23 @@ fn lost_of(
 
 #[test]
 fn killed_recorders_lose_what_was_not_flushed_and_the_run_nothing() {
-    kill_recorders(2, 16);
+    kill_recorders(2);
 }
 
 #[test]
 #[ignore = "takes most of a minute"]
 fn ten_killed_recorders_at_full_length() {
-    kill_recorders(5, 30);
+    kill_recorders(5);
 }
 
-/// Kills `count` recorders and as many beside them, one after the other, in a run of `seconds`.
-fn kill_recorders(count: usize, seconds: u32) {
+/// Kills `count` recorders and as many beside them, one after the other, in a run that is stopped then.
+fn kill_recorders(count: usize) {
     let folder = RunFolder::new("live-kills");
     let output = RunFolder::new("live-killed");
     let name = format!("kills-{}", std::process::id());
     let trial = Trial::shipped("local.toml", folder.path())
         .set(&format!("name=\"{name}\""))
-        .set(&format!("run.duration=\"{seconds} s\""));
+        .set("run.duration=\"10 min\"");
     let mut child = trial.start_here();
     let files = trial.folder("", LIMIT);
     wait_until(LIMIT, "the first records", || {
@@ -204,10 +207,13 @@ fn kill_recorders(count: usize, seconds: u32) {
         series.flat_map(|one| one.join().unwrap()).collect()
     });
     assert!(child.is_running(), "the run ended before the last kill");
-    child.wait_within(LIMIT).unwrap().assert_success();
+    // Messages of after the last kill as well.
+    thread::sleep(AFTERWARDS);
+    child.signal(Signal::SIGINT).unwrap();
+    child.wait_within(LIMIT).unwrap().assert_code(130);
     files.assert_nothing_left_here();
     let summary = files.summary();
-    assert_eq!(summary.run.outcome, Outcome::Completed);
+    assert_eq!(summary.run.outcome, Outcome::Stopped);
     assert_every_message_is_accounted_for(&summary);
     assert_accounts_close(&summary);
     let kills_ns: Vec<i64> = killed.iter().map(|one| one.at_ns).collect();

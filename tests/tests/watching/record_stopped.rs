@@ -45,7 +45,7 @@ fn played(folder: &RunFolder) -> Trial {
     let program = hil_recorder_binary().display().to_string();
     let file = commands(folder).display().to_string();
     Trial::shipped("shuttle-split.toml", &folder.join("second"))
-        .set("run.duration=\"20 s\"")
+        .set("run.duration=\"10 min\"")
         .set(&format!(
             "processes.controller.run=[\"{program}\", \"play\", \"{file}\", \"--only\", \
              \"{CHANNEL}\", \"--speed\", \"10\", \"--loop\"]"
@@ -103,7 +103,7 @@ fn a_recorder_that_stood_still_reads_the_rest_from_the_records_and_costs_the_run
             .arg(&outputs[index]);
         ChildGuard::spawn(&mut command).unwrap()
     });
-    let run = Split::start(&lab, &trial);
+    let mut run = Split::start(&lab, &trial);
     let files = run.files[1].clone();
     wait_until(LIMIT, "commands and files", || {
         arrived(&files) > ROOM_COUNT && outputs.iter().all(|file| partial(file).is_file())
@@ -118,7 +118,12 @@ fn a_recorder_that_stood_still_reads_the_rest_from_the_records_and_costs_the_run
     for recorder in &recorders {
         recorder.signal(Signal::SIGCONT).unwrap();
     }
-    let summaries = run.end();
+    let resumed_at = arrived(&files);
+    wait_until(LIMIT, "commands that are recorded as they come", || {
+        arrived(&files) > resumed_at + 2 * ROOM_COUNT
+    });
+    run.interrupt();
+    let summaries = run.stopped();
     for (index, recorder) in recorders.iter_mut().enumerate() {
         let finished = recorder.wait_within(LIMIT).unwrap();
         println!("{}", finished.stdout);

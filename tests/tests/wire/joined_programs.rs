@@ -447,7 +447,7 @@ fn killed_gateways_and_programs_come_back_and_frames_flow_again() {
         r#"version = 1
 name = "killed"
 [run]
-duration = "16 s"
+duration = "14 s"
 [hosts]
 control-pc = {{}}
 robot-pc = {{}}
@@ -599,7 +599,7 @@ fn what_a_stopped_process_of_ours_loses_is_the_harness_and_not_the_network() {
     let gateway = own(launch).unwrap();
     std::thread::sleep(Duration::from_secs(1));
     nix::sys::signal::kill(gateway, Signal::SIGSTOP).unwrap();
-    std::thread::sleep(Duration::from_secs(8));
+    std::thread::sleep(Duration::from_secs(5));
     nix::sys::signal::kill(gateway, Signal::SIGCONT).unwrap();
     std::thread::sleep(Duration::from_secs(1));
     child.signal(Signal::SIGINT).unwrap();

@@ -319,7 +319,13 @@ fn whoever_gives_orders_may_die_and_a_restarted_gateway_keeps_the_condition() {
     wait_until(LIMIT, "the restarted gateway's record", || {
         orders(&files, "backward").len() > count
     });
-    child.wait_within(LIMIT).unwrap();
+    let ingress = || files.record_bytes("shuttle.status.ingress.");
+    let before = ingress();
+    wait_until(LIMIT, "messages after the restart", || {
+        ingress() > before + 128 + 150 * 80
+    });
+    child.signal(Signal::SIGINT).unwrap();
+    child.wait_within(LIMIT).unwrap().assert_code(130);
     files.assert_nothing_left_here();
     let orders = orders(&files, "backward");
     let resumed = orders.last().unwrap();

@@ -17,7 +17,7 @@ use hil_tests::trial::{RunFiles, Trial};
 use hil_trace::{Trace, TraceFate, TraceHeader, TraceRecord, wire};
 
 const LIMIT: Duration = Duration::from_mins(1);
-const RUN_S: u64 = 8;
+const RUN_S: u64 = 5;
 /// Longer than the run, so that none of its messages comes after the end.
 const RECORD_COUNT: u64 = 2_000;
 

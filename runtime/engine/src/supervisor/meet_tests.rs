@@ -570,7 +570,7 @@ fn a_peer_that_makes_progress_with_another_host_is_waited_for() {
         let elsewhere = there.conversation();
         thread::scope(|scope| {
             scope.spawn(|| {
-                for _ in 0..100 {
+                for _ in 0..60 {
                     elsewhere.moved_count.fetch_add(1, Ordering::Relaxed);
                     thread::sleep(Duration::from_millis(50));
                 }
