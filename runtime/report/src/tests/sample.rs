@@ -582,10 +582,10 @@ fn what_had_no_room_in_a_receive_buffer_is_not_put_down_to_the_network() {
 
 #[test]
 fn a_gateway_that_was_late_is_not_the_network() {
-    let network = |superseded: u64, held: u64, is_stream: bool| {
+    let of = |superseded: u64, held: u64, via: &str| {
         let mut summary = full();
         let channel = &mut summary.channels[0];
-        channel.link = link(if is_stream { "tcp" } else { "udp" });
+        channel.link = link(via);
         let account = channel.account.as_mut().unwrap();
         account.published_count = 5_000;
         account.fates = FateCounts::default();
@@ -601,6 +601,8 @@ fn a_gateway_that_was_late_is_not_the_network() {
         }];
         Assessment::of(&summary).network
     };
+    let network =
+        |superseded, held, is_stream| of(superseded, held, if is_stream { "tcp" } else { "udp" });
     let late = |lost_count| NetworkVerdict::GatewayLate {
         channels: vec!["arm/command".to_owned()],
         loss: HostLoss {
@@ -615,6 +617,10 @@ fn a_gateway_that_was_late_is_not_the_network() {
     // Before a stream, messages wait for the network too.
     assert_eq!(network(600, 0, true), NetworkVerdict::NetworkResult);
     assert_eq!(network(600, 6, true), late(6));
+    // Behind an emulated link they wait because its model says so.
+    let emulated = |superseded, held| of(superseded, held, "emulated");
+    assert_eq!(emulated(5, 600), NetworkVerdict::EmulatedLink);
+    assert_eq!(emulated(6, 600), late(6));
 }
 
 #[test]
