@@ -140,6 +140,14 @@ impl MessageFate {
         }
     }
 
+    /// True when the network lost the message for certain, or had no way for it.
+    pub const fn is_loss_by_network(self) -> bool {
+        matches!(
+            self.crossing(),
+            Crossing::LostByNetwork | Crossing::Unreachable
+        )
+    }
+
     /// True when the message vanished, as opposed to having been taken, replaced by a newer
     /// one, still travelling, or unknown.
     pub const fn is_loss(self) -> bool {

@@ -4,8 +4,7 @@
 use core::fmt;
 
 use hil_account::flow::DeadlineMetrics;
-use hil_account::network::NetworkEventKind;
-use hil_account::{MessageFate, Standing};
+use hil_account::{ChannelAccount, MessageFate, Standing};
 use hil_core::case_study::{Occasions, Severity};
 use hil_core::interval::{Interval, Spread, TooSmall};
 use hil_platform::text::grouped;
@@ -26,7 +25,7 @@ use hil_present::units::{duration_s, figure, percent};
 pub const OCCASIONS_MIN: u64 = 10;
 /// A network event within seconds before explains nothing where more moments than this share have one.
 const CHANCE_MAX: f64 = 0.5;
-/// Messages lost in a row that make an outage; fewer are single losses, which a lossy link always has.
+/// Messages that the network lost in a row and that make an outage; fewer are single losses, which a lossy link always has.
 const OUTAGE_LOST_MIN: u64 = 3;
 /// Channels, processes or hosts that are named where many have the same fault.
 const NAMED_COUNT: usize = 3;
@@ -271,7 +270,7 @@ pub struct Sample {
     pub channel_count: u64,
     /// Messages published on them.
     pub message_count: u64,
-    /// What could have hurt the robot.
+    /// What could have hurt the robot, of the harm with the fewest; `None` where harms have none, and messages stand in.
     pub occasions: Option<OccasionCount>,
 }
 
@@ -297,13 +296,7 @@ pub struct Answer {
 impl Answer {
     /// Draws the answer.
     pub fn of(summary: &RunSummary, assessment: &Assessment) -> Self {
-        let occasions = summary.harms.first().and_then(|one| one.occasions.clone());
-        let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
-        let channels = summary.channels.iter().filter(|one| {
-            let has_account = one.account.is_some();
-            has_account && (one.link.is_crossing() || !has_crossed)
-        });
-        let accounts: Vec<_> = channels.filter_map(|one| one.account.as_ref()).collect();
+        let accounts = accounts_tested(summary);
         Self {
             hurt: hurt(summary, &assessment.network),
             subject: subject(summary, &assessment.network),
@@ -317,8 +310,8 @@ impl Answer {
             sample: Sample {
                 duration_s: summary.run.duration_s,
                 channel_count: accounts.len() as u64,
-                message_count: accounts.iter().map(|one| one.published_count).sum(),
-                occasions,
+                message_count: published_count(&accounts),
+                occasions: fewest_occasions(&summary.harms).cloned(),
             },
         }
     }
@@ -330,17 +323,18 @@ impl Answer {
 
     /// Why no more can be said, or in how many occasions nothing happened.
     pub(crate) fn reason(&self) -> Option<String> {
-        match (&self.hurt, &self.sample.occasions) {
-            (Hurt::No, Some(OccasionCount { what, count })) => {
-                let of = if self.has_own_harm {
-                    "no harm but by limits of the robot"
-                } else {
-                    "no harm"
-                };
-                Some(format!("{of} in {} {what}", grouped(*count)))
-            }
-            _ => self.hurt.reason(self.object),
+        if self.hurt != Hurt::No {
+            return self.hurt.reason(self.object);
         }
+        let of = if self.has_own_harm {
+            "no harm but by limits of the robot"
+        } else {
+            "no harm"
+        };
+        Some(match &self.sample.occasions {
+            Some(OccasionCount { what, count }) => format!("{of} in {} {what}", grouped(*count)),
+            None => format!("{of} in {}", counted(self.sample.message_count, "message")),
+        })
     }
 
     /// The answer to it.
@@ -521,9 +515,27 @@ impl fmt::Display for Unresolved {
     }
 }
 
-fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
-    let not_tested = |because| Hurt::NotTested { because };
-    let not_resolvable = |because| Hurt::NotResolvable { because };
+/// Accounts of the channels that crossed a network or a model of one; of all where none did.
+fn accounts_tested(summary: &RunSummary) -> Vec<&ChannelAccount> {
+    let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
+    let channels = summary.channels.iter();
+    let channels = channels.filter(|one| one.link.is_crossing() || !has_crossed);
+    channels.filter_map(|one| one.account.as_ref()).collect()
+}
+
+fn published_count(accounts: &[&ChannelAccount]) -> u64 {
+    accounts.iter().map(|one| one.published_count).sum()
+}
+
+/// Messages that were put to the test.
+pub(crate) fn tested_count(summary: &RunSummary) -> u64 {
+    published_count(&accounts_tested(summary))
+}
+
+/// What there is to say before any harm is looked at; `None` where harms decide.
+pub(crate) fn precondition(summary: &RunSummary, network: &NetworkVerdict) -> Option<Hurt> {
+    let not_tested = |because| Some(Hurt::NotTested { because });
+    let not_resolvable = |because| Some(Hurt::NotResolvable { because });
     match network {
         NetworkVerdict::RunFailed => return not_tested(Untested::RunFailed),
         NetworkVerdict::NoNetwork => return not_tested(Untested::NoNetwork),
@@ -536,16 +548,22 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
         _ => {}
     }
     if summary.harms.is_empty() {
-        return not_tested(Untested::NoScore);
+        not_tested(Untested::NoScore)
+    } else if is_valid(network) == Some(false) {
+        not_resolvable(Unresolved::InvalidMeasurement)
+    } else if *network == NetworkVerdict::HostUnknown {
+        not_resolvable(Unresolved::HostUnknown)
+    } else if is_score_incomplete(summary) {
+        not_resolvable(Unresolved::ScoreIncomplete)
+    } else {
+        None
     }
-    if is_valid(network) == Some(false) {
-        return not_resolvable(Unresolved::InvalidMeasurement);
-    }
-    if *network == NetworkVerdict::HostUnknown {
-        return not_resolvable(Unresolved::HostUnknown);
-    }
-    if is_score_incomplete(summary) {
-        return not_resolvable(Unresolved::ScoreIncomplete);
+}
+
+fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
+    let not_resolvable = |because| Hurt::NotResolvable { because };
+    if let Some(found) = precondition(summary, network) {
+        return found;
     }
     // Whose time it took is known of each request.
     if summary.deadlines.iter().any(|one| one.hurt_count > 0) {
@@ -570,18 +588,30 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
     if summary.harms.iter().any(|one| one.count.is_none()) {
         return not_resolvable(Unresolved::NotCounted);
     }
-    too_few_occasions(summary.harms.iter()).map_or(Hurt::No, not_resolvable)
+    too_few_occasions(&summary.harms, tested_count(summary)).map_or(Hurt::No, not_resolvable)
 }
 
-/// Nothing happened in the fewest occasions of a harm, and they are too few to tell.
+/// The harm with the fewest occasions is the least tested: an absence of harm rests on these.
+fn fewest_occasions<'a>(
+    harms: impl IntoIterator<Item = &'a HarmCount>,
+) -> Option<&'a OccasionCount> {
+    let occasions = harms.into_iter().filter_map(|harm| harm.occasions.as_ref());
+    occasions.min_by_key(|one| one.count)
+}
+
+/// Nothing happened in the fewest occasions of a harm, and they are too few to tell. Harms without occasions are
+/// tested by the `message_count` messages that crossed.
 pub(crate) fn too_few_occasions<'a>(
-    harms: impl Iterator<Item = &'a HarmCount>,
+    harms: impl IntoIterator<Item = &'a HarmCount>,
+    message_count: u64,
 ) -> Option<Unresolved> {
-    let occasions = harms.filter_map(|harm| harm.occasions.as_ref());
-    let fewest = occasions.min_by_key(|one| one.count)?;
-    (fewest.count < OCCASIONS_MIN).then(|| Unresolved::SampleTooSmall {
-        what: fewest.what.clone(),
-        count: fewest.count,
+    let (what, count) = match fewest_occasions(harms) {
+        Some(OccasionCount { what, count }) => (what.as_str(), *count),
+        None => ("messages", message_count),
+    };
+    (count < OCCASIONS_MIN).then(|| Unresolved::SampleTooSmall {
+        what: what.to_owned(),
+        count,
         needed: OCCASIONS_MIN,
     })
 }
@@ -612,29 +642,14 @@ impl Evidence {
             return false;
         }
         let mut messages = event.messages.iter();
-        let is_lost = messages.any(|one| {
-            matches!(
-                one.fate,
-                Some(
-                    MessageFate::NetworkUnreachable
-                        | MessageFate::LostOnWire
-                        | MessageFate::Incomplete
-                )
-            )
-        });
+        let is_lost = messages.any(|one| one.fate.is_some_and(MessageFate::is_loss_by_network));
         let has_outage = event.outages.iter().any(|outage| {
             let is_before = matches!(outage.standing, Standing::UnderWay | Standing::OverFor(_));
-            is_before && outage.lost_count >= OUTAGE_LOST_MIN
+            is_before && outage.lost_by_network_count >= OUTAGE_LOST_MIN
         });
-        let network = event.network.iter().flat_map(|network| &network.events);
-        let is_network = |kind: &NetworkEventKind| {
-            !matches!(
-                kind,
-                NetworkEventKind::ProcessDown { .. } | NetworkEventKind::ClockStep { .. }
-            )
-        };
-        let mut network = network.filter(|one| is_network(&one.event.kind));
-        is_lost || has_outage || (self.chance <= CHANCE_MAX && network.next().is_some())
+        let mut network = event.network.iter().flat_map(|network| &network.events);
+        let has_event = network.any(|one| one.event.is_by_network());
+        is_lost || has_outage || (self.chance <= CHANCE_MAX && has_event)
     }
 }
 

@@ -116,6 +116,7 @@ mod tests {
             until_s: None,
             length_s: None,
             lost_count: 230,
+            lost_by_network_count: 230,
             standing: Standing::UnderWay,
             clock_bound_s: 0.0,
             other_count: 0,

@@ -169,16 +169,28 @@ fn message(message: &ExplainedMessage) -> String {
 
 /// The network event that has most to do with `event`.
 pub(crate) fn cause(event: &ExplainedEvent) -> String {
-    let network = event.network.as_ref();
-    let outage = event.outages.first().map(|one| one.words.clone());
-    let beside = || event.network_beside().first().map(|one| one.words.clone());
-    let lost = || {
-        let mut messages = event.messages.iter();
-        let lost = messages.find(|one| one.fate.is_some_and(MessageFate::is_loss));
-        lost.map(|one| format!("{} {}: {}", one.channel, grouped(one.sequence), one.words))
+    // What the network did stands before what a process or a host did.
+    let of = |is_meant: fn(bool) -> bool| {
+        let mut outages = event.outages.iter();
+        let outage = outages.find(|one| is_meant(one.lost_by_network_count > 0));
+        let beside = event.network_beside().into_iter();
+        let mut beside = beside.filter(|one| is_meant(one.event.is_by_network()));
+        let mut lost = event.messages.iter().filter(|one| {
+            let fate = one.fate.filter(|fate| fate.is_loss());
+            fate.is_some_and(|fate| is_meant(fate.is_loss_by_network()))
+        });
+        outage
+            .map(|one| one.words.clone())
+            .or_else(|| Some(beside.next()?.words.clone()))
+            .or_else(|| {
+                let lost = lost.next()?;
+                let number = grouped(lost.sequence);
+                Some(format!("{} {number}: {}", lost.channel, lost.words))
+            })
     };
-    outage.or_else(beside).or_else(lost).unwrap_or_else(|| {
-        network.map_or_else(
+    let found = of(|is_network| is_network).or_else(|| of(|_| true));
+    found.unwrap_or_else(|| {
+        event.network.as_ref().map_or_else(
             || "nothing that is known of the network".to_owned(),
             PrecedingNetwork::nothing_words,
         )

@@ -1,5 +1,6 @@
 //! What a run answers, and the report that a run prints.
 
+use hil_account::MessageFate;
 use hil_account::flow::{DeadlineFold, DeadlineMetrics};
 use hil_core::case_study::Severity;
 
@@ -87,6 +88,80 @@ fn a_hurt_robot_is_put_down_to_a_network_that_misbehaved_before() {
     unordered.score_events.clocks_differ = true;
     let because = Unresolved::ClocksDiffer;
     assert_eq!(answer(&unordered).hurt, Hurt::NotResolvable { because });
+}
+
+#[test]
+fn what_a_killed_gateway_or_a_full_buffer_lost_is_not_the_network() {
+    use MessageFate as Fate;
+    let hurt = |fate: Fate, by_network_count: u64| {
+        let mut summary = run(lost_loops(Some(2), 0, 40));
+        for event in &mut summary.score_events.events {
+            event.network.as_mut().unwrap().events.clear();
+            for outage in &mut event.outages {
+                assert!(outage.lost_count > 3);
+                outage.lost_by_network_count = by_network_count;
+            }
+            for message in &mut event.messages {
+                message.fate = Some(fate);
+            }
+        }
+        answer(&summary).hurt
+    };
+    let because = Unresolved::NoNetworkEventBefore;
+    let unexplained = Hurt::NotResolvable { because };
+    for fate in [
+        Fate::LostInInterruption,
+        Fate::LostByHarness,
+        Fate::LostOnWireOrByHarness,
+    ] {
+        assert_eq!(hurt(fate, 0), unexplained, "{fate:?}");
+        // Single losses beside it are no outage of the network.
+        assert_eq!(hurt(fate, 2), unexplained, "{fate:?}");
+        assert_eq!(hurt(fate, 3), Hurt::Yes, "{fate:?}");
+    }
+    assert_eq!(hurt(Fate::LostOnWire, 0), Hurt::Yes, "a message is named");
+}
+
+#[test]
+fn a_harm_without_occasions_is_tested_by_the_messages_that_crossed() {
+    let of = |published_count: u64| {
+        let mut summary = run(HarmCount {
+            occasions: None,
+            ..lost_loops(Some(0), 0, 0)
+        });
+        count_all(&mut summary);
+        for channel in &mut summary.channels {
+            if let Some(account) = &mut channel.account {
+                account.published_count = if channel.link.is_crossing() {
+                    published_count
+                } else {
+                    5_000
+                };
+            }
+        }
+        answer(&summary)
+    };
+    // Two channels cross.
+    assert_eq!(of(5).words(), "NO: no harm in 10 messages");
+    let Hurt::NotResolvable {
+        because: Unresolved::SampleTooSmall { count: 8, .. },
+    } = of(4).hurt
+    else {
+        panic!("{:?}", of(4));
+    };
+}
+
+#[test]
+fn the_sample_of_an_answer_is_what_its_verdict_rests_on() {
+    let mut summary = run(lost_loops(Some(0), 0, 600));
+    summary.harms.push(HarmCount {
+        occasions: Some(OccasionCount {
+            what: "grasps".to_owned(),
+            count: 12,
+        }),
+        ..lost_loops(Some(0), 0, 0)
+    });
+    assert_eq!(answer(&summary).words(), "NO: no harm in 12 grasps");
 }
 
 #[test]

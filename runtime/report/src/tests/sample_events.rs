@@ -61,6 +61,7 @@ pub(crate) fn few_events() -> ScoreEvents {
         until_s: Some(4.4),
         length_s: Some(0.8),
         lost_count: 20,
+        lost_by_network_count: 20,
         standing: Standing::OverFor(521_000_000),
         clock_bound_s: 0.0,
         other_count: 3,
