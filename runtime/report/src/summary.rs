@@ -33,6 +33,7 @@ use crate::analysis::write_whole;
 use crate::nic_metrics::HardwareStamps;
 use hil_platform::host_facts::HostFacts;
 use hil_platform::text::grouped;
+use hil_present::UNAVAILABLE;
 use hil_rundir::event::{EventKind, ProcessKind};
 use hil_rundir::file_fault::RecordGap;
 use hil_rundir::launch::Side;
@@ -138,6 +139,19 @@ impl RunSummary {
             record_gaps: Vec::new(),
             warnings: Vec::new(),
         }
+    }
+
+    /// Why nothing is known of the robot of a case; `None` where something is, and of programs alone.
+    pub(crate) fn no_score_words(&self) -> Option<String> {
+        let has_score = self.score.iter().any(|one| one.value.is_some())
+            || self.harms.iter().any(|one| one.count.is_some())
+            || self.score_events.total_count() > 0;
+        if has_score || self.run.case.is_empty() {
+            return None;
+        }
+        let first = self.score.first();
+        let why = first.map_or("the case gave no score", |one| &one.method);
+        Some(format!("{UNAVAILABLE}: {why}"))
     }
 
     /// Takes what the case says of the robot, but the events, which need their messages.

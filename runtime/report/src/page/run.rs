@@ -94,7 +94,8 @@ fn ended(key: String, summary: &RunSummary, material: &Material, steps: usize) -
             text: facts.exit_reason.clone(),
         },
         answer: Some(answer_view(summary, &assessment)),
-        grave_count: sections::events::grave_count(&summary.score_events),
+        grave_count: (!facts.case.is_empty() && summary.no_score_words().is_none())
+            .then(|| sections::events::grave_count(&summary.score_events)),
         repeat_command: Some(facts.repeat_command.clone()),
         key,
         ..Run::default()

@@ -1,6 +1,5 @@
 //! What stands below the answer of a run, in every form. It draws no conclusions.
 
-use hil_account::MessageFate;
 use hil_core::interval::Spread;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
@@ -112,12 +111,11 @@ fn messages(summary: &RunSummary) -> Option<String> {
     if accounts.is_empty() {
         return None;
     }
-    let lost = accounts.iter().map(|(name, account)| {
-        let fates = MessageFate::ALL.into_iter().filter(|fate| fate.is_loss());
-        let lost: u64 = fates.map(|fate| account.fates.of(fate)).sum();
-        (*name, lost, account.published_count)
+    let lost = accounts.iter().filter_map(|(name, account)| {
+        Some((*name, account.lost_known()?, account.published_count))
     });
     let lost: Vec<_> = lost.collect();
+    let unknown_count = (accounts.len() - lost.len()) as u64;
     let all: u64 = lost.iter().map(|(_, lost, _)| lost).sum();
     let ratio = |lost: u64, of: u64| lost as f64 / of.max(1) as f64;
     let most = lost
@@ -125,13 +123,27 @@ fn messages(summary: &RunSummary) -> Option<String> {
         .filter(|(_, _, of)| *of >= OCCASIONS_MIN)
         .max_by(|a, b| ratio(a.1, a.2).total_cmp(&ratio(b.1, b.2)));
     let mut text = match most {
-        _ if lost.iter().all(|(_, _, of)| *of == 0) => "none published".to_owned(),
+        _ if lost.is_empty() => "how many were lost is unknown".to_owned(),
+        _ if unknown_count == 0 && lost.iter().all(|(_, _, of)| *of == 0) => {
+            "none published".to_owned()
+        }
         _ if all == 0 => "none lost".to_owned(),
         Some((name, lost, of)) if *lost > 0 => {
             format!("up to {} lost, on {name}", percent(ratio(*lost, *of)))
         }
         _ => format!("{} lost", grouped(all)),
     };
+    if unknown_count > 0 {
+        let of = if lost.is_empty() {
+            String::new()
+        } else {
+            format!(
+                "; of {} it is unknown",
+                counted(unknown_count, "other channel")
+            )
+        };
+        text.push_str(&[&of, ": records that would tell are not at hand"].concat());
+    }
     let gaps = accounts.iter().filter_map(|(name, account)| {
         let gap = account.gaps.longest?;
         Some((gap.length_ns, *name))

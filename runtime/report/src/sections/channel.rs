@@ -40,6 +40,7 @@ pub(crate) struct Sources<'a> {
 }
 
 const NO_ACCOUNT: &str = "no records of this channel";
+const PRODUCER_UNKNOWN: &str = "known here only: the producer's records are not at hand";
 const NO_NETWORK: &str = "no figures of a network under this channel";
 
 /// Lengths of runs of losses that are listed.
@@ -284,7 +285,6 @@ fn counts(sources: &Sources<'_>) -> Vec<Metric> {
     let taken = |account: &ChannelAccount| account.fates.of(MessageFate::Taken);
     let published = live(|one| one.published_count);
     let delivered = live(taken);
-    let lost = live(|one| one.fates.lost_count());
     let replaced = live(|one| {
         one.fates.of(MessageFate::SupersededAtInput)
             + one.fates.of(MessageFate::SupersededAtConsumer)
@@ -299,21 +299,27 @@ fn counts(sources: &Sources<'_>) -> Vec<Metric> {
                 "of {} the other host's records, which are not at hand, would tell; known: {} delivered, {} lost",
                 counted(count, "message"),
                 grouped(delivered.unwrap_or(0)),
-                grouped(lost.unwrap_or(0))
+                grouped(live(|one| one.fates.lost_count()).unwrap_or(0))
             )
         },
     );
-    let [delivered, lost] = [delivered, lost].map(|count| count.filter(|_| unknown.is_none()));
+    let delivered = delivered.filter(|_| unknown.is_none());
+    let lost = account.and_then(ChannelAccount::lost_known);
     let is_total_known = account.is_none_or(|one| one.published_unrecorded_count.is_some());
+    let lost_reason = if unknown.is_none() && !is_total_known {
+        PRODUCER_UNKNOWN
+    } else {
+        &reason
+    };
     let published_method = if is_total_known {
         "every sequence number up to the highest seen"
     } else {
-        "known here only: the producer's records are not at hand"
+        PRODUCER_UNKNOWN
     };
     [
         figure("published", "published", published, NO_ACCOUNT).by(published_method),
         figure("delivered", "delivered", delivered, &reason).by("taken by the consumer"),
-        figure("lost", "lost, by host or network", lost, &reason)
+        figure("lost", "lost, by host or network", lost, lost_reason)
             .by("vanished; messages that a newer one replaced and those under way are not lost"),
         figure("replaced", "replaced by newer ones", replaced, NO_ACCOUNT)
             .by("before the sending gateway or the consumer took them"),

@@ -23,11 +23,24 @@ const NETWORK_SHOWN_COUNT: usize = 3;
 /// Events of the network that are listed: under independent losses there are hundreds alike.
 const NETWORK_EVENTS_MAX: usize = 40;
 
+/// What is said of a robot to which nothing happened.
+pub(crate) const NOTHING_GRAVE: &str = "no incident and no hazard";
+
 /// What happened to the robot, the gravest events where there are too many, in order of time.
-pub(super) fn robot(all: &ScoreEvents) -> Section {
+pub(super) fn robot(summary: &RunSummary) -> Section {
     let title = "What happened to the robot, and the network before it";
-    let mut section = Section::new("robot", title, severity_counts(all));
-    if all.events.is_empty() {
+    let all = &summary.score_events;
+    let mut section = Section::new("robot", title, "");
+    if summary.run.case.is_empty() {
+        return section;
+    }
+    if let Some(words) = summary.no_score_words() {
+        section.note(Tone::Faint, words);
+        return section;
+    }
+    section.aside = severity_counts(all);
+    if all.total_count() == 0 {
+        section.note(Tone::Plain, NOTHING_GRAVE);
         return section;
     }
     if all.clocks_differ {

@@ -203,7 +203,11 @@ pub(super) fn score(summary: &RunSummary) -> Section {
         return section;
     }
     if summary.score.is_empty() {
-        section.note(Tone::Faint, "unavailable: the case gave no score");
+        let words = summary.no_score_words();
+        section.note(
+            Tone::Faint,
+            words.unwrap_or_else(|| "no figure but its events".to_owned()),
+        );
         return section;
     }
     let links = links_crossed(summary);

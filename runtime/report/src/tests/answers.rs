@@ -1,15 +1,17 @@
 //! What a run answers, and the report that a run prints.
 
-use hil_account::MessageFate;
 use hil_account::flow::{DeadlineFold, DeadlineMetrics};
+use hil_account::{ChannelAccount, FateCounts, MessageFate};
 use hil_core::case_study::Severity;
 
 use super::sample::{awkward, check_golden, empty, flow, full, link};
 use crate::answer::{Answer, Clocks, HarmCount, Hurt, OccasionCount, Unresolved, Untested};
 use crate::assessment::Assessment;
 use crate::network::{TimelineRow, TimelineSubject};
+use crate::page::Format;
+use crate::page::read::{Found, Material};
 use crate::score_event::ScoreEvents;
-use crate::summary::{ChannelFlows, Fact, LinkKind, Outcome, RunSummary};
+use crate::summary::{ChannelFlows, Fact, LinkKind, Outcome, RunSummary, ScoreMetric};
 use crate::terminal::{Style, brief, render};
 use hil_core::interval::{Interval, IntervalMethod, Spread};
 use hil_present::Tone;
@@ -40,6 +42,17 @@ fn run(harm: HarmCount) -> RunSummary {
     summary.processes[0].skipped_tick_count = Some(0);
     summary.harms = vec![harm];
     summary
+}
+
+/// The page of a run.
+fn page_text(summary: &RunSummary) -> String {
+    let material = Material {
+        folder: "run".to_owned(),
+        found: Found::Ended(Box::new(summary.clone())),
+        series: Vec::new(),
+        problems: Vec::new(),
+    };
+    crate::page::render(&[material], None, Format::Html, None).unwrap()
 }
 
 fn answer(summary: &RunSummary) -> Answer {
@@ -481,6 +494,63 @@ fn unaligned_clocks_are_told_beside_a_valid_measurement() {
         page.contains("one-way delays and the order of events are unavailable"),
         "{page}"
     );
+}
+
+#[test]
+fn a_robot_of_which_nothing_is_known_is_not_called_unhurt() {
+    for summary in [
+        empty(),
+        RunSummary {
+            score: vec![ScoreMetric {
+                value: None,
+                method: "the case gave no score".to_owned(),
+                ..full().score[2].clone()
+            }],
+            harms: vec![lost_loops(None, 0, 0)],
+            ..empty()
+        },
+    ] {
+        for page in [
+            brief(&summary, 100, Style::Plain),
+            render(&summary, 100, Style::Plain),
+            page_text(&summary),
+        ] {
+            let page = page.to_lowercase();
+            assert!(!page.contains("no incident"), "{page}");
+            assert!(!page.contains("0 incidents"), "{page}");
+            assert!(
+                page.contains("unavailable: the case gave no score"),
+                "{page}"
+            );
+        }
+    }
+}
+
+#[test]
+fn losses_that_only_missing_records_tell_are_unknown_and_not_none() {
+    let of = |change: &dyn Fn(&mut ChannelAccount)| {
+        let mut summary = run(lost_loops(Some(0), 0, 40));
+        for channel in &mut summary.channels {
+            channel.account.iter_mut().for_each(change);
+        }
+        let page = brief(&summary, 100, Style::Plain);
+        let words = page.split_whitespace().collect::<Vec<_>>().join(" ");
+        (words, render(&summary, 100, Style::Plain))
+    };
+    let peers = |account: &mut ChannelAccount| {
+        account.fates = FateCounts::default();
+        let fate = MessageFate::UnknownPeerRecordsUnavailable;
+        account.fates.add(fate, account.published_count);
+    };
+    let producers = |account: &mut ChannelAccount| account.published_unrecorded_count = None;
+    for (page, full) in [of(&peers), of(&producers)] {
+        assert!(page.contains("how many were lost is unknown"), "{page}");
+        assert!(page.contains("unknown of 5,000"), "{page}");
+        for words in ["none lost", "0 of 5,000", "up to"] {
+            assert!(!page.contains(words), "{words}: {page}");
+        }
+        assert!(!full.contains("lost, by host or network  "), "{full}");
+    }
 }
 
 #[test]
