@@ -13,13 +13,14 @@ use hil_stats::statistics::CONFIDENCE;
 use serde::{Deserialize, Serialize};
 
 use super::assessment::{
-    Assessment, HELD_MAX_NS, NetworkVerdict, SKIPPED_TICK_RATIO_MAX, uncounted_start_count,
+    Assessment, HELD_MAX_NS, NetworkVerdict, SKIPPED_TICK_RATIO_MAX, uncounted,
+    uncounted_start_count,
 };
 use super::clock_summary::ClockSection;
 use super::score_event::ExplainedEvent;
-use super::summary::{LinkKind, RunSummary, ScoreMetric};
+use super::summary::{LinkKind, RunSummary};
 use hil_present::Tone;
-use hil_present::units::{duration_s, figure, percent};
+use hil_present::units::{duration_s, percent};
 
 /// A rate of fewer occasions is not told, and no harm in fewer is no answer.
 pub const OCCASIONS_MIN: u64 = 10;
@@ -44,6 +45,9 @@ pub struct HarmCount {
     /// 95 % interval of its share of them, or why there is none.
     #[serde(default)]
     pub interval: Option<Spread>,
+    /// What it is, for a reader who does not know the term; empty where that is plain.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub note: String,
 }
 
 /// What could have hurt the robot; see [`Occasions`].
@@ -66,6 +70,7 @@ impl From<&hil_core::case_study::Harm> for HarmCount {
                 OccasionCount { what, count }
             }),
             interval: harm.interval,
+            note: harm.note.to_owned(),
         }
     }
 }
@@ -81,6 +86,7 @@ impl From<&DeadlineMetrics> for HarmCount {
                 count: deadline.request_count - deadline.unknown_count,
             }),
             interval: deadline.hurt_share,
+            note: String::new(),
         }
     }
 }
@@ -259,6 +265,8 @@ pub struct Measurement {
     pub clocks: Clocks,
     /// Starts of processes that left no counters: what these lost or skipped is unknown.
     pub uncounted_start_count: u64,
+    /// The processes concerned.
+    pub uncounted_process_count: u64,
 }
 
 /// How much the answer rests on.
@@ -306,6 +314,7 @@ impl Answer {
                 is_valid: is_valid(&assessment.network),
                 clocks: clocks(summary),
                 uncounted_start_count: uncounted_start_count(summary),
+                uncounted_process_count: uncounted(summary).count() as u64,
             },
             sample: Sample {
                 duration_s: summary.run.duration_s,
@@ -350,8 +359,7 @@ impl Answer {
         let percent = 100.0 * CONFIDENCE;
         (self.hurt == Hurt::No).then(|| {
             format!(
-                "up to {most:.1} independent events of harm in a run this long cannot be excluded ({percent:.0} %, \
-                 Poisson)"
+                "a run this long can miss up to {most:.0} such events ({percent:.0} %, Poisson)"
             )
         })
     }
@@ -366,11 +374,18 @@ impl Answer {
         }
     }
 
-    /// Green only for an unhurt robot and a valid measurement.
+    /// Green only for an unhurt robot and a measurement that is valid in all its parts.
     pub(crate) const fn tone(&self) -> Tone {
-        match (&self.hurt, self.measurement.is_valid) {
+        let Measurement {
+            is_valid,
+            clocks,
+            uncounted_start_count,
+            ..
+        } = self.measurement;
+        let is_whole = uncounted_start_count == 0 && !matches!(clocks, Clocks::Unaligned);
+        match (&self.hurt, is_valid) {
             (Hurt::Yes, _) => Tone::Bad,
-            (Hurt::No, Some(true)) if self.measurement.uncounted_start_count == 0 => Tone::Good,
+            (Hurt::No, Some(true)) if is_whole => Tone::Good,
             (Hurt::No | Hurt::NotResolvable { .. } | Hurt::NotTested { .. }, _) => Tone::Caution,
         }
     }
@@ -391,35 +406,27 @@ impl Answer {
                     .to_owned()
             }
         };
-        let uncounted_count = self.measurement.uncounted_start_count;
-        let uncounted = uncounted_words(uncounted_count);
+        let uncounted = self.measurement.uncounted_words();
         match invalid_words(network) {
             Some(why) => (Tone::Bad, format!("NOT VALID: {why}")),
             None if self.measurement.is_valid.is_none() => {
-                let uncounted = match network {
-                    NetworkVerdict::HostUnknown => uncounted,
-                    _ => String::new(),
-                };
+                let uncounted = uncounted.filter(|_| *network == NetworkVerdict::HostUnknown);
+                let uncounted = uncounted.map_or_else(String::new, |words| format!("; {words}"));
                 (
                     Tone::Plain,
                     format!("{}{uncounted}", unmeasured_words(network)),
                 )
             }
-            None if uncounted_count > 0 => (
-                Tone::Caution,
-                format!(
-                    "valid as far as known ({} left no counters){clocks}",
-                    counted(uncounted_count, "process start")
+            None => match (uncounted, self.measurement.clocks) {
+                (Some(words), _) => (
+                    Tone::Caution,
+                    format!("valid as far as known: {words}{clocks}"),
                 ),
-            ),
-            None => {
-                let valid = match self.measurement.clocks {
-                    Clocks::Unaligned => "valid in part",
-                    _ => "valid",
-                };
-                let words = format!("{valid}: hosts and links were kept up with{clocks}");
-                (Tone::Plain, words)
-            }
+                (None, Clocks::Unaligned) => {
+                    (Tone::Caution, format!("valid in part: {KEPT_UP}{clocks}"))
+                }
+                (None, _) => (Tone::Plain, format!("valid: {KEPT_UP}{clocks}")),
+            },
         }
     }
 
@@ -433,7 +440,7 @@ impl Answer {
         } = &self.sample;
         let messages = counted(*message_count, "message");
         let channels = counted(*channel_count, "channel");
-        let text = format!("{length_s:.1} s, {messages} published on {channels}");
+        let text = format!("{length_s:.1} s, {messages} on {channels}");
         match occasions {
             Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
                 format!("{text}, {what}: {count}, too few for a rate, which takes {OCCASIONS_MIN}")
@@ -458,7 +465,7 @@ impl Hurt {
         match self {
             Self::Yes => "YES",
             Self::No => "NO",
-            Self::NotResolvable { .. } => "NOT RESOLVABLE",
+            Self::NotResolvable { .. } => "CANNOT TELL",
             Self::NotTested { .. } => "NOT TESTED",
         }
     }
@@ -665,64 +672,6 @@ pub(crate) fn is_score_incomplete(summary: &RunSummary) -> bool {
     })
 }
 
-/// The figure in the unit that people think in, with its interval if it has one.
-pub(crate) fn metric_words(metric: &ScoreMetric) -> String {
-    let scale = UnitScale::of(&metric.unit);
-    let value = metric
-        .value
-        .map_or_else(|| "unavailable".to_owned(), |value| scale.words(value));
-    let interval = match metric.interval {
-        Some(Spread::Known(one)) => format!(
-            " [{}, {}]",
-            figure(scale.scaled(one.low)),
-            figure(scale.scaled(one.high))
-        ),
-        // The full report says why there is none.
-        None | Some(Spread::Unknown(_)) => String::new(),
-    };
-    format!("{value}{interval}")
-}
-
-/// From an SI unit to the one that people think in.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct UnitScale<'a> {
-    factor: f64,
-    unit: &'a str,
-}
-
-impl<'a> UnitScale<'a> {
-    /// Of figures in `unit`.
-    pub(crate) fn of(unit: &'a str) -> Self {
-        let (factor, unit) = match unit {
-            "rad" => (180.0 / core::f64::consts::PI, "°"),
-            "m" => (1e3, "mm"),
-            "s" => (1e3, "ms"),
-            "1" => (1.0, ""),
-            unit => (1.0, unit),
-        };
-        Self { factor, unit }
-    }
-
-    /// The unit that people think in; empty for a number.
-    pub(crate) const fn unit(self) -> &'a str {
-        self.unit
-    }
-
-    /// The value in that unit.
-    pub(crate) fn scaled(self, value: f64) -> f64 {
-        self.factor * value
-    }
-
-    /// The value with its unit.
-    pub(crate) fn words(self, value: f64) -> String {
-        let value = figure(self.scaled(value));
-        match self.unit {
-            "" => value,
-            unit => format!("{value} {unit}"),
-        }
-    }
-}
-
 fn subject(summary: &RunSummary, network: &NetworkVerdict) -> Subject {
     let mut links = summary.channels.iter().map(|one| one.link);
     match network {
@@ -745,11 +694,25 @@ const fn unmeasured_words(network: &NetworkVerdict) -> &'static str {
     }
 }
 
-/// What the judgement of a measurement cannot rest on; empty where everything was counted.
-pub(crate) fn uncounted_words(uncounted_start_count: u64) -> String {
-    match uncounted_start_count {
-        0 => String::new(),
-        count => format!("; {} left no counters", counted(count, "process start")),
+/// What makes a measurement valid.
+const KEPT_UP: &str = "hosts and links kept up";
+
+/// With what a reader may not know.
+pub(crate) fn with_note(words: String, note: &str) -> String {
+    match note {
+        "" => words,
+        note => format!("{words} ({note})"),
+    }
+}
+
+impl Measurement {
+    /// What the judgement cannot rest on; `None` where everything was counted.
+    fn uncounted_words(&self) -> Option<String> {
+        let count = self.uncounted_process_count;
+        (count > 0).then(|| {
+            let processes = counted(count, "killed or restarted process");
+            format!("what {processes} dropped or skipped is unknown")
+        })
     }
 }
 

@@ -334,7 +334,7 @@ fn frames_lost(summary: &RunSummary) -> Option<(Vec<String>, HostLoss)> {
 
 /// Processes some of whose starts left no counters. A process tells its counters as it ends in order, and those
 /// of its last start are kept.
-fn uncounted(summary: &RunSummary) -> impl Iterator<Item = &ProcessSummary> {
+pub(crate) fn uncounted(summary: &RunSummary) -> impl Iterator<Item = &ProcessSummary> {
     let carries_frames = |process: &ProcessSummary| {
         let mut channels = summary.channels.iter().filter(|channel| {
             let name = Some(process.name.as_str());
@@ -510,7 +510,7 @@ fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
     {
         let (ratio, least) = (percent(ratio), percent(CLOSED_RATIO_MIN));
         warnings.push(format!(
-            "{name}: the account closes for {ratio} of messages, less than {least}"
+            "{name}: the times of only {ratio} of messages add up, less than {least}"
         ));
     }
     // What has no stamps by design, nobody can do anything about.

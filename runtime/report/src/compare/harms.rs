@@ -192,6 +192,7 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
         own_count: 0,
         occasions: None,
         interval: None,
+        note: String::new(),
     };
     for run in runs {
         let Some(harm) = run.summary.harms.iter().find(|one| one.what == what) else {
@@ -200,6 +201,7 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
         };
         sum.count = sum.count.zip(harm.count).map(|(one, other)| one + other);
         sum.own_count += harm.own_count;
+        sum.note.clone_from(&harm.note);
         // Of several runs together there is none: their own differ.
         sum.interval = harm.interval.filter(|_| runs.len() == 1);
         if let Some(OccasionCount { what, count }) = &harm.occasions {
@@ -316,6 +318,7 @@ mod tests {
                 count: sent_count,
             }),
             interval: count.map(|count| of_loops(count, sent_count, true)),
+            note: String::new(),
         }];
         ComparedRun {
             folder: PathBuf::from("run"),
@@ -397,6 +400,7 @@ mod tests {
                     own_count: 0,
                     occasions: None,
                     interval: None,
+                    note: String::new(),
                 });
                 run
             });

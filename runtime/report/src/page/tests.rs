@@ -408,6 +408,13 @@ fn a_reason_is_said_once_with_all_that_it_is_for() {
     assert!(terminal.contains("unavailable, 10: no whole motion loop"));
     let markdown = render(&[material(summary.clone())], None, Format::Md, None).unwrap();
     assert_eq!(markdown.matches("no whole motion loop").count(), 1);
+    // Why a loss has no interval is said once.
+    let all = render(&[material(full())], None, Format::Csv, None).unwrap();
+    let loss = all
+        .lines()
+        .find(|line| line.contains(",loss_ratio,"))
+        .unwrap();
+    assert_eq!(loss.matches("effective observations").count(), 1, "{loss}");
     // For programs each figure stands by itself.
     let csv = render(&[material(summary)], None, Format::Csv, None).unwrap();
     assert_eq!(csv.matches("no whole motion loop").count(), 10);

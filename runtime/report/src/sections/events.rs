@@ -2,7 +2,6 @@
 
 use core::cmp::Reverse;
 
-use hil_account::MessageFate;
 use hil_account::network::NetworkEventKind;
 use hil_core::case_study::Severity;
 use hil_platform::text::grouped;
@@ -94,19 +93,12 @@ fn dropped_words(all: &ScoreEvents) -> Option<String> {
 
 /// How many there are of each severity, listed or not.
 pub(crate) fn severity_counts(all: &ScoreEvents) -> String {
-    let counts = [
+    format!(
+        "{} (must not happen), {} (nearly one), {}",
         counted(all.count_of(Severity::Incident), "incident"),
         counted(all.count_of(Severity::Hazard), "hazard"),
         counted(all.count_of(Severity::Notice), "notice"),
-    ];
-    let mut counts = counts.join(", ");
-    // A summary of an earlier version says only how many were left out.
-    let known: u64 = all.dropped_by_severity.values().sum();
-    let unknown = all.dropped_count.saturating_sub(known);
-    if unknown > 0 {
-        counts = format!("{counts}, {} of unknown severity", grouped(unknown));
-    }
-    counts
+    )
 }
 
 /// Incidents and hazards.
@@ -204,7 +196,7 @@ pub(crate) fn cause(event: &ExplainedEvent) -> String {
     let found = of(|is_network| is_network).or_else(|| of(|_| true));
     found.unwrap_or_else(|| {
         event.network.as_ref().map_or_else(
-            || "nothing that is known of the network".to_owned(),
+            || "nothing is known of the network".to_owned(),
             PrecedingNetwork::nothing_words,
         )
     })
@@ -218,12 +210,13 @@ pub(crate) fn gravest_first(events: &[ExplainedEvent]) -> Vec<&ExplainedEvent> {
     grave
 }
 
-/// The gravest event that the network explains, and what the network did before it.
-pub(crate) fn first_harm(summary: &RunSummary) -> Option<String> {
+/// The gravest event that the network explains with its time, and what the network did before it.
+pub(crate) fn gravest_harm(summary: &RunSummary) -> Option<(String, String)> {
     let evidence = Evidence::of(summary);
-    let gravest = gravest_first(&summary.score_events.events).into_iter();
-    let event = gravest.into_iter().find(|event| evidence.explains(event))?;
-    Some(format!("{}; network: {}", event.what, cause(event)))
+    let mut gravest = gravest_first(&summary.score_events.events).into_iter();
+    let event = gravest.find(|event| evidence.explains(event))?;
+    let at = event.at_s.map(|at_s| format!("at {}: ", seconds(at_s)));
+    Some((at.unwrap_or_default() + &event.what, cause(event)))
 }
 
 /// What happened on the network, the longest events.

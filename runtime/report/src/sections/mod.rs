@@ -9,7 +9,6 @@ pub(crate) mod events;
 mod flows;
 mod network;
 mod nics;
-mod paper;
 mod radio;
 mod run;
 mod timeline;

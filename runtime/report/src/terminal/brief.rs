@@ -178,11 +178,11 @@ fn causes(summary: &RunSummary, width: usize, shown_count: usize) -> Section {
     let room = 2 * (width - EVENT_MARGIN) - 20;
     let event = |event: &&ExplainedEvent| {
         let relation = if evidence.explains(event) {
-            "after"
+            "network before it"
         } else {
-            "beside"
+            "not explained by the network; about then"
         };
-        let cause = format!("{relation} {}", cause(event));
+        let cause = format!("{relation}: {}", cause(event));
         Event {
             at: event.at_s.map_or_else(|| UNAVAILABLE.to_owned(), seconds),
             severity: event.severity_word(),
