@@ -50,6 +50,15 @@ pub struct ChannelAccount {
     pub interruptions: Vec<InterruptionMetrics>,
 }
 
+impl ChannelAccount {
+    /// Messages that vanished; `None` where records that are not at hand would tell of others.
+    pub fn lost_known(&self) -> Option<u64> {
+        let unknown_count = self.fates.of(MessageFate::UnknownPeerRecordsUnavailable);
+        let is_known = unknown_count == 0 && self.published_unrecorded_count.is_some();
+        is_known.then(|| self.fates.lost_count())
+    }
+}
+
 /// Messages by fate.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]

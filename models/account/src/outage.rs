@@ -24,6 +24,8 @@ pub struct Outage {
     /// Messages lost in it. One that was replaced by a newer one before it was sent, or whose
     /// fate is unknown, says nothing about the way: it neither counts nor ends an outage.
     pub lost_count: u64,
+    /// Of these, lost by the network for certain, see [`MessageFate::is_loss_by_network`].
+    pub lost_by_network_count: u64,
     /// Sequence number of the first of them.
     pub first_sequence: u64,
     /// When the first of them was published, on the producer's clock, nanoseconds; `None` when
@@ -85,13 +87,20 @@ impl TakenAt {
 }
 
 impl OutageFinder {
-    /// `count` messages from `sequence` on were lost; the first was published at `published_ns`,
-    /// where that is known.
-    pub fn lost(&mut self, sequence: u64, count: u64, published_ns: Option<i64>) {
+    /// `count` messages from `sequence` on were lost, by the network for certain or not; the first was
+    /// published at `published_ns`, where that is known.
+    pub fn lost(
+        &mut self,
+        sequence: u64,
+        count: u64,
+        published_ns: Option<i64>,
+        is_by_network: bool,
+    ) {
         if !self.is_open {
             self.is_open = true;
             self.found.push(Outage {
                 lost_count: 0,
+                lost_by_network_count: 0,
                 first_sequence: sequence,
                 from_ns: None,
                 until_ns: None,
@@ -103,6 +112,9 @@ impl OutageFinder {
         let last_taken = self.last_taken;
         if let Some(outage) = self.found.last_mut() {
             outage.lost_count = outage.lost_count.saturating_add(count);
+            if is_by_network {
+                outage.lost_by_network_count = outage.lost_by_network_count.saturating_add(count);
+            }
             outage.from_ns = outage.from_ns.or(published_ns);
             let would_take_ns = || Some(last_taken?.would_take_ns(outage.from_ns?));
             outage.silent_from_ns = outage.silent_from_ns.or_else(would_take_ns);
@@ -152,7 +164,13 @@ impl OutageFinder {
             }
             fate if fate.is_loss() => {
                 let is_first = !self.is_open;
-                self.lost(message.key.sequence, message.count, published_ns);
+                let is_by_network = fate.is_loss_by_network();
+                self.lost(
+                    message.key.sequence,
+                    message.count,
+                    published_ns,
+                    is_by_network,
+                );
                 if let Some(outage) = self.found.last_mut().filter(|_| is_first) {
                     outage.interruption_index = message.interruption_index;
                 }

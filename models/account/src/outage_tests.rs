@@ -70,6 +70,35 @@ fn an_outage_lasts_from_the_first_lost_to_the_next_delivered_publication() {
 }
 
 #[test]
+fn what_a_host_lost_in_an_outage_is_not_the_networks() {
+    let fates = [
+        Fate::LostOnWire,
+        Fate::Incomplete,
+        Fate::RefusedByKernel,
+        Fate::Late,
+        Fate::RefusedAtIngress,
+    ];
+    let files = files(5_000, |sequence| match sequence {
+        5..10 => fates[usize::try_from(sequence).unwrap() - 5],
+        _ => Fate::Taken,
+    });
+    let outage = |interruptions: &[Interruption]| {
+        let context = same_clock(5_000 * PERIOD_NS).with_interruptions(interruptions);
+        let found = outages(&files.records(), &context);
+        (found[0].lost_count, found[0].lost_by_network_count)
+    };
+    assert_eq!(outage(&[]), (5, 2));
+    let killed = Interruption {
+        process: "gateway".to_owned(),
+        place: PathProcess::ReceivingGateway,
+        from: Instant::from_ns(5 * PERIOD_NS),
+        until: Instant::from_ns(12 * PERIOD_NS),
+        cause: "killed".to_owned(),
+    };
+    assert_eq!(outage(&[killed]), (5, 0));
+}
+
+#[test]
 fn an_outage_at_the_end_lasts_as_long_as_the_run() {
     let files = files(400, |sequence| match sequence {
         100.. => Fate::LostOnWire,
@@ -91,6 +120,7 @@ fn an_outage_at_the_end_lasts_as_long_as_the_run() {
 fn outages_are_sorted_by_length_and_their_borders_belong_to_the_longer_class() {
     let outage = |from_ms: i64, length_ms: i64| Outage {
         lost_count: 2,
+        lost_by_network_count: 2,
         first_sequence: 0,
         from_ns: Some(from_ms * PERIOD_NS),
         until_ns: Some((from_ms + length_ms) * PERIOD_NS),
@@ -201,21 +231,21 @@ fn before_an_outage_a_consumer_that_is_sent_nothing_misses_nothing() {
     // One message a minute, each taken after 50 ms.
     let mut finder = OutageFinder::default();
     finder.arrived(Some(0), Some(ns(50)));
-    finder.lost(1, 1, Some(ns(60_000)));
+    finder.lost(1, 1, Some(ns(60_000)), true);
     let open = finder.finish();
     assert_eq!(open[0].silent_from_ns, Some(ns(60_050)));
     assert_eq!(happened(&open, 60_049), None);
     assert_eq!(happened(&open, 60_050), Some(Standing::UnderWay));
     // Without a message before, the one after tells how long they take.
     let mut finder = OutageFinder::default();
-    finder.lost(0, 1, Some(ns(1_000)));
+    finder.lost(0, 1, Some(ns(1_000)), true);
     finder.arrived(Some(ns(2_000)), Some(ns(2_070)));
     let first = finder.finish();
     assert_eq!(first[0].silent_from_ns, Some(ns(1_070)));
     assert_eq!(first[0].silent_until_ns, Some(ns(2_070)));
     // With none at all, nobody knows.
     let mut finder = OutageFinder::default();
-    finder.lost(0, 1, Some(ns(1_000)));
+    finder.lost(0, 1, Some(ns(1_000)), true);
     let silent = finder.finish();
     assert_eq!(silent[0].silent_from_ns, None);
     assert_eq!(happened(&silent, 1_000), None);

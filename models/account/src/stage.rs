@@ -97,9 +97,9 @@ hil_core::labelled! {
         Incomplete = "incomplete: pieces lost on the wire",
         /// It came to the receiving host, which had no room for it: where its number is missing, the host counts as
         /// many datagrams without room as are missing.
-        LostByHarness = "lost by the harness (no room on the receiving host)",
+        LostByHarness = "lost by this program or its host (no room on the receiving host)",
         /// The same, but the host counts more or fewer than are missing there.
-        LostOnWireOrByHarness = "lost on the wire or by the harness",
+        LostOnWireOrByHarness = "lost on the wire or by this program or its host",
         /// Received and not forwarded, for no recorded reason.
         RefusedAtIngress = "refused by the receiving gateway",
         /// Received after the sequence window had moved on.
@@ -138,6 +138,14 @@ impl MessageFate {
             | Self::Duplicate
             | Self::LostInInterruption => Crossing::LostByHost,
         }
+    }
+
+    /// True when the network lost the message for certain, or had no way for it.
+    pub const fn is_loss_by_network(self) -> bool {
+        matches!(
+            self.crossing(),
+            Crossing::LostByNetwork | Crossing::Unreachable
+        )
     }
 
     /// True when the message vanished, as opposed to having been taken, replaced by a newer

@@ -1,6 +1,8 @@
 //! What a plot shows: columns of numbers with names, units and a word on how they came about. It
 //! draws nothing and writes no file.
 
+use core::fmt::Write;
+
 /// A table of numbers, one row per moment or thing, ready to be plotted.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlotSeries {
@@ -27,6 +29,23 @@ pub struct PlotColumn {
     pub unit: &'static str,
 }
 
+/// `text`, e.g. the name of a channel, as a part of a file's name and of an identifier. Different texts differ: a
+/// slash is a hyphen, and what is neither letter nor digit an underscore with itself or its bytes.
+pub fn name_part(text: &str) -> String {
+    let mut name = String::with_capacity(text.len());
+    for byte in text.bytes() {
+        match byte {
+            b'/' => name.push('-'),
+            b'-' | b'_' => name.extend(['_', char::from(byte)]),
+            _ if byte.is_ascii_alphanumeric() => name.push(char::from(byte)),
+            _ => {
+                let _infallible = write!(name, "_{byte:02x}");
+            }
+        }
+    }
+    name
+}
+
 impl PlotSeries {
     /// The rows.
     ///
@@ -34,5 +53,22 @@ impl PlotSeries {
     /// When there are no columns.
     pub fn rows(&self) -> impl Iterator<Item = &[f64]> {
         self.values.chunks_exact(self.columns.len())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_that_differ_have_files_that_differ() {
+        let names = [
+            "a/b", "a-b", "a.b", "a_b", "a2eb", "a_-b", "a/-b", "a-/b", "a//b", "a__b", "aµb",
+        ];
+        let parts = names.map(name_part);
+        assert_eq!(parts[..4], ["a-b", "a_-b", "a_2eb", "a__b"]);
+        let different: std::collections::BTreeSet<_> = parts.iter().collect();
+        assert_eq!(different.len(), names.len(), "{parts:?}");
+        assert_eq!(name_part("egm/right/command"), "egm-right-command");
     }
 }

@@ -72,6 +72,8 @@ pub struct Harm {
     pub occasions: Option<Occasions>,
     /// 95 % interval of its share of the occasions, or why there is none.
     pub interval: Option<Spread>,
+    /// For a reader who does not know the field's term, a few words; else empty.
+    pub note: &'static str,
 }
 
 /// What could have hurt the robot.
@@ -92,6 +94,7 @@ impl Harm {
             own_count: 0,
             occasions: None,
             interval: None,
+            note: "",
         }
     }
 
@@ -118,6 +121,8 @@ pub struct Metric {
     pub unit: &'static str,
     /// How it was obtained, or why it was not.
     pub method: String,
+    /// What a reader holds it against, a few words as `0 is a collision`; empty where the label says enough.
+    pub note: &'static str,
 }
 
 /// How much an event matters; where room is short, the higher one is shown.
@@ -202,6 +207,7 @@ impl ErrorSeries {
             value: (count > 0).then(|| sum / count as f64),
             interval: None,
             unit: self.unit,
+            note: "",
             method: match count {
                 0 if !log.has_one_clock() => "the hosts' clocks are not aligned".to_owned(),
                 0 => "the run has no sample of it".to_owned(),

@@ -352,7 +352,7 @@ fn incident(incident: &Incident, orders: &Orders, led_to: &BTreeMap<Key, Vec<Sen
 /// An incident alone.
 pub(crate) fn collision(incident: &Incident) -> ScoreEvent {
     let manner = match incident.kind {
-        IncidentKind::Section => "collided by the section checker",
+        IncidentKind::Section => "collided in their crossing section",
         IncidentKind::Overlap => "overlapped in a critical section",
         IncidentKind::Outside => "overlapped outside every critical section",
     };

@@ -76,7 +76,7 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
 fn harms(seen: Option<(&Tally, Option<Spread>, &[Standstill])>) -> Vec<Harm> {
     let count = |of: fn(&Tally) -> u64| seen.map(|(tally, _, _)| of(tally));
     let collisions = Harm::new(
-        "collisions, section checker",
+        "collisions, counted per crossing section",
         count(|tally| tally.section_collisions_count),
     );
     vec![
@@ -87,7 +87,10 @@ fn harms(seen: Option<(&Tally, Option<Spread>, &[Standstill])>) -> Vec<Harm> {
             },
             None => collisions,
         },
-        Harm::new("collisions, exact", count(|tally| tally.overlaps_count)),
+        Harm::new(
+            "collisions of outlines",
+            count(|tally| tally.overlaps_count),
+        ),
         Harm::new(
             "overruns of a late authority",
             count(|tally| tally.authorities_late_count),
@@ -111,11 +114,11 @@ fn standstill_harm(standing: Option<&[Standstill]>) -> Harm {
 
 pub(crate) const COLLISIONS: Label = label(
     "section_collisions_count",
-    "collisions, section checker",
+    "collisions, counted per crossing section",
     "1",
 );
 
-pub(crate) const OVERLAPS: Label = label("overlaps_count", "collisions, exact", "1");
+pub(crate) const OVERLAPS: Label = label("overlaps_count", "collisions of outlines", "1");
 
 pub(crate) const OUTSIDE: Label = label("outside_count", "collisions outside any section", "1");
 
@@ -150,7 +153,7 @@ fn collisions(tally: &Tally, interval: Option<Spread>) -> Vec<Metric> {
     let mut ratio = if passed == 0 {
         COLLISION_RATIO.unavailable("no robot has passed a critical section")
     } else {
-        let method = "section checker over sections passed";
+        let method = "collisions counted per crossing section over sections passed";
         COLLISION_RATIO.known(collided as f64 / passed as f64, method)
     };
     ratio.interval = interval.filter(|_| ratio.value.is_some());
@@ -166,7 +169,7 @@ fn collisions(tally: &Tally, interval: Option<Spread>) -> Vec<Metric> {
         ),
         OUTSIDE.count(
             tally.outside_count,
-            "exact collisions that began where no critical section is",
+            "collisions of outlines that began where no critical section is",
         ),
         CRITICAL_SECTIONS.count(
             passed,
@@ -181,7 +184,8 @@ fn collisions(tally: &Tally, interval: Option<Spread>) -> Vec<Metric> {
 }
 
 fn distances(case: &Fleet, tally: &Tally) -> Vec<Metric> {
-    let least = label("separation_m_min", "smallest distance of two robots", "m");
+    let least = label("separation_m_min", "smallest distance of two robots", "m")
+        .held_against("0 is a collision");
     let bound_m = case
         .parameters()
         .robot

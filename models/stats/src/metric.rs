@@ -12,14 +12,28 @@ pub struct Label {
     pub text: &'static str,
     /// Its unit; `1` for counts and ratios.
     pub unit: &'static str,
+    /// What a reader holds it against; see [`Metric::note`].
+    pub note: &'static str,
 }
 
 /// The label of a metric.
 pub const fn label(name: &'static str, text: &'static str, unit: &'static str) -> Label {
-    Label { name, text, unit }
+    Label {
+        name,
+        text,
+        unit,
+        note: "",
+    }
 }
 
 impl Label {
+    /// The same with what a reader holds it against.
+    #[must_use]
+    pub const fn held_against(mut self, note: &'static str) -> Self {
+        self.note = note;
+        self
+    }
+
     /// The metric with this value.
     pub fn known(self, value: f64, method: impl Into<String>) -> Metric {
         Metric {
@@ -29,6 +43,7 @@ impl Label {
             interval: None,
             unit: self.unit,
             method: method.into(),
+            note: self.note,
         }
     }
 

@@ -249,7 +249,8 @@ fn longest_outage(records: &[TraceRecord]) -> Option<TraceOutage> {
     for record in records {
         let published_ns = Some(record.published_ns);
         if record.fate.is_loss() {
-            outages.lost(record.sequence, 1, published_ns);
+            let is_by_network = record.fate == TraceFate::LostInNetwork;
+            outages.lost(record.sequence, 1, published_ns, is_by_network);
         } else if record.fate == TraceFate::Delivered {
             outages.arrived(published_ns, None);
         }

@@ -221,6 +221,14 @@ impl Metric {
         self
     }
 
+    /// The value with its interval, where it has one.
+    pub fn words(&self) -> String {
+        match self.low {
+            Some(_) => format!("{} [{}]", self.text, self.interval),
+            None => self.text.clone(),
+        }
+    }
+
     /// With its interval of 95 %.
     #[must_use]
     pub fn within(mut self, interval: Option<(f64, f64)>) -> Self {
@@ -412,6 +420,17 @@ impl Table {
             columns: columns.iter().map(column).collect(),
             ..Self::default()
         }
+    }
+
+    /// With one more column; its rows have no cell for it yet.
+    #[must_use]
+    pub fn with_column(mut self, label: &str) -> Self {
+        self.columns.push(Column {
+            key: label.to_owned(),
+            label: label.to_owned(),
+            rank: 0,
+        });
+        self
     }
 
     /// Ranks the column of `label`, see [`Column::rank`].

@@ -67,28 +67,28 @@ pub fn percent(ratio: f64) -> String {
 /// Below it a figure says no more than that it is.
 const FIGURE_MIN: f64 = 1e-12;
 
-/// A figure of a score, without an exponent: enough digits for its size, never more than it holds.
+/// A pure number, without an exponent: enough digits for its size, never more than it holds; from a thousand on
+/// in groups of digits.
 pub fn figure(value: f64) -> String {
     let magnitude = value.abs();
+    let is_whole = magnitude.fract() < f64::EPSILON;
     if magnitude > 0.0 && magnitude < FIGURE_MIN {
         format!("<{FIGURE_MIN:.12}")
-    } else if value.fract().abs() < f64::EPSILON && magnitude < 1e9 {
+    } else if magnitude >= 1e15 {
         format!("{value:.0}")
-    } else if magnitude < 1e6 {
-        let digits = 3.0 - magnitude.log10().floor().clamp(-12.0, 3.0);
-        format!("{value:.*}", digit_count(digits))
-    } else if magnitude < 1e15 {
+    } else if is_whole || magnitude >= 999.95 {
         let sign = if value < 0.0 { "-" } else { "" };
         format!("{sign}{}", grouped(whole(magnitude)))
     } else {
-        format!("{value:.0}")
+        let digits = 3.0 - magnitude.log10().floor().clamp(-12.0, 3.0);
+        format!("{value:.*}", digit_count(digits))
     }
 }
 
 #[allow(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
-    reason = "the caller asks for 1e6 to 1e15"
+    reason = "the caller asks for 0 to 1e15"
 )]
 const fn whole(value: f64) -> u64 {
     value.round() as u64
@@ -103,29 +103,40 @@ const fn digit_count(digits: f64) -> usize {
     digits as usize
 }
 
-/// A value of this unit; a ratio of the unit `share` in per cent.
+/// Of an SI unit the one that people think in and the factor to it, the same for all values of a series.
+pub fn scale(unit: &str) -> (f64, &str) {
+    match unit {
+        "rad" => (180.0 / core::f64::consts::PI, "°"),
+        "m" => (1e3, "mm"),
+        _ => (1.0, unit),
+    }
+}
+
+/// A value of this SI unit as people think of it: a ratio of the unit `share` in per cent, angles in degrees,
+/// durations, short lengths and rates of bytes in the unit of their size.
 pub fn value(value: f64, unit: &str) -> String {
     match unit {
         "s" => duration_s(value),
         "share" => percent(value),
-        "1" => number(value),
-        unit => format!("{}{JOINT}{unit}", number(value)),
+        "1" => figure(value),
+        "1/s" => format!("{}{JOINT}per{JOINT}second", figure(value)),
+        "B/s" => byte_rate(value),
+        "m" if value.abs() >= 1.0 => format!("{}{JOINT}m", figure(value)),
+        unit => {
+            let (factor, unit) = scale(unit);
+            format!("{}{JOINT}{unit}", figure(factor * value))
+        }
     }
 }
 
-/// A pure number; whole ones in groups of digits.
-#[allow(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "whole and between 0 and 1e15"
-)]
-pub fn number(value: f64) -> String {
-    let is_count = value.fract().abs() < f64::EPSILON && (0.0..1e15).contains(&value);
-    if is_count {
-        grouped(value as u64)
-    } else {
-        figure(value)
-    }
+fn byte_rate(value: f64) -> String {
+    let (factor, unit) = match value.abs() {
+        ..999.5 => return format!("{value:.0}{JOINT}B/s"),
+        ..999_500.0 => (1e-3, "kB/s"),
+        ..999.5e6 => (1e-6, "MB/s"),
+        _ => (1e-9, "GB/s"),
+    };
+    format!("{}{JOINT}{unit}", three_digits(factor * value))
 }
 
 /// Nanoseconds as seconds.
@@ -171,6 +182,13 @@ mod tests {
         assert_eq!(words(0.5, "share"), "50.00 %");
         assert_eq!(words(12_345.0, "1"), "12,345");
         assert_eq!(words(-1.5, "m"), "-1.500 m");
+        assert_eq!(words(0.1612, "m"), "161.2 mm");
+        assert_eq!(words(0.0, "m"), "0 mm");
+        assert_eq!(words(0.045_64, "rad"), "2.615 °");
+        assert_eq!(words(93.4, "s"), "93.4 s");
+        assert_eq!(words(125.0, "1/s"), "125 per second");
+        assert_eq!(words(11_338.0, "B/s"), "11.3 kB/s");
+        assert_eq!(words(3.0, "grasps"), "3 grasps");
     }
 
     #[test]
@@ -183,5 +201,9 @@ mod tests {
         assert_eq!(figure(f64::MIN_POSITIVE), "<0.000000000001");
         assert_eq!(figure(-0.5), "-0.5000");
         assert_eq!(figure(7_315_012.4), "7,315,012");
+        assert_eq!(figure(12_345.6), "12,346");
+        assert_eq!(figure(-1_234.5), "-1,235");
+        assert_eq!(figure(999.96), "1,000");
+        assert_eq!(figure(12_345.0), "12,345");
     }
 }

@@ -4,8 +4,7 @@
 use core::fmt;
 
 use hil_account::flow::DeadlineMetrics;
-use hil_account::network::NetworkEventKind;
-use hil_account::{MessageFate, Standing};
+use hil_account::{ChannelAccount, MessageFate, Standing};
 use hil_core::case_study::{Occasions, Severity};
 use hil_core::interval::{Interval, Spread, TooSmall};
 use hil_platform::text::grouped;
@@ -14,19 +13,20 @@ use hil_stats::statistics::CONFIDENCE;
 use serde::{Deserialize, Serialize};
 
 use super::assessment::{
-    Assessment, HELD_MAX_NS, NetworkVerdict, SKIPPED_TICK_RATIO_MAX, uncounted_start_count,
+    Assessment, HELD_MAX_NS, NetworkVerdict, SKIPPED_TICK_RATIO_MAX, uncounted,
+    uncounted_start_count,
 };
 use super::clock_summary::ClockSection;
 use super::score_event::ExplainedEvent;
-use super::summary::{LinkKind, RunSummary, ScoreMetric};
+use super::summary::{LinkKind, RunSummary};
 use hil_present::Tone;
-use hil_present::units::{duration_s, figure, percent};
+use hil_present::units::{duration_s, percent};
 
 /// A rate of fewer occasions is not told, and no harm in fewer is no answer.
 pub const OCCASIONS_MIN: u64 = 10;
 /// A network event within seconds before explains nothing where more moments than this share have one.
 const CHANCE_MAX: f64 = 0.5;
-/// Messages lost in a row that make an outage; fewer are single losses, which a lossy link always has.
+/// Messages that the network lost in a row and that make an outage; fewer are single losses, which a lossy link always has.
 const OUTAGE_LOST_MIN: u64 = 3;
 /// Channels, processes or hosts that are named where many have the same fault.
 const NAMED_COUNT: usize = 3;
@@ -45,6 +45,9 @@ pub struct HarmCount {
     /// 95 % interval of its share of them, or why there is none.
     #[serde(default)]
     pub interval: Option<Spread>,
+    /// What it is, for a reader who does not know the term; empty where that is plain.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub note: String,
 }
 
 /// What could have hurt the robot; see [`Occasions`].
@@ -67,6 +70,7 @@ impl From<&hil_core::case_study::Harm> for HarmCount {
                 OccasionCount { what, count }
             }),
             interval: harm.interval,
+            note: harm.note.to_owned(),
         }
     }
 }
@@ -82,6 +86,7 @@ impl From<&DeadlineMetrics> for HarmCount {
                 count: deadline.request_count - deadline.unknown_count,
             }),
             interval: deadline.hurt_share,
+            note: String::new(),
         }
     }
 }
@@ -260,6 +265,8 @@ pub struct Measurement {
     pub clocks: Clocks,
     /// Starts of processes that left no counters: what these lost or skipped is unknown.
     pub uncounted_start_count: u64,
+    /// The processes concerned.
+    pub uncounted_process_count: u64,
 }
 
 /// How much the answer rests on.
@@ -271,7 +278,7 @@ pub struct Sample {
     pub channel_count: u64,
     /// Messages published on them.
     pub message_count: u64,
-    /// What could have hurt the robot.
+    /// What could have hurt the robot, of the harm with the fewest; `None` where harms have none, and messages stand in.
     pub occasions: Option<OccasionCount>,
 }
 
@@ -297,13 +304,7 @@ pub struct Answer {
 impl Answer {
     /// Draws the answer.
     pub fn of(summary: &RunSummary, assessment: &Assessment) -> Self {
-        let occasions = summary.harms.first().and_then(|one| one.occasions.clone());
-        let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
-        let channels = summary.channels.iter().filter(|one| {
-            let has_account = one.account.is_some();
-            has_account && (one.link.is_crossing() || !has_crossed)
-        });
-        let accounts: Vec<_> = channels.filter_map(|one| one.account.as_ref()).collect();
+        let accounts = accounts_tested(summary);
         Self {
             hurt: hurt(summary, &assessment.network),
             subject: subject(summary, &assessment.network),
@@ -313,12 +314,13 @@ impl Answer {
                 is_valid: is_valid(&assessment.network),
                 clocks: clocks(summary),
                 uncounted_start_count: uncounted_start_count(summary),
+                uncounted_process_count: uncounted(summary).count() as u64,
             },
             sample: Sample {
                 duration_s: summary.run.duration_s,
                 channel_count: accounts.len() as u64,
-                message_count: accounts.iter().map(|one| one.published_count).sum(),
-                occasions,
+                message_count: published_count(&accounts),
+                occasions: fewest_occasions(&summary.harms).cloned(),
             },
         }
     }
@@ -330,17 +332,18 @@ impl Answer {
 
     /// Why no more can be said, or in how many occasions nothing happened.
     pub(crate) fn reason(&self) -> Option<String> {
-        match (&self.hurt, &self.sample.occasions) {
-            (Hurt::No, Some(OccasionCount { what, count })) => {
-                let of = if self.has_own_harm {
-                    "no harm but by limits of the robot"
-                } else {
-                    "no harm"
-                };
-                Some(format!("{of} in {} {what}", grouped(*count)))
-            }
-            _ => self.hurt.reason(self.object),
+        if self.hurt != Hurt::No {
+            return self.hurt.reason(self.object);
         }
+        let of = if self.has_own_harm {
+            "no harm but by limits of the robot"
+        } else {
+            "no harm"
+        };
+        Some(match &self.sample.occasions {
+            Some(OccasionCount { what, count }) => format!("{of} in {} {what}", grouped(*count)),
+            None => format!("{of} in {}", counted(self.sample.message_count, "message")),
+        })
     }
 
     /// The answer to it.
@@ -356,8 +359,7 @@ impl Answer {
         let percent = 100.0 * CONFIDENCE;
         (self.hurt == Hurt::No).then(|| {
             format!(
-                "up to {most:.1} independent events of harm in a run this long cannot be excluded ({percent:.0} %, \
-                 Poisson)"
+                "a run this long can miss up to {most:.0} such events ({percent:.0} %, Poisson)"
             )
         })
     }
@@ -372,11 +374,18 @@ impl Answer {
         }
     }
 
-    /// Green only for an unhurt robot and a valid measurement.
+    /// Green only for an unhurt robot and a measurement that is valid in all its parts.
     pub(crate) const fn tone(&self) -> Tone {
-        match (&self.hurt, self.measurement.is_valid) {
+        let Measurement {
+            is_valid,
+            clocks,
+            uncounted_start_count,
+            ..
+        } = self.measurement;
+        let is_whole = uncounted_start_count == 0 && !matches!(clocks, Clocks::Unaligned);
+        match (&self.hurt, is_valid) {
             (Hurt::Yes, _) => Tone::Bad,
-            (Hurt::No, Some(true)) if self.measurement.uncounted_start_count == 0 => Tone::Good,
+            (Hurt::No, Some(true)) if is_whole => Tone::Good,
             (Hurt::No | Hurt::NotResolvable { .. } | Hurt::NotTested { .. }, _) => Tone::Caution,
         }
     }
@@ -397,35 +406,27 @@ impl Answer {
                     .to_owned()
             }
         };
-        let uncounted_count = self.measurement.uncounted_start_count;
-        let uncounted = uncounted_words(uncounted_count);
+        let uncounted = self.measurement.uncounted_words();
         match invalid_words(network) {
             Some(why) => (Tone::Bad, format!("NOT VALID: {why}")),
             None if self.measurement.is_valid.is_none() => {
-                let uncounted = match network {
-                    NetworkVerdict::HostUnknown => uncounted,
-                    _ => String::new(),
-                };
+                let uncounted = uncounted.filter(|_| *network == NetworkVerdict::HostUnknown);
+                let uncounted = uncounted.map_or_else(String::new, |words| format!("; {words}"));
                 (
                     Tone::Plain,
                     format!("{}{uncounted}", unmeasured_words(network)),
                 )
             }
-            None if uncounted_count > 0 => (
-                Tone::Caution,
-                format!(
-                    "valid as far as known ({} left no counters){clocks}",
-                    counted(uncounted_count, "process start")
+            None => match (uncounted, self.measurement.clocks) {
+                (Some(words), _) => (
+                    Tone::Caution,
+                    format!("valid as far as known: {words}{clocks}"),
                 ),
-            ),
-            None => {
-                let valid = match self.measurement.clocks {
-                    Clocks::Unaligned => "valid in part",
-                    _ => "valid",
-                };
-                let words = format!("{valid}: hosts and links were kept up with{clocks}");
-                (Tone::Plain, words)
-            }
+                (None, Clocks::Unaligned) => {
+                    (Tone::Caution, format!("valid in part: {KEPT_UP}{clocks}"))
+                }
+                (None, _) => (Tone::Plain, format!("valid: {KEPT_UP}{clocks}")),
+            },
         }
     }
 
@@ -439,7 +440,7 @@ impl Answer {
         } = &self.sample;
         let messages = counted(*message_count, "message");
         let channels = counted(*channel_count, "channel");
-        let text = format!("{length_s:.1} s, {messages} published on {channels}");
+        let text = format!("{length_s:.1} s, {messages} on {channels}");
         match occasions {
             Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
                 format!("{text}, {what}: {count}, too few for a rate, which takes {OCCASIONS_MIN}")
@@ -464,7 +465,7 @@ impl Hurt {
         match self {
             Self::Yes => "YES",
             Self::No => "NO",
-            Self::NotResolvable { .. } => "NOT RESOLVABLE",
+            Self::NotResolvable { .. } => "CANNOT TELL",
             Self::NotTested { .. } => "NOT TESTED",
         }
     }
@@ -521,9 +522,27 @@ impl fmt::Display for Unresolved {
     }
 }
 
-fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
-    let not_tested = |because| Hurt::NotTested { because };
-    let not_resolvable = |because| Hurt::NotResolvable { because };
+/// Accounts of the channels that crossed a network or a model of one; of all where none did.
+fn accounts_tested(summary: &RunSummary) -> Vec<&ChannelAccount> {
+    let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
+    let channels = summary.channels.iter();
+    let channels = channels.filter(|one| one.link.is_crossing() || !has_crossed);
+    channels.filter_map(|one| one.account.as_ref()).collect()
+}
+
+fn published_count(accounts: &[&ChannelAccount]) -> u64 {
+    accounts.iter().map(|one| one.published_count).sum()
+}
+
+/// Messages that were put to the test.
+pub(crate) fn tested_count(summary: &RunSummary) -> u64 {
+    published_count(&accounts_tested(summary))
+}
+
+/// What there is to say before any harm is looked at; `None` where harms decide.
+pub(crate) fn precondition(summary: &RunSummary, network: &NetworkVerdict) -> Option<Hurt> {
+    let not_tested = |because| Some(Hurt::NotTested { because });
+    let not_resolvable = |because| Some(Hurt::NotResolvable { because });
     match network {
         NetworkVerdict::RunFailed => return not_tested(Untested::RunFailed),
         NetworkVerdict::NoNetwork => return not_tested(Untested::NoNetwork),
@@ -536,16 +555,22 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
         _ => {}
     }
     if summary.harms.is_empty() {
-        return not_tested(Untested::NoScore);
+        not_tested(Untested::NoScore)
+    } else if is_valid(network) == Some(false) {
+        not_resolvable(Unresolved::InvalidMeasurement)
+    } else if *network == NetworkVerdict::HostUnknown {
+        not_resolvable(Unresolved::HostUnknown)
+    } else if is_score_incomplete(summary) {
+        not_resolvable(Unresolved::ScoreIncomplete)
+    } else {
+        None
     }
-    if is_valid(network) == Some(false) {
-        return not_resolvable(Unresolved::InvalidMeasurement);
-    }
-    if *network == NetworkVerdict::HostUnknown {
-        return not_resolvable(Unresolved::HostUnknown);
-    }
-    if is_score_incomplete(summary) {
-        return not_resolvable(Unresolved::ScoreIncomplete);
+}
+
+fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
+    let not_resolvable = |because| Hurt::NotResolvable { because };
+    if let Some(found) = precondition(summary, network) {
+        return found;
     }
     // Whose time it took is known of each request.
     if summary.deadlines.iter().any(|one| one.hurt_count > 0) {
@@ -570,18 +595,30 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
     if summary.harms.iter().any(|one| one.count.is_none()) {
         return not_resolvable(Unresolved::NotCounted);
     }
-    too_few_occasions(summary.harms.iter()).map_or(Hurt::No, not_resolvable)
+    too_few_occasions(&summary.harms, tested_count(summary)).map_or(Hurt::No, not_resolvable)
 }
 
-/// Nothing happened in the fewest occasions of a harm, and they are too few to tell.
+/// The harm with the fewest occasions is the least tested: an absence of harm rests on these.
+fn fewest_occasions<'a>(
+    harms: impl IntoIterator<Item = &'a HarmCount>,
+) -> Option<&'a OccasionCount> {
+    let occasions = harms.into_iter().filter_map(|harm| harm.occasions.as_ref());
+    occasions.min_by_key(|one| one.count)
+}
+
+/// Nothing happened in the fewest occasions of a harm, and they are too few to tell. Harms without occasions are
+/// tested by the `message_count` messages that crossed.
 pub(crate) fn too_few_occasions<'a>(
-    harms: impl Iterator<Item = &'a HarmCount>,
+    harms: impl IntoIterator<Item = &'a HarmCount>,
+    message_count: u64,
 ) -> Option<Unresolved> {
-    let occasions = harms.filter_map(|harm| harm.occasions.as_ref());
-    let fewest = occasions.min_by_key(|one| one.count)?;
-    (fewest.count < OCCASIONS_MIN).then(|| Unresolved::SampleTooSmall {
-        what: fewest.what.clone(),
-        count: fewest.count,
+    let (what, count) = match fewest_occasions(harms) {
+        Some(OccasionCount { what, count }) => (what.as_str(), *count),
+        None => ("messages", message_count),
+    };
+    (count < OCCASIONS_MIN).then(|| Unresolved::SampleTooSmall {
+        what: what.to_owned(),
+        count,
         needed: OCCASIONS_MIN,
     })
 }
@@ -612,29 +649,14 @@ impl Evidence {
             return false;
         }
         let mut messages = event.messages.iter();
-        let is_lost = messages.any(|one| {
-            matches!(
-                one.fate,
-                Some(
-                    MessageFate::NetworkUnreachable
-                        | MessageFate::LostOnWire
-                        | MessageFate::Incomplete
-                )
-            )
-        });
+        let is_lost = messages.any(|one| one.fate.is_some_and(MessageFate::is_loss_by_network));
         let has_outage = event.outages.iter().any(|outage| {
             let is_before = matches!(outage.standing, Standing::UnderWay | Standing::OverFor(_));
-            is_before && outage.lost_count >= OUTAGE_LOST_MIN
+            is_before && outage.lost_by_network_count >= OUTAGE_LOST_MIN
         });
-        let network = event.network.iter().flat_map(|network| &network.events);
-        let is_network = |kind: &NetworkEventKind| {
-            !matches!(
-                kind,
-                NetworkEventKind::ProcessDown { .. } | NetworkEventKind::ClockStep { .. }
-            )
-        };
-        let mut network = network.filter(|one| is_network(&one.event.kind));
-        is_lost || has_outage || (self.chance <= CHANCE_MAX && network.next().is_some())
+        let mut network = event.network.iter().flat_map(|network| &network.events);
+        let has_event = network.any(|one| one.event.is_by_network());
+        is_lost || has_outage || (self.chance <= CHANCE_MAX && has_event)
     }
 }
 
@@ -648,64 +670,6 @@ pub(crate) fn is_score_incomplete(summary: &RunSummary) -> bool {
                 found.missing_count as f64 > SKIPPED_TICK_RATIO_MAX * all as f64
             })
     })
-}
-
-/// The figure in the unit that people think in, with its interval if it has one.
-pub(crate) fn metric_words(metric: &ScoreMetric) -> String {
-    let scale = UnitScale::of(&metric.unit);
-    let value = metric
-        .value
-        .map_or_else(|| "unavailable".to_owned(), |value| scale.words(value));
-    let interval = match metric.interval {
-        Some(Spread::Known(one)) => format!(
-            " [{}, {}]",
-            figure(scale.scaled(one.low)),
-            figure(scale.scaled(one.high))
-        ),
-        // The full report says why there is none.
-        None | Some(Spread::Unknown(_)) => String::new(),
-    };
-    format!("{value}{interval}")
-}
-
-/// From an SI unit to the one that people think in.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct UnitScale<'a> {
-    factor: f64,
-    unit: &'a str,
-}
-
-impl<'a> UnitScale<'a> {
-    /// Of figures in `unit`.
-    pub(crate) fn of(unit: &'a str) -> Self {
-        let (factor, unit) = match unit {
-            "rad" => (180.0 / core::f64::consts::PI, "°"),
-            "m" => (1e3, "mm"),
-            "s" => (1e3, "ms"),
-            "1" => (1.0, ""),
-            unit => (1.0, unit),
-        };
-        Self { factor, unit }
-    }
-
-    /// The unit that people think in; empty for a number.
-    pub(crate) const fn unit(self) -> &'a str {
-        self.unit
-    }
-
-    /// The value in that unit.
-    pub(crate) fn scaled(self, value: f64) -> f64 {
-        self.factor * value
-    }
-
-    /// The value with its unit.
-    pub(crate) fn words(self, value: f64) -> String {
-        let value = figure(self.scaled(value));
-        match self.unit {
-            "" => value,
-            unit => format!("{value} {unit}"),
-        }
-    }
 }
 
 fn subject(summary: &RunSummary, network: &NetworkVerdict) -> Subject {
@@ -730,11 +694,25 @@ const fn unmeasured_words(network: &NetworkVerdict) -> &'static str {
     }
 }
 
-/// What the judgement of a measurement cannot rest on; empty where everything was counted.
-pub(crate) fn uncounted_words(uncounted_start_count: u64) -> String {
-    match uncounted_start_count {
-        0 => String::new(),
-        count => format!("; {} left no counters", counted(count, "process start")),
+/// What makes a measurement valid.
+const KEPT_UP: &str = "hosts and links kept up";
+
+/// With what a reader may not know.
+pub(crate) fn with_note(words: String, note: &str) -> String {
+    match note {
+        "" => words,
+        note => format!("{words} ({note})"),
+    }
+}
+
+impl Measurement {
+    /// What the judgement cannot rest on; `None` where everything was counted.
+    fn uncounted_words(&self) -> Option<String> {
+        let count = self.uncounted_process_count;
+        (count > 0).then(|| {
+            let processes = counted(count, "killed or restarted process");
+            format!("what {processes} dropped or skipped is unknown")
+        })
     }
 }
 

@@ -156,7 +156,7 @@ mod tests {
         }
         let page = render(&run, 100, Style::Plain);
         assert!(
-            page.contains("NOT a network result, nor one about the link model"),
+            page.contains("NOT VALID: the host could not keep the emulated link of arm/command"),
             "{page}"
         );
         let again = RunSummary::from_json(&run.to_json().unwrap()).unwrap();

@@ -5,10 +5,18 @@ use core::fmt::Write;
 
 use super::link_change::LinkChange;
 use super::score_event::{ExplainedEvent, ScoreEvents};
+use super::summary::RunSummary;
 use hil_present::units::JOINT;
 
-/// The text of the file for the run called `name`.
-pub(crate) fn text(name: &str, all: &ScoreEvents, changes: &[LinkChange]) -> String {
+/// The text of the file of a run.
+pub(crate) fn of(summary: &RunSummary) -> String {
+    let missing = summary.no_score_words();
+    let (all, changes) = (&summary.score_events, &summary.link_changes);
+    text(&summary.run.name, all, changes, missing.as_deref())
+}
+
+/// The same for the run called `name`; without a score it says why there is none.
+fn text(name: &str, all: &ScoreEvents, changes: &[LinkChange], missing: Option<&str>) -> String {
     let mut text = format!("# {}\n", one_line(name));
     text.push_str(
         "# seconds since the start of the run, severity, what happened | outages beside it, then \
@@ -38,7 +46,9 @@ pub(crate) fn text(name: &str, all: &ScoreEvents, changes: &[LinkChange]) -> Str
         let count = all.dropped_count;
         let _infallible = writeln!(text, "# {count} more events found no room in the score");
     }
-    if all.events.is_empty() && !had_changes {
+    if let Some(why) = missing {
+        let _infallible = writeln!(text, "# what happened to the robot is {}", one_line(why));
+    } else if all.total_count() == 0 && !had_changes {
         text.push_str("# nothing happened\n");
     }
     text
@@ -116,6 +126,7 @@ mod tests {
             until_s: None,
             length_s: None,
             lost_count: 230,
+            lost_by_network_count: 230,
             standing: Standing::UnderWay,
             clock_bound_s: 0.0,
             other_count: 0,
@@ -133,7 +144,7 @@ mod tests {
      42.204000 incident session 3 ended by itself | outage of 1.84 s on egm/right/command
 # 7 more events found no room in the score
 ";
-        let text = |name: &str, all: &ScoreEvents| text(name, all, &[]);
+        let text = |name: &str, all: &ScoreEvents| text(name, all, &[], None);
         assert_eq!(text("run", &all), format!("# run\n{lines}"));
         all.clocks_differ = true;
         assert!(text("run", &all).contains("hold began (clock of robot-pc)\n"));
@@ -148,6 +159,9 @@ mod tests {
         assert!(text("run", &all).contains(words), "{}", text("run", &all));
         let nothing = text("run", &ScoreEvents::default());
         assert!(nothing.ends_with("# nothing happened\n"));
+        let unknown = of(&crate::tests::sample::empty());
+        let words = "# what happened to the robot is unavailable: the case gave no score\n";
+        assert!(unknown.ends_with(words), "{unknown}");
     }
     #[test]
     fn a_changed_link_stands_among_the_events_by_its_time() {
@@ -171,7 +185,7 @@ mod tests {
             ],
             ..ScoreEvents::default()
         };
-        let text = text("run", &all, &changes);
+        let text = text("run", &all, &changes, None);
         let lines: Vec<&str> = text.lines().skip(2).map(str::trim).collect();
         let expected = [
             "1.000000 notice   first",
@@ -180,7 +194,7 @@ mod tests {
             "9.000000 notice   link hop.forward changed by hand: as the topology says again",
         ];
         assert_eq!(lines, expected);
-        let alone = super::text("run", &ScoreEvents::default(), &changes[..1]);
+        let alone = super::text("run", &ScoreEvents::default(), &changes[..1], None);
         assert!(!alone.contains("nothing happened"), "{alone}");
     }
 }

@@ -8,6 +8,7 @@ mod adapter_warnings;
 pub mod analysis;
 pub mod answer;
 pub mod assessment;
+mod burst_classes;
 pub mod clock_summary;
 pub mod compare;
 pub mod emulation;

@@ -5,7 +5,7 @@ use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome};
 use hil_link::spec::Way;
 use serde::{Deserialize, Serialize};
 
-use hil_present::units::{JOINT, duration_s, seconds};
+use hil_present::units::{JOINT, duration_s, percent, seconds};
 
 /// One order to one direction of a link.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -91,7 +91,11 @@ impl LinkChange {
             ChangedTo::Fixed {
                 delay_s,
                 loss_ratio,
-            } => format!("delay {}, loss {loss_ratio}", duration_s(delay_s)),
+            } => format!(
+                "delay {}, loss {}",
+                duration_s(delay_s),
+                percent(loss_ratio)
+            ),
             ChangedTo::Cut => "cut".to_owned(),
             ChangedTo::Unknown => "an unknown condition".to_owned(),
         };
@@ -151,7 +155,7 @@ mod tests {
         let plain = |text: String| text.replace(JOINT, " ");
         assert_eq!(
             plain(change.what()),
-            "link hop.backward changed by hand: delay 50.0 ms, loss 0.1"
+            "link hop.backward changed by hand: delay 50.0 ms, loss 10.00 %"
         );
         assert_eq!(plain(change.time()), "at 12.300 s");
         assert!(change.is_in_force());

@@ -96,6 +96,14 @@ impl TimedEvent {
         )
     }
 
+    /// False for what a process or a clock of ours did.
+    pub(crate) const fn is_by_network(&self) -> bool {
+        !matches!(
+            self.kind,
+            NetworkEventKind::ProcessDown { .. } | NetworkEventKind::ClockStep { .. }
+        )
+    }
+
     /// How long before `at_s` it was over, seconds; 0 when it was under way, `None` when it cannot have
     /// been within [`PRECEDING_S`] before, as two hosts' times are known to `clock_bound_s` of each other.
     pub(crate) fn over_for_s(&self, at_s: f64, clock_bound_s: f64) -> Option<f64> {

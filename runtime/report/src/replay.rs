@@ -1,7 +1,6 @@
 //! `hil-runtime replay`: hands the recorded messages of a finished run back to its case, which runs
 //! the robot's side again in virtual time. What is compared, and how, is the case's to say.
 
-use core::fmt::Write;
 use std::fs;
 use std::path::PathBuf;
 
@@ -13,14 +12,12 @@ use crate::analysis::records::{MessageRecords, missing_count};
 use crate::summary::RunSummary;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
-use hil_present::terminal::canvas::wrapped;
+use hil_present::terminal::canvas::{Canvas, Style};
+use hil_present::terminal::section;
+use hil_present::{Section, Tone};
 use hil_rundir::manifest::Manifest;
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::{CaseEntry, CaseError, Registry};
-
-/// Columns of the outcome, and those before its texts.
-const PAGE_WIDTH: usize = 100;
-const LABEL_END: usize = 20;
 
 /// Why a run cannot be replayed at all.
 #[derive(Debug, thiserror::Error)]
@@ -181,32 +178,31 @@ impl Replayed {
         }
     }
 
-    /// The outcome for people.
-    pub fn text(&self) -> String {
+    /// The outcome for people, as text of at most `width` columns.
+    pub fn text(&self, width: usize) -> String {
         let replay = &self.replay;
-        let mut text = format!("{} · {}: {}\n", self.case, self.run, self.verdict());
-        let mut field = |label: &str, words: &str| {
-            for (index, row) in wrapped(words, PAGE_WIDTH - LABEL_END).iter().enumerate() {
-                let label = if index == 0 { label } else { "" };
-                let _infallible = writeln!(text, "  {label:<18}{row}");
-            }
-        };
-        field("method", &replay.method);
-        field("went in", &counted(replay.input_count, "message"));
+        let mut outcome = Section::new("replay", "", "");
+        let mut fact = |label: &str, words: String| outcome.fact(label, Tone::Plain, words);
+        fact("method", replay.method.clone());
+        fact("went in", counted(replay.input_count, "message"));
         let compared = counted(replay.compared_count, "message");
         let different = match replay.different_count {
             0 => "none differs".to_owned(),
             1 => "1 differs".to_owned(),
             count => format!("{} differ", grouped(count)),
         };
-        field("compared", &format!("{compared}, {different}"));
+        fact("compared", format!("{compared}, {different}"));
         if let Some(first) = &replay.first_difference {
-            field("first difference", first);
+            fact("first difference", first.clone());
         }
         for (index, gap) in replay.gaps.iter().enumerate() {
-            field(if index == 0 { "gaps" } else { "" }, gap);
+            fact(if index == 0 { "gaps" } else { "" }, gap.clone());
         }
-        text
+        let mut canvas = Canvas::new(width, Style::Plain);
+        let title = format!("{} · {}: {}", self.case, self.run, self.verdict());
+        canvas.paragraph(0, Tone::Plain, &title);
+        section(&mut canvas, &outcome);
+        canvas.finish()
     }
 
     /// The outcome for programs.

@@ -120,6 +120,8 @@ pub struct EventOutage {
     pub length_s: Option<f64>,
     /// Messages lost in it.
     pub lost_count: u64,
+    /// Of these, lost by the network for certain.
+    pub lost_by_network_count: u64,
     /// How it stands to the event in time, as far as the process that tells of it could see;
     /// nanoseconds.
     pub standing: Standing,
@@ -196,6 +198,7 @@ mod tests {
                 until_s: None,
                 length_s: None,
                 lost_count: 1,
+                lost_by_network_count: 1,
                 standing,
                 clock_bound_s: 0.0,
                 other_count: 0,
@@ -218,6 +221,7 @@ mod tests {
             until_s: None,
             length_s: None,
             lost_count: 1,
+            lost_by_network_count: 1,
             standing: Standing::Unknown,
             clock_bound_s: 0.0,
             other_count: 0,

@@ -291,7 +291,7 @@ impl Simulated {
         let summary = &self.summary;
         let written = summary.write(&files.summary());
         written.map_err(|error| SimulateError::Output(error.to_string()))?;
-        let events = event_log::text(&summary.run.name, &summary.score_events, &[]);
+        let events = event_log::of(summary);
         let events = [(files.events(), events)];
         for (path, text) in terminal::text_files(&files, summary)
             .into_iter()

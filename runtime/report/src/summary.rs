@@ -21,7 +21,7 @@ use hil_protocol::transport::Description;
 use serde::{Deserialize, Serialize};
 
 use super::adapter::AdapterSummary;
-use super::answer::{Answer, HarmCount};
+use super::answer::{Answer, HarmCount, with_note};
 use super::assessment::Assessment;
 use super::clock_summary::ClockSection;
 use super::emulation::EmulationMetrics;
@@ -31,8 +31,11 @@ use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
 use crate::analysis::write_whole;
 use crate::nic_metrics::HardwareStamps;
+use crate::sections::channel::with_spread;
 use hil_platform::host_facts::HostFacts;
 use hil_platform::text::grouped;
+use hil_present::UNAVAILABLE;
+use hil_present::units::duration_s;
 use hil_rundir::event::{EventKind, ProcessKind};
 use hil_rundir::file_fault::RecordGap;
 use hil_rundir::launch::Side;
@@ -44,9 +47,6 @@ use hil_topology::{Channel, Topology, Via};
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 2;
-
-/// The oldest layout that is read: those before keep refusals and counters elsewhere.
-pub const SCHEMA_VERSION_MIN: u32 = 2;
 
 /// Everything a finished run has to say.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -140,6 +140,19 @@ impl RunSummary {
         }
     }
 
+    /// Why nothing is known of the robot of a case; `None` where something is, and of programs alone.
+    pub(crate) fn no_score_words(&self) -> Option<String> {
+        let has_score = self.score.iter().any(|one| one.value.is_some())
+            || self.harms.iter().any(|one| one.count.is_some())
+            || self.score_events.total_count() > 0;
+        if has_score || self.run.case.is_empty() {
+            return None;
+        }
+        let first = self.score.first();
+        let why = first.map_or("the case gave no score", |one| &one.method);
+        Some(format!("{UNAVAILABLE}: {why}"))
+    }
+
     /// Takes what the case says of the robot, but the events, which need their messages.
     pub(crate) fn put_score(&mut self, score: &Score) {
         self.score = ScoreMetric::all_of(score);
@@ -175,7 +188,7 @@ impl RunSummary {
     /// Reads the text of `summary.json`.
     ///
     /// # Errors
-    /// When it is not JSON of this layout, or of a newer schema version, or of one that is too old.
+    /// When it is not JSON of this layout, or of another schema version.
     pub fn from_json(text: &str) -> Result<Self, SummaryError> {
         /// Read first, so that another layout is named as such instead of as a missing field.
         #[derive(Deserialize)]
@@ -183,13 +196,8 @@ impl RunSummary {
             schema_version: u32,
         }
         let version: Version = serde_json::from_str(text).map_err(SummaryError::Decode)?;
-        if version.schema_version > SCHEMA_VERSION {
-            return Err(SummaryError::NewerSchema {
-                found: version.schema_version,
-            });
-        }
-        if version.schema_version < SCHEMA_VERSION_MIN {
-            return Err(SummaryError::OlderSchema {
+        if version.schema_version != SCHEMA_VERSION {
+            return Err(SummaryError::OtherSchema {
                 found: version.schema_version,
             });
         }
@@ -221,15 +229,9 @@ pub enum SummaryError {
     /// Not JSON, or not this layout.
     #[error("not a run summary of schema version {SCHEMA_VERSION}")]
     Decode(#[source] serde_json::Error),
-    /// Written by a newer version.
-    #[error("schema version {found} is newer than {SCHEMA_VERSION}")]
-    NewerSchema {
-        /// Version of the file.
-        found: u32,
-    },
-    /// Written by a version so old that its figures cannot all be read.
-    #[error("schema version {found} is older than {SCHEMA_VERSION_MIN}, the oldest that is read")]
-    OlderSchema {
+    /// Written by another version of the program.
+    #[error("schema version {found} is not {SCHEMA_VERSION}, the one that is read")]
+    OtherSchema {
         /// Version of the file.
         found: u32,
     },
@@ -509,7 +511,7 @@ impl RunEvent {
         if let Some(absence) = self.absence {
             return Some(absence.length_s.map_or_else(
                 || "never came back".to_owned(),
-                |length_s| format!("away for {:.0} ms", length_s * 1e3),
+                |length_s| format!("away for {}", duration_s(length_s)),
             ));
         }
         match self.kind {
@@ -596,7 +598,7 @@ impl LinkKind {
             (Self::Emulated, MessageFate::LostOnWire) => "lost by the emulated link",
             (Self::Emulated, MessageFate::Incomplete) => "incomplete: lost by the emulated link",
             (Self::Emulated, MessageFate::LostOnWireOrByHarness) => {
-                "lost by the emulated link or by the harness"
+                "lost by the emulated link or by this program or its host"
             }
             (_, fate) => fate.label(),
         }
@@ -775,9 +777,34 @@ pub struct ScoreMetric {
     pub unit: String,
     /// How it was obtained, or why it was not.
     pub method: String,
+    /// What a reader holds it against, a few words.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub note: String,
 }
 
 impl ScoreMetric {
+    /// The unit in which a report shows a score of this name: a ratio in per cent, as everywhere.
+    pub(crate) fn shown_unit<'a>(name: &str, unit: &'a str) -> &'a str {
+        if unit == "1" && name.ends_with("_ratio") {
+            "share"
+        } else {
+            unit
+        }
+    }
+
+    /// As a report shows it.
+    pub(crate) fn shown(&self) -> hil_present::Metric {
+        let unit = Self::shown_unit(&self.name, &self.unit);
+        let metric =
+            hil_present::Metric::maybe(&self.name, &self.label, unit, self.value, &self.method);
+        with_spread(metric, self.interval).by(&self.method)
+    }
+
+    /// The value with its interval and what it is held against.
+    pub(crate) fn words(&self) -> String {
+        with_note(self.shown().words(), &self.note)
+    }
+
     /// The figures of a score, in its order.
     pub fn all_of(score: &Score) -> Vec<Self> {
         score.metrics.iter().map(Self::from).collect()
@@ -794,6 +821,7 @@ impl From<&Metric> for ScoreMetric {
             interval: metric.interval,
             unit: metric.unit.to_owned(),
             method: metric.method.clone(),
+            note: metric.note.to_owned(),
         }
     }
 }
@@ -803,6 +831,24 @@ mod tests {
     use hil_topology::registry::Registry;
 
     use super::*;
+
+    #[test]
+    fn an_absence_is_told_in_the_unit_of_its_size() {
+        let away = |length_s| {
+            let event = RunEvent {
+                at_s: None,
+                process: "gateway".to_owned(),
+                kind: RunEventKind::Process(EventKind::Warning {
+                    text: String::new(),
+                }),
+                absence: Some(Absence { length_s }),
+            };
+            event.cause().unwrap().replace('\u{a0}', " ")
+        };
+        assert_eq!(away(Some(75.0)), "away for 75.0 s");
+        assert_eq!(away(Some(0.757)), "away for 757 ms");
+        assert_eq!(away(None), "never came back");
+    }
 
     #[test]
     fn the_emulated_links_are_told_once_or_once_a_way() {

@@ -4,7 +4,7 @@
 
 use super::{Crossing, Moment, Passages};
 use crate::Side;
-use hil_core::plot::{PlotColumn, PlotSeries};
+use hil_core::plot::{PlotColumn, PlotSeries, name_part};
 use hil_stats::in_order::in_order;
 use hil_stats::samples::Samples;
 
@@ -32,6 +32,11 @@ pub fn bin_width_ns(duration_ns: i64) -> i64 {
 /// Puts moments of a channel's two hosts on the axis of the run: nanoseconds after its start, `None`
 /// where the clocks do not say.
 pub type Place<'a> = dyn Fn(Moment) -> Option<i64> + 'a;
+
+/// What [`NetworkBins::to_series`] calls the series of a channel.
+pub fn network_series_name(channel: &str) -> String {
+    format!("network-{}", name_part(channel))
+}
 
 /// What happened in one stretch of time.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -120,7 +125,7 @@ impl NetworkBins {
         let seconds = |ns: Option<i64>| ns.map_or(f64::NAN, |ns| ns as f64 * 1e-9);
         let rows = self.bins.iter().zip(0_i64..);
         PlotSeries {
-            name: format!("network-{}", file_name(channel)),
+            name: network_series_name(channel),
             title: format!("The network under {channel} over time"),
             notes,
             columns: vec![
@@ -169,18 +174,6 @@ impl NetworkBins {
                 .collect(),
         }
     }
-}
-
-/// A channel's name as part of a file's.
-fn file_name(channel: &str) -> String {
-    let fit = |c: char| {
-        if c.is_ascii_alphanumeric() || c == '_' {
-            c
-        } else {
-            '-'
-        }
-    };
-    channel.chars().map(fit).collect()
 }
 
 fn index_of(ns: i64, width_ns: i64, count: usize) -> Option<usize> {

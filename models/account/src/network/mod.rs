@@ -23,7 +23,7 @@ mod tests;
 
 use serde::{Deserialize, Serialize};
 
-pub use bins::{NetworkBin, NetworkBins, Place, bin_width_ns};
+pub use bins::{NetworkBin, NetworkBins, Place, bin_width_ns, network_series_name};
 pub use delay::{
     DelayMetrics, DelayQuantile, DelayVariation, InterarrivalJitter, SuccessiveVariation,
 };

@@ -207,6 +207,7 @@ impl Run {
         Harm {
             own_count: count - count.min(others),
             interval: Some(loops.loss_interval()),
+            note: "hand movements out and back that the arm did not make",
             ..harm.of(loops.sent_count() as u64, "motion loops sent")
         }
     }

@@ -187,7 +187,7 @@ pub(super) fn replay(
     console.result(&if json {
         replayed.json()
     } else {
-        replayed.text()
+        replayed.text(columns())
     });
     Ok(if replayed.is_identical() {
         exit::RAN

@@ -127,14 +127,22 @@ impl Canvas {
         self.blank();
         let width = self.width - margin;
         let title = shortened(title, width);
-        let aside = shortened(aside, width.saturating_sub(columns(&title) + 2));
+        // What has no room beside the title stands below it.
+        let (beside, below) = if columns(&title) + 2 + columns(aside) <= width {
+            (aside, "")
+        } else {
+            ("", aside)
+        };
         let line = format!(
             "{:margin$}{}  {}",
             "",
             self.paint(Tone::Strong, &title),
-            self.paint(Tone::Faint, &aside)
+            self.paint(Tone::Faint, beside)
         );
         self.line(&line);
+        if !below.is_empty() {
+            self.paragraph(margin + INDENT, Tone::Faint, below);
+        }
     }
 
     /// A label in a column of `label_width`, and a text that wraps beside it.
@@ -151,6 +159,13 @@ impl Canvas {
         tone: Tone,
         text: &str,
     ) {
+        // A label that has no room stands on lines of its own.
+        let label = if columns(label) < label_width {
+            label
+        } else {
+            self.paragraph(margin, Tone::Faint, label);
+            ""
+        };
         let label = self.paint(Tone::Faint, &left(label, label_width));
         let lead = format!("{:margin$}{label}", "");
         self.behind(&lead, margin + label_width, tone, text);
@@ -265,6 +280,30 @@ mod tests {
             }
         }
         assert_eq!(wrapped("", 10), [""]);
+    }
+
+    #[test]
+    fn what_has_no_room_beside_a_title_stands_whole_below_it() {
+        let drawn = |aside: &str| {
+            let mut canvas = Canvas::new(80, Style::Plain);
+            canvas.heading("Robot, and the network before it", aside);
+            canvas.finish()
+        };
+        let aside = "1 incident (must not happen), 1 hazard (nearly one), 0 notices";
+        let title = "\nRobot, and the network before it";
+        assert_eq!(drawn("1 incident"), format!("{title}  1 incident\n"));
+        assert_eq!(drawn(aside), format!("{title}\n  {aside}\n"));
+    }
+
+    #[test]
+    fn a_label_without_room_never_runs_into_its_value() {
+        let drawn = |label: &str| {
+            let mut canvas = Canvas::new(80, Style::Plain);
+            canvas.field_of(10, label, Tone::Plain, "2 of 40");
+            canvas.finish()
+        };
+        assert_eq!(drawn("loops"), "  loops     2 of 40\n");
+        assert_eq!(drawn("loops lost"), "  loops lost\n            2 of 40\n");
     }
 
     #[test]

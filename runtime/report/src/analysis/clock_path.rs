@@ -3,6 +3,7 @@
 
 use hil_clock::{ClockMap, ClockMetrics, ClockSettings, Exchange, Localised, Requester};
 use hil_core::time::{Instant, RemoteInstant};
+use hil_present::units::duration;
 
 use super::clocks;
 use super::records::RunRecords;
@@ -129,19 +130,16 @@ fn contradiction(
         let by_data = data.localise(remote)?;
         let beyond = |one: &Localised, other: &Localised| one.earliest.ns_since(other.latest);
         let gap_ns = beyond(&by_path, &by_data).max(beyond(&by_data, &by_path));
-        (gap_ns > 0).then_some((gap_ns, at_ns, by_path, by_data))
+        (gap_ns > 0).then_some((gap_ns, by_path, by_data))
     });
-    let (_, at_ns, by_path, by_data) = apart.max_by_key(|(gap_ns, ..)| *gap_ns)?;
-    let interval = |one: &Localised| {
-        let [lowest_ns, highest_ns] =
-            [one.earliest, one.latest].map(|instant| instant.as_ns().saturating_sub(at_ns));
-        format!("{lowest_ns} to {highest_ns} ns")
-    };
+    let (gap_ns, by_path, by_data) = apart.max_by_key(|(gap_ns, ..)| *gap_ns)?;
+    let bound = |one: &Localised| duration(one.latest.ns_since(one.earliest) / 2);
     Some(format!(
-        "the exchanges over the clock path prove an offset of {}, and those over the data path \
-         one of {}, at the same instant",
-        interval(&by_path),
-        interval(&by_data)
+        "the exchanges over the clock path prove an offset (within ±{}) that is at least {} beyond what \
+         those over the data path prove (within ±{}) of the same instant",
+        bound(&by_path),
+        duration(gap_ns),
+        bound(&by_data)
     ))
 }
 
@@ -220,7 +218,7 @@ mod tests {
             let data = map(100_000_000, 100_000, 100_000, 7 * SECOND_NS + apart_ns);
             let why = contradiction(&path, &data, instants()).unwrap();
             assert!(
-                why.contains("over the clock path prove an offset of"),
+                why.contains("over the clock path prove an offset (within"),
                 "{why}"
             );
             let why = contradiction(&data, &path, instants());

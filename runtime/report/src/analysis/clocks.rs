@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use hil_account::ChannelPath;
 use hil_clock::{ClockMap, ClockMetrics, ClockSettings, Exchange, Requester};
 use hil_core::time::{Alignment, Instant, RemoteInstant};
+use hil_present::units::{duration, unsigned_duration};
 
 use super::clock_path;
 use super::records::RunRecords;
@@ -203,8 +204,8 @@ fn choose(
             } else {
                 pair.rung = ClockRung::Exchanges;
                 pair.basis = format!(
-                    "narrower than the disciplined system clocks (±{} us), which agree with it",
-                    offset.bound_ns / 1_000
+                    "narrower than the disciplined system clocks (±{}), which agree with it",
+                    unsigned_duration(offset.bound_ns)
                 );
             }
         }
@@ -228,6 +229,8 @@ fn contradiction(claimed: DisciplinedOffset, exchanges: &ClockMetrics) -> Option
         .iter()
         .filter(|one| highest_ns < one.lowest_ns || lowest_ns > one.highest_ns);
     let first = apart.next()?;
+    let gap_ns = (first.lowest_ns.saturating_sub(highest_ns))
+        .max(lowest_ns.saturating_sub(first.highest_ns));
     let place = match stretches.len() {
         1 => String::new(),
         count => format!(
@@ -235,10 +238,13 @@ fn contradiction(claimed: DisciplinedOffset, exchanges: &ClockMetrics) -> Option
             1 + apart.count()
         ),
     };
+    let width_ns = first.highest_ns.saturating_sub(first.lowest_ns);
     Some(format!(
-        "the system clocks claim an offset of {lowest_ns} to {highest_ns} ns, and the exchanges prove \
-         one of {} to {} ns{place}",
-        first.lowest_ns, first.highest_ns
+        "the offset that the system clocks claim (within ±{}) is at least {} beyond what the exchanges \
+         prove (within ±{}){place}",
+        unsigned_duration(claimed.bound_ns),
+        duration(gap_ns),
+        duration(width_ns / 2)
     ))
 }
 

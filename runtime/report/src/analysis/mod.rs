@@ -217,11 +217,7 @@ pub fn conclude(
 /// Writes the summary, the events and the report into the run's folder.
 fn write_texts(summary: &RunSummary, result: &RunResult) -> Result<(), AnalysisError> {
     let path = result.folder.events();
-    let text = event_log::text(
-        &summary.run.name,
-        &summary.score_events,
-        &summary.link_changes,
-    );
+    let text = event_log::of(summary);
     write_whole(&path, &text).map_err(|source| AnalysisError::Write { path, source })?;
     summary.write(&result.folder.summary())?;
     for (path, text) in terminal::text_files(&result.folder, summary) {

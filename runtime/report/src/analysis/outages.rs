@@ -9,6 +9,7 @@ use hil_core::time::Instant;
 use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::score_event::EventOutage;
+use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_present::units::{duration_s, seconds};
 use hil_topology::Channel;
@@ -78,6 +79,7 @@ impl OutageHistory {
             until_s: outage.until_ns.and_then(since_start_s),
             length_s: outage.length_ns(self.end).map(|ns| ns as f64 * 1e-9),
             lost_count: outage.lost_count,
+            lost_by_network_count: outage.lost_by_network_count,
             standing: found.standing,
             clock_bound_s: 0.0,
             other_count: found.other_count,
@@ -128,7 +130,14 @@ fn words(outage: &EventOutage, interrupted: Option<&str>, later_ns: Option<i64>)
             None => "outage of unknown length".to_owned(),
         };
         let lost = counted(outage.lost_count, "message");
-        format!("{length} on {}, {time}, {lost} lost", outage.channel)
+        let by_network = match outage.lost_by_network_count {
+            count if count == outage.lost_count => String::new(),
+            0 if interrupted.is_some() => String::new(),
+            0 => ", none of them by the network for certain".to_owned(),
+            count => format!(", {} of them by the network", grouped(count)),
+        };
+        let channel = &outage.channel;
+        format!("{length} on {channel}, {time}, {lost} lost{by_network}")
     };
     if let Some(process) = interrupted {
         text.push_str(&[", while ", process, " was down"].concat());
@@ -175,6 +184,7 @@ mod tests {
     fn outage(from_ms: i64, until_ms: Option<i64>, lost_count: u64) -> Outage {
         Outage {
             lost_count,
+            lost_by_network_count: lost_count,
             first_sequence: 0,
             from_ns: Some(from_ms * MS),
             until_ns: until_ms.map(|ms| ms * MS),
@@ -196,6 +206,7 @@ mod tests {
     fn an_outage_beside_an_event_is_told_with_its_time_and_its_losses() {
         let mut broken = outage(50_000, Some(50_008), 1);
         broken.interruption_index = Some(0);
+        broken.lost_by_network_count = 0;
         let story = history(vec![
             outage(42_200, Some(44_040), 230),
             outage(44_100, Some(44_108), 1),

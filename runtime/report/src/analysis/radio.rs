@@ -218,7 +218,7 @@ fn write_series(
     };
     let rate = |rate: &RateRecord| {
         let mbps = (rate.kbps != NO_RATE).then(|| f64::from(rate.kbps) * 1e-3);
-        let mbps = mbps.map_or_else(String::new, |mbps| mbps.to_string());
+        let mbps = mbps.map_or_else(String::new, |mbps| format!("{mbps:.1}"));
         let modulation = rate.modulation().unwrap_or_default().replace(',', "");
         format!("{mbps},{modulation}")
     };

@@ -6,6 +6,7 @@
 use core::fmt;
 
 use hil_core::interval::Interval;
+use hil_present::units::figure;
 use serde::Serialize;
 
 use super::metrics::{Counts, is_partial};
@@ -353,9 +354,9 @@ impl fmt::Display for Judged {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let word = if self.holds { "FAILS" } else { "passes" };
         let with_unit = |value: f64| match self.unit.as_str() {
-            "" => format!("{value:.4}"),
-            "x" => format!("{value:.4}x"),
-            unit => format!("{value:.4} {unit}"),
+            "" => figure(value),
+            "x" => format!("{}x", figure(value)),
+            unit => format!("{} {unit}", figure(value)),
         };
         write!(
             formatter,

@@ -39,7 +39,7 @@ fn comparison() -> Comparison {
     Comparison {
         harms: Vec::new(),
         measurements: Vec::new(),
-        first_harm: None,
+        gravest_harm: None,
         object: Object::Robot,
         hurt: Hurt::No,
         headline: Vec::new(),
@@ -82,11 +82,11 @@ fn a_channel_that_cannot_be_judged_is_named_beside_those_that_can() {
     for (condition, first) in [
         (
             "p99 > 1.2x",
-            "passes: p99 > 1.2x: a/b:p99 is 1.3000x (1.1000x to 1.5000x)",
+            "passes: p99 > 1.2x: a/b:p99 is 1.300x (1.100x to 1.500x)",
         ),
         (
             "p99 > 1.05x",
-            "FAILS: p99 > 1.05x: a/b:p99 is 1.3000x (1.1000x to 1.5000x)",
+            "FAILS: p99 > 1.05x: a/b:p99 is 1.300x (1.100x to 1.500x)",
         ),
     ] {
         let lines = verdicts(condition, &both, false).unwrap().lines();
@@ -105,7 +105,7 @@ fn a_channel_that_cannot_be_judged_is_named_beside_those_that_can() {
     assert_eq!((strictly.judged.len(), strictly.unjudged.len()), (2, 0));
     let in_ns = verdicts("a/b:p99 > 1 ns", &both, false).unwrap().lines();
     assert!(
-        in_ns[0].ends_with("is 1.3000 ns (1.1000 ns to 1.5000 ns)"),
+        in_ns[0].ends_with("is 1.300 ns (1.100 ns to 1.500 ns)"),
         "{in_ns:?}"
     );
 }

@@ -8,10 +8,10 @@ use serde::Serialize;
 
 use super::ComparedRun;
 use crate::answer::{
-    HarmCount, Hurt, OCCASIONS_MIN, OccasionCount, Unresolved, Untested, is_valid,
-    too_few_occasions,
+    HarmCount, Hurt, OCCASIONS_MIN, OccasionCount, Unresolved, Untested, is_score_incomplete,
+    precondition, tested_count, too_few_occasions,
 };
-use crate::assessment::{Assessment, NetworkVerdict};
+use crate::assessment::Assessment;
 
 /// A harm on both sides.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -192,6 +192,7 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
         own_count: 0,
         occasions: None,
         interval: None,
+        note: String::new(),
     };
     for run in runs {
         let Some(harm) = run.summary.harms.iter().find(|one| one.what == what) else {
@@ -200,6 +201,7 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
         };
         sum.count = sum.count.zip(harm.count).map(|(one, other)| one + other);
         sum.own_count += harm.own_count;
+        sum.note.clone_from(&harm.note);
         // Of several runs together there is none: their own differ.
         sum.interval = harm.interval.filter(|_| runs.len() == 1);
         if let Some(OccasionCount { what, count }) = &harm.occasions {
@@ -216,20 +218,12 @@ fn pooled(what: &str, runs: &[ComparedRun]) -> HarmCount {
 /// Whether the robot was hurt more in the new runs.
 pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[ComparedRun]) -> Hurt {
     let not_resolvable = |because| Hurt::NotResolvable { because };
-    let mut assessments = base
+    let mut found = base
         .iter()
-        .chain(new)
-        .map(|run| Assessment::of(&run.summary));
-    let is_invalid = |assessment: Assessment| {
-        let has_failed = assessment.network == NetworkVerdict::RunFailed;
-        has_failed || is_valid(&assessment.network) == Some(false)
-    };
-    if assessments.any(is_invalid) {
-        return not_resolvable(Unresolved::InvalidMeasurement);
-    }
-    if harms.is_empty() {
-        let because = Untested::NoScore;
-        return Hurt::NotTested { because };
+        .filter_map(base_precondition)
+        .chain(new.iter().filter_map(run_precondition));
+    if let Some(found) = found.next() {
+        return found;
     }
     if harms
         .iter()
@@ -246,7 +240,9 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
         && harms
             .iter()
             .all(|one| one.change == Change::Less || one.new.count == Some(0));
-    if let Some(mut because) = too_few_occasions(harms.iter().map(|one| &one.new)) {
+    let message_count = new.iter().map(|run| tested_count(&run.summary)).sum();
+    let new_harms = harms.iter().map(|one| &one.new);
+    if let Some(mut because) = too_few_occasions(new_harms, message_count) {
         if let Unresolved::SampleTooSmall { what, .. } = &mut because {
             what.push_str(" in the new runs");
         }
@@ -256,6 +252,24 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
         return Hurt::No;
     }
     not_resolvable(too_small(harms).unwrap_or(Unresolved::WithinChance))
+}
+
+/// What a run alone has to say before its harms are looked at.
+fn run_precondition(run: &ComparedRun) -> Option<Hurt> {
+    precondition(&run.summary, &Assessment::of(&run.summary).network)
+}
+
+/// The same of a run to compare with: a robot without a network is one, whose score must be whole all the same.
+fn base_precondition(run: &ComparedRun) -> Option<Hurt> {
+    let no_network = Hurt::NotTested {
+        because: Untested::NoNetwork,
+    };
+    let found = run_precondition(run)?;
+    if found != no_network {
+        return Some(found);
+    }
+    let because = Unresolved::ScoreIncomplete;
+    is_score_incomplete(&run.summary).then_some(Hurt::NotResolvable { because })
 }
 
 /// The first harm of the new runs whose difference has no interval.
@@ -277,8 +291,9 @@ mod tests {
     use hil_stats::dependence::Batches;
 
     use super::*;
-    use crate::summary::Outcome;
+    use crate::summary::{LinkKind, Outcome, RunSummary};
     use crate::tests::sample::full;
+    use crate::tests::sample_events::recorded_channel;
 
     /// So many loops lost, evenly or in one go.
     fn of_loops(count: u64, sent_count: u64, is_even: bool) -> Spread {
@@ -303,6 +318,7 @@ mod tests {
                 count: sent_count,
             }),
             interval: count.map(|count| of_loops(count, sent_count, true)),
+            note: String::new(),
         }];
         ComparedRun {
             folder: PathBuf::from("run"),
@@ -384,6 +400,7 @@ mod tests {
                     own_count: 0,
                     occasions: None,
                     interval: None,
+                    note: String::new(),
                 });
                 run
             });
@@ -431,8 +448,8 @@ mod tests {
         };
         let mut failed = run(Some(0), 60);
         failed.summary.run.outcome = Outcome::Failed;
-        let because = Unresolved::InvalidMeasurement;
-        assert_eq!(compared(&clean, &[failed]), Hurt::NotResolvable { because });
+        let because = Untested::RunFailed;
+        assert_eq!(compared(&clean, &[failed]), Hurt::NotTested { because });
         let mut overrun = run(Some(9), 60);
         overrun.summary.processes[1].skipped_tick_count = Some(500);
         let because = Unresolved::InvalidMeasurement;
@@ -447,5 +464,49 @@ mod tests {
             compared(&[unscored.clone()], &[unscored]),
             Hurt::NotTested { because }
         );
+    }
+
+    #[test]
+    fn what_a_run_alone_cannot_answer_no_comparison_answers() {
+        let clean = || run(Some(0), 600);
+        let with = |change: &dyn Fn(&mut RunSummary)| {
+            let mut run = clean();
+            change(&mut run.summary);
+            run
+        };
+        let because = Unresolved::HostUnknown;
+        let silent = with(&|one| {
+            for process in &mut one.processes {
+                (process.tick_count, process.skipped_tick_count) = (None, None);
+            }
+        });
+        let unknown = Hurt::NotResolvable { because };
+        assert_eq!(compared(&[clean()], std::slice::from_ref(&silent)), unknown);
+        assert_eq!(compared(&[silent], &[clean()]), unknown);
+        let because = Unresolved::ScoreIncomplete;
+        let incomplete = with(&|one| {
+            let mut recorded = recorded_channel();
+            recorded.recorded = None;
+            one.channels.push(recorded);
+        });
+        let unscored = Hurt::NotResolvable { because };
+        assert_eq!(
+            compared(&[clean()], std::slice::from_ref(&incomplete)),
+            unscored
+        );
+        assert_eq!(compared(&[incomplete], &[clean()]), unscored);
+        let because = Untested::NoNetwork;
+        let direct = with(&|one| {
+            for channel in &mut one.channels {
+                channel.link = LinkKind::SharedMemory;
+            }
+        });
+        let mut stepped = direct.clone();
+        stepped.summary.run.is_virtual = true;
+        let untested = Hurt::NotTested { because };
+        for one in [direct, stepped] {
+            assert_eq!(compared(&[clean()], std::slice::from_ref(&one)), untested);
+            assert_eq!(compared(&[one], &[clean()]), Hurt::No, "to compare with");
+        }
     }
 }

@@ -20,7 +20,7 @@ use hil_stats::comparison::Estimate;
 use serde::Serialize;
 
 use crate::answer::{Hurt, Object};
-use crate::sections::events::first_harm;
+use crate::sections::events::gravest_harm;
 use crate::summary::{RunSummary, SummaryError};
 use harms::ComparedHarm;
 use hil_rundir::manifest::Manifest;
@@ -216,7 +216,7 @@ pub(crate) struct Comparison {
     /// Whether the runs measured what they were to measure.
     pub(crate) measurements: Vec<Measurements>,
     /// The gravest event of the new runs that the network explains, and what the network did before.
-    pub(crate) first_harm: Option<String>,
+    pub(crate) gravest_harm: Option<String>,
     /// Names of the scores to see first.
     pub(crate) headline: Vec<String>,
     pub(crate) figures: Vec<ComparedMetric>,
@@ -232,9 +232,10 @@ impl Comparison {
         cautions.extend(metrics::cautions(&figures, [base.len(), new.len()]));
         let harms = harms::of(base, new);
         let hurt = harms::hurt(&harms, base, new);
-        let mut first_harms = new.iter().filter_map(|run| {
-            let words = first_harm(&run.summary)?;
-            Some(format!("in {}: {words}", run.folder.display()))
+        let mut gravest_harms = new.iter().filter_map(|run| {
+            let (words, cause) = gravest_harm(&run.summary)?;
+            let run = run.folder.display();
+            Some(format!("in {run}, {words}; network before it: {cause}"))
         });
         let headline = new.first().map(|run| run.summary.headline.clone());
         Self {
@@ -252,7 +253,7 @@ impl Comparison {
             harms,
             hurt,
             measurements: origin::measurements(base, new),
-            first_harm: first_harms.next(),
+            gravest_harm: gravest_harms.next(),
             headline: headline.unwrap_or_default(),
             figures,
         }

@@ -8,7 +8,7 @@ use hil_platform::words::counted;
 use hil_present::template::{TemplateError, markdown as document};
 use hil_present::terminal::canvas::{Canvas, Style};
 use hil_present::terminal::section;
-use hil_present::units::{duration, figure, percent};
+use hil_present::units::{self, duration, percent};
 use hil_present::{Block, Section, Table, Tone, UNAVAILABLE};
 use hil_stats::comparison::Estimate;
 
@@ -16,7 +16,8 @@ use super::conditions::Verdicts;
 use super::harms::HarmDifference;
 use super::origin::{Difference, Differing};
 use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict};
-use crate::answer::{Hurt, Object, UnitScale};
+use crate::answer::{Hurt, Object, with_note};
+use crate::summary::ScoreMetric;
 
 const COLUMNS: [&str; 6] = ["metric", "base", "new", "new / base", "95 %", "verdict"];
 /// Differences and channels that are listed unless every metric is asked for.
@@ -156,7 +157,10 @@ fn runs(comparison: &Comparison, extent: Extent) -> Section {
 fn harms(comparison: &Comparison) -> Section {
     let mut section = Section::new("harms", "", "");
     for one in &comparison.harms {
-        section.note(Tone::Strong, &one.base.what);
+        section.note(
+            Tone::Strong,
+            with_note(one.base.what.clone(), &one.base.note),
+        );
         section.fact("base", Tone::Plain, one.base.words());
         section.fact("new", Tone::Plain, one.new.words());
         let is_none = one.base.count == Some(0) && one.new.count == Some(0);
@@ -164,8 +168,8 @@ fn harms(comparison: &Comparison) -> Section {
             section.fact("new less base", Tone::Plain, difference_words(difference));
         }
     }
-    if let Some(words) = &comparison.first_harm {
-        section.fact("first harm", Tone::Plain, words);
+    if let Some(words) = &comparison.gravest_harm {
+        section.fact("gravest harm", Tone::Plain, words);
     }
     for one in &comparison.measurements {
         let words = match one.runs.as_slice() {
@@ -286,11 +290,15 @@ fn cells(one: &ComparedMetric) -> [String; 6] {
             one.difference_interval
                 .map(|Interval { low, high, .. }| format!("{} to {}", points(low), points(high))),
         ),
-        ChartKind::Count | ChartKind::Score => (
-            one.difference.map(signed),
-            one.difference_interval
-                .map(|Interval { low, high, .. }| format!("{} to {}", signed(low), signed(high))),
-        ),
+        ChartKind::Count | ChartKind::Score => {
+            let signed = |value| signed(one, value);
+            (
+                one.difference.map(signed),
+                one.difference_interval.map(|Interval { low, high, .. }| {
+                    format!("{} to {}", signed(low), signed(high))
+                }),
+            )
+        }
     };
     let or_none = |text: Option<String>| text.unwrap_or_else(|| UNAVAILABLE.to_owned());
     [
@@ -307,8 +315,16 @@ fn points(share: f64) -> String {
     format!("{:+.3} pp", share * 100.0)
 }
 
-fn signed(value: f64) -> String {
-    let text = figure(value);
+/// The unit in which a score or a count is shown.
+fn shown_unit(one: &ComparedMetric) -> &str {
+    ScoreMetric::shown_unit(&one.metric, &one.unit)
+}
+
+fn signed(one: &ComparedMetric, value: f64) -> String {
+    let text = match shown_unit(one) {
+        "share" => return points(value),
+        unit => units::value(value, unit),
+    };
     if value > 0.0 {
         format!("+{text}")
     } else {
@@ -321,11 +337,10 @@ fn value(one: &ComparedMetric, estimate: Option<Estimate>) -> String {
     let Some(Estimate { value, .. }) = estimate else {
         return UNAVAILABLE.to_owned();
     };
-    match (one.kind, one.unit.as_str()) {
-        (ChartKind::Delay, _) => duration(value as i64),
-        (ChartKind::Loss, _) => percent(value),
-        (ChartKind::Count | ChartKind::Score, "1") => figure(value),
-        (ChartKind::Count | ChartKind::Score, unit) => format!("{} {unit}", figure(value)),
+    match one.kind {
+        ChartKind::Delay => duration(value as i64),
+        ChartKind::Loss => percent(value),
+        ChartKind::Count | ChartKind::Score => units::value(value, shown_unit(one)),
     }
 }
 
@@ -356,35 +371,61 @@ fn robot(comparison: &Comparison) -> Section {
     let mut section = Section::new("robot", "Robot", "");
     let scores = || {
         let all = comparison.figures.iter();
-        all.filter(|one| one.kind == ChartKind::Score && one.base.is_some() && one.new.is_some())
+        all.filter(|one| one.kind == ChartKind::Score)
     };
+    // One that changed and has no interval may have changed by chance or not: a reader must see it.
     let is_shown = |one: &&ComparedMetric| {
-        let differs = matches!(one.verdict, Verdict::Lower | Verdict::Higher);
-        differs || comparison.headline.contains(&one.metric)
+        let differs = match one.verdict {
+            Verdict::Lower | Verdict::Higher => true,
+            Verdict::NotTested => one.difference.is_some_and(|more| more.abs() > 0.0),
+            _ => false,
+        };
+        let has_both = one.base.is_some() && one.new.is_some();
+        has_both && (differs || comparison.headline.contains(&one.metric))
     };
     let mut table = Table::new("", &["score", "base", "new", "difference"]);
     for one in scores().filter(is_shown) {
-        let scale = UnitScale::of(&one.unit);
-        let [base, new] = [one.base, one.new]
-            .map(|side| side.map_or_else(String::new, |side| scale.words(side.value)));
+        let [base, new] = [one.base, one.new].map(|side| value(one, side));
         let mut verdict = one.verdict.words().to_owned();
         if base == new && one.verdict != Verdict::NoDifferenceShown {
             verdict.push_str(", by less than the digits shown");
         }
         table.push([one.label.clone(), base, new, verdict].map(Into::into));
     }
-    let hidden = scores().count() - table.rows.len();
-    if hidden > 0 {
-        let hidden = counted(hidden as u64, "other score");
-        table.note = format!("{hidden}: no difference shown");
-    }
-    if !table.rows.is_empty() || hidden > 0 {
+    let hidden = scores().filter(|one| !is_shown(one));
+    table.note = hidden_words(hidden);
+    if !table.rows.is_empty() || !table.note.is_empty() {
         section.table(table);
     }
     section
 }
 
-/// Loss of both sides, and how often as long the delays are; those that lose most first.
+/// How many scores are not listed, by why; empty without any.
+fn hidden_words<'a>(hidden: impl Iterator<Item = &'a ComparedMetric>) -> String {
+    let mut counts = [
+        (0, "with no difference shown"),
+        (0, "not tested (no interval)"),
+        (0, "unavailable on one side"),
+    ];
+    for one in hidden {
+        let index = match one.verdict {
+            _ if one.base.is_none() && one.new.is_none() => continue,
+            _ if one.base.is_none() || one.new.is_none() => 2,
+            Verdict::NotTested => 1,
+            _ => 0,
+        };
+        counts[index].0 += 1;
+    }
+    let told = counts.iter().filter(|(count, _)| *count > 0);
+    let told: Vec<String> = told.map(|(count, why)| format!("{count} {why}")).collect();
+    if told.is_empty() {
+        String::new()
+    } else {
+        format!("other scores: {}", told.join(", "))
+    }
+}
+
+/// Loss of both sides, and how often as long the delays are; those that differ first, then those that lose most.
 fn channels(comparison: &Comparison) -> Section {
     let mut section = Section::new("channels", "Channels", "");
     let mut names: Vec<&str> = Vec::new();
@@ -405,7 +446,16 @@ fn channels(comparison: &Comparison) -> Section {
         let new = metric(channel, None, "loss").and_then(|one| one.new);
         new.map_or(0.0, |one| one.value)
     };
-    names.sort_by(|one, other| share_lost(other).total_cmp(&share_lost(one)));
+    let has_verdict = |channel: &str| {
+        let whole = ["loss", "reordered", "duplicated"].map(|one| metric(channel, None, one));
+        let delays = ["p50", "p99"].map(|one| metric(channel, Some(Part::EndToEnd), one));
+        let mut all = whole.into_iter().chain(delays).flatten();
+        all.any(|one| is_verdict(one.verdict))
+    };
+    names.sort_by(|one, other| {
+        let by_verdict = has_verdict(other).cmp(&has_verdict(one));
+        by_verdict.then(share_lost(other).total_cmp(&share_lost(one)))
+    });
     if names.is_empty() {
         return section;
     }
@@ -447,22 +497,97 @@ fn channels(comparison: &Comparison) -> Section {
     let hidden = names.len().saturating_sub(CHANNELS_SHOWN) as u64;
     if hidden > 0 {
         let hidden = grouped(hidden);
-        table.note = format!("and {hidden} more that lose no larger share");
+        table.note = format!("and {hidden} more with --full");
     }
     section.table(table);
     section
 }
 
+/// Whether the figure differs for certain.
+const fn is_verdict(verdict: Verdict) -> bool {
+    !matches!(verdict, Verdict::NotTested | Verdict::NoDifferenceShown)
+}
+
 fn with_verdict(text: String, verdict: Verdict) -> String {
-    match verdict {
-        Verdict::NotTested | Verdict::NoDifferenceShown => text,
-        verdict => format!("{text}, {}", verdict.words()),
+    if is_verdict(verdict) {
+        format!("{text}, {}", verdict.words())
+    } else {
+        text
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use hil_present::terminal::render;
+
     use super::*;
+    use crate::compare::ComparedRun;
+    use crate::tests::sample::full;
+
+    fn run(loop_count: f64) -> ComparedRun {
+        let mut summary = full();
+        summary.score[1].value = Some(loop_count);
+        summary.score[1].interval = None;
+        let idle = ScoreMetric {
+            name: "idle".to_owned(),
+            label: "idle".to_owned(),
+            value: Some(2.0),
+            ..summary.score[1].clone()
+        };
+        summary.score.push(idle);
+        ComparedRun {
+            folder: PathBuf::from("run"),
+            topology: serde_json::Value::Null,
+            summary,
+        }
+    }
+
+    #[test]
+    fn a_score_that_changed_without_an_interval_is_listed_and_the_others_counted_by_why() {
+        let comparison = Comparison::of(&[run(4.0)], &[run(6.0)]);
+        let text = render(&[robot(&comparison)], 100, Style::Plain);
+        let changed = text.lines().find(|line| line.contains("motion loops"));
+        assert!(
+            changed.is_some_and(|line| line.contains("not tested")),
+            "{text}"
+        );
+        let hidden = "other scores: 1 with no difference shown, 1 not tested (no interval)";
+        assert!(text.contains(hidden), "{text}");
+        assert!(!text.contains("idle"), "{text}");
+        // As the score of a run has it.
+        let all = render(&[metrics(&comparison)], 100, Style::Plain);
+        assert!(all.contains("0.1223 °") && !all.contains("rad "), "{all}");
+    }
+
+    #[test]
+    fn a_channel_that_differs_stands_before_those_that_lose_more() {
+        let mut comparison = Comparison::of(&[run(4.0)], &[run(4.0)]);
+        let is_loss = |one: &&ComparedMetric| one.metric == "loss" && one.new.is_some();
+        let loss = comparison.figures.iter().find(is_loss).unwrap().clone();
+        let of = |name: String, share: f64, verdict| ComparedMetric {
+            channel: Some(name),
+            new: Some(Estimate {
+                value: share,
+                interval: None,
+            }),
+            verdict,
+            ..loss.clone()
+        };
+        comparison.figures = (0..14)
+            .map(|index| of(format!("lossy/{index}"), 0.5, Verdict::NotTested))
+            .collect();
+        let differs = of("arm/command".to_owned(), 0.01, Verdict::LosesMore);
+        comparison.figures.push(differs);
+        let text = render(&[channels(&comparison)], 100, Style::Plain);
+        let first = text
+            .lines()
+            .find(|line| line.contains('/') && !line.contains("new /"));
+        assert!(
+            first.is_some_and(|line| line.contains("arm/command")),
+            "{text}"
+        );
+        assert!(text.contains("and 3 more with --full"), "{text}");
+    }
 
     #[test]
     fn a_name_makes_no_difference_and_links_make_one_where_no_key_of_theirs_does() {

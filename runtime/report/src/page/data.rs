@@ -52,8 +52,8 @@ pub(crate) struct Run {
     pub(crate) answer: Option<AnswerView>,
     /// The few metrics to see first.
     pub(crate) headline: Vec<Tile>,
-    /// Incidents and hazards, also those that are not listed.
-    pub(crate) grave_count: u64,
+    /// Incidents and hazards, also those that are not listed; `null` without a score.
+    pub(crate) grave_count: Option<u64>,
     /// All it says.
     pub(crate) sections: Vec<Section>,
     pub(crate) repeat_command: Option<String>,

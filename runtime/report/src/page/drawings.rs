@@ -6,17 +6,9 @@ use super::charts::histogram::delay_histogram;
 use super::charts::waterfall::{Bar, waterfall};
 use crate::sections::Sources;
 use hil_account::ChannelAccount;
+use hil_core::plot::name_part;
 use hil_platform::text::grouped;
 use hil_present::Drawing;
-
-/// A name that is fit to be a file and an identifier.
-pub(super) fn name_of(parts: &[&str]) -> String {
-    let fit = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
-    let parts = parts
-        .iter()
-        .map(|part| part.chars().map(fit).collect::<String>());
-    parts.collect::<Vec<_>>().join("-")
-}
 
 /// The figures of one channel.
 pub(super) fn of_channel(key: &str, channel: &str, sources: &Sources<'_>) -> Vec<Drawing> {
@@ -24,7 +16,7 @@ pub(super) fn of_channel(key: &str, channel: &str, sources: &Sources<'_>) -> Vec
     let mut push = |kind: &str, title: &str, caption: &str, svg: Option<String>| {
         if let Some(svg) = svg {
             drawings.push(Drawing {
-                name: name_of(&[key, kind, channel]),
+                name: format!("{key}-{kind}-{}", name_part(channel)),
                 title: title.to_owned(),
                 caption: caption.to_owned(),
                 svg,
@@ -34,14 +26,8 @@ pub(super) fn of_channel(key: &str, channel: &str, sources: &Sources<'_>) -> Vec
     };
     let curves = curves(sources);
     let of = |title: &str| format!("{title}, {channel}");
-    let is_rough = curves.iter().any(|curve| curve.bins.is_empty());
-    let caption = if is_rough {
-        "Share of messages that took at most so long. This folder has no histograms, so points are \
-         the quantiles of summary.json, and lines between them are a guide only."
-    } else {
-        "Share of messages that took at most so long, in steps of nines: the same height for the \
-         slowest tenth as for the slowest hundredth of it."
-    };
+    let caption = "Share of messages that took at most so long, in steps of nines: the same height for the \
+                   slowest tenth as for the slowest hundredth of it.";
     push(
         "delay-cdf",
         "How long it took",
@@ -97,24 +83,22 @@ fn curves<'a>(sources: &Sources<'a>) -> Vec<Curve<'a>> {
             .iter()
             .filter(|segment| !segment.is_combined);
         for segment in chain {
-            if let Some(summary) = segment.distribution.measured() {
+            if segment.distribution.measured().is_some() {
                 curves.push(Curve {
                     label: segment.name(),
                     bins: &segment.bins,
-                    summary: Some(*summary),
                     is_whole: false,
                 });
             }
         }
         // On a direct channel the only segment is the whole.
-        if let Some(summary) = account.end_to_end.distribution.measured() {
+        if account.end_to_end.distribution.measured().is_some() {
             if curves.len() == 1 {
                 curves.clear();
             }
             curves.push(Curve {
                 label: "published → taken".to_owned(),
                 bins: &account.end_to_end.bins,
-                summary: Some(*summary),
                 is_whole: true,
             });
         }
@@ -125,7 +109,6 @@ fn curves<'a>(sources: &Sources<'a>) -> Vec<Curve<'a>> {
         curves.push(Curve {
             label: "network, one way".to_owned(),
             bins: &network.delay_bins,
-            summary: None,
             is_whole: true,
         });
     }
@@ -140,7 +123,7 @@ pub(super) fn of_accounts<'a>(
     let bars: Vec<Bar> = accounts.map(|(name, account)| bar(name, account)).collect();
     let title = "Where each microsecond went";
     Some(Drawing {
-        name: name_of(&[key, "waterfall"]),
+        name: format!("{key}-waterfall"),
         title: title.to_owned(),
         caption: "Medians of the segments that were measured, each channel to its own scale. Medians \
                   need not add up to the median of the whole; segment by segment, message by message, \

@@ -26,7 +26,7 @@ use hil_present::{Cell, Drawing, Section, Table, UNAVAILABLE, csv};
 use minijinja::{Value, context};
 use serde_json::json;
 
-use self::data::{Page, Run, RunKind, SCHEMA_VERSION};
+use self::data::{Page, Run, SCHEMA_VERSION};
 use self::read::Material;
 
 /// What a report is written as.
@@ -134,8 +134,7 @@ fn overview(runs: &[Run]) -> Table {
             );
             row.push(text.into());
         }
-        let is_known = run.kind != RunKind::Unfinished;
-        row.push(Cell::count(is_known.then_some(run.grave_count)));
+        row.push(Cell::count(run.grave_count));
         table.push(row);
     }
     "Largest values are those of the channel that has the largest; intervals are 95 %."

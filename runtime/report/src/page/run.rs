@@ -1,6 +1,6 @@
 //! One run of a page: the sections of the report with what only a page has, drawings and tiles.
 
-use hil_platform::text::grouped;
+use hil_platform::text::{grouped, shell_words};
 use hil_present::units::JOINT;
 use hil_present::{Block, Field, Metric, Section, Tone, UNAVAILABLE};
 
@@ -68,9 +68,9 @@ fn unfinished(key: String, manifest: &Manifest, material: &Material) -> Run {
         sections: vec![
             missing(lacks),
             facts,
-            sections::repeat(Some(&manifest.command_line.join(" "))),
+            sections::repeat(Some(&shell_words(&manifest.command_line))),
         ],
-        repeat_command: Some(manifest.command_line.join(" ")).filter(|line| !line.is_empty()),
+        repeat_command: Some(shell_words(&manifest.command_line)).filter(|line| !line.is_empty()),
         ..Run::default()
     }
 }
@@ -94,7 +94,8 @@ fn ended(key: String, summary: &RunSummary, material: &Material, steps: usize) -
             text: facts.exit_reason.clone(),
         },
         answer: Some(answer_view(summary, &assessment)),
-        grave_count: sections::events::grave_count(&summary.score_events),
+        grave_count: (!facts.case.is_empty() && summary.no_score_words().is_none())
+            .then(|| sections::events::grave_count(&summary.score_events)),
         repeat_command: Some(facts.repeat_command.clone()),
         key,
         ..Run::default()
@@ -106,7 +107,8 @@ fn ended(key: String, summary: &RunSummary, material: &Material, steps: usize) -
         metric,
         clean: None,
     };
-    run.headline = headline(&sections).into_iter().map(tile).collect();
+    let first = headline(&sections, &summary.headline);
+    run.headline = first.into_iter().map(tile).collect();
     run.sections = sections;
     run
 }
@@ -224,18 +226,16 @@ pub(super) const WORST: [(&str, &str); 3] = [
     ("network_p99", "network's largest p99"),
 ];
 
-/// The metrics to see first: what the case is about, and the worst of the network.
-fn headline(sections: &[Section]) -> Vec<Metric> {
-    let wanted = ["collision_ratio", "motion_loss_ratio"];
+/// The metrics to see first: what the case `wanted`, else its first one, and the worst of the network.
+fn headline(sections: &[Section], wanted: &[String]) -> Vec<Metric> {
     let of = |id: &str| sections.iter().find(|section| section.id == id);
     let score = of("score").map(Section::metrics).unwrap_or_default();
-    let named = score
-        .iter()
-        .find(|(_, one)| wanted.contains(&one.name.as_str()));
-    let first = named
-        .or_else(|| score.first())
-        .map(|(_, one)| (*one).clone());
-    let mut found: Vec<Metric> = first.into_iter().collect();
+    let named = |name: &String| score.iter().find(|(_, one)| one.name == *name);
+    let metric = |(_, one): &(&str, &Metric)| (*one).clone();
+    let mut found: Vec<Metric> = wanted.iter().filter_map(named).map(metric).collect();
+    if found.is_empty() {
+        found.extend(score.first().map(metric));
+    }
     let channels = of("channels").map_or(&[][..], |section| &section.children);
     for (name, words) in WORST {
         let is_quantile = name != "loss_ratio";
@@ -271,9 +271,27 @@ mod tests {
         };
         let mut all = Section::new("channels", "Channels", "");
         all.children = vec![channel("often", 100.0, 1e-3), channel("twice", 2.0, 5e-3)];
-        let [first] = headline(std::slice::from_ref(&all)).try_into().unwrap();
+        let [first] = headline(std::slice::from_ref(&all), &[])
+            .try_into()
+            .unwrap();
         assert_eq!(first.label, "largest p99: often");
         all.children.remove(0);
-        assert!(headline(&[all]).is_empty());
+        assert!(headline(&[all], &[]).is_empty());
+    }
+
+    #[test]
+    fn the_case_says_which_of_its_figures_are_seen_first() {
+        let mut score = Section::new("score", "Score", "");
+        for name in ["motion_loss_ratio", "separation_m_min", "missions_per_hour"] {
+            score.metric(Metric::new(name, name, "1", 1.0));
+        }
+        let of = |wanted: &[&str]| {
+            let wanted: Vec<String> = wanted.iter().map(|one| (*one).to_owned()).collect();
+            let found = headline(std::slice::from_ref(&score), &wanted);
+            found.into_iter().map(|one| one.name).collect::<Vec<_>>()
+        };
+        let wanted = ["missions_per_hour", "separation_m_min"];
+        assert_eq!(of(&wanted), wanted);
+        assert_eq!(of(&["no_such_figure"]), ["motion_loss_ratio"]);
     }
 }

@@ -93,13 +93,6 @@ impl Svg {
         ));
     }
 
-    pub(super) fn circle(&mut self, class: &str, x: f64, y: f64, radius: f64) {
-        let [x, y, r] = [x, y, radius].map(px);
-        self.put(format_args!(
-            r#"<circle class="{class}" cx="{x}" cy="{y}" r="{r}"/>"#
-        ));
-    }
-
     /// A path whose `d` the caller made of numbers.
     pub(super) fn path(&mut self, class: &str, d: &str) {
         if !d.is_empty() {

@@ -3,6 +3,8 @@
 use clap::ValueEnum as _;
 use std::collections::BTreeMap;
 
+use hil_account::network::network_series_name;
+
 use super::read::{Found, Manifest, Material};
 use super::series::{Series, parse};
 use super::{Format, PAGE_BYTES_MAX, figure_files, page_of, render};
@@ -159,7 +161,8 @@ fn hostile_texts_stay_texts() {
     for (name, svg) in figure_files(&[material], None).unwrap() {
         assert_well_formed(svg.trim_start_matches("<?xml version=\"1.0\" encoding=\"UTF-8\"?>"));
         assert!(
-            name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-'),
+            name.bytes()
+                .all(|b| b.is_ascii_alphanumeric() || b"-_".contains(&b)),
             "{name}"
         );
     }
@@ -172,7 +175,9 @@ fn runs_that_went_wrong_get_pages_that_say_so() {
     silent.network = None;
     let manifest = Manifest {
         name: "<killed>".to_owned(),
-        command_line: vec!["hil-runtime".to_owned()],
+        command_line: ["hil-runtime", "--set", "run.duration=\"1 s\""]
+            .map(str::to_owned)
+            .into(),
         records: (3, 400),
         ..Manifest::default()
     };
@@ -187,7 +192,11 @@ fn runs_that_went_wrong_get_pages_that_say_so() {
         (material(awkward()), "failed"),
         (material(empty()), "stopped early"),
         (material(silent), "no records of this channel"),
-        (unfinished, "left no summary"),
+        (unfinished.clone(), "left no summary"),
+        (
+            unfinished,
+            "hil-runtime --set &#39;run.duration=&quot;1 s&quot;&#39;",
+        ),
         (torn, "series/a.csv cannot be read"),
     ];
     for (material, expected) in cases {
@@ -258,6 +267,22 @@ fn a_million_values_make_a_small_page_that_says_it_is_thinned() {
     let page = render(&many, None, Format::Html, None).unwrap();
     assert!(page.contains("12 runs"));
     assert_well_formed(&page);
+}
+
+#[test]
+fn a_channel_with_a_dot_or_a_hyphen_finds_its_series() {
+    for name in ["arm.right/command", "arm-right/command"] {
+        let mut material = material(full());
+        if let Found::Ended(summary) = &mut material.found {
+            let network = summary.network.as_mut().unwrap();
+            network.channels[0].channel = name.to_owned();
+        }
+        assert!(!html(&material).contains("Delay, median"), "in no timeline");
+        let text = "time_s,sent_count,lost_count,delay_s_p50,delay_s_max,silence_s_max\n\
+                    0,9,1,0.001,0.002,0.01\n1,9,1,0.002,0.003,0.01\n";
+        material.series = vec![parse(&network_series_name(name), text).unwrap()];
+        assert!(html(&material).contains("Delay, median"), "{name}");
+    }
 }
 
 #[test]
@@ -383,6 +408,13 @@ fn a_reason_is_said_once_with_all_that_it_is_for() {
     assert!(terminal.contains("unavailable, 10: no whole motion loop"));
     let markdown = render(&[material(summary.clone())], None, Format::Md, None).unwrap();
     assert_eq!(markdown.matches("no whole motion loop").count(), 1);
+    // Why a loss has no interval is said once.
+    let all = render(&[material(full())], None, Format::Csv, None).unwrap();
+    let loss = all
+        .lines()
+        .find(|line| line.contains(",loss_ratio,"))
+        .unwrap();
+    assert_eq!(loss.matches("effective observations").count(), 1, "{loss}");
     // For programs each figure stands by itself.
     let csv = render(&[material(summary)], None, Format::Csv, None).unwrap();
     assert_eq!(csv.matches("no whole motion loop").count(), 10);
@@ -415,7 +447,7 @@ fn the_clean_runs_value_stands_below_each_tile() {
     let page = render(&run, Some(&clean), Format::Html, None).unwrap();
     assert_well_formed(&page);
     let page = page.replace(JOINT, " ");
-    assert!(page.contains("clean run: 0.001000 rad"), "{page}");
+    assert!(page.contains("clean run: 0.05730 °"), "{page}");
     assert!(!html(&run[0]).contains("clean run:"));
     let nothing = render(&run, Some(&material(empty())), Format::Html, None).unwrap();
     assert!(nothing.contains("clean run: unavailable"));

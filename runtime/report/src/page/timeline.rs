@@ -3,18 +3,17 @@
 
 use core::ops::Range;
 
+use hil_account::network::network_series_name;
 use hil_core::case_study::Severity;
 
 use super::charts::time::{Mark, MarkClass, over_time};
-use super::drawings::name_of;
 use super::series::{Plot, PlotPanel, Series, Thinned, thinned};
-use crate::answer::UnitScale;
 use crate::link_change::LinkChange;
 use crate::network::{NetworkQuantity, NetworkReport, TimelineRow, TimelineSubject};
 use crate::score_event::{ExplainedEvent, ScoreEvents};
 use hil_platform::text::grouped;
 use hil_present::Drawing;
-use hil_present::units::duration_s;
+use hil_present::units::{duration_s, scale};
 
 /// Lines of one panel; a series with more columns gets more panels.
 const LINES_MAX: usize = 7;
@@ -42,15 +41,15 @@ pub(super) fn over_run(
         let TimelineSubject::Robot { label } = &row.subject else {
             continue;
         };
-        let scale = UnitScale::of(&row.unit);
+        let (factor, unit) = scale(&row.unit);
         // A number of events has no unit; an error has.
-        let (title, unit) = match scale.unit() {
-            "" => (format!("Robot: {label}"), "count"),
+        let (title, unit) = match unit {
+            "1" => (format!("Robot: {label}"), "count"),
             unit => (format!("Robot: {label} ({unit})"), unit),
         };
         let mut series = of_row(label, row);
         for value in series.high.iter_mut().flatten() {
-            *value = scale.scaled(*value);
+            *value *= factor;
         }
         panels.push(PlotPanel {
             title,
@@ -77,7 +76,7 @@ pub(super) fn over_run(
         until_s: span.end,
         panels,
     };
-    let name = name_of(&[key, "timeline"]);
+    let name = format!("{key}-timeline");
     let title = report.timeline.title();
     let drawing = Drawing {
         svg: over_time(&name, title, &plot, &bands, &moments),
@@ -193,7 +192,7 @@ fn network_panels(
     let mut width_s = 0.0_f64;
     for one in &report.channels {
         let channel = one.channel.as_str();
-        let file = format!("network-{}", channel.replace('/', "-"));
+        let file = network_series_name(channel);
         let found = series.iter().find(|one| one.name == file);
         if let Some(found) = found.filter(|found| !found.rows.is_empty()) {
             let steps = steps.min(found.rows.len()).max(1);
@@ -293,7 +292,7 @@ pub(super) fn of_case(
         until_s,
         panels,
     };
-    let name = name_of(&[key, "robot"]);
+    let name = format!("{key}-robot");
     let title = "The robot, as its case plots it";
     let caption = format!(
         "Axis: {}. Each point stands for {} and has the smallest and largest value within; all values \

@@ -1,11 +1,10 @@
 //! The arms that a foreign program drove, or that were driven in a foreign robot: state, answers,
 //! and where time went in our adapter, held against the controller's cycle.
 
-use hil_stats::histogram::Distribution;
-
 use hil_present::units::{duration, percent};
 use hil_present::{Cell, Section, Table, Tone};
 
+use super::channel::quantile_table;
 use crate::adapter::AdapterSummary;
 use crate::summary::Fact;
 use hil_platform::text::grouped;
@@ -78,22 +77,21 @@ fn segments(adapter: &AdapterSummary) -> Table {
         || "cycle unavailable".to_owned(),
         |cycle_ns| format!("cycle {}", duration(cycle_ns)),
     );
-    let mut table = Table::new("", &[&cycle, "p50", "p99", "p99.9", "p99/cycle"]);
-    for segment in &adapter.segments {
-        let name = Cell::Text(segment.name.clone());
-        match &segment.distribution {
-            Distribution::Unavailable { reason } => {
-                table.push([name, format!("unavailable: {reason}").into()]);
-            }
-            Distribution::Measured(one) => table.push([
-                name,
-                Cell::Duration(one.p50_ns),
-                Cell::Duration(one.p99_ns),
-                Cell::Duration(one.p999_ns),
-                Cell::share(segment.p99_of_cycle(adapter.cycle_ns)),
-            ]),
+    let segments = adapter.segments.iter();
+    let rows: Vec<_> = segments
+        .map(|one| (one.name.as_str(), &one.distribution))
+        .collect();
+    let mut table = quantile_table(&rows)
+        .ranked("min", 2)
+        .ranked("max", 1)
+        .with_column("p99/cycle");
+    for (row, segment) in table.rows.iter_mut().zip(&adapter.segments) {
+        if segment.distribution.measured().is_some() {
+            let share = segment.p99_of_cycle(adapter.cycle_ns);
+            row.cells.push(Cell::share(share));
         }
     }
+    table.title = cycle;
     table
 }
 
@@ -105,6 +103,7 @@ mod tests {
     use hil_arm::egm::wire::Cause;
     use hil_present::terminal::{canvas::Style, render};
     use hil_rundir::pipe::{AdapterRefusal, RefusalCount};
+    use hil_stats::histogram::Distribution;
     use hil_stats::histogram::LatencyHistogram;
     use hil_topology::AdapterKind;
 

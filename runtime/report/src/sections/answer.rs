@@ -1,14 +1,13 @@
 //! What stands below the answer of a run, in every form. It draws no conclusions.
 
-use hil_account::MessageFate;
 use hil_core::interval::Spread;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_present::units::{duration, percent};
 use hil_present::{Field, Tone};
 
-use super::events::first_harm;
-use crate::answer::{Answer, HarmCount, Hurt, OCCASIONS_MIN, metric_words};
+use super::events::gravest_harm;
+use crate::answer::{Answer, HarmCount, Hurt, OCCASIONS_MIN, with_note};
 use crate::assessment::Assessment;
 use crate::summary::RunSummary;
 use hil_core::case_study::Severity;
@@ -34,16 +33,18 @@ impl AnswerFacts {
     ) -> Self {
         let (tone, validity) = answer.measurement_words(&assessment.network);
         let mut harms = Vec::new();
-        if answer.hurt == Hurt::Yes {
-            let first = first_harm(summary).map(|words| Field::new("first harm", words));
-            harms.extend(first);
+        if answer.hurt == Hurt::Yes
+            && let Some((harm, cause)) = gravest_harm(summary)
+        {
+            harms.push(Field::new("gravest harm", harm));
+            harms.push(Field::new("network before it", cause));
         }
         let mut counts: Vec<&HarmCount> = summary.harms.iter().collect();
         if counts.len() > harms_shown {
             counts.sort_by_key(|harm| harm.count == Some(0));
         }
         let shown = counts.iter().take(harms_shown);
-        harms.extend(shown.map(|harm| Field::new(&harm.what, harm.words())));
+        harms.extend(shown.map(|harm| Field::new(&harm.what, with_note(harm.words(), &harm.note))));
         let hidden = counts.len().saturating_sub(harms_shown) as u64;
         if hidden > 0 {
             let words = format!("{} with --full", counted(hidden, "further count"));
@@ -67,15 +68,11 @@ impl AnswerFacts {
         });
         let headline: Vec<_> = headline.take(harms_shown).collect();
         let figures = headline.iter();
-        rest.extend(figures.map(|one| Field::new(&one.label, metric_words(one))));
+        rest.extend(figures.map(|one| Field::new(&one.label, one.words())));
         let harms_of = summary.harms.iter().map(|one| one.interval);
         let mut intervals = harms_of.chain(headline.iter().map(|one| one.interval));
         let has_interval = intervals.any(|one| matches!(one, Some(Spread::Known(_))));
-        let note = if has_interval {
-            "; brackets are 95 % intervals"
-        } else {
-            ""
-        };
+        let note = if has_interval { "; brackets: 95 %" } else { "" };
         let words = format!("{}{note}", answer.sample_words());
         rest.push(Field::new("sample", words));
         Self {
@@ -112,12 +109,11 @@ fn messages(summary: &RunSummary) -> Option<String> {
     if accounts.is_empty() {
         return None;
     }
-    let lost = accounts.iter().map(|(name, account)| {
-        let fates = MessageFate::ALL.into_iter().filter(|fate| fate.is_loss());
-        let lost: u64 = fates.map(|fate| account.fates.of(fate)).sum();
-        (*name, lost, account.published_count)
+    let lost = accounts.iter().filter_map(|(name, account)| {
+        Some((*name, account.lost_known()?, account.published_count))
     });
     let lost: Vec<_> = lost.collect();
+    let unknown_count = (accounts.len() - lost.len()) as u64;
     let all: u64 = lost.iter().map(|(_, lost, _)| lost).sum();
     let ratio = |lost: u64, of: u64| lost as f64 / of.max(1) as f64;
     let most = lost
@@ -125,19 +121,42 @@ fn messages(summary: &RunSummary) -> Option<String> {
         .filter(|(_, _, of)| *of >= OCCASIONS_MIN)
         .max_by(|a, b| ratio(a.1, a.2).total_cmp(&ratio(b.1, b.2)));
     let mut text = match most {
-        _ if lost.iter().all(|(_, _, of)| *of == 0) => "none published".to_owned(),
+        _ if lost.is_empty() => "how many were lost is unknown".to_owned(),
+        _ if unknown_count == 0 && lost.iter().all(|(_, _, of)| *of == 0) => {
+            "none published".to_owned()
+        }
         _ if all == 0 => "none lost".to_owned(),
         Some((name, lost, of)) if *lost > 0 => {
             format!("up to {} lost, on {name}", percent(ratio(*lost, *of)))
         }
         _ => format!("{} lost", grouped(all)),
     };
+    if unknown_count > 0 {
+        let of = if lost.is_empty() {
+            String::new()
+        } else {
+            format!(
+                "; of {} it is unknown",
+                counted(unknown_count, "other channel")
+            )
+        };
+        text.push_str(&[&of, ": records that would tell are not at hand"].concat());
+    }
     let gaps = accounts.iter().filter_map(|(name, account)| {
-        let gap = account.gaps.longest?;
-        Some((gap.length_ns, *name))
+        let length_ns = account.gaps.longest?.length_ns;
+        let period = account.gaps.between_taken.measured();
+        Some((length_ns, *name, period.map(|one| one.p50_ns)))
     });
-    if let Some((length_ns, name)) = gaps.max().filter(|(length_ns, _)| *length_ns > 0) {
-        text = format!("{text}; longest gap {}, on {name}", duration(length_ns));
+    if let Some((length_ns, name, period_ns)) = gaps.max().filter(|(length_ns, ..)| *length_ns > 0)
+    {
+        let due = period_ns.filter(|ns| *ns > 0);
+        let due = due.map_or_else(String::new, |ns| {
+            format!(", where one is due every {}", duration(ns))
+        });
+        text = format!(
+            "{text}; longest gap {}, on {name}{due}",
+            duration(length_ns)
+        );
     }
     Some(text)
 }

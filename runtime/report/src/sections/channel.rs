@@ -40,6 +40,7 @@ pub(crate) struct Sources<'a> {
 }
 
 const NO_ACCOUNT: &str = "no records of this channel";
+const PRODUCER_UNKNOWN: &str = "known here only: the producer's records are not at hand";
 const NO_NETWORK: &str = "no figures of a network under this channel";
 
 /// Lengths of runs of losses that are listed.
@@ -194,7 +195,7 @@ fn facts(section: &mut Section, account: &ChannelAccount) {
             section.fact(
                 "account",
                 Tone::Faint,
-                format!("closing unavailable: {reason}"),
+                format!("whether the times add up is unavailable: {reason}"),
             );
         }
     }
@@ -284,7 +285,6 @@ fn counts(sources: &Sources<'_>) -> Vec<Metric> {
     let taken = |account: &ChannelAccount| account.fates.of(MessageFate::Taken);
     let published = live(|one| one.published_count);
     let delivered = live(taken);
-    let lost = live(|one| one.fates.lost_count());
     let replaced = live(|one| {
         one.fates.of(MessageFate::SupersededAtInput)
             + one.fates.of(MessageFate::SupersededAtConsumer)
@@ -299,21 +299,27 @@ fn counts(sources: &Sources<'_>) -> Vec<Metric> {
                 "of {} the other host's records, which are not at hand, would tell; known: {} delivered, {} lost",
                 counted(count, "message"),
                 grouped(delivered.unwrap_or(0)),
-                grouped(lost.unwrap_or(0))
+                grouped(live(|one| one.fates.lost_count()).unwrap_or(0))
             )
         },
     );
-    let [delivered, lost] = [delivered, lost].map(|count| count.filter(|_| unknown.is_none()));
+    let delivered = delivered.filter(|_| unknown.is_none());
+    let lost = account.and_then(ChannelAccount::lost_known);
     let is_total_known = account.is_none_or(|one| one.published_unrecorded_count.is_some());
+    let lost_reason = if unknown.is_none() && !is_total_known {
+        PRODUCER_UNKNOWN
+    } else {
+        &reason
+    };
     let published_method = if is_total_known {
         "every sequence number up to the highest seen"
     } else {
-        "known here only: the producer's records are not at hand"
+        PRODUCER_UNKNOWN
     };
     [
         figure("published", "published", published, NO_ACCOUNT).by(published_method),
         figure("delivered", "delivered", delivered, &reason).by("taken by the consumer"),
-        figure("lost", "lost, by host or network", lost, &reason)
+        figure("lost", "lost, by host or network", lost, lost_reason)
             .by("vanished; messages that a newer one replaced and those under way are not lost"),
         figure("replaced", "replaced by newer ones", replaced, NO_ACCOUNT)
             .by("before the sending gateway or the consumer took them"),
@@ -350,12 +356,12 @@ fn loss_ratio(network: Option<&NetworkMetrics>) -> Metric {
     match &network.loss {
         Measured::Measured(loss) => {
             let metric = Metric::new("loss_ratio", "lost by the network", "share", loss.ratio);
-            with_spread(metric, Some(loss.interval)).by(&format!(
-                "{} of {}; {}",
-                grouped(loss.lost_count),
-                grouped(loss.of_count),
-                loss.interval
-            ))
+            let mut method = format!("{} of {}", grouped(loss.lost_count), grouped(loss.of_count));
+            // Why there is none stands beside the value.
+            if loss.interval.known().is_some() {
+                method = format!("{method}; {}", loss.interval);
+            }
+            with_spread(metric, Some(loss.interval)).by(&method)
         }
         Measured::Unavailable { reason } => match network.loss_bounds() {
             Some(bounds) => unavailable(&format!(
@@ -368,7 +374,7 @@ fn loss_ratio(network: Option<&NetworkMetrics>) -> Metric {
 }
 
 /// With its interval, or why there is none.
-pub(super) fn with_spread(metric: Metric, spread: Option<Spread>) -> Metric {
+pub(crate) fn with_spread(metric: Metric, spread: Option<Spread>) -> Metric {
     match spread {
         None => metric,
         Some(Spread::Known(one)) => metric.within(Some((one.low, one.high))),
@@ -414,7 +420,7 @@ fn order(sources: &Sources<'_>) -> Vec<Metric> {
         }
     }
     if let Some(n) = by.and_then(|one| one.n_max) {
-        let label = "n-reordered, largest n";
+        let label = "overtaken by at least n messages, largest n";
         figures
             .push(Metric::new("n_reordered_max", label, "1", n as f64).by("RFC 4737, section 5"));
     }
@@ -812,16 +818,6 @@ fn segment_table(account: &ChannelAccount) -> Table {
     let scale: f64 = chain().map(median).sum();
     let mut start = 0.0;
     let mut rows: Vec<Row> = Vec::new();
-    let mut push = |row: Row| match rows.last_mut() {
-        // A reason is said once: rows of two cells have nothing but one.
-        Some(last)
-            if row.cells.len() == 2 && last.cells.len() == 2 && last.cells[1] == row.cells[1] =>
-        {
-            let both = format!("{}; {}", last.cells[0].text(), row.cells[0].text());
-            last.cells[0] = both.into();
-        }
-        _ => rows.push(row),
-    };
     for segment in chain() {
         let end = start + median(segment);
         let bound = segment.bound.map(|bound| bound.largest_ns);
@@ -830,17 +826,17 @@ fn segment_table(account: &ChannelAccount) -> Table {
             let [start, end] = [start, end].map(|at| at / scale);
             row.bar = Some(Bar { start, end });
         }
-        push(row);
+        rows.push(row);
         start = end;
     }
     if let Some(hardware) = &account.hardware_wire {
-        push(segment_row("card to card", hardware, None));
+        rows.push(segment_row("card to card", hardware, None));
     }
     let whole = &account.end_to_end;
     let bound = whole.alignment_bound_ns;
     let mut row = segment_row("published → taken", &whole.distribution, bound);
     row.tone = Tone::Strong;
-    push(row);
+    rows.push(row);
     for segment in account
         .segments
         .iter()
@@ -849,7 +845,7 @@ fn segment_table(account: &ChannelAccount) -> Table {
         let count = segment.distribution.measured().map_or(0, |one| one.count);
         let name = format!("{} ({} combined)", segment.name(), grouped(count));
         let bound = segment.bound.map(|bound| bound.largest_ns);
-        push(segment_row(&name, &segment.distribution, bound));
+        rows.push(segment_row(&name, &segment.distribution, bound));
     }
     table.rows = rows;
     "Quantiles are from histograms with three digits, of messages that have both ends; bars are medians; \
@@ -919,15 +915,18 @@ fn stamp_table(account: &ChannelAccount) -> Option<Table> {
 
 /// How the delay that a link model asked for was kept.
 fn emulation(section: &mut Section, emulation: &EmulationMetrics) {
-    let mut table = Table::new("Emulated link", &["delay", "p50", "p99", "p99.9", "max"]);
-    for (name, one) in [
-        ("requested", &emulation.requested),
-        ("achieved", &emulation.achieved),
-        ("scheduling error", &emulation.scheduling_error),
-    ] {
-        let cells = [one.p50_ns, one.p99_ns, one.p999_ns, one.max_ns].map(Cell::Duration);
-        table.push(core::iter::once(name.into()).chain(cells));
-    }
+    let [requested, achieved, error] = [
+        emulation.requested,
+        emulation.achieved,
+        emulation.scheduling_error,
+    ]
+    .map(Distribution::Measured);
+    let mut table = quantile_table(&[
+        ("requested", &requested),
+        ("achieved", &achieved),
+        ("scheduling error", &error),
+    ]);
+    "Emulated link, delay".clone_into(&mut table.title);
     let (tone, judgement) = if emulation.is_kept() {
         (Tone::Good, "kept")
     } else {
@@ -949,14 +948,14 @@ fn emulation(section: &mut Section, emulation: &EmulationMetrics) {
 fn closing_words(figures: &ClosingMetrics) -> Option<(Tone, String)> {
     let ratio = figures.closed_ratio()?;
     let mut text = format!(
-        "closes for {} of {} messages: {}",
+        "times add up: {} of {} messages, {}",
         grouped(figures.closed_count),
         grouped(figures.checked_count),
         percent(ratio),
     );
     if let Some(residual) = figures.residual.measured() {
         let words = format!(
-            "; residual p50 {}, p99.9 {}, max {} (limit {})",
+            "; off by p50 {}, p99.9 {}, max {} (limit {})",
             duration(residual.p50_ns),
             duration(residual.p999_ns),
             duration(residual.max_ns),
@@ -965,19 +964,13 @@ fn closing_words(figures: &ClosingMetrics) -> Option<(Tone, String)> {
         text.push_str(&words);
     }
     for (count, words) in [
-        (
-            figures.missing_stage_count,
-            "not closed for a missing stage",
-        ),
+        (figures.missing_stage_count, "not, for a missing stage"),
         (
             figures.negative_segment_count,
-            "for a stage before its predecessor",
+            "not, for a stage before its predecessor",
         ),
-        (figures.residual_count, "for the residual"),
-        (
-            figures.closed_combined_count,
-            "closed with a combined segment",
-        ),
+        (figures.residual_count, "not, as they are off by more"),
+        (figures.closed_combined_count, "with a combined segment"),
         (
             figures.unaligned_count,
             "not checked, published about a clock step",

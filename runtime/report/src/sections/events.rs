@@ -2,7 +2,6 @@
 
 use core::cmp::Reverse;
 
-use hil_account::MessageFate;
 use hil_account::network::NetworkEventKind;
 use hil_core::case_study::Severity;
 use hil_platform::text::grouped;
@@ -23,11 +22,24 @@ const NETWORK_SHOWN_COUNT: usize = 3;
 /// Events of the network that are listed: under independent losses there are hundreds alike.
 const NETWORK_EVENTS_MAX: usize = 40;
 
+/// What is said of a robot to which nothing happened.
+pub(crate) const NOTHING_GRAVE: &str = "no incident and no hazard";
+
 /// What happened to the robot, the gravest events where there are too many, in order of time.
-pub(super) fn robot(all: &ScoreEvents) -> Section {
+pub(super) fn robot(summary: &RunSummary) -> Section {
     let title = "What happened to the robot, and the network before it";
-    let mut section = Section::new("robot", title, severity_counts(all));
-    if all.events.is_empty() {
+    let all = &summary.score_events;
+    let mut section = Section::new("robot", title, "");
+    if summary.run.case.is_empty() {
+        return section;
+    }
+    if let Some(words) = summary.no_score_words() {
+        section.note(Tone::Faint, words);
+        return section;
+    }
+    section.aside = severity_counts(all);
+    if all.total_count() == 0 {
+        section.note(Tone::Plain, NOTHING_GRAVE);
         return section;
     }
     if all.clocks_differ {
@@ -81,19 +93,12 @@ fn dropped_words(all: &ScoreEvents) -> Option<String> {
 
 /// How many there are of each severity, listed or not.
 pub(crate) fn severity_counts(all: &ScoreEvents) -> String {
-    let counts = [
+    format!(
+        "{} (must not happen), {} (nearly one), {}",
         counted(all.count_of(Severity::Incident), "incident"),
         counted(all.count_of(Severity::Hazard), "hazard"),
         counted(all.count_of(Severity::Notice), "notice"),
-    ];
-    let mut counts = counts.join(", ");
-    // A summary of an earlier version says only how many were left out.
-    let known: u64 = all.dropped_by_severity.values().sum();
-    let unknown = all.dropped_count.saturating_sub(known);
-    if unknown > 0 {
-        counts = format!("{counts}, {} of unknown severity", grouped(unknown));
-    }
-    counts
+    )
 }
 
 /// Incidents and hazards.
@@ -169,17 +174,29 @@ fn message(message: &ExplainedMessage) -> String {
 
 /// The network event that has most to do with `event`.
 pub(crate) fn cause(event: &ExplainedEvent) -> String {
-    let network = event.network.as_ref();
-    let outage = event.outages.first().map(|one| one.words.clone());
-    let beside = || event.network_beside().first().map(|one| one.words.clone());
-    let lost = || {
-        let mut messages = event.messages.iter();
-        let lost = messages.find(|one| one.fate.is_some_and(MessageFate::is_loss));
-        lost.map(|one| format!("{} {}: {}", one.channel, grouped(one.sequence), one.words))
+    // What the network did stands before what a process or a host did.
+    let of = |is_meant: fn(bool) -> bool| {
+        let mut outages = event.outages.iter();
+        let outage = outages.find(|one| is_meant(one.lost_by_network_count > 0));
+        let beside = event.network_beside().into_iter();
+        let mut beside = beside.filter(|one| is_meant(one.event.is_by_network()));
+        let mut lost = event.messages.iter().filter(|one| {
+            let fate = one.fate.filter(|fate| fate.is_loss());
+            fate.is_some_and(|fate| is_meant(fate.is_loss_by_network()))
+        });
+        outage
+            .map(|one| one.words.clone())
+            .or_else(|| Some(beside.next()?.words.clone()))
+            .or_else(|| {
+                let lost = lost.next()?;
+                let number = grouped(lost.sequence);
+                Some(format!("{} {number}: {}", lost.channel, lost.words))
+            })
     };
-    outage.or_else(beside).or_else(lost).unwrap_or_else(|| {
-        network.map_or_else(
-            || "nothing that is known of the network".to_owned(),
+    let found = of(|is_network| is_network).or_else(|| of(|_| true));
+    found.unwrap_or_else(|| {
+        event.network.as_ref().map_or_else(
+            || "nothing is known of the network".to_owned(),
             PrecedingNetwork::nothing_words,
         )
     })
@@ -193,12 +210,13 @@ pub(crate) fn gravest_first(events: &[ExplainedEvent]) -> Vec<&ExplainedEvent> {
     grave
 }
 
-/// The gravest event that the network explains, and what the network did before it.
-pub(crate) fn first_harm(summary: &RunSummary) -> Option<String> {
+/// The gravest event that the network explains with its time, and what the network did before it.
+pub(crate) fn gravest_harm(summary: &RunSummary) -> Option<(String, String)> {
     let evidence = Evidence::of(summary);
-    let gravest = gravest_first(&summary.score_events.events).into_iter();
-    let event = gravest.into_iter().find(|event| evidence.explains(event))?;
-    Some(format!("{}; network: {}", event.what, cause(event)))
+    let mut gravest = gravest_first(&summary.score_events.events).into_iter();
+    let event = gravest.find(|event| evidence.explains(event))?;
+    let at = event.at_s.map(|at_s| format!("at {}: ", seconds(at_s)));
+    Some((at.unwrap_or_default() + &event.what, cause(event)))
 }
 
 /// What happened on the network, the longest events.

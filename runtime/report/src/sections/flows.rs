@@ -8,7 +8,7 @@ use hil_present::{Cell, Row, Section, Table, Tone};
 
 use crate::summary::{ChannelFlows, RunSummary};
 
-/// The flows of the run, at most `shown_count` of them, those of most frames first.
+/// The flows of the run, at most `shown_count` of them, those that lost the largest share first.
 pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
     let aside = "one way each, from the program's interface to the other's";
     let mut section = Section::new("flows", "Flows", aside);
@@ -17,13 +17,21 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
     if flows.is_empty() {
         return section;
     }
-    flows.sort_by_key(|flow| core::cmp::Reverse(flow.frame_count));
+    let lost_share = |flow: &FlowMetrics| {
+        let lost_count =
+            flow.lost_by_network_count + flow.lost_by_either_count + flow.lost_by_harness_count;
+        lost_count as f64 / flow.frame_count.max(1) as f64
+    };
+    flows.sort_by(|one, other| {
+        let by_loss = lost_share(other).total_cmp(&lost_share(one));
+        by_loss.then(other.frame_count.cmp(&one.frame_count))
+    });
     let columns = [
         "flow",
         "frames",
-        "network",
-        "either",
-        "harness",
+        "lost: network",
+        "network or host",
+        "host",
         "unknown",
         "reordered",
         "sent again",
@@ -32,9 +40,10 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
         "max",
     ];
     let mut table = Table::new("", &columns)
-        .ranked("sent again", 4)
-        .ranked("reordered", 3)
-        .ranked("unknown", 2)
+        .ranked("sent again", 5)
+        .ranked("reordered", 4)
+        .ranked("unknown", 3)
+        .ranked("p50", 2)
         .ranked("max", 1)
         .with_long_names();
     for flow in flows.iter().take(shown_count) {
@@ -64,7 +73,7 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
     if hidden > 0 {
         section.note(
             Tone::Faint,
-            format!("and {} of fewer frames", counted(hidden, "flow")),
+            format!("and {} that lost no larger share", counted(hidden, "flow")),
         );
     }
     let inlets = summary.flows.iter().map(ChannelFlows::inlet_lost_count);
@@ -72,15 +81,15 @@ pub(crate) fn flows(summary: &RunSummary, shown_count: usize) -> Section {
     let inlets = match inlets {
         0 => "none beside these was lost at an inlet".to_owned(),
         count => format!(
-            "{} more were lost at inlets, which is the harness, too",
+            "{} more were lost at inlets, which are this program's, too",
             grouped(count)
         ),
     };
     section.note(
         Tone::Faint,
         format!(
-            "lost by the network; by either: on the link or for want of room on the receiving host; by the \
-             harness: in a process, queue or socket of ours; {inlets}; reordered: RFC 4737"
+            "lost: network or host: on the link or for want of room on the receiving host; host: by this program or \
+             its host, in a process, queue or socket; {inlets}; reordered: RFC 4737"
         ),
     );
     section
@@ -104,7 +113,7 @@ pub(crate) fn deadlines(summary: &RunSummary, shown_count: usize) -> Section {
     if deadlines.len() > shown_count {
         deadlines.sort_by_key(|one| core::cmp::Reverse(one.hurt_count));
         let hidden = counted((deadlines.len() - shown_count) as u64, "further deadline");
-        table.note = format!("{hidden} with --full");
+        table.note = format!("{hidden} with --full. ");
     }
     for one in deadlines.into_iter().take(shown_count) {
         let response = one.response.measured();
@@ -113,12 +122,12 @@ pub(crate) fn deadlines(summary: &RunSummary, shown_count: usize) -> Section {
             ("network", one.late_by_network_count),
             ("program", one.late_by_program_count),
             ("both", one.late_by_both_count),
-            ("harness", one.late_by_harness_count),
+            ("host", one.late_by_harness_count),
         ];
         let missing = [
             ("network", one.missing_by_network_count),
             ("program", one.missing_by_program_count),
-            ("harness", one.missing_by_harness_count),
+            ("host", one.missing_by_harness_count),
         ];
         let cells = [
             format!("{} within {limit}", one.name).into(),
@@ -138,6 +147,7 @@ pub(crate) fn deadlines(summary: &RunSummary, shown_count: usize) -> Section {
             bar: None,
         });
     }
+    table.note += "host: by this program or its host";
     section.table(table);
     section
 }
@@ -177,13 +187,18 @@ mod tests {
         for words in [
             "icmp a → b",
             "100",
-            "1 flow of fewer",
+            "1 flow that lost no larger share",
             "7 more were lost at inlets",
             "5.00",
         ] {
             assert!(text.contains(words), "{words}:\n{text}");
         }
         assert!(!text.contains("arp"), "{text}");
+        // A flow of which everything was lost is small just because of that.
+        summary.flows[0].flows.push(flow("udp dead", 12, [12, 0]));
+        let text = render(&[flows(&summary, 1)], 100, Style::Plain);
+        assert!(text.contains("udp dead"), "{text}");
+        summary.flows[0].flows.pop();
         let name = "udp 10.77.0.1:40001 → 10.77.0.2:6510";
         summary.flows[0]
             .flows

@@ -9,7 +9,6 @@ pub(crate) mod events;
 mod flows;
 mod network;
 mod nics;
-mod paper;
 mod radio;
 mod run;
 mod timeline;
@@ -36,7 +35,7 @@ pub(crate) fn of_run(summary: &RunSummary, assessment: &Assessment) -> Vec<Secti
         run::outcome(summary, assessment),
         run::warnings(assessment),
         run::score(summary),
-        events::robot(&summary.score_events),
+        events::robot(summary),
     ];
     if let Some(report) = network {
         let mut over_time = Section::new(

@@ -30,7 +30,7 @@ pub(super) fn network(report: &NetworkReport) -> Section {
         "max",
         "bound ±",
         "loss",
-        "longest",
+        "longest outage",
         "reordered",
     ];
     // A narrow terminal does without; they stand with the channel as well.

@@ -140,10 +140,14 @@ fn hop_lines(section: &mut Section, hop: &RadioHopSummary) {
 }
 
 fn station_words(station: &StationSummary) -> String {
-    let spread = |name: &str, spread: &Option<Spread>, unit: &str| {
+    let spread = |name: &str, spread: &Option<Spread>, decimals: usize, unit: &str| {
         let words = spread.map_or_else(
             || "unavailable".to_owned(),
-            |s| format!("{} {unit} ({} to {})", s.median, s.min, s.max),
+            |s| {
+                let [median, min, max] =
+                    [s.median, s.min, s.max].map(|value| format!("{value:.decimals$}"));
+                format!("{median} {unit} ({min} to {max})")
+            },
         );
         format!("{name} {words}")
     };
@@ -161,9 +165,10 @@ fn station_words(station: &StationSummary) -> String {
             station.mac,
             grouped(station.sample_count)
         ),
-        spread("signal", &station.signal_dbm, "dBm"),
-        spread("sends at", &station.transmit_mbps, "Mbit/s") + &how(&station.transmit_modulation),
-        spread("hears at", &station.receive_mbps, "Mbit/s") + &how(&station.receive_modulation),
+        spread("signal", &station.signal_dbm, 0, "dBm"),
+        spread("sends at", &station.transmit_mbps, 1, "Mbit/s")
+            + &how(&station.transmit_modulation),
+        spread("hears at", &station.receive_mbps, 1, "Mbit/s") + &how(&station.receive_modulation),
         count("packets sent", station.tx_packet_count),
         count("retries", station.tx_retry_count),
         count("given up", station.tx_failed_count),

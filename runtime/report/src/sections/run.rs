@@ -1,15 +1,11 @@
 //! The parts of a report that are not about one channel: how the run ended, score, links, processes, host.
 
-use super::channel::with_spread;
-use hil_present::units::{duration_s, percent, seconds};
-use hil_present::{Block, Cell, Event, EventList, Metric, Row, Section, Table, Tone, UNAVAILABLE};
+use hil_present::units::{duration_s, seconds};
+use hil_present::{Block, Cell, Event, EventList, Row, Section, Table, Tone, UNAVAILABLE};
 
 use super::channel::stall_words;
-use super::paper;
-use crate::answer::uncounted_words;
-use crate::assessment::{
-    Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX, uncounted_start_count,
-};
+use crate::answer::Answer;
+use crate::assessment::Assessment;
 use crate::summary::{
     DirectionSummary, Outcome, ProcessSummary, RunEvent, RunEventKind, RunFacts, RunSummary,
     host_words,
@@ -40,7 +36,7 @@ const METHOD: [&str; 3] = [
      event stands beside an outage or follows a series is a matter of time, not of cause.",
 ];
 
-/// How the run ended, whether it says anything of a network, and what a reader must know.
+/// How the run ended, whether its measurement is valid, and what was changed meanwhile.
 pub(super) fn outcome(summary: &RunSummary, assessment: &Assessment) -> Section {
     let mut section = Section::new("outcome", "Outcome", "");
     let (tone, word) = outcome_words(summary.run.outcome);
@@ -49,14 +45,9 @@ pub(super) fn outcome(summary: &RunSummary, assessment: &Assessment) -> Section 
         tone,
         format!("{word}: {}", summary.run.exit_reason),
     );
-    let (tone, text) = network_words(&assessment.network);
-    let uncounted = uncounted_words(uncounted_start_count(summary));
-    let tone = if uncounted.is_empty() || tone != Tone::Good {
-        tone
-    } else {
-        Tone::Caution
-    };
-    section.fact("network", tone, text + &uncounted);
+    let answer = Answer::of(summary, assessment);
+    let (tone, words) = answer.measurement_words(&assessment.network);
+    section.fact("measurement", tone, words);
     if let Some(security) = &summary.run.security {
         let tone = match security.hops {
             HopProtection::Plain => Tone::Caution,
@@ -89,99 +80,11 @@ pub(super) fn outcome(summary: &RunSummary, assessment: &Assessment) -> Section 
 /// How a run ended, in a word.
 pub(crate) const fn outcome_words(outcome: Outcome) -> (Tone, &'static str) {
     match outcome {
-        Outcome::Completed => (Tone::Good, "completed"),
+        // That a run ended as planned says nothing of what it found.
+        Outcome::Completed => (Tone::Plain, "completed"),
         Outcome::CriterionFailed => (Tone::Bad, "criterion failed"),
         Outcome::Stopped => (Tone::Caution, "stopped early"),
         Outcome::Failed => (Tone::Bad, "failed"),
-    }
-}
-
-fn no_result(why: &str) -> (Tone, String) {
-    let cure = "repeat on an idle host or at a lower rate";
-    (Tone::Bad, format!("NOT a network result{why}; {cure}"))
-}
-
-/// What a run says about a network, in words.
-fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
-    let limit = percent(SKIPPED_TICK_RATIO_MAX);
-    match verdict {
-        NetworkVerdict::RunFailed => (Tone::Caution, "no verdict: the run failed".to_owned()),
-        NetworkVerdict::VirtualTime => {
-            let text = "virtual time: a result about the link models, not about a network";
-            (Tone::Plain, text.to_owned())
-        }
-        NetworkVerdict::EmulatedLink => {
-            let text = format!(
-                "an emulated link: a result about the model, not about a network; the hosts kept up \
-                 (limit: {limit} of ticks, datagrams and frames)"
-            );
-            (Tone::Good, text)
-        }
-        NetworkVerdict::EmulationNotKept { channels } => {
-            let why =
-                ", nor one about the link model: the host could not keep the emulated link of";
-            no_result(&format!("{why} {}", channels.join(", ")))
-        }
-        NetworkVerdict::NoNetwork => {
-            let text = "no channel went over a network; nothing here says anything about one";
-            (Tone::Plain, text.to_owned())
-        }
-        NetworkVerdict::ForeignProgram => {
-            let text = format!(
-                "a foreign program took part over its own protocol: its answers are its and its \
-                 network's; this host kept up (limit: {limit} of ticks)"
-            );
-            (Tone::Plain, text)
-        }
-        NetworkVerdict::NoForeignProgram => {
-            let text = "no foreign program answered, and no link of ours was a network; nothing \
-                        here says anything about one";
-            (Tone::Caution, text.to_owned())
-        }
-        NetworkVerdict::NetworkResult => {
-            let text = format!(
-                "a network result: the hosts kept up (limit: {limit} of ticks, datagrams and frames)"
-            );
-            (Tone::Good, text)
-        }
-        NetworkVerdict::HostOverran { processes } => {
-            let skipped = processes
-                .iter()
-                .map(|overrun| overrun.skipped_tick_count)
-                .sum();
-            let skipped = grouped(skipped);
-            no_result(&format!(
-                ": the host overran ({skipped} skipped ticks, more than {limit})"
-            ))
-        }
-        NetworkVerdict::ReceiverLate { channels, loss } => {
-            let why = "had no room in the receive buffer, their gateway was late with";
-            let count = loss.words("datagrams");
-            no_result(&format!(": {count} {why} {}", channels.join(", ")))
-        }
-        NetworkVerdict::GatewayLate { channels, loss } => {
-            let why = "replaced by newer ones or let wait by a late gateway, of";
-            let count = loss.words("messages");
-            no_result(&format!(": {count} {why} {}", channels.join(", ")))
-        }
-        NetworkVerdict::RecordsMissing { hosts } => {
-            let hosts = hosts.join(", ");
-            let text = format!("no verdict: records of other hosts are missing on {hosts}");
-            (Tone::Caution, text)
-        }
-        NetworkVerdict::FramesLost { channels, loss } => {
-            let why = ": processes, queues or inlets of a host lost";
-            let count = loss.words("frames");
-            no_result(&format!("{why} {count} of {}", channels.join(", ")))
-        }
-        NetworkVerdict::TicksUnknown => {
-            let text = "no verdict: a component left no count of its ticks";
-            (Tone::Caution, text.to_owned())
-        }
-        NetworkVerdict::HostUnknown => {
-            let text = "no verdict: nothing that ran tells whether the hosts kept up";
-            (Tone::Caution, text.to_owned())
-        }
     }
 }
 
@@ -196,51 +99,24 @@ pub(super) fn warnings(assessment: &Assessment) -> Section {
     section
 }
 
-/// What the robot did, and the run as a row of the seed paper's tables.
+/// What the robot did.
 pub(super) fn score(summary: &RunSummary) -> Section {
     let mut section = Section::new("score", "Score", "what the robot did");
     if summary.run.case.is_empty() {
         return section;
     }
     if summary.score.is_empty() {
-        section.note(Tone::Faint, "unavailable: the case gave no score");
+        let words = summary.no_score_words();
+        section.note(
+            Tone::Faint,
+            words.unwrap_or_else(|| "no figure but its events".to_owned()),
+        );
         return section;
     }
-    let links = links_crossed(summary);
-    let paper = paper::table(
-        &summary.run.case,
-        &summary.score,
-        summary.network.as_ref(),
-        &links,
-    );
-    section.blocks.extend(paper.map(Block::Table));
     for one in &summary.score {
-        // A ratio is shown in per cent, as everywhere.
-        let is_ratio = one.unit == "1" && one.name.ends_with("_ratio");
-        let unit = if is_ratio { "share" } else { &one.unit };
-        let metric = Metric::maybe(&one.name, &one.label, unit, one.value, &one.method);
-        section.metric(with_spread(metric, one.interval).by(&one.method));
+        section.metric(one.shown());
     }
     section
-}
-
-/// Kinds of links that channels of the run crossed.
-fn links_crossed(summary: &RunSummary) -> String {
-    let mut words: Vec<&str> = Vec::new();
-    let crossing = |name: &str| {
-        let report = summary.network.as_ref();
-        report.is_some_and(|report| report.channels.iter().any(|one| one.channel == name))
-    };
-    for one in summary.channels.iter().filter(|one| crossing(&one.name)) {
-        if !words.contains(&one.link.label()) {
-            words.push(one.link.label());
-        }
-    }
-    if words.is_empty() {
-        "no network".to_owned()
-    } else {
-        words.join(", ")
-    }
 }
 
 /// The gateways at both ends of each way of each link, and what they refused.

@@ -1,9 +1,8 @@
 //! Network and robot on one time axis.
 
-use hil_present::units::{duration_s, percent};
+use hil_present::units::{self, duration_s, percent};
 use hil_present::{Strip, Strips, Tone, UNAVAILABLE};
 
-use crate::answer::UnitScale;
 use crate::link_change::LinkChange;
 use crate::network::{NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 
@@ -60,6 +59,6 @@ fn scale(row: &TimelineRow) -> String {
         _ if largest <= 0.0 => "none".to_owned(),
         "s" => duration_s(largest) + &bound,
         "1" if matches!(row.subject, TimelineSubject::Channel { .. }) => percent(largest),
-        unit => UnitScale::of(unit).words(largest),
+        unit => units::value(largest, unit),
     }
 }

@@ -162,6 +162,7 @@ mod tests {
         score.add_event(early.naming(MessageRef::of("shuttle/command", &named)));
         let outage = Outage {
             lost_count: 90,
+            lost_by_network_count: 90,
             first_sequence: 1_000,
             from_ns: Some(10_000_000_000),
             until_ns: Some(10_900_000_000),
@@ -176,7 +177,7 @@ mod tests {
         let found = &events[1].outages[0];
         assert_eq!((found.from_s, found.until_s), (Some(10.0), Some(10.9)));
         assert_eq!(found.standing, Standing::OverFor(1_050_000_000));
-        assert_eq!(found.lost_count, 90);
+        assert_eq!((found.lost_count, found.lost_by_network_count), (90, 90));
         assert_eq!(events[2].outages[0].standing, Standing::BegunLater);
         let lost = &events[2].messages[0];
         assert_eq!(lost.fate, Some(MessageFate::LostOnWire));

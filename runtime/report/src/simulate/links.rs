@@ -68,7 +68,7 @@ impl LinkAccount {
         let published_ns = Some(now.as_ns());
         match arrival {
             Some(at) => self.outages.arrived(published_ns, Some(at.as_ns())),
-            None => self.outages.lost(envelope.sequence, 1, published_ns),
+            None => self.outages.lost(envelope.sequence, 1, published_ns, true),
         }
     }
 

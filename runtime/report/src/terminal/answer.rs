@@ -8,8 +8,9 @@ use hil_platform::text::{columns, shortened};
 use hil_present::Tone;
 use hil_present::terminal::canvas::Canvas;
 
-/// Columns of a line's label: the longest harm of a case fits.
-const LABEL_WIDTH: usize = 34;
+/// Columns of a line's label, with the blank behind it.
+const LABEL_WIDTH_MIN: usize = 14;
+const LABEL_WIDTH_MAX: usize = 36;
 
 /// How much of it is shown.
 #[derive(Debug, Clone, Copy)]
@@ -51,13 +52,16 @@ pub(super) fn answer(
         canvas.paragraph(0, answer.tone(), &words);
     }
     let facts = AnswerFacts::of(summary, assessment, &answer, extent.harms);
-    let room = extent.lines * (canvas.width() - LABEL_WIDTH) - 30;
-    for one in [facts.measurement]
-        .iter()
-        .chain(&facts.harms)
-        .chain(&facts.rest)
-    {
+    let all: Vec<_> = [facts.measurement]
+        .into_iter()
+        .chain(facts.harms)
+        .chain(facts.rest)
+        .collect();
+    let widest = all.iter().map(|one| columns(&one.label) + 2).max();
+    let label_width = widest.unwrap_or(0).clamp(LABEL_WIDTH_MIN, LABEL_WIDTH_MAX);
+    let room = extent.lines * (canvas.width() - label_width) - 30;
+    for one in &all {
         let value = shortened(&one.value, room);
-        canvas.field_of(LABEL_WIDTH, &one.label, one.tone, &value);
+        canvas.field_of(label_width, &one.label, one.tone, &value);
     }
 }

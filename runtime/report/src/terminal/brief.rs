@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
+use hil_account::ChannelAccount;
 use hil_account::network::NetworkMetrics;
-use hil_account::{ChannelAccount, MessageFate};
 use hil_platform::text::{columns, grouped, shell_word, shortened, visible};
 use hil_platform::words::counted;
 
@@ -19,7 +19,9 @@ use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested}
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
-use crate::sections::events::{cause, grave_count, gravest_first, severity_counts, severity_tone};
+use crate::sections::events::{
+    NOTHING_GRAVE, cause, grave_count, gravest_first, severity_counts, severity_tone,
+};
 use crate::sections::{deadlines, flows, outcome_words, strips};
 use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
@@ -159,23 +161,28 @@ fn causes(summary: &RunSummary, width: usize, shown_count: usize) -> Section {
     let evidence = Evidence::of(summary);
     let grave = gravest_first(&all.events);
     let title = "Robot, and the network before it";
-    let mut section = Section::new("robot", title, severity_counts(all));
+    let mut section = Section::new("robot", title, "");
     if summary.run.case.is_empty() {
         return section;
     }
+    if let Some(words) = summary.no_score_words() {
+        section.note(Tone::Caution, words);
+        return section;
+    }
+    section.aside = severity_counts(all);
     if grave.is_empty() {
-        section.note(Tone::Plain, "no incident and no hazard");
+        section.note(Tone::Plain, NOTHING_GRAVE);
         return section;
     }
     // Two lines each at most.
     let room = 2 * (width - EVENT_MARGIN) - 20;
     let event = |event: &&ExplainedEvent| {
         let relation = if evidence.explains(event) {
-            "after"
+            "network before it"
         } else {
-            "beside"
+            "not explained by the network; about then"
         };
-        let cause = format!("{relation} {}", cause(event));
+        let cause = format!("{relation}: {}", cause(event));
         Event {
             at: event.at_s.map_or_else(|| UNAVAILABLE.to_owned(), seconds),
             severity: event.severity_word(),
@@ -201,7 +208,8 @@ fn causes(summary: &RunSummary, width: usize, shown_count: usize) -> Section {
 struct Line {
     delay: Option<[i64; 3]>,
     published_count: u64,
-    lost_count: u64,
+    /// `None` where it is unknown.
+    lost_count: Option<u64>,
     gap_ns: Option<i64>,
 }
 
@@ -212,28 +220,41 @@ impl Line {
         // Virtual time knows what the link model did, and no other stage.
         let on_network = network.and_then(|one| one.delay.measured());
         let on_network = on_network.map(|one| [one.p50.value_ns, one.p99.value_ns, one.max_ns]);
-        let lost = MessageFate::ALL.into_iter().filter(|fate| fate.is_loss());
         Self {
             delay: delay.or(on_network),
             published_count: account.published_count,
-            lost_count: lost.map(|fate| account.fates.of(fate)).sum(),
+            lost_count: account.lost_known(),
             gap_ns: account.gaps.longest.map(|gap| gap.length_ns),
         }
     }
 
-    fn loss_ratio(&self) -> f64 {
-        self.lost_count as f64 / self.published_count.max(1) as f64
+    fn loss_ratio(&self) -> Option<f64> {
+        Some(self.lost_count? as f64 / self.published_count.max(1) as f64)
+    }
+
+    /// Where it stands among channels: one whose loss is unknown before those that lost nothing.
+    fn rank(&self) -> f64 {
+        self.loss_ratio().unwrap_or(f64::MIN_POSITIVE)
+    }
+
+    fn lost_words(&self) -> String {
+        let published = grouped(self.published_count);
+        match self.lost_count {
+            Some(count) => format!("{} of {published}", grouped(count)),
+            None => format!("unknown of {published}"),
+        }
     }
 
     fn is_alike(&self, other: &Self) -> bool {
         let near =
             |one: f64, other: f64| (one - other).abs() <= ALIKE_RATIO * one.abs().max(other.abs());
-        let is_delay_near = match (self.delay, other.delay) {
-            (Some(one), Some(other)) => near(one[1] as f64, other[1] as f64),
+        let are_near = |one: Option<f64>, other: Option<f64>| match (one, other) {
+            (Some(one), Some(other)) => near(one, other),
             (None, None) => true,
             _ => false,
         };
-        is_delay_near && near(self.loss_ratio(), other.loss_ratio())
+        let delay = |line: &Self| line.delay.map(|all| all[1] as f64);
+        are_near(delay(self), delay(other)) && are_near(self.loss_ratio(), other.loss_ratio())
     }
 
     /// The worse of both in everything.
@@ -246,7 +267,10 @@ impl Line {
                 (one, two) => one.or(two),
             },
             published_count: self.published_count + other.published_count,
-            lost_count: self.lost_count + other.lost_count,
+            lost_count: self
+                .lost_count
+                .zip(other.lost_count)
+                .map(|(one, two)| one + two),
             gap_ns: self.gap_ns.max(other.gap_ns),
         }
     }
@@ -338,7 +362,7 @@ fn channels(summary: &RunSummary, shown_count: usize) -> Section {
     if groups.is_empty() {
         return section;
     }
-    groups.sort_by(|one, other| other.line.loss_ratio().total_cmp(&one.line.loss_ratio()));
+    groups.sort_by(|one, other| other.line.rank().total_cmp(&one.line.rank()));
     let mut table = Table::new(
         "",
         &["channel", "p50", "p99", "max", "lost", "%", "longest gap"],
@@ -352,30 +376,33 @@ fn channels(summary: &RunSummary, shown_count: usize) -> Section {
                 delay(0),
                 delay(1),
                 delay(2),
-                format!(
-                    "{} of {}",
-                    grouped(line.lost_count),
-                    grouped(line.published_count)
-                )
-                .into(),
+                line.lost_words().into(),
                 // No rate of a few.
-                Cell::share((line.published_count >= OCCASIONS_MIN).then(|| line.loss_ratio())),
+                Cell::share(
+                    line.loss_ratio()
+                        .filter(|_| line.published_count >= OCCASIONS_MIN),
+                ),
                 Cell::duration(line.gap_ns),
             ],
-            tone: if line.lost_count > 0 {
-                Tone::Caution
-            } else {
+            tone: if line.lost_count == Some(0) {
                 Tone::Plain
+            } else {
+                Tone::Caution
             },
             bar: None,
         });
     }
     let hidden = groups.iter().skip(shown_count);
     let hidden: usize = hidden.map(|group| group.names.len()).sum();
+    let mut notes = Vec::new();
+    if groups.iter().any(|group| group.line.lost_count.is_none()) {
+        notes.push("unknown: records that would tell are not at hand".to_owned());
+    }
     if hidden > 0 {
         let hidden = counted(hidden as u64, "channel");
-        table.note = format!("and {hidden} that lost no larger share");
+        notes.push(format!("and {hidden} that lost no larger share"));
     }
+    table.note = notes.join("; ");
     section.table(table);
     section
 }
@@ -400,6 +427,13 @@ fn over_time(summary: &RunSummary, robot_row_count: usize) -> Section {
     section
 }
 
+fn larger(one: Option<f64>, other: Option<f64>) -> Option<f64> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(one.max(other)),
+        (one, other) => one.or(other),
+    }
+}
+
 /// The worst channel in each step.
 fn worst_of(rows: &[TimelineRow], quantity: NetworkQuantity) -> Option<TimelineRow> {
     let of_channels: BTreeMap<&str, &TimelineRow> = rows
@@ -422,11 +456,9 @@ fn worst_of(rows: &[TimelineRow], quantity: NetworkQuantity) -> Option<TimelineR
     };
     for row in of_channels.values().skip(1) {
         for (known, value) in worst.values.iter_mut().zip(&row.values) {
-            *known = match (*known, *value) {
-                (Some(one), Some(other)) => Some(one.max(other)),
-                (one, other) => one.or(other),
-            };
+            *known = larger(*known, *value);
         }
+        worst.bound = larger(worst.bound, row.bound);
     }
     Some(worst)
 }
@@ -557,4 +589,30 @@ fn without_duration(command: &str) -> String {
     };
     let rest = rest.split_once('\'').map_or("", |(_, rest)| rest);
     before.to_owned() + rest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_bound_of_the_worst_channel_is_the_largest() {
+        let row = |channel: &str, values: [f64; 2], bound| TimelineRow {
+            subject: TimelineSubject::Channel {
+                channel: channel.to_owned(),
+                quantity: NetworkQuantity::Delay,
+            },
+            unit: "s".to_owned(),
+            values: values.map(Some).into(),
+            bound,
+        };
+        let rows = [
+            row("a", [1e-3, 5e-3], Some(1e-6)),
+            row("b", [2e-3, 4e-3], Some(40e-6)),
+            row("c", [0.0, 0.0], None),
+        ];
+        let worst = worst_of(&rows, NetworkQuantity::Delay).unwrap();
+        assert_eq!(worst.values, [2e-3, 5e-3].map(Some));
+        assert_eq!(worst.bound, Some(40e-6));
+    }
 }

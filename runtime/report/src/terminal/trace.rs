@@ -11,6 +11,7 @@ use hil_trace::fit::{Fit, Ranking, TraceFit};
 use hil_trace::metrics::{Memory, TraceMetrics};
 use hil_trace::{Trace, TraceHeader};
 
+use crate::burst_classes::burst_classes;
 use hil_platform::text::grouped;
 use hil_present::terminal::canvas::Style;
 use hil_present::terminal::render;
@@ -344,9 +345,10 @@ pub(crate) fn render_trace_plots(
     let mut delays = trace.delays_ns();
     delays.sort_unstable();
     let mut within = Table::new("", &["delay", "share"]);
-    for row in 0..PLOT_ROWS.min(delays.len()) {
+    let row_count = if delays.is_empty() { 0 } else { PLOT_ROWS };
+    for row in 0..row_count {
         // From the smallest delay to the 99.9th percentile, in equal steps.
-        let last = delays[(delays.len() - 1) * 999 / 1000];
+        let last = delays[((delays.len() - 1) * 999).div_ceil(1000)];
         let step = i64::try_from(row + 1).unwrap_or(1);
         let rows = i64::try_from(PLOT_ROWS).unwrap_or(1);
         let upto = delays[0] + (last - delays[0]) / rows * step + i64::from(step == rows) * rows;
@@ -358,7 +360,9 @@ pub(crate) fn render_trace_plots(
         .children
         .push(plot(title, &delay_words(figures), within));
     let mut lost = Table::new("", &["in a row", "times"]);
-    for (name, count, share) in classes(&figures.loss_bursts) {
+    let total: u64 = figures.loss_bursts.iter().map(|run| run.count).sum();
+    for (name, count) in burst_classes(&figures.loss_bursts) {
+        let share = count as f64 / total.max(1) as f64;
         push_bar(&mut lost, name.into(), Cell::Count(count), share);
     }
     section
@@ -398,29 +402,6 @@ fn push_bar(table: &mut Table, name: Cell, value: Cell, end: f64) {
         tone: Tone::Plain,
         bar: Some(Bar { start: 0.0, end }),
     });
-}
-
-/// Burst lengths in classes of powers of two, with their share.
-fn classes(runs: &[BurstCount]) -> Vec<(String, u64, f64)> {
-    let total: u64 = runs.iter().map(|run| run.count).sum();
-    let mut found: Vec<(String, u64, f64)> = Vec::new();
-    let longest = runs.last().map_or(0, |run| run.length_messages);
-    let mut from = 1_u64;
-    while from <= longest {
-        let upto = from.saturating_mul(2) - 1;
-        let inside = runs
-            .iter()
-            .filter(|run| (from..=upto).contains(&run.length_messages));
-        let count: u64 = inside.map(|run| run.count).sum();
-        let name = if from == upto {
-            from.to_string()
-        } else {
-            format!("{from}–{upto}")
-        };
-        found.push((name, count, count as f64 / total.max(1) as f64));
-        from = upto.saturating_add(1);
-    }
-    found
 }
 
 #[cfg(test)]
@@ -471,6 +452,14 @@ mod tests {
             assert!(pages[0].contains(words), "{words}: {}", pages[0]);
         }
         assert!(pages[1].contains("gilbert-elliott"), "{}", pages[1]);
-        assert!(pages[2].contains("2–3"), "{}", pages[2]);
+        // Two of ten are lost, one after the other.
+        let is_pairs = |line: &str| line.split_whitespace().take(2).eq(["2", "40"]);
+        assert!(pages[2].lines().any(is_pairs), "{}", pages[2]);
+        let mut short = sample();
+        short.records.truncate(6);
+        let figures = TraceMetrics::of(&short);
+        let page = render_trace_plots(&short, &figures, 90, Style::Plain);
+        // The whole range, in as many rows, up to all of them.
+        assert!(page.contains("100.00 %"), "{page}");
     }
 }

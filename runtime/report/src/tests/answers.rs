@@ -1,14 +1,17 @@
 //! What a run answers, and the report that a run prints.
 
 use hil_account::flow::{DeadlineFold, DeadlineMetrics};
+use hil_account::{ChannelAccount, FateCounts, MessageFate};
 use hil_core::case_study::Severity;
 
 use super::sample::{awkward, check_golden, empty, flow, full, link};
 use crate::answer::{Answer, Clocks, HarmCount, Hurt, OccasionCount, Unresolved, Untested};
 use crate::assessment::Assessment;
 use crate::network::{TimelineRow, TimelineSubject};
+use crate::page::Format;
+use crate::page::read::{Found, Material};
 use crate::score_event::ScoreEvents;
-use crate::summary::{ChannelFlows, Fact, LinkKind, Outcome, RunSummary};
+use crate::summary::{ChannelFlows, Fact, LinkKind, Outcome, RunSummary, ScoreMetric};
 use crate::terminal::{Style, brief, render};
 use hil_core::interval::{Interval, IntervalMethod, Spread};
 use hil_present::Tone;
@@ -30,6 +33,7 @@ fn lost_loops(count: Option<u64>, own_count: u64, sent_count: u64) -> HarmCount 
             0.15,
             IntervalMethod::EffectiveShare,
         ))),
+        note: "hand movements out and back that the arm did not make".to_owned(),
     }
 }
 
@@ -39,6 +43,17 @@ fn run(harm: HarmCount) -> RunSummary {
     summary.processes[0].skipped_tick_count = Some(0);
     summary.harms = vec![harm];
     summary
+}
+
+/// The page of a run.
+fn page_text(summary: &RunSummary) -> String {
+    let material = Material {
+        folder: "run".to_owned(),
+        found: Found::Ended(Box::new(summary.clone())),
+        series: Vec::new(),
+        problems: Vec::new(),
+    };
+    crate::page::render(&[material], None, Format::Html, None).unwrap()
 }
 
 fn answer(summary: &RunSummary) -> Answer {
@@ -87,6 +102,82 @@ fn a_hurt_robot_is_put_down_to_a_network_that_misbehaved_before() {
     unordered.score_events.clocks_differ = true;
     let because = Unresolved::ClocksDiffer;
     assert_eq!(answer(&unordered).hurt, Hurt::NotResolvable { because });
+}
+
+#[test]
+fn what_a_killed_gateway_or_a_full_buffer_lost_is_not_the_network() {
+    use MessageFate as Fate;
+    let hurt = |fate: Fate, by_network_count: u64| {
+        let mut summary = run(lost_loops(Some(2), 0, 40));
+        for event in &mut summary.score_events.events {
+            event.network.as_mut().unwrap().events.clear();
+            for outage in &mut event.outages {
+                assert!(outage.lost_count > 3);
+                outage.lost_by_network_count = by_network_count;
+            }
+            for message in &mut event.messages {
+                message.fate = Some(fate);
+            }
+        }
+        answer(&summary).hurt
+    };
+    let because = Unresolved::NoNetworkEventBefore;
+    let unexplained = Hurt::NotResolvable { because };
+    for fate in [
+        Fate::LostInInterruption,
+        Fate::LostByHarness,
+        Fate::LostOnWireOrByHarness,
+    ] {
+        assert_eq!(hurt(fate, 0), unexplained, "{fate:?}");
+        // Single losses beside it are no outage of the network.
+        assert_eq!(hurt(fate, 2), unexplained, "{fate:?}");
+        assert_eq!(hurt(fate, 3), Hurt::Yes, "{fate:?}");
+    }
+    assert_eq!(hurt(Fate::LostOnWire, 0), Hurt::Yes, "a message is named");
+}
+
+#[test]
+fn a_harm_without_occasions_is_tested_by_the_messages_that_crossed() {
+    let of = |published_count: u64| {
+        let mut summary = run(HarmCount {
+            occasions: None,
+            ..lost_loops(Some(0), 0, 0)
+        });
+        count_all(&mut summary);
+        for channel in &mut summary.channels {
+            if let Some(account) = &mut channel.account {
+                account.published_count = if channel.link.is_crossing() {
+                    published_count
+                } else {
+                    5_000
+                };
+                account.fates = FateCounts::default();
+                account.segments.clear();
+            }
+        }
+        answer(&summary)
+    };
+    // Two channels cross.
+    assert_eq!(of(5).words(), "NO: no harm in 10 messages");
+    let Hurt::NotResolvable {
+        because: Unresolved::SampleTooSmall { count: 8, .. },
+    } = of(4).hurt
+    else {
+        panic!("{:?}", of(4));
+    };
+}
+
+#[test]
+fn the_sample_of_an_answer_is_what_its_verdict_rests_on() {
+    let mut summary = run(lost_loops(Some(0), 0, 600));
+    summary.harms.push(HarmCount {
+        occasions: Some(OccasionCount {
+            what: "grasps".to_owned(),
+            count: 12,
+        }),
+        ..lost_loops(Some(0), 0, 0)
+    });
+    assert_eq!(answer(&summary).words(), "NO: no harm in 12 grasps");
 }
 
 #[test]
@@ -212,11 +303,9 @@ fn counters_that_a_start_did_not_leave_are_unknown_and_not_zero() {
     assert_eq!(found.measurement.uncounted_start_count, 2);
     assert_eq!(found.tone(), Tone::Caution);
     let (_, words) = found.measurement_words(&assessment.network);
-    assert!(words.starts_with("valid as far as known ("), "{words}");
-    assert!(
-        words.contains("(2 process starts left no counters)"),
-        "{words}"
-    );
+    let expected =
+        "valid as far as known: what 1 killed or restarted process dropped or skipped is unknown";
+    assert!(words.replace(JOINT, " ").starts_with(expected), "{words}");
     let named = "robot gateway: the counters of 2 of its 2 starts are unavailable";
     let named = |one: &String| one.replace(JOINT, " ").starts_with(named);
     assert!(assessment.warnings.iter().any(named), "{assessment:?}");
@@ -232,7 +321,9 @@ fn counters_that_a_start_did_not_leave_are_unknown_and_not_zero() {
     assert_eq!(found.hurt, Hurt::NotResolvable { because });
     let (_, words) = found.measurement_words(&Assessment::of(&summary).network);
     assert!(
-        words.contains("; 1 process start left no counters"),
+        words
+            .replace(JOINT, " ")
+            .contains("; what 1 killed or restarted process"),
         "{words}"
     );
     count_all(&mut summary);
@@ -329,7 +420,7 @@ fn requests_that_the_network_made_late_or_lost_are_harm_and_others_are_not() {
     assert_eq!(hurt, Hurt::Yes);
     for words in [
         "Did the emulated link hurt the programs?  YES",
-        "command late or missing           25 of 500 requests of command: 5.00 %",
+        "command late or missing  25 of 500 requests of command: 5.00 %",
         "answers that would have come in time but for the network",
         "3 network, 90 program, 2 both",
     ] {
@@ -399,6 +490,12 @@ fn unaligned_clocks_are_told_beside_a_valid_measurement() {
     network.clock_bound_s = None;
     let found = answer(&summary);
     assert_eq!(found.measurement.clocks, Clocks::Unaligned);
+    count_all(&mut summary);
+    let counted = answer(&summary);
+    assert_eq!(
+        (counted.hurt.clone(), counted.tone()),
+        (Hurt::No, Tone::Caution)
+    );
     assert_eq!(found.measurement.is_valid, Some(true));
     let page = brief(&summary, 100, Style::Plain);
     let page = page.split_whitespace().collect::<Vec<_>>().join(" ");
@@ -406,6 +503,67 @@ fn unaligned_clocks_are_told_beside_a_valid_measurement() {
         page.contains("one-way delays and the order of events are unavailable"),
         "{page}"
     );
+}
+
+#[test]
+fn a_robot_of_which_nothing_is_known_is_not_called_unhurt() {
+    for summary in [
+        empty(),
+        RunSummary {
+            score: vec![ScoreMetric {
+                value: None,
+                method: "the case gave no score".to_owned(),
+                ..full().score[2].clone()
+            }],
+            harms: vec![lost_loops(None, 0, 0)],
+            ..empty()
+        },
+    ] {
+        for page in [
+            brief(&summary, 100, Style::Plain),
+            render(&summary, 100, Style::Plain),
+            page_text(&summary),
+        ] {
+            let page = page.to_lowercase();
+            assert!(!page.contains("no incident"), "{page}");
+            assert!(!page.contains("0 incidents"), "{page}");
+            assert!(
+                page.contains("unavailable: the case gave no score"),
+                "{page}"
+            );
+        }
+    }
+}
+
+#[test]
+fn losses_that_only_missing_records_tell_are_unknown_and_not_none() {
+    let of = |change: &dyn Fn(&mut ChannelAccount)| {
+        let mut summary = run(lost_loops(Some(0), 0, 40));
+        for channel in &mut summary.channels {
+            channel.account.iter_mut().for_each(change);
+        }
+        let page = brief(&summary, 100, Style::Plain);
+        let words = page.split_whitespace().collect::<Vec<_>>().join(" ");
+        let sections = crate::sections::of_run(&summary, &Assessment::of(&summary));
+        let metrics = sections.iter().flat_map(hil_present::Section::metrics);
+        let lost = metrics.filter(|(_, one)| one.name == "lost");
+        let lost: Vec<_> = lost.map(|(_, one)| one.value).collect();
+        (words, lost)
+    };
+    let peers = |account: &mut ChannelAccount| {
+        account.fates = FateCounts::default();
+        let fate = MessageFate::UnknownPeerRecordsUnavailable;
+        account.fates.add(fate, account.published_count);
+    };
+    let producers = |account: &mut ChannelAccount| account.published_unrecorded_count = None;
+    for (page, lost) in [of(&peers), of(&producers)] {
+        assert!(page.contains("how many were lost is unknown"), "{page}");
+        assert!(page.contains("unknown of 5,000"), "{page}");
+        for words in ["none lost", "0 of 5,000", "% lost"] {
+            assert!(!page.contains(words), "{words}: {page}");
+        }
+        assert_eq!(lost, [None; 3], "{page}");
+    }
 }
 
 #[test]
@@ -432,6 +590,25 @@ fn the_printed_report_reads_as_checked_in() {
         ),
     ] {
         check_golden(&brief(&summary, width, Style::Plain), file, expected);
+    }
+}
+
+#[test]
+fn answer_cause_and_validity_stand_in_twelve_lines() {
+    let summary = run(lost_loops(Some(2), 0, 40));
+    let page = brief(&summary, 100, Style::Plain);
+    let (_, block) = page.rsplit_once("\u{2500}\n").unwrap();
+    assert!(block.lines().count() <= 12, "{block}");
+    let block = block.split_whitespace().collect::<Vec<_>>().join(" ");
+    for words in [
+        "Did the network hurt the robot? YES",
+        "measurement valid as far as known: what 1 killed",
+        "gravest harm at 4.921 s: robots 3 and 5",
+        "network before it outage of 800 ms on fleet/authority",
+        "where one is due every",
+        "(hand movements out and back",
+    ] {
+        assert!(block.contains(words), "{words}:\n{block}");
     }
 }
 

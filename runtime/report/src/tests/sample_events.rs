@@ -61,6 +61,7 @@ pub(crate) fn few_events() -> ScoreEvents {
         until_s: Some(4.4),
         length_s: Some(0.8),
         lost_count: 20,
+        lost_by_network_count: 20,
         standing: Standing::OverFor(521_000_000),
         clock_bound_s: 0.0,
         other_count: 3,
@@ -222,7 +223,10 @@ fn the_report_has_every_event_and_counts_those_without_room() {
     let mut all = summary(recorded_channel());
     all.score_events = many_events("met");
     let text = render(&all, 100, Style::Plain);
-    assert!(text.contains("1 incident, 0 hazards, 37 notices"), "{text}");
+    assert!(
+        text.contains("1 incident (must not happen), 0 hazards (nearly one), 37 notices"),
+        "{text}"
+    );
     assert!(text.contains("met (clock of robot-pc)"), "{text}");
     assert_eq!(text.matches("braked (clock of robot-pc)").count(), 20);
     assert!(

@@ -46,7 +46,7 @@ fn judged(condition: &str, figure: &ComparedMetric) -> Result<bool, String> {
     let comparison = Comparison {
         harms: Vec::new(),
         measurements: Vec::new(),
-        first_harm: None,
+        gravest_harm: None,
         object: Object::Robot,
         hurt: Hurt::No,
         headline: Vec::new(),

@@ -3,48 +3,14 @@
 use hil_account::BurstCount;
 
 use super::{Frame, HALF_WIDTH};
+use crate::burst_classes::burst_classes;
 use crate::page::axis::{Axis, Unit};
 use crate::page::svg::{Anchor, Svg};
 use hil_platform::text::grouped;
 
-/// Lengths that get a bar of their own; beyond, a bar reaches to the next power of two.
-const SINGLE_MAX: u64 = 4;
-
-/// Bars: their words, and how many runs of losses they hold.
-fn bars(runs: &[BurstCount]) -> Vec<(String, u64)> {
-    let mut bars: Vec<((u64, u64), u64)> = Vec::new();
-    let longest = runs
-        .iter()
-        .map(|run| run.length_messages)
-        .max()
-        .unwrap_or(0);
-    let mut from = 1;
-    while from <= longest {
-        let until = if from <= SINGLE_MAX {
-            from
-        } else {
-            (from - 1).saturating_mul(2)
-        };
-        let within = runs
-            .iter()
-            .filter(|run| (from..=until).contains(&run.length_messages));
-        bars.push(((from, until), within.map(|run| run.count).sum()));
-        from = until.saturating_add(1);
-    }
-    let words = bars.into_iter().map(|((from, until), count)| {
-        let words = if from == until {
-            grouped(from)
-        } else {
-            format!("{from}–{until}")
-        };
-        (words, count)
-    });
-    words.collect()
-}
-
 /// The figure; `None` when nothing was lost.
 pub(in crate::page) fn loss_bursts(title: &str, runs: &[BurstCount]) -> Option<String> {
-    let bars = bars(runs);
+    let bars = burst_classes(runs);
     let most = bars
         .iter()
         .map(|(_, count)| *count)
@@ -86,16 +52,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn long_runs_share_bars_and_none_is_left_out() {
-        let runs = [(1, 50), (3, 2), (6, 1), (1_000, 4)];
-        let runs = runs.map(|(length_messages, count)| BurstCount {
-            length_messages,
-            count,
-        });
-        let bars = bars(&runs);
-        assert_eq!(bars[4], ("5–8".to_owned(), 1));
-        assert_eq!(bars.last(), Some(&("513–1024".to_owned(), 4)));
-        assert_eq!(bars.iter().map(|(_, count)| count).sum::<u64>(), 57);
+    fn nothing_is_drawn_of_no_loss() {
+        let runs = [BurstCount {
+            length_messages: 3,
+            count: 2,
+        }];
         assert!(loss_bursts("t", &runs).is_some());
         assert_eq!(loss_bursts("t", &[]), None);
     }

@@ -1,7 +1,7 @@
 //! How delays are distributed: one step curve per segment, over a logarithmic axis of time and an
 //! axis of shares whose steps are nines, so that the tail is as readable as the median.
 
-use hil_stats::histogram::{DurationBin, LatencySummary};
+use hil_stats::histogram::DurationBin;
 
 use super::{Frame, HALF_WIDTH, legend, legend_height, path_through};
 use crate::page::axis::{Axis, Unit};
@@ -11,29 +11,13 @@ use crate::page::svg::{Svg, line_class};
 #[derive(Debug, Clone)]
 pub(in crate::page) struct Curve<'a> {
     pub(in crate::page) label: String,
-    /// Empty in folders of older versions: then the quantiles of the summary are all there is.
     pub(in crate::page) bins: &'a [DurationBin],
-    pub(in crate::page) summary: Option<LatencySummary>,
     /// The sum of the others.
     pub(in crate::page) is_whole: bool,
 }
 
 /// Delay above 0 and the share of values up to it.
 fn steps(curve: &Curve<'_>) -> Vec<(f64, f64)> {
-    if curve.bins.is_empty() {
-        let Some(summary) = &curve.summary else {
-            return Vec::new();
-        };
-        let known = [
-            (summary.min_ns, 0.0),
-            (summary.p50_ns, 0.5),
-            (summary.p90_ns, 0.9),
-            (summary.p99_ns, 0.99),
-            (summary.p999_ns, 0.999),
-            (summary.max_ns, 1.0),
-        ];
-        return known.map(|(ns, share)| (ns as f64, share)).to_vec();
-    }
     let total: u64 = curve.bins.iter().map(|bin| bin.count).sum();
     let mut sum = 0;
     let mut points = Vec::with_capacity(curve.bins.len() * 2);
@@ -81,23 +65,18 @@ pub(in crate::page) fn delay_cdf(title: &str, curves: &[Curve<'_>]) -> Option<St
     legend(&mut svg, 8.0, 16.0, HALF_WIDTH - 8.0, &entries);
     let counts = drawn
         .iter()
-        .filter_map(|(curve, _)| Some(curve.summary?.count));
+        .map(|(curve, _)| curve.bins.iter().map(|bin| bin.count).sum::<u64>());
     let most = counts.max().unwrap_or(1).max(2) as f64;
     let nines = most.log10().clamp(2.0, 6.0);
     let x_axis = Axis::logarithmic(low, high, frame.left, frame.right);
     let y_axis = Axis::nines(nines, frame.bottom, frame.top + 6.0);
     frame.x_axis(&mut svg, &x_axis, Unit::Nanoseconds, "time, logarithmic");
     frame.y_axis(&mut svg, &y_axis, Unit::Share);
-    for ((curve, points), (class, _)) in drawn.iter().zip(&entries) {
+    for ((_, points), (class, _)) in drawn.iter().zip(&entries) {
         let places = points
             .iter()
             .map(|(ns, share)| Some((x_axis.at(*ns), y_axis.at(*share))));
         svg.path(class, &path_through(places));
-        if curve.bins.is_empty() {
-            for (ns, share) in points {
-                svg.circle(class, x_axis.at(*ns), y_axis.at(*share), 2.5);
-            }
-        }
     }
     Some(svg.finish(title, &[]))
 }
@@ -110,7 +89,6 @@ mod tests {
         Curve {
             label: "a → b".to_owned(),
             bins,
-            summary: None,
             is_whole: false,
         }
     }
