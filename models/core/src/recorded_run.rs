@@ -182,6 +182,8 @@ pub struct RecordedRun<P> {
     pub name: String,
     /// The published network that it stands for; `None` where it stands for itself.
     pub network: Option<PublishedNetwork>,
+    /// The row that it was made for, where that stands for no published network: runs of one such row are pooled.
+    pub row: Option<String>,
     /// What carried its messages.
     pub link: RecordedLink,
     /// Seed of its random streams.
@@ -248,6 +250,7 @@ impl<P> RecordedRun<P> {
             folder: self.folder,
             name: self.name,
             network: self.network,
+            row: self.row,
             link: self.link,
             seed: self.seed,
             parameters,

@@ -167,8 +167,9 @@ impl<P> RecordedRow<P> {
         for mut run in runs {
             let is_its = |row: &&mut Self| {
                 let first = row.first();
-                run.network.is_some()
+                (run.network.is_some() || run.row.is_some())
                     && first.network == run.network
+                    && first.row == run.row
                     && first.link == run.link
                     && are_alike(&first.parameters, &run.parameters)
             };
@@ -217,7 +218,8 @@ impl<P> RecordedRow<P> {
     /// How it was obtained, as the paper's first column has it.
     pub fn method(&self) -> String {
         let first = self.first();
-        let network = first.network.map_or(first.name.as_str(), |one| one.label());
+        let row = first.row.as_ref().unwrap_or(&first.name);
+        let network = first.network.map_or(row.as_str(), |one| one.label());
         let mut name = format!("HiL, {network}, {}", first.link.origin);
         if self.is_named_by_folder {
             name = format!("{name}, {}", first.folder);
@@ -332,6 +334,7 @@ mod tests {
             folder: folder.to_owned(),
             name: "two-pcs".to_owned(),
             network,
+            row: None,
             link: RecordedLink {
                 origin: LinkOrigin::Emulated,
                 about: "hop: 5 ms".to_owned(),
@@ -453,6 +456,16 @@ mod tests {
         // An emulated link draws the same for equal seeds.
         assert_eq!(rows[0].left_out[0].folder, "e");
         assert_eq!(rows[0].left_out[0].doubts, [Doubt::SharedSeed(1)]);
+        // Those that were made for one row are one without a label.
+        let made = |folder, seed| {
+            let mut run = run(folder, None, seed);
+            run.row = Some("lte".to_owned());
+            run
+        };
+        let made = vec![made("h", 1), run("i", None, 2), made("j", 2)];
+        let made = RecordedRow::of_runs(made, |_, _| true);
+        assert_eq!((made.len(), made[0].runs().len()), (2, 2));
+        assert_eq!(made[0].method(), "HiL, lte, emulated link");
         // Alike, but no repetitions of each other.
         assert_eq!(rows[2].method(), "HiL, two-pcs, emulated link, d");
     }

@@ -193,6 +193,7 @@ mod tests {
             folder: folder.to_owned(),
             name: "teleop-split".to_owned(),
             network,
+            row: None,
             link: RecordedLink {
                 origin: LinkOrigin::Real,
                 about: "UDP and TCP".to_owned(),
