@@ -199,7 +199,7 @@ fn run_command(
                 }
                 Some(file) => record_work::record(
                     &file,
-                    host,
+                    host.as_deref(),
                     record_work::TablesWanted {
                         overrides,
                         runs,

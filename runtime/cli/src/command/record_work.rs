@@ -4,7 +4,7 @@ use std::path::Path;
 
 use hil_engine::process::again::run_again;
 use hil_platform::console::Console;
-use hil_report::study::recording::{self, Place, RecordingError, RunEnd};
+use hil_report::study::recording::{self, RecordingError, RunEnd};
 use hil_report::study::{self, BatchArgs, RunArgument, Wanted};
 use hil_topology::Recording;
 use hil_topology::registry::Registry;
@@ -24,7 +24,7 @@ pub(super) struct TablesWanted {
 /// Records what the rows of `file` lack, and prints the tables with what there is.
 pub(super) fn record(
     file: &Path,
-    host: Option<String>,
+    host: Option<&str>,
     wanted: TablesWanted,
     registry: &Registry,
     console: &mut Console,
@@ -44,12 +44,11 @@ pub(super) fn record(
         hil_topology::load_case(path, &settings, registry.known()),
         console,
     )?;
-    let place = host.clone().map_or(Place::OnePc, Place::Host);
     let recorded = recording::record(
         &recording,
         &tables,
         registry,
-        &place,
+        host,
         &mut |arguments, output, meanwhile| {
             let code = run_again(arguments, output, &signals, meanwhile)?;
             let hopeless = [

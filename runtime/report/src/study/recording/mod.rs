@@ -97,15 +97,6 @@ pub enum RecordingError {
     },
 }
 
-/// Where runs go on, as the command line says it: all hosts on this PC, or one of them.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Place {
-    /// All of them.
-    OnePc,
-    /// This one.
-    Host(String),
-}
-
 /// A row to be recorded.
 #[derive(Debug)]
 struct Row<'a> {
@@ -340,7 +331,8 @@ fn rows<'a>(
     rows.collect()
 }
 
-/// Records what the rows of `recording` lack. A run that was under way when a call was killed is made again.
+/// Records what the rows of `recording` lack, with all hosts on this PC, or as this `host` beside others. A run that was under way
+/// when a call was killed is made again.
 ///
 /// # Errors
 /// When a topology, a run in the folder, or the folder itself cannot be used.
@@ -348,7 +340,7 @@ pub fn record(
     recording: &Recording,
     tables: &Topology,
     registry: &Registry,
-    place: &Place,
+    host: Option<&str>,
     start: Start<'_>,
     signals: &Signals,
     console: &mut Console,
@@ -360,7 +352,7 @@ pub fn record(
     let mut recorded = Recorded::default();
     let mut maker = RunMaker {
         registry,
-        place,
+        host,
         start,
         said,
         signals,
@@ -445,7 +437,7 @@ impl Said {
 /// Makes runs.
 struct RunMaker<'a> {
     registry: &'a Registry,
-    place: &'a Place,
+    host: Option<&'a str>,
     start: Start<'a>,
     said: Said,
     signals: &'a Signals,
@@ -558,9 +550,9 @@ impl RunMaker<'_> {
         let mut arguments = ["--topology", row.file, "--quiet"]
             .map(str::to_owned)
             .to_vec();
-        arguments.extend(match self.place {
-            Place::OnePc => vec!["--on-one-pc".to_owned()],
-            Place::Host(name) => vec!["--host".to_owned(), name.clone()],
+        arguments.extend(match self.host {
+            None => vec!["--on-one-pc".to_owned()],
+            Some(name) => vec!["--host".to_owned(), name.to_owned()],
         });
         arguments.extend(
             overrides
