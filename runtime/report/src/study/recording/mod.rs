@@ -11,12 +11,13 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_core::recorded_run::{PublishedNetwork, RowSample};
+use hil_core::recorded_run::{PublishedNetwork, RecordedRun, RowSample};
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
+use hil_stats::recorded::RecordedRow;
 use hil_topology::registry::Registry;
 use hil_topology::{Recording, Topology};
 use serde_json::Value;
@@ -36,6 +37,11 @@ const LOCK_PATIENCE: Duration = Duration::from_mins(1);
 const LOCK_PERIOD: Duration = Duration::from_millis(200);
 /// Where a case's keys are.
 const PARAMETERS: &str = "case.parameters.";
+/// More of their messages than of one copy's are lost by a network that many copies load. Trials have one seed, and an emulated link
+/// the same outages.
+const LOSS_MORE_MAX: f64 = 0.01;
+/// Their messages wait for each other, which come at once; a queue that grows makes it more than this.
+const DELAY_TIMES_MAX: f64 = 10.0;
 /// Keys that are named where many differ.
 const NAMED_COUNT: usize = 4;
 
@@ -131,6 +137,17 @@ impl Row<'_> {
         let doubts: Vec<_> = run.doubts.iter().map(ToString::to_string).collect();
         if !doubts.is_empty() {
             return Err(doubts.join("; "));
+        }
+        if let Part::Trial(2..) = part {
+            let one = ComparedRun::read(&self.folder.path(Part::Trial(1)));
+            let one = recorded(
+                one.map_err(|error| error.to_string())?,
+                self.network,
+                self.case,
+            )?;
+            if let Some(why) = overload(one, run.clone()) {
+                return Err(why);
+            }
         }
         match run.count(self.sample.metric) {
             Ok(0) if !part.is_trial() => Err(format!("it counted no {}", self.sample.what)),
@@ -277,6 +294,29 @@ impl Row<'_> {
         }
         text
     }
+}
+
+/// Why `many` copies do not meet the network that `one` met: as many messages as they send change what it does.
+fn overload(one: RecordedRun<Value>, many: RecordedRun<Value>) -> Option<String> {
+    let rows = [one, many].map(|run| RecordedRow::of_runs(vec![run], |_, _| true));
+    let rows = rows.each_ref().map(|rows| rows.first());
+    let of = |figure: fn(&RecordedRow<Value>) -> Option<f64>| rows.map(|row| row.and_then(figure));
+    if let [Some(one), Some(many)] = of(RecordedRow::loss_ratio)
+        && many > one + LOSS_MORE_MAX
+    {
+        let [one, many] = [one, many].map(|ratio| 100.0 * ratio);
+        return Some(format!(
+            "they load the network, which lost {many:.1} % of their messages and {one:.1} % of one's"
+        ));
+    }
+    if let [Some(one), Some(many)] = of(|row| row.delay_ms(0.5))
+        && many > DELAY_TIMES_MAX * one
+    {
+        return Some(format!(
+            "they load the network, which took {many:.2} ms for half of their messages and {one:.2} ms for one's"
+        ));
+    }
+    None
 }
 
 /// The rows of `recording` for tables of the case of `tables`.
@@ -588,6 +628,7 @@ impl RunMaker<'_> {
 mod tests {
     use super::*;
 
+    use hil_core::recorded_run::{DelayBin, LinkOrigin, RecordedCrossing, RecordedLink};
     use hil_shuttle::Shuttle;
 
     const FILE: &str = concat!(
@@ -646,6 +687,45 @@ mod tests {
         assert!(
             longer.starts_with("name was other, is shuttle-split; run.duration was 15 s, is "),
             "{longer}"
+        );
+    }
+
+    #[test]
+    fn copies_that_change_the_network_are_too_many() {
+        let run = |lost_count: u64, until_ns: i64| RecordedRun {
+            folder: String::new(),
+            name: String::new(),
+            network: None,
+            row: None,
+            link: RecordedLink {
+                origin: LinkOrigin::Emulated,
+                about: String::new(),
+            },
+            seed: 1,
+            parameters: Value::Null,
+            crossing: RecordedCrossing {
+                offered_count: 1000,
+                lost_count: Ok(lost_count),
+                delays: Ok(vec![DelayBin {
+                    above_ns: 0,
+                    until_ns,
+                    count: 1000,
+                }]),
+            },
+            score: BTreeMap::new(),
+            doubts: Vec::new(),
+        };
+        let of = |many| overload(run(20, 1_000_000), many);
+        assert_eq!(of(run(29, 9_000_000)), None);
+        let lost = of(run(454, 1_000_000)).unwrap();
+        assert!(
+            lost.contains("lost 45.4 % of their messages and 2.0 % of one's"),
+            "{lost}"
+        );
+        let late = of(run(20, 11_000_000)).unwrap();
+        assert!(
+            late.contains("took 5.50 ms for half of their messages and 0.50 ms"),
+            "{late}"
         );
     }
 
