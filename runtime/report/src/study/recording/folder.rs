@@ -9,13 +9,7 @@ use std::path::{Path, PathBuf};
 use hil_rundir::run_folder::RunFolder;
 
 /// What a kept run needs for tables, reports and comparisons.
-const KEPT: [&str; 5] = [
-    "manifest.json",
-    "summary.json",
-    "report.txt",
-    "report-full.txt",
-    "events.log",
-];
+const KEPT: [&str; 3] = ["manifest.json", "summary.json", "report.txt"];
 /// What is large in the folder of a run.
 const LARGE: [&str; 3] = ["records", "traces", "series"];
 /// Why a run was refused.
