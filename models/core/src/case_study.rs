@@ -11,7 +11,7 @@ use crate::endpoint::{RoleChannels, StatedChannel};
 use crate::message::{Message, MessageType, TypeInfo};
 use crate::options::Options;
 use crate::plot::PlotSeries;
-use crate::recorded_run::RecordedRun;
+use crate::recorded_run::{RecordedRun, RowSample};
 use crate::replay::Replay;
 use crate::run_log::RunLog;
 use crate::study::{Batch, StudyRefusal};
@@ -45,6 +45,8 @@ pub trait CaseStudy: Sized + Debug + 'static {
     const SERIES: &'static [&'static str] = &[];
     /// The figures that [`CaseStudy::calibration`] knows, by name.
     const CALIBRATED_FIGURES: &'static [&'static str] = &[];
+    /// What makes a row of recorded runs large enough for [`CaseStudy::study`]; `None` for a case whose tables take none.
+    const ROW_SAMPLE: Option<RowSample> = None;
     /// `[case.parameters]`, declared with [`options!`](crate::options!).
     type Parameters: Options + DeserializeOwned + Serialize + Default;
 

@@ -8,28 +8,41 @@ use crate::interval::Spread;
 use crate::options::Difference;
 use crate::study::StudyRefusal;
 
-hil_core::labelled! {
-    /// A network over which the seed paper measured with hardware in the loop (section III.A), and what it calls it.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-    pub enum PublishedNetwork, label {
+hil_core::words! {
+    /// A network over which the seed paper measured with hardware in the loop (section III.A).
+    pub enum PublishedNetwork {
         /// A wire.
-        Ethernet = "Ethernet",
+        Ethernet = "ethernet",
         /// A radio at 20 m.
-        ShortRange = "short-range Wi-Fi 6",
+        ShortRange = "short",
         /// A radio at 35 m.
-        LongRange = "long-range Wi-Fi 6",
+        LongRange = "long",
     }
 }
 
 impl PublishedNetwork {
-    /// Its word on a command line.
-    pub const fn word(self) -> &'static str {
+    /// What the paper calls it.
+    pub const fn label(self) -> &'static str {
         match self {
-            Self::Ethernet => "ethernet",
-            Self::ShortRange => "short",
-            Self::LongRange => "long",
+            Self::Ethernet => "Ethernet",
+            Self::ShortRange => "short-range Wi-Fi 6",
+            Self::LongRange => "long-range Wi-Fi 6",
         }
     }
+}
+
+/// How large a sample the runs of a row of a case's tables make together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RowSample {
+    /// The figure of the score that counts it.
+    pub metric: &'static str,
+    /// What it counts, in the plural.
+    pub what: &'static str,
+    /// As many are enough, where nobody asks for another number.
+    pub enough: u64,
+    /// The key below `[case.parameters]` that says how many copies of the robots share the channels, so that as many times
+    /// more is counted in the same time.
+    pub copies: Option<&'static str>,
 }
 
 hil_core::labelled! {
@@ -115,6 +128,13 @@ pub enum Doubt {
     SharedSeed(u64),
 }
 
+impl Doubt {
+    /// True where the figures themselves are in doubt, not only what they are held against.
+    pub const fn is_of_measurement(&self) -> bool {
+        !matches!(self, Self::OtherParameters(_))
+    }
+}
+
 /// Parameters that are named where many differ.
 const NAMED_COUNT: usize = 4;
 
@@ -162,6 +182,8 @@ pub struct RecordedRun<P> {
     pub name: String,
     /// The published network that it stands for; `None` where it stands for itself.
     pub network: Option<PublishedNetwork>,
+    /// The row that it was made for, where that stands for no published network: runs of one such row are pooled.
+    pub row: Option<String>,
     /// What carried its messages.
     pub link: RecordedLink,
     /// Seed of its random streams.
@@ -177,6 +199,11 @@ pub struct RecordedRun<P> {
 }
 
 impl<P> RecordedRun<P> {
+    /// True where its figures are not in doubt.
+    pub fn is_sound(&self) -> bool {
+        !self.doubts.iter().any(Doubt::is_of_measurement)
+    }
+
     /// The count called `name` of its score.
     ///
     /// # Errors
@@ -223,6 +250,7 @@ impl<P> RecordedRun<P> {
             folder: self.folder,
             name: self.name,
             network: self.network,
+            row: self.row,
             link: self.link,
             seed: self.seed,
             parameters,

@@ -14,7 +14,7 @@ use crate::score;
 use crate::world::Vehicle;
 use hil_core::case_study::{CaseStudy, ChannelSpec, ParameterError};
 use hil_core::component::Role;
-use hil_core::recorded_run::RecordedRun;
+use hil_core::recorded_run::{RecordedRun, RowSample};
 use hil_core::run_log::RunLog;
 use hil_core::score::{ErrorSeries, LiveEvents, Score};
 use hil_core::study::{Batch, StudyRefusal, into_batch};
@@ -65,6 +65,12 @@ impl CaseStudy for Fleet {
         ChannelSpec::recorded::<Truth>(FLEET_TRUTH, "robots"),
     ];
     const SCORE_CLOCK: Option<&'static str> = Some(FLEET_TRUTH);
+    const ROW_SAMPLE: Option<RowSample> = Some(RowSample {
+        metric: score::CRITICAL_SECTIONS.name,
+        what: "critical sections",
+        enough: 10_000,
+        copies: Some("fleets"),
+    });
     type Parameters = FleetParameters;
 
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {

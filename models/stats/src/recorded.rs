@@ -152,7 +152,12 @@ impl PooledShare {
 /// Runs that make one row: those of one published network, one link and like parameters, or a run alone.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordedRow<P> {
+    /// Its sound ones; where none is, all.
     runs: Vec<RecordedRun<P>>,
+    /// Doubted ones beside sound ones.
+    left_out: Vec<RecordedRun<P>>,
+    /// Another row has the same name otherwise.
+    is_named_by_folder: bool,
 }
 
 impl<P> RecordedRow<P> {
@@ -162,26 +167,42 @@ impl<P> RecordedRow<P> {
         for mut run in runs {
             let is_its = |row: &&mut Self| {
                 let first = row.first();
-                run.network.is_some()
+                (run.network.is_some() || run.row.is_some())
                     && first.network == run.network
+                    && first.row == run.row
                     && first.link == run.link
                     && are_alike(&first.parameters, &run.parameters)
             };
             let Some(row) = rows.iter_mut().find(is_its) else {
-                rows.push(Self { runs: vec![run] });
+                rows.push(Self {
+                    runs: vec![run],
+                    left_out: Vec::new(),
+                    is_named_by_folder: false,
+                });
                 continue;
             };
-            let mut known = row.runs.iter();
+            let mut sound = row.runs.iter().filter(|other| other.is_sound());
             let is_drawn = run.link.origin != LinkOrigin::Real;
-            if is_drawn && known.any(|other| other.seed == run.seed) {
+            if is_drawn && sound.any(|other| other.seed == run.seed) {
                 run.doubts.push(Doubt::SharedSeed(run.seed));
             }
             row.runs.push(run);
         }
+        for row in &mut rows {
+            if row.runs.iter().any(RecordedRun::is_sound) {
+                let runs = core::mem::take(&mut row.runs).into_iter();
+                (row.runs, row.left_out) = runs.partition(RecordedRun::is_sound);
+            }
+        }
+        let names: Vec<_> = rows.iter().map(Self::method).collect();
+        for (row, name) in rows.iter_mut().zip(&names) {
+            let alike = names.iter().filter(|other| *other == name).count();
+            row.is_named_by_folder = row.first().network.is_none() && alike > 1;
+        }
         rows
     }
 
-    /// Its runs.
+    /// The runs whose figures it has: its sound ones, or all where none is.
     pub fn runs(&self) -> &[RecordedRun<P>] {
         &self.runs
     }
@@ -197,8 +218,17 @@ impl<P> RecordedRow<P> {
     /// How it was obtained, as the paper's first column has it.
     pub fn method(&self) -> String {
         let first = self.first();
-        let network = first.network.map_or(first.name.as_str(), |one| one.label());
-        format!("HiL, {network}, {}", first.link.origin)
+        let row = first.row.as_ref().unwrap_or(&first.name);
+        let network = first.network.map_or(row.as_str(), |one| one.label());
+        let mut name = format!("HiL, {network}, {}", first.link.origin);
+        if self.is_named_by_folder {
+            name = format!("{name}, {}", first.folder);
+        }
+        // Where one run is sound, all that are left are.
+        if !first.is_sound() {
+            name.push_str(", doubted");
+        }
+        name
     }
 
     /// Share of the messages that the network lost; `None` where that is unavailable of a run.
@@ -273,6 +303,11 @@ impl<P> RecordedRow<P> {
                 parts.push(format!("{of}delays are unavailable: {why}"));
             }
         }
+        let left_out = self.left_out.iter().map(|run| {
+            let doubts: Vec<_> = run.doubts.iter().map(Doubt::to_string).collect();
+            format!("left out: {}: {}", run.folder, doubts.join(", "))
+        });
+        parts.extend(left_out);
         parts.retain(|part| !part.is_empty());
         format!("{}: {}", self.method(), parts.join("; "))
     }
@@ -299,6 +334,7 @@ mod tests {
             folder: folder.to_owned(),
             name: "two-pcs".to_owned(),
             network,
+            row: None,
             link: RecordedLink {
                 origin: LinkOrigin::Emulated,
                 about: "hop: 5 ms".to_owned(),
@@ -414,12 +450,68 @@ mod tests {
             row.runs.iter().map(|run| run.folder.clone()).collect()
         };
         let folders: Vec<_> = rows.iter().map(|row| folders(row).join(" ")).collect();
-        assert_eq!(folders, ["a c e", "b", "d", "f", "g"]);
+        assert_eq!(folders, ["a c", "b", "d", "f", "g"]);
         assert_eq!(rows[0].method(), "HiL, short-range Wi-Fi 6, emulated link");
-        assert_eq!(rows[1].method(), "HiL, two-pcs, emulated link");
+        assert_eq!(rows[1].method(), "HiL, two-pcs, emulated link, b");
         // An emulated link draws the same for equal seeds.
-        assert_eq!(rows[0].runs[2].doubts, [Doubt::SharedSeed(1)]);
-        assert_eq!(rows[0].runs[1].doubts, []);
+        assert_eq!(rows[0].left_out[0].folder, "e");
+        assert_eq!(rows[0].left_out[0].doubts, [Doubt::SharedSeed(1)]);
+        // Those that were made for one row are one without a label.
+        let made = |folder, seed| {
+            let mut run = run(folder, None, seed);
+            run.row = Some("lte".to_owned());
+            run
+        };
+        let made = vec![made("h", 1), run("i", None, 2), made("j", 2)];
+        let made = RecordedRow::of_runs(made, |_, _| true);
+        assert_eq!((made.len(), made[0].runs().len()), (2, 2));
+        assert_eq!(made[0].method(), "HiL, lte, emulated link");
+        // Alike, but no repetitions of each other.
+        assert_eq!(rows[2].method(), "HiL, two-pcs, emulated link, d");
+    }
+
+    #[test]
+    fn a_doubted_run_is_left_out_beside_sound_ones_and_named() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let late = |folder: &str, seed| {
+            let mut run = run(folder, short, seed);
+            run.doubts.push(Doubt::SkippedTicks {
+                skipped_count: 3,
+                due_count: 500,
+            });
+            run
+        };
+        let row = |runs| RecordedRow::of_runs(runs, |_, _| true).remove(0);
+        let happened = PooledShare::of(
+            &[RunShare {
+                share: share(0, 10_000),
+                interval: None,
+            }],
+            Some(1.0),
+        );
+        let published = Some(share(0, 10_000));
+        // The sound one has the seed of a doubted one, which counts for nothing.
+        let mixed = row(vec![late("a", 1), run("b", short, 1)]);
+        assert_eq!(mixed.runs().len(), 1);
+        assert_eq!(mixed.verdict(&happened, published), Verdict::Agrees);
+        assert_eq!(mixed.method(), "HiL, short-range Wi-Fi 6, emulated link");
+        let note = mixed.note(&happened);
+        let expected = "left out: a: 3 of 500 ticks were skipped";
+        assert!(
+            note.contains(": b; hop") && note.ends_with(expected),
+            "{note}"
+        );
+        let doubted = row(vec![late("a", 1), late("b", 2)]);
+        assert_eq!(doubted.runs().len(), 2);
+        assert_eq!(
+            doubted.verdict(&happened, published),
+            Verdict::NotComparable
+        );
+        assert!(doubted.method().ends_with(", doubted"));
+        let note = doubted.note(&happened);
+        assert!(
+            note.contains("not comparable: a: 3 of") && note.contains("not comparable: b: 3 of")
+        );
     }
 
     #[test]

@@ -82,7 +82,7 @@ use hil_core::case_study::{
 use hil_core::component::Role;
 use hil_core::plot::PlotSeries;
 use hil_core::random::RandomStream;
-use hil_core::recorded_run::RecordedRun;
+use hil_core::recorded_run::{RecordedRun, RowSample};
 use hil_core::replay::Replay;
 use hil_core::run_log::RunLog;
 use hil_core::study::{Batch, StudyRefusal, into_batch};
@@ -168,6 +168,12 @@ impl CaseStudy for Teleoperation {
         "motion-loops",
     ];
     const CALIBRATED_FIGURES: &'static [&'static str] = &["mlr"];
+    const ROW_SAMPLE: Option<RowSample> = Some(RowSample {
+        metric: score::LOOPS_SENT.name,
+        what: "motion loops",
+        enough: experiment::PUBLISHED_LOOPS as u64,
+        copies: None,
+    });
     type Parameters = TeleoperationParameters;
 
     fn read_files(

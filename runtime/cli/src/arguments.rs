@@ -60,6 +60,9 @@ Examples:
       --run ethernet=runs/eth-1 --run 'short=runs/wifi-*' --run runs/lte-1
       the same with recorded runs as rows: two beside the paper's rows for
       Ethernet and short-range Wi-Fi 6, one that stands for itself
+  hil-runtime tables --record deploy/recordings/fleet.toml
+      the runs of those rows are made first, hours of them; the same command
+      goes on where it was ended or killed
 
 Equal seeds give equal tables, whatever the number of threads. Ctrl-C prints
 what is complete. Exit code 1 when a criterion is missed.";
@@ -307,8 +310,15 @@ pub enum Command {
     #[command(after_help = TABLES_EXAMPLES)]
     Tables {
         /// The topology file (TOML); `[case]` and `[run]` are enough.
-        #[arg(long, short, value_name = "FILE")]
-        topology: PathBuf,
+        #[arg(long, short, value_name = "FILE", required_unless_present = "record")]
+        topology: Option<PathBuf>,
+        /// First repeat runs in real time, on this PC, until each row that this file (TOML) names has enough of
+        /// them; the file names the topology of the tables too.
+        #[arg(long, value_name = "FILE", conflicts_with = "topology")]
+        record: Option<PathBuf>,
+        /// Record with other PCs instead, on which the same command is called: this one is this host of the rows' topologies.
+        #[arg(long, value_name = "NAME", requires = "record")]
+        host: Option<String>,
         /// Change one value of the file; may be repeated.
         #[arg(long = "set", value_name = "KEY=VALUE")]
         overrides: Vec<String>,

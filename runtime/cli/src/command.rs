@@ -4,6 +4,7 @@ mod case_work;
 mod doctor_work;
 mod join_work;
 mod live_work;
+mod record_work;
 mod report_work;
 
 use core::fmt::Display;
@@ -182,6 +183,8 @@ fn run_command(
         ),
         Command::Tables {
             topology,
+            record,
+            host,
             mut overrides,
             sections,
             runs,
@@ -189,7 +192,23 @@ fn run_command(
         } => {
             overrides
                 .extend(sections.map(|count| format!("case.parameters.tables.sections={count}")));
-            case_work::tables(&topology, &overrides, &runs, &batch, registry, console)
+            match record {
+                None => {
+                    let path = topology.unwrap_or_default();
+                    case_work::tables(&path, &overrides, &runs, &batch, registry, console)
+                }
+                Some(file) => record_work::record(
+                    &file,
+                    host.as_deref(),
+                    record_work::TablesWanted {
+                        overrides,
+                        runs,
+                        batch,
+                    },
+                    registry,
+                    console,
+                ),
+            }
         }
         Command::Calibrate(args) => case_work::calibrate(args, registry, console),
         Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
@@ -251,12 +270,9 @@ fn load(
     )
 }
 
-/// The topology, or all its faults said.
-fn loaded(
-    topology: Result<Topology, TopologyErrors>,
-    console: &mut Console,
-) -> Result<Topology, Refusal> {
-    topology.map_err(|errors| {
+/// What a file says, or all its faults said.
+fn loaded<T>(found: Result<T, TopologyErrors>, console: &mut Console) -> Result<T, Refusal> {
+    found.map_err(|errors| {
         console.faults(&errors.render(io::stderr().is_terminal()));
         Refusal {
             code: exit::USAGE,

@@ -33,6 +33,7 @@ mod model;
 mod names;
 mod ports;
 mod reader;
+mod recording;
 pub mod registry;
 mod resolved;
 mod role_spec;
@@ -59,6 +60,7 @@ pub use model::{
 };
 pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name, witness_name};
 pub use ports::{WantedPort, collide, control_key};
+pub use recording::{Recording, RecordingRow};
 pub use role_spec::{RoleChannel, RoleSpec};
 pub use security::{Hops, Security};
 

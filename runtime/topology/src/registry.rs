@@ -9,7 +9,7 @@ use hil_core::case_study::{
 };
 use hil_core::component::Role;
 use hil_core::plot::PlotSeries;
-use hil_core::recorded_run::RecordedRun;
+use hil_core::recorded_run::{RecordedRun, RowSample};
 use hil_core::replay::Replay;
 use hil_core::run_log::RunLog;
 use hil_core::study::{Batch, StudyRefusal};
@@ -159,6 +159,8 @@ pub struct CaseEntry {
     pub series: &'static [&'static str],
     /// The figures it can be calibrated for, by name.
     pub calibrated_metrics: &'static [&'static str],
+    /// See [`CaseStudy::ROW_SAMPLE`].
+    pub row_sample: Option<RowSample>,
     make: fn(Value, u64) -> Result<Box<dyn Case>, CaseError>,
     defaults: fn() -> Value,
 }
@@ -207,6 +209,7 @@ impl Registry {
             score_clock: C::SCORE_CLOCK,
             series: C::SERIES,
             calibrated_metrics: C::CALIBRATED_FIGURES,
+            row_sample: C::ROW_SAMPLE,
             make: make::<C>,
             defaults: || serde_json::to_value(C::Parameters::default()).unwrap_or(Value::Null),
         });

@@ -25,6 +25,7 @@ mod many_channels;
 mod one_pc;
 mod own_programs;
 mod probe_run;
+mod recorded_rows;
 mod secured_run;
 mod soak;
 mod split_run;

@@ -93,7 +93,7 @@ impl CellId {
                     loss_ratio,
                     delay_ms,
                 } => format!("{scenario}, loss {loss_ratio}, {delay_ms} ms, {copies} copies"),
-                Condition::HardwareInTheLoop(network) => format!("{scenario}, {network}"),
+                Condition::HardwareInTheLoop(network) => format!("{scenario}, {}", network.label()),
             },
             Place::Variant(variant) => format!("{scenario}, {variant}"),
             Place::Mechanism { mechanism, mode } => format!("{scenario}, {mechanism}, {mode}"),

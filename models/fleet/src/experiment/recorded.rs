@@ -156,6 +156,7 @@ mod tests {
             folder: folder.to_owned(),
             name: "fleet-split".to_owned(),
             network,
+            row: None,
             link: RecordedLink {
                 origin: LinkOrigin::Real,
                 about: "UDP".to_owned(),

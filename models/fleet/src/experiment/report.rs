@@ -339,7 +339,7 @@ fn published_row(
             Cell::number(Some(delay_ms), 0),
         ],
         Condition::HardwareInTheLoop(network) => vec![
-            Cell::text(format!("HiL, {network}")),
+            Cell::text(format!("HiL, {}", network.label())),
             Cell::Absent,
             Cell::Absent,
         ],

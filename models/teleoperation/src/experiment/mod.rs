@@ -13,5 +13,6 @@ mod tests;
 mod trajectory;
 
 pub(crate) use calibration::Calibration;
+pub(crate) use conditions::PUBLISHED_LOOPS;
 pub(crate) use study::MotionLossStudy;
 pub use study::TableParameters;

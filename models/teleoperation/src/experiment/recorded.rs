@@ -20,7 +20,13 @@ pub(crate) struct MotionLossRow {
     pub(crate) lost: PooledShare,
     /// How it stands to the paper.
     pub(crate) verdict: Verdict,
+    /// The parameters of the table are the published ones.
+    is_fitted: bool,
 }
+
+/// Why a row beside a table of other parameters is not compared.
+const NOT_FITTED: &str =
+    "not comparable: the table's parameters are not those of the published rates";
 
 impl MotionLossRow {
     /// The rows of `recorded` beside a table of `parameters`; those are the published ones where `is_fitted`.
@@ -68,7 +74,17 @@ impl MotionLossRow {
             verdict: row.verdict(&lost, published),
             row,
             lost,
+            is_fitted,
         })
+    }
+
+    /// What a reader must know of it.
+    pub(crate) fn note(&self) -> String {
+        let note = self.row.note(&self.lost);
+        match self.published().filter(|_| !self.is_fitted) {
+            Some(_) => format!("{note}; {NOT_FITTED}"),
+            None => note,
+        }
     }
 
     fn published(&self) -> Option<Share> {
@@ -177,6 +193,7 @@ mod tests {
             folder: folder.to_owned(),
             name: "teleop-split".to_owned(),
             network,
+            row: None,
             link: RecordedLink {
                 origin: LinkOrigin::Real,
                 about: "UDP and TCP".to_owned(),
@@ -316,6 +333,24 @@ mod tests {
             note.contains("runs/1, runs/2, runs/3; UDP and TCP; interval of counts"),
             "{note}"
         );
+    }
+
+    #[test]
+    fn a_labelled_row_beside_a_table_that_is_not_fitted_says_so() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let parameters = TeleoperationParameters {
+            motion_period_s: 2.0,
+            ..TeleoperationParameters::default()
+        };
+        let note = |network| {
+            let mut run = run("runs/a", network, [890, 883], Some([0.003, 0.014]));
+            run.parameters = parameters.clone();
+            let rows = MotionLossRow::of_runs(vec![run], &parameters, false).unwrap();
+            assert_eq!(rows[0].verdict, Verdict::NotComparable);
+            rows[0].note()
+        };
+        assert!(note(short).ends_with(NOT_FITTED), "{}", note(short));
+        assert!(note(None).ends_with("no label says for which network it stands"));
     }
 
     #[test]

@@ -228,7 +228,7 @@ fn rates(rows: &[Row<'_>], recorded: &[MotionLossRow]) -> Table {
     wide.extend(recorded_at(None));
     table.rows = wide;
     table.notes.push(ROWS_NOTE.to_owned());
-    let notes = recorded.iter().map(|one| one.row.note(&one.lost));
+    let notes = recorded.iter().map(MotionLossRow::note);
     table.notes.extend(notes);
     table
 }

@@ -74,11 +74,17 @@ pub(super) fn tables(
     let topology = loaded(topology, console)?;
     let study = study::batch_of(&topology, registry, Wanted::Tables { runs });
     let path = path.display().to_string();
-    let runs: Vec<String> = runs.iter().map(RunArgument::to_string).collect();
-    let mut words = vec!["hil-runtime", "tables", "--topology", &path];
-    words.extend(runs.iter().flat_map(|run| ["--run", run]));
-    let invocation = invocation(&words, overrides);
+    let invocation = with_runs(&["tables", "--topology", &path], runs, overrides);
     compute(study, batch, &invocation, &signals, console)
+}
+
+/// The call of tables with `runs`.
+pub(super) fn with_runs(words: &[&str], runs: &[RunArgument], overrides: &[String]) -> Invocation {
+    let runs: Vec<String> = runs.iter().map(RunArgument::to_string).collect();
+    let mut all = vec!["hil-runtime"];
+    all.extend(words);
+    all.extend(runs.iter().flat_map(|run| ["--run", run]));
+    invocation(&all, overrides)
 }
 
 /// `calibrate`.
@@ -127,6 +133,7 @@ fn invocation(words: &[&str], overrides: &[String]) -> Invocation {
     Invocation {
         words: words.iter().map(|word| (*word).to_owned()).collect(),
         overrides: overrides.to_vec(),
+        remarks: Vec::new(),
         columns: columns(),
     }
 }
@@ -154,7 +161,7 @@ fn wanted_figure(mlr: Option<f64>, figure: Option<&str>) -> Result<(&str, f64), 
     }
 }
 
-fn compute(
+pub(super) fn compute(
     study: Result<Box<dyn Batch>, StudyError>,
     args: &BatchArgs,
     invocation: &Invocation,

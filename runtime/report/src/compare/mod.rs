@@ -26,6 +26,7 @@ use harms::ComparedHarm;
 use hil_rundir::manifest::Manifest;
 use hil_rundir::run_folder::RunFolder;
 use origin::Difference;
+pub(crate) use origin::add_leaves;
 use serde_json::Value;
 
 /// Why runs cannot be compared.

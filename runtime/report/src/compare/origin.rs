@@ -205,7 +205,7 @@ fn folded(differences: Vec<Difference>) -> Vec<Difference> {
 }
 
 /// Every value in `value` by its path; a list is one.
-fn add_leaves(leaves: &mut BTreeMap<String, String>, path: &str, value: &Value) {
+pub(crate) fn add_leaves(leaves: &mut BTreeMap<String, String>, path: &str, value: &Value) {
     match value {
         Value::Object(table) => {
             for (key, value) in table {

@@ -4,6 +4,7 @@
 
 mod pool;
 mod recorded;
+pub mod recording;
 mod sections;
 
 use std::num::NonZeroUsize;
@@ -53,6 +54,8 @@ pub struct Invocation {
     pub words: Vec<String>,
     /// `KEY=VALUE` each.
     pub overrides: Vec<String>,
+    /// What is to be said of the rows that it recorded.
+    pub remarks: Vec<String>,
     /// Columns of the page.
     pub columns: usize,
 }
@@ -182,7 +185,8 @@ pub fn run(
         .min(batch.task_count().max(1));
     let pool = Pool::new(batch, jobs);
     let (outcomes, cost) = pool.run(signals, console);
-    let report = batch.report(&outcomes);
+    let mut report = batch.report(&outcomes);
+    report.summary.extend_from_slice(&invocation.remarks);
     let text = |extent, style| sections::text(&report, &cost, invocation, extent, style);
     console.result(&if args.json {
         sections::json(&report, &cost)

@@ -25,6 +25,7 @@ use crate::summary::{ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, Ru
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RunArgument {
     network: Option<PublishedNetwork>,
+    row: Option<String>,
     folder: String,
 }
 
@@ -37,6 +38,7 @@ impl FromStr for RunArgument {
         let Some((label, folder)) = labelled.filter(|(label, _)| !label.contains('/')) else {
             return Ok(Self {
                 network: None,
+                row: None,
                 folder: text.to_owned(),
             });
         };
@@ -50,6 +52,7 @@ impl FromStr for RunArgument {
         }
         Ok(Self {
             network,
+            row: None,
             folder: folder.to_owned(),
         })
     }
@@ -65,6 +68,15 @@ impl fmt::Display for RunArgument {
 }
 
 impl RunArgument {
+    /// The run in `folder` for the row called `name`, which stands for `network`.
+    pub(super) fn of(name: &str, network: Option<PublishedNetwork>, folder: &Path) -> Self {
+        Self {
+            network,
+            row: network.is_none().then(|| name.to_owned()),
+            folder: folder.display().to_string(),
+        }
+    }
+
     /// The folders that it names, in the order of their names.
     fn folders(&self) -> Result<Vec<PathBuf>, String> {
         let path = Path::new(&self.folder);
@@ -121,7 +133,7 @@ pub(super) fn read(
     arguments: &[RunArgument],
     case: &str,
 ) -> Result<Vec<RecordedRun<Value>>, String> {
-    let mut runs: Vec<(ComparedRun, Option<PublishedNetwork>)> = Vec::new();
+    let mut runs: Vec<(ComparedRun, &RunArgument)> = Vec::new();
     for argument in arguments {
         for folder in argument.folders()? {
             let run = ComparedRun::read(&folder).map_err(|error| error.to_string())?;
@@ -133,12 +145,15 @@ pub(super) fn read(
                     other.folder.display()
                 ));
             }
-            runs.push((run, argument.network));
+            runs.push((run, argument));
         }
     }
-    let recorded = runs.into_iter().map(|(run, network)| {
+    let recorded = runs.into_iter().map(|(run, argument)| {
         let folder = run.folder.display().to_string();
-        recorded(run, network, case).map_err(|problem| format!("{folder}: {problem}"))
+        let run = recorded(run, argument.network, case);
+        let run = run.map_err(|problem| format!("{folder}: {problem}"))?;
+        let row = argument.row.clone();
+        Ok(RecordedRun { row, ..run })
     });
     recorded.collect()
 }
@@ -158,7 +173,7 @@ fn is_same_run(one: &ComparedRun, other: &ComparedRun) -> bool {
 ///
 /// # Errors
 /// Why it can be no row of them.
-fn recorded(
+pub(super) fn recorded(
     run: ComparedRun,
     network: Option<PublishedNetwork>,
     case: &str,
@@ -204,6 +219,7 @@ fn recorded(
             None => facts.name.clone(),
         },
         network,
+        row: None,
         link: link(&summary, &crossing),
         seed: facts.seed,
         parameters,
@@ -356,7 +372,11 @@ mod tests {
         let parsed = |text: &str| text.parse::<RunArgument>();
         let of = |network, folder: &str| {
             let folder = folder.to_owned();
-            Ok(RunArgument { network, folder })
+            Ok(RunArgument {
+                network,
+                row: None,
+                folder,
+            })
         };
         assert_eq!(parsed("runs/a=b"), of(None, "runs/a=b"));
         let short = Some(PublishedNetwork::ShortRange);

@@ -255,6 +255,7 @@ mod tests {
             overrides: ["run.seed=2", "case.parameters.tables.sections=420"]
                 .map(str::to_owned)
                 .to_vec(),
+            remarks: Vec::new(),
             columns: 80,
         };
         text(&report(), &cost, &invocation, extent, Style::Plain)

@@ -117,6 +117,7 @@ fn a_calibration_is_computed_and_written_like_tables() {
     let invocation = Invocation {
         words: vec!["hil-runtime".to_owned()],
         overrides: Vec::new(),
+        remarks: Vec::new(),
         columns: 100,
     };
     let mut console = Console::new(true);
