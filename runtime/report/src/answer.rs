@@ -502,7 +502,7 @@ impl fmt::Display for Unresolved {
                 needed,
             } => write!(
                 formatter,
-                "no harm was seen, but the sample is too small ({what}: {count}, needed: {needed})"
+                "the sample is too small for a NO ({what}: {count}, needed: {needed})"
             ),
             Self::ScoreIncomplete => {
                 formatter.write_str("records of what the robot did are missing")

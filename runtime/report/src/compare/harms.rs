@@ -242,16 +242,16 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
             .all(|one| one.change == Change::Less || one.new.count == Some(0));
     let message_count = new.iter().map(|run| tested_count(&run.summary)).sum();
     let new_harms = harms.iter().map(|one| &one.new);
-    if let Some(mut because) = too_few_occasions(new_harms, message_count) {
-        if let Unresolved::SampleTooSmall { what, .. } = &mut because {
-            what.push_str(" in the new runs");
-        }
-        return not_resolvable(because);
+    if !is_unhurt && !is_less {
+        return not_resolvable(too_small(harms).unwrap_or(Unresolved::WithinChance));
     }
-    if is_unhurt || is_less {
+    let Some(mut because) = too_few_occasions(new_harms, message_count) else {
         return Hurt::No;
+    };
+    if let Unresolved::SampleTooSmall { what, .. } = &mut because {
+        what.push_str(" in the new runs");
     }
-    not_resolvable(too_small(harms).unwrap_or(Unresolved::WithinChance))
+    not_resolvable(because)
 }
 
 /// What a run alone has to say before its harms are looked at.

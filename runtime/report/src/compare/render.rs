@@ -373,11 +373,15 @@ fn robot(comparison: &Comparison) -> Section {
         let all = comparison.figures.iter();
         all.filter(|one| one.kind == ChartKind::Score)
     };
-    // One that changed and has no interval may have changed by chance or not: a reader must see it.
+    // Where runs are repeated, one that changed and has no interval may have changed by chance or not: a reader must see it.
+    // Of one run a side nearly all are so.
+    let are_repeated = comparison.base.len() > 1 && comparison.new.len() > 1;
     let is_shown = |one: &&ComparedMetric| {
         let differs = match one.verdict {
             Verdict::Lower | Verdict::Higher => true,
-            Verdict::NotTested => one.difference.is_some_and(|more| more.abs() > 0.0),
+            Verdict::NotTested => {
+                are_repeated && one.difference.is_some_and(|more| more.abs() > 0.0)
+            }
             _ => false,
         };
         let has_both = one.base.is_some() && one.new.is_some();
@@ -544,7 +548,12 @@ mod tests {
 
     #[test]
     fn a_score_that_changed_without_an_interval_is_listed_and_the_others_counted_by_why() {
-        let comparison = Comparison::of(&[run(4.0)], &[run(6.0)]);
+        let mut comparison = Comparison::of(&[run(4.0)], &[run(6.0)]);
+        let text = render(&[robot(&comparison)], 100, Style::Plain);
+        assert!(!text.contains("motion loops"), "{text}");
+        assert!(text.contains("2 not tested (no interval)"), "{text}");
+        comparison.base.push(PathBuf::from("another"));
+        comparison.new.push(PathBuf::from("another"));
         let text = render(&[robot(&comparison)], 100, Style::Plain);
         let changed = text.lines().find(|line| line.contains("motion loops"));
         assert!(
