@@ -221,7 +221,7 @@ fn has_a_hundredth(channel: &Section) -> bool {
 
 /// Figures of which the channel with the largest is shown first, and what they are called.
 pub(super) const WORST: [(&str, &str); 3] = [
-    ("loss_ratio", "largest loss"),
+    ("loss_ratio", "largest loss by the network"),
     ("p99", "largest p99"),
     ("network_p99", "network's largest p99"),
 ];
