@@ -180,6 +180,12 @@ impl<'a> GapFold<'a> {
         };
         let length_ns = after.taken_ns.saturating_sub(before.taken_ns);
         self.histogram.record(length_ns);
+        self.close(before, after);
+        true
+    }
+
+    /// Takes the silence between two messages for what it is.
+    fn close(&mut self, before: TakenAt, after: TakenAt) {
         let start_ns = self.run.map_or(0, |run| run.start.as_ns());
         let next_ns = before.next_published_ns.unwrap_or(before.published_ns);
         let idle_ns = next_ns.saturating_sub(before.published_ns).max(0);
@@ -200,7 +206,22 @@ impl<'a> GapFold<'a> {
         if gap.interruption_index.is_none() {
             keep_longer(&mut self.longest_unattributed, gap);
         }
-        true
+    }
+
+    /// The silence that lasts to the end of the run, if a message was due in it.
+    fn close_last(&mut self) {
+        let (Some(last), Some(run)) = (self.last, self.run) else {
+            return;
+        };
+        let tail_ns = run.end.as_ns().saturating_sub(last.taken_ns);
+        if tail_ns > 0 && last.next_published_ns.is_some() {
+            let end = TakenAt {
+                taken_ns: run.end.as_ns(),
+                published_ns: last.published_ns.saturating_add(tail_ns),
+                ..last
+            };
+            self.close(last, end);
+        }
     }
 
     /// The silences, and by interruption the longest it overlaps.
@@ -208,6 +229,7 @@ impl<'a> GapFold<'a> {
         self.window
             .extend(self.held.take().map(|(_, held)| Reverse(held)));
         while self.close_next() {}
+        self.close_last();
         let run = self.run;
         let tail_ns = |last: TakenAt| Some(run?.end.as_ns().saturating_sub(last.taken_ns));
         let reason = if at_hand.taken {
@@ -242,5 +264,35 @@ fn overlaps(interruption: &Interruption, before: TakenAt, after: TakenAt) -> boo
 fn keep_longer(longest: &mut Option<Gap>, gap: Gap) {
     if longest.is_none_or(|known| known.length_ns < gap.length_ns) {
         *longest = Some(gap);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::account;
+    use crate::stage::MessageFate;
+    use crate::synthetic::{Files, PERIOD_NS, TAKEN_NS, at, same_clock};
+
+    /// Of a run of a second: `taken_count` messages come, then `lost_count` get lost.
+    fn longest_ns(taken_count: u64, lost_count: u64) -> Option<i64> {
+        let mut files = Files::default();
+        for sequence in 0..taken_count {
+            files.write(at(0, sequence), MessageFate::Taken);
+        }
+        for sequence in taken_count..taken_count + lost_count {
+            files.write(at(0, sequence), MessageFate::LostOnWire);
+        }
+        let account = account(&files.records(), &same_clock(1_000_000_000));
+        account.gaps.longest.map(|gap| gap.length_ns)
+    }
+
+    #[test]
+    fn an_outage_that_lasts_to_the_end_is_the_longest_silence() {
+        // Message 10 was due a period after the ninth was taken; nobody waits for what was not sent.
+        let due_ns = 10 * PERIOD_NS + TAKEN_NS;
+        assert_eq!(longest_ns(10, 5), Some(1_000_000_000 - due_ns));
+        assert_eq!(longest_ns(10, 0), Some(0));
+        assert_eq!(longest_ns(1, 1), Some(1_000_000_000 - PERIOD_NS - TAKEN_NS));
+        assert_eq!(longest_ns(0, 5), None);
     }
 }

@@ -273,7 +273,7 @@ impl BurstLengths {
 pub struct Gaps {
     /// All of them.
     pub between_taken: Distribution,
-    /// The longest time in which one was due; `None` below two taken messages.
+    /// The longest time in which one was due, to the end of the run if none came any more; `None` where there was none.
     pub longest: Option<Gap>,
     /// The longest that overlaps no interruption.
     pub longest_unattributed: Option<Gap>,

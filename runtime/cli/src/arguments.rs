@@ -356,7 +356,7 @@ pub enum Command {
     },
     /// Show the links of a run that goes on, and change emulated ones.
     #[command(
-        after_help = "Examples:\n  hil-runtime link show\n  hil-runtime link set hop --delay 50ms --loss 0.1\n  hil-runtime link reset hop"
+        after_help = "Examples:\n  hil-runtime link show\n  hil-runtime link set hop --delay 120ms --loss 0.3\n  hil-runtime link reset hop"
     )]
     Link {
         /// What to do with them.

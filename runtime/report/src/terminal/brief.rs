@@ -15,7 +15,7 @@ use hil_present::{Block, Cell, Event, EventList, Row, Section, Table, Tone, UNAV
 
 use super::answer::AnswerExtent;
 use super::{LINKS_SHOWN, answer, case_lead, links};
-use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved, Untested};
+use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved};
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
@@ -529,12 +529,6 @@ fn next_commands(summary: &RunSummary, answer: &Answer) -> Vec<NextCommand> {
         Hurt::NotResolvable {
             because: Unresolved::ClocksDiffer,
         } => push("what aligns the clocks", "hil-runtime doctor".to_owned()),
-        Hurt::NotTested {
-            because: Untested::NoNetwork,
-        } => push(
-            "over a link that hurts",
-            "hil-runtime --topology deploy/topologies/outages.toml".to_owned(),
-        ),
         _ => {}
     }
     if run.folder == NO_FOLDER {

@@ -16,7 +16,7 @@ Examples:
 
 const SET_EXAMPLES: &str = "\
 Examples:
-  hil-runtime link set hop --delay 50ms --loss 0.1
+  hil-runtime link set hop --delay 120ms --loss 0.3
       both directions of link hop: 50 ms one way, every tenth message lost
   hil-runtime link set hop.backward --cut
       nothing gets through from the second host to the first
