@@ -765,7 +765,7 @@ fn invalid_words(network: &NetworkVerdict) -> Option<String> {
         NetworkVerdict::TicksUnknown => "a component left no count of its ticks".to_owned(),
         NetworkVerdict::RecordsMissing { hosts } => {
             let hosts = named(hosts, NAMED_COUNT);
-            format!("records of other hosts are missing on {hosts}")
+            format!("records are missing on {hosts}")
         }
         NetworkVerdict::RunFailed
         | NetworkVerdict::VirtualTime

@@ -1,4 +1,4 @@
-//! The serialisable summary of a run, schema version 2. It holds figures, not judgements: those
+//! The serialisable summary of a run, schema version 3. It holds figures, not judgements: those
 //! are drawn from them in [`super::assessment`] whenever a summary is written.
 //!
 //! `summary.json` is one object with the fields of [`RunSummary`] under their own names plus
@@ -46,7 +46,7 @@ use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{Channel, Topology, Via};
 
 /// Version of the `summary.json` layout.
-pub const SCHEMA_VERSION: u32 = 2;
+pub const SCHEMA_VERSION: u32 = 3;
 
 /// Everything a finished run has to say.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

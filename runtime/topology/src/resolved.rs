@@ -27,11 +27,15 @@ impl Topology {
         self.resolved_with(true)
     }
 
-    fn resolved_with(&self, key_path: bool) -> Table {
+    fn resolved_with(&self, has_places: bool) -> Table {
         let mut table = Table::new();
         put(&mut table, "version", 1);
         put(&mut table, "name", self.name.as_str());
-        put(&mut table, "run", written(&mut self.run.clone()));
+        let mut run = written(&mut self.run.clone());
+        if !has_places {
+            run.remove("record");
+        }
+        put(&mut table, "run", run);
         if let Some(case) = &self.case {
             let mut case_table = Table::new();
             put(&mut case_table, "name", case.name.as_str());
@@ -58,7 +62,7 @@ impl Topology {
         put_named(&mut table, "flows", flows);
         if self.security.hops.is_some() {
             let mut security = written(&mut self.security.clone());
-            if !key_path {
+            if !has_places {
                 security.remove("key");
             }
             put(&mut table, "security", security);
@@ -66,8 +70,8 @@ impl Topology {
         table
     }
 
-    /// 64-bit FNV-1a of [`Topology::to_toml`] but for the place of the key file: equal on two hosts that
-    /// mean the same run.
+    /// 64-bit FNV-1a of [`Topology::to_toml`] but for the places of the key file and of the run's folder, which are each
+    /// host's own: equal on two hosts that mean the same run.
     ///
     /// It guards against two versions of a file, not against an adversary.
     ///

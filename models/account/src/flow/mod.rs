@@ -385,7 +385,9 @@ impl<'a> FlowFold<'a> {
         // An answer is told by its ends, however many there are; otherwise those beyond the bound are not told apart.
         let next = u32::try_from(self.keyed.len()).unwrap_or(UNKNOWN);
         let (kept, index) = match named.filter(|_| !is_timed) {
-            _ if !is_beyond || is_timed => (key, self.indices.entry(key).or_insert(next)),
+            _ if !is_beyond || is_timed || key == FlowKey::Unrecorded => {
+                (key, self.indices.entry(key).or_insert(next))
+            }
             Some(named) => (FlowKey::Rest, self.beyond.entry(named).or_insert(next)),
             None => (
                 FlowKey::Rest,
@@ -396,7 +398,7 @@ impl<'a> FlowFold<'a> {
         if index == next {
             let name = match named {
                 Some(named) => self.named[named].name.clone(),
-                None if is_beyond => FlowKey::Rest.to_string(),
+                None if is_beyond && key != FlowKey::Unrecorded => FlowKey::Rest.to_string(),
                 None => key.to_string(),
             };
             let is_shared = named.is_some() || is_beyond;
@@ -475,7 +477,12 @@ impl<'a> FlowFold<'a> {
     }
 
     /// The flows, those of most frames first, and the frames of those that deadlines are about.
-    pub fn finish(self) -> (Vec<FlowMetrics>, FlowPassages) {
+    pub fn finish(mut self) -> (Vec<FlowMetrics>, FlowPassages) {
+        // Of a part of a flow's streams there is no figure of the flow.
+        for index in self.beyond.values() {
+            let flow = self.keyed[*index as usize].flow;
+            self.flows[flow].retransmitted_count = None;
+        }
         let metrics = |flow: Flow| {
             let [taken, by_network, by_harness, unknown, by_either] = flow.counts;
             let reason = if taken == 0 {
@@ -838,7 +845,10 @@ mod tests {
         let beyond = fold.flows[FLOWS_MAX..].iter().map(|flow| &flow.name);
         assert_eq!(beyond.collect::<Vec<_>>(), ["requests", &rest, "pages"]);
         // Requests of two ends, and the answers to the first.
-        let (_, passages) = fold.finish();
+        let unknown = fold.index_of(FlowKey::Unrecorded);
+        assert_eq!(fold.keyed[unknown as usize].key, FlowKey::Unrecorded);
+        let (_, mut passages) = fold.finish();
+        assert_eq!(passages.remove(&FlowKey::Unrecorded), Some(Vec::new()));
         let keys: Vec<_> = passages.keys().map(ToString::to_string).collect();
         assert_eq!(
             keys,

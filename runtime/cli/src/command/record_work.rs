@@ -10,7 +10,7 @@ use hil_topology::Recording;
 use hil_topology::registry::Registry;
 
 use super::case_work::{compute, with_runs};
-use super::{Refusal, exit, failed, loaded, signals, usage};
+use super::{Refusal, exit, failed, interrupted, loaded, signals, usage};
 
 /// What is wanted of the tables beside the rows that are recorded.
 pub(super) struct TablesWanted {
@@ -51,17 +51,11 @@ pub(super) fn record(
         host,
         &mut |arguments, output, meanwhile| {
             let code = run_again(arguments, output, &signals, meanwhile)?;
-            let hopeless = [
-                exit::USAGE,
-                exit::PEER_ABSENT,
-                exit::FORBIDDEN,
-                exit::HOST_UNFIT,
-            ];
-            let is_hopeless = hopeless.iter().any(|one| code == Some(i32::from(*one)));
-            Ok(if is_hopeless {
-                RunEnd::Hopeless
-            } else {
-                RunEnd::Over
+            let code = code.and_then(|code| u8::try_from(code).ok());
+            Ok(match code {
+                Some(exit::HOST_UNFIT) => RunEnd::HostTooSmall,
+                Some(exit::USAGE | exit::PEER_ABSENT | exit::FORBIDDEN) => RunEnd::Hopeless,
+                _ => RunEnd::Over,
             })
         },
         &signals,
@@ -70,6 +64,7 @@ pub(super) fn record(
     let recorded = recorded.map_err(|error| match error {
         RecordingError::Io { .. } => failed(error),
         RecordingError::Busy(_) => Refusal::new(exit::TRY_AGAIN, error),
+        RecordingError::Interrupted => Refusal::new(interrupted(), error),
         other => usage(format!("{}: {other}", file.display())),
     })?;
     for fault in &recorded.faults {

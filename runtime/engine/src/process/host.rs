@@ -228,7 +228,7 @@ impl Words {
 /// them failed; `meanwhile` is called at each look. Gives the exit code of the first one that ended with another
 /// than 0.
 fn wait_for_all(hosts: &mut [Child], signals: &Signals, mut meanwhile: impl FnMut()) -> u8 {
-    let (mut code, mut stop_at, mut is_told, mut is_interrupted) = (0, None, false, false);
+    let (mut code, mut stop_at, mut told) = (0, None, None);
     loop {
         meanwhile();
         let ends: Vec<_> = hosts.iter_mut().map(Child::poll_end).collect();
@@ -238,7 +238,8 @@ fn wait_for_all(hosts: &mut [Child], signals: &Signals, mut meanwhile: impl FnMu
             && let Some(end) = failures.next()
         {
             let said = end.code().and_then(|code| code.try_into().ok());
-            let killed = if is_interrupted { INTERRUPTED } else { FAILED };
+            let is_told = told.is_some_and(|signal: Signal| end.signal() == Some(signal as i32));
+            let killed = if is_told { INTERRUPTED } else { FAILED };
             code = said.unwrap_or(killed);
             stop_at = stop_at.or(Some(now + PATIENCE));
         }
@@ -247,15 +248,15 @@ fn wait_for_all(hosts: &mut [Child], signals: &Signals, mut meanwhile: impl FnMu
         }
         let received = signals.received_signal();
         if received.is_some() {
-            is_interrupted = true;
             stop_at = Some(now);
         }
-        if !is_told && stop_at.is_some_and(|at| now >= at) {
-            is_told = true;
+        if told.is_none() && stop_at.is_some_and(|at| now >= at) {
             // Each host's report says by which signal the run ended.
+            let signal = received.unwrap_or(Signal::SIGTERM);
             for host in &mut *hosts {
-                host.signal(received.unwrap_or(Signal::SIGTERM));
+                host.signal(signal);
             }
+            told = Some(signal);
         }
         thread::sleep(LOOK_PERIOD);
     }

@@ -83,6 +83,8 @@ pub(crate) struct ManagedProcess {
     /// When it last said that its loops turn, or was asked to begin.
     pub(super) heard: Instant,
     seen_alive: Instant,
+    /// When its end was seen.
+    seen_ended: Option<Instant>,
     complaint: Option<Failure>,
     /// Warnings for which there was no room.
     left_out_count: u64,
@@ -146,6 +148,7 @@ impl ProcessGroup {
             is_ready: false,
             heard: Instant::ZERO,
             seen_alive: Instant::ZERO,
+            seen_ended: None,
             complaint: None,
             left_out_count: 0,
         });
@@ -285,6 +288,7 @@ impl ProcessGroup {
         let now = MonotonicClock::now();
         member.child = Some(child);
         member.complaint = None;
+        member.seen_ended = None;
         member.seen_alive = now;
         if member.is_ready && self.started.is_some() {
             self.close_interruptions(index, now);
@@ -339,9 +343,8 @@ impl ProcessGroup {
             };
             // Its last words decide what its end means. They come within moments, unless something that it started
             // has its output, too.
-            if !child.has_said_all()
-                && now.saturating_duration_since(member.seen_alive) < LAST_WORDS_PATIENCE
-            {
+            let ended = *member.seen_ended.get_or_insert(now);
+            if !child.has_said_all() && now.saturating_duration_since(ended) < LAST_WORDS_PATIENCE {
                 continue;
             }
             member.child = None;

@@ -225,15 +225,15 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
     if let Some(found) = found.next() {
         return found;
     }
+    let changes = harms.iter().map(|one| one.change);
+    if changes.clone().any(|change| change == Change::More) {
+        return Hurt::Yes;
+    }
     if harms
         .iter()
         .any(|one| one.base.count.is_none() || one.new.count.is_none())
     {
         return not_resolvable(Unresolved::NotCounted);
-    }
-    let changes = harms.iter().map(|one| one.change);
-    if changes.clone().any(|change| change == Change::More) {
-        return Hurt::Yes;
     }
     let is_unhurt = harms.iter().all(|one| one.new.count == Some(0));
     let is_less = changes.clone().any(|change| change == Change::Less)

@@ -150,11 +150,9 @@ fn messages(summary: &RunSummary) -> Option<String> {
     if let Some((length_ns, name, period_ns)) = gaps.max().filter(|(length_ns, ..)| *length_ns > 0)
     {
         let due = period_ns.filter(|ns| *ns > 0);
-        let due = due.map_or_else(String::new, |ns| {
-            format!(", where one is due every {}", duration(ns))
-        });
+        let due = due.map_or_else(String::new, |ns| format!(" (every {})", duration(ns)));
         text = format!(
-            "{text}; longest gap {}, on {name}{due}",
+            "{text}; longest gap {} after one was due{due}, on {name}",
             duration(length_ns)
         );
     }

@@ -17,7 +17,7 @@ Examples:
 const SET_EXAMPLES: &str = "\
 Examples:
   hil-runtime link set hop --delay 120ms --loss 0.3
-      both directions of link hop: 50 ms one way, every tenth message lost
+      both directions of link hop: 120 ms one way, three of ten messages lost
   hil-runtime link set hop.backward --cut
       nothing gets through from the second host to the first
   hil-runtime link set hop --delay 120ms runs/teleop-emulated-20261122-101500

@@ -27,6 +27,7 @@ use self::next::{Found, Next, REFUSED_MAX, Target, next};
 use super::RunArgument;
 use super::recorded::recorded;
 use crate::compare::{ComparedRun, add_leaves};
+use crate::summary::Outcome;
 
 /// A trial only shows whether the host keeps up.
 const TRIAL: &str = "15 s";
@@ -50,7 +51,9 @@ const NAMED_COUNT: usize = 4;
 pub enum RunEnd {
     /// What it left tells.
     Over,
-    /// It did not begin, and another one with these arguments would not either.
+    /// This host has too little for it.
+    HostTooSmall,
+    /// If it did not begin, another one with these arguments would not either.
     Hopeless,
 }
 
@@ -87,6 +90,9 @@ pub enum RecordingError {
         /// What is wrong, and where.
         problem: String,
     },
+    /// A signal came while the last run of a call before was waited for.
+    #[error("interrupted while the last run of a call before was waited for")]
+    Interrupted,
     /// Another call records into the folder.
     #[error(
         "{}: another call records into this folder, or a run of one that was killed has not ended yet",
@@ -432,9 +438,10 @@ fn lock(folder: &Path, signals: &Signals, console: &mut Console) -> Result<Said,
     loop {
         match file.try_lock() {
             Ok(()) => return Ok(Said { path, file }),
-            Err(TryLockError::WouldBlock)
-                if Instant::now() < deadline && signals.received().is_none() =>
-            {
+            Err(TryLockError::WouldBlock) if signals.received().is_some() => {
+                return Err(RecordingError::Interrupted);
+            }
+            Err(TryLockError::WouldBlock) if Instant::now() < deadline => {
                 progress.show(
                     console,
                     None,
@@ -605,21 +612,31 @@ impl RunMaker<'_> {
             meanwhile(share.min(1.0), self.console);
         });
         let end = end.map_err(failed)?;
-        if end == RunEnd::Hopeless {
-            return Ok(Made::Hopeless(self.said.last_line()));
-        }
         let folder = row.folder.ended().map_err(failed)?;
+        if folder.is_none() && end != RunEnd::Over {
+            let why = self.said.last_line();
+            return Ok(match (end, part) {
+                // One copy fewer may be kept.
+                (RunEnd::HostTooSmall, Part::Trial(2..)) => Made::Refused(why),
+                _ => Made::Hopeless(why),
+            });
+        }
+        let mut ended_elsewhere = None;
         let outcome = folder
             .ok_or_else(|| self.said.last_line())
             .and_then(|folder| {
                 let run = ComparedRun::read(&folder).map_err(|error| error.to_string())?;
+                let facts = &run.summary.run;
+                ended_elsewhere =
+                    (facts.outcome == Outcome::Stopped).then(|| facts.exit_reason.clone());
                 let count = row.judge(run, part)?;
                 Ok(Made::Sound { folder, count })
             });
         Ok(match outcome {
             Ok(made) => made,
             Err(_) if self.signals.received().is_some() => Made::Interrupted,
-            Err(why) => Made::Refused(why),
+            // As the call on the host that ended it, this one makes it again: all hosts make the same runs.
+            Err(why) => ended_elsewhere.map_or(Made::Refused(why), Made::Hopeless),
         })
     }
 }
