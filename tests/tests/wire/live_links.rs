@@ -276,7 +276,7 @@ fn check_report(files: &RunFiles) {
         let text = files.read(name).replace('\u{a0}', " ");
         text.split_whitespace().collect::<Vec<_>>().join(" ")
     };
-    let words = "link hop.backward changed by hand: delay 40.0 ms, loss 0.2";
+    let words = "link hop.backward changed by hand: delay 40.0 ms, loss 20.00 %";
     assert!(plain("report-full.txt").contains(words));
     let line = format!("{at_s:.6} notice {words}");
     assert!(plain("events.log").contains(&line), "{line}");
