@@ -12,7 +12,8 @@ Examples:
       interval
   hil-runtime compare --base runs/a1 runs/a2 --new runs/b1 runs/b2
       repetitions: intervals then know how runs differ from each other
-  hil-runtime compare --base runs/a1 runs/a2 --new runs/b1 runs/b2 --fail-if \"p99 > 1.2x\"
+  hil-runtime compare --base runs/a1 runs/a2 --new runs/b1 runs/b2 \\
+      --fail-if \"p99 > 1.2x\"
       for a script: exit code 1 when a condition holds beyond the figure's
       interval
   hil-runtime compare runs/before runs/after --format md > comparison.md

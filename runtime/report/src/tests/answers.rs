@@ -605,7 +605,7 @@ fn answer_cause_and_validity_stand_in_twelve_lines() {
         "measurement valid as far as known: what 1 killed",
         "gravest harm at 4.921 s: robots 3 and 5",
         "network before it outage of 800 ms on fleet/authority",
-        "where one is due every",
+        "after one was due (every",
         "(hand movements out and back",
     ] {
         assert!(block.contains(words), "{words}:\n{block}");

@@ -399,7 +399,7 @@ fn another_schema_is_refused_by_its_number() {
         let text = format!("{{\"schema_version\": {version}, \"runs\": []}}");
         let error = RunSummary::from_json(&text).unwrap_err();
         assert!(matches!(error, SummaryError::OtherSchema { found } if found == version));
-        let words = format!("schema version {version} is not 2, the one that is read");
+        let words = format!("schema version {version} is not 3, the one that is read");
         assert_eq!(error.to_string(), words);
     }
     assert!(matches!(
