@@ -62,7 +62,7 @@ Examples:
       Ethernet and short-range Wi-Fi 6, one that stands for itself
   hil-runtime tables --record deploy/recordings/fleet.toml
       the runs of those rows are made first, hours of them; the same command
-      goes on where it was ended or killed
+      resumes where it was ended or killed
 
 Equal seeds give equal tables, whatever the number of threads. Ctrl-C prints
 what is complete. Exit code 1 when a criterion is missed.";

@@ -362,6 +362,8 @@ fn the_hash_changes_with_every_meaning_and_with_no_spelling() {
     let hash = |overrides: &[&str]| load_shipped("split.toml", overrides).hash();
     let base = hash(&[]);
     assert_eq!(hash(&["run.duration=20000 ms"]), base);
+    // Each host has its own.
+    assert_eq!(hash(&["run.record=elsewhere/runs"]), base);
     assert_eq!(hash(&["processes.robot.wait=\"block\""]), base);
     for different in [
         "run.seed=2",

@@ -43,7 +43,7 @@ const INTERFACES: &str = "eth";
 const LINE_BYTES_MAX: usize = 4096;
 /// How often it is looked whether a host has ended.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
-/// How long the others may go on once a host has failed. Of a run that had begun they know by then and end by themselves.
+/// How long the others are left running once a host has failed. Of a run that had begun they know by then and end by themselves.
 const PATIENCE: Duration = Duration::from_secs(2);
 /// A run that begins before is told that nothing leaves its interface.
 const WIRES_UP_WITHIN: Duration = Duration::from_secs(2);

@@ -341,7 +341,7 @@ impl ProcessGroup {
                 member.seen_alive = now;
                 continue;
             };
-            // Its last words decide what its end means. They come within moments, unless something that it started
+            // What it said last decides what its end means. That comes within moments, unless something that it started
             // has its output, too.
             let ended = *member.seen_ended.get_or_insert(now);
             if !child.has_said_all() && now.saturating_duration_since(ended) < LAST_WORDS_PATIENCE {

@@ -393,7 +393,7 @@ pub fn record(
 ) -> Result<Recorded, RecordingError> {
     let rows = rows(recording, tables, registry)?;
     let said = lock(Path::new(&recording.folder), signals, console)?;
-    // Before the first run, so that nobody waits for hours to hear of another row's.
+    // Before the first run: a fault of the last row would be told after hours.
     let found = rows.iter().map(Row::found).collect::<Result<Vec<_>, _>>()?;
     let mut recorded = Recorded::default();
     let mut maker = RunMaker {
@@ -744,6 +744,49 @@ mod tests {
             late.contains("took 5.50 ms for half of their messages and 0.50 ms"),
             "{late}"
         );
+    }
+
+    #[test]
+    fn a_run_that_does_not_begin_ends_the_row_and_a_trial_that_is_too_large_does_not() {
+        let root = std::env::temp_dir().join(format!("hil-recording-{}", std::process::id()));
+        fs::create_dir_all(&root).unwrap();
+        let row = Row {
+            folder: RowFolder::new(root.join("a")),
+            ..row(&[])
+        };
+        let made = |end: RunEnd, part: Part| {
+            let path = root.join(LAST_RUN);
+            let mut said = File::options();
+            let said = said.create(true).truncate(true).read(true).write(true);
+            let file = said.open(&path).unwrap();
+            let mut maker = RunMaker {
+                registry: &registry(),
+                host: None,
+                start: &mut |_, output, _| {
+                    io::Write::write_all(&mut { output }, b"error: too little\n")?;
+                    Ok(end)
+                },
+                said: Said { path, file },
+                signals: &Signals::install().unwrap(),
+                console: &mut Console::new(true),
+            };
+            match maker.make(&row, part, None, &mut |_, _| {}).unwrap() {
+                Made::Refused(why) => ("refused", why),
+                Made::Hopeless(why) => ("hopeless", why),
+                Made::Sound { .. } | Made::Interrupted => panic!("it left nothing"),
+            }
+        };
+        for (end, part, expected) in [
+            (RunEnd::HostTooSmall, Part::Trial(2), "refused"),
+            (RunEnd::HostTooSmall, Part::Trial(1), "hopeless"),
+            (RunEnd::HostTooSmall, Part::Run(1), "hopeless"),
+            (RunEnd::Hopeless, Part::Trial(2), "hopeless"),
+            (RunEnd::Over, Part::Run(1), "refused"),
+        ] {
+            let why = "error: too little".to_owned();
+            assert_eq!(made(end, part), (expected, why), "{end:?} {part:?}");
+        }
+        fs::remove_dir_all(root).unwrap();
     }
 
     #[test]
