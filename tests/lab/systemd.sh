@@ -12,7 +12,7 @@
 # `systemctl enable --now` whose account closes, with its report and recording; units that come
 # back by themselves after the supervisor was killed, after a process of a run hung, after the
 # supervisor hung, and after a boot; a clean stop; what a user without rights is told; and that a purge
-# leaves nothing. Needs root; installs mmdebstrap and makes a root file system of 300 MB in the cache
+# leaves nothing. Needs root and python3; installs mmdebstrap and makes a root file system of 300 MB in the cache
 # folder the first time (see lib.sh). Takes about three minutes after that and never more than fifteen.
 # Exit code 0 when all holds, 1 when something does not, 2 when the lab could not be set up.
 set -u -o pipefail
@@ -156,10 +156,15 @@ is_waiting_and_up() {
 
 # Every channel that carried messages closes for all of them.
 account_closes() {
-    pc "$1" cat "$(newest split "$1")/report-full.txt" | awk '$1 == "account" && $2 == "closes" { channels += 1; gsub(",", "")
-            messages += $6; if ($4 != $6) open += 1 }
-        END { printf "%d channels, %d messages, %d channels open", channels, messages, open
-            exit channels < 4 || messages < 1000 || open > 0 }'
+    pc "$1" cat "$(newest split "$1")/summary.json" | python3 -c '
+import json, sys
+channels = [c["account"] for c in json.load(sys.stdin)["channels"]]
+channels = [a for a in channels if a and a["published_count"]]
+closings = [a["closing"] for a in channels]
+checked = sum(c.get("checked_count", 0) for c in closings)
+unclosed = [c for c in closings if c["state"] != "checked" or c["closed_count"] != c["checked_count"]]
+print(f"{len(closings)} channels, {checked} messages, {len(unclosed)} channels open")
+sys.exit(len(closings) < 4 or checked < 1000 or len(unclosed) > 0)'
 }
 
 # The last lines of a run.
@@ -391,6 +396,7 @@ is_done_after_boot() { is_done split "$1" && [[ $(finished_runs split "$1") -eq 
 
 main() {
     local name
+    lab_need python3 python3-minimal
     pcs_requirements
     if [[ -z $DEB ]]; then
         lab_say "package"
