@@ -194,6 +194,9 @@ pub struct RecordedRun<P> {
     pub crossing: RecordedCrossing,
     /// The figures of its score by name.
     pub score: BTreeMap<String, RecordedMetric>,
+    /// Scores of the same robots in virtual time over the traces of this run, each with a seed of its own, or why there are
+    /// none; empty where none was asked for.
+    pub replays: Result<Vec<BTreeMap<String, RecordedMetric>>, String>,
     /// Why it may be held against nothing; empty for most.
     pub doubts: Vec<Doubt>,
 }
@@ -256,6 +259,7 @@ impl<P> RecordedRun<P> {
             parameters,
             crossing: self.crossing,
             score: self.score,
+            replays: self.replays,
             doubts: self.doubts,
         })
     }

@@ -5,10 +5,11 @@ use core::fmt;
 use std::collections::BTreeMap;
 
 use hil_core::interval::{Interval, Spread, TooSmall};
-use hil_core::recorded_run::{Doubt, LinkOrigin, RecordedRun};
+use hil_core::recorded_run::{Doubt, LinkOrigin, RecordedCrossing, RecordedRun};
 use hil_core::study::Verdict;
 
-use crate::comparison::{Estimate, Scatter, Share, estimate_against_published};
+use crate::comparison::{Estimate, Judge, Scatter, Share, estimate_against_published};
+use crate::statistics::clopper_pearson_at;
 
 /// What happened in one run: so many of so many.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -147,6 +148,31 @@ impl PooledShare {
         estimate_against_published(published, ours, effective, self.scatter)
             .unwrap_or(Verdict::NotComparable)
     }
+
+    /// How it stands to what happened in the `recorded` runs of which it is the replay: given how often it happened in
+    /// both, how often in those is binomial (Przyborowski and Wilenski 1940). Counts are divided by the larger scatter of the two.
+    fn against_recorded(&self, recorded: &Self, judge: Judge) -> Verdict {
+        let both = self.share.count + recorded.share.count;
+        let is_enough = 2 * self.share.of >= recorded.share.of;
+        if both > 0 {
+            let known = [self, recorded].into_iter();
+            let known = known.filter(|one| one.interval.is_some());
+            let Some(scatter) = known.map(|one| one.scatter).reduce(f64::max) else {
+                return Verdict::Inconclusive;
+            };
+            let confidence = judge.miss_confidence();
+            let found = clopper_pearson_at(recorded.share.count, both, scatter, confidence);
+            let expected = recorded.share.of as f64 / (recorded.share.of + self.share.of) as f64;
+            if found.is_some_and(|interval| !interval.holds(expected)) {
+                return Verdict::Differs;
+            }
+        }
+        if is_enough {
+            Verdict::Agrees
+        } else {
+            Verdict::Inconclusive
+        }
+    }
 }
 
 /// Runs that make one row: those of one published network, one link and like parameters, or a run alone.
@@ -158,6 +184,8 @@ pub struct RecordedRow<P> {
     left_out: Vec<RecordedRun<P>>,
     /// Another row has the same name otherwise.
     is_named_by_folder: bool,
+    /// What happened is of replays of the runs.
+    is_replay: bool,
 }
 
 impl<P> RecordedRow<P> {
@@ -178,6 +206,7 @@ impl<P> RecordedRow<P> {
                     runs: vec![run],
                     left_out: Vec::new(),
                     is_named_by_folder: false,
+                    is_replay: false,
                 });
                 continue;
             };
@@ -215,12 +244,49 @@ impl<P> RecordedRow<P> {
         self.runs.first().expect("a row is made of a run")
     }
 
+    /// The same robots in virtual time over the traces of its runs; `None` where no run was replayed.
+    pub fn replayed(&self) -> Option<Self>
+    where
+        P: Clone,
+    {
+        let of_run = |run: &RecordedRun<P>| -> Vec<_> {
+            let scores = run.replays.iter().flatten();
+            let replay = |score: &BTreeMap<_, _>| {
+                let what = || "that of the runs themselves".to_owned();
+                RecordedRun {
+                    score: score.clone(),
+                    replays: Ok(Vec::new()),
+                    crossing: RecordedCrossing {
+                        offered_count: 0,
+                        lost_count: Err(what()),
+                        delays: Err(what()),
+                    },
+                    ..run.clone()
+                }
+            };
+            scores.map(replay).collect()
+        };
+        let runs: Vec<_> = self.runs.iter().flat_map(of_run).collect();
+        (!runs.is_empty()).then(|| Self {
+            runs,
+            left_out: Vec::new(),
+            is_named_by_folder: self.is_named_by_folder,
+            is_replay: true,
+        })
+    }
+
+    /// True of what happened in replays.
+    pub const fn is_replay(&self) -> bool {
+        self.is_replay
+    }
+
     /// How it was obtained, as the paper's first column has it.
     pub fn method(&self) -> String {
         let first = self.first();
         let row = first.row.as_ref().unwrap_or(&first.name);
         let network = first.network.map_or(row.as_str(), |one| one.label());
-        let mut name = format!("HiL, {network}, {}", first.link.origin);
+        let how = if self.is_replay { "Replay" } else { "HiL" };
+        let mut name = format!("{how}, {network}, {}", first.link.origin);
         if self.is_named_by_folder {
             name = format!("{name}, {}", first.folder);
         }
@@ -274,6 +340,20 @@ impl<P> RecordedRow<P> {
         }
     }
 
+    /// How what `happened` in these replays stands to what did in the `recorded` runs.
+    pub fn verdict_of_replay(
+        &self,
+        happened: &PooledShare,
+        recorded: &PooledShare,
+        judge: Judge,
+    ) -> Verdict {
+        if self.first().is_sound() {
+            happened.against_recorded(recorded, judge)
+        } else {
+            Verdict::NotComparable
+        }
+    }
+
     /// What a reader must know of the row: its runs, its link, what its interval rests on, and why it is not compared
     /// or lacks a figure.
     pub fn note(&self, happened: &PooledShare) -> String {
@@ -302,6 +382,9 @@ impl<P> RecordedRow<P> {
             if let Err(why) = &crossing.delays {
                 parts.push(format!("{of}delays are unavailable: {why}"));
             }
+            if let Err(why) = &run.replays {
+                parts.push(format!("{of}not replayed: {why}"));
+            }
         }
         let left_out = self.left_out.iter().map(|run| {
             let doubts: Vec<_> = run.doubts.iter().map(Doubt::to_string).collect();
@@ -318,12 +401,38 @@ pub const ROWS_NOTE: &str = "HiL with a kind of link: recorded runs in real time
                              network's, of all messages on the channels that crossed it, delays by a histogram of \
                              20 bins a decade";
 
+/// What a table with replays says of them all.
+pub const REPLAYS_NOTE: &str = "Replay: the same robots in virtual time over the traces of the runs in the row above, with \
+                                seeds of their own; the verdict is against that row";
+
+/// What the verdicts of a case's replays come to; `None` of none.
+pub fn replays_summary(verdicts: &[Verdict]) -> Option<String> {
+    let count = |wanted| verdicts.iter().filter(|one| **one == wanted).count();
+    let counts = Verdict::ALL
+        .map(|one| (count(one), one.words()))
+        .into_iter();
+    let counts = counts.filter(|(count, _)| *count > 0);
+    let counts: Vec<_> = counts
+        .map(|(count, words)| format!("{words} {count}"))
+        .collect();
+    (!verdicts.is_empty()).then(|| {
+        format!(
+            "Against their own traces in virtual time, of {} rows: {}; any of them differs by chance in one of twenty tables.",
+            verdicts.len(),
+            counts.join(", ")
+        )
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     use hil_core::interval::IntervalMethod;
-    use hil_core::recorded_run::{DelayBin, PublishedNetwork, RecordedCrossing, RecordedLink};
+    use hil_core::random::RandomStream;
+    use hil_core::recorded_run::{
+        DelayBin, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
+    };
 
     const fn share(count: u64, of: u64) -> Share {
         Share { count, of }
@@ -358,6 +467,7 @@ mod tests {
                 ]),
             },
             score: BTreeMap::new(),
+            replays: Ok(Vec::new()),
             doubts: Vec::new(),
         }
     }
@@ -564,5 +674,98 @@ mod tests {
         assert_eq!(verdict(&late), Verdict::NotComparable);
         let expected = "not comparable: 3 of 500 ticks were skipped";
         assert!(late.note(&happened).contains(expected));
+    }
+
+    /// How often, of `times` pairs of samples with these rates, a replay differs from its row, alone in its table.
+    fn differing(seed: u64, rates: [f64; 2], sizes: [u64; 2], times: u64) -> f64 {
+        let mut random = RandomStream::new(seed, "replays");
+        let mut sample = |rate: f64, of: u64| {
+            // In four runs, of which each draws for itself.
+            let mut run = |_| {
+                let hits = (0..of / 4).filter(|_| random.uniform() < rate);
+                RunShare {
+                    share: share(hits.count() as u64, of / 4),
+                    interval: None,
+                }
+            };
+            let runs: Vec<_> = (0..4).map(&mut run).collect();
+            PooledShare::of(&runs, Some(1.0))
+        };
+        let judge = Judge::of_tests(1);
+        let differing = (0..times).filter(|_| {
+            let [recorded, replay] = [0, 1].map(|one| sample(rates[one], sizes[one]));
+            replay.against_recorded(&recorded, judge) == Verdict::Differs
+        });
+        differing.count() as f64 / times as f64
+    }
+
+    #[test]
+    fn replays_of_the_same_rate_seldom_differ_and_those_of_another_do() {
+        for (seed, sizes) in [(1, [2000, 2000]), (2, [2000, 8000])] {
+            let alike = differing(seed, [0.005, 0.005], sizes, 400);
+            assert!(alike <= 0.05, "seed {seed}: {alike}");
+            let other = differing(seed, [0.01, 0.05], sizes, 100);
+            assert!(other >= 0.9, "seed {seed}: {other}");
+        }
+    }
+
+    #[test]
+    fn a_replay_is_a_row_of_its_own_beside_the_runs() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let metric = RecordedMetric {
+            value: Some(3.0),
+            interval: None,
+        };
+        let score = || BTreeMap::from([("collisions".to_owned(), metric)]);
+        let mut first = run("a", short, 1);
+        first.replays = Ok(vec![score(), score()]);
+        let mut other = run("b", short, 2);
+        other.replays = Err("it left no traces".to_owned());
+        let row = RecordedRow::of_runs(vec![first, other], |_, _| true).remove(0);
+        let replay = row.replayed().unwrap();
+        assert!(replay.is_replay() && replay.runs().len() == 2);
+        assert_eq!(replay.runs()[1].count("collisions").unwrap(), 3);
+        assert_eq!(
+            replay.method(),
+            "Replay, short-range Wi-Fi 6, emulated link"
+        );
+        // Loss and delay are those of the row.
+        assert_eq!((replay.loss_ratio(), replay.delay_ms(0.5)), (None, None));
+        let none = PooledShare::of(&[], Some(1.0));
+        assert!(
+            row.note(&none)
+                .contains("b: not replayed: it left no traces")
+        );
+        let alone = RecordedRow::of_runs(vec![run("c", short, 3)], |_, _| true);
+        assert_eq!(alone[0].replayed(), None);
+    }
+
+    #[test]
+    fn a_replay_that_saw_as_little_agrees_and_a_small_one_decides_nothing() {
+        let of = |count, of, interval: Option<[f64; 2]>| {
+            let interval = interval
+                .map(|[low, high]| Interval::new(low, high, IntervalMethod::EffectiveShare));
+            let interval = interval.map(Spread::Known);
+            PooledShare::of(
+                &[RunShare {
+                    share: share(count, of),
+                    interval,
+                }],
+                None,
+            )
+        };
+        let judge = Judge::of_tests(3);
+        let verdict =
+            |recorded: &PooledShare, replay: &PooledShare| replay.against_recorded(recorded, judge);
+        let none = of(0, 890, None);
+        assert_eq!(verdict(&none, &of(0, 3560, None)), Verdict::Agrees);
+        assert_eq!(verdict(&none, &of(0, 400, None)), Verdict::Inconclusive);
+        // How those of the replay come together is known.
+        let many = of(356, 3560, Some([0.0901, 0.1099]));
+        assert_eq!(verdict(&none, &many), Verdict::Differs);
+        assert_eq!(verdict(&none, &of(356, 3560, None)), Verdict::Inconclusive);
+        assert_eq!(replays_summary(&[]), None);
+        let words = replays_summary(&[Verdict::Agrees, Verdict::Differs, Verdict::Agrees]).unwrap();
+        assert!(words.contains("of 3 rows: agrees 2, differs 1;"), "{words}");
     }
 }

@@ -135,17 +135,39 @@ impl Manifest {
     /// # Errors
     /// When the program does not read it as the one that ran.
     pub fn read_topology(&self, known: &KnownCases) -> Result<Topology, ManifestTopologyError> {
-        let table = toml::Table::deserialize(&self.topology)
-            .map_err(|error| ManifestTopologyError::Table(error.to_string()))?;
-        let text = toml::to_string(&table)
-            .map_err(|error| ManifestTopologyError::Table(error.to_string()))?;
-        let topology = hil_topology::parse(&self.topology_file, &text, &[], known)?;
+        let topology = self.parse(&self.topology, known)?;
         let found = topology_hash(&topology);
         if found != self.topology_hash {
             let wanted = self.topology_hash.clone();
             return Err(ManifestTopologyError::Hash { found, wanted });
         }
         Ok(topology)
+    }
+
+    /// The topology that ran, but for what `change` makes of it.
+    ///
+    /// # Errors
+    /// When the program does not read it.
+    pub fn read_changed_topology(
+        &self,
+        change: impl FnOnce(&mut Value),
+        known: &KnownCases,
+    ) -> Result<Topology, ManifestTopologyError> {
+        let mut topology = self.topology.clone();
+        change(&mut topology);
+        self.parse(&topology, known)
+    }
+
+    fn parse(
+        &self,
+        topology: &Value,
+        known: &KnownCases,
+    ) -> Result<Topology, ManifestTopologyError> {
+        let table = toml::Table::deserialize(topology)
+            .map_err(|error| ManifestTopologyError::Table(error.to_string()))?;
+        let text = toml::to_string(&table)
+            .map_err(|error| ManifestTopologyError::Table(error.to_string()))?;
+        Ok(hil_topology::parse(&self.topology_file, &text, &[], known)?)
     }
 }
 

@@ -120,6 +120,20 @@ fn rows_that_were_ended_and_killed_become_those_of_their_runs() {
         counted.as_u64().is_some_and(|count| count >= 5),
         "{counted}"
     );
+    // Each run was replayed four times, with as many loops or one more or less.
+    let replay = &tables_of(&resumed)[0]["rows"][2];
+    let words = replay[0]["text"].as_str().unwrap_or_default();
+    assert_eq!(
+        words, "Replay, short-range Wi-Fi 6, emulated link",
+        "{replay}"
+    );
+    let replayed = replay[6]["count"].as_u64().unwrap();
+    let wanted = 4 * counted.as_u64().unwrap();
+    let runs = sound_runs(&row).len() as u64;
+    assert!(
+        replayed.abs_diff(wanted) <= 4 * runs,
+        "{replayed} for {wanted}"
+    );
     // Nothing is missing, so that it only prints.
     let names = sound_runs(&row);
     let again = record(&folder).wait_within(LIMIT).unwrap();

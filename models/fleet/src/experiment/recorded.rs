@@ -21,6 +21,8 @@ pub(crate) struct FleetRow {
     pub(crate) row: RecordedRow<FleetParameters>,
     /// What the referee of all its runs counted: sections and collisions.
     pub(crate) tally: Tally,
+    /// The same in virtual time over the traces of its runs.
+    pub(crate) replay: Option<Box<Self>>,
     collided: Vec<RunShare>,
 }
 
@@ -78,10 +80,12 @@ impl FleetRow {
                 interval: run.interval(COLLISION_RATIO.name),
             });
         }
+        let replay = row.replayed().map(Self::of).transpose()?;
         Ok(Self {
             scenario: row.first().parameters.world.scenario,
             row,
             tally,
+            replay: replay.map(Box::new),
             collided,
         })
     }
@@ -93,7 +97,7 @@ impl FleetRow {
 
     /// The paper's row for the same network.
     pub(crate) fn published(&self) -> Option<&'static PublishedRow> {
-        let network = self.row.first().network?;
+        let network = self.row.first().network.filter(|_| !self.row.is_replay())?;
         let mut rows = published_rows(self.scenario).iter();
         rows.find(|row| row.condition == Condition::HardwareInTheLoop(network))
     }
@@ -132,6 +136,7 @@ mod tests {
         DelayBin, LinkOrigin, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
     };
     use hil_core::study::{Cell, Study, StudyReport, Verdict};
+    use std::collections::BTreeMap;
 
     /// A run of so many collisions, true overlaps, overlaps outside every section, and critical sections.
     fn run(
@@ -173,6 +178,7 @@ mod tests {
                 }]),
             },
             score: score.collect(),
+            replays: Ok(Vec::new()),
             doubts: Vec::new(),
         }
     }
@@ -332,6 +338,45 @@ mod tests {
         let harbor = row(0, 10);
         assert_eq!(harbor[6], Cell::text("0 / 0 / 0"));
         assert_eq!(harbor[13], Cell::Verdict(Verdict::Differs));
+    }
+
+    #[test]
+    fn a_replayed_row_is_followed_by_what_its_traces_did_in_virtual_time() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let mut one = run("runs/a", short, Scenario::Harbor, [14, 20, 0, 15_489]);
+        one = with_interval(one, [0.000_5, 0.001_5]);
+        let scores = [[13, 20, 1, 15_500], [60, 70, 0, 15_500]];
+        let scores = scores.map(|counts| run("", None, Scenario::Harbor, counts).score);
+        let replayed = |scores: &[BTreeMap<String, RecordedMetric>]| {
+            let mut one = one.clone();
+            one.replays = Ok(scores.to_vec());
+            report(vec![one]).unwrap()
+        };
+        let found = replayed(&scores[..1]);
+        let harbor = &found.tables[0];
+        let at = harbor
+            .rows
+            .iter()
+            .position(|row| row[0] == Cell::text("Replay, short-range Wi-Fi 6, real link"));
+        let [row, replay] = harbor.rows[at.unwrap() - 1..=at.unwrap()]
+            .as_array()
+            .unwrap();
+        assert_eq!(row[0], Cell::text("HiL, short-range Wi-Fi 6, real link"));
+        assert_eq!(replay[1..5], [const { Cell::Absent }; 4]);
+        assert_eq!(replay[5], Cell::Count(15_500));
+        assert_eq!(replay[6], Cell::text("13 / 20 / 1"));
+        assert_eq!(replay[9..13], [const { Cell::Absent }; 4]);
+        assert_eq!(replay[13], Cell::Verdict(Verdict::Agrees));
+        assert!(harbor.notes.iter().any(|note| note.starts_with("Replay: ")));
+        let last = found.summary.last().unwrap();
+        assert!(last.contains("of 1 rows: agrees 1;"), "{last}");
+        let other = replayed(&scores[1..]);
+        assert_eq!(
+            other.tables[0].rows[at.unwrap()][13],
+            Cell::Verdict(Verdict::Differs)
+        );
+        let last = other.summary.last().unwrap();
+        assert!(last.contains("of 1 rows: differs 1;"), "{last}");
     }
 
     #[test]

@@ -13,7 +13,7 @@ use crate::scenario::Scenario;
 use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_link::impaired::DelayLaw;
 use hil_stats::comparison::{Judge, Scatter, Share, against_published, welch};
-use hil_stats::recorded::{PooledShare, ROWS_NOTE};
+use hil_stats::recorded::{PooledShare, REPLAYS_NOTE, ROWS_NOTE, replays_summary};
 use hil_stats::statistics::CONFIDENCE;
 
 /// A cell with what came of it; `None` when it was not run.
@@ -39,18 +39,37 @@ struct RecordedResult<'a> {
     of: &'a FleetRow,
     collided: PooledShare,
     verdict: Verdict,
+    replay: Option<Box<Self>>,
 }
 
 impl<'a> RecordedResult<'a> {
-    /// Without a collision, collisions are taken to scatter by `of_none`.
-    fn new(of: &'a FleetRow, of_none: f64) -> Self {
+    /// Without a collision, collisions are taken to scatter by `of_none`; `judge` is that of the replays.
+    fn new(of: &'a FleetRow, of_none: f64, judge: Judge) -> Self {
         let collided = of.pooled(of_none);
         let published = of.published().map(PublishedRow::share);
+        let replay = of.replay.as_deref().map(|of| {
+            let replayed = of.pooled(of_none);
+            Box::new(Self {
+                of,
+                collided: replayed,
+                verdict: of.row.verdict_of_replay(&replayed, &collided, judge),
+                replay: None,
+            })
+        });
         Self {
             of,
             collided,
             verdict: of.row.verdict(&collided, published),
+            replay,
         }
+    }
+
+    /// Its row and that of its replay.
+    fn rows(&self) -> impl Iterator<Item = Vec<Cell>> {
+        [Some(self), self.replay.as_deref()]
+            .into_iter()
+            .flatten()
+            .map(Self::cells)
     }
 
     fn cells(&self) -> Vec<Cell> {
@@ -91,8 +110,10 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
     let mut tables = Vec::new();
     let of_none = scatter(results).divisor().unwrap_or(1.0);
     let recorded = study.recorded.iter();
+    let replay_count = recorded.clone().filter(|one| one.replay.is_some()).count();
+    let of_replays = Judge::of_tests(replay_count);
     let recorded: Vec<_> = recorded
-        .map(|of| RecordedResult::new(of, of_none))
+        .map(|of| RecordedResult::new(of, of_none, of_replays))
         .collect();
     let has_published = !results.iter().all(CellResult::is_mechanism);
     if has_published || !recorded.is_empty() {
@@ -115,6 +136,10 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
             (name, one.verdict)
         }))
         .collect();
+    let replays = recorded.iter().filter_map(|one| one.replay.as_deref());
+    let replays: Vec<_> = replays.map(|one| one.verdict).collect();
+    let mut summary = study::summary(&named, &criteria);
+    summary.extend(replays_summary(&replays));
     StudyReport {
         title: study::title(
             "Case study 1: collisions per critical section (CS)",
@@ -122,7 +147,7 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
         ),
         notes: notes(study, results),
         tables,
-        summary: study::summary(&named, &criteria),
+        summary,
         larger: larger(study, &verdicts, &criteria),
         criteria,
     }
@@ -262,7 +287,7 @@ fn published_table(
         }
         let beside = recorded.iter();
         let beside = beside.filter(|one| one.of.published() == Some(published));
-        rows.extend(beside.map(|one| one.cells()));
+        rows.extend(beside.flat_map(|one| one.rows()));
     }
     for one in ours() {
         if let Place::Variant(variant) = one.place() {
@@ -280,7 +305,7 @@ fn published_table(
         }
     }
     let alone = recorded.iter().filter(|one| one.of.published().is_none());
-    rows.extend(alone.map(|one| one.cells()));
+    rows.extend(alone.flat_map(|one| one.rows()));
     let mut columns = vec![
         Column::new("method", "Method"),
         Column::new("loss_ratio", "PLR"),
@@ -312,6 +337,9 @@ fn published_table(
     };
     if is_wide {
         table.notes.push(ROWS_NOTE.to_owned());
+        if recorded.iter().any(|one| one.replay.is_some()) {
+            table.notes.push(REPLAYS_NOTE.to_owned());
+        }
         let notes = recorded.iter();
         table
             .notes

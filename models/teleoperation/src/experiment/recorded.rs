@@ -8,7 +8,7 @@ use crate::score::{LOOPS_EXECUTED, LOOPS_SENT, MOTION_LOSS};
 use hil_core::options::{Difference, differences};
 use hil_core::recorded_run::{Doubt, PublishedNetwork, RecordedRun};
 use hil_core::study::{Cell, StudyRefusal, Verdict};
-use hil_stats::comparison::Share;
+use hil_stats::comparison::{Judge, Share};
 use hil_stats::recorded::{PooledShare, RecordedRow, RunShare};
 
 /// A row of recorded runs.
@@ -20,6 +20,8 @@ pub(crate) struct MotionLossRow {
     pub(crate) lost: PooledShare,
     /// How it stands to the paper.
     pub(crate) verdict: Verdict,
+    /// The same in virtual time over the traces of its runs; its verdict is against them.
+    pub(crate) replay: Option<Box<Self>>,
     /// The parameters of the table are the published ones.
     is_fitted: bool,
 }
@@ -46,7 +48,16 @@ impl MotionLossRow {
         }
         let rows = RecordedRow::of_runs(recorded, |one, other| different(one, other).is_empty());
         let rows = rows.into_iter();
-        rows.map(|row| Self::of(row, is_fitted)).collect()
+        let rows = rows.map(|row| Self::of(row, is_fitted));
+        let mut rows = rows.collect::<Result<Vec<_>, _>>()?;
+        let replay_count = rows.iter().filter(|one| one.replay.is_some()).count();
+        let judge = Judge::of_tests(replay_count);
+        for one in &mut rows {
+            if let Some(replay) = &mut one.replay {
+                replay.verdict = replay.row.verdict_of_replay(&replay.lost, &one.lost, judge);
+            }
+        }
+        Ok(rows)
     }
 
     fn of(
@@ -69,11 +80,15 @@ impl MotionLossRow {
         }
         // How lost loops would come together, runs without any do not tell.
         let lost = PooledShare::of(&lost, None);
-        let published = row.first().network.map(published).filter(|_| is_fitted);
+        let replay = row.replayed().map(|row| Self::of(row, is_fitted));
+        let replay = replay.transpose()?.map(Box::new);
+        let network = row.first().network.filter(|_| !row.is_replay());
+        let published = network.map(published).filter(|_| is_fitted);
         Ok(Self {
             verdict: row.verdict(&lost, published),
             row,
             lost,
+            replay,
             is_fitted,
         })
     }
@@ -88,7 +103,8 @@ impl MotionLossRow {
     }
 
     fn published(&self) -> Option<Share> {
-        self.row.first().network.map(published)
+        let network = self.row.first().network.filter(|_| !self.row.is_replay());
+        network.map(published)
     }
 
     /// True beside the row of `condition`, which is held against the same published rate.
@@ -212,6 +228,7 @@ mod tests {
             score: score
                 .map(|(label, metric)| (label.name.to_owned(), metric))
                 .into(),
+            replays: Ok(Vec::new()),
             doubts: Vec::new(),
         }
     }
@@ -253,6 +270,26 @@ mod tests {
         ];
         assert_eq!(columns, expected);
         assert_eq!(report.tables[0].notes.len(), 2);
+    }
+
+    #[test]
+    fn a_replayed_row_is_followed_by_what_its_traces_did_in_virtual_time() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let mut one = run("runs/a", short, [890, 883], Some([0.002, 0.014]));
+        one.replays = Ok(vec![run("", None, [890, 882], None).score; 4]);
+        let found = report("range", vec![one]).unwrap();
+        let rows = rows(&found);
+        let at = rows
+            .iter()
+            .position(|name| name == "Replay, short-range Wi-Fi 6, real link");
+        let at = at.unwrap();
+        assert_eq!(rows[at - 1], "HiL, short-range Wi-Fi 6, real link");
+        let replay = &found.tables[0].rows[at];
+        assert_eq!(replay[6..8], [Cell::Count(3560), Cell::Count(32)]);
+        assert_eq!(replay[8..12], [const { Cell::Absent }; 4]);
+        assert_eq!(replay.last(), Some(&Cell::Verdict(Verdict::Agrees)));
+        let last = found.summary.last().unwrap();
+        assert!(last.contains("of 1 rows: agrees 1;"), "{last}");
     }
 
     #[test]

@@ -7,7 +7,7 @@ use crate::experiment::study::MotionLossStudy;
 use crate::score::loops::LossKind;
 use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_stats::comparison::{Judge, Share, against_published, mean_interval};
-use hil_stats::recorded::ROWS_NOTE;
+use hil_stats::recorded::{REPLAYS_NOTE, ROWS_NOTE, replays_summary};
 use hil_stats::statistics::CONFIDENCE;
 
 /// A condition with the runs of it that ended.
@@ -32,6 +32,10 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
     let recorded = study.recorded.iter();
     let recorded = recorded.map(|one| (one.row.method(), one.verdict));
     let named: Vec<_> = verdicts.iter().cloned().chain(recorded).collect();
+    let replays = study.recorded.iter();
+    let replays = replays.filter_map(|one| Some(one.replay.as_deref()?.verdict));
+    let mut summary = study::summary(&named, &criteria);
+    summary.extend(replays_summary(&replays.collect::<Vec<_>>()));
     StudyReport {
         title: study::title(
             "Case study 2: motion loss rate (MLR) by condition",
@@ -39,7 +43,7 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
         ),
         notes: notes(study, rows),
         tables: vec![rates(rows, &study.recorded), counts(rows), setups(rows)],
-        summary: study::summary(&named, &criteria),
+        summary,
         larger: larger(study, rows, &verdicts, &criteria),
         criteria,
     }
@@ -215,7 +219,13 @@ fn rates(rows: &[Row<'_>], recorded: &[MotionLossRow]) -> Table {
             let beside = |row: &Row<'_>| one.is_beside(row.condition);
             rows.iter().rposition(beside) == place
         };
-        recorded.iter().filter(is_there).map(recorded_cells)
+        let found = recorded.iter().filter(is_there);
+        found.flat_map(|one| {
+            [Some(one), one.replay.as_deref()]
+                .into_iter()
+                .flatten()
+                .map(recorded_cells)
+        })
     };
     let mut wide = Vec::new();
     for (index, (row, mut cells)) in rows.iter().zip(table.rows).enumerate() {
@@ -228,6 +238,9 @@ fn rates(rows: &[Row<'_>], recorded: &[MotionLossRow]) -> Table {
     wide.extend(recorded_at(None));
     table.rows = wide;
     table.notes.push(ROWS_NOTE.to_owned());
+    if recorded.iter().any(|one| one.replay.is_some()) {
+        table.notes.push(REPLAYS_NOTE.to_owned());
+    }
     let notes = recorded.iter().map(MotionLossRow::note);
     table.notes.extend(notes);
     table

@@ -18,7 +18,10 @@ use crate::answer::{Answer, is_score_incomplete};
 use crate::assessment::Assessment;
 use crate::compare::ComparedRun;
 use crate::link_change::LinkChange;
-use crate::summary::{ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RunSummary};
+use crate::study::recording::replay;
+use crate::summary::{
+    ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RunSummary, ScoreMetric,
+};
 
 /// Runs of the command line: a folder, or those that a `*` in its last part stands for, and the published network
 /// that they stand for.
@@ -205,13 +208,9 @@ pub(super) fn recorded(
     if crossing.is_empty() {
         return Err("no channel went over a network, or a model of one".to_owned());
     }
-    let score = summary.score.iter().map(|metric| {
-        let found = RecordedMetric {
-            value: metric.value,
-            interval: metric.interval,
-        };
-        (metric.name.clone(), found)
-    });
+    let replays = replay::read(&folder)
+        .map_err(|error| error.to_string())?
+        .map(|scores| scores.iter().map(|score| by_name(score)).collect());
     Ok(RecordedRun {
         folder: folder.display().to_string(),
         name: match topology.get("name").and_then(Value::as_str) {
@@ -224,9 +223,22 @@ pub(super) fn recorded(
         seed: facts.seed,
         parameters,
         crossing: crossing_of(&summary, &crossing),
-        score: score.collect::<BTreeMap<_, _>>(),
+        score: by_name(&summary.score),
+        replays,
         doubts: doubts(&summary),
     })
+}
+
+/// The figures of a score by name.
+fn by_name(score: &[ScoreMetric]) -> BTreeMap<String, RecordedMetric> {
+    let found = |metric: &ScoreMetric| RecordedMetric {
+        value: metric.value,
+        interval: metric.interval,
+    };
+    let score = score.iter();
+    score
+        .map(|metric| (metric.name.clone(), found(metric)))
+        .collect()
 }
 
 /// What carried the channels.

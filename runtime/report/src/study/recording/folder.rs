@@ -8,8 +8,15 @@ use std::path::{Path, PathBuf};
 
 use hil_rundir::run_folder::RunFolder;
 
+use super::replay;
+
 /// What a kept run needs for tables, reports and comparisons.
-const KEPT: [&str; 3] = ["manifest.json", "summary.json", "report.txt"];
+const KEPT: [&str; 4] = [
+    "manifest.json",
+    "summary.json",
+    "report.txt",
+    replay::FOLDER,
+];
 /// What is large in the folder of a run.
 const LARGE: [&str; 3] = ["records", "traces", "series"];
 /// Why a run was refused.

@@ -3,6 +3,7 @@
 
 mod folder;
 mod next;
+pub(in crate::study) mod replay;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, TryLockError};
@@ -24,6 +25,7 @@ use serde_json::Value;
 
 use self::folder::{Part, RowFolder};
 use self::next::{Found, Next, REFUSED_MAX, Target, next};
+use self::replay::Continue;
 use super::RunArgument;
 use super::recorded::recorded;
 use crate::compare::{ComparedRun, add_leaves};
@@ -632,6 +634,19 @@ impl RunMaker<'_> {
                 let count = row.judge(run, part)?;
                 Ok(Made::Sound { folder, count })
             });
+        if let (Ok(Made::Sound { folder, .. }), Part::Run(_)) = (&outcome, part) {
+            let (signals, console) = (self.signals, &mut *self.console);
+            let end = replay::write(folder, self.registry, &mut || {
+                meanwhile(1.0, console);
+                match signals.received() {
+                    None => Continue::Yes,
+                    Some(_) => Continue::No,
+                }
+            });
+            if end.map_err(failed)? == Continue::No {
+                return Ok(Made::Interrupted);
+            }
+        }
         Ok(match outcome {
             Ok(made) => made,
             Err(_) if self.signals.received().is_some() => Made::Interrupted,
@@ -730,6 +745,7 @@ mod tests {
                 }]),
             },
             score: BTreeMap::new(),
+            replays: Ok(Vec::new()),
             doubts: Vec::new(),
         };
         let of = |many| overload(run(20, 1_000_000), many);
