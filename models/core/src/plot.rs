@@ -12,6 +12,8 @@ pub struct PlotSeries {
     pub title: String,
     /// How it was made; one line each.
     pub notes: Vec<String>,
+    /// Lines that belong together in a panel of its picture, in the order of the columns; `None`: as many as a panel takes.
+    pub panel_lines: Option<usize>,
     /// Its columns.
     pub columns: Vec<PlotColumn>,
     /// Row after row, each with one number per column; NaN where there is none.

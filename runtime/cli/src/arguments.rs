@@ -115,6 +115,8 @@ Examples:
       one row per channel and figure, to standard output
   hil-runtime report runs/a --format svg -o figures
       every figure as a file of its own; --figure timeline for one
+  hil-runtime report runs/a runs/b --format pdf -o figures
+      the same for print: also run-1-fig6-input.pdf to fig11 of teleoperation
   hil-runtime report runs/a --template lab.html -o report.html
       the data of --format json through a template of your own
 

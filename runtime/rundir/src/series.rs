@@ -23,6 +23,9 @@ pub struct SeriesEntry {
     pub(crate) notes: Vec<String>,
     /// Rows of its file, below the one that names the columns.
     pub(crate) row_count: usize,
+    /// Lines that belong together in a panel of its picture, in the order of the columns.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub panel_lines: Option<usize>,
     /// The columns of its file.
     pub columns: Vec<SeriesColumn>,
 }
@@ -50,6 +53,7 @@ impl SeriesEntry {
             title: series.title.clone(),
             notes: series.notes.clone(),
             row_count: series.rows().count(),
+            panel_lines: series.panel_lines,
             columns: columns.collect(),
         }
     }
@@ -191,6 +195,7 @@ mod tests {
             name: name.to_owned(),
             title: "Tool position over time".to_owned(),
             notes: vec!["right arm, every cycle".to_owned()],
+            panel_lines: None,
             columns: vec![
                 column("time_s", "time since the start of the run", "s"),
                 column("tool_y_m", "|y| of the tool", "m"),

@@ -128,6 +128,7 @@ impl NetworkBins {
             name: network_series_name(channel),
             title: format!("The network under {channel} over time"),
             notes,
+            panel_lines: None,
             columns: vec![
                 column(
                     "time_s",

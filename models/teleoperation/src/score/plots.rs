@@ -96,6 +96,7 @@ pub(crate) fn motion_loops(run: &Run) -> Option<PlotSeries> {
              4 throttled by MaxSpeedDeviation, 5 merged with a neighbour"
                 .to_owned(),
         ],
+        panel_lines: None,
         columns: vec![
             column("loop_index", "motion loop, from 1 as in the events", "1"),
             column("sent_s", "sent, since the robot's first feedback", "s"),
@@ -135,6 +136,7 @@ fn input(log: &RunLog, origin_ns: i64) -> Option<PlotSeries> {
         name: "fig6-input".to_owned(),
         title: "Input human motion: side-to-side position of the right hand".to_owned(),
         notes: thinning_note(every).into_iter().collect(),
+        panel_lines: None,
         columns: vec![
             TIME,
             column(
@@ -182,6 +184,7 @@ impl RobotSeries<'_> {
             name: name.to_owned(),
             title: title.to_owned(),
             notes: notes.collect(),
+            panel_lines: None,
             columns: [TIME].into_iter().chain(columns).collect(),
             values,
         })
@@ -224,16 +227,20 @@ impl RobotSeries<'_> {
     }
 
     fn joints(&self) -> Option<PlotSeries> {
-        self.series(
+        let joints = self.series(
             "fig10-joints",
             "Desired and measured joint positions",
             Some(JOINT_NOTE),
-            DESIRED.into_iter().chain(MEASURED),
+            DESIRED.into_iter().zip(MEASURED).flat_map(<[_; 2]>::from),
             |feedback, command, values| {
-                values.extend(desired_rad(command));
-                values.extend(feedback.measured_rad);
+                let joints = desired_rad(command).into_iter().zip(feedback.measured_rad);
+                values.extend(joints.flat_map(<[_; 2]>::from));
             },
-        )
+        )?;
+        Some(PlotSeries {
+            panel_lines: Some(2),
+            ..joints
+        })
     }
 
     fn joint_error(&self) -> Option<PlotSeries> {

@@ -45,7 +45,8 @@ pub(super) fn report(
 fn to_files(args: &ReportArgs, console: &mut Console) -> Result<(), Refusal> {
     let format = format(args)?;
     let template = args.template.as_deref().map(template).transpose()?;
-    let is_folder = format == Format::Svg && args.figure.is_none() && template.is_none();
+    let is_figures = matches!(format, Format::Svg | Format::Pdf) && template.is_none();
+    let is_folder = is_figures && args.figure.is_none();
     if let Some(output) = args.output.as_deref().filter(|_| !is_folder) {
         write::check(output, args.force).map_err(usage)?;
     }
@@ -63,8 +64,8 @@ fn to_files(args: &ReportArgs, console: &mut Console) -> Result<(), Refusal> {
     });
     let materials = materials.map_err(usage)?;
     let (materials, clean) = materials.split_at(args.runs.len());
-    if format == Format::Svg && template.is_none() {
-        return charts(args, materials, console);
+    if is_figures {
+        return charts(args, format, materials, console);
     }
     let own = template
         .as_ref()
@@ -97,10 +98,12 @@ fn format(args: &ReportArgs) -> Result<Format, Refusal> {
     let by_name = args.output.as_deref().and_then(Format::of_path);
     let figure = args.figure.as_ref().map(|_| Format::Svg);
     let own = args.template.as_ref().map(|_| Format::Html);
-    if args.figure.is_some() && args.format.is_some_and(|format| format != Format::Svg) {
-        return Err(usage("--figure is for --format svg only"));
+    let found = args.format.or(by_name).or(figure).or(own);
+    let is_of_figures = |format: &Format| matches!(format, Format::Svg | Format::Pdf);
+    if args.figure.is_some() && !found.is_some_and(|format| is_of_figures(&format)) {
+        return Err(usage("--figure is for --format svg or pdf only"));
     }
-    args.format.or(figure).or(by_name).or(own).ok_or_else(|| {
+    found.ok_or_else(|| {
         let path = args.output.as_deref().unwrap_or_else(|| Path::new(""));
         let known = Format::value_variants().iter();
         let known = known.filter_map(Format::to_possible_value);
@@ -121,9 +124,14 @@ fn template(path: &Path) -> Result<(String, String), Refusal> {
 }
 
 /// One figure to a file or standard output, or all of them to a folder.
-fn charts(args: &ReportArgs, materials: &[Material], console: &mut Console) -> Result<(), Refusal> {
+fn charts(
+    args: &ReportArgs,
+    format: Format,
+    materials: &[Material],
+    console: &mut Console,
+) -> Result<(), Refusal> {
     let files = Progress::begin().during(console, "drawing", |_| {
-        page::figure_files(materials, args.figure.as_deref())
+        page::figure_files(materials, args.figure.as_deref(), format)
     });
     let files = files.map_err(usage)?;
     let Some(output) = &args.output else {
@@ -132,28 +140,36 @@ fn charts(args: &ReportArgs, materials: &[Material], console: &mut Console) -> R
                 "all figures need a folder: give --output DIR, or one with --figure NAME",
             ));
         }
-        for (_, text) in &files {
-            console.result(text);
+        if format == Format::Pdf {
+            return Err(usage(
+                "a PDF needs a file: give --output, e.g. -o figure.pdf",
+            ));
+        }
+        for file in &files {
+            console.result(&String::from_utf8_lossy(&file.bytes));
         }
         return Ok(());
     };
     if args.figure.is_some() {
-        for (_, text) in files.iter().take(1) {
-            write::write(output, text).map_err(failed)?;
+        for file in files.iter().take(1) {
+            write::write(output, &file.bytes).map_err(failed)?;
         }
         console.say(&format!("wrote {}", output.display()));
         return Ok(());
     }
-    let paths: Vec<PathBuf> = files
-        .iter()
-        .map(|(name, _)| output.join(format!("{name}.svg")))
-        .collect();
+    let ending = match format {
+        Format::Pdf => "pdf",
+        _ => "svg",
+    };
+    let paths = files.iter();
+    let paths = paths.map(|file| output.join(format!("{}.{ending}", file.name)));
+    let paths: Vec<PathBuf> = paths.collect();
     fs::create_dir_all(output).map_err(|error| failed(format!("{}: {error}", output.display())))?;
     for path in &paths {
         write::check(path, args.force).map_err(usage)?;
     }
-    for (path, (_, text)) in paths.iter().zip(&files) {
-        write::write(path, text).map_err(failed)?;
+    for (path, file) in paths.iter().zip(&files) {
+        write::write(path, &file.bytes).map_err(failed)?;
     }
     console.say(&format!(
         "wrote {} figures to {}",

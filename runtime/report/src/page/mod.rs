@@ -6,6 +6,7 @@ mod axis;
 mod charts;
 pub(crate) mod data;
 mod drawings;
+mod pdf;
 pub mod read;
 mod run;
 pub(crate) mod series;
@@ -44,6 +45,8 @@ pub enum Format {
     Json,
     /// The figures.
     Svg,
+    /// The figures, for print.
+    Pdf,
 }
 
 impl Format {
@@ -57,6 +60,7 @@ impl Format {
             "csv" => Some(Self::Csv),
             "json" => Some(Self::Json),
             "svg" => Some(Self::Svg),
+            "pdf" => Some(Self::Pdf),
             _ => None,
         }
     }
@@ -175,7 +179,9 @@ pub fn render(
                 csv::HEADER.to_owned() + &rows.collect::<String>()
             }
             (None, Format::Json) => json(&page),
-            (None, Format::Svg) => charts(&page).iter().map(|one| one.svg.as_str()).collect(),
+            (None, Format::Svg | Format::Pdf) => {
+                charts(&page).iter().map(|one| one.svg.as_str()).collect()
+            }
         };
         let is_page = template.is_none() && format == Format::Html;
         if !is_page || text.len() <= PAGE_BYTES_MAX || steps <= STEPS_MIN {
@@ -226,26 +232,38 @@ pub(crate) fn charts(page: &Page) -> Vec<&Drawing> {
     sections.flat_map(Section::drawings).collect()
 }
 
-/// Figures as files of their own: name and text. `wanted` is a name, with or without `run-1-`.
+/// A figure as a file of its own.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FigureFile {
+    /// Without ending.
+    pub name: String,
+    /// What is in it.
+    pub bytes: Vec<u8>,
+}
+
+/// Figures as files of their own, also each series of the case. `wanted` is a name, with or without `run-1-`.
 ///
 /// # Errors
-/// Names the figure that is not there, and those that are.
+/// Names the figure that is not there, and those that are; says why a PDF cannot be made.
 pub fn figure_files(
     materials: &[Material],
     wanted: Option<&str>,
-) -> Result<Vec<(String, String)>, String> {
+    format: Format,
+) -> Result<Vec<FigureFile>, String> {
     let page = page_of(materials, None, STEPS_MAX);
-    let all = charts(&page);
+    let runs = page.runs.iter().zip(materials);
+    let of_case = runs
+        .flat_map(|(run, material)| timeline::each_of_case(&run.key, &material.series, STEPS_MAX));
+    let of_case: Vec<_> = of_case.collect();
+    let all: Vec<_> = charts(&page).into_iter().chain(&of_case).collect();
     let is_wanted = |one: &&&Drawing| {
         wanted.is_none_or(|wanted| {
             one.name == wanted || one.name.strip_prefix("run-1-") == Some(wanted)
         })
     };
     let chosen = all.iter().filter(is_wanted);
-    let files: Vec<_> = chosen
-        .map(|one| (one.name.clone(), svg::standalone(&one.svg)))
-        .collect();
-    if files.is_empty() {
+    let chosen: Vec<_> = chosen.collect();
+    if chosen.is_empty() {
         let names: BTreeSet<&str> = all
             .iter()
             .map(|one| one.name.strip_prefix("run-1-").unwrap_or(&one.name))
@@ -261,5 +279,14 @@ pub fn figure_files(
             None => "this report has no figure: nothing was measured".to_owned(),
         });
     }
-    Ok(files)
+    let file = |one: &&&Drawing| {
+        Ok(FigureFile {
+            name: one.name.clone(),
+            bytes: match format {
+                Format::Pdf => pdf::of_figure(&one.svg)?,
+                _ => svg::standalone(&one.svg).into_bytes(),
+            },
+        })
+    };
+    chosen.iter().map(file).collect()
 }

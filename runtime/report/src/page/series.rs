@@ -15,6 +15,8 @@ pub(crate) struct Series {
     /// What it shows, from the folder's list; empty when that does not say.
     pub(crate) title: String,
     pub(crate) columns: Vec<SeriesColumn>,
+    /// Lines that belong together in a panel.
+    pub(crate) panel_lines: Option<usize>,
     /// Rows; each has a value or none per column.
     pub(crate) rows: Vec<Vec<Option<f64>>>,
 }
@@ -55,6 +57,7 @@ pub(crate) fn parse(name: &str, text: &str) -> Result<Series, String> {
     Ok(Series {
         name: name.to_owned(),
         columns,
+        panel_lines: None,
         rows,
         title: String::new(),
     })
@@ -64,6 +67,7 @@ impl Series {
     /// Puts what the folder's list says of it beside the columns.
     pub(crate) fn describe(&mut self, entry: SeriesEntry) {
         self.title = entry.title;
+        self.panel_lines = entry.panel_lines.filter(|lines| *lines > 0);
         for described in entry.columns {
             let column = self
                 .columns

@@ -156,6 +156,27 @@ pub(super) fn standalone(svg: &str) -> String {
     }
 }
 
+/// `svg` for what knows neither variables nor media in a style sheet: with the colours for print.
+pub(super) fn for_print(svg: &str) -> String {
+    let (plain, rules) = STYLE
+        .split_once("svg.figure {")
+        .expect("the sheet has variables, then rules");
+    let print = plain
+        .split_once("@media print")
+        .expect("the sheet has colours for print")
+        .1;
+    let mut rules = format!("svg.figure {{{rules}");
+    for declaration in print.split([';', '{', '}']) {
+        if let Some((name, value)) = declaration.split_once(':') {
+            rules = rules.replace(&format!("var({})", name.trim()), value.trim());
+        }
+    }
+    match svg.split_once('\n') {
+        Some((head, rest)) => format!("{head}\n<style>{rules}</style>\n{rest}"),
+        None => svg.to_owned(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -179,6 +200,19 @@ mod tests {
     #[test]
     fn coordinates_are_short() {
         assert_eq!([0.0, -0.01, 1.25, 3.0].map(px), ["0", "0", "1.2", "3"]);
+    }
+
+    #[test]
+    fn print_has_colours_and_no_variables() {
+        let text = for_print(&Svg::new(1.0, 1.0).finish("t", &[]));
+        assert!(
+            !text.contains("var(") && !text.contains("@media") && !text.contains("--"),
+            "{text}"
+        );
+        assert!(
+            text.contains("svg.figure text { fill: #000000; }"),
+            "{text}"
+        );
     }
 
     #[test]

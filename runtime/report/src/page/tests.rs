@@ -7,7 +7,7 @@ use hil_account::network::network_series_name;
 
 use super::read::{Found, Manifest, Material};
 use super::series::{Series, parse};
-use super::{Format, PAGE_BYTES_MAX, figure_files, page_of, render};
+use super::{FigureFile, Format, PAGE_BYTES_MAX, figure_files, page_of, render};
 use crate::network::TimelineSubject;
 use crate::summary::{Fact, RunSummary};
 use crate::terminal::Style;
@@ -158,7 +158,8 @@ fn hostile_texts_stay_texts() {
         !markdown.contains("<img") && !markdown.contains("<script"),
         "{markdown}"
     );
-    for (name, svg) in figure_files(&[material], None).unwrap() {
+    for FigureFile { name, bytes } in figure_files(&[material], None, Format::Svg).unwrap() {
+        let svg = String::from_utf8(bytes).unwrap();
         assert_well_formed(svg.trim_start_matches("<?xml version=\"1.0\" encoding=\"UTF-8\"?>"));
         assert!(
             name.bytes()
@@ -360,13 +361,26 @@ fn the_other_formats_have_the_same_metrics() {
     )
     .unwrap();
     assert_eq!(own, "<b>swing-split</b>");
-    let error = figure_files(&one, Some("none")).unwrap_err();
+    let error = figure_files(&one, Some("none"), Format::Svg).unwrap_err();
     assert!(
         error.starts_with("no figure \"none\"; figures of this report: "),
         "{error}"
     );
     assert!(error.contains("timeline"), "{error}");
-    assert_eq!(figure_files(&one, Some("timeline")).unwrap().len(), 1);
+    assert_eq!(
+        figure_files(&one, Some("timeline"), Format::Svg)
+            .unwrap()
+            .len(),
+        1
+    );
+    // Each of the case's series by itself, with the lines that belong together in one panel.
+    let mut material = material(full());
+    let mut joints = long_series("fig10-joints");
+    joints.panel_lines = Some(2);
+    material.series = vec![joints];
+    let files = figure_files(&[material], Some("fig10-joints"), Format::Svg).unwrap();
+    let svg = String::from_utf8(files[0].bytes.clone()).unwrap();
+    assert_eq!(svg.matches("class=\"panel\"").count(), 7, "{svg}");
 }
 
 /// Ten figures that there are none of, for one reason, around one that there is.

@@ -18,7 +18,7 @@ use hil_present::units::{duration_s, scale};
 /// Lines of one panel; a series with more columns gets more panels.
 const LINES_MAX: usize = 7;
 /// Panels of the case's own series.
-const CASE_PANELS_MAX: usize = 8;
+const CASE_PANELS_MAX: usize = 12;
 /// Outages shaded in the panels of the network.
 const BANDS_MAX: usize = 300;
 
@@ -259,19 +259,45 @@ fn network_points(series: &Series) -> [Vec<(f64, f64)>; 4] {
     ]
 }
 
-/// The case's own series over time, on the axis that they name.
-pub(super) fn of_case(
-    key: &str,
-    series: &[Series],
-    steps: usize,
-) -> (Option<(Drawing, Plot)>, Vec<String>) {
+/// The case's own series over time.
+fn timed_of_case(series: &[Series]) -> Vec<&Series> {
     let is_own = |one: &&Series| !one.name.starts_with("network-") && one.columns.len() > 1;
     let is_timed = |one: &&Series| {
         one.columns
             .first()
             .is_some_and(|column| column.name == "time_s")
     };
-    let timed: Vec<&Series> = series.iter().filter(is_own).filter(is_timed).collect();
+    series.iter().filter(is_own).filter(is_timed).collect()
+}
+
+/// Each of the case's own series over time as a picture of its own.
+pub(super) fn each_of_case(key: &str, series: &[Series], steps: usize) -> Vec<Drawing> {
+    let each = timed_of_case(series).into_iter();
+    let drawn = each.filter_map(|one| {
+        let (drawn, _) = drawn(&format!("{key}-{}", one.name), &one.title, &[one], steps);
+        Some(drawn?.0)
+    });
+    drawn.collect()
+}
+
+/// The case's own series over time, on the axis that they name.
+pub(super) fn of_case(
+    key: &str,
+    series: &[Series],
+    steps: usize,
+) -> (Option<(Drawing, Plot)>, Vec<String>) {
+    let title = "The robot, as its case plots it";
+    let timed = timed_of_case(series);
+    drawn(&format!("{key}-robot"), title, &timed, steps)
+}
+
+/// The picture of `timed`, and the files that found no room.
+fn drawn(
+    name: &str,
+    title: &str,
+    timed: &[&Series],
+    steps: usize,
+) -> (Option<(Drawing, Plot)>, Vec<String>) {
     let moments = timed
         .iter()
         .flat_map(|one| one.rows.iter().filter_map(|row| row.first().copied()?));
@@ -281,19 +307,17 @@ pub(super) fn of_case(
     if until_s <= from_s {
         return (None, Vec::new());
     }
-    let (panels, left_out) = case_panels(&timed, &(from_s..until_s), steps);
+    let (panels, left_out) = case_panels(timed, &(from_s..until_s), steps);
     let axis_words = timed
         .iter()
         .map(|one| one.columns[0].label.as_str())
         .find(|words| !words.is_empty());
     let plot = Plot {
-        axis: format!("{key}-case"),
+        axis: format!("{name}-case"),
         from_s,
         until_s,
         panels,
     };
-    let name = format!("{key}-robot");
-    let title = "The robot, as its case plots it";
     let caption = format!(
         "Axis: {}. Each point stands for {} and has the smallest and largest value within; all values \
          are in series/.",
@@ -301,8 +325,8 @@ pub(super) fn of_case(
         duration_s((until_s - from_s) / steps.max(1) as f64)
     );
     let drawing = Drawing {
-        svg: over_time(&name, title, &plot, &[], &[]),
-        name,
+        svg: over_time(name, title, &plot, &[], &[]),
+        name: name.to_owned(),
         title: title.to_owned(),
         caption,
         is_wide: true,
@@ -320,7 +344,7 @@ fn case_panels(
     let mut left_out = Vec::new();
     for one in timed {
         let columns: Vec<usize> = (1..one.columns.len()).collect();
-        for chunk in columns.chunks(LINES_MAX) {
+        for chunk in columns.chunks(one.panel_lines.unwrap_or(LINES_MAX)) {
             if panels.len() == CASE_PANELS_MAX {
                 left_out.push(format!("series/{}.csv", one.name));
                 break;

@@ -1,7 +1,7 @@
 //! Puts a report where the user wants it: whole or not at all, and never over what is not a report.
 
 use std::fs::{self, File};
-use std::io::{self, Read, Write};
+use std::io::{self, Read, Seek as _, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::process;
 
@@ -57,22 +57,37 @@ pub fn check(path: &Path, force: bool) -> Result<(), WriteError> {
     let is_own = head.contains(MARK) || head.starts_with("run,channel,figure,value,unit,low,high");
     // Data and figures have no place for a mark, but a shape that nobody else has.
     let is_data = head.contains("\"program\": \"hil-runtime ");
+    let is_print = head.starts_with("%PDF") && ends_with_mark(path).map_err(failed)?;
     let is_figure = head.contains("<svg") && head.contains("class=\"figure\"");
-    if is_own || is_data || is_figure {
+    if is_own || is_data || is_figure || is_print {
         Ok(())
     } else {
         Err(WriteError::Foreign(path.to_owned()))
     }
 }
 
-/// Writes `text` to `path`, beside it first.
+/// A PDF has its mark behind its end.
+fn ends_with_mark(path: &Path) -> io::Result<bool> {
+    let mut file = File::open(path)?;
+    let mark = format!("% {MARK}\n");
+    let behind = i64::try_from(mark.len()).map_err(io::Error::other)?;
+    if file.seek(SeekFrom::End(-behind)).is_err() {
+        return Ok(false);
+    }
+    let mut tail = Vec::new();
+    file.read_to_end(&mut tail)?;
+    Ok(tail == mark.as_bytes())
+}
+
+/// Writes bytes to `path`, beside it first.
 ///
 /// # Errors
 /// Names the file that cannot be written; nothing is left of a failed one.
-pub fn write(path: &Path, text: &str) -> Result<(), WriteError> {
+pub fn write(path: &Path, text: impl AsRef<[u8]>) -> Result<(), WriteError> {
+    let bytes = text.as_ref();
     let is_special = fs::metadata(path).is_ok_and(|facts| !facts.is_file());
     if is_special {
-        return fs::write(path, text).map_err(|source| WriteError::File {
+        return fs::write(path, bytes).map_err(|source| WriteError::File {
             path: path.to_owned(),
             source,
         });
@@ -81,10 +96,7 @@ pub fn write(path: &Path, text: &str) -> Result<(), WriteError> {
     name.push(format!(".{}.partial", process::id()));
     let partial = path.with_file_name(name);
     let written = plain_file::create_anew(&partial)
-        .and_then(|mut file| {
-            file.write_all(text.as_bytes())
-                .and_then(|()| file.sync_all())
-        })
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
         .and_then(|()| fs::rename(&partial, path));
     written.map_err(|source| {
         drop(fs::remove_file(&partial));

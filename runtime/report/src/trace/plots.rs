@@ -28,6 +28,7 @@ fn made(name: &str, title: &str, columns: Vec<PlotColumn>, values: Vec<f64>) -> 
         name: name.to_owned(),
         title: title.to_owned(),
         notes: Vec::new(),
+        panel_lines: None,
         columns,
         values,
     }
