@@ -335,16 +335,34 @@ fn copy_of(record: &IngressRecord) -> IngressRecord {
 }
 
 /// Everything that was told of a run.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Told {
     messages: Vec<MessageHistory>,
     passages: Vec<Passage>,
+    demand: DemandFold,
+}
+
+impl Default for Told {
+    fn default() -> Self {
+        let demand = Demand {
+            latency_max: Duration::from_micros(30),
+            survival_time: Duration::from_millis(2),
+            interval: Duration::from_millis(1),
+            availability: 0.999,
+        };
+        Self {
+            messages: Vec::new(),
+            passages: Vec::new(),
+            demand: DemandFold::new(&demand, None),
+        }
+    }
 }
 
 impl Told {
     fn add(&mut self, message: &MessageHistory, path: ChannelPath<'_>) {
         self.messages.push(*message);
         self.passages.push(message.passage(path));
+        self.demand.add(message, &AccountContext::new(path));
     }
 
     fn outages(&self) -> Vec<Outage> {
@@ -388,7 +406,7 @@ impl Told {
 
 #[test]
 fn a_run_is_told_alike_live_in_pieces_and_at_once() {
-    let (mut interrupted_count, mut wider_count) = (0, 0);
+    let (mut interrupted_count, mut wider_count, mut failure_count) = (0, 0, 0);
     let (mut stamped_count, mut stamped_live_count) = (0, 0);
     for seed in 0..150 {
         let run = Run::random(seed);
@@ -402,6 +420,15 @@ fn a_run_is_told_alike_live_in_pieces_and_at_once() {
         );
         let live = run.live(&run.events);
         assert_eq!(at_once.difference(&live, &run), None, "seed {seed}, live");
+        let [whole, pieces, live_demand] =
+            [&at_once, &pieces, &live].map(|told| told.demand.clone().finish());
+        assert_eq!(whole, pieces, "seed {seed}, in pieces");
+        // With two clocks, a watcher's wider bounds leave more messages unknown.
+        assert!(
+            run.has_two_clocks || whole == live_demand,
+            "seed {seed}, live"
+        );
+        failure_count += whole.service.measured().map_or(0, |one| one.failure_count);
         for (whole, live) in at_once.passages.iter().zip(&live.passages) {
             assert!(live.delay_ns.is_none() || live.delay_bound_ns >= whole.delay_bound_ns);
             wider_count += u64::from(live.delay_bound_ns > whole.delay_bound_ns);
@@ -413,6 +440,7 @@ fn a_run_is_told_alike_live_in_pieces_and_at_once() {
         interrupted_count += at_once.messages.iter().filter(is_interrupted).count();
     }
     assert!(interrupted_count > 100, "{interrupted_count}");
+    assert!(failure_count > 100, "{failure_count}");
     assert!(stamped_live_count * 10 > stamped_count * 9);
     assert!(wider_count > 0, "the clocks are known better at the end");
 }

@@ -17,6 +17,7 @@
 #![forbid(unsafe_code)]
 
 mod account;
+mod demand;
 mod fate;
 #[cfg(test)]
 mod feed_tests;
@@ -45,6 +46,9 @@ use core::fmt::Debug;
 use core::time::Duration;
 
 pub use account::{AccountFold, account};
+pub use demand::{
+    Demand, DemandFold, DemandMetrics, DemandVerdict, DownTime, ServiceMetrics, Transfer,
+};
 pub use fold::{
     ChannelFold, FirstNumber, FoldSettings, MessageName, RecordEvent, RecordsAtHand, each_history,
 };

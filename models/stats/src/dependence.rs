@@ -130,7 +130,7 @@ impl Batches {
         self.square += value * value * left as f64;
         while left > 0 {
             let batch = self.filled / self.per_batch;
-            let here = left.min((batch + 1) * self.per_batch - self.filled);
+            let here = left.min((batch + 1).saturating_mul(self.per_batch) - self.filled);
             let sum = usize::try_from(batch).ok();
             // What does not fill a batch is in the mean alone.
             if let Some(sum) = sum.and_then(|batch| self.sums.get_mut(batch)) {

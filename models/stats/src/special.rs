@@ -2,7 +2,7 @@
 //! accuracy before speed; nothing here is a general numerics library.
 
 use statrs::function::erf::erfc_inv;
-use statrs::function::gamma::ln_gamma;
+use statrs::function::gamma::{gamma_lr, ln_gamma};
 
 /// Terms after which a continued fraction is taken as converged. It needs about the square root of its
 /// largest parameter, so this serves counts far above 10^8.
@@ -114,6 +114,15 @@ pub fn student_quantile(probability: f64, freedom: f64) -> f64 {
         1.0 - 0.5 * incomplete_beta(freedom / 2.0, 0.5, x)
     };
     invert(probability, 0.0, 1e4, below)
+}
+
+/// The quantile of the gamma distribution with this shape and scale one.
+pub fn gamma_quantile(probability: f64, shape: f64) -> f64 {
+    // Far beyond any quantile that is asked for.
+    let high = shape + 12.0 * shape.sqrt() + 50.0;
+    invert(probability, 0.0, high, |x| {
+        if x > 0.0 { gamma_lr(shape, x) } else { 0.0 }
+    })
 }
 
 /// The place, from 0, of the smallest of `count` ascending values that at least `share` of them do not

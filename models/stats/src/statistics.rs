@@ -1,7 +1,7 @@
 //! Exact intervals of independent trials: repetitions, collisions of independent runs, tests. What messages of one
 //! run have is in [`crate::dependence`]. No interval is a promise about another day, room or host.
 
-use crate::special::{incomplete_beta, invert};
+use crate::special::{gamma_quantile, incomplete_beta, invert};
 use hil_core::interval::{Interval, IntervalMethod};
 
 /// The confidence every report uses.
@@ -60,9 +60,47 @@ fn check(successes: u64, trials: u64, confidence: f64) {
     );
 }
 
+/// The sum of what independent events weigh, e.g. of the lengths of failures, where their number is Poisson's.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct PoissonSum {
+    /// Events.
+    pub count: u64,
+    sum: f64,
+    squares: f64,
+    heaviest: f64,
+}
+
+impl PoissonSum {
+    /// Adds an event.
+    pub fn push(&mut self, weight: f64) {
+        self.count += 1;
+        self.sum += weight;
+        self.squares += weight * weight;
+        self.heaviest = self.heaviest.max(weight);
+    }
+
+    /// Ends of the interval of the expected sum (Fay and Feuer 1997, Stat. Med. 16:791; of equal weights that of Garwood 1936).
+    /// An event that did not happen would have weighed `weight_min` or as much as the heaviest. Weights are taken as known: of
+    /// exponential ones each end misses up to 6 % of the samples in place of 2.5 %.
+    pub fn interval(&self, weight_min: f64, confidence: f64) -> [f64; 2] {
+        let tail = 0.5 * (1.0 - confidence);
+        let end = |sum: f64, squares: f64, probability: f64| {
+            gamma_quantile(probability, sum * sum / squares) * squares / sum
+        };
+        let low = match self.count {
+            0 => 0.0,
+            _ => end(self.sum, self.squares, tail),
+        };
+        let one_more = self.heaviest.max(weight_min);
+        let squares = self.squares + one_more * one_more;
+        [low, end(self.sum + one_more, squares, 1.0 - tail)]
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hil_core::random::RandomStream;
 
     fn assert_interval(actual: Interval, low: f64, high: f64) {
         let matches = (actual.low - low).abs() < 5e-5 && (actual.high - high).abs() < 5e-5;
@@ -99,5 +137,44 @@ mod tests {
         assert!(whole(0).low < one.low && one.low < whole(1).low, "{one:?}");
         assert!(whole(0).high < one.high && one.high < whole(1).high);
         assert_interval(of(0), 0.0, whole(0).high);
+    }
+
+    #[test]
+    fn sums_of_equal_weights_have_garwoods_ends() {
+        // Of a Poisson mean, 90 %: Garwood (1936).
+        for (count, low, high) in [
+            (0, 0.0, 2.9957),
+            (1, 0.0513, 4.7439),
+            (3, 0.8177, 7.7537),
+            (10, 5.4254, 16.9622),
+        ] {
+            let mut sum = PoissonSum::default();
+            (0..count).for_each(|_| sum.push(0.5));
+            let ends = sum.interval(0.5, 0.9);
+            let expected = [0.5 * low, 0.5 * high];
+            let is_near = |index: usize| (ends[index] - expected[index]).abs() < 1e-4;
+            assert!(is_near(0) && is_near(1), "{count}: {ends:?}");
+        }
+    }
+
+    #[test]
+    fn each_end_of_a_sum_of_exponential_weights_holds_in_94_of_100_samples() {
+        let mut stream = RandomStream::new(1, "statistics.poisson_sum");
+        for mean in [1.0, 5.0, 40.0] {
+            let mut held = [0_u32; 2];
+            for _ in 0..4_000 {
+                let mut exponential = || -(1.0 - stream.uniform()).ln();
+                let mut sum = PoissonSum::default();
+                let mut at = exponential();
+                while at < mean {
+                    sum.push(exponential());
+                    at += exponential();
+                }
+                let [low, high] = sum.interval(1.0, 0.95);
+                held[0] += u32::from(low <= mean);
+                held[1] += u32::from(mean <= high);
+            }
+            assert!(held.iter().all(|&one| one > 3_740), "{mean}: {held:?}");
+        }
     }
 }

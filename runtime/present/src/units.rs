@@ -64,6 +64,20 @@ pub fn percent(ratio: f64) -> String {
     format!("{value:.2}{JOINT}%")
 }
 
+/// A ratio near one as per cent, with two digits of what it lacks: 99.9987 %.
+pub fn availability(ratio: f64) -> String {
+    let lacking = (1.0 - ratio) * 100.0;
+    if lacking.is_nan() || lacking <= 1e-9 {
+        return percent(ratio);
+    }
+    let digits = digit_count((1.0 - (lacking * (1.0 + 1e-6)).log10().floor()).clamp(2.0, 12.0));
+    let text = format!("{:.digits$}", 100.0 * ratio);
+    // 99.990 says no more than 99.99.
+    let spare = text.len() - text.trim_end_matches('0').len();
+    let kept = text.len() - spare.min(digits - 2);
+    format!("{}{JOINT}%", &text[..kept])
+}
+
 /// Below it a figure says no more than that it is.
 const FIGURE_MIN: f64 = 1e-12;
 
@@ -173,6 +187,21 @@ mod tests {
         assert_eq!(percent(0.5).replace(JOINT, " "), "50.00 %");
         assert_eq!(percent(0.000_001).replace(JOINT, " "), "<0.01 %");
         assert_eq!(percent(0.0).replace(JOINT, " "), "0.00 %");
+    }
+
+    #[test]
+    fn an_availability_has_the_digits_that_tell_it_from_one() {
+        for (ratio, expected) in [
+            (0.9999, "99.99 %"),
+            (0.999_987_2, "99.9987 %"),
+            (0.999_999, "99.9999 %"),
+            (0.943_75, "94.38 %"),
+            (0.5, "50.00 %"),
+            (1.0, "100.00 %"),
+            (0.0, "0.00 %"),
+        ] {
+            assert_eq!(availability(ratio).replace(JOINT, " "), expected, "{ratio}");
+        }
     }
 
     #[test]

@@ -10,7 +10,8 @@ use std::{fs, io};
 
 use hil_account::network::{Moment, NetworkContext};
 use hil_account::{
-    ChannelAccount, ChannelPath, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
+    ChannelAccount, ChannelPath, Closing, DemandFold, DemandMetrics, EndToEnd, FateCounts, Gaps,
+    MessageFate, RunSpan, StampCoverage,
 };
 use hil_core::case_study::ErrorSeries;
 use hil_core::link_model::{LinkModel, ReplayTally};
@@ -107,7 +108,17 @@ pub fn simulate(
         .ok_or_else(|| refused("the case lists a role it cannot make".to_owned()))?;
     let duration = topology.run().duration;
     let names = links.keys().cloned();
-    let mut accounts = LinkAccounts(names.map(|name| (name, LinkAccount::default())).collect());
+    let run = Some(RunSpan {
+        start: Instant::ZERO,
+        end: Instant::ZERO + duration,
+    });
+    let account = |name: String| {
+        let demand = topology.channel(&name).and_then(|one| one.demand.as_ref());
+        let mut account = LinkAccount::default();
+        account.demand = demand.map(|demand| DemandFold::new(demand, run));
+        (name, account)
+    };
+    let mut accounts = LinkAccounts(names.map(account).collect());
     let mut progress = Progress {
         duration,
         next: Instant::ZERO,
@@ -134,6 +145,7 @@ pub fn simulate(
             let story = outages.iter().find(|story| story.channel == channel.name);
             ChannelSummary {
                 outages: story.and_then(OutageHistory::metrics),
+                demand: demand_metrics(channel, &mut accounts),
                 ..channel_summary(topology, channel, &result, links.get(&channel.name))
             }
         })
@@ -303,6 +315,17 @@ impl Simulated {
     }
 }
 
+/// Whether the demand of `channel` was met, if the topology states one.
+fn demand_metrics(
+    channel: &Channel,
+    accounts: &mut BTreeMap<String, LinkAccount>,
+) -> Option<DemandMetrics> {
+    let demand = channel.demand.as_ref()?;
+    let account = accounts.get_mut(&channel.name);
+    let fold = account.and_then(|account| account.demand.take());
+    Some(fold.map_or_else(|| DemandMetrics::on_one_host(demand), DemandFold::finish))
+}
+
 /// The account of one channel, with what virtual time lacks "unavailable".
 fn channel_summary(
     topology: &Topology,
@@ -319,6 +342,7 @@ fn channel_summary(
         link: LinkKind::of(topology, channel),
         account: counts.map(account),
         outages: None,
+        demand: None,
         emulation: None,
         trace_replay: link.and_then(|link| Some(link.replay.as_ref()?.counts())),
         recorded: recorded.map(|count| RecordedMetrics {

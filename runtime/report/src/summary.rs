@@ -12,7 +12,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_account::flow::{DeadlineMetrics, FlowMetrics};
-use hil_account::{ChannelAccount, MessageFate, OutageMetrics};
+use hil_account::{ChannelAccount, DemandMetrics, MessageFate, OutageMetrics};
 use hil_core::case_study::{Metric, Score};
 use hil_core::link_model::ReplayCounts;
 use hil_link::condition::flow_label;
@@ -636,6 +636,9 @@ pub struct ChannelSummary {
     /// recorded.
     #[serde(default)]
     pub outages: Option<OutageMetrics>,
+    /// Whether it met the demand that the topology states; `None` where it states none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub demand: Option<DemandMetrics>,
     /// How well the hosts kept its emulated link; `None` on every other link, or when no message
     /// came through it.
     #[serde(default)]

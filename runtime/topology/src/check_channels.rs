@@ -119,6 +119,7 @@ fn case_channels(
             link: table.and_then(|table| table.link.clone()),
             is_carried: false,
             is_foreign: false,
+            demand: table.and_then(|table| table.demand.clone()),
         });
     }
     channels
@@ -211,6 +212,7 @@ fn foreign_channel(
         link: table.link.clone(),
         is_carried: false,
         is_foreign: true,
+        demand: table.demand.clone(),
     })
 }
 

@@ -7,6 +7,7 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
+use hil_account::Demand;
 use hil_core::case_study::ParameterError;
 use hil_core::message::ETHERNET_FRAME;
 use hil_core::{options, words};
@@ -353,7 +354,7 @@ impl MessageLayout {
 }
 
 /// One channel: one producer, and one consumer or none but the record.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Channel {
     /// Number in datagrams: the case's channels in their order, then foreign ones by name.
     pub channel_id: u16,
@@ -373,6 +374,8 @@ pub struct Channel {
     pub is_carried: bool,
     /// True when the file declares it, false when the case does.
     pub is_foreign: bool,
+    /// What its consumer asks of the network, if the file says.
+    pub demand: Option<Demand>,
 }
 
 impl Channel {

@@ -127,6 +127,7 @@ impl Channel {
             message: foreign.map(|channel| channel.message.clone()),
             from: foreign.map(|channel| channel.from.clone()),
             to: foreign.and_then(|channel| channel.to.clone()),
+            demand: self.demand.clone(),
         }
     }
 }

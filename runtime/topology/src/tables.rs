@@ -5,6 +5,7 @@
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 
+use hil_account::Demand;
 use hil_core::options;
 use hil_core::options::{Free, Named, TextRule};
 
@@ -236,6 +237,8 @@ options! {
         from: Option<String>;
         /// The process that subscribes.
         to: Option<String>;
+        /// What its consumer asks of the network; the report says whether it was met.
+        demand: Option<Demand>;
     }
 }
 

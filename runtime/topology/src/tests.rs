@@ -175,6 +175,11 @@ run = ["viewer"]
 [channels."arm/command"]
 depth = 4
 link = "hop"
+[channels."arm/command".demand]
+latency_max = "20 ms"
+survival_time = "24 ms"
+interval = "16 ms"
+availability = 0.9999
 [channels."arm/status"]
 link = "hop"
 [channels."camera/image"]

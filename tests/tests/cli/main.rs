@@ -4,6 +4,7 @@
 
 mod command_line;
 mod compare;
+mod demand;
 mod doctor;
 mod help;
 mod inherited;

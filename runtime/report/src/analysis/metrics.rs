@@ -6,7 +6,10 @@ use std::path::Path;
 
 use hil_account::flow::{FlowFold, FlowMetrics, FlowPassages, NamedFlow};
 use hil_account::radio::{RadioFold, RadioMetrics};
-use hil_account::{AccountFold, ChannelAccount, Outage, OutageFinder, RecordsAtHand, each_history};
+use hil_account::{
+    AccountFold, ChannelAccount, DemandFold, DemandMetrics, Outage, OutageFinder, RecordsAtHand,
+    each_history,
+};
 use hil_core::record::IngressRecord;
 
 use super::axis::RunAxis;
@@ -163,6 +166,7 @@ pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
 pub(super) struct ChannelReading {
     pub(super) account: ChannelAccount,
     pub(super) outages: Vec<Outage>,
+    pub(super) demand: Option<DemandMetrics>,
     pub(super) acknowledgements: Option<RadioMetrics>,
     /// Of a channel of frames.
     pub(super) flows: Vec<FlowMetrics>,
@@ -184,6 +188,8 @@ impl ChannelReading {
             let at_hand = RecordsAtHand::of(files, context);
             let mut account = AccountFold::new(at_hand, context);
             let mut outages = OutageFinder::default();
+            let stated = channel.demand.as_ref();
+            let mut demand = stated.map(|demand| DemandFold::of_channel(demand, context));
             let mut radio = RadioFold::new(at_hand);
             let mut flows = FlowFold::new(named);
             let frames = records.of_kind(&channel.name, |files| files.frame.as_ref());
@@ -191,6 +197,9 @@ impl ChannelReading {
             each_history(files, context, |message| {
                 account.add(message);
                 outages.add(message);
+                if let Some(demand) = &mut demand {
+                    demand.add(message, context);
+                }
                 radio.add(message);
                 flows.add(message, context);
             });
@@ -198,6 +207,7 @@ impl ChannelReading {
             Self {
                 account: account.finish(),
                 outages: outages.finish(),
+                demand: demand.map(DemandFold::finish),
                 acknowledgements: radio.finish(),
                 flows,
                 passages,
@@ -238,6 +248,7 @@ pub(super) fn channel_summary(records: &RunRecords<'_>, channel: &Channel) -> Ch
         link: LinkKind::of(records.topology, channel),
         account: None,
         outages: None,
+        demand: None,
         emulation: EmulationMetrics::of(
             records.of_kind::<IngressRecord>(&channel.name, |files| files.ingress.as_ref()),
             overflow_count,

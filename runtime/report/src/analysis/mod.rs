@@ -268,6 +268,7 @@ fn read_channels(
         let unknown = MessageFate::UnknownPeerRecordsUnavailable;
         let is_partial = reading.account.fates.of(unknown) > 0;
         summary.account = Some(reading.account);
+        summary.demand = reading.demand;
         for (key, frames) in reading.passages {
             passages.entry(key).or_default().extend(frames);
         }

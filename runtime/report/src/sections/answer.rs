@@ -6,6 +6,7 @@ use hil_platform::words::counted;
 use hil_present::units::{duration, percent};
 use hil_present::{Field, Tone};
 
+use super::demand;
 use super::events::gravest_harm;
 use crate::answer::{Answer, HarmCount, Hurt, OCCASIONS_MIN, with_note};
 use crate::assessment::Assessment;
@@ -61,6 +62,7 @@ impl AnswerFacts {
         }
         let mut rest = Vec::new();
         rest.extend(messages(summary).map(|words| Field::new("messages", words)));
+        rest.extend(demand::unmet(summary));
         let scores = summary.score.iter();
         let headline = summary.headline.iter().filter_map(|name| {
             let mut scores = scores.clone();

@@ -112,6 +112,9 @@ fn channel(one: &ChannelSummary, summary: &RunSummary) -> Section {
     section.subject.clone_from(&one.name);
     let sources = Sources::of(one, summary);
     metrics(&mut section, &sources);
+    if let Some(demand) = &one.demand {
+        super::demand::demand(&mut section, demand);
+    }
     if let Some(account) = &one.account {
         facts(&mut section, account);
     }

@@ -5,6 +5,7 @@ mod adapter;
 mod answer;
 pub(crate) mod channel;
 mod clocks;
+mod demand;
 pub(crate) mod events;
 mod flows;
 mod network;

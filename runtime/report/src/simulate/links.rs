@@ -4,8 +4,8 @@
 use core::time::Duration;
 use std::collections::BTreeMap;
 
-use hil_account::OutageFinder;
 use hil_account::network::{Crossing, Passage, Passages};
+use hil_account::{DemandFold, OutageFinder, Transfer};
 use hil_core::link_model::{LinkModel, LossCauses};
 use hil_core::message::Envelope;
 use hil_core::simulation::{Carrier, CaseModel, ChannelMessage, Observe};
@@ -47,6 +47,8 @@ pub(super) struct LinkAccount {
     pub(super) duplicated_count: u64,
     /// What was lost in a row.
     pub(super) outages: OutageFinder,
+    /// Whether the demand of its channel is met, if the topology states one.
+    pub(super) demand: Option<DemandFold>,
 }
 
 impl LinkAccount {
@@ -66,6 +68,13 @@ impl LinkAccount {
             },
         });
         let published_ns = Some(now.as_ns());
+        if let Some(demand) = &mut self.demand {
+            let transfer = arrival.map_or(Transfer::Lost, |at| Transfer::Received {
+                delay_ns: at.ns_since(now),
+                bound_ns: 0,
+            });
+            demand.offer(published_ns, 1, transfer);
+        }
         match arrival {
             Some(at) => self.outages.arrived(published_ns, Some(at.as_ns())),
             None => self.outages.lost(envelope.sequence, 1, published_ns, true),

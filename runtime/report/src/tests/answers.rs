@@ -4,7 +4,7 @@ use hil_account::flow::{DeadlineFold, DeadlineMetrics};
 use hil_account::{ChannelAccount, FateCounts, MessageFate};
 use hil_core::case_study::Severity;
 
-use super::sample::{awkward, check_golden, empty, flow, full, link};
+use super::sample::{awkward, check_golden, demand, empty, flow, full, link};
 use crate::answer::{Answer, Clocks, HarmCount, Hurt, OccasionCount, Unresolved, Untested};
 use crate::assessment::Assessment;
 use crate::network::{TimelineRow, TimelineSubject};
@@ -610,6 +610,46 @@ fn answer_cause_and_validity_stand_in_twelve_lines() {
     ] {
         assert!(block.contains(words), "{words}:\n{block}");
     }
+}
+
+#[test]
+fn a_demand_that_was_missed_or_not_decided_is_a_line_of_the_answer_and_all_of_it_stands_with_its_channel()
+ {
+    let words = |text: String| {
+        let text = text.replace(JOINT, " ");
+        text.split_whitespace().collect::<Vec<_>>().join(" ")
+    };
+    let told = |availability: f64| {
+        let mut summary = run(lost_loops(Some(2), 0, 40));
+        summary.channels[0].demand = Some(demand(availability));
+        let read = RunSummary::from_json(&summary.to_json().unwrap()).unwrap();
+        assert_eq!(read, summary);
+        let page = words(brief(&summary, 100, Style::Plain));
+        (
+            page,
+            words(render(&summary, 100, Style::Plain)),
+            words(page_text(&summary)),
+        )
+    };
+    let missed =
+        "arm/command MISSED: available 96.26 %, 99.99 % asked for; 1 failure, longest 747 ms";
+    let (page, full, html) = told(0.9999);
+    assert!(page.contains(missed), "{page}");
+    for text in [full, html] {
+        for part in [
+            "MISSED: available 96.26 %",
+            "in time within 1.00 ms, survival time 12.0 ms, a message every 4.00 ms",
+            "TS 22.261; 4,803 of 5,000, 197 lost, 193 of these by a host",
+        ] {
+            assert!(text.contains(part), "{part}: {text}");
+        }
+    }
+    let (page, full, _) = told(0.5);
+    assert!(!page.contains("demand"), "{page}");
+    assert!(
+        full.contains("met: available 96.26 %, 50.00 % asked for"),
+        "{full}"
+    );
 }
 
 #[test]

@@ -4,11 +4,12 @@
 
 use hil_core::interval::{Interval, IntervalMethod, Spread};
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use hil_account::flow::FlowMetrics;
 use hil_account::{
-    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, FateCounts, MessageFate,
-    SegmentMetrics, Stage, account,
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, Demand, DemandMetrics,
+    FateCounts, MessageFate, SegmentMetrics, Stage, account,
 };
 use hil_arm::egm::messages::Side as ArmSide;
 use hil_core::time::Alignment;
@@ -111,6 +112,7 @@ fn channel(
         link,
         account: Some(account),
         outages: None,
+        demand: None,
         emulation: None,
         trace_replay: None,
         recorded: None,
@@ -134,6 +136,17 @@ fn channels() -> Vec<ChannelSummary> {
         files.direct(),
     );
     vec![command, status, motion, recorded_channel()]
+}
+
+/// What became of a demand of `arm/command` on one clock, of 4 ms and 12 ms.
+pub(crate) fn demand(availability: f64) -> DemandMetrics {
+    let demand = Demand {
+        latency_max: Duration::from_millis(1),
+        survival_time: Duration::from_millis(12),
+        interval: Duration::from_millis(4),
+        availability,
+    };
+    Files::sample().demand(&demand, Some(Alignment::SAME_CLOCK))
 }
 
 /// The gateway that receives what goes over the network one way.
@@ -267,6 +280,7 @@ pub(crate) fn empty() -> RunSummary {
             link: link("udp"),
             account,
             outages: None,
+            demand: None,
             emulation: None,
             trace_replay: None,
             recorded: None,

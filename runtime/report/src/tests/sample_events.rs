@@ -122,6 +122,7 @@ pub(crate) fn recorded_channel() -> ChannelSummary {
         link: LinkKind::RecordOnly,
         account: None,
         outages: None,
+        demand: None,
         emulation: None,
         trace_replay: None,
         recorded: Some(RecordedMetrics {

@@ -1,8 +1,8 @@
 //! The records of a run that never was, for the reports that are checked in.
 
 use hil_account::{
-    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Interruption, OutageFinder,
-    OutageMetrics, PathProcess, RunSpan, account, each_history,
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Demand, DemandFold, DemandMetrics,
+    Interruption, OutageFinder, OutageMetrics, PathProcess, RunSpan, account, each_history,
 };
 use hil_core::random::RandomStream;
 use hil_core::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
@@ -115,6 +115,15 @@ impl Files {
         });
         let end = Instant::from_ns(5_000 * PERIOD_NS);
         OutageMetrics::of(&found.finish(), Some(end))
+    }
+
+    /// What became of a demand on the same channel.
+    pub(crate) fn demand(&self, demand: &Demand, alignment: Option<Alignment>) -> DemandMetrics {
+        self.consult(alignment, |records, context| {
+            let mut fold = DemandFold::of_channel(demand, context);
+            each_history(records, context, |message| fold.add(message, context));
+            fold.finish()
+        })
     }
 
     fn consult<T>(

@@ -383,6 +383,37 @@ const FAULTY: &[Faulty] = &[
         "channels.\"arm/status\".link",
         &["via \"shared-memory\", but the channel joins"],
     ),
+    // Demands.
+    Faulty(
+        "[channels.\"arm/status\"]",
+        "[channels.\"arm/command\".demand]\nlatency_max = \"20 s\" #!\nsurvival_time = \"24 ms\"\ninterval = \"16 ms\"\navailability = 0.9999\n[channels.\"arm/status\"]",
+        "channels.\"arm/command\".demand.latency_max",
+        &["outside", "10 s"],
+    ),
+    Faulty(
+        "[channels.\"arm/status\"]",
+        "[channels.\"arm/command\".demand]\nlatency_max = \"20 ms\"\nsurvival_time = 24 #!\ninterval = \"16 ms\"\navailability = 0.9999\n[channels.\"arm/status\"]",
+        "channels.\"arm/command\".demand.survival_time",
+        &["expected a string with a duration"],
+    ),
+    Faulty(
+        "[channels.\"arm/status\"]",
+        "[channels.\"arm/command\".demand]\nlatency_max = \"20 ms\"\nsurvival_time = \"24 ms\"\ninterval = \"16 ms\"\navailability = 99.99 #!\n[channels.\"arm/status\"]",
+        "channels.\"arm/command\".demand.availability",
+        &["99.99 is outside 0 to 0.999999999"],
+    ),
+    Faulty(
+        "[channels.\"arm/status\"]",
+        "[channels.\"arm/command\".demand]\nlatency_max = \"20 ms\"\nsurvival_time = \"24 ms\"\ninterval = \"16 ms\"\navailability = 0.9999\nsurvivaltime = 1 #!\n[channels.\"arm/status\"]",
+        "channels.\"arm/command\".demand.survivaltime",
+        &["did you mean `survival_time`?"],
+    ),
+    Faulty(
+        "[channels.\"arm/status\"]",
+        "[channels.\"arm/command\".demand] #!\nlatency_max = \"20 ms\"\nsurvival_time = \"24 ms\"\navailability = 0.9999\n[channels.\"arm/status\"]",
+        "channels.\"arm/command\".demand.interval",
+        &["missing"],
+    ),
     Faulty(
         "[channels.\"arm/status\"]",
         "[channels.\"arm/statsu\"] #!\n[channels.\"arm/status\"]",
