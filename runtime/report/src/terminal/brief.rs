@@ -14,7 +14,7 @@ use hil_present::units::seconds;
 use hil_present::{Block, Cell, Event, EventList, Row, Section, Table, Tone, UNAVAILABLE};
 
 use super::answer::AnswerExtent;
-use super::{LINKS_SHOWN, answer, case_lead, links};
+use super::{answer, case_lead};
 use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved};
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
@@ -31,7 +31,6 @@ use crate::summary::{ChannelSummary, Outcome, RunSummary};
 struct Extent {
     /// Events of the robot.
     causes: usize,
-    /// Channels, and links above them.
     channels: usize,
     flows: usize,
     deadlines: usize,
@@ -101,14 +100,7 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
         title(&mut begin, summary);
         for one in [
             causes(summary, begin.width(), extent.causes),
-            // A line for each link is one less for channels.
-            channels(
-                summary,
-                extent
-                    .channels
-                    .saturating_sub(summary.run.links.len().min(LINKS_SHOWN + 1))
-                    .max(1),
-            ),
+            channels(summary, extent.channels),
             flows(summary, extent.flows),
             deadlines(summary, extent.deadlines),
             over_time(summary, extent.robot_rows),
@@ -147,7 +139,6 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
     );
     let facts = shortened(&facts, canvas.width());
     canvas.painted_line(Tone::Strong, &facts);
-    links(canvas, summary, 1);
     if run.outcome != Outcome::Completed {
         let (tone, word) = outcome_words(run.outcome);
         let text = shortened(&format!("{word}: {}", run.exit_reason), 2 * canvas.width());
@@ -182,7 +173,7 @@ fn causes(summary: &RunSummary, width: usize, shown_count: usize) -> Section {
         } else {
             "not explained by the network; about then"
         };
-        let cause = format!("{relation}: {}", cause(event));
+        let cause = format!("{relation}: {}", cause(event, summary.network.as_ref()));
         Event {
             at: event.at_s.map_or_else(|| UNAVAILABLE.to_owned(), seconds),
             severity: event.severity_word(),
@@ -217,7 +208,6 @@ impl Line {
     fn of(account: &ChannelAccount, network: Option<&NetworkMetrics>) -> Self {
         let delay = account.end_to_end.distribution.measured();
         let delay = delay.map(|one| [one.p50_ns, one.p99_ns, one.max_ns]);
-        // Virtual time knows what the link model did, and no other stage.
         let on_network = network.and_then(|one| one.delay.measured());
         let on_network = on_network.map(|one| [one.p50.value_ns, one.p99.value_ns, one.max_ns]);
         Self {
@@ -348,7 +338,12 @@ fn groups<'a>(channels: &[&'a ChannelSummary], network: &[ChannelNetwork]) -> Ve
 
 /// One line a channel, alike ones together, those that lost most first.
 fn channels(summary: &RunSummary, shown_count: usize) -> Section {
-    let aside = "from publication to the consumer; gap: no message while one was due";
+    // Virtual time knows what the link model did, and no other stage.
+    let aside = if summary.run.is_virtual {
+        "delay of the link model; lost of those published; gap: none while one was due"
+    } else {
+        "publication to consumer, delay and loss; gap: none while one was due"
+    };
     let mut section = Section::new("channels", "Channels", aside);
     let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
     let shown: Vec<&ChannelSummary> = summary
