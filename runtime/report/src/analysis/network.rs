@@ -479,10 +479,8 @@ fn add_channel(
     };
     records.consult(channel, |files, context| {
         let mut ways = Passages::default();
-        let mut duplicated_count = 0;
         each_history(files, context, |message| {
             ways.push(&message.passage(context.path));
-            duplicated_count += message.copies.duplicated_count;
             if let Some(frames) = &mut frames {
                 frames.note(message);
             }
@@ -504,8 +502,6 @@ fn add_channel(
                 path: context.path,
                 run_ns: Some((producer_start.as_ns(), producer_end.as_ns())),
                 payload_bytes,
-                duplicated_count: files.ingress.map(|_| duplicated_count),
-                round_trips_ns: context.round_trips_ns,
             },
         });
     });

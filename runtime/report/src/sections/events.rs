@@ -24,23 +24,31 @@ const NETWORK_SHOWN_COUNT: usize = 3;
 const NETWORK_EVENTS_MAX: usize = 40;
 
 /// What is said of a robot to which nothing happened.
-pub(crate) const NOTHING_GRAVE: &str = "no incident and no hazard";
+const NOTHING_GRAVE: &str = "no incident and no hazard";
+
+/// The head of what happened to the robot; whether there is more to say of its events, of which `count` are to be listed.
+pub(crate) fn robot_head(summary: &RunSummary, title: &str, count: u64) -> (Section, bool) {
+    let mut section = Section::new("robot", title, "");
+    if summary.run.case.is_empty() {
+        return (section, false);
+    }
+    if let Some(words) = summary.no_score_words() {
+        section.note(Tone::Caution, words);
+        return (section, false);
+    }
+    section.aside = severity_counts(&summary.score_events);
+    if count == 0 {
+        section.note(Tone::Plain, NOTHING_GRAVE);
+    }
+    (section, count > 0)
+}
 
 /// What happened to the robot, the gravest events where there are too many, in order of time.
 pub(super) fn robot(summary: &RunSummary) -> Section {
     let title = "What happened to the robot, and the network before it";
     let all = &summary.score_events;
-    let mut section = Section::new("robot", title, "");
-    if summary.run.case.is_empty() {
-        return section;
-    }
-    if let Some(words) = summary.no_score_words() {
-        section.note(Tone::Faint, words);
-        return section;
-    }
-    section.aside = severity_counts(all);
-    if all.total_count() == 0 {
-        section.note(Tone::Plain, NOTHING_GRAVE);
+    let (mut section, has_events) = robot_head(summary, title, all.total_count());
+    if !has_events {
         return section;
     }
     if all.clocks_differ {
@@ -93,7 +101,7 @@ fn dropped_words(all: &ScoreEvents) -> Option<String> {
 }
 
 /// How many there are of each severity, listed or not.
-pub(crate) fn severity_counts(all: &ScoreEvents) -> String {
+fn severity_counts(all: &ScoreEvents) -> String {
     format!(
         "{} (must not happen), {} (nearly one), {}",
         counted(all.count_of(Severity::Incident), "incident"),

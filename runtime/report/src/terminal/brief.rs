@@ -19,9 +19,7 @@ use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved};
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
-use crate::sections::events::{
-    NOTHING_GRAVE, cause, grave_count, gravest_first, severity_counts, severity_tone,
-};
+use crate::sections::events::{cause, grave_count, gravest_first, robot_head, severity_tone};
 use crate::sections::{deadlines, flows, outcome_words, strips};
 use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
@@ -152,17 +150,8 @@ fn causes(summary: &RunSummary, width: usize, shown_count: usize) -> Section {
     let evidence = Evidence::of(summary);
     let grave = gravest_first(&all.events);
     let title = "Robot, and the network before it";
-    let mut section = Section::new("robot", title, "");
-    if summary.run.case.is_empty() {
-        return section;
-    }
-    if let Some(words) = summary.no_score_words() {
-        section.note(Tone::Caution, words);
-        return section;
-    }
-    section.aside = severity_counts(all);
-    if grave.is_empty() {
-        section.note(Tone::Plain, NOTHING_GRAVE);
+    let (mut section, has_grave) = robot_head(summary, title, grave.len() as u64);
+    if !has_grave {
         return section;
     }
     // Two lines each at most.

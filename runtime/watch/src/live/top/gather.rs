@@ -285,7 +285,7 @@ fn channel_row(observer: &Observer, name: &str, account: Option<&ChannelAccount>
             None if observer.is_recorded(name) => Some("no message in this time".to_owned()),
             None => Some("nothing of it is recorded here".to_owned()),
         },
-        bound_ns: end_to_end.and_then(|one| one.alignment_bound_ns),
+        bound_ns: end_to_end.and_then(|one| one.alignment_bound_ns()),
         segments: segments.unwrap_or_default(),
         history_ns: Vec::new(),
     }
