@@ -243,13 +243,13 @@ impl UsualLosses {
         if report.foregoing_chance_ratio <= CHANCE_MAX {
             return None;
         }
-        let lost = event.messages.iter().filter(|one| {
+        let missing = event.messages.iter().filter(|one| {
             let fate = one.fate;
             fate.is_some_and(MessageFate::is_loss_by_network)
         });
         let outages = event.outages.iter();
         let outages = outages.filter(|one| one.lost_by_network_count > 0);
-        let named = lost.map(|one| &one.channel);
+        let named = missing.map(|one| &one.channel);
         let mut named = named.chain(outages.map(|one| &one.channel));
         let mut losses = network.losses.iter();
         let loss = match named.next() {
