@@ -185,6 +185,11 @@ pub enum Unresolved {
         /// Why not.
         why: TooSmall,
     },
+    /// Of a comparison: no repetition differs from another of its side, so that nothing tells how runs scatter.
+    NoScatter {
+        /// In what.
+        what: String,
+    },
 }
 
 hil_core::labelled! {
@@ -526,6 +531,10 @@ impl fmt::Display for Unresolved {
             Self::NoInterval { what, why } => {
                 write!(formatter, "the difference of {what} has {why}")
             }
+            Self::NoScatter { what } => write!(
+                formatter,
+                "no run differs from another of its side in {what}, and nothing tells how runs scatter"
+            ),
             Self::ClocksDiffer => formatter.write_str(
                 "the hosts' clocks are not aligned, which leaves open whether a network event came before the harm",
             ),

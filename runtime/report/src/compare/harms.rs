@@ -255,7 +255,9 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
             .iter()
             .all(|one| one.change == Change::Less || one.new.count == Some(0));
     if !is_unhurt && !is_less {
-        return not_resolvable(too_small(harms).unwrap_or(Unresolved::WithinChance));
+        let are_repeated = base.len().min(new.len()) > 1;
+        let because = too_small(harms, are_repeated).unwrap_or(Unresolved::WithinChance);
+        return not_resolvable(because);
     }
     too_few(harms, base, new).map_or(Hurt::No, not_resolvable)
 }
@@ -305,14 +307,15 @@ fn base_precondition(run: &ComparedRun) -> Option<Hurt> {
 }
 
 /// The first harm of the new runs whose difference has no interval.
-fn too_small(harms: &[ComparedHarm]) -> Option<Unresolved> {
+fn too_small(harms: &[ComparedHarm], are_repeated: bool) -> Option<Unresolved> {
     let mut hurt = harms.iter().filter(|one| one.new.count != Some(0));
-    hurt.find_map(|one| match one.difference?.interval {
-        Spread::Known(_) => None,
-        Spread::Unknown(why) => Some(Unresolved::NoInterval {
-            what: one.new.what.clone(),
-            why,
-        }),
+    hurt.find_map(|one| {
+        let what = one.new.what.clone();
+        match one.difference?.interval {
+            Spread::Known(_) => None,
+            Spread::Unknown(_) if are_repeated => Some(Unresolved::NoScatter { what }),
+            Spread::Unknown(why) => Some(Unresolved::NoInterval { what, why }),
+        }
     })
 }
 
@@ -424,6 +427,11 @@ mod tests {
         let runs = |counts: [u64; 3]| counts.map(|count| run(Some(count), 17));
         assert_eq!(compared(&runs([0; 3]), &runs([11, 9, 12])), Hurt::Yes);
         assert_eq!(compared(&runs([0; 3]), &runs([0; 3])), Hurt::No);
+        let because = Unresolved::NoScatter {
+            what: "motion loops lost".to_owned(),
+        };
+        let alike = compared(&runs([0; 3]), &runs([3; 3]));
+        assert_eq!(alike, Hurt::NotResolvable { because });
         assert_eq!(compared(&runs([11, 9, 12]), &runs([0; 3])), Hurt::No);
         // As do repetitions beside one run that is long enough.
         let long = |counts: [u64; 3]| counts.map(|count| run(Some(count), 600));

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use hil_core::interval::{Interval, Spread};
-use hil_platform::text::{grouped, shell_word};
+use hil_platform::text::grouped;
 use hil_platform::words::counted;
 use hil_present::template::{TemplateError, markdown as document};
 use hil_present::terminal::canvas::{Canvas, Style};
@@ -23,6 +23,8 @@ const COLUMNS: [&str; 6] = ["metric", "base", "new", "new / base", "95 %", "verd
 /// Differences and channels that are listed unless every metric is asked for.
 const DIFFERENCES_SHOWN: usize = 8;
 const CHANNELS_SHOWN: usize = 12;
+/// Repetitions a side that are asked for.
+const REPETITIONS_MIN: usize = 3;
 
 /// How much is shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -233,15 +235,17 @@ fn resolve(section: &mut Section, comparison: &Comparison) {
     else {
         return;
     };
-    let words = "repeat the runs of both sides, each with a seed of its own, until there are three a side or more:";
-    section.fact("to resolve it", Tone::Plain, words);
-    let words = |runs: &[PathBuf]| {
-        let words = runs.iter().map(|run| shell_word(&run.to_string_lossy()));
-        words.collect::<Vec<_>>().join(" ")
+    let words = if comparison.base.len().min(comparison.new.len()) < REPETITIONS_MIN {
+        format!(
+            "repeat the runs of both sides, each with a seed of its own, until there are \
+             {REPETITIONS_MIN} a side or more:"
+        )
+    } else {
+        "more repetitions on both sides, each with a seed of its own:".to_owned()
     };
-    let (base, new) = (words(&comparison.base), words(&comparison.new));
+    section.fact("to resolve it", Tone::Plain, words);
     section.blocks.push(Block::Command {
-        text: format!("hil-runtime compare --base {base} BASE-RUNS --new {new} NEW-RUNS"),
+        text: "hil-runtime compare --base BASE-RUNS --new NEW-RUNS".to_owned(),
     });
 }
 
